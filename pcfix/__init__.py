@@ -1,0 +1,93 @@
+"""Refraction correction of through-water photogrammetric point clouds.
+
+The names here are the whole public interface; each is loaded when it is first used, so that
+``import pcfix`` is quick.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
+    from pcfix.flow import correct_file, correct_points, restore_file
+    from pcfix.io.cameras import read_cameras
+    from pcfix.io.water import read_water
+    from pcfix.model import (
+        Cameras,
+        Correction,
+        Lens,
+        Outcome,
+        Settings,
+        Summary,
+        Views,
+        WaterDimension,
+        WaterMesh,
+        WaterPlane,
+        WaterSurface,
+    )
+    from pcfix.simulate import simulate
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "correct_file": "pcfix.flow",
+    "correct_points": "pcfix.flow",
+    "restore_file": "pcfix.flow",
+    "read_cameras": "pcfix.io.cameras",
+    "read_water": "pcfix.io.water",
+    "simulate": "pcfix.simulate",
+    "Cameras": "pcfix.model",
+    "Correction": "pcfix.model",
+    "Lens": "pcfix.model",
+    "Outcome": "pcfix.model",
+    "Settings": "pcfix.model",
+    "Summary": "pcfix.model",
+    "Views": "pcfix.model",
+    "WaterDimension": "pcfix.model",
+    "WaterMesh": "pcfix.model",
+    "WaterPlane": "pcfix.model",
+    "WaterSurface": "pcfix.model",
+    "PcfixError": "pcfix.errors",
+    "InputError": "pcfix.errors",
+    "SettingError": "pcfix.errors",
+    "GeometryError": "pcfix.errors",
+    "PcfixWarning": "pcfix.errors",
+}
+
+__all__ = [
+    "Cameras",
+    "Correction",
+    "GeometryError",
+    "InputError",
+    "Lens",
+    "Outcome",
+    "PcfixError",
+    "PcfixWarning",
+    "SettingError",
+    "Settings",
+    "Summary",
+    "Views",
+    "WaterDimension",
+    "WaterMesh",
+    "WaterPlane",
+    "WaterSurface",
+    "correct_file",
+    "correct_points",
+    "read_cameras",
+    "read_water",
+    "restore_file",
+    "simulate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name from its home."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'pcfix' has no attribute '{name}'")
+    return getattr(import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

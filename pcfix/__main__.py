@@ -1,0 +1,5 @@
+"""``python -m pcfix``."""
+
+from pcfix.cli import main
+
+main()

@@ -1,0 +1,205 @@
+"""The calculation over arrays, and the checks that cloud, water and cameras fit together."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pcfix.errors import GeometryError, SettingError
+from pcfix.io.water import read_water
+from pcfix.label.surface import SurfaceAbove, is_submerged, surface_above
+from pcfix.model import (
+    DEFAULT_REFRACTIVE_INDEX,
+    Cameras,
+    Correction,
+    Settings,
+    Views,
+    WaterDimension,
+    WaterMesh,
+    WaterPlane,
+    WaterSurface,
+)
+from pcfix.refract.intersect import intersect
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from pcfix.model import FloatArray
+
+
+def correct_points(
+    xyz: npt.ArrayLike,
+    cameras: Cameras,
+    water: WaterSurface | float | npt.ArrayLike,
+    *,
+    refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
+    max_angle_deg: float | None = None,
+    max_cameras: int | None = None,
+    views: Views | None = None,
+) -> Correction:
+    """Correct apparent points for refraction at the water surface.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 3)
+        Points as the SfM software placed them, metres, world frame. Those below the water
+        surface are moved, the others come back bit for bit.
+    cameras : Cameras
+        Poses in the same frame; see `pcfix.read_cameras`.
+    water : WaterSurface, float, or array of shape (n,)
+        The water surface (see `pcfix.read_water`), its level in metres, or its height above
+        each point, NaN where it is not known.
+    refractive_index : float, default 1.34
+        Water relative to air, 1.0 to 1.5.
+    max_angle_deg : float, optional
+        Use only rays with at most this incidence angle in air, from the surface normal.
+        Default: no limit where cameras have angles, 80 degrees where they have none.
+    max_cameras : int, optional
+        Use at most so many rays a point, the steepest ones.
+    views : Views, optional
+        Which cameras made each point. Default: every camera whose frame holds it.
+
+    Returns
+    -------
+    Correction
+        One row per input point, in the same order.
+
+    Raises
+    ------
+    SettingError
+        If an argument is outside its rule, or a coordinate is not finite.
+    GeometryError
+        If a camera stands under the water.
+
+    Notes
+    -----
+    For each camera the line from the projection centre to the apparent point is bent where it
+    pierces the surface (Snell in vector form, Skarlatos & Agrafiotis 2018, eq 10); the true
+    point is the one nearest to all bent rays in the sense of least squares (eq 11, for any
+    number of rays). Nothing is iterated and no sum depends on the number of threads.
+
+    Examples
+    --------
+    Two cameras 100 m above a bed that looks 2 m deep:
+
+    >>> import numpy as np, pcfix
+    >>> cameras = pcfix.Cameras(("a", "b"), np.array([[-20.0, 0, 100], [20.0, 0, 100]]))
+    >>> result = pcfix.correct_points([[0.0, 0.0, -2.0]], cameras, 0.0)
+    >>> result.xyz.round(3).tolist()
+    [[0.0, 0.0, -2.703]]
+    """
+    points = _checked_points(xyz)
+    settings = Settings(refractive_index, max_angle_deg, max_cameras)
+    surface, dimension = _as_surface(water, len(points))
+    check_above_water(cameras, surface)
+    if views is not None:
+        _check_views(views, len(points), len(cameras))
+    return correct_checked(points, cameras, surface, settings, dimension, views)
+
+
+def _checked_points(xyz: npt.ArrayLike) -> FloatArray:
+    points = np.ascontiguousarray(xyz, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise SettingError(f"xyz must have the shape (n, 3), not {points.shape}.")
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        raise SettingError(f"xyz row {row} is not finite: {points[row].tolist()}; remove it.")
+    return points
+
+
+def _as_surface(
+    water: WaterSurface | float | npt.ArrayLike, n: int
+) -> tuple[WaterSurface, FloatArray | None]:
+    if isinstance(water, WaterPlane | WaterDimension | WaterMesh):
+        return water, None
+    heights = np.asarray(water, dtype=np.float64)
+    if heights.ndim == 0:
+        return read_water(float(heights)), None
+    if heights.shape != (n,):
+        raise SettingError(f"water must be one height or {n}, not of shape {heights.shape}.")
+    return WaterDimension("given heights"), heights
+
+
+def _check_views(views: Views, n: int, k: int) -> None:
+    if len(views.start) != n + 1 or views.start[0] != 0 or views.start[-1] != len(views.camera):
+        raise SettingError(f"views must have {n + 1} starts, from 0 to the number of entries.")
+    if (np.diff(views.start) < 0).any():
+        raise SettingError("views: the starts must not decrease.")
+    if len(views.camera) and not 0 <= views.camera.min() <= views.camera.max() < k:
+        raise SettingError(f"views name camera {views.camera.max()}, but there are {k}.")
+
+
+def correct_checked(
+    xyz: FloatArray,
+    cameras: Cameras,
+    water: WaterSurface,
+    settings: Settings,
+    dimension: FloatArray | None = None,
+    views: Views | None = None,
+) -> Correction:
+    """Label, refract, and spread the result over all rows: what every door runs."""
+    surface = surface_above(water, xyz, dimension)
+    submerged = is_submerged(xyz[:, 2], surface)
+    rows = np.flatnonzero(submerged)
+    above = SurfaceAbove(surface.height_m[rows], surface.slope[rows])
+    found = intersect(
+        xyz[rows], above, water, cameras, settings, None if views is None else views.take(rows)
+    )
+    true = xyz[rows] + found.shift_m
+    rise = (above.slope * found.shift_m[:, :2]).sum(axis=1)
+
+    def spread(values: npt.NDArray[Any]) -> Any:
+        full = np.zeros((len(xyz), *values.shape[1:]), values.dtype)
+        full[rows] = values
+        return full
+
+    corrected = xyz.copy()
+    corrected[rows] = true
+    known = np.isfinite(surface.height_m)
+    return Correction(
+        xyz=corrected,
+        shift_m=spread(found.shift_m),
+        outcome=spread(found.outcome),
+        ray_count=spread(found.ray_count),
+        ray_miss_m=spread(found.ray_miss_m),
+        depth_m=spread(above.height_m + rise - true[:, 2]),
+        incidence_deg=spread(found.incidence_deg),
+        sigma_z_m=spread(found.sigma_z_m),
+        camera_used=found.camera_used,
+        water_known=known,
+        lowest_water_m=float(surface.height_m[known].min()) if known.any() else np.inf,
+    )
+
+
+def check_above_water(cameras: Cameras, water: WaterSurface) -> None:
+    """Refuse cameras that stand under the water.
+
+    Raises
+    ------
+    GeometryError
+        With the first of them, and what is likely wrong.
+    """
+    match water:
+        case WaterPlane(a, b, c):
+            level = a + b * cameras.centres[:, 0] + c * cameras.centres[:, 1]
+        case WaterMesh(vertices):
+            from scipy.spatial import cKDTree
+
+            nearest = cKDTree(vertices[:, :2]).query(cameras.centres[:, :2])[1]
+            level = vertices[nearest, 2]
+        case WaterDimension():
+            return  # known only once the points are; see `correct_file`
+    refuse_under_water(cameras, level, str(water))
+
+
+def refuse_under_water(cameras: Cameras, level: FloatArray | float, water: str) -> None:
+    below = np.flatnonzero(cameras.centres[:, 2] <= level)
+    if below.size:
+        first = below[0]
+        raise GeometryError(
+            f"{below.size} of {len(cameras)} cameras are under the water, the first"
+            f" {cameras.labels[first]} at z = {cameras.centres[first, 2]:.2f} m ({water}): check"
+            " the heights' datum, the order of the columns and the water surface."
+        )

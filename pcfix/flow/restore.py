@@ -1,0 +1,101 @@
+"""Undo a correction from the dimensions that it left in the file."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pcfix.errors import InputError
+from pcfix.flow.files import CHUNK_POINTS
+from pcfix.flow.threads import threads
+from pcfix.io.files import check_input, check_output
+from pcfix.io.las.columns import SHIFTS, columns_for, is_corrected, is_marked_uncorrected
+from pcfix.io.las.provenance import read_settings
+from pcfix.io.las.sink import (
+    LasSink,
+    check_suffix,
+    output_evlrs,
+    restored_header,
+    write_shifted,
+)
+from pcfix.io.las.source import LasSource
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Callable
+    from pathlib import Path
+
+    import laspy
+    import numpy.typing as npt
+
+    PathLike = str | os.PathLike[str]
+
+
+def restore_file(
+    input: PathLike,  # noqa: A002
+    output: PathLike,
+    *,
+    overwrite: bool = False,
+    jobs: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> int:
+    """Give back the apparent cloud that a corrected one came from, bit for bit.
+
+    Parameters
+    ----------
+    input : path
+        A cloud that pcfix corrected with ``dimensions="all"``.
+    output : path
+        The cloud as it was: coordinates, classes, flags, point format, version.
+    overwrite, jobs, progress
+        See `correct_file`.
+
+    Returns
+    -------
+    int
+        Points written. Rows dropped by ``uncorrected="drop"`` are gone.
+
+    Raises
+    ------
+    InputError
+        If pcfix did not correct the file, or without the dimensions that undo it.
+    """
+    source_path = check_input(input)
+    target = check_output(output, overwrite=overwrite, inputs=[source_path])
+    check_suffix(target)
+    with LasSource(source_path, jobs) as source, threads(jobs):
+        content = read_settings(source.vlrs, source_path)
+        if content is None:
+            raise InputError(f"{source_path}: was not corrected by pcfix; there is nothing to undo.")
+        columns = columns_for(content["settings"]["dimensions"])
+        names = {column.name for column in columns}
+        if not names.issuperset(SHIFTS):
+            raise InputError(
+                f"{source_path}: was written with --dimensions {content['settings']['dimensions']},"
+                " which keeps no way back; use the original cloud."
+            )
+        header = restored_header(source, content["before"], names)
+        offset = np.array(content["before"]["steps"])
+        with LasSink(target, header, output_evlrs(source), jobs) as sink:
+            done = 0
+            for points in source.chunks(CHUNK_POINTS):
+                sink.write(_restored(points, header, target, offset))
+                done += len(points)
+                if progress is not None:
+                    progress(done, len(source))
+    return done
+
+
+def _restored(
+    points: laspy.ScaleAwarePointRecord,
+    header: laspy.LasHeader,
+    path: Path,
+    offset: npt.NDArray[np.int64],
+) -> laspy.ScaleAwarePointRecord:
+    moved = is_corrected(points)
+    points.array["classification"][moved] = points.array["SourceClass"][moved]
+    withheld = np.asarray(points["withheld"]).astype(bool)
+    points["withheld"][:] = (withheld & ~is_marked_uncorrected(points)).astype(np.uint8)
+    shift = np.column_stack([points.array[name] for name in SHIFTS]).astype(np.int64)
+    return write_shifted(points, header, path, -shift - offset)

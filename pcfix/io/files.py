@@ -1,0 +1,75 @@
+"""Rules for every file that pcfix writes: whole or not at all, and never over another's work."""
+
+from __future__ import annotations
+
+import os
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pcfix.errors import InputError, SettingError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+
+def check_input(path: str | os.PathLike[str]) -> Path:
+    """Return the path of a file that exists.
+
+    Raises
+    ------
+    InputError
+        If there is no such file.
+    """
+    found = Path(path)
+    if not found.is_file():
+        raise InputError(f"{found}: there is no such file.")
+    return found
+
+
+def check_output(
+    path: str | os.PathLike[str], *, overwrite: bool, inputs: Iterable[str | os.PathLike[str]] = ()
+) -> Path:
+    """Return the path of a file that may be written.
+
+    Raises
+    ------
+    SettingError
+        If it is one of the inputs, exists without `overwrite`, or has no folder to be in.
+    """
+    target = Path(path)
+    for source in inputs:
+        if target.resolve() == Path(source).resolve():
+            raise SettingError(
+                f"{target}: output and input are the same file; give the output another name."
+            )
+    if target.is_dir():
+        raise SettingError(f"{target}: the output is a folder; give a file name.")
+    if target.exists() and not overwrite:
+        raise SettingError(f"{target}: the output exists; add --overwrite to replace it.")
+    if not target.parent.is_dir():
+        raise SettingError(f"{target}: the folder {target.parent} does not exist; make it first.")
+    return target
+
+
+@contextmanager
+def replaced_when_whole(target: Path) -> Iterator[Path]:
+    """Give a name beside the target to write to, and rename it once the block ends well.
+
+    The name keeps the target's suffix. Whatever goes wrong, nothing is left behind.
+    """
+    draft = target.with_name(f".{target.stem}.{os.getpid()}.part{target.suffix}")
+    try:
+        yield draft
+        draft.replace(target)
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written ({error.strerror or error}).") from error
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def write_text(path: str | os.PathLike[str], text: str, *, overwrite: bool) -> None:
+    """Write a small text file under the same rules."""
+    target = check_output(path, overwrite=overwrite)
+    with replaced_when_whole(target) as draft:
+        draft.write_text(text, encoding="utf-8")

@@ -1,0 +1,167 @@
+"""The extra dimensions that a correction leaves in the file: what, how wide, in which unit.
+
+All are integers with a scale, so that LAZ packs them well. Each has a narrow type, which nearly
+every cloud fits, and a wide one; a cloud with a value outside the narrow range is written again
+with the wide types.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import laspy
+import numpy as np
+from laspy.vlrs.known import ExtraBytesStruct
+
+from pcfix.errors import InputError
+from pcfix.model import Outcome
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from pcfix.model import BoolArray, Correction, Dimensions, FloatArray
+
+
+class TooNarrow(Exception):
+    """A value does not fit the narrow types; write the file again with the wide ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One extra dimension. Scale 0 means the file's own scale of that axis; 1 means a count."""
+
+    name: str
+    narrow: str
+    wide: str
+    scale: float
+    description: str
+    saturates: bool = False
+
+    def dtype(self, *, wide: bool) -> np.dtype[Any]:
+        """Return the numpy type."""
+        return np.dtype(self.wide if wide else self.narrow)
+
+
+COLUMNS = (
+    Column("ShiftX", "int16", "int32", 0.0, "true minus apparent X"),
+    Column("ShiftY", "int16", "int32", 0.0, "true minus apparent Y"),
+    Column("ShiftZ", "int16", "int32", 0.0, "true minus apparent Z"),
+    Column("WaterDepth", "uint16", "uint32", 0.001, "below the water surface, m"),
+    Column("RayMiss", "uint16", "uint32", 0.0001, "rms distance from the rays, m", True),
+    Column("SigmaZ", "uint16", "uint32", 0.0001, "formal, scatter of rays only, m", True),
+    Column("Incidence", "uint16", "uint16", 0.01, "largest angle in air, deg"),
+    Column("RayCount", "uint16", "uint16", 1.0, "rays intersected", True),
+    Column("SourceClass", "uint8", "uint8", 1.0, "class before the correction"),
+)
+SHIFTS = ("ShiftX", "ShiftY", "ShiftZ")
+MINIMAL = ("ShiftZ", "RayCount")
+
+
+def columns_for(dimensions: Dimensions) -> tuple[Column, ...]:
+    """Return the columns that ``--dimensions`` asks for."""
+    if dimensions == "all":
+        return COLUMNS
+    names = MINIMAL if dimensions == "minimal" else ()
+    return tuple(column for column in COLUMNS if column.name in names)
+
+
+def column_scale(column: Column, scales: FloatArray) -> float:
+    """Return the scale of a column in a file with the given coordinate scales."""
+    return float(scales[SHIFTS.index(column.name)]) if column.scale == 0.0 else column.scale
+
+
+def extra_bytes(
+    columns: tuple[Column, ...], scales: FloatArray, *, wide: bool
+) -> tuple[list[laspy.ExtraBytesParams], bytes]:
+    """Return the dimensions for laspy's point format and the bytes of their VLR records."""
+    params, records = [], b""
+    for column in columns:
+        scale = column_scale(column, scales)
+        scaled = None if scale == 1.0 else np.array([scale])
+        offset = None if scale == 1.0 else np.zeros(1)
+        dtype = column.dtype(wide=wide)
+        params.append(
+            laspy.ExtraBytesParams(column.name, dtype, column.description, offset, scaled)
+        )
+        number = ["uint8", "int8", "uint16", "int16", "uint32", "int32"].index(dtype.name) + 1
+        record = ExtraBytesStruct(
+            column.name.encode(), number, column.description.encode(), scaled, offset
+        )
+        record.options &= ~(record.MIN_BIT_MASK | record.MAX_BIT_MASK)
+        record._min[:], record._max[:] = type(record._min)(), type(record._max)()
+        records += bytes(record)
+    return params, records
+
+
+def shift_steps(correction: Correction, scales: FloatArray) -> npt.NDArray[np.int64]:
+    """Return the shift in steps of the file's own scale, shape (n, 3)."""
+    return np.rint(correction.shift_m / scales).astype(np.int64)
+
+
+def fill(
+    points: laspy.ScaleAwarePointRecord,
+    columns: tuple[Column, ...],
+    correction: Correction,
+    steps: npt.NDArray[np.int64],
+    rows: BoolArray,
+) -> None:
+    """Write the columns of the given rows; the others keep zero.
+
+    Raises
+    ------
+    TooNarrow
+        If a value does not fit its type and the type may be widened.
+    """
+    values: dict[str, npt.NDArray[Any]] = {
+        "ShiftX": steps[:, 0],
+        "ShiftY": steps[:, 1],
+        "ShiftZ": steps[:, 2],
+        "WaterDepth": correction.depth_m,
+        "RayMiss": correction.ray_miss_m,
+        "SigmaZ": correction.sigma_z_m,
+        "Incidence": correction.incidence_deg,
+        "RayCount": correction.ray_count,
+        "SourceClass": np.asarray(points["classification"]),
+    }
+    for column in columns:
+        target = points.array[column.name]
+        limits = np.iinfo(target.dtype)
+        value = values[column.name][rows]
+        if column.scale not in (0.0, 1.0):
+            value = np.rint(value / column.scale)
+        if column.saturates:
+            value = np.minimum(value, limits.max)
+        if column.name == "WaterDepth":
+            value = np.maximum(value, 1)  # a submerged point is never at zero depth
+        if value.size and (value.min() < limits.min or value.max() > limits.max):
+            if target.dtype != column.dtype(wide=True):
+                raise TooNarrow
+            raise InputError(
+                f"{column.name} reaches {value.max():g} steps of {column_scale(column, points.scales)}"
+                f", more than {target.dtype} holds: the cloud has points far below the water;"
+                " remove them, or write it with a coarser scale."
+            )
+        target[rows] = value
+
+
+def changed_rows(correction: Correction, withheld: BoolArray) -> BoolArray:
+    """Return the rows that get values: corrected ones, and uncorrected ones not yet withheld.
+
+    An uncorrected point that came withheld is left wholly as it was, so that `restore` can tell
+    it from one that pcfix withheld.
+    """
+    return correction.corrected | (correction.submerged & ~withheld)
+
+
+def is_corrected(points: laspy.ScaleAwarePointRecord) -> BoolArray:
+    """Return which rows of an output file were moved."""
+    return np.asarray(points.array["RayCount"] > 0)
+
+
+def is_marked_uncorrected(points: laspy.ScaleAwarePointRecord) -> BoolArray:
+    """Return which rows of an output file pcfix found submerged and could not move."""
+    return np.asarray((points.array["RayCount"] == 0) & (points.array["WaterDepth"] > 0))
+
+
+UNCORRECTED = tuple(o for o in Outcome if o not in (Outcome.LAND, Outcome.CORRECTED))

@@ -1,0 +1,77 @@
+"""Point formats: class 40 needs LAS 1.4 formats 6 and up, which hold all that 0 to 5 hold."""
+
+from __future__ import annotations
+
+import laspy
+import numpy as np
+
+UPGRADE = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10, 6: 6, 7: 7, 8: 8, 9: 9, 10: 10}
+"""The format that each one becomes (LAS 1.4 R15, table 6 and on)."""
+
+SCAN_ANGLE_STEP_DEG = 0.006
+"""Unit of the scan angle in formats 6 and up; whole degrees before."""
+
+_PACKED = (
+    "return_number",
+    "number_of_returns",
+    "scan_direction_flag",
+    "edge_of_flight_line",
+    "classification",
+    "synthetic",
+    "key_point",
+    "withheld",
+)
+
+
+def upgraded(point_format: laspy.PointFormat) -> laspy.PointFormat:
+    """Return the output's point format, with the input's extra dimensions."""
+    return _with_extra(UPGRADE[point_format.id], point_format)
+
+
+def _with_extra(format_id: int, like: laspy.PointFormat) -> laspy.PointFormat:
+    new = laspy.PointFormat(format_id)
+    new.dimensions.extend(like.extra_dimensions)
+    return new
+
+
+def convert(
+    points: laspy.ScaleAwarePointRecord, point_format: laspy.PointFormat
+) -> laspy.ScaleAwarePointRecord:
+    """Return the points in another format, which may have more or fewer extra dimensions.
+
+    Values that both formats have come over bit for bit; dimensions that are new are zero.
+    """
+    array = np.zeros(len(points), point_format.dtype())
+    new = laspy.ScaleAwarePointRecord(array, point_format, points.scales, points.offsets)
+    if points.point_format.id == point_format.id and _one_begins_the_other(points.array, array):
+        size = min(points.array.itemsize, array.itemsize)
+        _bytes(array)[:, :size] = _bytes(points.array)[:, :size]
+        return new
+    for name in points.array.dtype.names:
+        if name in array.dtype.names and name != "bit_fields":
+            array[name] = points.array[name]
+    if points.point_format.id == point_format.id:
+        array["bit_fields"] = points.array["bit_fields"]
+        return new
+    for name in _PACKED:
+        new[name][:] = np.asarray(points[name])
+    _convert_scan_angle(points.array, array)
+    return new
+
+
+def _one_begins_the_other(one: np.ndarray, other: np.ndarray) -> bool:
+    names = min(one.dtype.names, other.dtype.names, key=len)
+    fields = [(one.dtype.fields[n], other.dtype.fields[n]) for n in names if n in one.dtype.names
+              and n in other.dtype.names]  # fmt: skip
+    return len(fields) == len(names) and all(a[:2] == b[:2] for a, b in fields)
+
+
+def _bytes(array: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(array).view(np.uint8).reshape(len(array), array.itemsize)
+
+
+def _convert_scan_angle(old: np.ndarray, new: np.ndarray) -> None:
+    if "scan_angle" in new.dtype.names and "scan_angle_rank" in old.dtype.names:
+        new["scan_angle"] = np.rint(old["scan_angle_rank"] / SCAN_ANGLE_STEP_DEG)
+    elif "scan_angle_rank" in new.dtype.names and "scan_angle" in old.dtype.names:
+        new["scan_angle_rank"] = np.rint(old["scan_angle"] * SCAN_ANGLE_STEP_DEG)

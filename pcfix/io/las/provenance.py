@@ -1,0 +1,47 @@
+"""The VLR that says what pcfix did, and what the file was before."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+from laspy.vlrs.vlr import VLR
+
+from pcfix.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+USER_ID = "pcfix"
+SETTINGS_RECORD = 1
+DESCRIPTION = "pcfix settings (JSON)"
+
+
+def is_ours(vlr: VLR) -> bool:
+    """Whether a VLR is the one of `settings_vlr`."""
+    return bool(vlr.user_id == USER_ID and vlr.record_id == SETTINGS_RECORD)
+
+
+def settings_vlr(content: dict[str, Any]) -> VLR:
+    """Return the VLR that holds the content as JSON."""
+    text = json.dumps(content, ensure_ascii=True, separators=(",", ":"))
+    return VLR(USER_ID, SETTINGS_RECORD, DESCRIPTION, text.encode())
+
+
+def read_settings(vlrs: Iterable[VLR], path: Path) -> dict[str, Any] | None:
+    """Return the content of the VLR, or None where there is none.
+
+    Raises
+    ------
+    InputError
+        If the VLR is damaged.
+    """
+    for vlr in vlrs:
+        if is_ours(vlr):
+            try:
+                content: dict[str, Any] = json.loads(vlr.record_data)
+            except ValueError as error:
+                raise InputError(f"{path}: pcfix's own VLR is damaged ({error}).") from error
+            return content
+    return None

@@ -1,0 +1,176 @@
+"""Read a LAS or LAZ file chunk by chunk, and keep what laspy would rewrite."""
+
+from __future__ import annotations
+
+import struct
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import laspy
+import lazrs
+import numpy as np
+from laspy.vlrs.vlr import VLR
+
+from pcfix.errors import InputError
+from pcfix.io.files import check_input
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Iterator
+    from pathlib import Path
+    from typing import BinaryIO
+
+    from pcfix.model import FloatArray
+
+WAVEFORM_PACKETS = ("LASF_Spec", 65535)
+
+
+@contextmanager
+def las_errors(path: Path) -> Iterator[None]:
+    """Turn whatever the LAS libraries raise into one sentence about the file."""
+    try:
+        yield
+    except (
+        laspy.LaspyException,
+        lazrs.LazrsError,
+        struct.error,
+        ValueError,
+        IndexError,
+        OverflowError,
+        OSError,
+    ) as error:
+        reason = str(error).strip().rstrip(".") or type(error).__name__
+        raise InputError(
+            f"{path}: is not a whole LAS or LAZ file ({reason}); export or copy it again."
+        ) from error
+
+
+class LasSource:
+    """An open LAS or LAZ file.
+
+    Use it as a context manager.
+
+    Attributes
+    ----------
+    path : Path
+    header : laspy.LasHeader
+    vlrs, evlrs : list of laspy.VLR
+        Every (extended) variable length record with its bytes as they are in the file;
+        laspy's own classes lose some of them when they write.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], jobs: int | None = None) -> None:
+        """Open and check the header.
+
+        Raises
+        ------
+        InputError
+            If the file is missing, damaged or empty, or its scales or offsets are unusable.
+        """
+        self.path = check_input(path)
+        with las_errors(self.path):
+            self._reader = laspy.open(self.path, laz_backend=backend(jobs))
+        self.header: laspy.LasHeader = self._reader.header
+        try:
+            self._check_header()
+            with las_errors(self.path), self.path.open("rb") as stream:
+                self.vlrs, self.evlrs = _raw_records(stream, self.header)
+        except BaseException:
+            self._reader.close()
+            raise
+
+    def __enter__(self) -> LasSource:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._reader.close()
+
+    def __len__(self) -> int:
+        return int(self.header.point_count)
+
+    def _check_header(self) -> None:
+        scales, offsets = self.header.scales, self.header.offsets
+        if not (np.isfinite(scales).all() and (scales > 0).all() and np.isfinite(offsets).all()):
+            raise InputError(
+                f"{self.path}: the header's scales {scales.tolist()} and offsets"
+                f" {offsets.tolist()} must be finite and the scales positive; export it again."
+            )
+        if len(self) == 0:
+            raise InputError(f"{self.path}: holds no points.")
+
+    def chunks(self, size: int) -> Iterator[laspy.ScaleAwarePointRecord]:
+        """Yield all points, in order, at most `size` at a time.
+
+        Raises
+        ------
+        InputError
+            If the file ends before its last point.
+        """
+        read = 0
+        while read < len(self):
+            with las_errors(self.path):
+                points = self._reader.read_points(size)
+            if len(points) < min(size, len(self) - read):
+                raise InputError(
+                    f"{self.path}: is cut short: the header promises {len(self):,} points,"
+                    f" the file holds {read + len(points):,}; copy it again."
+                )
+            read += len(points)
+            yield points
+
+    def dimension(self, points: laspy.ScaleAwarePointRecord, name: str) -> FloatArray:
+        """Return one dimension of a chunk, scaled, as float64.
+
+        Raises
+        ------
+        InputError
+            If the cloud has no such dimension.
+        """
+        names = list(self.header.point_format.dimension_names)
+        if name not in names:
+            extra = list(self.header.point_format.extra_dimension_names)
+            listing = f"its extra dimensions are {', '.join(extra)}" if extra else "it has no extra"
+            raise InputError(f"{self.path}: has no dimension {name}; {listing}.")
+        return np.asarray(points[name], dtype=np.float64)
+
+
+def backend(jobs: int | None) -> laspy.LazBackend:
+    """Return the LAZ backend: one thread when asked for one job, else all cores."""
+    return laspy.LazBackend.Lazrs if jobs == 1 else laspy.LazBackend.LazrsParallel
+
+
+def coordinates(points: laspy.ScaleAwarePointRecord) -> FloatArray:
+    """Return x, y, z of a chunk, shape (n, 3), metres."""
+    xyz = np.empty((len(points), 3))
+    for axis, name in enumerate("XYZ"):
+        np.multiply(points.array[name], points.scales[axis], out=xyz[:, axis])
+        xyz[:, axis] += points.offsets[axis]
+    return xyz
+
+
+def _raw_records(stream: BinaryIO, header: laspy.LasHeader) -> tuple[list[VLR], list[VLR]]:
+    stream.seek(94)
+    (header_size,) = struct.unpack("<H", stream.read(2))
+    stream.seek(100)
+    (count,) = struct.unpack("<I", stream.read(4))
+    stream.seek(header_size)
+    vlrs = [_raw_record(stream, "<2x16sHH32s") for _ in range(count)]
+    evlrs = []
+    if header.version.minor >= 4 and header.number_of_evlrs:
+        stream.seek(header.start_of_first_evlr)
+        evlrs = [_raw_record(stream, "<2x16sHQ32s") for _ in range(header.number_of_evlrs)]
+    elif header.version.minor == 3 and header.global_encoding.waveform_data_packets_internal:
+        stream.seek(header.start_of_waveform_data_packet_record)
+        evlrs = [_raw_record(stream, "<2x16sHQ32s")]
+    return vlrs, evlrs
+
+
+def _raw_record(stream: BinaryIO, layout: str) -> VLR:
+    user_id, record_id, length, description = struct.unpack(
+        layout, stream.read(struct.calcsize(layout))
+    )
+    data = stream.read(length)
+    if len(data) < length:
+        raise ValueError(f"record {record_id} is cut short")
+    text = description.rstrip(b"\0")
+    return VLR(user_id.split(b"\0")[0].decode("latin-1"), record_id, text, data)

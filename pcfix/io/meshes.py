@@ -1,0 +1,90 @@
+"""Triangle meshes: OBJ and PLY.
+
+PLY goes through open3d, which keeps double precision. OBJ does not: open3d hands OBJ
+coordinates on as 32-bit floats, half a metre apart at a northing of five million, so the two
+kinds of line that matter are read here.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pcfix.errors import InputError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pcfix.model import FloatArray, IntArray
+
+
+def read_mesh(path: Path) -> tuple[FloatArray, IntArray]:
+    """Return vertices, shape (v, 3), and triangles, shape (t, 3), of an OBJ or PLY file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    return _read_obj(path) if path.suffix.lower() == ".obj" else _read_ply(path)
+
+
+def _read_obj(path: Path) -> tuple[FloatArray, IntArray]:
+    vertices: list[list[float]] = []
+    triangles: list[list[int]] = []
+    for number, line in enumerate(path.read_text("latin-1").splitlines(), start=1):
+        key, *fields = line.split() or [""]
+        try:
+            if key == "v":
+                x, y, z = fields[:3]
+                vertices.append([float(x), float(y), float(z)])
+            elif key == "f":
+                corners = [_obj_index(field, len(vertices)) for field in fields]
+                triangles += [[corners[0], *corners[i : i + 2]] for i in range(1, len(corners) - 1)]
+        except ValueError as error:
+            raise InputError(f"{path}: line {number} is not an OBJ line ({error}).") from error
+    return np.array(vertices).reshape(-1, 3), np.array(triangles, dtype=np.int64).reshape(-1, 3)
+
+
+def _obj_index(field: str, count: int) -> int:
+    """Return the row of a corner such as ``7``, ``7/1/3`` or, counted from the end, ``-1``."""
+    index = int(field.split("/")[0])
+    return index - 1 if index > 0 else count + index
+
+
+def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
+    o3d = load_open3d()
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        mesh = o3d.io.read_triangle_mesh(str(path))
+    if len(mesh.vertices) == 0:
+        raise InputError(f"{path}: is not a PLY mesh that open3d can read.")
+    return np.array(mesh.vertices), np.array(mesh.triangles, dtype=np.int64)
+
+
+def load_open3d() -> Any:
+    """Import open3d, with the libusb that it needs.
+
+    Its camera drivers link to the system's libusb-1.0, which servers often lack; the one of the
+    package libusb-package serves as well.
+
+    Raises
+    ------
+    InputError
+        If it cannot be imported; the message says what to install.
+    """
+    try:
+        try:
+            import libusb_package
+
+            ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+        except (ImportError, OSError):
+            pass  # the system's own may do
+        import open3d
+    except (ImportError, OSError) as error:
+        raise InputError(
+            f"open3d cannot be loaded ({error}); on Debian and Ubuntu: apt-get install"
+            " libusb-1.0-0 libgl1 libgomp1."
+        ) from error
+    return open3d

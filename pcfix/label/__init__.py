@@ -1,0 +1,1 @@
+"""Which points are under water, and what the surface looks like above them."""

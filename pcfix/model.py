@@ -1,0 +1,306 @@
+"""The frozen dataclasses that pass between the rooms.
+
+Frames, once for all: the *world* is the cloud's own projected CRS, metres, right-handed, Z up.
+The *camera frame* is OpenCV's: x right, y down, z forward; ``x_camera = R (x_world - C)``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any, Literal, TypeAlias, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from pcfix.errors import SettingError
+
+FloatArray: TypeAlias = npt.NDArray[np.float64]
+IntArray: TypeAlias = npt.NDArray[np.int64]
+BoolArray: TypeAlias = npt.NDArray[np.bool_]
+
+Uncorrected = Literal["keep", "withhold", "drop"]
+Dimensions = Literal["all", "minimal", "none"]
+
+DEFAULT_REFRACTIVE_INDEX = 1.34
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """A central projection: u = focal x / z + principal_x, v = focal y / z + principal_y.
+
+    All five numbers in one unit, pixels or millimetres; the origin is the frame's upper left
+    corner.
+    """
+
+    focal: float
+    width: float
+    height: float
+    principal_x: float
+    principal_y: float
+
+
+@dataclass(frozen=True, eq=False)
+class Cameras:
+    """The exterior orientation of k images, as a struct of arrays.
+
+    Attributes
+    ----------
+    labels : tuple of str, length k
+        Names of the images; not a key, as real projects have duplicates.
+    centres : array, shape (k, 3)
+        Projection centres, metres, world frame.
+    rotations : array, shape (k, 3, 3), or None
+        World to camera. None when the source has no angles; then every camera is a candidate
+        for every point.
+    lenses : tuple of Lens, length k, or None
+        Interior orientation of each image; None exactly when `rotations` is None.
+    crs : str or None
+        CRS of the source, None when it does not say (then the cloud's CRS is assumed).
+    notes : tuple of str
+        What was done on reading, for the summary.
+    """
+
+    labels: tuple[str, ...]
+    centres: FloatArray
+    rotations: FloatArray | None = None
+    lenses: tuple[Lens, ...] | None = None
+    crs: str | None = None
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check that the arrays belong together."""
+        k = len(self.labels)
+        if k == 0 or self.centres.shape != (k, 3):
+            raise SettingError(
+                f"Cameras need one label per centre and at least one: {k} labels,"
+                f" centres of shape {self.centres.shape}."
+            )
+        if not np.isfinite(self.centres).all():
+            bad = self.labels[int(np.argmin(np.isfinite(self.centres).all(axis=1)))]
+            raise SettingError(f"Camera {bad}: the projection centre is not finite.")
+        if (self.rotations is None) != (self.lenses is None):
+            raise SettingError("Cameras need rotations and lenses together, or neither.")
+        if self.rotations is not None and self.rotations.shape != (k, 3, 3):
+            raise SettingError(f"rotations must be ({k}, 3, 3), not {self.rotations.shape}.")
+        if self.lenses is not None and len(self.lenses) != k:
+            raise SettingError(f"lenses must be {k}, not {len(self.lenses)}.")
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+
+@dataclass(frozen=True, slots=True)
+class WaterPlane:
+    """The plane z = a + b x + c y in world coordinates; a level when b = c = 0."""
+
+    a: float
+    b: float = 0.0
+    c: float = 0.0
+
+    def __str__(self) -> str:
+        if self.b == self.c == 0.0:
+            return f"level {self.a:g} m"
+        return f"plane z = {self.a:g} + {self.b:g} x + {self.c:g} y"
+
+
+@dataclass(frozen=True, slots=True)
+class WaterDimension:
+    """A dimension of the cloud that holds the height (m) of the water surface above each point.
+
+    The surface is taken as level above each point.
+    """
+
+    name: str
+
+    def __str__(self) -> str:
+        return f"dimension {self.name}"
+
+
+@dataclass(frozen=True, eq=False)
+class WaterMesh:
+    """A triangulated height field.
+
+    Attributes
+    ----------
+    vertices : array, shape (v, 3)
+        Metres, world frame.
+    triangles : array, shape (t, 3)
+        Row numbers of `vertices`.
+    name : str
+        Where it came from.
+    """
+
+    vertices: FloatArray
+    triangles: IntArray
+    name: str = "mesh"
+
+    def __str__(self) -> str:
+        return f"mesh {self.name}, {len(self.triangles)} triangles"
+
+
+WaterSurface: TypeAlias = WaterPlane | WaterDimension | WaterMesh
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Which cameras made each of n points: rows of a ragged table.
+
+    The cameras of point i are ``camera[start[i]:start[i + 1]]``, row numbers of `Cameras`.
+    """
+
+    start: IntArray
+    camera: IntArray
+
+    def take(self, rows: IntArray) -> Views:
+        """Return the views of the given points, in that order."""
+        counts = (self.start[1:] - self.start[:-1])[rows]
+        start = np.concatenate([[0], np.cumsum(counts)])
+        where = np.repeat(self.start[rows] - start[:-1], counts) + np.arange(start[-1])
+        return Views(start, self.camera[where])
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What the user may choose; every door turns its user's words into one of these.
+
+    Attributes
+    ----------
+    refractive_index : float
+        Water relative to air, 1.0 to 1.5.
+    max_angle_deg : float or None
+        Largest incidence angle in air of a ray that is used, from the surface normal.
+    max_cameras : int or None
+        Use at most so many rays a point, those with the smallest incidence angle.
+    uncorrected : {"withhold", "keep", "drop"}
+        What becomes of a submerged point with fewer than two usable rays.
+    dimensions : {"all", "minimal", "none"}
+        Extra dimensions to write.
+    """
+
+    refractive_index: float = DEFAULT_REFRACTIVE_INDEX
+    max_angle_deg: float | None = None
+    max_cameras: int | None = None
+    uncorrected: Uncorrected = "withhold"
+    dimensions: Dimensions = "all"
+
+    def __post_init__(self) -> None:
+        """Check every value against its rule."""
+        n, angle, most = self.refractive_index, self.max_angle_deg, self.max_cameras
+        if not (math.isfinite(n) and 1.0 <= n <= 1.5):
+            raise SettingError(
+                f"refractive index {n:g} is outside 1.0 to 1.5: give the index of water"
+                " relative to air, about 1.333 for fresh and 1.34 for sea water."
+            )
+        if angle is not None and not 0.0 < angle <= 90.0:
+            raise SettingError(
+                f"max-angle {angle:g} is outside 0 to 90: give degrees from the surface normal."
+            )
+        if most is not None and most < 2:
+            raise SettingError(
+                f"max-cameras {most} is less than 2: an intersection needs two rays."
+            )
+        for name, allowed in (("uncorrected", Uncorrected), ("dimensions", Dimensions)):
+            value = getattr(self, name)
+            if value not in get_args(allowed):
+                raise SettingError(f"{name} '{value}' is not one of {', '.join(get_args(allowed))}.")
+
+
+class Outcome(IntEnum):
+    """What became of a point, and why."""
+
+    LAND = 0
+    CORRECTED = 1
+    NO_CAMERA = 2
+    ONE_CAMERA = 3
+    PARALLEL_RAYS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """The result for n points, one row per input point; zero on land.
+
+    Attributes
+    ----------
+    xyz : array, shape (n, 3)
+        True points, metres, world frame. Land and uncorrected points as they came.
+    shift_m : array, shape (n, 3)
+        True minus apparent.
+    outcome : array of uint8, shape (n,)
+        Values of `Outcome`.
+    ray_count : array of int32, shape (n,)
+        Rays that were intersected.
+    ray_miss_m : array, shape (n,)
+        Root mean square distance of the true point from its rays.
+    depth_m : array, shape (n,)
+        Depth below the water surface along the vertical, positive down; of the apparent point
+        where the point could not be corrected.
+    incidence_deg : array, shape (n,)
+        The largest incidence angle in air among the rays used.
+    sigma_z_m : array, shape (n,)
+        Formal standard error of Z from the scatter of the rays alone. It knows nothing of
+        errors in water level, refractive index or poses.
+    camera_used : array of bool, shape (k,)
+        Which cameras gave at least one ray.
+    water_known : array of bool, shape (n,)
+        Whether the water surface has a height above the point.
+    lowest_water_m : float
+        The lowest height of the water surface above any point; infinite where none is known.
+    """
+
+    xyz: FloatArray
+    shift_m: FloatArray
+    outcome: npt.NDArray[np.uint8]
+    ray_count: npt.NDArray[np.int32]
+    ray_miss_m: FloatArray
+    depth_m: FloatArray
+    incidence_deg: FloatArray
+    sigma_z_m: FloatArray
+    camera_used: BoolArray
+    water_known: BoolArray
+    lowest_water_m: float
+
+    @property
+    def submerged(self) -> BoolArray:
+        """Points below the water surface."""
+        return self.outcome != Outcome.LAND
+
+    @property
+    def corrected(self) -> BoolArray:
+        """Points that were moved."""
+        return self.outcome == Outcome.CORRECTED
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a run over a file did, in numbers; `as_dict` is what ``--summary`` writes."""
+
+    input: str
+    output: str
+    pcfix: str
+    points: int
+    submerged: int
+    corrected: int
+    uncorrected: dict[str, int]
+    dropped: int
+    water_unknown: int
+    depth_m: dict[str, float]
+    shift_z_m: dict[str, float]
+    rays: int
+    cameras: int
+    cameras_used: int
+    cameras_unused: list[str]
+    water: str
+    settings: dict[str, Any]
+    seconds: float
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def points_per_s(self) -> float:
+        """Points read per second, files included."""
+        return self.points / max(self.seconds, 1e-9)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return {**vars(self), "points_per_s": round(self.points_per_s)}

@@ -1,0 +1,1 @@
+"""Refraction itself: arrays in, arrays out."""

@@ -1,0 +1,382 @@
+"""Send each point's rays through the surface and re-intersect them.
+
+Two kernels do the same sum. `_all_in_frame` takes every camera whose frame holds the point; its
+inner loop runs over the points of a tile, so that the processor works on several points at
+once. `_chosen` takes a list of cameras per point (view lists, or the steepest few) or bends the
+rays at a mesh, and goes point by point. Both add the same terms in the order of the cameras, so
+that they agree to the bit wherever both apply.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numba import njit, prange
+
+from pcfix.label.tin import build_tin, locate
+from pcfix.model import Outcome, WaterMesh
+from pcfix.refract.frames import frame_planes, in_frame, may_hold, pyramid
+from pcfix.refract.piercing import pierce_mesh
+from pcfix.refract.rays import line_terms, nearest_point, refracted
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from pcfix.label.surface import SurfaceAbove
+    from pcfix.label.tin import Tin
+    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Settings, Views, WaterSurface
+    from pcfix.refract.frames import Pyramid
+
+TILE = 128
+"""Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""
+
+_NO_CAMERA, _ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
+_PARALLEL, _CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
+
+
+class Intersection(NamedTuple):
+    """The result for m submerged points; see `pcfix.Correction` for the meaning of each."""
+
+    shift_m: FloatArray
+    outcome: npt.NDArray[np.uint8]
+    ray_count: npt.NDArray[np.int32]
+    ray_miss_m: FloatArray
+    sigma_z_m: FloatArray
+    incidence_deg: FloatArray
+    camera_used: BoolArray
+    pairs_tested: int
+
+
+def intersect(
+    xyz: FloatArray,
+    surface: SurfaceAbove,
+    water: WaterSurface,
+    cameras: Cameras,
+    settings: Settings,
+    views: Views | None = None,
+) -> Intersection:
+    """Re-intersect the refracted rays of submerged points.
+
+    Parameters
+    ----------
+    xyz : array, shape (m, 3)
+        Apparent points below the surface, metres, world frame.
+    surface : SurfaceAbove
+        The water surface above each of them.
+    water : WaterSurface
+        Needed for its facets where it is a mesh.
+    cameras : Cameras
+        Projection centres and frames, world frame.
+    settings : Settings
+        Refractive index, largest angle, most cameras.
+    views : Views, optional
+        The cameras of each point; without it, every camera whose frame holds the point.
+
+    Returns
+    -------
+    Intersection
+        One row per input point, in the same order.
+
+    Notes
+    -----
+    Skarlatos & Agrafiotis 2018, eqs 10 and 11, for any number of rays with equal weight. The
+    frame test is for the apparent point, as that is where the SfM software projected it.
+    """
+    order = spatial_order(xyz)
+    result = np.zeros((len(xyz), 8))
+    used = np.zeros(len(cameras), np.bool_)
+    tested = np.zeros((len(xyz) + TILE - 1) // TILE, np.int64)
+    common = (
+        order,
+        np.ascontiguousarray(xyz),
+        np.ascontiguousarray(surface.height_m),
+        np.ascontiguousarray(surface.slope),
+        np.ascontiguousarray(cameras.centres),
+        frame_planes(cameras),
+        _least_cosine2(settings, cameras),
+        1.0 / settings.refractive_index,
+        result,
+        used,
+        tested,
+    )
+    if views is None and settings.max_cameras is None and not isinstance(water, WaterMesh):
+        _all_in_frame(*common)
+    else:
+        tin = build_tin(water) if isinstance(water, WaterMesh) else None
+        rows = None if views is None else (views.start, views.camera)
+        _chosen(*common, tin, rows, settings.max_cameras or len(cameras))
+    return Intersection(
+        shift_m=result[:, :3],
+        outcome=result[:, _OUTCOME].astype(np.uint8),
+        ray_count=result[:, _COUNT].astype(np.int32),
+        ray_miss_m=result[:, _MISS],
+        sigma_z_m=result[:, _SIGMA_Z],
+        incidence_deg=np.degrees(np.arccos(np.sqrt(np.clip(result[:, _COSINE2], 0.0, 1.0)))),
+        camera_used=used,
+        pairs_tested=int(tested.sum()),
+    )
+
+
+def spatial_order(xyz: FloatArray) -> IntArray:
+    """Return an order that brings neighbours together, about `TILE` points to a cell.
+
+    Only speed depends on it: a tile of neighbours needs few cameras.
+    """
+    if len(xyz) <= TILE:
+        return np.arange(len(xyz))
+    x, y = xyz[:, 0], xyz[:, 1]
+    width, height = max(np.ptp(x), 1e-6), max(np.ptp(y), 1e-6)
+    cells = min(len(xyz) / TILE, 2.0**14)
+    cell_m = max(np.sqrt(width * height / cells), max(width, height) / cells)
+    columns = int(width / cell_m) + 1
+    column = ((x - x.min()) / cell_m).astype(np.int32)
+    row = ((y - y.min()) / cell_m).astype(np.int32)
+    code = row * columns + np.where(row & 1, columns - 1 - column, column)  # to and fro
+    return np.argsort(code.astype(np.uint16), kind="stable")  # 16 bits: numpy sorts by radix
+
+
+MAX_ANGLE_WITHOUT_FRAMES_DEG = 80.0
+"""Cameras without angles have no frame to leave; nobody matches images as flat as this, and a
+block in another CRS is told apart."""
+
+
+def _least_cosine2(settings: Settings, cameras: Cameras) -> float:
+    limit = settings.max_angle_deg
+    if limit is None and cameras.rotations is None:
+        limit = MAX_ANGLE_WITHOUT_FRAMES_DEG
+    return 0.0 if limit is None else float(np.cos(np.radians(limit)) ** 2)
+
+
+# Rows of the result, one line of cache per point, as they are written in scattered order.
+_MISS, _SIGMA_Z, _COSINE2, _COUNT, _OUTCOME = 3, 4, 5, 6, 7
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _gather(
+    tile: FloatArray, order: IntArray, xyz: FloatArray, surface: FloatArray, slope: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Bring a tile together: runs of x, y, z, surface height and unit normal; return its box."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for j in range(order.size):
+        i = order[j]
+        for axis in range(3):
+            value = xyz[i, axis]
+            tile[axis * TILE + j] = value
+            low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
+        b, c = slope[i, 0], slope[i, 1]
+        up = 1.0 / np.sqrt(1.0 + b * b + c * c)
+        tile[3 * TILE + j] = surface[i]
+        tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j] = -b * up, -c * up, up
+    return low, high
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _usable(
+    g: Pyramid, ex: float, ey: float, ez: float, h: float, height: float, length2: float,
+    least_cosine2: float,
+) -> bool:  # fmt: skip
+    """Whether a camera above the water has the point in its frame, steeply enough."""
+    steep = (height > h) & (height * height >= least_cosine2 * length2)
+    return in_frame(g, ex, ey, ez) & steep
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _solve(
+    row: FloatArray, k: float, xx: float, xy: float, xz: float, yy: float, yz: float,
+    bx: float, by: float, bz: float, s: float, cosine2: float,
+) -> None:  # fmt: skip
+    """Solve one point and write its row; a point without a solution keeps a shift of zero."""
+    row[_COSINE2] = 1.0
+    if k < 2.0:
+        row[_OUTCOME] = _ONE_CAMERA if k == 1.0 else _NO_CAMERA
+        return
+    solved, qx, qy, qz, miss, sigma_z = nearest_point(k, xx, xy, xz, yy, yz, bx, by, bz, s)
+    if not solved:
+        row[_OUTCOME] = _PARALLEL
+        return
+    row[0], row[1], row[2] = qx, qy, qz
+    row[_MISS], row[_SIGMA_Z], row[_COSINE2] = miss, sigma_z, cosine2
+    row[_COUNT], row[_OUTCOME] = k, _CORRECTED
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _add_camera(
+    sums: FloatArray, tile: FloatArray, m: int,
+    centre: FloatArray, g: Pyramid, least_cosine2: float, r: float,
+) -> int:  # fmt: skip
+    """Add one camera's rays to the sums of a tile; return how many it gave.
+
+    `sums` and `tile` hold runs of `TILE` numbers in one array each: with one base address and
+    fixed distances the compiler sees that the runs cannot overlap, and vectorises.
+    """
+    cx, cy, cz = centre[0], centre[1], centre[2]
+    rays = 0
+    for j in range(m):
+        z = tile[2 * TILE + j]
+        ex, ey, ez = cx - tile[j], cy - tile[TILE + j], cz - z
+        nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+        height = nx * ex + ny * ey + nz * ez
+        h = nz * (tile[3 * TILE + j] - z)
+        length2 = ex * ex + ey * ey + ez * ez
+        use = _usable(g, ex, ey, ez, h, height, length2, least_cosine2)
+        # one division for two; a ray that is not used adds zeros
+        q = 1.0 / (length2 * height)
+        f = h * length2 * q if use else 0.0
+        inv = height * q if use else 0.0
+        dx, dy, dz = refracted(ex, ey, ez, length2, nx, ny, nz, height, r)
+        xx, xy, xz, yy, yz, bx, by, bz, s = line_terms(f * ex, f * ey, f * ez, dx, dy, dz, inv)
+        sums[j] += xx
+        sums[TILE + j] += xy
+        sums[2 * TILE + j] += xz
+        sums[3 * TILE + j] += yy
+        sums[4 * TILE + j] += yz
+        sums[5 * TILE + j] += bx
+        sums[6 * TILE + j] += by
+        sums[7 * TILE + j] += bz
+        sums[8 * TILE + j] += s
+        sums[9 * TILE + j] += 1.0 if use else 0.0
+        cosine2 = height * height * inv
+        sums[10 * TILE + j] = min(sums[10 * TILE + j], cosine2 if use else 1.0)
+        rays += 1 if use else 0
+    return rays
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _all_in_frame(
+    order: IntArray, xyz: FloatArray, surface: FloatArray, slope: FloatArray,
+    centres: FloatArray, planes: FloatArray, least_cosine2: float, r: float,
+    result: FloatArray, used: BoolArray, tested: IntArray,
+) -> None:  # fmt: skip
+    """Every camera whose frame holds the point; the surface above it is a plane."""
+    for t in prange(tested.size):
+        rows = order[t * TILE : (t + 1) * TILE]
+        tile = np.empty(7 * TILE)
+        low, high = _gather(tile, rows, xyz, surface, slope)
+        sums = np.zeros(11 * TILE)
+        sums[10 * TILE :] = 1.0
+        for c in range(len(centres)):
+            if may_hold(planes[c], centres[c], low, high):
+                tested[t] += rows.size
+                frame = pyramid(planes[c])
+                if _add_camera(sums, tile, rows.size, centres[c], frame, least_cosine2, r):
+                    used[c] = True  # threads may write it at once: always the same value
+        for j in range(rows.size):
+            _solve(
+                result[rows[j]], sums[9 * TILE + j], sums[j], sums[TILE + j],
+                sums[2 * TILE + j], sums[3 * TILE + j], sums[4 * TILE + j], sums[5 * TILE + j],
+                sums[6 * TILE + j], sums[7 * TILE + j], sums[8 * TILE + j], sums[10 * TILE + j],
+            )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _keep_steepest(chosen: IntArray, cosine2: FloatArray, k: int, most: int) -> int:
+    """Bring the `most` steepest of k cameras to the front, in the order of the cameras."""
+    if k <= most:
+        return k
+    ranked = np.argsort(-cosine2[:k], kind="mergesort")[:most]
+    ranked.sort()
+    for j in range(most):
+        chosen[j] = chosen[ranked[j]]
+    return most
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _near(
+    planes: FloatArray, centres: FloatArray, low: FloatArray, high: FloatArray
+) -> IntArray:
+    """Return the cameras whose frames may hold a point of the box."""
+    near = np.empty(len(centres), np.int64)
+    count = 0
+    for c in range(len(centres)):
+        if may_hold(planes[c], centres[c], low, high):
+            near[count] = c
+            count += 1
+    return near[:count]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _choose(
+    candidates: IntArray, tile: FloatArray, j: int, centres: FloatArray, planes: FloatArray,
+    least_cosine2: float, most: int,
+) -> IntArray:  # fmt: skip
+    """Return the cameras whose rays a point of the tile gets, in the order of the candidates."""
+    chosen = np.empty(candidates.size, np.int64)
+    cosine2 = np.empty(candidates.size)
+    k = 0
+    for c in candidates:
+        z = tile[2 * TILE + j]
+        ex = centres[c, 0] - tile[j]
+        ey = centres[c, 1] - tile[TILE + j]
+        ez = centres[c, 2] - z
+        nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+        height = nx * ex + ny * ey + nz * ez
+        length2 = ex * ex + ey * ey + ez * ez
+        h = nz * (tile[3 * TILE + j] - z)
+        if _usable(pyramid(planes[c]), ex, ey, ez, h, height, length2, least_cosine2):
+            chosen[k], cosine2[k] = c, height * height / length2
+            k += 1
+    return chosen[: _keep_steepest(chosen, cosine2, k, most)]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _chosen(
+    order: IntArray, xyz: FloatArray, surface: FloatArray, slope: FloatArray,
+    centres: FloatArray, planes: FloatArray, least_cosine2: float, r: float,
+    result: FloatArray, used: BoolArray, tested: IntArray,
+    tin: Tin | None, views: tuple[IntArray, IntArray] | None, most: int,
+) -> None:  # fmt: skip
+    """Chosen cameras per point, or rays that bend at a mesh."""
+    anywhere = np.zeros_like(planes)
+    for t in prange(tested.size):
+        rows = order[t * TILE : (t + 1) * TILE]
+        tile = np.empty(7 * TILE)
+        low, high = _gather(tile, rows, xyz, surface, slope)
+        near = _near(planes, centres, low, high)
+        for j in range(rows.size):
+            if views is None:
+                candidates = near
+                cameras = _choose(near, tile, j, centres, planes, least_cosine2, most)
+            else:
+                candidates = views[1][views[0][rows[j]] : views[0][rows[j] + 1]]
+                cameras = _choose(candidates, tile, j, centres, anywhere, least_cosine2, most)
+            tested[t] += candidates.size
+            _intersect_one(
+                result[rows[j]], cameras, tile, j, centres, r, used, tin
+            )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _intersect_one(
+    row: FloatArray, cameras: IntArray, tile: FloatArray, j: int, centres: FloatArray, r: float,
+    used: BoolArray, tin: Tin | None,
+) -> None:  # fmt: skip
+    """Intersect the rays of one point with its own cameras."""
+    px, py, pz = tile[j], tile[TILE + j], tile[2 * TILE + j]
+    nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+    h = nz * (tile[3 * TILE + j] - pz)
+    facet = -1 if tin is None else locate(tin, px, py)
+    sums = np.zeros(9)
+    least = 1.0
+    for c in cameras:
+        used[c] = True
+        ex, ey, ez = centres[c, 0] - px, centres[c, 1] - py, centres[c, 2] - pz
+        length2 = ex * ex + ey * ey + ez * ez
+        if tin is None:
+            height = nx * ex + ny * ey + nz * ez
+            q = 1.0 / (length2 * height)
+            f = h * length2 * q
+        else:
+            f, nx, ny, nz = pierce_mesh(tin, px, py, pz, ex, ey, ez, facet)
+            height = nx * ex + ny * ey + nz * ez
+            q = 1.0 / (length2 * height)
+        inv = height * q
+        dx, dy, dz = refracted(ex, ey, ez, length2, nx, ny, nz, height, r)
+        terms = line_terms(f * ex, f * ey, f * ez, dx, dy, dz, inv)
+        for i in range(9):
+            sums[i] += terms[i]
+        least = min(least, height * height * inv)
+    _solve(
+        row, float(cameras.size), sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6],
+        sums[7], sums[8], least,
+    )  # fmt: skip
