@@ -27,7 +27,7 @@ if TYPE_CHECKING:
         WaterPlane,
         WaterSurface,
     )
-    from pcfix.simulate import simulate
+    from pcfix.simulate import simulate_scene
 
 __version__ = "0.1.0"
 
@@ -37,7 +37,7 @@ _HOME = {
     "restore_file": "pcfix.flow",
     "read_cameras": "pcfix.io.cameras",
     "read_water": "pcfix.io.water",
-    "simulate": "pcfix.simulate",
+    "simulate_scene": "pcfix.simulate",
     "Cameras": "pcfix.model",
     "Correction": "pcfix.model",
     "Lens": "pcfix.model",
@@ -78,7 +78,7 @@ __all__ = [
     "read_cameras",
     "read_water",
     "restore_file",
-    "simulate",
+    "simulate_scene",
 ]
 
 

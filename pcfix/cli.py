@@ -51,8 +51,12 @@ class Block(str, Enum):  # noqa: UP042
     oblique = "oblique"
 
 
-Input = Annotated[Path, typer.Argument(metavar="INPUT", help="LAS or LAZ cloud.", show_default=False)]
-Output = Annotated[Path, typer.Argument(metavar="OUTPUT", help="LAS or LAZ to write.", show_default=False)]
+Input = Annotated[
+    Path, typer.Argument(metavar="INPUT", help="LAS or LAZ cloud.", show_default=False)
+]
+Output = Annotated[
+    Path, typer.Argument(metavar="OUTPUT", help="LAS or LAZ to write.", show_default=False)
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an output that exists.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No summary and no progress.")]
 Jobs = Annotated[int | None, typer.Option(help="Threads.", show_default="all cores")]
@@ -147,11 +151,15 @@ def restore(
 
 @app.command(no_args_is_help=True)
 def simulate(
-    out_dir: Annotated[Path, typer.Argument(metavar="OUT_DIR", help="Folder for the scene.", show_default=False)],
+    out_dir: Annotated[
+        Path, typer.Argument(metavar="OUT_DIR", help="Folder for the scene.", show_default=False)
+    ],
     block: Annotated[Block, typer.Option(help="Nadir images only, or obliques too.")] = Block.nadir,
     points: Annotated[int, typer.Option(help="Points of the cloud.")] = 100_000,
-    cameras: Annotated[int | None, typer.Option(
-        help="About so many nadir images.", show_default="as the area needs")] = None,
+    cameras: Annotated[
+        int | None,
+        typer.Option(help="About so many nadir images.", show_default="as the area needs"),
+    ] = None,
     index: Annotated[
         float, typer.Option(help="Refractive index of the water.")
     ] = DEFAULT_REFRACTIVE_INDEX,
@@ -165,7 +173,7 @@ def simulate(
     from pcfix.io.scenes import write_scene
 
     with _progress("Simulating", quiet) as progress:
-        scene = pcfix.simulate(
+        scene = pcfix.simulate_scene(
             points=points,
             block=block.value,
             cameras=cameras,
@@ -182,7 +190,9 @@ def simulate(
 
 @app.command()
 def demo(
-    out_dir: Annotated[Path, typer.Argument(metavar="OUT_DIR", help="Folder to make.")] = Path("pcfix-demo"),
+    out_dir: Annotated[Path, typer.Argument(metavar="OUT_DIR", help="Folder to make.")] = Path(
+        "pcfix-demo"
+    ),
     points: Annotated[int, typer.Option(help="Points of each scene.")] = 50_000,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -202,7 +212,13 @@ def _progress(title: str, quiet: bool) -> Iterator[Callable[[int, int], None] | 
         yield None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
     columns = (
         TextColumn("{task.description}"),

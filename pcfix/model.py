@@ -204,7 +204,9 @@ class Settings:
         for name, allowed in (("uncorrected", Uncorrected), ("dimensions", Dimensions)):
             value = getattr(self, name)
             if value not in get_args(allowed):
-                raise SettingError(f"{name} '{value}' is not one of {', '.join(get_args(allowed))}.")
+                raise SettingError(
+                    f"{name} '{value}' is not one of {', '.join(get_args(allowed))}."
+                )
 
 
 class Outcome(IntEnum):

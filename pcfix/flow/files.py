@@ -123,9 +123,7 @@ def correct_file(
         check_output(summary, overwrite=overwrite, inputs=[source_path, target])
     block = cameras if isinstance(cameras, Cameras) else read_cameras(cameras, sensor)
     surface = (
-        water
-        if isinstance(water, WaterPlane | WaterDimension | WaterMesh)
-        else read_water(water)
+        water if isinstance(water, WaterPlane | WaterDimension | WaterMesh) else read_water(water)
     )
     check_above_water(block, surface)
     with threads(jobs):
@@ -238,7 +236,9 @@ def _summarise(
     target: Path,
     seconds: float,
 ) -> Summary:
-    unused = [label for label, used in zip(cameras.labels, tally.camera_used, strict=True) if not used]
+    unused = [
+        label for label, used in zip(cameras.labels, tally.camera_used, strict=True) if not used
+    ]
     uncorrected = tally.uncorrected()
     return Summary(
         input=str(source),

@@ -67,7 +67,9 @@ def restore_file(
     with LasSource(source_path, jobs) as source, threads(jobs):
         content = read_settings(source.vlrs, source_path)
         if content is None:
-            raise InputError(f"{source_path}: was not corrected by pcfix; there is nothing to undo.")
+            raise InputError(
+                f"{source_path}: was not corrected by pcfix; there is nothing to undo."
+            )
         columns = columns_for(content["settings"]["dimensions"])
         names = {column.name for column in columns}
         if not names.issuperset(SHIFTS):

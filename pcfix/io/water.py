@@ -73,7 +73,9 @@ def read_water(spec: float | str | os.PathLike[str]) -> WaterSurface:
         return WaterPlane(*_finite([text], text))
     except SettingError:
         if Path(text).is_file():
-            raise InputError(f"{text}: is not a water surface that pcfix reads; give {KINDS}.") from None
+            raise InputError(
+                f"{text}: is not a water surface that pcfix reads; give {KINDS}."
+            ) from None
         raise
 
 

@@ -282,9 +282,7 @@ def _keep_steepest(chosen: IntArray, cosine2: FloatArray, k: int, most: int) -> 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _near(
-    planes: FloatArray, centres: FloatArray, low: FloatArray, high: FloatArray
-) -> IntArray:
+def _near(planes: FloatArray, centres: FloatArray, low: FloatArray, high: FloatArray) -> IntArray:
     """Return the cameras whose frames may hold a point of the box."""
     near = np.empty(len(centres), np.int64)
     count = 0

@@ -174,3 +174,9 @@ def _raw_record(stream: BinaryIO, layout: str) -> VLR:
         raise ValueError(f"record {record_id} is cut short")
     text = description.rstrip(b"\0")
     return VLR(user_id.split(b"\0")[0].decode("latin-1"), record_id, text, data)
+
+
+def read_xyz(path: str | os.PathLike[str]) -> FloatArray:
+    """Return all coordinates of a cloud that fits in memory, shape (n, 3), metres."""
+    with LasSource(path) as source:
+        return np.vstack([coordinates(points) for points in source.chunks(10_000_000)])

@@ -1,0 +1,1 @@
+"""How far a cloud is from a reference."""

@@ -1,0 +1,5 @@
+"""Scenes with known truth, traced by code that shares nothing with `pcfix.refract`."""
+
+from pcfix.simulate.scene import Scene, simulate_scene
+
+__all__ = ["Scene", "simulate_scene"]

@@ -1,0 +1,76 @@
+"""Simulate, correct, and hold the result against the truth: what ``pcfix demo`` runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pcfix.compare.truth import errors_against_truth
+from pcfix.flow import correct_file
+from pcfix.io.las.source import read_xyz
+from pcfix.io.scenes import write_scene
+from pcfix.simulate.scene import BlockKind, Scene, simulate_scene
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Callable
+
+    from pcfix.model import FloatArray
+
+LEAST_DEPTH_M = 0.2  # shallower points have no refraction worth a percentage
+BLOCKS: tuple[BlockKind, ...] = ("nadir", "oblique")
+
+
+def run_demo(
+    out_dir: str | os.PathLike[str],
+    *,
+    points: int = 50_000,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> str:
+    """Make both blocks of scenes in a folder, correct them through files, return the table."""
+    sections = []
+    for number, kind in enumerate(BLOCKS):
+        folder = Path(out_dir) / kind
+
+        def step(done: int, total: int, number: int = number) -> None:
+            if progress is not None:
+                progress(number * total + done, len(BLOCKS) * total)
+
+        scene = simulate_scene(points, block=kind, progress=step)
+        write_scene(scene, folder, overwrite=overwrite)
+        sections.append(f"{folder}\n{scene.description}\n{_table(scene, folder, overwrite)}")
+    return "\n\n".join(sections)
+
+
+def _table(scene: Scene, folder: Path, overwrite: bool) -> str:
+    deep = scene.true_xyz[:, 2] < scene.water_level_m - LEAST_DEPTH_M
+    below = scene.apparent_xyz[:, 2] < scene.water_level_m
+    times_n = scene.apparent_xyz.copy()
+    depth = scene.water_level_m - times_n[below, 2]
+    times_n[below, 2] = scene.water_level_m - scene.refractive_index * depth
+    rows = [
+        ("as it came", scene.apparent_xyz),
+        (f"depth times {scene.refractive_index:g}", times_n),
+        ("pcfix correct", _corrected(scene, folder, overwrite)),
+    ]
+    head = f"error of {deep.sum():,} bed points"
+    lines = [f"{head:<30}{'mean Z':>20}{'RMSE Z':>20}{'RMSE XY':>20}"]
+    for name, xyz in rows:
+        errors = errors_against_truth(xyz[deep], scene.true_xyz[deep])
+        cells = (f"{100 * e:.1f} cm {e / scene.gsd_m:6.1f} GSD" for e in errors)
+        lines.append(f"{name:<30}" + "".join(f"{cell:>20}" for cell in cells))
+    return "\n".join(lines)
+
+
+def _corrected(scene: Scene, folder: Path, overwrite: bool) -> FloatArray:
+    """Correct the scene's files and read the result."""
+    correct_file(
+        folder / "cloud.laz",
+        folder / "corrected.laz",
+        cameras=folder / "cameras.csv",
+        water=scene.water_level_m,
+        refractive_index=scene.refractive_index,
+        overwrite=overwrite,
+    )
+    return read_xyz(folder / "corrected.laz")
