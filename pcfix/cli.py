@@ -74,7 +74,7 @@ def version(
 
 @app.command(no_args_is_help=True)
 def correct(
-    input: Input,  # noqa: A002
+    input: Input,
     output: Output,
     cameras: Annotated[
         Path, typer.Option(help="CSV: label,x,y,z and, if known, yaw,pitch,roll (degrees).")
@@ -134,7 +134,7 @@ def correct(
 
 @app.command(no_args_is_help=True)
 def restore(
-    input: Input,  # noqa: A002
+    input: Input,
     output: Output,
     overwrite: Overwrite = False,
     quiet: Quiet = False,

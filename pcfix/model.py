@@ -266,12 +266,12 @@ class Correction:
     @property
     def submerged(self) -> BoolArray:
         """Points below the water surface."""
-        return self.outcome != Outcome.LAND
+        return np.asarray(self.outcome != Outcome.LAND)
 
     @property
     def corrected(self) -> BoolArray:
         """Points that were moved."""
-        return self.outcome == Outcome.CORRECTED
+        return np.asarray(self.outcome == Outcome.CORRECTED)
 
 
 @dataclass(frozen=True)

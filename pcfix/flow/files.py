@@ -15,7 +15,7 @@ from pcfix.flow.points import check_above_water, correct_checked, refuse_under_w
 from pcfix.flow.threads import threads
 from pcfix.io.cameras import read_cameras
 from pcfix.io.files import check_input, check_output, write_text
-from pcfix.io.las.columns import TooNarrow, changed_rows, columns_for, fill, shift_steps
+from pcfix.io.las.columns import TooNarrowError, changed_rows, columns_for, fill, shift_steps
 from pcfix.io.las.sink import (
     LasSink,
     check_suffix,
@@ -60,7 +60,7 @@ BATHYMETRIC_POINT = 40
 
 
 def correct_file(
-    input: PathLike,  # noqa: A002
+    input: PathLike,
     output: PathLike,
     *,
     cameras: Cameras | PathLike,
@@ -129,7 +129,7 @@ def correct_file(
     with threads(jobs):
         try:
             tally = _stream(source_path, target, block, surface, settings, jobs, progress, False)
-        except TooNarrow:
+        except TooNarrowError:
             tally = _stream(source_path, target, block, surface, settings, jobs, progress, True)
     result = _summarise(
         tally, block, surface, settings, source_path, target, time.perf_counter() - started

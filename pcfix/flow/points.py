@@ -195,6 +195,7 @@ def check_above_water(cameras: Cameras, water: WaterSurface) -> None:
 
 
 def refuse_under_water(cameras: Cameras, level: FloatArray | float, water: str) -> None:
+    """Refuse cameras below a level, metres: one for all, or one each, shape (k,)."""
     below = np.flatnonzero(cameras.centres[:, 2] <= level)
     if below.size:
         first = below[0]

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 def restore_file(
-    input: PathLike,  # noqa: A002
+    input: PathLike,
     output: PathLike,
     *,
     overwrite: bool = False,

@@ -13,8 +13,6 @@ from pyproj import CRS
 import pcfix
 from pcfix.io.files import check_output, write_text
 from pcfix.io.las.sink import LasSink
-from pcfix.simulate.block import FOCAL_MM, SENSOR_MM
-from pcfix.simulate.scene import EPSG
 
 if TYPE_CHECKING:
     import os
@@ -47,15 +45,15 @@ def write_scene(scene: Scene, out_dir: str | os.PathLike[str], *, overwrite: boo
         check_output(folder / name, overwrite=overwrite)
     wet = scene.lidar_xyz[:, 2] < scene.water_level_m
     classes = np.where(wet, BATHYMETRIC_POINT, GROUND).astype(np.uint8)
-    _write_cloud(folder / "cloud.laz", scene.apparent_xyz, _colours(scene))
-    _write_cloud(folder / "truth.laz", scene.true_xyz)
-    _write_cloud(folder / "lidar.laz", scene.lidar_xyz, classes=classes)
+    _write_cloud(folder / "cloud.laz", scene.apparent_xyz, scene.epsg, _colours(scene))
+    _write_cloud(folder / "truth.laz", scene.true_xyz, scene.epsg)
+    _write_cloud(folder / "lidar.laz", scene.lidar_xyz, scene.epsg, classes=classes)
     write_text(folder / "cameras.csv", _cameras_csv(scene), overwrite=overwrite)
-    sensor = f"focal,sensor_x,sensor_y\n{FOCAL_MM},{SENSOR_MM[0]},{SENSOR_MM[1]}\n"
+    sensor = "focal,sensor_x,sensor_y\n" + ",".join(map(str, scene.sensor_mm)) + "\n"
     write_text(folder / "sensor.csv", sensor, overwrite=overwrite)
     facts = {
         "made_by": f"pcfix {pcfix.__version__}",
-        "crs": f"EPSG:{EPSG}",
+        "crs": f"EPSG:{scene.epsg}",
         "water_level_m": scene.water_level_m,
         "refractive_index": scene.refractive_index,
         "gsd_m": scene.gsd_m,
@@ -85,13 +83,14 @@ def _colours(scene: Scene) -> FloatArray:
 def _write_cloud(
     path: Path,
     xyz: FloatArray,
+    epsg: int,
     colours: FloatArray | None = None,
     classes: np.ndarray | None = None,
 ) -> None:
     header = laspy.LasHeader(version="1.4", point_format=6 if colours is None else 7)
     header.scales = np.full(3, 0.001)
     header.offsets = np.floor(xyz.min(axis=0))
-    header.add_crs(CRS.from_epsg(EPSG))
+    header.add_crs(CRS.from_epsg(epsg))
     header.generating_software = f"pcfix {pcfix.__version__}"
     points = laspy.ScaleAwarePointRecord.zeros(len(xyz), header=header)
     for axis, name in enumerate("XYZ"):

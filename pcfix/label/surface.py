@@ -51,12 +51,12 @@ def surface_above(
             height = a + (b * xyz[:, 0] + c * xyz[:, 1])
             return SurfaceAbove(height, np.broadcast_to([b, c], (len(xyz), 2)))
         case WaterDimension(name):
-            if dimension is None or np.shape(dimension) != (len(xyz),):
+            height = np.asarray([] if dimension is None else dimension, dtype=np.float64)
+            if height.shape != (len(xyz),):
                 raise SettingError(
                     f"The water surface is the dimension {name}: give one height per point,"
-                    f" shape ({len(xyz)},), not {np.shape(dimension)}."
+                    f" shape ({len(xyz)},), not {height.shape}."
                 )
-            height = np.asarray(dimension, dtype=np.float64)
             return SurfaceAbove(
                 np.where(np.isfinite(height), height, np.nan), np.zeros((len(xyz), 2))
             )

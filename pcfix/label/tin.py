@@ -1,4 +1,4 @@
-"""A triangulated height field that answers: which facet lies above this place?
+"""A triangulated height field, and which of its facets lies above a place.
 
 The plan is covered by a grid of square cells; each cell lists the facets whose bounding box
 touches it. Coordinates inside are relative to the mesh's lower left corner, so that nothing is

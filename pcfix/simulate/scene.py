@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.model import DEFAULT_REFRACTIVE_INDEX, Cameras, FloatArray, IntArray, Settings, Views
-from pcfix.simulate.block import base_and_spacing_m, fly, gsd_m, lens
+from pcfix.model import DEFAULT_REFRACTIVE_INDEX, Cameras, FloatArray, Settings, Views
+from pcfix.simulate.block import FOCAL_MM, SENSOR_MM, base_and_spacing_m, fly, gsd_m, lens
 from pcfix.simulate.terrain import Shore
 from pcfix.simulate.tracing import piercing_points, project, triangulate
 
@@ -42,6 +42,9 @@ class Scene:
     lidar_xyz : array, shape (m, 3)
         A reference cloud of the true surface with noise.
     water_level_m, refractive_index, gsd_m : float
+    sensor_mm : tuple of float
+        Focal length, sensor width and height.
+    epsg : int
     settings : dict
         The arguments that made it.
     """
@@ -55,6 +58,8 @@ class Scene:
     water_level_m: float
     refractive_index: float
     gsd_m: float
+    sensor_mm: tuple[float, float, float]
+    epsg: int
     settings: dict[str, Any]
 
     @property
@@ -141,6 +146,8 @@ def simulate_scene(
         water_level_m=water_level_m,
         refractive_index=refractive_index,
         gsd_m=gsd_m(FLYING_HEIGHT_M),
+        sensor_mm=(FOCAL_MM, *SENSOR_MM),
+        epsg=EPSG,
         settings={
             "points": points,
             "block": block,
@@ -211,8 +218,3 @@ def _observe(
         starts = np.concatenate([start[:-1][made], start[-1:]])
         apparent[made] = triangulate(pixels, cameras, camera, starts, optics, truth[made])
     return apparent, Views(start, camera)
-
-
-def rows_made(scene: Scene) -> IntArray:
-    """Return the rows of points that enough images show; the others stand at their truth."""
-    return np.flatnonzero(np.diff(scene.views.start) > 0)

@@ -68,11 +68,14 @@ def read_cameras(
     (35, 3)
     """
     source = check_input(path)
+    sensor_file = None if sensor is None else check_input(sensor)
     with source.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
     for candidate in FORMATS:
         if candidate.recognises(source, head):
-            cameras = candidate.read(source, None if sensor is None else check_input(sensor))
+            cameras: Cameras = candidate.read(
+                source, None if sensor is None else check_input(sensor)
+            )
             for note in cameras.notes:
                 warnings.warn(note, PcfixWarning, stacklevel=2)
             return cameras

@@ -15,7 +15,6 @@ import numpy as np
 from laspy.vlrs.known import ExtraBytesStruct
 
 from pcfix.errors import InputError
-from pcfix.model import Outcome
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     from pcfix.model import BoolArray, Correction, Dimensions, FloatArray
 
 
-class TooNarrow(Exception):
+class TooNarrowError(Exception):
     """A value does not fit the narrow types; write the file again with the wide ones."""
 
 
@@ -110,7 +109,7 @@ def fill(
 
     Raises
     ------
-    TooNarrow
+    TooNarrowError
         If a value does not fit its type and the type may be widened.
     """
     values: dict[str, npt.NDArray[Any]] = {
@@ -136,11 +135,12 @@ def fill(
             value = np.maximum(value, 1)  # a submerged point is never at zero depth
         if value.size and (value.min() < limits.min or value.max() > limits.max):
             if target.dtype != column.dtype(wide=True):
-                raise TooNarrow
+                raise TooNarrowError
+            step = column_scale(column, points.scales)
             raise InputError(
-                f"{column.name} reaches {value.max():g} steps of {column_scale(column, points.scales)}"
-                f", more than {target.dtype} holds: the cloud has points far below the water;"
-                " remove them, or write it with a coarser scale."
+                f"{column.name} reaches {value.max() * step:g} m, more than {target.dtype} holds:"
+                " the cloud has points far below the water; remove them, or write it with a"
+                " coarser scale."
             )
         target[rows] = value
 
@@ -162,6 +162,3 @@ def is_corrected(points: laspy.ScaleAwarePointRecord) -> BoolArray:
 def is_marked_uncorrected(points: laspy.ScaleAwarePointRecord) -> BoolArray:
     """Return which rows of an output file pcfix found submerged and could not move."""
     return np.asarray((points.array["RayCount"] == 0) & (points.array["WaterDepth"] > 0))
-
-
-UNCORRECTED = tuple(o for o in Outcome if o not in (Outcome.LAND, Outcome.CORRECTED))

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any, TypeAlias
+
 import laspy
 import numpy as np
+
+Records: TypeAlias = Any
+"""A numpy array of point records, whose dtype has named fields."""
 
 UPGRADE = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10, 6: 6, 7: 7, 8: 8, 9: 9, 10: 10}
 """The format that each one becomes (LAS 1.4 R15, table 6 and on)."""
@@ -41,7 +46,7 @@ def convert(
 
     Values that both formats have come over bit for bit; dimensions that are new are zero.
     """
-    array = np.zeros(len(points), point_format.dtype())
+    array: Records = np.zeros(len(points), point_format.dtype())
     new = laspy.ScaleAwarePointRecord(array, point_format, points.scales, points.offsets)
     if points.point_format.id == point_format.id and _one_begins_the_other(points.array, array):
         size = min(points.array.itemsize, array.itemsize)
@@ -59,18 +64,19 @@ def convert(
     return new
 
 
-def _one_begins_the_other(one: np.ndarray, other: np.ndarray) -> bool:
-    names = min(one.dtype.names, other.dtype.names, key=len)
-    fields = [(one.dtype.fields[n], other.dtype.fields[n]) for n in names if n in one.dtype.names
-              and n in other.dtype.names]  # fmt: skip
-    return len(fields) == len(names) and all(a[:2] == b[:2] for a, b in fields)
+def _one_begins_the_other(one: Records, other: Records) -> bool:
+    layouts = [
+        [(name, *array.dtype.fields[name][:2]) for name in array.dtype.names]
+        for array in (one, other)
+    ]
+    return all(a == b for a, b in zip(*layouts, strict=False))
 
 
-def _bytes(array: np.ndarray) -> np.ndarray:
+def _bytes(array: Records) -> Records:
     return np.ascontiguousarray(array).view(np.uint8).reshape(len(array), array.itemsize)
 
 
-def _convert_scan_angle(old: np.ndarray, new: np.ndarray) -> None:
+def _convert_scan_angle(old: Records, new: Records) -> None:
     if "scan_angle" in new.dtype.names and "scan_angle_rank" in old.dtype.names:
         new["scan_angle"] = np.rint(old["scan_angle_rank"] / SCAN_ANGLE_STEP_DEG)
     elif "scan_angle_rank" in new.dtype.names and "scan_angle" in old.dtype.names:

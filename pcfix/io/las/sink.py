@@ -179,9 +179,12 @@ def restored_header(source: LasSource, before: dict[str, Any], drop: set[str]) -
     if before["added_wkt"]:
         last = max(i for i, v in enumerate(vlrs) if v.user_id == "LASF_Projection")
         del vlrs[last]
-    structs = _extra_bytes_of(source)
     size = ExtraBytesStruct.size()
-    _set_records(header, vlrs, structs[: len(kept) * size])
+    records = _extra_bytes_of(source)
+    described = [records[i : i + size] for i in range(0, len(records), size)]
+    names = [d.name for d in source.header.point_format.extra_dimensions]
+    kept_records = [r for r, name in zip(described, names, strict=True) if name not in drop]
+    _set_records(header, vlrs, b"".join(kept_records))
     return header
 
 
