@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 import warnings
 from contextlib import contextmanager
 from enum import Enum
@@ -229,10 +230,11 @@ def _progress(title: str, quiet: bool) -> Iterator[Callable[[int, int], None] | 
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(title, total=None, rate="")
+        started = time.perf_counter()
 
         def update(done: int, total: int) -> None:
-            speed = bar.tasks[0].speed or 0.0
-            bar.update(task, completed=done, total=total, rate=f"{speed:,.0f} points/s")
+            rate = done / (time.perf_counter() - started)
+            bar.update(task, completed=done, total=total, rate=f"{rate:,.0f} points/s")
 
         yield update
 

@@ -187,6 +187,9 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Check every value against its rule."""
+        object.__setattr__(self, "refractive_index", float(self.refractive_index))
+        if self.max_angle_deg is not None:
+            object.__setattr__(self, "max_angle_deg", float(self.max_angle_deg))
         n, angle, most = self.refractive_index, self.max_angle_deg, self.max_cameras
         if not (math.isfinite(n) and 1.0 <= n <= 1.5):
             raise SettingError(

@@ -65,7 +65,7 @@ def read_cameras(
     >>> import pcfix
     >>> cameras = pcfix.read_cameras("samples/scene/cameras.csv")
     >>> cameras.centres.shape
-    (35, 3)
+    (40, 3)
     """
     source = check_input(path)
     sensor_file = None if sensor is None else check_input(sensor)
@@ -73,9 +73,7 @@ def read_cameras(
         head = stream.read(_HEAD_BYTES)
     for candidate in FORMATS:
         if candidate.recognises(source, head):
-            cameras: Cameras = candidate.read(
-                source, None if sensor is None else check_input(sensor)
-            )
+            cameras: Cameras = candidate.read(source, sensor_file)
             for note in cameras.notes:
                 warnings.warn(note, PcfixWarning, stacklevel=2)
             return cameras

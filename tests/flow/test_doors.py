@@ -1,0 +1,173 @@
+"""The same cloud through Python arrays, Python files and the command line."""
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+
+import pcfix
+from pcfix.io.scenes import write_scene
+from tests.utils.shared import ROOT, needs
+
+RIVER, river = needs("river")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    made = pcfix.simulate_scene(3000, seed=3)
+    write_scene(made, folder, overwrite=False)
+    return folder
+
+
+def run(*words, **more):
+    return subprocess.run(
+        [sys.executable, "-m", "pcfix", *map(str, words)],
+        capture_output=True, text=True, check=False, **more,
+    )  # fmt: skip
+
+
+def test_command_line_and_python_give_the_same_file(scene, tmp_path):
+    words = ("--cameras", scene / "cameras.csv", "--water", "0.37", "--max-angle", "45")
+    done = run("correct", scene / "cloud.laz", tmp_path / "a.las", *words, "--jobs", "1")
+    assert done.returncode == 0, done.stderr
+    pcfix.correct_file(
+        scene / "cloud.laz",
+        tmp_path / "b.las",
+        cameras=scene / "cameras.csv",
+        water=0.37,
+        max_angle_deg=45,
+    )
+    assert (tmp_path / "a.las").read_bytes() == (tmp_path / "b.las").read_bytes()
+
+
+def test_arrays_and_files_give_the_same_coordinates(scene, tmp_path):
+    pcfix.correct_file(
+        scene / "cloud.laz", tmp_path / "out.las", cameras=scene / "cameras.csv", water=0.37
+    )
+    apparent, out = laspy.read(scene / "cloud.laz"), laspy.read(tmp_path / "out.las")
+    result = pcfix.correct_points(
+        apparent.xyz, pcfix.read_cameras(scene / "cameras.csv"), pcfix.read_water("0.37")
+    )
+    steps = np.rint(result.shift_m / apparent.header.scales).astype(int)
+    for axis, name in enumerate("XYZ"):
+        assert np.array_equal(out[name], apparent[name] + steps[:, axis])
+    assert np.array_equal(out.RayCount, result.ray_count)
+    assert np.asarray(out.RayMiss) == pytest.approx(result.ray_miss_m, abs=0.00005001)
+    assert np.asarray(out.WaterDepth) == pytest.approx(result.depth_m, abs=0.0005001)
+    assert np.asarray(out.Incidence) == pytest.approx(result.incidence_deg, abs=0.005001)
+
+
+def test_piped_output_is_the_summary_and_nothing_else(scene, tmp_path):
+    words = ("--cameras", scene / "cameras.csv", "--water", "0.37")
+    done = run(
+        "correct", scene / "cloud.laz", tmp_path / "out.laz", *words,
+        "--summary", tmp_path / "run.json",
+    )  # fmt: skip
+    assert done.stderr == ""
+    report = json.loads((tmp_path / "run.json").read_text())
+    assert f"{report['submerged']:,} (" in done.stdout
+    assert report["points"] == 3000
+    assert report["submerged"] == report["corrected"] + sum(report["uncorrected"].values())
+    assert report["cameras"] == report["cameras_used"] + len(report["cameras_unused"])
+    depth = report["depth_m"]
+    assert 0 <= depth["min"] < depth["mean"] < depth["max"] < 13
+
+
+def test_progress_counts_every_point(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("pcfix.flow.files.CHUNK_POINTS", 700)
+    calls = []
+    pcfix.correct_file(
+        scene / "cloud.laz",
+        tmp_path / "out.las",
+        cameras=scene / "cameras.csv",
+        water=0.37,
+        progress=lambda done, total: calls.append((done, total)),
+    )
+    assert calls == [(700, 3000), (1400, 3000), (2100, 3000), (2800, 3000), (3000, 3000)]
+
+
+def test_bar_on_a_terminal(scene, tmp_path):
+    import pty
+
+    parent, child = pty.openpty()
+    words = ("--cameras", scene / "cameras.csv", "--water", "0.37", "--quiet")
+    for quiet in (words, words[:-1]):
+        done = subprocess.run(
+            [sys.executable, "-m", "pcfix", "correct", str(scene / "cloud.laz"),
+             str(tmp_path / f"{len(quiet)}.las"), *map(str, quiet)],
+            stderr=child, stdout=subprocess.PIPE, check=True,
+            env={**os.environ, "TERM": "xterm", "COLUMNS": "100"},
+        )  # fmt: skip
+        assert (done.stdout == b"") == ("--quiet" in quiet)
+    os.close(child)
+    seen = ""
+    with contextlib.suppress(OSError):  # the end of a terminal is an error
+        while part := os.read(parent, 4096):
+            seen += part.decode(errors="replace")
+    assert "Correcting" in seen
+    assert "points/s" in seen
+
+
+def test_demo_prints_errors_before_and_after(tmp_path):
+    done = run("demo", tmp_path / "demo", "--points", "1500")
+    assert done.returncode == 0, done.stderr
+    rows = {}
+    for line in done.stdout.splitlines():
+        for name in ("as it came", "depth times 1.34", "pcfix correct"):
+            if line.startswith(name):
+                rows.setdefault(name, []).append(float(line[len(name) :].split()[4]))
+    before, factor, ours = (np.array(r) for r in rows.values())
+    assert (ours < 0.2 * factor).all()
+    assert (factor < before).all()
+    again = run("demo", tmp_path / "demo", "--points", "1500")
+    assert again.returncode == 1
+    assert "exists; add --overwrite" in again.stderr
+
+
+@river
+def test_river_in_one_command(tmp_path):
+    out = tmp_path / "river.las"
+    done = run(
+        "correct", RIVER / "points.las", out, "--cameras", RIVER / "cameras.csv",
+        "--water", "dim:w_surf", "--index", "1.337", "--max-angle", "35",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("\n") == 1  # the labels that occur twice
+    cloud, source = laspy.read(out), laspy.read(RIVER / "points.las")
+    reference = np.genfromtxt(RIVER / "ref_out.csv", delimiter=",", names=True)
+    assert (cloud.classification == 40).all()
+    assert np.array_equal(cloud.w_surf, source.w_surf)
+    # the same cameras within the angle, but for footprints on a flat plane and their edges
+    assert (cloud.RayCount == reference["n_cams35"]).mean() > 0.95
+    deep = reference["h_a"] > 0.1
+    ratio = (np.asarray(source.w_surf) - cloud.z)[deep] / reference["h_a"][deep]
+    # the intersection of rays up to 35 degrees deepens more than the mean of depths over them
+    assert np.median(ratio) == pytest.approx(1.3873, rel=0.05)
+
+
+def test_sample_scripts_run(tmp_path):
+    for script in sorted((ROOT / "samples").glob("[0-9]*.py")):
+        done = subprocess.run(
+            [sys.executable, str(script)], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        assert done.stdout
+
+
+def test_sample_scene_is_what_its_recipe_makes(tmp_path):
+    recipe = json.loads((ROOT / "samples/scene/scene.json").read_text())
+    made = pcfix.simulate_scene(**recipe["arguments"])
+    write_scene(made, tmp_path, overwrite=False)
+    for name in ("cloud.laz", "truth.laz", "lidar.laz"):
+        stored, fresh = laspy.read(ROOT / "samples/scene" / name), laspy.read(tmp_path / name)
+        # another processor may round the last bit of a coordinate another way: one step of 1 mm
+        assert np.abs(stored.xyz - fresh.xyz).max() <= 0.0010001
+    size = sum(f.stat().st_size for f in Path(ROOT / "samples").rglob("*") if f.is_file())
+    assert size < 2_000_000

@@ -1,0 +1,147 @@
+"""What refraction must do, whatever the code looks like."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pcfix
+from tests.utils.twins import correct_slowly, light_path, stacked_intersection
+
+UTM = np.array([512_345.678, 4_987_654.321, 0.0])
+NANOMETRE = 1e-9  # doubles at UTM coordinates have steps of 1e-9 m; results are relative to P
+
+
+def block(seed=0, k=6, height=80.0, spread=50.0):
+    rng = np.random.default_rng(seed)
+    plan = rng.uniform(-spread, spread, (k, 2))
+    centres = np.column_stack([plan, height + rng.normal(0, 2, k)])
+    return pcfix.Cameras(tuple(f"c{i}" for i in range(k)), centres + UTM)
+
+
+def bed(seed=1, n=200, deepest=10.0):
+    rng = np.random.default_rng(seed)
+    xyz = np.column_stack([rng.uniform(-20, 20, (n, 2)), -rng.uniform(0.01, deepest, n)])
+    return xyz + UTM
+
+
+def test_index_of_one_changes_nothing():
+    result = pcfix.correct_points(bed(), block(), 0.0, refractive_index=1.0)
+    assert result.corrected.all()
+    assert np.abs(result.shift_m).max() < NANOMETRE
+
+
+@pytest.mark.parametrize("n", [1.333, 1.34, 1.42])
+def test_straight_down_depth_grows_by_n(n):
+    # two cameras almost overhead: in the paraxial limit depth is multiplied by n; the next
+    # term is about depth * tan^2(0.3 deg) / 2 = 0.1 mm at 5 m
+    cameras = pcfix.Cameras(("a", "b"), np.array([[-0.5, 0, 100.0], [0.5, 0, 100.0]]))
+    result = pcfix.correct_points([[0, 0, -5.0]], cameras, 0.0, refractive_index=n)
+    assert result.depth_m[0] == pytest.approx(5.0 * n, abs=1.5e-4)
+    assert np.abs(result.shift_m[0, :2]).max() < NANOMETRE
+
+
+@pytest.mark.parametrize("plane", [(0.0, 0.0, 0.0), (0.5, 0.003, -0.002), (-0.3, 0.05, 0.08)])
+def test_slow_twin_agrees(plane):
+    a, b, c = plane
+    cameras, points = block(), bed()
+    water = pcfix.WaterPlane(a - b * UTM[0] - c * UTM[1], b, c)
+    result = pcfix.correct_points(points, cameras, water)
+    local = cameras.centres - UTM
+    checked = 0
+    for i in np.flatnonzero(result.corrected)[:60]:
+        true, miss, angle = correct_slowly(points[i] - UTM, local, plane, 1.34)
+        # the plane's height at UTM is a difference of numbers near 4e5: 1e-10 m are lost there
+        assert result.xyz[i] - UTM == pytest.approx(true, abs=2 * NANOMETRE)
+        assert result.ray_miss_m[i] == pytest.approx(miss, abs=1e-7)  # square root of a difference
+        assert result.incidence_deg[i] == pytest.approx(angle, abs=1e-6)
+        checked += 1
+    assert checked == 60
+
+
+def test_two_rays_equal_equation_11_as_a_system_of_six_by_five():
+    cameras = pcfix.Cameras(("a", "b"), np.array([[-30.0, 5, 80], [25.0, -10, 75]]))
+    point = np.array([3.0, -2.0, -4.0])
+    anchors, directions = [], []
+    for centre in cameras.centres:
+        down = (point - centre) / np.linalg.norm(point - centre)
+        anchors.append(centre - down * centre[2] / down[2])
+        incidence = math.acos(-down[2])
+        refraction = math.asin(math.sin(incidence) / 1.34)
+        plan = down[:2] / np.linalg.norm(down[:2])
+        directions.append(np.array([*(math.sin(refraction) * plan), -math.cos(refraction)]))
+    expected = stacked_intersection(anchors, directions)
+    result = pcfix.correct_points([point], cameras, 0.0)
+    assert result.xyz[0] == pytest.approx(expected, abs=NANOMETRE)
+    assert result.ray_count[0] == 2
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    x=st.floats(-40, 40),
+    y=st.floats(-40, 40),
+    depth=st.floats(0.05, 15),
+    slope=st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05)),
+    n=st.floats(1.01, 1.5),
+)
+def test_out_through_the_surface_and_back_comes_home(x, y, depth, slope, n):
+    # two cameras symmetric about the vertical plane of the point see rays that truly meet;
+    # their straight prolongations meet as well, at the apparent point
+    plane = (0.0, *slope)
+    point = np.array([x, y, slope[0] * x + slope[1] * y - depth])
+    strike = math.atan2(slope[0], -slope[1])  # horizontal, along the contours of the surface
+    across = np.array([math.cos(strike), math.sin(strike), 0.0])
+    centres = point + np.array([0, 0, 70.0]) + np.outer([-20.0, 20.0], across)
+    crossings = [light_path(point, c, plane, n) for c in centres]
+    directions = [(a - c) / np.linalg.norm(a - c) for a, c in zip(crossings, centres, strict=True)]
+    apparent = stacked_intersection(centres, directions)
+    cameras = pcfix.Cameras(("a", "b"), centres)
+    result = pcfix.correct_points([apparent], cameras, pcfix.WaterPlane(*plane), refractive_index=n)
+    # the crossing is known to 1e-9 m, and a base of 40 m over 70 m multiplies that by a few
+    assert result.xyz[0] == pytest.approx(point, abs=1e-7)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    depth=st.floats(0.01, 30),
+    n=st.floats(1.0, 1.5),
+    turn=st.floats(0, 2 * math.pi),
+    level=st.floats(-50, 500),
+)
+def test_result_turns_and_rises_with_the_scene(depth, n, turn, level):
+    centres = np.array([[-20.0, 3, 60], [15, -12, 65], [4, 30, 70]])
+    point = np.array([1.0, 2.0, -depth])
+    rotation = np.array(
+        [[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]]
+    )
+    here = pcfix.correct_points([point], named(centres), 0.0, refractive_index=n).xyz[0]
+    up = np.array([0, 0, level])
+    there = pcfix.correct_points(
+        [rotation @ point + up], named(centres @ rotation.T + up), level, refractive_index=n
+    ).xyz[0]
+    assert there == pytest.approx(rotation @ here + up, abs=1e-7)  # det may be as low as 1e-2
+
+
+def named(centres):
+    return pcfix.Cameras(tuple(str(i) for i in range(len(centres))), centres)
+
+
+def test_a_wider_base_looks_shallower_so_its_correction_is_larger():
+    def shift(half_base):
+        cameras = named(np.array([[-half_base, 0, 50.0], [half_base, 0, 50.0]]))
+        return pcfix.correct_points([[0, 0, -3.0]], cameras, 0.0).shift_m[0, 2]
+
+    shifts = [shift(b) for b in (2.0, 10.0, 25.0, 50.0)]
+    assert shifts == sorted(shifts, reverse=True)
+    assert shifts[0] == pytest.approx(-0.34 * 3.0, rel=0.01)
+
+
+def test_land_is_bit_identical_and_zero():
+    xyz = np.array([[1.1, 2.2, 0.1], [1.1, 2.2, -1.0], [3.3, 4.4, 0.0]])
+    result = pcfix.correct_points(xyz, named(np.array([[0.0, 0, 50], [9, 9, 50]])), 0.0)
+    assert result.outcome.tolist() == [0, 1, 0]
+    assert (result.xyz[[0, 2]] == xyz[[0, 2]]).all()
+    for values in (result.shift_m, result.depth_m, result.ray_count, result.incidence_deg):
+        assert (values[[0, 2]] == 0).all()
