@@ -8,6 +8,7 @@ import numpy as np
 
 from pcfix.io.cameras.table import rotations_from_yaw_pitch_roll
 from pcfix.model import Cameras, FloatArray, Lens
+from pcfix.simulate.terrain import GREATEST_DEPTH_M
 
 FOCAL_MM, SENSOR_MM, SENSOR_PX = 8.8, (13.2, 8.8), (5472, 3648)  # a common survey drone
 FORWARD_OVERLAP, SIDE_OVERLAP = 0.8, 0.7
@@ -37,6 +38,20 @@ def base_and_spacing_m(flying_height_m: float) -> tuple[float, float]:
     """Return the distance between images of a strip, and between strips."""
     width, height = (flying_height_m * side / FOCAL_MM for side in SENSOR_MM)
     return height * (1.0 - FORWARD_OVERLAP), width * (1.0 - SIDE_OVERLAP)
+
+
+def reach_m(cameras: Cameras, water_level_m: float) -> FloatArray:
+    """Return how far from below each camera it can see anything, metres, shape (k,).
+
+    Generous: the flattest ray of the frame's corner, prolonged as if there were no refraction.
+    """
+    if cameras.rotations is None:
+        return np.full(len(cameras), np.inf)
+    half_diagonal = np.arctan(np.hypot(*SENSOR_MM) / 2.0 / FOCAL_MM)
+    off_nadir = np.arccos(np.clip(-cameras.rotations[:, 2, 2], -1.0, 1.0))
+    flattest = np.minimum(half_diagonal + off_nadir, np.radians(80.0))
+    height = cameras.centres[:, 2] - water_level_m + GREATEST_DEPTH_M
+    return np.asarray(height * np.tan(flattest))
 
 
 def fly(

@@ -9,7 +9,7 @@ import numpy as np
 
 from pcfix.errors import SettingError
 from pcfix.model import DEFAULT_REFRACTIVE_INDEX, Cameras, FloatArray, Settings, Views
-from pcfix.simulate.block import FOCAL_MM, SENSOR_MM, base_and_spacing_m, fly, gsd_m, lens
+from pcfix.simulate.block import FOCAL_MM, SENSOR_MM, base_and_spacing_m, fly, gsd_m, lens, reach_m
 from pcfix.simulate.terrain import Shore
 from pcfix.simulate.tracing import piercing_points, project, triangulate
 
@@ -198,10 +198,8 @@ def _observe(
 ) -> tuple[FloatArray, Views]:
     """Return the apparent points and their views; with too few views a point is not moved."""
     optics = lens()
-    point, camera = (a.ravel() for a in np.indices((len(truth), len(cameras))))
-    far = np.hypot(*(truth[point, :2] - cameras.centres[camera, :2]).T)
-    near = far < 3.0 * FLYING_HEIGHT_M
-    point, camera = point[near], camera[near]
+    across = truth[:, None, 0] - cameras.centres[:, 0], truth[:, None, 1] - cameras.centres[:, 1]
+    point, camera = np.nonzero(np.hypot(*across) < reach_m(cameras, water_level_m))
     surface = piercing_points(
         truth[point], cameras.centres[camera], water_level_m, refractive_index
     )

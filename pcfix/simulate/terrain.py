@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial import cKDTree
+from scipy.special import expit
 
 if TYPE_CHECKING:
     from pcfix.model import FloatArray
@@ -47,7 +49,7 @@ class Shore:
         """Return z at plan positions, metres; never deeper than `GREATEST_DEPTH_M`."""
         slope = LAND_HEIGHT_M - (LAND_HEIGHT_M + GREATEST_DEPTH_M) * (x / self.length_m) ** 1.2
         swell = 0.4 * np.sin(x / 7.0) * np.cos(y / 9.0) + 0.15 * np.sin(x / 2.3 + y / 3.1)
-        ledge = -0.6 / (1.0 + np.exp(-(x - 0.6 * self.length_m - 0.1 * y) / 0.3))
+        ledge = -0.6 * expit((x - 0.6 * self.length_m - 0.1 * y) / 0.3)
         z = slope + swell + ledge
         for start in range(0, len(x), 50_000):
             part = slice(start, start + 50_000)
@@ -55,8 +57,6 @@ class Shore:
         return self.water_level_m + np.maximum(z, -GREATEST_DEPTH_M)
 
     def _rocks(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        from scipy.spatial import cKDTree
-
         near = cKDTree(self.rocks[:, :2]).query(np.column_stack([x, y]), k=1)
         distance, (height, radius) = near[0], self.rocks[near[1], 2:].T
         return np.asarray(height * np.exp(-((distance / radius) ** 2)))

@@ -1,0 +1,47 @@
+#!/usr/bin/env bash
+# Make a Python environment and install pcfix in it.
+#
+#   bash samples/install.sh [FOLDER] [EXTRAS]
+#
+# FOLDER   of the environment, default .venv in this checkout
+# EXTRAS   such as "test", default none
+#
+# Needs Python 3.11 or newer (PYTHON=... names another than python3). What Debian and Ubuntu keep
+# apart (venv, and the libraries that open3d links to) is installed with apt where that is
+# possible; elsewhere the names are printed.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+folder=${1:-.venv}
+extras=${2:+[$2]}
+python=${PYTHON:-python3}
+
+as_root() {
+    if [ "$(id -u)" = 0 ]; then "$@"; elif command -v sudo >/dev/null; then sudo "$@"; else return 1; fi
+}
+
+system_packages() {
+    if command -v apt-get >/dev/null && as_root apt-get update -qq &&
+        as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >/dev/null; then
+        return
+    fi
+    echo "install.sh: please install: $*" >&2
+}
+
+if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
+    echo "install.sh: pcfix needs Python 3.11 or newer, this is $("$python" --version)" >&2
+    exit 1
+fi
+missing=()
+"$python" -c 'import ensurepip, venv' 2>/dev/null || missing+=(python3-venv)
+if [ "$(uname -s)" = Linux ] && command -v ldconfig >/dev/null; then
+    libraries=$(ldconfig -p)
+    for pair in libgomp.so.1=libgomp1 libGL.so.1=libgl1 libX11.so.6=libx11-6; do
+        case $libraries in *"${pair%=*}"*) ;; *) missing+=("${pair#*=}") ;; esac
+    done
+fi
+if [ ${#missing[@]} -gt 0 ]; then system_packages "${missing[@]}"; fi
+
+if [ ! -x "$folder/bin/python" ]; then "$python" -m venv "$folder"; fi
+"$folder/bin/python" -m pip install --quiet --upgrade pip
+"$folder/bin/python" -m pip install --quiet --editable ".$extras"
+echo "pcfix $("$folder/bin/python" -c 'import pcfix; print(pcfix.__version__)') is in $folder"

@@ -1,0 +1,136 @@
+"""How much longer a correction takes than a plain copy of the same file.
+
+Simulates a cloud once (kept in a folder for the next run), then times, in one run and by turns,
+``pcfix correct`` and a plain laspy read-and-write, each as a process of its own. Prints the
+ratio, the peak memory, and the speed of the kernel in point-camera pairs per second.
+
+    python tests/benchmarks/copy_ratio.py [--points 5000000] [--cameras 200] [--folder DIR]
+"""
+
+import argparse
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+COPY = """
+import sys, laspy
+with laspy.open(sys.argv[1]) as source, laspy.open(
+    sys.argv[2], "w", header=source.header, do_compress=sys.argv[2].endswith("z")
+) as sink:
+    for points in source.chunk_iterator(1_000_000):
+        sink.write_points(points)
+"""
+
+
+def main():
+    arguments = parsed()
+    folder = arguments.folder
+    folder.mkdir(parents=True, exist_ok=True)
+    cloud = folder / f"cloud_{arguments.points}_{arguments.cameras}.laz"
+    if not cloud.exists():
+        make(cloud, arguments.points, arguments.cameras)
+    scene = folder / f"cameras_{arguments.points}_{arguments.cameras}.csv"
+    copied, corrected = folder / "copy.laz", folder / "corrected.laz"
+    words = ["--cameras", scene, "--sensor", folder / "sensor.csv", "--water", "0.37"]
+    commands = {
+        "plain copy": [sys.executable, "-c", COPY, cloud, copied],
+        "pcfix correct": [
+            *(sys.executable, "-m", "pcfix", "correct", cloud, corrected),
+            *(*words, "--overwrite", "--quiet"),
+        ],
+    }
+    run(commands["pcfix correct"])  # compile the kernels
+    seconds, peak = {name: [] for name in commands}, dict.fromkeys(commands, 0.0)
+    for _ in range(arguments.runs):
+        for name, command in commands.items():
+            taken, memory = run(command)
+            seconds[name].append(taken)
+            peak[name] = max(peak[name], memory)
+    for name in commands:
+        middle, least = statistics.median(seconds[name]), min(seconds[name])
+        print(
+            f"{name:<14} {middle:7.2f} s median, {least:6.2f} s least,"
+            f" {arguments.points / middle / 1e6:5.2f} M points/s, peak {peak[name]:5.0f} MB"
+        )
+    pairs = zip(seconds["pcfix correct"], seconds["plain copy"], strict=True)
+    ratio = statistics.median(one / other for one, other in pairs)
+    print(f"ratio          {ratio:7.2f} (correct / copy, median of {arguments.runs} pairs of runs)")
+    sizes = [p.stat().st_size / arguments.points for p in (cloud, corrected)]
+    print(f"file           {sizes[0]:.2f} -> {sizes[1]:.2f} bytes a point")
+    kernel(cloud, scene, folder / "sensor.csv")
+
+
+def parsed():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--points", type=int, default=5_000_000)
+    parser.add_argument("--cameras", type=int, default=200)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument(
+        "--folder", type=Path, default=Path(tempfile.gettempdir()) / "pcfix-benchmark"
+    )
+    return parser.parse_args()
+
+
+def make(cloud, points, cameras):
+    import pcfix
+    from pcfix.io.scenes import write_scene
+
+    print(f"simulating {points:,} points once ...", flush=True)
+    scene = pcfix.simulate_scene(points, cameras=cameras)
+    print(scene.description)
+    write_scene(scene, cloud.parent, overwrite=True)
+    (cloud.parent / "cloud.laz").rename(cloud)
+    (cloud.parent / "cameras.csv").rename(
+        cloud.with_name(cloud.name.replace("cloud", "cameras")).with_suffix(".csv")
+    )
+
+
+def run(command):
+    """Return seconds and peak memory, MB, of a process."""
+    started = time.perf_counter()
+    child = subprocess.Popen([str(word) for word in command])
+    _, status, usage = resource_of(child)
+    if status:
+        raise SystemExit(f"failed: {command}")
+    return time.perf_counter() - started, usage.ru_maxrss / 1024
+
+
+def resource_of(child):
+    import os
+
+    return os.wait4(child.pid, 0)
+
+
+def kernel(cloud, cameras, sensor):
+    """Time the intersection alone on a million points in memory."""
+    import laspy
+    import numpy as np
+
+    import pcfix
+    from pcfix.label.surface import SurfaceAbove
+    from pcfix.refract.intersect import intersect
+
+    with laspy.open(cloud) as source:
+        xyz = next(source.chunk_iterator(5_000_000)).xyz
+    xyz = xyz[xyz[:, 2] < 0.37][:1_000_000]
+    block, water = pcfix.read_cameras(cameras, sensor), pcfix.WaterPlane(0.37)
+    surface = SurfaceAbove(np.full(len(xyz), 0.37), np.zeros((len(xyz), 2)))
+    best, found = np.inf, None
+    for _ in range(5):
+        started = time.perf_counter()
+        found = intersect(xyz, surface, water, block, pcfix.Settings())
+        best = min(best, time.perf_counter() - started)
+    rays = int(found.ray_count.sum())
+    print(
+        f"kernel         {found.pairs_tested / best / 1e6:7.0f} M point-camera pairs/s,"
+        f" {rays / best / 1e6:.0f} M rays/s ({len(xyz):,} points, {len(block)} cameras,"
+        f" {found.pairs_tested / len(xyz):.0f} pairs and {rays / len(xyz):.0f} rays a point;"
+        " ordering and scattering included)"
+    )
+
+
+if __name__ == "__main__":
+    main()
