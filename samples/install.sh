@@ -35,7 +35,7 @@ missing=()
 "$python" -c 'import ensurepip, venv' 2>/dev/null || missing+=(python3-venv)
 if [ "$(uname -s)" = Linux ] && command -v ldconfig >/dev/null; then
     libraries=$(ldconfig -p)
-    for pair in libgomp.so.1=libgomp1 libGL.so.1=libgl1 libX11.so.6=libx11-6; do
+    for pair in libgomp.so.1=libgomp1 libGL.so.1=libgl1 libEGL.so.1=libegl1 libX11.so.6=libx11-6; do
         case $libraries in *"${pair%=*}"*) ;; *) missing+=("${pair#*=}") ;; esac
     done
 fi

@@ -5,26 +5,22 @@ from __future__ import annotations
 import json
 import time
 from dataclasses import asdict
+from os import PathLike
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 import pcfix
-from pcfix.errors import GeometryError
+from pcfix.errors import GeometryError, InputError
 from pcfix.flow.points import check_above_water, correct_checked, refuse_under_water
 from pcfix.flow.threads import threads
 from pcfix.io.cameras import read_cameras
 from pcfix.io.files import check_input, check_output, write_text
 from pcfix.io.las.columns import TooNarrowError, changed_rows, columns_for, fill, shift_steps
-from pcfix.io.las.sink import (
-    LasSink,
-    check_suffix,
-    corrected_header,
-    offset_steps,
-    output_evlrs,
-    write_shifted,
-)
-from pcfix.io.las.source import LasSource, coordinates
+from pcfix.io.las.formats import OutOfRangeError, shifted
+from pcfix.io.las.headers import corrected_header, corrected_identity, output_evlrs
+from pcfix.io.las.sink import LasSink, check_suffix
+from pcfix.io.las.source import LasSource, centring_steps, coordinates
 from pcfix.io.water import read_water
 from pcfix.model import (
     DEFAULT_REFRACTIVE_INDEX,
@@ -43,7 +39,6 @@ from pcfix.model import (
 from pcfix.report.tally import Tally
 
 if TYPE_CHECKING:
-    import os
     from collections.abc import Callable
     from pathlib import Path
 
@@ -52,7 +47,7 @@ if TYPE_CHECKING:
 
     from pcfix.io.las.columns import Column
 
-    PathLike = str | os.PathLike[str]
+    AnyPath = str | PathLike[str]
 
 CHUNK_POINTS = 1_000_000
 BATHYMETRIC_POINT = 40
@@ -60,18 +55,18 @@ BATHYMETRIC_POINT = 40
 
 
 def correct_file(
-    input: PathLike,
-    output: PathLike,
+    input: AnyPath,
+    output: AnyPath,
     *,
-    cameras: Cameras | PathLike,
-    water: WaterSurface | float | PathLike,
-    sensor: PathLike | None = None,
+    cameras: Cameras | AnyPath,
+    water: WaterSurface | float | AnyPath,
+    sensor: AnyPath | None = None,
     refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
     max_angle_deg: float | None = None,
     max_cameras: int | None = None,
     uncorrected: Uncorrected = "withhold",
     dimensions: Dimensions = "all",
-    summary: PathLike | None = None,
+    summary: AnyPath | None = None,
     overwrite: bool = False,
     jobs: int | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -117,26 +112,52 @@ def correct_file(
     started = time.perf_counter()
     settings = Settings(refractive_index, max_angle_deg, max_cameras, uncorrected, dimensions)
     source_path = check_input(input)
-    target = check_output(output, overwrite=overwrite, inputs=[source_path])
+    inputs = [p for p in (input, cameras, sensor, water) if isinstance(p, str | PathLike)]
+    target = check_output(output, overwrite=overwrite, inputs=inputs)
     check_suffix(target)
     if summary is not None:
-        check_output(summary, overwrite=overwrite, inputs=[source_path, target])
+        check_output(summary, overwrite=overwrite, inputs=[*inputs, target])
     block = cameras if isinstance(cameras, Cameras) else read_cameras(cameras, sensor)
     surface = (
         water if isinstance(water, WaterPlane | WaterDimension | WaterMesh) else read_water(water)
     )
     check_above_water(block, surface)
     with threads(jobs):
-        try:
-            tally = _stream(source_path, target, block, surface, settings, jobs, progress, False)
-        except TooNarrowError:
-            tally = _stream(source_path, target, block, surface, settings, jobs, progress, True)
+        tally = _stream_until_it_fits(source_path, target, block, surface, settings, jobs, progress)
     result = _summarise(
         tally, block, surface, settings, source_path, target, time.perf_counter() - started
     )
     if summary is not None:
         write_text(summary, json.dumps(result.as_dict(), indent=2) + "\n", overwrite=overwrite)
     return result
+
+
+def _stream_until_it_fits(
+    source_path: Path,
+    target: Path,
+    cameras: Cameras,
+    water: WaterSurface,
+    settings: Settings,
+    jobs: int | None,
+    progress: Callable[[int, int], None] | None,
+) -> Tally:
+    """Write with narrow types and the input's offsets, and again where a cloud is beyond them."""
+    wide = False
+    steps: tuple[int, ...] = (0, 0, 0)
+    while True:
+        try:
+            return _stream(
+                source_path, target, cameras, water, settings, jobs, progress, wide, steps
+            )
+        except TooNarrowError:
+            wide = True
+        except OutOfRangeError as axis:
+            old, steps = steps, centring_steps(source_path, jobs)
+            if steps == old:
+                raise InputError(
+                    f"{source_path}: the scale of {axis} is too fine to hold the result in 32"
+                    " bits; write the cloud with a coarser scale first."
+                ) from axis
 
 
 def _stream(
@@ -148,6 +169,7 @@ def _stream(
     jobs: int | None,
     progress: Callable[[int, int], None] | None,
     wide: bool,
+    steps: tuple[int, ...],
 ) -> Tally:
     """Read, correct and write chunk by chunk."""
     tally = Tally(len(cameras))
@@ -159,9 +181,9 @@ def _stream(
         "cameras": len(cameras),
     }
     with LasSource(source_path, jobs) as source:
-        header = corrected_header(source, columns, content, wide=wide)
-        steps = np.array(offset_steps(source.header))
-        with LasSink(target, header, output_evlrs(source), jobs) as sink:
+        header = corrected_header(source, columns, content, wide=wide, steps=steps)
+        evlrs, identity = output_evlrs(source), corrected_identity(source)
+        with LasSink(target, header, evlrs, identity, jobs) as sink:
             for points in source.chunks(CHUNK_POINTS):
                 xyz = coordinates(points)
                 heights = (
@@ -172,7 +194,7 @@ def _stream(
                 correction = correct_checked(xyz, cameras, water, settings, heights)
                 tally.add(xyz, correction)
                 moved = shift_steps(correction, header.scales)
-                new = write_shifted(points, header, target, moved + steps)
+                new = shifted(points, header, moved + np.array(steps))
                 _mark(new, columns, correction, moved, settings)
                 if settings.uncorrected == "drop":
                     new = new[~(correction.submerged & ~correction.corrected)]

@@ -11,30 +11,27 @@ from pcfix.flow.files import CHUNK_POINTS
 from pcfix.flow.threads import threads
 from pcfix.io.files import check_input, check_output
 from pcfix.io.las.columns import SHIFTS, columns_for, is_corrected, is_marked_uncorrected
+from pcfix.io.las.formats import shifted
+from pcfix.io.las.headers import output_evlrs, restored_header
 from pcfix.io.las.provenance import read_settings
-from pcfix.io.las.sink import (
-    LasSink,
-    check_suffix,
-    output_evlrs,
-    restored_header,
-    write_shifted,
-)
+from pcfix.io.las.sink import LasSink, check_suffix
 from pcfix.io.las.source import LasSource
 
 if TYPE_CHECKING:
     import os
     from collections.abc import Callable
-    from pathlib import Path
 
     import laspy
     import numpy.typing as npt
 
-    PathLike = str | os.PathLike[str]
+    from pcfix.model import Dimensions
+
+    AnyPath = str | os.PathLike[str]
 
 
 def restore_file(
-    input: PathLike,
-    output: PathLike,
+    input: AnyPath,
+    output: AnyPath,
     *,
     overwrite: bool = False,
     jobs: int | None = None,
@@ -66,33 +63,40 @@ def restore_file(
     check_suffix(target)
     with LasSource(source_path, jobs) as source, threads(jobs):
         content = read_settings(source.vlrs, source_path)
-        if content is None:
-            raise InputError(
-                f"{source_path}: was not corrected by pcfix; there is nothing to undo."
-            )
-        columns = columns_for(content["settings"]["dimensions"])
-        names = {column.name for column in columns}
-        if not names.issuperset(SHIFTS):
-            raise InputError(
-                f"{source_path}: was written with --dimensions {content['settings']['dimensions']},"
-                " which keeps no way back; use the original cloud."
-            )
+        names = _ours(source, content["settings"]["dimensions"])
         header = restored_header(source, content["before"], names)
+        identity = content["before"]["identity"].encode("latin-1")
         offset = np.array(content["before"]["steps"])
-        with LasSink(target, header, output_evlrs(source), jobs) as sink:
+        with LasSink(target, header, output_evlrs(source), identity, jobs) as sink:
             done = 0
             for points in source.chunks(CHUNK_POINTS):
-                sink.write(_restored(points, header, target, offset))
+                sink.write(_restored(points, header, offset))
                 done += len(points)
                 if progress is not None:
                     progress(done, len(source))
     return done
 
 
+def _ours(source: LasSource, dimensions: Dimensions) -> set[str]:
+    """Return the dimensions that pcfix added, once all that undo its work are there."""
+    names = {column.name for column in columns_for(dimensions)}
+    if not names.issuperset(SHIFTS):
+        raise InputError(
+            f"{source.path}: was written with --dimensions {dimensions}, which keeps no way back;"
+            " use the original cloud."
+        )
+    missing = names.difference(source.header.point_format.dimension_names)
+    if missing:
+        raise InputError(
+            f"{source.path}: has lost the dimensions {', '.join(sorted(missing))} since it was"
+            " corrected; use the original cloud."
+        )
+    return names
+
+
 def _restored(
     points: laspy.ScaleAwarePointRecord,
     header: laspy.LasHeader,
-    path: Path,
     offset: npt.NDArray[np.int64],
 ) -> laspy.ScaleAwarePointRecord:
     moved = is_corrected(points)
@@ -100,4 +104,4 @@ def _restored(
     withheld = np.asarray(points["withheld"]).astype(bool)
     points["withheld"][:] = (withheld & ~is_marked_uncorrected(points)).astype(np.uint8)
     shift = np.column_stack([points.array[name] for name in SHIFTS]).astype(np.int64)
-    return write_shifted(points, header, path, -shift - offset)
+    return shifted(points, header, -shift - offset)

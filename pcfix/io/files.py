@@ -39,9 +39,9 @@ def check_output(
     """
     target = Path(path)
     for source in inputs:
-        if target.resolve() == Path(source).resolve():
+        if _is_same(target, Path(source)):
             raise SettingError(
-                f"{target}: output and input are the same file; give the output another name."
+                f"{target}: output and {source} are the same file; give the output another name."
             )
     if target.is_dir():
         raise SettingError(f"{target}: the output is a folder; give a file name.")
@@ -50,6 +50,12 @@ def check_output(
     if not target.parent.is_dir():
         raise SettingError(f"{target}: the folder {target.parent} does not exist; make it first.")
     return target
+
+
+def _is_same(one: Path, other: Path) -> bool:
+    if one.exists() and other.exists():
+        return one.samefile(other)
+    return one.resolve() == other.resolve()
 
 
 @contextmanager

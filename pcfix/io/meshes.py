@@ -8,13 +8,17 @@ kinds of line that matter are read here.
 from __future__ import annotations
 
 import ctypes
-from typing import TYPE_CHECKING, Any
+import os
+import tempfile
+from contextlib import contextmanager
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from pcfix.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from pcfix.model import FloatArray, IntArray
@@ -56,11 +60,28 @@ def _obj_index(field: str, count: int) -> int:
 
 def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
     o3d = load_open3d()
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+    quiet = o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
+    with _stderr_of_c() as messages, quiet:
         mesh = o3d.io.read_triangle_mesh(str(path))
-    if len(mesh.vertices) == 0:
-        raise InputError(f"{path}: is not a PLY mesh that open3d can read.")
+        messages.seek(0)
+        complaints = [line for line in messages.read().decode().splitlines() if "RPly:" in line]
+    if complaints or len(mesh.vertices) == 0:
+        reason = complaints[0].partition("RPly: ")[2] if complaints else "no vertices"
+        raise InputError(f"{path}: is not a whole PLY mesh ({reason}); export it again.")
     return np.array(mesh.vertices), np.array(mesh.triangles, dtype=np.int64)
+
+
+@contextmanager
+def _stderr_of_c() -> Iterator[IO[bytes]]:
+    """Catch what C code writes to stderr: open3d returns half a mesh and says so only there."""
+    with tempfile.TemporaryFile() as messages:
+        kept = os.dup(2)
+        try:
+            os.dup2(messages.fileno(), 2)
+            yield messages
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
 
 
 def load_open3d() -> Any:
@@ -85,6 +106,6 @@ def load_open3d() -> Any:
     except (ImportError, OSError) as error:
         raise InputError(
             f"open3d cannot be loaded ({error}); on Debian and Ubuntu: apt-get install"
-            " libusb-1.0-0 libgl1 libgomp1."
+            " libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6."
         ) from error
     return open3d

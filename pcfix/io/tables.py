@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from pcfix.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
 
@@ -76,7 +76,7 @@ def read_table(path: Path, required: Sequence[str]) -> Table:
             f" {', '.join(missing)} missing (it has: {', '.join(header)})."
         )
     rows, numbers = [], []
-    for number, fields in enumerate(csv.reader(lines, delimiter=delimiter), start=1):
+    for number, fields in enumerate(_split(path, lines, delimiter), start=1):
         if number == 1 or not any(field.strip() for field in fields):
             continue
         if len(fields) != len(header):
@@ -89,3 +89,11 @@ def read_table(path: Path, required: Sequence[str]) -> Table:
     if not rows:
         raise InputError(f"{path}: has a header but no rows.")
     return Table(path, header, rows, numbers)
+
+
+def _split(path: Path, lines: list[str], delimiter: str) -> Iterator[list[str]]:
+    reader = csv.reader(lines, delimiter=delimiter)
+    try:
+        yield from reader
+    except csv.Error as error:
+        raise InputError(f"{path}: line {reader.line_num} is not CSV ({error}).") from error

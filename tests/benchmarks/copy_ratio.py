@@ -8,6 +8,7 @@ ratio, the peak memory, and the speed of the kernel in point-camera pairs per se
 """
 
 import argparse
+import os
 import statistics
 import subprocess
 import sys
@@ -32,7 +33,7 @@ def main():
     cloud = folder / f"cloud_{arguments.points}_{arguments.cameras}.laz"
     if not cloud.exists():
         make(cloud, arguments.points, arguments.cameras)
-    scene = folder / f"cameras_{arguments.points}_{arguments.cameras}.csv"
+    scene = camera_table(cloud)
     copied, corrected = folder / "copy.laz", folder / "corrected.laz"
     words = ["--cameras", scene, "--sensor", folder / "sensor.csv", "--water", "0.37"]
     commands = {
@@ -75,46 +76,37 @@ def parsed():
 
 
 def make(cloud, points, cameras):
-    import pcfix
-    from pcfix.io.scenes import write_scene
+    """Simulate in a process of its own: what this one holds would count as its children's."""
+    folder, words = cloud.parent, ["--points", points, "--cameras", cameras, "--overwrite"]
+    run([sys.executable, "-m", "pcfix", "simulate", folder, *words])
+    (folder / "cloud.laz").rename(cloud)
+    (folder / "cameras.csv").rename(camera_table(cloud))
 
-    print(f"simulating {points:,} points once ...", flush=True)
-    scene = pcfix.simulate_scene(points, cameras=cameras)
-    print(scene.description)
-    write_scene(scene, cloud.parent, overwrite=True)
-    (cloud.parent / "cloud.laz").rename(cloud)
-    (cloud.parent / "cameras.csv").rename(
-        cloud.with_name(cloud.name.replace("cloud", "cameras")).with_suffix(".csv")
-    )
+
+def camera_table(cloud):
+    return cloud.with_name(cloud.name.replace("cloud", "cameras")).with_suffix(".csv")
 
 
 def run(command):
     """Return seconds and peak memory, MB, of a process."""
     started = time.perf_counter()
     child = subprocess.Popen([str(word) for word in command])
-    _, status, usage = resource_of(child)
+    _, status, usage = os.wait4(child.pid, 0)
     if status:
         raise SystemExit(f"failed: {command}")
     return time.perf_counter() - started, usage.ru_maxrss / 1024
 
 
-def resource_of(child):
-    import os
-
-    return os.wait4(child.pid, 0)
-
-
 def kernel(cloud, cameras, sensor):
     """Time the intersection alone on a million points in memory."""
-    import laspy
     import numpy as np
 
     import pcfix
+    from pcfix.io.las.source import read_xyz
     from pcfix.label.surface import SurfaceAbove
     from pcfix.refract.intersect import intersect
 
-    with laspy.open(cloud) as source:
-        xyz = next(source.chunk_iterator(5_000_000)).xyz
+    xyz = read_xyz(cloud)
     xyz = xyz[xyz[:, 2] < 0.37][:1_000_000]
     block, water = pcfix.read_cameras(cameras, sensor), pcfix.WaterPlane(0.37)
     surface = SurfaceAbove(np.full(len(xyz), 0.37), np.zeros((len(xyz), 2)))

@@ -49,7 +49,7 @@ COLUMNS = (
     Column("WaterDepth", "uint16", "uint32", 0.001, "below the water surface, m"),
     Column("RayMiss", "uint16", "uint32", 0.0001, "rms distance from the rays, m", True),
     Column("SigmaZ", "uint16", "uint32", 0.0001, "formal, scatter of rays only, m", True),
-    Column("Incidence", "uint16", "uint16", 0.01, "largest angle in air, deg"),
+    Column("Incidence", "uint16", "uint16", 0.1, "largest angle in air, deg"),
     Column("RayCount", "uint16", "uint16", 1.0, "rays intersected", True),
     Column("SourceClass", "uint8", "uint8", 1.0, "class before the correction"),
 )

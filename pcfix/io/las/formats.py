@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import laspy
 import numpy as np
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
 
 Records: TypeAlias = Any
 """A numpy array of point records, whose dtype has named fields."""
@@ -15,6 +18,8 @@ UPGRADE = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10, 6: 6, 7: 7, 8: 8, 9: 9, 10: 10}
 
 SCAN_ANGLE_STEP_DEG = 0.006
 """Unit of the scan angle in formats 6 and up; whole degrees before."""
+
+_INT32 = np.iinfo(np.int32)
 
 _PACKED = (
     "return_number",
@@ -26,6 +31,10 @@ _PACKED = (
     "key_point",
     "withheld",
 )
+
+
+class OutOfRangeError(Exception):
+    """A coordinate leaves the 32 bits that LAS has; move the offsets and write again."""
 
 
 def upgraded(point_format: laspy.PointFormat) -> laspy.PointFormat:
@@ -81,3 +90,25 @@ def _convert_scan_angle(old: Records, new: Records) -> None:
         new["scan_angle"] = np.rint(old["scan_angle_rank"] / SCAN_ANGLE_STEP_DEG)
     elif "scan_angle_rank" in new.dtype.names and "scan_angle" in old.dtype.names:
         new["scan_angle_rank"] = np.rint(old["scan_angle"] * SCAN_ANGLE_STEP_DEG)
+
+
+def shifted(
+    points: laspy.ScaleAwarePointRecord,
+    header: laspy.LasHeader,
+    steps: npt.NDArray[np.int64],
+) -> laspy.ScaleAwarePointRecord:
+    """Return points in the header's format, moved by whole steps of its scale, shape (n, 3).
+
+    Raises
+    ------
+    OutOfRangeError
+        If a coordinate does not fit 32 bits.
+    """
+    new = convert(points, header.point_format)
+    for axis, name in enumerate("XYZ"):
+        moved = points.array[name].astype(np.int64) + steps[:, axis]
+        if moved.size and (moved.min() < _INT32.min or moved.max() > _INT32.max):
+            raise OutOfRangeError(name)
+        new.array[name] = moved
+    new.offsets = header.offsets
+    return new

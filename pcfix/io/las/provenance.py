@@ -16,6 +16,17 @@ if TYPE_CHECKING:
 USER_ID = "pcfix"
 SETTINGS_RECORD = 1
 DESCRIPTION = "pcfix settings (JSON)"
+BEFORE = (
+    "version",
+    "point_format",
+    "identity",
+    "global_encoding",
+    "offsets",
+    "steps",
+    "added_wkt",
+    "undescribed",
+)
+"""What the VLR says of the file before the correction."""
 
 
 def is_ours(vlr: VLR) -> bool:
@@ -29,19 +40,22 @@ def settings_vlr(content: dict[str, Any]) -> VLR:
     return VLR(USER_ID, SETTINGS_RECORD, DESCRIPTION, text.encode())
 
 
-def read_settings(vlrs: Iterable[VLR], path: Path) -> dict[str, Any] | None:
-    """Return the content of the VLR, or None where there is none.
+def read_settings(vlrs: Iterable[VLR], path: Path) -> dict[str, Any]:
+    """Return the content of the VLR.
 
     Raises
     ------
     InputError
-        If the VLR is damaged.
+        If there is none, or it is damaged.
     """
-    for vlr in vlrs:
-        if is_ours(vlr):
-            try:
-                content: dict[str, Any] = json.loads(vlr.record_data)
-            except ValueError as error:
-                raise InputError(f"{path}: pcfix's own VLR is damaged ({error}).") from error
-            return content
-    return None
+    ours = next((vlr for vlr in vlrs if is_ours(vlr)), None)
+    if ours is None:
+        raise InputError(f"{path}: was not corrected by pcfix; there is nothing to undo.")
+    try:
+        content: dict[str, Any] = json.loads(ours.record_data)
+        _ = content["settings"]["dimensions"], [content["before"][key] for key in BEFORE]
+    except (ValueError, TypeError, KeyError) as error:
+        raise InputError(
+            f"{path}: pcfix's own VLR is damaged ({error}); use the original cloud."
+        ) from error
+    return content

@@ -9,20 +9,20 @@ from typing import TYPE_CHECKING
 import laspy
 import lazrs
 import numpy as np
-from laspy.vlrs.vlr import VLR
 
 from pcfix.errors import InputError
 from pcfix.io.files import check_input
+from pcfix.io.las.records import read_records
 
 if TYPE_CHECKING:
     import os
     from collections.abc import Iterator
     from pathlib import Path
-    from typing import BinaryIO
 
     from pcfix.model import FloatArray
 
-WAVEFORM_PACKETS = ("LASF_Spec", 65535)
+IDENTITY_PLACE, _IDENTITY_SIZE = 26, 68
+"""Where the header names system, software and date (LAS 1.4 R15, table 3)."""
 
 
 @contextmanager
@@ -41,7 +41,7 @@ def las_errors(path: Path) -> Iterator[None]:
     ) as error:
         reason = str(error).strip().rstrip(".") or type(error).__name__
         raise InputError(
-            f"{path}: is not a whole LAS or LAZ file ({reason}); export or copy it again."
+            f"{path}: is damaged, or is not LAS or LAZ ({reason}); export or copy it again."
         ) from error
 
 
@@ -54,9 +54,11 @@ class LasSource:
     ----------
     path : Path
     header : laspy.LasHeader
-    vlrs, evlrs : list of laspy.VLR
-        Every (extended) variable length record with its bytes as they are in the file;
-        laspy's own classes lose some of them when they write.
+    vlrs, evlrs : list of Record
+        See `read_records`.
+    identity : bytes
+        System identifier, generating software and date, as they are in the file: other
+        software writes there what laspy would not.
     """
 
     def __init__(self, path: str | os.PathLike[str], jobs: int | None = None) -> None:
@@ -69,12 +71,14 @@ class LasSource:
         """
         self.path = check_input(path)
         with las_errors(self.path):
+            with self.path.open("rb") as stream:
+                self.vlrs, self.evlrs = read_records(stream)
+                stream.seek(IDENTITY_PLACE)
+                self.identity = stream.read(_IDENTITY_SIZE)
             self._reader = laspy.open(self.path, laz_backend=backend(jobs))
         self.header: laspy.LasHeader = self._reader.header
         try:
             self._check_header()
-            with las_errors(self.path), self.path.open("rb") as stream:
-                self.vlrs, self.evlrs = _raw_records(stream, self.header)
         except BaseException:
             self._reader.close()
             raise
@@ -148,32 +152,15 @@ def coordinates(points: laspy.ScaleAwarePointRecord) -> FloatArray:
     return xyz
 
 
-def _raw_records(stream: BinaryIO, header: laspy.LasHeader) -> tuple[list[VLR], list[VLR]]:
-    stream.seek(94)
-    (header_size,) = struct.unpack("<H", stream.read(2))
-    stream.seek(100)
-    (count,) = struct.unpack("<I", stream.read(4))
-    stream.seek(header_size)
-    vlrs = [_raw_record(stream, "<2x16sHH32s") for _ in range(count)]
-    evlrs = []
-    if header.version.minor >= 4 and header.number_of_evlrs:
-        stream.seek(header.start_of_first_evlr)
-        evlrs = [_raw_record(stream, "<2x16sHQ32s") for _ in range(header.number_of_evlrs)]
-    elif header.version.minor == 3 and header.global_encoding.waveform_data_packets_internal:
-        stream.seek(header.start_of_waveform_data_packet_record)
-        evlrs = [_raw_record(stream, "<2x16sHQ32s")]
-    return vlrs, evlrs
-
-
-def _raw_record(stream: BinaryIO, layout: str) -> VLR:
-    user_id, record_id, length, description = struct.unpack(
-        layout, stream.read(struct.calcsize(layout))
-    )
-    data = stream.read(length)
-    if len(data) < length:
-        raise ValueError(f"record {record_id} is cut short")
-    text = description.rstrip(b"\0")
-    return VLR(user_id.split(b"\0")[0].decode("latin-1"), record_id, text, data)
+def centring_steps(path: str | os.PathLike[str], jobs: int | None = None) -> tuple[int, ...]:
+    """Return by how many steps each integer axis must be moved to have its middle at zero."""
+    with LasSource(path, jobs) as source:
+        bounds = [
+            [(int(p.array[axis].min()), int(p.array[axis].max())) for axis in "XYZ"]
+            for p in source.chunks(10_000_000)
+        ]
+    low, high = np.min(bounds, axis=0)[:, 0], np.max(bounds, axis=0)[:, 1]
+    return tuple((-(low + high) // 2).tolist())
 
 
 def read_xyz(path: str | os.PathLike[str]) -> FloatArray:

@@ -1,0 +1,197 @@
+"""The header of a corrected file from that of its input, and the way back."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import TYPE_CHECKING, Any
+
+import laspy
+import numpy as np
+from laspy.vlrs.known import ExtraBytesStruct, WktCoordinateSystemVlr
+from laspy.vlrs.vlr import VLR
+
+import pcfix
+from pcfix.errors import InputError
+from pcfix.io.las.columns import Column, extra_bytes
+from pcfix.io.las.formats import upgraded
+from pcfix.io.las.provenance import is_ours, settings_vlr
+from pcfix.io.las.records import Record, RecordList
+from pcfix.io.las.source import las_errors
+
+if TYPE_CHECKING:
+    from pcfix.io.las.source import LasSource
+
+EXTRA_BYTES = ("LASF_Spec", 4)
+_SOFTWARE = slice(32, 64)
+"""Where a file's identity names the generating software."""
+
+
+def corrected_header(
+    source: LasSource,
+    columns: tuple[Column, ...],
+    content: dict[str, Any],
+    *,
+    wide: bool,
+    steps: tuple[int, ...] = (0, 0, 0),
+) -> laspy.LasHeader:
+    """Return the header of a corrected file: LAS 1.4, the input's records, and pcfix's own.
+
+    Parameters
+    ----------
+    source : LasSource
+    columns : tuple of Column
+        Extra dimensions to add.
+    content : dict
+        What the provenance VLR shall say; what the file was before is added to it.
+    wide : bool
+        Whether the columns have their wide types.
+    steps : tuple of int
+        By how many steps each integer axis will be moved; the offsets make up for it.
+
+    Raises
+    ------
+    InputError
+        If the cloud already has a dimension of one of these names, or was corrected before.
+    """
+    _refuse_twice(source, columns)
+    old = source.header
+    header = _copied(old)
+    params, records = extra_bytes(columns, old.scales, wide=wide)
+    point_format = upgraded(old.point_format)
+    for param in params:
+        point_format.add_extra_dimension(param)
+    version = max(old.version, laspy.header.Version(1, 4))
+    header.set_version_and_point_format(version, point_format)
+    header.offsets = old.offsets - np.array(steps) * old.scales
+
+    vlrs = [v for v in source.vlrs if not _is_layout(v)]
+    wkt = _wkt_for(header, source)
+    described, undescribed = _extra_bytes_of(source)
+    before = {
+        "version": str(old.version),
+        "point_format": old.point_format.id,
+        "identity": source.identity.decode("latin-1"),
+        "global_encoding": old.global_encoding.value,
+        "offsets": old.offsets.tolist(),
+        "steps": list(steps),
+        "added_wkt": wkt is not None,
+        "undescribed": [dimension.name for dimension in undescribed],
+    }
+    if wkt is not None:
+        vlrs.append(wkt)
+        header.global_encoding.wkt = True
+    vlrs.append(settings_vlr({**content, "before": before}))
+    for dimension in undescribed:
+        described += bytes(ExtraBytesStruct(dimension.name.encode(), (0, dimension.num_bits // 8)))
+    _set_records(header, vlrs, described + records)
+    return header
+
+
+def corrected_identity(source: LasSource) -> bytes:
+    """Return the identity of a corrected file: made by pcfix, else as it was."""
+    name = f"pcfix {pcfix.__version__}".encode().ljust(32, b"\0")
+    return source.identity[: _SOFTWARE.start] + name + source.identity[_SOFTWARE.stop :]
+
+
+def restored_header(source: LasSource, before: dict[str, Any], drop: set[str]) -> laspy.LasHeader:
+    """Return the header that a file had before it was corrected.
+
+    Parameters
+    ----------
+    source : LasSource
+        The corrected file.
+    before : dict
+        From its provenance VLR.
+    drop : set of str
+        The extra dimensions that pcfix added.
+    """
+    header = _copied(source.header)
+    extra = list(source.header.point_format.extra_dimensions)
+    point_format = laspy.PointFormat(before["point_format"])
+    point_format.dimensions.extend(d for d in extra if d.name not in drop)
+    header.set_version_and_point_format(
+        laspy.header.Version.from_str(before["version"]), point_format
+    )
+    header.global_encoding.value = before["global_encoding"]
+    header.offsets = np.array(before["offsets"], dtype=np.float64)
+    vlrs = [v for v in source.vlrs if not _is_layout(v) and not is_ours(v)]
+    if before["added_wkt"]:
+        last = max(i for i, v in enumerate(vlrs) if v.user_id == "LASF_Projection")
+        del vlrs[last]
+    size = ExtraBytesStruct.size()
+    records, _ = _extra_bytes_of(source)
+    described = [records[i : i + size] for i in range(0, len(records), size)]
+    gone = drop.union(before["undescribed"])
+    kept = [r for r, d in zip(described, extra, strict=False) if d.name not in gone]
+    _set_records(header, vlrs, b"".join(kept))
+    return header
+
+
+def output_evlrs(source: LasSource) -> list[Record]:
+    """Return the EVLRs to carry over: all but the index of a COPC file, which would be wrong."""
+    return [v for v in source.evlrs if v.user_id != "copc"]
+
+
+def _refuse_twice(source: LasSource, columns: tuple[Column, ...]) -> None:
+    if any(is_ours(v) for v in source.vlrs):
+        raise InputError(
+            f"{source.path}: was corrected by pcfix already; use the original, or get it back"
+            " with 'pcfix restore'."
+        )
+    there = set(source.header.point_format.dimension_names)
+    for column in columns:
+        if column.name in there:
+            raise InputError(
+                f"{source.path}: has a dimension {column.name} already, which pcfix would write;"
+                " rename it, or use --dimensions none."
+            )
+
+
+def _copied(header: laspy.LasHeader) -> laspy.LasHeader:
+    """Return a copy without the names that laspy cannot always write; `LasSink` sets them."""
+    copy = deepcopy(header)
+    copy.system_identifier = copy.generating_software = ""
+    return copy
+
+
+def _is_layout(vlr: VLR) -> bool:
+    """Whether a record describes how this very file is laid out on disk."""
+    return vlr.user_id in ("laszip encoded", "copc")
+
+
+def _is_extra_bytes(vlr: VLR) -> bool:
+    return (vlr.user_id, vlr.record_id) == EXTRA_BYTES
+
+
+def _extra_bytes_of(source: LasSource) -> tuple[bytes, list[Any]]:
+    """Return the description of the input's extra dimensions, and those that it leaves out."""
+    dimensions = list(source.header.point_format.extra_dimensions)
+    records = b"".join(v.record_data for v in source.vlrs if _is_extra_bytes(v))
+    count = len(records) // ExtraBytesStruct.size() if dimensions else 0
+    return records[: count * ExtraBytesStruct.size()], dimensions[count:]
+
+
+def _set_records(header: laspy.LasHeader, vlrs: list[VLR], described: bytes) -> None:
+    """Put records in the header, past laspy's setter, which would rewrite some.
+
+    The description of the extra bytes stays where it was, or comes last.
+    """
+    places = [i for i, v in enumerate(vlrs) if _is_extra_bytes(v)]
+    records = [v for v in vlrs if not _is_extra_bytes(v)]
+    if described and places:
+        records.insert(places[0], vlrs[places[0]].replaced(described))
+    elif described:
+        records.append(VLR(*EXTRA_BYTES, "Extra Bytes Record", described))
+    header._vlrs = RecordList(records)
+
+
+def _wkt_for(header: laspy.LasHeader, source: LasSource) -> VLR | None:
+    """Return the CRS as WKT, which formats 6 and up want, where the input has only GeoTIFF keys."""
+    if source.header.point_format.id >= 6 or header.global_encoding.wkt:
+        return None
+    with las_errors(source.path):
+        crs = source.header.parse_crs()
+    if crs is None:
+        return None
+    wkt = WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL"))
+    return VLR("LASF_Projection", 2112, "OGC COORDINATE SYSTEM WKT", wkt.record_data_bytes())
