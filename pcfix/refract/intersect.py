@@ -112,7 +112,7 @@ def intersect(
         ray_count=result[:, _COUNT].astype(np.int32),
         ray_miss_m=result[:, _MISS],
         sigma_z_m=result[:, _SIGMA_Z],
-        incidence_deg=np.degrees(np.arccos(np.sqrt(np.clip(result[:, _COSINE2], 0.0, 1.0)))),
+        incidence_deg=result[:, _INCIDENCE],
         camera_used=used,
         pairs_tested=int(tested.sum()),
     )
@@ -129,11 +129,29 @@ def spatial_order(xyz: FloatArray) -> IntArray:
     width, height = max(np.ptp(x), 1e-6), max(np.ptp(y), 1e-6)
     cells = min(len(xyz) / TILE, 2.0**14)
     cell_m = max(np.sqrt(width * height / cells), max(width, height) / cells)
-    columns = int(width / cell_m) + 1
-    column = ((x - x.min()) / cell_m).astype(np.int32)
-    row = ((y - y.min()) / cell_m).astype(np.int32)
-    code = row * columns + np.where(row & 1, columns - 1 - column, column)  # to and fro
-    return np.argsort(code.astype(np.uint16), kind="stable")  # 16 bits: numpy sorts by radix
+    columns, rows = int(width / cell_m) + 1, int(height / cell_m) + 1
+    return _cell_order(xyz, x.min(), y.min(), 1.0 / cell_m, columns, rows)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _cell_order(
+    xyz: FloatArray, x0: float, y0: float, cells_per_m: float, columns: int, rows: int
+) -> IntArray:
+    """Sort by cells, row after row to and fro, with one count and one pass over the points."""
+    cell = np.empty(len(xyz), np.int64)
+    place = np.zeros(columns * rows + 1, np.int64)
+    for i in range(len(xyz)):
+        column = min(int((xyz[i, 0] - x0) * cells_per_m), columns - 1)
+        row = min(int((xyz[i, 1] - y0) * cells_per_m), rows - 1)
+        cell[i] = row * columns + (columns - 1 - column if row & 1 else column)
+        place[cell[i] + 1] += 1
+    for c in range(columns * rows):
+        place[c + 1] += place[c]
+    order = np.empty(len(xyz), np.int64)
+    for i in range(len(xyz)):
+        order[place[cell[i]]] = i
+        place[cell[i]] += 1
+    return order
 
 
 MAX_ANGLE_WITHOUT_FRAMES_DEG = 80.0
@@ -149,7 +167,7 @@ def _least_cosine2(settings: Settings, cameras: Cameras) -> float:
 
 
 # Rows of the result, one line of cache per point, as they are written in scattered order.
-_MISS, _SIGMA_Z, _COSINE2, _COUNT, _OUTCOME = 3, 4, 5, 6, 7
+_MISS, _SIGMA_Z, _INCIDENCE, _COUNT, _OUTCOME = 3, 4, 5, 6, 7
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -187,7 +205,6 @@ def _solve(
     bx: float, by: float, bz: float, s: float, cosine2: float,
 ) -> None:  # fmt: skip
     """Solve one point and write its row; a point without a solution keeps a shift of zero."""
-    row[_COSINE2] = 1.0
     if k < 2.0:
         row[_OUTCOME] = _ONE_CAMERA if k == 1.0 else _NO_CAMERA
         return
@@ -196,7 +213,8 @@ def _solve(
         row[_OUTCOME] = _PARALLEL
         return
     row[0], row[1], row[2] = qx, qy, qz
-    row[_MISS], row[_SIGMA_Z], row[_COSINE2] = miss, sigma_z, cosine2
+    row[_MISS], row[_SIGMA_Z] = miss, sigma_z
+    row[_INCIDENCE] = np.degrees(np.arccos(np.sqrt(min(cosine2, 1.0))))
     row[_COUNT], row[_OUTCOME] = k, _CORRECTED
 
 
