@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
-    from pcfix.flow import correct_file, correct_points, restore_file
+    from pcfix.flow.files import correct_file
+    from pcfix.flow.points import correct_points
+    from pcfix.flow.restore import restore_file
     from pcfix.io.cameras import read_cameras
     from pcfix.io.water import read_water
     from pcfix.model import (
@@ -32,9 +34,9 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
-    "correct_file": "pcfix.flow",
-    "correct_points": "pcfix.flow",
-    "restore_file": "pcfix.flow",
+    "correct_file": "pcfix.flow.files",
+    "correct_points": "pcfix.flow.points",
+    "restore_file": "pcfix.flow.restore",
     "read_cameras": "pcfix.io.cameras",
     "read_water": "pcfix.io.water",
     "simulate_scene": "pcfix.simulate",

@@ -73,38 +73,49 @@ def version(
         raise typer.Exit
 
 
+CamerasOption = Annotated[
+    Path,
+    typer.Option("--cameras", help="CSV: label,x,y,z and, if known, yaw,pitch,roll (degrees)."),
+]
+WaterOption = Annotated[
+    str,
+    typer.Option("--water", help="A level (0.37), plane:a,b,c, dim:NAME, or a mesh (.obj, .ply)."),
+]
+Sensor = Annotated[
+    Path | None,
+    typer.Option(
+        help="CSV: focal,sensor_x,sensor_y in mm.", show_default="sensor.csv beside the cameras"
+    ),
+]
+Index = Annotated[float, typer.Option(help="Refractive index of the water relative to air.")]
+MaxAngle = Annotated[
+    float | None, typer.Option(help="Use rays up to this incidence angle, degrees.")
+]
+MaxCameras = Annotated[int | None, typer.Option(help="Use so many rays a point, the steepest.")]
+UncorrectedOption = Annotated[
+    Uncorrected,
+    typer.Option("--uncorrected", help="Submerged points with fewer than two usable rays."),
+]
+DimensionsOption = Annotated[
+    Dimensions,
+    typer.Option("--dimensions", help="Extra dimensions; 'pcfix restore' needs all."),
+]
+SummaryOption = Annotated[Path | None, typer.Option("--summary", help="Write the summary as JSON.")]
+
+
 @app.command(no_args_is_help=True)
 def correct(
     input: Input,
     output: Output,
-    cameras: Annotated[
-        Path, typer.Option(help="CSV: label,x,y,z and, if known, yaw,pitch,roll (degrees).")
-    ],
-    water: Annotated[
-        str, typer.Option(help="A level (0.37), plane:a,b,c, dim:NAME, or a mesh (.obj, .ply).")
-    ],
-    sensor: Annotated[
-        Path | None,
-        typer.Option(
-            help="CSV: focal,sensor_x,sensor_y in mm.", show_default="sensor.csv beside the cameras"
-        ),
-    ] = None,
-    index: Annotated[
-        float, typer.Option(help="Refractive index of the water relative to air.")
-    ] = DEFAULT_REFRACTIVE_INDEX,
-    max_angle: Annotated[
-        float | None, typer.Option(help="Use rays up to this incidence angle, degrees.")
-    ] = None,
-    max_cameras: Annotated[
-        int | None, typer.Option(help="Use so many rays a point, the steepest.")
-    ] = None,
-    uncorrected: Annotated[
-        Uncorrected, typer.Option(help="Submerged points with fewer than two usable rays.")
-    ] = Uncorrected.withhold,
-    dimensions: Annotated[
-        Dimensions, typer.Option(help="Extra dimensions; 'pcfix restore' needs all.")
-    ] = Dimensions.all,
-    summary: Annotated[Path | None, typer.Option(help="Write the summary as JSON.")] = None,
+    cameras: CamerasOption,
+    water: WaterOption,
+    sensor: Sensor = None,
+    index: Index = DEFAULT_REFRACTIVE_INDEX,
+    max_angle: MaxAngle = None,
+    max_cameras: MaxCameras = None,
+    uncorrected: UncorrectedOption = Uncorrected.withhold,
+    dimensions: DimensionsOption = Dimensions.all,
+    summary: SummaryOption = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     jobs: Jobs = None,
@@ -131,6 +142,44 @@ def correct(
         )
     if not quiet:
         typer.echo(summary_text(result))
+
+
+@app.command(no_args_is_help=True)
+def pipeline(
+    input: Input,
+    output: Output,
+    cameras: CamerasOption,
+    water: WaterOption,
+    sensor: Sensor = None,
+    index: Index = DEFAULT_REFRACTIVE_INDEX,
+    max_angle: MaxAngle = None,
+    max_cameras: MaxCameras = None,
+    uncorrected: UncorrectedOption = Uncorrected.withhold,
+    dimensions: DimensionsOption = Dimensions.all,
+    summary: SummaryOption = None,
+    overwrite: Overwrite = False,
+    jobs: Jobs = None,
+) -> None:
+    """Print the PDAL pipeline of the same 'pcfix correct', as JSON."""
+    import json
+
+    from pcfix.flow.pipeline import pipeline_for
+
+    settings = pcfix.Settings(index, max_angle, max_cameras, uncorrected.value, dimensions.value)
+    options = {
+        "cameras": str(cameras),
+        "water": water,
+        "sensor": None if sensor is None else str(sensor),
+        "index": index,
+        "max_angle": max_angle,
+        "max_cameras": max_cameras,
+        "uncorrected": uncorrected.value,
+        "dimensions": dimensions.value,
+        "summary": None if summary is None else str(summary),
+        "overwrite": overwrite or None,
+        "jobs": jobs,
+    }
+    typer.echo(json.dumps(pipeline_for(input, output, settings, options), indent=2))
 
 
 @app.command(no_args_is_help=True)

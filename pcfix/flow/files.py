@@ -4,39 +4,39 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import asdict
 from os import PathLike
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-import pcfix
-from pcfix.errors import GeometryError, InputError
-from pcfix.flow.points import check_above_water, correct_checked, refuse_under_water
+from pcfix.errors import InputError
+from pcfix.flow.job import Job
+from pcfix.flow.points import CHUNK_POINTS
 from pcfix.flow.threads import threads
-from pcfix.io.cameras import read_cameras
 from pcfix.io.files import check_input, check_output, write_text
-from pcfix.io.las.columns import TooNarrowError, changed_rows, columns_for, fill, shift_steps
+from pcfix.io.las.columns import (
+    BATHYMETRIC_POINT,
+    TooNarrowError,
+    changed_rows,
+    columns_for,
+    fill,
+    shift_steps,
+)
 from pcfix.io.las.formats import OutOfRangeError, shifted
 from pcfix.io.las.headers import corrected_header, corrected_identity, output_evlrs
 from pcfix.io.las.sink import LasSink, check_suffix
 from pcfix.io.las.source import LasSource, centring_steps, coordinates
-from pcfix.io.water import read_water
 from pcfix.model import (
     DEFAULT_REFRACTIVE_INDEX,
     Cameras,
     Correction,
     Dimensions,
-    Outcome,
     Settings,
     Summary,
     Uncorrected,
     WaterDimension,
-    WaterMesh,
-    WaterPlane,
     WaterSurface,
 )
-from pcfix.report.tally import Tally
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -46,12 +46,9 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcfix.io.las.columns import Column
+    from pcfix.model import FloatArray
 
     AnyPath = str | PathLike[str]
-
-CHUNK_POINTS = 1_000_000
-BATHYMETRIC_POINT = 40
-"""ASPRS class of a point on the bed (LAS 1.4, topo-bathy lidar domain profile)."""
 
 
 def correct_file(
@@ -111,98 +108,79 @@ def correct_file(
     """
     started = time.perf_counter()
     settings = Settings(refractive_index, max_angle_deg, max_cameras, uncorrected, dimensions)
-    source_path = check_input(input)
+    source = check_input(input)
     inputs = [p for p in (input, cameras, sensor, water) if isinstance(p, str | PathLike)]
     target = check_output(output, overwrite=overwrite, inputs=inputs)
     check_suffix(target)
     if summary is not None:
         check_output(summary, overwrite=overwrite, inputs=[*inputs, target])
-    block = cameras if isinstance(cameras, Cameras) else read_cameras(cameras, sensor)
-    surface = (
-        water if isinstance(water, WaterPlane | WaterDimension | WaterMesh) else read_water(water)
-    )
-    check_above_water(block, surface)
+    job = Job(str(source), settings, cameras, water, sensor)
     with threads(jobs):
-        tally = _stream_until_it_fits(source_path, target, block, surface, settings, jobs, progress)
-    result = _summarise(
-        tally, block, surface, settings, source_path, target, time.perf_counter() - started
-    )
+        _write_until_it_fits(job, source, target, jobs, progress)
+    result = job.summary(str(source), str(target), time.perf_counter() - started)
     if summary is not None:
         write_text(summary, json.dumps(result.as_dict(), indent=2) + "\n", overwrite=overwrite)
     return result
 
 
-def _stream_until_it_fits(
-    source_path: Path,
+def _write_until_it_fits(
+    job: Job,
+    source: Path,
     target: Path,
-    cameras: Cameras,
-    water: WaterSurface,
-    settings: Settings,
     jobs: int | None,
     progress: Callable[[int, int], None] | None,
-) -> Tally:
+) -> None:
     """Write with narrow types and the input's offsets, and again where a cloud is beyond them."""
     wide = False
     steps: tuple[int, ...] = (0, 0, 0)
     while True:
         try:
-            return _stream(
-                source_path, target, cameras, water, settings, jobs, progress, wide, steps
-            )
+            return _write(job, source, target, jobs, progress, wide=wide, steps=steps)
         except TooNarrowError:
             wide = True
         except OutOfRangeError as axis:
-            old, steps = steps, centring_steps(source_path, jobs)
+            old, steps = steps, centring_steps(source, jobs)
             if steps == old:
                 raise InputError(
-                    f"{source_path}: the scale of {axis} is too fine to hold the result in 32"
-                    " bits; write the cloud with a coarser scale first."
+                    f"{source}: the scale of {axis} is too fine to hold the result in 32 bits;"
+                    " write the cloud with a coarser scale first."
                 ) from axis
+        job.restart()
 
 
-def _stream(
-    source_path: Path,
+def _write(
+    job: Job,
+    path: Path,
     target: Path,
-    cameras: Cameras,
-    water: WaterSurface,
-    settings: Settings,
     jobs: int | None,
     progress: Callable[[int, int], None] | None,
+    *,
     wide: bool,
     steps: tuple[int, ...],
-) -> Tally:
+) -> None:
     """Read, correct and write chunk by chunk."""
-    tally = Tally(len(cameras))
-    columns = columns_for(settings.dimensions)
-    content = {
-        "pcfix": pcfix.__version__,
-        "settings": asdict(settings),
-        "water": str(water),
-        "cameras": len(cameras),
-    }
-    with LasSource(source_path, jobs) as source:
-        header = corrected_header(source, columns, content, wide=wide, steps=steps)
+    columns = columns_for(job.settings.dimensions)
+    with LasSource(path, jobs) as source:
+        header = corrected_header(source, columns, job.provenance(), wide=wide, steps=steps)
         evlrs, identity = output_evlrs(source), corrected_identity(source)
         with LasSink(target, header, evlrs, identity, jobs) as sink:
             for points in source.chunks(CHUNK_POINTS):
-                xyz = coordinates(points)
-                heights = (
-                    source.dimension(points, water.name)
-                    if isinstance(water, WaterDimension)
-                    else None
-                )
-                correction = correct_checked(xyz, cameras, water, settings, heights)
-                tally.add(xyz, correction)
+                correction = job.correct(coordinates(points), _heights(job, source, points))
                 moved = shift_steps(correction, header.scales)
                 new = shifted(points, header, moved + np.array(steps))
-                _mark(new, columns, correction, moved, settings)
-                if settings.uncorrected == "drop":
+                _mark(new, columns, correction, moved, job.settings)
+                if job.settings.uncorrected == "drop":
                     new = new[~(correction.submerged & ~correction.corrected)]
                 sink.write(new)
                 if progress is not None:
-                    progress(tally.points, len(source))
-            _check_fit(tally, cameras, water, settings, source_path)
-    return tally
+                    progress(job.tally.points, len(source))
+            job.check_fit()
+
+
+def _heights(job: Job, source: LasSource, points: laspy.ScaleAwarePointRecord) -> FloatArray | None:
+    if isinstance(job.water, WaterDimension):
+        return source.dimension(points, job.water.name)
+    return None
 
 
 def _mark(
@@ -219,67 +197,3 @@ def _mark(
     if settings.uncorrected == "withhold":
         stuck = correction.submerged & ~correction.corrected
         new["withheld"][:] = (withheld | stuck).astype(np.uint8)
-
-
-def _check_fit(
-    tally: Tally, cameras: Cameras, water: WaterSurface, settings: Settings, path: Path
-) -> None:
-    """Refuse a result in which cloud, water and cameras did not meet."""
-    if tally.submerged == 0:
-        raise GeometryError(
-            f"{path}: no point lies below the water ({water}); check the water's height, and"
-            " that it has the cloud's vertical datum."
-        )
-    if isinstance(water, WaterDimension):
-        refuse_under_water(cameras, tally.lowest_water_m, str(water))
-    if tally.outcomes[Outcome.NO_CAMERA] == tally.submerged:
-        middle = (tally.low + tally.high) / 2.0
-        distance = float(np.hypot(*(cameras.centres - middle)[:, :2].T).min())
-        limit = settings.max_angle_deg
-        raise GeometryError(
-            f"{path}: no camera has a submerged point in sight"
-            + (f" within {limit:g} degrees" if limit else "")
-            + f"; the nearest stands {_distance(distance)} in plan from the middle of the"
-            f" {tally.submerged:,} submerged points; check that cameras and cloud have the same"
-            " CRS, and that pitch 0 means straight down."
-        )
-
-
-def _distance(metres: float) -> str:
-    return f"{metres / 1000.0:,.1f} km" if metres >= 10_000.0 else f"{metres:,.1f} m"
-
-
-def _summarise(
-    tally: Tally,
-    cameras: Cameras,
-    water: WaterSurface,
-    settings: Settings,
-    source: Path,
-    target: Path,
-    seconds: float,
-) -> Summary:
-    unused = [
-        label for label, used in zip(cameras.labels, tally.camera_used, strict=True) if not used
-    ]
-    uncorrected = tally.uncorrected()
-    return Summary(
-        input=str(source),
-        output=str(target),
-        pcfix=pcfix.__version__,
-        points=tally.points,
-        submerged=tally.submerged,
-        corrected=tally.corrected,
-        uncorrected=uncorrected,
-        dropped=sum(uncorrected.values()) if settings.uncorrected == "drop" else 0,
-        water_unknown=tally.water_unknown,
-        depth_m=tally.depth_m(),
-        shift_z_m=tally.shift_z_m(),
-        rays=tally.rays,
-        cameras=len(cameras),
-        cameras_used=len(cameras) - len(unused),
-        cameras_unused=unused,
-        water=str(water),
-        settings=asdict(settings),
-        seconds=round(seconds, 3),
-        warnings=list(cameras.notes),
-    )

@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     from pcfix.model import FloatArray
 
 
+CHUNK_POINTS = 1_000_000
+"""Points that are worked on at a time, which bounds the memory."""
+
+
 def correct_points(
     xyz: npt.ArrayLike,
     cameras: Cameras,
@@ -89,7 +93,7 @@ def correct_points(
     >>> result.xyz.round(3).tolist()
     [[0.0, 0.0, -2.703]]
     """
-    points = _checked_points(xyz)
+    points = checked_points(xyz)
     settings = Settings(refractive_index, max_angle_deg, max_cameras)
     surface, dimension = _as_surface(water, len(points))
     check_above_water(cameras, surface)
@@ -98,7 +102,14 @@ def correct_points(
     return correct_checked(points, cameras, surface, settings, dimension, views)
 
 
-def _checked_points(xyz: npt.ArrayLike) -> FloatArray:
+def checked_points(xyz: npt.ArrayLike) -> FloatArray:
+    """Return finite points, C-contiguous, shape (n, 3).
+
+    Raises
+    ------
+    SettingError
+        If the shape is another, or a coordinate is not finite.
+    """
     points = np.ascontiguousarray(xyz, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise SettingError(f"xyz must have the shape (n, 3), not {points.shape}.")
@@ -203,4 +214,19 @@ def refuse_under_water(cameras: Cameras, level: FloatArray | float, water: str) 
             f"{below.size} of {len(cameras)} cameras are under the water, the first"
             f" {cameras.labels[first]} at z = {cameras.centres[first, 2]:.2f} m ({water}): check"
             " the heights' datum, the order of the columns and the water surface."
+        )
+
+
+def check_submerged(count: int, name: str, water: WaterSurface) -> None:
+    """Refuse a cloud of which no point lies below the water.
+
+    Raises
+    ------
+    GeometryError
+        With the cloud's name and the surface.
+    """
+    if count == 0:
+        raise GeometryError(
+            f"{name}: no point lies below the water ({water}); check the water's height, and that"
+            " it has the cloud's vertical datum."
         )

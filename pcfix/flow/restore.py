@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.flow.files import CHUNK_POINTS
+from pcfix.flow.points import CHUNK_POINTS
 from pcfix.flow.threads import threads
 from pcfix.io.files import check_input, check_output
 from pcfix.io.las.columns import SHIFTS, columns_for, is_corrected, is_marked_uncorrected

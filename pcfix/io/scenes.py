@@ -12,6 +12,7 @@ from pyproj import CRS
 
 import pcfix
 from pcfix.io.files import check_output, write_text
+from pcfix.io.las.columns import BATHYMETRIC_POINT
 from pcfix.io.las.sink import LasSink
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from pcfix.model import FloatArray
     from pcfix.simulate.scene import Scene
 
-GROUND, BATHYMETRIC_POINT = 2, 40
+GROUND = 2
 FILES = {
     "cloud.laz": "the cloud as SfM software that knows nothing of water makes it",
     "truth.laz": "the true position of each of its points, row by row",

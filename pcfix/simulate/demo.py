@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pcfix.compare.truth import errors_against_truth
-from pcfix.flow import correct_file
+from pcfix.flow.files import correct_file
 from pcfix.io.las.source import read_xyz
 from pcfix.io.scenes import write_scene
 from pcfix.simulate.scene import BlockKind, Scene, simulate_scene

@@ -1,6 +1,1 @@
-"""LAS and LAZ: in by chunks, out by chunks, nothing lost on the way."""
-
-from pcfix.io.las.sink import LasSink
-from pcfix.io.las.source import LasSource
-
-__all__ = ["LasSink", "LasSource"]
+"""LAS and LAZ: read chunk by chunk, write chunk by chunk, and lose nothing in between."""

@@ -10,16 +10,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import laspy
 import numpy as np
-from laspy.vlrs.known import ExtraBytesStruct
 
 from pcfix.errors import InputError
 
 if TYPE_CHECKING:
+    import laspy
     import numpy.typing as npt
 
     from pcfix.model import BoolArray, Correction, Dimensions, FloatArray
+
+
+BATHYMETRIC_POINT = 40
+"""ASPRS class of a point on the bed (LAS 1.4, topo-bathy lidar domain profile)."""
 
 
 class TooNarrowError(Exception):
@@ -70,39 +73,55 @@ def column_scale(column: Column, scales: FloatArray) -> float:
     return float(scales[SHIFTS.index(column.name)]) if column.scale == 0.0 else column.scale
 
 
-def extra_bytes(
-    columns: tuple[Column, ...], scales: FloatArray, *, wide: bool
-) -> tuple[list[laspy.ExtraBytesParams], bytes]:
-    """Return the dimensions for laspy's point format and the bytes of their VLR records."""
-    params, records = [], b""
-    for column in columns:
-        scale = column_scale(column, scales)
-        scaled = None if scale == 1.0 else np.array([scale])
-        offset = None if scale == 1.0 else np.zeros(1)
-        dtype = column.dtype(wide=wide)
-        params.append(
-            laspy.ExtraBytesParams(column.name, dtype, column.description, offset, scaled)
-        )
-        number = ["uint8", "int8", "uint16", "int16", "uint32", "int32"].index(dtype.name) + 1
-        record = ExtraBytesStruct(
-            column.name.encode(), number, column.description.encode(), scaled, offset
-        )
-        record.options &= ~(record.MIN_BIT_MASK | record.MAX_BIT_MASK)
-        record._min[:], record._max[:] = type(record._min)(), type(record._max)()
-        records += bytes(record)
-    return params, records
-
-
 def shift_steps(correction: Correction, scales: FloatArray) -> npt.NDArray[np.int64]:
     """Return the shift in steps of the file's own scale, shape (n, 3)."""
     return np.rint(correction.shift_m / scales).astype(np.int64)
+
+
+def in_steps(
+    column: Column,
+    correction: Correction,
+    moved: npt.NDArray[np.int64],
+    classes: npt.NDArray[Any],
+    rows: BoolArray,
+) -> npt.NDArray[Any]:
+    """Return a column's values of the given rows, whole numbers of its scale.
+
+    Parameters
+    ----------
+    column : Column
+    correction : Correction
+        Of n points.
+    moved : array, shape (n, 3)
+        See `shift_steps`.
+    classes : array, shape (n,)
+        Before the correction.
+    rows : array of bool, shape (n,)
+    """
+    values: dict[str, npt.NDArray[Any]] = {
+        "ShiftX": moved[:, 0],
+        "ShiftY": moved[:, 1],
+        "ShiftZ": moved[:, 2],
+        "WaterDepth": correction.depth_m,
+        "RayMiss": correction.ray_miss_m,
+        "SigmaZ": correction.sigma_z_m,
+        "Incidence": correction.incidence_deg,
+        "RayCount": correction.ray_count,
+        "SourceClass": classes,
+    }
+    value = values[column.name][rows]
+    if column.scale not in (0.0, 1.0):
+        value = np.rint(value / column.scale)
+    if column.name == "WaterDepth":
+        value = np.maximum(value, 1)  # a submerged point is never at zero depth
+    return value
 
 
 def fill(
     points: laspy.ScaleAwarePointRecord,
     columns: tuple[Column, ...],
     correction: Correction,
-    steps: npt.NDArray[np.int64],
+    moved: npt.NDArray[np.int64],
     rows: BoolArray,
 ) -> None:
     """Write the columns of the given rows; the others keep zero.
@@ -112,27 +131,13 @@ def fill(
     TooNarrowError
         If a value does not fit its type and the type may be widened.
     """
-    values: dict[str, npt.NDArray[Any]] = {
-        "ShiftX": steps[:, 0],
-        "ShiftY": steps[:, 1],
-        "ShiftZ": steps[:, 2],
-        "WaterDepth": correction.depth_m,
-        "RayMiss": correction.ray_miss_m,
-        "SigmaZ": correction.sigma_z_m,
-        "Incidence": correction.incidence_deg,
-        "RayCount": correction.ray_count,
-        "SourceClass": np.asarray(points["classification"]),
-    }
+    classes = np.array(points["classification"])
     for column in columns:
         target = points.array[column.name]
         limits = np.iinfo(target.dtype)
-        value = values[column.name][rows]
-        if column.scale not in (0.0, 1.0):
-            value = np.rint(value / column.scale)
+        value = in_steps(column, correction, moved, classes, rows)
         if column.saturates:
             value = np.minimum(value, limits.max)
-        if column.name == "WaterDepth":
-            value = np.maximum(value, 1)  # a submerged point is never at zero depth
         if value.size and (value.min() < limits.min or value.max() > limits.max):
             if target.dtype != column.dtype(wide=True):
                 raise TooNarrowError

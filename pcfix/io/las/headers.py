@@ -12,7 +12,7 @@ from laspy.vlrs.vlr import VLR
 
 import pcfix
 from pcfix.errors import InputError
-from pcfix.io.las.columns import Column, extra_bytes
+from pcfix.io.las.columns import Column, column_scale
 from pcfix.io.las.formats import upgraded
 from pcfix.io.las.provenance import is_ours, settings_vlr
 from pcfix.io.las.records import Record, RecordList
@@ -20,6 +20,7 @@ from pcfix.io.las.source import las_errors
 
 if TYPE_CHECKING:
     from pcfix.io.las.source import LasSource
+    from pcfix.model import FloatArray
 
 EXTRA_BYTES = ("LASF_Spec", 4)
 _SOFTWARE = slice(32, 64)
@@ -56,7 +57,7 @@ def corrected_header(
     _refuse_twice(source, columns)
     old = source.header
     header = _copied(old)
-    params, records = extra_bytes(columns, old.scales, wide=wide)
+    params, records = _extra_bytes(columns, old.scales, wide=wide)
     point_format = upgraded(old.point_format)
     for param in params:
         point_format.add_extra_dimension(param)
@@ -130,6 +131,29 @@ def restored_header(source: LasSource, before: dict[str, Any], drop: set[str]) -
 def output_evlrs(source: LasSource) -> list[Record]:
     """Return the EVLRs to carry over: all but the index of a COPC file, which would be wrong."""
     return [v for v in source.evlrs if v.user_id != "copc"]
+
+
+def _extra_bytes(
+    columns: tuple[Column, ...], scales: FloatArray, *, wide: bool
+) -> tuple[list[laspy.ExtraBytesParams], bytes]:
+    """Return the dimensions for laspy's point format and the bytes of their VLR records."""
+    params, records = [], b""
+    for column in columns:
+        scale = column_scale(column, scales)
+        scaled = None if scale == 1.0 else np.array([scale])
+        offset = None if scale == 1.0 else np.zeros(1)
+        dtype = column.dtype(wide=wide)
+        params.append(
+            laspy.ExtraBytesParams(column.name, dtype, column.description, offset, scaled)
+        )
+        number = ["uint8", "int8", "uint16", "int16", "uint32", "int32"].index(dtype.name) + 1
+        record = ExtraBytesStruct(
+            column.name.encode(), number, column.description.encode(), scaled, offset
+        )
+        record.options &= ~(record.MIN_BIT_MASK | record.MAX_BIT_MASK)
+        record._min[:], record._max[:] = type(record._min)(), type(record._max)()
+        records += bytes(record)
+    return params, records
 
 
 def _refuse_twice(source: LasSource, columns: tuple[Column, ...]) -> None:

@@ -1,0 +1,88 @@
+"""The PDAL pipeline that does what a call of `correct_file` does."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from pcfix.errors import InputError
+from pcfix.flow.job import Job
+from pcfix.io.las.columns import columns_for
+from pcfix.io.las.formats import UPGRADE
+from pcfix.io.las.sink import check_suffix
+from pcfix.io.las.source import LasSource
+from pcfix.io.pdal import CLASS_FLAGS, OUTCOME, STAGE_SOURCE, add_dimension
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import laspy
+
+    from pcfix.io.las.columns import Column
+    from pcfix.model import Settings
+
+WAVEFORM_FORMATS = (9, 10)
+
+
+def pipeline_for(
+    input: Path, output: Path, settings: Settings, options: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the pipeline, ready for JSON.
+
+    Parameters
+    ----------
+    input, output : Path
+        As of `correct_file`. PDAL replaces an output that exists.
+    settings : Settings
+    options : dict
+        The stage's options as the user gave them; those that are None are left out.
+
+    Raises
+    ------
+    PcfixError
+        If `correct_file` would refuse them at its start, or PDAL cannot write the point format.
+    """
+    check_suffix(output)
+    Job(str(input), settings, options["cameras"], options["water"], options.get("sensor"))
+    with LasSource(input) as source:
+        point_format = source.header.point_format
+    if UPGRADE[point_format.id] in WAVEFORM_FORMATS:
+        raise InputError(
+            f"{input}: has waveforms (point format {point_format.id}), which PDAL does not write;"
+            " use 'pcfix correct'."
+        )
+    columns = columns_for(settings.dimensions)
+    drop = settings.uncorrected == "drop"
+    if drop:
+        options = {**options, "uncorrected": "keep"}
+    added = [add_dimension(columns), CLASS_FLAGS, f"{OUTCOME}=uint8" if drop else ""]
+    stage = {
+        "type": "filters.python",
+        "source": STAGE_SOURCE,
+        "module": "pcfix_stage",
+        "function": "correct",
+        "add_dimension": ",".join(filter(None, added)),
+        "pdalargs": {name: value for name, value in options.items() if value is not None},
+    }
+    dropping = {"type": "filters.range", "limits": f"{OUTCOME}[0:1]"}
+    writer = {
+        "type": "writers.las",
+        "filename": str(output),
+        "forward": "all",
+        "minor_version": 4,
+        "dataformat_id": UPGRADE[point_format.id],
+        "extra_dims": _extra_dims(point_format, columns),
+    }
+    reader = {"type": "readers.las", "filename": str(input)}
+    return {"pipeline": [reader, stage, *([dropping] if drop else []), writer]}
+
+
+def _extra_dims(point_format: laspy.PointFormat, columns: tuple[Column, ...]) -> str:
+    """Return the extra dimensions of the input, as PDAL names them, and those of pcfix."""
+    names = []
+    for dimension in point_format.extra_dimensions:
+        kind = "double" if dimension.is_scaled else str(dimension.dtype.base)
+        if dimension.num_elements == 1:
+            names.append(f"{dimension.name}={kind}")
+        elif dimension.num_elements <= 3:  # PDAL does not read longer ones
+            names += [f"{dimension.name}{i}={kind}" for i in range(dimension.num_elements)]
+    return ",".join(filter(None, [*names, add_dimension(columns)]))

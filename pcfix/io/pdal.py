@@ -1,0 +1,203 @@
+"""A cloud as PDAL hands it to ``filters.python``: dictionaries of arrays and of metadata.
+
+PDAL checks neither the length nor the strides of the arrays that it gets back; those made here
+have its own types, are C-contiguous, and are as long as its own.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from pcfix.errors import SettingError
+from pcfix.io.las.columns import (
+    BATHYMETRIC_POINT,
+    changed_rows,
+    column_scale,
+    in_steps,
+    shift_steps,
+)
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from pcfix.io.las.columns import Column
+    from pcfix.model import Correction, FloatArray, Summary
+
+Dimensions: TypeAlias = "dict[str, npt.NDArray[Any]]"
+
+NAME = "the pipeline's cloud"
+OUTCOME = "Outcome"
+"""A dimension that is filled where ``add_dimension`` asks for it: `pcfix.Outcome`."""
+
+STAGE_SOURCE = "from pcfix.pdal_stage import stages; correct, label = stages(globals())"
+"""What a pipeline says to have the stage."""
+
+CLASS_FLAGS = "ClassFlags=uint8"
+"""To be added for PDAL 2.2, where point formats 0 to 5 have no such dimension."""
+
+_WITHHELD_FLAG = 4
+"""Bit of ClassFlags, which older PDAL has in place of the dimension Withheld."""
+
+
+def add_dimension(columns: tuple[Column, ...]) -> str:
+    """Return the value of a stage's ``add_dimension`` for these columns."""
+    return ",".join(f"{c.name}={c.narrow if c.scale == 1.0 else 'float'}" for c in columns)
+
+
+def check_dimensions(ins: Dimensions, columns: tuple[Column, ...]) -> None:
+    """Refuse a cloud without the dimensions that are to be filled.
+
+    Raises
+    ------
+    SettingError
+        With the value that ``add_dimension`` should have.
+    """
+    missing = [c.name for c in columns if c.name not in ins]
+    if missing:
+        raise SettingError(
+            f"add_dimension: {', '.join(missing)} missing; give"
+            f' "{add_dimension(columns)}", or set dimensions to minimal or none.'
+        )
+    for column in columns:
+        if column.scale != 1.0 and ins[column.name].dtype.kind != "f":
+            raise SettingError(f"add_dimension: {column.name} must be float.")
+
+
+def dimension(ins: Dimensions, name: str) -> FloatArray:
+    """Return one dimension as float64.
+
+    Raises
+    ------
+    SettingError
+        If the cloud has no such dimension.
+    """
+    if name not in ins:
+        raise SettingError(f"{NAME}: has no dimension {name}; it has {', '.join(ins)}.")
+    values: FloatArray = ins[name].astype(np.float64)
+    return values
+
+
+class Results:
+    """The output arrays: C-contiguous, of PDAL's own types and length, as nobody checks them."""
+
+    def __init__(
+        self, ins: Dimensions, columns: tuple[Column, ...], flags: Flags, scales: FloatArray | None
+    ) -> None:
+        self._columns, self._flags, self._scales = columns, flags, scales
+        copied = {axis: np.array(ins[axis], order="C") for axis in "XYZ"}
+        zero = {column.name: np.zeros_like(ins[column.name]) for column in columns}
+        self._added: Dimensions = copied | zero | {"Classification": flags.classes.copy()}
+        if OUTCOME in ins:
+            self._added[OUTCOME] = np.zeros_like(ins[OUTCOME])
+
+    def add(self, rows: slice, correction: Correction, withhold: bool) -> None:
+        """Add one chunk."""
+        out, classes = self._added, self._flags.classes[rows]
+        # without one known scale, a step so fine that it is far below any
+        scales = np.full(3, 2.0**-20) if self._scales is None else self._scales
+        moved = shift_steps(correction, scales)
+        for i, axis in enumerate("XYZ"):
+            # land keeps its bits, negative zero included
+            out[axis][rows][correction.corrected] += moved[correction.corrected, i] * scales[i]
+        changed = changed_rows(correction, self._flags.withheld[rows])
+        for column in self._columns:
+            values = in_steps(column, correction, moved, classes, changed)
+            out[column.name][rows][changed] = values * column_scale(column, scales)
+        out["Classification"][rows][correction.corrected] = BATHYMETRIC_POINT
+        if OUTCOME in out:
+            out[OUTCOME][rows] = correction.outcome
+        if withhold:
+            self._flags.withheld[rows] |= correction.submerged & ~correction.corrected
+
+    @property
+    def dimensions(self) -> Dimensions:
+        """What PDAL takes over."""
+        return self._added | self._flags.dimensions()
+
+
+class Flags:
+    """Classes and withheld flags, wherever this PDAL keeps them.
+
+    PDAL 2.2 has the flags in ClassFlags, and those of point formats 0 to 5 in the upper bits of
+    Classification; later versions have a dimension Withheld.
+    """
+
+    def __init__(self, ins: Dimensions, metadata: dict[str, Any] | None) -> None:
+        if "Classification" not in ins:
+            raise SettingError(
+                f'{NAME}: has no Classification; add "Classification=uint8" to add_dimension.'
+            )
+        self._ins = ins
+        self.classes = np.array(ins["Classification"], order="C")
+        self._class_flags = np.array(ins["ClassFlags"]) if "ClassFlags" in ins else None
+        if "Withheld" not in ins and _is_packed(metadata):
+            packed = self.classes >> 5
+            self.classes &= 31
+            if self._class_flags is None:
+                raise SettingError(
+                    f"{NAME}: this PDAL keeps the flags of point formats 0 to 5 in Classification,"
+                    ' where class 40 has no room; add "ClassFlags=uint8" to add_dimension.'
+                )
+            self._class_flags |= packed.astype(self._class_flags.dtype)
+        if "Withheld" in ins:
+            self.withheld = ins["Withheld"] != 0
+        elif self._class_flags is not None:
+            self.withheld = (self._class_flags & _WITHHELD_FLAG) != 0
+        else:
+            self.withheld = np.zeros(len(self.classes), np.bool_)
+
+    def dimensions(self) -> Dimensions:
+        """Return the flags as PDAL has them."""
+        out: Dimensions = {}
+        if "Withheld" in self._ins:
+            out["Withheld"] = self.withheld.astype(self._ins["Withheld"].dtype)
+        if self._class_flags is not None:
+            out["ClassFlags"] = np.where(
+                self.withheld, self._class_flags | _WITHHELD_FLAG, self._class_flags
+            ).astype(self._class_flags.dtype)
+        return out
+
+
+def _is_packed(metadata: dict[str, Any] | None) -> bool:
+    """Whether a LAS file of point format 0 to 5 is among the inputs."""
+    return any(int(format_id) < 6 for format_id in _reader_values(metadata, "dataformat_id"))
+
+
+def scales_of(metadata: dict[str, Any] | None) -> FloatArray | None:
+    """Return the scale of all input files, where they have one."""
+    found = [set(_reader_values(metadata, f"scale_{axis}")) for axis in "xyz"]
+    if any(len(values) != 1 for values in found):
+        return None
+    return np.array([float(next(iter(values))) for values in found])
+
+
+def _reader_values(metadata: dict[str, Any] | None, name: str) -> list[str]:
+    """Return what the readers' metadata say under a name."""
+    readers = [
+        node for node in (metadata or {}).get("children", []) if node["name"].startswith("readers.")
+    ]
+    return [
+        child["value"]
+        for reader in readers
+        for child in reader.get("children", [])
+        if child["name"] == name
+    ]
+
+
+def metadata_of(summary: Summary) -> dict[str, Any]:
+    """Return the summary as PDAL's metadata."""
+    values = {k: v for k, v in summary.as_dict().items() if k not in ("input", "output")}
+    return node("pcfix", children=[node(name, value) for name, value in values.items()])
+
+
+def node(
+    name: str, value: Any = "", children: list[dict[str, Any]] | None = None
+) -> dict[str, Any]:
+    """Return a node of PDAL's metadata; a nested value as JSON text, with a type in any case."""
+    kinds = {bool: "boolean", int: "integer", float: "double"}
+    text = json.dumps(value) if isinstance(value, dict | list) else value
+    kind = kinds.get(type(value), "string")
+    return {"name": name, "value": text, "type": kind, "children": children or []}
