@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import cached_property
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
@@ -228,8 +229,8 @@ class Correction:
 
     Attributes
     ----------
-    xyz : array, shape (n, 3)
-        True points, metres, world frame. Land and uncorrected points as they came.
+    apparent_xyz : array, shape (n, 3)
+        The points as they came, metres, world frame.
     shift_m : array, shape (n, 3)
         True minus apparent.
     outcome : array of uint8, shape (n,)
@@ -254,7 +255,7 @@ class Correction:
         The lowest height of the water surface above any point; infinite where none is known.
     """
 
-    xyz: FloatArray
+    apparent_xyz: FloatArray
     shift_m: FloatArray
     outcome: npt.NDArray[np.uint8]
     ray_count: npt.NDArray[np.int32]
@@ -265,6 +266,13 @@ class Correction:
     camera_used: BoolArray
     water_known: BoolArray
     lowest_water_m: float
+
+    @cached_property
+    def xyz(self) -> FloatArray:
+        """True points, metres, world frame; land and uncorrected points as they came."""
+        xyz = self.apparent_xyz.copy()
+        xyz[self.corrected] += self.shift_m[self.corrected]
+        return xyz
 
     @property
     def submerged(self) -> BoolArray:

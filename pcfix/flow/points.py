@@ -113,9 +113,9 @@ def checked_points(xyz: npt.ArrayLike) -> FloatArray:
     points = np.ascontiguousarray(xyz, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise SettingError(f"xyz must have the shape (n, 3), not {points.shape}.")
-    finite = np.isfinite(points).all(axis=1)
+    finite = np.isfinite(points)
     if not finite.all():
-        row = int(np.argmin(finite))
+        row = int(np.argmin(finite.all(axis=1)))
         raise SettingError(f"xyz row {row} is not finite: {points[row].tolist()}; remove it.")
     return points
 
@@ -158,24 +158,22 @@ def correct_checked(
     found = intersect(
         xyz[rows], above, water, cameras, settings, None if views is None else views.take(rows)
     )
-    true = xyz[rows] + found.shift_m
-    rise = (above.slope * found.shift_m[:, :2]).sum(axis=1)
+    shift_x, shift_y, shift_z = found.shift_m.T
+    rise = above.slope[:, 0] * shift_x + above.slope[:, 1] * shift_y
 
     def spread(values: npt.NDArray[Any]) -> Any:
         full = np.zeros((len(xyz), *values.shape[1:]), values.dtype)
         full[rows] = values
         return full
 
-    corrected = xyz.copy()
-    corrected[rows] = true
     known = np.isfinite(surface.height_m)
     return Correction(
-        xyz=corrected,
+        apparent_xyz=xyz,
         shift_m=spread(found.shift_m),
         outcome=spread(found.outcome),
         ray_count=spread(found.ray_count),
         ray_miss_m=spread(found.ray_miss_m),
-        depth_m=spread(above.height_m + rise - true[:, 2]),
+        depth_m=spread(above.height_m + rise - (xyz[rows, 2] + shift_z)),
         incidence_deg=spread(found.incidence_deg),
         sigma_z_m=spread(found.sigma_z_m),
         camera_used=found.camera_used,

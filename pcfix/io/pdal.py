@@ -87,11 +87,16 @@ class Results:
         self, ins: Dimensions, columns: tuple[Column, ...], flags: Flags, scales: FloatArray | None
     ) -> None:
         self._columns, self._flags, self._scales = columns, flags, scales
-        copied = {axis: np.array(ins[axis], order="C") for axis in "XYZ"}
-        zero = {column.name: np.zeros_like(ins[column.name]) for column in columns}
-        self._added: Dimensions = copied | zero | {"Classification": flags.classes.copy()}
-        if OUTCOME in ins:
-            self._added[OUTCOME] = np.zeros_like(ins[OUTCOME])
+        names = [
+            *"XYZ",
+            *(column.name for column in columns),
+            *([OUTCOME] if OUTCOME in ins else []),
+        ]
+        # PDAL's own arrays are written to and given back: they are copies of its points
+        self._added: Dimensions = {name: np.ascontiguousarray(ins[name]) for name in names}
+        for name in names[3:]:
+            self._added[name].fill(0)
+        self._added["Classification"] = flags.classes.copy()
 
     def add(self, rows: slice, correction: Correction, withhold: bool) -> None:
         """Add one chunk."""

@@ -46,8 +46,9 @@ class Tally:
         self.camera_used |= correction.camera_used
         submerged = apparent[correction.submerged]
         if len(submerged):
-            self.low = np.minimum(self.low, submerged.min(axis=0))
-            self.high = np.maximum(self.high, submerged.max(axis=0))
+            # axis by axis: numpy is slow along the short one
+            self.low = np.minimum(self.low, [values.min() for values in submerged.T])
+            self.high = np.maximum(self.high, [values.max() for values in submerged.T])
         self.lowest_water_m = min(self.lowest_water_m, correction.lowest_water_m)
         moved = correction.corrected
         if moved.any():

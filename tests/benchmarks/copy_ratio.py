@@ -27,7 +27,7 @@ with laspy.open(sys.argv[1]) as source, laspy.open(
 
 
 def main():
-    arguments = parsed()
+    arguments = parsed(__doc__)
     folder = arguments.folder
     folder.mkdir(parents=True, exist_ok=True)
     cloud = folder / f"cloud_{arguments.points}_{arguments.cameras}.laz"
@@ -64,8 +64,8 @@ def main():
     kernel(cloud, scene, folder / "sensor.csv")
 
 
-def parsed():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def parsed(about):
+    parser = argparse.ArgumentParser(description=about.splitlines()[0])
     parser.add_argument("--points", type=int, default=5_000_000)
     parser.add_argument("--cameras", type=int, default=200)
     parser.add_argument("--runs", type=int, default=5)
@@ -87,10 +87,10 @@ def camera_table(cloud):
     return cloud.with_name(cloud.name.replace("cloud", "cameras")).with_suffix(".csv")
 
 
-def run(command):
+def run(command, stdout=None):
     """Return seconds and peak memory, MB, of a process."""
     started = time.perf_counter()
-    child = subprocess.Popen([str(word) for word in command])
+    child = subprocess.Popen([str(word) for word in command], stdout=stdout)
     _, status, usage = os.wait4(child.pid, 0)
     if status:
         raise SystemExit(f"failed: {command}")
