@@ -17,6 +17,7 @@ Options have the names of the command line, with underscores, and are checked by
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import sys
@@ -101,10 +102,10 @@ def _run(
         work(namespace, ins, outs)
         return True
     except PcfixError as error:
-        _give_stdout_back()
+        _repair_process(error)
         mistake = error
-    except BaseException:
-        _give_stdout_back()
+    except BaseException as error:
+        _repair_process(error)
         raise
     finally:
         sys.setdlopenflags(before)
@@ -116,8 +117,8 @@ def _run(
 def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
     from pcfix.flow.job import Job
     from pcfix.flow.points import checked_points
-    from pcfix.flow.threads import threads
     from pcfix.io.las.columns import columns_for
+    from pcfix.refract.threads import threads
 
     started = time.perf_counter()
     options = _options(namespace, _CORRECT_OPTIONS, needed=("cameras", "water"))
@@ -250,11 +251,13 @@ def _write_summary(options: dict[str, Any], summary: Summary) -> None:
         write_text(options["summary"], text, overwrite=options.get("overwrite", False))
 
 
-def _give_stdout_back() -> None:
-    """Undo PDAL's redirection of stdout, which outlives a pipeline that fails.
+def _repair_process(error: BaseException) -> None:
+    """Make up for what PDAL's plugin does to a Python process when a stage fails.
 
-    PDAL undoes it at the end of a pipeline that succeeds, so one is run.
+    It drops one reference too many to the exception's class, which in the end frees the class;
+    and it leaves stdout redirected, which it only undoes after a pipeline that succeeds.
     """
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(type(error)))
     pdal = sys.modules.get("pdal")
     if pdal is None or type(sys.stdout).__module__ != "redirector":
         return

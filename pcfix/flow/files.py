@@ -12,7 +12,6 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.flow.job import Job
 from pcfix.flow.points import CHUNK_POINTS
-from pcfix.flow.threads import threads
 from pcfix.io.files import check_input, check_output, write_text
 from pcfix.io.las.columns import (
     BATHYMETRIC_POINT,
@@ -37,6 +36,7 @@ from pcfix.model import (
     WaterDimension,
     WaterSurface,
 )
+from pcfix.refract.threads import threads
 
 if TYPE_CHECKING:
     from collections.abc import Callable

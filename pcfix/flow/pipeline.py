@@ -70,8 +70,10 @@ def pipeline_for(
         "forward": "all",
         "minor_version": 4,
         "dataformat_id": UPGRADE[point_format.id],
-        "extra_dims": _extra_dims(point_format, columns),
     }
+    extra = _extra_dims(point_format, columns)
+    if extra:
+        writer["extra_dims"] = extra
     reader = {"type": "readers.las", "filename": str(input)}
     return {"pipeline": [reader, stage, *([dropping] if drop else []), writer]}
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.flow.points import CHUNK_POINTS
-from pcfix.flow.threads import threads
 from pcfix.io.files import check_input, check_output
 from pcfix.io.las.columns import SHIFTS, columns_for, is_corrected, is_marked_uncorrected
 from pcfix.io.las.formats import shifted
@@ -16,6 +15,7 @@ from pcfix.io.las.headers import output_evlrs, restored_header
 from pcfix.io.las.provenance import read_settings
 from pcfix.io.las.sink import LasSink, check_suffix
 from pcfix.io.las.source import LasSource
+from pcfix.refract.threads import threads
 
 if TYPE_CHECKING:
     import os

@@ -19,6 +19,7 @@ from pcfix.model import Outcome, WaterMesh
 from pcfix.refract.frames import frame_planes, in_frame, may_hold, pyramid
 from pcfix.refract.piercing import pierce_mesh
 from pcfix.refract.rays import line_terms, nearest_point, refracted
+from pcfix.refract.threads import one_caller
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -100,12 +101,13 @@ def intersect(
         used,
         tested,
     )
-    if views is None and settings.max_cameras is None and not isinstance(water, WaterMesh):
-        _all_in_frame(*common)
-    else:
-        tin = build_tin(water) if isinstance(water, WaterMesh) else None
-        rows = None if views is None else (views.start, views.camera)
-        _chosen(*common, tin, rows, settings.max_cameras or len(cameras))
+    with one_caller():
+        if views is None and settings.max_cameras is None and not isinstance(water, WaterMesh):
+            _all_in_frame(*common)
+        else:
+            tin = build_tin(water) if isinstance(water, WaterMesh) else None
+            rows = None if views is None else (views.start, views.camera)
+            _chosen(*common, tin, rows, settings.max_cameras or len(cameras))
     return Intersection(
         shift_m=result[:, :3],
         outcome=result[:, _OUTCOME].astype(np.uint8),

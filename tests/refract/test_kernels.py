@@ -1,5 +1,6 @@
 """Both kernels, any number of threads, tiles and orders: the same bits."""
 
+import os
 import subprocess
 import sys
 
@@ -172,3 +173,20 @@ def interpreted_environment():
     import os
 
     return {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+
+
+def test_threads_of_python_may_call_at_once():
+    """Under numba's own pool of threads, two callers at once would end the process."""
+    program = """
+import threading, numpy as np, pcfix
+cameras = pcfix.Cameras(("a", "b"), np.array([[-20.0, 0, 100], [20.0, 0, 100]]))
+xyz = np.random.default_rng(1).uniform((-50, -50, -9), (50, 50, 0), (200_000, 3))
+results = [None] * 4
+def work(i): results[i] = pcfix.correct_points(xyz, cameras, 0.0).xyz
+threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
+for t in threads: t.start()
+for t in threads: t.join()
+assert all(np.array_equal(r, results[0]) for r in results)
+"""
+    environment = {**os.environ, "NUMBA_THREADING_LAYER": "workqueue"}
+    subprocess.run([sys.executable, "-c", program], check=True, env=environment)

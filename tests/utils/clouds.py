@@ -189,6 +189,8 @@ def random_cloud(
     header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     if not plain:
         _add_records(header, rng)
+    elif point_format >= 6:
+        header.global_encoding.wkt = True
     las = laspy.LasData(header)
     las.points = laspy.ScaleAwarePointRecord.zeros(count, header=header)
     _fill(las.points.array, rng)

@@ -1,0 +1,457 @@
+"""The stage and its recipes in a real PDAL: the program, and ``pdal.Pipeline`` in Python."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import laspy
+import numpy as np
+import pytest
+
+import pcfix
+from pcfix.io.las.columns import COLUMNS
+from pcfix.io.pdal import CLASS_FLAGS, STAGE_SOURCE, add_dimension
+from tests.utils.clouds import WATER_M, block, cameras_csv, framed_block, random_cloud, write_cloud
+from tests.utils.pdal import ROOT, needs_pdal, pdal, python
+from tests.utils.shared import needs
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+RECIPES = sorted((ROOT / "pipelines").glob("*.json"))
+SCENE = ROOT / "samples" / "scene"
+RIVER, needs_river = needs("river")
+
+EXECUTE = """
+import json, sys, pdal
+pipeline = pdal.Pipeline(open(sys.argv[1]).read())
+pipeline.execute()
+"""
+
+
+def run_pipeline(door: str, job: dict[str, Any] | list[Any], folder: Path) -> Any:
+    """Run a pipeline through one of the doors that PDAL has."""
+    (folder / "job.json").write_text(json.dumps(job))
+    if door == "program":
+        return pdal("pipeline", "job.json", folder=folder)
+    return python(EXECUTE, "job.json", folder=folder)
+
+
+def pipeline_of(folder: Path, *words: object) -> dict[str, Any]:
+    """Return what ``pcfix pipeline`` prints."""
+    program = "import sys; from pcfix.cli import main; sys.argv[0] = 'pcfix'; main()"
+    done = python(program, "pipeline", *words, folder=folder)
+    assert (done.returncode, done.stderr) == (0, "")
+    job: dict[str, Any] = json.loads(done.stdout)
+    return job
+
+
+def stage_of(**options: object) -> dict[str, Any]:
+    return {
+        "type": "filters.python",
+        "source": STAGE_SOURCE,
+        "module": "pcfix_stage",
+        "function": "correct",
+        "add_dimension": f"{add_dimension(COLUMNS)},{CLASS_FLAGS}",
+        "pdalargs": {"cameras": "cameras.csv", "water": WATER_M, **options},
+    }
+
+
+def assert_same(one: Path, other: Path) -> None:
+    """Compare coordinates, classes, flags and dimensions, to the last bit of the scale."""
+    a, b = laspy.read(one), laspy.read(other)
+    assert str(a.header.version) == str(b.header.version) == "1.4"
+    assert a.header.point_format.id == b.header.point_format.id
+    np.testing.assert_array_equal(a.header.scales, b.header.scales)
+    np.testing.assert_array_equal(a.header.offsets, b.header.offsets)
+    standard = set(a.point_format.standard_dimension_names) - {"scan_angle"}
+    for name in standard:
+        np.testing.assert_array_equal(np.array(b[name]), np.array(a[name]), name)
+    for column in COLUMNS:
+        found, expected = np.array(b[column.name]), np.array(a[column.name])
+        np.testing.assert_array_equal(found, expected.astype(found.dtype), column.name)
+
+
+@needs_pdal
+@pytest.mark.parametrize("door", ["program", "python"])
+@pytest.mark.parametrize("number", [0, 1, 2, 3, 6, 7, 8])
+def test_stage_and_command_line_agree(tmp_path: Path, number: int, door: str) -> None:
+    write_cloud(tmp_path / "cloud.las", number, plain=True)
+    cameras_csv(tmp_path / "cameras.csv", framed_block(), angles=True)
+    (tmp_path / "sensor.csv").write_text("focal,sensor_x,sensor_y\n24,24,9.6\n")
+    words = ["cloud.las", "stage.las", "--cameras", "cameras.csv", "--water", WATER_M]
+    job = pipeline_of(tmp_path, *words)
+    done = run_pipeline(door, job, tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    pcfix.correct_file(
+        tmp_path / "cloud.las", tmp_path / "cli.las",
+        cameras=tmp_path / "cameras.csv", water=WATER_M,
+    )  # fmt: skip
+    assert_same(tmp_path / "cli.las", tmp_path / "stage.las")
+
+
+@needs_pdal
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"uncorrected": "drop", "max_angle_deg": 20.0},
+        {"uncorrected": "keep", "max_cameras": 3, "refractive_index": 1.333},
+        {"dimensions": "minimal", "jobs": 1},
+        {"dimensions": "none"},
+    ],
+    ids=lambda more: " ".join(map(str, more.values())),
+)
+def test_any_call_has_its_pipeline(tmp_path: Path, more: dict[str, Any]) -> None:
+    write_cloud(tmp_path / "cloud.las", 7, plain=True)
+    cameras_csv(tmp_path / "cameras.csv", block())
+    names = {"max_angle_deg": "--max-angle", "refractive_index": "--index"}
+    words = [
+        word
+        for name, value in more.items()
+        for word in (names.get(name, "--" + name.replace("_", "-")), value)
+    ]
+    words += ["--cameras", "cameras.csv", "--water", WATER_M]
+    done = run_pipeline(
+        "program", pipeline_of(tmp_path, "cloud.las", "stage.las", *words), tmp_path
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    pcfix.correct_file(
+        tmp_path / "cloud.las", tmp_path / "cli.las",
+        cameras=tmp_path / "cameras.csv", water=WATER_M, **more,
+    )  # fmt: skip
+    cli, stage = laspy.read(tmp_path / "cli.las"), laspy.read(tmp_path / "stage.las")
+    for name in [*"XYZ", "classification", "withheld"]:
+        np.testing.assert_array_equal(np.array(stage[name]), np.array(cli[name]), name)
+    assert list(stage.point_format.extra_dimension_names) == list(
+        cli.point_format.extra_dimension_names
+    )
+
+
+@needs_pdal
+def test_dimensions_of_the_input_go_through(tmp_path: Path) -> None:
+    write_cloud(tmp_path / "cloud.las", 7)
+    cameras_csv(tmp_path / "cameras.csv", block())
+    words = ["cloud.las", "stage.las", "--cameras", "cameras.csv", "--water", WATER_M]
+    done = run_pipeline("program", pipeline_of(tmp_path, *words), tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    before, after = laspy.read(tmp_path / "cloud.las"), laspy.read(tmp_path / "stage.las")
+    for name in ("Quality", "Level", "Precise", "Echo"):
+        np.testing.assert_array_equal(np.array(after[name]), np.array(before[name]), name)
+    for axis in range(3):
+        np.testing.assert_array_equal(after[f"Normal{axis}"], before["Normal"][:, axis])
+
+
+@needs_pdal
+@pytest.mark.parametrize("door", ["program", "python"])
+def test_water_of_a_dimension(tmp_path: Path, door: str) -> None:
+    las = random_cloud(7, plain=True)
+    las.add_extra_dim(laspy.ExtraBytesParams("w_surf", "float64"))
+    las.w_surf = 12.0 + 0.01 * (np.array(las.x) - np.mean(las.x))
+    las.write(tmp_path / "cloud.las")
+    cameras_csv(tmp_path / "cameras.csv", block())
+    words = ["cloud.las", "stage.las", "--cameras", "cameras.csv", "--water", "dim:w_surf"]
+    done = run_pipeline(door, pipeline_of(tmp_path, *words), tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    pcfix.correct_file(
+        tmp_path / "cloud.las", tmp_path / "cli.las",
+        cameras=tmp_path / "cameras.csv", water="dim:w_surf",
+    )  # fmt: skip
+    assert_same(tmp_path / "cli.las", tmp_path / "stage.las")
+
+
+@needs_pdal
+@pytest.mark.parametrize("door", ["program", "python"])
+def test_libraries_of_pcfix_and_of_pdal_live_in_one_process(tmp_path: Path, door: str) -> None:
+    """Two PROJ or GDAL libraries in a process have crashed the program at its exit."""
+    pytest.importorskip("rasterio")
+    write_cloud(tmp_path / "cloud.las", 7, plain=True)
+    cameras_csv(tmp_path / "cameras.csv", block())
+    (tmp_path / "water.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty double x\nproperty double y\n"
+        "property double z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
+        f"455000 5431000 {WATER_M}\n457000 5431000 {WATER_M}\n"
+        f"455000 5433000 {WATER_M}\n457000 5433000 {WATER_M}\n3 0 1 2\n3 1 3 2\n"
+    )
+    loading = (
+        "\nimport pcfix.pdal_stage as entry"
+        "\ndef libraries(ins, outs):"
+        "\n    def work(*a):"
+        "\n        import laspy, pyproj, rasterio, open3d, numba, scipy.spatial"
+        "\n        pyproj.Transformer.from_crs(32633, 4326).transform(456000, 5432000)"
+        "\n        rasterio.crs.CRS.from_epsg(32633).to_wkt()"
+        "\n    return entry._run(work, globals(), ins, outs)"
+    )
+    first = {
+        "type": "filters.python", "source": loading, "module": "m", "function": "libraries"
+    }  # fmt: skip
+    job = ["cloud.las", first, stage_of(water="water.ply"),
+           {"type": "writers.las", "filename": "stage.las", "minor_version": 4,
+            "dataformat_id": 7, "forward": "all"}]  # fmt: skip
+    done = run_pipeline(door, job, tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert np.sum(laspy.read(tmp_path / "stage.las").classification == 40) > 100
+
+
+# Recipes
+
+
+def options_of(recipe: str, folder: Path, **more: object) -> list[str]:
+    """Return the words that send a recipe to the sample scene and its outputs to a folder."""
+    args = json.dumps({"cameras": str(SCENE / "cameras.csv"), "water": 0.37, **more})
+    words = [f"--readers.las.filename={SCENE / 'cloud.laz'}"]
+    if recipe != "label.json":
+        words.append(f"--filters.python.pdalargs={args}")
+    return [*words, f"--writers.las.filename={folder / 'out.las'}"]
+
+
+def corrected_scene(folder: Path) -> Path:
+    pcfix.correct_file(
+        SCENE / "cloud.laz", folder / "cli.las", cameras=SCENE / "cameras.csv", water=0.37
+    )
+    return folder / "cli.las"
+
+
+@needs_pdal
+def test_correct_recipe(tmp_path: Path) -> None:
+    recipe = ROOT / "pipelines" / "correct.json"
+    words = [*options_of("correct.json", tmp_path), "--metadata", "meta.json"]
+    done = pdal("pipeline", recipe, *words, folder=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert_same(corrected_scene(tmp_path), tmp_path / "out.las")
+    assert laspy.read(tmp_path / "out.las").header.parse_crs().to_epsg() == 32633
+    report = (tmp_path / "meta.json").read_text()
+    assert '"corrected": 14736' in report
+    assert '"pcfix": "0.' in report
+
+
+@needs_pdal
+def test_correct_recipe_as_it_stands(tmp_path: Path) -> None:
+    """From a checkout, with nothing overridden but where the output goes."""
+    out = f"--writers.las.filename={tmp_path / 'out.las'}"
+    done = pdal("pipeline", "pipelines/correct.json", out, folder=ROOT)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert_same(corrected_scene(tmp_path), tmp_path / "out.las")
+
+
+@needs_pdal
+@needs_river
+def test_correct_recipe_on_the_river(tmp_path: Path) -> None:
+    cameras = next(RIVER.glob("*cam*.csv"))
+    args = json.dumps({"cameras": str(cameras), "water": "dim:w_surf", "index": 1.337,
+                       "max_angle": 35})  # fmt: skip
+    done = pdal(
+        "pipeline", ROOT / "pipelines" / "correct.json",
+        f"--readers.las.filename={RIVER / 'points.las'}",
+        f"--writers.las.filename={tmp_path / 'out.las'}", f"--filters.python.pdalargs={args}",
+        folder=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    with pytest.warns(pcfix.PcfixWarning, match="7 labels occur more than once"):
+        pcfix.correct_file(
+            RIVER / "points.las", tmp_path / "cli.las", cameras=cameras, water="dim:w_surf",
+            refractive_index=1.337, max_angle_deg=35.0,
+        )  # fmt: skip
+    cli, stage = laspy.read(tmp_path / "cli.las"), laspy.read(tmp_path / "out.las")
+    for name in [*"XYZ", "classification", "withheld", "RayCount"]:
+        np.testing.assert_array_equal(np.array(stage[name]), np.array(cli[name]), name)
+
+
+@needs_pdal
+def test_label_recipe(tmp_path: Path) -> None:
+    recipe = ROOT / "pipelines" / "label.json"
+    done = pdal("pipeline", recipe, *options_of("label.json", tmp_path), folder=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    before, after = laspy.read(SCENE / "cloud.laz"), laspy.read(tmp_path / "out.las")
+    for axis in "XYZ":
+        np.testing.assert_array_equal(after[axis], before[axis])
+    wet = np.array(before.z) < 0.37
+    expected = np.where(wet, 40, np.array(before.classification))
+    np.testing.assert_array_equal(np.array(after.classification), expected)
+
+
+@needs_pdal
+def test_recipe_with_cleaning_and_surface_model(tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    recipe = ROOT / "pipelines" / "correct_clean_dsm.json"
+    words = options_of("correct_clean_dsm.json", tmp_path)
+    done = pdal(
+        "pipeline", recipe, *words, f"--writers.gdal.filename={tmp_path / 'dsm.tif'}",
+        folder=tmp_path,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    cloud, truth = laspy.read(tmp_path / "out.las"), laspy.read(SCENE / "truth.laz")
+    assert len(cloud) == len(truth)
+    assert 0 < np.sum(cloud.classification == 7) < 0.05 * len(cloud)
+    with rasterio.open(tmp_path / "dsm.tif") as grid:
+        assert grid.crs.to_epsg() == 32633
+        heights = next(grid.sample(np.column_stack([truth.x, truth.y]).mean(axis=0)[None]))
+        sampled = np.array(list(grid.sample(np.column_stack([truth.x, truth.y])[::20])))[:, 0]
+    assert np.isfinite(heights).all()
+    error = sampled - np.array(truth.z)[::20]
+    # cells of 1 m over a bed with relief: the cloud as it came is 1.3 m too high on average
+    assert abs(np.median(error)) < 0.05
+    assert np.percentile(np.abs(error), 90) < 0.5
+
+
+@needs_pdal
+def test_recipe_for_many_tiles(tmp_path: Path) -> None:
+    (tmp_path / "tiles").mkdir()
+    las = laspy.read(SCENE / "cloud.laz")
+    for i, rows in enumerate(np.array_split(np.arange(len(las)), 3)):
+        tile = laspy.LasData(las.header)
+        tile.points = las.points[rows]
+        tile.write(tmp_path / "tiles" / f"tile_{i}.laz")
+    recipe = ROOT / "pipelines" / "correct_many.json"
+    words = options_of("correct_many.json", tmp_path)[1:-1]
+    done = pdal("pipeline", recipe, *words, folder=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    tiles = [laspy.read(path) for path in sorted(tmp_path.glob("corrected_*.las"))]
+    assert len(tiles) > 1
+    whole = laspy.read(corrected_scene(tmp_path))
+
+    def rows(cloud: laspy.LasData) -> np.ndarray:
+        names = ["classification", "ShiftX", "ShiftZ", "RayCount"]
+        columns = [cloud.x, cloud.y, cloud.z, *(cloud[name] for name in names)]
+        return np.column_stack([np.round(np.asarray(c, float), 3) for c in columns])
+
+    found, expected = np.vstack([rows(tile) for tile in tiles]), rows(whole)
+    assert found.shape == expected.shape
+    np.testing.assert_allclose(
+        found[np.lexsort(found.T)], expected[np.lexsort(expected.T)], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
+def test_recipes_say_what_must_be_said(path: Path) -> None:
+    """PDAL's defaults are LAS 1.2 and centimetres; 2.2 and current releases share these options."""
+    stages = json.loads(path.read_text())["pipeline"]
+    stage = next(s for s in stages if s["type"] == "filters.python")
+    assert stage["source"] == STAGE_SOURCE
+    assert "script" not in stage
+    if stage["function"] == "correct":
+        assert stage["add_dimension"].startswith(f"{add_dimension(COLUMNS)},{CLASS_FLAGS}")
+    writer = next(s for s in stages if s["type"] == "writers.las")
+    assert writer["minor_version"] == 4
+    assert writer["dataformat_id"] >= 6
+    assert writer["forward"] == "all"
+    assert {s["type"] for s in stages} <= {
+        "readers.las", "filters.python", "filters.merge", "filters.splitter", "filters.outlier",
+        "filters.range", "writers.las", "writers.gdal",
+    }  # fmt: skip
+
+
+# Mistakes
+
+
+MISTAKES = {
+    "an option that is none": ({"watre": 1}, "no option 'watre'"),
+    "a value": ({"index": 1.6}, "refractive index 1.6 is outside 1.0 to 1.5"),
+    "no such cameras": ({"cameras": "none.csv"}, "none.csv: there is no such file"),
+    "water too low": ({"water": -40}, "no point lies below the water"),
+    "no such dimension": ({"water": "dim:w_surf"}, "has no dimension w_surf"),
+}
+
+SURVIVE = """
+import json, os, signal, sys, pdal
+job = open(sys.argv[1]).read()
+before = sys.stdout, os.getcwd(), signal.getsignal(signal.SIGINT), sys.getdlopenflags()
+for attempt in range(30):
+    try:
+        pdal.Pipeline(job).execute()
+    except RuntimeError as error:
+        message = str(error)
+    else:
+        raise SystemExit("no error")
+    after = sys.stdout, os.getcwd(), signal.getsignal(signal.SIGINT), sys.getdlopenflags()
+    assert after == before, after
+good = json.loads(job)
+good[1]["pdalargs"] = {"cameras": "cameras.csv", "water": float(sys.argv[2])}
+assert pdal.Pipeline(json.dumps(good)).execute() == 300
+assert sys.stdout is before[0]
+print(message)
+"""
+
+
+def mistaken_job(folder: Path, options: dict[str, Any]) -> list[Any]:
+    write_cloud(folder / "cloud.las", 7, plain=True, count=300)
+    cameras_csv(folder / "cameras.csv", block())
+    writer = {"type": "writers.las", "filename": "out.las", "forward": "all",
+              "minor_version": 4, "dataformat_id": 7}  # fmt: skip
+    return ["cloud.las", stage_of(**options), writer]
+
+
+@needs_pdal
+@pytest.mark.parametrize("case", MISTAKES)
+def test_program_fails_with_the_sentence_and_writes_nothing(tmp_path: Path, case: str) -> None:
+    options, sentence = MISTAKES[case]
+    done = run_pipeline("program", mistaken_job(tmp_path, options), tmp_path)
+    assert done.returncode != 0
+    lines = [line for line in done.stderr.splitlines() if line.startswith("pcfix: ")]
+    assert len(lines) == 1, done.stderr
+    assert sentence in lines[0]
+    assert not (tmp_path / "out.las").exists()
+
+
+@needs_pdal
+@pytest.mark.parametrize("case", MISTAKES)
+def test_process_stays_usable_after_a_mistake(tmp_path: Path, case: str) -> None:
+    options, sentence = MISTAKES[case]
+    (tmp_path / "job.json").write_text(json.dumps(mistaken_job(tmp_path, options)))
+    done = python(SURVIVE, "job.json", WATER_M, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert sentence in done.stdout
+
+
+@needs_pdal
+def test_process_stays_usable_after_a_fault_of_pcfix(tmp_path: Path) -> None:
+    (tmp_path / "job.json").write_text(json.dumps(mistaken_job(tmp_path, {})))
+    breaking = (
+        "import pcfix.flow.job\n"
+        "whole = pcfix.flow.job.Job.correct\n"
+        "def broken(*a, calls=[]):\n"
+        "    calls.append(1)\n"
+        "    if len(calls) < 31: raise ZeroDivisionError('a fault')\n"
+        "    return whole(*a)\n"
+        "pcfix.flow.job.Job.correct = broken\n"
+    )
+    done = python(breaking + SURVIVE, "job.json", WATER_M, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "ZeroDivisionError: a fault" in done.stdout
+
+
+@needs_pdal
+def test_dimensions_that_a_pipeline_forgot(tmp_path: Path) -> None:
+    job = mistaken_job(tmp_path, {})
+    job[1]["add_dimension"] = "ShiftX=float"
+    done = run_pipeline("program", job, tmp_path)
+    assert done.returncode != 0
+    assert f'give "{add_dimension(COLUMNS)}"' in done.stderr
+    assert not (tmp_path / "out.las").exists()
+
+
+def test_pipeline_command_refuses_what_correct_refuses(tmp_path: Path) -> None:
+    write_cloud(tmp_path / "cloud.las", 7, plain=True, count=300)
+    write_cloud(tmp_path / "waves.las", 10, plain=True, count=300)
+    cameras_csv(tmp_path / "cameras.csv", block())
+    program = "import sys; from pcfix.cli import main; sys.argv[0] = 'pcfix'; main()"
+    good = ["--cameras", "cameras.csv", "--water", "5"]
+    for words, sentence in [
+        (["cloud.las", "out.las", *good, "--index", "1.6"], "outside 1.0 to 1.5"),
+        (["cloud.las", "out.las", *good[:2], "--water", "wet"], "not understood"),
+        (["cloud.las", "out.las", *good, "--cameras", "none.csv"], "no such file"),
+        (["none.las", "out.las", *good], "no such file"),
+        (["cloud.las", "out.txt", *good], "ends in .las or .laz"),
+        (["cloud.las", "out.las", *good, "--water", "500"], "under the water"),
+        (["waves.las", "out.las", *good], "has waveforms"),
+    ]:
+        done = python(program, "pipeline", *words, folder=tmp_path)
+        assert (done.returncode, done.stdout) == (1, "")
+        assert len(done.stderr.splitlines()) == 1
+        assert sentence in done.stderr
+
+
+def test_recipes_are_all_there() -> None:
+    assert [path.name for path in RECIPES] == [
+        "correct.json", "correct_clean_dsm.json", "correct_many.json", "label.json",
+    ]  # fmt: skip
