@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import pcfix
-from pcfix.errors import PcfixError, PcfixWarning
+from pcfix.errors import PcfixError, show_warning
 from pcfix.model import DEFAULT_REFRACTIVE_INDEX
 
 if TYPE_CHECKING:
@@ -288,17 +288,9 @@ def _progress(title: str, quiet: bool) -> Iterator[Callable[[int, int], None] | 
         yield update
 
 
-def _show_warning(
-    message: Warning | str, category: type[Warning], *where: object, **more: object
-) -> None:
-    del where, more
-    if issubclass(category, PcfixWarning):
-        typer.echo(f"pcfix: warning: {message}", err=True)
-
-
 def main() -> None:
     """Run the command line; a user's mistake is one line on stderr and exit code 1."""
-    warnings.showwarning = _show_warning
+    warnings.showwarning = show_warning
     try:
         app()
     except PcfixError as error:

@@ -3,6 +3,8 @@
 Each message is one sentence that a person can act on: the file, the value, the rule, the remedy.
 """
 
+import sys
+
 
 class PcfixError(Exception):
     """Anything that a user can mend; the command line prints it and exits with 1."""
@@ -22,3 +24,12 @@ class GeometryError(PcfixError):
 
 class PcfixWarning(UserWarning):
     """Something that was done on the user's behalf and that they should know of."""
+
+
+def show_warning(
+    message: Warning | str, category: type[Warning], *where: object, **more: object
+) -> None:
+    """Show a warning of pcfix as one line on stderr, others not: for `warnings.showwarning`."""
+    del where, more
+    if issubclass(category, PcfixWarning):
+        sys.stderr.write(f"pcfix: warning: {message}\n")

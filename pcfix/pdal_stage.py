@@ -22,11 +22,12 @@ import json
 import os
 import sys
 import time
+import warnings
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from pcfix.errors import PcfixError, SettingError
+from pcfix.errors import PcfixError, SettingError, show_warning
 from pcfix.io.pdal import (
     NAME,
     OUTCOME,
@@ -98,8 +99,12 @@ def _run(
     before = sys.getdlopenflags()
     # PDAL links to a PROJ and a GDAL of its own; two of a kind crash the program at its exit
     sys.setdlopenflags(os.RTLD_NOW | getattr(os, "RTLD_DEEPBIND", 0))
+    in_program = "pdal" not in sys.modules
     try:
-        work(namespace, ins, outs)
+        with warnings.catch_warnings():
+            if in_program:
+                warnings.showwarning = show_warning
+            work(namespace, ins, outs)
         return True
     except PcfixError as error:
         _repair_process(error)
@@ -109,7 +114,7 @@ def _run(
         raise
     finally:
         sys.setdlopenflags(before)
-    if "pdal" not in sys.modules:  # in the program, which shows the error as a Python repr
+    if in_program:  # which shows the error as a Python repr
         sys.stderr.write(f"pcfix: {mistake}\n")
     raise type(mistake)(str(mistake))  # anew, without the places in pcfix that it came through
 

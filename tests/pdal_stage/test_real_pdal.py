@@ -247,6 +247,8 @@ def test_correct_recipe_on_the_river(tmp_path: Path) -> None:
         folder=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("pcfix: warning: ")
     with pytest.warns(pcfix.PcfixWarning, match="7 labels occur more than once"):
         pcfix.correct_file(
             RIVER / "points.las", tmp_path / "cli.las", cameras=cameras, water="dim:w_surf",
