@@ -1,0 +1,105 @@
+"""Arguments and options that several commands have, and the bar that shows progress."""
+
+from __future__ import annotations
+
+import sys
+import time
+from contextlib import contextmanager
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+
+class Uncorrected(str, Enum):  # noqa: UP042 - typer shows the values of a str Enum
+    """What becomes of submerged points that cannot be corrected."""
+
+    withhold = "withhold"
+    keep = "keep"
+    drop = "drop"
+
+
+class Dimensions(str, Enum):  # noqa: UP042
+    """Which extra dimensions are written."""
+
+    all = "all"
+    minimal = "minimal"
+    none = "none"
+
+
+Input = Annotated[
+    Path, typer.Argument(metavar="INPUT", help="LAS or LAZ cloud.", show_default=False)
+]
+Output = Annotated[
+    Path, typer.Argument(metavar="OUTPUT", help="LAS or LAZ to write.", show_default=False)
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an output that exists.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No summary and no progress.")]
+Jobs = Annotated[int | None, typer.Option(help="Threads.", show_default="all cores")]
+
+
+CamerasOption = Annotated[
+    Path,
+    typer.Option("--cameras", help="CSV: label,x,y,z and, if known, yaw,pitch,roll (degrees)."),
+]
+WaterOption = Annotated[
+    str,
+    typer.Option("--water", help="A level (0.37), plane:a,b,c, dim:NAME, or a mesh (.obj, .ply)."),
+]
+Sensor = Annotated[
+    Path | None,
+    typer.Option(
+        help="CSV: focal,sensor_x,sensor_y in mm.", show_default="sensor.csv beside the cameras"
+    ),
+]
+Index = Annotated[float, typer.Option(help="Refractive index of the water relative to air.")]
+MaxAngle = Annotated[
+    float | None, typer.Option(help="Use rays up to this incidence angle, degrees.")
+]
+MaxCameras = Annotated[int | None, typer.Option(help="Use so many rays a point, the steepest.")]
+UncorrectedOption = Annotated[
+    Uncorrected,
+    typer.Option("--uncorrected", help="Submerged points with fewer than two usable rays."),
+]
+DimensionsOption = Annotated[
+    Dimensions,
+    typer.Option("--dimensions", help="Extra dimensions; 'pcfix restore' needs all."),
+]
+SummaryOption = Annotated[Path | None, typer.Option("--summary", help="Write the summary as JSON.")]
+
+
+@contextmanager
+def progress_bar(title: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
+    """Show a bar with points/s and the time left on a terminal; nothing when piped."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=None, rate="")
+        started = time.perf_counter()
+
+        def update(done: int, total: int) -> None:
+            rate = done / (time.perf_counter() - started)
+            bar.update(task, completed=done, total=total, rate=f"{rate:,.0f} points/s")
+
+        yield update
