@@ -316,22 +316,29 @@ def _near(planes: FloatArray, centres: FloatArray, low: FloatArray, high: FloatA
 @njit(cache=True, error_model="numpy", nogil=True)
 def _choose(
     candidates: IntArray, tile: FloatArray, j: int, centres: FloatArray, planes: FloatArray,
-    least_cosine2: float, most: int,
+    least_cosine2: float, most: int, tin: Tin | None, facet: int,
 ) -> IntArray:  # fmt: skip
-    """Return the cameras whose rays a point of the tile gets, in the order of the candidates."""
+    """Return the cameras whose rays a point of the tile gets, in the order of the candidates.
+
+    On a mesh the incidence angle is that at the facet which the ray pierces.
+    """
     chosen = np.empty(candidates.size, np.int64)
     cosine2 = np.empty(candidates.size)
+    some_only = least_cosine2 > 0.0 or most < candidates.size
     k = 0
     for c in candidates:
-        z = tile[2 * TILE + j]
-        ex = centres[c, 0] - tile[j]
-        ey = centres[c, 1] - tile[TILE + j]
-        ez = centres[c, 2] - z
+        px, py, pz = tile[j], tile[TILE + j], tile[2 * TILE + j]
+        ex, ey, ez = centres[c, 0] - px, centres[c, 1] - py, centres[c, 2] - pz
         nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+        h = nz * (tile[3 * TILE + j] - pz)
         height = nx * ex + ny * ey + nz * ez
         length2 = ex * ex + ey * ey + ez * ez
-        h = nz * (tile[3 * TILE + j] - z)
-        if _usable(pyramid(planes[c]), ex, ey, ez, h, height, length2, least_cosine2):
+        if not _usable(pyramid(planes[c]), ex, ey, ez, h, height, length2, 0.0):
+            continue
+        if tin is not None and some_only:
+            _, nx, ny, nz = pierce_mesh(tin, px, py, pz, ex, ey, ez, facet)
+            height = max(nx * ex + ny * ey + nz * ez, 0.0)
+        if height * height >= least_cosine2 * length2:
             chosen[k], cosine2[k] = c, height * height / length2
             k += 1
     return chosen[: _keep_steepest(chosen, cosine2, k, most)]
@@ -352,28 +359,25 @@ def _chosen(
         low, high = _gather(tile, rows, xyz, surface, slope)
         near = _near(planes, centres, low, high)
         for j in range(rows.size):
-            if views is None:
-                candidates = near
-                cameras = _choose(near, tile, j, centres, planes, least_cosine2, most)
-            else:
+            facet = -1 if tin is None else locate(tin, tile[j], tile[TILE + j])
+            candidates, frames = near, planes
+            if views is not None:
                 candidates = views[1][views[0][rows[j]] : views[0][rows[j] + 1]]
-                cameras = _choose(candidates, tile, j, centres, anywhere, least_cosine2, most)
+                frames = anywhere
+            cameras = _choose(candidates, tile, j, centres, frames, least_cosine2, most, tin, facet)
             tested[t] += candidates.size
-            _intersect_one(
-                result[rows[j]], cameras, tile, j, centres, r, used, tin
-            )  # fmt: skip
+            _intersect_one(result[rows[j]], cameras, tile, j, centres, r, used, tin, facet)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _intersect_one(
     row: FloatArray, cameras: IntArray, tile: FloatArray, j: int, centres: FloatArray, r: float,
-    used: BoolArray, tin: Tin | None,
+    used: BoolArray, tin: Tin | None, facet: int,
 ) -> None:  # fmt: skip
     """Intersect the rays of one point with its own cameras."""
     px, py, pz = tile[j], tile[TILE + j], tile[2 * TILE + j]
     nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
     h = nz * (tile[3 * TILE + j] - pz)
-    facet = -1 if tin is None else locate(tin, px, py)
     sums = np.zeros(9)
     least = 1.0
     for c in cameras:

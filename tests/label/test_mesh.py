@@ -88,3 +88,27 @@ def test_vertical_and_degenerate_facets_are_ignored():
     assert np.isnan(heights[1])
     with pytest.raises(pcfix.GeometryError, match="no facet"):
         surface_above(pcfix.WaterMesh(vertices, triangles[:2]), np.zeros((1, 3)))
+
+
+@pytest.mark.parametrize("limit_deg", [12.0, 18.0, 25.0])
+def test_limit_holds_at_the_facet_that_the_ray_pierces(limit_deg):
+    vertices, triangles = random_mesh(relief=0.5)
+    mesh = pcfix.WaterMesh(vertices, triangles)
+    rng = np.random.default_rng(9)
+    points = np.column_stack([rng.uniform(10, 40, (30, 2)), rng.uniform(-9, -3, 30)]) + UTM
+    centres = np.column_stack([rng.uniform(0, 50, (12, 2)), rng.uniform(55, 65, 12)]) + UTM
+    cameras = pcfix.Cameras(tuple("abcdefghijkl"), centres)
+    result = pcfix.correct_points(points, cameras, mesh, max_angle_deg=limit_deg)
+    for i, point in enumerate(points):
+        angles = np.array([local_incidence_deg(vertices[triangles], c, point) for c in centres])
+        assert result.ray_count[i] in (0, np.sum(angles <= limit_deg))
+        if result.corrected[i]:
+            assert result.incidence_deg[i] == pytest.approx(
+                angles[angles <= limit_deg].max(), abs=1e-6
+            )
+
+
+def local_incidence_deg(facets, centre, point):
+    _, normal = first_hit(facets, centre, point)
+    up = (centre - point) / np.linalg.norm(centre - point)
+    return np.degrees(np.arccos(min(1.0, float(normal @ up))))

@@ -13,7 +13,7 @@ import pcfix
 from pcfix.io.las.columns import COLUMNS
 from pcfix.io.pdal import CLASS_FLAGS, STAGE_SOURCE, add_dimension
 from tests.utils.clouds import WATER_M, block, cameras_csv, framed_block, random_cloud, write_cloud
-from tests.utils.pdal import ROOT, needs_pdal, pdal, python
+from tests.utils.real_pdal import ROOT, needs_pdal, pdal, python
 from tests.utils.shared import needs
 
 if TYPE_CHECKING:
