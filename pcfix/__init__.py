@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
+    from pcfix.flow.clean import clean_file
+    from pcfix.flow.compare import compare_clouds
+    from pcfix.flow.dsm import grid_dsm
     from pcfix.flow.files import correct_file
     from pcfix.flow.points import correct_points
     from pcfix.flow.restore import restore_file
@@ -34,6 +37,9 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
+    "clean_file": "pcfix.flow.clean",
+    "compare_clouds": "pcfix.flow.compare",
+    "grid_dsm": "pcfix.flow.dsm",
     "correct_file": "pcfix.flow.files",
     "correct_points": "pcfix.flow.points",
     "restore_file": "pcfix.flow.restore",
@@ -75,8 +81,11 @@ __all__ = [
     "WaterMesh",
     "WaterPlane",
     "WaterSurface",
+    "clean_file",
+    "compare_clouds",
     "correct_file",
     "correct_points",
+    "grid_dsm",
     "read_cameras",
     "read_water",
     "restore_file",

@@ -9,8 +9,12 @@ from typing import Annotated
 import typer
 
 import pcfix
+from pcfix.cli.clean import clean
+from pcfix.cli.compare import compare
 from pcfix.cli.correct import correct, pipeline
+from pcfix.cli.dsm import dsm
 from pcfix.cli.restore import restore
+from pcfix.cli.run import run
 from pcfix.cli.simulate import demo, simulate
 from pcfix.errors import PcfixError, show_warning
 
@@ -22,7 +26,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (correct, restore, simulate, pipeline):
+for command in (run, correct, clean, dsm, compare, restore, simulate, pipeline):
     app.command(no_args_is_help=True)(command)
 app.command()(demo)
 

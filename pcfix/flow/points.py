@@ -95,7 +95,7 @@ def correct_points(
     """
     points = checked_points(xyz)
     settings = Settings(refractive_index, max_angle_deg, max_cameras)
-    surface, dimension = _as_surface(water, len(points))
+    surface, dimension = as_surface(water, len(points))
     check_above_water(cameras, surface)
     if views is not None:
         _check_views(views, len(points), len(cameras))
@@ -120,9 +120,16 @@ def checked_points(xyz: npt.ArrayLike) -> FloatArray:
     return points
 
 
-def _as_surface(
+def as_surface(
     water: WaterSurface | float | npt.ArrayLike, n: int
 ) -> tuple[WaterSurface, FloatArray | None]:
+    """Return the water surface, and its height above each of n points where it is given so.
+
+    Raises
+    ------
+    SettingError
+        If there is not one height per point.
+    """
     if isinstance(water, WaterPlane | WaterDimension | WaterMesh):
         return water, None
     heights = np.asarray(water, dtype=np.float64)

@@ -74,8 +74,13 @@ def replaced_when_whole(target: Path) -> Iterator[Path]:
         draft.unlink(missing_ok=True)
 
 
-def write_text(path: str | os.PathLike[str], text: str, *, overwrite: bool) -> None:
-    """Write a small text file under the same rules."""
+def write_bytes(path: str | os.PathLike[str], data: bytes, *, overwrite: bool) -> None:
+    """Write a small file under the same rules."""
     target = check_output(path, overwrite=overwrite)
     with replaced_when_whole(target) as draft:
-        draft.write_text(text, encoding="utf-8")
+        draft.write_bytes(data)
+
+
+def write_text(path: str | os.PathLike[str], text: str, *, overwrite: bool) -> None:
+    """Write a small text file under the same rules."""
+    write_bytes(path, text.encode(), overwrite=overwrite)

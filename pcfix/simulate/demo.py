@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pcfix.compare.truth import errors_against_truth
-from pcfix.flow.files import correct_file
+from pcfix.flow.run import Request, run_all
 from pcfix.io.las.source import read_xyz
 from pcfix.io.scenes import write_scene
 from pcfix.simulate.scene import BlockKind, Scene, simulate_scene
@@ -21,6 +21,9 @@ LEAST_DEPTH_M = 0.2  # shallower points have no refraction worth a percentage
 BLOCKS: tuple[BlockKind, ...] = ("nadir", "oblique")
 
 
+REPORT = "run"
+
+
 def run_demo(
     out_dir: str | os.PathLike[str],
     *,
@@ -28,7 +31,7 @@ def run_demo(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> str:
-    """Make both blocks of scenes in a folder, correct them through files, return the table."""
+    """Make both blocks of scenes in a folder, run all steps on them, return the table."""
     sections = []
     for number, kind in enumerate(BLOCKS):
         folder = Path(out_dir) / kind
@@ -39,7 +42,10 @@ def run_demo(
 
         scene = simulate_scene(points, block=kind, progress=step)
         write_scene(scene, folder, overwrite=overwrite)
-        sections.append(f"{folder}\n{scene.description}\n{_table(scene, folder, overwrite)}")
+        table = _table(scene, folder, overwrite)
+        sections.append(
+            f"{folder}\n{scene.description}\n{table}\nreport: {folder / REPORT / 'report.html'}"
+        )
     return "\n\n".join(sections)
 
 
@@ -64,13 +70,13 @@ def _table(scene: Scene, folder: Path, overwrite: bool) -> str:
 
 
 def _corrected(scene: Scene, folder: Path, overwrite: bool) -> FloatArray:
-    """Correct the scene's files and read the result."""
-    correct_file(
-        folder / "cloud.laz",
-        folder / "corrected.laz",
-        cameras=folder / "cameras.csv",
-        water=scene.water_level_m,
+    """Run all steps on the scene's files and read the corrected cloud."""
+    request = Request(
+        input=str(folder / "cloud.laz"),
+        cameras=str(folder / "cameras.csv"),
+        water=str(scene.water_level_m),
+        reference=str(folder / "lidar.laz"),
         refractive_index=scene.refractive_index,
-        overwrite=overwrite,
     )
-    return read_xyz(folder / "corrected.laz")
+    run_all(request, folder / REPORT, overwrite=overwrite)
+    return read_xyz(folder / REPORT / "corrected.laz")

@@ -1,9 +1,9 @@
-"""The header of a corrected file from that of its input, and the way back."""
+"""The header of a corrected or cleaned file from that of its input, and the way back."""
 
 from __future__ import annotations
 
 from copy import deepcopy
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import laspy
 import numpy as np
@@ -14,7 +14,7 @@ import pcfix
 from pcfix.errors import InputError
 from pcfix.io.las.columns import Column, column_scale
 from pcfix.io.las.formats import upgraded
-from pcfix.io.las.provenance import is_ours, settings_vlr
+from pcfix.io.las.provenance import cleaning_vlr, is_ours, settings_vlr
 from pcfix.io.las.records import Record, RecordList
 from pcfix.io.las.source import las_errors
 
@@ -56,18 +56,9 @@ def corrected_header(
     """
     _refuse_twice(source, columns)
     old = source.header
-    header = _copied(old)
     params, records = _extra_bytes(columns, old.scales, wide=wide)
-    point_format = upgraded(old.point_format)
-    for param in params:
-        point_format.add_extra_dimension(param)
-    version = max(old.version, laspy.header.Version(1, 4))
-    header.set_version_and_point_format(version, point_format)
-    header.offsets = old.offsets - np.array(steps) * old.scales
-
-    vlrs = [v for v in source.vlrs if not _is_layout(v)]
-    wkt = _wkt_for(header, source)
-    described, undescribed = _extra_bytes_of(source)
+    new = _upgraded(source, params)
+    new.header.offsets = old.offsets - np.array(steps) * old.scales
     before = {
         "version": str(old.version),
         "point_format": old.point_format.id,
@@ -75,21 +66,61 @@ def corrected_header(
         "global_encoding": old.global_encoding.value,
         "offsets": old.offsets.tolist(),
         "steps": list(steps),
-        "added_wkt": wkt is not None,
-        "undescribed": [dimension.name for dimension in undescribed],
+        "added_wkt": new.added_wkt,
+        "undescribed": new.undescribed,
     }
+    vlrs = [*new.vlrs, settings_vlr({**content, "before": before})]
+    _set_records(new.header, vlrs, new.described + records)
+    return new.header
+
+
+def cleaned_header(source: LasSource, content: dict[str, Any]) -> laspy.LasHeader:
+    """Return the header of a cleaned file: LAS 1.4, the input's records, and one on the cleaning.
+
+    Parameters
+    ----------
+    source : LasSource
+    content : dict
+        What the record shall say; those of earlier cleanings stay before it.
+    """
+    new = _upgraded(source, [])
+    _set_records(new.header, [*new.vlrs, cleaning_vlr(content)], new.described)
+    return new.header
+
+
+class _Upgraded(NamedTuple):
+    """A header of LAS 1.4, and the records and the description of dimensions to put in it."""
+
+    header: laspy.LasHeader
+    vlrs: list[VLR]
+    described: bytes
+    added_wkt: bool
+    undescribed: list[str]
+
+
+def _upgraded(source: LasSource, params: list[laspy.ExtraBytesParams]) -> _Upgraded:
+    """Return the input's header in LAS 1.4 with dimensions added; its records not yet set."""
+    old = source.header
+    header = _copied(old)
+    point_format = upgraded(old.point_format)
+    for param in params:
+        point_format.add_extra_dimension(param)
+    version = max(old.version, laspy.header.Version(1, 4))
+    header.set_version_and_point_format(version, point_format)
+    vlrs = [v for v in source.vlrs if not _is_layout(v)]
+    wkt = _wkt_for(header, source)
     if wkt is not None:
         vlrs.append(wkt)
         header.global_encoding.wkt = True
-    vlrs.append(settings_vlr({**content, "before": before}))
+    described, undescribed = _extra_bytes_of(source)
     for dimension in undescribed:
         described += bytes(ExtraBytesStruct(dimension.name.encode(), (0, dimension.num_bits // 8)))
-    _set_records(header, vlrs, described + records)
-    return header
+    names = [dimension.name for dimension in undescribed]
+    return _Upgraded(header, vlrs, described, wkt is not None, names)
 
 
 def corrected_identity(source: LasSource) -> bytes:
-    """Return the identity of a corrected file: made by pcfix, else as it was."""
+    """Return the identity of a corrected or cleaned file: made by pcfix, else as it was."""
     name = f"pcfix {pcfix.__version__}".encode().ljust(32, b"\0")
     return source.identity[: _SOFTWARE.start] + name + source.identity[_SOFTWARE.stop :]
 

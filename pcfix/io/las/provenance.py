@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 USER_ID = "pcfix"
 SETTINGS_RECORD = 1
 DESCRIPTION = "pcfix settings (JSON)"
+CLEANING_RECORD = 2
+CLEANING_DESCRIPTION = "pcfix cleaning (JSON)"
 BEFORE = (
     "version",
     "point_format",
@@ -36,8 +38,17 @@ def is_ours(vlr: VLR) -> bool:
 
 def settings_vlr(content: dict[str, Any]) -> VLR:
     """Return the VLR that holds the content as JSON."""
+    return _json_vlr(SETTINGS_RECORD, DESCRIPTION, content)
+
+
+def cleaning_vlr(content: dict[str, Any]) -> VLR:
+    """Return the VLR that says how a file was cleaned, as JSON; one for each cleaning."""
+    return _json_vlr(CLEANING_RECORD, CLEANING_DESCRIPTION, content)
+
+
+def _json_vlr(record: int, description: str, content: dict[str, Any]) -> VLR:
     text = json.dumps(content, ensure_ascii=True, separators=(",", ":"))
-    return VLR(USER_ID, SETTINGS_RECORD, DESCRIPTION, text.encode())
+    return VLR(USER_ID, record, description, text.encode())
 
 
 def read_settings(vlrs: Iterable[VLR], path: Path) -> dict[str, Any]:

@@ -1,0 +1,170 @@
+"""The nearest neighbours of points, exact across the borders of tiles.
+
+A point's neighbours are looked for in its own tile, then in every other tile whose box is nearer
+than the farthest neighbour so far; the k nearest of all that were found are kept. So the result is
+that of one tree over the whole cloud, however the tiles lie, and an outlier far from everything
+costs a few queries, not a tree of everything.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pcfix.clean.tiles import Tiles
+    from pcfix.model import FloatArray, IntArray
+
+SLACK = 1.0 + 1e-9
+"""Distances nearer to each other than this count as equal: more than rounding, less than any
+step of a LAS file at the distance of neighbours."""
+_TREES = 16
+_SPARE, _MOST_COLUMNS = 8, 1024
+_ENTRIES = 4_000_000
+
+
+class Neighbours:
+    """Finds neighbours among the points of tiles.
+
+    Parameters
+    ----------
+    tiles : Tiles
+    axes : {3, 2}
+        Distances in space, or in plan.
+    jobs : int, optional
+        Threads; default all cores.
+    """
+
+    def __init__(self, tiles: Tiles, axes: int, jobs: int | None = None) -> None:
+        self.tiles, self.axes, self.workers = tiles, axes, -1 if jobs is None else jobs
+        self._low, self._high = tiles.low[:, :axes], tiles.high[:, :axes]
+        self._tree = _trees(tiles, axes)
+
+    def nearest(self, xyz: FloatArray, k: int) -> tuple[FloatArray, IntArray]:
+        """Return the k nearest points of the tiles, which hold at least k.
+
+        Parameters
+        ----------
+        xyz : array, shape (q, 3)
+            Best near to each other.
+        k : int
+
+        Returns
+        -------
+        distance_m : array, shape (q, k)
+            Ascending.
+        place : array of int, shape (q, k)
+            In the arrays of the tiles. Which of equally far points comes first, or comes at all
+            where the last are equally far, is not defined.
+        """
+        points = np.ascontiguousarray(xyz[:, : self.axes])
+        distance = np.full((len(points), k), np.inf)
+        place = np.zeros((len(points), k), np.int64)
+        gaps = _gap(points.min(axis=0), points.max(axis=0), self._low, self._high)
+        middle = points.mean(axis=0) - (self._low + self._high) / 2.0
+        rest = np.arange(len(points))
+        for tile in np.lexsort((np.hypot(*middle[:, :2].T), gaps)):
+            rest = rest[distance[rest, -1] * SLACK >= gaps[tile]]
+            if not rest.size:
+                break
+            gap = _gap(points[rest], points[rest], self._low[tile], self._high[tile])
+            rows = rest[distance[rest, -1] * SLACK >= gap]
+            if rows.size:
+                self._add(int(tile), points, rows, distance, place)
+        return distance, place
+
+    def _add(
+        self, tile: int, points: FloatArray, rows: IntArray, distance: FloatArray, place: IntArray
+    ) -> None:
+        """Merge the neighbours in one tile into those of the given rows."""
+        tree, k = self._tree(tile), distance.shape[1]
+        found = tree.query(
+            points[rows],
+            k=list(range(1, min(k, tree.n) + 1)),
+            distance_upper_bound=float(distance[rows, -1].max()) * SLACK,
+            workers=self.workers,
+        )
+        new, where = np.asarray(found[0]), np.asarray(found[1])
+        places = where + self.tiles.start[tile]
+        if np.isinf(distance[rows, 0]).all():  # nothing to merge with
+            distance[rows, : new.shape[1]], place[rows, : new.shape[1]] = new, places
+            return
+        both, places = np.hstack([distance[rows], new]), np.hstack([place[rows], places])
+        order = np.argsort(both, axis=1, kind="stable")[:, :k]
+        distance[rows] = np.take_along_axis(both, order, axis=1)
+        place[rows] = np.take_along_axis(places, order, axis=1)
+
+
+def _trees(tiles: Tiles, axes: int) -> Callable[[int], cKDTree]:
+    """Return what grows the tree of a tile, and keeps the last few."""
+
+    @lru_cache(maxsize=_TREES)
+    def tree(tile: int) -> cKDTree:
+        first, last = tiles.start[tile : tile + 2]
+        return cKDTree(np.array(tiles.xyz[first:last, :axes]))
+
+    return tree
+
+
+def _gap(
+    low: FloatArray, high: FloatArray, other_low: FloatArray, other_high: FloatArray
+) -> FloatArray:
+    """Return the distance between boxes, zero where they touch; the last axis is x, y(, z)."""
+    apart = np.maximum(np.maximum(other_low - high, low - other_high), 0.0)
+    return np.asarray(np.sqrt((apart * apart).sum(axis=-1)))
+
+
+def mean_of_first(distance: FloatArray, k: int) -> FloatArray:
+    """Return the mean of the first k columns, shape (q,), summed from the left."""
+    total = np.zeros(len(distance))
+    for column in range(k):
+        total += distance[:, column]
+    return total / k
+
+
+def height_quartiles(
+    neighbours: Neighbours, xyz: FloatArray, k: int, columns: int | None = None
+) -> FloatArray:
+    """Return the lower and upper quartile of the neighbours' heights, shape (q, 2), metres.
+
+    The neighbours are the k nearest in plan and all that are as far as the last of them, so that
+    the result does not depend on the order of the points. (Where more than a thousand are equally
+    far, any thousand of them.)
+
+    Parameters
+    ----------
+    neighbours : Neighbours
+        With two axes.
+    xyz : array, shape (q, 3)
+        Metres, world frame.
+    k : int
+    columns : int, optional
+        How many to look at; grows until all that are equally far are among them.
+    """
+    count = len(neighbours.tiles.row)
+    columns = min(columns or k + _SPARE, count)
+    distance, place = neighbours.nearest(xyz, columns)
+    near = distance <= distance[:, k - 1 : k] * SLACK
+    heights = np.where(near, neighbours.tiles.xyz[:, 2][place], np.inf)
+    quartiles = _quartiles(np.sort(heights, axis=1), near.sum(axis=1))
+    if columns < min(count, _MOST_COLUMNS):
+        tied = np.flatnonzero(near[:, -1])
+        size = max(1, _ENTRIES // (2 * columns))
+        for first in range(0, len(tied), size):
+            rows = tied[first : first + size]
+            quartiles[rows] = height_quartiles(neighbours, xyz[rows], k, 2 * columns)
+    return quartiles
+
+
+def _quartiles(ascending: FloatArray, count: IntArray) -> FloatArray:
+    """Return the quartiles of the first `count` entries of each row, between two of them linear."""
+    position = (count[:, None] - 1) * np.array([0.25, 0.75])
+    left = np.floor(position).astype(np.int64)
+    right = np.minimum(left + 1, count[:, None] - 1)
+    a, b = (np.take_along_axis(ascending, at, axis=1) for at in (left, right))
+    return np.asarray(a + (position - left) * (b - a))

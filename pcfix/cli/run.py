@@ -1,0 +1,92 @@
+"""``pcfix run``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pcfix.cli.words import (
+    Index,
+    Jobs,
+    MaxAngle,
+    MaxCameras,
+    Overwrite,
+    Quiet,
+    Sensor,
+    progress_bar,
+)
+from pcfix.model import DEFAULT_REFRACTIVE_INDEX
+
+Input = Annotated[
+    Path | None, typer.Argument(metavar="INPUT", help="LAS or LAZ cloud.", show_default=False)
+]
+OutDir = Annotated[
+    Path | None,
+    typer.Argument(metavar="OUT_DIR", help="Folder for all results.", show_default=False),
+]
+Cameras = Annotated[
+    Path | None, typer.Option(help="CSV: label,x,y,z and, if known, yaw,pitch,roll (degrees).")
+]
+Water = Annotated[
+    str | None, typer.Option(help="A level (0.37), plane:a,b,c, dim:NAME, or a mesh (.obj, .ply).")
+]
+Reference = Annotated[
+    Path | None, typer.Option(help="LiDAR cloud, CSV check points or GeoTIFF to compare with.")
+]
+Resolution = Annotated[
+    float | None, typer.Option(help="Of the rasters, m.", show_default="4 points a cell")
+]
+Config = Annotated[Path | None, typer.Option(help="run.json of an earlier run, to repeat it.")]
+
+
+def run(
+    input: Input = None,
+    out_dir: OutDir = None,
+    cameras: Cameras = None,
+    water: Water = None,
+    reference: Reference = None,
+    sensor: Sensor = None,
+    index: Index = DEFAULT_REFRACTIVE_INDEX,
+    max_angle: MaxAngle = None,
+    max_cameras: MaxCameras = None,
+    resolution: Resolution = None,
+    config: Config = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    jobs: Jobs = None,
+) -> None:
+    """Correct, clean, grid, compare and report; resumes where it stopped.
+
+    With --config give only the folder: pcfix run OUT_DIR --config run.json.
+    """
+    from pcfix.flow.run import Request, request_of, run_all
+
+    if config is not None:
+        folder = out_dir or input
+        if folder is None or cameras is not None or water is not None:
+            raise typer.BadParameter("with --config give OUT_DIR alone")
+        request = request_of(config)
+    else:
+        if input is None or out_dir is None or cameras is None or water is None:
+            raise typer.BadParameter("INPUT, OUT_DIR, --cameras and --water are needed")
+        folder = out_dir
+        request = Request(
+            input=str(input),
+            cameras=str(cameras),
+            water=water,
+            sensor=None if sensor is None else str(sensor),
+            reference=None if reference is None else str(reference),
+            refractive_index=index,
+            max_angle_deg=max_angle,
+            max_cameras=max_cameras,
+            resolution_m=resolution,
+        )
+
+    def say(text: str) -> None:
+        if not quiet:
+            typer.echo(text)
+
+    with progress_bar("Correcting", quiet) as progress:
+        run_all(request, folder, overwrite=overwrite, jobs=jobs, say=say, progress=progress)

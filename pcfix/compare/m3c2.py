@@ -1,0 +1,173 @@
+"""M3C2 distances, by the library py4dgeo, which is the optional extra ``m3c2``."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from dataclasses import dataclass
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pcfix.compare.neighbours import Neighbours
+from pcfix.compare.statistics import Statistics, statistics_of
+from pcfix.errors import GeometryError, SettingError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from pcfix.model import FloatArray, IntArray
+
+MAX_CORE_POINTS = 100_000
+SPACING_SAMPLE = 10_000
+NORMAL_SPACINGS, CYLINDER_SPACINGS = 6.0, 3.0
+"""Default scales, in point spacings of the sparser cloud: a cylinder holds about 28 points."""
+
+
+@dataclass(frozen=True, slots=True)
+class M3c2:
+    """Signed distances along the local normal, positive where the cloud lies above.
+
+    Attributes
+    ----------
+    core_points : int
+        Where the distance was asked for.
+    statistics : Statistics
+        Of the distances, metres, where both clouds had points in the cylinder.
+    mean_level_of_detection_m : float
+        At 95 %: what roughness and density alone could make.
+    significant_share : float
+        Of the distances, how many are beyond their own level of detection, 0 to 1.
+    normal_radius_m, cylinder_radius_m, max_distance_m : float
+        The scales that were used.
+    """
+
+    core_points: int
+    statistics: Statistics
+    mean_level_of_detection_m: float
+    significant_share: float
+    normal_radius_m: float
+    cylinder_radius_m: float
+    max_distance_m: float
+
+
+def load_py4dgeo() -> Any:
+    """Import py4dgeo.
+
+    Raises
+    ------
+    SettingError
+        If it is not installed; the message names the extra.
+    """
+    try:
+        with _silence():
+            return import_module("py4dgeo")
+    except ImportError as error:
+        raise SettingError(
+            "M3C2 needs py4dgeo, which is not installed; run: pip install 'pcfix[m3c2]'."
+        ) from error
+
+
+def point_spacing_m(xyz: FloatArray) -> float:
+    """Return the median distance to the nearest other point, of a sample of the cloud (n, 3)."""
+    rows = sample_rows(len(xyz), SPACING_SAMPLE)
+    found = [far[:, -1] for _, far, _ in Neighbours(xyz).find(xyz[rows], min(2, len(xyz)))]
+    return float(np.median(np.concatenate(found)))
+
+
+def sample_rows(count: int, most: int) -> IntArray:
+    """Return at most `most` of `count` row numbers, evenly spread and always the same."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
+
+
+def m3c2_distances(
+    xyz: FloatArray,
+    reference: FloatArray,
+    max_distance_m: float,
+    *,
+    core_points: int = MAX_CORE_POINTS,
+    normal_radius_m: float | None = None,
+    cylinder_radius_m: float | None = None,
+) -> M3c2:
+    """Return M3C2 distances of a cloud from a reference.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 3)
+        Metres, world frame; the core points are rows of it, and it gives the normals.
+    reference : array, shape (m, 3)
+        The same frame.
+    max_distance_m : float
+        Half the length of the cylinders.
+    core_points : int
+        At most so many, evenly spread.
+    normal_radius_m, cylinder_radius_m : float, optional
+        Default 6 and 3 times the point spacing of the sparser cloud.
+
+    Raises
+    ------
+    SettingError
+        If py4dgeo is not installed.
+    GeometryError
+        If no cylinder holds points of both clouds.
+    """
+    spacing = max(point_spacing_m(xyz), point_spacing_m(reference), 1e-3)
+    normal = normal_radius_m or NORMAL_SPACINGS * spacing
+    cylinder = cylinder_radius_m or CYLINDER_SPACINGS * spacing
+    origin = np.floor(reference.mean(axis=0))
+    core = xyz[sample_rows(len(xyz), core_points)] - origin
+    distance, detection = _run(
+        xyz - origin, reference - origin, core, normal, cylinder, max_distance_m
+    )
+    known = np.isfinite(distance)
+    if not known.any():
+        raise GeometryError(
+            f"M3C2: no cylinder of {cylinder:.3g} m radius holds points of both clouds within"
+            f" {max_distance_m:.3g} m; check that they overlap."
+        )
+    found, limits = distance[known], detection[known]
+    certain = np.isfinite(limits)
+    return M3c2(
+        len(core),
+        statistics_of(found),
+        float(limits[certain].mean()) if certain.any() else float("nan"),
+        float((np.abs(found[certain]) > limits[certain]).mean()) if certain.any() else 0.0,
+        normal,
+        cylinder,
+        max_distance_m,
+    )
+
+
+def _run(
+    xyz: FloatArray,
+    reference: FloatArray,
+    core: FloatArray,
+    normal_m: float,
+    cylinder_m: float,
+    max_distance_m: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Return distance and level of detection of each core point; NaN where not known."""
+    py4dgeo = load_py4dgeo()
+    with _silence():
+        cloud, below = py4dgeo.Epoch(xyz), py4dgeo.Epoch(reference)
+        distance, uncertainty = py4dgeo.M3C2(
+            epochs=(below, cloud),
+            corepoints=np.ascontiguousarray(core),
+            normal_radii=[normal_m],
+            cyl_radius=cylinder_m,
+            max_distance=max_distance_m,
+            cloud_for_normals=cloud,
+        ).run()
+    return np.asarray(distance), np.asarray(uncertainty["lodetection"])
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keep py4dgeo's progress from stdout and from a log file in the working folder."""
+    logger = logging.getLogger("py4dgeo")
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = before

@@ -1,0 +1,184 @@
+"""Cross-sections: heights along lines in plan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pcfix.errors import GeometryError, SettingError
+from pcfix.model import FloatArray  # noqa: TC001 - dataclass fields
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+STATIONS = 200
+"""Stations of a section at most; they are never closer than a quarter of the corridor's width."""
+
+
+@dataclass(frozen=True, slots=True)
+class SectionLine:
+    """A line in plan from (x1, y1) to (x2, y2), metres, world frame."""
+
+    x1: float
+    y1: float
+    x2: float
+    y2: float
+
+    def __post_init__(self) -> None:
+        """Check that the line has a length."""
+        if not (np.isfinite(self.length_m) and self.length_m > 0.0):
+            raise SettingError(
+                f"section {self}: give two different points x1,y1,x2,y2 in the cloud's coordinates."
+            )
+
+    def __str__(self) -> str:
+        return f"{self.x1:.10g},{self.y1:.10g},{self.x2:.10g},{self.y2:.10g}"
+
+    @property
+    def length_m(self) -> float:
+        """Length in plan."""
+        return float(np.hypot(self.x2 - self.x1, self.y2 - self.y1))
+
+    def along_across(self, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the distance along the line from its start, and to its left, metres."""
+        east, north = (self.x2 - self.x1) / self.length_m, (self.y2 - self.y1) / self.length_m
+        u, v = xy[:, 0] - self.x1, xy[:, 1] - self.y1
+        return np.asarray(u * east + v * north), np.asarray(v * east - u * north)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Section:
+    """Heights along a line: running medians of the points in a corridor.
+
+    Attributes
+    ----------
+    line : SectionLine
+    half_width_m : float
+        Of the corridor.
+    distance_m : array, shape (s,)
+        Stations, from the start of the line.
+    heights_m : dict of array, shape (s,)
+        World Z of ``water``, ``apparent``, ``corrected`` and ``reference``, as far as known; NaN
+        where the corridor is empty.
+    """
+
+    line: SectionLine
+    half_width_m: float
+    distance_m: FloatArray
+    heights_m: dict[str, FloatArray] = field(default_factory=dict)
+
+    def table(self) -> str:
+        """Return the section as CSV text; empty fields where nothing is known."""
+        columns = [self.distance_m, *self.heights_m.values()]
+        lines = [",".join(["distance_m", *(f"{name}_m" for name in self.heights_m)])]
+        lines += [
+            ",".join("" if np.isnan(value) else f"{value:.4f}" for value in row)
+            for row in zip(*columns, strict=True)
+        ]
+        return "\n".join(lines) + "\n"
+
+
+def parse_line(text: str) -> SectionLine:
+    """Return the line that the words ``x1,y1,x2,y2`` describe.
+
+    Raises
+    ------
+    SettingError
+        If these are not four numbers, or the points are one.
+    """
+    try:
+        x1, y1, x2, y2 = (float(part) for part in text.split(","))
+    except ValueError:
+        raise SettingError(
+            f"section '{text}' is not understood; give four numbers x1,y1,x2,y2 in the cloud's"
+            " coordinates."
+        ) from None
+    return SectionLine(x1, y1, x2, y2)
+
+
+def section_along(line: SectionLine, layers: dict[str, FloatArray], half_width_m: float) -> Section:
+    """Return the heights of several clouds along a line.
+
+    Parameters
+    ----------
+    line : SectionLine
+    layers : dict of array, shape (n, 3)
+        Clouds by name, metres, world frame.
+    half_width_m : float
+        Points up to this far from the line count.
+
+    Raises
+    ------
+    SettingError
+        If the half-width is not positive.
+    """
+    if not (np.isfinite(half_width_m) and half_width_m > 0.0):
+        raise SettingError(f"corridor {half_width_m:g} is not positive; give metres.")
+    step = max(line.length_m / STATIONS, 0.5 * half_width_m)
+    stations = np.linspace(0.0, line.length_m, max(round(line.length_m / step), 1) + 1)
+    window = max(step, half_width_m)
+    heights = {
+        name: _medians(line, xyz, stations, half_width_m, window) for name, xyz in layers.items()
+    }
+    return Section(line, half_width_m, stations, heights)
+
+
+def _medians(
+    line: SectionLine, xyz: FloatArray, stations: FloatArray, half_width_m: float, window_m: float
+) -> FloatArray:
+    """Return the median height within `window_m` along of each station."""
+    along, across = line.along_across(xyz[:, :2])
+    inside = np.flatnonzero(np.abs(across) <= half_width_m)
+    inside = inside[np.argsort(along[inside], kind="stable")]
+    along, z = along[inside], xyz[inside, 2]
+    first = np.searchsorted(along, stations - window_m, side="left")
+    last = np.searchsorted(along, stations + window_m, side="right")
+    return np.array(
+        [np.median(z[a:b]) if b > a else np.nan for a, b in zip(first, last, strict=True)]
+    )
+
+
+def lines_downslope(xyz: FloatArray, count: int) -> tuple[SectionLine, ...]:
+    """Return evenly spaced lines down the steepest direction of a bed.
+
+    The direction is that of the plane fitted to all points; each line runs over the extent of
+    the points in its own share of the bed, from high to low.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 3)
+        The bed, metres, world frame.
+    count : int
+
+    Raises
+    ------
+    SettingError
+        If `count` is less than one.
+    GeometryError
+        If the points lie on a line in plan.
+    """
+    if count < 1:
+        raise SettingError(f"sections {count} is less than 1.")
+    origin = xyz.mean(axis=0)
+    local = xyz - origin
+    covariance = local[:, :2].T @ local[:, :2]
+    eigenvalues = np.linalg.eigvalsh(covariance)
+    if len(xyz) < 3 or eigenvalues[0] <= 1e-6 * eigenvalues[1]:
+        raise GeometryError("The bed lies on a line in plan; give --section x1,y1,x2,y2 instead.")
+    gradient = np.linalg.solve(covariance, local[:, :2].T @ local[:, 2])
+    steepness = float(np.hypot(*gradient))
+    down = -gradient / steepness if steepness > 1e-9 else np.array([1.0, 0.0])
+    left = np.array([-down[1], down[0]])
+    along, across = local[:, :2] @ down, local[:, :2] @ left
+    edges = np.linspace(across.min(), across.max(), count + 1)
+    lines = []
+    for low, high in pairwise(edges):
+        share = along[(across >= low) & (across <= high)]
+        if len(share) and np.ptp(share) > 0.0:
+            middle = origin[:2] + 0.5 * (low + high) * left
+            ends: Sequence[float] = [*(middle + share.min() * down), *(middle + share.max() * down)]
+            lines.append(SectionLine(*map(float, ends)))
+    return tuple(lines)

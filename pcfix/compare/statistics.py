@@ -1,0 +1,148 @@
+"""What a sample of distances or of signed errors says, in numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pcfix.errors import GeometryError
+from pcfix.model import FloatArray  # noqa: TC001 - dataclass fields
+
+PERCENTILES = (5, 25, 50, 75, 95)
+NMAD_FACTOR = 1.4826
+"""Of the median absolute deviation: makes it the standard deviation of a normal sample."""
+BINS = 64
+TAIL_PERCENT = 0.5
+"""A histogram leaves out so much on either side, so that one outlier does not set its width."""
+
+
+@dataclass(frozen=True, slots=True)
+class Histogram:
+    """Counts between edges (m), and how many values lie outside on either side."""
+
+    edges_m: list[float]
+    counts: list[int]
+    below: int
+    above: int
+
+
+@dataclass(frozen=True, slots=True)
+class Normal:
+    """A normal distribution fitted to a sample.
+
+    Attributes
+    ----------
+    mu_m, sigma_m : float
+        By maximum likelihood: mean and standard deviation of the sample.
+    histogram_mu_m, histogram_sigma_m : float or None
+        Of the parabola fitted to the histogram's logarithm, which outliers hardly move; None
+        where there is no solution.
+    note : str
+        Why something is missing; empty when nothing is.
+    """
+
+    mu_m: float
+    sigma_m: float
+    histogram_mu_m: float | None
+    histogram_sigma_m: float | None
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """A sample of distances or errors, metres.
+
+    For signed errors the mean is the bias. The standard deviation is that of the sample itself
+    (divided by n), so that rmse^2 = mean^2 + sd^2.
+    """
+
+    count: int
+    mean_m: float
+    sd_m: float
+    rmse_m: float
+    nmad_m: float
+    median_m: float
+    min_m: float
+    max_m: float
+    percentiles_m: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Distribution:
+    """Statistics of a sample with its histogram and the fitted normal distribution."""
+
+    statistics: Statistics
+    histogram: Histogram
+    normal: Normal
+
+
+def statistics_of(values: FloatArray) -> Statistics:
+    """Return the statistics of a sample.
+
+    Parameters
+    ----------
+    values : array, shape (n,)
+        Metres, finite.
+
+    Raises
+    ------
+    GeometryError
+        If the sample is empty.
+    """
+    if len(values) == 0:
+        raise GeometryError("There is no difference to take statistics of: no point is left.")
+    marks = np.percentile(values, (*PERCENTILES, 0, 100))
+    median = float(marks[PERCENTILES.index(50)])
+    return Statistics(
+        count=len(values),
+        mean_m=float(values.mean()),
+        sd_m=float(values.std()),
+        rmse_m=float(np.sqrt(np.mean(values * values))),
+        nmad_m=float(NMAD_FACTOR * np.median(np.abs(values - median))),
+        median_m=median,
+        min_m=float(marks[-2]),
+        max_m=float(marks[-1]),
+        percentiles_m={
+            f"p{name}": float(mark) for name, mark in zip(PERCENTILES, marks, strict=False)
+        },
+    )
+
+
+def distribution_of(values: FloatArray) -> Distribution:
+    """Return statistics, histogram and fitted normal distribution of a sample, shape (n,), m."""
+    statistics, histogram = statistics_of(values), histogram_of(values)
+    return Distribution(statistics, histogram, normal_of(statistics, histogram))
+
+
+def histogram_of(values: FloatArray) -> Histogram:
+    """Return the histogram of a sample, shape (n,), metres, between its outer half percents."""
+    tails = np.percentile(values, (TAIL_PERCENT, 100.0 - TAIL_PERCENT))
+    low, high = float(tails[0]), float(tails[1])
+    if not high > low:
+        low, high = low - 0.5e-3, high + 0.5e-3
+    counts, edges = np.histogram(values, BINS, (low, high))
+    below, above = int((values < low).sum()), int((values > high).sum())
+    return Histogram(edges.tolist(), counts.tolist(), below, above)
+
+
+def normal_of(statistics: Statistics, histogram: Histogram) -> Normal:
+    """Fit a normal distribution, by maximum likelihood and to the histogram.
+
+    The logarithm of a normal density is a parabola. It is fitted to the logarithms of the counts
+    by least squares, each weighted with its count, as the logarithm of a small count says little.
+    """
+    mu, sigma = statistics.mean_m, statistics.sd_m
+    if sigma <= abs(mu) * 1e-12:
+        return Normal(mu, 0.0, None, None, "all values are equal: no normal distribution fits")
+    edges, counts = np.array(histogram.edges_m), np.array(histogram.counts, np.float64)
+    held = counts > 0
+    if held.sum() < 3:
+        return Normal(mu, sigma, None, None, "the histogram holds too few values to fit")
+    scale = edges[-1] - edges[0]
+    x = (0.5 * (edges[:-1] + edges[1:])[held] - statistics.median_m) / scale
+    square, linear, _ = np.polyfit(x, np.log(counts[held]), 2, w=counts[held])
+    if square >= 0.0:
+        return Normal(mu, sigma, None, None, "the histogram has no peak: no normal one fits")
+    centre = statistics.median_m - scale * float(linear / (2.0 * square))
+    return Normal(mu, sigma, centre, scale * float(np.sqrt(-0.5 / square)))

@@ -1,0 +1,108 @@
+"""The height of a sampled surface at any place in plan: a plane through the nearest points."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from pcfix.compare.neighbours import Neighbours
+from pcfix.errors import GeometryError, SettingError
+
+if TYPE_CHECKING:
+    from pcfix.model import BoolArray, FloatArray
+
+MIN_NEIGHBOURS = 6
+DEFAULT_NEIGHBOURS = 8
+MIN_SHAPE = 1e-3
+"""Least ratio of the neighbours' variances across and along; below, they lie on a line."""
+MAX_REACH = 3.0
+"""Farthest place from the neighbours' centre, in their standard deviations that way."""
+
+
+class Heights(NamedTuple):
+    """Heights of a surface at n places.
+
+    height_m : shape (n,), world Z.
+    by_nearest : shape (n,), where no plane could be fitted and the nearest point's height stands.
+    """
+
+    height_m: FloatArray
+    by_nearest: BoolArray
+
+
+def check_neighbours(neighbours: int) -> None:
+    """Refuse a number of neighbours that cannot carry a plane.
+
+    Raises
+    ------
+    SettingError
+        If it is less than six.
+    """
+    if neighbours < MIN_NEIGHBOURS:
+        raise SettingError(
+            f"neighbours {neighbours} is less than {MIN_NEIGHBOURS}: a plane through so few"
+            " points follows their noise; 8 is usual."
+        )
+
+
+def heights_at(
+    xy: FloatArray, surface: FloatArray, neighbours: int = DEFAULT_NEIGHBOURS
+) -> Heights:
+    """Return the height of a surface at places in plan.
+
+    At each place a plane is fitted to the nearest points of the surface (nearest in plan, least
+    squares in Z) and evaluated there. Where these points lie on a line, or the place lies far
+    outside them, a plane has no meaning, and the height of the nearest point is taken.
+
+    Parameters
+    ----------
+    xy : array, shape (n, 2)
+        Metres, world frame.
+    surface : array, shape (m, 3)
+        The same frame.
+    neighbours : int
+        Points a plane, at least 6.
+
+    Returns
+    -------
+    Heights
+
+    Raises
+    ------
+    SettingError
+        If `neighbours` is less than six.
+    GeometryError
+        If the surface has fewer points than that.
+    """
+    check_neighbours(neighbours)
+    if len(surface) < neighbours:
+        raise GeometryError(
+            f"A surface of {len(surface)} points is too few for planes through {neighbours};"
+            " give more points."
+        )
+    index = Neighbours(surface[:, :2])
+    sorted_surface = surface[index.row]
+    height, by_nearest = np.empty(len(xy)), np.empty(len(xy), np.bool_)
+    for rows, _, number in index.find(xy, neighbours):
+        near = sorted_surface[number]
+        near[:, :, :2] -= xy[rows, np.newaxis]
+        height[rows], by_nearest[rows] = _plane_at_origin(near)
+    return Heights(height, by_nearest)
+
+
+def _plane_at_origin(near: FloatArray) -> Heights:
+    """Return the height at u = v = 0 of planes through points (n, k, 3) of u, v, z."""
+    middle = near.mean(axis=1)
+    u, v, z = np.moveaxis(near - middle[:, np.newaxis], 2, 0)
+    uu, uv, vv = (u * u).mean(axis=1), (u * v).mean(axis=1), (v * v).mean(axis=1)
+    uz, vz = (u * z).mean(axis=1), (v * z).mean(axis=1)
+    determinant, trace = uu * vv - uv * uv, uu + vv
+    flat = determinant > MIN_SHAPE * trace * trace
+    safe = np.where(flat, determinant, 1.0)
+    slope_u, slope_v = (vv * uz - uv * vz) / safe, (uu * vz - uv * uz) / safe
+    mu, mv = middle[:, 0], middle[:, 1]
+    reach = (vv * mu * mu - 2.0 * uv * mu * mv + uu * mv * mv) / safe
+    fitted = flat & (reach <= MAX_REACH**2)
+    plane = middle[:, 2] - slope_u * mu - slope_v * mv
+    return Heights(np.where(fitted, plane, near[:, 0, 2]), ~fitted)

@@ -1,0 +1,286 @@
+"""The whole way in one call: correct, clean, grid, compare, report."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.flow.clean import clean_file
+from pcfix.flow.compare import compare_clouds
+from pcfix.flow.dsm import grid_dsm
+from pcfix.flow.files import correct_file
+from pcfix.flow.report import write_report
+from pcfix.flow.steps import Record, read_record
+from pcfix.io.cameras import read_cameras
+from pcfix.io.dod import preview, write_dod
+from pcfix.io.files import check_input
+from pcfix.io.las.source import LasSource
+from pcfix.io.rasters import open_raster
+from pcfix.io.water import read_water
+from pcfix.model import DEFAULT_REFRACTIVE_INDEX, Settings, Summary
+from pcfix.report.evaluation import evaluation, in_a_sentence
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pcfix.flow.comparison import Comparison
+    from pcfix.report.page import Picture, Table
+
+RECORD = "run.json"
+SECTIONS = 3
+DOD, REFERENCE_DSM = "dod.tif", "reference_dsm.tif"
+CLOUDS = (".las", ".laz")
+POINTS_PER_CELL = 4.0
+"""Where no resolution is given, cells hold so many points on average."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """Everything that the results of a run depend on, in plain values; ``run.json`` keeps it.
+
+    Attributes
+    ----------
+    input, cameras, water, sensor, refractive_index, max_angle_deg, max_cameras
+        See `pcfix.correct_file`; files by their paths.
+    reference : str or None
+        See `pcfix.flow.compare.compare_clouds`.
+    resolution_m : float or None
+        Of the rasters; None: four points a cell on average.
+    """
+
+    input: str
+    cameras: str
+    water: str
+    sensor: str | None = None
+    reference: str | None = None
+    refractive_index: float = DEFAULT_REFRACTIVE_INDEX
+    max_angle_deg: float | None = None
+    max_cameras: int | None = None
+    resolution_m: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        Settings(self.refractive_index, self.max_angle_deg, self.max_cameras)
+        if self.resolution_m is not None and not 0.0 < self.resolution_m < math.inf:
+            raise SettingError(f"resolution {self.resolution_m:g} is not positive; give metres.")
+
+    def files(self) -> list[Path]:
+        """Return the input files, each of which exists."""
+        names = [self.input, self.cameras, self.sensor, self.reference]
+        found = [check_input(name) for name in names if name is not None]
+        return [*found, Path(self.water)] if Path(self.water).is_file() else found
+
+
+def request_of(record: Path) -> Request:
+    """Return what an earlier run was asked for, from its ``run.json``."""
+    try:
+        return Request(**read_record(record)["request"])
+    except TypeError as error:
+        raise InputError(f"{record}: is not the record of a run ({error}).") from error
+
+
+@dataclass(frozen=True)
+class Files:
+    """Where a run leaves what it makes."""
+
+    folder: Path
+
+    def __getattr__(self, name: str) -> Path:
+        """Return the path of a result."""
+        return self.folder / _NAMES[name]
+
+
+_NAMES = {
+    "corrected": "corrected.laz",
+    "cleaned": "cleaned.laz",
+    "dsm": "dsm.tif",
+    "dsm_bed": "dsm_bed.tif",
+    "hillshade": "hillshade.tif",
+    "compare": "compare",
+    "report": "report.html",
+}
+
+
+def run_all(
+    request: Request,
+    out_dir: Path,
+    *,
+    overwrite: bool = False,
+    jobs: int | None = None,
+    say: Callable[[str], None] = lambda text: None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Do every step that is not done yet; what ``pcfix run`` runs.
+
+    Parameters
+    ----------
+    request : Request
+    out_dir : Path
+        Made where its parent exists. A run with the same request resumes there.
+    overwrite : bool
+        Replace the results of another request.
+    jobs : int, optional
+        Threads.
+    say : callable, optional
+        Called with a line on each step.
+    progress : callable, optional
+        See `correct_file`.
+
+    Returns
+    -------
+    Path
+        Of the report.
+
+    Raises
+    ------
+    PcfixError
+        With one sentence on what to mend; the steps before it stay done.
+    """
+    inputs = request.files()
+    if not out_dir.parent.is_dir():
+        raise SettingError(f"{out_dir}: the folder {out_dir.parent} does not exist; make it first.")
+    out_dir.mkdir(exist_ok=True)
+    record = Record(out_dir / RECORD, asdict(request), inputs)
+    if not (overwrite or record.resumes) and any(out_dir.iterdir()):
+        raise SettingError(
+            f"{out_dir}: holds other files, or a run of another request; add --overwrite to"
+            " replace them, or give another folder."
+        )
+    files = Files(out_dir)
+
+    def step(name: str, outputs: list[Path], work: Callable[[], Any]) -> Any:
+        result, was_done = record.step(name, outputs, work)
+        say(f"{name:<9} {'done before' if was_done else 'done'}: {outputs[0]}")
+        return result
+
+    corrected = step("correct", [files.corrected], lambda: _correct(request, files, jobs, progress))
+    step("clean", [files.cleaned], lambda: _clean(request, files, jobs))
+    step("dsm", [files.dsm, files.dsm_bed, files.hillshade], lambda: _grid(request, files))
+    compared = None
+    if request.reference is not None:
+        compared = step(
+            "compare", [files.compare / "compare.json"], lambda: _compare(request, files)
+        )
+    step("report", [files.report], lambda: _report(request, files, inputs, corrected, compared))
+    return files.report
+
+
+def _correct(
+    request: Request,
+    files: Files,
+    jobs: int | None,
+    progress: Callable[[int, int], None] | None,
+) -> dict[str, Any]:
+    summary = correct_file(
+        request.input,
+        files.corrected,
+        cameras=request.cameras,
+        water=request.water,
+        sensor=request.sensor,
+        refractive_index=request.refractive_index,
+        max_angle_deg=request.max_angle_deg,
+        max_cameras=request.max_cameras,
+        overwrite=True,
+        jobs=jobs,
+        progress=progress,
+    )
+    return vars(summary)
+
+
+def _clean(request: Request, files: Files, jobs: int | None) -> dict[str, Any]:
+    # the surface of a dimension is still in the cloud, and what was corrected is known anyway
+    summary = clean_file(files.corrected, files.cleaned, overwrite=True, jobs=jobs)
+    return summary.as_dict()
+
+
+def _grid(request: Request, files: Files) -> dict[str, Any]:
+    resolution = request.resolution_m or _resolution_m(files.cleaned)
+    whole = grid_dsm(
+        files.cleaned, files.dsm, resolution_m=resolution, hillshade=files.hillshade, overwrite=True
+    )
+    bed = grid_dsm(
+        files.cleaned, files.dsm_bed, resolution_m=resolution, surface="bed", overwrite=True
+    )
+    return {"dsm": whole.as_dict(), "bed": bed.as_dict()}
+
+
+def _resolution_m(path: Path) -> float:
+    """Return a round resolution with about `POINTS_PER_CELL` points in the cells of the bounds."""
+    with LasSource(path) as source:
+        size = source.header.maxs[:2] - source.header.mins[:2]
+        side = math.sqrt(max(float(size.prod()), 1e-6) * POINTS_PER_CELL / len(source))
+    power = 10.0 ** math.floor(math.log10(side))
+    return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= side * 0.999)
+
+
+def _compare(request: Request, files: Files) -> dict[str, Any]:
+    reference = Path(str(request.reference))
+    result = compare_clouds(
+        files.cleaned, reference, out_dir=files.compare, sections=SECTIONS, overwrite=True
+    )
+    if _rasters(request):
+        heights = reference
+        if reference.suffix.lower() in CLOUDS:
+            heights = files.compare / REFERENCE_DSM
+            with open_raster(files.dsm) as dsm:
+                resolution = float(dsm.res[0])
+            with warnings.catch_warnings():  # the cells are those of the cloud
+                warnings.simplefilter("ignore", PcfixWarning)
+                grid_dsm(reference, heights, resolution_m=resolution, overwrite=True)
+        write_dod(files.dsm, heights, files.compare / DOD, overwrite=True)
+    return {"figures": result.as_dict(), "sections": _plain_sections(result)}
+
+
+def _rasters(request: Request) -> list[str]:
+    """Return the rasters that a comparison leaves: none with check points."""
+    suffix = Path(str(request.reference)).suffix.lower()
+    if suffix in CLOUDS:
+        return [DOD, REFERENCE_DSM]
+    return [DOD] if suffix in (".tif", ".tiff") else []
+
+
+def _plain_sections(result: Comparison) -> list[dict[str, Any]]:
+    return [
+        {
+            "distance_m": section.distance_m.tolist(),
+            "heights_m": {
+                name: [None if math.isnan(value) else value for value in heights.tolist()]
+                for name, heights in section.heights_m.items()
+            },
+        }
+        for section in result.sections
+    ]
+
+
+def _report(
+    request: Request,
+    files: Files,
+    inputs: list[Path],
+    corrected: dict[str, Any],
+    compared: dict[str, Any] | None,
+) -> str:
+    more: tuple[list[Picture], list[Table]] = [], []
+    verdict = ""
+    if compared is not None:
+        dod = preview(files.compare / DOD) if _rasters(request) else None
+        more = evaluation(compared["figures"], compared["sections"], dod)
+        verdict = in_a_sentence(compared["figures"])
+    with warnings.catch_warnings():  # they were shown when the cloud was corrected
+        warnings.simplefilter("ignore", PcfixWarning)
+        cameras = read_cameras(request.cameras, request.sensor)
+    page = write_report(
+        files.corrected,
+        files.folder,
+        summary=Summary(**corrected),
+        cameras=cameras,
+        water=read_water(request.water),
+        inputs=inputs,
+        more=more,
+        verdict=verdict,
+        overwrite=True,
+    )
+    return str(page)

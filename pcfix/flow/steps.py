@@ -1,0 +1,105 @@
+"""Steps of a longer job that resumes where it stopped, with its record in one JSON file."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+from pcfix.errors import InputError
+from pcfix.io.files import write_text
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+
+class Record:
+    """What was asked for, from which files, and which steps are done.
+
+    A step counts as done while the request and the input files are those of the record, every
+    step before it was found done, and its own files are as it left them.
+
+    Parameters
+    ----------
+    path : Path
+        Of the JSON file; it is written after each step.
+    request : dict
+        Plain values: everything that the results depend on.
+    inputs : sequence of Path
+        Files that they depend on.
+    """
+
+    def __init__(self, path: Path, request: dict[str, Any], inputs: Sequence[Path]) -> None:
+        self._path = path
+        self._content: dict[str, Any] = {
+            "request": request,
+            "inputs": [_state(p) for p in inputs],
+            "steps": {},
+        }
+        self._earlier = self._read()
+
+    @property
+    def resumes(self) -> bool:
+        """Whether there is an earlier run that was asked for the same."""
+        return bool(self._earlier)
+
+    def _read(self) -> dict[str, Any]:
+        """Return the steps of an earlier run that was asked for the same."""
+        if not self._path.exists():
+            return {}
+        earlier = read_record(self._path)
+        plain = json.loads(json.dumps(self._content))
+        same = all(earlier.get(key) == plain[key] for key in ("request", "inputs"))
+        steps: dict[str, Any] = earlier["steps"] if same else {}
+        return steps
+
+    def step(self, name: str, outputs: Sequence[Path], work: Callable[[], Any]) -> tuple[Any, bool]:
+        """Do a step unless it is done; return its result, plain values, and whether it was done.
+
+        Parameters
+        ----------
+        name : str
+        outputs : sequence of Path
+            Every file that `work` leaves.
+        work : callable
+            Returns what later steps need, as JSON can hold it.
+        """
+        earlier = self._earlier.get(name)
+        if earlier is not None and earlier["outputs"] == [_state(p) for p in outputs]:
+            self._note(name, earlier)
+            return earlier["result"], True
+        self._earlier = {}  # what follows was made from other files
+        result = work()
+        self._note(name, {"outputs": [_state(p) for p in outputs], "result": result})
+        return json.loads(json.dumps(result)), False
+
+    def _note(self, name: str, step: dict[str, Any]) -> None:
+        self._content["steps"][name] = step
+        write_text(self._path, json.dumps(self._content, indent=2) + "\n", overwrite=True)
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """Return the content of a record.
+
+    Raises
+    ------
+    InputError
+        If the file is none.
+    """
+    try:
+        content: dict[str, Any] = json.loads(path.read_text("utf-8"))
+        _ = content["request"], content["inputs"], content["steps"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: is not the record of a run ({error}); give the run.json of an earlier run,"
+            " or remove it."
+        ) from error
+    return content
+
+
+def _state(path: Path) -> dict[str, Any]:
+    """Return what tells whether a file changed."""
+    if not path.exists():
+        return {"path": str(path), "bytes": None}
+    found = path.stat()
+    return {"path": str(path), "bytes": found.st_size, "changed_ns": found.st_mtime_ns}

@@ -1,0 +1,211 @@
+"""The cells of a raster: squares whose edges are multiples of the resolution."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from pcfix.errors import SettingError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from pcfix.model import FloatArray, IntArray
+
+MAX_CELLS = 4_000_000_000
+MIN_RESOLUTION_M = 1e-4
+EDGE_M = 1e-7
+"""A point this near to an edge lies on it: 5432000.1 / 0.1 in floating point may fall short."""
+
+
+class Window(NamedTuple):
+    """A rectangle of cells; the stops are not part of it."""
+
+    row: int
+    row_stop: int
+    column: int
+    column_stop: int
+
+    @property
+    def height(self) -> int:
+        """Number of rows."""
+        return self.row_stop - self.row
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return self.column_stop - self.column
+
+    def grown(self, cells: int) -> Window:
+        """Return the window with a margin on each side, which may reach beyond the raster."""
+        return Window(
+            self.row - cells, self.row_stop + cells, self.column - cells, self.column_stop + cells
+        )
+
+    def clipped(self, other: Window) -> Window:
+        """Return what this window and another have in common."""
+        return Window(
+            max(self.row, other.row),
+            min(self.row_stop, other.row_stop),
+            max(self.column, other.column),
+            min(self.column_stop, other.column_stop),
+        )
+
+    def within(self, other: Window) -> tuple[slice, slice]:
+        """Return the rows and columns of this window in an array that covers `other`."""
+        return (
+            slice(self.row - other.row, self.row_stop - other.row),
+            slice(self.column - other.column, self.column_stop - other.column),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Lattice:
+    """The cells of one raster.
+
+    Attributes
+    ----------
+    resolution_m : float
+    first_column, first_row : int
+        How many cells the left edge lies east of x = 0, and the top edge south of y = 0.
+    width, height : int
+        In cells.
+    """
+
+    resolution_m: float
+    first_column: int
+    first_row: int
+    width: int
+    height: int
+
+    @property
+    def left_m(self) -> float:
+        """The x of the left edge, world frame, metres."""
+        return self.first_column * self.resolution_m
+
+    @property
+    def top_m(self) -> float:
+        """The y of the top edge, world frame, metres."""
+        return -self.first_row * self.resolution_m
+
+    @property
+    def bounds_m(self) -> tuple[float, float, float, float]:
+        """Left, bottom, right, top; world frame, metres."""
+        return (
+            self.left_m,
+            -(self.first_row + self.height) * self.resolution_m,
+            (self.first_column + self.width) * self.resolution_m,
+            self.top_m,
+        )
+
+    @property
+    def window(self) -> Window:
+        """The whole raster."""
+        return Window(0, self.height, 0, self.width)
+
+    def windows(self, side: int) -> Iterator[Window]:
+        """Yield squares of `side` cells that cover the raster, row by row."""
+        for row in range(0, self.height, side):
+            for column in range(0, self.width, side):
+                yield Window(row, row + side, column, column + side).clipped(self.window)
+
+    def positions(self, xyz: FloatArray) -> FloatArray:
+        """Return columns and rows of points, shape (n, 2), cells from the top left corner."""
+        return np.column_stack(
+            [
+                (xyz[:, 0] - self.left_m) / self.resolution_m,
+                (self.top_m - xyz[:, 1]) / self.resolution_m,
+            ]
+        )
+
+
+def cells_of(xyz: FloatArray, resolution_m: float) -> IntArray:
+    """Return in which cells points lie, counted from x = 0 and y = 0.
+
+    A point on an edge belongs to the cell east or north of it.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 2) or (n, 3)
+        Metres, world frame.
+    resolution_m : float
+
+    Returns
+    -------
+    array of int, shape (n, 2)
+        Columns eastwards and rows southwards.
+    """
+    cells = np.floor((xyz[:, :2] + EDGE_M) / resolution_m).astype(np.int64)
+    cells[:, 1] = -cells[:, 1] - 1
+    return cells
+
+
+def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float) -> Lattice:
+    """Return the cells that cover a rectangle.
+
+    Parameters
+    ----------
+    low, high : array, shape (2,)
+        Its south-west and north-east corners, metres, world frame; see `fits`.
+    resolution_m : float
+    """
+    (west, south), (east, north) = cells_of(np.array([low, high]), resolution_m).tolist()
+    return Lattice(resolution_m, west, north, east - west + 1, south - north + 1)
+
+
+def check_resolution(resolution_m: float) -> None:
+    """Refuse a cell size that is none.
+
+    Raises
+    ------
+    SettingError
+        If it is not finite or smaller than a tenth of a millimetre.
+    """
+    if not (math.isfinite(resolution_m) and resolution_m >= MIN_RESOLUTION_M):
+        raise SettingError(
+            f"The resolution is {resolution_m:g} m; it must be a positive number of metres, at"
+            f" least {MIN_RESOLUTION_M:g}."
+        )
+
+
+def fits(low: FloatArray, high: FloatArray, resolution_m: float) -> bool:
+    """Return whether a raster over the rectangle has no more cells than are allowed."""
+    columns, rows = _size(low, high, resolution_m)
+    return columns * rows <= MAX_CELLS
+
+
+def refuse_size(low: FloatArray, high: FloatArray, resolution_m: float, name: str) -> None:
+    """Refuse a raster with more cells than are allowed.
+
+    Raises
+    ------
+    SettingError
+        With the smallest resolution that is.
+    """
+    if fits(low, high, resolution_m):
+        return
+    columns, rows = _size(low, high, resolution_m)
+    raise SettingError(
+        f"{name}: a resolution of {resolution_m:g} m makes {columns:,.0f} x {rows:,.0f} cells, more"
+        f" than the {MAX_CELLS / 1e9:g} gigapixels that are allowed; take"
+        f" {finest_m(low, high):g} m or coarser."
+    )
+
+
+def finest_m(low: FloatArray, high: FloatArray) -> float:
+    """Return the smallest resolution for which `fits` holds, rounded up to three digits."""
+    finest = MIN_RESOLUTION_M
+    while not fits(low, high, finest):
+        step = 10.0 ** (math.floor(math.log10(finest * 1.0000001)) - 2)
+        finest = round(finest / step + 1.0) * step
+    return finest
+
+
+def _size(low: FloatArray, high: FloatArray, resolution_m: float) -> tuple[float, float]:
+    """Return columns and rows, as floats, which cannot overflow."""
+    first = np.floor((low + EDGE_M) / resolution_m)
+    columns, rows = (np.floor((high + EDGE_M) / resolution_m) - first + 1.0).tolist()
+    return columns, rows

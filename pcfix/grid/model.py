@@ -1,0 +1,120 @@
+"""What is asked of a DSM, and what it came to."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, get_args
+
+from pcfix.errors import SettingError
+from pcfix.grid.lattice import check_resolution
+
+Method = Literal["mean", "median", "min", "max", "idw", "tin"]
+SurfaceChoice = Literal["all", "bed"]
+
+MAX_HOLE_CELLS = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class DsmSettings:
+    """How a cloud becomes a raster; see `pcfix.grid_dsm`.
+
+    Raises
+    ------
+    SettingError
+        If a value is outside its rule.
+    """
+
+    resolution_m: float
+    method: Method = "mean"
+    surface: SurfaceChoice = "all"
+    fill_m: float | None = None
+    azimuth_deg: float = 315.0
+    altitude_deg: float = 45.0
+
+    def __post_init__(self) -> None:
+        check_resolution(self.resolution_m)
+        _check_choice("method", self.method, get_args(Method))
+        _check_choice("surface", self.surface, get_args(SurfaceChoice))
+        if not math.isfinite(self.azimuth_deg):
+            raise SettingError(f"The azimuth is {self.azimuth_deg:g}; it must be in degrees.")
+        if not 0.0 < self.altitude_deg <= 90.0:
+            raise SettingError(
+                f"The altitude of the sun is {self.altitude_deg:g} degrees; it must be above 0 and"
+                " at most 90."
+            )
+        if self.fill_m is not None:
+            _check_fill(self.fill_m, self.resolution_m)
+
+
+def _check_choice(name: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise SettingError(f"The {name} is {value!r}; it must be one of {', '.join(known)}.")
+
+
+def _check_fill(fill_m: float, resolution_m: float) -> None:
+    if not (math.isfinite(fill_m) and fill_m > 0.0):
+        raise SettingError(f"The width of holes to fill is {fill_m:g} m; it must be positive.")
+    if fill_m > MAX_HOLE_CELLS * resolution_m:
+        raise SettingError(
+            f"Holes up to {fill_m:g} m are more than {MAX_HOLE_CELLS:,} cells of {resolution_m:g} m"
+            f" wide; fill up to {MAX_HOLE_CELLS * resolution_m:g} m, or take a coarser resolution."
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class DsmSummary:
+    """What a DSM came to; the keys of ``pcfix dsm --summary`` are these names.
+
+    Attributes
+    ----------
+    input, output : str
+    hillshade : str or None
+    pcfix : str
+        Version.
+    crs : str or None
+        Name of the coordinate system that the cloud states.
+    width, height : int
+        Columns and rows.
+    bounds_m : tuple of float
+        Left, bottom, right, top.
+    points, points_used : int
+        In the cloud, and in the raster: of the surface asked for, neither noise nor withheld.
+    cells : int
+        With points.
+    filled : int
+        With a height but no points.
+    empty : int
+        Without a height.
+    points_per_cell : float
+        Mean, over the cells with points.
+    spacing_m : float
+        Of the points used: the side of the square each has for itself, where there are any.
+    hole_m : float or None
+        Width of the widest hole that was bridged.
+    settings : dict
+    seconds : float
+    """
+
+    input: str
+    output: str
+    hillshade: str | None
+    pcfix: str
+    crs: str | None
+    width: int
+    height: int
+    bounds_m: tuple[float, float, float, float]
+    points: int
+    points_used: int
+    cells: int
+    filled: int
+    empty: int
+    points_per_cell: float
+    spacing_m: float
+    hole_m: float | None
+    settings: dict[str, Any]
+    seconds: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON."""
+        return asdict(self)

@@ -1,0 +1,244 @@
+"""Read rasters, and write GeoTIFFs part by part."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from pcfix.errors import InputError, SettingError
+from pcfix.io.files import check_input, check_output
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Iterable, Iterator, Mapping
+    from pathlib import Path
+
+    import numpy.typing as npt
+    from pyproj import CRS
+    from rasterio.io import DatasetReader, DatasetWriter
+    from rasterio.transform import Affine
+
+    from pcfix.grid.lattice import Lattice, Window
+    from pcfix.model import FloatArray
+
+    AnyPath = str | os.PathLike[str]
+
+NO_HEIGHT = -9999.0
+"""Value of cells without a height; every program that reads GeoTIFF knows this one."""
+TILE = 256
+_SUFFIXES = (".tif", ".tiff")
+
+
+class Raster(NamedTuple):
+    """A raster in memory.
+
+    Attributes
+    ----------
+    array : array, shape (bands, rows, columns)
+        As stored; the first row is at the top.
+    transform : Affine
+        From (column, row) of a cell's corner to x and y in the raster's CRS.
+    crs : rasterio CRS or None
+    nodata : float or None
+        Value of cells that have none.
+    """
+
+    array: npt.NDArray[Any]
+    transform: Affine
+    crs: Any
+    nodata: float | None
+
+
+def read_raster(path: AnyPath) -> Raster:
+    """Return a whole raster of any format that GDAL reads.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or it is none.
+    """
+    with open_raster(path) as source:
+        return Raster(source.read(), source.transform, source.crs, source.nodata)
+
+
+@contextmanager
+def open_raster(path: AnyPath) -> Iterator[DatasetReader]:
+    """Open a raster to read parts of it.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or it is none.
+    """
+    import rasterio
+
+    found = check_input(path)
+    try:
+        source = rasterio.open(found)
+    except rasterio.errors.RasterioError as error:
+        raise InputError(
+            f"{found}: is damaged, or is not a raster ({error}); export it again as GeoTIFF."
+        ) from error
+    with source:
+        yield source
+
+
+def read_heights(source: DatasetReader, window: Window) -> FloatArray:
+    """Return part of the first band, shape (rows, columns), with NaN where it has no value."""
+    height = source.read(1, window=_slices(window)).astype(np.float64)
+    height[height == source.nodata] = np.nan
+    return np.asarray(height)
+
+
+def write_part(target: DatasetWriter, values: npt.NDArray[Any], window: Window, band: int) -> None:
+    """Write part of a band, shape (rows, columns); NaN becomes the raster's nodata."""
+    if np.issubdtype(values.dtype, np.floating):
+        values = np.where(np.isnan(values), target.nodata, values)
+    target.write(values.astype(target.dtypes[band - 1]), band, window=_slices(window))
+
+
+def _slices(window: Window) -> tuple[tuple[int, int], tuple[int, int]]:
+    return (window.row, window.row_stop), (window.column, window.column_stop)
+
+
+def check_tif(
+    path: AnyPath, *, overwrite: bool, inputs: Iterable[str | os.PathLike[str]] = ()
+) -> Path:
+    """Return the path of a GeoTIFF that may be written; see `pcfix.io.files.check_output`.
+
+    Raises
+    ------
+    SettingError
+        Also if the name does not end in ``.tif`` or ``.tiff``.
+    """
+    target = check_output(path, overwrite=overwrite, inputs=inputs)
+    if target.suffix.lower() not in _SUFFIXES:
+        raise SettingError(f"{target}: a raster is written as GeoTIFF; end the name in .tif.")
+    return target
+
+
+def check_cog() -> None:
+    """Refuse to promise a cloud optimised GeoTIFF where GDAL cannot write one.
+
+    Raises
+    ------
+    SettingError
+    """
+    import rasterio
+
+    with rasterio.Env() as environment:
+        known = "COG" in environment.drivers()
+    if not known:
+        raise SettingError(
+            f"The GDAL {rasterio.__gdal_version__} of this rasterio has no COG driver, which came"
+            " with GDAL 3.1; leave --cog out, or install a newer rasterio."
+        )
+
+
+@contextmanager
+def new_raster(
+    path: Path,
+    lattice: Lattice,
+    crs: CRS | None,
+    bands: Mapping[str, str],
+    *,
+    dtype: str = "float32",
+    nodata: float = NO_HEIGHT,
+    tags: Mapping[str, str] | None = None,
+) -> Iterator[DatasetWriter]:
+    """Open a new tiled, compressed GeoTIFF for `write_part`.
+
+    Parameters
+    ----------
+    path : Path
+    lattice : Lattice
+    crs : pyproj CRS or None
+    bands : mapping
+        Description and unit of each band.
+    dtype, nodata
+        Of all bands.
+    tags : mapping, optional
+        Metadata of the file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    import rasterio
+    from rasterio.transform import from_origin
+
+    size = lattice.resolution_m
+    profile = {
+        "driver": "GTiff",
+        "width": lattice.width,
+        "height": lattice.height,
+        "count": len(bands),
+        "dtype": dtype,
+        "nodata": nodata,
+        "crs": None if crs is None else rasterio.CRS.from_wkt(crs.to_wkt()),
+        "transform": from_origin(lattice.left_m, lattice.top_m, size, size),
+        "interleave": "band",
+        "tiled": True,
+        "blockxsize": TILE,
+        "blockysize": TILE,
+        **_compression(dtype),
+    }
+    try:
+        with rasterio.open(path, "w", **profile) as target:
+            for number, (name, unit) in enumerate(bands.items(), start=1):
+                target.set_band_description(number, name)
+                target.set_band_unit(number, unit)
+            target.update_tags(**(tags or {}))
+            yield target
+    except rasterio.errors.RasterioError as error:
+        raise InputError(f"{path}: the raster cannot be written ({error}).") from error
+
+
+def add_overviews(path: Path) -> None:
+    """Give a GeoTIFF smaller versions of itself, in the same file, until one fits a tile."""
+    import rasterio
+    from rasterio.enums import Resampling
+
+    with rasterio.open(path) as raster:
+        dtype, longest = raster.dtypes[0], max(raster.width, raster.height)
+    factors = _factors(longest)
+    if factors:
+        with rasterio.Env(**_overview_compression(dtype)), rasterio.open(path, "r+") as raster:
+            raster.build_overviews(factors, Resampling.average)
+
+
+def _predictor(dtype: str) -> int:
+    return 3 if dtype.startswith("float") else 2
+
+
+def _compression(dtype: str) -> dict[str, Any]:
+    return {"compress": "deflate", "predictor": _predictor(dtype), "bigtiff": "IF_SAFER"}
+
+
+def _overview_compression(dtype: str) -> dict[str, Any]:
+    return {
+        "COMPRESS_OVERVIEW": "DEFLATE",
+        "PREDICTOR_OVERVIEW": str(_predictor(dtype)),
+        "BIGTIFF_OVERVIEW": "IF_SAFER",
+        "GDAL_TIFF_OVR_BLOCKSIZE": str(TILE),
+    }
+
+
+def _factors(longest: int) -> list[int]:
+    """Return by how much each overview is smaller."""
+    factors: list[int] = []
+    while longest > TILE * 2 ** len(factors):
+        factors.append(2 ** (len(factors) + 1))
+    return factors
+
+
+def copy_as_cog(source: Path, target: Path) -> None:
+    """Write a GeoTIFF again, cloud optimised: what is needed first stands first in the file."""
+    from rasterio.shutil import copy
+
+    with open_raster(source) as raster:
+        options = _compression(raster.dtypes[0])
+    copy(source, target, driver="COG", blocksize=TILE, **options)

@@ -1,0 +1,137 @@
+"""The page that a surveyor hands to a client: one HTML file with everything inside."""
+
+from __future__ import annotations
+
+import base64
+import json
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from pcfix.model import FloatArray
+    from pcfix.report.maps import Maps
+
+_NO_DATA = -32768
+_STEPS = 32_000
+"""Of the 16 bits in which the page holds the values of its map."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure with its title, and what it shows in words."""
+
+    name: str
+    title: str
+    alt: str
+    figure: Figure
+
+    def png(self, dpi: int = 130) -> bytes:
+        """Return the picture as a file."""
+        stream = BytesIO()
+        self.figure.savefig(stream, format="png", dpi=dpi)
+        return stream.getvalue()
+
+    @property
+    def data(self) -> str:
+        """The picture for an HTML page."""
+        return base64.b64encode(self.png()).decode()
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text under a header; the first column names the row."""
+
+    title: str
+    header: list[str]
+    rows: list[list[str]]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One choice of the map: values per cell, shape (rows, columns), NaN where there are none."""
+
+    name: str
+    unit: str
+    values: FloatArray
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that the page says, in its order."""
+
+    title: str
+    lead: str
+    facts: Table
+    warnings: list[str]
+    maps: Maps
+    layers: list[Layer]
+    pictures: list[Picture]
+    tables: list[Table]
+    provenance: list[Table] = field(default_factory=list)
+
+
+def render(report: Report) -> str:
+    """Return the page: no address outside it is used, and it works without scripts too."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    # no "</script>" can end the data early, as JSON may say "<" in another way
+    data = json.dumps(_map_data(report)).replace("<", "\\u003c")
+    return environment.get_template("page.html.j2").render(report=report, map_data=Markup(data))
+
+
+def _map_data(report: Report) -> dict[str, Any]:
+    west, _, _, north = report.maps.extent_m
+    rows, columns = report.maps.height_m.shape
+    return {
+        "rows": rows,
+        "columns": columns,
+        "west": west,
+        "north": north,
+        "cell": report.maps.cell_m,
+        "noData": _NO_DATA,
+        "colours": _colours(),
+        "layers": [_packed(layer) for layer in report.layers],
+    }
+
+
+def _packed(layer: Layer) -> dict[str, Any]:
+    """Return a layer as 16-bit whole numbers; its range leaves out a percent at each end."""
+    known = layer.values[np.isfinite(layer.values)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    step = max(high - low, 1e-9) / _STEPS
+    whole = np.where(
+        np.isfinite(layer.values), np.rint((layer.values - low) / step), _NO_DATA
+    ).astype("<i2")
+    shown = np.percentile(known, [1.0, 99.0]) if known.size else np.array([0.0, 1.0])
+    return {
+        "name": layer.name,
+        "unit": layer.unit,
+        "offset": low,
+        "step": step,
+        "low": float(shown[0]),
+        "high": float(max(shown[1], shown[0] + 1e-9)),
+        "values": base64.b64encode(whole.tobytes()).decode(),
+    }
+
+
+def _colours() -> list[list[int]]:
+    from matplotlib import colormaps
+
+    shades: list[list[int]] = (
+        (colormaps["viridis"](np.linspace(0, 1, 64))[:, :3] * 255).astype(int).tolist()
+    )
+    return shades

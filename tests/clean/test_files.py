@@ -1,0 +1,287 @@
+"""Files: nothing is lost, the result is that of arrays, and a correction can still be undone."""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import TYPE_CHECKING
+
+import laspy
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+import pcfix
+from pcfix.clean import CleanSettings, clean_file, clean_points
+from pcfix.cli.clean import clean
+from pcfix.errors import GeometryError, InputError, SettingError
+from pcfix.flow import clean as flow_clean
+from pcfix.io.las.source import read_xyz
+from tests.clean.scenes import spoilt_scene
+from tests.utils.clouds import (
+    WATER_M,
+    RawLas,
+    add_undescribed_bytes,
+    block,
+    fields,
+    random_cloud,
+    read_raw,
+    write_cloud,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+MANY = CleanSettings(deviations=0.5, fences=0.2)
+"""On a cloud of white noise, a third of the points."""
+RUN = CliRunner()
+OURS = (b"pcfix", 2)
+
+
+def _plain(path: Path, xyz: np.ndarray) -> Path:
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = np.full(3, 0.001), np.floor(xyz.min(axis=0))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = xyz.T
+    las.write(path)
+    return path
+
+
+def _before(raw: RawLas) -> np.ndarray:
+    """Points that were withheld or noise already."""
+    whole = fields(raw)
+    return (whole["withheld"] != 0) | np.isin(whole["class"], (7, 18))
+
+
+def _assert_nothing_lost(before: RawLas, after: RawLas, noise: np.ndarray) -> None:
+    """All is as it was but for class and withheld flag of the noise."""
+    old, new = fields(before), fields(after)
+    assert set(old) <= set(new)
+    for name, values in old.items():
+        if name == "angle" and before.point_format < 6:
+            values = np.rint(values / 0.006)
+        expected = values.copy()
+        if name == "class":
+            expected[noise] = 7
+        elif name == "withheld":
+            expected[noise] = 1
+        assert np.array_equal(new[name], expected), name
+    assert after.scales == before.scales
+    assert after.offsets == before.offsets
+    records = [r for r in after.foreign() if r.kind != OURS]
+    kept = [r for r in records if r in before.foreign()]
+    assert kept == before.foreign()
+    assert {r.kind for r in records if r not in kept} <= {(b"LASF_Projection", 2112)}
+    assert after.extended == before.extended
+    assert after.extra_bytes()[: len(before.extra_bytes())] == before.extra_bytes()
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize("point_format", range(11))
+def test_nothing_is_lost(tmp_path: Path, point_format: int, suffix: str) -> None:
+    source = write_cloud(tmp_path / f"in{suffix}", point_format)
+    target = tmp_path / f"out{suffix}"
+    result = clean_file(source, target, water=WATER_M, settings=MANY)
+    before, after = read_raw(source), read_raw(target)
+    aside = _before(before)
+    noise = clean_points(read_xyz(source), water=WATER_M, used=~aside, settings=MANY) != 0
+    assert 100 < result.noise == noise.sum()
+    assert not (noise & aside).any()
+    assert (after.version, after.point_format >= 6) == ((1, 4), True)
+    _assert_nothing_lost(before, after, noise)
+    assert result.set_aside == aside.sum()
+
+
+def test_bytes_that_no_one_describes_stay(tmp_path: Path) -> None:
+    source = add_undescribed_bytes(write_cloud(tmp_path / "in.las", 6, plain=True), 5)
+    clean_file(source, tmp_path / "out.las", water=WATER_M, settings=MANY)
+    old, new = read_raw(source), read_raw(tmp_path / "out.las")
+    assert np.array_equal(old.points[:, -5:], new.points[:, -5:])
+
+
+def test_drop_leaves_the_other_rows_as_they_are(tmp_path: Path) -> None:
+    source = write_cloud(tmp_path / "in.laz", 7)
+    clean_file(source, tmp_path / "flagged.laz", water=WATER_M, settings=MANY)
+    result = clean_file(source, tmp_path / "out.laz", water=WATER_M, settings=MANY, drop=True)
+    before, flagged = read_raw(source), read_raw(tmp_path / "flagged.laz")
+    noise = (_before(flagged)) & ~_before(before)
+    after = read_raw(tmp_path / "out.laz")
+    assert np.array_equal(after.points, before.points[~noise])
+    assert result.dropped == result.noise == noise.sum() > 0
+    assert struct.unpack_from("<Q", after.header, 247)[0] == len(after.points)
+
+
+@pytest.mark.parametrize("tile_m", [15.0, 1e6])
+def test_chunks_and_tiles_do_not_change_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tile_m: float
+) -> None:
+    s = spoilt_scene(20_000, 100)
+    source = _plain(tmp_path / "in.laz", s.xyz)
+    clean_file(source, tmp_path / "one.las", water=s.water_level_m)
+    monkeypatch.setattr(flow_clean, "CHUNK_POINTS", 3000)
+    clean_file(source, tmp_path / "two.las", water=s.water_level_m, tile_m=tile_m, jobs=1)
+    assert (tmp_path / "one.las").read_bytes() == (tmp_path / "two.las").read_bytes()
+
+
+def test_the_record_says_what_was_done(tmp_path: Path) -> None:
+    s = spoilt_scene(20_000, 100)
+    source = _plain(tmp_path / "in.las", s.xyz)
+    result = clean_file(source, tmp_path / "out.las", water=s.water_level_m)
+    (record,) = [r for r in read_raw(tmp_path / "out.las").records if r.kind == OURS]
+    said = json.loads(record.data)
+    assert said["settings"] == result.settings
+    assert said["reasons"] == result.reasons
+    assert (said["pcfix"], said["drop"]) == (pcfix.__version__, False)
+    clean_file(tmp_path / "out.las", tmp_path / "twice.las", water=s.water_level_m)
+    records = [r for r in read_raw(tmp_path / "twice.las").records if r.kind == OURS]
+    assert len(records) == 2
+    assert records[0] == record
+
+
+def test_noise_stays_noise_and_is_no_neighbour(tmp_path: Path) -> None:
+    s = spoilt_scene(20_000, 100)
+    clean_file(_plain(tmp_path / "in.las", s.xyz), tmp_path / "a.las", water=s.water_level_m)
+    clean_file(tmp_path / "a.las", tmp_path / "b.las", water=s.water_level_m)
+    first, second = (read_raw(tmp_path / name) for name in ("a.las", "b.las"))
+    aside = _before(first)
+    again = clean_points(s.xyz.round(3), water=s.water_level_m, used=~aside) != 0
+    assert np.array_equal(_before(second), aside | again)
+
+
+@pytest.mark.parametrize("uncorrected", ["withhold", "keep"])
+def test_restore_after_cleaning_gives_the_apparent_cloud(tmp_path: Path, uncorrected: str) -> None:
+    source = write_cloud(tmp_path / "in.laz", 1)
+    steps = [tmp_path / name for name in ("corrected.laz", "cleaned.laz", "restored.laz")]
+    cameras = block()
+    pcfix.correct_file(source, steps[0], cameras=cameras, water=WATER_M, uncorrected=uncorrected)
+    result = clean_file(steps[0], steps[1], settings=MANY)
+    assert result.not_run == []
+    assert result.reasons["below_bed"] > 0
+    pcfix.restore_file(steps[1], steps[2])
+    before, after = read_raw(source), read_raw(steps[2])
+    noise = _before(read_raw(steps[1])) & ~_before(read_raw(steps[0]))
+    assert noise.sum() == result.noise > 100
+    old, new = fields(before), fields(after)
+    for name, values in old.items():
+        rows = ~noise if name in ("class", "withheld") else slice(None)
+        assert np.array_equal(new[name][rows], values[rows]), name
+    assert after.version == before.version
+    assert after.point_format == before.point_format
+    assert [r for r in after.foreign() if r.kind != OURS] == before.foreign()
+
+
+def test_restore_of_a_cloud_that_was_cleaned_first_gives_the_cleaned_one(tmp_path: Path) -> None:
+    write_cloud(tmp_path / "in.las", 7)
+    clean_file(tmp_path / "in.las", tmp_path / "a.las", water=WATER_M, settings=MANY)
+    pcfix.correct_file(tmp_path / "a.las", tmp_path / "b.las", cameras=block(), water=WATER_M)
+    pcfix.restore_file(tmp_path / "b.las", tmp_path / "c.las")
+    assert (tmp_path / "c.las").read_bytes() == (tmp_path / "a.las").read_bytes()
+
+
+def test_weak_intersections_of_a_corrected_cloud(tmp_path: Path) -> None:
+    write_cloud(tmp_path / "in.las", 7)
+    pcfix.correct_file(tmp_path / "in.las", tmp_path / "a.las", cameras=block(), water=WATER_M)
+    las = laspy.read(tmp_path / "a.las")
+    limit = float(np.median(las.Incidence[las.RayCount > 0]))
+    only = CleanSettings(
+        deviations=None, below_m=None, floating_m=None, max_incidence_deg=limit, max_ray_miss_m=9.0
+    )
+    result = clean_file(tmp_path / "a.las", tmp_path / "b.las", settings=only)
+    aside = _before(read_raw(tmp_path / "a.las"))
+    weak = (las.RayCount > 0) & (np.array(las.Incidence) > limit) & ~aside
+    assert result.reasons["incidence"] == weak.sum() > 50
+    assert result.submerged == 0
+
+
+def test_tests_that_the_cloud_does_not_allow_are_named(tmp_path: Path) -> None:
+    s = spoilt_scene(20_000, 100)
+    source = _plain(tmp_path / "in.las", s.xyz)
+    result = clean_file(source, tmp_path / "out.las")
+    assert result.not_run == [
+        "few rays: the cloud has no dimension RayCount",
+        "ray miss: the cloud has no dimension RayCount",
+        "incidence: the cloud has no dimension RayCount",
+        "below bed, floating: no --water, and no dimension RayCount",
+    ]
+    assert result.reasons["statistical"] > 0
+
+
+def _commands() -> typer.Typer:
+    app = typer.Typer()
+    app.command()(clean)
+    return app
+
+
+def test_the_command(tmp_path: Path) -> None:
+    s = spoilt_scene(20_000, 100)
+    source = _plain(tmp_path / "in.laz", s.xyz)
+    words = [str(source), str(tmp_path / "out.laz"), "--water", str(s.water_level_m)]
+    done = RUN.invoke(_commands(), [*words, "--summary", str(tmp_path / "s.json")])
+    assert done.exit_code == 0, done.output
+    said = json.loads((tmp_path / "s.json").read_text())
+    assert f"noise        {said['noise']:,}" in done.output
+    assert "below bed" in done.output
+    assert said["settings"]["neighbours"] == 20
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["in.laz", "out.laz", "s.json"]
+    off = ["--no-statistical", "--no-weak", "--no-below", "--overwrite", "--quiet"]
+    done = RUN.invoke(_commands(), [*words, *off, "--summary", str(tmp_path / "s.json")])
+    assert (done.exit_code, done.output) == (0, "")
+    reasons = json.loads((tmp_path / "s.json").read_text())["reasons"]
+    assert reasons.pop("floating") > 0
+    assert not any(reasons.values())
+
+
+def test_bad_input_is_one_sentence_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    s = spoilt_scene(20_000, 100)
+    good = _plain(tmp_path / "good.las", s.xyz)
+    few = _plain(tmp_path / "few.las", s.xyz[:5])
+    las = laspy.read(good)
+    las.classification[:] = 18
+    las.write(tmp_path / "noise.las")
+    (tmp_path / "cut.las").write_bytes(good.read_bytes()[:-500])
+    (tmp_path / "there.las").write_bytes(b"work")
+    before = sorted(p.name for p in tmp_path.iterdir())
+    out = tmp_path / "out.las"
+    cases = [
+        (InputError, "no such file", (tmp_path / "nowhere.las", out), {}),
+        (InputError, "has 5 points .* too few", (few, out), {}),
+        (InputError, "nothing left to clean", (tmp_path / "noise.las", out), {}),
+        (InputError, "cut short|damaged", (tmp_path / "cut.las", out), {}),
+        (InputError, "has no dimension Level", (good, out), {"water": "dim:Level"}),
+        (GeometryError, "no point lies below the water", (good, out), {"water": -500.0}),
+        (SettingError, "same file", (good, good), {"overwrite": True}),
+        (SettingError, "add --overwrite", (good, tmp_path / "there.las"), {}),
+        (SettingError, r"ends in \.las or \.laz", (good, tmp_path / "out.txt"), {}),
+        (SettingError, "jobs 0", (good, out), {"jobs": 0}),
+        (SettingError, "tile_m 0", (good, out), {"tile_m": 0.0}),
+    ]
+    for kind, message, files, options in cases:
+        with pytest.raises(kind, match=message) as caught:
+            clean_file(*files, **options)
+        assert "\n" not in str(caught.value)
+    assert sorted(p.name for p in tmp_path.iterdir()) == before
+    assert (tmp_path / "there.las").read_bytes() == b"work"
+
+
+def test_not_all_may_be_dropped(tmp_path: Path) -> None:
+    las = random_cloud(7)
+    las.classification[:], las.withheld[:] = 40, 0
+    las.add_extra_dim(laspy.ExtraBytesParams("RayCount", "uint16"))
+    las.RayCount[:] = 2
+    las.write(tmp_path / "in.las")
+    with pytest.raises(InputError, match="every point is noise"):
+        clean_file(tmp_path / "in.las", tmp_path / "out.las", drop=True)
+    assert not (tmp_path / "out.las").exists()
+
+
+def test_a_full_disk_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = _plain(tmp_path / "in.las", spoilt_scene(20_000, 100).xyz)
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pcfix.io.scratch._reserve", full)
+    with pytest.raises(InputError, match="temporary space beside it cannot be had"):
+        clean_file(source, tmp_path / "out.las")
+    assert [p.name for p in tmp_path.iterdir()] == ["in.las"]

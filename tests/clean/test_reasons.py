@@ -1,0 +1,192 @@
+"""What is found, what is spared, and what is refused."""
+
+from __future__ import annotations
+
+import doctest
+
+import numpy as np
+import pytest
+
+from pcfix.clean import CleanSettings, Reason, clean_points
+from pcfix.errors import InputError, SettingError
+from pcfix.flow import clean_points as door
+from pcfix.model import WaterPlane
+from tests.clean.scenes import spoilt_scene
+
+
+def _scene_reasons(settings: CleanSettings | None = None) -> np.ndarray:
+    s = spoilt_scene()
+    return clean_points(
+        s.xyz,
+        water=s.water_level_m,
+        ray_count=s.ray_count,
+        ray_miss_m=s.ray_miss_m,
+        incidence_deg=s.incidence_deg,
+        settings=settings,
+    )
+
+
+def test_outliers_are_found_and_good_points_spared() -> None:
+    """The band of the bed is a slope's drop in a neighbourhood of 1.3 m, at least 0.3 m.
+
+    Outliers stand at least 0.8 m below and 1 m above a bed point. On the steepest slopes, and at
+    the rim of the water, the band is wider than that: a twentieth may stay. In the air, 4 m up,
+    some have another outlier near: a twentieth again. The fences leave one in some 10,000 points
+    of a normal distribution outside, the floors nearly all of these inside.
+    """
+    s, reasons = spoilt_scene(), _scene_reasons()
+    assert (reasons[s.below] & Reason.BELOW_BED > 0).mean() > 0.95
+    assert (reasons[s.floating] & Reason.FLOATING > 0).mean() > 0.95
+    assert (reasons[s.air] & Reason.STATISTICAL > 0).mean() > 0.95
+    assert (reasons[s.good] > 0).mean() < 1e-3
+
+
+def test_a_clean_scene_loses_next_to_nothing() -> None:
+    """Without outliers the deviation is that of the good points; what is beyond four are edges."""
+    s = spoilt_scene()
+    reasons = clean_points(s.xyz[s.good], water=s.water_level_m)
+    assert (reasons > 0).mean() < 3e-3
+    assert (reasons & (Reason.BELOW_BED | Reason.FLOATING) > 0).mean() < 1e-4
+
+
+def test_reasons_name_the_side() -> None:
+    s, reasons = spoilt_scene(), _scene_reasons(CleanSettings(deviations=None))
+    assert not (reasons[s.below] & Reason.FLOATING).any()
+    assert not (reasons[s.floating] & Reason.BELOW_BED).any()
+    assert not reasons[s.air].any()
+
+
+def test_a_quay_wall_and_a_rock_are_terrain() -> None:
+    """A step of 3 m, with points on its face, and a rock of 1.5 m: breaks of the bed, not noise."""
+    rng = np.random.default_rng(8)
+    xyz = rng.uniform((0.0, 0.0, -8.0), (40.0, 40.0, -8.0), (16_000, 3))
+    xyz[xyz[:, 0] > 20.0, 2] = -5.0
+    xyz[np.hypot(xyz[:, 0] - 10.0, xyz[:, 1] - 10.0) < 1.5, 2] = -6.5
+    face = rng.uniform((20.0, 0.0, -8.0), (20.01, 40.0, -5.0), (1200, 3))
+    xyz = np.vstack([xyz, face])
+    xyz[:, 2] += rng.normal(0.0, 0.03, len(xyz))
+    reasons = clean_points(xyz, water=0.0, settings=CleanSettings(deviations=None))
+    # the rock's crown of 1.5 m holds 70 points, more than twice a neighbourhood
+    assert (reasons > 0).mean() < 1e-3
+
+
+def test_dry_points_are_not_tested_against_the_bed() -> None:
+    """Ground under a canopy lies far below its neighbours in plan."""
+    rng = np.random.default_rng(4)
+    canopy = rng.uniform((0, 0, 8.0), (30, 30, 9.0), (9000, 3))
+    ground = rng.uniform((0, 0, 1.0), (30, 30, 1.0), (300, 3))
+    bed = rng.uniform((40, 0, -2.1), (70, 30, -2.0), (9000, 3))
+    xyz = np.vstack([canopy, ground, bed])
+    assert not clean_points(xyz, water=0.0, settings=CleanSettings(deviations=None)).any()
+
+
+@pytest.mark.parametrize("how", ["level", "plane", "heights", "rays"])
+def test_any_water_tells_the_same_points_apart(how: str) -> None:
+    s = spoilt_scene(20_000, 100)
+    level, rays = s.water_level_m, s.ray_count
+    water = {
+        "level": level,
+        "plane": WaterPlane(level),
+        "heights": np.full(len(rays), level),
+        "rays": None,
+    }[how]
+    settings = CleanSettings(min_rays=None, max_ray_miss_m=None, max_incidence_deg=None)
+    found = clean_points(s.xyz, water=water, ray_count=rays, settings=settings)
+    assert np.array_equal(found, clean_points(s.xyz, water=level, settings=settings))
+
+
+def test_weak_intersections() -> None:
+    xyz = spoilt_scene().xyz[:50]
+    rays, miss, angle = np.zeros(50), np.zeros(50), np.zeros(50)
+    miss[:10], angle[:10] = 9.0, 89.0  # on land these say nothing
+    rays[10:] = 3
+    rays[20], miss[21], angle[22] = 2, 0.51, 75.1
+    rays[23], miss[23] = 2, 0.6
+    only = CleanSettings(deviations=None, below_m=None, floating_m=None)
+    found = clean_points(xyz, ray_count=rays, ray_miss_m=miss, incidence_deg=angle, settings=only)
+    weak = {20: 4, 21: 8, 22: 16, 23: 12}
+    assert found.tolist() == [weak.get(i, 0) for i in range(50)]
+    assert clean_points(xyz, ray_count=rays, settings=only).tolist() == [
+        4 if i in (20, 23) else 0 for i in range(50)
+    ]
+
+
+def test_points_that_are_not_used_are_no_neighbours() -> None:
+    s = spoilt_scene(20_000, 100)
+    used = np.zeros(len(s.xyz), bool)
+    used[::2] = True
+    found = clean_points(s.xyz, water=s.water_level_m, used=used)
+    alone = clean_points(s.xyz[::2], water=s.water_level_m)
+    assert np.array_equal(found[::2], alone)
+    assert not found[1::2].any()
+
+
+def test_the_input_is_not_changed() -> None:
+    xyz = spoilt_scene(20_000, 100).xyz.copy()
+    before = xyz.copy()
+    clean_points(xyz, water=0.37)
+    assert np.array_equal(xyz, before)
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        ({"neighbours": 5}, "neighbours 5 must be a whole number at least 6"),
+        ({"neighbours": 20.5}, "neighbours 20.5"),
+        ({"deviations": 0.0}, "deviations 0.0 must be above 0"),
+        ({"deviations": np.nan}, "deviations nan"),
+        ({"radius_m": -1.0}, "radius -1.0"),
+        ({"radius_neighbours": 0}, "radius-neighbours 0"),
+        ({"min_rays": 1}, "min-rays 1"),
+        ({"max_ray_miss_m": np.inf}, "max-ray-miss inf"),
+        ({"max_incidence_deg": 91.0}, "max-incidence 91.0 must be above 0 and at most 90"),
+        ({"bed_neighbours": 501}, "bed-neighbours 501"),
+        ({"fences": 0.0}, "fences 0.0"),
+        ({"below_m": "deep"}, "below deep"),
+        ({"floating_m": -0.1}, "floating -0.1"),
+        (
+            {
+                "deviations": None,
+                "min_rays": None,
+                "max_ray_miss_m": None,
+                "max_incidence_deg": None,
+                "below_m": None,
+                "floating_m": None,
+            },
+            "No test is left",
+        ),
+    ],
+)
+def test_settings_outside_their_rule(choice: dict, message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        CleanSettings(**choice)
+
+
+def test_bad_arrays() -> None:
+    xyz = spoilt_scene(20_000, 100).xyz[:100]
+    with pytest.raises(SettingError, match="used must have one value per point"):
+        clean_points(xyz, used=np.ones(99, bool))
+    with pytest.raises(SettingError, match="tile_m -1"):
+        clean_points(xyz, tile_m=-1.0)
+    with pytest.raises(SettingError, match="not finite"):
+        clean_points(np.full((100, 3), np.nan))
+    with pytest.raises(InputError, match=r"has 20 points .* too few for a neighbourhood of 20"):
+        clean_points(xyz[:20])
+    with pytest.raises(InputError, match=r"has 5 points .* too few for a neighbourhood of 6"):
+        clean_points(xyz[:5], settings=CleanSettings(neighbours=6))
+    level = np.sort(xyz[:, 2])[10]
+    with pytest.raises(InputError, match="has 10 submerged points"):
+        clean_points(xyz, water=level)
+
+
+def test_no_spread_at_all_is_no_noise() -> None:
+    """Coincident points, and a ring on which all distances are the same."""
+    assert not clean_points(np.zeros((50, 3)), water=1.0).any()
+    angle = np.arange(400) * np.pi / 200
+    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(400)])
+    assert not clean_points(ring * 50).any()
+
+
+def test_the_example_of_the_docstring() -> None:
+    found = doctest.testmod(door)
+    assert (found.failed, found.attempted > 3) == (0, True)

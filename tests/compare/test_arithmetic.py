@@ -1,0 +1,276 @@
+"""Distances, planes, statistics and tables against slow twins and known closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+
+from pcfix.compare.c2c import cloud_to_cloud
+from pcfix.compare.depth import binned, distance_from_shore, fit_line
+from pcfix.compare.neighbours import Neighbours, strip_order
+from pcfix.compare.overlap import near_in_plan
+from pcfix.compare.sections import lines_downslope, parse_line, section_along
+from pcfix.compare.statistics import distribution_of, statistics_of
+from pcfix.compare.vertical import heights_at
+from pcfix.errors import GeometryError, SettingError
+
+EAST_M, NORTH_M = 456_000.0, 5_432_000.0
+
+
+def scattered(count, seed, side_m=40.0):
+    """Return points over a wavy bed, UTM-like coordinates."""
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(0.0, side_m, (count, 2))
+    z = -3.0 + 0.4 * np.sin(xy[:, 0] / 5.0) + 0.05 * xy[:, 1] + rng.normal(0.0, 0.02, count)
+    return np.column_stack([xy[:, 0] + EAST_M, xy[:, 1] + NORTH_M, z])
+
+
+def lifted(xyz, by_m):
+    return xyz + np.array([0.0, 0.0, by_m])
+
+
+def tilted_grid(side=30, step_m=0.5):
+    """Return a grid on the plane z = 2 + 0.1 x - 0.2 y (x, y from the grid's corner)."""
+    x, y = (a.ravel() * step_m for a in np.meshgrid(np.arange(side), np.arange(side)))
+    return np.column_stack([x + EAST_M, y + NORTH_M, 2.0 + 0.1 * x - 0.2 * y])
+
+
+def on_the_plane(xy):
+    return 2.0 + 0.1 * (xy[:, 0] - EAST_M) - 0.2 * (xy[:, 1] - NORTH_M)
+
+
+@pytest.mark.parametrize("offset_m", [0.0, 2.0, 90.0])  # 90 m: beyond the cells, by the tree
+def test_c2c_is_the_least_of_all_distances(offset_m):
+    cloud, reference = lifted(scattered(300, 1), offset_m), scattered(400, 2)
+    slow = [min(math.dist(p, q) for q in reference.tolist()) for p in cloud.tolist()]
+    # coordinates of 5e6 m are known to 1e-9 m in float64
+    np.testing.assert_allclose(cloud_to_cloud(cloud, reference), slow, rtol=0, atol=5e-9)
+
+
+def test_cells_and_tree_agree_however_points_are_spread():
+    rng = np.random.default_rng(30)
+    ways = [
+        rng.uniform(0.0, 1.0, (900, 3)),
+        rng.normal(0.0, 1.0, (900, 3)) ** 5,  # dense in the middle, thin outside
+        np.column_stack([np.arange(900.0), np.zeros(900), rng.uniform(0, 5, 900)]),
+        np.repeat(rng.uniform(0.0, 9.0, (30, 3)), 30, axis=0),
+        np.column_stack([np.arange(900.0), np.arange(900.0), np.zeros(900)]),
+    ]
+    for reference in ways:
+        for cloud in ways:
+            tree, _ = Neighbours(reference).nearest(cloud)
+            np.testing.assert_allclose(cloud_to_cloud(cloud, reference), tree, atol=1e-9)
+
+
+def test_nearest_rows_are_those_of_the_arrays_that_came_in():
+    cloud, reference = scattered(250, 3), scattered(350, 4)
+    distance, row = Neighbours(reference).nearest(cloud)
+    np.testing.assert_allclose(np.linalg.norm(cloud - reference[row], axis=1), distance, atol=5e-9)
+    assert sorted(strip_order(cloud)) == list(range(250))
+
+
+def test_one_point_and_points_on_a_line_can_be_asked():
+    one = np.array([[1.0, 2.0, 3.0]])
+    assert cloud_to_cloud(one, one) == [0.0]
+    line = np.column_stack([np.arange(9.0), np.zeros(9), np.zeros(9)])
+    np.testing.assert_allclose(cloud_to_cloud(lifted(line, 2.0), line), 2.0)
+
+
+def test_a_plane_is_met_exactly_between_its_points():
+    rng = np.random.default_rng(5)
+    xy = np.array([EAST_M, NORTH_M]) + rng.uniform(1.0, 13.0, (500, 2))
+    heights = heights_at(xy, tilted_grid())
+    assert not heights.by_nearest.any()
+    # the plane is exact; only rounding is left
+    np.testing.assert_allclose(heights.height_m, on_the_plane(xy), atol=1e-9)
+
+
+def test_a_plane_is_that_of_a_general_least_squares_solver():
+    reference, places = scattered(500, 6), scattered(60, 7)[:, :2]
+    heights = heights_at(places, reference, 9)
+    for place, height, by_nearest in zip(places, *heights, strict=True):
+        near = reference[np.argsort(np.hypot(*(reference[:, :2] - place).T))[:9]]
+        design = np.column_stack([np.ones(9), near[:, :2] - place])
+        slow = near[0, 2] if by_nearest else np.linalg.lstsq(design, near[:, 2])[0][0]
+        assert height == pytest.approx(slow, abs=1e-8)
+
+
+def test_where_neighbours_lie_on_a_line_the_nearest_height_stands():
+    line = np.column_stack([np.arange(20.0), np.zeros(20), np.arange(20.0)])
+    heights = heights_at(np.array([[3.2, 0.1], [7.9, 0.3]]), line)
+    assert heights.by_nearest.all()
+    assert heights.height_m.tolist() == [3.0, 8.0]
+
+
+def test_far_outside_the_reference_a_plane_is_not_extended():
+    heights = heights_at(np.array([[EAST_M - 30.0, NORTH_M]]), tilted_grid())
+    assert heights.by_nearest.all()
+    assert heights.height_m[0] == 2.0  # the corner
+
+
+def test_repeated_points_do_no_harm():
+    heights = heights_at(np.zeros((3, 2)), np.tile([0.0, 0.0, 7.0], (8, 1)))
+    assert heights.height_m.tolist() == [7.0] * 3
+
+
+def test_too_few_points_for_a_plane_are_refused():
+    with pytest.raises(GeometryError, match="5 points is too few"):
+        heights_at(np.zeros((1, 2)), np.zeros((5, 3)), 6)
+    with pytest.raises(SettingError, match="neighbours 5 is less than 6"):
+        heights_at(np.zeros((1, 2)), np.zeros((50, 3)), 5)
+
+
+def test_statistics_are_those_of_plain_formulas():
+    values = np.random.default_rng(8).gamma(2.0, 0.1, 1001) - 0.1
+    found, plain = statistics_of(values), sorted(values.tolist())
+    mean = math.fsum(plain) / 1001
+    assert found.mean_m == pytest.approx(mean, rel=1e-12)
+    assert found.sd_m == pytest.approx(
+        math.sqrt(math.fsum((v - mean) ** 2 for v in plain) / 1001), rel=1e-12
+    )
+    assert found.rmse_m**2 == pytest.approx(found.mean_m**2 + found.sd_m**2, rel=1e-12)
+    assert found.median_m == plain[500]
+    assert found.nmad_m == 1.4826 * sorted(abs(v - plain[500]) for v in plain)[500]
+    assert (found.min_m, found.max_m) == (plain[0], plain[-1])
+    # 5 % of 1000 steps between 1001 sorted values: the 50th from below
+    assert found.percentiles_m["p5"] == pytest.approx(plain[50])
+    assert found.percentiles_m["p95"] == pytest.approx(plain[950])
+
+
+def test_a_normal_sample_gives_its_own_parameters_back():
+    count, mu, sigma = 200_000, 0.35, 0.04
+    found = distribution_of(np.random.default_rng(9).normal(mu, sigma, count))
+    # four standard errors of mean and sd, sigma / sqrt(n) and sigma / sqrt(2 n)
+    error = 4.0 * sigma / math.sqrt(count)
+    assert found.normal.mu_m == pytest.approx(mu, abs=error)
+    assert found.normal.sigma_m == pytest.approx(sigma, abs=error)
+    # the fit to the histogram is less efficient, and bins have a width: 2 % of sigma
+    assert found.normal.histogram_mu_m == pytest.approx(mu, abs=0.02 * sigma)
+    assert found.normal.histogram_sigma_m == pytest.approx(sigma, rel=0.02)
+    histogram = found.histogram
+    assert sum(histogram.counts) + histogram.below + histogram.above == count
+    assert found.statistics.nmad_m == pytest.approx(sigma, rel=0.02)
+
+
+def test_outliers_hardly_move_the_fit_to_the_histogram():
+    rng = np.random.default_rng(10)
+    values = np.concatenate([rng.normal(0.1, 0.03, 50_000), rng.uniform(-3.0, 3.0, 400)])
+    normal = distribution_of(values).normal
+    assert normal.sigma_m > 0.1
+    assert normal.histogram_sigma_m == pytest.approx(0.03, rel=0.1)
+    assert normal.histogram_mu_m == pytest.approx(0.1, abs=0.003)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.1, -7.25])
+def test_equal_values_have_a_note_and_no_normal_distribution(value):
+    found = distribution_of(np.full(20, value))
+    assert found.statistics.mean_m == pytest.approx(value)
+    assert found.normal.histogram_sigma_m is None
+    assert "equal" in found.normal.note
+    assert sum(found.histogram.counts) == 20
+
+
+def test_no_values_are_refused():
+    with pytest.raises(GeometryError, match="no point is left"):
+        statistics_of(np.empty(0))
+
+
+def test_a_line_is_found_again():
+    depth = np.linspace(0.5, 12.0, 400)
+    line = fit_line(depth, -0.05 + depth / 1.34)
+    assert (line.slope, line.intercept_m, line.r2) == pytest.approx((1 / 1.34, -0.05, 1.0))
+    noisy = depth + np.random.default_rng(11).normal(0.0, 0.3, 400)
+    line = fit_line(depth, noisy)
+    assert (line.slope, line.intercept_m) == pytest.approx(tuple(np.polyfit(depth, noisy, 1)))
+    assert line.r2 == pytest.approx(np.corrcoef(depth, noisy)[0, 1] ** 2)
+
+
+def test_a_line_through_equal_or_too_few_depths_is_not_defined():
+    assert fit_line(np.full(50, 4.0), np.linspace(3.0, 4.0, 50)) is None
+    assert fit_line(np.array([1.0, 2.0]), np.array([1.0, 2.0])) is None
+
+
+def test_bins_hold_what_lies_between_their_edges():
+    rng = np.random.default_rng(12)
+    depth, error = rng.uniform(0.0, 5.0, 3000), rng.normal(0.0, 0.1, 3000)
+    depth = depth[(depth < 2.0) | (depth >= 3.0)]
+    bins = binned(depth, error[: len(depth)], 2.0 * error[: len(depth)], 0.5)
+    assert [b.from_m for b in bins] == [0.0, 0.5, 1.0, 1.5, 3.0, 3.5, 4.0, 4.5]
+    for one in bins:
+        inside = [
+            e for d, e in zip(depth, error, strict=False) if one.from_m <= d < one.to_m
+        ]  # fmt: skip
+        assert one.after.count == len(inside)
+        assert one.after.mean_m == pytest.approx(math.fsum(inside) / len(inside))
+        assert one.before.rmse_m == pytest.approx(2.0 * one.after.rmse_m)
+
+
+@pytest.mark.parametrize("width", [0.0, -1.0, math.nan, math.inf])
+def test_a_bin_width_must_be_positive(width):
+    with pytest.raises(SettingError, match="bin width"):
+        binned(np.ones(3), np.ones(3), None, width)
+
+
+def test_distance_from_shore_is_to_the_nearest_dry_point():
+    wet, dry = scattered(80, 13)[:, :2], scattered(60, 14)[:, :2]
+    slow = [min(math.dist(p, q) for q in dry.tolist()) for p in wet.tolist()]
+    np.testing.assert_allclose(distance_from_shore(wet, dry), slow, atol=5e-9)
+
+
+def test_overlap_takes_all_within_the_limit_and_none_beyond_its_square():
+    rng = np.random.default_rng(15)
+    xy, other = rng.uniform(-20, 60, (2000, 2)), rng.uniform(0, 40, (30, 2))
+    limit = 2.5
+    far = np.array([min(math.dist(p, q) for q in other.tolist()) for p in xy.tolist()])
+    near = near_in_plan(xy, other, limit)
+    assert near[far <= limit].all()
+    assert not near[far > 2.0 * math.sqrt(2.0) * limit].any()
+
+
+def test_a_section_is_the_running_median_of_its_corridor():
+    cloud = scattered(4000, 16)
+    line = parse_line(f"{EAST_M + 5},{NORTH_M + 5},{EAST_M + 35},{NORTH_M + 25}")
+    section = section_along(line, {"corrected": cloud, "reference": lifted(cloud, 1.5)}, 2.0)
+    east, north = 30.0 / math.hypot(30, 20), 20.0 / math.hypot(30, 20)
+    for station in (3, 10, 20):
+        s = section.distance_m[station]
+        heights = [
+            z
+            for x, y, z in (cloud - [line.x1, line.y1, 0.0]).tolist()
+            if abs(y * east - x * north) <= 2.0 and abs(x * east + y * north - s) <= 2.0
+        ]
+        assert section.heights_m["corrected"][station] == pytest.approx(np.median(heights))
+    difference = section.heights_m["reference"] - section.heights_m["corrected"]
+    np.testing.assert_allclose(difference, 1.5)
+
+
+def test_a_section_is_empty_where_nothing_lies():
+    section = section_along(
+        parse_line("0,0,10,0"), {"corrected": np.array([[9.9, 0.1, -2.0]])}, 0.5
+    )
+    rows = section.table().splitlines()
+    assert rows[0] == "distance_m,corrected_m"
+    assert rows[1] == "0.0000,"
+    assert rows[-1] == "10.0000,-2.0000"
+
+
+@pytest.mark.parametrize("text", ["1,2,3", "a,b,c,d", "1,1,1,1", "1,2,nan,4", ""])
+def test_words_that_are_no_line_are_refused(text):
+    with pytest.raises(SettingError, match="section"):
+        parse_line(text)
+
+
+def test_automatic_lines_run_down_the_slope_side_by_side():
+    bed = tilted_grid()  # steepest down: (-0.1, 0.2), that is towards north-north-west
+    lines = lines_downslope(bed, 4)
+    assert len(lines) == 4
+    for line in lines:
+        run = np.array([line.x2 - line.x1, line.y2 - line.y1]) / line.length_m
+        np.testing.assert_allclose(run, np.array([-0.1, 0.2]) / math.hypot(0.1, 0.2), atol=1e-9)
+    across = [0.2 * line.x1 + 0.1 * line.y1 for line in lines]
+    np.testing.assert_allclose(np.diff(across), np.diff(across)[0], rtol=1e-6)
+
+
+def test_points_on_a_line_have_no_slope_across():
+    with pytest.raises(GeometryError, match="--section"):
+        lines_downslope(np.column_stack([np.arange(9.0)] * 3), 2)

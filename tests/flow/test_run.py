@@ -1,0 +1,197 @@
+"""All steps in one call: what it leaves, and how it resumes."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+import rasterio
+
+import pcfix
+from pcfix.flow.run import Request, request_of, run_all
+
+SCENE = Path(__file__).parents[2] / "samples" / "scene"
+WORDS = [
+    str(SCENE / "cloud.laz"), "out", "--cameras", str(SCENE / "cameras.csv"), "--water", "0.37",
+    "--reference", str(SCENE / "lidar.laz"),
+]  # fmt: skip
+RESULTS = [
+    "cleaned.laz", "compare", "corrected.laz", "dsm.tif", "dsm_bed.tif", "figures",
+    "hillshade.tif", "report.html", "run.json",
+]  # fmt: skip
+
+
+def run(folder, *words):
+    command = [sys.executable, "-m", "pcfix", "run", *words]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    done = run(folder, *WORDS)
+    assert (done.returncode, done.stderr) == (0, "")
+    return folder / "out", done.stdout
+
+
+@pytest.fixture
+def copied(finished, tmp_path):
+    shutil.copytree(finished[0], tmp_path / "out")
+    for path in (finished[0]).rglob("*"):
+        stat = path.stat()
+        target = tmp_path / "out" / path.relative_to(finished[0])
+        os.utime(target, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    record = tmp_path / "out" / "run.json"
+    record.write_text(record.read_text().replace(str(finished[0]), "out"))
+    return tmp_path
+
+
+def test_every_step_leaves_its_files(finished):
+    folder, said = finished
+    assert sorted(path.name for path in folder.iterdir()) == RESULTS
+    assert [line.split()[0] for line in said.splitlines()] == [
+        "correct", "clean", "dsm", "compare", "report",
+    ]  # fmt: skip
+
+
+def test_cloud_is_that_of_correct(finished, tmp_path):
+    pcfix.correct_file(
+        SCENE / "cloud.laz", tmp_path / "c.laz", cameras=SCENE / "cameras.csv", water=0.37
+    )
+    one, other = laspy.read(tmp_path / "c.laz"), laspy.read(finished[0] / "corrected.laz")
+    np.testing.assert_array_equal(one.points.array, other.points.array)
+
+
+def test_difference_of_the_surfaces_is_that_of_the_rasters(finished):
+    names = ("dsm.tif", "compare/reference_dsm.tif", "compare/dod.tif")
+    dsm, reference, dod = (rasterio.open(finished[0] / name) for name in names)
+    with dsm, reference, dod:
+        window = rasterio.windows.from_bounds(*dod.bounds, reference.transform)
+        expected = dsm.read(1, masked=True) - reference.read(
+            1, window=window, masked=True, boundless=True, fill_value=reference.nodata
+        )
+        found = dod.read(1, masked=True)
+    both = ~np.ma.getmaskarray(expected) & ~np.ma.getmaskarray(found)
+    assert both.sum() > 0.95 * found.count()
+    # float32 heights of about 10 m are stored to 1e-6 m
+    np.testing.assert_allclose(found[both], expected[both], atol=2e-6)
+    assert abs(np.median(found.compressed())) < 0.02  # a bed gridded at 2 m, noise of 4 cm
+
+
+def test_report_holds_the_comparison(finished):
+    text = (finished[0] / "report.html").read_text()
+    for word in ("RMSE", "Cross-section 3", "Difference of the surfaces", "Against lidar.laz"):
+        assert word in text
+    assert len(list((finished[0] / "figures").glob("*.png"))) == text.count("<img ")
+
+
+def test_a_finished_run_is_not_done_again(copied):
+    before = {path: path.stat().st_mtime_ns for path in (copied / "out").glob("*.*")}
+    done = run(copied, *WORDS)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.count("done before") == 5
+    after = {path: path.stat().st_mtime_ns for path in (copied / "out").glob("*.*")}
+    changed = {path.name for path in before if before[path] != after[path]}
+    assert changed == {"run.json"}
+
+
+def test_a_run_resumes_where_a_file_is_missing(copied):
+    (copied / "out" / "dsm.tif").unlink()
+    done = run(copied, *WORDS)
+    assert (done.returncode, done.stderr) == (0, "")
+    steps = {line.split()[0]: "done before" in line for line in done.stdout.splitlines()}
+    assert steps == {
+        "correct": True, "clean": True, "dsm": False, "compare": False, "report": False,
+    }  # fmt: skip
+    assert (copied / "out" / "dsm.tif").exists()
+
+
+def test_another_request_does_not_replace_a_run_unasked(copied):
+    done = run(copied, *WORDS, "--index", "1.33")
+    assert done.returncode == 1
+    assert "--overwrite" in done.stderr
+    done = run(copied, *WORDS, "--index", "1.33", "--overwrite")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "done before" not in done.stdout
+    record = json.loads((copied / "out" / "run.json").read_text())
+    assert record["request"]["refractive_index"] == 1.33
+
+
+def test_a_record_repeats_its_run(finished, tmp_path):
+    done = run(tmp_path, "again", "--config", str(finished[0] / "run.json"))
+    assert (done.returncode, done.stderr) == (0, "")
+    one, other = (laspy.read(p / "cleaned.laz") for p in (finished[0], tmp_path / "again"))
+    np.testing.assert_array_equal(one.points.array, other.points.array)
+    assert request_of(tmp_path / "again" / "run.json") == request_of(finished[0] / "run.json")
+
+
+def test_without_a_reference_there_is_a_report_all_the_same(tmp_path):
+    request = Request(str(SCENE / "cloud.laz"), str(SCENE / "cameras.csv"), "0.37")
+    page = run_all(request, tmp_path / "out")
+    assert "Cross-section" not in page.read_text()
+    assert not (tmp_path / "out" / "compare").exists()
+
+
+def test_check_points_as_reference(tmp_path):
+    lidar = laspy.read(SCENE / "lidar.laz")
+    rows = np.random.default_rng(2).choice(len(lidar), 300, replace=False)
+    lines = [f"{x:.3f},{y:.3f},{z:.3f}" for x, y, z in lidar.xyz[rows]]
+    (tmp_path / "check.csv").write_text("\n".join(["x,y,z", *lines]))
+    request = Request(
+        str(SCENE / "cloud.laz"), str(SCENE / "cameras.csv"), "0.37",
+        reference=str(tmp_path / "check.csv"),
+    )  # fmt: skip
+    with pytest.warns(pcfix.PcfixWarning, match="CRS"):
+        page = run_all(request, tmp_path / "out")
+    assert "check.csv" in page.read_text()
+    assert not (tmp_path / "out" / "compare" / "dod.tif").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--water", "-40"], "no point lies below the water"),
+        (["--reference", "none.laz"], "there is no such file"),
+        (["--cameras", "none.csv"], "there is no such file"),
+        (["--resolution", "0"], "resolution 0 is not positive"),
+        (["--index", "2"], "refractive index 2 is outside"),
+    ],
+)
+def test_mistakes_have_one_sentence(tmp_path, words, sentence):
+    done = run(tmp_path, *WORDS, *words)
+    assert done.returncode == 1
+    assert len(done.stderr.splitlines()) == 1
+    assert sentence in done.stderr
+    assert not (tmp_path / "out" / "corrected.laz").exists()
+
+
+def test_a_folder_with_other_work_is_left_alone(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.txt").write_text("years")
+    done = run(tmp_path, *WORDS)
+    assert done.returncode == 1
+    assert "holds other files" in done.stderr
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.txt"]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{}", "[]", '{"request": {"watre": 1}, "inputs": [], "steps": {}}']
+)
+def test_a_record_that_is_none(tmp_path, text):
+    (tmp_path / "run.json").write_text(text)
+    done = run(tmp_path, "out", "--config", "run.json")
+    assert done.returncode == 1
+    assert "not the record of a run" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("words", [[], ["a.laz", "out"], ["--config", "run.json"]])
+def test_wrong_usage(tmp_path, words):
+    assert run(tmp_path, *words).returncode == 2

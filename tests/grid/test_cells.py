@@ -1,0 +1,101 @@
+"""Every cell of a small cloud against a slow twin."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from pcfix.flow.dsm import grid_dsm
+from pcfix.grid.lattice import cells_of
+from pcfix.grid.shade import hillshade
+from pcfix.io.rasters import read_raster
+from tests.grid.clouds import EAST, NORTH, SCALE, scattered, write
+from tests.grid.twins import exact, slow_hillshade, slow_raster
+
+METHODS = ("mean", "median", "min", "max", "idw", "tin")
+
+FLOAT32_M = 2e-6
+"""Heights reach 30 m; half the distance of neighbouring float32 numbers there is 1e-6 m."""
+
+
+@pytest.fixture(scope="module")
+def cloud(tmp_path_factory):
+    xyz = scattered(36, 6.0, 5.0)
+    xyz[:3, :2] = (EAST + 2.0, NORTH + 3.0), (EAST + 2.7, NORTH + 3.0), (EAST + 3.0, NORTH + 1.9)
+    xyz[3:5] = xyz[3] + ((0, 0, 0), (0, 0, 1.5))  # the same place twice
+    return write(tmp_path_factory.mktemp("cells") / "cloud.las", xyz), xyz
+
+
+@pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
+@pytest.mark.parametrize(
+    ("method", "resolution"),
+    [(m, r) for m in METHODS for r in ("1", "0.7", "0.1") if (m, r) != ("tin", "0.1")],
+)
+def test_every_cell(cloud, tmp_path, method, resolution):
+    path, xyz = cloud
+    summary = grid_dsm(path, tmp_path / "d.tif", resolution_m=float(resolution), method=method)
+    steps = np.rint((xyz - (EAST, NORTH, 0.0)) / float(SCALE))
+    axes = [exact(steps[:, i], SCALE, (int(EAST), int(NORTH), 0)[i]) for i in range(3)]
+    if method == "tin":
+        axes = one_a_place(*axes)
+    widest = (summary.hole_m or 0.0) / float(resolution)
+    left, top, height, count, spread = slow_raster(*axes, Fraction(resolution), method, widest)
+    if method == "tin":  # points and spread are still of all points
+        *_, count, spread = slow_raster(
+            *(exact(steps[:, i], SCALE, (int(EAST), int(NORTH), 0)[i]) for i in range(3)),
+            Fraction(resolution),
+            "mean",
+        )
+    raster = read_raster(tmp_path / "d.tif")
+    found = np.where(raster.array == raster.nodata, np.nan, raster.array)
+    assert raster.array.shape == (3, *height.shape)
+    assert raster.transform.c == pytest.approx(left * float(resolution), abs=1e-9)
+    assert raster.transform.f == pytest.approx((top + 1) * float(resolution), abs=1e-9)
+    np.testing.assert_allclose(found[0], height, rtol=0, atol=FLOAT32_M)
+    np.testing.assert_array_equal(found[1], count)
+    np.testing.assert_allclose(found[2], spread, rtol=0, atol=FLOAT32_M)
+    assert summary.cells == (count > 0).sum()
+    assert summary.empty == np.isnan(height).sum()
+    assert summary.filled == ((count == 0) & ~np.isnan(height)).sum()
+    assert summary.points_per_cell == pytest.approx(len(xyz) / summary.cells)
+
+
+def one_a_place(x, y, z):
+    places: dict = {}
+    for a, b, c in zip(x, y, z, strict=True):
+        places.setdefault((a, b), []).append(c)
+    mean = [sum(heights) / len(heights) for heights in places.values()]
+    return [a for a, _ in places], [b for _, b in places], mean
+
+
+@pytest.mark.parametrize("resolution", ["0.1", "0.3", "0.05", "0.025", "7", "0.0007"])
+def test_points_on_edges(resolution):
+    """Whole multiples of the resolution are edges, whatever floating point makes of them."""
+    size = Fraction(resolution)
+    number = np.random.default_rng(1).integers(-60_000_000, 60_000_000, (500, 2))
+    xy = np.array([[float(Fraction(int(v)) * size) for v in row] for row in number])
+    cells = cells_of(xy, float(resolution))
+    np.testing.assert_array_equal(cells[:, 0], number[:, 0])
+    np.testing.assert_array_equal(cells[:, 1], -number[:, 1] - 1)
+
+
+def test_hillshade_of_every_cell():
+    rng = np.random.default_rng(2)
+    height = rng.normal(0.0, 0.4, (9, 11))
+    height[rng.random(height.shape) < 0.2] = np.nan
+    around = np.full((11, 13), np.nan)
+    around[1:-1, 1:-1] = height
+    for azimuth, altitude in ((315.0, 45.0), (20.0, 10.0), (180.0, 90.0)):
+        light = hillshade(around, 0.5, azimuth, altitude)
+        np.testing.assert_array_equal(light, slow_hillshade(height, 0.5, azimuth, altitude))
+
+
+def test_a_slope_that_faces_the_sun_is_the_brightest():
+    """From the north-west at 45 degrees, a 45 degree slope falling to the north-west gets all."""
+    row, column = np.mgrid[:5, :5] * 1.0
+    towards = (column + row) / np.sqrt(2.0)  # rises to the south-east
+    assert (hillshade(towards, 1.0, 315.0, 45.0) == 255).all()
+    assert (hillshade(-towards, 1.0, 315.0, 45.0) == 1).all()
+    assert (hillshade(0.0 * row, 1.0, 315.0, 45.0) == round(1 + 254 * np.sqrt(0.5))).all()

@@ -1,0 +1,31 @@
+"""A real browser without a screen: Chromium, where it is installed."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+PROGRAM = shutil.which("chromium") or shutil.which("google-chrome")
+
+needs_browser = pytest.mark.skipif(PROGRAM is None, reason="no chromium on this machine")
+
+QUIET = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--hide-scrollbars",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+    "--disable-quic", "--host-resolver-rules=MAP * ~NOTFOUND",
+)  # fmt: skip
+
+
+def open_page(page: Path, profile: Path, *more: str) -> subprocess.CompletedProcess[str]:
+    """Open a page, let its scripts run, and return its DOM and what the browser logs."""
+    words = [
+        str(PROGRAM), *QUIET, f"--user-data-dir={profile}", "--enable-logging=stderr",
+        "--virtual-time-budget=5000", *more, "--dump-dom", page.as_uri(),
+    ]  # fmt: skip
+    return subprocess.run(words, capture_output=True, text=True, check=True, timeout=120)
