@@ -18,7 +18,7 @@ needs_browser = pytest.mark.skipif(PROGRAM is None, reason="no chromium on this 
 QUIET = (
     "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--hide-scrollbars",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
-    "--disable-quic", "--host-resolver-rules=MAP * ~NOTFOUND",
+    "--disable-quic", "--disable-dev-shm-usage", "--host-resolver-rules=MAP * ~NOTFOUND",
 )  # fmt: skip
 
 
