@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
 from importlib.metadata import version
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 import pcfix
 from pcfix.errors import InputError
 from pcfix.flow.points import CHUNK_POINTS
-from pcfix.io.files import write_bytes, write_text
+from pcfix.io.files import sha256, write_bytes, write_text
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates
 from pcfix.model import WaterPlane
@@ -207,13 +206,8 @@ def _settings(s: Summary) -> Table:
 
 
 def _files(paths: Iterable[Path]) -> Table:
-    rows = [[path.name, f"{path.stat().st_size:,}", _checksum(path)] for path in paths]
+    rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in paths]
     return Table("Input files", ["file", "bytes", "SHA-256"], rows)
-
-
-def _checksum(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _versions() -> Table:

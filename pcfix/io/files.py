@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from contextlib import contextmanager
 from pathlib import Path
@@ -72,6 +73,12 @@ def replaced_when_whole(target: Path) -> Iterator[Path]:
         raise InputError(f"{target}: cannot be written ({error.strerror or error}).") from error
     finally:
         draft.unlink(missing_ok=True)
+
+
+def sha256(path: Path) -> str:
+    """Return the checksum of a file, as hexadecimal digits."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes, *, overwrite: bool) -> None:

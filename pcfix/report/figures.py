@@ -17,9 +17,6 @@ BEFORE, AFTER, WATER, REFERENCE = "#b3541e", "#0b5e8a", "#4aa3c7", "#222222"
 """Colours that differ in lightness too, for those who cannot tell the hues apart."""
 
 
-_HOLE_CELLS = 3
-
-
 def new_figure(width_in: float = 8.0, height_in: float = 4.5, **grid: Any) -> tuple[Figure, Any]:
     """Return a figure and its axes, drawn without a screen."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -30,32 +27,20 @@ def new_figure(width_in: float = 8.0, height_in: float = 4.5, **grid: Any) -> tu
     return figure, figure.subplots(**grid)
 
 
-def hillshade(height_m: FloatArray, cell_m: float) -> FloatArray:
-    """Return the shade of a surface lit from the north-west, 45 degrees up, 0 to 1.
+def relief(height_m: FloatArray, cell_m: float) -> FloatArray:
+    """Return the shade of a surface lit from the north-west, 45 degrees up, 0 to 1."""
+    from pcfix.grid.shade import NO_LIGHT, hillshade
 
-    Holes of a few cells are shaded as their nearest neighbour is high.
-    """
-    from scipy.ndimage import binary_closing, distance_transform_edt
-
-    known = ~np.isnan(height_m)
-    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    inside = known | binary_closing(known, iterations=_HOLE_CELLS)
-    closed = np.where(inside, height_m[tuple(nearest)], np.nan)
-    down_row, along_column = np.gradient(closed, cell_m)
-    slope = np.arctan(np.hypot(along_column, down_row))
-    aspect = np.arctan2(down_row, -along_column)
-    azimuth, altitude = np.radians(360.0 - 315.0 + 90.0), np.radians(45.0)
-    shade: FloatArray = np.sin(altitude) * np.cos(slope) + np.cos(altitude) * np.sin(
-        slope
-    ) * np.cos(azimuth - aspect)
-    return shade
+    light = hillshade(np.pad(height_m, 1, constant_values=np.nan), cell_m, 315.0, 45.0)
+    return np.where(light == NO_LIGHT, np.nan, (light - 1.0) / 254.0)
 
 
 def map_figure(maps: Maps, values: FloatArray, label: str, colours: str) -> Figure:
     """Draw a map of values over the shaded relief."""
     figure, axes = new_figure(8.0, _map_height_in(maps.extent_m))
-    shade = hillshade(maps.height_m, maps.cell_m)
-    axes.imshow(shade, extent=maps.extent_m, cmap="gray", vmin=0.0, vmax=1.0)
+    axes.imshow(
+        relief(maps.height_m, maps.cell_m), extent=maps.extent_m, cmap="gray", vmin=0.0, vmax=1.0
+    )
     image = axes.imshow(values, extent=maps.extent_m, cmap=colours, alpha=0.75)
     figure.colorbar(image, ax=axes, label=label, shrink=0.9)
     _plan(axes)
