@@ -27,12 +27,59 @@ Dimensions = Literal["all", "minimal", "none"]
 DEFAULT_REFRACTIVE_INDEX = 1.34
 
 
+Projection = Literal["perspective", "equidistant", "polynomial", "fov", "dual", "division"]
+
+
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """A central projection: u = focal x / z + principal_x, v = focal y / z + principal_y.
+    """An interior orientation: how a direction in the camera frame becomes a place in the image.
 
-    All five numbers in one unit, pixels or millimetres; the origin is the frame's upper left
-    corner.
+    Three steps. First the direction (X, Y, Z), at the angle theta from the axis, is projected;
+    with (e, g) = (X, Y) / hypot(X, Y):
+
+    =============  =============================================  =========================
+    `projection`   plane coordinates (x, y)                       `shape`
+    =============  =============================================  =========================
+    perspective    (X, Y) / Z
+    equidistant    theta (e, g)
+    polynomial     (s0 + s1 q + s2 q^2 + ...) (e, g), q = 2 theta / pi   s0, s1, ... (Pix4D)
+    fov            atan(2 tan(s0 / 2) tan theta) / s0 (e, g)      s0 (COLMAP's FOV)
+    dual           (s0 tan theta + (1 - s0) theta) (e, g)         s0 (OpenSfM's dual)
+    division       m (e, g) with m / (1 + s0 m^2) = tan theta     s0
+    =============  =============================================  =========================
+
+    Then Brown's distortion, about the point `distortion_centre`, with r^2 = x^2 + y^2 there:
+
+        x' = x (1 + k1 r^2 + k2 r^4 + ...) / (1 + d1 r^2 + d2 r^4 + ...)
+             + (p1 (r^2 + 2 x^2) + 2 p2 x y) (1 + p3 r^2 + p4 r^4) + s1 r^2 + s2 r^4
+        y' = y (...) + (p2 (r^2 + 2 y^2) + 2 p1 x y) (...) + s3 r^2 + s4 r^4
+
+    and last the image, origin in the upper left corner of the upper left pixel:
+
+        u = principal_x + (focal + b1) x' + b2 y'
+        v = principal_y + focal y' + b3 x'
+
+    Attributes
+    ----------
+    focal, width, height, principal_x, principal_y, b1, b2, b3 : float
+        All in one unit, pixels or millimetres.
+    projection : Projection
+    shape : tuple of float
+        The parameters of the projection, see the table.
+    radial, denominator : tuple of float
+        k1, k2, ... and d1, d2, ...; as many as there are.
+    tangential : tuple of float
+        p1 ... p4 in Brown's order (Metashape's; OpenCV's p1 and p2 the other way round).
+    thin_prism : tuple of float
+        s1 ... s4.
+    distortion_centre : tuple of 2 float
+        In plane coordinates.
+    inverse : bool
+        Brown's formula goes from (x', y') to (x, y) instead.
+    pixel_size_mm : float or None
+        Where the source tells it, and the other numbers are pixels.
+    sensor : str
+        What the source calls it.
     """
 
     focal: float
@@ -40,6 +87,38 @@ class Lens:
     height: float
     principal_x: float
     principal_y: float
+    b1: float = 0.0
+    b2: float = 0.0
+    b3: float = 0.0
+    projection: Projection = "perspective"
+    shape: tuple[float, ...] = ()
+    radial: tuple[float, ...] = ()
+    denominator: tuple[float, ...] = ()
+    tangential: tuple[float, ...] = ()
+    thin_prism: tuple[float, ...] = ()
+    distortion_centre: tuple[float, float] = (0.0, 0.0)
+    inverse: bool = False
+    pixel_size_mm: float | None = None
+    sensor: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class GnssPositions:
+    """Where the GNSS said that the projection centres were, beside where they were adjusted to.
+
+    Attributes
+    ----------
+    xyz : array, shape (k, 3)
+        One row per camera, NaN where there is none, in `crs`.
+    sigma_m : array, shape (k, 3)
+        Stated standard deviation east, north, up in metres, NaN where none is stated.
+    crs : str or None
+        Of `xyz`, with the order of axes x (east, longitude), y (north, latitude), z.
+    """
+
+    xyz: FloatArray
+    sigma_m: FloatArray
+    crs: str | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +135,22 @@ class Cameras:
         World to camera. None when the source has no angles; then every camera is a candidate
         for every point.
     lenses : tuple of Lens, length k, or None
-        Interior orientation of each image; None exactly when `rotations` is None.
+        Interior orientation of each image. None where the source has none; then a frame holds
+        every point.
     crs : str or None
-        CRS of the source, None when it does not say (then the cloud's CRS is assumed).
+        CRS of centres and rotations: what pyproj understands (geocentric ones are allowed), or
+        ``ENU:latitude,longitude,height`` for axes east, north, up at that place, or ``local``
+        where the source says that its frame is not tied to the earth. None when it does not
+        say; then the cloud's CRS is assumed.
+    project_crs : str or None
+        The CRS in which the software delivers its clouds, where that is not `crs`.
+    gnss : GnssPositions or None
+    unposed : tuple of str
+        Images without a pose, which are left out.
     notes : tuple of str
         What was done on reading, for the summary.
+    source : str
+        The software and its version.
     """
 
     labels: tuple[str, ...]
@@ -69,6 +159,10 @@ class Cameras:
     lenses: tuple[Lens, ...] | None = None
     crs: str | None = None
     notes: tuple[str, ...] = ()
+    project_crs: str | None = None
+    gnss: GnssPositions | None = None
+    unposed: tuple[str, ...] = ()
+    source: str = ""
 
     def __post_init__(self) -> None:
         """Check that the arrays belong together."""
@@ -81,8 +175,8 @@ class Cameras:
         if not np.isfinite(self.centres).all():
             bad = self.labels[int(np.argmin(np.isfinite(self.centres).all(axis=1)))]
             raise SettingError(f"Camera {bad}: the projection centre is not finite.")
-        if (self.rotations is None) != (self.lenses is None):
-            raise SettingError("Cameras need rotations and lenses together, or neither.")
+        if self.rotations is None and self.lenses is not None:
+            raise SettingError("Cameras with lenses need rotations.")
         if self.rotations is not None and self.rotations.shape != (k, 3, 3):
             raise SettingError(f"rotations must be ({k}, 3, 3), not {self.rotations.shape}.")
         if self.lenses is not None and len(self.lenses) != k:
@@ -160,6 +254,26 @@ class Views:
         start = np.concatenate([[0], np.cumsum(counts)])
         where = np.repeat(self.start[rows] - start[:-1], counts) + np.arange(start[-1])
         return Views(start, self.camera[where])
+
+
+@dataclass(frozen=True, eq=False)
+class TiePoints:
+    """The m points of a sparse model and where the images saw them.
+
+    Attributes
+    ----------
+    xyz : array, shape (m, 3)
+        In the frame of the cameras that were read with them; NaN where the source has none.
+    views : Views
+        Which cameras saw each point.
+    image_xy : array, shape (o, 2)
+        Where, one row per entry of ``views.camera``: in the unit of the lens, usually pixels,
+        from the upper left corner of the image.
+    """
+
+    xyz: FloatArray
+    views: Views
+    image_xy: FloatArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,30 +1,35 @@
 """Camera poses, whatever wrote them: one module per format behind one `read_cameras`.
 
-A format module has two functions: ``recognises(path, head)`` looks at the first bytes, and
-``read(path, sensor)`` returns `Cameras`. To add a format, write its module and name it in
-`FORMATS`; nothing else changes.
+A format module has ``SOFTWARE``, ``recognises(source)``, ``read(source)`` and, where the format has
+tie points, ``tie_points(source, cameras)``; see `formats.CameraFormat`. To add a format, write its
+module and name it in `FORMATS`; nothing else changes.
 """
 
 from __future__ import annotations
 
 import warnings
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import table
+from pcfix.io.cameras.formats import Angles, Source, SparseModel
 from pcfix.io.files import check_input
 
 if TYPE_CHECKING:
     import os
 
-    from pcfix.model import Cameras
+    from pcfix.io.cameras.formats import CameraFormat
+    from pcfix.model import Cameras, TiePoints
 
-FORMATS = (table,)
-_HEAD_BYTES = 4096
+FORMATS: tuple[CameraFormat, ...] = (table,)  # the plain table last: its content says least
 
 
 def read_cameras(
-    path: str | os.PathLike[str], sensor: str | os.PathLike[str] | None = None
+    path: str | os.PathLike[str],
+    sensor: str | os.PathLike[str] | None = None,
+    *,
+    angles: Angles | None = None,
 ) -> Cameras:
     """Read the exterior (and interior) orientation of a block of images.
 
@@ -44,6 +49,8 @@ def read_cameras(
     sensor : path, optional
         A CSV table ``focal, sensor_x, sensor_y`` in millimetres, one row, for all images.
         Default: a ``sensor.csv`` beside the cameras.
+    angles : {"omega-phi-kappa", "yaw-pitch-roll", "aircraft"}, optional
+        What the angles of a table are, where its header cannot say.
 
     Returns
     -------
@@ -67,17 +74,51 @@ def read_cameras(
     >>> cameras.centres.shape
     (40, 3)
     """
-    source = check_input(path)
-    sensor_file = None if sensor is None else check_input(sensor)
-    with source.open("rb") as stream:
-        head = stream.read(_HEAD_BYTES)
-    for candidate in FORMATS:
-        if candidate.recognises(source, head):
-            cameras: Cameras = candidate.read(source, sensor_file)
-            for note in cameras.notes:
-                warnings.warn(note, PcfixWarning, stacklevel=2)
-            return cameras
+    source, form = _recognised(path, sensor, angles)
+    cameras = form.read(source)
+    for note in cameras.notes:
+        warnings.warn(note, PcfixWarning, stacklevel=2)
+    return cameras
+
+
+def read_tie_points(path: str | os.PathLike[str], cameras: Cameras) -> TiePoints:
+    """Read the tie points of a sparse model, in the frame of the file.
+
+    Parameters
+    ----------
+    path : path
+        What `cameras` was read from.
+    cameras : Cameras
+        As `read_cameras` gave them.
+
+    Returns
+    -------
+    TiePoints
+
+    Raises
+    ------
+    InputError
+        If the format has no tie points, or the file has none.
+    """
+    source, form = _recognised(path, None, None)
+    if not isinstance(form, SparseModel):
+        raise InputError(f"{source.path}: the format ({form.SOFTWARE}) has no tie points.")
+    return form.tie_points(source, cameras)
+
+
+def _recognised(
+    path: str | os.PathLike[str], sensor: str | os.PathLike[str] | None, angles: Angles | None
+) -> tuple[Source, CameraFormat]:
+    where = Path(path)
+    source = Source(
+        where if where.is_dir() else check_input(where),
+        None if sensor is None else check_input(sensor),
+        angles,
+    )
+    for form in FORMATS:
+        if form.recognises(source):
+            return source, form
     raise InputError(
-        f"{source}: is not a camera file that pcfix knows; give a CSV table with the columns"
+        f"{where}: is not a camera file that pcfix knows; give a CSV table with the columns"
         " label, x, y, z and, if you have them, yaw, pitch, roll."
     )

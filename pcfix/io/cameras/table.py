@@ -16,27 +16,29 @@ from pcfix.model import Cameras, FloatArray, Lens
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from pcfix.io.cameras.formats import Source
     from pcfix.io.tables import Table
 
+SOFTWARE = "CSV table"
 POSITION = ("label", "x", "y", "z")
 ANGLES = ("yaw", "pitch", "roll")
 SENSOR = ("focal", "sensor_x", "sensor_y")
 UP_BACK_TO_DOWN_FORWARD = np.diag([1.0, -1.0, -1.0])
 
 
-def recognises(path: Path, head: bytes) -> bool:
+def recognises(source: Source) -> bool:
     """Whether the first line is a header with at least two of the four needed names."""
-    del path
-    line = head.decode("latin-1").removeprefix("\u00ef\u00bb\u00bf").partition("\n")[0]
+    line = source.text.partition("\n")[0]
     return len(set(POSITION) & set(split_header(line.strip())[0])) >= 2
 
 
-def read(path: Path, sensor: Path | None) -> Cameras:
+def read(source: Source) -> Cameras:
     """Read the table; see `pcfix.read_cameras`."""
+    path = source.path
     table = read_table(path, POSITION)
     labels = table.column("label")
     centres = np.column_stack([table.numbers(axis) for axis in "xyz"])
-    rotations, lens = _orientation(table, sensor)
+    rotations, lens = _orientation(table, source.sensor)
     keep, notes = _without_copies(path, labels, centres)
     return Cameras(
         labels=tuple(labels[i] for i in keep),

@@ -1,0 +1,80 @@
+"""Rules that the numbers of every camera file must keep; each message names file and image."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pcfix.errors import InputError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pcfix.model import FloatArray, Lens
+
+ROUNDING = 1e-3
+"""Of a rotation's elements: files with four decimals pass, a mirrored or scaled one does not."""
+
+
+def rotation(path: Path, label: str, matrix: FloatArray) -> FloatArray:
+    """Return the proper rotation next to a 3x3 matrix that is one but for its rounding.
+
+    Raises
+    ------
+    InputError
+        If it is not orthonormal, or mirrors.
+    """
+    if not np.isfinite(matrix).all() or np.abs(matrix @ matrix.T - np.eye(3)).max() > ROUNDING:
+        raise InputError(
+            f"{path}: image {label}: the rotation matrix is not orthonormal; export it again."
+        )
+    if np.linalg.det(matrix) < 0.0:
+        raise InputError(
+            f"{path}: image {label}: the rotation matrix mirrors (determinant -1); its axes are"
+            " left-handed, export it again."
+        )
+    u, _, v = np.linalg.svd(matrix)
+    return np.asarray(u @ v)
+
+
+def quaternion(path: Path, label: str, wxyz: FloatArray) -> FloatArray:
+    """Return the rotation matrix of a unit quaternion, the scalar first.
+
+    Raises
+    ------
+    InputError
+        If its length is not 1.
+    """
+    from scipy.spatial.transform import Rotation
+
+    length = float(np.linalg.norm(wxyz))
+    if not abs(length - 1.0) <= ROUNDING:
+        raise InputError(
+            f"{path}: image {label}: the quaternion has length {length:g} instead of 1; export"
+            " the poses again."
+        )
+    return np.asarray(Rotation.from_quat(np.roll(wxyz, -1)).as_matrix())
+
+
+def lens(path: Path, name: str, given: Lens) -> Lens:
+    """Return the lens when its numbers can be those of a camera.
+
+    Raises
+    ------
+    InputError
+        If focal length or frame are not positive, or a number is not finite.
+    """
+    numbers = (
+        *(given.focal, given.width, given.height, given.principal_x, given.principal_y),
+        *(given.b1, given.b2, given.b3, *given.shape, *given.radial, *given.denominator),
+        *(*given.tangential, *given.thin_prism, *given.distortion_centre),
+    )
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{path}: camera {name}: its calibration has a number that is not finite.")
+    if not min(given.focal, given.width, given.height) > 0.0:
+        raise InputError(
+            f"{path}: camera {name}: focal length {given.focal:g} and frame {given.width:g} x"
+            f" {given.height:g} must be positive; export the calibration again."
+        )
+    return given

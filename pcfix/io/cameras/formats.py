@@ -1,0 +1,77 @@
+"""What every module of a camera format gets and gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
+
+from pcfix.io.files import check_input
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pcfix.model import Cameras, TiePoints
+
+Angles = Literal["omega-phi-kappa", "yaw-pitch-roll", "aircraft"]
+
+_HEAD_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file or folder that may hold cameras, and what the user said about it.
+
+    Attributes
+    ----------
+    path : Path
+    sensor : Path or None
+        The ``--sensor`` file.
+    angles : Angles or None
+        Which angles a table has, where its header cannot say.
+    """
+
+    path: Path
+    sensor: Path | None = None
+    angles: Angles | None = None
+
+    @cached_property
+    def head(self) -> bytes:
+        """The first bytes of a file; nothing of a folder."""
+        if self.path.is_dir():
+            return b""
+        with check_input(self.path).open("rb") as stream:
+            return stream.read(_HEAD_BYTES)
+
+    @cached_property
+    def text(self) -> str:
+        """The first bytes as text, without a byte order mark."""
+        return self.head.decode("utf-8-sig", errors="replace")
+
+    @cached_property
+    def names(self) -> frozenset[str]:
+        """Names of what lies in a folder; nothing for a file."""
+        return frozenset(p.name for p in self.path.iterdir()) if self.path.is_dir() else frozenset()
+
+
+class CameraFormat(Protocol):
+    """A module of this folder."""
+
+    SOFTWARE: str
+
+    def recognises(self, source: Source) -> bool:
+        """Whether the content is of this format; cheap, and never an error."""
+        ...
+
+    def read(self, source: Source) -> Cameras:
+        """Read poses and lenses, in the frame of the file."""
+        ...
+
+
+@runtime_checkable
+class SparseModel(CameraFormat, Protocol):
+    """A format that has tie points too."""
+
+    def tie_points(self, source: Source, cameras: Cameras) -> TiePoints:
+        """Read points and observations; `cameras` is what `read` gave for the same source."""
+        ...
