@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from pcfix.cli.words import Overwrite, Quiet, SummaryOption  # noqa: TC001 - typer reads them
+from pcfix.cli.words import Overwrite, Quiet, SummaryOption, WithM3c2  # noqa: TC001 - typer reads them
 
 Cloud = Annotated[
     Path, typer.Argument(metavar="CLOUD", help="LAS or LAZ cloud.", show_default=False)
@@ -36,7 +36,6 @@ Water = Annotated[
 C2cOnly = Annotated[
     bool, typer.Option("--c2c-only", help="Distances to the nearest point, nothing signed.")
 ]
-WithM3c2 = Annotated[bool, typer.Option("--m3c2", help="Also M3C2, by py4dgeo: the extra m3c2.")]
 Neighbours = Annotated[int, typer.Option(help="Reference points of each fitted plane.")]
 BinWidth = Annotated[float, typer.Option(help="Of the table by depth, metres.")]
 ShoreBinWidth = Annotated[float, typer.Option(help="Of the table by distance from shore, metres.")]

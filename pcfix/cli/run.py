@@ -15,6 +15,7 @@ from pcfix.cli.words import (
     Overwrite,
     Quiet,
     Sensor,
+    WithM3c2,
     progress_bar,
 )
 from pcfix.model import DEFAULT_REFRACTIVE_INDEX
@@ -52,6 +53,7 @@ def run(
     max_angle: MaxAngle = None,
     max_cameras: MaxCameras = None,
     resolution: Resolution = None,
+    m3c2: WithM3c2 = False,
     config: Config = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -82,6 +84,7 @@ def run(
             max_angle_deg=max_angle,
             max_cameras=max_cameras,
             resolution_m=resolution,
+            m3c2=m3c2,
         )
 
     def say(text: str) -> None:

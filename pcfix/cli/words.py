@@ -69,6 +69,9 @@ DimensionsOption = Annotated[
     Dimensions,
     typer.Option("--dimensions", help="Extra dimensions; 'pcfix restore' needs all."),
 ]
+WithM3c2 = Annotated[
+    bool, typer.Option("--m3c2", help="Compare by M3C2 too, with py4dgeo: the extra m3c2.")
+]
 SummaryOption = Annotated[Path | None, typer.Option("--summary", help="Write the summary as JSON.")]
 
 

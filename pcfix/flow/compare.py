@@ -12,7 +12,7 @@ from pcfix.compare.sections import parse_line
 from pcfix.compare.vertical import DEFAULT_NEIGHBOURS
 from pcfix.errors import SettingError
 from pcfix.flow.comparison import CompareSettings, Comparison, bins_table
-from pcfix.flow.figures import figures_of
+from pcfix.flow.evaluate import figures_of
 from pcfix.flow.match import match
 from pcfix.io.files import check_output, write_text
 
@@ -135,5 +135,8 @@ def _write(
             files[f"section_{number:02d}.csv"] = section.table()
         for name, content in files.items():
             write_text(folder / name, content, overwrite=overwrite)
+        for path in folder.glob("section_*.csv"):  # of an earlier comparison with more of them
+            if path.name not in files:
+                path.unlink()
     if summary is not None:
         write_text(summary, text, overwrite=overwrite)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -89,6 +89,9 @@ class Job:
             "pcfix": pcfix.__version__,
             "settings": asdict(self.settings),
             "water": str(self.water),
+            "water_plane": list(astuple(self.water))
+            if isinstance(self.water, WaterPlane)
+            else None,
             "cameras": len(self.cameras),
         }
 

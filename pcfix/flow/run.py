@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.clean import clean_file
 from pcfix.flow.compare import compare_clouds
@@ -50,6 +51,8 @@ class Request:
         See `pcfix.flow.compare.compare_clouds`.
     resolution_m : float or None
         Of the rasters; None: four points a cell on average.
+    m3c2 : bool
+        Compare by M3C2 too.
     """
 
     input: str
@@ -61,12 +64,15 @@ class Request:
     max_angle_deg: float | None = None
     max_cameras: int | None = None
     resolution_m: float | None = None
+    m3c2: bool = False
 
     def __post_init__(self) -> None:
         """Check the values."""
         Settings(self.refractive_index, self.max_angle_deg, self.max_cameras)
         if self.resolution_m is not None and not 0.0 < self.resolution_m < math.inf:
             raise SettingError(f"resolution {self.resolution_m:g} is not positive; give metres.")
+        if self.m3c2 and self.reference is None:
+            raise SettingError("m3c2 compares with a reference; give --reference too.")
 
     def files(self) -> list[Path]:
         """Return the input files, each of which exists."""
@@ -141,6 +147,8 @@ def run_all(
         With one sentence on what to mend; the steps before it stay done.
     """
     inputs = request.files()
+    if request.m3c2:
+        load_py4dgeo()
     if not out_dir.parent.is_dir():
         raise SettingError(f"{out_dir}: the folder {out_dir.parent} does not exist; make it first.")
     out_dir.mkdir(exist_ok=True)
@@ -220,8 +228,9 @@ def _resolution_m(path: Path) -> float:
 def _compare(request: Request, files: Files) -> dict[str, Any]:
     reference = Path(str(request.reference))
     result = compare_clouds(
-        files.cleaned, reference, out_dir=files.compare, sections=SECTIONS, overwrite=True
-    )
+        files.cleaned, reference, out_dir=files.compare, sections=SECTIONS, m3c2=request.m3c2,
+        overwrite=True,
+    )  # fmt: skip
     if _rasters(request):
         heights = reference
         if reference.suffix.lower() in CLOUDS:

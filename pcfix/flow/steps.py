@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from pcfix.errors import InputError
-from pcfix.io.files import write_text
+from pcfix.io.files import file_state, read_json, write_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -33,7 +33,7 @@ class Record:
         self._path = path
         self._content: dict[str, Any] = {
             "request": request,
-            "inputs": [_state(p) for p in inputs],
+            "inputs": [file_state(p) for p in inputs],
             "steps": {},
         }
         self._earlier = self._read()
@@ -65,12 +65,12 @@ class Record:
             Returns what later steps need, as JSON can hold it.
         """
         earlier = self._earlier.get(name)
-        if earlier is not None and earlier["outputs"] == [_state(p) for p in outputs]:
+        if earlier is not None and earlier["outputs"] == [file_state(p) for p in outputs]:
             self._note(name, earlier)
             return earlier["result"], True
         self._earlier = {}  # what follows was made from other files
         result = work()
-        self._note(name, {"outputs": [_state(p) for p in outputs], "result": result})
+        self._note(name, {"outputs": [file_state(p) for p in outputs], "result": result})
         return json.loads(json.dumps(result)), False
 
     def _note(self, name: str, step: dict[str, Any]) -> None:
@@ -87,7 +87,7 @@ def read_record(path: Path) -> dict[str, Any]:
         If the file is none.
     """
     try:
-        content: dict[str, Any] = json.loads(path.read_text("utf-8"))
+        content: dict[str, Any] = read_json(path)
         _ = content["request"], content["inputs"], content["steps"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
@@ -95,11 +95,3 @@ def read_record(path: Path) -> dict[str, Any]:
             " or remove it."
         ) from error
     return content
-
-
-def _state(path: Path) -> dict[str, Any]:
-    """Return what tells whether a file changed."""
-    if not path.exists():
-        return {"path": str(path), "bytes": None}
-    found = path.stat()
-    return {"path": str(path), "bytes": found.st_size, "changed_ns": found.st_mtime_ns}

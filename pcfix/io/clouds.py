@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -161,17 +160,15 @@ def _part(
 
 
 def _own_water(source: LasSource) -> WaterSurface | None:
-    """Return the level water surface or the dimension that the cloud's own VLR names, if any."""
+    """Return the plane of the water surface that the cloud's own VLR names, if any."""
     ours = next((vlr for vlr in source.vlrs if is_ours(vlr)), None)
     try:
-        said = "" if ours is None else str(json.loads(ours.record_data)["water"])
+        plane = None if ours is None else json.loads(ours.record_data)["water_plane"]
+        return None if plane is None else WaterPlane(*map(float, plane))
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(
             f"{source.path}: pcfix's own VLR is damaged ({error}); correct the original again."
         ) from error
-    if level := re.fullmatch(r"level (\S+) m", said):
-        return WaterPlane(float(level[1]))
-    return None
 
 
 def _crs(source: LasSource) -> CRS | None:

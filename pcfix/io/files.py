@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pcfix.errors import InputError, SettingError
 
@@ -79,6 +80,25 @@ def sha256(path: Path) -> str:
     """Return the checksum of a file, as hexadecimal digits."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def file_state(path: Path) -> dict[str, Any]:
+    """Return what tells whether a file changed, in plain values."""
+    if not path.exists():
+        return {"path": str(path), "bytes": None}
+    found = path.stat()
+    return {"path": str(path), "bytes": found.st_size, "changed_ns": found.st_mtime_ns}
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of a JSON file.
+
+    Raises
+    ------
+    OSError, ValueError
+        If it cannot be read, or is no JSON.
+    """
+    return json.loads(path.read_text("utf-8"))
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes, *, overwrite: bool) -> None:

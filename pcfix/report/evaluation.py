@@ -189,7 +189,8 @@ def _label(axes: Axes) -> None:
 def _statistics(compared: Plain) -> Table:
     header = ["", "points", "mean", "sd", "RMSE", "NMAD", "median", "95 %"]
     rows = []
-    for key, kind in (("vertical", "Vertical error"), ("c2c", "C2C distance")):
+    kinds = (("vertical", "Vertical error"), ("m3c2", "M3C2 distance"), ("c2c", "C2C distance"))
+    for key, kind in kinds:
         for when, name, _ in _TIMES:
             if compared[key] is not None and compared[key][when] is not None:
                 s = compared[key][when]["statistics"]

@@ -256,6 +256,27 @@ def refused(error, match, *paths, **options):
     assert "\n" not in str(caught.value)
 
 
+def test_a_tilted_water_plane_stays_known_to_the_cloud(tmp_path):
+    low = laspy.read(SCENE / "cloud.laz").header.mins
+    tilt = f"plane:{0.37 - 1e-3 * low[0]},1e-3,0"
+    corrected = tmp_path / "tilted.laz"
+    pcfix.correct_file(
+        SCENE / "cloud.laz", corrected, cameras=SCENE / "cameras.csv", water=tilt,
+        dimensions="minimal",
+    )  # fmt: skip
+    said = compare_clouds(corrected, LIDAR).depth
+    told = compare_clouds(corrected, LIDAR, water=tilt).depth
+    assert said is not None
+    assert said.after == told.after
+
+
+def test_sections_of_an_earlier_comparison_go_with_it(tmp_path, corrected):
+    folder = tmp_path / "out"
+    compare_clouds(corrected, LIDAR, out_dir=folder, sections=3)
+    compare_clouds(corrected, LIDAR, out_dir=folder, sections=1, overwrite=True)
+    assert [path.name for path in folder.glob("section_*.csv")] == ["section_01.csv"]
+
+
 def test_what_does_not_overlap_is_refused_with_both_places(tmp_path):
     far = write_las(tmp_path / "far.las", plane(100, 14) + np.array([5000.0, 0.0, 0.0]))
     refused(pcfix.GeometryError, r"do not overlap.*x 415000.*the reference in x 4102", far, LIDAR)

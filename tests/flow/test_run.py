@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import shutil
@@ -90,6 +91,22 @@ def test_report_holds_the_comparison(finished):
     for word in ("RMSE", "Cross-section 3", "Difference of the surfaces", "Against lidar.laz"):
         assert word in text
     assert len(list((finished[0] / "figures").glob("*.png"))) == text.count("<img ")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("py4dgeo") is None, reason="needs the extra m3c2")
+def test_m3c2_is_in_the_report_when_asked_for(copied):
+    done = run(copied, *WORDS, "--m3c2", "--overwrite")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "M3C2 distance, corrected" in (copied / "out" / "report.html").read_text()
+    m3c2 = json.loads((copied / "out" / "compare" / "compare.json").read_text())["m3c2"]
+    assert abs(m3c2["after"]["statistics"]["mean_m"]) < 0.05  # noise of 4 cm; 1.3 m before
+    assert m3c2["before"]["statistics"]["mean_m"] > 1.0
+
+
+def test_m3c2_without_a_reference_is_refused(tmp_path):
+    done = run(tmp_path, *WORDS[:-2], "--m3c2")
+    assert done.returncode == 1
+    assert "give --reference" in done.stderr
 
 
 def test_a_finished_run_is_not_done_again(copied):
