@@ -27,7 +27,9 @@ Dimensions = Literal["all", "minimal", "none"]
 DEFAULT_REFRACTIVE_INDEX = 1.34
 
 
-Projection = Literal["perspective", "equidistant", "polynomial", "fov", "dual", "division"]
+Projection = Literal[
+    "perspective", "equidistant", "equisolid", "polynomial", "fov", "dual", "division", "eucm"
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,10 +44,13 @@ class Lens:
     =============  =============================================  =========================
     perspective    (X, Y) / Z
     equidistant    theta (e, g)
+    equisolid      2 sin(theta / 2) (e, g)
     polynomial     (s0 + s1 q + s2 q^2 + ...) (e, g), q = 2 theta / pi   s0, s1, ... (Pix4D)
     fov            atan(2 tan(s0 / 2) tan theta) / s0 (e, g)      s0 (COLMAP's FOV)
     dual           (s0 tan theta + (1 - s0) theta) (e, g)         s0 (OpenSfM's dual)
     division       m (e, g) with m / (1 + s0 m^2) = tan theta     s0
+    eucm           (X, Y) / (s0 d + (1 - s0) Z), with             s0, s1 (COLMAP's EUCM)
+                   d^2 = s1 (X^2 + Y^2) + Z^2
     =============  =============================================  =========================
 
     Then Brown's distortion, about the point `distortion_centre`, with r^2 = x^2 + y^2 there:
@@ -76,10 +81,15 @@ class Lens:
         In plane coordinates.
     inverse : bool
         Brown's formula goes from (x', y') to (x, y) instead.
+    in_turn : bool
+        The tangential and thin prism terms take x, y and r as the radial terms left them
+        (COLMAP's RAD_TAN_THIN_PRISM_FISHEYE).
     pixel_size_mm : float or None
         Where the source tells it, and the other numbers are pixels.
     sensor : str
         What the source calls it.
+    unit : {"px", "mm"}
+        Of the lengths.
     """
 
     focal: float
@@ -98,8 +108,10 @@ class Lens:
     thin_prism: tuple[float, ...] = ()
     distortion_centre: tuple[float, float] = (0.0, 0.0)
     inverse: bool = False
+    in_turn: bool = False
     pixel_size_mm: float | None = None
     sensor: str = ""
+    unit: Literal["px", "mm"] = "px"
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,18 +254,21 @@ WaterSurface: TypeAlias = WaterPlane | WaterDimension | WaterMesh
 class Views:
     """Which cameras made each of n points: rows of a ragged table.
 
-    The cameras of point i are ``camera[start[i]:start[i + 1]]``, row numbers of `Cameras`.
+    The cameras of point i are ``camera[start[i]:start[i + 1]]``, row numbers of `Cameras`;
+    `weight`, where the source has one, is what each of them counted for, in the same order.
     """
 
     start: IntArray
     camera: IntArray
+    weight: npt.NDArray[np.float32] | None = None
 
     def take(self, rows: IntArray) -> Views:
         """Return the views of the given points, in that order."""
         counts = (self.start[1:] - self.start[:-1])[rows]
         start = np.concatenate([[0], np.cumsum(counts)])
         where = np.repeat(self.start[rows] - start[:-1], counts) + np.arange(start[-1])
-        return Views(start, self.camera[where])
+        weight = None if self.weight is None else self.weight[where]
+        return Views(start, self.camera[where], weight)
 
 
 @dataclass(frozen=True, eq=False)
@@ -421,6 +436,7 @@ class Summary:
     water: str
     settings: dict[str, Any]
     seconds: float
+    views: dict[str, Any] | None = None
     warnings: list[str] = field(default_factory=list)
 
     @property

@@ -35,6 +35,7 @@ from pcfix.io.pdal import (
     Flags,
     Results,
     check_dimensions,
+    crs_of,
     dimension,
     metadata_of,
     node,
@@ -44,6 +45,7 @@ from pcfix.io.pdal import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from pcfix.flow.inputs import Inputs
     from pcfix.model import FloatArray, Settings, Summary, WaterSurface
 
     Stage: TypeAlias = Callable[[Dimensions, Dimensions], bool]
@@ -52,6 +54,10 @@ _CORRECT_OPTIONS: dict[str, tuple[type, ...]] = {
     "cameras": (str,),
     "water": (str, float),
     "sensor": (str,),
+    "angles": (str,),
+    "cameras_crs": (str,),
+    "cameras_offset": (str,),
+    "views": (str,),
     "index": (float,),
     "max_angle": (float,),
     "max_cameras": (int,),
@@ -130,10 +136,19 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
     settings = _settings(options)
     columns = columns_for(settings.dimensions)
     check_dimensions(ins, columns)
-    job = Job(NAME, settings, options["cameras"], options["water"], options.get("sensor"))
+    metadata = namespace.get("metadata")
+    scales = scales_of(metadata)
+    job = Job(
+        NAME,
+        settings,
+        _inputs(options),
+        cloud_crs=crs_of(metadata),
+        points=len(ins["X"]),
+        step_m=0.0 if scales is None else float(scales.max()),
+    )
     _prepare_summary(options)
-    flags = Flags(ins, namespace.get("metadata"))
-    results = Results(ins, columns, flags, scales_of(namespace.get("metadata")))
+    flags = Flags(ins, metadata)
+    results = Results(ins, columns, flags, scales)
     with threads(options.get("jobs")):
         for rows in _chunks(len(ins["X"])):
             xyz = checked_points(np.column_stack([ins[axis][rows] for axis in "XYZ"]))
@@ -224,6 +239,13 @@ def _settings(options: dict[str, Any]) -> Settings:
     )
 
 
+def _inputs(options: dict[str, Any]) -> Inputs:
+    from pcfix.flow.inputs import inputs_of, offset_of
+
+    offset = offset_of(options.get("cameras_offset"))
+    return inputs_of({**options, "cameras_offset_m": offset})
+
+
 def _heights(water: WaterSurface, ins: Dimensions, rows: slice) -> FloatArray | None:
     from pcfix.model import WaterDimension
 
@@ -240,11 +262,10 @@ def _prepare_summary(options: dict[str, Any]) -> None:
     from pcfix.io.files import check_output
 
     if "summary" in options:
-        inputs = [options[name] for name in ("cameras", "sensor", "water") if name in options]
         check_output(
             options["summary"],
             overwrite=options.get("overwrite", False),
-            inputs=[path for path in inputs if isinstance(path, str)],
+            inputs=_inputs(options).paths(),
         )
 
 

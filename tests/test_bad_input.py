@@ -345,7 +345,7 @@ TABLES = {
     "too many fields": ("label,x,y,z\n" + ROWS + "d,1,456060,5432060,90\n", ["line 5", "shifted"]),
     "too few fields": ("label,x,y,z\n" + ROWS + "d,5432060,90\n", ["line 5", "shifted"]),
     "no column z": ("label,x,y\na,1,2\n", ["z missing", "line 1"]),
-    "no column label": ("name,x,y,z\n" + ROWS, ["label missing"]),
+    "no column label": ("who,x,y,z\n" + ROWS, ["label missing"]),
     "a word": ("label,x,y,z\na,456010,5432010,90\nb,east,5432010,90\n", ["line 3", "column x"]),
     "an empty field": ("label,x,y,z\n" + ROWS + "d,456060,,90\n", ["line 5", "column y"]),
     "nan": ("label,x,y,z\n" + ROWS + "d,456060,5432060,nan\n", ["line 5", "column z", "'nan'"]),
@@ -628,7 +628,7 @@ def test_wrong_usage_is_exit_code_2(
 KEYS = {
     "input", "output", "pcfix", "points", "submerged", "corrected", "uncorrected", "dropped",
     "water_unknown", "depth_m", "shift_z_m", "rays", "cameras", "cameras_used", "cameras_unused",
-    "water", "settings", "seconds", "warnings", "points_per_s",
+    "water", "settings", "seconds", "views", "warnings", "points_per_s",
 }  # fmt: skip
 
 

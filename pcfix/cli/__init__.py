@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 import pcfix
+from pcfix.cli.cameras import cameras
 from pcfix.cli.clean import clean
 from pcfix.cli.compare import compare
 from pcfix.cli.correct import correct, pipeline
@@ -26,7 +27,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (run, correct, clean, dsm, compare, restore, simulate, pipeline):
+for command in (run, correct, clean, dsm, compare, cameras, restore, simulate, pipeline):
     app.command(no_args_is_help=True)(command)
 app.command()(demo)
 

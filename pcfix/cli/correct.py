@@ -5,37 +5,31 @@ from __future__ import annotations
 import typer
 
 import pcfix
+from pcfix.cli.groups import CorrectionWords, takes
 from pcfix.cli.words import (
     CamerasOption,
     Dimensions,
     DimensionsOption,
-    Index,
     Input,
     Jobs,
-    MaxAngle,
-    MaxCameras,
     Output,
     Overwrite,
     Quiet,
-    Sensor,
     SummaryOption,
     Uncorrected,
     UncorrectedOption,
     WaterOption,
     progress_bar,
 )
-from pcfix.model import DEFAULT_REFRACTIVE_INDEX
 
 
+@takes(CorrectionWords)
 def correct(
+    words: CorrectionWords,
     input: Input,
     output: Output,
     cameras: CamerasOption,
     water: WaterOption,
-    sensor: Sensor = None,
-    index: Index = DEFAULT_REFRACTIVE_INDEX,
-    max_angle: MaxAngle = None,
-    max_cameras: MaxCameras = None,
     uncorrected: UncorrectedOption = Uncorrected.withhold,
     dimensions: DimensionsOption = Dimensions.all,
     summary: SummaryOption = None,
@@ -52,10 +46,7 @@ def correct(
             output,
             cameras=cameras,
             water=water,
-            sensor=sensor,
-            refractive_index=index,
-            max_angle_deg=max_angle,
-            max_cameras=max_cameras,
+            **words.keywords(),
             uncorrected=uncorrected.value,
             dimensions=dimensions.value,
             summary=summary,
@@ -67,15 +58,13 @@ def correct(
         typer.echo(summary_text(result))
 
 
+@takes(CorrectionWords)
 def pipeline(
+    words: CorrectionWords,
     input: Input,
     output: Output,
     cameras: CamerasOption,
     water: WaterOption,
-    sensor: Sensor = None,
-    index: Index = DEFAULT_REFRACTIVE_INDEX,
-    max_angle: MaxAngle = None,
-    max_cameras: MaxCameras = None,
     uncorrected: UncorrectedOption = Uncorrected.withhold,
     dimensions: DimensionsOption = Dimensions.all,
     summary: SummaryOption = None,
@@ -85,20 +74,22 @@ def pipeline(
     """Print the PDAL pipeline of the same 'pcfix correct', as JSON."""
     import json
 
+    from pcfix.flow.inputs import inputs_of
     from pcfix.flow.pipeline import pipeline_for
 
-    settings = pcfix.Settings(index, max_angle, max_cameras, uncorrected.value, dimensions.value)
+    keywords = {"cameras": cameras, "water": water, **words.keywords()}
+    settings = pcfix.Settings(
+        words.index, words.max_angle, words.max_cameras, uncorrected.value, dimensions.value
+    )
     options = {
         "cameras": str(cameras),
         "water": water,
-        "sensor": None if sensor is None else str(sensor),
-        "index": index,
-        "max_angle": max_angle,
-        "max_cameras": max_cameras,
+        **words.plain(),
         "uncorrected": uncorrected.value,
         "dimensions": dimensions.value,
         "summary": None if summary is None else str(summary),
         "overwrite": overwrite or None,
         "jobs": jobs,
     }
-    typer.echo(json.dumps(pipeline_for(input, output, settings, options), indent=2))
+    stages = pipeline_for(input, output, settings, inputs_of(keywords), options)
+    typer.echo(json.dumps(stages, indent=2))

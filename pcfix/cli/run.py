@@ -7,18 +7,14 @@ from typing import Annotated
 
 import typer
 
+from pcfix.cli.groups import CorrectionWords, takes
 from pcfix.cli.words import (
-    Index,
     Jobs,
-    MaxAngle,
-    MaxCameras,
     Overwrite,
     Quiet,
-    Sensor,
     WithM3c2,
     progress_bar,
 )
-from pcfix.model import DEFAULT_REFRACTIVE_INDEX
 
 Input = Annotated[
     Path | None, typer.Argument(metavar="INPUT", help="LAS or LAZ cloud.", show_default=False)
@@ -27,9 +23,7 @@ OutDir = Annotated[
     Path | None,
     typer.Argument(metavar="OUT_DIR", help="Folder for all results.", show_default=False),
 ]
-Cameras = Annotated[
-    Path | None, typer.Option(help="CSV: label,x,y,z and, if known, yaw,pitch,roll (degrees).")
-]
+Cameras = Annotated[Path | None, typer.Option(help="File or folder of camera poses.")]
 Water = Annotated[
     str | None, typer.Option(help="A level (0.37), plane:a,b,c, dim:NAME, or a mesh (.obj, .ply).")
 ]
@@ -42,16 +36,14 @@ Resolution = Annotated[
 Config = Annotated[Path | None, typer.Option(help="run.json of an earlier run, to repeat it.")]
 
 
+@takes(CorrectionWords)
 def run(
+    words: CorrectionWords,
     input: Input = None,
     out_dir: OutDir = None,
     cameras: Cameras = None,
     water: Water = None,
     reference: Reference = None,
-    sensor: Sensor = None,
-    index: Index = DEFAULT_REFRACTIVE_INDEX,
-    max_angle: MaxAngle = None,
-    max_cameras: MaxCameras = None,
     resolution: Resolution = None,
     m3c2: WithM3c2 = False,
     config: Config = None,
@@ -78,11 +70,8 @@ def run(
             input=str(input),
             cameras=str(cameras),
             water=water,
-            sensor=None if sensor is None else str(sensor),
             reference=None if reference is None else str(reference),
-            refractive_index=index,
-            max_angle_deg=max_angle,
-            max_cameras=max_cameras,
+            **words.keywords(),
             resolution_m=resolution,
             m3c2=m3c2,
         )

@@ -23,6 +23,14 @@ class Uncorrected(str, Enum):  # noqa: UP042 - typer shows the values of a str E
     drop = "drop"
 
 
+class AngleWords(str, Enum):  # noqa: UP042
+    """Which angles a table of cameras has."""
+
+    opk = "omega-phi-kappa"
+    ypr = "yaw-pitch-roll"
+    aircraft = "aircraft"
+
+
 class Dimensions(str, Enum):  # noqa: UP042
     """Which extra dimensions are written."""
 
@@ -44,23 +52,16 @@ Jobs = Annotated[int | None, typer.Option(help="Threads.", show_default="all cor
 
 CamerasOption = Annotated[
     Path,
-    typer.Option("--cameras", help="CSV: label,x,y,z and, if known, yaw,pitch,roll (degrees)."),
+    typer.Option(
+        "--cameras",
+        help="File or folder of camera poses: Metashape, Pix4D, ODM, OpenSfM, COLMAP, MicMac,"
+        " Bundler, VisualSFM, BlocksExchange, RealityCapture, or a CSV table.",
+    ),
 ]
 WaterOption = Annotated[
     str,
     typer.Option("--water", help="A level (0.37), plane:a,b,c, dim:NAME, or a mesh (.obj, .ply)."),
 ]
-Sensor = Annotated[
-    Path | None,
-    typer.Option(
-        help="CSV: focal,sensor_x,sensor_y in mm.", show_default="sensor.csv beside the cameras"
-    ),
-]
-Index = Annotated[float, typer.Option(help="Refractive index of the water relative to air.")]
-MaxAngle = Annotated[
-    float | None, typer.Option(help="Use rays up to this incidence angle, degrees.")
-]
-MaxCameras = Annotated[int | None, typer.Option(help="Use so many rays a point, the steepest.")]
 UncorrectedOption = Annotated[
     Uncorrected,
     typer.Option("--uncorrected", help="Submerged points with fewer than two usable rays."),

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import time
-from os import PathLike
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pcfix.errors import InputError
+from pcfix.flow.inputs import Inputs
 from pcfix.flow.job import Job
 from pcfix.flow.points import CHUNK_POINTS
 from pcfix.io.files import check_input, check_output, write_text
@@ -21,6 +21,7 @@ from pcfix.io.las.columns import (
     fill,
     shift_steps,
 )
+from pcfix.io.las.crs import metric_crs
 from pcfix.io.las.formats import OutOfRangeError, shifted
 from pcfix.io.las.headers import corrected_header, corrected_identity, output_evlrs
 from pcfix.io.las.sink import LasSink, check_suffix
@@ -40,11 +41,13 @@ from pcfix.refract.threads import threads
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from os import PathLike
     from pathlib import Path
 
     import laspy
     import numpy.typing as npt
 
+    from pcfix.io.cameras.formats import Angles
     from pcfix.io.las.columns import Column
     from pcfix.model import FloatArray
 
@@ -58,6 +61,10 @@ def correct_file(
     cameras: Cameras | AnyPath,
     water: WaterSurface | float | AnyPath,
     sensor: AnyPath | None = None,
+    angles: Angles | None = None,
+    cameras_crs: str | None = None,
+    cameras_offset_m: tuple[float, float, float] | None = None,
+    views: AnyPath | None = None,
     refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
     max_angle_deg: float | None = None,
     max_cameras: int | None = None,
@@ -79,8 +86,16 @@ def correct_file(
         See `pcfix.read_cameras`.
     water : WaterSurface, float, str or path
         See `pcfix.read_water`.
-    sensor : path, optional
+    sensor, angles
         See `pcfix.read_cameras`.
+    cameras_crs : str, optional
+        Of the cameras, as ``EPSG:25830``; ``local`` takes their numbers as they are. Default: what
+        their file says, else the cloud's.
+    cameras_offset_m : tuple of 3 float, optional
+        Added to the projection centres, in the axes of their file.
+    views : path, optional
+        Which cameras made each point; see `pcfix.io.views.read_views`. The camera file itself
+        stands for the tracks of its tie points. Default: every camera whose frame holds it.
     refractive_index, max_angle_deg, max_cameras
         See `correct_points`.
     uncorrected : {"withhold", "keep", "drop"}
@@ -109,18 +124,27 @@ def correct_file(
     started = time.perf_counter()
     settings = Settings(refractive_index, max_angle_deg, max_cameras, uncorrected, dimensions)
     source = check_input(input)
-    inputs = [p for p in (input, cameras, sensor, water) if isinstance(p, str | PathLike)]
-    target = check_output(output, overwrite=overwrite, inputs=inputs)
+    inputs = Inputs(cameras, water, sensor, angles, cameras_crs, cameras_offset_m, views)
+    given = [input, *inputs.paths()]
+    target = check_output(output, overwrite=overwrite, inputs=given)
     check_suffix(target)
     if summary is not None:
-        check_output(summary, overwrite=overwrite, inputs=[*inputs, target])
-    job = Job(str(source), settings, cameras, water, sensor)
+        check_output(summary, overwrite=overwrite, inputs=[*given, target])
+    job = job_for(source, settings, inputs)
     with threads(jobs):
         _write_until_it_fits(job, source, target, jobs, progress)
     result = job.summary(str(source), str(target), time.perf_counter() - started)
     if summary is not None:
         write_text(summary, json.dumps(result.as_dict(), indent=2) + "\n", overwrite=overwrite)
     return result
+
+
+def job_for(path: Path, settings: Settings, inputs: Inputs) -> Job:
+    """Return the job of correcting a LAS or LAZ file."""
+    with LasSource(path) as source:
+        crs, points = metric_crs(source), len(source)
+        step = float(max(source.header.scales))
+    return Job(str(path), settings, inputs, cloud_crs=crs, points=points, step_m=step)
 
 
 def _write_until_it_fits(

@@ -2,40 +2,35 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import asdict, astuple
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import pcfix
-from pcfix.errors import GeometryError
+from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.flow.points import (
     check_above_water,
     check_submerged,
     correct_checked,
     refuse_under_water,
 )
-from pcfix.io.cameras import read_cameras
-from pcfix.io.water import read_water
 from pcfix.model import (
-    Cameras,
     Correction,
     Outcome,
     Settings,
     Summary,
     WaterDimension,
-    WaterMesh,
     WaterPlane,
-    WaterSurface,
 )
 from pcfix.report.tally import Tally
 
 if TYPE_CHECKING:
-    import os
+    from pyproj import CRS
 
+    from pcfix.flow.inputs import Inputs
     from pcfix.model import FloatArray
-
-    AnyPath = str | os.PathLike[str]
 
 
 class Job:
@@ -46,40 +41,52 @@ class Job:
     name : str
         What is being corrected, for messages.
     settings : Settings
-    cameras, water, sensor
-        See `pcfix.correct_file`.
+    inputs : Inputs
+    cloud_crs : CRS or None
+        Projected, metres.
+    points : int
+        Of the whole cloud.
+    step_m : float
+        To which its coordinates are rounded.
 
     Raises
     ------
     PcfixError
-        If cameras or water cannot be read, or a camera stands under the water.
+        If an input cannot be read or they do not fit, or a camera stands under the water.
     """
 
     def __init__(
         self,
         name: str,
         settings: Settings,
-        cameras: Cameras | AnyPath,
-        water: WaterSurface | float | AnyPath,
-        sensor: AnyPath | None = None,
+        inputs: Inputs,
+        *,
+        cloud_crs: CRS | str | None = None,
+        points: int = 0,
+        step_m: float = 0.0,
     ) -> None:
         self.name, self.settings = name, settings
-        self.cameras = cameras if isinstance(cameras, Cameras) else read_cameras(cameras, sensor)
-        self.water: WaterSurface = (
-            water
-            if isinstance(water, WaterPlane | WaterDimension | WaterMesh)
-            else read_water(water)
-        )
+        self.cameras, self._list = inputs.block(cloud_crs)
+        self.water = inputs.surface()
+        self._points, self._step_m = points, step_m
         check_above_water(self.cameras, self.water)
-        self.tally = Tally(len(self.cameras))
+        self.restart()
 
     def restart(self) -> None:
         """Forget the chunks so far."""
         self.tally = Tally(len(self.cameras))
+        self._views = None
+        if self._list is not None:
+            from pcfix.io.views import ViewMatch
+
+            self._views = ViewMatch(
+                self._list, self.cameras, points=self._points, step_m=self._step_m
+            )
 
     def correct(self, xyz: FloatArray, heights: FloatArray | None) -> Correction:
         """Correct one chunk, shape (n, 3), metres; `heights` where the water is a dimension."""
-        correction = correct_checked(xyz, self.cameras, self.water, self.settings, heights)
+        views = None if self._views is None else self._views.for_chunk(xyz, self.tally.points)
+        correction = correct_checked(xyz, self.cameras, self.water, self.settings, heights, views)
         self.tally.add(xyz, correction)
         return correction
 
@@ -93,6 +100,8 @@ class Job:
             if isinstance(self.water, WaterPlane)
             else None,
             "cameras": len(self.cameras),
+            "cameras_source": self.cameras.source,
+            "views": None if self._list is None else str(self._list.raw.path),
         }
 
     def check_fit(self) -> None:
@@ -104,6 +113,10 @@ class Job:
             If no point lies below the water, or no camera sees one that does.
         """
         tally = self.tally
+        if self._views is not None:
+            self._views.report.check()
+            for sentence in self._views.report.warnings():
+                warnings.warn(sentence, PcfixWarning, stacklevel=2)
         check_submerged(tally.submerged, self.name, self.water)
         if isinstance(self.water, WaterDimension):
             refuse_under_water(self.cameras, tally.lowest_water_m, str(self.water))
@@ -128,6 +141,7 @@ class Job:
             if not used
         ]
         uncorrected = tally.uncorrected()
+        views = None if self._views is None else self._views.report
         return Summary(
             input=input,
             output=output,
@@ -147,7 +161,8 @@ class Job:
             water=str(self.water),
             settings=asdict(self.settings),
             seconds=round(seconds, 3),
-            warnings=list(self.cameras.notes),
+            views=None if views is None else views.as_dict(),
+            warnings=[*self.cameras.notes, *([] if views is None else views.warnings())],
         )
 
 

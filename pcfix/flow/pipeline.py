@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pcfix.errors import InputError
-from pcfix.flow.job import Job
+from pcfix.flow.files import job_for
 from pcfix.io.las.columns import columns_for
 from pcfix.io.las.formats import UPGRADE
 from pcfix.io.las.sink import check_suffix
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     import laspy
 
+    from pcfix.flow.inputs import Inputs
     from pcfix.io.las.columns import Column
     from pcfix.model import Settings
 
@@ -24,7 +25,7 @@ WAVEFORM_FORMATS = (9, 10)
 
 
 def pipeline_for(
-    input: Path, output: Path, settings: Settings, options: dict[str, Any]
+    input: Path, output: Path, settings: Settings, inputs: Inputs, options: dict[str, Any]
 ) -> dict[str, Any]:
     """Return the pipeline, ready for JSON.
 
@@ -33,6 +34,7 @@ def pipeline_for(
     input, output : Path
         As of `correct_file`. PDAL replaces an output that exists.
     settings : Settings
+    inputs : Inputs
     options : dict
         The stage's options as the user gave them; those that are None are left out.
 
@@ -42,7 +44,7 @@ def pipeline_for(
         If `correct_file` would refuse them at its start, or PDAL cannot write the point format.
     """
     check_suffix(output)
-    Job(str(input), settings, options["cameras"], options["water"], options.get("sensor"))
+    job_for(input, settings, inputs)
     with LasSource(input) as source:
         point_format = source.header.point_format
     if UPGRADE[point_format.id] in WAVEFORM_FORMATS:

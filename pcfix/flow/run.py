@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,14 +14,14 @@ from pcfix.flow.clean import clean_file
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.files import correct_file
+from pcfix.flow.inputs import Inputs
 from pcfix.flow.report import write_report
 from pcfix.flow.steps import Record, read_record
-from pcfix.io.cameras import read_cameras
 from pcfix.io.dod import preview, write_dod
-from pcfix.io.files import check_input
+from pcfix.io.files import files_in
+from pcfix.io.las.crs import metric_crs
 from pcfix.io.las.source import LasSource
 from pcfix.io.rasters import open_raster
-from pcfix.io.water import read_water
 from pcfix.model import DEFAULT_REFRACTIVE_INDEX, Settings, Summary
 from pcfix.report.evaluation import evaluation, in_a_sentence
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from pcfix.flow.comparison import Comparison
+    from pcfix.io.cameras.formats import Angles
     from pcfix.report.page import Picture, Table
 
 RECORD = "run.json"
@@ -45,7 +46,8 @@ class Request:
 
     Attributes
     ----------
-    input, cameras, water, sensor, refractive_index, max_angle_deg, max_cameras
+    input, cameras, water, sensor, angles, cameras_crs, cameras_offset_m, views, refractive_index,
+    max_angle_deg, max_cameras
         See `pcfix.correct_file`; files by their paths.
     reference : str or None
         See `pcfix.flow.compare.compare_clouds`.
@@ -59,6 +61,10 @@ class Request:
     cameras: str
     water: str
     sensor: str | None = None
+    angles: Angles | None = None
+    cameras_crs: str | None = None
+    cameras_offset_m: tuple[float, float, float] | None = None
+    views: str | None = None
     reference: str | None = None
     refractive_index: float = DEFAULT_REFRACTIVE_INDEX
     max_angle_deg: float | None = None
@@ -74,10 +80,14 @@ class Request:
         if self.m3c2 and self.reference is None:
             raise SettingError("m3c2 compares with a reference; give --reference too.")
 
+    def inputs(self) -> dict[str, Any]:
+        """Return what `pcfix.flow.inputs.Inputs` takes."""
+        return {field.name: getattr(self, field.name) for field in fields(Inputs)}
+
     def files(self) -> list[Path]:
         """Return the input files, each of which exists."""
-        names = [self.input, self.cameras, self.sensor, self.reference]
-        found = [check_input(name) for name in names if name is not None]
+        names = [self.input, self.cameras, self.sensor, self.views, self.reference]
+        found = [path for name in names if name is not None for path in files_in(name)]
         return [*found, Path(self.water)] if Path(self.water).is_file() else found
 
 
@@ -186,9 +196,7 @@ def _correct(
     summary = correct_file(
         request.input,
         files.corrected,
-        cameras=request.cameras,
-        water=request.water,
-        sensor=request.sensor,
+        **request.inputs(),
         refractive_index=request.refractive_index,
         max_angle_deg=request.max_angle_deg,
         max_cameras=request.max_cameras,
@@ -278,15 +286,17 @@ def _report(
         dod = preview(files.compare / DOD) if _rasters(request) else None
         more = evaluation(compared["figures"], compared["sections"], dod)
         verdict = in_a_sentence(compared["figures"])
+    inputs_again = Inputs(**{**request.inputs(), "views": None})
     with warnings.catch_warnings():  # they were shown when the cloud was corrected
         warnings.simplefilter("ignore", PcfixWarning)
-        cameras = read_cameras(request.cameras, request.sensor)
+        with LasSource(files.corrected) as source:
+            cameras, _ = inputs_again.block(metric_crs(source))
     page = write_report(
         files.corrected,
         files.folder,
         summary=Summary(**corrected),
         cameras=cameras,
-        water=read_water(request.water),
+        water=inputs_again.surface(),
         inputs=inputs,
         more=more,
         verdict=verdict,

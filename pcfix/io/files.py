@@ -29,6 +29,14 @@ def check_input(path: str | os.PathLike[str]) -> Path:
     return found
 
 
+def files_in(path: str | os.PathLike[str]) -> list[Path]:
+    """Return a file, or the files directly in a folder, in the order of their names."""
+    found = Path(path)
+    if found.is_dir():
+        return sorted(one for one in found.iterdir() if one.is_file())
+    return [check_input(found)]
+
+
 def check_output(
     path: str | os.PathLike[str], *, overwrite: bool, inputs: Iterable[str | os.PathLike[str]] = ()
 ) -> Path:

@@ -179,6 +179,12 @@ def scales_of(metadata: dict[str, Any] | None) -> FloatArray | None:
     return np.array([float(next(iter(values))) for values in found])
 
 
+def crs_of(metadata: dict[str, Any] | None) -> str | None:
+    """Return the CRS that all input files state, as WKT, where they have one."""
+    stated = set(_reader_values(metadata, "comp_spatialreference"))
+    return stated.pop() or None if len(stated) == 1 else None
+
+
 def _reader_values(metadata: dict[str, Any] | None, name: str) -> list[str]:
     """Return what the readers' metadata say under a name."""
     readers = [

@@ -10,6 +10,7 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.clouds import NOISE, read_cloud
+from pcfix.io.crs import is_same, parts
 from pcfix.io.files import check_input
 from pcfix.io.tables import read_table
 from pcfix.model import FloatArray  # noqa: TC001 - dataclass fields
@@ -127,33 +128,16 @@ def check_same_crs(cloud: str, crs: CRS | None, reference: str, other: CRS | Non
                 stacklevel=3,
             )
         return
-    plan, height = _parts(crs)
-    other_plan, other_height = _parts(other)
-    if not _is_same(plan, other_plan):
+    plan, height = parts(crs)
+    other_plan, other_height = parts(other)
+    if not is_same(plan, other_plan):
         raise InputError(
             f"{cloud} is in {plan.name}, {reference} in {other_plan.name}; bring the reference to"
             " the CRS of the cloud first, heights included (PDAL's filters.reprojection or"
             " gdalwarp), and check its vertical datum."
         )
-    if height is not None and other_height is not None and not _is_same(height, other_height):
+    if height is not None and other_height is not None and not is_same(height, other_height):
         raise InputError(
             f"{cloud} has heights in {height.name}, {reference} in {other_height.name}; bring the"
             " reference to the heights of the cloud first."
         )
-
-
-def _parts(crs: CRS) -> tuple[CRS, CRS | None]:
-    """Return the horizontal and the vertical part of a CRS."""
-    if crs.is_bound and crs.source_crs is not None:
-        crs = crs.source_crs
-    if crs.is_compound:
-        plan, height = crs.sub_crs_list[:2]
-        return (plan.source_crs or plan) if plan.is_bound else plan, height
-    return crs, None
-
-
-def _is_same(one: CRS, other: CRS) -> bool:
-    code, other_code = one.to_epsg(), other.to_epsg()
-    if code is not None and other_code is not None:
-        return code == other_code
-    return one.equals(other, ignore_axis_order=True) or one.name == other.name

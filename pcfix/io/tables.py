@@ -1,4 +1,4 @@
-"""Small CSV tables with a header line: names and numbers, and errors that name row and column."""
+"""Small tables of text with a header line: names and numbers, and errors that say where."""
 
 from __future__ import annotations
 
@@ -35,10 +35,7 @@ class Table(NamedTuple):
         """
         values = []
         for line, text in zip(self.line, self.column(name), strict=True):
-            try:
-                value = float(text)
-            except ValueError:
-                value = math.nan
+            value = number(text)
             if not math.isfinite(value):
                 raise InputError(
                     f"{self.path}: line {line}, column {name}: '{text}' is not a finite number."
@@ -47,14 +44,39 @@ class Table(NamedTuple):
         return values
 
 
+def number(text: str) -> float:
+    """Return the number in a text, NaN where there is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
 def split_header(line: str) -> tuple[list[str], str]:
     """Return the names of a header line, lower case, and the delimiter between them."""
+    delimiter = delimiter_of(line)
+    names = line.split(None if delimiter == " " else delimiter)
+    return [name.strip().strip("\"'").lower() for name in names], delimiter
+
+
+def delimiter_of(line: str) -> str:
+    """Return the tab, semicolon or comma between the fields of a line; without any, the space."""
     delimiter = max(",;\t", key=line.count)
-    return [name.strip().strip('"').lower() for name in line.split(delimiter)], delimiter
+    return delimiter if delimiter in line else " "
+
+
+def read_lines(path: Path) -> list[str]:
+    """Read a text file, with or without a byte order mark."""
+    data = path.read_bytes()
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")  # only names can be affected
+    return text.splitlines()
 
 
 def read_table(path: Path, required: Sequence[str]) -> Table:
-    """Read a CSV table; comma, semicolon or tab, with or without a byte order mark.
+    """Read a table; comma, semicolon, tab or space, with or without a byte order mark.
 
     Raises
     ------
@@ -62,38 +84,69 @@ def read_table(path: Path, required: Sequence[str]) -> Table:
         If a required column is missing, a row has another number of fields than the header, or
         there are no rows.
     """
-    data = path.read_bytes()
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = data.decode("latin-1")  # only names can be affected
-    lines = text.splitlines()
+    lines = read_lines(path)
     header, delimiter = split_header(lines[0] if lines else "")
+    require(path, 1, header, required)
+    return table_below(path, lines, header, delimiter)
+
+
+def require(path: Path, line: int, header: Sequence[str], required: Sequence[str]) -> None:
+    """Refuse a header that lacks a column."""
     missing = [name for name in required if name not in header]
     if missing:
         raise InputError(
-            f"{path}: line 1 must name the columns {', '.join(required)};"
+            f"{path}: line {line} must name the columns {', '.join(required)};"
             f" {', '.join(missing)} missing (it has: {', '.join(header)})."
         )
+
+
+def table_below(
+    path: Path,
+    lines: list[str],
+    header: list[str],
+    delimiter: str,
+    *,
+    at: int = 0,
+    comments: bool = False,
+) -> Table:
+    """Return the rows below the header, which is ``lines[at]``.
+
+    Empty lines do not count and, with `comments`, nor do those that begin with #.
+
+    Raises
+    ------
+    InputError
+        If a row has another number of fields than the header, or there are no rows.
+    """
     rows, numbers = [], []
-    for number, fields in enumerate(_split(path, lines, delimiter), start=1):
-        if number == 1 or not any(field.strip() for field in fields):
+    below = ["" if comments and line.startswith("#") else line for line in lines[at + 1 :]]
+    for number_, fields in _split(path, below, delimiter, at + 2):
+        if not any(field.strip() for field in fields):
             continue
         if len(fields) != len(header):
             raise InputError(
-                f"{path}: line {number} has {len(fields)} fields, the header {len(header)};"
+                f"{path}: line {number_} has {len(fields)} fields, the header {len(header)};"
                 " a column is shifted or missing."
             )
         rows.append([field.strip() for field in fields])
-        numbers.append(number)
+        numbers.append(number_)
     if not rows:
         raise InputError(f"{path}: has a header but no rows.")
     return Table(path, header, rows, numbers)
 
 
-def _split(path: Path, lines: list[str], delimiter: str) -> Iterator[list[str]]:
-    reader = csv.reader(lines, delimiter=delimiter)
+def _split(
+    path: Path, lines: list[str], delimiter: str, first: int
+) -> Iterator[tuple[int, list[str]]]:
+    """Yield the line number and the fields of each row; `first` is the number of the first."""
+    spaced = delimiter == " "
+    if spaced:
+        lines = [" ".join(line.split("\t")).strip() for line in lines]
+    quote = "'" if spaced and any(line.startswith("'") for line in lines[:1]) else '"'
+    reader = csv.reader(lines, delimiter=delimiter, quotechar=quote, skipinitialspace=spaced)
     try:
-        yield from reader
+        yield from enumerate(reader, start=first)
     except csv.Error as error:
-        raise InputError(f"{path}: line {reader.line_num} is not CSV ({error}).") from error
+        raise InputError(
+            f"{path}: line {first + reader.line_num - 1} is not CSV ({error})."
+        ) from error

@@ -16,7 +16,19 @@ from numba import njit, prange
 
 from pcfix.label.tin import build_tin, locate
 from pcfix.model import Outcome, WaterMesh
-from pcfix.refract.frames import frame_planes, in_frame, may_hold, pyramid
+from pcfix.refract.frames import (
+    EVERYWHERE,
+    NOT_DISTORTED,
+    frames_of,
+    holds,
+    in_frame,
+    mark,
+    may_hold,
+    may_reach,
+    no_frames,
+    pyramid,
+    surely_holds,
+)
 from pcfix.refract.piercing import pierce_mesh
 from pcfix.refract.rays import line_terms, nearest_point, refracted
 from pcfix.refract.threads import one_caller
@@ -27,7 +39,7 @@ if TYPE_CHECKING:
     from pcfix.label.surface import SurfaceAbove
     from pcfix.label.tin import Tin
     from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Settings, Views, WaterSurface
-    from pcfix.refract.frames import Pyramid
+    from pcfix.refract.frames import Frames, Pyramid
 
 TILE = 128
 """Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""
@@ -94,7 +106,7 @@ def intersect(
         np.ascontiguousarray(surface.height_m),
         np.ascontiguousarray(surface.slope),
         np.ascontiguousarray(cameras.centres),
-        frame_planes(cameras),
+        frames_of(cameras) if views is None else no_frames(len(cameras)),
         _least_cosine2(settings, cameras),
         1.0 / settings.refractive_index,
         result,
@@ -157,13 +169,13 @@ def _cell_order(
 
 
 MAX_ANGLE_WITHOUT_FRAMES_DEG = 80.0
-"""Cameras without angles have no frame to leave; nobody matches images as flat as this, and a
+"""Cameras without a lens have no frame to leave; nobody matches images as flat as this, and a
 block in another CRS is told apart."""
 
 
 def _least_cosine2(settings: Settings, cameras: Cameras) -> float:
     limit = settings.max_angle_deg
-    if limit is None and cameras.rotations is None:
+    if limit is None and cameras.lenses is None:
         limit = MAX_ANGLE_WITHOUT_FRAMES_DEG
     return 0.0 if limit is None else float(np.cos(np.radians(limit)) ** 2)
 
@@ -176,7 +188,10 @@ _MISS, _SIGMA_Z, _INCIDENCE, _COUNT, _OUTCOME = 3, 4, 5, 6, 7
 def _gather(
     tile: FloatArray, order: IntArray, xyz: FloatArray, surface: FloatArray, slope: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Bring a tile together: runs of x, y, z, surface height and unit normal; return its box."""
+    """Bring a tile together: runs of x, y, z, surface height and unit normal; return its box.
+
+    The eighth run is left for marks.
+    """
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for j in range(order.size):
         i = order[j]
@@ -193,11 +208,16 @@ def _gather(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _usable(
-    g: Pyramid, ex: float, ey: float, ez: float, h: float, height: float, length2: float,
-    least_cosine2: float,
+    g: Pyramid | None, marked: float, ex: float, ey: float, ez: float, h: float, height: float,
+    length2: float, least_cosine2: float,
 ) -> bool:  # fmt: skip
-    """Whether a camera above the water has the point in its frame, steeply enough."""
+    """Whether a camera above the water has the point in its frame, steeply enough.
+
+    The frame is a pyramid, or it was tested before and left a mark.
+    """
     steep = (height > h) & (height * height >= least_cosine2 * length2)
+    if g is None:
+        return (marked > 0.0) & steep
     return in_frame(g, ex, ey, ez) & steep
 
 
@@ -223,7 +243,7 @@ def _solve(
 @njit(cache=True, error_model="numpy", nogil=True)
 def _add_camera(
     sums: FloatArray, tile: FloatArray, m: int,
-    centre: FloatArray, g: Pyramid, least_cosine2: float, r: float,
+    centre: FloatArray, g: Pyramid | None, least_cosine2: float, r: float,
 ) -> int:  # fmt: skip
     """Add one camera's rays to the sums of a tile; return how many it gave.
 
@@ -239,7 +259,8 @@ def _add_camera(
         height = nx * ex + ny * ey + nz * ez
         h = nz * (tile[3 * TILE + j] - z)
         length2 = ex * ex + ey * ey + ez * ez
-        use = _usable(g, ex, ey, ez, h, height, length2, least_cosine2)
+        marked = tile[7 * TILE + j]
+        use = _usable(g, marked, ex, ey, ez, h, height, length2, least_cosine2)
         # one division for two; a ray that is not used adds zeros
         q = 1.0 / (length2 * height)
         f = h * length2 * q if use else 0.0
@@ -265,22 +286,40 @@ def _add_camera(
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _all_in_frame(
     order: IntArray, xyz: FloatArray, surface: FloatArray, slope: FloatArray,
-    centres: FloatArray, planes: FloatArray, least_cosine2: float, r: float,
+    centres: FloatArray, frames: Frames, least_cosine2: float, r: float,
     result: FloatArray, used: BoolArray, tested: IntArray,
 ) -> None:  # fmt: skip
     """Every camera whose frame holds the point; the surface above it is a plane."""
+    outer, inner, cone, row = frames.outer, frames.inner, frames.cone, frames.row
     for t in prange(tested.size):
         rows = order[t * TILE : (t + 1) * TILE]
-        tile = np.empty(7 * TILE)
+        tile = np.empty(8 * TILE)
         low, high = _gather(tile, rows, xyz, surface, slope)
         sums = np.zeros(11 * TILE)
         sums[10 * TILE :] = 1.0
+        x, y, z = (
+            tile[: rows.size],
+            tile[TILE : TILE + rows.size],
+            tile[2 * TILE : 2 * TILE + rows.size],
+        )
+        marks = tile[7 * TILE : 7 * TILE + rows.size]
         for c in range(len(centres)):
-            if may_hold(planes[c], centres[c], low, high):
-                tested[t] += rows.size
-                frame = pyramid(planes[c])
-                if _add_camera(sums, tile, rows.size, centres[c], frame, least_cosine2, r):
-                    used[c] = True  # threads may write it at once: always the same value
+            if not may_hold(outer[c], centres[c], low, high):
+                continue
+            if row[c] == NOT_DISTORTED:
+                frame = pyramid(outer[c])
+                rays = _add_camera(sums, tile, rows.size, centres[c], frame, least_cosine2, r)
+            elif surely_holds(inner[c], centres[c], low, high):
+                rays = _add_camera(sums, tile, rows.size, centres[c], EVERYWHERE, least_cosine2, r)
+            elif may_reach(cone[c], centres[c], low, high):
+                if not mark(marks, x, y, z, centres[c], frames, c):
+                    continue
+                rays = _add_camera(sums, tile, rows.size, centres[c], None, least_cosine2, r)
+            else:
+                continue
+            tested[t] += rows.size
+            if rays:
+                used[c] = True  # threads may write it at once: always the same value
         for j in range(rows.size):
             _solve(
                 result[rows[j]], sums[9 * TILE + j], sums[j], sums[TILE + j],
@@ -302,12 +341,15 @@ def _keep_steepest(chosen: IntArray, cosine2: FloatArray, k: int, most: int) -> 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _near(planes: FloatArray, centres: FloatArray, low: FloatArray, high: FloatArray) -> IntArray:
+def _near(frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray) -> IntArray:
     """Return the cameras whose frames may hold a point of the box."""
+    outer, cone, row = frames.outer, frames.cone, frames.row
     near = np.empty(len(centres), np.int64)
     count = 0
     for c in range(len(centres)):
-        if may_hold(planes[c], centres[c], low, high):
+        if not may_hold(outer[c], centres[c], low, high):
+            continue
+        if row[c] == NOT_DISTORTED or may_reach(cone[c], centres[c], low, high):
             near[count] = c
             count += 1
     return near[:count]
@@ -315,7 +357,7 @@ def _near(planes: FloatArray, centres: FloatArray, low: FloatArray, high: FloatA
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _choose(
-    candidates: IntArray, tile: FloatArray, j: int, centres: FloatArray, planes: FloatArray,
+    candidates: IntArray, tile: FloatArray, j: int, centres: FloatArray, frames: Frames,
     least_cosine2: float, most: int, tin: Tin | None, facet: int,
 ) -> IntArray:  # fmt: skip
     """Return the cameras whose rays a point of the tile gets, in the order of the candidates.
@@ -333,7 +375,7 @@ def _choose(
         h = nz * (tile[3 * TILE + j] - pz)
         height = nx * ex + ny * ey + nz * ez
         length2 = ex * ex + ey * ey + ez * ez
-        if not _usable(pyramid(planes[c]), ex, ey, ez, h, height, length2, 0.0):
+        if not (height > h and holds(frames, c, ex, ey, ez)):
             continue
         if tin is not None and some_only:
             _, nx, ny, nz = pierce_mesh(tin, px, py, pz, ex, ey, ez, facet)
@@ -347,23 +389,21 @@ def _choose(
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _chosen(
     order: IntArray, xyz: FloatArray, surface: FloatArray, slope: FloatArray,
-    centres: FloatArray, planes: FloatArray, least_cosine2: float, r: float,
+    centres: FloatArray, frames: Frames, least_cosine2: float, r: float,
     result: FloatArray, used: BoolArray, tested: IntArray,
     tin: Tin | None, views: tuple[IntArray, IntArray] | None, most: int,
 ) -> None:  # fmt: skip
     """Chosen cameras per point, or rays that bend at a mesh."""
-    anywhere = np.zeros_like(planes)
     for t in prange(tested.size):
         rows = order[t * TILE : (t + 1) * TILE]
-        tile = np.empty(7 * TILE)
+        tile = np.empty(8 * TILE)
         low, high = _gather(tile, rows, xyz, surface, slope)
-        near = _near(planes, centres, low, high)
+        near = _near(frames, centres, low, high)
         for j in range(rows.size):
             facet = -1 if tin is None else locate(tin, tile[j], tile[TILE + j])
-            candidates, frames = near, planes
+            candidates = near
             if views is not None:
                 candidates = views[1][views[0][rows[j]] : views[0][rows[j] + 1]]
-                frames = anywhere
             cameras = _choose(candidates, tile, j, centres, frames, least_cosine2, most, tin, facet)
             tested[t] += candidates.size
             _intersect_one(result[rows[j]], cameras, tile, j, centres, r, used, tin, facet)

@@ -15,7 +15,7 @@ _BIN_M = 0.001
 _REACH_M = 100.0  # shifts beyond it share the last bin, which only percentiles would notice
 
 REASONS = {
-    Outcome.NO_CAMERA: "in no camera's frame",
+    Outcome.NO_CAMERA: "no camera has it in its frame, or in its list of views",
     Outcome.ONE_CAMERA: "one usable ray only",
     Outcome.PARALLEL_RAYS: "rays nearly parallel",
 }

@@ -12,7 +12,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pcfix.errors import InputError, PcfixWarning
-from pcfix.io.cameras import table
+from pcfix.io.cameras import (
+    blocksexchange,
+    bundler,
+    colmap,
+    metashape,
+    micmac,
+    nvm,
+    odm,
+    opensfm,
+    pix4d,
+    realitycapture,
+    table,
+    unsupported,
+)
 from pcfix.io.cameras.formats import Angles, Source, SparseModel
 from pcfix.io.files import check_input
 
@@ -22,7 +35,12 @@ if TYPE_CHECKING:
     from pcfix.io.cameras.formats import CameraFormat
     from pcfix.model import Cameras, TiePoints
 
-FORMATS: tuple[CameraFormat, ...] = (table,)  # the plain table last: its content says least
+FORMATS: tuple[CameraFormat, ...] = (
+    metashape, pix4d, odm, opensfm, colmap, micmac, bundler, nvm, blocksexchange, realitycapture,
+    table, unsupported,
+)  # fmt: skip
+"""In the order in which they are asked: ODM knows more of an OpenSfM file than OpenSfM, and a plain
+table says least of all."""
 
 
 def read_cameras(

@@ -25,7 +25,7 @@ def rotation(path: Path, label: str, matrix: FloatArray) -> FloatArray:
     InputError
         If it is not orthonormal, or mirrors.
     """
-    if not np.isfinite(matrix).all() or np.abs(matrix @ matrix.T - np.eye(3)).max() > ROUNDING:
+    if not (np.abs(matrix) < 2.0).all() or np.abs(matrix @ matrix.T - np.eye(3)).max() > ROUNDING:
         raise InputError(
             f"{path}: image {label}: the rotation matrix is not orthonormal; export it again."
         )
@@ -34,8 +34,9 @@ def rotation(path: Path, label: str, matrix: FloatArray) -> FloatArray:
             f"{path}: image {label}: the rotation matrix mirrors (determinant -1); its axes are"
             " left-handed, export it again."
         )
-    u, _, v = np.linalg.svd(matrix)
-    return np.asarray(u @ v)
+    for _ in range(2):  # Newton's iteration to the polar factor; the rounding is squared each time
+        matrix = 1.5 * matrix - 0.5 * matrix @ matrix.T @ matrix
+    return matrix
 
 
 def quaternion(path: Path, label: str, wxyz: FloatArray) -> FloatArray:
@@ -48,7 +49,8 @@ def quaternion(path: Path, label: str, wxyz: FloatArray) -> FloatArray:
     """
     from scipy.spatial.transform import Rotation
 
-    length = float(np.linalg.norm(wxyz))
+    with np.errstate(over="ignore"):
+        length = float(np.linalg.norm(wxyz))
     if not abs(length - 1.0) <= ROUNDING:
         raise InputError(
             f"{path}: image {label}: the quaternion has length {length:g} instead of 1; export"
@@ -78,3 +80,27 @@ def lens(path: Path, name: str, given: Lens) -> Lens:
             f" {given.height:g} must be positive; export the calibration again."
         )
     return given
+
+
+def crs(path: Path, definition: str) -> str:
+    """Return what a file says of its CRS: ``local``, or a definition that PROJ understands.
+
+    Raises
+    ------
+    InputError
+        If PROJ does not understand it.
+    """
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    text = definition.strip()
+    if text.lower() == "local" or text.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")):
+        return "local"
+    try:
+        CRS.from_user_input(text)
+    except CRSError as error:
+        raise InputError(
+            f"{path}: the CRS '{text[:80]}' is not one that PROJ knows; export the poses in a CRS"
+            " with an EPSG code."
+        ) from error
+    return text

@@ -36,13 +36,13 @@ def read_xml(path: Path, stream: IO[bytes] | None = None) -> Element:
 
     try:
         root: Element = parse(stream if stream is not None else path, forbid_dtd=False).getroot()
-    except ParseError as error:
-        raise InputError(
-            f"{path}: the XML is damaged or cut off ({error}); export it again."
-        ) from error
     except DefusedXmlException as error:
         raise InputError(
             f"{path}: the XML declares entities, which no camera file needs; it is not read."
+        ) from error
+    except (ParseError, LookupError, ValueError) as error:
+        raise InputError(
+            f"{path}: the XML is damaged or cut off ({error}); export it again."
         ) from error
     return root
 

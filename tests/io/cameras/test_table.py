@@ -1,16 +1,23 @@
 """Poses from CSV tables."""
 
 import csv
+import re
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import pcfix
+from pcfix.io.cameras import table
+from pcfix.io.cameras.formats import Source
+from tests.utils.reprojection import check_file, row_of
 from tests.utils.shared import needs
 
 RENDERED, rendered = needs("rendered_a")
 RIVER, river = needs("river")
+METASHAPE, metashape = needs("cameras", "metashape_opk", "sfmrefract")
+ODM, odm = needs("cameras", "odm", "orthority_odm")
+PIX4D, pix4d = needs("cameras", "pix4d", "ca502_oblique5", "params")
 
 
 def write(tmp_path, text, sensor="focal,sensor_x,sensor_y\n8.8,13.2,8.8\n"):
@@ -139,4 +146,555 @@ def test_sensor_elsewhere(tmp_path):
     sensor = tmp_path / "p4p.csv"
     sensor.write_text("focal,sensor_x,sensor_y\n8.8,13.2,8.8\n")
     lens = pcfix.read_cameras(path, sensor).lenses[0]
-    assert lens == pcfix.Lens(8.8, 13.2, 8.8, 6.6, 4.4)
+    assert lens == pcfix.Lens(8.8, 13.2, 8.8, 6.6, 4.4, unit="mm")
+
+
+# Columns
+
+
+def plain(tmp_path, text, **options):
+    """Return the cameras of a table as this module reads it, with the usual sensor beside it."""
+    path = write(tmp_path, text)
+    assert table.recognises(Source(path))
+    return table.read(Source(path, **options))
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "name,x,y,z",
+        "#Label,X/Easting,Y/Northing,Z/Altitude",
+        "Image,Easting,Northing,Height",
+        "filename,X[m],Y[m],Z[m]",
+        "PhotoID,x_m,y_m,z_m",
+        "imageName,East,North,Elevation (m)",
+        '"file name","projectedX","projectedY","projectedZ"',
+        "#name,x,y,alt",
+    ],
+)
+def test_spellings(tmp_path, header):
+    cameras = plain(tmp_path, header + "\na.jpg,1,2,3\nb.jpg,4,5,6\n")
+    assert cameras.labels == ("a.jpg", "b.jpg")
+    assert cameras.centres.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert cameras.crs is None
+    assert cameras.notes == ()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "label x y z\na 1 2 3\n",
+        "label   x  y z\n a   1 2    3 \n",
+        "# made by hand\nlabel\tx\ty\tz\n# not this\na\t1\t2\t3\n",
+        "# label, x, y, z\na\t1\t2\t3\n",
+        "#cameras 1\n#name,x,y,z\na,1,2,3\n",
+        "#\n\n# \nlabel,x,y,z\na,1,2,3\n",
+        "'label' 'x' 'y' 'z'\n'a' 1 2 3\n",
+    ],
+)
+def test_more_dialects(tmp_path, text):
+    cameras = plain(tmp_path, text)
+    assert cameras.labels == ("a",)
+    assert cameras.centres.tolist() == [[1, 2, 3]]
+
+
+def test_names_with_spaces_in_a_table_of_spaces(tmp_path):
+    cameras = plain(tmp_path, 'label x y z\n"a b.jpg" 1 2 3\n')
+    assert cameras.labels == ("a b.jpg",)
+
+
+def test_the_column_of_the_plain_name_counts(tmp_path):
+    cameras = plain(tmp_path, "label,filename,x,y,z,height,longitude,latitude\na,b,1,2,3,9,7,8\n")
+    assert cameras.labels == ("a",)
+    assert cameras.centres.tolist() == [[1, 2, 3]]
+
+
+@pytest.mark.parametrize(
+    ("header", "crs"),
+    [
+        ("label,longitude,latitude,altitude", "EPSG:4326"),
+        ("Label,X/Longitude,Y/Latitude,Z/Altitude", "EPSG:4326"),
+        ("image,lon,lat,ellipsoidal_height", "EPSG:4979"),
+    ],
+)
+def test_degrees(tmp_path, header, crs):
+    cameras = plain(tmp_path, header + "\na,12.5,55.25,90\n")
+    assert cameras.centres.tolist() == [[12.5, 55.25, 90]]
+    assert cameras.crs == crs
+
+
+def test_latitude_first(tmp_path):
+    cameras = plain(tmp_path, "image,lat,lon,alt\na,55.25,12.5,90\n")
+    assert cameras.centres.tolist() == [[12.5, 55.25, 90]]
+
+
+@pytest.mark.parametrize(
+    ("said", "crs"),
+    [
+        ("# CoordinateSystem: EPSG:32632", "EPSG:32632"),
+        ("# crs: EPSG:25832+7837", "EPSG:25832+7837"),
+        ('# CoordinateSystem: LOCAL_CS["Local Coordinates (m)",UNIT["metre",1]]', "local"),
+    ],
+)
+def test_the_crs_of_a_comment(tmp_path, said, crs):
+    assert plain(tmp_path, said + "\n#Label,X,Y,Z\na,1,2,3\n").crs == crs
+
+
+def test_a_crs_that_is_not_understood(tmp_path):
+    cameras = plain(tmp_path, '# CoordinateSystem: PROJCS["WGS 84" GEOGCS\n#Label,X,Y,Z\na,1,2,3\n')
+    assert cameras.crs is None
+    assert "not understood" in cameras.notes[0]
+
+
+# Angles
+
+
+def nadir(cameras):
+    """Return the angles between the views and straight down."""
+    forward = cameras.rotations[:, 2]
+    return np.degrees(np.arctan2(np.hypot(forward[:, 0], forward[:, 1]), -forward[:, 2]))
+
+
+def turn_deg(one, other):
+    return np.degrees(Rotation.from_matrix(one @ other.transpose(0, 2, 1)).magnitude())
+
+
+def photogrammetric(omega, phi, kappa):
+    """Return Kraus's matrix, camera to world, written out, as rotations of pcfix."""
+    so, co, sp, cp = np.sin(omega), np.cos(omega), np.sin(phi), np.cos(phi)
+    sk, ck = np.sin(kappa), np.cos(kappa)
+    to_world = np.array(
+        [
+            [cp * ck, -cp * sk, sp],
+            [co * sk + so * sp * ck, co * ck - so * sp * sk, -so * cp],
+            [so * sk - co * sp * ck, so * ck + co * sp * sk, co * cp],
+        ]
+    )
+    return np.stack([to_world[:, 0], -to_world[:, 1], -to_world[:, 2]])
+
+
+@pytest.mark.parametrize(
+    ("header", "per_degree"),
+    [
+        ("label,x,y,z,omega,phi,kappa", 1.0),
+        ("label,x,y,z,omega[deg],phi[deg],kappa[deg]", 1.0),
+        ("label,x,y,z,omega[gon],phi[gon],kappa[gon]", 10 / 9),
+        ("label,x,y,z,omega_rad,phi_rad,kappa_rad", np.pi / 180),
+    ],
+)
+def test_omega_phi_kappa(tmp_path, header, per_degree):
+    angles = np.array([12.0, -7.0, 130.0])
+    row = ",".join(repr(float(a)) for a in angles * per_degree)
+    cameras = plain(tmp_path, f"{header}\na,1,2,3,{row}\n")
+    assert cameras.rotations[0] == pytest.approx(photogrammetric(*np.radians(angles)), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("angles", "forward", "top", "right"),
+    [
+        ((0, -90, 0), (0, 0, -1), (0, 1, 0), (1, 0, 0)),
+        ((90, -90, 0), (0, 0, -1), (1, 0, 0), (0, -1, 0)),
+        ((0, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 0)),
+        ((90, 0, 0), (1, 0, 0), (0, 0, 1), (0, -1, 0)),
+        ((0, -30, 0), (0, np.sqrt(0.75), -0.5), (0, 0.5, np.sqrt(0.75)), (1, 0, 0)),
+        ((0, 0, 90), (0, 1, 0), (1, 0, 0), (0, 0, -1)),
+    ],
+)
+def test_aircraft(tmp_path, angles, forward, top, right):
+    text = "label,x,y,z,yaw,pitch,roll\na,1,2,3," + ",".join(map(str, angles))
+    found = looks(plain(tmp_path, text, angles="aircraft"))
+    for vector, expected in zip(found, (forward, top, right), strict=True):
+        assert vector == pytest.approx(expected, abs=1e-12)
+
+
+GIMBAL = "label,x,y,z,{}\na,1,2,3,10,-90,0\nb,1,2,3,20,-60,0\n"
+
+
+def test_angles_of_a_gimbal_do_not_pass_as_others(tmp_path):
+    text = GIMBAL.format("yaw,pitch,roll")
+    with pytest.raises(pcfix.InputError, match=r"cameras\.csv: .*--angles aircraft"):
+        plain(tmp_path, text)
+    assert nadir(plain(tmp_path, text, angles="aircraft")) == pytest.approx([0, 30])
+    assert nadir(plain(tmp_path, text, angles="yaw-pitch-roll")) == pytest.approx([90, 60])
+
+
+def test_a_header_can_say_gimbal(tmp_path):
+    text = GIMBAL.format("GimbalYawDegree,GimbalPitchDegree,GimbalRollDegree")
+    assert nadir(plain(tmp_path, text)) == pytest.approx([0, 30])
+
+
+def test_obliques_among_views_down_are_not_taken_for_a_gimbal(tmp_path):
+    rows = "".join(f"{i},1,2,3,10,{pitch},0\n" for i, pitch in enumerate((0, 1, -2, 55, -50)))
+    cameras = plain(tmp_path, "label,x,y,z,yaw,pitch,roll\n" + rows)
+    assert nadir(cameras) == pytest.approx([0, 1, 2, 55, 50])
+
+
+def test_the_option_chooses_between_angles_that_are_both_there(tmp_path):
+    text = "label,x,y,z,yaw,pitch,roll,omega,phi,kappa\na,1,2,3,0,20,0,10,0,0\n"
+    assert nadir(plain(tmp_path, text)) == pytest.approx([10])
+    assert nadir(plain(tmp_path, text, angles="yaw-pitch-roll")) == pytest.approx([20])
+
+
+def test_quaternions_turn_world_to_camera(tmp_path):
+    turn = Rotation.from_euler("XYZ", [170.0, 12.0, 40.0], degrees=True)
+    x, y, z, w = turn.as_quat()
+    cameras = plain(tmp_path, f"label,x,y,z,qw,qx,qy,qz\na,1,2,3,{w},{x},{y},{z}\n")
+    assert cameras.rotations[0] == pytest.approx(turn.as_matrix(), abs=1e-12)
+
+
+@pytest.mark.parametrize("flip", [np.eye(3), np.diag([1.0, -1.0, -1.0])])
+def test_matrices_alone_look_down(tmp_path, flip):
+    turn = photogrammetric(0.1, -0.2, 2.0)
+    header = ",".join(f"r{i}{j}" for i in "123" for j in "123")
+    row = ",".join(map(repr, (flip @ turn).ravel().tolist()))
+    cameras = plain(tmp_path, f"label,x,y,z,{header}\na,1,2,3,{row}\n")
+    assert cameras.rotations[0] == pytest.approx(turn, abs=1e-12)
+
+
+# Software
+
+
+@metashape
+def test_metashape_omega_phi_kappa():
+    source = Source(METASHAPE / "trajectory.txt", METASHAPE / "io" / "ioP4P.xml")
+    cameras = table.read(source)
+    expected = check_file(METASHAPE)["projection_centres"]
+    assert len(cameras) == 89
+    assert cameras.notes == ()
+    for truth in expected:
+        i = row_of(cameras, truth["image"])
+        assert cameras.centres[i] == pytest.approx([truth[a] for a in "XYZ"], abs=1e-4)
+        assert cameras.rotations[i][2] == pytest.approx(truth["view_dir"], abs=1e-6)
+        assert -cameras.rotations[i][1] == pytest.approx(truth["up_dir_minus_cam_y"], abs=1e-6)
+    lens = cameras.lenses[0]
+    assert (lens.width, lens.height) == (5472, 3648)
+    assert lens.focal == pytest.approx(3734.78562573314)
+    assert lens.principal_x == pytest.approx(2736 - 18.7767676938948)
+
+
+@metashape
+def test_matrix_and_angles_of_a_flight_agree():
+    path = METASHAPE / "trajectory.txt"
+    both = table.read(Source(path, METASHAPE / "io" / "ioP4P.xml"))
+    matrices = np.loadtxt(path, usecols=range(7, 16)).reshape(-1, 3, 3)
+    flipped = np.diag([1.0, -1.0, -1.0]) @ matrices
+    assert turn_deg(both.rotations, flipped).max() < 1e-9
+
+
+METASHAPE_TABLE = """\
+# CoordinateSystem: EPSG:32632
+#Label,Enable,X/Easting,Y/Northing,Z/Altitude,Yaw,Pitch,Roll,Accuracy_X/Y/Z_(m),\
+Accuracy_Yaw/Pitch/Roll_(deg),Error_(m),X_error,X_est,Y_est,Z_est,Yaw_est,Pitch_est,Roll_est,X_var
+a,1,500001,5600002,90,10,1,2,0.05,,1.5,1,500002,5600003,91,11,0,0,0.1
+b,0,500011,5600012,90,,,,0.02,,1.5,1,500012,5600013,91,12,5,0,0.1
+c,1,500021,5600022,90,10,1,2,0.05,,,,,,,,,,
+d,1,,,,,,,,,,,500032,5600033,91,13,0,0,0.1
+"""
+
+
+def test_metashape_reference_has_estimates_and_sources(tmp_path):
+    cameras = plain(tmp_path, METASHAPE_TABLE)
+    assert cameras.labels == ("a", "b", "d")
+    assert cameras.unposed == ("c",)
+    assert cameras.crs == "EPSG:32632"
+    assert cameras.centres[0].tolist() == [500002, 5600003, 91]
+    assert nadir(cameras) == pytest.approx([0, 5, 0], abs=1e-6)
+    assert -cameras.rotations[0][1, :2] == pytest.approx(
+        [np.sin(np.radians(11)), np.cos(np.radians(11))]
+    )
+    assert cameras.gnss.crs == "EPSG:32632"
+    assert cameras.gnss.xyz[0].tolist() == [500001, 5600002, 90]
+    assert cameras.gnss.sigma_m[0].tolist() == [0.05] * 3
+    assert np.isnan(cameras.gnss.xyz[1:]).all()  # b is switched off, d has none
+    assert cameras.notes == ()
+
+
+def test_metashape_sources_alone_are_not_adjusted(tmp_path):
+    text = "#Label,X/Longitude,Y/Latitude,Z/Altitude,Accuracy_X/Y_(m),Accuracy_Z_(m)\n"
+    cameras = plain(tmp_path, text + "a,9.5,50.5,90,0.02,0.04\nb,,,,,\n")
+    assert cameras.labels == ("a",)
+    assert cameras.unposed == ("b",)
+    assert "not adjusted" in cameras.notes[0]
+
+
+@odm
+def test_odm_omega_phi_kappa(tmp_path):
+    sensor = tmp_path / "sensor.csv"
+    sensor.write_text("focal_px,width_px,height_px\n3648,5472,3648\n")
+    cameras = table.read(Source(ODM / "odm_xyz_opk.csv", sensor))
+    for truth in check_file(ODM)["projection_centres"]:
+        i = row_of(cameras, truth["image"])
+        assert cameras.centres[i] == pytest.approx([truth[a] for a in "XYZ"], abs=1e-3)
+        assert cameras.rotations[i][2] == pytest.approx(truth["view_dir"], abs=2e-5)
+        assert -cameras.rotations[i][1] == pytest.approx(truth["up_dir_minus_cam_y"], abs=2e-5)
+
+
+@odm
+def test_odm_roll_pitch_yaw_is_zero_straight_down(tmp_path):
+    # navigation, not adjusted: 4 degrees tell the two conventions apart, which are 60 off
+    sensor = tmp_path / "sensor.csv"
+    sensor.write_text("focal_px,width_px,height_px\n3648,5472,3648\n")
+    cameras = table.read(Source(ODM / "odm_lla_rpy.csv", sensor))
+    assert cameras.crs == "EPSG:4326"
+    for truth in check_file(ODM)["projection_centres"]:
+        i = row_of(cameras, truth["image"])
+        apart = np.arccos(cameras.rotations[i][2] @ truth["view_dir"])
+        assert np.degrees(apart) < 4.0
+
+
+@pix4d
+def test_pix4d_external_parameters_can_be_read_as_a_table(tmp_path):
+    path = next(PIX4D.glob("*external_camera_parameters.txt"))
+    sensor = tmp_path / "sensor.csv"
+    sensor.write_text("focal,sensor_x,sensor_y\n35,36,24\n")
+    cameras = table.read(Source(path, sensor))
+    for truth in check_file(PIX4D.parent)["projection_centres"]:
+        i = row_of(cameras, truth["image"])
+        assert cameras.centres[i] == pytest.approx([truth[a] for a in "XYZ"], abs=1e-3)
+        assert cameras.rotations[i][2] == pytest.approx(truth["view_dir"], abs=1e-5)
+
+
+RC = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
+RC_FRAME = "width_px,height_px\n3840,2880\n"
+
+
+def test_realitycapture_turns_as_its_xmp(tmp_path):
+    # one camera that a user of RealityCapture published in both forms
+    (tmp_path / "frame.csv").write_text(RC_FRAME)
+    angles = "163.736597399311,83.4154313461628,174.386496244756"
+    text = RC + f"a.jpg,1,2,3,{angles},24,0,0,0,0,0,0,0,0\n"
+    cameras = plain(tmp_path, text, sensor=tmp_path / "frame.csv")
+    xmp = [0.982594073038806, 0.185426733553445, -0.0112166890261935]
+    xmp += [-0.032113633044729, 0.11008102707942, -0.993403685341366]
+    assert cameras.rotations[0][:2].ravel() == pytest.approx(xmp, abs=1e-8)
+
+
+def test_realitycapture_lens(tmp_path):
+    (tmp_path / "frame.csv").write_text(RC_FRAME)
+    row = "{},44.5,138.8,6.8,170.3,5.1,-2.7,{},-1e-3,2e-3,0.01,-0.02,0.03,0.04,5e-4,6e-4\n"
+    text = RC + row.format("a", 18) + row.format("b", 18) + row.format("c", 27)
+    cameras = plain(tmp_path, text, sensor=tmp_path / "frame.csv")
+    lens = cameras.lenses[0]
+    assert lens == pcfix.Lens(
+        focal=1920.0,
+        width=3840.0,
+        height=2880.0,
+        principal_x=1920.0 - 3.84,
+        principal_y=1440.0 + 7.68,
+        radial=(0.01, -0.02, 0.03, 0.04),
+        tangential=(5e-4, 6e-4),
+    )
+    assert cameras.lenses[1] is lens
+    assert cameras.lenses[2].focal == pytest.approx(2880.0)
+
+
+def test_realitycapture_takes_the_shape_from_any_sensor(tmp_path):
+    cameras = plain(tmp_path, RC + "a,1,2,3,0,0,0,24,0,0,0,0,0,0,0,0\n")
+    lens = cameras.lenses[0]
+    assert (lens.focal, lens.width, lens.height) == pytest.approx((8.8, 13.2, 8.8))
+
+
+# Sensors
+
+
+def test_a_sensor_in_pixels_has_the_order_of_opencv(tmp_path):
+    sensor = tmp_path / "sensor.csv"
+    sensor.write_text(
+        "focal_px,width_px,height_px,cx,cy,k1,k2,p1,p2,k3\n3000,4000,3000,2010,1490,.1,.2,.3,.4,.5\n"
+    )
+    assert table.read_sensor(sensor) == pcfix.Lens(
+        3000, 4000, 3000, 2010, 1490, radial=(0.1, 0.2, 0.5), tangential=(0.4, 0.3)
+    )
+
+
+def test_a_sensor_in_pixels_without_the_rest(tmp_path):
+    sensor = tmp_path / "sensor.csv"
+    sensor.write_text("focal_px,width_px,height_px\n3000,4000,3000\n")
+    lens = table.read_sensor(sensor)
+    assert (lens.principal_x, lens.principal_y) == (2000, 1500)
+    assert lens.denominator == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("focal_px,width_px,height_px,cx,cy\n3000,4000,3000,10,-5\n", "upper left corner"),
+        ("focal_px,width_px,height_px\n0,4000,3000\n", "must be positive"),
+        ("focal_px,width_px,height_px\n3000,4000,3000\n3000,4000,3000\n", "one row"),
+        ("focal_px,width_px,height_px,k1\n3000,4000,3000,x\n", "column k1"),
+    ],
+)
+def test_sensors_in_pixels_that_are_not_right(tmp_path, text, message):
+    sensor = tmp_path / "lens.csv"
+    sensor.write_text(text)
+    with pytest.raises(pcfix.InputError, match=message) as refusal:
+        table.read_sensor(sensor)
+    assert "lens.csv" in str(refusal.value)
+
+
+# GNSS
+
+
+def test_geo_txt(tmp_path):
+    path = tmp_path / "geo.txt"
+    path.write_text(
+        "WGS84 UTM 16S\nDJI_0028.JPG 500000.5 4000000 198.6\n\n"
+        "DJI_0032.JPG 500010 4000000 199 10 0 0 0.02 0.04 more of it\nDJI_0033.JPG 1 2\n"
+    )
+    labels, gnss = table.read_gnss(path)
+    assert labels == ("DJI_0028.JPG", "DJI_0032.JPG", "DJI_0033.JPG")
+    assert gnss.crs == "EPSG:32716"
+    assert gnss.xyz[:2].tolist() == [[500000.5, 4000000, 198.6], [500010, 4000000, 199]]
+    assert np.isnan(gnss.xyz[2]).all()
+    assert np.isnan(gnss.sigma_m[0]).all()
+    assert gnss.sigma_m[1].tolist() == [0.02, 0.02, 0.04]
+
+
+def test_geo_txt_as_cameras(tmp_path):
+    path = tmp_path / "geo.txt"
+    path.write_text("EPSG:4326\na.jpg -91.99 46.84 198.6 0 0 0\nb.jpg -91.98 46.84\n")
+    assert table.recognises(Source(path))
+    cameras = table.read(Source(path))
+    assert cameras.centres.tolist() == [[-91.99, 46.84, 198.6]]
+    assert cameras.unposed == ("b.jpg",)
+    assert cameras.rotations is None
+    assert cameras.crs == "EPSG:4326"
+    assert "not adjusted" in cameras.notes[0]
+
+
+EXIFTOOL = (
+    "SourceFile,FileName,GPSLatitude,GPSLongitude,GPSAltitude\n"
+    './day/a.JPG,a.JPG,"41 deg 24\' 12.20"" N","2 deg 10\' 26.50"" W",120.5 m Above Sea Level\n'
+    "./day/b.JPG,b.JPG,-41.5,2.5,-3.25\n"
+    "./day/c.JPG,c.JPG,,,\n"
+)
+
+
+def test_exiftool(tmp_path):
+    labels, gnss = table.read_gnss(write(tmp_path, EXIFTOOL))
+    assert labels == ("a.JPG", "b.JPG", "c.JPG")
+    assert gnss.crs == "EPSG:4326"
+    expected = [-(2 + 10 / 60 + 26.5 / 3600), 41 + 24 / 60 + 12.2 / 3600, 120.5]
+    assert gnss.xyz[0] == pytest.approx(expected, abs=1e-12)
+    assert gnss.xyz[1].tolist() == [2.5, -41.5, -3.25]
+    assert np.isnan(gnss.xyz[2]).all()
+
+
+def test_exiftool_with_the_hemisphere_apart(tmp_path):
+    text = (
+        "SourceFile,GPSLatitude,GPSLatitudeRef,GPSLongitude,GPSLongitudeRef,GPSAltitude\n"
+        "C:\\day\\a.JPG,41.5,South,2.5,W,12\n"
+    )
+    labels, gnss = table.read_gnss(write(tmp_path, text))
+    assert labels == ("a.JPG",)
+    assert gnss.xyz.tolist() == [[-2.5, -41.5, 12]]
+
+
+def test_exiftool_as_cameras(tmp_path):
+    cameras = plain(tmp_path, EXIFTOOL)
+    assert len(cameras) == 2
+    assert cameras.unposed == ("c.JPG",)
+    assert "not adjusted" in cameras.notes[0]
+
+
+def test_gnss_of_a_metashape_reference(tmp_path):
+    labels, gnss = table.read_gnss(write(tmp_path, METASHAPE_TABLE))
+    assert labels == ("a", "b", "c", "d")
+    assert gnss.xyz[[0, 2], 0].tolist() == [500001, 500021]
+
+
+@pytest.mark.parametrize("text", ["#Label,X_est,Y_est,Z_est\na,1,2,3\n", "EPSG:4326\na.jpg 1 2\n"])
+def test_no_gnss_at_all(tmp_path, text):
+    with pytest.raises(pcfix.InputError, match=r"cameras\.csv: has no GNSS positions"):
+        table.read_gnss(write(tmp_path, text))
+
+
+# Tables that are not right
+
+ANGLED = "label,x,y,z,omega,phi,kappa\n"
+MATRIX = "label,x,y,z," + ",".join(f"r{i}{j}" for i in "123" for j in "123")
+REFUSED = {
+    "two names for one thing": ("label,easting,east,y,z\na,1,1,2,3\n", r"line 1: .*easting, east"),
+    "one name twice": ("label,x,x,y,z\na,1,1,2,3\n", r"line 1: .*x, x"),
+    "feet": ("label,x[ft],y[ft],z[ft]\na,1,2,3\n", r"column x is in 'ft'"),
+    "mils": ("label,x,y,z,omega[mil],phi,kappa\na,1,2,3,0,0,0\n", r"column omega is in 'mil'"),
+    "no label": ("longitude,latitude,altitude\n1,2,3\n", r"label missing"),
+    "no height": ("label,lon,lat\na,1,2\n", r"line 1 .*z missing"),
+    "an empty label": ("label,x,y,z\na,1,2,3\n,1,2,3\n", r"line 3: the image has no name"),
+    "no number": ("label,x,y,z\na.jpg,1,two,3\n", r"line 2 \(image a.jpg\), column y: 'two'"),
+    "nan": (ANGLED + "a.jpg,1,2,3,0,nan,0\n", r"line 2 \(image a.jpg\), column phi: 'nan'"),
+    "latitude": ("label,lon,lat,alt\na,1,2,3\nb,55,512,3\n", r"line 3 \(image b\): .*latitude 512"),
+    "metres as degrees": (
+        "# crs: EPSG:4326\n#Label,X,Y,Z\na,500000,5600000,3\n",
+        r"line 3 \(image a\): longitude 500000",
+    ),
+    "two angles": ("label,x,y,z,omega,phi\na,1,2,3,0,0\n", r"has omega, phi but lacks kappa"),
+    "alpha, nu": ("label,x,y,z,alpha,nu,kappa\na,1,2,3,0,0,0\n", r"lacks omega, phi|alpha, nu"),
+    "phi first": ("label,x,y,z,phi,omega,kappa\na,1,2,3,0,0,0\n", r"--angles omega-phi-kappa"),
+    "RealityCapture's omega": ("#name,x,y,z,omega,phi,kappa\na,1,2,3,0,0,0\n", r"RealityCapture"),
+    "a translation": ("label,qw,qx,qy,qz,tx,ty,tz\na,1,0,0,0,1,2,3\n", r"tx, ty, tz.*x, y, z"),
+    "a quaternion": (
+        "label,x,y,z,qw,qx,qy,qz\na.jpg,1,2,3,1,1,0,0\n",
+        r"image a.jpg: .*length 1.41",
+    ),
+    "a mirror": (MATRIX + "\na.jpg,1,2,3,1,0,0,0,1,0,0,0,-1\n", r"image a.jpg: .*mirrors"),
+    "a stretch": (MATRIX + "\na.jpg,1,2,3,2,0,0,0,1,0,0,0,1\n", r"image a.jpg: .*orthonormal"),
+    "two sorts of axes": (
+        MATRIX + "\na,1,2,3,1,0,0,0,-1,0,0,0,-1\nb,1,2,3,1,0,0,0,1,0,0,0,1\n",
+        r"line 3 \(image b\): r33",
+    ),
+    "matrix against angles": (
+        MATRIX + ",omega,phi,kappa\na.jpg,1,2,3,1,0,0,0,1,0,0,0,1,0,1,0\n",
+        r"line 2 \(image a.jpg\): .*1 degrees apart",
+    ),
+    "nothing adjusted": (
+        "#Label,X,Y,Z,X_est,Y_est,Z_est\na,1,2,3,,,\n",
+        r"no image has a position",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_tables_that_are_not_right(tmp_path, case):
+    text, message = REFUSED[case]
+    with pytest.raises(pcfix.InputError, match=message) as refusal:
+        plain(tmp_path, text)
+    assert "cameras.csv" in str(refusal.value)
+
+
+def test_an_option_that_the_table_cannot_fill(tmp_path):
+    with pytest.raises(pcfix.InputError, match=re.escape("--angles aircraft needs")):
+        plain(tmp_path, ANGLED + "a,1,2,3,0,0,0\n", angles="aircraft")
+
+
+def test_the_option_settles_the_order_of_the_turns(tmp_path):
+    text = "#name,x,y,z,omega,phi,kappa\na,1,2,3,10,0,0\n"
+    assert nadir(plain(tmp_path, text, angles="omega-phi-kappa")) == pytest.approx([10])
+
+
+@pytest.mark.parametrize("text", [ANGLED, RC])
+def test_angles_need_a_sensor(tmp_path, text):
+    row = "a,1,2,3" + ",0" * (text.count(",") - 3)
+    with pytest.raises(pcfix.InputError, match=r"cameras\.csv: .*--sensor"):
+        table.read(Source(write(tmp_path, text + row, sensor=None)))
+
+
+def test_geo_txt_with_a_short_row(tmp_path):
+    (tmp_path / "geo.txt").write_text("EPSG:4326\na.jpg 1 2 3\nb.jpg 1\n")
+    with pytest.raises(pcfix.InputError, match=r"geo\.txt: line 3 has 2 fields"):
+        table.read_gnss(tmp_path / "geo.txt")
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_damage_is_refused_or_read_but_never_an_error_of_python(tmp_path, seed):
+    random = np.random.default_rng(seed)
+    data = bytearray(METASHAPE_TABLE.encode())
+    for _ in range(1 + seed):
+        data[random.integers(len(data))] = random.integers(256)
+    path = write(tmp_path, bytes(data[: random.integers(len(data))]))
+    try:
+        cameras = table.read(Source(path))
+    except pcfix.InputError as refusal:
+        assert "cameras.csv" in str(refusal)
+    else:
+        assert np.isfinite(cameras.centres).all()

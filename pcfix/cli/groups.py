@@ -1,0 +1,140 @@
+"""Options that several commands share, said once.
+
+A group is a dataclass whose fields are options. A command that is decorated with ``@takes(Group)``
+has a first argument of that class, and on the command line all its fields.
+"""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import MISSING, Field, dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
+
+import typer
+
+from pcfix.cli.words import AngleWords  # noqa: TC001 - typer reads it
+from pcfix.model import DEFAULT_REFRACTIVE_INDEX
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+Group = TypeVar("Group")
+Result = TypeVar("Result")
+
+
+def takes(group: type[Group]) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
+    """Let a command take the fields of a group as options beside its own parameters."""
+
+    def wrap(command: Callable[..., Result]) -> Callable[..., Result]:
+        first, *own = inspect.signature(command, eval_str=True).parameters.values()
+        types = get_type_hints(group, include_extras=True)
+        shared = [_parameter(field, types[field.name]) for field in _fields(group)]
+        names = [p.name for p in shared]
+
+        def called(**given: Any) -> Result:
+            chosen = group(**{name: given.pop(name) for name in names})
+            return command(**{first.name: chosen}, **given)
+
+        called.__name__, called.__doc__ = command.__name__, command.__doc__
+        ordered = sorted([*shared, *own], key=lambda p: p.default is not p.empty)
+        parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in ordered]
+        called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        called.__annotations__ = {p.name: p.annotation for p in parameters}
+        return called
+
+    return wrap
+
+
+def _fields(group: type) -> tuple[Field[Any], ...]:
+    return fields(group)
+
+
+def _parameter(field: Field[Any], annotation: Any) -> inspect.Parameter:
+    default = inspect.Parameter.empty if field.default is MISSING else field.default
+    return inspect.Parameter(
+        field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
+    )
+
+
+@dataclass(frozen=True)
+class CameraWords:
+    """How a camera file is to be read."""
+
+    sensor: Annotated[
+        Path | None,
+        typer.Option(
+            help="Interior orientation where the cameras have none: CSV focal,sensor_x,sensor_y"
+            " in mm, or a Metashape calibration.",
+            show_default="sensor.csv beside the cameras",
+        ),
+    ] = None
+    cameras_crs: Annotated[
+        str | None,
+        typer.Option(
+            help="CRS of the cameras, as EPSG:25830; 'local' takes the numbers as they are.",
+            show_default="what their file says, else the cloud's",
+        ),
+    ] = None
+    cameras_offset: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,Z", help="Added to the projection centres, m."),
+    ] = None
+    angles: Annotated[
+        AngleWords | None,
+        typer.Option(
+            help="Which angles a table has, where its header cannot say: aircraft means pitch -90"
+            " straight down.",
+        ),
+    ] = None
+
+    def keywords(self) -> dict[str, Any]:
+        """Return them as `pcfix.correct_file` takes them."""
+        from pcfix.flow.inputs import offset_of
+
+        return {
+            "sensor": self.sensor,
+            "angles": None if self.angles is None else self.angles.value,
+            "cameras_crs": self.cameras_crs,
+            "cameras_offset_m": offset_of(self.cameras_offset),
+        }
+
+    def plain(self) -> dict[str, Any]:
+        """Return the words that were given, as a stage of PDAL takes them."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {
+            name: getattr(value, "value", str(value) if isinstance(value, Path) else value)
+            for name, value in values.items()
+        }
+
+
+@dataclass(frozen=True)
+class CorrectionWords(CameraWords):
+    """How cameras are read and rays chosen."""
+
+    views: Annotated[
+        Path | None,
+        typer.Option(
+            help="Which cameras made each point: COLMAP's fused.ply.vis, the dense PLY of"
+            " OpenMVS, or the camera file itself for the tracks of its tie points.",
+        ),
+    ] = None
+    index: Annotated[float, typer.Option(help="Refractive index of the water relative to air.")] = (
+        DEFAULT_REFRACTIVE_INDEX
+    )
+    max_angle: Annotated[
+        float | None, typer.Option(help="Use rays up to this incidence angle, degrees.")
+    ] = None
+    max_cameras: Annotated[
+        int | None, typer.Option(help="Use so many rays a point, the steepest.")
+    ] = None
+
+    def keywords(self) -> dict[str, Any]:
+        """Return them as `pcfix.correct_file` takes them."""
+        return {
+            **super().keywords(),
+            "views": self.views,
+            "refractive_index": self.index,
+            "max_angle_deg": self.max_angle,
+            "max_cameras": self.max_cameras,
+        }

@@ -1,0 +1,281 @@
+"""From the frame of a camera file into the cloud's CRS.
+
+Centres go through PROJ, point by point. A rotation is taken over at its own centre: the directions
+one metre along the source's axes become three vectors in the target, and the rotation next to them
+turns the camera. That is the meridian convergence between maps, and all of the rotation from
+geocentric or topocentric axes. What it cannot hold is the scale of the map against that of the
+heights, 0.9996 on the central meridian of UTM: points 100 m below lie up to that part of their
+distance from the principal point elsewhere in the image, 0.8 px at the edge of 4000 px. A cloud
+in map coordinates has the same flaw.
+
+Heights are shifted only where both sides say what theirs are. Where one does not, they stay:
+ellipsoidal ones remain ellipsoidal, whatever the cloud's datum is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pcfix.errors import InputError
+from pcfix.io.cameras.frames import Frame, frame_of
+from pcfix.io.cameras.heights import (
+    Statement,
+    completed,
+    height_notes,
+    heights_agree,
+    is_same_numbers,
+    is_tied,
+    statement,
+    without_grid,
+)
+from pcfix.io.crs import (
+    check_projected_metres,
+    crs_text,
+    is_local,
+    parse_crs,
+    plan_unit,
+    shortened,
+)
+from pcfix.io.transformations import (
+    HeightsError,
+    Transformation,
+    transformation_in_plan,
+    transformation_in_space,
+)
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+    from pcfix.model import Cameras, FloatArray
+
+STEP_M = 10.0
+"""Half the distance over which directions are compared."""
+
+
+@dataclass(frozen=True, eq=False)
+class Georeference:
+    """The way from the frame of a camera file into another.
+
+    Attributes
+    ----------
+    frame : Frame or None
+        Where the numbers come from; None where they are taken as they are.
+    transformation : Transformation or None
+    offset : array, shape (3,)
+        Added before all else.
+    crs : str or None
+        Where the numbers end, as `Cameras.crs` says it.
+    notes : tuple of str
+    name : str
+        For messages.
+    """
+
+    frame: Frame | None
+    transformation: Transformation | None
+    offset: FloatArray
+    crs: str | None
+    notes: tuple[str, ...]
+    name: str
+
+    def cameras(self, cameras: Cameras) -> Cameras:
+        """Return the cameras with centres and rotations there; `gnss` stays in its own CRS.
+
+        Raises
+        ------
+        InputError
+            If a centre has no place there, or the source's axes are left-handed.
+        """
+        rotations = cameras.rotations
+        if rotations is not None and self.transformation is not None:
+            rotations = rotations @ self.turns(cameras.centres).transpose(0, 2, 1)
+        return replace(
+            cameras,
+            centres=self._centres(cameras),
+            rotations=rotations,
+            crs=self.crs,
+            project_crs=None,
+            notes=cameras.notes + self.notes,
+        )
+
+    def points(self, xyz: FloatArray) -> FloatArray:
+        """Return points (n, 3) there; NaN where one is not finite or has no place there."""
+        return np.where(np.isfinite(found := self._forward(xyz + self.offset)), found, np.nan)
+
+    def turns(self, xyz: FloatArray) -> FloatArray:
+        """Return the rotations from the source's axes to the target's at points (n, 3).
+
+        Raises
+        ------
+        InputError
+            If the axes of one of the two are left-handed.
+        """
+        if self.frame is None or self.transformation is None:
+            return np.broadcast_to(np.eye(3), (len(xyz), 3, 3))
+        at = xyz + self.offset
+        steps = STEP_M * np.eye(3) * self.frame.per_metre(at)[:, None, :]
+        ahead, behind = (self._forward((at[:, None] + s).reshape(-1, 3)) for s in (steps, -steps))
+        if not (np.isfinite(ahead).all() and np.isfinite(behind).all()):
+            return np.full((len(xyz), 3, 3), np.nan)
+        vectors = (ahead - behind).reshape(-1, 3, 3).transpose(0, 2, 1) / (2.0 * STEP_M)
+        if (np.linalg.det(vectors) < 0.0).any():
+            raise InputError(
+                f"{self.name}: the axes of {self.frame.crs.name} are left-handed, so rotations"
+                " have no meaning in it; export the cameras in another CRS."
+            )
+        u, _, v = np.linalg.svd(vectors)
+        return np.asarray(u @ v)
+
+    def _forward(self, xyz: FloatArray) -> FloatArray:
+        if self.frame is None or self.transformation is None:
+            return xyz
+        return self.transformation.forward(self.frame.enter(xyz))
+
+    def _centres(self, cameras: Cameras) -> FloatArray:
+        centres = self.points(cameras.centres)
+        lost = ~np.isfinite(centres).all(axis=1)
+        if lost.any():
+            i = int(np.argmax(lost))
+            x, y, z = cameras.centres[i] + self.offset
+            raise InputError(
+                f"{self.name}: image {cameras.labels[i]}: its position {x:.10g}, {y:.10g},"
+                f" {z:.6g} cannot be brought to {shortened(self.crs or '')}; check the CRS of the"
+                " cameras (--cameras-crs)."
+            )
+        return centres
+
+
+def bring_to(
+    cameras: Cameras,
+    cloud_crs: str | CRS | None,
+    *,
+    cameras_crs: str | None = None,
+    offset_m: tuple[float, float, float] | None = None,
+    name: str = "cameras",
+) -> Cameras:
+    """Return cameras in the cloud's CRS.
+
+    Parameters
+    ----------
+    cameras : Cameras
+        As a reader gave them, in the frame of their file.
+    cloud_crs : str, CRS or None
+        Projected, in metres; None where the cloud names none.
+    cameras_crs : str, optional
+        Overrides what the file says. ``local``: the numbers are taken as they are. A CRS without
+        heights says that these agree with the cloud's, and so does ``ENU:lat,lon,height``. For a
+        file with geocentric positions it is the CRS in which its software delivers clouds, unless
+        it is geocentric itself.
+    offset_m : tuple of 3 float, optional
+        Added to the centres before all else, in the axes and the unit of the cameras' frame.
+    name : str
+        What is being read, for messages.
+
+    Returns
+    -------
+    Cameras
+        `crs` says where they are now. `gnss` is left in its own CRS; see `adjusted_minus_gnss`.
+
+    Raises
+    ------
+    InputError
+        If a CRS is unknown, the two cannot be brought together, a vertical grid is missing, or
+        the file calls its frame local and the cloud's is not.
+    """
+    there = georeference(cameras, cloud_crs, cameras_crs=cameras_crs, offset_m=offset_m, name=name)
+    return there.cameras(cameras)
+
+
+def georeference(
+    cameras: Cameras,
+    cloud_crs: str | CRS | None,
+    *,
+    cameras_crs: str | None = None,
+    offset_m: tuple[float, float, float] | None = None,
+    name: str = "cameras",
+) -> Georeference:
+    """Return the way into the cloud's CRS, for cameras, tie points and others; see `bring_to`."""
+    offset = np.zeros(3) if offset_m is None else np.asarray(offset_m, np.float64)
+    if offset.shape != (3,) or not np.isfinite(offset).all():
+        raise InputError(f"{name}: the offset {offset_m} is not three numbers x, y, z.")
+    cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
+    said = statement(cameras, cameras_crs, name)
+    tied = is_tied(said.crs, name)
+    if cloud is None:
+        return _without_cloud_crs(said, cameras, offset, name, tied=tied)
+    if tied:
+        if is_local(cloud):
+            raise InputError(
+                f"{name}: is in {shortened(said.crs or '')}, but the cloud is in a local frame"
+                f" ({cloud.name}); set the cloud's CRS, or give --cameras-crs local to take the"
+                " numbers as they are."
+            )
+        return _into(cloud, said, cameras, offset, name)
+    if said.crs is not None and not said.chosen and not is_local(cloud):
+        raise InputError(
+            f"{name}: is in a local frame, not tied to the earth, but the cloud is in"
+            f" {cloud.name}; export the cameras in that CRS, or, if their numbers are in it up to"
+            " a shift, give --cameras-crs local (and --cameras-offset)."
+        )
+    return Georeference(None, None, offset, crs_text(cloud), (), name)
+
+
+def _without_cloud_crs(
+    said: Statement, cameras: Cameras, offset: FloatArray, name: str, *, tied: bool
+) -> Georeference:
+    """Return the way to where the software delivers clouds: mostly where the cameras are."""
+    as_it_is = Georeference(None, None, offset, said.crs, (), name)
+    if not tied:
+        return as_it_is
+    frame = frame_of(said.crs or "", name)
+    if frame.topocentric:
+        return replace(as_it_is, notes=(_taken(name, shortened(said.crs or "")),))
+    if frame.direct and frame.crs.is_projected:
+        unit, size = plan_unit(frame.crs)
+        words = frame.crs.name + ("" if size == 1.0 else f", unit {unit},")
+        return replace(as_it_is, notes=(_taken(name, words),))
+    if frame.direct or said.project is None or not said.project.is_projected:
+        kind = "degrees" if frame.direct else "geocentric coordinates"
+        raise InputError(
+            f"{name}: is in {kind} ({frame.crs.name}) and the cloud names no CRS; set the cloud's"
+            " CRS."
+        )
+    found = _into(said.project, said, cameras, offset, name)
+    return replace(found, notes=(_taken(name, said.project.name), *found.notes))
+
+
+def _taken(name: str, crs: str) -> str:
+    return f"{name}: the cloud names no CRS; taken to be in {crs} as the cameras are."
+
+
+def _into(
+    cloud: CRS, said: Statement, cameras: Cameras, offset: FloatArray, name: str
+) -> Georeference:
+    """Return the way from a frame tied to the earth into a CRS."""
+    check_projected_metres(cloud, "the cloud")
+    frame = frame_of(said.crs or "", name)
+    if frame.direct and frame.crs.is_geographic and offset.any():
+        raise InputError(
+            f"{name}: an offset in metres cannot be added to degrees ({frame.crs.name})."
+        )
+    at = cameras.centres + offset
+    frame.check(at, cameras.labels, name)
+    target = completed(cloud, frame, said)
+    crs, notes = crs_text(target), height_notes(frame, target, said, name)
+    if not heights_agree(frame, target, said):
+        step = _in_space(frame, target, frame.enter(at), name)
+    elif frame.direct and is_same_numbers(frame.crs, target):
+        return Georeference(frame, None, offset, crs, notes, name)
+    else:
+        step = transformation_in_plan(frame.crs, target, frame.enter(at), name)
+    return Georeference(frame, step, offset, crs, (*step.notes, *notes), name)
+
+
+def _in_space(frame: Frame, target: CRS, at: FloatArray, name: str) -> Transformation:
+    """Return the transformation of plan and heights, or refuse with every way out."""
+    try:
+        return transformation_in_space(frame.crs, target, at, name)
+    except HeightsError as error:
+        raise HeightsError(f"{error}; {without_grid(frame, target)}.") from None

@@ -1,0 +1,275 @@
+"""VisualSFM's N-view match files, ``NVM_V3``.
+
+Definition: C. Wu, "VisualSFM: documentation", section "The output format: N-View Match"
+(http://ccwu.me/vsfm/doc.html#nvm). The first line may go on with the calibration that was held,
+``FixedK fx cx fy cy``. Then come models: a number of cameras, a line for each (name, f, quaternion
+with the scalar first, projection centre, k, 0), a number of points, a line for each (x y z, colour,
+n, then n times image, feature, x, y). A model without points holds the images that have no pose.
+A 0 or the end of the file ends the models. In names, ``"`` stands for a space.
+
+The quaternion is world to camera in OpenCV's axes. ``NVM_V3_R9T`` has the matrix and the
+translation of ``x_cam = R x + t`` instead (``pba/src/pba/util.h`` of Multicore Bundle Adjustment).
+k is of the measured place: ``(1 + k r^2) m / f`` is the undistorted one, with ``r = |m| / f``.
+Measured places m are counted from the principal point, which is the middle of the frame unless
+FixedK says otherwise, x right, y down.
+
+OpenSfM and ODM write files of this form with places from the upper left corner, and scale the
+shorter side of the frame by its own length instead of the longer one's. Such a file is told by
+places none of which is negative and which are far from where the points project; the middle of its
+frame, and whether the shorter side is squeezed, then follow from the points themselves.
+
+Sizes of the images are taken as `pcfix.io.cameras.sizes` says. The CRS is not told.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from pcfix.errors import InputError
+from pcfix.io.cameras import checks, sizes, tracks
+from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pcfix.io.cameras.formats import Source
+
+SOFTWARE = "VisualSFM"
+_HEAD = re.compile(r"NVM_V3(_R9T)?\b(.*)")
+_FIXED = re.compile(r"\s*FixedK\s+(.*)")
+_QUATERNION_NUMBERS, _MATRIX_NUMBERS = 10, 15
+_FAR_PX = 5.0
+"""Larger than a median residual that any block has, smaller than half of any frame."""
+_LARGEST_PX = 1e6
+_LEAST_VIEWS = 10
+"""Of one camera, to find the middle of its frame from."""
+
+
+class Part(NamedTuple):
+    """A model of the file: names, a row of numbers for each camera, points, FixedK or nothing."""
+
+    path: Path
+    names: list[str]
+    rows: FloatArray
+    points: tracks.PointList
+    fixed: FloatArray | None
+
+    @property
+    def posed(self) -> IntArray:
+        """Row numbers of the cameras with a focal length, so with a pose."""
+        return np.flatnonzero(self.rows[:, 0] > 0.0)
+
+
+def recognises(source: Source) -> bool:
+    """Whether the first word is that of the format."""
+    return _HEAD.match(source.text.lstrip()) is not None
+
+
+def read(source: Source) -> Cameras:
+    """Read the poses and lenses of the largest model."""
+    parts = _parts(source.path)
+    part, notes = _largest(parts)
+    posed = part.posed
+    labels = tuple(part.names[i] for i in posed)
+    poses = [_pose(part, i) for i in posed]
+    lenses, more = _lenses(part, labels)
+    taken = set(labels)
+    everything = (name for other in parts for name in other.names)
+    return Cameras(
+        labels=labels,
+        centres=np.array([centre for _, centre in poses]),
+        rotations=np.array([rotation for rotation, _ in poses]),
+        lenses=lenses,
+        notes=(*notes, *more),
+        unposed=tuple(dict.fromkeys(name for name in everything if name not in taken)),
+        source=SOFTWARE,
+    )
+
+
+def tie_points(source: Source, cameras: Cameras) -> TiePoints:
+    """Read the points of the largest model and where the images saw them."""
+    part, _ = _largest(_parts(source.path))
+    points = part.points
+    if not len(points.image) or cameras.lenses is None:
+        raise InputError(f"{source.path}: has no points; no tie points.")
+    row = np.full(len(part.rows), -1)
+    row[part.posed] = np.arange(len(cameras))
+    camera = row[points.image]
+    middle = np.array([[lens.principal_x, lens.principal_y] for lens in cameras.lenses])
+    return tracks.tie_points(points.xyz, points.point, camera, middle[camera] + _placed(part)[0])
+
+
+def _parts(path: Path) -> list[Part]:
+    """Return all models of the file."""
+    text = path.read_bytes().decode("utf-8-sig", "replace").lstrip()
+    head, _, body = text.partition("\n")
+    found = _HEAD.match(head)
+    if found is None:
+        raise InputError(f"{path}: line 1 must begin with NVM_V3.")
+    lines = [line for line in body.splitlines() if line.strip() and line.lstrip()[0] != "#"]
+    width = _MATRIX_NUMBERS if found[1] else _QUATERNION_NUMBERS
+    fixed = _fixed(path, found[2])
+    parts = []
+    at = 0
+    while at < len(lines) and (count := _count(path, lines, at, "cameras")) > 0:
+        names, rows = _cameras(path, lines[at + 1 : at + 1 + count], width)
+        at += 1 + count
+        points = _count(path, lines, at, "points")
+        listed = tracks.numbers(path, "\n".join(lines[at + 1 : at + 1 + points]))
+        parts.append(
+            Part(path, names, rows, tracks.point_list(path, listed, points, count, 4), fixed)
+        )
+        at += 1 + points
+    if not parts:
+        raise InputError(f"{path}: has no model; run the reconstruction and save it again.")
+    return parts
+
+
+def _count(path: Path, lines: list[str], at: int, what: str) -> int:
+    """Return the number in a line that announces so many more lines."""
+    text = lines[at].strip() if at < len(lines) else ""
+    if not (text.isascii() and text.isdecimal()) or int(text[:18]) > len(lines) - at - 1:
+        raise InputError(
+            f"{path}: is cut off or damaged: a number of {what} is '{text[:40]}', and"
+            f" {max(len(lines) - at - 1, 0)} lines follow; export it again."
+        )
+    return int(text)
+
+
+def _fixed(path: Path, text: str) -> FloatArray | None:
+    """Return fx, cx, fy, cy of the first line."""
+    found = _FIXED.match(text)
+    if found is None:
+        return None
+    values = tracks.numbers(path, found[1])
+    if len(values) < 4 or not (np.isfinite(values).all() and (values[:4] > 0.0).all()):
+        raise InputError(f"{path}: line 1: FixedK must be followed by positive fx, cx, fy and cy.")
+    return values[:4]
+
+
+def _cameras(path: Path, lines: list[str], width: int) -> tuple[list[str], FloatArray]:
+    names, rows = [], []
+    for line in lines:
+        name, *words = line.rsplit(None, width)
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError:
+            words = []
+        if len(words) != width:
+            raise InputError(
+                f"{path}: image {line.split()[0][:80]}: its line must have {width} numbers after"
+                " the name; export it again."
+            )
+        names.append(name.strip().strip('"').replace('"', " "))
+    return names, np.array(rows)
+
+
+def _largest(parts: list[Part]) -> tuple[Part, tuple[str, ...]]:
+    """Return the model with most posed images, of those with points if there are any."""
+    models = [part for part in parts if len(part.points.xyz)] or parts
+    largest = max(models, key=lambda part: len(part.posed))
+    if not len(largest.posed):
+        raise InputError(f"{largest.path}: no image has a pose (all focal lengths are 0).")
+    if len(models) == 1:
+        return largest, ()
+    return largest, (
+        f"{largest.path}: has {len(models)} models, which are not tied to each other; the largest,"
+        f" with {len(largest.posed)} images, is taken.",
+    )
+
+
+def _pose(part: Part, row: int) -> tuple[FloatArray, FloatArray]:
+    """Return rotation and projection centre."""
+    name, numbers = part.names[row], part.rows[row]
+    if len(numbers) == _MATRIX_NUMBERS:
+        rotation = checks.rotation(part.path, name, numbers[1:10].reshape(3, 3))
+        centre = -rotation.T @ numbers[10:13]
+    else:
+        rotation = checks.quaternion(part.path, name, numbers[1:5])
+        centre = numbers[5:8]
+    if not np.isfinite(centre).all():
+        raise InputError(f"{part.path}: image {name}: its position is not finite.")
+    return rotation, centre
+
+
+def _lenses(part: Part, labels: tuple[str, ...]) -> tuple[tuple[Lens, ...] | None, tuple[str, ...]]:
+    rows = part.rows[part.posed]
+    smallest = _placed(part)[1][part.posed]
+    frames, notes = sizes.frames(part.path, labels, rows[:, 0], smallest)
+    if frames is None:
+        return None, notes
+    lenses = []
+    for label, row, (w, h) in zip(labels, rows.tolist(), frames.tolist(), strict=True):
+        fixed = (row[0], w / 2.0, row[0], h / 2.0) if part.fixed is None else part.fixed.tolist()
+        fx, cx, fy, cy = fixed
+        lens = Lens(fy, w, h, cx, cy, b1=fx - fy, radial=(row[-2],), inverse=True)
+        lenses.append(checks.lens(part.path, f"of image {label}", lens))
+    return tuple(lenses), notes
+
+
+def _placed(part: Part) -> tuple[FloatArray, FloatArray]:
+    """Return the places of views from the principal point, and the least frame of each image."""
+    image, seen = part.points.image, part.points.rest[:, 1:].copy()
+    least = np.zeros((len(part.rows), 2))
+    if part.fixed is not None:
+        least[:] = 2.0 * part.fixed[[1, 3]]
+    elif _from_corner(part):
+        expected = _expected(part)
+        for focal in np.unique(part.rows[part.posed, 0]):
+            rows = part.rows[image, 0] == focal
+            if np.isfinite(expected[rows]).all(axis=1).sum() >= _LEAST_VIEWS:
+                squeeze, frame = _squeeze_and_frame(expected[rows], seen[rows])
+                seen[rows] = (seen[rows] - frame / 2.0) / squeeze
+                least[part.rows[:, 0] == focal] = frame
+    else:
+        np.maximum.at(least, image, 2.0 * np.abs(seen))
+    return seen, least
+
+
+def _from_corner(part: Part) -> bool:
+    """Whether places are from the corner: none negative, and far from where points project."""
+    seen = part.points.rest[:, 1:]
+    if not len(seen) or not ((seen >= 0.0) & (seen < _LARGEST_PX)).all():
+        return False
+    miss = np.abs(seen - _expected(part))
+    return bool(np.median(miss[np.isfinite(miss)] if np.isfinite(miss).any() else 0.0) > _FAR_PX)
+
+
+def _expected(part: Part) -> FloatArray:
+    """Return where points project without distortion, from the principal point; NaN if nowhere."""
+    points = part.points
+    expected = np.full((len(points.image), 2), np.nan)
+    order = np.argsort(points.image, kind="stable")
+    bounds = np.searchsorted(points.image[order], np.arange(len(part.rows) + 1))
+    for row in part.posed:
+        rotation, centre = _pose(part, row)
+        rows = order[bounds[row] : bounds[row + 1]]
+        with np.errstate(over="ignore", invalid="ignore"):
+            x, y, z = rotation @ (points.xyz[points.point[rows]] - centre).T
+            z = np.where(z > 0.0, z, np.nan)
+            places = part.rows[row, 0] * np.column_stack([x / z, y / z])
+        expected[rows] = np.where(np.abs(places) < _LARGEST_PX, places, np.nan)
+    return expected
+
+
+def _squeeze_and_frame(expected: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Fit seen = squeeze x expected + frame / 2 on each axis, the second time without outliers.
+
+    The frame is whole pixels, and the squeeze is 1 or its sides in units of the longer one,
+    whichever is nearer.
+    """
+    slopes, offsets = np.empty((2, 2))
+    there = np.isfinite(expected).all(axis=1)
+    for axis, (e, s) in enumerate(zip(expected[there].T, seen[there].T, strict=True)):
+        good = np.full(len(e), True)
+        for _ in range(2):
+            offsets[axis], slopes[axis] = np.polynomial.polynomial.polyfit(e[good], s[good], 1)
+            miss = np.abs(s - slopes[axis] * e - offsets[axis])
+            good = miss <= 3.0 * np.median(miss)
+    frame = np.round(2.0 * offsets)
+    squeeze = frame / frame.max()
+    nearer = np.abs(slopes - squeeze) < np.abs(slopes - 1.0)
+    return np.where(nearer, squeeze, 1.0), frame

@@ -1,0 +1,238 @@
+"""RealityCapture and RealityScan: .xmp files beside the images, one each.
+
+The fields of the namespace ``xcr`` are attributes or child elements. `Rotation` is world to
+camera by rows (x right, y down, z forward) and `Position` the projection centre. Focal length and
+principal point are shares of the larger side of the image, the focal length times 36 (the film of
+35 mm cameras), the principal point from the centre of the image:
+
+    scale = max(width, height),  f = FocalLength35mm / 36 scale
+    u = width / 2 + U scale + f x' + Skew scale y'
+    v = height / 2 + V scale + AspectRatio f y'
+
+The coefficients are k1, k2, k3, k4, t1, t2 of Brown's formula, in Brown's order,
+x' = ... + t1 (r^2 + 2 x^2) + 2 t2 x y; models named brown3 leave k4 out, those without "t2" the
+last two. The division model undoes the distortion after the calibration matrix, about the centre
+of the image: m = m' / (1 + k1 |m'|^2), m and m' places in shares of the larger side.
+
+The width and height are not in the file: they come from the image beside it, or from the
+proportions of ``--sensor``. Positions called relative or rigid are in a local frame; absolute
+ones are in the CRS of the export, which the file does not name. `latitude` and `longitude` are
+not those of the image.
+
+References: Epic Games, "RealityScan/RealityCapture XMP camera math" and RealityScan Help, "XMP
+Metadata" (tools/xmpalign). The software's own export template for OpenCV writes t2, t1 where
+OpenCV has p1, p2, and its template of projection matrices builds K [R | -R C] with one scale for
+both axes; the converters of AliceVision and EasyVolcap agree. There was no file with measurements
+to check any of this.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from pcfix.errors import InputError
+from pcfix.io.cameras import checks
+from pcfix.io.cameras.sizes import image_size
+from pcfix.io.cameras.table.sensor import read_sensor
+from pcfix.io.cameras.xml import number, numbers, read_xml
+from pcfix.model import Cameras, Lens
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from pcfix.io.cameras.formats import Source
+    from pcfix.model import FloatArray
+
+SOFTWARE = "RealityCapture (XMP)"
+NAMESPACE = "http://www.capturingreality.com/ns/xcr/"
+DESCRIPTION = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"
+HEAD_BYTES = 65536
+FILM_MM = 36.0
+MODELS = {
+    "perspective": (0, 0),
+    "brown3": (3, 0),
+    "brown4": (4, 0),
+    "brown3t2": (3, 2),
+    "brown4t2": (4, 2),
+    "division": (1, 0),
+}
+"""How many radial and tangential coefficients each model has."""
+IMAGES = (".jpg", ".jpeg", ".tif", ".tiff", ".png", ".webp", ".bmp", ".exr", ".jp2")
+
+
+class Image(NamedTuple):
+    """One file: the name of its image and its fields."""
+
+    path: Path
+    label: str
+    fields: dict[str, str]
+
+
+def recognises(source: Source) -> bool:
+    """Whether a file, or one of the .xmp files of a folder, uses RealityCapture's namespace."""
+    if not source.path.is_dir():
+        return NAMESPACE.encode() in source.head
+    return any(_is_ours(path) for path in _files(source.path))
+
+
+def read(source: Source) -> Cameras:
+    """Read the poses, and the lenses where the size of the images is known."""
+    path = source.path
+    images = _images(path)
+    posed = [image for image in images if _is_posed(image)]
+    if not posed:
+        raise InputError(
+            f"{path}: has no xcr:Rotation and xcr:Position; export the XMP after the alignment,"
+            " with poses."
+        )
+    frames = _frames(source, posed)
+    lenses = None if frames is None else tuple(map(_lens, posed, frames))
+    relative = any(image.fields.get("Coordinates", "absolute") != "absolute" for image in posed)
+    return Cameras(
+        labels=tuple(image.label for image in posed),
+        centres=np.array([_numbers(image, "Position", 3) for image in posed]),
+        rotations=np.array([_rotation(image) for image in posed]),
+        lenses=lenses,
+        crs="local" if relative else None,
+        notes=() if lenses else (_note(path),),
+        unposed=tuple(image.label for image in images if not _is_posed(image)),
+        source="RealityCapture",
+    )
+
+
+def _is_posed(image: Image) -> bool:
+    return {"Rotation", "Position"} <= image.fields.keys()
+
+
+def _note(path: Path) -> str:
+    return (
+        f"{path}: XMP files do not tell the size of the images, and those are not beside them; put"
+        " them there or give --sensor. Frames are taken as boundless."
+    )
+
+
+def _files(path: Path) -> list[Path]:
+    """Return the .xmp files of a folder, or the one file."""
+    if not path.is_dir():
+        return [path]
+    return sorted(p for p in path.iterdir() if p.suffix.lower() == ".xmp" and p.is_file())
+
+
+def _is_ours(path: Path) -> bool:
+    try:
+        with path.open("rb") as stream:
+            return NAMESPACE.encode() in stream.read(HEAD_BYTES)
+    except OSError:
+        return False
+
+
+def _images(path: Path) -> list[Image]:
+    """Read the files; ``_common.xmp`` speaks of no image."""
+    files = _files(path)
+    folder = path if path.is_dir() else path.parent
+    beside = {p.stem: p.name for p in folder.iterdir() if p.suffix.lower() in IMAGES}
+    return [
+        Image(file, beside.get(file.stem, file.stem), _fields(file))
+        for file in files
+        if _is_ours(file) and file.stem != "_common"
+    ]
+
+
+def _fields(path: Path) -> dict[str, str]:
+    """Return the fields of all descriptions, from attributes and child elements."""
+    fields: dict[str, str] = {}
+    for description in read_xml(path).iter(DESCRIPTION):
+        pairs = [*description.attrib.items(), *((str(e.tag), e.text) for e in description)]
+        for name, text in pairs:
+            if name.startswith("{" + NAMESPACE):
+                fields[name.partition("}")[2]] = (text or "").strip()
+    return fields
+
+
+def _frames(source: Source, images: list[Image]) -> Sequence[tuple[float, float]] | None:
+    """Return width and height of each image; None when one of them is not known."""
+    folder = source.path if source.path.is_dir() else source.path.parent
+    beside = folder / "sensor.csv"
+    sensor = source.sensor or (beside if beside.is_file() else None)
+    given = None
+    if sensor is not None:
+        lens = read_sensor(sensor)
+        given = (lens.width, lens.height)
+    frames = [image_size(folder, image.label) or given for image in images]
+    known = [frame for frame in frames if frame is not None]
+    return known if len(known) == len(images) else None
+
+
+def _rotation(image: Image) -> FloatArray:
+    matrix = _numbers(image, "Rotation", 9).reshape(3, 3)
+    return checks.rotation(image.path, image.label, matrix)
+
+
+def _numbers(image: Image, name: str, count: int) -> FloatArray:
+    where = f"image {image.label}, xcr:{name}"
+    return numbers(image.path, where, image.fields[name], count)
+
+
+def _number(image: Image, name: str, default: str) -> float:
+    text = image.fields.get(name, default)
+    return number(image.path, f"image {image.label}, xcr:{name}", text)
+
+
+def _lens(image: Image, frame: tuple[float, float]) -> Lens:
+    """Return the lens, in the unit of the frame."""
+    width, height = frame
+    scale = max(frame)
+    across = _number(image, "FocalLength35mm", "") / FILM_MM * scale
+    u, v = (_number(image, f"PrincipalPoint{axis}", "0") * scale for axis in "UV")
+    focal = across * _number(image, "AspectRatio", "1")
+    model, radial, tangential = _distortion(image)
+    lens = Lens(
+        focal=focal,
+        width=width,
+        height=height,
+        principal_x=width / 2.0 + u,
+        principal_y=height / 2.0 + v,
+        b1=across - focal,
+        b2=_number(image, "Skew", "0") * scale,
+        radial=radial,
+        tangential=tangential,
+    )
+    checks.lens(image.path, f"of image {image.label}", lens)
+    return _with_division(lens, scale) if model == "division" else lens
+
+
+def _distortion(image: Image) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
+    """Return the model and its radial and tangential coefficients."""
+    model = image.fields.get("DistortionModel", "perspective")
+    if model not in MODELS:
+        raise InputError(
+            f"{image.path}: image {image.label}: the distortion model '{model}' is not supported;"
+            f" export with one of {', '.join(MODELS)}."
+        )
+    text = image.fields.get("DistortionCoeficients", "")
+    given = numbers(
+        image.path, f"image {image.label}, xcr:DistortionCoeficients", text, len(text.split())
+    )
+    k = np.zeros(6)
+    k[: len(given)] = given[:6]
+    radial, tangential = MODELS[model]
+    return model, tuple(k[:radial].tolist()), tuple(k[4 : 4 + tangential].tolist())
+
+
+def _with_division(lens: Lens, scale: float) -> Lens:
+    """Return the lens with its radial coefficient taken as that of the division model.
+
+    In plane coordinates the centre of the image is at minus the principal point over the focal
+    length, and a length there is a share of the image divided by that of the focal length.
+    """
+    across = lens.focal + lens.b1
+    centre = (
+        (lens.width / 2.0 - lens.principal_x) / across,
+        (lens.height / 2.0 - lens.principal_y) / lens.focal,
+    )
+    k = lens.radial[0] * (across / scale) ** 2
+    return replace(lens, radial=(), denominator=(k,), distortion_centre=centre, inverse=True)

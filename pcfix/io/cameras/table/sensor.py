@@ -1,0 +1,159 @@
+"""The lens of the images of a table: from a table beside it, a calibration, or its own columns."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pcfix.errors import InputError
+from pcfix.io.cameras import checks
+from pcfix.io.files import check_input
+from pcfix.io.tables import read_lines, read_table, split_header
+from pcfix.model import Lens
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pcfix.io.cameras.table.columns import Columns
+    from pcfix.io.tables import Table
+
+MILLIMETRES = ("focal", "sensor_x", "sensor_y")
+PIXELS = ("focal_px", "width_px", "height_px")
+FRAME = ("width_px", "height_px")
+DISTORTION = ("k1", "k2", "k3", "k4", "t1", "t2")
+FILM_MM = 36.0
+"""Larger side of the film that 35 mm focal lengths mean."""
+
+
+def read_sensor(path: Path) -> Lens:
+    """Read the lens of all images.
+
+    Parameters
+    ----------
+    path : Path
+        A calibration of Metashape (XML), or a table of one row. Its columns are either focal,
+        sensor_x, sensor_y in mm; the principal point is then the centre. Or they are focal_px,
+        width_px, height_px and, where known, OpenCV's cx, cy (pixels from the upper left corner
+        of the image), k1 ... k6, p1, p2.
+
+    Raises
+    ------
+    InputError
+        If it is neither, or a number cannot be that of a camera.
+    """
+    if _is_xml(check_input(path)):
+        from pcfix.io.cameras.metashape import read_calibration
+
+        lens: Lens = read_calibration(path)
+        return lens
+    if _names(path) >= set(PIXELS):
+        return _from_pixels(read_table(path, PIXELS))
+    table = read_table(path, MILLIMETRES)
+    focal, width, height = (table.numbers(name)[0] for name in MILLIMETRES)
+    if len(table.rows) != 1 or min(focal, width, height) <= 0.0:
+        raise InputError(
+            f"{path}: give one row of positive focal, sensor_x and sensor_y in mm, not"
+            f" {len(table.rows)} row(s) beginning {focal:g}, {width:g}, {height:g}."
+        )
+    return Lens(focal, width, height, width / 2.0, height / 2.0, unit="mm")
+
+
+def read_lenses(columns: Columns, sensor: Path | None) -> tuple[Lens, ...]:
+    """Return the lens of each row.
+
+    Raises
+    ------
+    InputError
+        If there is no sensor, neither given nor beside the table.
+    """
+    own = columns.has("f", "px", "py")
+    beside = columns.path.with_name("sensor.csv")
+    if sensor is None and not beside.is_file():
+        raise InputError(
+            f"{columns.path}: has the shape of no image: give --sensor a table with the columns"
+            " width_px,height_px."
+            if own
+            else f"{columns.path}: has angles, but there is no sensor: give --sensor, put"
+            " sensor.csv (focal,sensor_x,sensor_y in mm) beside it, or leave the angles out."
+        )
+    path = sensor or beside
+    return _own_lenses(columns, path) if own else (read_sensor(path),) * len(columns.labels)
+
+
+def _own_lenses(columns: Columns, sensor: Path) -> tuple[Lens, ...]:
+    """Return the lenses of RealityCapture's table, whose sensor says only the shape."""
+    width, height = _frame(sensor)
+    largest = max(width, height)
+    rows = columns.of(("f", "px", "py"))
+    brown = np.nan_to_num(columns.where_there(DISTORTION))
+    seen: dict[bytes, Lens] = {}
+    lenses = []
+    for label, (focal, x, y), k in zip(columns.labels, rows, brown, strict=True):
+        key = np.array([focal, x, y, *k]).tobytes()
+        if key not in seen:
+            lens = Lens(
+                focal=focal * largest / FILM_MM,
+                width=width,
+                height=height,
+                principal_x=width / 2.0 + x * largest,
+                principal_y=height / 2.0 + y * largest,
+                radial=tuple(k[:4].tolist()),
+                tangential=tuple(k[4:].tolist()),
+            )
+            seen[key] = checks.lens(columns.path, label, lens)
+        lenses.append(seen[key])
+    return tuple(lenses)
+
+
+def _frame(path: Path) -> tuple[float, float]:
+    """Return width and height of the images, pixels or millimetres."""
+    if not _is_xml(check_input(path)) and _names(path) >= set(FRAME):
+        width, height = (read_table(path, FRAME).numbers(name)[0] for name in FRAME)
+        if min(width, height) <= 0.0:
+            raise InputError(
+                f"{path}: width_px {width:g} and height_px {height:g} must be positive."
+            )
+        return width, height
+    lens = read_sensor(path)
+    return lens.width, lens.height
+
+
+def _from_pixels(table: Table) -> Lens:
+    """Return the lens of a row in pixels, with OpenCV's names."""
+    if len(table.rows) != 1:
+        raise InputError(f"{table.path}: give one row for all images, not {len(table.rows)}.")
+
+    def value(name: str, default: float = 0.0) -> float:
+        return table.numbers(name)[0] if name in table.header else default
+
+    focal, width, height = (value(name) for name in PIXELS)
+    cx, cy = value("cx", width / 2.0), value("cy", height / 2.0)
+    radial = [value(f"k{i}") for i in range(1, 7)]
+    lens = Lens(
+        focal=focal,
+        width=width,
+        height=height,
+        principal_x=cx,
+        principal_y=cy,
+        radial=tuple(radial[:3]),
+        denominator=tuple(radial[3:]) if any(radial[3:]) else (),
+        tangential=(value("p2"), value("p1")),
+    )
+    checks.lens(table.path, table.path.stem, lens)
+    if not (0.25 < cx / width < 0.75 and 0.25 < cy / height < 0.75):
+        raise InputError(
+            f"{table.path}: cx {cx:g}, cy {cy:g} is far from the centre; count them"
+            " in pixels from its upper left corner."
+        )
+    return lens
+
+
+def _is_xml(path: Path) -> bool:
+    with path.open("rb") as stream:
+        return stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+
+
+def _names(path: Path) -> set[str]:
+    lines = read_lines(path)
+    return set(split_header(lines[0].strip())[0]) if lines else set()

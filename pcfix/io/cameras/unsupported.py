@@ -1,0 +1,166 @@
+"""Files that are known but not read: each is refused with its name and a way round.
+
+Only what no reader has claimed comes here. Recognised are signatures, keywords in the first bytes
+and, of folders, the names inside.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, NamedTuple, NoReturn
+
+import numpy as np
+
+from pcfix.errors import InputError
+from pcfix.io.tables import number
+
+if TYPE_CHECKING:
+    from pcfix.io.cameras.formats import Source
+
+SOFTWARE = "a format that pcfix does not read"
+
+ANY_CAMERAS = "give the file or folder with the camera poses"
+OMEGA_PHI_KAPPA = (
+    "write a table with the header label,x,y,z,omega,phi,kappa and give its lens by --sensor"
+)
+COLMAP = "export a COLMAP model (cameras, images, points3D)"
+METASHAPE = "in Metashape, File > Export > Export Cameras, Agisoft XML"
+
+
+class Refusal(NamedTuple):
+    """A format: what it is, what its content matches, and what to do instead."""
+
+    what: str
+    pattern: bytes
+    remedy: str
+
+
+OPENMVG = Refusal("a scene of OpenMVG", rb'"sfm_data_version"', f"{COLMAP} (openMVG2Colmap)")
+ALICEVISION = Refusal(
+    "a scene of AliceVision (Meshroom)",
+    rb'"viewId"|"featuresFolders"|"pipelineVersion"',
+    f"{COLMAP} (aliceVision_exportColmap)",
+)
+NERFSTUDIO = Refusal(
+    "a scene of nerfstudio or instant-ngp",
+    rb'"transform_matrix"|"camera_angle_x"|"fl_x"',
+    "give the model from which it was converted; its axes and scale are no longer the cloud's",
+)
+IMAGES = Refusal("an image", rb"\A(\xff\xd8\xff|II[*+]\0|MM\0[*+]|\x89PNG)", ANY_CAMERAS)
+PIX4D = Refusal(
+    "a project of Pix4D", rb"<pix4uav|<!DOCTYPE Pix4D", "give its folder 1_initial/params"
+)
+
+FILES = (
+    IMAGES,
+    Refusal("a point cloud (LAS, LAZ)", rb"\ALASF", ANY_CAMERAS),
+    Refusal("a point cloud or mesh (PLY)", rb"\Aply\r?\n", ANY_CAMERAS),
+    Refusal("a GeoPackage or other SQLite database", rb"\ASQLite format 3\0", ANY_CAMERAS),
+    Refusal("a shapefile", rb"\A\0\0\x27\x0a", ANY_CAMERAS),
+    Refusal("an archive (gzip)", rb"\A\x1f\x8b", f"unpack it, then {ANY_CAMERAS}"),
+    Refusal("an archive (ZIP)", rb"\APK[\x03\x05]", f"unpack it, then {ANY_CAMERAS}"),
+    Refusal("a scene of OpenMVS", rb"\AMVS[I\0]", f"{COLMAP} from what OpenMVS was run on"),
+    PIX4D,
+    Refusal(
+        "a project of Metashape without its poses",
+        rb"\A\s*(<\?xml[^>]*>\s*)?<document[^>]*\bpath=",
+        f"keep the folder .files beside it, or {METASHAPE}",
+    ),
+    Refusal(
+        "a project of RealityCapture",
+        rb"<Reality(Capture|Scan)",
+        "export Internal/External camera parameters (CSV) or XMP files",
+    ),
+    Refusal("a map of Google Earth (KML)", rb"<kml[\s>]", ANY_CAMERAS),
+    Refusal("a survey job (Trimble, Leica)", rb"<(JOBFile|HeXML|LandXML)[\s>]", ANY_CAMERAS),
+    Refusal(
+        "a list of ground control points (ODM)",
+        rb"\A(EPSG:\d|\+proj=|WGS84 UTM )[^\n]*\n\s*[-+.\d]+[ \t]+[-+.\d]+[ \t]",
+        ANY_CAMERAS,
+    ),
+    Refusal("a table of the sensor", rb"\A(\xef\xbb\xbf)?focal", "give it by --sensor"),
+    Refusal(
+        "a project of Inpho (Trimble)",
+        rb"\A\s*\$PROJECT\b|^\s*\$(PHOTO_NUM|EXT_ORI)\b",
+        OMEGA_PHI_KAPPA,
+    ),
+    Refusal(
+        "a support file of SOCET SET",
+        rb"^\s*(SENSOR_TYPE|IMAGE_SUPPORT|SENSOR_SERIAL_NUMBER|TRIANGULATION_TYPE)\s",
+        OMEGA_PHI_KAPPA,
+    ),
+    Refusal("a file of BINGO", rb"^\s*(ORI[AE]|PRO[JI]|GEOI|BILD)\s+\S+\s+\S", OMEGA_PHI_KAPPA),
+    OPENMVG,
+    ALICEVISION,
+    NERFSTUDIO,
+)
+"""The first that matches counts."""
+
+FOLDERS = (
+    (r"sfm_data\.(json|bin)", OPENMVG),
+    (r".*\.(sfm|mg)", ALICEVISION),
+    (r"transforms\.json", NERFSTUDIO),
+    (r"1_initial", PIX4D),
+    (r"(?i).*\.(jpe?g|tiff?|png|dng)", IMAGES._replace(what="a folder of images")),
+)
+"""What the name of a file inside says of a folder."""
+PATB = Refusal("a text like PATB's .ori, with rotation matrices", b"", OMEGA_PHI_KAPPA)
+BARE = Refusal(
+    "a table without a header",
+    b"",
+    "put one above the rows, for example label,x,y,z,omega,phi,kappa",
+)
+
+
+def recognises(source: Source) -> bool:
+    """Whether the content is one of these."""
+    return _refusal(source) is not None
+
+
+def read(source: Source) -> NoReturn:
+    """Refuse the file.
+
+    Raises
+    ------
+    InputError
+        Always; with the name of the format and what to give instead.
+    """
+    found = _refusal(source)
+    what, remedy = (found.what, found.remedy) if found else (SOFTWARE, ANY_CAMERAS)
+    raise InputError(f"{source.path}: is {what}, which pcfix does not read as cameras; {remedy}.")
+
+
+def _refusal(source: Source) -> Refusal | None:
+    """Return what the content is, or None where it is not known."""
+    if source.path.is_dir():
+        known = (f for name, f in FOLDERS if any(re.fullmatch(name, n) for n in source.names))
+        return next(known, None)
+    for each in FILES:
+        if re.search(each.pattern, source.head, re.MULTILINE):
+            return each
+    return None if b"\0" in source.head else _bare_numbers(source.text)
+
+
+def _bare_numbers(text: str) -> Refusal | None:
+    """Return what a text is whose lines are numbers, but for the name of the image."""
+    lines = (text.rpartition("\n")[0] or text).splitlines()  # the last may be cut off
+    rows = [_numbers(line) for line in lines if line.strip() and not line.startswith("#")]
+    for i in range(len(rows) - 2):
+        three = rows[i : i + 3]
+        if all(len(row) == 3 for row in three) and _is_rotation(np.array(three)):
+            return PATB
+    return BARE if rows and all(len(row) >= 3 for row in rows[:20]) else None
+
+
+def _numbers(line: str) -> list[float]:
+    """Return the numbers of a line, after at most one name; nothing where other words are."""
+    words = re.split(r"[,;\s]+", line.strip())
+    values = [number(word) for word in words]
+    if np.isnan(values[0]):
+        values = values[1:]
+    return [] if np.isnan(values).any() else values
+
+
+def _is_rotation(matrix: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> bool:
+    with np.errstate(all="ignore"):
+        return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() < 1e-3)

@@ -1,0 +1,206 @@
+"""Coordinate reference systems: what a text names, its parts, its units, the kind of its heights.
+
+Numbers always stand in the order x (east, longitude), y (north, latitude), z, whatever order of
+axes a CRS states.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from pcfix.errors import InputError
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+Heights = Literal["ellipsoidal", "gravity", "unstated"]
+
+METRES = ("metre", "meter")
+
+
+def parse_crs(given: str | CRS, name: str) -> CRS:
+    """Return the CRS that a text names, as EPSG code, WKT of any flavour, PROJ string or name.
+
+    Parameters
+    ----------
+    given : str or CRS
+    name : str
+        Whose it is, for the message.
+
+    Raises
+    ------
+    InputError
+        If PROJ does not know it, or it says where nothing lies (a vertical CRS alone).
+    """
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    if isinstance(given, CRS):
+        return CRS(given)
+    text = re.sub(r"^(\w+)::", r"\1:", given.strip())
+    try:
+        crs = CRS.from_user_input(int(text) if text.isdecimal() else text)
+    except (CRSError, ValueError, OverflowError) as error:
+        raise InputError(
+            f"{name}: the CRS '{shortened(text)}' is not one that PROJ knows; give an EPSG code"
+            " (EPSG:25830, or EPSG:25830+5782 with the heights), WKT or a PROJ string."
+        ) from error
+    if crs.is_vertical and not crs.is_compound and len(crs.axis_info) == 1:
+        raise InputError(
+            f"{name}: {crs.name} is a vertical CRS; add the horizontal one, as EPSG:25830+5782."
+        )
+    return crs
+
+
+def is_local(crs: CRS) -> bool:
+    """Whether a CRS is not tied to the earth (engineering CRS, LOCAL_CS)."""
+    return crs.is_engineering or any(part.is_engineering for part in crs.sub_crs_list)
+
+
+def parts(crs: CRS) -> tuple[CRS, CRS | None]:
+    """Return the horizontal CRS, two axes, and the vertical CRS where there is one."""
+    if crs.is_compound:
+        plan, vertical = crs.sub_crs_list[:2]
+        return plan, (vertical.source_crs or vertical) if vertical.is_bound else vertical
+    if crs.is_bound and crs.source_crs is not None and crs.source_crs.is_compound:
+        return parts(crs.source_crs)
+    return (crs if crs.is_geocentric else crs.to_2d()), None
+
+
+def heights_of(crs: CRS) -> Heights:
+    """Return what z means: above the ellipsoid, above a vertical datum, or not stated."""
+    if parts(crs)[1] is not None:
+        return "gravity"
+    return "ellipsoidal" if len(crs.axis_info) == 3 else "unstated"
+
+
+def is_same(one: CRS, other: CRS) -> bool:
+    """Whether two CRS are one, whatever their order of axes and their shift to WGS 84."""
+    one, other = unbound(one), unbound(other)
+    if one.equals(other, ignore_axis_order=True):
+        return True
+    if _differ_in_projection(one, other):  # cheap, where looking for a code may take a second
+        return False
+    code = one.to_epsg()
+    return code is not None and code == other.to_epsg()
+
+
+def _differ_in_projection(one: CRS, other: CRS) -> bool:
+    """Whether one alone is a map, or both are the same kind of map with other parameters."""
+    if one.is_projected != other.is_projected:
+        return True
+    first, second = one.coordinate_operation, other.coordinate_operation
+    if first is None or second is None or first.method_name != second.method_name:
+        return False
+    here, there = (
+        np.sort([float(p.value) * p.unit_conversion_factor for p in operation.params])
+        if all(isinstance(p.value, float) for p in operation.params)
+        else np.empty(0)
+        for operation in (first, second)
+    )
+    return len(here) == len(there) and not np.allclose(here, there, rtol=1e-9, atol=1e-9)
+
+
+def is_same_vertical_datum(one: CRS, other: CRS) -> bool:
+    """Whether two vertical CRS count from one datum, in whatever unit."""
+    names = [_datum_name(crs) for crs in (one, other)]
+    return is_same(one, other) or (names[0] == names[1] and names[0] not in ("", "unknown"))
+
+
+def _datum_name(vertical: CRS) -> str:
+    name = vertical.datum.name if vertical.datum is not None else vertical.name
+    return "".join(c for c in name.lower() if c.isalnum())
+
+
+def unbound(crs: CRS) -> CRS:
+    """Return a CRS without its shift to WGS 84 (TOWGS84)."""
+    return crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
+
+
+def plan_unit(crs: CRS) -> tuple[str, float]:
+    """Return name and size of the unit of x and y: metres, or radians of a geographic CRS."""
+    axis = crs.axis_info[0]
+    return axis.unit_name, axis.unit_conversion_factor
+
+
+def metres_up(crs: CRS) -> float:
+    """Return how many metres up one unit of z is; heights not stated are in the unit of the plan.
+
+    A frame of cameras has one scale, so a projected CRS in feet without a vertical part has its
+    heights in feet too. Degrees go with metres.
+    """
+    vertical = parts(crs)[1]
+    if vertical is not None:
+        axis = vertical.axis_info[0]
+        return axis.unit_conversion_factor * (-1.0 if axis.direction.lower() == "down" else 1.0)
+    if len(crs.axis_info) == 3:
+        return crs.axis_info[2].unit_conversion_factor
+    return 1.0 if crs.is_geographic else plan_unit(crs)[1]
+
+
+def check_projected_metres(crs: CRS, name: str) -> None:
+    """Refuse a CRS in which a cloud cannot be computed.
+
+    Raises
+    ------
+    InputError
+        If it is geographic or geocentric, or in another unit than metres, heights included.
+    """
+    if not crs.is_projected:
+        kind = "degrees" if crs.is_geographic else "no map projection"
+        raise InputError(
+            f"{name}: {crs.name} is in {kind}; reproject the cloud to a projected CRS in metres"
+            " (UTM, say) and set that as its CRS."
+        )
+    units = {axis.unit_name for axis in crs.axis_info}
+    if not units.issubset(METRES):
+        raise InputError(
+            f"{name}: {crs.name} is in {' and '.join(sorted(units))}; reproject the cloud to one"
+            " in metres, heights included."
+        )
+
+
+def with_heights(plan: CRS, vertical: CRS) -> CRS:
+    """Return a horizontal CRS with the datum of a vertical one, heights in metres."""
+    from pyproj import CRS
+    from pyproj.crs import CompoundCRS
+
+    if vertical.axis_info[0].unit_name not in METRES:
+        vertical = _in_metres(vertical)
+    return CRS(CompoundCRS(f"{plan.name} + {vertical.name}", [plan, vertical]))
+
+
+def _in_metres(vertical: CRS) -> CRS:
+    """Return the vertical CRS of the same datum with heights in metres."""
+    from pyproj.crs import VerticalCRS
+
+    if vertical.datum is None:
+        return vertical
+    return VerticalCRS(f"{vertical.datum.name} height", vertical.datum)
+
+
+def crs_text(crs: CRS) -> str:
+    """Return the shortest text that names a CRS exactly: codes where it has them, else WKT."""
+    whole = _code(crs)
+    if whole is not None:
+        return ":".join(whole)
+    codes = [_code(part) for part in crs.sub_crs_list]
+    known = [code[1] for code in codes if code is not None and code[0] == "EPSG"]
+    if crs.is_compound and len(known) == len(codes):
+        return "EPSG:" + "+".join(known)
+    return crs.to_wkt()
+
+
+def _code(crs: CRS) -> tuple[str, str] | None:
+    """Return authority and code that a CRS has itself; a search for one that fits takes long."""
+    given = crs.to_json_dict().get("id")
+    return None if given is None else (str(given["authority"]), str(given["code"]))
+
+
+def shortened(text: str) -> str:
+    """Return a text on one line that fits into a message."""
+    text = " ".join(text.split())
+    return text if len(text) <= 60 else f"{text[:57]}..."

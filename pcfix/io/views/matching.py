@@ -1,0 +1,205 @@
+"""Give each row of a cloud its list: by row where that is safe, else by position.
+
+A row of the cloud gets the list of the same row when the list's position agrees with it to a
+fraction of the spacing, whatever the numbers of rows. Every other row gets the list of the nearest
+point within a tolerance. The default tolerance is as strict: neighbours in a dense cloud are often
+made by other images (on a real one, points 5 cm apart hardly have a camera in common), so that a
+list is trusted for its own point only. A list without positions goes by row alone; then the
+numbers must match, and the listed cameras must have the points in their frames, chunk by chunk.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pcfix.errors import InputError, SettingError
+from pcfix.io.views.geometry import fitted
+from pcfix.io.views.report import ViewReport
+from pcfix.model import Views
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+    from pcfix.io.views.lists import ViewList
+    from pcfix.model import Cameras, FloatArray, IntArray
+
+_QUERIES = 250_000
+"""Points looked up at a time, which bounds the memory."""
+
+_SAME = 0.05
+"""A fraction of the spacing within which two positions are those of one point."""
+
+_ROUNDING = 1.01 * np.sqrt(3.0)
+
+
+class ViewMatch:
+    """A view list and a cloud whose chunks come in order.
+
+    Attributes
+    ----------
+    report : ViewReport
+    """
+
+    def __init__(
+        self,
+        views: ViewList,
+        cameras: Cameras,
+        *,
+        points: int | None = None,
+        step_m: float = 0.0,
+        tolerance_m: float | None = None,
+        jobs: int | None = None,
+    ) -> None:
+        """Check that the list can belong to the cloud.
+
+        Parameters
+        ----------
+        views : ViewList
+        cameras : Cameras
+            Those the list was read with.
+        points : int, optional
+            Of the whole cloud; needed where the list has no positions.
+        step_m : float
+            To which the cloud's coordinates are rounded, the scale of a LAS file.
+        tolerance_m : float, optional
+            For a match by position. Default: what rounding explains, or a twentieth of the
+            spacing of a dense list, or the spacing of tie points.
+        jobs : int, optional
+            Threads. Default: all.
+
+        Raises
+        ------
+        InputError
+            If the list has no positions and another number of points.
+        SettingError
+            If the tolerance is not positive.
+        """
+        if tolerance_m is not None and not (np.isfinite(tolerance_m) and tolerance_m > 0.0):
+            raise SettingError(f"the tolerance {tolerance_m} must be more than 0 metres.")
+        self._views, self._cameras = views, cameras
+        self._workers = -1 if jobs is None else jobs
+        self._tree: cKDTree | None = None
+        raw = views.raw
+        self.report = ViewReport(
+            f"{raw.what} {raw.path}",
+            len(views),
+            notes=list(raw.notes),
+            weights=raw.weight is not None,
+        )
+        self._same_m = _ROUNDING * (step_m / 2 + raw.resolution_m)
+        if raw.xyz is None:
+            self._check_count(points)
+        else:
+            self._set_tolerances(views.spacing_m or 0.0, tolerance_m)
+        self._note_order()
+
+    def _set_tolerances(self, spacing_m: float, tolerance_m: float | None) -> None:
+        rounding_m = self._same_m
+        own = max(rounding_m, self._views.default_spacings * spacing_m)
+        self.report.tolerance_m = own if tolerance_m is None else tolerance_m
+        self._same_m = min(max(rounding_m, _SAME * spacing_m), self.report.tolerance_m)
+        if rounding_m > spacing_m / 2:
+            self.report.notes.append(
+                f"{self._views.raw.path}: positions agree with the cloud's to {rounding_m:.2g} m at"
+                f" best, but points are {spacing_m:.2g} m apart, so that a point may get its"
+                " neighbour's list; use files with more decimals, as the software wrote them."
+            )
+
+    def _check_count(self, points: int | None) -> None:
+        if points != len(self._views):
+            raise InputError(
+                f"{self._views.raw.path}: has the lists of {len(self._views):,} points, the cloud"
+                f" has {'an unknown number' if points is None else f'{points:,}'}, and without"
+                " positions they cannot be told apart; put the PLY file that was written with the"
+                " list beside it, or give the cloud as it was when the list was written."
+            )
+
+    def _note_order(self) -> None:
+        order = self._views.orders[0]
+        shares = (self.report.share_seen, self._views.share_seen)
+        self.report.share_seen = min((s for s in shares if s is not None), default=None)
+        self.report.image_order = order.what
+        self.report.unposed = order.unposed
+
+    def for_chunk(self, xyz: FloatArray, first_row: int) -> Views:
+        """Return the cameras of a chunk's points; a point without a match has none.
+
+        Parameters
+        ----------
+        xyz : array, shape (n, 3)
+            Apparent points, frame of the cameras.
+        first_row : int
+            The cloud's row of the first of them.
+
+        Returns
+        -------
+        Views
+            Of n points, with weights where the list has them.
+
+        Raises
+        ------
+        InputError
+            If the list goes by row alone and its cameras do not see the points.
+        """
+        if self._views.raw.xyz is None:
+            row = np.arange(first_row, first_row + len(xyz))
+            self._check_row(row)
+            self._views = fitted(self._views, self._cameras, xyz, row)
+            self._note_order()
+            self.report.by_row += len(row)
+        else:
+            row = self._rows(xyz, first_row, self._views.raw.xyz)
+        return self._given(row)
+
+    def _check_row(self, row: IntArray) -> None:
+        if row.size and not 0 <= row[0] <= row[-1] < len(self._views):
+            raise InputError(
+                f"{self._views.raw.path}: has no row {row[-1]:,}, it has {len(self._views):,}; the"
+                " cloud has changed since its points were counted."
+            )
+
+    def _rows(self, xyz: FloatArray, first_row: int, listed: FloatArray) -> IntArray:
+        """Return the list's row of each point, -1 where it has none."""
+        row = np.full(len(xyz), -1)
+        beside = listed[first_row : first_row + len(xyz)]
+        apart_m = np.linalg.norm(beside - xyz[: len(beside)], axis=1)
+        near = apart_m <= self._same_m
+        row[: len(beside)][near] = first_row + np.flatnonzero(near)
+        self.report.by_row += int(np.count_nonzero(near))
+        rest = np.flatnonzero(row < 0)
+        for at in range(0, len(rest), _QUERIES):
+            some = rest[at : at + _QUERIES]
+            row[some] = self._nearest(xyz[some], listed)
+        return row
+
+    def _nearest(self, xyz: FloatArray, listed: FloatArray) -> IntArray:
+        """Return the nearest row within the tolerance of each point, -1 where there is none."""
+        if self._tree is None:
+            from scipy.spatial import cKDTree
+
+            self._tree = cKDTree(listed, balanced_tree=False, compact_nodes=False)
+        tolerance_m = self.report.tolerance_m or 0.0
+        reach = float(np.nextafter(tolerance_m, np.inf))
+        found_at, row = self._tree.query(xyz, distance_upper_bound=reach, workers=self._workers)
+        distance = np.asarray(found_at)
+        found = np.isfinite(distance)
+        self.report.add_distances(distance[found])
+        self.report.unmatched += int(np.count_nonzero(~found))
+        return np.where(found, row, -1)
+
+    def _given(self, row: IntArray) -> Views:
+        """Turn the images of the given rows into cameras, and leave out those without a pose."""
+        from pcfix.io.views.ragged import copy_posed, posed_starts
+
+        raw, camera = self._views.raw, self._views.orders[0].camera
+        start, left_out = posed_starts(row, raw.start, raw.image, camera)
+        weight = np.zeros(0, np.float32) if raw.weight is None else raw.weight
+        given = np.empty(int(start[-1]), np.int64)
+        given_weight = np.empty(len(given) if weight.size else 0, np.float32)
+        copy_posed(row, raw.start, raw.image, camera, weight, given, given_weight)
+        self.report.entries += len(given)
+        self.report.unposed_entries += left_out
+        self.report.without_camera += int(np.count_nonzero((row >= 0) & (np.diff(start) == 0)))
+        return Views(start, given, None if raw.weight is None else given_weight)

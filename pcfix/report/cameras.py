@@ -1,0 +1,150 @@
+"""A block of cameras in words and as a picture."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pcfix.refract.visibility import footprint
+from pcfix.report.figures import AFTER, WATER, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from pcfix.flow.cameras import CamerasReport, GnssResiduals, Sensor
+    from pcfix.model import FloatArray
+
+MOST_FOOTPRINTS = 400
+MOST_POINTS = 8000
+
+
+def cameras_text(report: CamerasReport) -> str:
+    """Return what a person wants to know of a camera file."""
+    r, cameras = report, report.cameras
+    unposed = len(cameras.unposed)
+    names = ", ".join(cameras.unposed[:5]) + (", ..." if unposed > 5 else "")
+    lines = [
+        f"{r.path}: {r.source or 'cameras'}",
+        f"images       {len(cameras):,} with a pose"
+        + (f", {unposed:,} without: {names}" if unposed else ""),
+        *(_sensor(sensor) for sensor in r.sensors),
+    ]
+    if not r.sensors:
+        lines.append("sensor       none: frames are not known")
+    if cameras.rotations is None:
+        lines.append("angles       none: every camera counts as seeing every point")
+    lines.append(f"CRS          {_short(r.crs_read) or 'the file states none'}")
+    if r.crs != r.crs_read:
+        lines.append(f"  now        {_short(r.crs) or 'the cloud states none'}")
+    if r.problem:
+        lines.append(f"  problem    {r.problem}")
+    else:
+        z = cameras.centres[:, 2]
+        lines.append(f"heights      {z.min():.2f} to {z.max():.2f} m, mean {z.mean():.2f} m")
+    if r.height_above_water_m is not None:
+        low, mean, high = r.height_above_water_m
+        lines.append(f"over water   {low:.1f} to {high:.1f} m, mean {mean:.1f} m")
+    if r.tilt_deg is not None:
+        median, largest = r.tilt_deg
+        lines.append(f"tilt         median {median:.1f}, largest {largest:.1f} degrees")
+    if r.gnss is not None:
+        lines += _gnss(r.gnss)
+    return "\n".join([*lines, *_fit(r)])
+
+
+def _sensor(s: Sensor) -> str:
+    kind = s.projection + (", distorted" if s.distorted else "")
+    size = f"{s.width:g} x {s.height:g} {s.unit}, focal length {s.focal:.6g} {s.unit}"
+    if s.pixel_size_um is not None and s.focal_mm is not None:
+        size += f" = {s.focal_mm:.3f} mm, pixel {s.pixel_size_um:.2f} um"
+    gsd = "" if s.gsd_m is None else f", GSD {100.0 * s.gsd_m:.2f} cm at the water"
+    return f"sensor       {s.name or 'unnamed'}: {s.images:,} images, {size}, {kind}{gsd}"
+
+
+def _short(crs: str | None) -> str:
+    """Return the name of a CRS, whose text may be pages long."""
+    if crs is None or len(crs) < 60:
+        return crs or ""
+    return crs.split('"')[1] if '"' in crs else crs[:60] + " ..."
+
+
+def _gnss(g: GnssResiduals) -> list[str]:
+    if g.images == 0:
+        return [f"GNSS         {g.reason}"]
+
+    def three(values: tuple[float | None, ...]) -> str:
+        return ", ".join("-" if v is None else f"{v:+.3f}" for v in values)
+
+    lines = [
+        f"GNSS         {g.images:,} images; adjusted minus GNSS east, north, up: mean"
+        f" {three(g.mean_m)} m, sd {three(g.sd_m).replace('+', '')} m; largest {g.largest_m:.3f} m"
+        f" ({g.largest_image})"
+    ]
+    return [*lines, f"  note       {g.reason}"] if g.reason else lines
+
+
+def _fit(report: CamerasReport) -> list[str]:
+    fit = report.fit
+    if fit is None:
+        return []
+    seen = ", ".join(f"{name}: {100.0 * part:.1f} %" for name, part in fit.seen_by.items())
+    lines = ["", f"{fit.cloud} ({fit.points_sampled:,} points looked at)", f"seen by      {seen}"]
+    if fit.distance_m > 0.0:
+        lines.append(f"apart        {fit.distance_m:,.1f} m in plan between block and cloud")
+    if fit.below_ground:
+        lines.append(f"below ground {fit.below_ground} cameras")
+    return [*lines, f"fit          {fit.verdict or 'cameras and cloud fit'}"]
+
+
+def block_figure(report: CamerasReport) -> Figure:
+    """Draw the block in plan, with the footprints of its frames, and from the south."""
+    cameras, xyz = report.cameras, report.sample_xyz
+    figure, (plan, side) = new_figure(8.0, 8.5, nrows=2, height_ratios=[5, 2])
+    level = _level(report)
+    if len(xyz):
+        some = xyz[:: max(1, len(xyz) // MOST_POINTS)]
+        dots = plan.scatter(*some[:, :2].T, c=some[:, 2], s=2, cmap="cividis", label="cloud")
+        figure.colorbar(dots, ax=plan, label="Height of the cloud (m)", shrink=0.8)
+        side.plot(some[:, 0], some[:, 2], ".", color="0.6", markersize=1, label="cloud")
+    borders = _footprints(report, level)
+    for border in borders:
+        plan.plot(*np.vstack([border, border[:1]]).T, color=WATER, linewidth=0.6, alpha=0.6)
+    plan.plot(*cameras.centres[:, :2].T, "^", color=AFTER, markersize=4, label="cameras")
+    if borders:
+        plan.plot([], [], color=WATER, label=f"footprints at {level:.1f} m")
+    side.plot(cameras.centres[:, 0], cameras.centres[:, 2], "^", color=AFTER, markersize=4)
+    if report.level_m is not None:
+        side.axhline(report.level_m, color=WATER, label="water")
+    plan.set_aspect("equal")
+    for axes in (plan, side):
+        axes.ticklabel_format(style="plain", useOffset=False)
+        axes.tick_params(axis="x", labelrotation=20)
+        axes.set_xlabel("East (m)")
+    plan.set_ylabel("North (m)")
+    side.set_ylabel("Height (m)")
+    plan.legend(loc="upper right")
+    if side.get_legend_handles_labels()[0]:
+        side.legend(loc="best")
+    return figure
+
+
+def _level(report: CamerasReport) -> float:
+    """Return where to draw footprints: at the water, else at the middle of the cloud."""
+    if report.level_m is not None:
+        return report.level_m
+    return float(np.median(report.sample_xyz[:, 2])) if len(report.sample_xyz) else np.nan
+
+
+def _footprints(report: CamerasReport, level_m: float) -> list[FloatArray]:
+    rows = range(0, len(report.cameras), max(1, len(report.cameras) // MOST_FOOTPRINTS))
+    borders = (footprint(report.cameras, row, level_m) for row in rows)
+    return [border for border in borders if len(border) and np.isfinite(border).all()]
+
+
+def png_of(figure: Figure) -> bytes:
+    """Return a figure as a PNG file."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=130)
+    return stream.getvalue()

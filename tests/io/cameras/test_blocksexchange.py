@@ -1,0 +1,428 @@
+"""BlocksExchange XML."""
+
+import zipfile
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import pcfix
+from pcfix.io.cameras import blocksexchange
+from pcfix.io.cameras.formats import Source
+from pcfix.refract.lens import project
+from tests.utils.reprojection import check_file, residuals_px, row_of
+from tests.utils.shared import needs
+
+PARIS, paris = needs("cameras", "blocksexchange", "paris_doc_example", "Paris2012_one_photo.xml")
+ENU, enu = needs("cameras", "blocksexchange", "goodale_enu_one_photo", "AT_one_photo.xml")
+
+TURN = Rotation.from_euler("XYZ", (178.0, 3.0, 40.0), degrees=True).as_matrix().T
+"""World to x right, y down, z forward of a camera that looks nearly down."""
+GROUP = """<Name>wide</Name>
+<ImageDimensions><Width>6000</Width><Height>4000</Height></ImageDimensions>
+<FocalLength>24</FocalLength><SensorSize>36</SensorSize>
+<PrincipalPoint><x>3010</x><y>1990</y></PrincipalPoint>"""
+SRS = "<SRS><Id>3</Id><Name>UTM</Name><Definition>EPSG:32632</Definition></SRS>"
+
+
+def matrix(rotation=TURN):
+    return "".join(
+        f"<M_{i}{j}>{float(rotation[i][j])!r}</M_{i}{j}>" for i in range(3) for j in range(3)
+    )
+
+
+def photo(number=0, rotation=None, centre=(1, 2, 3), extra="", pose_extra="", component=""):
+    turn = f"<Rotation>{matrix() if rotation is None else rotation}</Rotation>"
+    x, y, z = centre
+    place = f"<Center><x>{x}</x><y>{y}</y><z>{z}</z></Center>"
+    part = f"<Component>{component}</Component>" if component else ""
+    return (
+        f"<Photo><Id>{number}</Id><ImagePath>D:\\flight\\p{number}.jpg</ImagePath>{part}"
+        f"<Pose>{turn}{place}{pose_extra}</Pose>{extra}</Photo>"
+    )
+
+
+def group(*photos, head=GROUP):
+    return f"<Photogroup>{head}{''.join(photos)}</Photogroup>"
+
+
+def block(*groups, tail="", srs="<SRSId>3</SRSId>"):
+    return f"<Block>{srs}<Photogroups>{''.join(groups)}</Photogroups>{tail}</Block>"
+
+
+def document(*blocks, systems=SRS):
+    return (
+        '<?xml version="1.0" encoding="utf-8"?>\n<BlocksExchange version="3.2">'
+        f"<SpatialReferenceSystems>{systems}</SpatialReferenceSystems>{''.join(blocks)}"
+        "</BlocksExchange>"
+    )
+
+
+def simple(*photos, head=GROUP, tail=""):
+    return document(block(group(*photos, head=head), tail=tail))
+
+
+def write(tmp_path, text, name="block.xml"):
+    path = tmp_path / name
+    path.write_text(text)
+    return path
+
+
+def read(path):
+    assert blocksexchange.recognises(Source(path))
+    return blocksexchange.read(Source(path))
+
+
+def ties_of(path):
+    return blocksexchange.tie_points(Source(path), read(path))
+
+
+@paris
+def test_example_of_the_vendor():
+    cameras = read(PARIS)
+    check = check_file(PARIS.parent)
+    found = residuals_px(cameras, check["observations"], shift_px=0.5)
+    assert found == pytest.approx([seen["res_px"] for seen in check["observations"]], abs=0.001)
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(0.303, abs=0.001)
+    for given in check["projection_centres"]:
+        i = row_of(cameras, given["image"])
+        assert cameras.centres[i] == pytest.approx([given[a] for a in "XYZ"], abs=1e-4)
+        assert cameras.rotations[i][2] == pytest.approx(given["view_dir"], abs=1e-6)
+        assert -cameras.rotations[i][1] == pytest.approx(given["up_dir_minus_cam_y"], abs=1e-6)
+    assert cameras.crs == "EPSG:2154"
+    assert cameras.lenses[0].pixel_size_mm == pytest.approx(0.0072)
+
+
+@paris
+def test_tie_point_of_the_example_projects_where_it_was_measured():
+    cameras = read(PARIS)
+    ties = ties_of(PARIS)
+    ray = cameras.rotations[0] @ (ties.xyz[0] - cameras.centres[0])
+    miss = project(cameras.lenses[0], ray[None])[0] - ties.image_xy[0]
+    assert np.hypot(*miss) == pytest.approx(0.346, abs=0.001)
+
+
+@paris
+def test_angles_of_the_example_are_its_matrix(tmp_path):
+    text = PARIS.read_text()
+    start, end = text.index("<M_00>"), text.index("</M_22>") + len("</M_22>")
+    angles = (
+        "<Omega>179.6523471469934</Omega><Phi>0.04985630236313049</Phi>"
+        "<Kappa>179.9065465708369</Kappa>"
+    )
+    cameras = read(write(tmp_path, text[:start] + angles + text[end:]))
+    assert cameras.rotations == pytest.approx(read(PARIS).rotations, abs=1e-12)
+
+
+@enu
+def test_local_frame_at_a_place_and_gnss():
+    cameras = read(ENU)
+    assert cameras.crs == "ENU:39.97523,-83.00678,0"
+    assert cameras.gnss.crs == "EPSG:4326+5773"
+    assert cameras.gnss.xyz[0] == pytest.approx([-83.0064163888889, 39.9752701666667, 157.918])
+    assert cameras.rotations[0][2] == pytest.approx([-0.868160, -0.188568, -0.459064], abs=1e-6)
+
+
+AXES = {"Right": (1, 0), "Left": (-1, 0), "Down": (0, 1), "Up": (0, -1)}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("XRightYDown", "XRightYUp", "XLeftYDown", "XLeftYUp"),
+        *("XDownYRight", "XDownYLeft", "XUpYRight", "XUpYLeft"),
+    ],
+)
+@pytest.mark.parametrize("angles", [False, True])
+def test_camera_orientations(tmp_path, name, angles):
+    # a point one metre along the camera's x must be seen where the name says that x points
+    x, y = (AXES[word] for word in name[1:].split("Y"))
+    omega, phi, kappa = (-5.0, 12.0, 33.0)
+    world_to_camera = Rotation.from_euler("XYZ", (omega, phi, kappa), degrees=True).as_matrix().T
+    rotation = matrix(world_to_camera)
+    if angles:
+        rotation = f"<Omega>{omega}</Omega><Phi>{phi}</Phi><Kappa>{kappa}</Kappa>"
+    head = GROUP + f"<CameraOrientation>{name}</CameraOrientation>"
+    cameras = read(write(tmp_path, simple(photo(rotation=rotation), head=head)))
+    for axis, place in zip(world_to_camera[:2], (x, y), strict=True):
+        assert cameras.rotations[0] @ axis == pytest.approx([*place, 0.0], abs=1e-12)
+    assert np.linalg.det(cameras.rotations[0]) == pytest.approx(1.0)
+
+
+BROWN = (
+    "<Distortion><K1>0.1</K1><K2>-0.2</K2><K3>0.3</K3><P1>0.01</P1><P2>0.02</P2></Distortion>"
+    "<AspectRatio>1.1</AspectRatio><Skew>5</Skew>"
+)
+
+
+@pytest.mark.parametrize(
+    "focal",
+    [
+        "<FocalLength>24</FocalLength><SensorSize>36</SensorSize>",
+        "<FocalLength>24</FocalLength><PixelSize>0.006</PixelSize>",
+        "<FocalLengthPixels>4000</FocalLengthPixels>",
+    ],
+)
+def test_perspective_lens(tmp_path, focal):
+    head = GROUP.replace("<FocalLength>24</FocalLength><SensorSize>36</SensorSize>", focal)
+    lens = read(write(tmp_path, simple(photo(), head=head + BROWN))).lenses[0]
+    x, y = 0.2, -0.1
+    r2 = x * x + y * y
+    radial = 1 + 0.1 * r2 - 0.2 * r2**2 + 0.3 * r2**3
+    xd = x * radial + 0.01 * (r2 + 2 * x * x) + 2 * 0.02 * x * y
+    yd = y * radial + 0.02 * (r2 + 2 * y * y) + 2 * 0.01 * x * y
+    expected = (3010.5 + 4000 * xd + 5 * yd, 1990.5 + 4400 * yd)
+    assert project(lens, np.array([[x, y, 1.0]]))[0] == pytest.approx(expected)
+    assert (lens.pixel_size_mm is None) == ("Pixels" in focal)
+
+
+@pytest.mark.parametrize(
+    ("principal", "orientation", "expected"),
+    [
+        ("", "XRightYDown", (3000, 2000)),
+        ("<xmm>0.06</xmm><ymm>-0.12</ymm>", "XRightYDown", (3010, 1980)),
+        ("<xmm>0.06</xmm><ymm>-0.12</ymm>", "XRightYUp", (3010, 2020)),
+        ("<xmm>0.06</xmm><ymm>-0.12</ymm>", "XDownYRight", (2980, 2010)),
+    ],
+)
+def test_principal_point(tmp_path, principal, orientation, expected):
+    head = GROUP[: GROUP.index("<PrincipalPoint>")]
+    head += f"<PrincipalPoint>{principal}</PrincipalPoint>"
+    head += f"<CameraOrientation>{orientation}</CameraOrientation>"
+    lens = read(write(tmp_path, simple(photo(), head=head))).lenses[0]
+    assert (lens.principal_x, lens.principal_y) == pytest.approx(expected)
+
+
+MATRIX = (
+    "<FisheyeFocalMatrix><M_00>1960</M_00><M_01>2</M_01><M_10>-3</M_10><M_11>1970</M_11>"
+    "</FisheyeFocalMatrix>"
+)
+POLYNOMIAL = (
+    "<FisheyeDistortion><P0>0</P0><P1>1</P1><P2>0.02</P2><P3>-0.1</P3><P4>0.01</P4>"
+    "</FisheyeDistortion>"
+)
+
+
+@pytest.mark.parametrize("direction", [(0.3, 0.4, 1.0), (-2.0, 1.0, 0.1)])
+def test_fisheye(tmp_path, direction):
+    head = GROUP + "<CameraModelType>Fisheye</CameraModelType>" + MATRIX + POLYNOMIAL
+    lens = read(write(tmp_path, simple(photo(), head=head))).lenses[0]
+    x, y, z = direction
+    q = 2 / np.pi * np.arctan2(np.hypot(x, y), z)
+    rho = q + 0.02 * q**2 - 0.1 * q**3 + 0.01 * q**4
+    xd, yd = rho * np.array([x, y]) / np.hypot(x, y)
+    expected = (3010.5 + 1960 * xd + 2 * yd, 1990.5 - 3 * xd + 1970 * yd)
+    assert project(lens, np.array([direction]))[0] == pytest.approx(expected)
+
+
+def test_fisheye_without_matrix_is_equidistant(tmp_path):
+    head = GROUP + "<CameraModelType>Fisheye</CameraModelType>"
+    lens = read(write(tmp_path, simple(photo(), head=head))).lenses[0]
+    angle = 1.1
+    uv = project(lens, np.array([[np.sin(angle), 0.0, np.cos(angle)]]))[0]
+    assert uv == pytest.approx([3010.5 + 4000 * angle, 1990.5])
+
+
+def test_photos_without_a_pose_in_the_block_are_left_out(tmp_path):
+    bare = "<Photo><Id>7</Id><ImagePath>bare.jpg</ImagePath><Component>0</Component></Photo>"
+    only_position = photo(8, rotation="").replace("<Rotation></Rotation>", "")
+    text = simple(photo(1), bare, only_position, photo(9, component=2), photo(2, component=1))
+    cameras = read(write(tmp_path, text))
+    assert cameras.labels == ("p1.jpg", "p2.jpg")
+    assert sorted(cameras.unposed) == ["bare.jpg", "p8.jpg", "p9.jpg"]
+    assert cameras.notes == ()
+    assert cameras.crs == "EPSG:32632"
+
+
+def test_positions_alone(tmp_path):
+    text = simple(photo(1).replace(f"<Rotation>{matrix()}</Rotation>", ""))
+    cameras = read(write(tmp_path, text))
+    assert cameras.rotations is None
+    assert cameras.lenses is None
+    assert cameras.centres.tolist() == [[1, 2, 3]]
+    assert "only positions are read" in cameras.notes[0]
+
+
+def test_group_without_focal_length_has_no_frames(tmp_path):
+    head = "<Name>old</Name><ImageDimensions><Width>60</Width><Height>40</Height></ImageDimensions>"
+    cameras = read(write(tmp_path, simple(photo(1), head=head)))
+    assert cameras.rotations[0] == pytest.approx(TURN)
+    assert cameras.lenses is None
+    assert "image p1.jpg: its photogroup has no frame or focal length" in cameras.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("definition", "crs"),
+    [
+        ("EPSG:32632+5773", "EPSG:32632+5773"),
+        ("+proj=utm +zone=32 +datum=WGS84", "+proj=utm +zone=32 +datum=WGS84"),
+        ("ENU:47.5,8.25", "ENU:47.5,8.25,0"),
+        ("ENU:47.5,8.25,410.5", "ENU:47.5,8.25,410.5"),
+        ("Local", "local"),
+        ('LOCAL_CS["Local coordinates",UNIT["m",1.0]]', "local"),
+    ],
+)
+def test_reference_systems(tmp_path, definition, crs):
+    systems = SRS.replace("EPSG:32632", definition)
+    text = document(block(group(photo())), systems=systems)
+    assert read(write(tmp_path, text)).crs == crs
+
+
+def test_block_without_reference_system_is_local(tmp_path):
+    assert read(write(tmp_path, document(block(group(photo()), srs="")))).crs == "local"
+
+
+def test_gps_of_exif(tmp_path):
+    gps = (
+        "<ExifData><GPS><Latitude>45.5</Latitude><Longitude>2.5</Longitude>"
+        "<Altitude>1589</Altitude></GPS></ExifData>"
+    )
+    cameras = read(write(tmp_path, simple(photo(1, extra=gps), photo(2))))
+    assert cameras.gnss.xyz[0].tolist() == [2.5, 45.5, 1589]
+    assert np.isnan(cameras.gnss.xyz[1]).all()
+    assert cameras.gnss.crs == "EPSG:4326"
+
+
+TIE = (
+    "<TiePoint><Position><x>1</x><y>2</y><z>3</z></Position>"
+    "<Measurement><PhotoId>1</PhotoId><x>10</x><y>20</y></Measurement>"
+    "<Measurement><PhotoId>99</PhotoId><x>1</x><y>1</y></Measurement>"
+    "<Measurement><PhotoId>2</PhotoId><xmm>0.6</xmm><ymm>-0.6</ymm></Measurement></TiePoint>"
+    "<TiePoint><Measurement><PhotoId>2</PhotoId><x>0</x><y>0</y></Measurement></TiePoint>"
+    "<TiePoint><SRSId>0</SRSId><Position><x>1</x><y>2</y><z>3</z></Position>"
+    "<Measurement><PhotoId>2</PhotoId><x>5</x><y>6</y></Measurement></TiePoint>"
+    "<TiePoint><Measurement><PhotoId>99</PhotoId><x>0</x><y>0</y></Measurement></TiePoint>"
+)
+
+
+@pytest.mark.parametrize("external", [False, True])
+def test_tie_points(tmp_path, external):
+    inside = "<Path>TiePoints.xml</Path>" if external else TIE
+    (tmp_path / "TiePoints.xml").write_text('<?xml version="1.0" encoding="utf-8"?>\n' + TIE)
+    text = simple(photo(1), photo(2), tail=f"<TiePoints>{inside}</TiePoints>")
+    ties = ties_of(write(tmp_path, text))
+    assert ties.views.start.tolist() == [0, 2, 3, 4]
+    assert ties.views.camera.tolist() == [0, 1, 1, 1]
+    expected = [[10.5, 20.5], [3110.5, 1890.5], [0.5, 0.5], [5.5, 6.5]]
+    assert ties.image_xy == pytest.approx(np.array(expected))
+    assert ties.xyz[0].tolist() == [1, 2, 3]
+    assert np.isnan(ties.xyz[1:]).all()
+
+
+def test_archive(tmp_path):
+    path = tmp_path / "block.xmlz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("block.xml", simple(photo(1)))
+    assert read(path).labels == ("p1.jpg",)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (simple(photo())[:-200], "damaged or cut off"),
+        (
+            simple(photo()).replace("?>", '?><!DOCTYPE a [<!ENTITY b "c">]>', 1),
+            "declares entities",
+        ),
+        (simple(), "no photo has a pose"),
+        (simple(photo(centre=("x", 2, 3))), "image p0.jpg, Center: 'x' is not a number"),
+        (simple(photo(rotation=matrix(2 * TURN))), "image p0.jpg: the rotation matrix is not"),
+        (simple(photo(rotation=matrix(-TURN))), "image p0.jpg: the rotation matrix mirrors"),
+        (simple(photo(rotation="<M_00>1</M_00>")), "image p0.jpg, M_01: '' is not a number"),
+        (
+            simple(photo(rotation="<Yaw>1</Yaw><Pitch>2</Pitch><Roll>3</Roll>")),
+            r"image p0.jpg: its rotation is in yaw \(or heading\), pitch and roll",
+        ),
+        (simple(photo(), head=GROUP.replace(">24<", ">0<")), "of photogroup wide: focal length 0"),
+        (simple(photo(), head=GROUP.replace(">24<", ">many<")), "wide, FocalLength: 'many'"),
+        (
+            simple(photo(), head=GROUP + "<CameraModelType>Spherical</CameraModelType>"),
+            "photogroup wide: the camera model Spherical is not supported",
+        ),
+        (
+            simple(photo(), head=GROUP + "<InverseDistortion/>"),
+            "photogroup wide: the distortion InverseDistortion is not supported",
+        ),
+        (
+            simple(photo(), head=GROUP + "<CameraOrientation>XUpYDown</CameraOrientation>"),
+            "the camera orientation 'XUpYDown' is not one of XRightYDown",
+        ),
+        (document(block(group(photo())), systems=""), "no spatial reference system with the id 3"),
+        (
+            document(block(group(photo())), systems=SRS.replace("EPSG:32632", "EPSG:nothing")),
+            "the CRS 'EPSG:nothing' is not one that PROJ knows",
+        ),
+        (
+            document(block(group(photo())), systems=SRS.replace("EPSG:32632", "ENU:here")),
+            "'ENU:here' is not ENU:latitude,longitude",
+        ),
+        (
+            document(block(group(photo(1)), group(photo(2), head=GROUP + "<SRSId>0</SRSId>"))),
+            "several spatial reference systems",
+        ),
+        (
+            document(block(group(photo(1))), block(group(photo(1)))),
+            "image p1.jpg is in several blocks",
+        ),
+    ],
+)
+def test_bad_input(tmp_path, text, message):
+    path = write(tmp_path, text)
+    with pytest.raises(pcfix.InputError, match=message) as caught:
+        read(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("tail", "message"),
+    [
+        ("", "has no tie points"),
+        ("<TiePoints><Path>gone.xml</Path></TiePoints>", "gone.xml, which is not beside it"),
+        (
+            f"<TiePoints>{TIE.replace('>10<', '>ten<')}</TiePoints>",
+            "x of a tie point: .*'ten'",
+        ),
+        (f"<TiePoints>{TIE.replace('<y>20</y>', '')}</TiePoints>", "photo 1: a measurement"),
+    ],
+)
+def test_bad_tie_points(tmp_path, tail, message):
+    path = write(tmp_path, simple(photo(1), tail=tail))
+    with pytest.raises(pcfix.InputError, match=message):
+        ties_of(path)
+
+
+def test_tie_points_cut_off(tmp_path):
+    (tmp_path / "t.xml").write_text(TIE[:-30])
+    path = write(tmp_path, simple(photo(1), tail="<TiePoints><Path>t.xml</Path></TiePoints>"))
+    with pytest.raises(pcfix.InputError, match=r"t\.xml: is cut off"):
+        ties_of(path)
+
+
+def test_comments_count_for_nothing(tmp_path):
+    text = simple(photo(1), tail=f"<!--<TiePoints>--><!--{TIE}--><!--</TiePoints>-->")
+    with pytest.raises(pcfix.InputError, match="has no tie points"):
+        ties_of(write(tmp_path, text))
+
+
+def test_damaged_archive(tmp_path):
+    path = tmp_path / "block.xmlz"
+    path.write_bytes(b"PK\x03\x04" + b"\x00" * 100)
+    assert not blocksexchange.recognises(Source(path))
+    with pytest.raises(pcfix.InputError, match="the archive is damaged"):
+        blocksexchange.read(Source(path))
+
+
+def test_archive_that_unpacks_to_too_much(tmp_path):
+    path = tmp_path / "block.xmlz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("block.xml", simple(photo(1)) + " " * 10_000_000)
+    with pytest.raises(pcfix.InputError, match="far too much"):
+        blocksexchange.read(Source(path))
+
+
+@pytest.mark.parametrize("data", [b"", b"\x00\xff" * 3000, b"<document></document>", b"label,x,y"])
+def test_other_files_are_not_taken(tmp_path, data):
+    path = tmp_path / "file"
+    path.write_bytes(data)
+    assert not blocksexchange.recognises(Source(path))
+    assert not blocksexchange.recognises(Source(tmp_path))

@@ -1,0 +1,583 @@
+"""Cameras from the frame of their file into the cloud's CRS."""
+
+import csv
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pyproj import CRS, Transformer
+from scipy.spatial.transform import Rotation
+
+from pcfix.errors import InputError
+from pcfix.io.cameras.georeference import bring_to, georeference
+from pcfix.model import Cameras, GnssPositions
+from tests.utils.reprojection import check_file
+from tests.utils.shared import needs
+
+UCLM, uclm = needs("cameras", "metashape", "uclm_sorolla")
+WHEAT, wheat = needs("cameras", "metashape", "easyidp_wheat_psx")
+DULUTH, duluth = needs("cameras", "odm", "testerarm_sub0")
+BERLIN, berlin = needs("cameras", "opensfm", "berlin")
+BANGKOK, bangkok = needs("cameras", "pix4d", "ca502_oblique5")
+
+FOCAL_PX, FRAME_PX, BELOW_M = 3650.0, 4000.0, 100.0
+NADIR = np.diag([1.0, -1.0, -1.0])
+LOCAL_CS = 'LOCAL_CS["Local",LOCAL_DATUM["Local",0],UNIT["metre",1]]'
+VALENCIA = [725448.8215, 4369128.6996, 142.4802]
+VALENCIA_LON_LAT = [-0.3802, 39.4423, 142.48]
+UTM30, UTM30_ALICANTE = "EPSG:25830", "EPSG:25830+5782"
+
+
+def cameras(centres, crs, rotations=None, **more):
+    centres = np.atleast_2d(np.asarray(centres, float))
+    labels = tuple(f"{i}.jpg" for i in range(len(centres)))
+    return Cameras(labels, centres, rotations, crs=crs, **more)
+
+
+def geocentric(lon, lat, h, a=6378137.0, f=1 / 298.257222101):
+    """Return geocentric coordinates; the textbook formula."""
+    lam, phi = np.radians(lon), np.radians(lat)
+    e2 = f * (2 - f)
+    n = a / np.sqrt(1 - e2 * np.sin(phi) ** 2)
+    return np.stack(
+        [
+            (n + h) * np.cos(phi) * np.cos(lam),
+            (n + h) * np.cos(phi) * np.sin(lam),
+            (n * (1 - e2) + h) * np.sin(phi),
+        ],
+        axis=-1,
+    )
+
+
+def east_north_up(lon, lat):
+    """Return east, north and up in geocentric axes, one a row."""
+    lam, phi = np.radians([lon, lat])
+    return np.array(
+        [
+            [-np.sin(lam), np.cos(lam), 0],
+            [-np.sin(phi) * np.cos(lam), -np.sin(phi) * np.sin(lam), np.cos(phi)],
+            [np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)],
+        ]
+    )
+
+
+def image_px(rotation, centre, points):
+    x, y, z = rotation @ (points - centre).T
+    return FOCAL_PX * np.column_stack([x / z, y / z])
+
+
+# ---- centres ----
+
+
+@uclm
+def test_geocentric_positions_of_metashape_on_a_map():
+    truth = check_file(UCLM)["projection_centres"]
+    read = cameras([t["ECEF"] for t in truth], "EPSG:4936", project_crs=UTM30)
+    found = bring_to(read, UTM30)
+    assert found.centres == pytest.approx(
+        np.array([[t["X"], t["Y"], t["Z"]] for t in truth]), abs=1e-3
+    )
+    assert (found.crs, found.project_crs, found.notes) == (UTM30, None, ())
+
+
+@uclm
+def test_survey_points_in_four_crs_are_the_same_points():
+    def table(name):
+        rows = csv.reader((UCLM / name).read_text().split(), delimiter=";")
+        return np.array([row[1:4] for row in rows], float)
+
+    texts = (UCLM / "gcp_ecef.csv").read_text().splitlines()
+    ecef = np.array([t.replace(" ", "").split(";")[1:4] for t in texts if t.strip()], float)
+    utm, degrees = table("gcp_25830.csv"), table("gcp_4258.csv")
+    assert bring_to(cameras(degrees, "EPSG:4258"), UTM30).centres == pytest.approx(utm, abs=2e-3)
+    there = georeference(cameras(ecef, "EPSG:4936", project_crs=UTM30), UTM30)
+    assert there.points(ecef) == pytest.approx(utm, abs=2e-3)
+
+
+@wheat
+def test_a_geographic_chunk_goes_to_utm():
+    truth = check_file(WHEAT)["projection_centres"]
+    degrees = np.array([[t["X"], t["Y"], t["Z"]] for t in truth])
+    read = cameras([t["ECEF"] for t in truth], "EPSG:4978", project_crs="EPSG:4326")
+    found = bring_to(read, "EPSG:32654")
+    east, north = Transformer.from_crs("EPSG:4326", "EPSG:32654", always_xy=True).transform(
+        degrees[:, 0], degrees[:, 1]
+    )
+    assert found.centres == pytest.approx(np.column_stack([east, north, degrees[:, 2]]), abs=2e-3)
+    assert found.notes == ()
+
+
+@duluth
+def test_a_topocentric_block_of_odm_goes_where_its_cloud_is():
+    truth = check_file(DULUTH)["projection_centres"]
+    block = json.loads((DULUTH / "opensfm/reconstruction.json").read_text())[0]["shots"]
+    turns = [Rotation.from_rotvec(block[t["image"]]["rotation"]).as_matrix() for t in truth]
+    shifts = [block[t["image"]]["translation"] for t in truth]
+    centres = [-r.T @ t for r, t in zip(turns, shifts, strict=True)]
+    lla = json.loads((DULUTH / "opensfm/reference_lla.json").read_text())
+    crs = f"ENU:{lla['latitude']!r},{lla['longitude']!r},{lla['altitude']!r}"
+    found = bring_to(cameras(centres, crs, np.array(turns)), "EPSG:32615")
+    expected = np.array([[t["X"], t["Y"], t["Z"]] for t in truth])
+    assert found.centres == pytest.approx(expected, abs=5e-3)
+    for i, t in enumerate(truth):
+        assert found.rotations[i][2] == pytest.approx(t["view_dir"], abs=2e-5)
+        top = np.array(t["up_dir_minus_cam_y"])  # through a matrix with the scale of the map
+        assert -found.rotations[i][1] == pytest.approx(top / np.linalg.norm(top), abs=2e-5)
+
+
+@berlin
+def test_a_topocentric_block_of_opensfm_by_closed_formulas():
+    report = check_file(BERLIN)
+    lla, truth = report["reference_lla"], report["projection_centres"]
+    enu = np.array([[t["X"], t["Y"], t["Z"]] for t in truth])
+    lat, lon, h = lla["latitude"], lla["longitude"], lla["altitude"]
+    f = 1 / 298.257223563
+    ecef = geocentric(lon, lat, h, f=f) + enu @ east_north_up(lon, lat)
+    to_map = Transformer.from_crs("EPSG:4978", CRS("EPSG:32633").to_3d(), always_xy=True)
+    found = bring_to(cameras(enu, f"ENU:{lat},{lon},{h}"), "EPSG:32633")
+    assert found.centres == pytest.approx(np.column_stack(to_map.transform(*ecef.T)), abs=1e-5)
+
+
+@bangkok
+def test_longitude_and_latitude_of_pix4d_agree_with_its_map():
+    folder = BANGKOK / "params"
+    stem = "CA502_ReDateTime_reprocess_calibrated_external_camera_parameters"
+    degrees, utm = (
+        np.array(
+            [line.split()[1:7] for line in (folder / name).read_text().splitlines()[1:]], float
+        )
+        for name in (f"{stem}_wgs84.txt", f"{stem}.txt")
+    )
+    found = bring_to(cameras(degrees[:, :3], "EPSG:4326"), "EPSG:32647")
+    assert found.centres == pytest.approx(utm[:, :3], abs=2e-3)  # eight decimals of a degree
+
+
+def test_feet_become_metres_heights_too():
+    to_feet = Transformer.from_crs("EPSG:26910", "EPSG:2992", always_xy=True)
+    x, y = to_feet.transform(500000.0, 4900000.0)
+    found = bring_to(cameras([x, y, 1000.0], "EPSG:2992"), "EPSG:26910", name="a.xml")
+    assert found.centres[0] == pytest.approx([500000.0, 4900000.0, 304.8], abs=1e-3)
+    assert found.notes == ("a.xml: heights are taken to be in foot, as x and y are.",)
+
+
+def test_stated_heights_in_feet_become_metres():
+    read = cameras([500000.0, 4900000.0, 1000.0], "EPSG:26910+6360")
+    found = bring_to(read, "EPSG:26910+5703")
+    assert found.centres[0] == pytest.approx([500000.0, 4900000.0, 1200000.0 / 3937.0], abs=1e-9)
+
+
+@pytest.mark.parametrize("code", ["EPSG:2193", "EPSG:31467", "EPSG:2180"])
+def test_a_map_with_north_first_is_read_east_first(code):
+    crs = CRS(code)
+    area = crs.area_of_use
+    lon, lat = (area.west + area.east) / 2, (area.south + area.north) / 2
+    x, y = Transformer.from_crs(crs.geodetic_crs, crs, always_xy=True).transform(lon, lat)
+    assert [a.direction for a in crs.axis_info] == ["north", "east"]
+    found = bring_to(cameras([lon, lat, 50.0], crs.geodetic_crs.to_wkt()), code)
+    assert found.centres[0] == pytest.approx([x, y, 50.0], abs=1e-4)
+    ellipsoid = "bessel" if code == "EPSG:31467" else "GRS80"
+    here = f"+proj=tmerc +lat_0={lat} +lon_0={lon} +ellps={ellipsoid} +type=crs"
+    back = bring_to(cameras([x, y, 50.0], code), here)
+    assert np.hypot(*back.centres[0, :2]) < 1e-2
+
+
+def test_grads_from_paris():
+    crs = CRS("EPSG:4807")
+    degrees = Transformer.from_crs("EPSG:4275", crs, always_xy=True).transform(2.5, 46.5)
+    at = cameras([*degrees, 300.0], "EPSG:4807", NADIR[None])
+    found = bring_to(at, "EPSG:27572")
+    expected = Transformer.from_crs("EPSG:4275", "EPSG:27572", always_xy=True).transform(2.5, 46.5)
+    assert found.centres[0] == pytest.approx([*expected, 300.0], abs=1e-3)
+    gamma = np.radians(2.5 - 2.33722917) * np.sin(np.radians(46.8))  # n of the cone
+    assert np.arctan2(-found.rotations[0, 0, 1], found.rotations[0, 0, 0]) == pytest.approx(
+        -gamma, abs=1e-5
+    )
+
+
+def test_bound_and_esri_wkt_are_the_crs_they_hold():
+    bound = CRS(UTM30).to_wkt("WKT1_GDAL").replace(
+        'AUTHORITY["EPSG","6258"]', 'TOWGS84[0,0,0,0,0,0,0],AUTHORITY["EPSG","6258"]'
+    )  # fmt: skip
+    assert CRS(bound).is_bound
+    for text in (bound, CRS(UTM30).to_wkt("WKT1_ESRI"), "+proj=utm +zone=30 +ellps=GRS80"):
+        found = bring_to(cameras(VALENCIA, text, NADIR[None]), UTM30)
+        assert found.centres[0].tolist() == VALENCIA
+        assert found.rotations[0].tolist() == NADIR.tolist()
+        assert found.notes == ()
+
+
+def test_the_same_crs_changes_no_bit():
+    rotation = Rotation.from_euler("xyz", [170.0, 8.0, 33.0], degrees=True).as_matrix()[None]
+    for crs in (UTM30, None, UTM30_ALICANTE):
+        found = bring_to(cameras(VALENCIA, crs, rotation), crs)
+        assert found.centres.tobytes() == np.array([VALENCIA]).tobytes()
+        assert found.rotations.tobytes() == rotation.tobytes()
+        assert found.crs == crs
+
+
+def test_an_offset_comes_before_all_else():
+    shift = (725000.0, 4369000.0, 100.0)
+    moved = np.array(VALENCIA) - shift
+    direct = bring_to(cameras(VALENCIA, "EPSG:32630"), UTM30).centres
+    assert bring_to(cameras(moved, "EPSG:32630"), UTM30, offset_m=shift).centres == pytest.approx(
+        direct, abs=1e-8
+    )
+    assert bring_to(cameras(moved, None), UTM30, offset_m=shift).centres[0] == pytest.approx(
+        VALENCIA, abs=1e-9
+    )
+
+
+def test_tie_points_go_the_same_way_and_unknown_ones_stay_unknown():
+    read = cameras([VALENCIA_LON_LAT], "EPSG:4258")
+    there = georeference(read, UTM30)
+    points = np.array([VALENCIA_LON_LAT, [np.nan] * 3, [-0.3801, 39.4424, 3.0], [1e9, 1e9, 0]])
+    found = there.points(points)
+    assert found[0] == pytest.approx(there.cameras(read).centres[0], abs=1e-9)
+    assert np.isnan(found[[1, 3]]).any(axis=1).all()
+    assert np.isfinite(found[2]).all()
+
+
+def test_gnss_positions_stay_where_they_were_said_to_be():
+    gnss = GnssPositions(np.array([VALENCIA_LON_LAT]), np.full((1, 3), 0.02), "EPSG:4258")
+    found = bring_to(cameras(VALENCIA, "EPSG:32630", gnss=gnss), UTM30)
+    assert found.gnss is gnss
+
+
+# ---- rotations ----
+
+
+def convergence_rad(lon, lat, meridian):
+    """Return the angle from true to grid north on a transverse Mercator map (sphere)."""
+    return np.arctan(np.tan(np.radians(lon - meridian)) * np.sin(np.radians(lat)))
+
+
+@pytest.mark.parametrize(("lon", "lat"), [(-0.5, 39.4), (-5.0, 60.0), (-1.0, -33.0), (-3.0, 10.0)])
+def test_north_turns_by_the_meridian_convergence(lon, lat):
+    code = "EPSG:32630" if lat > 0 else "EPSG:32730"
+    found = bring_to(cameras([lon, lat, 100.0], "EPSG:4326", NADIR[None]), code)
+    gamma = convergence_rad(lon, lat, -3.0)
+    true_north = -found.rotations[0][1]  # the top of the image was true north
+    assert true_north == pytest.approx([-np.sin(gamma), np.cos(gamma), 0.0], abs=5e-6)
+    assert found.rotations[0] @ found.rotations[0].T == pytest.approx(np.eye(3), abs=1e-12)
+
+
+def frames_of_a_place(kind, lon, lat, h):
+    """Return CRS, centre, axes (east, north, up, one a row) of a frame, and its way to a map."""
+    f84 = 1 / 298.257223563
+    centre = geocentric(lon, lat, h, f=f84)
+    if kind == "ECEF":
+        return "EPSG:4978", centre, east_north_up(lon, lat), lambda p: p
+    axes = east_north_up(lon + 0.01, lat - 0.01)
+    origin = geocentric(lon + 0.01, lat - 0.01, 20.0, f=f84)
+    crs = f"ENU:{lat - 0.01!r},{lon + 0.01!r},20"
+    return (
+        crs,
+        axes @ (centre - origin),
+        (axes @ east_north_up(lon, lat).T).T,
+        (lambda p: origin + p @ axes),
+    )
+
+
+@pytest.mark.parametrize("kind", ["ECEF", "ENU", "degrees"])
+@pytest.mark.parametrize(
+    ("lon", "lat"), [(-0.38, 39.44), (-3.1, 39.4), (-5.9, 65.0), (-2.0, -33.0)]
+)
+@pytest.mark.parametrize("tilt_deg", [0.0, 30.0])
+def test_points_below_a_camera_fall_on_the_same_pixels(kind, lon, lat, tilt_deg):
+    """But for the scale of the map against the heights: up to |k - 1| of the image distance."""
+    h = 150.0
+    code = "EPSG:32630" if lat > 0 else "EPSG:32730"
+    truth = frames_of_a_place("ECEF" if kind == "degrees" else kind, lon, lat, h)
+    crs, centre, axes, to_ecef = truth
+    looks = NADIR @ Rotation.from_euler("zx", [40.0, tilt_deg], degrees=True).as_matrix()
+    x, y = np.meshgrid(*[np.linspace(-0.5, 0.5, 9) * FRAME_PX / FOCAL_PX] * 2)
+    rays = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)]) @ looks  # east, north, up
+    enu = rays * (-BELOW_M / rays[:, 2])[:, None]
+    seen = image_px(looks, 0.0, enu)
+    ecef = to_ecef(centre + enu @ axes)
+    to_map = Transformer.from_crs("EPSG:4978", CRS(code).to_3d(), always_xy=True)
+    points = np.column_stack(to_map.transform(*ecef.T))
+    if kind == "degrees":
+        read = cameras([lon, lat, h], "EPSG:4979", looks[None])
+    else:
+        read = cameras(centre, crs, (looks @ axes)[None])
+    found = bring_to(read, code)
+    areas = [np.linalg.det(np.cov(xyz[:, :2].T)) for xyz in (points, enu)]
+    k = (areas[0] / areas[1]) ** 0.25
+    raw = image_px(found.rotations[0], found.centres[0], points) - seen
+    tilted = 1.0 + np.tan(np.radians(tilt_deg)) ** 2
+    bound = abs(k - 1) * np.hypot(*seen.T).max() * 2.0 * tilted + 0.1
+    assert np.hypot(*raw.T).max() < bound
+    assert np.hypot(*raw.T).max() < 2.5
+    even = found.centres[0] + (points - found.centres[0]) / [k, k, 1.0]
+    left = image_px(found.rotations[0], found.centres[0], even) - seen
+    drop_m = np.linalg.norm(enu, axis=1).max() ** 2 / 2 / 6.37e6  # the earth is curved
+    assert np.hypot(*left.T).max() < 1.2 * FOCAL_PX * drop_m / BELOW_M
+
+
+def test_pixels_are_kept_between_two_maps():
+    """From one zone to the next: 4.5 degrees of convergence, another scale."""
+    lon, lat = 0.0, 45.0
+    to_30, to_31 = (
+        Transformer.from_crs("EPSG:4326", code, always_xy=True)
+        for code in ("EPSG:32630", "EPSG:32631")
+    )
+    centre = np.array([*to_30.transform(lon, lat), 150.0])
+    looks = NADIR @ Rotation.from_euler("z", 25.0, degrees=True).as_matrix()
+    x, y = np.meshgrid(*[np.linspace(-0.5, 0.5, 5) * FRAME_PX / FOCAL_PX * BELOW_M] * 2)
+    points = centre + np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -BELOW_M)])
+    degrees = to_30.transform(points[:, 0], points[:, 1], direction="INVERSE")
+    there = np.column_stack([*to_31.transform(*degrees), points[:, 2]])
+    found = bring_to(cameras(centre, "EPSG:32630", looks[None]), "EPSG:32631")
+    moved = image_px(found.rotations[0], found.centres[0], there) - image_px(looks, centre, points)
+    assert np.hypot(*moved.T).max() < 0.01  # half way between them the scales are equal
+    turn = convergence_rad(lon, lat, 3.0) - convergence_rad(lon, lat, -3.0)
+    old_top, new_top = -looks[1], -found.rotations[0][1]
+    angle = np.arctan2(*new_top[[1, 0]]) - np.arctan2(*old_top[[1, 0]])
+    assert angle == pytest.approx(turn, abs=2e-5)
+
+
+def test_a_thousand_cameras_turn_at_once_as_one_by_one():
+    rng = np.random.default_rng(4)
+    degrees = np.column_stack(
+        [rng.uniform(-1, 0, 1000), rng.uniform(39, 40, 1000), rng.uniform(50, 500, 1000)]
+    )
+    turns = Rotation.random(1000, rng=7).as_matrix()
+    block = bring_to(cameras(degrees, "EPSG:4258", turns), UTM30)
+    for i in (0, 499, 999):
+        one = bring_to(cameras(degrees[i], "EPSG:4258", turns[i][None]), UTM30)
+        assert block.rotations[i] == pytest.approx(one.rotations[0], abs=1e-12)
+        assert block.centres[i] == pytest.approx(one.centres[0], abs=1e-9)
+
+
+def test_left_handed_axes_are_refused():
+    crs = CRS("EPSG:5513")  # south, west
+    x, y = Transformer.from_crs("EPSG:4156", crs, always_xy=True).transform(15.0, 50.0)
+    read = cameras([x, y, 300.0], "EPSG:5513", NADIR[None])
+    with pytest.raises(InputError, match="Krovak are left-handed, so rotations"):
+        bring_to(read, "EPSG:5514", name="a.csv")
+    assert np.isfinite(bring_to(replace(read, rotations=None), "EPSG:5514").centres).all()
+
+
+# ---- heights ----
+
+
+def test_a_missing_geoid_is_refused_and_named():
+    ecef = geocentric(*VALENCIA_LON_LAT)
+    read = cameras(ecef, "EPSG:4936", project_crs=UTM30_ALICANTE)
+    for cloud in (UTM30, UTM30_ALICANTE):  # a LAS often states the plan alone
+        with pytest.raises(InputError) as caught:
+            bring_to(read, cloud, name="cameras.xml")
+        message = str(caught.value)
+        assert message.startswith("cameras.xml: ellipsoidal heights (ETRS89) cannot be brought to")
+        assert "es_ign_egm08-rednap.tif" in message
+        assert "pyproj sync" in message
+        assert "PROJ_NETWORK=ON" in message
+        assert message.endswith(
+            "known to agree, give --cameras-crs EPSG:25830, the horizontal CRS alone."
+        )
+
+
+@pytest.mark.parametrize("cloud", [UTM30, UTM30_ALICANTE])
+def test_the_user_may_vouch_for_heights(cloud):
+    ecef = geocentric(*VALENCIA_LON_LAT)
+    read = cameras(ecef, "EPSG:4936", project_crs=UTM30_ALICANTE)
+    found = bring_to(read, cloud, cameras_crs=UTM30)
+    assert found.centres[0, 2] == pytest.approx(142.48, abs=1e-6)
+    assert found.crs == cloud
+    assert found.notes == ()
+
+
+GEOID = """
+import sys, numpy as np, pyproj, rasterio
+from rasterio.transform import from_origin
+folder = sys.argv[1]
+north, west = np.mgrid[40.5:38.5:-0.05, -1.5:0.5:0.05]
+grid = (50.0 + 0.02 * (west + 0.38) * 85.9).astype("float32")
+with rasterio.open(folder + "/es_ign_egm08-rednap.tif", "w", driver="GTiff", count=1,
+                   dtype="float32", width=grid.shape[1], height=grid.shape[0], crs="EPSG:4258",
+                   transform=from_origin(-1.525, 40.525, 0.05, 0.05)) as out:
+    out.write(grid, 1)
+    out.update_tags(TYPE="VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL", AREA_OR_POINT="Point")
+    out.set_band_description(1, "geoid_undulation")
+pyproj.datadir.append_data_dir(folder)
+from pcfix.io.cameras.georeference import bring_to
+from pcfix.model import Cameras
+ecef = [[float(w) for w in sys.argv[2:5]]]
+read = Cameras(("a",), np.array(ecef), np.eye(3)[None], crs="EPSG:4936",
+               project_crs="EPSG:25830+5782")
+for cloud in ("EPSG:25830", "EPSG:25830+5782"):
+    found = bring_to(read, cloud)
+    flat = bring_to(read, cloud, cameras_crs="EPSG:25830")
+    turn = flat.rotations[0] @ found.rotations[0].T
+    turn_deg = np.degrees(np.linalg.norm(turn - turn.T) / np.sqrt(8))
+    print(found.crs, *found.centres[0], turn_deg, found.notes)
+"""
+
+
+def test_with_the_geoid_installed_heights_are_brought_over(tmp_path):
+    ecef = geocentric(*VALENCIA_LON_LAT)
+    script = tmp_path / "geoid.py"
+    script.write_text(GEOID)
+    done = subprocess.run(
+        [sys.executable, str(script), str(tmp_path), *map(repr, ecef.tolist())],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    for line in done.stdout.splitlines():
+        crs, _, _, z, turn_deg, notes = line.split(maxsplit=5)
+        assert crs == UTM30_ALICANTE
+        assert float(z) == pytest.approx(142.48 - 50.0, abs=2e-3)
+        # 0.02 m per km of slope: half of it is a turn, half shear
+        assert float(turn_deg) == pytest.approx(np.degrees(0.5 * 0.02e-3), rel=0.1)
+        assert notes == "()"
+
+
+def test_two_vertical_datums_need_their_grids():
+    with pytest.raises(InputError, match=r"EGM96 height cannot be brought to Alicante height") as e:
+        bring_to(cameras(VALENCIA, "EPSG:32630+5773"), UTM30_ALICANTE)
+    assert "us_nga_egm96_15.tif" in str(e.value)
+    assert "--cameras-crs EPSG:32630, the" in str(e.value)
+
+
+def test_ellipsoidal_heights_stay_where_nobody_says_more():
+    found = bring_to(cameras(VALENCIA_LON_LAT, "EPSG:4937"), UTM30, name="a.txt")
+    assert found.centres[0, 2] == 142.48
+    assert found.notes == (
+        "a.txt: the cloud's CRS (ETRS89 / UTM zone 30N) does not say what its heights are; taken"
+        " to be ellipsoidal, of ETRS89.",
+    )
+
+
+def test_another_ellipsoid_shifts_no_height_by_forty_metres():
+    read = cameras(geocentric(5.0, 52.0, 50.0, f=1 / 298.257223563), "EPSG:4978")
+    found = bring_to(replace(read, project_crs="EPSG:28992"), "EPSG:28992")
+    assert found.centres[0, 2] == pytest.approx(50.0, abs=1e-6)  # 6.4 m above Bessel's ellipsoid
+    assert "taken to be ellipsoidal, of WGS 84" in found.notes[-1]
+
+
+@pytest.mark.parametrize(("at", "crs"), [(VALENCIA_LON_LAT, "EPSG:4326"), (VALENCIA, UTM30)])
+def test_heights_not_stated_are_the_clouds_and_it_says_so(at, crs):
+    found = bring_to(cameras(at, crs), UTM30_ALICANTE, name="a.txt")
+    assert found.centres[0, 2] == at[2]
+    assert found.notes[-1].startswith("a.txt: does not say what its heights are; taken to be the")
+    assert bring_to(cameras(at, crs), UTM30_ALICANTE, cameras_crs=crs).notes == ()
+
+
+def test_a_topocentric_frame_needs_the_grid_unless_the_user_gives_its_height():
+    frame = "ENU:39.44,-0.38,92.5"
+    with pytest.raises(InputError, match="give --cameras-crs ENU:latitude,longitude,height with"):
+        bring_to(cameras([0.0, 0, 50], frame), UTM30_ALICANTE)
+    found = bring_to(cameras([0.0, 0, 50], frame), UTM30_ALICANTE, cameras_crs=frame)
+    assert found.centres[0, 2] == pytest.approx(142.5, abs=1e-6)
+
+
+def test_heights_of_the_file_name_those_of_the_cloud():
+    assert bring_to(cameras(VALENCIA, UTM30_ALICANTE), UTM30).crs == UTM30_ALICANTE
+    found = bring_to(cameras([500000.0, 4900000.0, 1000.0], "EPSG:26910+6360"), "EPSG:26910")
+    assert found.centres[0, 2] == pytest.approx(1200000.0 / 3937.0)
+
+
+# ---- who says what ----
+
+
+def test_a_file_that_says_nothing_is_in_the_clouds_crs():
+    found = bring_to(cameras(VALENCIA, None), CRS(UTM30))
+    assert (found.crs, found.notes) == (UTM30, ())
+
+
+@pytest.mark.parametrize("crs", ["local", LOCAL_CS])
+def test_a_local_frame_is_refused_unless_told_so(crs):
+    with pytest.raises(InputError, match=r"a.xml: is in a local frame, not tied .* ETRS89 / UTM"):
+        bring_to(cameras(VALENCIA, crs), UTM30, name="a.xml")
+    found = bring_to(cameras(VALENCIA, crs), UTM30, cameras_crs="Local")
+    assert (found.crs, found.centres[0].tolist()) == (UTM30, VALENCIA)
+    assert bring_to(cameras(VALENCIA, crs), UTM30, cameras_crs=UTM30).crs == UTM30
+
+
+def test_a_local_cloud_takes_local_cameras_and_no_others():
+    for crs in ("local", LOCAL_CS, None):
+        assert bring_to(cameras([1.0, 2, 3], crs), LOCAL_CS).centres.tolist() == [[1, 2, 3]]
+    for crs in (UTM30, "ENU:1,2,3", "EPSG:4978"):
+        with pytest.raises(InputError, match="but the cloud is in a local frame"):
+            bring_to(cameras(VALENCIA, crs), LOCAL_CS)
+    assert bring_to(cameras(VALENCIA, UTM30), LOCAL_CS, cameras_crs="local").crs
+
+
+def test_local_means_the_numbers_as_they_are():
+    found = bring_to(cameras(VALENCIA, "EPSG:4978"), UTM30, cameras_crs="local", offset_m=(1, 2, 3))
+    assert found.centres[0] == pytest.approx(np.add(VALENCIA, [1, 2, 3]))
+
+
+def test_the_option_overrides_the_file():
+    found = bring_to(cameras(VALENCIA, "EPSG:32631"), UTM30, cameras_crs="EPSG:25830")
+    assert found.centres[0].tolist() == VALENCIA
+
+
+def test_without_the_clouds_crs():
+    ecef = geocentric(*VALENCIA_LON_LAT)
+    found = bring_to(cameras(ecef, "EPSG:4936", project_crs=UTM30), None, name="a.xml")
+    assert (found.crs, found.centres[0, 2]) == (UTM30, pytest.approx(142.48))
+    assert found.notes == (
+        "a.xml: the cloud names no CRS; taken to be in ETRS89 / UTM zone 30N as the cameras are.",
+    )
+    for at, crs in ((VALENCIA, UTM30), ([1.0, 2, 3], "ENU:39,0,5"), ([6.0, 4, 2], "EPSG:2992")):
+        found = bring_to(cameras(at, crs), None)
+        assert (found.crs, found.centres[0].tolist()) == (crs, list(at))
+        assert "taken to be in" in found.notes[0]
+    assert "unit foot," in found.notes[0]
+    for crs in ("local", None):
+        found = bring_to(cameras([1.0, 2, 3], crs), None)
+        assert (found.crs, found.centres.tolist(), found.notes) == (crs, [[1, 2, 3]], ())
+
+
+@pytest.mark.parametrize(
+    ("at", "crs", "more"),
+    [
+        (VALENCIA_LON_LAT, "EPSG:4326", {}),
+        (geocentric(*VALENCIA_LON_LAT), "EPSG:4936", {}),
+        (geocentric(*VALENCIA_LON_LAT), "EPSG:4936", {"project_crs": "EPSG:4258"}),
+        (geocentric(*VALENCIA_LON_LAT), "EPSG:4936", {"project_crs": LOCAL_CS}),
+    ],
+)
+def test_without_the_clouds_crs_no_map_is_chosen(at, crs, more):
+    with pytest.raises(InputError, match=r"a.xml: is in .* names no CRS; set the cloud's CRS"):
+        bring_to(cameras(at, crs, **more), None, name="a.xml")
+
+
+@pytest.mark.parametrize(
+    ("at", "crs", "cloud", "message"),
+    [
+        (VALENCIA, "EPSG:4326", UTM30, r"image 0.jpg: 725448.8.* are not longitude and latitude"),
+        (VALENCIA, "EPSG:4978", UTM30, r"image 0.jpg: .* are not geocentric coordinates \(WGS 84"),
+        (VALENCIA, "EPSG:4326+5773", UTM30, "are not longitude and latitude"),
+        (VALENCIA, "nonsense", UTM30, "a.xml: the CRS 'nonsense' is not one"),
+        (VALENCIA, UTM30, "nonsense", "the cloud: the CRS 'nonsense' is not one"),
+        (VALENCIA, "EPSG:32630", "EPSG:4326", "the cloud: WGS 84 is in degrees; reproject"),
+        (VALENCIA, "EPSG:32630", "EPSG:2992", "is in foot; reproject"),
+        (VALENCIA, "ENU:39", UTM30, "a.xml: 'ENU:39' is not ENU:latitude"),
+        (VALENCIA, "EPSG:5703", UTM30, "is a vertical CRS"),
+        ([1e30, 1e30, 5.0], "EPSG:32631", UTM30, r"image 0.jpg: its position 1e\+30.*cannot be"),
+    ],
+)
+def test_what_is_refused(at, crs, cloud, message):
+    with pytest.raises(InputError, match=message):
+        bring_to(cameras(at, crs, NADIR[None]), cloud, name="a.xml")
+
+
+def test_an_option_that_is_no_crs():
+    with pytest.raises(InputError, match=r"^--cameras-crs: the CRS 'EPSG:0' is not one that"):
+        bring_to(cameras(VALENCIA, None), UTM30, cameras_crs="EPSG:0")
+
+
+@pytest.mark.parametrize("offset", [(1.0, 2.0), (np.nan, 0.0, 0.0)])
+def test_an_offset_that_is_none(offset):
+    with pytest.raises(InputError, match="is not three numbers"):
+        bring_to(cameras(VALENCIA, None), UTM30, offset_m=offset)
+
+
+def test_no_metres_on_degrees():
+    with pytest.raises(InputError, match="an offset in metres cannot be added to degrees"):
+        bring_to(cameras(VALENCIA_LON_LAT, "EPSG:4326"), UTM30, offset_m=(1.0, 0.0, 0.0))

@@ -1,0 +1,143 @@
+"""Adjusted centres minus GNSS positions."""
+
+import numpy as np
+import pytest
+from pyproj import CRS, Transformer
+
+from pcfix.io.cameras.georeference import bring_to
+from pcfix.io.cameras.gnss import adjusted_minus_gnss
+from pcfix.model import Cameras, GnssPositions
+from tests.utils.reprojection import check_file
+from tests.utils.shared import needs
+
+WHEAT, wheat = needs("cameras", "metashape", "easyidp_wheat_psx")
+
+LON, LAT, H = 139.5405, 35.7380, 130.0
+ENU_M = np.array([[1.5, -2.0, 0.5], [0.0, 0.25, -3.0], [np.nan] * 3])
+
+
+def block(crs, gnss_crs, enu_m=ENU_M, height=H, **more):
+    """Return cameras in a CRS and GNSS positions that differ from them by ENU_M."""
+    to_ecef = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    lam, phi = np.radians([LON, LAT])
+    axes = np.array(
+        [
+            [-np.sin(lam), np.cos(lam), 0],
+            [-np.sin(phi) * np.cos(lam), -np.sin(phi) * np.sin(lam), np.cos(phi)],
+            [np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)],
+        ]
+    )
+    origin = np.array(to_ecef.transform(LON, LAT, height))
+    adjusted = origin + np.array([[0.0, 0, 0], [5.0, 8.0, 1.0], [9.0, -4.0, 0.0]]) @ axes
+    measured = adjusted - enu_m @ axes
+
+    def there(ecef, crs):
+        if crs.startswith("ENU"):
+            return (ecef - origin) @ axes.T
+        target = CRS(crs)
+        target = target if len(target.axis_info) == 3 else target.to_3d()
+        step = Transformer.from_crs("EPSG:4978", target, always_xy=True)
+        return np.column_stack(step.transform(*ecef.T))
+
+    gnss = GnssPositions(there(measured, gnss_crs), np.full((3, 3), np.nan), gnss_crs)
+    labels = ("a", "b", "c")
+    return Cameras(labels, there(adjusted, crs), crs=crs, gnss=gnss, **more)
+
+
+ENU = f"ENU:{LAT},{LON},{H}"
+
+
+@pytest.mark.parametrize("gnss", ["EPSG:4326", "EPSG:4979", "EPSG:4978", "EPSG:32654"])
+@pytest.mark.parametrize("crs", ["EPSG:4978", "EPSG:4979", "EPSG:4326", ENU])
+def test_differences_are_east_north_up(crs, gnss):
+    found = adjusted_minus_gnss(block(crs, gnss))
+    assert found.enu_m == pytest.approx(ENU_M, abs=2e-4, nan_ok=True)
+    assert found.reason == ""
+
+
+def test_in_the_axes_of_a_map():
+    read = block("EPSG:4978", "EPSG:4326", project_crs="EPSG:32654")
+    found = adjusted_minus_gnss(bring_to(read, "EPSG:32654"))
+    gamma = np.arctan(np.tan(np.radians(LON - 141.0)) * np.sin(np.radians(LAT)))
+    east, north = ENU_M[:2, :2].T
+    turned = np.column_stack(
+        [east * np.cos(gamma) - north * np.sin(gamma), east * np.sin(gamma) + north * np.cos(gamma)]
+    )
+    assert found.enu_m[:2, :2] == pytest.approx(turned, abs=2e-3)  # scale 0.9997 of 3 m
+    assert found.enu_m[:2, 2] == pytest.approx(ENU_M[:2, 2], abs=1e-4)
+    assert np.isnan(found.enu_m[2]).all()
+
+
+def test_in_feet_they_are_metres():
+    x, y = Transformer.from_crs("EPSG:4326", "EPSG:2992", always_xy=True).transform(-120.5, 44.0)
+    gnss = GnssPositions(np.array([[x, y, 100.0]]), np.full((1, 3), np.nan), "EPSG:2992")
+    feet = Cameras(("a",), np.array([[x + 10.0, y, 110.0]]), crs="EPSG:2992", gnss=gnss)
+    assert adjusted_minus_gnss(feet).enu_m[0] == pytest.approx([3.048, 0, 3.048], abs=1e-6)
+
+
+@wheat
+def test_a_camera_where_the_gnss_put_it():
+    truth = check_file(WHEAT)["projection_centres"]
+    degrees = np.array([[t["X"], t["Y"], t["Z"]] for t in truth])
+    gnss = GnssPositions(degrees, np.full(degrees.shape, np.nan), "EPSG:4326")
+    read = Cameras(
+        tuple(t["image"] for t in truth),
+        np.array([t["ECEF"] for t in truth]),
+        crs="EPSG:4978",
+        project_crs="EPSG:4326",
+        gnss=gnss,
+    )
+    for found in (read, bring_to(read, "EPSG:32654")):
+        assert adjusted_minus_gnss(found).enu_m == pytest.approx(0.0, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("crs", "gnss_crs", "reason"),
+    [
+        ("EPSG:4978", "EPSG:4326+5773", "without the grid us_nga_egm96_15.tif"),
+        ("EPSG:32654+5773", "EPSG:4979", "without the grid us_nga_egm96_15.tif"),
+        ("EPSG:32654+5773", "EPSG:4326", "the CRS of the GNSS does not say what its heights are"),
+        ("EPSG:32654", "EPSG:4326+5773", "the CRS of the cameras does not say"),
+    ],
+)
+def test_heights_that_cannot_be_compared_leave_the_plan(crs, gnss_crs, reason):
+    flat = [text.partition("+")[0] for text in (crs, gnss_crs)]
+    as_metres = block(flat[0], flat[1])
+    read = Cameras(
+        as_metres.labels,
+        as_metres.centres,
+        crs=crs,
+        gnss=GnssPositions(as_metres.gnss.xyz, as_metres.gnss.sigma_m, gnss_crs),
+    )
+    found = adjusted_minus_gnss(read, "a.xml")
+    assert found.reason.startswith("a.xml: ")
+    assert reason in found.reason
+    assert found.reason.endswith("only plan is compared.")
+    assert "--cameras-crs" not in found.reason
+    assert np.isnan(found.enu_m[:, 2]).all()
+    lengths = np.hypot(*found.enu_m[:2, :2].T)
+    assert lengths == pytest.approx(np.hypot(*ENU_M[:2, :2].T), rel=5e-4)
+
+
+def test_positions_without_a_crs_are_in_that_of_the_cameras():
+    gnss = GnssPositions(np.array([[1.0, 2, 3]]), np.full((1, 3), np.nan), None)
+    for crs in (None, "local", "EPSG:32654", "ENU:1,2,3"):
+        read = Cameras(("a",), np.array([[2.0, 2, 5]]), crs=crs, gnss=gnss)
+        assert adjusted_minus_gnss(read).enu_m.tolist() == [[1.0, 0.0, 2.0]]
+
+
+@pytest.mark.parametrize("crs", [None, "local"])
+def test_a_local_block_cannot_be_compared(crs):
+    gnss = GnssPositions(np.array([[LON, LAT, H]]), np.full((1, 3), np.nan), "EPSG:4326")
+    found = adjusted_minus_gnss(Cameras(("a",), np.zeros((1, 3)), crs=crs, gnss=gnss), "a.xml")
+    assert np.isnan(found.enu_m).all()
+    assert "a.xml: positions of the GNSS and adjusted centres are not both tied" in found.reason
+
+
+def test_no_positions_at_all():
+    found = adjusted_minus_gnss(Cameras(("a",), np.zeros((1, 3))), "a.xml")
+    assert found.enu_m.shape == (1, 3)
+    assert found.reason == "a.xml: has no positions of the GNSS."
+    none = GnssPositions(np.full((1, 3), np.nan), np.full((1, 3), np.nan), "EPSG:4326")
+    read = Cameras(("a",), np.array([[5e5, 4e6, 1.0]]), crs="EPSG:32654", gnss=none)
+    assert np.isnan(adjusted_minus_gnss(read).enu_m).all()

@@ -1,0 +1,1027 @@
+"""Poses, lenses, GNSS positions, tie points and markers from Agisoft Metashape."""
+
+import re
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+from pyproj import Transformer
+
+from pcfix.errors import InputError
+from pcfix.io.cameras import metashape
+from pcfix.io.cameras.formats import Source, SparseModel
+from pcfix.io.cameras.metashape import read_calibration
+from pcfix.model import Lens
+from pcfix.refract.lens import project
+from tests.utils.reprojection import check_file, residuals_px, row_of
+from tests.utils.shared import needs
+
+SOROLLA, sorolla = needs("cameras", "metashape", "uclm_sorolla")
+RIG, rig = needs("cameras", "metashape", "micasense_rig")
+WHEAT, wheat = needs("cameras", "metashape", "easyidp_wheat_psx")
+CAMCAL, camcal = needs("cameras", "metashape", "dbat_camcal_psz")
+BODIES, bodies = needs("cameras", "metashape", "bitbyt3r_local93")
+IO, io_xml = needs("cameras", "metashape_opk", "sfmrefract", "io")
+
+SAMPLES = {
+    "uclm_sorolla": (SOROLLA / "markers_25830-5782.xml", "EPSG:4936", "EPSG:4937"),
+    "micasense_rig": (RIG / "markers_micasenses_rededge.xml", "EPSG:4936", "EPSG:4937"),
+    "easyidp_wheat_psx": (WHEAT / "wheat_tanashi.psx", "EPSG:4978", "EPSG:4979"),
+    "dbat_camcal_psz": (CAMCAL / "c4040z.psz", None, None),
+    "bitbyt3r_local93": (BODIES / "cameras.xml", None, None),
+}
+ONE = "1 0 0 {} 0 1 0 {} 0 0 1 {} 0 0 0 1"
+QUARTER = "0 -1 0 1 0 0 0 0 1"
+"""A quarter turn about z: (x, y, z) goes to (-y, x, z)."""
+
+UTM30 = (
+    'PROJCS["ETRS89 / UTM zone 30N",GEOGCS["ETRS89",DATUM["European Terrestrial Reference System'
+    ' 1989",SPHEROID["GRS 1980",6378137,298.257222101,AUTHORITY["EPSG","7019"]],TOWGS84[0,0,0,0,0,'
+    '0,0],AUTHORITY["EPSG","6258"]],PRIMEM["Greenwich",0,AUTHORITY["EPSG","8901"]],UNIT["degree",'
+    '0.01745329251994328,AUTHORITY["EPSG","9102"]],AUTHORITY["EPSG","4258"]],PROJECTION['
+    '"Transverse_Mercator",AUTHORITY["EPSG","9807"]],PARAMETER["latitude_of_origin",0],PARAMETER['
+    '"central_meridian",-3],PARAMETER["scale_factor",0.9996],PARAMETER["false_easting",500000],'
+    'PARAMETER["false_northing",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]],AUTHORITY["EPSG",'
+    '"25830"]]'
+)
+WGS84 = (
+    'GEOGCS["WGS 84",DATUM["World Geodetic System 1984",SPHEROID["WGS 84",6378137,298.257223563,'
+    'AUTHORITY["EPSG","7030"]],TOWGS84[0,0,0,0,0,0,0],AUTHORITY["EPSG","6326"]],PRIMEM['
+    '"Greenwich",0,AUTHORITY["EPSG","8901"]],UNIT["degree",0.01745329251994328,AUTHORITY["EPSG",'
+    '"9102"]],AUTHORITY["EPSG","4326"]]'
+)
+GEOCENTRIC = (
+    'GEOCCS["WGS 84",DATUM["World Geodetic System 1984",SPHEROID["WGS 84",6378137,298.257223563]],'
+    'PRIMEM["Greenwich",0],UNIT["metre",1],AUTHORITY["EPSG","4978"]]'
+)
+MILLIMETRES = (
+    'LOCAL_CS["Local Coordinates (mm)",LOCAL_DATUM["Local Datum",0],UNIT["millimetre",0.001,'
+    'AUTHORITY["EPSG","1025"]]]'
+)
+
+
+def calibration(inner="<f>100</f>", kind="frame", use="adjusted", size='width="60" height="40"'):
+    return f'<calibration type="{kind}" class="{use}"><resolution {size}/>{inner}</calibration>'
+
+
+def sensor(inner=None, number=0, attributes='type="frame"'):
+    inner = calibration() if inner is None else inner
+    return (
+        f'<sensor id="{number}" label="S{number}" {attributes}>'
+        f'<resolution width="60" height="40"/>{inner}</sensor>'
+    )
+
+
+def camera(number, inner=None, attributes='sensor_id="0"', label=None):
+    inner = f"<transform>{ONE.format(1, 2, 3)}</transform>" if inner is None else inner
+    name = f"img{number}.jpg" if label is None else label
+    return f'<camera id="{number}" label="{name}" {attributes}>{inner}</camera>'
+
+
+def transform(translation="10 20 30", rotation=QUARTER, scale="2"):
+    return (
+        f'<transform><rotation locked="true">{rotation}</rotation>'
+        f"<translation>{translation}</translation><scale>{scale}</scale></transform>"
+    )
+
+
+def chunk(sensors=None, cameras=None, rest="", attributes='label="C" enabled="true"'):
+    sensors = sensor() if sensors is None else sensors
+    cameras = camera(0) if cameras is None else cameras
+    return (
+        f'<chunk {attributes}><sensors next_id="9">{sensors}</sensors>'
+        f'<cameras next_id="9">{cameras}</cameras>{rest}</chunk>'
+    )
+
+
+def document(content, attributes='version="2.0.0"'):
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n<document {attributes}>{content}</document>'
+
+
+def write(tmp_path, content, name="cameras.xml"):
+    path = tmp_path / name
+    path.write_text(document(content))
+    return path
+
+
+def read(path):
+    source = Source(path)
+    assert metashape.recognises(source)
+    return metashape.read(source)
+
+
+def read_chunk(tmp_path, *args, **kwargs):
+    return read(write(tmp_path, chunk(*args, **kwargs)))
+
+
+def lens_of(tmp_path, inner, **kwargs):
+    return read_chunk(tmp_path, sensors=sensor(inner, **kwargs)).lenses[0]
+
+
+def put_zip(path, entries, compression=zipfile.ZIP_DEFLATED):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, content in entries.items():
+            archive.writestr(name, content)
+    return path
+
+
+def ply(properties, rows, order="little"):
+    kinds = {"float": "f", "int": "i", "uint": "I", "uint64": "Q", "uchar": "B"}
+    head = "".join(f"property {kind} {name}\n" for kind, name in properties)
+    layout = ("<" if order == "little" else ">") + "".join(kinds[k] for k, _ in properties)
+    body = b"".join(struct.pack(layout, *row) for row in rows)
+    text = f"ply\nformat binary_{order}_endian 1.0\nelement vertex {len(rows)}\n{head}end_header\n"
+    return text.encode() + body
+
+
+POINT = (("float", "x"), ("float", "y"), ("float", "z"), ("int", "id"))
+MARK = (("float", "x"), ("float", "y"), ("float", "size"), ("int", "id"))
+
+
+# The samples
+
+
+def in_world_of_the_file(cameras, geographic, observations):
+    """Return observations and centres with X, Y, Z as the file has them: geocentric or local."""
+    if geographic is None:
+        return observations
+    moved = []
+    for seen in observations:
+        crs = "EPSG:4326" if abs(seen["X"]) <= 180.0 else "EPSG:25830"
+        lonlat = Transformer.from_crs(crs, geographic, always_xy=True)
+        to_earth = Transformer.from_crs(geographic, cameras.crs, always_xy=True)
+        x, y = lonlat.transform(seen["X"], seen["Y"])
+        xyz = to_earth.transform(x, y, seen["Z"])  # its heights are ellipsoidal
+        moved.append({**seen, **dict(zip("XYZ", xyz, strict=True))})
+    return moved
+
+
+@pytest.mark.parametrize(
+    ("name", "most_px"),
+    [
+        pytest.param("uclm_sorolla", 0.49, marks=sorolla),
+        pytest.param("micasense_rig", 0.11, marks=rig),
+        pytest.param("easyidp_wheat_psx", 2.08, marks=wheat),
+        pytest.param("dbat_camcal_psz", 0.90, marks=camcal),
+    ],
+)
+def test_observations_of_samples_reproject(name, most_px):
+    path, _, geographic = SAMPLES[name]
+    cameras = read(path)
+    check = check_file(path.parent)
+    observations = in_world_of_the_file(cameras, geographic, check["observations"])
+    found = residuals_px(cameras, observations)
+    expected = np.array([seen["res_px"] for seen in observations])
+    assert len(found) >= 23
+    assert np.sqrt(np.mean(found**2)) < most_px
+    # positions in check.json are rounded, most coarsely to 1e-8 degrees, 0.09 px at 30 m
+    assert found == pytest.approx(expected, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("uclm_sorolla", marks=sorolla),
+        pytest.param("micasense_rig", marks=rig),
+        pytest.param("easyidp_wheat_psx", marks=wheat),
+        pytest.param("dbat_camcal_psz", marks=camcal),
+        pytest.param("bitbyt3r_local93", marks=bodies),
+    ],
+)
+def test_centres_and_views_of_samples(name):
+    path, crs, _ = SAMPLES[name]
+    cameras = read(path)
+    check = check_file(path.parent)
+    assert len(cameras) == check["n_posed"]
+    assert len(cameras) + len(cameras.unposed) == check["n_images"]
+    assert cameras.crs == (crs or "local")
+    for given in check["projection_centres"]:
+        i = row_of(cameras, given["image"])
+        centre = given.get("ECEF") or [given[axis] for axis in "XYZ"]
+        assert cameras.centres[i] == pytest.approx(centre, abs=1e-4)
+        axes = east_north_up(centre) if crs else np.eye(3)
+        # up is taken from the centre of the earth, 0.19 degrees off the normal of the ellipsoid
+        assert axes @ cameras.rotations[i][2] == pytest.approx(
+            np.array(given["view_dir_approx"]), abs=5e-3
+        )
+
+
+def east_north_up(centre):
+    up = np.array(centre) / np.linalg.norm(centre)
+    east = np.cross([0.0, 0.0, 1.0], up)
+    east /= np.linalg.norm(east)
+    return np.array([east, np.cross(up, east), up])
+
+
+@sorolla
+def test_sample_says_where_its_gnss_was():
+    cameras = read(SAMPLES["uclm_sorolla"][0])
+    assert cameras.project_crs.startswith('COMPD_CS["ETRS89 / UTM zone 30N + Alicante height"')
+    assert cameras.source == "Agisoft Metashape 2.0.1.16069"
+    assert cameras.gnss.crs.startswith('GEOGCS["WGS 84"')
+    assert cameras.gnss.sigma_m[0].tolist() == [0.08, 0.08, 0.12]
+    to_earth = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    where = np.column_stack(to_earth.transform(*cameras.gnss.xyz.T))
+    # heights of one datum were typed for another (SOURCE.txt): only the plan is near
+    off = (where - cameras.centres) @ east_north_up(cameras.centres[0]).T
+    assert np.abs(off[:, :2]).max() < 0.3
+
+
+@rig
+def test_sample_with_a_rig_has_degrees_in_a_metric_chunk():
+    cameras = read(SAMPLES["micasense_rig"][0])
+    assert [note.partition(".xml: ")[2][:50] for note in cameras.notes] == [
+        "the reference positions of the cameras are degrees"
+    ]
+    to_earth = Transformer.from_crs(cameras.gnss.crs, "EPSG:4978", always_xy=True)
+    has = np.isfinite(cameras.gnss.xyz).all(axis=1)
+    assert has.sum() == 173  # the masters
+    where = np.column_stack(to_earth.transform(*cameras.gnss.xyz[has].T))
+    off = (where - cameras.centres[has]) @ east_north_up(where[0]).T
+    assert np.abs(off[:, :2]).max() < 10.0  # navigation grade
+
+
+@camcal
+def test_sample_with_tie_points_has_the_residuals_of_all():
+    source = Source(SAMPLES["dbat_camcal_psz"][0])
+    cameras = metashape.read(source)
+    ties = metashape.tie_points(source, cameras)
+    point = np.repeat(np.arange(len(ties.xyz)), np.diff(ties.views.start))
+    found = []
+    for i, lens in enumerate(cameras.lenses):
+        mine = ties.views.camera == i
+        rays = (ties.xyz[point[mine]] - cameras.centres[i]) @ cameras.rotations[i].T
+        found.append(np.hypot(*(project(lens, rays) - ties.image_xy[mine]).T))
+    found = np.concatenate(found)
+    check = check_file(CAMCAL)
+    assert len(found) == check["n_observations_used_for_rms"]
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(check["reprojection_rms_px"], abs=1e-4)
+    assert np.median(found) == pytest.approx(check["reprojection_median_px"], abs=1e-4)
+
+
+@wheat
+def test_sample_project_without_its_clouds_has_its_markers():
+    source = Source(SAMPLES["easyidp_wheat_psx"][0])
+    cameras = metashape.read(source)
+    ties = metashape.tie_points(source, cameras)
+    assert ties.xyz.shape == (6, 3)
+    assert np.isnan(ties.xyz).all()
+    assert len(ties.image_xy) == check_file(WHEAT)["n_observations_used_for_rms"]
+    folder = Source(WHEAT / "wheat_tanashi.files")
+    assert metashape.recognises(folder)
+    assert metashape.read(folder).centres.tolist() == cameras.centres.tolist()
+
+
+@bodies
+def test_images_turned_by_their_exif_keep_the_axes_of_the_stored_image():
+    # portraits: a camera turned to the right has the x axis down, one turned to the left up, so
+    # the matrices are those of the stored image and the orientation only says how to show it
+    text = SAMPLES["bitbyt3r_local93"][0].read_text()
+    turned = dict(re.findall(r'label="(\d+)">.*?<orientation>(\d)<', text, re.DOTALL))
+    cameras = read(SAMPLES["bitbyt3r_local93"][0])
+    x_axes = {
+        way: np.mean(
+            [cameras.rotations[row_of(cameras, n)][0] for n in turned if turned[n] == way], 0
+        )
+        for way in "68"
+    }
+    assert np.linalg.norm(x_axes["6"]) > 0.9
+    assert x_axes["6"] == pytest.approx(-x_axes["8"], abs=0.05)
+    assert {(lens.width, lens.height) for lens in cameras.lenses} == {(5184.0, 3456.0)}
+
+
+@io_xml
+def test_sample_calibrations():
+    lenses = [read_calibration(path) for path in sorted(IO.glob("*.xml"))]
+    assert len(lenses) == 2
+    assert {lens.width for lens in lenses} == {4000.0, 5472.0}
+    made_up = next(lens for lens in lenses if lens.width == 4000.0)
+    assert made_up == Lens(3500.0, 4000.0, 3000.0, 2000.0, 1500.0, sensor="ioFoo")
+
+
+# The format
+
+
+def test_is_a_format_with_tie_points():
+    assert isinstance(metashape, SparseModel)
+
+
+def test_scale_enters_the_centre_alone(tmp_path):
+    cameras = read_chunk(tmp_path, rest=transform())
+    assert cameras.centres.tolist() == [[10 - 2 * 2, 20 + 2 * 1, 30 + 2 * 3]]
+    assert cameras.rotations[0] == pytest.approx(np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]))
+    assert cameras.crs == "local"
+    assert cameras.notes == ()
+
+
+def test_chunk_matrix_with_the_scale_inside(tmp_path):
+    one = read_chunk(tmp_path, rest=transform())
+    two = read_chunk(tmp_path, rest="<transform>0 -2 0 10 2 0 0 20 0 0 2 30 0 0 0 1</transform>")
+    assert two.centres == pytest.approx(one.centres, abs=1e-12)
+    assert two.rotations == pytest.approx(one.rotations, abs=1e-12)
+
+
+def test_no_transform_leaves_the_frame_of_the_chunk(tmp_path):
+    cameras = read_chunk(tmp_path, rest=f"<reference>{UTM30}</reference>")
+    assert cameras.centres.tolist() == [[1.0, 2.0, 3.0]]
+    assert cameras.crs == "local"
+    assert cameras.project_crs is None
+
+
+@pytest.mark.parametrize(
+    ("wkt", "crs", "project_crs"),
+    [
+        (UTM30, "EPSG:4936", UTM30),
+        (WGS84, "EPSG:4978", WGS84),
+        (GEOCENTRIC, "EPSG:4978", "EPSG:4978"),
+        ("EPSG::32630", "EPSG:4978", "EPSG::32630"),
+        (
+            f'COMPD_CS["x",{UTM30},VERT_CS["h",VERT_DATUM["h",2005],UNIT["metre",1]]]',
+            "EPSG:4936",
+            1,
+        ),
+        ('LOCAL_CS["Local",LOCAL_DATUM["Local Datum",0],UNIT["metre",1]]', "local", None),
+        ("LOCAL", "local", None),
+    ],
+)
+def test_world_of_each_kind_of_crs(tmp_path, wkt, crs, project_crs):
+    place = "4932318 -32706 4030484"
+    cameras = read_chunk(tmp_path, rest=transform(place) + f"<reference>{wkt}</reference>")
+    assert cameras.crs == crs
+    assert cameras.project_crs == (wkt if project_crs == 1 else project_crs)
+    assert cameras.centres.tolist() == [[4932318 - 4, -32706 + 2, 4030484 + 6]]
+
+
+def test_datum_shift_of_the_wkt_is_not_applied_on_the_own_datum(tmp_path):
+    shifted = UTM30.replace("[0,0,0,0,0,0,0]", "[565,50,465,1.9,-1.7,9.1,4.07]")
+    shifted = shifted.replace('AUTHORITY["EPSG","6258"]', "").replace(",]", "]")
+    place = "4932318 -32706 4030484"
+    cameras = read_chunk(tmp_path, rest=transform(place) + f"<reference>{shifted}</reference>")
+    to_map = Transformer.from_crs(cameras.crs, cameras.project_crs, always_xy=True)
+    plain = Transformer.from_crs("EPSG:4936", "EPSG:25830", always_xy=True)
+    assert to_map.transform(*cameras.centres[0])[:2] == pytest.approx(
+        plain.transform(*cameras.centres[0])[:2], abs=1e-3
+    )
+
+
+def test_local_millimetres_are_told(tmp_path):
+    cameras = read_chunk(tmp_path, rest=transform() + f"<reference>{MILLIMETRES}</reference>")
+    assert cameras.crs == "local"
+    assert "in millimetre; its transform is in metres" in cameras.notes[0]
+
+
+def components(*inner, active=0):
+    each = "".join(f'<component id="{i}">{part}</component>' for i, part in enumerate(inner))
+    return f'<components next_id="9" active_id="{active}">{each}</components>'
+
+
+TWO = camera(0, attributes='sensor_id="0" component_id="0"') + camera(
+    1, attributes='sensor_id="0" component_id="1"'
+)
+
+
+def test_each_component_has_its_own_transform(tmp_path):
+    rest = components(transform(), transform("0 0 0", "1 0 0 0 1 0 0 0 1", "10")) + transform()
+    cameras = read_chunk(tmp_path, cameras=TWO, rest=rest)
+    assert cameras.centres.tolist() == [[6, 22, 36], [10, 20, 30]]
+    assert cameras.notes == ()
+
+
+def test_component_without_a_place_is_left_out(tmp_path):
+    cameras = read_chunk(tmp_path, cameras=TWO, rest=components(transform(), ""))
+    assert cameras.labels == ("img0.jpg",)
+    assert cameras.unposed == ("img1.jpg",)
+    assert "1 images are in a component that has no transform" in cameras.notes[0]
+
+
+def test_of_components_without_places_the_active_one_is_read(tmp_path):
+    cameras = read_chunk(tmp_path, cameras=TWO, rest=components("", "", active=1))
+    assert cameras.labels == ("img1.jpg",)
+    assert cameras.crs == "local"
+
+
+def test_transform_of_the_chunk_is_that_of_its_active_component(tmp_path):
+    cameras = read_chunk(tmp_path, cameras=TWO, rest=components("", "", active=1) + transform())
+    assert cameras.labels == ("img1.jpg",)
+    assert cameras.centres.tolist() == [[6, 22, 36]]
+
+
+def test_component_that_lists_its_images(tmp_path):
+    listed = "<partition><partition><camera_ids>1</camera_ids></partition></partition>"
+    cameras = read_chunk(
+        tmp_path,
+        cameras=camera(0) + camera(1),
+        rest=components("", listed + transform("0 0 0", scale="1")) + transform(),
+    )
+    assert cameras.centres.tolist() == [[6, 22, 36], [-2, 1, 3]]
+
+
+def test_slave_sits_on_its_master(tmp_path):
+    slave = sensor(
+        calibration()
+        + f"<rotation>{QUARTER}</rotation><rotation_covariance>1 2</rotation_covariance>"
+        + "<location>0.5 0 0</location><location_covariance>1 2</location_covariance>",
+        number=1,
+        attributes='type="frame" master_id="0"',
+    )
+    master = camera(7, "<transform>0 -1 0 1 1 0 0 2 0 0 1 3 0 0 0 1</transform>")
+    cameras = read_chunk(
+        tmp_path,
+        sensors=sensor() + slave,
+        cameras=camera(8, "", 'sensor_id="1" master_id="7"') + master,
+    )
+    assert cameras.labels == ("img8.jpg", "img7.jpg")
+    # half a unit along the master's x axis, which is the chunk's y axis
+    assert cameras.centres.tolist() == [[1.0, 2.5, 3.0], [1.0, 2.0, 3.0]]
+    # two quarter turns
+    assert cameras.rotations[0] == pytest.approx(np.diag([-1.0, -1.0, 1.0]))
+    assert [lens.sensor for lens in cameras.lenses] == ["S1", "S0"]
+
+
+def test_slave_with_empty_offsets_or_a_master_without_pose(tmp_path):
+    slave = sensor(
+        calibration() + '<rotation fixed="true"/><location fixed="true"/>', 1, 'master_id="0"'
+    )
+    images = (
+        camera(0)
+        + camera(1, "", 'sensor_id="1" master_id="0"')
+        + camera(2, "")
+        + camera(3, "", 'sensor_id="1" master_id="2"')
+        + camera(4, "", 'sensor_id="1" master_id="99"')
+    )
+    cameras = read_chunk(tmp_path, sensors=sensor() + slave, cameras=images)
+    assert cameras.labels == ("img0.jpg", "img1.jpg")
+    assert cameras.centres.tolist() == [[1, 2, 3], [1, 2, 3]]
+    assert cameras.unposed == ("img2.jpg", "img3.jpg", "img4.jpg")
+
+
+def test_groups_keyframes_disabled_and_repeated_labels(tmp_path):
+    images = (
+        f'<group id="0" type="folder">{camera(0)}<group id="1">{camera(1)}</group></group>'
+        + camera(2, attributes='sensor_id="0" enabled="false"')
+        + camera(3, "", 'sensor_id="0" enabled="false"')
+        + camera(4, attributes='sensor_id="0" type="keyframe"')
+        + camera(5, label="img0.jpg", attributes='sensor_id="0" enabled="true"')
+    )
+    cameras = read_chunk(tmp_path, cameras=images)
+    assert cameras.labels == ("img0.jpg", "img1.jpg", "img0.jpg")
+    assert cameras.unposed == ("img2.jpg", "img3.jpg")
+    assert len(cameras.notes) == 1
+    assert cameras.notes[0].endswith("1 images are aligned but disabled; left out.")
+
+
+# Lenses
+
+
+def test_new_calibration(tmp_path):
+    inner = (
+        "<f>100</f><cx>3</cx><cy>-4</cy><b1>0.5</b1><b2>0.25</b2><k1>0.1</k1><k2>0.2</k2>"
+        "<k3>0.3</k3><k4>0.4</k4><p1>0.01</p1><p2>0.02</p2><p3>0.03</p3><p4>0.04</p4>"
+    )
+    size = '<property name="pixel_width" value="0.005"/>'
+    lens = lens_of(tmp_path, size + calibration(inner))
+    assert lens == Lens(
+        *(100.0, 60.0, 40.0, 33.0, 16.0, 0.5, 0.25),
+        radial=(0.1, 0.2, 0.3, 0.4),
+        tangential=(0.01, 0.02, 0.03, 0.04),
+        pixel_size_mm=0.005,
+        sensor="S0",
+    )
+    # the manual's formula, written out again
+    x, y = 0.2, -0.1
+    r2 = x * x + y * y
+    radial = 1 + 0.1 * r2 + 0.2 * r2**2 + 0.3 * r2**3 + 0.4 * r2**4
+    more = 1 + 0.03 * r2 + 0.04 * r2**2
+    xd = x * radial + (0.01 * (r2 + 2 * x * x) + 2 * 0.02 * x * y) * more
+    yd = y * radial + (0.02 * (r2 + 2 * y * y) + 2 * 0.01 * x * y) * more
+    u = 60 * 0.5 + 3 + xd * 100 + xd * 0.5 + yd * 0.25
+    v = 40 * 0.5 - 4 + yd * 100
+    assert project(lens, np.array([[2 * x, 2 * y, 2.0]]))[0] == pytest.approx([u, v], abs=1e-9)
+
+
+def test_old_calibration_is_absolute_and_in_the_order_of_opencv(tmp_path):
+    inner = (
+        "<fx>101</fx><fy>100</fy><cx>33</cx><cy>16</cy><skew>0.25</skew><k1>0.1</k1>"
+        "<p1>0.01</p1><p2>0.02</p2>"
+    )
+    lens = lens_of(tmp_path, calibration(inner))
+    x, y = 0.2, -0.1
+    r2 = x * x + y * y
+    xd = x * (1 + 0.1 * r2) + 2 * 0.01 * x * y + 0.02 * (r2 + 2 * x * x)
+    yd = y * (1 + 0.1 * r2) + 2 * 0.02 * x * y + 0.01 * (r2 + 2 * y * y)
+    expected = [33 + 101 * xd + 0.25 * yd, 16 + 100 * yd]
+    assert project(lens, np.array([[x, y, 1.0]]))[0] == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("kind", "radius"),
+    [
+        ("fisheye", lambda theta: theta),
+        ("equidistant_fisheye", lambda theta: theta),
+        ("equisolid_fisheye", lambda theta: 2 * np.sin(theta / 2)),
+    ],
+)
+def test_fisheyes_have_the_distortion_of_a_frame_camera(tmp_path, kind, radius):
+    inner = calibration("<f>20</f><k1>0.1</k1>", kind=kind)
+    lens = lens_of(tmp_path, inner, attributes=f'type="{kind}"')
+    theta = 0.8
+    r = radius(theta)
+    expected = [30 + 20 * r * (1 + 0.1 * r * r), 20.0]
+    ray = np.array([[np.sin(theta), 0.0, np.cos(theta)]])
+    assert project(lens, ray)[0] == pytest.approx(expected, abs=1e-9)
+
+
+def test_of_two_calibrations_the_adjusted_one(tmp_path):
+    both = calibration("<f>1</f>", use="initial") + calibration("<f>2</f>")
+    assert lens_of(tmp_path, both).focal == 2.0
+    assert lens_of(tmp_path, calibration("<f>1</f>", use="initial")).focal == 1.0
+
+
+def test_sensor_with_its_data_sheet_alone(tmp_path):
+    inner = '<property name="pixel_width" value="0.01"/><property name="focal_length" value="8"/>'
+    cameras = read_chunk(tmp_path, sensors=sensor(inner))
+    assert cameras.lenses[0] == Lens(800.0, 60.0, 40.0, 30.0, 20.0, pixel_size_mm=0.01, sensor="S0")
+    assert "sensor S0 has no calibration" in cameras.notes[0]
+
+
+def test_what_a_lens_here_has_not_is_told(tmp_path):
+    corrections = '<corrections type="fourier"><coeffs>3 4 0 0</coeffs></corrections>'
+    cameras = read_chunk(
+        tmp_path,
+        sensors=sensor(
+            calibration("<f>9</f>" + corrections)
+            + '<property name="rolling_shutter" value="true"/>'
+        ),
+    )
+    assert len(cameras.notes) == 2
+    assert "additional corrections, 3.54 px rms" in cameras.notes[0]
+    assert "rolling shutter" in cameras.notes[1]
+
+
+@pytest.mark.parametrize("kind", ["spherical", "cylindrical", "rpc"])
+def test_images_without_a_central_projection_are_left_out(tmp_path, kind):
+    cameras = read_chunk(
+        tmp_path,
+        sensors=sensor() + sensor(calibration(kind=kind), 1, f'type="{kind}"'),
+        cameras=camera(0) + camera(1, attributes='sensor_id="1"'),
+    )
+    assert cameras.unposed == ("img1.jpg",)
+    assert f"1 images are of a {kind} sensor" in cameras.notes[0]
+
+
+def test_calibration_file(tmp_path):
+    path = tmp_path / "calibration.xml"
+    path.write_text(
+        "<calibration><projection>fisheye</projection><width>60</width><height>40</height>"
+        "<f>100</f><cx>1</cx><b1>2</b1><k2>0.5</k2><p2>0.25</p2><date>2020</date></calibration>"
+    )
+    assert read_calibration(path) == Lens(
+        *(100.0, 60.0, 40.0, 31.0, 20.0, 2.0),
+        projection="equidistant",
+        radial=(0.0, 0.5),
+        tangential=(0.0, 0.25),
+        sensor="calibration",
+    )
+    assert not metashape.recognises(Source(path))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<document/>", "is not a Metashape calibration"),
+        (
+            "<calibration><projection>spherical</projection></calibration>",
+            "'spherical' has no lens",
+        ),
+        (
+            "<calibration><width>x</width></calibration>",
+            "calibration.xml: width: 'x' is not a number",
+        ),
+        ("<calibration><width>6</width><height>4</height></calibration>", "no focal length"),
+    ],
+)
+def test_calibration_file_that_is_none(tmp_path, text, message):
+    path = tmp_path / "calibration.xml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_calibration(path)
+
+
+# GNSS
+
+
+def reference(attributes, pose=True):
+    transform = f"<transform>{ONE.format(1, 2, 3)}</transform>" if pose else ""
+    return f"{transform}<reference {attributes}/>"
+
+
+def test_gnss_positions_and_their_accuracy(tmp_path):
+    images = (
+        camera(0, reference('x="-0.5" y="39" z="100" enabled="true"'))
+        + camera(1, reference('x="-0.6" y="39" z="101" sxyz="3"'))
+        + camera(2, reference('x="-0.7" y="39" z="102" sxy="1" sz="2"'))
+        + camera(3, reference('x="-0.8" y="39" enabled="true" sx="4"'))
+        + camera(4, reference('x="-0.9" y="39" z="104" enabled="false"'))
+        + camera(5)
+    )
+    settings = (
+        '<settings><property name="accuracy_cameras" value="10"/>'
+        '<property name="accuracy_cameras_z" value="20"/></settings>'
+    )
+    rest = f"<reference>{UTM30}</reference><camera_reference>{WGS84}</camera_reference>"
+    gnss = read_chunk(tmp_path, cameras=images, rest=rest + settings).gnss
+    assert gnss.crs == WGS84
+    none = np.nan
+    assert gnss.xyz == pytest.approx(
+        np.array(
+            [
+                [-0.5, 39, 100],
+                [-0.6, 39, 101],
+                [-0.7, 39, 102],
+                [-0.8, 39, none],
+                [none] * 3,
+                [none] * 3,
+            ]
+        ),
+        nan_ok=True,
+    )
+    assert gnss.sigma_m == pytest.approx(
+        np.array([[10, 10, 20], [3, 3, 3], [1, 1, 2], [4, 10, none], [none] * 3, [none] * 3]),
+        nan_ok=True,
+    )
+
+
+def test_gnss_positions_are_kept_when_all_are_unticked(tmp_path):
+    image = camera(0, reference('x="500000" y="4300000" z="100" enabled="false"'))
+    rest = f"<reference>{UTM30}</reference>"
+    rest += '<settings><property name="accuracy/cameras" value="1 2 3"/></settings>'
+    gnss = read_chunk(tmp_path, cameras=image, rest=rest).gnss
+    assert gnss.crs == UTM30
+    assert gnss.xyz.tolist() == [[500000, 4300000, 100]]
+    assert gnss.sigma_m.tolist() == [[1, 2, 3]]
+
+
+def test_gnss_positions_of_a_local_chunk_and_none(tmp_path):
+    image = camera(0, reference('x="1" y="2" z="3" sxyz="0"'))
+    gnss = read_chunk(tmp_path, cameras=image).gnss
+    assert gnss.crs == "local"
+    assert np.isnan(gnss.sigma_m).all()
+    assert read_chunk(tmp_path, cameras=camera(0, reference('yaw="10"'))).gnss is None
+
+
+def test_antenna_offset_is_told(tmp_path):
+    antenna = "<antenna><location>0 0 0.2</location></antenna>"
+    image = camera(0, reference('x="1" y="2" z="3"'))
+    cameras = read_chunk(tmp_path, sensors=sensor(calibration() + antenna), cameras=image)
+    assert "GNSS positions are those of the antenna" in cameras.notes[0]
+    level = antenna.replace("0.2", "0")
+    assert not read_chunk(tmp_path, sensors=sensor(calibration() + level), cameras=image).notes
+
+
+# Projects
+
+
+def project_of(tmp_path, chunks, active=0, frame="<frame></frame>", entries=None):
+    """Write a .psx with its folder; `chunks` are chunk elements, `entries` the tie points."""
+    folder = tmp_path / "river.files"
+    listed = "".join(f'<chunk id="{i}" path="{i}/chunk.zip"/>' for i in range(len(chunks)))
+    top = document(f'<chunks next_id="9" active_id="{active}">{listed}</chunks>')
+    put_zip(folder / "project.zip", {"doc.xml": top})
+    for i, content in enumerate(chunks):
+        put_zip(folder / f"{i}/chunk.zip", {"doc.xml": content})
+        put_zip(folder / f"{i}/0/frame.zip", {"doc.xml": frame})
+        if entries is not None:
+            put_zip(folder / f"{i}/0/point_cloud/point_cloud.zip", entries)
+    path = tmp_path / "river.psx"
+    path.write_text(document("", 'version="1.2.0" path="{projectname}.files/project.zip"'))
+    return path
+
+
+FRAMES = '<frames next_id="1"><frame id="0" path="0/frame.zip"/></frames>'
+
+
+def test_active_chunk_of_a_project(tmp_path):
+    chunks = [
+        chunk(attributes='label="one"'),
+        chunk(attributes='label="two"', cameras=camera(5)),
+        chunk(attributes='label="empty"', cameras=camera(6, "")),
+    ]
+    cameras = read(project_of(tmp_path, chunks, active=1))
+    assert cameras.labels == ("img5.jpg",)
+    assert "2 chunks have aligned images; read is two, not one:" in cameras.notes[0]
+
+
+def test_active_chunk_without_poses_gives_way(tmp_path):
+    chunks = [chunk(attributes='label="empty"', cameras=camera(6, "")), chunk()]
+    cameras = read(project_of(tmp_path, chunks))
+    assert cameras.labels == ("img0.jpg",)
+    assert cameras.notes == ()
+
+
+def test_lost_archive_of_another_chunk_does_no_harm(tmp_path):
+    path = project_of(tmp_path, [chunk(), chunk()])
+    (tmp_path / "river.files/1/chunk.zip").unlink()
+    assert read(path).labels == ("img0.jpg",)
+
+
+def test_chunk_archive_alone(tmp_path):
+    project_of(tmp_path, [chunk()])
+    assert read(tmp_path / "river.files/0/chunk.zip").labels == ("img0.jpg",)
+
+
+def test_project_in_one_file(tmp_path):
+    content = document(f"<chunks>{chunk()}</chunks>")
+    assert read(put_zip(tmp_path / "a.psz", {"doc.xml": content})).labels == ("img0.jpg",)
+
+
+# Tie points
+
+
+TIES = (
+    '<point_cloud version="1.7.0"><tracks path="tracks.ply" count="9"/>'
+    '<points component_id="0" path="points0.ply"/><points component_id="1" path="points1.ply"/>'
+    '<projections camera_id="0" path="p0.ply"/><projections camera_id="1" path="p1.ply"/>'
+    '<projections camera_id="2" path="p2.ply"/><projections camera_id="9" path="p9.ply"/>'
+    "</point_cloud>"
+)
+MARKERS = (
+    '<markers><marker marker_id="0"><location camera_id="0" pinned="true" x="1.5" y="2.5"/>'
+    '<location camera_id="1" pinned="false" x="9" y="9"/><location camera_id="77" x="9" y="9"/>'
+    '</marker><marker marker_id="1"><location camera_id="1" pinned="false" x="9" y="9"/></marker>'
+    '<marker marker_id="2"><location camera_id="2" x="3" y="4"/>'
+    '<location camera_id="0" valid="false" x="9" y="9"/></marker></markers>'
+)
+
+
+def tie_project(tmp_path):
+    """A project with two components, of which the second is ten times as large in its frame."""
+    images = (
+        camera(0, attributes='sensor_id="0" component_id="0"')
+        + camera(1, attributes='sensor_id="0" component_id="0"')
+        + camera(2, attributes='sensor_id="0" component_id="1"')
+    )
+    rest = components(transform(), transform("0 0 0", scale="10")) + FRAMES
+    frame = f'<frame>{MARKERS}<point_cloud path="point_cloud/point_cloud.zip"/></frame>'
+    newer = (*MARK, ("float", "z"), ("uint64", "keypoint"))
+    entries = {
+        "doc.xml": TIES,
+        "points0.ply": ply(POINT, [(1, 2, 3, 7), (4, 5, 6, 4)]),
+        "points1.ply": ply(POINT, [(1, 0, 0, 7)], order="big"),
+        "p0.ply": ply(MARK, [(10, 11, 1, 4), (12, 13, 1, 5), (14, 15, 1, 7)]),
+        "p1.ply": ply(newer, [(20, 21, 1, 7, -1, 3)]),
+        "p2.ply": ply(MARK, [(30, 31, 1, 7)]),
+    }
+    return project_of(tmp_path, [chunk(cameras=images, rest=rest)], frame=frame, entries=entries)
+
+
+def test_tie_points_of_components_and_markers(tmp_path):
+    source = Source(tie_project(tmp_path))
+    ties = metashape.tie_points(source, metashape.read(source))
+    none = [np.nan] * 3
+    assert ties.xyz == pytest.approx(
+        np.array([[6, 22, 36], [0, 28, 42], [0, 10, 0], none, none]), nan_ok=True
+    )
+    assert ties.views.start.tolist() == [0, 2, 3, 4, 5, 6]
+    assert ties.views.camera.tolist() == [0, 1, 0, 2, 0, 2]
+    assert ties.image_xy.tolist() == [[14, 15], [20, 21], [10, 11], [30, 31], [1.5, 2.5], [3, 4]]
+
+
+def test_markers_of_an_export(tmp_path):
+    images = camera(0) + camera(1) + camera(2)
+    frames = f'<frames next_id="1"><frame id="0">{MARKERS}</frame></frames>'
+    source = Source(write(tmp_path, chunk(cameras=images, rest=frames)))
+    ties = metashape.tie_points(source, metashape.read(source))
+    assert ties.image_xy.tolist() == [[1.5, 2.5], [3.0, 4.0]]
+    assert ties.views.camera.tolist() == [0, 2]
+
+
+def test_nothing_measured_is_said(tmp_path):
+    source = Source(write(tmp_path, chunk()))
+    with pytest.raises(InputError, match=r"cameras.xml: has neither tie points nor markers"):
+        metashape.tie_points(source, metashape.read(source))
+
+
+def test_cameras_of_another_file_are_refused(tmp_path):
+    source = Source(tie_project(tmp_path))
+    other = read_chunk(tmp_path)
+    with pytest.raises(InputError, match="3 aligned images, but the cameras are 1"):
+        metashape.tie_points(source, other)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("points0.ply", b"solid", r"point_cloud.zip: points0.ply: is not a binary PLY"),
+        ("points0.ply", ply(MARK, []), "points0.ply: has no property z"),
+        ("p1.ply", ply(MARK, [(1, 2, 3, 4)])[:-1], "says 1 vertices but is cut off after 0"),
+        (
+            "p1.ply",
+            ply(MARK, []).replace(b"vertex 0", b"vertex 9" + b"9" * 30),
+            "is cut off after 0",
+        ),
+        ("p1.ply", ply(MARK, []).replace(b"vertex 0", b"vertex -1"), "is not understood"),
+        (
+            "p1.ply",
+            ply(MARK, []).replace(b"float size", b"list uchar int size"),
+            "is not understood",
+        ),
+        ("p1.ply", ply(MARK, []).replace(b"size", b"x"), "or a property twice"),
+        ("p1.ply", ply((*MARK[:3], ("float", "id")), []), "id of p1.ply is not a whole number"),
+        ("p1.ply", None, "point_cloud.zip: has no p1.ply"),
+    ],
+)
+def test_damaged_tie_points(tmp_path, name, content, message):
+    source = Source(tie_project(tmp_path))
+    archive = tmp_path / "river.files/0/0/point_cloud/point_cloud.zip"
+    with zipfile.ZipFile(archive) as old:
+        entries = {entry: old.read(entry) for entry in old.namelist() if entry != name}
+    put_zip(archive, entries if content is None else {**entries, name: content})
+    cameras = metashape.read(source)
+    with pytest.raises(InputError, match=message):
+        metashape.tie_points(source, cameras)
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (
+            chunk(cameras=camera(0, "")),
+            "none of the 1 images of the chunk C can be used: no image is",
+        ),
+        (chunk(cameras=""), "none of the 0 images"),
+        (
+            chunk(cameras=camera(0, attributes='sensor_id="0" enabled="false"') + camera(1, "")),
+            "1 are not aligned, 1 images are aligned but disabled",
+        ),
+        (chunk(sensors=""), "image img0.jpg: its sensor 0 is not in the file"),
+        (chunk(sensors=sensor("")), "image img0.jpg: its sensor S0 has no calibration"),
+        (
+            chunk(sensors=f'<sensor id="0" label="S0">{calibration(size="")}</sensor>'),
+            "sensor S0, resolution: '' is not a number",
+        ),
+        (
+            chunk(sensors='<sensor id="0" label="S0"><calibration><f>1</f></calibration></sensor>'),
+            "image img0.jpg: its sensor S0 has no resolution",
+        ),
+        (chunk(sensors=sensor(calibration(""))), "sensor S0: its calibration has no focal length"),
+        (
+            chunk(sensors=sensor(calibration("<f>0</f>"))),
+            "camera S0: focal length 0 and frame 60 x 40",
+        ),
+        (chunk(sensors=sensor(calibration("<f>nan</f>"))), "sensor S0, f: 'nan' is not a number"),
+        (
+            chunk(cameras=camera(0, "<transform>1 2 3</transform>")),
+            "image img0.jpg, transform: has 3 numbers instead of 16",
+        ),
+        (
+            chunk(cameras=camera(0, "<transform>" + "2 0 0 0 " * 4 + "</transform>")),
+            "image img0.jpg: the last row of its transform is not 0 0 0 1",
+        ),
+        (
+            chunk(cameras=camera(0, "<transform>2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform>")),
+            "image img0.jpg: the rotation matrix is not orthonormal",
+        ),
+        (
+            chunk(cameras=camera(0, "<transform>-1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform>")),
+            "image img0.jpg: the rotation matrix mirrors",
+        ),
+        (chunk(rest=transform(scale="-1")), "not a rotation with one positive scale"),
+        (chunk(rest=transform(rotation="1 0 0 0 1 0 0 0 -1")), "not a rotation with one positive"),
+        (
+            chunk(rest=f"<transform>{'0 ' * 16}</transform>"),
+            "not a rotation with one positive scale",
+        ),
+        (chunk(rest=transform("x 1 2")), "transform of the chunk: 'x' is not a number"),
+        (
+            chunk(rest=transform() + "<reference>PROJCS[nonsense</reference>"),
+            "the CRS 'PROJCS.nonsense' is not one that PROJ knows",
+        ),
+        (
+            chunk(cameras=camera(0, reference('x="1" y="b" z="3"'))),
+            "image img0.jpg, reference: 'b' is not a number",
+        ),
+        (
+            chunk(cameras=camera(0, reference('x="1" y="2" z="3" sxy="1 2 3"'))),
+            "image img0.jpg, reference, sxy: has 3 numbers instead of 2",
+        ),
+    ],
+)
+def test_bad_numbers_name_file_and_image(tmp_path, content, message):
+    path = write(tmp_path, content)
+    with pytest.raises(InputError, match=message) as caught:
+        read(path)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_document_without_a_chunk(tmp_path):
+    with pytest.raises(InputError, match="has no chunk"):
+        metashape.read(Source(write(tmp_path, "<chunks/>")))
+
+
+def test_entities_are_refused(tmp_path):
+    path = tmp_path / "cameras.xml"
+    bomb = '<!DOCTYPE d [<!ENTITY a "b"><!ENTITY c "&a;&a;">]>'
+    path.write_text(document(chunk()).replace("<document", bomb + "<document", 1))
+    with pytest.raises(InputError, match="declares entities"):
+        metashape.read(Source(path))
+
+
+def test_project_without_its_folder(tmp_path):
+    path = project_of(tmp_path, [chunk()])
+    (tmp_path / "river.files").rename(tmp_path / "other.files")
+    with pytest.raises(InputError, match=r"river.files/project.zip: is missing; keep all files"):
+        read(path)
+
+
+def test_project_without_its_chunk(tmp_path):
+    path = project_of(tmp_path, [chunk()])
+    (tmp_path / "river.files/0/chunk.zip").unlink()
+    with pytest.raises(InputError, match=r"0/chunk.zip: is missing"):
+        read(path)
+
+
+def test_archive_without_a_document(tmp_path):
+    path = project_of(tmp_path, [chunk()])
+    put_zip(tmp_path / "river.files/0/chunk.zip", {"other.xml": ""})
+    with pytest.raises(InputError, match=r"chunk.zip: has no doc.xml"):
+        read(path)
+
+
+def test_archive_made_to_burst(tmp_path):
+    path = project_of(tmp_path, [chunk()])
+    bomb = chunk() + " " * 30_000_000
+    put_zip(tmp_path / "river.files/0/chunk.zip", {"doc.xml": bomb})
+    with pytest.raises(InputError, match=r"doc\.xml would unpack to 30 MB"):
+        read(path)
+
+
+def test_archive_whose_directory_lies(tmp_path):
+    path = put_zip(tmp_path / "a.psz", {"doc.xml": document(chunk())}, zipfile.ZIP_STORED)
+    data = bytearray(path.read_bytes())
+    size = len(document(chunk()))
+    at = data.rfind(struct.pack("<I", size))
+    data[at : at + 4] = struct.pack("<I", 4_000_000_000)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"a\.psz: doc\.xml would unpack to 4000 MB"):
+        metashape.read(Source(path))
+
+
+def test_every_cut_and_every_wrong_byte_is_an_input_error_or_harmless(tmp_path):
+    whole = put_zip(tmp_path / "whole.psz", {"doc.xml": document(chunk(rest=transform()))})
+    random = np.random.default_rng(6)
+    for name, data in (
+        ("a.psz", whole.read_bytes()),
+        ("a.xml", document(chunk(rest=transform() + f"<reference>{WGS84}</reference>")).encode()),
+    ):
+        path = tmp_path / name
+        for _ in range(150):
+            broken = bytearray(
+                data[: random.integers(len(data))] if random.random() < 0.5 else data
+            )
+            for at in random.integers(max(len(broken), 1), size=3 if broken else 0):
+                broken[at] = random.integers(256)
+            path.write_bytes(broken)
+            source = Source(path)
+            metashape.recognises(source)
+            try:
+                metashape.read(source)
+            except InputError as error:
+                assert str(path) in str(error)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (document(chunk()), True),
+        ("\ufeff<!-- a\n comment --> <document version='1.2.0'>\n <chunks active_id='0'>", True),
+        ("<chunk label='C'><sensors/></chunk>", True),
+        ("<document><other/></document>", False),
+        ("<BlocksExchange><chunk/></BlocksExchange>", False),
+        ("label,x,y,z\n", False),
+        ("", False),
+    ],
+)
+def test_recognised_by_content(tmp_path, text, expected):
+    path = tmp_path / "some.txt"
+    path.write_text(text, encoding="utf-8")
+    assert metashape.recognises(Source(path)) is expected
+
+
+def test_other_archives_are_not_recognised(tmp_path):
+    assert not metashape.recognises(Source(put_zip(tmp_path / "a.kmz", {"doc.kml": "<kml/>"})))
+    assert not metashape.recognises(Source(put_zip(tmp_path / "b.zip", {"doc.xml": "<kml/>"})))
+    cut = tmp_path / "c.zip"
+    cut.write_bytes(b"PK\x03\x04" + bytes(20))
+    assert not metashape.recognises(Source(cut))
+    assert not metashape.recognises(Source(tmp_path))
+
+
+def test_cut_document_in_an_archive(tmp_path):
+    path = put_zip(tmp_path / "a.psz", {"doc.xml": "<document><chunk"})
+    with pytest.raises(InputError, match=r"a\.psz: the XML is damaged or cut off"):
+        read(path)

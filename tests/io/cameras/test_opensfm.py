@@ -1,0 +1,386 @@
+"""OpenSfM's reconstruction.json."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pcfix.errors import InputError
+from pcfix.io.cameras import opensfm
+from pcfix.io.cameras.formats import Source
+from pcfix.refract.lens import project
+from tests.utils.reprojection import check_file, residuals_px, row_of
+from tests.utils.shared import needs
+
+BERLIN, berlin = needs("cameras", "opensfm", "berlin")
+
+CAMERA = {"projection_type": "perspective", "width": 4000, "height": 3000, "focal": 0.8}
+SHOT = {"camera": "c", "rotation": [0.1, 2.9, 0.3], "translation": [1.0, 2.0, 30.0]}
+LLA = {"latitude": 47.0, "longitude": 8.0, "altitude": 400.0}
+
+
+def scene(**changes):
+    return {"cameras": {"c": CAMERA}, "shots": {"a.jpg": SHOT}, "reference_lla": LLA, **changes}
+
+
+def write(tmp_path, *reconstructions):
+    path = tmp_path / "reconstruction.json"
+    path.write_text(json.dumps(list(reconstructions)))
+    return path
+
+
+def read(tmp_path, *reconstructions):
+    source = Source(write(tmp_path, *reconstructions))
+    assert opensfm.recognises(source)
+    return opensfm.read(source)
+
+
+def fails(tmp_path, reconstruction, *words):
+    with pytest.raises(InputError) as error:
+        opensfm.read(Source(write(tmp_path, reconstruction)))
+    for word in ("reconstruction.json", *words):
+        assert word in str(error.value)
+
+
+@berlin
+def test_sample_reprojects_as_expected():
+    cameras, check = opensfm.read(Source(BERLIN)), check_file(BERLIN)
+    expected = np.array([seen["res_px"] for seen in check["observations"]])
+    found = residuals_px(cameras, check["observations"])
+    assert found == pytest.approx(expected, abs=0.02)  # coordinates are listed to 0.1 mm
+    for truth in check["projection_centres"]:
+        i = row_of(cameras, truth["image"])
+        assert cameras.centres[i] == pytest.approx([truth[k] for k in "XYZ"], abs=1e-4)
+        assert cameras.rotations[i][2] == pytest.approx(truth["view_dir"], abs=1e-6)
+        assert -cameras.rotations[i][1] == pytest.approx(truth["up_dir_minus_cam_y"], abs=1e-6)
+    assert cameras.crs == cameras.gnss.crs == "ENU:52.51896296296295,13.400376851851851,0.0"
+    assert cameras.gnss.sigma_m == pytest.approx(np.full((3, 3), 5.0))
+
+
+@berlin
+def test_tie_points_of_the_sample_reproject_as_expected():
+    source = Source(BERLIN / "reconstruction.json")
+    cameras, check = opensfm.read(source), check_file(BERLIN)
+    points = opensfm.tie_points(source, cameras)
+    misses = residuals(cameras, points)
+    assert len(points.xyz) == check["n_points"]
+    assert len(misses) == check["n_observations_used_for_rms"]
+    assert np.sqrt(np.mean(misses**2)) == pytest.approx(check["reprojection_rms_px"], abs=1e-3)
+    assert np.median(misses) == pytest.approx(check["reprojection_median_px"], abs=1e-3)
+
+
+def residuals(cameras, points):
+    point = np.repeat(np.arange(len(points.xyz)), np.diff(points.views.start))
+    misses = np.empty(len(point))
+    for i in range(len(cameras)):
+        rows = points.views.camera == i
+        rays = (points.xyz[point[rows]] - cameras.centres[i]) @ cameras.rotations[i].T
+        misses[rows] = np.hypot(*(project(cameras.lenses[i], rays) - points.image_xy[rows]).T)
+    return misses
+
+
+def test_pose_is_world_to_camera(tmp_path):
+    cameras = read(tmp_path, scene())
+    point = np.array([3.0, -4.0, 5.0])
+    x, y, z = SHOT["rotation"]
+    angle = math.sqrt(x * x + y * y + z * z)
+    axis = np.array([x, y, z]) / angle
+    turned = (  # Rodrigues
+        point * math.cos(angle)
+        + np.cross(axis, point) * math.sin(angle)
+        + axis * (axis @ point) * (1.0 - math.cos(angle))
+    )
+    expected = turned + SHOT["translation"]
+    assert cameras.rotations[0] @ (point - cameras.centres[0]) == pytest.approx(expected)
+    assert cameras.crs == "ENU:47.0,8.0,400.0"
+    assert cameras.labels == ("a.jpg",)
+
+
+def seen_by(model, camera, direction):
+    """The place in the image as OpenSfM's formulas give it, one direction at a time."""
+    x, y, z = direction
+    r = math.hypot(x, y)
+    theta = math.atan2(r, z)
+    scale = {
+        "perspective": 1.0 / z,
+        "fisheye": theta / r,
+        "dual": camera.get("transition", 0.5) / z
+        + (1.0 - camera.get("transition", 0.5)) * theta / r,
+    }[model]
+    x, y = x * scale, y * scale
+    r2 = x * x + y * y
+    k = [camera.get(f"k{i}", 0.0) for i in range(1, 7)]
+    p1, p2 = camera.get("p1", 0.0), camera.get("p2", 0.0)
+    s = [camera.get(f"s{i}", 0.0) for i in range(4)]
+    bent = 1.0 + sum(c * r2 ** (i + 1) for i, c in enumerate(k))
+    xd = x * bent + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s[0] * r2 + s[1] * r2 * r2
+    yd = y * bent + 2 * p2 * x * y + p1 * (r2 + 2 * y * y) + s[2] * r2 + s[3] * r2 * r2
+    fx = camera.get("focal_x", camera.get("focal"))
+    fy = camera.get("focal_y", camera.get("focal"))
+    u = fx * xd + camera.get("c_x", 0.0)
+    v = fy * yd + camera.get("c_y", 0.0)
+    return u * 4000 + 2000, v * 4000 + 1500
+
+
+AFFINE = {"focal_x": 0.8, "focal_y": 0.79, "c_x": 0.01, "c_y": -0.02}
+FOUR = {"k1": -0.02, "k2": 0.01, "k3": -0.003, "k4": 0.001}
+
+
+@pytest.mark.parametrize(
+    ("kind", "model", "parameters"),
+    [
+        ("perspective", "perspective", {"focal": 0.8, "k1": -0.1, "k2": 0.02}),
+        ("simple_radial", "perspective", {**AFFINE, "k1": -0.1}),
+        ("radial", "perspective", {**AFFINE, "k1": -0.1, "k2": 0.02}),
+        (
+            "brown",
+            "perspective",
+            {**AFFINE, "k1": -0.1, "k2": 0.02, "k3": -0.001, "p1": 0.002, "p2": -0.003},
+        ),
+        ("fisheye", "fisheye", {"focal": 0.5, "k1": -0.02, "k2": 0.01}),
+        ("fisheye_opencv", "fisheye", {**AFFINE, **FOUR}),
+        (
+            "fisheye62",
+            "fisheye",
+            {**AFFINE, **FOUR, "k5": 1e-4, "k6": -1e-5, "p1": 0.002, "p2": -0.003},
+        ),
+        (
+            "fisheye624",
+            "fisheye",
+            {**AFFINE, **FOUR, "p1": 0.002, "p2": -0.003}
+            | {"s0": 0.001, "s1": -0.002, "s2": 0.003, "s3": 0.0005},
+        ),
+        ("dual", "dual", {"focal": 0.8, "k1": -0.02, "k2": 0.01, "transition": 0.3}),
+    ],
+)
+def test_every_camera_model(tmp_path, kind, model, parameters):
+    camera = {"projection_type": kind, "width": 4000, "height": 3000, **parameters}
+    lens = read(tmp_path, scene(cameras={"c": camera})).lenses[0]
+    for direction in [(0.3, 0.2, 1.0), (-0.4, 0.1, 1.0), (0.05, -0.45, 1.0)]:
+        expected = seen_by(model, camera, direction)
+        assert project(lens, np.array([direction]))[0] == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name", ["v2 dji fc330 4000 3000 brown 0.5555 rgb", "apple iphone4,1 4000 3000 perspective 0.9"]
+)
+def test_size_of_the_images_may_stand_in_the_name_of_the_camera(tmp_path, name):
+    camera = {"projection_type": "perspective", "focal": 0.8}
+    shots = {"a.jpg": {**SHOT, "camera": name}}
+    lens = read(tmp_path, scene(cameras={name: camera}, shots=shots)).lenses[0]
+    assert (lens.width, lens.height, lens.focal) == (4000, 3000, 3200)
+
+
+def test_image_in_portrait_is_scaled_by_its_height(tmp_path):
+    lens = read(tmp_path, scene(cameras={"c": {**CAMERA, "width": 3000, "height": 4000}})).lenses[0]
+    assert (lens.focal, lens.principal_x, lens.principal_y) == (3200, 1500, 2000)
+
+
+def rigged(**shot):
+    return scene(
+        shots={"left.jpg": {"camera": "c", **shot}},
+        rig_cameras={"L": {"rotation": [0.0, 0.2, 0.0], "translation": [0.1, 0.2, 0.3]}},
+        rig_instances={
+            "7": {
+                "rotation": [0.1, 2.9, 0.3],
+                "translation": [1.0, 2.0, 30.0],
+                "rig_camera_ids": {"left.jpg": "L"},
+            }
+        },
+    )
+
+
+def test_shot_on_a_rig(tmp_path):
+    cameras = read(tmp_path, rigged())
+    world = np.array([5.0, 6.0, -7.0])
+    on_rig = np.add(Rotation.from_rotvec([0.1, 2.9, 0.3]).apply(world), [1.0, 2.0, 30.0])
+    expected = np.add(Rotation.from_rotvec([0.0, 0.2, 0.0]).apply(on_rig), [0.1, 0.2, 0.3])
+    assert cameras.rotations[0] @ (world - cameras.centres[0]) == pytest.approx(expected)
+
+
+def test_pose_of_the_shot_itself_comes_before_that_of_its_rig(tmp_path):
+    pose = {key: SHOT[key] for key in ("rotation", "translation")}
+    own, plain = read(tmp_path, rigged(**pose)), read(tmp_path, scene())
+    assert own.centres == pytest.approx(plain.centres)
+
+
+def test_gnss_positions_stand_beside_the_centres(tmp_path):
+    shots = {
+        "a.jpg": {**SHOT, "gps_position": [1.0, 2.0, 3.0], "gps_dop": 0.05},
+        "b.jpg": {**SHOT, "gps_position": [0.0, 0.0, 0.0], "gps_dop": 999999.0},
+        "c.jpg": {**SHOT, "gps_position": [4.0, 5.0, 6.0]},
+        "d.jpg": SHOT,
+    }
+    gnss = read(tmp_path, scene(shots=shots)).gnss
+    assert gnss.xyz[0] == pytest.approx([1, 2, 3])
+    assert gnss.sigma_m[0] == pytest.approx([0.05] * 3)
+    assert np.isnan(gnss.xyz[[1, 3]]).all()
+    assert gnss.xyz[2] == pytest.approx([4, 5, 6])
+    assert np.isnan(gnss.sigma_m[2]).all()
+    assert gnss.crs == "ENU:47.0,8.0,400.0"
+
+
+def test_largest_of_several_reconstructions(tmp_path):
+    (tmp_path / "image_list.txt").write_text("../images/a.jpg\n../images/z.jpg\n")
+    small = scene(shots={"x.jpg": SHOT})
+    large = scene(shots={"a.jpg": SHOT, "b.jpg": SHOT})
+    cameras = read(tmp_path, small, large)
+    assert cameras.labels == ("a.jpg", "b.jpg")
+    assert cameras.unposed == ("x.jpg", "z.jpg")
+    assert "2 reconstructions" in cameras.notes[0]
+
+
+def test_reference_beside_the_file(tmp_path):
+    (tmp_path / "reference_lla.json").write_text(json.dumps(LLA))
+    without = scene()
+    del without["reference_lla"]
+    assert read(tmp_path, without).crs == "ENU:47.0,8.0,400.0"
+
+
+@pytest.mark.parametrize("beside", [None, "../elsewhere/reference_lla.json"])
+def test_without_reference_the_frame_is_local(tmp_path, beside):
+    if beside:
+        (tmp_path / "reference_lla.json").write_text(beside)
+    without = scene(shots={"a.jpg": {**SHOT, "gps_position": [1.0, 2.0, 3.0]}})
+    del without["reference_lla"]
+    cameras = read(tmp_path, without)
+    assert (cameras.crs, cameras.gnss) == ("local", None)
+
+
+def test_made_up_reference_is_local(tmp_path):
+    zero = {"latitude": 0.0, "longitude": 0.0, "altitude": 0.0}
+    assert read(tmp_path, scene(reference_lla=zero)).crs == "local"
+
+
+def test_projected_coordinates_are_not_called_topocentric(tmp_path):
+    shot = {"camera": "c", "rotation": [0, 0, 0], "translation": [-576684.0, -5188159.0, -200.0]}
+    assert read(tmp_path, scene(shots={"a.jpg": shot})).crs is None
+
+
+def test_panoramas_are_left_out(tmp_path):
+    cameras = {"c": CAMERA, "s": {"projection_type": "spherical", "width": 8000, "height": 4000}}
+    shots = {"a.jpg": SHOT, "pano.jpg": {**SHOT, "camera": "s"}}
+    found = read(tmp_path, scene(cameras=cameras, shots=shots))
+    assert (found.labels, found.unposed) == (("a.jpg",), ("pano.jpg",))
+    assert "1 images of all-round cameras" in found.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("header", "tail"),
+    [
+        ("", "\t200\t10\t20"),
+        ("OPENSFM_TRACKS_VERSION_v1\n", "\t0.01\t200\t10\t20"),
+        ("OPENSFM_TRACKS_VERSION_v2\n", "\t0.01\t200\t10\t20\t-1\t-1"),
+    ],
+)
+def test_tracks_of_every_version(tmp_path, header, tail):
+    lines = [
+        "b.jpg\t12\t5\t0.25\t-0.125" + tail,
+        "a.jpg\t11\t6\t0\t1e-3" + tail,
+        "a.jpg\t99\t6\t0\t0" + tail,  # a track that was not triangulated
+        "c.jpg\t11\t6\t0\t0" + tail,  # an image that was not
+        "a.jpg\t12\t7\t-0.5\t0.375" + tail,
+    ]
+    (tmp_path / "tracks.csv").write_text(header + "\n".join(lines) + "\n")
+    points = {"12": {"coordinates": [1, 2, 3]}, "11": {"coordinates": [4, 5, 6]}}
+    path = write(tmp_path, scene(shots={"a.jpg": SHOT, "b.jpg": SHOT}, points=points))
+    cameras = opensfm.read(Source(path))
+    found = opensfm.tie_points(Source(path), cameras)
+    assert found.xyz.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert found.views.start.tolist() == [0, 2, 3]
+    assert found.views.camera.tolist() == [0, 1, 0]
+    assert found.image_xy == pytest.approx(np.array([[0, 3000], [3000, 1000], [2000, 1504]]))
+
+
+def test_tracks_longer_than_a_block(tmp_path, monkeypatch):
+    monkeypatch.setattr(opensfm.tracks, "CHUNK_BYTES", 7)
+    lines = [f"a.jpg\t{i}\t0\t{i / 100}\t0\t1\t2\t3" for i in range(20)]
+    (tmp_path / "tracks.csv").write_text("\n".join(lines))
+    points = {str(i): {"coordinates": [i, 0, 0]} for i in range(20)}
+    path = write(tmp_path, scene(points=points))
+    found = opensfm.tie_points(Source(path), opensfm.read(Source(path)))
+    assert found.image_xy[:, 0] == pytest.approx(2000 + 40.0 * np.arange(20))
+
+
+@pytest.mark.parametrize(
+    ("tracks", "words"),
+    [
+        (None, "no tracks.csv"),
+        ("", "tracks.csv: is empty"),
+        ("a.jpg\t1\t2\n", "'a.jpg' is cut off"),
+        ("a.jpg\t1\t2\tx\t0.5\t1\n", "not a number"),
+        ("a.jpg\t1\t2\tnan\t0.5\t1\n", "not finite"),
+    ],
+)
+def test_damaged_tracks(tmp_path, tracks, words):
+    if tracks is not None:
+        (tmp_path / "tracks.csv").write_text(tracks)
+    path = write(tmp_path, scene(points={"1": {"coordinates": [1, 2, 3]}}))
+    with pytest.raises(InputError, match=words):
+        opensfm.tie_points(Source(path), opensfm.read(Source(path)))
+
+
+@pytest.mark.parametrize("point", [{}, {"coordinates": [1, 2]}, {"coordinates": "x"}, 7])
+def test_damaged_points(tmp_path, point):
+    (tmp_path / "tracks.csv").write_text("a.jpg\t1\t2\t0\t0\n")
+    path = write(tmp_path, scene(points={"1": {"coordinates": [1, 2, 3]}, "2": point}))
+    with pytest.raises(InputError, match=r"reconstruction\.json.*point"):
+        opensfm.tie_points(Source(path), opensfm.read(Source(path)))
+
+
+def test_no_points(tmp_path):
+    path = write(tmp_path, scene())
+    with pytest.raises(InputError, match="no tie points"):
+        opensfm.tie_points(Source(path), opensfm.read(Source(path)))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"shots": {"a.jpg": {**SHOT, "rotation": [1, 2]}}}, ("a.jpg, rotation", "[1, 2]")),
+        ({"shots": {"a.jpg": {**SHOT, "rotation": [1, 2, None]}}}, ("a.jpg, rotation",)),
+        ({"shots": {"a.jpg": {**SHOT, "translation": [1, 2, 10**400]}}}, ("a.jpg, translation",)),
+        ({"shots": {"a.jpg": {"camera": "c"}}}, ("a.jpg, rotation", "None")),
+        ({"shots": {"a.jpg": {**SHOT, "camera": "d"}}}, ("a.jpg", "'d'")),
+        ({"shots": {"a.jpg": 7}}, ("a.jpg", "7")),
+        ({"shots": {}}, ("no images",)),
+        ({"cameras": []}, ("cameras",)),
+        ({"cameras": {"c": {**CAMERA, "projection_type": "pinhole9"}}}, ("c", "pinhole9")),
+        ({"cameras": {"c": {**CAMERA, "focal": 0}}}, ("c", "focal length 0")),
+        ({"cameras": {"c": {**CAMERA, "focal": float("nan")}}}, ("c, focal", "nan")),
+        ({"cameras": {"c": {**CAMERA, "k1": "much"}}}, ("c, k1", "much")),
+        ({"cameras": {"c": {"width": 4000, "height": 3000}}}, ("c", "lacks focal")),
+        ({"cameras": {"c": {"focal": 0.8}}}, ("c", "size of its images")),
+        ({"cameras": {"c": {"projection_type": "equirectangular"}}}, ("all-round",)),
+        ({"reference_lla": {"latitude": 47.0}}, ("reference_lla",)),
+        ({"reference_lla": {**LLA, "latitude": 4700.0}}, ("reference_lla", "4700")),
+        ({"points": [1]}, ("points",)),
+    ],
+)
+def test_damaged_entries_are_named(tmp_path, change, words):
+    fails(tmp_path, scene(**change), *words)
+
+
+def test_rig_camera_that_is_missing(tmp_path):
+    broken = rigged()
+    broken["rig_cameras"] = {}
+    fails(tmp_path, broken, "left.jpg", "rig camera 'L'")
+
+
+@pytest.mark.parametrize("text", ["[{", "[1]", "{}", "\x00\x01", "[" * 100_000])
+def test_damaged_file(tmp_path, text):
+    path = tmp_path / "reconstruction.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"reconstruction\.json"):
+        opensfm.read(Source(path))
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{}", "label,x,y,z\n", "[1, 2]", '[{"a": 1}]', '{"cameras": {}}']
+)
+def test_other_files_are_not_recognised(tmp_path, text):
+    path = tmp_path / "other.json"
+    path.write_text(text)
+    assert not opensfm.recognises(Source(path))

@@ -1,0 +1,467 @@
+"""Pix4D params folders."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pyproj import CRS
+from scipy.spatial.transform import Rotation
+
+import pcfix
+from pcfix.io.cameras import pix4d
+from pcfix.io.cameras.formats import Source
+from pcfix.refract.lens import project, unproject
+from tests.utils.reprojection import check_file, residuals_px, row_of
+from tests.utils.shared import needs
+
+CA502, ca502 = needs("cameras", "pix4d", "ca502_oblique5")
+LOD3, lod3 = needs("cameras", "pix4d", "lod3_amsterdam")
+EASYIDP, easyidp = needs("cameras", "pix4d", "easyidp_pix4d_origin")
+
+HEADER = """fileName imageWidth imageHeight
+camera matrix K [3x3]
+radial distortion [3x1]
+tangential distortion [2x1]
+camera position t [3x1]
+camera rotation R [3x3]
+camera model m = K [R|-Rt] X
+
+"""
+DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+def utm_wkt():
+    return CRS.from_epsg(32647).to_wkt("WKT1_GDAL")
+
+
+def block(label, position, rotation=DOWN, k=((4000, 0, 3010), (0, 4000, 1990), (0, 0, 1))):
+    rows = [" ".join(repr(float(x)) for x in row) for row in (*k, (0.1, -0.2, 0.3), (0.01, 0.02))]
+    rows += [" ".join(map(str, position))]
+    rows += [" ".join(repr(float(x)) for x in row) for row in rotation]
+    return "\n".join([f"{label} 6000 4000", *rows]) + "\n"
+
+
+def external(*rows):
+    return "imageName X Y Z Omega Phi Kappa\n" + "".join(" ".join(map(str, r)) + "\n" for r in rows)
+
+
+def params(tmp_path, **files):
+    """Write files named by the end of their name, and return the folder."""
+    names = {
+        "parameters": "job_calibrated_camera_parameters.txt",
+        "external": "job_calibrated_external_camera_parameters.txt",
+        "offset": "job_offset.xyz",
+        "wkt": "job_wkt.prj",
+        "cam": "job_pix4d_calibrated_internal_camera_parameters.cam",
+        "bingo": "job_tp_bingo.txt",
+        "ties": "job_tp_pix4d.txt",
+        "gcps": "job_measured_estimated_gcps_position.txt",
+    }
+    folder = tmp_path / "job" / "1_initial" / "params"
+    folder.mkdir(parents=True, exist_ok=True)
+    for key, text in files.items():
+        (folder / names[key]).write_text(text)
+    return folder
+
+
+def read(path):
+    assert pix4d.recognises(Source(path))
+    return pix4d.read(Source(path))
+
+
+@ca502
+def test_oblique_block_fits_its_measurements():
+    cameras = read(CA502)
+    check = check_file(CA502)
+    found = residuals_px(cameras, check["observations"])
+    expected = [seen["res_px"] for seen in check["observations"]]
+    assert found == pytest.approx(expected, abs=0.01)  # points are given to 0.1 mm
+    assert len(cameras) == 1265
+    assert cameras.crs.startswith('PROJCS["WGS 84 / UTM zone 47N"')
+    assert cameras.notes == cameras.unposed == ()
+    sizes = [lens.pixel_size_mm for lens in cameras.lenses]
+    assert sizes == pytest.approx([23.52 / 6000] * 1265)
+    assert len({lens.focal for lens in cameras.lenses}) == 5
+
+
+@ca502
+def test_all_tie_points_of_the_oblique_block():
+    cameras = read(CA502)
+    ties = pix4d.tie_points(Source(CA502), cameras)
+    assert len(ties.image_xy) == len(ties.views.camera) == 103328
+    assert np.isfinite(ties.xyz).all(axis=1).sum() == 11  # control points
+    misses = np.concatenate(list(misses_px(cameras, ties)))
+    assert np.median(misses) == pytest.approx(1.498, abs=0.01)
+    assert np.sqrt(np.mean(misses**2)) == pytest.approx(2.128, abs=0.01)
+
+
+def misses_px(cameras, ties):
+    """Triangulate every point that four images or more saw; give its residuals."""
+    camera = ties.views.camera
+    rays = np.empty((len(camera), 3))
+    for i in np.unique(camera):
+        mine = camera == i
+        rays[mine] = unproject(cameras.lenses[i], ties.image_xy[mine]) @ cameras.rotations[i]
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    for start, end in zip(ties.views.start[:-1], ties.views.start[1:], strict=True):
+        rows = np.arange(start, end)
+        if len(rows) < 4:
+            continue
+        centres = cameras.centres[camera[rows]]
+        local = centres - centres[0]
+        right = (across[rows] @ local[:, :, None]).sum(axis=0)[:, 0]
+        point = np.linalg.lstsq(across[rows].sum(axis=0), right, rcond=None)[0] + centres[0]
+        for row in rows:
+            i = camera[row]
+            ray = cameras.rotations[i] @ (point - cameras.centres[i])
+            yield np.hypot(*(project(cameras.lenses[i], ray[None]) - ties.image_xy[row]).T)
+
+
+@easyidp
+def test_virtual_points_of_the_projection_matrices():
+    cameras = read(EASYIDP)
+    assert cameras.crs is None
+    assert len(cameras) == 168
+    ideal = [replace(lens, radial=(), tangential=()) for lens in cameras.lenses]
+    cameras = replace(cameras, lenses=tuple(ideal))
+    listed = residuals_px(cameras, check_file(EASYIDP)["observations"])
+    assert listed.max() < 0.02  # the points are given to 0.1 mm, and are 15 m away
+    offset = np.array([368109.0, 3956043.0, 96.0])
+    misses = []
+    for line in (EASYIDP / "pix4d.origin_pmatrix.txt").read_text().splitlines():
+        label, *numbers = line.split()
+        i = cameras.labels.index(label)
+        point = cameras.centres[i] + cameras.rotations[i].T @ [2.0, -3.0, 15.0]
+        u, v, w = np.array(numbers, float).reshape(3, 4) @ [*(point - offset), 1.0]
+        ray = cameras.rotations[i] @ (point - cameras.centres[i])
+        misses.append(project(ideal[i], ray[None])[0] - (u / w, v / w))
+    assert np.sqrt(np.mean(np.square(misses))) < 0.001  # the matrices have six decimals
+
+
+@easyidp
+@lod3
+@ca502
+@pytest.mark.parametrize("sample", [CA502, LOD3, EASYIDP], ids=lambda path: path.name)
+def test_centres_and_views_of_the_samples(sample):
+    cameras = read(sample)
+    for given in check_file(sample)["projection_centres"]:
+        i = row_of(cameras, given["image"])
+        assert cameras.centres[i] == pytest.approx([given[a] for a in "XYZ"], abs=1e-4)
+        assert cameras.rotations[i][2] == pytest.approx(given["view_dir"], abs=1e-6)
+        assert -cameras.rotations[i][1] == pytest.approx(given["up_dir_minus_cam_y"], abs=1e-6)
+
+
+@lod3
+def test_a_wrong_offset_is_noticed_and_the_absolute_table_believed():
+    cameras = read(LOD3)
+    assert cameras.unposed == ("403_0032_00130203.tif",)  # only relative, and the offset is wrong
+    (note,) = cameras.notes
+    assert "differ by up to 218.28 m and 0.000 degrees" in note
+    assert np.ptp(cameras.centres[:, 2]) < 30.0
+
+
+def test_poses_of_either_table_agree(tmp_path):
+    opk = (12.0, -7.0, 140.0)
+    turn = Rotation.from_euler("XYZ", opk, degrees=True).as_matrix()
+    rotation = DOWN @ turn.T
+    centre = np.array([500_010.5, 4_000_020.25, 130.0])
+    files = {
+        "parameters": HEADER + block("a b.jpg", (10.5, 20.25, 30.0), rotation),
+        "offset": "500000.000 4000000.000 100.000\n",
+        "external": external(("a b.jpg", *centre, *opk)),
+        "wkt": utm_wkt(),
+    }
+    everything = read(params(tmp_path / "all", **files))
+    del files["external"]
+    relative = read(params(tmp_path / "relative", **files))
+    for cameras in (everything, relative):
+        assert cameras.labels == ("a b.jpg",)
+        assert cameras.centres[0] == pytest.approx(centre)
+        assert cameras.rotations[0] == pytest.approx(rotation, abs=1e-9)
+        assert cameras.notes == ()
+        assert cameras.crs.startswith("PROJCS")
+
+
+def test_distortion_is_in_the_order_of_opencv(tmp_path):
+    path = params(tmp_path, parameters=HEADER + block("a.jpg", (0, 0, 0)), offset="0 0 0")
+    lens = read(path).lenses[0]
+    x, y = 0.2, -0.1
+    r2 = x * x + y * y
+    radial = 1 + 0.1 * r2 - 0.2 * r2**2 + 0.3 * r2**3
+    u = 3010 + 4000 * (x * radial + 2 * 0.01 * x * y + 0.02 * (r2 + 2 * x * x))
+    v = 1990 + 4000 * (y * radial + 0.01 * (r2 + 2 * y * y) + 2 * 0.02 * x * y)
+    assert project(lens, np.array([[x, y, 1.0]]))[0] == pytest.approx([u, v])
+
+
+FISHEYE_HEADER = """fileName imageWidth imageHeight
+principal point [2x1]
+affine transformation c d e f [4x1]
+polynomial p0 p1 p2 p3 [4x1]
+camera position t [3x1]
+camera rotation R [3x3]
+
+"""
+FISHEYE = """Pix4D camera calibration file 0
+#Fisheye assuming a sensor width of 12.0x8.0mm
+C 1780.0
+D 2.0
+E -3.0
+F 1790.0
+Px 6.01
+Py 3.98
+p2 0.02
+p3 -0.15
+"""
+
+
+def fisheye_uv(direction):
+    """Return where the fisheye of the texts above sees a direction."""
+    x, y, z = direction
+    theta = 2.0 / np.pi * np.arctan2(np.hypot(x, y), z)
+    rho = theta + 0.02 * theta**2 - 0.15 * theta**3
+    xh, yh = rho * x / np.hypot(x, y), rho * y / np.hypot(x, y)
+    return 1780.0 * xh + 2.0 * yh + 3005.0, -3.0 * xh + 1790.0 * yh + 1990.0
+
+
+@pytest.mark.parametrize("where", ["table", "calibration"])
+def test_fisheye(tmp_path, where):
+    numbers = "3005 1990\n1780 2 -3 1790\n0 1 0.02 -0.15\n" if where == "table" else ""
+    pose = "1 2 3\n1 0 0\n0 -1 0\n0 0 -1\n"
+    head = FISHEYE_HEADER
+    if where == "calibration":
+        head = "".join(
+            line
+            for line in head.splitlines(keepends=True)
+            if not line.startswith(("principal", "affine", "polynomial"))
+        )
+    files = {"parameters": head + "f.jpg 6000 4000\n" + numbers + pose, "offset": "10 20 30"}
+    cameras = read(params(tmp_path, cam=FISHEYE, **files))
+    assert cameras.centres.tolist() == [[11, 22, 33]]
+    lens = cameras.lenses[0]
+    for direction in ((0.3, 0.4, 1.0), (-2.0, 1.0, 0.1)):
+        found = project(lens, np.array([direction]))[0]
+        assert found == pytest.approx(fisheye_uv(direction), abs=1e-6)
+    assert lens.pixel_size_mm == pytest.approx(0.002)
+
+
+CAMERA = """Pix4D camera calibration file {0}
+#Focal Length mm assuming a sensor width of 12.0x8.0mm
+F 8.0
+#Principal Point mm
+Px 6.02
+Py 3.98
+#Symmetrical Lens Distortion Coeffs
+K1 0.1
+K2 -0.2
+K3 0.3
+#Tangential Lens Distortion Coeffs
+T1 0.01
+T2 0.02
+
+"""
+
+
+def test_external_table_with_the_only_calibration(tmp_path):
+    path = params(tmp_path, external=external(("a.jpg", 1, 2, 3, 0, 0, 0)), cam=CAMERA.format(0))
+    cameras = read(path)
+    assert cameras.notes == ()
+    uv = project(cameras.lenses[0], np.array([[0.2, -0.1, 1.0]]))[0]
+    full = read(
+        params(tmp_path / "b", parameters=HEADER + block("a.jpg", (1, 2, 3)), offset="0 0 0")
+    )
+    expected = project(full.lenses[0], np.array([[0.2, -0.1, 1.0]]))[0]
+    assert uv * 500 == pytest.approx(expected)  # 6000 px are 12 mm
+
+
+def test_external_table_alone_has_no_frames(tmp_path):
+    two = CAMERA.format(0) + CAMERA.format(1)
+    path = params(tmp_path, external=external(("a.jpg", 1, 2, 3, 0, 0, 0)), cam=two)
+    cameras = read(path)
+    assert cameras.lenses is None
+    assert cameras.rotations[0] == pytest.approx(DOWN)
+    assert "frames are taken as boundless" in cameras.notes[0]
+
+
+@pytest.mark.parametrize("where", ["project", "1_initial", "params", "parameters", "external"])
+def test_any_way_into_a_project(tmp_path, where):
+    folder = params(
+        tmp_path,
+        parameters=HEADER + block("a.jpg", (1, 2, 3)),
+        external=external(("a.jpg", 11, 22, 33, 0, 0, 0)),
+        offset="10 20 30",
+    )
+    path = {
+        "project": tmp_path / "job",
+        "1_initial": tmp_path / "job" / "1_initial",
+        "params": folder,
+        "parameters": folder / "job_calibrated_camera_parameters.txt",
+        "external": folder / "job_calibrated_external_camera_parameters.txt",
+    }[where]
+    cameras = read(path)
+    assert cameras.centres.tolist() == [[11, 22, 33]]
+    assert cameras.lenses[0].focal == 4000.0
+
+
+def test_a_table_of_another_name_is_known_by_its_content(tmp_path):
+    path = tmp_path / "poses of june.dat"
+    path.write_text(external(("a.jpg", 11, 22, 33, 0, 0, 90)))
+    assert read(path).rotations[0][0] == pytest.approx([0, 1, 0], abs=1e-12)
+
+
+def test_offsets_of_groups(tmp_path):
+    parameters = HEADER + block("402_1.tif", (1, 2, 3)) + block("403_1.tif", (1, 2, 3))
+    parameters += block("999_1.tif", (1, 2, 3))
+    path = params(tmp_path, parameters=parameters, offset="402 10 20 30\n403 100 200 300\n")
+    cameras = read(path)
+    assert cameras.centres.tolist() == [[11, 22, 33], [101, 202, 303]]
+    assert cameras.unposed == ("999_1.tif",)
+
+
+def test_no_offset_is_told(tmp_path):
+    path = params(tmp_path, parameters=HEADER + block("a.jpg", (1, 2, 3)))
+    cameras = read(path)
+    assert cameras.centres.tolist() == [[1, 2, 3]]
+    assert "there is no offset.xyz beside it" in cameras.notes[0]
+
+
+PROJECT = """<?xml version="1.0" encoding="UTF-8"?>
+<!DOCTYPE Pix4D>
+<pix4uav><version value="1615"/><WKTImages value="EPSG:32647"/>
+<image path="D:\\flight\\a.jpg" type="group1" enabled="true"><camera id="0"/>
+  {0}<toleranceXY value="2"/><toleranceZ value="4"/></image>
+<image path="D:\\flight\\b.jpg" type="group1" enabled="true">{0}</image>
+<image path="D:\\flight\\c.jpg" type="group1" enabled="false">{0}</image>
+</pix4uav>
+"""
+
+
+@pytest.mark.parametrize(
+    ("position", "xyz", "crs"),
+    [
+        ('<gps lat="14.5" lng="101.25" alt="180"/>', [101.25, 14.5, 180], "EPSG:4326"),
+        ('<xyz x="1" y="2" z="3"/>', [1, 2, 3], "EPSG:32647"),
+    ],
+)
+@pytest.mark.parametrize("name_it", [True, False])
+def test_initial_positions_of_the_project(tmp_path, position, xyz, crs, name_it):
+    folder = params(tmp_path, external=external(("a.jpg", 11, 22, 33, 0, 0, 0)), cam=CAMERA)
+    project_file = tmp_path / "job.p4d"
+    project_file.write_text(PROJECT.format(position))
+    cameras = read(project_file if name_it else folder)
+    assert cameras.gnss.xyz.tolist() == [xyz]
+    assert cameras.gnss.sigma_m.tolist() == [[2, 2, 4]]
+    assert cameras.gnss.crs == crs
+    assert cameras.unposed == ("b.jpg",)
+
+
+BINGO = """a H_12.0_8.0
+7 -6.0 4.0
+GCP_G1 1.0 -1.0
+-99
+lost H_12.0_8.0
+7 0 0
+-99
+b H_12.0_8.0
+7 0.002 0.0
+-99
+"""
+PIXELS = "a\n7 0 0 1.5\nGCP_G1 3500 2500 1.5\n-99\nlost\n7 5 5\n-99\nb\n7 3001 2000\n-99\n"
+GCPS = "GCP label, mx, my, mz, ex, ey, ez, weight, n\nG1, 1, 2, 3, 4, 5, 6, 0.9, 1\n"
+
+
+@pytest.mark.parametrize("form", [{"bingo": BINGO}, {"ties": PIXELS}])
+def test_tie_points(tmp_path, form):
+    parameters = HEADER + block("b.jpg", (1, 2, 3)) + block("a.jpg", (1, 2, 3))
+    path = params(tmp_path, parameters=parameters, offset="0 0 0", gcps=GCPS, **form)
+    ties = pix4d.tie_points(Source(path), read(path))
+    assert ties.views.start.tolist() == [0, 2, 3]
+    assert ties.views.camera.tolist() == [1, 0, 1]
+    assert ties.image_xy == pytest.approx(np.array([[0, 0], [3001, 2000], [3500, 2500]]))
+    assert np.isnan(ties.xyz[0]).all()
+    assert ties.xyz[1].tolist() == [4, 5, 6]
+
+
+GOOD = {"parameters": HEADER + block("a.jpg", (1, 2, 3)), "offset": "0 0 0"}
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        ({"parameters": GOOD["parameters"][:-30]}, "parameters.txt: image a.jpg: has 19 numbers"),
+        ({"parameters": GOOD["parameters"] + "b.jpg\n"}, "'b.jpg' should be the name, width"),
+        (
+            {"parameters": GOOD["parameters"].replace("0.3", "zero")},
+            "image a.jpg: .*'zero'.*; the file is damaged",
+        ),
+        ({"parameters": GOOD["parameters"].replace("0.3", "nan")}, "image a.jpg: .* not finite"),
+        ({"parameters": HEADER}, "has a header but no images"),
+        ({"parameters": "fileName imageWidth imageHeight\n1\n"}, "does not name the fields"),
+        (
+            {"parameters": HEADER + block("a.jpg", (1, 2, 3), np.diag([2.0, -1, -1]))},
+            "image a.jpg: the rotation matrix is not orthonormal",
+        ),
+        (
+            {"parameters": HEADER + block("a.jpg", (1, 2, 3), np.diag([1.0, 1, -1]))},
+            "image a.jpg: the rotation matrix mirrors",
+        ),
+        (
+            {"parameters": HEADER + block("a.jpg", (1, 2, 3), k=((0, 0, 1), (0, 0, 1), (0, 0, 1)))},
+            "camera a.jpg: focal length 0",
+        ),
+        ({**GOOD, "offset": "1 2"}, "offset.xyz: '1 2' is not an offset"),
+        ({**GOOD, "offset": ""}, "offset.xyz: is empty"),
+        ({**GOOD, "wkt": "PROJCS[nothing"}, "wkt.prj: the CRS 'PROJCS"),
+        ({**GOOD, "external": external()}, "external_.*: has a header but no images"),
+        ({**GOOD, "external": external(("b.jpg", 1, 2, 3, 0, 0, 0))}, "names none of the images"),
+        ({**GOOD, "external": external(("a.jpg", 1, 2))}, "has 2 numbers instead of 6"),
+        ({**GOOD, "external": external(("a.jpg", 1, 2, 3, 0, 0, "inf"))}, "a.jpg: .*not finite"),
+    ],
+)
+def test_bad_input(tmp_path, files, message):
+    path = params(tmp_path, **files)
+    with pytest.raises(pcfix.InputError, match=message) as caught:
+        read(path)
+    assert str(path) in str(caught.value)
+
+
+def test_several_projects_in_a_folder(tmp_path):
+    folder = params(tmp_path, **GOOD)
+    (folder / "other_calibrated_camera_parameters.txt").write_text(GOOD["parameters"])
+    with pytest.raises(pcfix.InputError, match=r"several projects \(job_, other_\); give one"):
+        read(folder)
+
+
+def test_geographic_table_alone_does_not_suffice(tmp_path):
+    path = tmp_path / "job_calibrated_external_camera_parameters_wgs84.txt"
+    path.write_text("imageName longitude latitude altitude Omega Phi Kappa\na 1 2 3 0 0 0\n")
+    with pytest.raises(pcfix.InputError, match="alone does not suffice"):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    ("form", "message"),
+    [
+        ({}, "no tie points"),
+        ({"bingo": BINGO.replace("-6.0", "x")}, "tp_bingo.txt: .*; the file is damaged"),
+        ({"bingo": BINGO.replace(" H_12.0_8.0", "")}, "lacks its sensor size"),
+        ({"bingo": "a H_12.0_8.0\n7 1\n"}, "'7 1' is not a point"),
+        ({"bingo": "z H_12.0_8.0\n7 1 2\n-99\n"}, "measures nothing in the images"),
+        ({"bingo": BINGO, "gcps": "head\nG1, 1, 2\n"}, "fewer than 7 fields"),
+    ],
+)
+def test_bad_tie_points(tmp_path, form, message):
+    path = params(tmp_path, **GOOD, **form)
+    cameras = read(path)
+    with pytest.raises(pcfix.InputError, match=message):
+        pix4d.tie_points(Source(path), cameras)
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\x00\xff" * 3000, b"label,x,y,z\na,1,2,3\n", b"PK\x03\x04"]
+)
+def test_other_files_are_not_taken(tmp_path, data):
+    path = tmp_path / "file"
+    path.write_bytes(data)
+    assert not pix4d.recognises(Source(path))
+    assert not pix4d.recognises(Source(tmp_path))
