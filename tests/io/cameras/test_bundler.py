@@ -12,7 +12,7 @@ from tests.utils.reprojection import check_file
 from tests.utils.shared import needs
 
 KERMIT, kermit = needs("cameras", "bundler", "kermit")
-TESTERARM, testerarm = needs("cameras", "bundler", "mve_testerarm")
+TESTERARM, on_testerarm = needs("cameras", "bundler", "mve_testerarm")
 
 TURN = Rotation.from_euler("xyz", [170, 12, 34], degrees=True).as_matrix()
 CENTRE = np.array([3.0, -2.0, 50.0])
@@ -115,7 +115,7 @@ def test_kermit():
     )
 
 
-@testerarm
+@on_testerarm
 def test_mve():
     cameras = read(TESTERARM / "synth_0.out")
     assert cameras.source == "MVE"

@@ -11,7 +11,7 @@ from pcfix.refract.lens import project
 from tests.utils.reprojection import check_file, residuals_px, row_of
 from tests.utils.shared import needs
 
-TESTERARM, testerarm = needs("cameras", "nvm", "testerarm_undistorted")
+TESTERARM, on_testerarm = needs("cameras", "nvm", "testerarm_undistorted")
 
 TURN = Rotation.from_euler("xyz", [170, 12, 34], degrees=True)
 CENTRE = np.array([3.0, -2.0, 50.0])
@@ -69,7 +69,7 @@ def all_residuals(path):
     return np.array(misses)
 
 
-@testerarm
+@on_testerarm
 def test_testerarm():
     check = check_file(TESTERARM)
     path = TESTERARM / "reconstruction.nvm"

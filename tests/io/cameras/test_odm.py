@@ -15,7 +15,7 @@ from tests.io.cameras.test_opensfm import residuals
 from tests.utils.reprojection import check_file, residuals_px, row_of
 from tests.utils.shared import needs
 
-TESTERARM, testerarm = needs("cameras", "odm", "testerarm_sub0")
+TESTERARM, on_testerarm = needs("cameras", "odm", "testerarm_sub0")
 HECTORSOSA, hectorsosa = needs("cameras", "odm", "hectorsosa")
 ORTHORITY, orthority = needs("cameras", "odm", "orthority_odm")
 
@@ -121,7 +121,7 @@ def check_centres(cameras, sample, metres):
         assert -cameras.rotations[i][1] == pytest.approx(up, abs=2e-5)
 
 
-@testerarm
+@on_testerarm
 @pytest.mark.parametrize(
     "path", ["", "opensfm", "opensfm/reconstruction.json", "odm_report/shots.geojson"]
 )
@@ -138,7 +138,7 @@ def test_old_project_comes_out_in_its_projected_crs(path):
     assert cameras.gnss.xyz[:, 0] == pytest.approx(-91.994, abs=1e-3)
 
 
-@testerarm
+@on_testerarm
 def test_old_project_turns_by_the_meridian_convergence():
     source = Source(TESTERARM / "opensfm" / "reconstruction.json")
     projected, plain = odm.read(source), opensfm.read(source)
@@ -152,7 +152,7 @@ def test_old_project_turns_by_the_meridian_convergence():
     assert np.degrees(np.arctan2(north[0], north[1])) == pytest.approx(-0.7339, abs=1e-3)
 
 
-@testerarm
+@on_testerarm
 def test_tie_points_of_the_old_project_lie_in_its_frame():
     source, check = Source(TESTERARM), check_file(TESTERARM)
     cameras = odm.read(source)
