@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from pcfix.flow.points import correct_points
     from pcfix.flow.restore import restore_file
     from pcfix.io.cameras import read_cameras
+    from pcfix.refract.index import refractive_index
     from pcfix.io.water import read_water
     from pcfix.model import (
         Cameras,
@@ -44,6 +45,7 @@ _HOME = {
     "correct_points": "pcfix.flow.points",
     "restore_file": "pcfix.flow.restore",
     "read_cameras": "pcfix.io.cameras",
+    "refractive_index": "pcfix.refract.index",
     "read_water": "pcfix.io.water",
     "simulate_scene": "pcfix.simulate",
     "Cameras": "pcfix.model",
@@ -88,6 +90,7 @@ __all__ = [
     "grid_dsm",
     "read_cameras",
     "read_water",
+    "refractive_index",
     "restore_file",
     "simulate_scene",
 ]

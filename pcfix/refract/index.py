@@ -1,0 +1,106 @@
+"""The refractive index of natural waters, relative to air."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from pcfix.errors import SettingError
+
+SALINITY_PSU, TEMPERATURE_C, WAVELENGTH_UM = (0.0, 40.0), (0.0, 30.0), (0.4, 0.7)
+"""Where the formula was fitted (its salinities end at 35; natural seas go a little beyond)."""
+
+GREEN_UM = 0.53
+"""Where cameras see most through water: the peak of their green pixels."""
+
+
+class Water(NamedTuple):
+    """What decides the refractive index."""
+
+    salinity_psu: float
+    temperature_c: float = 15.0
+    wavelength_um: float = GREEN_UM
+
+
+WATERS = {"fresh": Water(0.0), "sea": Water(35.0)}
+"""Waters by name."""
+
+
+def refractive_index(
+    salinity: float = 35.0, temperature_c: float = 15.0, wavelength_um: float = GREEN_UM
+) -> float:
+    """Return the refractive index of water relative to air.
+
+    Parameters
+    ----------
+    salinity : float
+        PSU (grams of salt in a kilogram, nearly), 0 to 40.
+    temperature_c : float
+        Degrees Celsius, 0 to 30.
+    wavelength_um : float
+        Of the light, micrometres, 0.4 to 0.7.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    SettingError
+        If a value is outside its range.
+
+    Notes
+    -----
+    Skarlatos & Agrafiotis 2018, eq 13, which is the fit of Quan & Fry 1995 (*Applied Optics* 34,
+    3477, eq 3) to the measurements of Austin & Halikas 1976. The wavelength enters in nanometres;
+    the term in T^2 alone and the one in 1 / lambda^2 are negative. Without dispersion in mind a
+    camera's green, 0.53 um, is a fair choice; blue and red differ by 0.004.
+
+    Examples
+    --------
+    >>> import pcfix
+    >>> round(pcfix.refractive_index(salinity=0.0, temperature_c=20.0, wavelength_um=0.5893), 4)
+    1.333
+    """
+    for name, value, (low, high), unit in (
+        ("salinity", salinity, SALINITY_PSU, "PSU"),
+        ("temperature", temperature_c, TEMPERATURE_C, "degrees Celsius"),
+        ("wavelength", wavelength_um, WAVELENGTH_UM, "micrometres"),
+    ):
+        if not (math.isfinite(value) and low <= value <= high):
+            raise SettingError(
+                f"{name} {value:g} is outside {low:g} to {high:g}: give it in {unit}."
+            )
+    s, t, nm = float(salinity), float(temperature_c), 1000.0 * wavelength_um
+    return (
+        1.31405
+        + (1.779e-4 - 1.05e-6 * t + 1.6e-8 * t * t) * s
+        - 2.02e-6 * t * t
+        + (15.868 + 0.01155 * s - 0.00423 * t) / nm
+        - 4382.0 / nm**2
+        + 1.1455e6 / nm**3
+    )
+
+
+def index_of(words: str) -> tuple[float, Water | None]:
+    """Return the refractive index that a text means, and the water where it names one.
+
+    Parameters
+    ----------
+    words : str
+        A number, ``fresh`` or ``sea``.
+
+    Raises
+    ------
+    SettingError
+        If it is neither.
+    """
+    water = WATERS.get(words.strip().lower())
+    if water is not None:
+        return refractive_index(*water), water
+    try:
+        return float(words), None
+    except ValueError:
+        raise SettingError(
+            f"index '{words}' is neither a number nor {' nor '.join(WATERS)}."
+        ) from None
