@@ -17,6 +17,13 @@ if TYPE_CHECKING:
 UP_BACK_TO_DOWN_FORWARD = np.diag([1.0, -1.0, -1.0])
 
 
+def from_rotation_vectors(vectors_rad: FloatArray) -> FloatArray:
+    """Return rotations, shape (k, 3, 3), from axes times angles, shape (k, 3), world to camera."""
+    from scipy.spatial.transform import Rotation  # not quick to load
+
+    return np.asarray(Rotation.from_rotvec(vectors_rad).as_matrix())
+
+
 def from_photogrammetric(world_to_camera: FloatArray) -> FloatArray:
     """Return rotations from those to the photogrammetric camera, shape (k, 3, 3) both."""
     return np.asarray(UP_BACK_TO_DOWN_FORWARD @ world_to_camera)

@@ -6,7 +6,6 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
@@ -14,6 +13,7 @@ from pcfix.io.cameras.odm.crs import crs_of_place
 from pcfix.io.cameras.opensfm.lenses import is_panorama, lens
 from pcfix.io.cameras.opensfm.reconstruction import left_out
 from pcfix.io.cameras.opensfm.values import load, mapping, number, rows, vector
+from pcfix.io.cameras.rotations import from_rotation_vectors
 from pcfix.model import Cameras, GnssPositions, Lens
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def read_shots(project: Project, path: Path, source: str) -> Cameras:
     return Cameras(
         labels=labels,
         centres=np.array(list(positions(path).values())),
-        rotations=np.asarray(Rotation.from_rotvec(np.array(turns)).as_matrix()),
+        rotations=from_rotation_vectors(np.array(turns)),
         lenses=lenses,
         crs=project.crs() or _crs_of_geometry(path, shots),
         notes=notes,

@@ -7,11 +7,11 @@ from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from pcfix.errors import InputError
 from pcfix.io.cameras.opensfm.lenses import is_panorama, lens
 from pcfix.io.cameras.opensfm.values import load, mapping, number, rows, vector
+from pcfix.io.cameras.rotations import from_rotation_vectors
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -166,7 +166,7 @@ def _pose(path: Path, where: str, value: Any) -> tuple[FloatArray, FloatArray]:
     entry = mapping(path, where, value)
     turn = vector(path, f"{where}, rotation", entry.get("rotation"), 3)
     shift = vector(path, f"{where}, translation", entry.get("translation"), 3)
-    return np.asarray(Rotation.from_rotvec(turn).as_matrix()), shift
+    return from_rotation_vectors(turn), shift
 
 
 def _riders(path: Path, chosen: dict[str, Any]) -> dict[str, tuple[str, str]]:
