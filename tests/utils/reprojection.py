@@ -4,6 +4,7 @@ import json
 from pathlib import PurePath
 
 import numpy as np
+from pyproj import CRS, Transformer
 
 from pcfix.refract.lens import project
 
@@ -15,7 +16,7 @@ def check_file(sample):
 
 def row_of(cameras, image):
     """Return the row of an image, whether or not its label has a file extension."""
-    names = [label for label in cameras.labels]
+    names = list(cameras.labels)
     if image in names:
         return names.index(image)
     stems = [PurePath(name).stem for name in names]
@@ -36,3 +37,34 @@ def residuals_px(cameras, observations, *, shift_px=0.0):
         u, v = project(cameras.lenses[i], ray[None])[0]
         misses.append(np.hypot(u - seen["u"] - shift_px, v - seen["v"] - shift_px))
     return np.array(misses)
+
+
+def tie_point_residuals_px(cameras, ties):
+    """Return the same for every observation of a sparse model whose point has a position."""
+    point = np.repeat(np.arange(len(ties.xyz)), np.diff(ties.views.start))
+    known = np.isfinite(ties.xyz[point]).all(axis=1)
+    misses = []
+    for i, (rotation, centre) in enumerate(zip(cameras.rotations, cameras.centres, strict=True)):
+        mine = known & (ties.views.camera == i)
+        rays = (ties.xyz[point[mine]] - centre) @ rotation.T
+        misses.append(np.hypot(*(project(cameras.lenses[i], rays) - ties.image_xy[mine]).T))
+    return np.concatenate(misses)
+
+
+def in_geocentric(observations, crs, geocentric_crs):
+    """Return observations with X, Y, Z, ellipsoidal heights in `crs`, in geocentric axes."""
+    step = Transformer.from_crs(CRS(crs).to_3d(), geocentric_crs, always_xy=True)
+    places = [step.transform(*(seen[axis] for axis in "XYZ")) for seen in observations]
+    return [
+        {**seen, **dict(zip("XYZ", xyz, strict=True))}
+        for seen, xyz in zip(observations, places, strict=True)
+    ]
+
+
+def from_upper_left(cameras, observations):
+    """Return observations whose u and v are from the middle of the frame, y up (Bundler)."""
+    lenses = [cameras.lenses[row_of(cameras, seen["image"])] for seen in observations]
+    return [
+        {**seen, "u": lens.width / 2.0 + seen["u"], "v": lens.height / 2.0 - seen["v"]}
+        for seen, lens in zip(observations, lenses, strict=True)
+    ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from pcfix.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from pcfix.model import FloatArray, Lens
@@ -37,6 +39,18 @@ def rotation(path: Path, label: str, matrix: FloatArray) -> FloatArray:
     for _ in range(2):  # Newton's iteration to the polar factor; the rounding is squared each time
         matrix = 1.5 * matrix - 0.5 * matrix @ matrix.T @ matrix
     return matrix
+
+
+def repeated(path: Path, labels: Sequence[str], dropped: int = 0) -> tuple[str, ...]:
+    """Return a note where labels repeat: they are no key, and their images are kept apart."""
+    names = [label for label, count in Counter(labels).items() if count > 1]
+    if not names:
+        return ()
+    listed = ", ".join(names[:10]) + (", ..." if len(names) > 10 else "")
+    return (
+        f"{path}: {len(names)} labels occur more than once ({listed}); cameras at different"
+        f" positions are kept as different images, {dropped} exact copies dropped.",
+    )
 
 
 def quaternion(path: Path, label: str, wxyz: FloatArray) -> FloatArray:

@@ -363,6 +363,13 @@ def test_other_files_are_not_recognised(tmp_path, text):
     assert not odm.recognises(Source(tmp_path))
 
 
+def twice():
+    shots = geojson(PLACES)
+    first, _, third = (feature["properties"] for feature in shots["features"][:3])
+    third["filename"] = first["filename"]
+    return shots
+
+
 def without(name):
     shots = geojson(PLACES)
     del shots["features"][2]["properties"][name]
@@ -373,6 +380,7 @@ def without(name):
     ("files", "words"),
     [
         ({"shots": without("filename")}, "shots.geojson: feature 3 has no filename"),
+        ({"shots": twice()}, "shots.geojson: feature 3 repeats the filename"),
         ({"shots": without("rotation")}, r"shots.geojson: image 2.jpg, rotation"),
         ({"shots": without("translation")}, "shots.geojson: translation"),
         ({"shots": without("focal")}, r"shots.geojson: image 2.jpg, width, height, focal"),

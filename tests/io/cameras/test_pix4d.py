@@ -156,8 +156,9 @@ def test_centres_and_views_of_the_samples(sample):
 def test_a_wrong_offset_is_noticed_and_the_absolute_table_believed():
     cameras = read(LOD3)
     assert cameras.unposed == ("403_0032_00130203.tif",)  # only relative, and the offset is wrong
-    (note,) = cameras.notes
-    assert "differ by up to 218.28 m and 0.000 degrees" in note
+    wrong, repeated = cameras.notes
+    assert "differ by up to 218.28 m and 0.000 degrees" in wrong
+    assert "3 labels occur more than once" in repeated
     assert np.ptp(cameras.centres[:, 2]) < 30.0
 
 

@@ -104,6 +104,11 @@ def _shots(path: Path) -> dict[str, dict[str, Any]]:
         name = shot.get("filename")
         if not isinstance(name, str):
             raise InputError(f"{path}: feature {i + 1} has no filename.")
+        if name in shots:
+            raise InputError(
+                f"{path}: feature {i + 1} repeats the filename {name}; give every image a name of"
+                " its own, as OpenDroneMap needs."
+            )
         shots[name] = {**shot, "geometry": feature.get("geometry")}
     return shots
 

@@ -67,7 +67,7 @@ def read_block(source: Source) -> Cameras:
         rotations=poses.rotations,
         lenses=lenses,
         crs=_crs(files.wkt),
-        notes=poses.notes,
+        notes=(*poses.notes, *checks.repeated(source.path, labels)),
         gnss=gnss,
         unposed=tuple(dict.fromkeys(n for n in (*poses.unposed, *others) if n not in posed)),
         source="Pix4D",

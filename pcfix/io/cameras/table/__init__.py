@@ -36,12 +36,12 @@ its f, px, py and the order of t1, t2 are those of AliceVision's reader of the s
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pcfix.errors import InputError
+from pcfix.io.cameras import checks
 from pcfix.io.cameras.rotations import from_yaw_pitch_roll as rotations_from_yaw_pitch_roll
 from pcfix.io.cameras.table.attitude import read_rotations
 from pcfix.io.cameras.table.headers import axes, headers, is_header
@@ -159,11 +159,4 @@ def _without_copies(columns: Columns, xyz: FloatArray) -> tuple[IntArray, tuple[
         if key not in seen:
             seen.add(key)
             keep.append(i)
-    repeated = [label for label, count in Counter(labels).items() if count > 1]
-    note = (
-        f"{columns.path}: {len(repeated)} labels occur more than once"
-        f" ({', '.join(repeated[:10])}{', ...' if len(repeated) > 10 else ''}); cameras at"
-        f" different positions are kept as different images, {len(labels) - len(keep)} exact"
-        " copies dropped."
-    )
-    return np.array(keep), (note,) if repeated else ()
+    return np.array(keep), checks.repeated(columns.path, labels, len(labels) - len(keep))

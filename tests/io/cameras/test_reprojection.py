@@ -1,0 +1,187 @@
+"""Every real sample: object points fall where its images saw them, and cameras are where they were.
+
+What is expected stands in the check.json beside each sample: for some observations the residual
+that a right reading leaves (`res_px`), for all of the block its RMS, and for some images centre and
+view. Run with -s for the table.
+"""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+from pyproj import Transformer
+
+import pcfix
+from pcfix.io.cameras import read_tie_points
+from tests.utils.pose_files.block import axes_at
+from tests.utils.reprojection import (
+    check_file,
+    from_upper_left,
+    in_geocentric,
+    residuals_px,
+    row_of,
+    tie_point_residuals_px,
+)
+from tests.utils.shared import needs
+
+
+@dataclass(frozen=True)
+class Sample:
+    """How a sample is read, and how its check.json is to be taken.
+
+    `path` is below the sample's folder. `frame` is the CRS of X, Y, Z where the file itself is
+    geocentric. `seen` makes observations those of an image from its upper left corner. `apart_px`
+    and `apart_m` are how far we may be from what is expected, which is written with few digits.
+    `rms_px` is the same for the RMS of all tie points, where the file has them.
+    """
+
+    path: str = ""
+    options: dict = field(default_factory=dict)
+    frame: str | None = None
+    seen: Callable = lambda cameras, observations: observations
+    shift_px: float = 0.0
+    name_of: Callable = lambda image: image
+    distorted: bool = True
+    apart_px: float = 0.02
+    apart_m: float = 2e-4
+    rms_px: float | None = None
+
+
+SAMPLES = {
+    "metashape/uclm_sorolla": Sample("markers_25830-5782.xml", frame="EPSG:25830"),
+    "metashape/micasense_rig": Sample("markers_micasenses_rededge.xml", frame="EPSG:25830"),
+    # 1e-8 degrees are 1 mm, seen from 30 m
+    "metashape/easyidp_wheat_psx": Sample("wheat_tanashi.psx", frame="EPSG:4326", apart_px=0.1),
+    "metashape/dbat_camcal_psz": Sample("c4040z.psz", rms_px=1e-3),
+    "metashape/bitbyt3r_local93": Sample("cameras.xml"),
+    "metashape_opk/sfmrefract": Sample("trajectory.txt", {"sensor": "io/ioP4P.xml"}),
+    "pix4d/ca502_oblique5": Sample("params"),
+    "pix4d/lod3_amsterdam": Sample(),
+    # pmatrix projects without distortion
+    "pix4d/easyidp_pix4d_origin": Sample(distorted=False),
+    # the map scales in plan alone (0.9996), which no rotation can: in the corners
+    "odm/testerarm_sub0": Sample(apart_px=0.06, rms_px=3e-3),
+    "odm/hectorsosa": Sample(),
+    "odm/orthority_odm": Sample(apart_m=1e-3),
+    "opensfm/berlin": Sample(rms_px=1e-3),
+    "colmap/ar_boxes": Sample("bin", rms_px=1e-3),
+    "colmap/wesley_dense": Sample(rms_px=1e-3),
+    "micmac/li3ds": Sample(name_of=lambda image: image.split("-")[-1].removesuffix(".xml")),
+    "bundler/kermit": Sample("bundle.out", seen=from_upper_left, rms_px=1e-3),
+    "bundler/mve_testerarm": Sample("synth_0.out", name_of=lambda image: image.split(" (")[0]),
+    "nvm/testerarm_undistorted": Sample("reconstruction.nvm", rms_px=1e-3),
+    # pixels from the centre of the first
+    "blocksexchange/paris_doc_example": Sample("Paris2012_one_photo.xml", shift_px=0.5),
+}
+MARKED = [
+    pytest.param(name, marks=needs("cameras", *name.split("/"))[1], id=name) for name in SAMPLES
+]
+VIEW_DEG, APPROXIMATE_DEG = 1e-3, 0.1
+"""view_dir_approx of a projected chunk is in the axes of the map, up to 1.7 degrees off: 0.06 for
+views that are nearly vertical."""
+HEAD = (
+    f"\n{'sample':<33}{'images':>7}{'seen':>6}{'median, expected':>19}{'RMS, expected':>17}"
+    f"{'all':>7}{'RMS, expected':>17}{'centres':>12}{'views':>12}"
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def head():
+    print(HEAD, end="")
+
+
+def sample(name):
+    """Return how to take a sample, its cameras as `pcfix.read_cameras` gives them, and check."""
+    told = SAMPLES[name]
+    folder = needs("cameras", *name.split("/"))[0]
+    options = {key: folder / value for key, value in told.options.items()}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pcfix.PcfixWarning)  # the tests of each format ask for them
+        cameras = pcfix.read_cameras(folder / told.path, **options)
+    return told, cameras, check_file(folder), folder / told.path
+
+
+def observations_of(told, cameras, check):
+    """Return observations in the frame of the cameras, from the upper left corner."""
+    listed = check.get("observations", [])
+    listed = [{**seen, "image": told.name_of(seen["image"])} for seen in listed]
+    if told.frame is not None and listed:
+        listed = in_geocentric(listed, told.frame, cameras.crs)
+    return told.seen(cameras, listed)
+
+
+def centre_and_view(told, cameras, given):
+    """Return how far a projection centre (m) and its view or top (degrees) are off."""
+    i = row_of(cameras, told.name_of(given["image"]))
+    centre = given.get("ECEF") or [given[axis] for axis in "XYZ"]
+    apart = np.abs(cameras.centres[i] - centre).max()
+    axes = np.eye(3) if told.frame is None else east_north_up(cameras.crs, cameras.centres[i])
+    rotation = cameras.rotations[i] @ axes.T
+    view = given.get("view_dir", given.get("view_dir_approx"))
+    pairs = [(rotation[2], view)]
+    if "up_dir_minus_cam_y" in given:
+        pairs.append((-rotation[1], given["up_dir_minus_cam_y"]))
+    return apart, max(degrees_between(*pair) for pair in pairs)
+
+
+def degrees_between(one, other):
+    one, other = np.array(one), np.array(other)
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other))
+
+
+def east_north_up(geocentric_crs, centre):
+    """Return the axes at a place, one a row, up along the normal of the ellipsoid."""
+    step = Transformer.from_crs(geocentric_crs, "EPSG:4979", always_xy=True)
+    return axes_at(*step.transform(*centre)[:2])
+
+
+def rms(misses):
+    return float(np.sqrt(np.mean(np.square(misses))))
+
+
+def beside(ours, expected, width):
+    return f"{ours:>{width - 9}.3f} ({expected:5.3f})"
+
+
+@pytest.mark.parametrize("name", MARKED)
+def test_sample(name):
+    told, cameras, check, path = sample(name)
+    row = f"{name:<33}{len(cameras):>7}"
+    observations = observations_of(told, cameras, check)
+    if observations:
+        taken = cameras
+        if not told.distorted:
+            ideal = [replace(lens, radial=(), tangential=()) for lens in cameras.lenses]
+            taken = replace(cameras, lenses=tuple(ideal))
+        found = residuals_px(taken, observations, shift_px=told.shift_px)
+        # without res_px u and v are not measured but projected
+        expected = np.array([seen.get("res_px", 0.0) for seen in observations])
+        row += f"{len(found):>6}{beside(np.median(found), np.median(expected), 19)}"
+        row += beside(rms(found), rms(expected), 17)
+    else:
+        row += f"{'-':>6}{'-':>19}{'-':>17}"
+    if told.rms_px is not None:
+        every = tie_point_residuals_px(cameras, read_tie_points(path, cameras))
+        row += f"{len(every):>7}{beside(rms(every), check['reprojection_rms_px'], 17)}"
+    else:
+        row += f"{'-':>7}{'-':>17}"
+    offs = [centre_and_view(told, cameras, given) for given in check["projection_centres"]]
+    apart_m, turned_deg = np.max(offs, axis=0)
+    print(f"\n{row}{apart_m:>10.1e} m{turned_deg:>8.1e} deg", end="")
+
+    if observations:
+        assert found == pytest.approx(expected, abs=told.apart_px)
+    if told.rms_px is not None:
+        assert len(every) == check["n_observations_used_for_rms"]
+        assert rms(every) == pytest.approx(check["reprojection_rms_px"], abs=told.rms_px)
+    assert apart_m < told.apart_m
+    rough = "view_dir_approx" in check["projection_centres"][0]
+    assert turned_deg < (APPROXIMATE_DEG if rough else VIEW_DEG)
+
+
+def test_no_sample_is_left_out():
+    folder, _ = needs("cameras")
+    there = {f"{p.parent.parent.name}/{p.parent.name}" for p in folder.glob("*/*/check.json")}
+    assert there <= set(SAMPLES)
