@@ -33,6 +33,10 @@ SAMPLE_POINTS = 50_000
 """Points of the cloud that are looked for in the frames, evenly spread over the file."""
 
 
+LEAST_SEEN_TWICE = 0.9
+"""Share of a cloud that two frames or more should hold, as two made each point."""
+
+
 @dataclass(frozen=True)
 class Sensor:
     """The images of one interior orientation; None where the file does not say."""
@@ -331,9 +335,10 @@ def _fit(cameras: Cameras, cloud: str, xyz: FloatArray, crs: Any) -> Fit:
             f"{below} of {len(cameras)} cameras stand below the ground: heights of cameras and"
             " cloud have different datums, or the axes are swapped."
         )
-    if not verdict and float(np.mean(seen >= 2)) < 0.5:
+    twice = float(np.mean(seen >= 2))
+    if not verdict and twice < LEAST_SEEN_TWICE:
         verdict = (
-            f"only {100 * float(np.mean(seen >= 2)):.0f} % of the points lie in the frames of two"
+            f"only {100 * twice:.0f} % of the points lie in the frames of two"
             " cameras or more, although the block is over the cloud: check the convention of the"
             " angles and the interior orientation."
         )

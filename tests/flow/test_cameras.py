@@ -1,0 +1,180 @@
+"""Cameras through the doors: what `pcfix cameras` says, and options that place and choose them."""
+
+import json
+import re
+import struct
+
+import laspy
+import numpy as np
+import pytest
+from pyproj import Transformer
+from typer.testing import CliRunner
+
+import pcfix
+from pcfix.cli import app
+from pcfix.flow.cameras import check_cameras
+from pcfix.refract.lens import project
+from pcfix.report.cameras import cameras_text
+from tests.utils.shared import ROOT, needs
+
+SCENE = ROOT / "samples" / "scene"
+CLOUD, CAMERAS, SENSOR = SCENE / "cloud.laz", SCENE / "cameras.csv", SCENE / "sensor.csv"
+RENDERED, rendered = needs("rendered_a")
+
+
+def table(path, change=lambda xyz: xyz, crs=None):
+    """Write the scene's cameras with other coordinates, and return the path."""
+    lines = CAMERAS.read_text().splitlines()
+    rows = [line.split(",") for line in lines[1:]]
+    moved = change(np.array([[float(v) for v in row[1:4]] for row in rows]))
+    text = [f"# crs: {crs}"] if crs else []
+    text.append(lines[0])
+    text += [
+        ",".join([row[0], *(repr(float(v)) for v in xyz), *row[4:]])
+        for row, xyz in zip(rows, moved, strict=True)
+    ]
+    path.write_text("\n".join(text) + "\n")
+    return path
+
+
+def words(*arguments):
+    result = CliRunner().invoke(app, list(map(str, arguments)))
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.output
+
+
+def test_a_block_that_fits_is_said_to_fit(tmp_path):
+    said = words(
+        "cameras", CAMERAS, "--cloud", CLOUD, "--water", "0.37",
+        "--plot", tmp_path / "block.png", "--summary", tmp_path / "s.json",
+    )  # fmt: skip
+    assert "cameras and cloud fit" in said
+    assert "40 with a pose" in said
+    assert (tmp_path / "block.png").read_bytes().startswith(b"\x89PNG")
+    found = json.loads((tmp_path / "s.json").read_text())
+    assert found["fit"]["fits"]
+    assert found["fit"]["seen_by"]["3 or more"] == 1.0
+    # the scene is flown 80 m above the water, tilted by a few degrees (pcfix.simulate.block)
+    assert found["height_above_water_m"][1] == pytest.approx(80.0, abs=1.0)
+    assert found["tilt_deg"][1] < 6.0
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda p: p[:, [1, 0, 2]], "swapped"),
+        (lambda p: p / 0.3048, "feet"),
+        (lambda p: p - [410_000.0, 4_650_000.0, 0.0], "--cameras-offset"),
+        (lambda p: p - [0.0, 0.0, 100.0], "above the ellipsoid"),
+        (lambda p: p + np.array([5e3, 0.0, 0.0]), "5004 m from the cloud in plan"),
+    ],
+)
+def test_what_is_likely_wrong_is_said(tmp_path, change, said):
+    path = table(tmp_path / "cameras.csv", change)
+    report = check_cameras(path, CLOUD, sensor=SENSOR)
+    assert not report.fit.fits
+    assert re.search(said, report.fit.verdict), report.fit.verdict
+    assert report.fit.verdict in cameras_text(report)
+
+
+def test_wrong_angles_are_noticed(tmp_path):
+    lines = CAMERAS.read_text().splitlines()
+    rows = [line.split(",") for line in lines[1:]]
+    text = [lines[0], *(",".join([*r[:4], r[4], "60", r[6]]) for r in rows)]
+    (tmp_path / "cameras.csv").write_text("\n".join(text) + "\n")
+    report = check_cameras(tmp_path / "cameras.csv", CLOUD, sensor=SENSOR)
+    assert "angles" in report.fit.verdict
+    assert report.tilt_deg[0] > 50.0
+
+
+def corrected(tmp_path, name, **options):
+    path = tmp_path / name
+    summary = pcfix.correct_file(CLOUD, path, **{"water": 0.37, "sensor": SENSOR, **options})
+    return laspy.read(path), summary
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    return corrected(tmp_path_factory.mktemp("plain"), "plain.las", cameras=CAMERAS)
+
+
+def same(one, other, steps=0):
+    """Whether coordinates differ by at most so many steps of the file."""
+    return all(np.abs(one[axis].astype(np.int64) - other[axis]).max() <= steps for axis in "XYZ")
+
+
+def test_cameras_in_another_zone_are_brought_over(tmp_path, plain):
+    east = Transformer.from_crs("EPSG:32633", "EPSG:32634", always_xy=True)
+
+    def moved(xyz):
+        x, y = east.transform(xyz[:, 0], xyz[:, 1])
+        return np.column_stack([x, y, xyz[:, 2]])
+
+    # without angles: yaw counts from grid north, which differs by the convergence
+    def bare(path, **more):
+        lines = table(path, **more).read_text().splitlines()
+        path.write_text("\n".join(",".join(line.split(",")[:4]) for line in lines) + "\n")
+        return path
+
+    here = {"max_angle_deg": 40.0, "sensor": None}
+    expected, _ = corrected(tmp_path, "a.las", cameras=bare(tmp_path / "a.csv"), **here)
+    other = bare(tmp_path / "b.csv", change=moved)
+    found, _ = corrected(tmp_path, "b.las", cameras=other, cameras_crs="EPSG:32634", **here)
+    assert same(found, expected, steps=1)  # PROJ there and back is good to a micrometre
+    with pytest.raises(pcfix.GeometryError):
+        corrected(tmp_path, "c.las", cameras=other, **here)
+
+
+def test_cameras_shifted_to_the_origin_take_an_offset(tmp_path, plain):
+    shift = np.array([410_000.0, 4_650_000.0, 0.0])
+    path = table(tmp_path / "cameras.csv", lambda xyz: xyz - shift)
+    found, _ = corrected(tmp_path, "o.las", cameras=path, cameras_offset_m=tuple(shift))
+    assert same(found, plain[0], steps=1)
+
+
+@pytest.mark.parametrize("text", ["1,2", "a,b,c", "1,2,inf", ""])
+def test_an_offset_is_three_numbers(tmp_path, text):
+    result = CliRunner().invoke(
+        app,
+        ["correct", str(CLOUD), str(tmp_path / "o.las"), "--cameras", str(CAMERAS), "--water",
+         "0.37", "--cameras-offset", text],
+    )  # fmt: skip
+    assert isinstance(result.exception, pcfix.SettingError)
+    assert "three numbers X,Y,Z" in str(result.exception)
+
+
+def in_frame(xyz, cameras):
+    """Return which cameras (columns) hold which points, by projection."""
+    held = []
+    for rotation, centre, lens in zip(
+        cameras.rotations, cameras.centres, cameras.lenses, strict=True
+    ):
+        u, v = project(lens, (xyz - centre) @ rotation.T).T
+        held.append((u >= 0) & (u <= lens.width) & (v >= 0) & (v <= lens.height))
+    return np.array(held).T
+
+
+def test_a_list_of_all_in_frame_gives_what_no_list_gives(tmp_path, plain):
+    cameras, xyz = pcfix.read_cameras(CAMERAS), laspy.read(CLOUD).xyz
+    parts = [struct.pack("<Q", len(xyz))]
+    for row in in_frame(xyz, cameras):
+        names = np.flatnonzero(row)
+        parts.append(struct.pack(f"<I{len(names)}I", len(names), *names))
+    (tmp_path / "cloud.vis").write_bytes(b"".join(parts))
+    found, summary = corrected(tmp_path, "v.las", cameras=CAMERAS, views=tmp_path / "cloud.vis")
+    assert same(found, plain[0])
+    assert summary.views["by_row"] == len(xyz)
+    assert summary.views["share_seen"] == 1.0
+
+
+@rendered
+def test_views_of_a_real_cloud_change_the_rays(tmp_path):
+    offset = [float(word) for word in (RENDERED / "offset.txt").read_text().splitlines()[1].split()]
+    with pytest.warns(pcfix.PcfixWarning, match="dense.ply: has 83,334 points"):
+        summary = pcfix.correct_file(
+        RENDERED / "cloud.las", tmp_path / "c.las", cameras=RENDERED / "colmap", water=0.37,
+        cameras_offset_m=tuple(offset), views=RENDERED / "dense.vis",
+    )  # fmt: skip
+    assert summary.corrected == summary.submerged
+    assert summary.rays / summary.corrected == pytest.approx(5.5, abs=0.1)  # of the list's README
