@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from pcfix.flow.points import correct_points
     from pcfix.flow.restore import restore_file
     from pcfix.io.cameras import read_cameras
-    from pcfix.refract.index import refractive_index
     from pcfix.io.water import read_water
     from pcfix.model import (
         Cameras,
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
         WaterPlane,
         WaterSurface,
     )
+    from pcfix.refract.index import refractive_index
     from pcfix.simulate import simulate_scene
 
 __version__ = "0.1.0"
@@ -44,6 +44,10 @@ _HOME = {
     "correct_file": "pcfix.flow.files",
     "correct_points": "pcfix.flow.points",
     "restore_file": "pcfix.flow.restore",
+    "label_file": "pcfix.flow.label",
+    "label_points": "pcfix.flow.label",
+    "LabelSettings": "pcfix.model",
+    "WaterRaster": "pcfix.model",
     "read_cameras": "pcfix.io.cameras",
     "refractive_index": "pcfix.refract.index",
     "read_water": "pcfix.io.water",
@@ -71,6 +75,7 @@ __all__ = [
     "Correction",
     "GeometryError",
     "InputError",
+    "LabelSettings",
     "Lens",
     "Outcome",
     "PcfixError",
@@ -82,12 +87,15 @@ __all__ = [
     "WaterDimension",
     "WaterMesh",
     "WaterPlane",
+    "WaterRaster",
     "WaterSurface",
     "clean_file",
     "compare_clouds",
     "correct_file",
     "correct_points",
     "grid_dsm",
+    "label_file",
+    "label_points",
     "read_cameras",
     "read_water",
     "refractive_index",

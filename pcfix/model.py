@@ -247,7 +247,54 @@ class WaterMesh:
         return f"mesh {self.name}, {len(self.triangles)} triangles"
 
 
-WaterSurface: TypeAlias = WaterPlane | WaterDimension | WaterMesh
+@dataclass(frozen=True, eq=False)
+class WaterRaster:
+    """Heights on a regular grid, bilinear between the centres of the cells.
+
+    A place is known where all four centres around it are; in the outer half of the cells at
+    the edge the outermost four go on. So a raster without gaps covers exactly its cells.
+
+    Attributes
+    ----------
+    height_m : array, shape (rows, columns)
+        World frame; the first row is the northern one. NaN where the surface is not known.
+    left_m, top_m : float
+        The upper left corner of the upper left cell, world frame.
+    cell_m : tuple of 2 float
+        Width and height of a cell.
+    name : str
+        Where it came from.
+    """
+
+    height_m: FloatArray
+    left_m: float
+    top_m: float
+    cell_m: tuple[float, float]
+    name: str = "raster"
+
+    def __post_init__(self) -> None:
+        """Check that it is a raster with some heights."""
+        shape = self.height_m.shape
+        if len(shape) != 2 or min(shape) < 2:
+            raise SettingError(f"A water raster needs two rows and columns at least, not {shape}.")
+        numbers = (self.left_m, self.top_m, *self.cell_m)
+        if not (np.isfinite(numbers).all() and min(self.cell_m) > 0.0):
+            raise SettingError(
+                f"Water raster {self.name}: the corner {self.left_m:g}, {self.top_m:g} must be"
+                f" finite and the cells {self.cell_m[0]:g} x {self.cell_m[1]:g} m positive."
+            )
+        if np.isinf(self.height_m).any() or not np.isfinite(self.height_m).any():
+            raise SettingError(
+                f"Water raster {self.name}: heights must be finite, or NaN where there are none,"
+                " but not all of them."
+            )
+
+    def __str__(self) -> str:
+        rows, columns = self.height_m.shape
+        return f"raster {self.name}, {columns} x {rows} cells of {self.cell_m[0]:g} m"
+
+
+WaterSurface: TypeAlias = WaterPlane | WaterDimension | WaterMesh | WaterRaster
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,6 +354,8 @@ class Settings:
         What becomes of a submerged point with fewer than two usable rays.
     dimensions : {"all", "minimal", "none"}
         Extra dimensions to write.
+    refractive_index_from : str
+        Which water it is of, in words, where it was not given as a number.
     """
 
     refractive_index: float = DEFAULT_REFRACTIVE_INDEX
@@ -314,6 +363,7 @@ class Settings:
     max_cameras: int | None = None
     uncorrected: Uncorrected = "withhold"
     dimensions: Dimensions = "all"
+    refractive_index_from: str = ""
 
     def __post_init__(self) -> None:
         """Check every value against its rule."""
@@ -340,6 +390,74 @@ class Settings:
                 raise SettingError(
                     f"{name} '{value}' is not one of {', '.join(get_args(allowed))}."
                 )
+
+
+@dataclass(frozen=True, slots=True)
+class LabelSettings:
+    """Which points count as submerged, beyond lying below the surface; see `pcfix.flow.label`.
+
+    Attributes
+    ----------
+    band_m : float
+        Points at most so far from the water surface, above or below, are water surface (class
+        41); 0 for none.
+    dead_band_m : float
+        Points at most so far from it take the label of their surroundings; 0 for none.
+    connected : bool
+        Leave out pools that are apart from the water.
+    least_pool_m2 : float or None
+        With `connected`: pools of at least this area stay in. None: of at least a tenth of the
+        largest water.
+    respect_classes : tuple of int
+        Points that come with one of these classes are never submerged.
+    reset : bool
+        Points that come as class 40 or 41 and are neither become class 1.
+    """
+
+    band_m: float = 0.0
+    dead_band_m: float = 0.0
+    connected: bool = False
+    least_pool_m2: float | None = None
+    respect_classes: tuple[int, ...] = ()
+    reset: bool = False
+
+    def __post_init__(self) -> None:
+        """Check every value against its rule."""
+        for name in ("band", "dead_band"):
+            value = float(getattr(self, f"{name}_m"))
+            object.__setattr__(self, f"{name}_m", value)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise SettingError(
+                    f"{name.replace('_', '-')} {value:g} must not be negative: give metres from"
+                    " the water surface, or 0 for none."
+                )
+        if 0.0 < self.dead_band_m <= self.band_m:
+            raise SettingError(
+                f"dead-band {self.dead_band_m:g} does not reach beyond band {self.band_m:g}, in"
+                " which all points are class 41: give a wider dead band, or 0 for none."
+            )
+        self._check_pool()
+        object.__setattr__(self, "respect_classes", _class_numbers(self.respect_classes))
+
+    def _check_pool(self) -> None:
+        least = self.least_pool_m2
+        if least is None:
+            return
+        if not self.connected:
+            raise SettingError("least-pool is of no use without connected; give both, or neither.")
+        if not (math.isfinite(least) and least >= 0.0):
+            raise SettingError(f"least-pool {least:g} must not be negative: give square metres.")
+        object.__setattr__(self, "least_pool_m2", float(least))
+
+
+def _class_numbers(given: tuple[int, ...]) -> tuple[int, ...]:
+    """Return class numbers, each once, in order."""
+    for number in given:
+        if not 0 <= number <= 255:
+            raise SettingError(
+                f"respect-classes: {number} is no class of LAS; give numbers from 0 to 255."
+            )
+    return tuple(sorted({int(number) for number in given}))
 
 
 class Outcome(IntEnum):
@@ -437,7 +555,9 @@ class Summary:
     settings: dict[str, Any]
     seconds: float
     views: dict[str, Any] | None = None
+    water_fit: dict[str, Any] | None = None
     warnings: list[str] = field(default_factory=list)
+    labelling: dict[str, Any] | None = None
 
     @property
     def points_per_s(self) -> float:
@@ -445,5 +565,7 @@ class Summary:
         return self.points / max(self.seconds, 1e-9)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        return {**vars(self), "points_per_s": round(self.points_per_s)}
+        """Return plain values, ready for JSON; `labelling` where it had rules."""
+        values = {name: value for name, value in vars(self).items() if name != "labelling"}
+        more = {} if self.labelling is None else {"labelling": self.labelling}
+        return {**values, **more, "points_per_s": round(self.points_per_s)}

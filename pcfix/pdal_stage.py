@@ -23,6 +23,7 @@ import os
 import sys
 import time
 import warnings
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -46,7 +47,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from pcfix.flow.inputs import Inputs
-    from pcfix.model import FloatArray, Settings, Summary, WaterSurface
+    from pcfix.flow.job import Points
+    from pcfix.flow.surfaces import CloudView
+    from pcfix.model import FloatArray, LabelSettings, Settings, Summary, WaterSurface
 
     Stage: TypeAlias = Callable[[Dimensions, Dimensions], bool]
 
@@ -58,7 +61,18 @@ _CORRECT_OPTIONS: dict[str, tuple[type, ...]] = {
     "cameras_crs": (str,),
     "cameras_offset": (str,),
     "views": (str,),
-    "index": (float,),
+    "water_mask": (str,),
+    "connected": (bool,),
+    "least_pool": (float,),
+    "respect_classes": (str, int),
+    "index": (float, str),
+    "salinity": (float,),
+    "temperature": (float,),
+    "wavelength": (float,),
+    "tide": (str,),
+    "image_times": (str,),
+    "water_model": (str,),
+    "water_crs": (str,),
     "max_angle": (float,),
     "max_cameras": (int,),
     "uncorrected": (str,),
@@ -67,7 +81,18 @@ _CORRECT_OPTIONS: dict[str, tuple[type, ...]] = {
     "overwrite": (bool,),
     "jobs": (int,),
 }
-_LABEL_OPTIONS: dict[str, tuple[type, ...]] = {"water": (str, float)}
+_LABEL_OPTIONS: dict[str, tuple[type, ...]] = {
+    "water": (str, float),
+    "water_model": (str,),
+    "water_crs": (str,),
+    "water_mask": (str,),
+    "band": (float,),
+    "dead_band": (float,),
+    "connected": (bool,),
+    "least_pool": (float,),
+    "respect_classes": (str, int),
+    "reset": (bool,),
+}
 _WORD = {str: "a text", float: "a number", int: "a whole number", bool: "true or false"}
 
 
@@ -83,7 +108,7 @@ def stages(namespace: dict[str, Any]) -> tuple[Stage, Stage]:
     -------
     correct, label : callable
         Each takes PDAL's dictionaries of input and output arrays. ``correct`` does what
-        ``pcfix correct`` does; ``label`` sets class 40 below the water and nothing else.
+        ``pcfix correct`` does; ``label`` sets classes as ``pcfix label`` does, and nothing else.
     """
 
     def correct(ins: Dimensions, outs: Dimensions) -> bool:
@@ -127,7 +152,6 @@ def _run(
 
 def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
     from pcfix.flow.job import Job
-    from pcfix.flow.points import checked_points
     from pcfix.io.las.columns import columns_for
     from pcfix.refract.threads import threads
 
@@ -138,21 +162,21 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
     check_dimensions(ins, columns)
     metadata = namespace.get("metadata")
     scales = scales_of(metadata)
+    flags = Flags(ins, metadata)
     job = Job(
         NAME,
         settings,
         _inputs(options),
-        cloud_crs=crs_of(metadata),
-        points=len(ins["X"]),
+        view=_view(ins, metadata, flags),
         step_m=0.0 if scales is None else float(scales.max()),
+        label=_label_settings(options),
     )
     _prepare_summary(options)
-    flags = Flags(ins, metadata)
     results = Results(ins, columns, flags, scales)
     with threads(options.get("jobs")):
-        for rows in _chunks(len(ins["X"])):
-            xyz = checked_points(np.column_stack([ins[axis][rows] for axis in "XYZ"]))
-            correction = job.correct(xyz, _heights(job.water, ins, rows))
+        job.look_around(lambda: (points for _, points in _chunks(ins, job.water, flags)))
+        for rows, points in _chunks(ins, job.water, flags):
+            correction = job.correct(*points)
             results.add(rows, correction, settings.uncorrected == "withhold")
     job.check_fit()
     outs.update(results.dimensions)
@@ -162,26 +186,57 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
 
 
 def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
-    from pcfix.flow.points import check_submerged, checked_points
-    from pcfix.io.las.columns import BATHYMETRIC_POINT
-    from pcfix.io.water import read_water
-    from pcfix.label.surface import is_submerged, surface_above
+    from pcfix.flow.inputs import mask_of
+    from pcfix.flow.job import parts_of
+    from pcfix.flow.label import Counts
+    from pcfix.flow.points import check_submerged
+    from pcfix.flow.surfaces import WaterWords, find_surface
+    from pcfix.label.labelling import Labelling
 
     options = _options(namespace, _LABEL_OPTIONS, needed=("water",))
-    water = read_water(options["water"])
-    flags = Flags(ins, namespace.get("metadata"))
+    metadata = namespace.get("metadata")
+    flags, counts = Flags(ins, metadata), Counts()
+    view = _view(ins, metadata, flags)
+    words = WaterWords(
+        options["water"], options.get("water_model", "auto"), options.get("water_crs")
+    )
+    water = find_surface(words, view).surface
+    mask = mask_of(options.get("water_mask"), view.crs, view.low, view.high)
+    labelling = Labelling(_label_settings(options), mask)
     classes = flags.classes.copy()
-    count = 0
-    for rows in _chunks(len(ins["X"])):
-        xyz = checked_points(np.column_stack([ins[axis][rows] for axis in "XYZ"]))
-        surface = surface_above(water, xyz, _heights(water, ins, rows))
-        submerged = is_submerged(xyz[:, 2], surface)
-        classes[rows][submerged] = BATHYMETRIC_POINT
-        count += int(submerged.sum())
-    check_submerged(count, NAME, water)
+    if labelling.looks_around:
+        chunks = partial(_chunks, ins, water, flags)
+        labelling.look_around(
+            lambda: parts_of((p for _, p in chunks()), water), view.low, view.high
+        )
+    for rows, points in _chunks(ins, water, flags):
+        (part,) = parts_of([points], water)
+        labels = labelling.labels(part)
+        classes[rows] = labels.classes
+        counts.add(part, labels)
+    labelling.check(NAME)
+    check_submerged(counts.submerged + counts.water_surface, NAME, water)
     outs["Classification"] = classes
     outs.update(flags.dimensions())
-    namespace["out_metadata"] = node("pcfix", children=[node("submerged", count)])
+    found = {**vars(counts), "labelling": labelling.report()}
+    namespace["out_metadata"] = node(
+        "pcfix", children=[node(name, value) for name, value in found.items() if value is not None]
+    )
+
+
+def _label_settings(options: dict[str, Any]) -> LabelSettings:
+    from pcfix.flow.inputs import classes_of
+    from pcfix.model import LabelSettings
+
+    given = options.get("respect_classes")
+    return LabelSettings(
+        band_m=options.get("band", 0.0),
+        dead_band_m=options.get("dead_band", 0.0),
+        connected=options.get("connected", False),
+        least_pool_m2=options.get("least_pool"),
+        respect_classes=classes_of(None if given is None else str(given)),
+        reset=options.get("reset", False),
+    )
 
 
 def _options(
@@ -222,7 +277,8 @@ def _converted(name: str, value: Any, types: tuple[type, ...]) -> Any:
 
 
 def _settings(options: dict[str, Any]) -> Settings:
-    from pcfix.model import DEFAULT_REFRACTIVE_INDEX, Settings
+    from pcfix.model import Settings
+    from pcfix.refract.index import index_of, index_words
 
     if options.get("uncorrected") == "drop":
         raise SettingError(
@@ -230,12 +286,15 @@ def _settings(options: dict[str, Any]) -> Settings:
             f' use withhold or keep, add "{OUTCOME}=uint8" to add_dimension, and let'
             f' filters.range keep "{OUTCOME}[0:1]".'
         )
+    water = (options.get(name) for name in ("salinity", "temperature", "wavelength"))
+    index, origin = index_of(index_words(options.get("index"), *water))
     return Settings(
-        options.get("index", DEFAULT_REFRACTIVE_INDEX),
+        index,
         options.get("max_angle"),
         options.get("max_cameras"),
         options.get("uncorrected", "withhold"),
         options.get("dimensions", "all"),
+        origin,
     )
 
 
@@ -252,10 +311,44 @@ def _heights(water: WaterSurface, ins: Dimensions, rows: slice) -> FloatArray | 
     return dimension(ins, water.name)[rows] if isinstance(water, WaterDimension) else None
 
 
-def _chunks(n: int) -> Iterator[slice]:
+def _slices(n: int) -> Iterator[slice]:
     from pcfix.flow.points import CHUNK_POINTS
 
     return (slice(start, start + CHUNK_POINTS) for start in range(0, n, CHUNK_POINTS))
+
+
+def _chunks(ins: Dimensions, water: WaterSurface, flags: Flags) -> Iterator[tuple[slice, Points]]:
+    """Yield the rows of each chunk, and its coordinates, heights of the water and classes."""
+    from pcfix.flow.points import checked_points
+
+    for rows in _slices(len(ins["X"])):
+        xyz = checked_points(np.column_stack([ins[axis][rows] for axis in "XYZ"]))
+        yield rows, (xyz, _heights(water, ins, rows), flags.classes[rows])
+
+
+def _view(ins: Dimensions, metadata: dict[str, Any] | None, flags: Flags) -> CloudView:
+    """Return the cloud as a water surface needs it."""
+    from pcfix.flow.surfaces import CloudView, Seen
+
+    def chunks() -> Iterator[Seen]:
+        colours = ("Red", "Green", "Blue")
+        for rows in _slices(len(ins["X"])):
+            xyz = np.column_stack([ins[axis][rows] for axis in "XYZ"])
+            rgb = None
+            if all(name in ins for name in colours):
+                rgb = np.column_stack([ins[name][rows] for name in colours])
+            returns = ins["NumberOfReturns"][rows] if "NumberOfReturns" in ins else None
+            yield Seen(xyz, rgb, flags.classes[rows], returns)
+
+    return CloudView(NAME, crs_of(metadata), *_corners(ins), len(ins["X"]), chunks)
+
+
+def _corners(ins: Dimensions) -> tuple[FloatArray, FloatArray]:
+    """Return the south-west and north-east corner of the cloud, metres; NaN where it is empty."""
+    if not len(ins["X"]):
+        return np.full(2, np.nan), np.full(2, np.nan)
+    low, high = ([reach(ins[axis]) for axis in "XY"] for reach in (np.min, np.max))
+    return np.array(low), np.array(high)
 
 
 def _prepare_summary(options: dict[str, Any]) -> None:

@@ -601,7 +601,7 @@ def test_a_full_disk_leaves_nothing_behind(
         ["correct", "cloud.las", "out.las", "--water", "3"],
         ["correct", "cloud.las", "out.las", "--cameras", "cameras.csv"],
         job("--deeper"),
-        job("--index", "wet"),
+        job("--max-angle", "wet"),
         job("--uncorrected", "burn"),
         job("--dimensions", "some"),
         ["restore", "cloud.las"],
@@ -628,7 +628,7 @@ def test_wrong_usage_is_exit_code_2(
 KEYS = {
     "input", "output", "pcfix", "points", "submerged", "corrected", "uncorrected", "dropped",
     "water_unknown", "depth_m", "shift_z_m", "rays", "cameras", "cameras_used", "cameras_unused",
-    "water", "settings", "seconds", "views", "warnings", "points_per_s",
+    "water", "settings", "seconds", "views", "water_fit", "warnings", "points_per_s",
 }  # fmt: skip
 
 

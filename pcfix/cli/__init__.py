@@ -14,9 +14,11 @@ from pcfix.cli.clean import clean
 from pcfix.cli.compare import compare
 from pcfix.cli.correct import correct, pipeline
 from pcfix.cli.dsm import dsm
+from pcfix.cli.label import label
 from pcfix.cli.restore import restore
 from pcfix.cli.run import run
 from pcfix.cli.simulate import demo, simulate
+from pcfix.cli.water import water
 from pcfix.errors import PcfixError, show_warning
 
 app = typer.Typer(
@@ -27,7 +29,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (run, correct, clean, dsm, compare, cameras, restore, simulate, pipeline):
+COMMANDS = (
+    run, correct, label, clean, dsm, compare, cameras, water, restore, simulate, pipeline,
+)  # fmt: skip
+for command in COMMANDS:
     app.command(no_args_is_help=True)(command)
 app.command()(demo)
 

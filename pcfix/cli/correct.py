@@ -38,6 +38,7 @@ def correct(
     jobs: Jobs = None,
 ) -> None:
     """Move the points below the water surface to where they are."""
+    from pcfix.cli.label import left_out_lines
     from pcfix.report.text import summary_text
 
     with progress_bar("Correcting", quiet) as progress:
@@ -55,7 +56,7 @@ def correct(
             progress=progress,
         )
     if not quiet:
-        typer.echo(summary_text(result))
+        typer.echo("\n".join([summary_text(result), *left_out_lines(result.labelling)]))
 
 
 @takes(CorrectionWords)
@@ -76,11 +77,13 @@ def pipeline(
 
     from pcfix.flow.inputs import inputs_of
     from pcfix.flow.pipeline import pipeline_for
+    from pcfix.refract.index import index_of
 
     keywords = {"cameras": cameras, "water": water, **words.keywords()}
     settings = pcfix.Settings(
-        words.index, words.max_angle, words.max_cameras, uncorrected.value, dimensions.value
-    )
+        index_of(words.refractive_index())[0], words.max_angle, words.max_cameras,
+        uncorrected.value, dimensions.value,
+    )  # fmt: skip
     options = {
         "cameras": str(cameras),
         "water": water,
@@ -91,5 +94,7 @@ def pipeline(
         "overwrite": overwrite or None,
         "jobs": jobs,
     }
-    stages = pipeline_for(input, output, settings, inputs_of(keywords), options)
+    stages = pipeline_for(
+        input, output, settings, inputs_of(keywords), options, words.label_settings()
+    )
     typer.echo(json.dumps(stages, indent=2))

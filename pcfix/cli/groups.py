@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
-from pcfix.cli.words import AngleWords  # noqa: TC001 - typer reads it
-from pcfix.model import DEFAULT_REFRACTIVE_INDEX
+from pcfix.cli.words import AngleWords, WaterModels
+from pcfix.model import DEFAULT_REFRACTIVE_INDEX, LabelSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -101,16 +101,85 @@ class CameraWords:
 
     def plain(self) -> dict[str, Any]:
         """Return the words that were given, as a stage of PDAL takes them."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        given = {f.name: getattr(self, f.name) for f in fields(self)}
+        given = {f.name: given[f.name] for f in fields(self) if given[f.name] != f.default}
         return {
             name: getattr(value, "value", str(value) if isinstance(value, Path) else value)
-            for name, value in values.items()
+            for name, value in given.items()
         }
 
 
 @dataclass(frozen=True)
-class CorrectionWords(CameraWords):
-    """How cameras are read and rays chosen."""
+class WaterFitWords:
+    """How a water surface is fitted to shoreline points."""
+
+    water_model: Annotated[
+        WaterModels,
+        typer.Option(
+            help="What is fitted to shoreline points: auto chooses among level, plane and along"
+            " (tilted along the points, level across).",
+        ),
+    ] = WaterModels.auto
+    water_crs: Annotated[
+        str | None,
+        typer.Option(help="CRS of the shoreline points.", show_default="what their file says"),
+    ] = None
+
+    def water_keywords(self) -> dict[str, Any]:
+        """Return them as `pcfix.correct_file` takes them."""
+        return {"water_model": self.water_model.value, "water_crs": self.water_crs}
+
+
+@dataclass(frozen=True)
+class LabelWords(WaterFitWords):
+    """Which points below the surface are land all the same."""
+
+    water_mask: Annotated[
+        Path | None,
+        typer.Option(
+            help="Polygons (.gpkg, .shp, .geojson, .wkt) inside which points may be submerged.",
+            show_default="everywhere",
+        ),
+    ] = None
+    connected: Annotated[
+        bool,
+        typer.Option(
+            "--connected/--no-connected",
+            help="Leave out pools that are apart from the water; what was left out is reported.",
+        ),
+    ] = False
+    least_pool: Annotated[
+        float | None,
+        typer.Option(
+            help="With --connected: pools of at least this area stay in, m2.",
+            show_default="a tenth of the largest water",
+        ),
+    ] = None
+    respect_classes: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N,N,...",
+            help="Points of these classes are never submerged, as 2,5,6 for ground, trees and"
+            " buildings.",
+            show_default="none",
+        ),
+    ] = None
+
+    def label_settings(self, **more: Any) -> LabelSettings:
+        """Return them as settings, with some more of these."""
+        from pcfix.flow.inputs import classes_of
+
+        return LabelSettings(
+            connected=self.connected,
+            least_pool_m2=self.least_pool,
+            respect_classes=classes_of(self.respect_classes),
+            **more,
+        )
+
+
+@dataclass(frozen=True)
+class CorrectionWords(LabelWords, CameraWords):
+    """How cameras are read, rays chosen, and points left out."""
 
     views: Annotated[
         Path | None,
@@ -119,9 +188,33 @@ class CorrectionWords(CameraWords):
             " OpenMVS, or the camera file itself for the tracks of its tie points.",
         ),
     ] = None
-    index: Annotated[float, typer.Option(help="Refractive index of the water relative to air.")] = (
-        DEFAULT_REFRACTIVE_INDEX
-    )
+    tide: Annotated[
+        Path | None,
+        typer.Option(help="CSV time,level_m: each image gets the water level of its time."),
+    ] = None
+    image_times: Annotated[
+        Path | None,
+        typer.Option(
+            help="With --tide: CSV label,time, or the folder of the images.",
+            show_default="what the camera file says",
+        ),
+    ] = None
+    index: Annotated[
+        str | None,
+        typer.Option(
+            help="Refractive index of the water relative to air: a number, fresh or sea.",
+            show_default=str(DEFAULT_REFRACTIVE_INDEX),
+        ),
+    ] = None
+    salinity: Annotated[
+        float | None, typer.Option(help="Instead of --index, PSU.", show_default="35")
+    ] = None
+    temperature: Annotated[
+        float | None, typer.Option(help="Of the water, degrees Celsius.", show_default="15")
+    ] = None
+    wavelength: Annotated[
+        float | None, typer.Option(help="Of the light, micrometres.", show_default="0.53")
+    ] = None
     max_angle: Annotated[
         float | None, typer.Option(help="Use rays up to this incidence angle, degrees.")
     ] = None
@@ -129,12 +222,26 @@ class CorrectionWords(CameraWords):
         int | None, typer.Option(help="Use so many rays a point, the steepest.")
     ] = None
 
+    def refractive_index(self) -> float | str:
+        """Return what `pcfix.correct_file` takes for it."""
+        from pcfix.refract.index import index_words
+
+        return index_words(self.index, self.salinity, self.temperature, self.wavelength)
+
     def keywords(self) -> dict[str, Any]:
         """Return them as `pcfix.correct_file` takes them."""
+        label = self.label_settings()
         return {
+            **self.water_keywords(),
+            "tide": self.tide,
+            "image_times": self.image_times,
+            "water_mask": self.water_mask,
+            "connected": label.connected,
+            "least_pool_m2": label.least_pool_m2,
+            "respect_classes": label.respect_classes,
             **super().keywords(),
             "views": self.views,
-            "refractive_index": self.index,
+            "refractive_index": self.refractive_index(),
             "max_angle_deg": self.max_angle,
             "max_cameras": self.max_cameras,
         }

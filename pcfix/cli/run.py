@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -71,7 +71,7 @@ def run(
             cameras=str(cameras),
             water=water,
             reference=None if reference is None else str(reference),
-            **words.keywords(),
+            **{name: _plain(value) for name, value in words.keywords().items()},
             resolution_m=resolution,
             m3c2=m3c2,
         )
@@ -82,3 +82,8 @@ def run(
 
     with progress_bar("Correcting", quiet) as progress:
         run_all(request, folder, overwrite=overwrite, jobs=jobs, say=say, progress=progress)
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as the record of a run keeps it: paths as text."""
+    return str(value) if isinstance(value, Path) else value

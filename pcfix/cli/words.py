@@ -31,6 +31,16 @@ class AngleWords(str, Enum):  # noqa: UP042
     aircraft = "aircraft"
 
 
+class WaterModels(str, Enum):  # noqa: UP042
+    """What is fitted to shoreline points."""
+
+    auto = "auto"
+    level = "level"
+    plane = "plane"
+    along = "along"
+    river = "river"
+
+
 class Dimensions(str, Enum):  # noqa: UP042
     """Which extra dimensions are written."""
 
@@ -60,7 +70,11 @@ CamerasOption = Annotated[
 ]
 WaterOption = Annotated[
     str,
-    typer.Option("--water", help="A level (0.37), plane:a,b,c, dim:NAME, or a mesh (.obj, .ply)."),
+    typer.Option(
+        "--water",
+        help="A level (0.37), plane:a,b,c, dim:NAME, a mesh (.obj, .ply), a raster (.tif),"
+        " shoreline points (.csv, .gpkg, .shp, .geojson, .wkt), or auto.",
+    ),
 ]
 UncorrectedOption = Annotated[
     Uncorrected,

@@ -12,6 +12,7 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.points import CHUNK_POINTS
+from pcfix.flow.surfaces import view_of
 from pcfix.io.cameras import read_cameras
 from pcfix.io.cameras.gnss import adjusted_minus_gnss
 from pcfix.io.cameras.mistakes import likely_mistake
@@ -194,7 +195,8 @@ def check_cameras(
         check_output(plot, overwrite=overwrite, inputs=[p for p in (path, cloud) if p is not None])
     inputs = Inputs(path, 0.0 if water is None else water, **words)
     crs, xyz, heights = None, np.zeros((0, 3)), None
-    surface = None if water is None else inputs.surface()
+    view = None if cloud is None else view_of(check_input(cloud))
+    surface = None if water is None else inputs.surface(view).surface
     if cloud is not None:
         with LasSource(check_input(cloud)) as source:
             crs = metric_crs(source)

@@ -16,15 +16,16 @@ from pcfix.clean.settings import CleanSettings, CleanSummary, Reason
 from pcfix.errors import InputError
 from pcfix.flow.clean_points import check_tile, flag_neighbours
 from pcfix.flow.points import CHUNK_POINTS, check_submerged
+from pcfix.flow.surfaces import WaterWords, find_surface, view_of
 from pcfix.io.files import check_input, check_output, write_text
 from pcfix.io.las.formats import convert
-from pcfix.io.las.headers import cleaned_header, corrected_identity, output_evlrs
+from pcfix.io.las.headers import corrected_identity, noted_header, output_evlrs
+from pcfix.io.las.provenance import cleaning_vlr
 from pcfix.io.las.sink import LasSink, check_suffix
 from pcfix.io.las.source import LasSource, coordinates
 from pcfix.io.scratch import scratch_arrays
-from pcfix.io.water import read_water
 from pcfix.label.surface import is_submerged, surface_above
-from pcfix.model import WaterDimension, WaterMesh, WaterPlane
+from pcfix.model import WaterDimension
 from pcfix.refract.threads import threads
 
 if TYPE_CHECKING:
@@ -105,7 +106,7 @@ def clean_file(
     check_suffix(target)
     if summary is not None:
         check_output(summary, overwrite=overwrite, inputs=[*inputs, target])
-    surface = _surface(water)
+    surface = _surface(water, source)
     with threads(jobs):
         with scratch_arrays(target) as empty, LasSource(source, jobs) as las:
             steps = _Steps(len(las), progress)
@@ -205,10 +206,8 @@ class _Cloud(NamedTuple):
     reasons: npt.NDArray[np.uint8]
 
 
-def _surface(water: WaterSurface | float | AnyPath | None) -> WaterSurface | None:
-    if water is None or isinstance(water, WaterPlane | WaterDimension | WaterMesh):
-        return water
-    return read_water(water)
+def _surface(water: WaterSurface | float | AnyPath | None, path: Path) -> WaterSurface | None:
+    return None if water is None else find_surface(WaterWords(water), view_of(path)).surface
 
 
 def _read(
@@ -305,7 +304,7 @@ def _write(
             f"{path}: every point is noise by these thresholds; choose wider ones, or do not drop."
         )
     with LasSource(path, jobs) as source:
-        header = cleaned_header(source, content)
+        header = noted_header(source, cleaning_vlr(content))
         evlrs, identity = output_evlrs(source), corrected_identity(source)
         with LasSink(target, header, evlrs, identity, jobs) as sink:
             first = 0

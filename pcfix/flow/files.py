@@ -12,6 +12,7 @@ from pcfix.errors import InputError
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.job import Job
 from pcfix.flow.points import CHUNK_POINTS
+from pcfix.flow.surfaces import view_of
 from pcfix.io.files import check_input, check_output, write_text
 from pcfix.io.las.columns import (
     BATHYMETRIC_POINT,
@@ -21,7 +22,6 @@ from pcfix.io.las.columns import (
     fill,
     shift_steps,
 )
-from pcfix.io.las.crs import metric_crs
 from pcfix.io.las.formats import OutOfRangeError, shifted
 from pcfix.io.las.headers import corrected_header, corrected_identity, output_evlrs
 from pcfix.io.las.sink import LasSink, check_suffix
@@ -31,22 +31,26 @@ from pcfix.model import (
     Cameras,
     Correction,
     Dimensions,
+    LabelSettings,
     Settings,
     Summary,
     Uncorrected,
     WaterDimension,
     WaterSurface,
 )
+from pcfix.refract.index import index_of
 from pcfix.refract.threads import threads
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from os import PathLike
     from pathlib import Path
 
     import laspy
     import numpy.typing as npt
 
+    from pcfix.flow.job import Points
+    from pcfix.flow.surfaces import WaterModel
     from pcfix.io.cameras.formats import Angles
     from pcfix.io.las.columns import Column
     from pcfix.model import FloatArray
@@ -65,7 +69,15 @@ def correct_file(
     cameras_crs: str | None = None,
     cameras_offset_m: tuple[float, float, float] | None = None,
     views: AnyPath | None = None,
-    refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
+    water_model: WaterModel = "auto",
+    water_crs: str | None = None,
+    tide: AnyPath | None = None,
+    image_times: AnyPath | None = None,
+    water_mask: AnyPath | None = None,
+    connected: bool = False,
+    least_pool_m2: float | None = None,
+    respect_classes: tuple[int, ...] = (),
+    refractive_index: float | str = DEFAULT_REFRACTIVE_INDEX,
     max_angle_deg: float | None = None,
     max_cameras: int | None = None,
     uncorrected: Uncorrected = "withhold",
@@ -85,7 +97,7 @@ def correct_file(
     cameras : Cameras or path
         See `pcfix.read_cameras`.
     water : WaterSurface, float, str or path
-        See `pcfix.read_water`.
+        See `pcfix.read_water`; besides, shoreline points in a vector file, or ``auto``.
     sensor, angles
         See `pcfix.read_cameras`.
     cameras_crs : str, optional
@@ -96,7 +108,20 @@ def correct_file(
     views : path, optional
         Which cameras made each point; see `pcfix.io.views.read_views`. The camera file itself
         stands for the tracks of its tie points. Default: every camera whose frame holds it.
-    refractive_index, max_angle_deg, max_cameras
+    water_model, water_crs
+        See `pcfix.flow.surfaces.WaterWords`.
+    tide, image_times : path, optional
+        Water levels over time (CSV ``time,level_m``) and when each image was taken (CSV
+        ``label,time``, or the folder of images): each ray bends at the level of its own image.
+        Default of the times: what the camera file says.
+    water_mask : path, optional
+        Polygons outside which no point is submerged; see `pcfix.flow.label.label_file`.
+    connected, least_pool_m2, respect_classes
+        See `pcfix.LabelSettings`.
+    refractive_index : float or str
+        A number, or the water: ``fresh``, ``sea``, or salinity, temperature and wavelength as
+        ``35,15,0.53`` (PSU, degrees Celsius, micrometres); see `pcfix.refractive_index`.
+    max_angle_deg, max_cameras
         See `correct_points`.
     uncorrected : {"withhold", "keep", "drop"}
         What becomes of a submerged point with fewer than two usable rays: unmoved with its
@@ -122,16 +147,24 @@ def correct_file(
         With one sentence on what to mend; no output is left behind.
     """
     started = time.perf_counter()
-    settings = Settings(refractive_index, max_angle_deg, max_cameras, uncorrected, dimensions)
+    index, index_from = index_of(refractive_index)
+    settings = Settings(index, max_angle_deg, max_cameras, uncorrected, dimensions, index_from)
+    label = LabelSettings(
+        connected=connected, least_pool_m2=least_pool_m2, respect_classes=respect_classes
+    )
     source = check_input(input)
-    inputs = Inputs(cameras, water, sensor, angles, cameras_crs, cameras_offset_m, views)
+    inputs = Inputs(
+        cameras, water, sensor, angles, cameras_crs, cameras_offset_m, views, water_mask,
+        tide, image_times, water_model, water_crs,
+    )  # fmt: skip
     given = [input, *inputs.paths()]
     target = check_output(output, overwrite=overwrite, inputs=given)
     check_suffix(target)
     if summary is not None:
         check_output(summary, overwrite=overwrite, inputs=[*given, target])
-    job = job_for(source, settings, inputs)
+    job = job_for(source, settings, inputs, label)
     with threads(jobs):
+        job.look_around(lambda: file_points(source, job.water, jobs))
         _write_until_it_fits(job, source, target, jobs, progress)
     result = job.summary(str(source), str(target), time.perf_counter() - started)
     if summary is not None:
@@ -139,12 +172,22 @@ def correct_file(
     return result
 
 
-def job_for(path: Path, settings: Settings, inputs: Inputs) -> Job:
+def job_for(
+    path: Path, settings: Settings, inputs: Inputs, label: LabelSettings | None = None
+) -> Job:
     """Return the job of correcting a LAS or LAZ file."""
+    view = view_of(path)
     with LasSource(path) as source:
-        crs, points = metric_crs(source), len(source)
         step = float(max(source.header.scales))
-    return Job(str(path), settings, inputs, cloud_crs=crs, points=points, step_m=step)
+    return Job(str(path), settings, inputs, view=view, step_m=step, label=label or LabelSettings())
+
+
+def file_points(path: Path, water: WaterSurface, jobs: int | None = None) -> Iterator[Points]:
+    """Yield all points of a LAS or LAZ file, chunk by chunk."""
+    with LasSource(path, jobs) as source:
+        for points in source.chunks(CHUNK_POINTS):
+            heights = water_heights(water, source, points)
+            yield coordinates(points), heights, np.asarray(points["classification"])
 
 
 def _write_until_it_fits(
@@ -189,7 +232,9 @@ def _write(
         evlrs, identity = output_evlrs(source), corrected_identity(source)
         with LasSink(target, header, evlrs, identity, jobs) as sink:
             for points in source.chunks(CHUNK_POINTS):
-                correction = job.correct(coordinates(points), _heights(job, source, points))
+                heights = water_heights(job.water, source, points)
+                classes = np.asarray(points["classification"])
+                correction = job.correct(coordinates(points), heights, classes)
                 moved = shift_steps(correction, header.scales)
                 new = shifted(points, header, moved + np.array(steps))
                 _mark(new, columns, correction, moved, job.settings)
@@ -201,10 +246,11 @@ def _write(
             job.check_fit()
 
 
-def _heights(job: Job, source: LasSource, points: laspy.ScaleAwarePointRecord) -> FloatArray | None:
-    if isinstance(job.water, WaterDimension):
-        return source.dimension(points, job.water.name)
-    return None
+def water_heights(
+    water: WaterSurface, source: LasSource, points: laspy.ScaleAwarePointRecord
+) -> FloatArray | None:
+    """Return the heights of the water of a chunk, shape (n,), where they are a dimension."""
+    return source.dimension(points, water.name) if isinstance(water, WaterDimension) else None
 
 
 def _mark(

@@ -11,17 +11,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.errors import PcfixWarning, SettingError
+from pcfix.flow.surfaces import WaterWords, find_surface
 from pcfix.io.cameras import read_cameras, read_tie_points
 from pcfix.io.cameras.georeference import georeference
-from pcfix.io.water import read_water
-from pcfix.model import Cameras, WaterDimension, WaterMesh, WaterPlane
+from pcfix.io.vectors import LAYER_MARK
+from pcfix.model import Cameras
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
+    from pcfix.flow.surfaces import CloudView, FoundSurface, WaterModel
     from pcfix.io.cameras.formats import Angles
     from pcfix.io.views import ViewList
-    from pcfix.model import WaterSurface
+    from pcfix.label.mask import WaterMask
+    from pcfix.model import FloatArray, WaterSurface
 
     AnyPath = str | PathLike[str]
 
@@ -34,8 +37,8 @@ class Inputs:
     ----------
     cameras : Cameras or path
         See `pcfix.read_cameras`. Cameras that are given as such are in the cloud's CRS.
-    water : WaterSurface, float, str or path
-        See `pcfix.read_water`.
+    water, water_model, water_crs
+        See `pcfix.flow.surfaces.WaterWords`.
     sensor, angles
         See `pcfix.read_cameras`.
     cameras_crs : str or None
@@ -44,6 +47,13 @@ class Inputs:
         Added to the projection centres, in the axes of the camera file.
     views : path or None
         See `pcfix.io.views.read_views`; the camera file itself for the tracks of its tie points.
+    water_mask : path or None
+        See `pcfix.io.shorelines.read_water_polygons`.
+    tide : path or None
+        See `pcfix.io.tides.read_tide`: each image gets its own level, the water shifted along the
+        vertical; the water is that of the images' mean level.
+    image_times : path or None
+        See `pcfix.io.image_times.read_image_times`. Default, with a tide: the camera file.
     """
 
     cameras: Cameras | AnyPath
@@ -53,17 +63,47 @@ class Inputs:
     cameras_crs: str | None = None
     cameras_offset_m: tuple[float, float, float] | None = None
     views: AnyPath | None = None
+    water_mask: AnyPath | None = None
+    tide: AnyPath | None = None
+    image_times: AnyPath | None = None
+    water_model: WaterModel = "auto"
+    water_crs: str | None = None
 
     def paths(self) -> list[AnyPath]:
         """Return what may be files, which no output may replace."""
-        given = (self.cameras, self.water, self.sensor, self.views)
-        return [one for one in given if isinstance(one, str | PathLike)]
+        mask = None if self.water_mask is None else file_of(self.water_mask)
+        water = file_of(self.water) if isinstance(self.water, str | PathLike) else None
+        given = (self.cameras, water, self.sensor, self.views, mask)
+        moving = (self.tide, self.image_times)
+        return [one for one in (*given, *moving) if isinstance(one, str | PathLike)]
 
-    def surface(self) -> WaterSurface:
-        """Return the water surface."""
-        if isinstance(self.water, WaterPlane | WaterDimension | WaterMesh):
-            return self.water
-        return read_water(self.water)
+    def surface(self, view: CloudView | None = None) -> FoundSurface:
+        """Return the water surface over a cloud; see `pcfix.flow.surfaces.find_surface`."""
+        return find_surface(WaterWords(self.water, self.water_model, self.water_crs), view)
+
+    def level_offset_m(self, cameras: Cameras) -> FloatArray | None:
+        """Return how much higher the water stood at each image, shape (k,), where it moved.
+
+        Raises
+        ------
+        PcfixError
+            If the tide or the times cannot be read, or do not cover the images.
+        """
+        if self.tide is None:
+            if self.image_times is not None:
+                raise SettingError("image-times is of no use without tide; give both, or neither.")
+            return None
+        from pcfix.io.image_times import read_image_times
+        from pcfix.io.tides import level_offsets, read_tide
+
+        given = self.cameras if self.image_times is None else self.image_times
+        if isinstance(given, Cameras):
+            raise SettingError("a tide needs image-times: when each image was taken.")
+        times = read_image_times(given, cameras.labels)
+        offset, notes = level_offsets(read_tide(self.tide), times, cameras.labels)
+        for note in notes:
+            warnings.warn(note, PcfixWarning, stacklevel=2)
+        return offset
 
     def block(self, cloud_crs: str | CRS | None) -> tuple[Cameras, ViewList | None]:
         """Return the cameras in the cloud's CRS, and the view list where one was named.
@@ -93,6 +133,57 @@ class Inputs:
             ties = read_tie_points(self.cameras, read)
             return cameras, track_views(Path(self.views), ties, cameras, to_cloud=way.points)
         return cameras, read_views(self.views, cameras, to_cloud=way.points)
+
+
+def mask_of(
+    path: AnyPath | None, cloud_crs: str | CRS | None, low: FloatArray, high: FloatArray
+) -> WaterMask | None:
+    """Return the mask in the cloud's CRS, where a file was named, and warn of what was done to it.
+
+    Parameters
+    ----------
+    path : path or None
+        See `pcfix.io.shorelines.read_water_polygons`.
+    cloud_crs : str, CRS or None
+    low, high : array, shape (2,)
+        South-west and north-east corner of the cloud, metres.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, holds no polygon, or cannot be brought to the cloud's CRS.
+    """
+    if path is None:
+        return None
+    from pcfix.io.shorelines import read_water_polygons
+    from pcfix.label.mask import WaterMask
+
+    polygons = read_water_polygons(path, cloud_crs)
+    for note in polygons.notes:
+        warnings.warn(note, PcfixWarning, stacklevel=2)
+    return WaterMask(polygons.area, polygons.name, low, high, polygons.notes)
+
+
+def file_of(path: AnyPath) -> Path:
+    """Return a vector file, which may be named with a layer."""
+    return Path(str(path).partition(LAYER_MARK)[0])
+
+
+def classes_of(text: str | None) -> tuple[int, ...]:
+    """Return the class numbers of ``2,5,6``.
+
+    Raises
+    ------
+    SettingError
+        If they are not whole numbers.
+    """
+    words = [] if text is None else text.split(",")
+    try:
+        return tuple(int(word) for word in words)
+    except ValueError:
+        raise SettingError(
+            f"respect-classes '{text}' must be whole numbers with commas between, as 2,5,6."
+        ) from None
 
 
 def inputs_of(options: dict[str, Any]) -> Inputs:

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import asdict, astuple
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 import pcfix
 from pcfix.errors import GeometryError, PcfixWarning
+from pcfix.flow.inputs import mask_of
 from pcfix.flow.points import (
     check_above_water,
-    check_submerged,
     correct_checked,
     refuse_under_water,
 )
+from pcfix.flow.water_checks import WaterMeeting, check_tilt
+from pcfix.label.labelling import Labelling, Part
+from pcfix.label.surface import surface_above
 from pcfix.model import (
     Correction,
+    LabelSettings,
     Outcome,
     Settings,
     Summary,
@@ -27,10 +32,19 @@ from pcfix.model import (
 from pcfix.report.tally import Tally
 
 if TYPE_CHECKING:
-    from pyproj import CRS
+    from collections.abc import Callable, Iterable
+
+    import numpy.typing as npt
 
     from pcfix.flow.inputs import Inputs
-    from pcfix.model import FloatArray
+    from pcfix.flow.surfaces import CloudView
+    from pcfix.model import FloatArray, WaterSurface
+
+    Points: TypeAlias = tuple[FloatArray, FloatArray | None, npt.NDArray[np.uint8]]
+    """Some points: coordinates (n, 3), water heights where those are a dimension, classes."""
+
+
+PLAIN = LabelSettings()
 
 
 class Job:
@@ -42,12 +56,12 @@ class Job:
         What is being corrected, for messages.
     settings : Settings
     inputs : Inputs
-    cloud_crs : CRS or None
-        Projected, metres.
-    points : int
+    view : CloudView
         Of the whole cloud.
     step_m : float
         To which its coordinates are rounded.
+    label : LabelSettings
+        Without a band or a dead band: a point that is moved lies below the surface.
 
     Raises
     ------
@@ -61,20 +75,28 @@ class Job:
         settings: Settings,
         inputs: Inputs,
         *,
-        cloud_crs: CRS | str | None = None,
-        points: int = 0,
+        view: CloudView,
         step_m: float = 0.0,
+        label: LabelSettings = PLAIN,
     ) -> None:
         self.name, self.settings = name, settings
-        self.cameras, self._list = inputs.block(cloud_crs)
-        self.water = inputs.surface()
-        self._points, self._step_m = points, step_m
-        check_above_water(self.cameras, self.water)
+        self.cameras, self._list = inputs.block(view.crs)
+        self.found = inputs.surface(view)
+        self.water = self.found.surface
+        self.level_offset_m = inputs.level_offset_m(self.cameras)
+        self._points, self._step_m = view.points, step_m
+        check_above_water(self.cameras, self.water, self.level_offset_m)
+        check_tilt(self.water)
+        self._low, self._high = view.low, view.high
+        mask = mask_of(inputs.water_mask, view.crs, view.low, view.high)
+        self.labelling = Labelling(label, mask)
         self.restart()
 
     def restart(self) -> None:
         """Forget the chunks so far."""
         self.tally = Tally(len(self.cameras))
+        self.meeting = WaterMeeting(self.water)
+        self.labelling.restart()
         self._views = None
         if self._list is not None:
             from pcfix.io.views import ViewMatch
@@ -83,11 +105,35 @@ class Job:
                 self._list, self.cameras, points=self._points, step_m=self._step_m
             )
 
-    def correct(self, xyz: FloatArray, heights: FloatArray | None) -> Correction:
-        """Correct one chunk, shape (n, 3), metres; `heights` where the water is a dimension."""
+    def look_around(self, chunks: Callable[[], Iterable[Points]]) -> None:
+        """Learn the surroundings of the points where the labelling needs them."""
+        if self.labelling.looks_around:
+            self.labelling.look_around(
+                lambda: parts_of(chunks(), self.water), self._low, self._high
+            )
+
+    def correct(
+        self, xyz: FloatArray, heights: FloatArray | None, classes: npt.NDArray[np.uint8]
+    ) -> Correction:
+        """Correct one chunk of n points.
+
+        Parameters
+        ----------
+        xyz : array, shape (n, 3)
+            Metres.
+        heights : array, shape (n,), or None
+            Where the water is a dimension.
+        classes : array, shape (n,)
+            That the points come with.
+        """
         views = None if self._views is None else self._views.for_chunk(xyz, self.tally.points)
-        correction = correct_checked(xyz, self.cameras, self.water, self.settings, heights, views)
+        label = partial(self.labelling.submerged, classes=classes)
+        correction = correct_checked(
+            xyz, self.cameras, self.water, self.settings, heights, views, label,
+            self.level_offset_m,
+        )  # fmt: skip
         self.tally.add(xyz, correction)
+        self.meeting.add(xyz, correction)
         return correction
 
     def provenance(self) -> dict[str, Any]:
@@ -102,7 +148,16 @@ class Job:
             "cameras": len(self.cameras),
             "cameras_source": self.cameras.source,
             "views": None if self._list is None else str(self._list.raw.path),
+            **self._labelling_words(),
         }
+
+    def _labelling_words(self) -> dict[str, Any]:
+        """Return what a file shall say of the rules by which points were left out, if any."""
+        labelling = self.labelling
+        if labelling.is_plain:
+            return {}
+        mask = None if labelling.mask is None else labelling.mask.name
+        return {"labelling": {**asdict(labelling.settings), "water_mask": mask}}
 
     def check_fit(self) -> None:
         """Refuse a result in which cloud, water and cameras did not meet.
@@ -117,9 +172,11 @@ class Job:
             self._views.report.check()
             for sentence in self._views.report.warnings():
                 warnings.warn(sentence, PcfixWarning, stacklevel=2)
-        check_submerged(tally.submerged, self.name, self.water)
+        self.labelling.check(self.name)
+        self.meeting.check_submerged(self.name)
         if isinstance(self.water, WaterDimension):
             refuse_under_water(self.cameras, tally.lowest_water_m, str(self.water))
+        self.meeting.check_reach(self.name)
         if tally.outcomes[Outcome.NO_CAMERA] == tally.submerged:
             middle = (tally.low + tally.high) / 2.0
             distance = float(np.hypot(*(self.cameras.centres - middle)[:, :2].T).min())
@@ -162,8 +219,23 @@ class Job:
             settings=asdict(self.settings),
             seconds=round(seconds, 3),
             views=None if views is None else views.as_dict(),
-            warnings=[*self.cameras.notes, *([] if views is None else views.warnings())],
+            warnings=[
+                *self.cameras.notes,
+                *([] if views is None else views.warnings()),
+                *self.labelling.notes,
+                *self.found.notes,
+                *self.meeting.notes,
+            ],
+            labelling=self.labelling.report(),
+            water_fit=self.found.as_dict(),
         )
+
+
+def parts_of(chunks: Iterable[Points], water: WaterSurface) -> Iterable[Part]:
+    """Return chunks with the water above them."""
+    return (
+        Part(xyz, surface_above(water, xyz, heights), classes) for xyz, heights, classes in chunks
+    )
 
 
 def _distance(metres: float) -> str:

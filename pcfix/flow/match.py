@@ -12,17 +12,11 @@ from pcfix.compare.neighbours import Neighbours, mean_spacing_m
 from pcfix.compare.overlap import near_in_plan
 from pcfix.errors import GeometryError, InputError
 from pcfix.flow.comparison import CompareSettings  # noqa: TC001 - dataclass fields
+from pcfix.flow.surfaces import WaterWords, find_surface, view_of
 from pcfix.io.clouds import SurveyCloud, read_cloud
+from pcfix.io.files import check_input
 from pcfix.io.references import Reference, check_same_crs, read_reference
-from pcfix.io.water import read_water
-from pcfix.model import (
-    BoolArray,
-    FloatArray,
-    WaterDimension,
-    WaterMesh,
-    WaterPlane,
-    WaterSurface,
-)
+from pcfix.model import BoolArray, FloatArray, WaterSurface  # noqa: TC001 - dataclass fields
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -115,11 +109,9 @@ def match(
         If a file is damaged, the CRS differ, nothing is under water where that was asked for, or
         the two do not overlap.
     """
-    given = (
-        water
-        if water is None or isinstance(water, WaterPlane | WaterDimension | WaterMesh)
-        else read_water(water)
-    )
+    given = None
+    if water is not None:
+        given = find_surface(WaterWords(water), view_of(check_input(cloud))).surface
     target, whole = read_reference(reference), read_cloud(cloud, given)
     check_same_crs(whole.name, whole.crs, target.name, target.crs)
     wet = _submerged(whole, given=given is not None)

@@ -19,13 +19,18 @@ if TYPE_CHECKING:
 
     from pcfix.flow.inputs import Inputs
     from pcfix.io.las.columns import Column
-    from pcfix.model import Settings
+    from pcfix.model import LabelSettings, Settings
 
 WAVEFORM_FORMATS = (9, 10)
 
 
 def pipeline_for(
-    input: Path, output: Path, settings: Settings, inputs: Inputs, options: dict[str, Any]
+    input: Path,
+    output: Path,
+    settings: Settings,
+    inputs: Inputs,
+    options: dict[str, Any],
+    label: LabelSettings | None = None,
 ) -> dict[str, Any]:
     """Return the pipeline, ready for JSON.
 
@@ -37,6 +42,8 @@ def pipeline_for(
     inputs : Inputs
     options : dict
         The stage's options as the user gave them; those that are None are left out.
+    label : LabelSettings, optional
+        As of `correct_file`.
 
     Raises
     ------
@@ -44,7 +51,7 @@ def pipeline_for(
         If `correct_file` would refuse them at its start, or PDAL cannot write the point format.
     """
     check_suffix(output)
-    job_for(input, settings, inputs)
+    job_for(input, settings, inputs, label)
     with LasSource(input) as source:
         point_format = source.header.point_format
     if UPGRADE[point_format.id] in WAVEFORM_FORMATS:

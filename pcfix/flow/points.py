@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -18,14 +18,19 @@ from pcfix.model import (
     WaterDimension,
     WaterMesh,
     WaterPlane,
+    WaterRaster,
     WaterSurface,
 )
 from pcfix.refract.intersect import intersect
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import numpy.typing as npt
 
-    from pcfix.model import FloatArray
+    from pcfix.model import BoolArray, FloatArray
+
+    Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
 
 
 CHUNK_POINTS = 1_000_000
@@ -41,6 +46,8 @@ def correct_points(
     max_angle_deg: float | None = None,
     max_cameras: int | None = None,
     views: Views | None = None,
+    may_be_submerged: npt.ArrayLike | None = None,
+    level_offset_m: npt.ArrayLike | None = None,
 ) -> Correction:
     """Correct apparent points for refraction at the water surface.
 
@@ -63,6 +70,13 @@ def correct_points(
         Use at most so many rays a point, the steepest ones.
     views : Views, optional
         Which cameras made each point. Default: every camera whose frame holds it.
+    may_be_submerged : array of bool, shape (n,), optional
+        The other points are land, even below the surface; `pcfix.flow.label.label_points` finds
+        them. Default: all.
+    level_offset_m : array, shape (k,), optional
+        How much higher than `water` the surface stood when each camera took its image, as
+        `pcfix.io.tides.level_offsets` finds it. Each ray bends at its own surface; which points
+        are submerged, and how deep, goes by `water`. Default: zero.
 
     Returns
     -------
@@ -96,10 +110,32 @@ def correct_points(
     points = checked_points(xyz)
     settings = Settings(refractive_index, max_angle_deg, max_cameras)
     surface, dimension = as_surface(water, len(points))
-    check_above_water(cameras, surface)
+    offset = None if level_offset_m is None else _offsets(level_offset_m, len(cameras))
+    check_above_water(cameras, surface, offset)
     if views is not None:
         _check_views(views, len(points), len(cameras))
-    return correct_checked(points, cameras, surface, settings, dimension, views)
+    label = None if may_be_submerged is None else _only(may_be_submerged, len(points))
+    return correct_checked(points, cameras, surface, settings, dimension, views, label, offset)
+
+
+def _offsets(level_offset_m: npt.ArrayLike, k: int) -> FloatArray:
+    offset = np.ascontiguousarray(level_offset_m, dtype=np.float64)
+    if offset.shape != (k,) or not np.isfinite(offset).all():
+        raise SettingError(
+            f"level_offset_m must be {k} finite numbers, one per camera, not of shape"
+            f" {offset.shape}."
+        )
+    return offset
+
+
+def _only(may_be_submerged: npt.ArrayLike, n: int) -> Label:
+    """Return the rule that of the points below the surface some are land."""
+    allowed = np.asarray(may_be_submerged)
+    if allowed.shape != (n,) or allowed.dtype != np.bool_:
+        raise SettingError(
+            f"may_be_submerged must be {n} booleans, not {allowed.dtype} of shape {allowed.shape}."
+        )
+    return lambda xyz, surface: is_submerged(xyz[:, 2], surface) & allowed
 
 
 def checked_points(xyz: npt.ArrayLike) -> FloatArray:
@@ -130,7 +166,7 @@ def as_surface(
     SettingError
         If there is not one height per point.
     """
-    if isinstance(water, WaterPlane | WaterDimension | WaterMesh):
+    if isinstance(water, WaterSurface):
         return water, None
     heights = np.asarray(water, dtype=np.float64)
     if heights.ndim == 0:
@@ -156,15 +192,16 @@ def correct_checked(
     settings: Settings,
     dimension: FloatArray | None = None,
     views: Views | None = None,
+    label: Label | None = None,
+    level_offset_m: FloatArray | None = None,
 ) -> Correction:
     """Label, refract, and spread the result over all rows: what every door runs."""
     surface = surface_above(water, xyz, dimension)
-    submerged = is_submerged(xyz[:, 2], surface)
+    submerged = is_submerged(xyz[:, 2], surface) if label is None else label(xyz, surface)
     rows = np.flatnonzero(submerged)
     above = SurfaceAbove(surface.height_m[rows], surface.slope[rows])
-    found = intersect(
-        xyz[rows], above, water, cameras, settings, None if views is None else views.take(rows)
-    )
+    mine = None if views is None else views.take(rows)
+    found = intersect(xyz[rows], above, water, cameras, settings, mine, level_offset_m)
     shift_x, shift_y, shift_z = found.shift_m.T
     rise = above.slope[:, 0] * shift_x + above.slope[:, 1] * shift_y
 
@@ -189,8 +226,10 @@ def correct_checked(
     )
 
 
-def check_above_water(cameras: Cameras, water: WaterSurface) -> None:
-    """Refuse cameras that stand under the water.
+def check_above_water(
+    cameras: Cameras, water: WaterSurface, level_offset_m: FloatArray | None = None
+) -> None:
+    """Refuse cameras that stand under the water, each under its own where that moves.
 
     Raises
     ------
@@ -205,9 +244,13 @@ def check_above_water(cameras: Cameras, water: WaterSurface) -> None:
 
             nearest = cKDTree(vertices[:, :2]).query(cameras.centres[:, :2])[1]
             level = vertices[nearest, 2]
+        case WaterRaster():
+            height = surface_above(water, cameras.centres).height_m
+            level = np.where(np.isnan(height), np.nanmin(water.height_m), height)
         case WaterDimension():
             return  # known only once the points are; see `correct_file`
-    refuse_under_water(cameras, level, str(water))
+    offset = 0.0 if level_offset_m is None else level_offset_m
+    refuse_under_water(cameras, level + offset, str(water))
 
 
 def refuse_under_water(cameras: Cameras, level: FloatArray | float, water: str) -> None:
@@ -222,16 +265,16 @@ def refuse_under_water(cameras: Cameras, level: FloatArray | float, water: str) 
         )
 
 
-def check_submerged(count: int, name: str, water: WaterSurface) -> None:
+def check_submerged(count: int, name: str, water: WaterSurface, heights: str = "") -> None:
     """Refuse a cloud of which no point lies below the water.
 
     Raises
     ------
     GeometryError
-        With the cloud's name and the surface.
+        With the cloud's name, the surface, and what `heights` says of the cloud's.
     """
     if count == 0:
         raise GeometryError(
-            f"{name}: no point lies below the water ({water}); check the water's height, and that"
-            " it has the cloud's vertical datum."
+            f"{name}: no point lies below the water ({water}){heights}; check the water's height,"
+            " and that it has the cloud's vertical datum."
         )

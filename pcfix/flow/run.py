@@ -14,21 +14,24 @@ from pcfix.flow.clean import clean_file
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.files import correct_file
-from pcfix.flow.inputs import Inputs
+from pcfix.flow.inputs import Inputs, file_of
 from pcfix.flow.report import write_report
 from pcfix.flow.steps import Record, read_record
+from pcfix.flow.surfaces import view_of
+from pcfix.io.clouds import own_water
 from pcfix.io.dod import preview, write_dod
 from pcfix.io.files import files_in
-from pcfix.io.las.crs import metric_crs
 from pcfix.io.las.source import LasSource
 from pcfix.io.rasters import open_raster
-from pcfix.model import DEFAULT_REFRACTIVE_INDEX, Settings, Summary
+from pcfix.model import DEFAULT_REFRACTIVE_INDEX, LabelSettings, Settings, Summary
+from pcfix.refract.index import index_of
 from pcfix.report.evaluation import evaluation, in_a_sentence
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from pcfix.flow.comparison import Comparison
+    from pcfix.flow.surfaces import WaterModel
     from pcfix.io.cameras.formats import Angles
     from pcfix.report.page import Picture, Table
 
@@ -46,8 +49,9 @@ class Request:
 
     Attributes
     ----------
-    input, cameras, water, sensor, angles, cameras_crs, cameras_offset_m, views, refractive_index,
-    max_angle_deg, max_cameras
+    input, cameras, water, sensor, angles, cameras_crs, cameras_offset_m, views, water_mask,
+    tide, image_times, water_model, water_crs, connected, least_pool_m2, respect_classes,
+    refractive_index, max_angle_deg, max_cameras
         See `pcfix.correct_file`; files by their paths.
     reference : str or None
         See `pcfix.flow.compare.compare_clouds`.
@@ -65,8 +69,16 @@ class Request:
     cameras_crs: str | None = None
     cameras_offset_m: tuple[float, float, float] | None = None
     views: str | None = None
+    water_mask: str | None = None
+    tide: str | None = None
+    image_times: str | None = None
+    water_model: WaterModel = "auto"
+    water_crs: str | None = None
+    connected: bool = False
+    least_pool_m2: float | None = None
+    respect_classes: tuple[int, ...] = ()
     reference: str | None = None
-    refractive_index: float = DEFAULT_REFRACTIVE_INDEX
+    refractive_index: float | str = DEFAULT_REFRACTIVE_INDEX
     max_angle_deg: float | None = None
     max_cameras: int | None = None
     resolution_m: float | None = None
@@ -74,7 +86,8 @@ class Request:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        Settings(self.refractive_index, self.max_angle_deg, self.max_cameras)
+        Settings(index_of(self.refractive_index)[0], self.max_angle_deg, self.max_cameras)
+        self.label()
         if self.resolution_m is not None and not 0.0 < self.resolution_m < math.inf:
             raise SettingError(f"resolution {self.resolution_m:g} is not positive; give metres.")
         if self.m3c2 and self.reference is None:
@@ -84,9 +97,19 @@ class Request:
         """Return what `pcfix.flow.inputs.Inputs` takes."""
         return {field.name: getattr(self, field.name) for field in fields(Inputs)}
 
+    def label(self) -> LabelSettings:
+        """Return the rules by which points are left out."""
+        return LabelSettings(
+            connected=self.connected,
+            least_pool_m2=self.least_pool_m2,
+            respect_classes=tuple(self.respect_classes),
+        )
+
     def files(self) -> list[Path]:
         """Return the input files, each of which exists."""
-        names = [self.input, self.cameras, self.sensor, self.views, self.reference]
+        mask = None if self.water_mask is None else str(file_of(self.water_mask))
+        names = [self.input, self.cameras, self.sensor, self.views, mask, self.reference]
+        names += [self.tide, self.image_times]
         found = [path for name in names if name is not None for path in files_in(name)]
         return [*found, Path(self.water)] if Path(self.water).is_file() else found
 
@@ -197,6 +220,9 @@ def _correct(
         request.input,
         files.corrected,
         **request.inputs(),
+        connected=request.connected,
+        least_pool_m2=request.least_pool_m2,
+        respect_classes=tuple(request.respect_classes),
         refractive_index=request.refractive_index,
         max_angle_deg=request.max_angle_deg,
         max_cameras=request.max_cameras,
@@ -290,13 +316,15 @@ def _report(
     with warnings.catch_warnings():  # they were shown when the cloud was corrected
         warnings.simplefilter("ignore", PcfixWarning)
         with LasSource(files.corrected) as source:
-            cameras, _ = inputs_again.block(metric_crs(source))
+            water = own_water(source)
+        view = view_of(files.corrected)
+        cameras, _ = inputs_again.block(view.crs)
     page = write_report(
         files.corrected,
         files.folder,
         summary=Summary(**corrected),
         cameras=cameras,
-        water=inputs_again.surface(),
+        water=water or inputs_again.surface(view).surface,
         inputs=inputs,
         more=more,
         verdict=verdict,

@@ -94,7 +94,7 @@ def read_cloud(
     """
     with LasSource(path) as source:
         crs = _crs(source)
-        own = water or _own_water(source)
+        own = water or own_water(source)
         chunks = source.chunks(CHUNK_POINTS)
         parts = [_part(source, p, own, given=water is not None, skip=skip_classes) for p in chunks]
         count = len(source)
@@ -159,7 +159,7 @@ def _part(
     return _Part(xyz[keep], shift, classes[keep] == BATHYMETRIC_POINT, above[keep])
 
 
-def _own_water(source: LasSource) -> WaterSurface | None:
+def own_water(source: LasSource) -> WaterSurface | None:
     """Return the plane of the water surface that the cloud's own VLR names, if any."""
     ours = next((vlr for vlr in source.vlrs if is_ours(vlr)), None)
     try:

@@ -10,18 +10,23 @@ from __future__ import annotations
 import ctypes
 import os
 import tempfile
+import warnings
 from contextlib import contextmanager
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, PcfixWarning
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from pcfix.model import FloatArray, IntArray
+    from pcfix.model import FloatArray, IntArray, WaterMesh
+
+MOST_OVERLAP = 0.01
+"""Of the plan area: what folds at the rim of a triangulated shore come to."""
+LEAST_FACET_M2 = 1e-6
 
 
 def read_mesh(path: Path) -> tuple[FloatArray, IntArray]:
@@ -33,6 +38,45 @@ def read_mesh(path: Path) -> tuple[FloatArray, IntArray]:
         If the file cannot be read.
     """
     return _read_obj(path) if path.suffix.lower() == ".obj" else _read_ply(path)
+
+
+def check_mesh(mesh: WaterMesh, path: Path) -> None:
+    """Refuse a mesh that is no height field, and warn of facets that do not count.
+
+    Which way a facet faces does not matter, nor do holes, edges of three facets, or facets that
+    overlap at one height: all are well defined as heights. Vertical facets have none.
+
+    Raises
+    ------
+    InputError
+        If much of it lies above another part, as a closed body or two surfaces do.
+    """
+    from pcfix.label.sheets import in_two_sheets
+    from pcfix.label.tin import build_tin
+
+    tin = build_tin(mesh)
+    double, area_m2 = in_two_sheets(tin)
+    share = float(area_m2[double].sum() / area_m2.sum())
+    if share > MOST_OVERLAP:
+        raise InputError(
+            f"{path}: {100.0 * share:.0f} % of the mesh lies above or below another part of it;"
+            " the water has one height at a place, so export its surface alone, not a closed body"
+            " or several surfaces."
+        )
+    if double.any():
+        _note(
+            f"{path}: facets overlap others at another height ({int(double.sum()):,} of"
+            f" {len(mesh.triangles):,}); there the water may be either."
+        )
+    edges = np.diff(mesh.vertices[mesh.triangles], axis=1)
+    size_m2 = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2.0
+    upright = int((size_m2 > LEAST_FACET_M2).sum()) - int((area_m2 > LEAST_FACET_M2).sum())
+    if upright > 0:
+        _note(f"{path}: vertical facets have no height and are left out ({upright:,}).")
+
+
+def _note(sentence: str) -> None:
+    warnings.warn(sentence, PcfixWarning, stacklevel=4)
 
 
 def _read_obj(path: Path) -> tuple[FloatArray, IntArray]:

@@ -10,18 +10,31 @@ import numpy as np
 
 from pcfix.errors import InputError, SettingError
 from pcfix.io.files import check_input
-from pcfix.io.meshes import read_mesh
+from pcfix.io.meshes import check_mesh, read_mesh
+from pcfix.io.water_rasters import read_water_raster
 from pcfix.model import WaterDimension, WaterMesh, WaterPlane
 
 if TYPE_CHECKING:
     import os
 
+    from pyproj import CRS
+
     from pcfix.model import WaterSurface
 
-KINDS = "a level such as 0.37, plane:a,b,c, dim:NAME, or a mesh file (.obj, .ply)"
+KINDS = (
+    "a level such as 0.37, plane:a,b,c, dim:NAME, a mesh file (.obj, .ply), or a raster of heights"
+    " (.tif or another that GDAL reads)"
+)
+
+_NO_RASTERS = (".csv", ".txt", ".json", ".geojson", ".gpkg", ".shp", ".wkt", ".las", ".laz")
+"""GDAL would try some of these as rasters all the same."""
 
 
-def read_water(spec: float | str | os.PathLike[str]) -> WaterSurface:
+def read_water(
+    spec: float | str | os.PathLike[str],
+    cloud_crs: str | CRS | None = None,
+    bounds: tuple[float, float, float, float] | None = None,
+) -> WaterSurface:
     """Return the water surface that a word describes.
 
     Parameters
@@ -35,7 +48,14 @@ def read_water(spec: float | str | os.PathLike[str]) -> WaterSurface:
             a dimension of the cloud that holds the height of the surface above each point;
             NaN where it is not known;
         ``surface.obj``, ``surface.ply``
-            a triangulated surface in the cloud's own coordinates.
+            a triangulated surface in the cloud's own coordinates;
+        ``surface.tif``
+            or another raster that GDAL reads: one band of heights, in any CRS.
+    cloud_crs : str or CRS, optional
+        Projected, metres; rasters are brought to it. Default: that of the raster.
+    bounds : tuple of 4 float, optional
+        West, south, east and north end of the cloud: of a large raster only what lies about it
+        is read.
 
     Returns
     -------
@@ -46,7 +66,7 @@ def read_water(spec: float | str | os.PathLike[str]) -> WaterSurface:
     SettingError
         If the word is none of these, or its numbers are not finite.
     InputError
-        If the mesh is missing or damaged.
+        If the mesh or raster is missing or damaged, or cannot be brought to the cloud's CRS.
 
     Examples
     --------
@@ -72,11 +92,11 @@ def read_water(spec: float | str | os.PathLike[str]) -> WaterSurface:
     try:
         return WaterPlane(*_finite([text], text))
     except SettingError:
-        if Path(text).is_file():
-            raise InputError(
-                f"{text}: is not a water surface that pcfix reads; give {KINDS}."
-            ) from None
-        raise
+        if not Path(text).is_file():
+            raise
+    if Path(text).suffix.lower() in _NO_RASTERS:
+        raise InputError(f"{text}: is not a water surface that pcfix reads; give {KINDS}.")
+    return read_water_raster(text, cloud_crs, bounds)
 
 
 def _finite(values: list[str] | list[float], text: str) -> list[float]:
@@ -97,4 +117,6 @@ def _mesh(path: Path) -> WaterMesh:
         raise InputError(f"{path}: a vertex is not finite; export the mesh again.")
     if triangles.min() < 0 or triangles.max() >= len(vertices):
         raise InputError(f"{path}: a face names a vertex that is not there; export it again.")
-    return WaterMesh(vertices, triangles, path.name)
+    mesh = WaterMesh(vertices, triangles, path.name)
+    check_mesh(mesh, path)
+    return mesh

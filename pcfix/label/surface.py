@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pcfix.errors import SettingError
+from pcfix.label.raster import build_field, heights_above
 from pcfix.label.tin import build_tin, facets_above
-from pcfix.model import WaterDimension, WaterMesh, WaterPlane
+from pcfix.model import WaterDimension, WaterMesh, WaterPlane, WaterRaster
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -62,6 +63,9 @@ def surface_above(
             )
         case WaterMesh():
             return _mesh_above(water, xyz)
+        case WaterRaster():
+            x, y = np.ascontiguousarray(xyz[:, 0]), np.ascontiguousarray(xyz[:, 1])
+            return SurfaceAbove(*heights_above(build_field(water), x, y))
 
 
 def _mesh_above(mesh: WaterMesh, xyz: FloatArray) -> SurfaceAbove:

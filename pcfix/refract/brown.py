@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 Jacobian: TypeAlias = tuple[float, float, float, float]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 def _radial(c: FloatArray, r2: float) -> tuple[float, float]:
     """Return r' / r and its derivative by r^2."""
     k, d = int(c[RADIALS]), int(c[DENOMINATORS])
@@ -54,7 +54,7 @@ def _radial(c: FloatArray, r2: float) -> tuple[float, float]:
     return g, (slope - g * below_slope) / below
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 def _sideways(c: FloatArray, x: float, y: float) -> tuple[float, float]:
     """Return the tangential and thin prism terms."""
     p1, p2, p3, p4 = c[TANGENTIAL], c[TANGENTIAL + 1], c[TANGENTIAL + 2], c[TANGENTIAL + 3]
@@ -66,7 +66,7 @@ def _sideways(c: FloatArray, x: float, y: float) -> tuple[float, float]:
     return tx + (s1 + s2 * r2) * r2, ty + (s3 + s4 * r2) * r2
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 def distorted(c: FloatArray, x: float, y: float) -> tuple[float, float]:
     """Return Brown's formula at a place; NaN outside the disc where it is one to one."""
     r2 = x * x + y * y

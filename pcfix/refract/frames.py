@@ -4,9 +4,11 @@ The frame of a central projection without distortion is a pyramid with its tip i
 projection centre. Four planes bound it; a point is in the frame when it is on the inner side of
 all four.
 
-A distorted frame has curved sides. It gets two pyramids: one around it, outside of which there
-is nothing of the frame, and one within it, inside of which there is nothing else. Only between
-them the point is projected. A frame too wide for a pyramid gets a cone around it.
+A distorted frame has curved sides, and the point has to be projected. Most tiles are spared
+that: those outside of a pyramid around the frame (of a cone, where the frame is too wide), and
+those whose middle falls so far from the border of the image that no ray of the tile can cross
+it. How far that is says the `scale` of the lens: no turn of a ray by an angle moves its image by
+more than `scale` times that angle, in the frame and within a `margin` around it.
 """
 
 from __future__ import annotations
@@ -43,26 +45,33 @@ if TYPE_CHECKING:
 Plane: TypeAlias = tuple[float, float, float]
 Pyramid: TypeAlias = tuple[Plane, Plane, Plane, Plane]
 
-EVERYWHERE = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-"""A pyramid that holds every point."""
-
 NOT_DISTORTED = -1
+NOTHING, SOME, ALL = 0, 1, 2
 
 
 class Frames(NamedTuple):
     """The frames of k cameras; directions are in the world frame.
 
-    `outer` and `inner`, shape (k, 4, 3), are the inward normals of the pyramids around and
-    within each frame. `row` is the lens of each camera in the table of `coefficients`, or
-    `NOT_DISTORTED`: then `outer` is the frame itself. `cone`, shape (k, 4), is an axis and the
-    angle (rad) from it that nothing of the frame exceeds. An outer pyramid of zeros holds
-    everything, an inner one nothing.
+    Attributes
+    ----------
+    planes : array, shape (k, 4, 3)
+        Inward normals of the pyramid that is the frame, or is around it. Zeros hold everything.
+    row : array, shape (k,)
+        The lens of each camera in `lenses`, or `NOT_DISTORTED`: then the pyramid is the frame.
+    cone : array, shape (k, 4)
+        An axis, and the angle (rad) from it that nothing of the frame exceeds.
+    reach : array, shape (k, 2)
+        Scale (unit of the lens per rad) and margin (unit of the lens) of the lens.
+    lenses : array, shape (l, ...)
+        Coefficients, one row per lens.
+    rotations : array, shape (k, 3, 3)
+        World to camera.
     """
 
-    outer: FloatArray
-    inner: FloatArray
-    cone: FloatArray
+    planes: FloatArray
     row: IntArray
+    cone: FloatArray
+    reach: FloatArray
     lenses: FloatArray
     rotations: FloatArray
 
@@ -70,17 +79,22 @@ class Frames(NamedTuple):
 class _Shape(NamedTuple):
     """The frame of one lens, camera frame; see `Frames`."""
 
-    outer: FloatArray
-    inner: FloatArray
-    widest: float
+    planes: FloatArray
     distorted: bool
+    widest: float
+    reach: tuple[float, float]
 
 
 def no_frames(k: int) -> Frames:
     """Return frames of k cameras that hold every point."""
-    nothing = np.zeros((k, 4, 3))
-    row = np.full(k, NOT_DISTORTED)
-    return Frames(nothing, nothing, np.zeros((k, 4)), row, np.zeros((1, 1)), np.zeros((k, 3, 3)))
+    return Frames(
+        planes=np.zeros((k, 4, 3)),
+        row=np.full(k, NOT_DISTORTED),
+        cone=np.zeros((k, 4)),
+        reach=np.zeros((k, 2)),
+        lenses=np.zeros((1, 1)),
+        rotations=np.zeros((k, 3, 3)),
+    )
 
 
 def frames_of(cameras: Cameras) -> Frames:
@@ -88,21 +102,21 @@ def frames_of(cameras: Cameras) -> Frames:
 
     Without lenses a frame is everything in front of the camera, without angles everything.
     """
-    k = len(cameras)
     if cameras.rotations is None:
-        return no_frames(k)
+        return no_frames(len(cameras))
     rotations = np.ascontiguousarray(cameras.rotations, np.float64)
     if cameras.lenses is None:
         front = np.repeat(rotations[:, 2:3], 4, axis=1)
-        return no_frames(k)._replace(outer=front, rotations=rotations)
+        return no_frames(len(cameras))._replace(planes=front)
     rows: dict[Lens, int] = {}
     row = np.array([rows.setdefault(lens, len(rows)) for lens in cameras.lenses])
     shapes = [_shape(lens) for lens in rows]
+    widest = np.array([shape.widest for shape in shapes])
     return Frames(
-        outer=np.ascontiguousarray(np.array([s.outer for s in shapes])[row] @ rotations),
-        inner=np.ascontiguousarray(np.array([s.inner for s in shapes])[row] @ rotations),
-        cone=np.column_stack([rotations[:, 2], np.array([s.widest for s in shapes])[row]]),
+        planes=np.ascontiguousarray(np.array([s.planes for s in shapes])[row] @ rotations),
         row=np.where(np.array([s.distorted for s in shapes])[row], row, NOT_DISTORTED),
+        cone=np.column_stack([rotations[:, 2], widest[row]]),
+        reach=np.array([s.reach for s in shapes])[row],
         lenses=_table(list(rows)),
         rotations=rotations,
     )
@@ -119,15 +133,16 @@ def _table(lenses: list[Lens]) -> FloatArray:
 
 @lru_cache(maxsize=8192)
 def _shape(lens: Lens) -> _Shape:
-    """Return the pyramids of a lens and the largest angle of its frame from the axis."""
+    """Return the frame of a lens."""
     if _is_a_pyramid(lens):
-        return _Shape(_frame_planes(lens), np.zeros((4, 3)), np.pi, distorted=False)
-    border = unproject(lens, _border(np.zeros(2), np.array([lens.width, lens.height])))
-    flat = _in_tangent_plane(border)
-    outer = np.zeros((4, 3))
-    if np.isfinite(flat).all():
-        outer = _box_planes(*_box_around(flat))
-    return _Shape(outer, _inner_planes(lens, flat), _widest_angle(lens, border), distorted=True)
+        return _Shape(_frame_planes(lens), distorted=False, widest=np.pi, reach=(np.inf, 0.0))
+    border = unproject(lens, _border(lens))
+    return _Shape(
+        _planes_around(border),
+        distorted=True,
+        widest=_widest_angle(lens, border),
+        reach=_reach(lens) if np.isfinite(border).all() else (np.inf, 0.0),
+    )
 
 
 def _is_a_pyramid(lens: Lens) -> bool:
@@ -154,64 +169,30 @@ STEEPEST = np.cos(np.radians(80.0))
 """A pyramid with flatter sides would be too long to be of use."""
 
 
-def _border(low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return points around a rectangle: top, right, bottom, left, and the first one again."""
-    (left, top), (right, bottom) = low, high
-    corners = np.array([(left, top), (right, top), (right, bottom), (left, bottom), (left, top)])
+def _border(lens: Lens) -> FloatArray:
+    """Return points around the image, the first one again at the end."""
+    w, h = lens.width, lens.height
+    corners = np.array([(0.0, 0.0), (w, 0.0), (w, h), (0.0, h), (0.0, 0.0)])
     share = np.linspace(0.0, 1.0, BORDER, endpoint=False)[:, None]
     sides = [(1.0 - share) * corners[i] + share * corners[i + 1] for i in range(4)]
     return np.vstack([*sides, corners[:1]])
 
 
-def _in_tangent_plane(directions: FloatArray) -> FloatArray:
-    """Return X / Z and Y / Z, NaN for directions that are too flat."""
-    z = np.where(directions[:, 2:] > STEEPEST, directions[:, 2:], np.nan)
-    return np.asarray(directions[:, :2] / z)
-
-
 def _widest_step(points: FloatArray) -> float:
     """Return the largest distance between neighbours; a curve strays less from its points."""
-    return float(np.hypot(*np.diff(points, axis=0).T).max())
+    return float(np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1).max()))
 
 
-def _box_around(flat: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the lowest and highest corner of a box around a curve and what it encloses."""
+def _planes_around(border: FloatArray) -> FloatArray:
+    """Return a pyramid around the directions of the border, shape (4, 3)."""
+    if not (border[:, 2] > STEEPEST).all():
+        return np.zeros((4, 3))
+    flat = border[:, :2] / border[:, 2:]
     step = _widest_step(flat)
-    return flat.min(axis=0) - step, flat.max(axis=0) + step
-
-
-def _box_planes(low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return the inward normals of the pyramid through a box in the tangent plane."""
-    (left, top), (right, bottom) = low, high
-    return np.array([(1.0, 0.0, -left), (-1.0, 0.0, right), (0.0, 1.0, -top), (0.0, -1.0, bottom)])
-
-
-def _inner_planes(lens: Lens, flat: FloatArray) -> FloatArray:
-    """Return a pyramid within the frame, zeros where none is found.
-
-    Its box touches the sides of the frame from within, and then shrinks towards the middle
-    until the image of its border lies inside the frame: then that of its inside does as well.
-    """
-    low, high = _box_within(flat)
-    size = np.array([lens.width, lens.height])
-    middle = _in_tangent_plane(unproject(lens, size[None] / 2.0))[0]
-    for scale in 0.98 ** np.arange(1, 100):
-        left, right = middle + scale * (low - middle), middle + scale * (high - middle)
-        border = _border(left, right)
-        image = project(lens, np.column_stack([border, np.ones(len(border))]))
-        step = _widest_step(image)
-        if (left < right).all() and (image >= step).all() and (image <= size - step).all():
-            return _box_planes(left, right)
-    return np.zeros((4, 3))
-
-
-def _box_within(flat: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the lowest and highest corner of a box that the sides of a frame leave free."""
-    top, right, bottom, left = (flat[i * BORDER : (i + 1) * BORDER + 1] for i in range(4))
-    far = np.sqrt(0.5 / STEEPEST**2 - 0.5)  # such that the corners of a box are not too flat
-    low = np.fmax(-far, [np.fmax.reduce(left[:, 0]), np.fmax.reduce(top[:, 1])])
-    high = np.fmin(far, [np.fmin.reduce(right[:, 0]), np.fmin.reduce(bottom[:, 1])])
-    return low, high
+    (left, top), (right, bottom) = flat.min(axis=0) - step, flat.max(axis=0) + step
+    return np.array([
+        (1.0, 0.0, -left), (-1.0, 0.0, right), (0.0, 1.0, -top), (0.0, -1.0, bottom),
+    ])  # fmt: skip
 
 
 def _widest_angle(lens: Lens, border: FloatArray) -> float:
@@ -224,6 +205,40 @@ def _widest_angle(lens: Lens, border: FloatArray) -> float:
     if lens.inverse or np.isnan(widest):
         widest = float(c[LARGEST_ANGLE])
     return widest + 1e-6
+
+
+MARGIN = 0.1
+"""Of the longer side of the image."""
+
+_GRID = 41
+_SAFETY = 1.1  # the scale is smooth, and known at a grid of places
+
+
+def _reach(lens: Lens) -> tuple[float, float]:
+    """Return scale and margin; the margin is zero where part of it is beyond the fold."""
+    margin = MARGIN * max(lens.width, lens.height)
+    scale = _largest_scale(lens, margin)
+    if np.isfinite(scale):
+        return _SAFETY * scale, margin
+    return _SAFETY * _largest_scale(lens, 0.0), 0.0
+
+
+def _largest_scale(lens: Lens, margin: float) -> float:
+    """Return the largest derivative of the image by an angle; infinite if a place has none."""
+    u = np.linspace(-margin, lens.width + margin, _GRID)
+    v = np.linspace(-margin, lens.height + margin, _GRID)
+    d = unproject(lens, np.column_stack([np.repeat(u, _GRID), np.tile(v, _GRID)]))
+    side = np.cross(d, np.where(np.abs(d[:, :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    turn = 1e-6
+    by_side, by_other = (
+        (project(lens, d + turn * t) - project(lens, d - turn * t)) / (2.0 * turn)
+        for t in (side, np.cross(d, side))
+    )
+    jacobian = np.stack([by_side, by_other], axis=-1)
+    if np.isnan(jacobian).any():
+        return np.inf
+    return float(np.linalg.norm(jacobian, ord=2, axis=(1, 2)).max())
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -251,37 +266,31 @@ def in_frame(g: Pyramid, ex: float, ey: float, ez: float) -> bool:
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _well_inside(g: Pyramid, ex: float, ey: float, ez: float) -> bool:
-    """Whether the point at C - e is inside and on none of the planes."""
-    return (
-        (g[0][0] * ex + g[0][1] * ey + g[0][2] * ez < 0.0)
-        & (g[1][0] * ex + g[1][1] * ey + g[1][2] * ez < 0.0)
-        & (g[2][0] * ex + g[2][1] * ey + g[2][2] * ez < 0.0)
-        & (g[3][0] * ex + g[3][1] * ey + g[3][2] * ez < 0.0)
-    )
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _images(lens: FloatArray, r: FloatArray, ex: float, ey: float, ez: float) -> bool:
-    """Whether a lens with rotation r images the point at C - e in its frame."""
-    u, v = image_of(
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def _image(lens: FloatArray, r: FloatArray, ex: float, ey: float, ez: float) -> tuple[float, float]:
+    """Return where a lens with rotation r images the point at C - e."""
+    return image_of(
         lens,
         -(r[0, 0] * ex + r[0, 1] * ey + r[0, 2] * ez),
         -(r[1, 0] * ex + r[1, 1] * ey + r[1, 2] * ez),
         -(r[2, 0] * ex + r[2, 1] * ey + r[2, 2] * ez),
     )
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def _images(lens: FloatArray, r: FloatArray, ex: float, ey: float, ez: float) -> bool:
+    """Whether that place is in the frame."""
+    u, v = _image(lens, r, ex, ey, ez)
     return (u >= 0.0) & (u <= lens[WIDTH]) & (v >= 0.0) & (v <= lens[HEIGHT])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def holds(frames: Frames, c: int, ex: float, ey: float, ez: float) -> bool:
     """Whether the frame of camera c holds the point at C - e, distortion included."""
-    if not in_frame(pyramid(frames.outer[c]), ex, ey, ez):
+    if not in_frame(pyramid(frames.planes[c]), ex, ey, ez):
         return False
-    if frames.row[c] == NOT_DISTORTED or _well_inside(pyramid(frames.inner[c]), ex, ey, ez):
-        return True
-    return _images(frames.lenses[frames.row[c]], frames.rotations[c], ex, ey, ez)
+    row = frames.row[c]
+    return row == NOT_DISTORTED or _images(frames.lenses[row], frames.rotations[c], ex, ey, ez)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -296,22 +305,20 @@ def mark(
     lens = frames.lenses[frames.row[c]]
     if lens[PLAIN] != 0.0:
         return _mark_plain(marks, x, y, z, centre, frames.rotations[c], lens)
-    outer, inner = pyramid(frames.outer[c]), pyramid(frames.inner[c])
-    return _mark_any(marks, x, y, z, centre, outer, inner, frames.rotations[c], lens)
+    around = pyramid(frames.planes[c])
+    return _mark_any(marks, x, y, z, centre, around, frames.rotations[c], lens)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _mark_any(
     marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, centre: FloatArray,
-    outer: Pyramid, inner: Pyramid, r: FloatArray, lens: FloatArray,
+    around: Pyramid, r: FloatArray, lens: FloatArray,
 ) -> int:  # fmt: skip
-    """Any lens: the pyramids decide where they can."""
+    """Take any lens, point by point."""
     count = 0
     for j in range(marks.size):
         ex, ey, ez = centre[0] - x[j], centre[1] - y[j], centre[2] - z[j]
-        inside = in_frame(outer, ex, ey, ez)
-        if inside and not _well_inside(inner, ex, ey, ez):
-            inside = _images(lens, r, ex, ey, ez)
+        inside = in_frame(around, ex, ey, ez) and _images(lens, r, ex, ey, ez)
         marks[j] = 1.0 if inside else 0.0
         count += 1 if inside else 0
     return count
@@ -322,7 +329,7 @@ def _mark_plain(
     marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, centre: FloatArray,
     r: FloatArray, c: FloatArray,
 ) -> int:  # fmt: skip
-    """The common lens: `image_of` written out without branches, for several points at once."""
+    """Take the common lens: `image_of` written out without branches, for several points at once."""
     cx, cy, cz = centre[0], centre[1], centre[2]
     xx, xy, xz, yx, yy, yz = r[0, 0], r[0, 1], r[0, 2], r[1, 0], r[1, 1], r[1, 2]
     zx, zy, zz = r[2, 0], r[2, 1], r[2, 2]
@@ -364,28 +371,28 @@ def may_hold(g: FloatArray, centre: FloatArray, low: FloatArray, high: FloatArra
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def may_reach(cone: FloatArray, centre: FloatArray, low: FloatArray, high: FloatArray) -> bool:
-    """Whether a cone can hold any point of the ball around a box; never wrongly False."""
-    far2, ball2, along = 0.0, 0.0, 0.0
-    for axis in range(3):
-        middle = 0.5 * (low[axis] + high[axis]) - centre[axis]
-        far2 += middle * middle
-        ball2 += 0.25 * (high[axis] - low[axis]) ** 2
-        along += middle * cone[axis]
-    if ball2 >= far2:
-        return True
-    off_axis = np.arccos(max(-1.0, min(1.0, along / np.sqrt(far2))))
-    return off_axis <= cone[3] + np.arcsin(np.sqrt(ball2 / far2)) + 1e-6
+def judge(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: FloatArray) -> int:
+    """Return whether the distorted frame of camera c holds all or nothing of an upright box.
 
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def surely_holds(g: FloatArray, centre: FloatArray, low: FloatArray, high: FloatArray) -> bool:
-    """Whether a pyramid holds all of an upright box; one of zeros never does."""
-    for p in range(4):
-        reach = 0.0
-        for axis in range(3):
-            corner = low[axis] if g[p, axis] > 0.0 else high[axis]
-            reach += g[p, axis] * (corner - centre[axis])
-        if not reach > 0.0:
-            return False
-    return True
+    `ALL`, `NOTHING` or `SOME`; never wrongly one of the first two. The box is taken as the ball
+    around it, seen from the camera under the angle `turn` about its middle.
+    """
+    ex = centre[0] - 0.5 * (low[0] + high[0])
+    ey = centre[1] - 0.5 * (low[1] + high[1])
+    ez = centre[2] - 0.5 * (low[2] + high[2])
+    far2 = ex * ex + ey * ey + ez * ez
+    size2 = (high[0] - low[0]) ** 2 + (high[1] - low[1]) ** 2 + (high[2] - low[2]) ** 2
+    if not 0.25 * size2 < far2:
+        return SOME
+    turn = np.arcsin(np.sqrt(0.25 * size2 / far2)) + 1e-6
+    axis, widest = frames.cone[c, :3], frames.cone[c, 3]
+    along = -(axis[0] * ex + axis[1] * ey + axis[2] * ez) / np.sqrt(far2)
+    if np.arccos(max(-1.0, min(1.0, along))) > widest + turn:
+        return NOTHING
+    lens, r = frames.lenses[frames.row[c]], frames.rotations[c]
+    u, v = _image(lens, r, ex, ey, ez)
+    within = min(min(u, lens[WIDTH] - u), min(v, lens[HEIGHT] - v))
+    move, margin = turn * frames.reach[c, 0], frames.reach[c, 1]
+    if within > move:
+        return ALL
+    return SOME if within >= -move or move >= margin else NOTHING

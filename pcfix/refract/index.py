@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 from pcfix.errors import SettingError
+from pcfix.model import DEFAULT_REFRACTIVE_INDEX
 
 SALINITY_PSU, TEMPERATURE_C, WAVELENGTH_UM = (0.0, 40.0), (0.0, 30.0), (0.4, 0.7)
 """Where the formula was fitted (its salinities end at 35; natural seas go a little beyond)."""
@@ -82,25 +83,64 @@ def refractive_index(
     )
 
 
-def index_of(words: str) -> tuple[float, Water | None]:
-    """Return the refractive index that a text means, and the water where it names one.
-
-    Parameters
-    ----------
-    words : str
-        A number, ``fresh`` or ``sea``.
+def index_words(
+    index: float | str | None,
+    salinity: float | None,
+    temperature_c: float | None,
+    wavelength_um: float | None,
+) -> float | str:
+    """Return what `index_of` takes, of an index or what decides it.
 
     Raises
     ------
     SettingError
-        If it is neither.
+        If both are given.
     """
-    water = WATERS.get(words.strip().lower())
-    if water is not None:
-        return refractive_index(*water), water
-    try:
-        return float(words), None
-    except ValueError:
+    if salinity is None and temperature_c is None and wavelength_um is None:
+        return DEFAULT_REFRACTIVE_INDEX if index is None else index
+    if index is not None:
         raise SettingError(
-            f"index '{words}' is neither a number nor {' nor '.join(WATERS)}."
+            "index and salinity, temperature or wavelength say the same twice; give one of them."
+        )
+    given = Water(35.0 if salinity is None else salinity)
+    temperature = given.temperature_c if temperature_c is None else temperature_c
+    wavelength = given.wavelength_um if wavelength_um is None else wavelength_um
+    return f"{given.salinity_psu!r},{temperature!r},{wavelength!r}"
+
+
+def index_of(given: float | str) -> tuple[float, str]:
+    """Return the refractive index that a number or a word means, and what water that is.
+
+    Parameters
+    ----------
+    given : float or str
+        A number; ``fresh`` or ``sea``; or ``S,T`` or ``S,T,W``: salinity in PSU, temperature in
+        degrees Celsius and wavelength in micrometres.
+
+    Returns
+    -------
+    index : float
+    water : str
+        In words; empty where only a number was given.
+
+    Raises
+    ------
+    SettingError
+        If it is none of these, or a value is outside its range.
+    """
+    words = str(given).strip().lower()
+    water = WATERS.get(words)
+    try:
+        if water is None and "," in words:
+            water = Water(*(float(word) for word in words.split(",")))
+        if water is None:
+            return float(words), ""
+    except (ValueError, TypeError):
+        raise SettingError(
+            f"index '{given}' is neither a number nor {' nor '.join(WATERS)}, nor salinity,"
+            " temperature and wavelength as 35,15,0.53."
         ) from None
+    name = f"{words}: " if words in WATERS else ""
+    return refractive_index(*water), (
+        f"{name}{water.salinity_psu:g} PSU, {water.temperature_c:g} C, {water.wavelength_um:g} um"
+    )

@@ -3,8 +3,12 @@
 Two kernels do the same sum. `_all_in_frame` takes every camera whose frame holds the point; its
 inner loop runs over the points of a tile, so that the processor works on several points at
 once. `_chosen` takes a list of cameras per point (view lists, or the steepest few) or bends the
-rays at a mesh, and goes point by point. Both add the same terms in the order of the cameras, so
-that they agree to the bit wherever both apply.
+rays at a mesh or raster, and goes point by point. Both add the same terms in the order of the
+cameras, so that they agree to the bit wherever both apply.
+
+Each camera may have had its own water level, the surface shifted along the vertical. The point is
+lowered by the shift instead, where only its distance from the surface counts. A camera whose own
+water lay below the apparent point saw it through air; its ray goes straight on.
 """
 
 from __future__ import annotations
@@ -14,28 +18,31 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit, prange
 
+from pcfix.label.raster import build_field
 from pcfix.label.tin import build_tin, locate
-from pcfix.model import Outcome, WaterMesh
+from pcfix.model import Outcome, WaterMesh, WaterRaster
 from pcfix.refract.frames import (
-    EVERYWHERE,
+    ALL,
     NOT_DISTORTED,
+    NOTHING,
+    SOME,
     frames_of,
     holds,
     in_frame,
+    judge,
     mark,
     may_hold,
-    may_reach,
     no_frames,
     pyramid,
-    surely_holds,
 )
-from pcfix.refract.piercing import pierce_mesh
+from pcfix.refract.piercing import pierce_mesh, pierce_raster
 from pcfix.refract.rays import line_terms, nearest_point, refracted
 from pcfix.refract.threads import one_caller
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
+    from pcfix.label.raster import Field
     from pcfix.label.surface import SurfaceAbove
     from pcfix.label.tin import Tin
     from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Settings, Views, WaterSurface
@@ -68,6 +75,7 @@ def intersect(
     cameras: Cameras,
     settings: Settings,
     views: Views | None = None,
+    level_offset_m: FloatArray | None = None,
 ) -> Intersection:
     """Re-intersect the refracted rays of submerged points.
 
@@ -78,13 +86,15 @@ def intersect(
     surface : SurfaceAbove
         The water surface above each of them.
     water : WaterSurface
-        Needed for its facets where it is a mesh.
+        Needed for its shape where it is a mesh or raster.
     cameras : Cameras
         Projection centres and frames, world frame.
     settings : Settings
         Refractive index, largest angle, most cameras.
     views : Views, optional
         The cameras of each point; without it, every camera whose frame holds the point.
+    level_offset_m : array, shape (k,), optional
+        How much higher than `surface` the water stood when each camera took its image.
 
     Returns
     -------
@@ -106,6 +116,7 @@ def intersect(
         np.ascontiguousarray(surface.height_m),
         np.ascontiguousarray(surface.slope),
         np.ascontiguousarray(cameras.centres),
+        np.zeros(len(cameras)) if level_offset_m is None else level_offset_m,
         frames_of(cameras) if views is None else no_frames(len(cameras)),
         _least_cosine2(settings, cameras),
         1.0 / settings.refractive_index,
@@ -114,12 +125,13 @@ def intersect(
         tested,
     )
     with one_caller():
-        if views is None and settings.max_cameras is None and not isinstance(water, WaterMesh):
+        tin = build_tin(water) if isinstance(water, WaterMesh) else None
+        field = build_field(water) if isinstance(water, WaterRaster) else None
+        if views is None and settings.max_cameras is None and tin is None and field is None:
             _all_in_frame(*common)
         else:
-            tin = build_tin(water) if isinstance(water, WaterMesh) else None
             rows = None if views is None else (views.start, views.camera)
-            _chosen(*common, tin, rows, settings.max_cameras or len(cameras))
+            _chosen(*common, tin, field, rows, settings.max_cameras or len(cameras))
     return Intersection(
         shift_m=result[:, :3],
         outcome=result[:, _OUTCOME].astype(np.uint8),
@@ -188,10 +200,7 @@ _MISS, _SIGMA_Z, _INCIDENCE, _COUNT, _OUTCOME = 3, 4, 5, 6, 7
 def _gather(
     tile: FloatArray, order: IntArray, xyz: FloatArray, surface: FloatArray, slope: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Bring a tile together: runs of x, y, z, surface height and unit normal; return its box.
-
-    The eighth run is left for marks.
-    """
+    """Bring a tile together: runs of x, y, z, surface height and unit normal; return its box."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for j in range(order.size):
         i = order[j]
@@ -242,8 +251,8 @@ def _solve(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _add_camera(
-    sums: FloatArray, tile: FloatArray, m: int,
-    centre: FloatArray, g: Pyramid | None, least_cosine2: float, r: float,
+    sums: FloatArray, tile: FloatArray, marks: FloatArray,
+    centre: FloatArray, offset: float, g: Pyramid | None, least_cosine2: float, r: float,
 ) -> int:  # fmt: skip
     """Add one camera's rays to the sums of a tile; return how many it gave.
 
@@ -252,20 +261,21 @@ def _add_camera(
     """
     cx, cy, cz = centre[0], centre[1], centre[2]
     rays = 0
-    for j in range(m):
+    for j in range(marks.size):
         z = tile[2 * TILE + j]
         ex, ey, ez = cx - tile[j], cy - tile[TILE + j], cz - z
         nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
         height = nx * ex + ny * ey + nz * ez
-        h = nz * (tile[3 * TILE + j] - z)
+        h = nz * (tile[3 * TILE + j] - (z - offset))
         length2 = ex * ex + ey * ey + ez * ez
-        marked = tile[7 * TILE + j]
+        marked = marks[j]
         use = _usable(g, marked, ex, ey, ez, h, height, length2, least_cosine2)
         # one division for two; a ray that is not used adds zeros
         q = 1.0 / (length2 * height)
-        f = h * length2 * q if use else 0.0
+        f = h * length2 * q if use and h > 0.0 else 0.0
         inv = height * q if use else 0.0
-        dx, dy, dz = refracted(ex, ey, ez, length2, nx, ny, nz, height, r)
+        bend = r if h > 0.0 else 1.0
+        dx, dy, dz = refracted(ex, ey, ez, length2, nx, ny, nz, height, bend)
         xx, xy, xz, yy, yz, bx, by, bz, s = line_terms(f * ex, f * ey, f * ez, dx, dy, dz, inv)
         sums[j] += xx
         sums[TILE + j] += xy
@@ -286,14 +296,14 @@ def _add_camera(
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _all_in_frame(
     order: IntArray, xyz: FloatArray, surface: FloatArray, slope: FloatArray,
-    centres: FloatArray, frames: Frames, least_cosine2: float, r: float,
+    centres: FloatArray, offset: FloatArray, frames: Frames, least_cosine2: float, r: float,
     result: FloatArray, used: BoolArray, tested: IntArray,
 ) -> None:  # fmt: skip
     """Every camera whose frame holds the point; the surface above it is a plane."""
-    outer, inner, cone, row = frames.outer, frames.inner, frames.cone, frames.row
+    planes, row = frames.planes, frames.row
     for t in prange(tested.size):
         rows = order[t * TILE : (t + 1) * TILE]
-        tile = np.empty(8 * TILE)
+        tile, marks = np.empty(7 * TILE), np.empty(rows.size)
         low, high = _gather(tile, rows, xyz, surface, slope)
         sums = np.zeros(11 * TILE)
         sums[10 * TILE :] = 1.0
@@ -302,21 +312,23 @@ def _all_in_frame(
             tile[TILE : TILE + rows.size],
             tile[2 * TILE : 2 * TILE + rows.size],
         )
-        marks = tile[7 * TILE : 7 * TILE + rows.size]
         for c in range(len(centres)):
-            if not may_hold(outer[c], centres[c], low, high):
+            if not may_hold(planes[c], centres[c], low, high):
                 continue
             if row[c] == NOT_DISTORTED:
-                frame = pyramid(outer[c])
-                rays = _add_camera(sums, tile, rows.size, centres[c], frame, least_cosine2, r)
-            elif surely_holds(inner[c], centres[c], low, high):
-                rays = _add_camera(sums, tile, rows.size, centres[c], EVERYWHERE, least_cosine2, r)
-            elif may_reach(cone[c], centres[c], low, high):
-                if not mark(marks, x, y, z, centres[c], frames, c):
-                    continue
-                rays = _add_camera(sums, tile, rows.size, centres[c], None, least_cosine2, r)
+                frame = pyramid(planes[c])
+                rays = _add_camera(
+                    sums, tile, marks, centres[c], offset[c], frame, least_cosine2, r
+                )
             else:
-                continue
+                held = judge(frames, c, centres[c], low, high)
+                if held == SOME and not mark(marks, x, y, z, centres[c], frames, c):
+                    held = NOTHING
+                if held == NOTHING:
+                    continue
+                if held == ALL:
+                    marks[:] = 1.0
+                rays = _add_camera(sums, tile, marks, centres[c], offset[c], None, least_cosine2, r)
             tested[t] += rows.size
             if rays:
                 used[c] = True  # threads may write it at once: always the same value
@@ -343,13 +355,13 @@ def _keep_steepest(chosen: IntArray, cosine2: FloatArray, k: int, most: int) -> 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _near(frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray) -> IntArray:
     """Return the cameras whose frames may hold a point of the box."""
-    outer, cone, row = frames.outer, frames.cone, frames.row
+    planes, row = frames.planes, frames.row
     near = np.empty(len(centres), np.int64)
     count = 0
     for c in range(len(centres)):
-        if not may_hold(outer[c], centres[c], low, high):
+        if not may_hold(planes[c], centres[c], low, high):
             continue
-        if row[c] == NOT_DISTORTED or may_reach(cone[c], centres[c], low, high):
+        if row[c] == NOT_DISTORTED or judge(frames, c, centres[c], low, high) != NOTHING:
             near[count] = c
             count += 1
     return near[:count]
@@ -357,12 +369,13 @@ def _near(frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _choose(
-    candidates: IntArray, tile: FloatArray, j: int, centres: FloatArray, frames: Frames,
-    least_cosine2: float, most: int, tin: Tin | None, facet: int,
+    candidates: IntArray, tile: FloatArray, j: int, centres: FloatArray, offset: FloatArray,
+    frames: Frames, least_cosine2: float, most: int,
+    tin: Tin | None, field: Field | None, facet: int,
 ) -> IntArray:  # fmt: skip
     """Return the cameras whose rays a point of the tile gets, in the order of the candidates.
 
-    On a mesh the incidence angle is that at the facet which the ray pierces.
+    On a mesh or raster the incidence angle is that where the ray pierces it.
     """
     chosen = np.empty(candidates.size, np.int64)
     cosine2 = np.empty(candidates.size)
@@ -372,13 +385,17 @@ def _choose(
         px, py, pz = tile[j], tile[TILE + j], tile[2 * TILE + j]
         ex, ey, ez = centres[c, 0] - px, centres[c, 1] - py, centres[c, 2] - pz
         nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-        h = nz * (tile[3 * TILE + j] - pz)
+        lowered = pz - offset[c]
+        h = nz * (tile[3 * TILE + j] - lowered)
         height = nx * ex + ny * ey + nz * ez
         length2 = ex * ex + ey * ey + ez * ez
         if not (height > h and holds(frames, c, ex, ey, ez)):
             continue
-        if tin is not None and some_only:
-            _, nx, ny, nz = pierce_mesh(tin, px, py, pz, ex, ey, ez, facet)
+        if h > 0.0 and some_only and (tin is not None or field is not None):
+            if tin is not None:
+                _, nx, ny, nz = pierce_mesh(tin, px, py, lowered, ex, ey, ez, facet)
+            if field is not None:
+                _, nx, ny, nz = pierce_raster(field, px, py, lowered, ex, ey, ez, h, nx, ny, nz)
             height = max(nx * ex + ny * ey + nz * ez, 0.0)
         if height * height >= least_cosine2 * length2:
             chosen[k], cosine2[k] = c, height * height / length2
@@ -389,14 +406,14 @@ def _choose(
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _chosen(
     order: IntArray, xyz: FloatArray, surface: FloatArray, slope: FloatArray,
-    centres: FloatArray, frames: Frames, least_cosine2: float, r: float,
+    centres: FloatArray, offset: FloatArray, frames: Frames, least_cosine2: float, r: float,
     result: FloatArray, used: BoolArray, tested: IntArray,
-    tin: Tin | None, views: tuple[IntArray, IntArray] | None, most: int,
+    tin: Tin | None, field: Field | None, views: tuple[IntArray, IntArray] | None, most: int,
 ) -> None:  # fmt: skip
-    """Chosen cameras per point, or rays that bend at a mesh."""
+    """Chosen cameras per point, or rays that bend at a mesh or raster."""
     for t in prange(tested.size):
         rows = order[t * TILE : (t + 1) * TILE]
-        tile = np.empty(8 * TILE)
+        tile = np.empty(7 * TILE)
         low, high = _gather(tile, rows, xyz, surface, slope)
         near = _near(frames, centres, low, high)
         for j in range(rows.size):
@@ -404,36 +421,44 @@ def _chosen(
             candidates = near
             if views is not None:
                 candidates = views[1][views[0][rows[j]] : views[0][rows[j] + 1]]
-            cameras = _choose(candidates, tile, j, centres, frames, least_cosine2, most, tin, facet)
+            cameras = _choose(
+                candidates, tile, j, centres, offset, frames, least_cosine2, most, tin, field, facet
+            )
             tested[t] += candidates.size
-            _intersect_one(result[rows[j]], cameras, tile, j, centres, r, used, tin, facet)
+            row = result[rows[j]]
+            _intersect_one(row, cameras, tile, j, centres, offset, r, used, tin, field, facet)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _intersect_one(
-    row: FloatArray, cameras: IntArray, tile: FloatArray, j: int, centres: FloatArray, r: float,
-    used: BoolArray, tin: Tin | None, facet: int,
+    row: FloatArray, cameras: IntArray, tile: FloatArray, j: int, centres: FloatArray,
+    offset: FloatArray, r: float, used: BoolArray,
+    tin: Tin | None, field: Field | None, facet: int,
 ) -> None:  # fmt: skip
     """Intersect the rays of one point with its own cameras."""
     px, py, pz = tile[j], tile[TILE + j], tile[2 * TILE + j]
-    nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-    h = nz * (tile[3 * TILE + j] - pz)
+    ux, uy, uz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
     sums = np.zeros(9)
     least = 1.0
     for c in cameras:
         used[c] = True
         ex, ey, ez = centres[c, 0] - px, centres[c, 1] - py, centres[c, 2] - pz
         length2 = ex * ex + ey * ey + ez * ez
-        if tin is None:
-            height = nx * ex + ny * ey + nz * ez
-            q = 1.0 / (length2 * height)
+        lowered = pz - offset[c]
+        h = uz * (tile[3 * TILE + j] - lowered)
+        f, bend, nx, ny, nz = 0.0, 1.0, ux, uy, uz
+        if h > 0.0:
+            bend = r
+            if tin is not None:
+                f, nx, ny, nz = pierce_mesh(tin, px, py, lowered, ex, ey, ez, facet)
+            if field is not None:
+                f, nx, ny, nz = pierce_raster(field, px, py, lowered, ex, ey, ez, h, ux, uy, uz)
+        height = nx * ex + ny * ey + nz * ez
+        q = 1.0 / (length2 * height)
+        if h > 0.0 and tin is None and field is None:
             f = h * length2 * q
-        else:
-            f, nx, ny, nz = pierce_mesh(tin, px, py, pz, ex, ey, ez, facet)
-            height = nx * ex + ny * ey + nz * ez
-            q = 1.0 / (length2 * height)
         inv = height * q
-        dx, dy, dz = refracted(ex, ey, ez, length2, nx, ny, nz, height, r)
+        dx, dy, dz = refracted(ex, ey, ez, length2, nx, ny, nz, height, bend)
         terms = line_terms(f * ex, f * ey, f * ez, dx, dy, dz, inv)
         for i in range(9):
             sums[i] += terms[i]

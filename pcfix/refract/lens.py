@@ -105,7 +105,7 @@ def _is_plain(lens: Lens) -> bool:
     return lens.projection == "perspective" and not (lens.inverse or lens.in_turn or any(beyond))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 def in_plane(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]:
     """Return the plane coordinates of a direction, before distortion."""
     if c[_KIND] == _PERSPECTIVE:
@@ -120,7 +120,7 @@ def in_plane(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]
     return scale * x, scale * y
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 def image_of(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]:
     """Return u, v of one direction."""
     px, py = in_plane(c, x, y, z)

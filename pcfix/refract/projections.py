@@ -67,18 +67,22 @@ def _end_of_polynomial(shape: tuple[float, ...]) -> float:
 
 
 def first_root(polynomial: Polynomial) -> float:
-    """Return the smallest positive real root, infinite where there is none."""
-    roots = np.asarray(polynomial.trim().roots(), complex)
-    real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
-    return float(real.min()) if real.size else np.inf
+    """Return the smallest positive real root; infinite where there is none.
+
+    Found as the largest root of the polynomial in 1 / x, as the lowest coefficient is never
+    small while the highest may be next to nothing.
+    """
+    roots = np.asarray(Polynomial(polynomial.coef[::-1]).roots(), complex)
+    real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 1e-300)]
+    return 1.0 / float(real.max()) if real.size else np.inf
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 def _shape(c: FloatArray, i: int) -> float:
     return c[int(c[SHAPE]) + i]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 def radius(c: FloatArray, theta: float) -> float:
     """Return the distance from the centre of the plane of a direction at an angle."""
     kind, s0, s1 = int(c[KIND]), _shape(c, 0), _shape(c, 1)
@@ -128,7 +132,7 @@ def angle(c: FloatArray, rho: float) -> float:
     return np.arctan(rho)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 def _polynomial(c: FloatArray, theta: float) -> tuple[float, float]:
     """Return Pix4D's polynomial and its slope."""
     q = theta / RIGHT_ANGLE
@@ -139,7 +143,7 @@ def _polynomial(c: FloatArray, theta: float) -> tuple[float, float]:
     return value, slope / RIGHT_ANGLE
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 def _dual(share: float, theta: float) -> tuple[float, float]:
     """Return the mean of perspective and equidistant, and its slope."""
     if share == 0.0:

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from pcfix.model import DEFAULT_REFRACTIVE_INDEX
+
 if TYPE_CHECKING:
     from pcfix.model import Summary
+
+BED_PER_LEVEL = 0.44
+"""How far a bed moves with the level, measured over whole blocks; straight down it is n - 1."""
 
 
 def summary_text(summary: Summary) -> str:
@@ -36,9 +41,39 @@ def summary_text(summary: Summary) -> str:
         f"cameras      {s.cameras_used} of {s.cameras} used"
         + (f"; {unused} see no corrected point: {names}" if unused else ""),
         f"rays         {s.rays:,} ({s.rays / max(s.corrected, 1):.1f} a point)",
-        f"water        {s.water}, refractive index {s.settings['refractive_index']:g}",
+        f"water        {s.water}, refractive index {s.settings['refractive_index']:.6g}",
+        *_index(s),
+        *_water_fit(s),
     ]
     return "\n".join(lines)
+
+
+def _index(s: Summary) -> list[str]:
+    """Say what a water's own index changes: straight down, depth is in proportion to it."""
+    settings = s.settings
+    if not settings["refractive_index_from"] or not s.depth_m:
+        return []
+    change = 1.0 - DEFAULT_REFRACTIVE_INDEX / settings["refractive_index"]
+    mean, most = (100.0 * change * s.depth_m[name] for name in ("mean", "max"))
+    way = "deeper" if change > 0.0 else "shallower"
+    return [
+        f"  index      of {settings['refractive_index_from']}; against"
+        f" {DEFAULT_REFRACTIVE_INDEX:g} the bed is {abs(mean):.1f} cm {way} on average,"
+        f" {abs(most):.1f} cm at most"
+    ]
+
+
+def _water_fit(s: Summary) -> list[str]:
+    """Say how well a fitted water level is known, and what that does to the bed."""
+    fit = s.water_fit
+    if fit is None:
+        return []
+    sigma = fit["sigma_level_m"]
+    used = f", {fit['accepted']} of {fit['points']} points" if "points" in fit else ""
+    return [
+        f"  fitted     {fit['model']}{used}; standard error of the level {sigma:.3f} m, of the bed"
+        f" by it {BED_PER_LEVEL * sigma:.3f} m"
+    ]
 
 
 def share(part: int, whole: int) -> str:

@@ -1,9 +1,16 @@
-"""One word that says what the water surface is."""
+"""One word that says what the water surface is, and whether it fits the cloud."""
 
+import laspy
 import numpy as np
 import pytest
+import rasterio
+from pyproj import Transformer
+from rasterio.transform import Affine, from_origin
 
 import pcfix
+from pcfix.io.scenes import write_scene
+from pcfix.io.water_rasters import MARGIN_M
+from pcfix.label.surface import surface_above
 from tests.utils.shared import needs
 
 RIVER, river = needs("river")
@@ -72,3 +79,352 @@ def test_river_mesh():
     assert mesh.vertices.shape == (22, 3)
     assert mesh.triangles.shape == (31, 3)
     assert mesh.vertices[0].tolist() == [338418.55069, 272913.3172, 174.798798]
+
+
+# Rasters
+
+UTM33 = "EPSG:32633"
+LEFT, TOP = 410_000.0, 4_650_400.0
+
+
+def tilted(x, y):
+    return 5.0 + 0.003 * (x - LEFT) - 0.002 * (y - TOP)
+
+
+def write(path, heights, transform=None, crs=UTM33, nodata=np.nan, bands=1, **more):
+    profile = {
+        "driver": "GTiff", "height": heights.shape[0], "width": heights.shape[1], "count": bands,
+        "dtype": heights.dtype, "crs": crs, "nodata": nodata,
+        "transform": transform or from_origin(LEFT, TOP, 2.0, 2.0),
+    }  # fmt: skip
+    unit = more.pop("unit", None)
+    with rasterio.open(path, "w", **{**profile, **more}) as target:
+        for band in range(1, bands + 1):
+            target.write(heights, band)
+        if unit:
+            target.set_band_unit(1, unit)
+    return path
+
+
+def cells(transform, rows=150, columns=200):
+    column, row = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
+    x = transform.a * column + transform.b * row + transform.c
+    return x, transform.d * column + transform.e * row + transform.f
+
+
+def plane_in(crs, transform, **size):
+    """Return heights of the tilted plane of UTM zone 33 on cells in another CRS."""
+    x, y = cells(transform, **size)
+    step = Transformer.from_crs(crs, UTM33, always_xy=True)
+    return tilted(*step.transform(x, y))
+
+
+def places(n=500, inside=20.0):
+    rng = np.random.default_rng(2)
+    x = rng.uniform(LEFT + inside, LEFT + 400 - inside, n)
+    return np.column_stack([x, rng.uniform(TOP - 300 + inside, TOP - inside, n), np.zeros(n)])
+
+
+def expect_plane(water, at=None, within_m=1e-6):
+    at = places() if at is None else at
+    surface = surface_above(water, at)
+    assert surface.height_m == pytest.approx(tilted(*at[:, :2].T), abs=within_m)
+    assert surface.slope == pytest.approx(np.tile([0.003, -0.002], (len(at), 1)), abs=1e-5)
+
+
+def test_a_north_up_raster_is_taken_cell_by_cell(tmp_path):
+    heights = tilted(*cells(from_origin(LEFT, TOP, 2.0, 2.0)))
+    heights[3:5, 7] = np.nan
+    water = pcfix.read_water(write(tmp_path / "water.tif", heights), UTM33)
+    assert np.array_equal(water.height_m, heights, equal_nan=True)
+    assert (water.left_m, water.top_m, water.cell_m) == (LEFT, TOP, (2.0, 2.0))
+    assert str(water) == "raster water.tif, 200 x 150 cells of 2 m"
+    expect_plane(water, places()[np.isfinite(surface_above(water, places()).height_m)])
+
+
+def test_only_the_surroundings_of_the_cloud_are_read(tmp_path):
+    transform = from_origin(LEFT, TOP, 2.0, 2.0)
+    path = write(tmp_path / "water.tif", tilted(*cells(transform, 600, 700)))
+    west, north = LEFT + 500.0, TOP - 500.0
+    water = pcfix.read_water(path, UTM33, (west, north - 50.0, west + 100.0, north))
+    assert water.height_m.shape[0] * 2.0 < 50.0 + 2 * MARGIN_M + 12.0
+    assert water.height_m.shape[1] * 2.0 < 100.0 + 2 * MARGIN_M + 12.0
+    at = places(50)[:, :] * 0 + [west + 33.3, north - 44.4, 0.0]
+    expect_plane(water, at)
+    with pytest.raises(pcfix.InputError, match="does not reach the cloud"):
+        pcfix.read_water(path, UTM33, (west + 5000, north, west + 6000, north + 50))
+
+
+@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:32632", "EPSG:3857"])
+def test_another_crs_is_resampled(tmp_path, crs):
+    to = Transformer.from_crs(UTM33, crs, always_xy=True)
+    x, y = to.transform(LEFT - 60.0, TOP + 60.0)
+    size = 2e-5 if crs == "EPSG:4326" else 2.0
+    transform = from_origin(x, y, size, size)
+    rows, columns = 320, 420
+    path = write(
+        tmp_path / "w.tif", plane_in(crs, transform, rows=rows, columns=columns), transform, crs
+    )
+    bounds = (LEFT, TOP - 300.0, LEFT + 400.0, TOP)
+    # the plane is bent by a map of another zone: below 0.1 mm over a cell
+    expect_plane(pcfix.read_water(path, UTM33, bounds), within_m=1e-4)
+
+
+def turned_by(degrees, left, top):
+    c, s = 2.0 * np.cos(np.radians(degrees)), 2.0 * np.sin(np.radians(degrees))
+    return Affine(c, s, left, s, -c, top)
+
+
+def test_a_turned_raster_is_resampled(tmp_path):
+    turned = turned_by(-30.0, LEFT + 100.0, TOP + 100.0)
+    path = write(tmp_path / "w.tif", tilted(*cells(turned, 300, 300)), turned)
+    water = pcfix.read_water(path, UTM33)
+    at = np.array([[LEFT + 200.0, TOP - 300.0, 0.0], [LEFT + 250.5, TOP - 222.2, 0.0]])
+    expect_plane(water, at)
+    assert np.isnan(surface_above(water, np.array([[LEFT - 200.0, TOP - 200.0, 0.0]])).height_m)
+
+
+def test_a_raster_from_south_to_north_is_turned_over(tmp_path):
+    upside = Affine(2.0, 0.0, LEFT, 0.0, 2.0, TOP - 300.0)
+    expect_plane(pcfix.read_water(write(tmp_path / "w.tif", tilted(*cells(upside)), upside), UTM33))
+
+
+def test_a_gap_stays_a_gap_when_resampled(tmp_path):
+    turned = turned_by(20.0, LEFT, TOP)
+    heights = tilted(*cells(turned, 200, 200))
+    heights[100, 100] = np.nan
+    water = pcfix.read_water(write(tmp_path / "w.tif", heights, turned), UTM33)
+    gap = np.array([turned.a * 100.5 + turned.b * 100.5 + turned.c, 0.0, 0.0])
+    gap[1] = turned.d * 100.5 + turned.e * 100.5 + turned.f
+    assert np.isnan(surface_above(water, gap[None]).height_m)
+
+
+def test_stated_and_unstated_nodata(tmp_path):
+    heights = tilted(*cells(from_origin(LEFT, TOP, 2.0, 2.0))).astype(np.float32)
+    heights[0, 0] = -9999.0
+    stated = pcfix.read_water(write(tmp_path / "a.tif", heights, nodata=-9999.0), UTM33)
+    with pytest.warns(pcfix.PcfixWarning, match="no nodata value; 1 cells"):
+        unstated = pcfix.read_water(write(tmp_path / "b.tif", heights, nodata=None), UTM33)
+    assert np.isnan(stated.height_m[0, 0])
+    assert np.array_equal(stated.height_m, unstated.height_m, equal_nan=True)
+    heights[:] = -9999.0
+    with pytest.raises(pcfix.InputError, match="holds no height; check its nodata"):
+        pcfix.read_water(write(tmp_path / "c.tif", heights, nodata=-9999.0), UTM33)
+
+
+def test_whole_numbers_with_a_scale(tmp_path):
+    heights = tilted(*cells(from_origin(LEFT, TOP, 2.0, 2.0)))
+    path = write(tmp_path / "w.tif", np.rint(heights * 1000).astype(np.int32), nodata=-1)
+    with rasterio.open(path, "r+") as target:
+        target.scales, target.offsets = (0.001,), (0.25,)
+    water = pcfix.read_water(path, UTM33)
+    assert water.height_m == pytest.approx(heights + 0.25, abs=0.00051)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("m", 1.0), ("ft", 0.3048), ("cm", 0.01)])
+def test_heights_in_another_unit_are_converted(tmp_path, unit, factor):
+    heights = tilted(*cells(from_origin(LEFT, TOP, 2.0, 2.0)))
+    for crs in (UTM33, None):
+        path = write(tmp_path / "w.tif", heights / factor, unit=unit, crs=crs)
+        expect_plane(pcfix.read_water(path, crs))
+    with pytest.raises(pcfix.InputError, match="its heights are in 'furlong'"):
+        pcfix.read_water(write(tmp_path / "f.tif", heights, unit="furlong"), UTM33)
+
+
+def test_a_vertical_crs_in_feet_is_converted(tmp_path):
+    # NAVD88 in US survey feet against the same datum in metres
+    heights = tilted(*cells(from_origin(LEFT, TOP, 2.0, 2.0)))
+    path = write(tmp_path / "w.tif", heights * 3937.0 / 1200.0, crs="EPSG:26910+6360")
+    expect_plane(pcfix.read_water(path, "EPSG:26910+5703"))
+    with pytest.warns(pcfix.PcfixWarning, match="the cloud names no CRS; taken to be in NAD83"):
+        expect_plane(pcfix.read_water(path))
+
+
+def test_a_crs_in_feet_says_what_heights_are(tmp_path):
+    path = write(tmp_path / "w.tif", np.full((5, 5), 10.0), crs="EPSG:2225")
+    with (
+        pytest.warns(pcfix.PcfixWarning, match=r"taken to be in that of its CRS \(0.3048 m\)"),
+        pytest.raises(pcfix.InputError, match="the cloud names no CRS"),
+    ):
+        pcfix.read_water(path, "EPSG:26910")
+        pcfix.read_water(path)
+
+
+def test_heights_of_another_datum_are_refused(tmp_path):
+    path = write(tmp_path / "w.tif", np.full((5, 5), 10.0), crs="EPSG:25833+7837")
+    with pytest.raises(pcfix.InputError, match="cannot be brought to"):
+        pcfix.read_water(path, "EPSG:25833+5621")
+
+
+def test_a_raster_without_a_crs_says_so(tmp_path):
+    path = write(tmp_path / "w.tif", tilted(*cells(from_origin(LEFT, TOP, 2, 2))), crs=None)
+    with pytest.warns(pcfix.PcfixWarning, match="names no CRS; taken to be in the cloud's"):
+        expect_plane(pcfix.read_water(path, UTM33))
+
+
+def test_rasters_that_are_no_surface(tmp_path):
+    heights = np.full((5, 5), 10.0)
+    with pytest.raises(pcfix.InputError, match="has 3 bands; write the height"):
+        pcfix.read_water(write(tmp_path / "rgb.tif", heights, bands=3), UTM33)
+    with pytest.raises(pcfix.InputError, match="complex"):
+        pcfix.read_water(write(tmp_path / "c.tif", heights.astype(complex)), UTM33)
+    with pytest.raises(pcfix.InputError, match="fewer than two rows"):
+        pcfix.read_water(write(tmp_path / "row.tif", heights[:1]), UTM33)
+    with pytest.warns(rasterio.errors.NotGeoreferencedWarning):
+        path = write(tmp_path / "n.tif", heights, Affine.identity(), crs=None)
+        with pytest.raises(pcfix.InputError, match="no place in the world"):
+            pcfix.read_water(path, UTM33)
+    (tmp_path / "garbage.tif").write_bytes(b"II*\0nonsense")
+    with pytest.raises(pcfix.InputError, match=r"garbage.tif: is damaged, or is not a raster"):
+        pcfix.read_water(tmp_path / "garbage.tif")
+    (tmp_path / "shore.csv").write_text("x,y,z\n1,2,3\n")
+    with pytest.raises(pcfix.InputError, match="is not a water surface that pcfix reads"):
+        pcfix.read_water(tmp_path / "shore.csv")
+
+
+def test_too_many_cells_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("pcfix.io.water_rasters.MOST_CELLS", 100)
+    path = write(tmp_path / "w.tif", np.full((20, 20), 10.0))
+    with pytest.raises(pcfix.InputError, match="400 cells are too many"):
+        pcfix.read_water(path, UTM33)
+
+
+# Meshes that are not plain height fields
+
+
+def write_obj(path, vertices, faces):
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices]
+    path.write_text("\n".join([*lines, *(f"f {a} {b} {c}" for a, b, c in faces)]) + "\n")
+    return path
+
+
+SQUARE = [(0, 0, 1.0), (10, 0, 1.1), (10, 10, 1.1), (0, 10, 1.0)]
+
+
+def test_facets_may_face_down(tmp_path):
+    one = pcfix.read_water(write_obj(tmp_path / "a.obj", SQUARE, [(1, 2, 3), (1, 3, 4)]))
+    other = pcfix.read_water(write_obj(tmp_path / "b.obj", SQUARE, [(1, 3, 2), (1, 3, 4)]))
+    at = np.random.default_rng(1).uniform(0, 10, (200, 3))
+    for name in ("height_m", "slope"):
+        assert getattr(surface_above(one, at), name) == pytest.approx(
+            getattr(surface_above(other, at), name), abs=1e-12
+        )
+
+
+def test_a_closed_body_is_refused(tmp_path):
+    below = [(x, y, z - 3.0) for x, y, z in SQUARE]
+    faces = [(1, 2, 3), (1, 3, 4), (5, 7, 6), (5, 8, 7), (1, 2, 6), (1, 6, 5)]
+    with pytest.raises(pcfix.InputError, match=r"100 % of the mesh lies above or below another"):
+        pcfix.read_water(write_obj(tmp_path / "box.obj", SQUARE + below, faces))
+
+
+def test_small_folds_and_walls_are_said(tmp_path):
+    fold = [(9.0, 9.0, 2.0), (9.9, 9.0, 2.0), (9.0, 9.9, 2.0), (0, 0, 5.0)]
+    plain, walls = [(1, 2, 3), (1, 3, 4)], [(1, 2, 8)]
+    with pytest.warns(pcfix.PcfixWarning, match=r"overlap others at another height \(1 of 3\)"):
+        pcfix.read_water(write_obj(tmp_path / "fold.obj", SQUARE + fold, [*plain, (5, 6, 7)]))
+    with pytest.warns(pcfix.PcfixWarning, match=r"left out \(1\)"):
+        pcfix.read_water(write_obj(tmp_path / "wall.obj", SQUARE + fold, plain + walls))
+    twice = write_obj(tmp_path / "twice.obj", SQUARE, plain + plain)
+    assert len(pcfix.read_water(twice).triangles) == 4  # at one height: no harm
+
+
+# Water and cloud
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    made = pcfix.simulate_scene(2000, seed=3)
+    write_scene(made, folder, overwrite=False)
+    return folder, made
+
+
+def corrected(scene, output, water, **more):
+    folder, _ = scene
+    return pcfix.correct_file(
+        folder / "cloud.laz", output, cameras=folder / "cameras.csv", water=water, **more
+    )
+
+
+def level_raster(path, made, cover, level=None):
+    """Write the level of a scene over part of its length, west of the rest."""
+    west, south = made.true_xyz[:, :2].min(axis=0) - 20.0
+    east, north = made.true_xyz[:, :2].max(axis=0) + 20.0
+    heights = np.full((int(north - south), int((east - west) * cover)), level or made.water_level_m)
+    return write(path, heights, from_origin(west, north, 1.0, 1.0), f"EPSG:{made.epsg}")
+
+
+def test_a_raster_of_the_level_corrects_as_the_level_does(scene, tmp_path):
+    path = level_raster(tmp_path / "water.tif", scene[1], 1.0)
+    corrected(scene, tmp_path / "a.las", path)
+    corrected(scene, tmp_path / "b.las", scene[1].water_level_m)
+    one, other = laspy.read(tmp_path / "a.las"), laspy.read(tmp_path / "b.las")
+    assert np.array_equal(one.classification, other.classification)
+    for axis in "XYZ":  # a step of the file, where the last bit decides the rounding
+        assert np.abs(one[axis] - other[axis]).max() <= 1
+
+
+def test_what_a_raster_does_not_cover_is_said_and_left(scene, tmp_path):
+    path = level_raster(tmp_path / "water.tif", scene[1], 0.5)
+    with pytest.warns(pcfix.PcfixWarning, match=r"does not cover \d+\.\d % of the points") as said:
+        summary = corrected(scene, tmp_path / "a.las", path)
+    assert 0 < summary.water_unknown < summary.points
+    assert summary.warnings[-1] in [str(one.message) for one in said]
+    share = 100.0 * summary.water_unknown / summary.points
+    assert f"cover {share:.1f} %" in summary.warnings[-1]
+
+
+def test_a_tilt_above_five_percent_is_refused(scene, tmp_path):
+    x, y = scene[1].true_xyz[:, :2].mean(axis=0)
+    plane = f"plane:{0.06 * -x + 0.37},0.06,0"
+    with pytest.raises(pcfix.GeometryError, match=r"is tilted by 6\.0 %; 5 % is the most"):
+        corrected(scene, tmp_path / "a.las", plane)
+    corners = [(x - 200, y, -12), (x + 200, y, 12), (x, y + 200, 0), (x, y - 200, 0)]
+    mesh = write_obj(tmp_path / "m.obj", corners, [(1, 2, 3), (1, 4, 2)])
+    with pytest.raises(pcfix.GeometryError, match=r"is tilted by 6\.0 %"):
+        corrected(scene, tmp_path / "a.las", mesh)
+    heights = np.tile(np.linspace(-9, 9, 300), (300, 1)).astype(np.float32)
+    steep = write(tmp_path / "s.tif", heights, from_origin(x - 150, y + 150, 1, 1), "EPSG:32633")
+    with pytest.raises(pcfix.GeometryError, match=r"is tilted by 6\.0 %"):
+        corrected(scene, tmp_path / "a.las", steep)
+
+
+def test_water_far_below_names_the_heights_of_the_cloud(scene, tmp_path):
+    with pytest.raises(
+        pcfix.GeometryError, match=r"no point lies below.*heights are -\d+\.\d\d to"
+    ):
+        corrected(scene, tmp_path / "a.las", -40)
+
+
+def moved(scene, path, up, scale=1.0):
+    """Write the scene's cloud and cameras higher up, or in another unit of height."""
+    folder, _ = scene
+    las = laspy.read(folder / "cloud.laz")
+    las.change_scaling(offsets=[*las.header.offsets[:2], up])
+    las.z = (np.asarray(las.z) + up) * scale
+    las.write(path / "cloud.laz")
+    rows = (folder / "cameras.csv").read_text().splitlines()
+    at = rows[0].split(",").index("z")
+    table = [row.split(",") for row in rows]
+    for row in table[1:]:
+        row[at] = str((float(row[at]) + up + 500.0) * scale)
+    (path / "cameras.csv").write_text("\n".join(map(",".join, table)) + "\n")
+    (path / "sensor.csv").write_text((folder / "sensor.csv").read_text())
+    return path, scene[1]
+
+
+def test_water_far_above_and_feet(scene, tmp_path):
+    there = moved(scene, tmp_path, 174.0)
+    with pytest.raises(pcfix.GeometryError, match=r"all points lie more than 100 m below") as said:
+        corrected(there, tmp_path / "a.las", 174.37 / 0.3048)
+    assert "would lie among them if the water is in feet" in str(said.value)
+    with pytest.raises(pcfix.GeometryError, match="all points lie more than 100 m") as said:
+        corrected(there, tmp_path / "a.las", 400)
+    assert "in feet" not in str(said.value)
+
+
+def test_a_cloud_in_feet_is_guessed(scene, tmp_path):
+    there = moved(scene, tmp_path, 174.0, 1 / 0.3048)
+    with pytest.raises(pcfix.GeometryError, match="if the cloud's heights are in feet"):
+        corrected(there, tmp_path / "a.las", 174.37)

@@ -67,7 +67,10 @@ def test_index_falls_with_temperature_and_wavelength_and_grows_with_salt():
 def test_waters_by_name():
     assert index_of("fresh")[0] == pytest.approx(1.335, abs=0.001)
     assert index_of(" Sea ")[0] == pytest.approx(1.342, abs=0.001)
-    assert index_of("1.337") == (1.337, None)
+    assert index_of("1.337") == (1.337, "")
+    assert index_of(1.337) == (1.337, "")
+    assert index_of("sea") == (index_of("35,15,0.53")[0], "sea: 35 PSU, 15 C, 0.53 um")
+    assert index_of("20,4")[0] == refractive_index(20.0, 4.0)
 
 
 @pytest.mark.parametrize(
@@ -84,6 +87,7 @@ def test_values_outside_the_fit_are_refused(words, message):
         refractive_index(**words)
 
 
-def test_words_that_are_no_water_are_refused():
+@pytest.mark.parametrize("words", ["brackish", "", "35,warm", "1,2,3,4", "35;15"])
+def test_words_that_are_no_water_are_refused(words):
     with pytest.raises(pcfix.SettingError, match="neither a number nor fresh nor sea"):
-        index_of("brackish")
+        index_of(words)

@@ -14,7 +14,7 @@ import pcfix
 from pcfix.errors import InputError
 from pcfix.io.las.columns import Column, column_scale
 from pcfix.io.las.formats import upgraded
-from pcfix.io.las.provenance import cleaning_vlr, is_ours, settings_vlr
+from pcfix.io.las.provenance import is_ours, settings_vlr
 from pcfix.io.las.records import Record, RecordList
 from pcfix.io.las.source import las_errors
 
@@ -74,17 +74,17 @@ def corrected_header(
     return new.header
 
 
-def cleaned_header(source: LasSource, content: dict[str, Any]) -> laspy.LasHeader:
-    """Return the header of a cleaned file: LAS 1.4, the input's records, and one on the cleaning.
+def noted_header(source: LasSource, note: VLR) -> laspy.LasHeader:
+    """Return the header of a file with other classes or flags: LAS 1.4, its records, and a note.
 
     Parameters
     ----------
     source : LasSource
-    content : dict
-        What the record shall say; those of earlier cleanings stay before it.
+    note : VLR
+        What was done; notes of earlier times stay before it.
     """
     new = _upgraded(source, [])
-    _set_records(new.header, [*new.vlrs, cleaning_vlr(content)], new.described)
+    _set_records(new.header, [*new.vlrs, note], new.described)
     return new.header
 
 

@@ -18,6 +18,8 @@ SETTINGS_RECORD = 1
 DESCRIPTION = "pcfix settings (JSON)"
 CLEANING_RECORD = 2
 CLEANING_DESCRIPTION = "pcfix cleaning (JSON)"
+LABELLING_RECORD = 3
+LABELLING_DESCRIPTION = "pcfix labelling (JSON)"
 BEFORE = (
     "version",
     "point_format",
@@ -44,6 +46,11 @@ def settings_vlr(content: dict[str, Any]) -> VLR:
 def cleaning_vlr(content: dict[str, Any]) -> VLR:
     """Return the VLR that says how a file was cleaned, as JSON; one for each cleaning."""
     return _json_vlr(CLEANING_RECORD, CLEANING_DESCRIPTION, content)
+
+
+def labelling_vlr(content: dict[str, Any]) -> VLR:
+    """Return the VLR that says how a file was labelled, as JSON; one for each labelling."""
+    return _json_vlr(LABELLING_RECORD, LABELLING_DESCRIPTION, content)
 
 
 def _json_vlr(record: int, description: str, content: dict[str, Any]) -> VLR:

@@ -1,0 +1,253 @@
+"""The water surface of a cloud: read, fitted to a shoreline, or found in the cloud itself."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from os import PathLike
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+
+from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.io.las.crs import metric_crs
+from pcfix.io.las.source import LasSource, coordinates
+from pcfix.io.water import read_water
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    import numpy.typing as npt
+    from pyproj import CRS
+
+    from pcfix.label.auto import WaterProposal
+    from pcfix.label.fit import WaterFit
+    from pcfix.label.river import RiverFit
+    from pcfix.model import FloatArray, WaterSurface
+
+    AnyPath = str | PathLike[str]
+    Evidence: TypeAlias = WaterFit | RiverFit | WaterProposal
+
+WaterModel = Literal["auto", "level", "plane", "along", "river"]
+AUTO = "auto"
+SAMPLE_POINTS = 2_000_000
+"""Points of a cloud that are looked at for a surface, evenly spread."""
+SHORE_RADIUS_M = 1.0
+"""About shoreline points without a height, which they take from the cloud."""
+CHUNK_POINTS = 1_000_000
+
+
+class Seen(NamedTuple):
+    """Some points of a cloud, and what they show; None where the cloud does not have it."""
+
+    xyz: FloatArray
+    rgb: npt.NDArray[Any] | None
+    classes: npt.NDArray[Any] | None
+    returns: npt.NDArray[Any] | None
+
+
+@dataclass(frozen=True)
+class CloudView:
+    """A cloud as a water surface needs it.
+
+    Attributes
+    ----------
+    name : str
+        For messages.
+    crs : CRS, str or None
+    low, high : array, shape (2,)
+        South-west and north-east corner, metres.
+    points : int
+    chunks : callable
+        Returns the points, `Seen` after `Seen`.
+    """
+
+    name: str
+    crs: CRS | str | None
+    low: FloatArray
+    high: FloatArray
+    points: int
+    chunks: Callable[[], Iterator[Seen]]
+
+
+def view_of(path: Path, jobs: int | None = None) -> CloudView:
+    """Return the view of a LAS or LAZ file."""
+    with LasSource(path, jobs) as source:
+        crs, points = metric_crs(source), len(source)
+        low, high = np.array(source.header.mins[:2]), np.array(source.header.maxs[:2])
+
+    def chunks() -> Iterator[Seen]:
+        with LasSource(path, jobs) as source:
+            names = set(source.header.point_format.dimension_names)
+            for some in source.chunks(CHUNK_POINTS):
+                rgb = None
+                if {"red", "green", "blue"} <= names:
+                    rgb = np.column_stack([some["red"], some["green"], some["blue"]])
+                classes, returns = some["classification"], some["number_of_returns"]
+                yield Seen(coordinates(some), rgb, np.asarray(classes), np.asarray(returns))
+
+    return CloudView(str(path), crs, low, high, points, chunks)
+
+
+@dataclass(frozen=True)
+class WaterWords:
+    """The water surface as the user names it.
+
+    Attributes
+    ----------
+    water : WaterSurface, float, str or path
+        See `pcfix.read_water`; besides, a vector file of shoreline points or lines, to which a
+        surface is fitted, or ``auto``: the surface is sought in the cloud.
+    model : {"auto", "level", "plane", "along", "river"}
+        What is fitted to shoreline points; see `pcfix.label.fit.fit_water` and
+        `pcfix.label.river.fit_river`.
+    crs : str or None
+        Of shoreline points, instead of what their file says.
+    """
+
+    water: WaterSurface | float | AnyPath
+    model: WaterModel = "auto"
+    crs: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FoundSurface:
+    """A water surface and how it was come by.
+
+    Attributes
+    ----------
+    surface : WaterSurface
+    evidence : WaterFit, RiverFit, WaterProposal or None
+        None where the surface was given as it is.
+    points : array, shape (n, 3)
+        Shoreline points that were fitted, metres, the cloud's CRS.
+    notes : tuple of str
+    """
+
+    surface: WaterSurface
+    evidence: Evidence | None = None
+    points: FloatArray | None = None
+    notes: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, Any] | None:
+        """Return the figures of a fit as plain values; None where nothing was fitted."""
+        found = self.evidence
+        if found is None:
+            return None
+        if hasattr(found, "as_dict"):
+            return dict(found.as_dict())
+        return {
+            "model": "auto",
+            "level_m": found.level_m,
+            "sigma_level_m": found.sigma_level_m,
+            "at_xy": found.centre_xy.tolist(),
+            "tilt_percent": 100.0 * float(np.hypot(*found.tilt)),
+            "confidence": found.confidence,
+            "evidence": found.evidence,
+            "notes": list(found.reasons),
+        }
+
+
+def find_surface(words: WaterWords, view: CloudView | None) -> FoundSurface:
+    """Return the water surface that the user means, for a cloud.
+
+    Parameters
+    ----------
+    words : WaterWords
+    view : CloudView or None
+        Without a cloud only surfaces that do not need one.
+
+    Raises
+    ------
+    PcfixError
+        If the surface cannot be read, fitted or found, or needs a cloud and there is none.
+    """
+    from pcfix.io.vectors import is_vector_file
+
+    water = words.water
+    if not isinstance(water, str | PathLike | float | int):
+        return FoundSurface(water)
+    if str(water).strip().lower() == AUTO:
+        return _sought(view)
+    if isinstance(water, str | PathLike) and is_vector_file(water):
+        return _fitted(words, water, view)
+    if view is None:
+        return FoundSurface(read_water(water))
+    return FoundSurface(read_water(water, view.crs, _bounds(view.low, view.high)))
+
+
+def _bounds(low: FloatArray, high: FloatArray) -> tuple[float, float, float, float]:
+    """Return the west, south, east and north end of a box."""
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def _sought(view: CloudView | None) -> FoundSurface:
+    from pcfix.label.auto import find_water
+
+    if view is None:
+        raise SettingError("water 'auto' is found in a cloud; give the cloud too.")
+    every = max(1, view.points // SAMPLE_POINTS)
+    parts = [_thinned(seen, every) for seen in view.chunks()]
+
+    def whole(name: str) -> Any:
+        arrays = [getattr(part, name) for part in parts]
+        return None if any(a is None for a in arrays) else np.concatenate(arrays)
+
+    proposal = find_water(
+        whole("xyz"),
+        rgb=whole("rgb"),
+        classes=whole("classes"),
+        number_of_returns=whole("returns"),
+    )
+    return FoundSurface(proposal.surface, proposal, proposal.shoreline)
+
+
+def _thinned(seen: Seen, every: int) -> Seen:
+    return Seen(
+        seen.xyz[::every],
+        *(None if values is None else values[::every] for values in seen[1:]),
+    )
+
+
+def _fitted(words: WaterWords, path: AnyPath, view: CloudView | None) -> FoundSurface:
+    """Return the surface fitted to shoreline points."""
+    from pcfix.io.shorelines import read_shoreline
+    from pcfix.label.fit import fit_water
+    from pcfix.label.river import fit_river
+
+    shore = read_shoreline(path, None if view is None else view.crs, crs=words.crs)
+    xyz, notes = shore.xyz, list(shore.notes)
+    if np.isnan(xyz[:, 2]).any():
+        xyz = _with_heights(xyz, shore.name, view, notes)
+    found: WaterFit | RiverFit
+    if words.model == "river":
+        corners = (xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0))
+        low, high = corners if view is None else (view.low, view.high)
+        found = fit_river(xyz, _bounds(low, high), name=shore.name)
+    else:
+        found = fit_water(xyz, model=words.model)
+    for note in notes:
+        warnings.warn(note, PcfixWarning, stacklevel=2)
+    return FoundSurface(found.surface, found, xyz, (*notes, *found.notes))
+
+
+def _with_heights(
+    xyz: FloatArray, name: str, view: CloudView | None, notes: list[str]
+) -> FloatArray:
+    """Give the points without a height that of the cloud about them."""
+    from pcfix.label.cloud_heights import heights_from_cloud, is_near
+
+    if view is None:
+        raise InputError(f"{name}: has points without a height; give the cloud too.")
+    lacking = np.isnan(xyz[:, 2])
+    places = xyz[lacking, :2]
+    near = [seen.xyz[is_near(places, seen.xyz, SHORE_RADIUS_M)] for seen in view.chunks()]
+    heights = heights_from_cloud(places, np.vstack(near), SHORE_RADIUS_M)
+    notes.append(
+        f"{name}: {int(lacking.sum()):,} points have no height and take that of the cloud within"
+        f" {SHORE_RADIUS_M:g} m; {heights.missing:,} found none and do not count."
+    )
+    filled = xyz.copy()
+    filled[lacking, 2] = heights.height_m
+    return filled

@@ -1,0 +1,218 @@
+"""Which points are submerged, and which class they get: one rule for every door.
+
+A point is submerged if it lies below the water surface, is inside the mask where there is one,
+does not come with a class to respect, and, where that is asked for, belongs to water that is
+joined. Within the dead band its surroundings decide instead of its own height: each point inside
+the mask, and of no class to respect, has a vote, its height above the surface divided by the dead
+band and cut to -1 ... 1; a point within the dead band is submerged if the votes of its cell and
+the eight cells around it are negative together.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from pcfix.io.las.columns import BATHYMETRIC_POINT
+from pcfix.label.connected import Grid
+from pcfix.label.left_out import LeftOut
+from pcfix.label.surface import is_submerged
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    import numpy.typing as npt
+
+    from pcfix.label.connected import Surroundings
+    from pcfix.label.mask import WaterMask
+    from pcfix.label.surface import SurfaceAbove
+    from pcfix.model import BoolArray, FloatArray, IntArray, LabelSettings
+
+    Classes = npt.NDArray[np.uint8]
+
+UNCLASSIFIED, WATER_SURFACE = 1, 41
+"""ASPRS classes (LAS 1.4 R15, table 17, and its topo-bathy lidar domain profile)."""
+
+
+class Part(NamedTuple):
+    """Some points of a cloud: shape (n, 3), metres; the water above them; shape (n,)."""
+
+    xyz: FloatArray
+    surface: SurfaceAbove
+    classes: Classes
+
+
+class Labels(NamedTuple):
+    """What n points become: their classes, and which of them got 40 and 41 just now."""
+
+    classes: Classes
+    submerged: BoolArray
+    at_surface: BoolArray
+
+
+class Labelling:
+    """The settings, mask and surroundings of a labelling, and what it left out so far (`left_out`).
+
+    Parameters
+    ----------
+    settings : LabelSettings
+    mask : WaterMask or None
+    """
+
+    def __init__(self, settings: LabelSettings, mask: WaterMask | None = None) -> None:
+        self.settings, self.mask = settings, mask
+        self._around: Surroundings | None = None
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the points so far, but not their surroundings."""
+        self.left_out = LeftOut(self.settings, self.mask, self._around)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was done to the mask on reading it."""
+        return () if self.mask is None else self.mask.notes
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether all that counts for being submerged is to lie below the surface."""
+        s = self.settings
+        return self.mask is None and not (s.respect_classes or s.connected or s.dead_band_m)
+
+    @property
+    def looks_around(self) -> bool:
+        """Whether `look_around` must see the whole cloud first."""
+        return self.settings.connected or self.settings.dead_band_m > 0.0
+
+    def look_around(
+        self, parts: Callable[[], Iterable[Part]], low: FloatArray, high: FloatArray
+    ) -> None:
+        """Learn the surroundings of all points.
+
+        Parameters
+        ----------
+        parts : callable
+            Returns the whole cloud, part by part; called again if the corners were wrong.
+        low, high : array, shape (2,)
+            South-west and north-east corner of the cloud, as far as they are known.
+        """
+        settings = self.settings
+        if not (np.isfinite([low, high]).all() and (low <= high).all()):
+            low = high = np.zeros(2)
+        while True:
+            grid = Grid(low, high, settings.dead_band_m)
+            for part in parts():
+                x, y, z = np.ascontiguousarray(part.xyz.T)
+                height = z - part.surface.height_m
+                grid.add(x, y, height, self._counting(x, y, height, part.classes))
+            if grid.fits:
+                break
+            low, high = grid.low, grid.high
+        self._around = grid.surroundings(
+            connected=settings.connected, least_pool_m2=settings.least_pool_m2
+        )
+        self.restart()
+
+    def _counting(
+        self, x: FloatArray, y: FloatArray, height: FloatArray, classes: Classes
+    ) -> BoolArray:
+        """Return which points count; high ones do not matter without a dead band."""
+        counts = np.ones(len(x), np.bool_) if self.settings.dead_band_m else height < 0.0
+        if self.settings.respect_classes:
+            counts &= ~np.isin(classes, self.settings.respect_classes)
+        if self.mask is not None:
+            rows = np.flatnonzero(counts)
+            counts[rows] = self.mask.inside(x[rows], y[rows])
+        return counts
+
+    def submerged(self, xyz: FloatArray, surface: SurfaceAbove, classes: Classes) -> BoolArray:
+        """Return which of n points are submerged, and count those that are not although below.
+
+        Parameters
+        ----------
+        xyz : array, shape (n, 3)
+            Metres, world frame.
+        surface : SurfaceAbove
+        classes : array, shape (n,)
+            That they come with.
+        """
+        below = is_submerged(xyz[:, 2], surface)
+        if self.is_plain:
+            return below
+        height = xyz[:, 2] - surface.height_m
+        wet = below | self._within(height, self.settings.dead_band_m)
+        rows = np.flatnonzero(wet)
+        wet[rows] = self._decided(xyz[rows], height[rows], classes[rows])
+        return wet
+
+    def labels(self, part: Part) -> Labels:
+        """Return what points become; the classes of all that is not submerged stay."""
+        wet = self.submerged(*part)
+        new = part.classes.copy()
+        if self.settings.reset:
+            old = sets_class(part.classes) & ~np.isin(part.classes, self.settings.respect_classes)
+            new[old] = UNCLASSIFIED
+        at_surface = np.zeros(len(wet), np.bool_)
+        if self.settings.band_m > 0.0:
+            at_surface[self._at_surface(*part)] = True
+        wet &= ~at_surface
+        new[wet], new[at_surface] = BATHYMETRIC_POINT, WATER_SURFACE
+        return Labels(new, wet, at_surface)
+
+    def _at_surface(self, xyz: FloatArray, surface: SurfaceAbove, classes: Classes) -> IntArray:
+        """Return the rows of points in the band.
+
+        With `connected` they need water that stays in their cell or beside it.
+        """
+        near = self._within(xyz[:, 2] - surface.height_m, self.settings.band_m)
+        near &= ~np.isin(classes, self.settings.respect_classes)
+        rows = np.flatnonzero(near)
+        x, y = np.ascontiguousarray(xyz[rows, :2].T)
+        keep = np.ones(len(rows), np.bool_) if self.mask is None else self.mask.inside(x, y)
+        if self._around is not None and self._around.joined is not None:
+            keep &= self._around.joined[self._around.cells(x, y)]
+        return rows[keep]
+
+    def _within(self, height: FloatArray, reach_m: float) -> BoolArray:
+        return np.asarray(np.abs(height) <= reach_m) if reach_m else np.zeros(len(height), np.bool_)
+
+    def _decided(self, xyz: FloatArray, height: FloatArray, classes: Classes) -> BoolArray:
+        """Return which points that are below or within the dead band are submerged."""
+        x, y, _ = np.ascontiguousarray(xyz.T)
+        below = height < 0.0
+        inside = np.ones(len(x), np.bool_) if self.mask is None else self.mask.inside(x, y)
+        respected = np.isin(classes, self.settings.respect_classes)
+        self.left_out.add(x[below], y[below], inside[below], respected[below])
+        wet = inside & ~respected
+        if self._around is not None:
+            wet = self._decided_around(self._around, x, y, height, wet)
+        return wet
+
+    def _decided_around(
+        self, around: Surroundings, x: FloatArray, y: FloatArray, height: FloatArray, wet: BoolArray
+    ) -> BoolArray:
+        """Return what the surroundings leave of the submerged points."""
+        row, column = around.cells(x, y)
+        unsure = self._within(height, self.settings.dead_band_m)
+        if unsure.any():
+            wet = wet & (~unsure | around.is_wet[row, column])
+        if around.pools is not None:
+            number = around.pools.number[row, column]
+            stays = around.pools.stays[number]
+            self.left_out.add_separate(number[wet & ~stays])
+            wet = wet & stays
+        return wet
+
+    def check(self, name: str) -> None:
+        """See `LeftOut.check`."""
+        self.left_out.check(name)
+
+    def report(self) -> dict[str, Any] | None:
+        """Return what was left out, in plain values; None if there was no rule to leave out."""
+        return None if self.is_plain else self.left_out.as_dict()
+
+
+def sets_class(classes: Classes) -> BoolArray:
+    """Return which classes are among those that a labelling sets."""
+    return np.asarray((classes == BATHYMETRIC_POINT) | (classes == WATER_SURFACE))

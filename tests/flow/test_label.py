@@ -1,0 +1,380 @@
+"""Labelling files: what is kept, what is said, and the same result through every door."""
+
+import json
+from contextlib import nullcontext as no_warning
+
+import laspy
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import pcfix
+from pcfix.cli import app
+from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.flow.label import label_file, label_points
+from pcfix.flow.run import Request, request_of
+from pcfix.model import LabelSettings
+from tests.pdal_stage.test_arrays import arrays_of, metadata_of, run
+from tests.utils.clouds import (
+    EAST_M,
+    NORTH_M,
+    WATER_M,
+    block,
+    cameras_csv,
+    fields,
+    read_raw,
+    write_cloud,
+)
+
+shapely = pytest.importorskip("shapely")
+
+LAKE = shapely.box(EAST_M + 20, NORTH_M + 10, EAST_M + 90, NORTH_M + 100)
+ISLAND = shapely.box(EAST_M + 40, NORTH_M + 40, EAST_M + 60, NORTH_M + 70)
+
+
+@pytest.fixture
+def mask(tmp_path):
+    """Return a lake with an island, as WKT in the CRS of `random_cloud`."""
+    return wkt(tmp_path / "lake.wkt", LAKE.difference(ISLAND))
+
+
+def wkt(path, area, srid=32633):
+    path.write_text(f"SRID={srid};{area.wkt}\n")
+    return path
+
+
+def metadata(las):
+    """Return what PDAL says of a cloud, its CRS included."""
+    found = metadata_of(las.header)
+    wkt = las.header.parse_crs().to_wkt()
+    found["children"][0]["children"].append({"name": "comp_spatialreference", "value": wkt})
+    return found
+
+
+def inside(x, y):
+    east, north = np.asarray(x) - EAST_M, np.asarray(y) - NORTH_M
+    lake = (east >= 20) & (east <= 90) & (north >= 10) & (north <= 100)
+    return lake & ~((east > 40) & (east < 60) & (north > 40) & (north < 70))
+
+
+@pytest.mark.parametrize("point_format", [1, 3, 5, 6, 8, 10])
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_everything_but_the_class_is_kept(tmp_path, mask, point_format, suffix):
+    path = write_cloud(tmp_path / f"in{suffix}", point_format)
+    target = tmp_path / f"out{suffix}"
+    result = label_file(path, target, water=WATER_M, water_mask=mask)
+    before, after = read_raw(path), read_raw(target)
+    old, new = fields(before), fields(after)
+    source = laspy.read(path)
+    wet = (np.asarray(source.z) < WATER_M) & inside(source.x, source.y)
+    assert after.version == (1, 4)
+    assert result.submerged == wet.sum() > 100
+    np.testing.assert_array_equal(new.pop("class"), np.where(wet, 40, old.pop("class")))
+    for name in set(old) - {"angle"}:
+        np.testing.assert_array_equal(new[name], old[name], name)
+    ours = [r for r in after.records if r.user_id.startswith(b"pcfix")]
+    assert [r.record_id for r in ours] == [3]
+    said = json.loads(ours[0].data)
+    assert said["water_mask"] == str(mask)
+    assert said["water_plane"] == [WATER_M, 0.0, 0.0]
+
+
+def test_labelled_corrected_and_restored(tmp_path):
+    """The record of a labelling is not taken for one of a correction, nor the other way round."""
+    path = write_cloud(tmp_path / "in.las", 7)
+    cameras_csv(tmp_path / "cameras.csv", block())
+    label_file(path, tmp_path / "labelled.las", water=WATER_M)
+    with pytest.raises(InputError, match="was not corrected by pcfix"):
+        pcfix.restore_file(tmp_path / "labelled.las", tmp_path / "no.las")
+    pcfix.correct_file(
+        tmp_path / "labelled.las", tmp_path / "corrected.las", cameras=block(), water=WATER_M
+    )
+    again = LabelSettings(dead_band_m=0.1)
+    label_file(tmp_path / "corrected.las", tmp_path / "twice.las", water=WATER_M, settings=again)
+    pcfix.restore_file(tmp_path / "twice.las", tmp_path / "back.las")
+    first, last = laspy.read(tmp_path / "labelled.las"), laspy.read(tmp_path / "back.las")
+    np.testing.assert_array_equal(first.xyz, last.xyz)
+    records = [v.record_id for v in laspy.read(tmp_path / "twice.las").vlrs if v.user_id == "pcfix"]
+    assert records == [3, 1, 3]
+
+
+CHOICES = [
+    {},
+    {"dead_band": 0.5, "reset": True},
+    {"connected": True, "least_pool": 300.0},
+    {"band": 0.2, "dead_band": 0.6, "connected": True, "respect_classes": "2,5,6,7,8,9"},
+]
+
+
+def settings_of(choices):
+    names = {"band": "band_m", "dead_band": "dead_band_m", "least_pool": "least_pool_m2"}
+    words = {names.get(name, name): value for name, value in choices.items()}
+    if "respect_classes" in words:
+        words["respect_classes"] = tuple(map(int, words["respect_classes"].split(",")))
+    return LabelSettings(**words)
+
+
+def options_of(choices):
+    pairs = [(f"--{name.replace('_', '-')}", value) for name, value in choices.items()]
+    return [w for name, value in pairs for w in ([name] if value is True else [name, str(value)])]
+
+
+def invoke(*words):
+    return CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
+
+
+@pytest.mark.parametrize("choices", CHOICES)
+def test_label_through_every_door(tmp_path, mask, choices, monkeypatch):
+    path = write_cloud(tmp_path / "in.las", 7)
+    las, said = laspy.read(path), settings_of(choices)
+    words = ["--water", WATER_M, "--water-mask", mask, *options_of(choices)]
+    summary = tmp_path / "s.json"
+    done = invoke("label", path, tmp_path / "a.las", *words, "--summary", summary)
+    assert done.exit_code == 0
+    found = np.asarray(laspy.read(tmp_path / "a.las").classification)
+    arrays = label_points(
+        las.xyz, WATER_M, classes=np.asarray(las.classification), water_mask=mask,
+        crs="EPSG:32633", settings=said,
+    )  # fmt: skip
+    np.testing.assert_array_equal(found, arrays)
+    outs, report = run("label", arrays_of(las), metadata(las), water=WATER_M,
+                       water_mask=str(mask), **choices)  # fmt: skip
+    np.testing.assert_array_equal(found, outs["Classification"])
+    written = json.loads(summary.read_text())
+    assert report["children"][0]["value"] == written["submerged"]
+    assert (
+        written["submerged"] + written["water_surface"] <= (found == 40).sum() + (found == 41).sum()
+    )
+    assert written["labelling"]["outside_mask"] > 0
+    for module in ("files", "label", "points"):
+        monkeypatch.setattr(f"pcfix.flow.{module}.CHUNK_POINTS", 333)
+    label_file(path, tmp_path / "b.las", water=WATER_M, water_mask=mask, settings=said)
+    assert (tmp_path / "a.las").read_bytes() == (tmp_path / "b.las").read_bytes()
+
+
+@pytest.mark.parametrize("choices", [{}, *CHOICES[2:3], {"respect_classes": "1,2,3,4"}])
+def test_correct_through_every_door(tmp_path, mask, choices):
+    path = write_cloud(tmp_path / "in.las", 7)
+    cameras = cameras_csv(tmp_path / "cameras.csv", block())
+    las, said = laspy.read(path), settings_of(choices)
+    words = ["--cameras", cameras, "--water", WATER_M, "--water-mask", mask, *options_of(choices)]
+    assert invoke("correct", path, tmp_path / "a.las", *words).exit_code == 0
+    result = pcfix.correct_file(
+        path, tmp_path / "b.las", cameras=cameras, water=WATER_M, water_mask=mask,
+        connected=said.connected, least_pool_m2=said.least_pool_m2,
+        respect_classes=said.respect_classes,
+    )  # fmt: skip
+    assert (tmp_path / "a.las").read_bytes() == (tmp_path / "b.las").read_bytes()
+    out = laspy.read(tmp_path / "a.las")
+    classes = np.asarray(las.classification)
+    unlabelled = np.where(classes == 40, 0, classes).astype(np.uint8)
+    labels = label_points(
+        las.xyz, WATER_M, classes=unlabelled, water_mask=mask, crs="EPSG:32633", settings=said
+    )
+    submerged = labels == 40
+    arrays = pcfix.correct_points(
+        las.xyz, pcfix.read_cameras(cameras), WATER_M, may_be_submerged=submerged
+    )
+    np.testing.assert_array_equal(arrays.corrected, np.asarray(out.RayCount) > 0)
+    assert result.submerged == submerged.sum() == arrays.submerged.sum()
+    assert 0 < result.submerged < (np.asarray(las.z) < WATER_M).sum()
+    outs, _ = run("correct", arrays_of(las), metadata(las), cameras=str(cameras),
+                  water=WATER_M, water_mask=str(mask), **choices)  # fmt: skip
+    np.testing.assert_array_equal(outs["RayCount"], out.RayCount)
+    np.testing.assert_array_equal(outs["Classification"], np.asarray(out.classification))
+    for axis in "XYZ":
+        scale, offset = (getattr(out.header, f"{axis.lower()}_{w}") for w in ("scale", "offset"))
+        np.testing.assert_array_equal(np.rint((outs[axis] - offset) / scale), out[axis])
+    dry = ~submerged
+    np.testing.assert_array_equal(out.xyz[dry], las.xyz[dry])
+
+
+def test_without_choices_a_correction_says_nothing_of_them(tmp_path):
+    path = write_cloud(tmp_path / "in.las", 7)
+    result = pcfix.correct_file(path, tmp_path / "out.las", cameras=block(), water=WATER_M)
+    assert result.labelling is None
+    (vlr,) = [v for v in laspy.read(tmp_path / "out.las").vlrs if v.user_id == "pcfix"]
+    assert set(json.loads(vlr.record_data)) == {
+        "pcfix", "settings", "water", "water_plane", "cameras", "cameras_source", "views", "before",
+    }  # fmt: skip
+
+
+def test_summary_says_what_was_left_out(tmp_path, mask):
+    path = write_cloud(tmp_path / "in.las", 7)
+    words = ["--water", WATER_M, "--water-mask", mask, "--connected", "--respect-classes", "9, 2"]
+    done = invoke("label", path, tmp_path / "out.las", *words)
+    assert "points below lie outside: land" in done.stdout
+    assert "points below keep their class" in done.stdout
+    assert "came as class 40 or 41 and are neither: left so; --reset makes" in done.stdout
+    cameras = cameras_csv(tmp_path / "cameras.csv", block())
+    done = invoke("correct", path, tmp_path / "c.las", "--cameras", cameras, *words)
+    assert "points below lie outside: land" in done.stdout
+    plain = invoke("label", path, tmp_path / "p.las", "--water", WATER_M)
+    assert "outside" not in plain.stdout
+    assert "class 41 " not in plain.stdout
+
+
+def test_pools_left_out_are_told(tmp_path):
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = np.full(3, 0.001), np.array([EAST_M, NORTH_M, 0.0])
+    las = laspy.LasData(header)
+    x, y = (grid.ravel() for grid in np.meshgrid(np.arange(0, 60, 0.5), np.arange(0, 40, 0.5)))
+    pit = np.hypot(x - 50, y - 20) < 3
+    las.x, las.y, las.z = EAST_M + x, NORTH_M + y, np.where((x < 30) | pit, -1.0, 1.0)
+    las.write(tmp_path / "in.las")
+    done = invoke("label", tmp_path / "in.las", tmp_path / "out.las", "--water", 0, "--connected")
+    told = f"{pit.sum()} points in 1 pools apart from the water were left as land; the largest, "
+    assert told in done.stdout
+    place = done.stdout.split("is at ")[1].split("\n")[0].split(", ")
+    assert np.hypot(float(place[0]) - EAST_M - 50, float(place[1]) - NORTH_M - 20) < 3.5
+    wet = np.asarray(laspy.read(tmp_path / "out.las").classification) == 40
+    np.testing.assert_array_equal(wet, x < 30)
+    every = invoke("label", tmp_path / "in.las", tmp_path / "all.las", "--water", 0)
+    assert "separate" not in every.stdout
+    assert (np.asarray(laspy.read(tmp_path / "all.las").classification) == 40).sum() == (
+        (x < 30) | pit
+    ).sum()
+
+
+def test_mask_in_another_crs(tmp_path):
+    from pyproj import Transformer
+
+    path = write_cloud(tmp_path / "in.las", 7)
+    there = Transformer.from_crs(32633, 4326, always_xy=True)
+    lake = shapely.transform(LAKE.difference(ISLAND).segmentize(1.0), lambda p: np.column_stack(
+        there.transform(*p.T)))  # fmt: skip
+    far = {"type": "Feature", "properties": {}, "geometry": json.loads(shapely.to_geojson(lake))}
+    document = {"type": "FeatureCollection", "features": [far]}
+    (tmp_path / "lake.geojson").write_text(json.dumps(document))
+    label_file(path, tmp_path / "out.las", water=WATER_M, water_mask=tmp_path / "lake.geojson")
+    las, out = laspy.read(path), laspy.read(tmp_path / "out.las")
+    border = shapely.distance(LAKE.difference(ISLAND).boundary, shapely.points(las.x, las.y))
+    clear = border > 0.01  # m: GeoJSON of 1e-7 degrees and more digits, edges of 1 m
+    wet = (np.asarray(las.z) < WATER_M) & inside(las.x, las.y)
+    expected = np.where(wet, 40, np.asarray(las.classification))
+    np.testing.assert_array_equal(np.asarray(out.classification)[clear], expected[clear])
+
+
+def test_mask_that_crosses_itself_is_mended_and_said_so(tmp_path):
+    path = write_cloud(tmp_path / "in.las", 7)
+    corners = [(20, 20), (100, 100), (100, 20), (20, 100)]
+    crossed = shapely.Polygon([(EAST_M + x, NORTH_M + y) for x, y in corners])
+    bow = wkt(tmp_path / "bow.wkt", crossed)
+    with pytest.warns(PcfixWarning, match="bow.wkt: 1 of 1 polygons cross or touch themselves"):
+        result = label_file(path, tmp_path / "out.las", water=WATER_M, water_mask=bow)
+    assert "were repaired" in result.warnings[0]
+    las = laspy.read(path)
+    u, v = np.asarray(las.x) - EAST_M - 60, np.asarray(las.y) - NORTH_M - 60
+    bows = (np.abs(v) < np.abs(u)) & (np.abs(u) < 40)
+    assert result.submerged == (bows & (np.asarray(las.z) < WATER_M)).sum()
+
+
+@pytest.mark.parametrize(
+    ("area", "sentence"),
+    [
+        (shapely.Point(EAST_M, NORTH_M), r"mask.wkt: holds no polygon \(Point\); a mask needs"),
+        (
+            shapely.box(10, 20, 30, 40),
+            r"mask.wkt: the mask holds none of the \d+ points",
+        ),
+    ],
+)
+def test_masks_that_cannot_be_used(tmp_path, area, sentence):
+    path = write_cloud(tmp_path / "in.las", 7)
+    bad = wkt(tmp_path / "mask.wkt", area)
+    with pytest.raises(pcfix.PcfixError, match=sentence):
+        label_file(path, tmp_path / "out.las", water=WATER_M, water_mask=bad)
+    with pytest.raises(pcfix.PcfixError, match=sentence):
+        pcfix.correct_file(
+            path, tmp_path / "out.las", cameras=block(), water=WATER_M, water_mask=bad
+        )
+    las = laspy.read(path)
+    with pytest.raises(pcfix.PcfixError, match=sentence):
+        run("label", arrays_of(las), metadata(las), water=WATER_M, water_mask=str(bad))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["in.las", "mask.wkt"]
+
+
+def test_nothing_is_replaced_unasked(tmp_path, mask):
+    path = write_cloud(tmp_path / "in.las", 7)
+    label_file(path, tmp_path / "out.las", water=WATER_M)
+    with pytest.raises(SettingError, match="the output exists; add --overwrite"):
+        label_file(path, tmp_path / "out.las", water=WATER_M)
+    with pytest.raises(SettingError, match="are the same file"):
+        label_file(path, path, water=WATER_M, overwrite=True)
+    with pytest.raises(SettingError, match="are the same file"):
+        label_file(path, tmp_path / "out.las", water=WATER_M, water_mask=mask, summary=mask,
+                   overwrite=True)  # fmt: skip
+    with pytest.raises(pcfix.GeometryError, match="no point lies below the water"):
+        label_file(path, tmp_path / "new.las", water=-50.0)
+    assert not (tmp_path / "new.las").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--respect-classes", "2;5"], "respect-classes '2;5' must be whole numbers with commas"),
+        (["--respect-classes", "300"], "300 is no class of LAS"),
+        (["--band", "-1"], "band -1 must not be negative"),
+        (["--least-pool", "5"], "least-pool is of no use without connected"),
+        (["--water-mask", "no.gpkg"], "no.gpkg: there is no such file"),
+    ],
+)
+def test_words_that_make_no_sense(tmp_path, words, sentence):
+    path = write_cloud(tmp_path / "in.las", 7)
+    with pytest.raises(pcfix.PcfixError, match=sentence):
+        invoke("label", path, tmp_path / "out.las", "--water", WATER_M, *words)
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        ({"classes": [1, 2]}, r"classes must be 1 values of uint8"),
+        ({"classes": np.zeros(1)}, r"not float64 of shape \(1,\)"),
+    ],
+)
+def test_arrays_that_do_not_fit(more, sentence):
+    with pytest.raises(SettingError, match=sentence):
+        label_points([[0, 0, -1.0]], 0.0, **more)
+
+
+def test_land_by_choice_needs_a_boolean_each():
+    with pytest.raises(SettingError, match=r"may_be_submerged must be 1 booleans, not int64"):
+        pcfix.correct_points([[0, 0, -1.0]], block(), 0.0, may_be_submerged=[1])
+
+
+def test_pipeline_has_the_same_options(tmp_path, mask):
+    path = write_cloud(tmp_path / "in.las", 7)
+    cameras = cameras_csv(tmp_path / "cameras.csv", block())
+    words = [path, tmp_path / "out.las", "--cameras", cameras, "--water", WATER_M]
+    more = ["--water-mask", mask, "--connected", "--least-pool", 9, "--respect-classes", "2,5"]
+    stage = json.loads(invoke("pipeline", *words, *more).stdout)["pipeline"][1]
+    expected = {"water_mask": str(mask), "connected": True, "least_pool": 9.0}
+    assert expected.items() <= stage["pdalargs"].items()
+    assert stage["pdalargs"]["respect_classes"] == "2,5"
+    plain = json.loads(invoke("pipeline", *words).stdout)["pipeline"][1]["pdalargs"]
+    assert set(plain) == {"cameras", "water", "uncorrected", "dimensions"}
+
+
+def test_run_keeps_them_in_its_record(tmp_path, mask):
+    scene = tmp_path / "scene"
+    from pcfix.io.scenes import write_scene
+
+    scene.mkdir()
+    write_scene(pcfix.simulate_scene(3000, seed=3), scene, overwrite=False)
+    las = laspy.read(scene / "cloud.laz")
+    middle = np.mean(las.x)
+    west = shapely.box(*las.header.mins[:2], middle, las.header.maxs[1])
+    half = tmp_path / "half.wkt"
+    half.write_text(west.wkt + "\n")
+    with pytest.warns(PcfixWarning) if las.header.parse_crs() else no_warning():
+        done = invoke("run", scene / "cloud.laz", tmp_path / "out", "--cameras",
+                      scene / "cameras.csv", "--sensor", scene / "sensor.csv", "--water", 0.37,
+                      "--water-mask", half, "--respect-classes", "9")  # fmt: skip
+    assert done.exit_code == 0
+    request = request_of(tmp_path / "out" / "run.json")
+    assert request.water_mask == str(half)
+    assert request.label() == LabelSettings(respect_classes=(9,))
+    moved = np.asarray(laspy.read(tmp_path / "out" / "corrected.laz").RayCount) > 0
+    np.testing.assert_array_equal(moved, (las.z < 0.37) & (las.x <= middle))
+    with pytest.raises(SettingError, match="least-pool is of no use"):
+        Request("a.las", "b.csv", "0", least_pool_m2=4.0)

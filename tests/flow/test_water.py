@@ -1,0 +1,192 @@
+"""The water surface through the doors: fitted, as raster and mesh, and found."""
+
+import json
+
+import laspy
+import numpy as np
+import pytest
+import rasterio
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+import pcfix
+from pcfix.cli import app
+from pcfix.flow.surfaces import WaterWords
+from pcfix.flow.water import check_water
+from tests.utils.shared import ROOT
+
+SCENE = ROOT / "samples" / "scene"
+CLOUD, CAMERAS = SCENE / "cloud.laz", SCENE / "cameras.csv"
+LEVEL_M = 0.37
+CRS = "EPSG:32633"
+TILT = 0.003
+
+
+class River:
+    """A level scene turned by 0.3 %: then its water is a tilted plane, and all else is exact."""
+
+    def __init__(self):
+        scene = pcfix.simulate_scene(6000, seed=11)
+        pivot = np.array([410_260.0, 4_650_340.0, LEVEL_M])
+        turn = Rotation.from_euler("y", -np.arctan(TILT)).as_matrix()
+
+        def turned(xyz):
+            return (xyz - pivot) @ turn.T + pivot
+
+        self.apparent, self.true = turned(scene.apparent_xyz), turned(scene.true_xyz)
+        self.cameras = pcfix.Cameras(
+            scene.cameras.labels, turned(scene.cameras.centres),
+            scene.cameras.rotations @ turn.T, scene.cameras.lenses,
+        )  # fmt: skip
+        self.views, self.gsd_m, self.pivot = scene.views, scene.gsd_m, pivot
+        self.low, self.high = self.apparent[:, :2].min(axis=0), self.apparent[:, :2].max(axis=0)
+
+    def height_at(self, xy):
+        """Return the true surface at places (n, 2)."""
+        return LEVEL_M + TILT * (xy[:, 0] - self.pivot[0])
+
+    def shoreline(self, seed, count=30, noise_m=0.01, outliers=0.2):
+        """Return points on both banks, of which a fifth are decimetres off."""
+        rng = np.random.default_rng(seed)
+        x = rng.uniform(self.low[0], self.high[0], count)
+        y = np.where(rng.random(count) < 0.5, self.low[1], self.high[1])
+        xy = np.column_stack([x, y + rng.uniform(-1.0, 1.0, count)])
+        z = self.height_at(xy) + rng.normal(0.0, noise_m, count)
+        wrong = rng.permutation(count)[: round(outliers * count)]
+        z[wrong] += rng.choice([-1.0, 1.0], len(wrong)) * rng.uniform(0.3, 2.0, len(wrong))
+        return np.column_stack([xy, z]), wrong
+
+    def rmse_z(self, corrected):
+        wet = self.true[:, 2] < self.height_at(self.true[:, :2]) - 0.2
+        return np.sqrt(np.mean((corrected.xyz - self.true)[wet, 2] ** 2))
+
+
+@pytest.fixture(scope="module")
+def river():
+    return River()
+
+
+def write_points(path, xyz, names="x,y,z"):
+    rows = "\n".join(",".join(f"{v:.4f}" for v in row) for row in xyz)
+    path.write_text(f"{names}\n{rows}\n")
+    return path
+
+
+def test_tilted_river_from_thirty_points_a_fifth_of_them_wrong(river, tmp_path):
+    points, wrong = river.shoreline(seed=5)
+    path = write_points(tmp_path / "shore.csv", points)
+    report = check_water(WaterWords(path))
+    fit = report.found.evidence
+    corners = np.array([[x, y] for x in (0, 1) for y in (0, 1)]) * (river.high - river.low)
+    corners = corners + river.low
+    miss = fit.height_at(corners) - river.height_at(corners)
+    # noise of 1 cm on 24 good points: standard error 4 mm at a corner, so that 2 cm are 4 of them
+    assert np.abs(miss).max() < 0.02
+    assert set(np.flatnonzero(~fit.accepted)) == set(wrong)
+    assert fit.tilt_percent == pytest.approx(0.3, abs=0.03)
+    found = pcfix.correct_points(
+        river.apparent, river.cameras, report.found.surface, views=river.views
+    )
+    assert river.rmse_z(found) < river.gsd_m
+    level = pcfix.correct_points(
+        river.apparent, river.cameras, float(np.mean(points[:, 2])), views=river.views
+    )
+    assert river.rmse_z(level) > 2.0 * river.gsd_m  # what ignoring the tilt costs
+
+
+def test_raster_and_mesh_of_a_plane_are_the_plane(river, tmp_path):
+    plane = pcfix.WaterPlane(LEVEL_M - TILT * river.pivot[0], TILT, 0.0)
+    west, south = np.floor(river.low) - 20.0
+    east, north = np.ceil(river.high) + 20.0
+    cell = 2.0
+    x = np.arange(west + cell / 2, east, cell)
+    y = np.arange(north - cell / 2, south, -cell)
+    grid = np.broadcast_to(plane.a + plane.b * x, (len(y), len(x)))
+    raster = tmp_path / "water.tif"
+    with rasterio.open(
+        raster, "w", driver="GTiff", width=len(x), height=len(y), count=1, dtype="float64",
+        transform=rasterio.transform.from_origin(west, north, cell, cell),
+    ) as out:  # fmt: skip
+        out.write(grid, 1)
+    corners = [(px, py, plane.a + plane.b * px) for px in (west, east) for py in (south, north)]
+    mesh = tmp_path / "water.obj"
+    mesh.write_text("".join(f"v {a:.17g} {b:.17g} {c:.17g}\n" for a, b, c in corners) + "f 1 3 4\nf 1 4 2\n")
+    given = [pcfix.read_water(one) for one in (raster, mesh)]
+    options = {"views": river.views}
+    expected = pcfix.correct_points(river.apparent, river.cameras, plane, **options)
+    for surface in given:
+        found = pcfix.correct_points(river.apparent, river.cameras, surface, **options)
+        # 1 mm is the need; secant steps end at 1e-6 m, and heights of 64 bits add nothing
+        assert np.abs(found.xyz - expected.xyz).max() < 1e-5
+
+
+def invoke(*arguments):
+    result = CliRunner().invoke(app, list(map(str, arguments)))
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.output
+
+
+def test_every_door_takes_shoreline_points(tmp_path):
+    low, high = laspy.read(CLOUD).header.mins, laspy.read(CLOUD).header.maxs
+    rng = np.random.default_rng(3)
+    xy = rng.uniform(low[:2], high[:2], (20, 2))
+    path = write_points(tmp_path / "shore.csv", np.column_stack([xy, np.full(20, LEVEL_M)]))
+    water = ["--water", path, "--water-crs", CRS]
+    said = invoke("correct", CLOUD, tmp_path / "a.las", "--cameras", CAMERAS, *water)
+    assert "fitted     level, 20 of 20 points" in said
+    pcfix.correct_file(CLOUD, tmp_path / "b.las", cameras=CAMERAS, water=LEVEL_M)
+    one, other = (laspy.read(tmp_path / name).points.array for name in ("a.las", "b.las"))
+    np.testing.assert_array_equal(one, other)
+    invoke("label", CLOUD, tmp_path / "c.las", *water)
+    classes = np.asarray(laspy.read(tmp_path / "c.las").classification)
+    np.testing.assert_array_equal(classes == 40, one["classification"] == 40)
+    summary = tmp_path / "w.json"
+    more = ["--plot", tmp_path / "w.png", "--summary", summary]
+    invoke("water", path, "--water-crs", CRS, "--cloud", CLOUD, *more)
+    assert (tmp_path / "w.png").read_bytes().startswith(b"\x89PNG")
+    found = json.loads(summary.read_text())
+    assert found["fit"]["level_m"] == pytest.approx(LEVEL_M, abs=1e-6)
+    assert found["share_below"] == pytest.approx(0.7368, abs=0.001)  # 14,736 of 20,000 points
+
+
+def test_points_without_heights_take_the_clouds(tmp_path):
+    xyz = laspy.read(CLOUD).xyz
+    near = xyz[np.abs(xyz[:, 2] - LEVEL_M) < 0.02]
+    path = write_points(tmp_path / "shore.csv", near[:, :2], names="x,y")
+    with pytest.warns(pcfix.PcfixWarning, match=f"{len(near)} points have no height"):
+        report = check_water(WaterWords(path, "level", CRS), CLOUD)
+    # the bank is 3 % steep and rough by some centimetres
+    assert report.found.evidence.level_m == pytest.approx(LEVEL_M, abs=0.1)
+    with pytest.raises(pcfix.InputError, match="give the cloud too"):
+        check_water(WaterWords(path))
+
+
+def test_auto_finds_the_sample_scene_and_says_by_what(tmp_path):
+    said = invoke("water", "auto", "--cloud", CLOUD, "--plot", tmp_path / "auto.png")
+    assert "evidence" in said
+    assert (tmp_path / "auto.png").stat().st_size > 10_000
+    found = check_water(WaterWords("auto"), CLOUD).found.evidence
+    assert abs(found.level_m - LEVEL_M) < 3.0 * found.sigma_level_m
+    with pytest.raises(pcfix.SettingError, match="found in a cloud"):
+        check_water(WaterWords("auto"))
+
+
+def test_a_run_finds_its_water_and_reports_on_that(tmp_path):
+    invoke(
+        "run", CLOUD, tmp_path / "out", "--cameras", CAMERAS, "--water", "auto", "--index", "sea"
+    )
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    summary = record["steps"]["correct"]["result"]
+    assert summary["water_fit"]["model"] == "auto"
+    assert summary["settings"]["refractive_index_from"] == "sea: 35 PSU, 15 C, 0.53 um"
+    assert "level 0.3" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_index_and_salinity_are_not_given_twice(tmp_path):
+    words = ["correct", CLOUD, tmp_path / "o.las", "--cameras", CAMERAS, "--water", "0.37"]
+    with pytest.raises(pcfix.SettingError, match="give one of them"):
+        invoke(*words, "--index", "1.34", "--salinity", "35")
+    said = invoke(*words, "--salinity", "0", "--temperature", "20", "--wavelength", "0.5893")
+    assert "refractive index 1.333" in said
+    assert "cm shallower on average" in said

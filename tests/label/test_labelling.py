@@ -1,0 +1,257 @@
+"""Dead band, connectivity, class 41 and classes to respect, on shores with a known waterline."""
+
+from collections import defaultdict
+
+import numpy as np
+import pytest
+
+from pcfix.errors import GeometryError, SettingError
+from pcfix.label.labelling import Labelling, Part
+from pcfix.label.mask import WaterMask
+from pcfix.label.surface import SurfaceAbove
+from pcfix.model import LabelSettings
+
+EAST, NORTH, WATER_M = 456_000.0, 5_432_000.0, 12.4
+
+
+def part_of(xyz, classes=None, level=WATER_M):
+    n = len(xyz)
+    surface = SurfaceAbove(np.broadcast_to(level, n).astype(float), np.zeros((n, 2)))
+    return Part(xyz, surface, np.zeros(n, np.uint8) if classes is None else classes)
+
+
+def labelled(part, mask=None, pieces=1, corners=None, **choices):
+    """Label a cloud in pieces; return the classes and the labelling."""
+    labelling = Labelling(LabelSettings(**choices), mask)
+    rows = np.array_split(np.arange(len(part.xyz)), pieces)
+
+    def parts():
+        for r in rows:
+            above = SurfaceAbove(part.surface.height_m[r], part.surface.slope[r])
+            yield Part(part.xyz[r], above, part.classes[r])
+
+    if labelling.looks_around:
+        low, high = part.xyz[:, :2].min(axis=0), part.xyz[:, :2].max(axis=0)
+        labelling.look_around(parts, *(corners or (low, high)))
+    return np.concatenate([labelling.labels(p).classes for p in parts()]), labelling
+
+
+def beach(count=60_000, noise_m=0.03, seed=1):
+    """Return a shore of 2 % with its waterline at 50 m, a berm, and a pit of 4 m behind it.
+
+    Coordinates from the corner, true height above the water, and the cloud with noise.
+    """
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, 100, count), rng.uniform(0, 40, count)
+    height = 0.02 * (x - 50.0) + 0.8 * np.exp(-(((x - 62.0) / 2.0) ** 2))
+    height -= 1.2 * np.exp(-((x - 80.0) ** 2 + (y - 20.0) ** 2) / 16.0)
+    z = WATER_M + height + rng.normal(0.0, noise_m, count)
+    return x, y, height, np.column_stack([EAST + x, NORTH + y, z])
+
+
+def changes(x, y, wet):
+    """Return how often the label changes on the way from sea to land, a strip of 1 m on average."""
+    strips = [np.flatnonzero(np.floor(y) == k) for k in range(40)]
+    ordered = [wet[s[np.argsort(x[s])]] for s in strips]
+    return np.mean([(along[1:] != along[:-1]).sum() for along in ordered])
+
+
+def test_without_choices_it_is_the_surface_alone():
+    *_, xyz = beach(5000)
+    level = np.full(5000, WATER_M)
+    level[::7] = np.nan
+    classes = np.random.default_rng(0).integers(0, 256, 5000).astype(np.uint8)
+    found, labelling = labelled(part_of(xyz, classes, level))
+    np.testing.assert_array_equal(found, np.where(xyz[:, 2] < level, 40, classes))
+    assert labelling.report() is None
+
+
+def test_dead_band_quietens_the_waterline_and_does_not_move_it():
+    x, y, height, xyz = beach()
+    near = x < 58.0
+    plain = labelled(part_of(xyz))[0] == 40
+    quiet, labelling = labelled(part_of(xyz), dead_band_m=0.1)
+    quiet = quiet == 40
+    before, after = (changes(x[near], y[near], wet[near]) for wet in (plain, quiet))
+    assert before > 20.0
+    # a strip of 1 m has a few cells side by side, whose edges need not be in line
+    assert after < 4.0
+    truly = height < 0.0
+    assert (quiet != truly)[near].sum() < 0.1 * (plain != truly)[near].sum()
+    # the line itself: as many points beyond it as short of it, to half a cell
+    assert np.abs(quiet[near].sum() - truly[near].sum()) / (15.0 * 40.0) < (
+        labelling.report()["cell_m"] / 2.0
+    )
+    clear = np.abs(xyz[:, 2] - WATER_M) > 0.1
+    np.testing.assert_array_equal(quiet[clear], plain[clear])
+
+
+def test_dead_band_is_the_vote_of_nine_cells():
+    _, _, _, xyz = beach(8000, noise_m=0.1)
+    found, labelling = labelled(part_of(xyz), dead_band_m=0.15)
+    side = labelling.report()["cell_m"]
+    height = xyz[:, 2] - WATER_M
+    votes = defaultdict(int)
+    cells = [tuple(c) for c in np.floor(xyz[:, :2] / side).astype(int).tolist()]
+    for cell, h in zip(cells, height, strict=True):
+        votes[cell] += round(float(np.clip(h / 0.15, -1, 1)) * 1000)
+    for i, ((c, r), h) in enumerate(zip(cells, height, strict=True)):
+        around = sum(votes.get((c + a, r + b), 0) for a in (-1, 0, 1) for b in (-1, 0, 1))
+        expected = h < 0 if abs(h) > 0.15 else around < 0
+        assert (found[i] == 40) == expected
+
+
+def test_pit_behind_a_berm_is_not_sea_unless_joined():
+    x, _, _, xyz = beach()
+    pit = (x > 66.0) & (xyz[:, 2] < WATER_M)
+    plain, _ = labelled(part_of(xyz))
+    found, labelling = labelled(part_of(xyz), connected=True)
+    assert (plain[pit] == 40).all()
+    assert (found[x > 66.0] != 40).all()
+    np.testing.assert_array_equal(found[x < 50.0], plain[x < 50.0])
+    apart = labelling.report()["separate"]
+    assert apart["points"] == (plain == 40).sum() - (found == 40).sum()
+    most = apart["largest"]
+    assert np.hypot(most["x"] - EAST - 80.0, most["y"] - NORTH - 20.0) < 4.0
+    # its waterline: 1.2 exp(-r^2 / 16) = 0.6, so r^2 = 16 ln 2; the cells on it count in full
+    radius = 4.0 * np.sqrt(np.log(2.0))
+    rim = 2.0 * np.pi * radius * labelling.report()["cell_m"]
+    assert 0.0 < most["area_m2"] - np.pi * radius**2 < rim
+
+    channel = (np.abs(xyz[:, 1] - NORTH - 20.0) < 1.0) & (x > 40) & (x < 82)
+    xyz[channel, 2] = WATER_M - 0.3
+    found, labelling = labelled(part_of(xyz), connected=True)
+    assert (found[(np.hypot(x - 80, xyz[:, 1] - NORTH - 20) < 2)] == 40).all()
+
+
+def test_large_pools_stay_and_a_threshold_says_which():
+    x, _, _, xyz = beach()
+    pit = np.hypot(x - 80.0, xyz[:, 1] - NORTH - 20.0) < 2.0
+    assert (labelled(part_of(xyz), connected=True, least_pool_m2=20.0)[0][pit] == 40).all()
+    assert (labelled(part_of(xyz), connected=True, least_pool_m2=60.0)[0][pit] != 40).all()
+    # the largest stays whatever is asked for
+    assert (labelled(part_of(xyz), connected=True, least_pool_m2=1e9)[0][x < 42] == 40).all()
+    two = np.abs(x - 25.0) > 6.0  # dry ground parts the sea in two of like size
+    xyz[~two, 2] = WATER_M + 1.0
+    assert (labelled(part_of(xyz), connected=True)[0][two & (x < 42)] == 40).all()
+
+
+def test_sparse_water_hangs_together():
+    """Matching finds less under water than on land; and some of it has gaps."""
+    x, *_, xyz = beach(200_000)
+    rng = np.random.default_rng(3)
+    keep = (x > 50.0) | (rng.uniform(size=len(x)) < 0.05)
+    found, _ = labelled(part_of(xyz[keep]), connected=True)
+    sea = x[keep] < 42.0
+    assert (found[sea] == 40).mean() > 0.999
+
+
+@pytest.mark.parametrize(
+    "choices",
+    [
+        {"dead_band_m": 0.1},
+        {"connected": True},
+        {"dead_band_m": 0.08, "connected": True, "band_m": 0.02},
+    ],
+)
+def test_parts_order_and_corners_leave_no_trace(choices):
+    *_, xyz = beach(20_000)
+    area = WaterMask(pytest.importorskip("shapely").box(EAST, NORTH, EAST + 90, NORTH + 30))
+    part = part_of(xyz)
+    whole, first = labelled(part, area, **choices)
+    middle = xyz[0, :2]
+    for corners in ((middle, middle + 1), (middle - 5000, middle + 9000),
+                    (np.full(2, np.nan), np.full(2, np.nan)), (middle, middle - 1)):  # fmt: skip
+        found, again = labelled(part, area, pieces=7, corners=corners, **choices)
+        np.testing.assert_array_equal(found, whole)
+        assert again.report() == first.report()
+    mixed = np.random.default_rng(2).permutation(len(xyz))
+    found, _ = labelled(part_of(xyz[mixed]), area, pieces=3, **choices)
+    np.testing.assert_array_equal(found, whole[mixed])
+
+
+def test_band_is_water_surface_on_both_sides():
+    x, _, _, xyz = beach(20_000)
+    height = xyz[:, 2] - WATER_M
+    found, _ = labelled(part_of(xyz), band_m=0.05)
+    expected = np.where(np.abs(height) <= 0.05, 41, np.where(height < 0, 40, 0))
+    np.testing.assert_array_equal(found, expected)
+    joined, _ = labelled(part_of(xyz), band_m=0.05, connected=True)
+    assert not np.isin(joined[x > 70.0], (40, 41)).any()
+    np.testing.assert_array_equal(joined[x < 48], expected[x < 48])
+
+
+def test_respected_classes_are_left_in_peace():
+    *_, xyz = beach(20_000)
+    classes = np.random.default_rng(0).choice([0, 2, 5, 40, 41], 20_000).astype(np.uint8)
+    wet = xyz[:, 2] < WATER_M
+    found, labelling = labelled(part_of(xyz, classes), respect_classes=(5, 2, 2))
+    kept = np.isin(classes, (2, 5))
+    np.testing.assert_array_equal(found, np.where(wet & ~kept, 40, classes))
+    assert labelling.report()["respected"] == (wet & kept).sum()
+    found, _ = labelled(part_of(xyz, classes), respect_classes=(2, 41), reset=True, band_m=0.02)
+    kept = np.isin(classes, (2, 41))
+    np.testing.assert_array_equal(found[kept], classes[kept])
+    assert (found[(classes == 40) & (xyz[:, 2] > WATER_M + 0.02)] == 1).all()
+    with pytest.raises(GeometryError, match=r"all \d+,\d+ points below .* respect \(0, 2, 5, 40"):
+        labelled(part_of(xyz, classes), respect_classes=(0, 2, 5, 40, 41))[1].check("cloud")
+
+
+def test_reset_takes_back_what_no_longer_holds():
+    *_, xyz = beach(20_000)
+    classes = np.random.default_rng(0).choice([2, 40, 41, 42, 43, 45], 20_000).astype(np.uint8)
+    wet = xyz[:, 2] < WATER_M
+    found, _ = labelled(part_of(xyz, classes), reset=True)
+    stale = np.isin(classes, (40, 41))
+    np.testing.assert_array_equal(found, np.where(wet, 40, np.where(stale, 1, classes)))
+    found, _ = labelled(part_of(xyz, classes))
+    np.testing.assert_array_equal(found, np.where(wet, 40, classes))
+
+
+def test_mask_that_holds_no_water_says_where_both_lie():
+    *_, xyz = beach(2000)
+    box = pytest.importorskip("shapely").box(0, 10, 20, 30)
+    _, labelling = labelled(part_of(xyz), WaterMask(box, "lake.gpkg"))
+    with pytest.raises(
+        GeometryError, match=r"lake.gpkg: .* none of .* x 0.0 to 20.0, y 10.0 to 30.0, these points"
+        r" at x 45600\d.\d to 4560\d\d.\d, y 54320"
+    ):  # fmt: skip
+        labelling.check("cloud.las")
+
+
+@pytest.mark.parametrize("at", [(0.0, 0.0), (EAST, NORTH)])
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_a_handful_of_points(at, count):
+    x, y = np.linspace(-40, 30, count) + at[0], np.linspace(-9, 70, count) + at[1]
+    xyz = np.column_stack([x, y, np.zeros(count)])
+    found, _ = labelled(part_of(xyz), connected=True, dead_band_m=0.5)
+    assert found.tolist() == [40] * count
+    found, _ = labelled(part_of(xyz, level=-1.0), connected=True, dead_band_m=0.5)
+    assert not found.any()
+
+
+def test_a_line_of_points_and_a_stray_one():
+    xyz = np.column_stack([EAST + np.arange(4000.0), np.full(4000, NORTH), np.full(4000, 12.0)])
+    xyz[0, :2] += 4e6
+    found, labelling = labelled(part_of(xyz), connected=True, least_pool_m2=1e5)
+    assert (found[1:] == 40).all()
+    # 4e6 m across in 4096 cells
+    assert labelling.report()["cell_m"] == 1024.0
+
+
+@pytest.mark.parametrize(
+    ("choices", "sentence"),
+    [
+        ({"band_m": -0.1}, r"band -0.1 must not be negative: give metres"),
+        ({"dead_band_m": -1}, r"dead-band -1 must not be negative"),
+        ({"band_m": float("nan")}, r"band nan must not be negative"),
+        ({"band_m": 0.2, "dead_band_m": 0.1}, r"dead-band 0.1 does not reach beyond band 0.2"),
+        ({"respect_classes": (2, 256)}, r"respect-classes: 256 is no class of LAS; .* 0 to 255"),
+        ({"respect_classes": (-1,)}, r"respect-classes: -1 is no class"),
+        ({"least_pool_m2": 5.0}, r"least-pool is of no use without connected"),
+        ({"least_pool_m2": -5.0, "connected": True}, r"least-pool -5 must not be negative"),
+    ],
+)
+def test_settings_that_make_no_sense(choices, sentence):
+    with pytest.raises(SettingError, match=sentence):
+        LabelSettings(**choices)

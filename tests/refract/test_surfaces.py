@@ -1,0 +1,341 @@
+"""Rasters as water surfaces, and a level that moves: against planes, meshes and slow twins."""
+
+import math
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import RegularGridInterpolator
+
+import pcfix
+from pcfix.label.surface import surface_above
+from pcfix.model import WaterRaster
+from pcfix.simulate.block import fly, gsd_m, lens
+from pcfix.simulate.tracing import piercing_points, project, triangulate
+from tests.utils.twins import correct_under
+
+UTM = np.array([512_345.0, 4_987_654.0, 0.0])
+MICROMETRE = 1e-6
+HALF = 60.0  # metres from the middle to the edge of the rasters
+
+
+def raster(surface, cell=(1.0, 1.0), half=HALF, origin=UTM):
+    """Return a raster of z = surface(x, y), x and y from `origin`."""
+    x = np.arange(-half + cell[0] / 2, half, cell[0])
+    y = np.arange(half - cell[1] / 2, -half, -cell[1])
+    heights = surface(x[None, :], y[:, None]) + np.zeros((len(y), len(x)))
+    return WaterRaster(heights, origin[0] - half, origin[1] + half, cell)
+
+
+def bilinear(water, origin=UTM):
+    """Return scipy's interpolation of a raster, x and y from `origin`."""
+    rows, columns = water.height_m.shape
+    x = water.left_m - origin[0] + (np.arange(columns) + 0.5) * water.cell_m[0]
+    y = water.top_m - origin[1] - (np.arange(rows) + 0.5) * water.cell_m[1]
+    found = RegularGridInterpolator(
+        (y[::-1], x), water.height_m[::-1], bounds_error=False, fill_value=None
+    )
+    return lambda px, py: float(found([[py, px]])[0])
+
+
+def plane(a, b, c):
+    return lambda x, y: a + b * x + c * y
+
+
+def waves(x, y):
+    return 0.3 + 0.003 * x + 0.15 * np.sin(x / 4.0) * np.cos(y / 3.0)
+
+
+def weir(x, y):
+    return 0.25 * np.tanh(-x / 1.5) + 0.002 * y  # half a metre over 3 m
+
+
+def cameras(k=5, spread=35.0, height=60.0, seed=4):
+    rng = np.random.default_rng(seed)
+    centres = np.column_stack([rng.uniform(-spread, spread, (k, 2)), height + rng.normal(0, 2, k)])
+    return pcfix.Cameras(tuple(map(str, range(k))), centres + UTM)
+
+
+def bed(n=60, spread=20.0, seed=6):
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.uniform(-spread, spread, (n, 2)), rng.uniform(-8, -1, n)]) + UTM
+
+
+def test_height_is_bilinear_and_the_outermost_patch_goes_on():
+    water = raster(waves, (0.7, 1.1), half=15.4)
+    plan = np.random.default_rng(0).uniform(-18, 18, (4000, 2))
+    found = surface_above(water, np.column_stack([plan, np.zeros(4000)]) + UTM)
+    inside = (np.abs(plan) <= 15.4).all(axis=1)
+    assert np.array_equal(np.isfinite(found.height_m), inside)
+    expected = [bilinear(water)(*at) for at in plan[inside]]
+    # coordinates of UTM have steps of 1e-9 m, the slope is below 0.1
+    assert found.height_m[inside] == pytest.approx(expected, abs=1e-9)
+
+
+def test_slope_is_the_gradient_of_the_height():
+    water = raster(waves, (0.7, 1.1))
+    plan, step = np.random.default_rng(1).uniform(-50, 50, (500, 2)), 1e-4
+    here = np.column_stack([plan, np.zeros(500)]) + UTM
+    slope = surface_above(water, here).slope
+    for axis in (0, 1):
+        aside = np.zeros(3)
+        aside[axis] = step
+        ends = [surface_above(water, here + sign * aside).height_m for sign in (1, -1)]
+        difference = (ends[0] - ends[1]) / (2 * step)
+        # where the step crosses into another patch the slope differs
+        assert np.mean(np.abs(slope[:, axis] - difference) < 1e-6) > 0.99
+
+
+def test_an_unknown_cell_makes_four_patches_unknown():
+    water = raster(plane(0.0, 0, 0), half=5.0)
+    water.height_m[4, 3] = np.nan  # its centre lies at (-1.5, 0.5)
+    at = np.array([[-2.4, 0.5, -1], [-1.5, 1.4, -1], [-2.6, 0.5, -1], [-0.4, 0.5, -1], [9, 0, -1]])
+    known = np.isfinite(surface_above(water, at + UTM).height_m)
+    assert known.tolist() == [False, False, True, True, False]
+    high = pcfix.Cameras(("a", "b"), np.array([[-9.0, 0, 50], [9, 0, 50]]) + UTM)
+    result = pcfix.correct_points(at + UTM, high, water)
+    assert result.water_known.tolist() == known.tolist()
+    assert result.submerged.tolist() == known.tolist()
+    assert np.array_equal(result.xyz[~known], (at + UTM)[~known])
+
+
+@pytest.mark.parametrize("abc", [(0.4, 0.0, 0.0), (0.2, 0.003, -0.002), (-0.1, 0.04, 0.03)])
+@pytest.mark.parametrize("options", [{}, {"max_cameras": 3}, {"max_angle_deg": 25.0}])
+def test_a_raster_of_a_plane_equals_the_plane(abc, options):
+    a, b, c = abc
+    there = pcfix.WaterPlane(a - b * UTM[0] - c * UTM[1], b, c)
+    one = pcfix.correct_points(bed(), cameras(), raster(plane(*abc)), **options)
+    other = pcfix.correct_points(bed(), cameras(), there, **options)
+    assert np.array_equal(one.outcome, other.outcome)
+    assert one.corrected.any()
+    assert one.xyz == pytest.approx(other.xyz, abs=MICROMETRE)
+    assert one.depth_m == pytest.approx(other.depth_m, abs=MICROMETRE)
+    assert one.incidence_deg == pytest.approx(other.incidence_deg, abs=1e-6)
+
+
+def test_raster_and_mesh_of_a_plane_agree_to_a_millimetre_in_32_bits():
+    surface = plane(174.8, 0.003, -0.001)  # as of a river: floats in steps of 15 um, slopes of 3e-5
+    water = raster(surface, (0.5, 0.5))
+    stored = WaterRaster(
+        water.height_m.astype(np.float32).astype(float), water.left_m, water.top_m, (0.5, 0.5)
+    )
+    corners = np.array([[-60.0, -60], [60, -60], [60, 60], [-60, 60]])
+    mesh = pcfix.WaterMesh(
+        np.column_stack([corners, surface(*corners.T)]) + UTM, np.array([[0, 1, 2], [0, 2, 3]])
+    )
+    up = np.array([0, 0, 174.5])
+    above = pcfix.Cameras(cameras().labels, cameras().centres + up)
+    one = pcfix.correct_points(bed() + up, above, stored)
+    other = pcfix.correct_points(bed() + up, above, mesh)
+    assert one.corrected.all()
+    assert one.xyz == pytest.approx(other.xyz, abs=1e-3)
+    exact = pcfix.correct_points(bed() + up, above, water)
+    assert exact.xyz == pytest.approx(other.xyz, abs=MICROMETRE)
+
+
+@pytest.mark.parametrize("surface", [waves, weir])
+def test_slow_twin_on_the_interpolated_field(surface):
+    water = raster(surface)
+    points, block = bed(), cameras()
+    result = pcfix.correct_points(points, block, water)
+    assert result.corrected.all()
+    field = bilinear(water)
+    for point, found in zip(points - UTM, result.xyz - UTM, strict=True):
+        expected = correct_under(field, point, block.centres - UTM, 1.34)
+        # heights are known to 1e-9 m and slopes of the twin to 1e-8
+        assert found == pytest.approx(expected, abs=MICROMETRE)
+
+
+@pytest.mark.parametrize(("cell", "within_m"), [(0.5, 0.01), (0.125, 0.002)])
+def test_a_curved_surface_converges_to_its_formula(cell, within_m):
+    points, block = bed(), cameras()
+    result = pcfix.correct_points(points, block, raster(weir, (cell, cell)))
+    apart = [
+        found - correct_under(weir, point, block.centres - UTM, 1.34)
+        for point, found in zip(points - UTM, result.xyz - UTM, strict=True)
+    ]
+    assert np.sqrt(np.mean(np.square(apart))) < within_m
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    slope=st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05)),
+    cell=st.tuples(st.floats(0.3, 9.0), st.floats(0.3, 9.0)),
+    at=st.tuples(st.floats(-20, 20), st.floats(-20, 20)),
+    depth=st.floats(0.01, 12.0),
+)
+def test_any_cells_of_any_plane(slope, cell, at, depth):
+    surface = plane(0.0, *slope)
+    point = np.array([[*at, surface(*at) - depth]])
+    block = pcfix.Cameras(cameras().labels, cameras().centres - UTM)
+    one = pcfix.correct_points(point, block, raster(surface, cell, origin=np.zeros(3)))
+    other = pcfix.correct_points(point, block, pcfix.WaterPlane(0.0, *slope))
+    assert one.xyz == pytest.approx(other.xyz, abs=MICROMETRE)
+
+
+def test_beyond_the_edge_the_last_plane_goes_on():
+    # the raster ends 0.3 m beyond the point; its rays pass the water 1.5 to 3 m away
+    abc = (0.1, 0.02, -0.01)
+    small = raster(plane(*abc), (0.25, 0.25), half=2.0)
+    points = np.array([[1.7, 1.7, -4.0], [-1.9, 0.3, -6.0]]) + UTM
+    there = pcfix.WaterPlane(abc[0] - abc[1] * UTM[0] - abc[2] * UTM[1], *abc[1:])
+    one = pcfix.correct_points(points, cameras(), small)
+    assert one.corrected.all()
+    other = pcfix.correct_points(points, cameras(), there)
+    assert one.xyz == pytest.approx(other.xyz, abs=MICROMETRE)
+
+
+def test_a_cliff_in_the_raster_gives_finite_coordinates():
+    water = raster(lambda x, y: np.where(x > 3.0, -9.0, 0.0) + 0.0 * y)
+    result = pcfix.correct_points(bed(), cameras(), water)
+    assert np.isfinite(result.xyz).all()
+    assert np.isfinite(result.ray_miss_m).all()
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="needs two threads")
+def test_neither_threads_nor_company_change_the_bits():
+    water, points = raster(waves), bed(700)
+    whole = pcfix.correct_points(points, cameras(), water)
+    numba.set_num_threads(1)
+    one = pcfix.correct_points(points, cameras(), water)
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    assert np.array_equal(whole.xyz, one.xyz)
+    for i in range(0, 700, 77):
+        alone = pcfix.correct_points(points[i : i + 1], cameras(), water)
+        assert np.array_equal(alone.xyz[0], whole.xyz[i])
+
+
+def test_a_camera_under_the_raster_is_refused():
+    with pytest.raises(pcfix.GeometryError, match="5 of 5 cameras are under the water"):
+        pcfix.correct_points(bed(), cameras(), raster(plane(90.0, 0, 0)))
+
+
+@pytest.mark.parametrize(
+    ("heights", "cell", "message"),
+    [
+        (np.zeros((1, 5)), (1.0, 1.0), "two rows and columns"),
+        (np.zeros((3, 3)), (1.0, 0.0), "positive"),
+        (np.full((3, 3), np.nan), (1.0, 1.0), "not all of them"),
+        (np.full((3, 3), np.inf), (1.0, 1.0), "must be finite"),
+    ],
+)
+def test_what_is_no_raster(heights, cell, message):
+    with pytest.raises(pcfix.SettingError, match=message):
+        WaterRaster(heights, 0.0, 0.0, cell)
+
+
+# A level that moves
+
+
+def surfaces():
+    corners = np.array([[-60.0, -60], [60, -60], [60, 60], [-60, 60]])
+    vertices = np.column_stack([corners, 0.2 + 0.003 * corners[:, 0]]) + UTM
+    return {
+        "level": 0.2,
+        "plane": pcfix.WaterPlane(0.2 - 0.003 * UTM[0], 0.003, 0.0),
+        "mesh": pcfix.WaterMesh(vertices, np.array([[0, 1, 2], [0, 2, 3]])),
+        "raster": raster(waves),
+    }
+
+
+@pytest.mark.parametrize("kind", surfaces())
+@pytest.mark.parametrize("options", [{}, {"max_cameras": 3}])
+def test_offsets_of_zero_give_the_same_bits(kind, options):
+    one = pcfix.correct_points(bed(300), cameras(), surfaces()[kind], **options)
+    other = pcfix.correct_points(
+        bed(300), cameras(), surfaces()[kind], level_offset_m=np.zeros(5), **options
+    )
+    for name in ("xyz", "ray_miss_m", "sigma_z_m", "incidence_deg", "outcome", "ray_count"):
+        assert np.array_equal(getattr(one, name), getattr(other, name)), name
+
+
+@pytest.mark.parametrize("kind", surfaces())
+@pytest.mark.parametrize("options", [{}, {"max_cameras": 5}])
+def test_one_offset_for_all_is_another_surface(kind, options):
+    water, up = surfaces()[kind], 0.31
+    match water:
+        case float():
+            higher = water + up
+        case pcfix.WaterPlane(a, b, c):
+            higher = pcfix.WaterPlane(a + up, b, c)
+        case pcfix.WaterMesh(vertices, triangles):
+            higher = pcfix.WaterMesh(vertices + np.array([0, 0, up]), triangles)
+        case WaterRaster():
+            higher = raster(lambda x, y: waves(x, y) + up)
+    one = pcfix.correct_points(bed(), cameras(), water, level_offset_m=np.full(5, up), **options)
+    other = pcfix.correct_points(bed(), cameras(), higher, **options)
+    assert one.xyz == pytest.approx(other.xyz, abs=1e-8)
+    assert one.depth_m + up == pytest.approx(other.depth_m, abs=1e-8)  # of the surface given
+
+
+@pytest.mark.parametrize("kind", ["plane", "raster"])
+def test_slow_twin_of_a_level_of_its_own_for_each_camera(kind):
+    offset = np.array([-0.4, 0.3, 0.0, 0.7, -0.2])
+    result = pcfix.correct_points(bed(), cameras(), surfaces()[kind], level_offset_m=offset)
+    base = bilinear(surfaces()["raster"]) if kind == "raster" else plane(0.2, 0.003, 0.0)
+    own = [lambda x, y, up=up: base(x, y) + up for up in offset]
+    for point, found in zip(bed() - UTM, result.xyz - UTM, strict=True):
+        expected = correct_under(own, point, cameras().centres - UTM, 1.34)
+        assert found == pytest.approx(expected, abs=MICROMETRE)
+
+
+@pytest.mark.parametrize("options", [{}, {"max_cameras": 2}])
+def test_a_camera_that_saw_the_point_dry_has_a_straight_ray(options):
+    """Its own water lay below the apparent point, so that nothing bent its light."""
+    centres = np.array([[-20.0, 0, 50], [20.0, 0, 50]])
+    two, point = pcfix.Cameras(("wet", "dry"), centres), np.array([[0.0, 0, -0.1]])
+    result = pcfix.correct_points(point, two, 0.0, level_offset_m=[0.2, -0.2], **options)
+    bent = math.asin(math.sin(math.atan2(20.0, 50.1)) / 1.34)
+    entry = -20.0 + 20.0 * (50.0 - 0.2) / 50.1  # where the wet ray meets its water
+    slope, dry = math.tan(bent), 20.0 / 50.1
+    # entry + slope (0.2 - z) = (z + 0.1) dry
+    z = (entry + 0.2 * slope - 0.1 * dry) / (slope + dry)
+    assert result.xyz[0] == pytest.approx([(z + 0.1) * dry, 0.0, z], abs=1e-9)
+
+
+@pytest.mark.parametrize("offset", [np.zeros(4), np.array([0, 0, np.nan, 0, 0]), 0.3])
+def test_offsets_must_be_one_finite_number_per_camera(offset):
+    with pytest.raises(pcfix.SettingError, match="5 finite numbers, one per camera"):
+        pcfix.correct_points(bed(), cameras(), 0.0, level_offset_m=offset)
+
+
+def traced(truth, block, levels):
+    """Return what SfM makes of points seen through each camera's own level, and their views."""
+    optics, pixels, seen = lens(), [], []
+    for c, level in enumerate(levels):
+        centre = np.broadcast_to(block.centres[c], truth.shape)
+        surface = piercing_points(truth, centre, level, 1.34)
+        uv, z = project(surface, block, np.full(len(truth), c), optics)
+        pixels.append(uv)
+        seen.append((z > 0) & ((uv >= 0) & (uv < [optics.width, optics.height])).all(axis=1))
+    point, camera = np.nonzero(np.array(seen).T)
+    counts = np.bincount(point, minlength=len(truth))
+    assert counts.min() >= 3
+    start = np.concatenate([[0], np.cumsum(counts)])
+    image = np.array(pixels).transpose(1, 0, 2)[point, camera]
+    return triangulate(image, block, camera, start, optics, truth), pcfix.Views(start, camera)
+
+
+def test_two_flights_at_two_levels_leave_no_bias_where_each_image_has_its_own():
+    """Traced forwards by other code: the south flown at low water, the north 1 m higher."""
+    rng = np.random.default_rng(11)
+    flown = fly(120.0, 200.0, 0.0, 80.0, obliques=False, rng=rng).cameras
+    levels = np.where(flown.centres[:, 1] < 100.0, -0.5, 0.5)
+    low, high = np.array([0.0, 0, -9]), np.array([120.0, 200, -2])
+    truth = rng.uniform(low, high, (600, 3))
+    sides = truth[:, 1] < 60.0, truth[:, 1] > 140.0
+    apparent, views = traced(truth, flown, levels)
+
+    def bias(points, **more):
+        corrected = pcfix.correct_points(points, flown, 0.0, views=views, **more)
+        return np.array([(corrected.xyz - truth)[side, 2].mean() for side in sides])
+
+    still = bias(traced(truth, flown, np.zeros(len(flown)))[0])  # of the method itself
+    assert np.abs(still).max() < gsd_m(80.0)
+    own = bias(apparent, level_offset_m=levels)
+    assert own == pytest.approx(still, abs=0.005)  # depths differ by half a metre: 0.01 of it
+    mean = bias(apparent)
+    # a level that is too high by 0.5 m moves z by about -0.44 of that, too low by +0.44
+    assert mean - own == pytest.approx([-0.2, 0.2], abs=0.06)
