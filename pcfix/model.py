@@ -148,7 +148,7 @@ class Cameras:
         for every point.
     lenses : tuple of Lens, length k, or None
         Interior orientation of each image. None where the source has none; then a frame holds
-        every point.
+        every point in front of the camera.
     crs : str or None
         CRS of centres and rotations: what pyproj understands (geocentric ones are allowed), or
         ``ENU:latitude,longitude,height`` for axes east, north, up at that place, or ``local``

@@ -9,7 +9,7 @@ cameras go through, which refuse what PROJ can only guess.
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.crs import is_local, metres_up, parse_crs, parts
 from pcfix.io.placement import way_to_cloud
 from pcfix.io.rasters import open_raster
+from pcfix.io.resampling import Part, check_size, place_of, sampled
 from pcfix.io.transformations import transformation_in_plan
 from pcfix.model import WaterRaster
 
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
 
 MARGIN_M = 100.0
 """Beyond the cloud: rays pass the water at most about so far from their points."""
-MOST_CELLS = 50_000_000
 IMPOSSIBLE_M = 9000.0
 """No water surface is so far from zero; where no nodata value is stated, this is one."""
 _UNITS_M = {
@@ -44,14 +44,6 @@ _UNITS_M = {
     "us-ft": 1200.0 / 3937.0, "ftus": 1200.0 / 3937.0, "us survey foot": 1200.0 / 3937.0,
 }  # fmt: skip
 _EDGE_POINTS = 33
-_AT_ONCE = 1_000_000
-
-
-class _Part(NamedTuple):
-    """Part of a raster: heights, and the transform from (column, row) of it to its CRS."""
-
-    heights: FloatArray
-    transform: Affine
 
 
 def read_water_raster(
@@ -69,7 +61,7 @@ def read_water_raster(
         to share the other's.
     bounds : tuple of 4 float, optional
         West, south, east and north end of the cloud, metres: only what lies within `MARGIN_M`
-        of it is read. Default: the whole raster.
+        of it is read. Default, and where one is not finite: the whole raster.
 
     Returns
     -------
@@ -87,6 +79,7 @@ def read_water_raster(
     PcfixWarning
         Of what was taken for granted.
     """
+    bounds = _about(bounds)
     with open_raster(path) as source:
         name = str(path)
         _check_band(source, name)
@@ -101,7 +94,15 @@ def read_water_raster(
         warnings.warn(note, PcfixWarning, stacklevel=3)
     if to_cloud is None and _is_north_up(part.transform):
         return _as_it_is(part, title)
-    return _sampled(part, to_cloud or (lambda xyz: xyz), from_cloud, bounds, (name, title))
+    return sampled(part, to_cloud or (lambda xyz: xyz), from_cloud, bounds, (name, title))
+
+
+def _about(bounds: Bounds | None) -> Bounds | None:
+    """Return the cloud's bounds with their margin, None where they are not known."""
+    if bounds is None or not np.isfinite(bounds).all():
+        return None
+    west, south, east, north = bounds
+    return west - MARGIN_M, south - MARGIN_M, east + MARGIN_M, north + MARGIN_M
 
 
 def _there(bounds: Bounds | None) -> str:
@@ -127,7 +128,7 @@ def _ways(
 ) -> tuple[Points | None, Points, tuple[str, ...]]:
     """Return the way to the cloud (None: the same numbers), the way back in plan, and notes."""
     stated = None if source.crs is None else source.crs.to_wkt()
-    corners = np.array([_at(source.transform, *corner) for corner in _corners(source)])
+    corners = np.array([place_of(source.transform, *corner) for corner in _corners(source)])
     at = np.column_stack([corners, np.zeros(len(corners))])
     way = way_to_cloud(stated, cloud_crs, at, name, heights=True)
     if way.forward is None or stated is None or cloud_crs is None:
@@ -139,36 +140,29 @@ def _ways(
     return lambda xyz: forward(xyz / unit), back.forward, way.notes
 
 
-def _at(transform: Affine, column: Any, row: Any) -> tuple[Any, Any]:
-    """Return the place of a column and row: numbers or arrays of them."""
-    t = transform
-    return t.a * column + t.b * row + t.c, t.d * column + t.e * row + t.f
-
-
 def _corners(source: DatasetReader) -> list[tuple[float, float]]:
     width, height = source.width, source.height
     return [(0, 0), (width, 0), (0, height), (width, height), (width / 2, height / 2)]
 
 
 def _edge(bounds: Bounds) -> FloatArray:
-    """Return points along the cloud's bounds with their margin, z = 0."""
+    """Return points along bounds, z = 0."""
     west, south, east, north = bounds
     share = np.linspace(0.0, 1.0, _EDGE_POINTS)
-    x = west - MARGIN_M + share * (east - west + 2.0 * MARGIN_M)
-    y = south - MARGIN_M + share * (north - south + 2.0 * MARGIN_M)
+    x, y = west + share * (east - west), south + share * (north - south)
     sides = [(x, np.full_like(x, end)) for end in (y[0], y[-1])]
     sides += [(np.full_like(y, end), y) for end in (x[0], x[-1])]
     plan = np.hstack([np.stack(side) for side in sides]).T
     return np.column_stack([plan, np.zeros(len(plan))])
 
 
-def _read(source: DatasetReader, name: str, near: FloatArray | None) -> _Part:
+def _read(source: DatasetReader, name: str, near: FloatArray | None) -> Part:
     """Read the heights around some places, shape (n, 3), or all; metres of the raster's CRS."""
     from rasterio.windows import Window
 
     left, top, right, bottom = 0, 0, source.width, source.height
     if near is not None and np.isfinite(near).all():
-        column, row = _at(~source.transform, near[:, 0], near[:, 1])
+        column, row = place_of(~source.transform, near[:, 0], near[:, 1])
         left, right = (int(v) for v in np.clip([column.min() - 2, column.max() + 3], 0, right))
         top, bottom = (int(v) for v in np.clip([row.min() - 2, row.max() + 3], 0, bottom))
     if right - left < 2 or bottom - top < 2:
@@ -183,21 +177,7 @@ def _read(source: DatasetReader, name: str, near: FloatArray | None) -> _Part:
     if source.nodata is None:
         heights[np.abs(heights) > IMPOSSIBLE_M] = np.nan
     heights[np.isinf(heights)] = np.nan
-    return _Part(heights, source.window_transform(window))
-
-
-def check_size(cells: int, name: str) -> None:
-    """Refuse more cells than memory should hold.
-
-    Raises
-    ------
-    InputError
-    """
-    if cells > MOST_CELLS:
-        raise InputError(
-            f"{name}: {cells:,} cells are too many ({MOST_CELLS:,} at most); water is smooth, so"
-            " resample it to coarser cells, 1 m for instance."
-        )
+    return Part(heights, source.window_transform(window))
 
 
 def _metres(source: DatasetReader, name: str) -> float:
@@ -243,62 +223,6 @@ def _is_north_up(transform: Affine) -> bool:
     return bool(t.b == t.d == 0.0 and t.a > 0.0 > t.e)
 
 
-def _as_it_is(part: _Part, title: str) -> WaterRaster:
+def _as_it_is(part: Part, title: str) -> WaterRaster:
     t = part.transform
     return WaterRaster(part.heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), title)
-
-
-def _sampled(
-    part: _Part,
-    to_cloud: Points,
-    from_cloud: Points,
-    bounds: Bounds | None,
-    names: tuple[str, str],
-) -> WaterRaster:
-    """Sample on a grid in the cloud's CRS with square cells as fine as the raster's finest."""
-    cell, (west, south, east, north) = _extent(part, to_cloud, names[0])
-    if bounds is not None:
-        west, south = max(west, bounds[0] - MARGIN_M), max(south, bounds[1] - MARGIN_M)
-        east, north = min(east, bounds[2] + MARGIN_M), min(north, bounds[3] + MARGIN_M)
-    left, top = np.floor(west / cell) * cell, np.ceil(north / cell) * cell
-    columns, rows = int(np.ceil((east - left) / cell)), int(np.ceil((top - south) / cell))
-    check_size(columns * rows, names[0])
-    heights = np.empty((max(rows, 2), max(columns, 2)))
-    x = left + (np.arange(heights.shape[1]) + 0.5) * cell
-    for first in range(0, len(heights), max(1, _AT_ONCE // len(x))):
-        some = heights[first : first + max(1, _AT_ONCE // len(x))]
-        y = top - (first + np.arange(len(some)) + 0.5) * cell
-        plan = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x)), np.zeros(some.size)])
-        some[:] = _heights_at(part, from_cloud(plan), to_cloud).reshape(some.shape)
-    if not np.isfinite(heights).any():
-        raise InputError(f"{names[0]}: holds no height{_there(bounds)}; check its CRS.")
-    return WaterRaster(heights, float(left), float(top), (float(cell), float(cell)), names[1])
-
-
-def _extent(part: _Part, to_cloud: Points, name: str) -> tuple[float, Bounds]:
-    """Return the smaller side of a cell amid a raster, and the raster's bounds, in the cloud's."""
-    rows, columns = part.heights.shape
-    share = np.linspace(0.0, 1.0, _EDGE_POINTS)
-    c, r = (grid.ravel() for grid in np.meshgrid(share * columns, share * rows))
-    amid = columns / 2.0 + np.array([0.0, 1.0, 0.0]), rows / 2.0 + np.array([0.0, 0.0, 1.0])
-    x, y = _at(part.transform, np.append(c, amid[0]), np.append(r, amid[1]))
-    level = np.full(len(x), np.nanmean(part.heights))
-    placed = to_cloud(np.column_stack([x, y, level]))
-    if not np.isfinite(placed).all():
-        raise InputError(f"{name}: reaches beyond where the cloud's CRS can be used; clip it.")
-    sides = np.hypot(*(placed[-2:] - placed[-3])[:, :2].T)
-    (west, south, _), (east, north, _) = placed.min(axis=0), placed.max(axis=0)
-    return float(sides.min()), (float(west), float(south), float(east), float(north))
-
-
-def _heights_at(part: _Part, places: FloatArray, to_cloud: Points) -> FloatArray:
-    """Return heights in the cloud's system at places in the raster's CRS; NaN where unknown."""
-    from pcfix.label.raster import Field, heights_above
-
-    column, row = _at(~part.transform, places[:, 0], places[:, 1])
-    cells = Field(np.ascontiguousarray(part.heights), 0.5, -0.5, 1.0, 1.0)
-    height, _ = heights_above(cells, np.ascontiguousarray(column), np.ascontiguousarray(-row))
-    known = np.isfinite(height)
-    height[known] = to_cloud(np.column_stack([places[known, :2], height[known]]))[:, 2]
-    height[~np.isfinite(height)] = np.nan
-    return np.asarray(height)

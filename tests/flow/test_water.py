@@ -110,7 +110,9 @@ def test_raster_and_mesh_of_a_plane_are_the_plane(river, tmp_path):
         out.write(grid, 1)
     corners = [(px, py, plane.a + plane.b * px) for px in (west, east) for py in (south, north)]
     mesh = tmp_path / "water.obj"
-    mesh.write_text("".join(f"v {a:.17g} {b:.17g} {c:.17g}\n" for a, b, c in corners) + "f 1 3 4\nf 1 4 2\n")
+    mesh.write_text(
+        "".join(f"v {a:.17g} {b:.17g} {c:.17g}\n" for a, b, c in corners) + "f 1 3 4\nf 1 4 2\n"
+    )
     given = [pcfix.read_water(one) for one in (raster, mesh)]
     options = {"views": river.views}
     expected = pcfix.correct_points(river.apparent, river.cameras, plane, **options)
@@ -190,3 +192,28 @@ def test_index_and_salinity_are_not_given_twice(tmp_path):
     said = invoke(*words, "--salinity", "0", "--temperature", "20", "--wavelength", "0.5893")
     assert "refractive index 1.333" in said
     assert "cm shallower on average" in said
+
+
+def test_a_tide_gives_every_image_its_own_level(tmp_path):
+    labels = pcfix.read_cameras(CAMERAS).labels
+    times = [f"2026-06-01T10:{i:02d}:00Z" for i in range(len(labels))]
+    rows = "\n".join(f"{label},{time}" for label, time in zip(labels, times, strict=True))
+    (tmp_path / "times.csv").write_text(f"label,time\n{rows}\n")
+    options = {"cameras": CAMERAS, "water": LEVEL_M, "image_times": tmp_path / "times.csv"}
+
+    def corrected(name, low_m, high_m):
+        (tmp_path / "tide.csv").write_text(
+            f"time,level_m\n2026-06-01T10:00:00Z,{low_m}\n2026-06-01T10:39:00Z,{high_m}\n"
+        )
+        summary = pcfix.correct_file(CLOUD, tmp_path / name, **options, tide=tmp_path / "tide.csv")
+        return laspy.read(tmp_path / name), summary
+
+    still, _ = corrected("still.las", 1.0, 1.0)
+    pcfix.correct_file(CLOUD, tmp_path / "plain.las", cameras=CAMERAS, water=LEVEL_M)
+    plain = laspy.read(tmp_path / "plain.las")
+    np.testing.assert_array_equal(still.points.array, plain.points.array)
+    moving, summary = corrected("moving.las", 0.0, 0.4)
+    assert "-0.200 to +0.200 m at the times of the images" in summary.water
+    assert np.abs(moving.z - plain.z).max() > 0.01
+    with pytest.raises(pcfix.SettingError, match="image-times is of no use without tide"):
+        pcfix.correct_file(CLOUD, tmp_path / "no.las", **options)
