@@ -191,6 +191,7 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     from pcfix.flow.label import Counts
     from pcfix.flow.points import check_submerged
     from pcfix.flow.surfaces import WaterWords, find_surface
+    from pcfix.flow.water_checks import check_tilt
     from pcfix.label.labelling import Labelling
 
     options = _options(namespace, _LABEL_OPTIONS, needed=("water",))
@@ -201,6 +202,7 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
         options["water"], options.get("water_model", "auto"), options.get("water_crs")
     )
     water = find_surface(words, view).surface
+    check_tilt(water)
     mask = mask_of(options.get("water_mask"), view.crs, view.low, view.high)
     labelling = Labelling(_label_settings(options), mask)
     classes = flags.classes.copy()

@@ -151,6 +151,15 @@ class Job:
             **self._labelling_words(),
         }
 
+    def _water_words(self) -> str:
+        """Return the water surface in words, and how far it moved where it did."""
+        moved = self.level_offset_m
+        if moved is None:
+            return str(self.water)
+        return (
+            f"{self.water}, {moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
+        )
+
     def _labelling_words(self) -> dict[str, Any]:
         """Return what a file shall say of the rules by which points were left out, if any."""
         labelling = self.labelling
@@ -215,7 +224,7 @@ class Job:
             cameras=len(self.cameras),
             cameras_used=len(self.cameras) - len(unused),
             cameras_unused=unused,
-            water=str(self.water),
+            water=self._water_words(),
             settings=asdict(self.settings),
             seconds=round(seconds, 3),
             views=None if views is None else views.as_dict(),

@@ -17,6 +17,7 @@ from pcfix.flow.inputs import file_of, mask_of
 from pcfix.flow.job import parts_of
 from pcfix.flow.points import CHUNK_POINTS, as_surface, check_submerged, checked_points
 from pcfix.flow.surfaces import WaterWords, find_surface, view_of
+from pcfix.flow.water_checks import check_tilt
 from pcfix.io.files import check_input, check_output, write_text
 from pcfix.io.las.formats import convert
 from pcfix.io.las.headers import corrected_identity, noted_header, output_evlrs
@@ -248,6 +249,7 @@ def _surface_and_rules(
     """Return the water and the rules, with the surroundings of all points where they need them."""
     view = view_of(path)
     surface = find_surface(words, view).surface
+    check_tilt(surface)
     labelling = Labelling(settings, mask_of(water_mask, view.crs, view.low, view.high))
     if labelling.looks_around:
         labelling.look_around(
