@@ -54,26 +54,30 @@ def read_cameras(
     Parameters
     ----------
     path : path
-        A CSV table with a header line. Columns, in any order, upper or lower case:
+        A file or folder that photogrammetry software wrote; its content decides which. Each
+        module of this folder says what it takes and in which convention. Or a table with a
+        header line; columns, in any order, upper or lower case:
 
         ``label, x, y, z``
-            Projection centres, metres, in the cloud's own CRS. Every camera is then a candidate
-            for every point.
-        ``label, x, y, z, yaw, pitch, roll``
-            and the angles in degrees: yaw clockwise from north, pitch 0 straight down and
-            positive when the view lifts towards the yaw direction, roll positive when the right
-            side goes down (the reference angles of Metashape, the table of pyBathySfM). Needs
-            the sensor.
+            Projection centres. Every camera is then a candidate for every point.
+        and ``omega, phi, kappa``; ``yaw, pitch, roll``; ``qw, qx, qy, qz``; or ``r11 ... r33``
+            Angles in degrees, or the rotation from world to camera. Yaw is clockwise from north,
+            pitch 0 straight down and positive when the view lifts towards the yaw direction,
+            roll positive when the right side goes down (the angles of Metashape, the table of
+            pyBathySfM). Needs the sensor.
     sensor : path, optional
-        A CSV table ``focal, sensor_x, sensor_y`` in millimetres, one row, for all images.
+        For tables: a CSV table of one row for all images, ``focal, sensor_x, sensor_y`` in
+        millimetres or ``focal_px, width_px, height_px, ...``, or a calibration of Metashape.
         Default: a ``sensor.csv`` beside the cameras.
     angles : {"omega-phi-kappa", "yaw-pitch-roll", "aircraft"}, optional
-        What the angles of a table are, where its header cannot say.
+        What the angles of a table are, where its header cannot say. Of an aircraft's or a
+        gimbal's, pitch -90 looks straight down.
 
     Returns
     -------
     Cameras
-        World to camera rotations in OpenCV axes.
+        World to camera rotations in OpenCV axes, all in the frame of the file:
+        `pcfix.io.cameras.georeference.bring_to` takes them to the cloud's CRS.
 
     Warns
     -----
