@@ -124,17 +124,20 @@ def _points(plan: Axes, side: Axes, points: FloatArray, fit: WaterFit | RiverFit
         if rows.any():
             plan.plot(*points[rows, :2].T, mark, color=colour, markersize=5, label=name)
             side.plot(station[rows], points[rows, 2], mark, color=colour, markersize=5)
-    side.set_xlabel("Along the points (m)")
+    side.set_xlabel("Down the flow (m)" if isinstance(fit, RiverFit) else "Along the points (m)")
     side.set_ylabel("Height (m)")
     side.legend(loc="best")
-    plan.legend(loc="best")
+    plan.legend(loc="upper right", bbox_to_anchor=(1.0, 1.0))
 
 
 def _station(points: FloatArray, fit: WaterFit | RiverFit) -> FloatArray:
-    """Return how far along the river, or along their longest extent, points lie."""
+    """Return how far down the river or the tilt, or along their longest extent, points lie."""
     if isinstance(fit, RiverFit):
         return np.asarray(fit.axis.locate(points[:, :2])[0])
     centred = points[:, :2] - points[:, :2].mean(axis=0)
-    axis = np.linalg.svd(centred, full_matrices=False)[2][0]
+    if fit.tilt.any():
+        axis = -fit.tilt / np.hypot(*fit.tilt)
+    else:
+        axis = np.linalg.svd(centred, full_matrices=False)[2][0]
     station = centred @ axis
     return np.asarray(station - station.min())
