@@ -10,6 +10,8 @@ import numpy as np
 
 from pcfix.flow.surfaces import CloudView, FoundSurface, WaterWords, find_surface, view_of
 from pcfix.io.files import check_input, check_output, write_bytes
+from pcfix.label.fit import WaterFit
+from pcfix.label.river import RiverFit
 from pcfix.label.surface import surface_above
 from pcfix.model import WaterDimension
 
@@ -51,11 +53,28 @@ class WaterReport:
             "water": self.spec,
             "surface": str(self.found.surface),
             "fit": self.found.as_dict(),
+            "points": self._points(),
             "cloud": self.cloud,
             "share_below": self.below,
             "share_unknown": self.unknown,
             "notes": list(self.found.notes),
         }
+
+    def _points(self) -> list[dict[str, Any]] | None:
+        """Return each fitted point with its residual, None where it has no height."""
+        found = self.found
+        if found.points is None or not isinstance(found.evidence, WaterFit | RiverFit):
+            return None
+        fit = found.evidence
+        rows = zip(found.points, fit.residual_m, fit.accepted, strict=True)
+        return [
+            {
+                "xyz": [float(v) if np.isfinite(v) else None for v in xyz],
+                "residual_m": float(residual) if np.isfinite(residual) else None,
+                "accepted": bool(accepted),
+            }
+            for xyz, residual, accepted in rows
+        ]
 
 
 def check_water(

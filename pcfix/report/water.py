@@ -74,12 +74,17 @@ def _river(river: RiverFit, points: FloatArray | None) -> list[str]:
 
 
 def _rejected(residual_m: FloatArray, accepted: BoolArray, points: FloatArray | None) -> list[str]:
-    """List the points that were not believed, worst first."""
+    """Sum up the residuals, and list the points that were not believed, worst first."""
+    good = np.abs(residual_m[accepted])
+    said = [
+        f"residuals    of the accepted points: rms {np.sqrt(np.mean(good**2)):.3f} m, median"
+        f" {np.median(good):.3f} m, largest {good.max():.3f} m"
+    ]
     rows = np.flatnonzero(~accepted & np.isfinite(residual_m))
     rows = rows[np.argsort(-np.abs(residual_m[rows]), kind="stable")]
     if points is None or len(rows) == 0:
-        return []
-    lines = [
+        return said
+    lines = said + [
         f"rejected     {points[i, 0]:.2f}, {points[i, 1]:.2f}, {points[i, 2]:.2f}:"
         f" {residual_m[i]:+.3f} m"
         for i in rows[:MOST_LISTED]

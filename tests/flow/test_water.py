@@ -149,6 +149,7 @@ def test_every_door_takes_shoreline_points(tmp_path):
     assert (tmp_path / "w.png").read_bytes().startswith(b"\x89PNG")
     found = json.loads(summary.read_text())
     assert found["fit"]["level_m"] == pytest.approx(LEVEL_M, abs=1e-6)
+    assert [point["residual_m"] for point in found["points"]] == pytest.approx([0.0] * 20, abs=1e-6)
     assert found["share_below"] == pytest.approx(0.7368, abs=0.001)  # 14,736 of 20,000 points
 
 
