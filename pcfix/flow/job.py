@@ -18,6 +18,7 @@ from pcfix.flow.points import (
     refuse_under_water,
 )
 from pcfix.flow.water_checks import WaterMeeting, check_tilt
+from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.label.labelling import Labelling, Part
 from pcfix.label.surface import surface_above
 from pcfix.model import (
@@ -84,7 +85,7 @@ class Job:
         self.found = inputs.surface(view)
         self.water = self.found.surface
         self.level_offset_m = inputs.level_offset_m(self.cameras)
-        self._points, self._step_m = view.points, step_m
+        self._points, self._step_m, self._crs = view.points, step_m, view.crs
         check_above_water(self.cameras, self.water, self.level_offset_m)
         check_tilt(self.water)
         self._low, self._high = view.low, view.high
@@ -195,8 +196,14 @@ class Job:
                 + (f" within {limit:g} degrees" if limit else "")
                 + f"; the nearest stands {_distance(distance)} in plan from the middle of the"
                 f" {tally.submerged:,} submerged points; check that cameras and cloud have the"
-                " same CRS, and that pitch 0 means straight down."
+                " same CRS, and that pitch 0 means straight down." + self._likely_mistake()
             )
+
+    def _likely_mistake(self) -> str:
+        """Return what is likely wrong with cameras that do not see the cloud, as a sentence."""
+        tally = self.tally
+        found = likely_mistake(self.cameras.centres, tally.low, tally.high, self._crs)
+        return f" {found}" if found else ""
 
     def summary(self, input: str, output: str, seconds: float) -> Summary:
         """Return the numbers of all chunks."""

@@ -92,11 +92,17 @@ def read_water(
     try:
         return WaterPlane(*_finite([text], text))
     except SettingError:
-        if not Path(text).is_file():
+        if not (Path(text).is_file() or _is_named_like_a_file(text)):
             raise
+        check_input(text)
     if Path(text).suffix.lower() in _NO_RASTERS:
         raise InputError(f"{text}: is not a water surface that pcfix reads; give {KINDS}.")
     return read_water_raster(text, cloud_crs, bounds)
+
+
+def _is_named_like_a_file(text: str) -> bool:
+    """Whether a word ends as file names do, with a suffix that no number has."""
+    return Path(text).suffix[1:2].isalpha()
 
 
 def _finite(values: list[str] | list[float], text: str) -> list[float]:
