@@ -38,7 +38,6 @@ def correct(
     jobs: Jobs = None,
 ) -> None:
     """Move the points below the water surface to where they are."""
-    from pcfix.cli.label import left_out_lines
     from pcfix.report.text import summary_text
 
     with progress_bar("Correcting", quiet) as progress:
@@ -56,7 +55,7 @@ def correct(
             progress=progress,
         )
     if not quiet:
-        typer.echo("\n".join([summary_text(result), *left_out_lines(result.labelling)]))
+        typer.echo(summary_text(result))
 
 
 @takes(CorrectionWords)

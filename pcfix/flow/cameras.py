@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +11,6 @@ from pcfix.errors import InputError
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.points import CHUNK_POINTS
 from pcfix.flow.surfaces import view_of
-from pcfix.io.cameras import read_cameras
 from pcfix.io.cameras.gnss import adjusted_minus_gnss
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.files import check_input, check_output, write_bytes
@@ -194,6 +191,7 @@ def check_cameras(
     if plot is not None:
         check_output(plot, overwrite=overwrite, inputs=[p for p in (path, cloud) if p is not None])
     inputs = Inputs(path, 0.0 if water is None else water, **words)
+    read = inputs.read()
     crs, xyz, heights = None, np.zeros((0, 3)), None
     view = None if cloud is None else view_of(check_input(cloud))
     surface = None if water is None else inputs.surface(view).surface
@@ -202,9 +200,9 @@ def check_cameras(
             crs = metric_crs(source)
             dimension = surface.name if isinstance(surface, WaterDimension) else None
             xyz, heights = _sample(source, dimension)
-        cameras, problem = inputs.block(crs)[0], ""
+        cameras, problem = inputs.block(crs, read)[0], ""
     else:
-        cameras, problem = _without_cloud(inputs)
+        cameras, problem = _without_cloud(inputs, read)
     level = None
     if surface is not None and not (isinstance(surface, WaterDimension) and heights is None):
         at = cameras.centres if heights is None else xyz
@@ -213,34 +211,25 @@ def check_cameras(
     above = None if level is None else cameras.centres[:, 2] - level
     report = CamerasReport(
         str(path), cameras.source, cameras,
-        _crs_read(inputs), cameras.crs, _sensors(cameras, above),
+        read.crs, cameras.crs, _sensors(cameras, above),
         None if above is None else (float(above.min()), float(above.mean()), float(above.max())),
         None if problem else _tilt_deg(cameras), _gnss(cameras, str(path)),
         None if cloud is None else _fit(cameras, str(cloud), xyz, crs), xyz, level, problem,
     )  # fmt: skip
     if plot is not None:
-        from pcfix.report.cameras import block_figure, png_of
+        from pcfix.report.cameras import block_figure
+        from pcfix.report.figures import png_of
 
         write_bytes(plot, png_of(block_figure(report)), overwrite=overwrite)
     return report
 
 
-def _without_cloud(inputs: Inputs) -> tuple[Cameras, str]:
+def _without_cloud(inputs: Inputs, read: Cameras) -> tuple[Cameras, str]:
     """Return the cameras where their software delivers clouds, or as read and why not there."""
     try:
-        return inputs.block(None)[0], ""
+        return inputs.block(None, read)[0], ""
     except InputError as error:
-        with warnings.catch_warnings():  # they were shown at the first reading
-            warnings.simplefilter("ignore")
-            read = read_cameras(Path(str(inputs.cameras)), inputs.sensor, angles=inputs.angles)
         return read, str(error)
-
-
-def _crs_read(inputs: Inputs) -> str | None:
-    """Return the CRS that the file states."""
-    with warnings.catch_warnings():  # they were shown at the first reading
-        warnings.simplefilter("ignore")
-        return read_cameras(Path(str(inputs.cameras)), inputs.sensor, angles=inputs.angles).crs
 
 
 def _sample(source: LasSource, dimension: str | None) -> tuple[FloatArray, FloatArray | None]:

@@ -105,8 +105,22 @@ class Inputs:
             warnings.warn(note, PcfixWarning, stacklevel=2)
         return offset
 
-    def block(self, cloud_crs: str | CRS | None) -> tuple[Cameras, ViewList | None]:
+    def read(self) -> Cameras:
+        """Return the cameras in the frame of their file."""
+        if isinstance(self.cameras, Cameras):
+            return self.cameras
+        return read_cameras(self.cameras, self.sensor, angles=self.angles)
+
+    def block(
+        self, cloud_crs: str | CRS | None, read: Cameras | None = None
+    ) -> tuple[Cameras, ViewList | None]:
         """Return the cameras in the cloud's CRS, and the view list where one was named.
+
+        Parameters
+        ----------
+        cloud_crs : str, CRS or None
+        read : Cameras, optional
+            What `read` gave, where that was called before.
 
         Raises
         ------
@@ -119,7 +133,7 @@ class Inputs:
             if self.views is None:
                 return self.cameras, None
             return self.cameras, read_views(self.views, self.cameras)
-        read = read_cameras(self.cameras, self.sensor, angles=self.angles)
+        read = self.read() if read is None else read
         way = georeference(
             read, cloud_crs, cameras_crs=self.cameras_crs, offset_m=self.cameras_offset_m,
             name=str(self.cameras),

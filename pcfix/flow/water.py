@@ -114,7 +114,7 @@ def check_water(
     spec = str(words.water)
     report = WaterReport(spec, found, None if view is None else view.name, below, unknown, sample)
     if plot is not None:
-        from pcfix.report.cameras import png_of
+        from pcfix.report.figures import png_of
         from pcfix.report.water import water_figure
 
         write_bytes(Path(plot), png_of(water_figure(report)), overwrite=overwrite)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -141,10 +140,3 @@ def _footprints(report: CamerasReport, level_m: float) -> list[FloatArray]:
     rows = range(0, len(report.cameras), max(1, len(report.cameras) // MOST_FOOTPRINTS))
     borders = (footprint(report.cameras, row, level_m) for row in rows)
     return [border for border in borders if len(border) and np.isfinite(border).all()]
-
-
-def png_of(figure: Figure) -> bytes:
-    """Return a figure as a PNG file."""
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=130)
-    return stream.getvalue()

@@ -5,11 +5,12 @@ from __future__ import annotations
 import base64
 import json
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from pcfix.report.figures import png_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,9 +34,7 @@ class Picture:
 
     def png(self, dpi: int = 130) -> bytes:
         """Return the picture as a file."""
-        stream = BytesIO()
-        self.figure.savefig(stream, format="png", dpi=dpi)
-        return stream.getvalue()
+        return png_of(self.figure, dpi)
 
     @property
     def data(self) -> str:

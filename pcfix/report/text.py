@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pcfix.model import DEFAULT_REFRACTIVE_INDEX
 
@@ -45,7 +45,7 @@ def summary_text(summary: Summary) -> str:
         *_index(s),
         *_water_fit(s),
     ]
-    return "\n".join(lines)
+    return "\n".join([*lines, *left_out_lines(s.labelling)])
 
 
 def _index(s: Summary) -> list[str]:
@@ -74,6 +74,28 @@ def _water_fit(s: Summary) -> list[str]:
         f"  fitted     {fit['model']}{used}; standard error of the level {sigma:.3f} m, of the bed"
         f" by it {BED_PER_LEVEL * sigma:.3f} m"
     ]
+
+
+def left_out_lines(labelling: dict[str, Any] | None) -> list[str]:
+    """Return what was left as land although it lies below the surface."""
+    if labelling is None:
+        return []
+    lines = []
+    if labelling["water_mask"] is not None:
+        lines.append(f"mask         {labelling['outside_mask']:,} points below lie outside: land")
+    if labelling["respected"]:
+        lines.append(f"respected    {labelling['respected']:,} points below keep their class")
+    apart = labelling["separate"]
+    if apart is not None and apart["pools"]:
+        most = apart["largest"]
+        lines.append(
+            f"separate     {apart['points']:,} points in {apart['pools']:,} pools apart from the"
+            f" water were left as land; the largest, {most['area_m2']:,.1f} m2 with"
+            f" {most['points']:,} points, is at {most['x']:.1f}, {most['y']:.1f}"
+        )
+    elif apart is not None:
+        lines.append("separate     no pools apart from the water")
+    return lines
 
 
 def share(part: int, whole: int) -> str:
