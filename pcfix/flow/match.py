@@ -12,7 +12,6 @@ from pcfix.compare.neighbours import Neighbours, mean_spacing_m
 from pcfix.compare.overlap import near_in_plan
 from pcfix.errors import GeometryError, InputError
 from pcfix.flow.comparison import CompareSettings  # noqa: TC001 - dataclass fields
-from pcfix.flow.surfaces import WaterWords, find_surface, view_of
 from pcfix.io.clouds import SurveyCloud, read_cloud
 from pcfix.io.files import check_input
 from pcfix.io.references import Reference, check_same_crs, read_reference
@@ -111,6 +110,8 @@ def match(
     """
     given = None
     if water is not None:
+        from pcfix.flow.surfaces import WaterWords, find_surface, view_of  # not quick to load
+
         given = find_surface(WaterWords(water), view_of(check_input(cloud))).surface
     target, whole = read_reference(reference), read_cloud(cloud, given)
     check_same_crs(whole.name, whole.crs, target.name, target.crs)
