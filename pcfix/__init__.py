@@ -24,7 +24,6 @@ if TYPE_CHECKING:
         Correction,
         Lens,
         Outcome,
-        Settings,
         Summary,
         Views,
         WaterDimension,
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
         WaterSurface,
     )
     from pcfix.refract.index import refractive_index
+    from pcfix.settings import Settings
     from pcfix.simulate import simulate_scene
 
 __version__ = "0.1.0"
@@ -46,7 +46,7 @@ _HOME = {
     "restore_file": "pcfix.flow.restore",
     "label_file": "pcfix.flow.label",
     "label_points": "pcfix.flow.label",
-    "LabelSettings": "pcfix.model",
+    "LabelSettings": "pcfix.settings",
     "WaterRaster": "pcfix.model",
     "read_cameras": "pcfix.io.cameras",
     "refractive_index": "pcfix.refract.index",
@@ -56,7 +56,7 @@ _HOME = {
     "Correction": "pcfix.model",
     "Lens": "pcfix.model",
     "Outcome": "pcfix.model",
-    "Settings": "pcfix.model",
+    "Settings": "pcfix.settings",
     "Summary": "pcfix.model",
     "Views": "pcfix.model",
     "WaterDimension": "pcfix.model",

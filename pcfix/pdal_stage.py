@@ -49,7 +49,8 @@ if TYPE_CHECKING:
     from pcfix.flow.inputs import Inputs
     from pcfix.flow.job import Points
     from pcfix.flow.surfaces import CloudView
-    from pcfix.model import FloatArray, LabelSettings, Settings, Summary, WaterSurface
+    from pcfix.model import FloatArray, Summary, WaterSurface
+    from pcfix.settings import LabelSettings, Settings
 
     Stage: TypeAlias = Callable[[Dimensions, Dimensions], bool]
 
@@ -228,7 +229,7 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
 
 def _label_settings(options: dict[str, Any]) -> LabelSettings:
     from pcfix.flow.inputs import classes_of
-    from pcfix.model import LabelSettings
+    from pcfix.settings import LabelSettings
 
     given = options.get("respect_classes")
     return LabelSettings(
@@ -279,8 +280,8 @@ def _converted(name: str, value: Any, types: tuple[type, ...]) -> Any:
 
 
 def _settings(options: dict[str, Any]) -> Settings:
-    from pcfix.model import Settings
     from pcfix.refract.index import index_of, index_words
+    from pcfix.settings import Settings
 
     if options.get("uncorrected") == "drop":
         raise SettingError(

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 import typer
 
 from pcfix.cli.words import AngleWords, WaterModels
-from pcfix.model import DEFAULT_REFRACTIVE_INDEX, LabelSettings
+from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, LabelSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable

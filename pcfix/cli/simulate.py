@@ -10,7 +10,7 @@ import typer
 
 import pcfix
 from pcfix.cli.words import Overwrite, Quiet, progress_bar
-from pcfix.model import DEFAULT_REFRACTIVE_INDEX
+from pcfix.settings import DEFAULT_REFRACTIVE_INDEX
 
 
 class Block(str, Enum):  # noqa: UP042

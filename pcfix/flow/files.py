@@ -26,20 +26,16 @@ from pcfix.io.las.formats import OutOfRangeError, shifted
 from pcfix.io.las.headers import corrected_header, corrected_identity, output_evlrs
 from pcfix.io.las.sink import LasSink, check_suffix
 from pcfix.io.las.source import LasSource, centring_steps, coordinates
-from pcfix.model import (
+from pcfix.model import Cameras, Correction, Summary, WaterDimension, WaterSurface
+from pcfix.refract.index import index_of
+from pcfix.refract.threads import threads
+from pcfix.settings import (
     DEFAULT_REFRACTIVE_INDEX,
-    Cameras,
-    Correction,
     Dimensions,
     LabelSettings,
     Settings,
-    Summary,
     Uncorrected,
-    WaterDimension,
-    WaterSurface,
 )
-from pcfix.refract.index import index_of
-from pcfix.refract.threads import threads
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -21,16 +21,9 @@ from pcfix.flow.water_checks import WaterMeeting, check_tilt
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.label.labelling import Labelling, Part
 from pcfix.label.surface import surface_above
-from pcfix.model import (
-    Correction,
-    LabelSettings,
-    Outcome,
-    Settings,
-    Summary,
-    WaterDimension,
-    WaterPlane,
-)
+from pcfix.model import Correction, Outcome, Summary, WaterDimension, WaterPlane
 from pcfix.report.tally import Tally
+from pcfix.settings import LabelSettings, Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

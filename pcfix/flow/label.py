@@ -26,8 +26,9 @@ from pcfix.io.las.sink import LasSink, check_suffix
 from pcfix.io.las.source import LasSource, coordinates
 from pcfix.label.labelling import Labelling, Part, sets_class
 from pcfix.label.surface import surface_above
-from pcfix.model import LabelSettings, WaterPlane
+from pcfix.model import WaterPlane
 from pcfix.refract.threads import threads
+from pcfix.settings import LabelSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable

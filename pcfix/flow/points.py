@@ -10,10 +10,8 @@ from pcfix.errors import GeometryError, SettingError
 from pcfix.io.water import read_water
 from pcfix.label.surface import SurfaceAbove, is_submerged, surface_above
 from pcfix.model import (
-    DEFAULT_REFRACTIVE_INDEX,
     Cameras,
     Correction,
-    Settings,
     Views,
     WaterDimension,
     WaterMesh,
@@ -22,6 +20,7 @@ from pcfix.model import (
     WaterSurface,
 )
 from pcfix.refract.intersect import intersect
+from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable

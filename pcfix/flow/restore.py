@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import laspy
     import numpy.typing as npt
 
-    from pcfix.model import Dimensions
+    from pcfix.settings import Dimensions
 
     AnyPath = str | os.PathLike[str]
 

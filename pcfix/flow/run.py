@@ -23,9 +23,10 @@ from pcfix.io.dod import preview, write_dod
 from pcfix.io.files import files_in
 from pcfix.io.las.source import LasSource
 from pcfix.io.rasters import open_raster
-from pcfix.model import DEFAULT_REFRACTIVE_INDEX, LabelSettings, Settings, Summary
+from pcfix.model import Summary
 from pcfix.refract.index import index_of
 from pcfix.report.evaluation import evaluation, in_a_sentence
+from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, LabelSettings, Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable

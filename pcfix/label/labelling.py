@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from pcfix.label.connected import Surroundings
     from pcfix.label.mask import WaterMask
     from pcfix.label.surface import SurfaceAbove
-    from pcfix.model import BoolArray, FloatArray, IntArray, LabelSettings
+    from pcfix.model import BoolArray, FloatArray, IntArray
+    from pcfix.settings import LabelSettings
 
     Classes = npt.NDArray[np.uint8]
 

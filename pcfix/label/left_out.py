@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
     from pcfix.label.connected import Lattice, Pools, Surroundings
     from pcfix.label.mask import WaterMask
-    from pcfix.model import BoolArray, FloatArray, LabelSettings
+    from pcfix.model import BoolArray, FloatArray
+    from pcfix.settings import LabelSettings
 
 
 class LeftOut:

@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 from pcfix.errors import SettingError
-from pcfix.model import DEFAULT_REFRACTIVE_INDEX
+from pcfix.settings import DEFAULT_REFRACTIVE_INDEX
 
 SALINITY_PSU, TEMPERATURE_C, WAVELENGTH_UM = (0.0, 40.0), (0.0, 30.0), (0.4, 0.7)
 """Where the formula was fitted (its salinities end at 35; natural seas go a little beyond)."""

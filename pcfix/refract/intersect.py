@@ -45,8 +45,16 @@ if TYPE_CHECKING:
     from pcfix.label.raster import Field
     from pcfix.label.surface import SurfaceAbove
     from pcfix.label.tin import Tin
-    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Settings, Views, WaterSurface
+    from pcfix.model import (
+        BoolArray,
+        Cameras,
+        FloatArray,
+        IntArray,
+        Views,
+        WaterSurface,
+    )
     from pcfix.refract.frames import Frames, Pyramid
+    from pcfix.settings import Settings
 
 TILE = 128
 """Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pcfix.model import DEFAULT_REFRACTIVE_INDEX
+from pcfix.settings import DEFAULT_REFRACTIVE_INDEX
 
 if TYPE_CHECKING:
     from pcfix.model import Summary

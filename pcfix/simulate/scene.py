@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.model import DEFAULT_REFRACTIVE_INDEX, Cameras, FloatArray, Settings, Views
+from pcfix.model import Cameras, FloatArray, Views
+from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, Settings
 from pcfix.simulate.block import FOCAL_MM, SENSOR_MM, base_and_spacing_m, fly, gsd_m, lens, reach_m
 from pcfix.simulate.terrain import Shore
 from pcfix.simulate.tracing import piercing_points, project, triangulate

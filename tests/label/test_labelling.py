@@ -9,7 +9,7 @@ from pcfix.errors import GeometryError, SettingError
 from pcfix.label.labelling import Labelling, Part
 from pcfix.label.mask import WaterMask
 from pcfix.label.surface import SurfaceAbove
-from pcfix.model import LabelSettings
+from pcfix.settings import LabelSettings
 
 EAST, NORTH, WATER_M = 456_000.0, 5_432_000.0, 12.4
 

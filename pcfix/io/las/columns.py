@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     import laspy
     import numpy.typing as npt
 
-    from pcfix.model import BoolArray, Correction, Dimensions, FloatArray
+    from pcfix.model import BoolArray, Correction, FloatArray
+    from pcfix.settings import Dimensions
 
 
 BATHYMETRIC_POINT = 40
