@@ -296,11 +296,15 @@ class Views:
 
     The cameras of point i are ``camera[start[i]:start[i + 1]]``, row numbers of `Cameras`;
     `weight`, where the source has one, is what each of them counted for, in the same order.
+
+    As `tracks` they are the images whose rays were intersected; as `depth-maps` those whose depth
+    maps, each matched with other images, were averaged.
     """
 
     start: IntArray
     camera: IntArray
     weight: npt.NDArray[np.float32] | None = None
+    kind: Literal["tracks", "depth-maps"] = "tracks"
 
     def take(self, rows: IntArray) -> Views:
         """Return the views of the given points, in that order."""
@@ -308,7 +312,7 @@ class Views:
         start = np.concatenate([[0], np.cumsum(counts)])
         where = np.repeat(self.start[rows] - start[:-1], counts) + np.arange(start[-1])
         weight = None if self.weight is None else self.weight[where]
-        return Views(start, self.camera[where], weight)
+        return Views(start, self.camera[where], weight, self.kind)
 
 
 @dataclass(frozen=True, eq=False)

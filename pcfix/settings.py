@@ -3,15 +3,69 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal, get_args
 
 from pcfix.errors import SettingError
 
 Uncorrected = Literal["keep", "withhold", "drop"]
 Dimensions = Literal["all", "minimal", "none"]
+Method = Literal[
+    "snell", "consistent", "shan", "butler", "murase", "dietrich", "factor", "regression"
+]
+CameraSet = Literal["mvs", "all"]
+Occlusion = Literal["auto", "on", "off"]
+ViewsAre = Literal["auto", "tracks", "depth-maps"]
 
 DEFAULT_REFRACTIVE_INDEX = 1.34
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorBudget:
+    """Standard deviations of what goes into a correction; see `pcfix.refract.uncertainty`.
+
+    Attributes
+    ----------
+    image_px : float
+        Of an image coordinate that the cloud was made from.
+    level_m : float or None
+        Of the height of the water surface. None: what its fit says, else `LEVEL_M`.
+    tilt_deg : float
+        Of the slope of the water surface, about each horizontal axis.
+    index : float
+        Of the refractive index.
+    waves_deg : float
+        Of the slope of the surface where each ray pierces it, independent from ray to ray.
+    centre_m : float
+        Of a projection centre, each axis, independent from image to image.
+    attitude_deg : float
+        Of the attitude of an image, about each axis, independent from image to image.
+    """
+
+    image_px: float = 0.5
+    level_m: float | None = None
+    tilt_deg: float = 0.0
+    index: float = 0.002
+    waves_deg: float = 0.0
+    centre_m: float = 0.0
+    attitude_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check that none is negative."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is None:
+                continue
+            object.__setattr__(self, field.name, float(value))
+            if not (math.isfinite(value) and value >= 0.0):
+                name = field.name.rpartition("_")[0] or field.name
+                raise SettingError(
+                    f"sigma-{name} {value:g} must not be negative: give a standard deviation."
+                )
+
+
+LEVEL_M = 0.02
+"""Standard deviation of a water level that nothing else is known of."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +86,20 @@ class Settings:
         Extra dimensions to write.
     refractive_index_from : str
         Which water it is of, in words, where it was not given as a number.
+    method : Method
+        How the true point follows from the apparent one; see `pcfix.refract.methods`.
+    camera_set : {"mvs", "all"}
+        Which cameras made a point, where no list says it: those of a model of dense matching,
+        or all in whose frame it lies.
+    occlusion : {"auto", "on", "off"}
+        Whether cameras are left out to which the cloud itself hides the point; auto: where some
+        are oblique.
+    depth_factor : float or None
+        With the method factor: true by apparent depth. None: the refractive index.
+    least_r2 : float
+        With the method regression: a fit with a lower coefficient of determination is refused.
+    errors : ErrorBudget
+        From which the standard errors of the points follow.
     """
 
     refractive_index: float = DEFAULT_REFRACTIVE_INDEX
@@ -40,6 +108,12 @@ class Settings:
     uncorrected: Uncorrected = "withhold"
     dimensions: Dimensions = "all"
     refractive_index_from: str = ""
+    method: Method = "snell"
+    camera_set: CameraSet = "all"
+    occlusion: Occlusion = "auto"
+    depth_factor: float | None = None
+    least_r2: float = 0.5
+    errors: ErrorBudget = ErrorBudget()
 
     def __post_init__(self) -> None:
         """Check every value against its rule."""
@@ -60,12 +134,34 @@ class Settings:
             raise SettingError(
                 f"max-cameras {most} is less than 2: an intersection needs two rays."
             )
-        for name, allowed in (("uncorrected", Uncorrected), ("dimensions", Dimensions)):
+        self._check_depths()
+        for name, allowed in _CHOICES.items():
             value = getattr(self, name)
             if value not in get_args(allowed):
                 raise SettingError(
-                    f"{name} '{value}' is not one of {', '.join(get_args(allowed))}."
+                    f"{name.replace('_', '-')} '{value}' is not one of"
+                    f" {', '.join(get_args(allowed))}."
                 )
+
+    def _check_depths(self) -> None:
+        factor, r2 = self.depth_factor, self.least_r2
+        if factor is not None and not 1.0 <= factor <= 3.0:
+            raise SettingError(
+                f"depth-factor {factor:g} is outside 1 to 3: give true by apparent depth."
+            )
+        if factor is not None and self.method != "factor":
+            raise SettingError("depth-factor is of no use without --method factor; give both.")
+        if not 0.0 <= r2 <= 1.0:
+            raise SettingError(f"least-r2 {r2:g} is outside 0 to 1.")
+
+
+_CHOICES = {
+    "uncorrected": Uncorrected,
+    "dimensions": Dimensions,
+    "method": Method,
+    "camera_set": CameraSet,
+    "occlusion": Occlusion,
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ water lay below the apparent point saw it through air; its ray goes straight on.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit, prange
@@ -21,13 +21,13 @@ from numba import njit, prange
 from pcfix.label.raster import build_field
 from pcfix.label.tin import build_tin, locate
 from pcfix.model import Outcome, WaterMesh, WaterRaster
+from pcfix.refract.choice import TILE, choose, gather, least_cosine2, near_cameras, spatial_order
 from pcfix.refract.frames import (
     ALL,
     NOT_DISTORTED,
     NOTHING,
     SOME,
     frames_of,
-    holds,
     in_frame,
     judge,
     mark,
@@ -37,11 +37,10 @@ from pcfix.refract.frames import (
 )
 from pcfix.refract.piercing import pierce_mesh, pierce_raster
 from pcfix.refract.rays import line_terms, nearest_point, refracted
+from pcfix.refract.result import Intersection
 from pcfix.refract.threads import one_caller
 
 if TYPE_CHECKING:
-    import numpy.typing as npt
-
     from pcfix.label.raster import Field
     from pcfix.label.surface import SurfaceAbove
     from pcfix.label.tin import Tin
@@ -56,24 +55,8 @@ if TYPE_CHECKING:
     from pcfix.refract.frames import Frames, Pyramid
     from pcfix.settings import Settings
 
-TILE = 128
-"""Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""
-
 _NO_CAMERA, _ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
 _PARALLEL, _CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
-
-
-class Intersection(NamedTuple):
-    """The result for m submerged points; see `pcfix.Correction` for the meaning of each."""
-
-    shift_m: FloatArray
-    outcome: npt.NDArray[np.uint8]
-    ray_count: npt.NDArray[np.int32]
-    ray_miss_m: FloatArray
-    sigma_z_m: FloatArray
-    incidence_deg: FloatArray
-    camera_used: BoolArray
-    pairs_tested: int
 
 
 def intersect(
@@ -126,7 +109,7 @@ def intersect(
         np.ascontiguousarray(cameras.centres),
         np.zeros(len(cameras)) if level_offset_m is None else level_offset_m,
         frames_of(cameras) if views is None else no_frames(len(cameras)),
-        _least_cosine2(settings, cameras),
+        least_cosine2(settings, cameras),
         1.0 / settings.refractive_index,
         result,
         used,
@@ -152,75 +135,8 @@ def intersect(
     )
 
 
-def spatial_order(xyz: FloatArray) -> IntArray:
-    """Return an order that brings neighbours together, about `TILE` points to a cell.
-
-    Only speed depends on it: a tile of neighbours needs few cameras.
-    """
-    if len(xyz) <= TILE:
-        return np.arange(len(xyz))
-    x, y = xyz[:, 0], xyz[:, 1]
-    width, height = max(np.ptp(x), 1e-6), max(np.ptp(y), 1e-6)
-    cells = min(len(xyz) / TILE, 2.0**14)
-    cell_m = max(np.sqrt(width * height / cells), max(width, height) / cells)
-    columns, rows = int(width / cell_m) + 1, int(height / cell_m) + 1
-    return _cell_order(xyz, x.min(), y.min(), 1.0 / cell_m, columns, rows)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _cell_order(
-    xyz: FloatArray, x0: float, y0: float, cells_per_m: float, columns: int, rows: int
-) -> IntArray:
-    """Sort by cells, row after row to and fro, with one count and one pass over the points."""
-    cell = np.empty(len(xyz), np.int64)
-    place = np.zeros(columns * rows + 1, np.int64)
-    for i in range(len(xyz)):
-        column = min(int((xyz[i, 0] - x0) * cells_per_m), columns - 1)
-        row = min(int((xyz[i, 1] - y0) * cells_per_m), rows - 1)
-        cell[i] = row * columns + (columns - 1 - column if row & 1 else column)
-        place[cell[i] + 1] += 1
-    for c in range(columns * rows):
-        place[c + 1] += place[c]
-    order = np.empty(len(xyz), np.int64)
-    for i in range(len(xyz)):
-        order[place[cell[i]]] = i
-        place[cell[i]] += 1
-    return order
-
-
-MAX_ANGLE_WITHOUT_FRAMES_DEG = 80.0
-"""Cameras without a lens have no frame to leave; nobody matches images as flat as this, and a
-block in another CRS is told apart."""
-
-
-def _least_cosine2(settings: Settings, cameras: Cameras) -> float:
-    limit = settings.max_angle_deg
-    if limit is None and cameras.lenses is None:
-        limit = MAX_ANGLE_WITHOUT_FRAMES_DEG
-    return 0.0 if limit is None else float(np.cos(np.radians(limit)) ** 2)
-
-
 # Rows of the result, one line of cache per point, as they are written in scattered order.
 _MISS, _SIGMA_Z, _INCIDENCE, _COUNT, _OUTCOME = 3, 4, 5, 6, 7
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _gather(
-    tile: FloatArray, order: IntArray, xyz: FloatArray, surface: FloatArray, slope: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Bring a tile together: runs of x, y, z, surface height and unit normal; return its box."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for j in range(order.size):
-        i = order[j]
-        for axis in range(3):
-            value = xyz[i, axis]
-            tile[axis * TILE + j] = value
-            low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
-        b, c = slope[i, 0], slope[i, 1]
-        up = 1.0 / np.sqrt(1.0 + b * b + c * c)
-        tile[3 * TILE + j] = surface[i]
-        tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j] = -b * up, -c * up, up
-    return low, high
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -312,7 +228,7 @@ def _all_in_frame(
     for t in prange(tested.size):
         rows = order[t * TILE : (t + 1) * TILE]
         tile, marks = np.empty(7 * TILE), np.empty(rows.size)
-        low, high = _gather(tile, rows, xyz, surface, slope)
+        low, high = gather(tile, rows, xyz, surface, slope)
         sums = np.zeros(11 * TILE)
         sums[10 * TILE :] = 1.0
         x, y, z = (
@@ -348,69 +264,6 @@ def _all_in_frame(
             )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _keep_steepest(chosen: IntArray, cosine2: FloatArray, k: int, most: int) -> int:
-    """Bring the `most` steepest of k cameras to the front, in the order of the cameras."""
-    if k <= most:
-        return k
-    ranked = np.argsort(-cosine2[:k], kind="mergesort")[:most]
-    ranked.sort()
-    for j in range(most):
-        chosen[j] = chosen[ranked[j]]
-    return most
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _near(frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray) -> IntArray:
-    """Return the cameras whose frames may hold a point of the box."""
-    planes, row = frames.planes, frames.row
-    near = np.empty(len(centres), np.int64)
-    count = 0
-    for c in range(len(centres)):
-        if not may_hold(planes[c], centres[c], low, high):
-            continue
-        if row[c] == NOT_DISTORTED or judge(frames, c, centres[c], low, high) != NOTHING:
-            near[count] = c
-            count += 1
-    return near[:count]
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _choose(
-    candidates: IntArray, tile: FloatArray, j: int, centres: FloatArray, offset: FloatArray,
-    frames: Frames, least_cosine2: float, most: int,
-    tin: Tin | None, field: Field | None, facet: int,
-) -> IntArray:  # fmt: skip
-    """Return the cameras whose rays a point of the tile gets, in the order of the candidates.
-
-    On a mesh or raster the incidence angle is that where the ray pierces it.
-    """
-    chosen = np.empty(candidates.size, np.int64)
-    cosine2 = np.empty(candidates.size)
-    some_only = least_cosine2 > 0.0 or most < candidates.size
-    k = 0
-    for c in candidates:
-        px, py, pz = tile[j], tile[TILE + j], tile[2 * TILE + j]
-        ex, ey, ez = centres[c, 0] - px, centres[c, 1] - py, centres[c, 2] - pz
-        nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-        lowered = pz - offset[c]
-        h = nz * (tile[3 * TILE + j] - lowered)
-        height = nx * ex + ny * ey + nz * ez
-        length2 = ex * ex + ey * ey + ez * ez
-        if not (height > h and holds(frames, c, ex, ey, ez)):
-            continue
-        if h > 0.0 and some_only and (tin is not None or field is not None):
-            if tin is not None:
-                _, nx, ny, nz = pierce_mesh(tin, px, py, lowered, ex, ey, ez, facet)
-            if field is not None:
-                _, nx, ny, nz = pierce_raster(field, px, py, lowered, ex, ey, ez, h, nx, ny, nz)
-            height = max(nx * ex + ny * ey + nz * ez, 0.0)
-        if height * height >= least_cosine2 * length2:
-            chosen[k], cosine2[k] = c, height * height / length2
-            k += 1
-    return chosen[: _keep_steepest(chosen, cosine2, k, most)]
-
-
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _chosen(
     order: IntArray, xyz: FloatArray, surface: FloatArray, slope: FloatArray,
@@ -422,19 +275,21 @@ def _chosen(
     for t in prange(tested.size):
         rows = order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
-        low, high = _gather(tile, rows, xyz, surface, slope)
-        near = _near(frames, centres, low, high)
+        low, high = gather(tile, rows, xyz, surface, slope)
+        near = near_cameras(frames, centres, low, high)
         for j in range(rows.size):
             facet = -1 if tin is None else locate(tin, tile[j], tile[TILE + j])
             candidates = near
             if views is not None:
                 candidates = views[1][views[0][rows[j]] : views[0][rows[j] + 1]]
-            cameras = _choose(
+            kept = choose(
                 candidates, tile, j, centres, offset, frames, least_cosine2, most, tin, field, facet
             )
             tested[t] += candidates.size
             row = result[rows[j]]
-            _intersect_one(row, cameras, tile, j, centres, offset, r, used, tin, field, facet)
+            _intersect_one(
+                row, candidates[kept], tile, j, centres, offset, r, used, tin, field, facet
+            )
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

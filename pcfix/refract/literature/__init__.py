@@ -1,0 +1,1 @@
+"""Methods of the literature, for comparison; each a function that takes a `Bundle`."""
