@@ -1,0 +1,215 @@
+"""Depths by regression: true depth = a + b * apparent depth, fitted to check depths."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pcfix.errors import GeometryError, SettingError
+from pcfix.refract.literature.factor import without_rays
+from pcfix.refract.literature.level import apparent_depth
+
+if TYPE_CHECKING:
+    from pcfix.model import FloatArray, IntArray
+    from pcfix.refract.bundles import Bundle
+    from pcfix.refract.result import Intersection
+
+LEAST_COUNT, FEW = 3, 10
+"""A line through two check depths fits whatever they are; a third is the first that can disagree.
+Below ten the standard errors are themselves only known to a quarter or worse."""
+OUTLIER_CHANCE = 0.05
+"""That a set of good check depths is said to hold an outlier."""
+_SAME_M = 1e-3
+
+
+@dataclass(frozen=True)
+class DepthRegression:
+    """The line true depth = `intercept_m` + `slope` * apparent depth, and how well it fits.
+
+    Attributes
+    ----------
+    intercept_m, slope : float
+    intercept_se_m, slope_se : float
+        Their standard errors.
+    r2 : float
+        Coefficient of determination.
+    rmse_m : float
+        Root mean square of the residuals; too good, as the line was fitted to them.
+    cv_rmse_m : float or None
+        The same with each check depth predicted from all others (leave-one-out). None where a
+        depth cannot be left out without leaving the slope open.
+    count : int
+        Check depths that were fitted.
+    shallowest_m, deepest_m : float
+        Of their apparent depths; the line is extrapolated beyond.
+    outliers : tuple of int
+        Which of them, from 0, lie too far off the line to be of one set with the rest.
+    notes : tuple of str
+        What a user should know.
+    """
+
+    intercept_m: float
+    slope: float
+    intercept_se_m: float
+    slope_se: float
+    r2: float
+    rmse_m: float
+    cv_rmse_m: float | None
+    count: int
+    shallowest_m: float
+    deepest_m: float
+    outliers: tuple[int, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def depth_m(self, apparent_m: FloatArray) -> FloatArray:
+        """Return the true depths of apparent ones; never above the water, where a line may lead."""
+        return np.asarray(np.maximum(self.intercept_m + self.slope * apparent_m, 0.0))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it in plain values."""
+        return {**asdict(self), "outliers": list(self.outliers), "notes": list(self.notes)}
+
+    def __str__(self) -> str:
+        return (
+            f"depth = {self.intercept_m:.3f} m + {self.slope:.3f} x apparent depth"
+            f" ({self.count} check depths, r2 {self.r2:.3f})"
+        )
+
+
+def regression(bundle: Bundle) -> Intersection:
+    """Apply the regression that was learned to the apparent depths; only Z moves.
+
+    Parameters
+    ----------
+    bundle : Bundle
+
+    Returns
+    -------
+    Intersection
+        Every point is corrected, as no ray is needed; see
+        `pcfix.refract.literature.factor.without_rays`.
+
+    Raises
+    ------
+    SettingError
+        If no regression was learned.
+
+    Notes
+    -----
+    Method III of Hsu & Wang, whose text was not at hand: a line fitted to check depths. With a
+    negative intercept the line takes very shallow points above the water; they go to its surface.
+    """
+    learned = bundle.learned.regression
+    if learned is None:
+        raise SettingError("method regression needs a regression; fit one of check depths first.")
+    apparent = apparent_depth(bundle)
+    return without_rays(bundle, learned.depth_m(apparent) - apparent)
+
+
+def fit_depths(apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:
+    """Fit the line by least squares, all check depths with equal weight and none left out.
+
+    Parameters
+    ----------
+    apparent_m, true_m : array, shape (m,)
+        Metres, positive down.
+
+    Returns
+    -------
+    DepthRegression
+
+    Raises
+    ------
+    GeometryError
+        If there are fewer than three, all have one apparent depth, or the line falls.
+    """
+    from scipy.stats import linregress
+
+    x, y = np.asarray(apparent_m, np.float64), np.asarray(true_m, np.float64)
+    if len(x) < LEAST_COUNT:
+        raise GeometryError(
+            f"{len(x)} check depths are too few for a regression: give {LEAST_COUNT} at least,"
+            f" better {FEW} or more."
+        )
+    if np.ptp(x) < _SAME_M:
+        raise GeometryError(
+            f"all {len(x)} check depths lie at one apparent depth, {x.mean():.3f} m, which leaves"
+            " the slope open: give check depths from shallow to deep."
+        )
+    line = linregress(x, y)
+    if not line.slope > 0.0:
+        raise GeometryError(
+            f"the check depths do not grow with the depths of the cloud (slope {line.slope:.3f}):"
+            " check that they are positive down and lie in the cloud's CRS."
+        )
+    residual = y - (line.intercept + line.slope * x)
+    leverage = 1.0 / len(x) + (x - x.mean()) ** 2 / ((x - x.mean()) ** 2).sum()
+    return DepthRegression(
+        intercept_m=float(line.intercept),
+        slope=float(line.slope),
+        intercept_se_m=float(line.intercept_stderr),
+        slope_se=float(line.stderr),
+        r2=float(line.rvalue**2),
+        rmse_m=float(np.sqrt(np.mean(residual**2))),
+        cv_rmse_m=_cross_validated(residual, leverage),
+        count=len(x),
+        shallowest_m=float(x.min()),
+        deepest_m=float(x.max()),
+        outliers=tuple(int(i) for i in outliers(residual, leverage)),
+        notes=_notes(len(x), float(line.slope)),
+    )
+
+
+def _cross_validated(residual: FloatArray, leverage: FloatArray) -> float | None:
+    """Return the root mean square of the errors of predicting each value from all others.
+
+    Without value i the line misses it by residual_i / (1 - h_i), h the diagonal of the hat
+    matrix; no fit needs to be repeated. Where h_i is 1 the others all have one depth.
+    """
+    if (leverage > 1.0 - 1e-9).any():
+        return None
+    return float(np.sqrt(np.mean((residual / (1.0 - leverage)) ** 2)))
+
+
+def outliers(residual: FloatArray, leverage: FloatArray) -> IntArray:
+    """Return which residuals are too large to be of one set with the rest.
+
+    By externally studentised residuals, each with the standard error from the other values, and
+    the limit of Student's distribution for the largest of all m (Bonferroni).
+
+    Parameters
+    ----------
+    residual, leverage : array, shape (m,)
+
+    Returns
+    -------
+    array of int, shape (outliers,)
+    """
+    from scipy.stats import t
+
+    m = len(residual)
+    if m < LEAST_COUNT + 1:
+        return np.zeros(0, np.int64)
+    free = np.maximum(1.0 - leverage, 1e-9)
+    others = np.maximum((residual**2).sum() - residual**2 / free, 0.0) / (m - 3)
+    limit = t.isf(OUTLIER_CHANCE / (2 * m), m - 3)
+    # a residual below a tenth of a millimetre is none, however well the others fit
+    far = residual**2 > np.maximum(limit**2 * others * free, 1e-8)
+    return np.flatnonzero(far & (leverage < 1.0 - 1e-9))
+
+
+def _notes(count: int, slope: float) -> tuple[str, ...]:
+    notes = []
+    if count < FEW:
+        notes.append(
+            f"the regression rests on {count} check depths; with fewer than {FEW} its errors are"
+            " little more than a guess."
+        )
+    if not 1.0 <= slope <= 2.0:
+        notes.append(
+            f"the regression's slope {slope:.3f} is not what refraction does (1.33 to 1.6); check"
+            " the water's height and the check depths."
+        )
+    return tuple(notes)

@@ -1,0 +1,274 @@
+"""The regression on check depths: known lines come back, and what does not fit is said."""
+
+import math
+
+import numpy as np
+import pytest
+
+import pcfix
+from pcfix.errors import GeometryError, SettingError
+from pcfix.flow.regression import learn_regression
+from pcfix.label.labelling import Part
+from pcfix.label.surface import surface_above
+from pcfix.model import Outcome, WaterPlane
+from pcfix.refract.apparent_depths import LEAST_NEIGHBOURS, NEIGHBOURS, ApparentDepths
+from pcfix.refract.learned import Learned
+from pcfix.refract.methods import correct
+from pcfix.refract.regression import DepthRegression, fit_depths
+from pcfix.settings import Settings
+
+ORIGIN = np.array([500_000.0, 4_600_000.0])
+LEVEL = WaterPlane(12.0)
+A, B = 0.05, 1.42
+SETTINGS = Settings(method="regression")
+
+
+def apparent_at(xy):
+    """The apparent bed: an even slope from 0.1 m to 5 m of water over 50 m, level across."""
+    return 0.1 + 0.098 * (xy[:, 0] - ORIGIN[0])
+
+
+def cloud(n=20_000, seed=1, noise_m=0.0, water=LEVEL):
+    rng = np.random.default_rng(seed)
+    xy = ORIGIN + rng.uniform(0, 50, (n, 2))
+    height = surface_above(water, np.column_stack([xy, np.zeros(n)])).height_m
+    return np.column_stack([xy, height - apparent_at(xy) + rng.normal(0, noise_m, n)])
+
+
+def parts(xyz, chunks=4, water=LEVEL, classes=None):
+    given = np.ones(len(xyz), np.uint8) if classes is None else classes
+    rows = np.array_split(np.arange(len(xyz)), chunks)
+    return (Part(xyz[r], surface_above(water, xyz[r]), given[r]) for r in rows)
+
+
+def places(p=30, seed=2):
+    return ORIGIN + np.random.default_rng(seed).uniform(2, 48, (p, 2))
+
+
+def table(tmp_path, xy, values, column="depth"):
+    path = tmp_path / "checks.csv"
+    rows = [f"{x:.4f},{y:.4f},{v:.6f}" for (x, y), v in zip(xy, values, strict=True)]
+    path.write_text("\n".join([f"x,y,{column}", *rows]) + "\n")
+    return path
+
+
+def true_at(xy):
+    return A + B * apparent_at(xy)
+
+
+def test_a_known_line_comes_back(tmp_path):
+    xy = places()
+    found = learn_regression(table(tmp_path, xy, true_at(xy)), parts(cloud()), SETTINGS)
+    # without noise; the median of 3 to 16 points within 0.7 m on a slope of 0.098 is off by some
+    # centimetres, which 30 places bring down to a third of it
+    assert found.intercept_m == pytest.approx(A, abs=0.05)
+    assert found.slope == pytest.approx(B, abs=0.02)
+    assert found.count == 30
+    assert found.r2 > 0.999
+    assert found.notes == ()
+    assert 0.1 < found.shallowest_m < found.deepest_m < 5.0
+
+
+def test_noise_is_what_the_standard_errors_say(tmp_path):
+    # 60 sets of 20 depths with 0.1 m of noise: the line is off by its standard error, rms
+    rng, off = np.random.default_rng(5), []
+    for _ in range(60):
+        x = rng.uniform(0.2, 5.0, 20)
+        found = fit_depths(x, A + B * x + rng.normal(0, 0.1, 20))
+        off.append(
+            [(found.intercept_m - A) / found.intercept_se_m, (found.slope - B) / found.slope_se]
+        )
+        assert found.cv_rmse_m > found.rmse_m
+    # Student's t with 18 degrees has a standard deviation of 1.06; of 60 it is known to 0.1
+    assert np.sqrt(np.mean(np.square(off), axis=0)) == pytest.approx([1.06, 1.06], abs=0.3)
+
+
+def test_leave_one_out_equals_fitting_again_without_each():
+    rng = np.random.default_rng(7)
+    x = rng.uniform(0.2, 5.0, 12)
+    y = A + B * x + rng.normal(0, 0.2, 12)
+    missed = []
+    for i in range(12):
+        keep = np.arange(12) != i
+        slope, intercept = np.polyfit(x[keep], y[keep], 1)
+        missed.append(y[i] - intercept - slope * x[i])
+    assert fit_depths(x, y).cv_rmse_m == pytest.approx(math.sqrt(np.mean(np.square(missed))), 1e-9)
+
+
+def test_figures_agree_with_their_definitions():
+    rng = np.random.default_rng(8)
+    x = rng.uniform(0.2, 5.0, 15)
+    y = A + B * x + rng.normal(0, 0.2, 15)
+    design = np.column_stack([np.ones(15), x])
+    answer, (squares,), _, _ = np.linalg.lstsq(design, y, rcond=None)
+    errors = np.sqrt(np.diag(np.linalg.inv(design.T @ design)) * squares / 13)
+    found = fit_depths(x, y)
+    assert [found.intercept_m, found.slope] == pytest.approx(answer.tolist(), rel=1e-9)
+    assert [found.intercept_se_m, found.slope_se] == pytest.approx(errors.tolist(), rel=1e-9)
+    assert found.rmse_m == pytest.approx(math.sqrt(squares / 15), rel=1e-9)
+    assert found.r2 == pytest.approx(1.0 - squares / ((y - y.mean()) ** 2).sum(), rel=1e-9)
+    assert found.as_dict()["slope"] == found.slope
+    assert "15 check depths" in str(found)
+
+
+def test_without_its_only_other_depth_nothing_can_be_predicted():
+    found = fit_depths(np.array([1.0, 1.0, 2.0]), np.array([1.3, 1.4, 2.7]))
+    assert found.cv_rmse_m is None
+    assert "rests on 3 check depths" in found.notes[0]
+
+
+def test_chunks_and_their_order_do_not_matter(tmp_path):
+    xy, xyz = places(), cloud(noise_m=0.02)
+    path = table(tmp_path, xy, true_at(xy))
+    whole = learn_regression(path, parts(xyz, 1), SETTINGS)
+    assert learn_regression(path, parts(xyz, 37), SETTINGS) == whole
+    assert learn_regression(path, parts(xyz[::-1], 5), SETTINGS) == whole
+
+
+def test_heights_become_depths_at_the_water_above_their_place(tmp_path):
+    tilted = WaterPlane(12.0 - 0.01 * ORIGIN[0] - 0.004 * ORIGIN[1], 0.01, 0.004)
+    xy, xyz = places(), cloud(water=tilted)
+    level = surface_above(tilted, np.column_stack([xy, np.zeros(30)])).height_m
+    by_depth = learn_regression(
+        table(tmp_path, xy, true_at(xy)), parts(xyz, water=tilted), SETTINGS
+    )
+    by_height = learn_regression(
+        table(tmp_path, xy, level - true_at(xy), "z"), parts(xyz, water=tilted), SETTINGS
+    )
+    # six decimals in the table, and heights at 4e6 m times 0.004 that lose 1e-9 m
+    assert by_height.slope == pytest.approx(by_depth.slope, abs=2e-6)
+    assert by_height.intercept_m == pytest.approx(by_depth.intercept_m, abs=4e-6)
+
+
+def test_noise_and_land_do_not_count(tmp_path):
+    xy, xyz = places(), cloud()
+    path = table(tmp_path, xy, true_at(xy))
+    alone = learn_regression(path, parts(xyz), SETTINGS)
+    low, land = xyz - [0, 0, 9.0], xyz - [0, 0, -30.0]
+    classes = np.repeat([1, 7, 1], len(xyz)).astype(np.uint8)
+    mixed = learn_regression(path, parts(np.vstack([xyz, low, land]), classes=classes), SETTINGS)
+    assert mixed == alone
+
+
+def test_nearest_points_are_those_of_a_full_search():
+    xyz, xy = cloud(3000, noise_m=0.1), places(8)
+    around = ApparentDepths(xy)
+    for part in parts(xyz, 7):
+        around.add(part.xyz, part.surface)
+    depth, level, covered = around.medians(1.5)
+    for i, place in enumerate(xy):
+        distance = np.hypot(*(xyz[:, :2] - place).T)
+        wet = xyz[:, 2] < 12.0
+        rows = np.argsort(np.where(wet, distance, np.inf))[:NEIGHBOURS]
+        rows = rows[distance[rows] <= 1.5]
+        assert covered[i] == (len(rows) >= LEAST_NEIGHBOURS)
+        assert depth[i] == pytest.approx(np.median(12.0 - xyz[rows, 2]), abs=1e-12)
+        assert level[i] == 12.0
+
+
+def test_spacing_is_that_of_a_grid():
+    x, y = np.meshgrid(np.arange(0, 20, 0.25), np.arange(0, 20, 0.25))
+    xyz = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -1.0)])
+    around = ApparentDepths(np.array([[3.3, 4.4], [500.0, 500.0]]))
+    around.add(xyz, surface_above(WaterPlane(0.0), xyz))
+    assert around.spacing_m == pytest.approx(0.25)  # also for the place far away
+
+
+def test_check_depths_off_the_cloud_are_left_out_and_said(tmp_path):
+    xy = places(12)
+    xy[[3, 8]] += 200.0
+    found = learn_regression(table(tmp_path, xy, true_at(xy)), parts(cloud()), SETTINGS)
+    assert found.count == 10
+    assert "line 5" in found.notes[0]
+    assert "2 of 12 are like that and are left out" in found.notes[0]
+
+
+def test_an_outlier_is_said_and_kept(tmp_path):
+    xy = places(12)
+    depths = true_at(xy)
+    depths[4] += 1.5
+    found = learn_regression(table(tmp_path, xy, depths), parts(cloud()), SETTINGS)
+    assert found.count == 12
+    assert found.outliers == (4,)
+    assert "line 6" in found.notes[-1]
+    assert "it was kept" in found.notes[-1]
+
+
+def test_good_check_depths_are_seldom_called_outliers():
+    rng, called = np.random.default_rng(9), 0
+    for _ in range(200):
+        x = rng.uniform(0.2, 5.0, 15)
+        called += bool(fit_depths(x, A + B * x + rng.normal(0, 0.1, 15)).outliers)
+    assert called <= 20  # 5 % of 200 are 10, give or take 3
+
+
+@pytest.mark.parametrize(
+    ("depths", "column", "said"),
+    [
+        (lambda xy: np.full(len(xy), 3.0) + np.arange(len(xy)) % 2, "depth", "lower --least-r2"),
+        (lambda xy: 9.0 - true_at(xy), "depth", "do not grow with the depths of the cloud"),
+        (lambda xy: np.full(len(xy), 12.5), "z", "the height 12.50 m is above the water, 12.00 m"),
+    ],
+)
+def test_depths_that_do_not_fit_are_refused(tmp_path, depths, column, said):
+    xy = places(10)
+    xy[:, 0] = np.sort(xy[:, 0])
+    with pytest.raises(GeometryError) as caught:
+        learn_regression(table(tmp_path, xy, depths(xy), column), parts(cloud()), SETTINGS)
+    assert said in str(caught.value)
+    assert "checks.csv" in str(caught.value)
+
+
+def test_a_poor_fit_is_taken_when_told(tmp_path):
+    xy = places(10)
+    xy[:, 0] = np.sort(xy[:, 0])
+    path = table(tmp_path, xy, 3.0 + 0.01 * np.arange(10) + np.arange(10) % 2)
+    told = Settings(method="regression", least_r2=0.0)
+    found = learn_regression(path, parts(cloud()), told)
+    assert found.r2 < 0.5
+    assert "is not what refraction does" in " ".join(found.notes)
+
+
+def test_too_few_on_the_cloud_are_refused_with_the_first_that_is_not(tmp_path):
+    xy = places(5)
+    xy[1:4] += 300.0
+    path = table(tmp_path, xy, true_at(xy))
+    with pytest.raises(GeometryError, match=r"line 3 .*3 of 5 are like that and cannot be used"):
+        learn_regression(path, parts(cloud()), SETTINGS)
+    dry = cloud() - [0, 0, -50.0]
+    with pytest.raises(GeometryError, match="the cloud has no submerged point"):
+        learn_regression(path, parts(dry), SETTINGS)
+
+
+def test_two_check_depths_are_too_few(tmp_path):
+    xy = places(2)
+    with pytest.raises(GeometryError, match="2 check depths are too few"):
+        learn_regression(table(tmp_path, xy, true_at(xy)), parts(cloud()), SETTINGS)
+
+
+def test_one_depth_leaves_the_slope_open(tmp_path):
+    xyz = cloud()
+    xyz[:, 2] = 10.0
+    with pytest.raises(GeometryError, match=r"one apparent depth, 2\.000 m"):
+        learn_regression(table(tmp_path, places(9), np.full(9, 2.7)), parts(xyz), SETTINGS)
+
+
+def test_a_radius_must_be_positive(tmp_path):
+    path = table(tmp_path, places(9), np.full(9, 2.7))
+    with pytest.raises(SettingError, match="radius"):
+        learn_regression(path, parts(cloud()), SETTINGS, radius_m=0.0)
+
+
+def test_it_is_applied(tmp_path):
+    xy, xyz = places(), cloud(500)
+    found = learn_regression(table(tmp_path, xy, true_at(xy)), parts(cloud()), SETTINGS)
+    assert isinstance(found, DepthRegression)
+    above = surface_above(LEVEL, xyz)
+    cameras = pcfix.Cameras(("a",), np.array([[*ORIGIN, 100.0]]))
+    result = correct(xyz, above, LEVEL, cameras, SETTINGS, learned=Learned(regression=found))
+    assert (result.outcome == Outcome.CORRECTED).all()
+    depth = 12.0 - xyz[:, 2]
+    expected = found.intercept_m + found.slope * depth
+    assert depth - result.shift_m[:, 2] == pytest.approx(expected, abs=1e-12)
+    # the line itself is off by some centimetres, see the first test
+    assert depth - result.shift_m[:, 2] == pytest.approx(true_at(xyz), abs=0.06)
