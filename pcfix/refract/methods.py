@@ -6,6 +6,7 @@ others get the chosen cameras of some points at a time.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -13,22 +14,27 @@ import numpy as np
 
 from pcfix.refract.bundles import Bundle
 from pcfix.refract.choice import chosen_views, spatial_order
+from pcfix.refract.depth_maps import invert_depth_maps
 from pcfix.refract.intersect import intersect
 from pcfix.refract.learned import Learned
+from pcfix.refract.matcher import steepest_and_partners, without_border
+from pcfix.refract.occlusion import in_sight
 from pcfix.refract.result import Intersection
+from pcfix.refract.uncertainty import with_uncertainty
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from pcfix.label.surface import SurfaceAbove
     from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterSurface
+    from pcfix.refract.occlusion import Occluder
     from pcfix.settings import Settings
 
 POINTS_AT_ONCE = 100_000
 """Bounds the memory of the lists of cameras: some 50 MB at 40 rays a point."""
 
 _HOMES = {
-    "snell": "pcfix.refract.intersect",
+    "snell": "pcfix.refract.methods",
     "consistent": "pcfix.refract.consistent",
     "shan": "pcfix.refract.literature.shan",
     "butler": "pcfix.refract.literature.butler",
@@ -49,6 +55,7 @@ def correct(
     views: Views | None = None,
     level_offset_m: FloatArray | None = None,
     learned: Learned | None = None,
+    level_sigma_m: FloatArray | float | None = None,
 ) -> Intersection:
     """Correct submerged points by the method that the settings name.
 
@@ -57,6 +64,8 @@ def correct(
     xyz, surface, water, cameras, settings, views, level_offset_m
         As of `pcfix.refract.intersect.intersect`.
     learned : Learned, optional
+    level_sigma_m : array, shape (m,), or float, optional
+        As of `pcfix.refract.uncertainty.covariances`.
 
     Returns
     -------
@@ -64,19 +73,95 @@ def correct(
         One row per input point, in the same order.
     """
     learned = learned or Learned()
-    if settings.method == "snell" and learned.occluder is None:
-        return intersect(xyz, surface, water, cameras, settings, views, level_offset_m)
-    method = getattr(import_module(_HOMES[settings.method]), settings.method)
+    if settings.method == "snell" and learned == Learned(regression=learned.regression):
+        found = intersect(xyz, surface, water, cameras, settings, views, level_offset_m)
+        return with_uncertainty(
+            found, xyz, surface, cameras, settings, views, level_offset_m, learned, level_sigma_m
+        )
+    method = _method(settings, views, learned)
     offset = np.zeros(len(cameras)) if level_offset_m is None else level_offset_m
     order = spatial_order(xyz)
     parts = []
     for rows in _batches(order):
         above = type(surface)(surface.height_m[rows], surface.slope[rows])
         mine = None if views is None else views.take(rows)
-        chosen = chosen_views(xyz[rows], above, water, cameras, settings, mine, offset)
+        chosen = _cameras_of(xyz[rows], above, water, cameras, settings, mine, offset, learned)
         bundle = Bundle(xyz[rows], above, water, cameras, chosen, settings, offset, learned)
-        parts.append(method(bundle))
+        sigma = level_sigma_m[rows] if isinstance(level_sigma_m, np.ndarray) else level_sigma_m
+        parts.append(
+            with_uncertainty(
+                method(bundle), xyz[rows], above, cameras, settings, chosen, offset, learned, sigma
+            )
+        )
     return _joined(parts, order, len(cameras))
+
+
+def _method(
+    settings: Settings, views: Views | None, learned: Learned
+) -> Callable[[Bundle], Intersection]:
+    """Return the function that corrects; what a list of depth maps needs is not triangulation."""
+    fused = learned.matcher is not None if views is None else views.kind == "depth-maps"
+    if settings.method == "consistent" and fused:
+        return invert_depth_maps
+    found: Callable[[Bundle], Intersection] = getattr(
+        import_module(_HOMES[settings.method]), settings.method
+    )
+    return found
+
+
+def _cameras_of(
+    xyz: FloatArray,
+    surface: SurfaceAbove,
+    water: WaterSurface,
+    cameras: Cameras,
+    settings: Settings,
+    views: Views | None,
+    offset: FloatArray,
+    learned: Learned,
+) -> Views:
+    """Return the cameras of a list, of the model of a matcher, or all in frame; none hidden.
+
+    Of the model, `consistent` takes all images that may have a depth of the point, as it weighs
+    them by itself; to the other methods go the steepest image and those it was matched with.
+    """
+    if views is not None or learned.matcher is None:
+        return _in_sight(xyz, surface, water, cameras, settings, views, offset, learned.occluder)
+    inner = without_border(cameras)
+    if settings.method == "consistent":
+        return _in_sight(xyz, surface, water, inner, settings, None, offset, learned.occluder)
+    any_number = replace(settings, max_cameras=None)
+    seeing = _in_sight(xyz, surface, water, inner, any_number, None, offset, learned.occluder)
+    partners = steepest_and_partners(xyz, cameras.centres, seeing, learned.matcher)
+    return chosen_views(xyz, surface, water, cameras, settings, partners, offset)
+
+
+def snell(bundle: Bundle) -> Intersection:
+    """Return what `pcfix.refract.intersect.intersect` makes of the chosen cameras."""
+    return intersect(
+        bundle.xyz, bundle.surface, bundle.water, bundle.cameras, bundle.settings, bundle.views,
+        bundle.level_offset_m,
+    )  # fmt: skip
+
+
+def _in_sight(
+    xyz: FloatArray,
+    surface: SurfaceAbove,
+    water: WaterSurface,
+    cameras: Cameras,
+    settings: Settings,
+    views: Views | None,
+    offset: FloatArray,
+    occluder: Occluder | None,
+) -> Views:
+    """Return the chosen cameras, without those that the cloud hides; the steepest of the rest."""
+    if occluder is None:
+        return chosen_views(xyz, surface, water, cameras, settings, views, offset)
+    any_number = replace(settings, max_cameras=None)
+    chosen = chosen_views(xyz, surface, water, cameras, any_number, views, offset)
+    seeing = in_sight(xyz, cameras.centres, chosen, occluder)
+    if settings.max_cameras is None:
+        return seeing
+    return chosen_views(xyz, surface, water, cameras, settings, seeing, offset)
 
 
 def _batches(order: IntArray) -> Iterator[IntArray]:
@@ -88,12 +173,17 @@ def _joined(parts: list[Intersection], order: IntArray, k: int) -> Intersection:
     """Return the results of batches as one, back in the order of the points."""
 
     def back(name: str) -> Any:
+        if parts[0].covariance_m2 is None and name == "covariance_m2":
+            return None
         values = np.concatenate([getattr(part, name) for part in parts])
         full = np.empty_like(values)
         full[order] = values
         return full
 
-    per_point = ("shift_m", "outcome", "ray_count", "ray_miss_m", "sigma_z_m", "incidence_deg")
+    per_point = (
+        "shift_m", "outcome", "ray_count", "ray_miss_m", "sigma_z_m", "incidence_deg",
+        "covariance_m2",
+    )  # fmt: skip
     used = np.any([part.camera_used for part in parts], axis=0) if k else np.zeros(0, np.bool_)
     tested = sum(part.pairs_tested for part in parts)
     return Intersection(

@@ -1,0 +1,144 @@
+"""The surface of a whole cloud that hides its points from cameras."""
+
+import numpy as np
+import pytest
+
+import pcfix.refract.top_surface as top_surface
+from pcfix import Cameras, Settings
+from pcfix.flow.occlusion import OccluderBuilder, occluder_of, wants_occlusion
+
+UTM = np.array([512_345.678, 4_987_654.321, 0.0])
+NAMES = ("height", "margin", "block_top", "large_block_top")
+
+
+def hills(n=50_000, seed=1):
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(0.0, [60.0, 40.0], (n, 2))
+    z = 3.0 * np.sin(xy[:, 0] / 5.0) + rng.normal(0.0, 0.05, n)
+    return np.column_stack([xy, z]) + UTM
+
+
+def cameras(*tilts_deg):
+    """Return cameras that look down, each tilted about its x axis."""
+    turned = []
+    for tilt in np.radians(tilts_deg):
+        s, c = np.sin(tilt), np.cos(tilt)
+        turned.append(np.array([[1, 0, 0], [0, c, s], [0, -s, c]]) @ np.diag([1.0, -1.0, -1.0]))
+    k = len(tilts_deg)
+    return Cameras(tuple(map(str, range(k))), np.zeros((k, 3)), np.array(turned))
+
+
+def same(one, other):
+    assert one[1:5] == other[1:5]
+    for name in NAMES:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+# --- whether -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("tilts_deg", "wanted"),
+    [((0.0, 3.0, -14.0), False), ((0.0, 16.0), True), ((0.0, -30.0), True), ((90.0,), True)],
+)
+def test_auto_goes_by_the_axes(tilts_deg, wanted):
+    assert wants_occlusion(cameras(*tilts_deg), Settings()) is wanted
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 40.0])
+def test_on_and_off_are_as_told(tilt_deg):
+    assert wants_occlusion(cameras(tilt_deg), Settings(occlusion="on")) is True
+    assert wants_occlusion(cameras(tilt_deg), Settings(occlusion="off")) is False
+
+
+def test_cameras_without_angles_count_as_nadir():
+    block = Cameras(("a",), np.zeros((1, 3)))
+    assert wants_occlusion(block, Settings()) is False
+    assert wants_occlusion(block, Settings(occlusion="on")) is True
+
+
+# --- the surface ---------------------------------------------------------------------------------
+
+
+def test_height_is_that_of_the_second_highest_point_of_a_cell():
+    xyz = hills()
+    occluder = occluder_of(xyz)
+    column = np.floor((xyz[:, 0] - occluder.left_m) / occluder.cell_m).astype(int)
+    row = np.floor((xyz[:, 1] - occluder.bottom_m) / occluder.cell_m).astype(int)
+    rows, columns = occluder.height.shape
+    second = np.full((rows, columns), np.nan)
+    for r in range(rows):
+        for c in range(columns):
+            z = np.sort(xyz[(row == r) & (column == c), 2])
+            second[r, c] = z[-2] if len(z) > 1 else np.nan
+    inner = second[1:-1, 1:-1]
+    beside = np.stack(
+        [second[1 + i : rows - 1 + i, 1 + j : columns - 1 + j]
+         for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+    )  # fmt: skip
+    expected = np.fmin(inner, np.nanmax(beside, axis=0))
+    expected[np.isnan(inner)] = np.nan
+    np.testing.assert_array_equal(occluder.height[1:-1, 1:-1], expected.astype(np.float32))
+
+
+def test_cells_are_two_to_four_point_spacings_wide_where_there_are_points():
+    spacing = np.sqrt(60.0 * 40.0 / 50_000)
+    assert 2.0 <= occluder_of(hills()).cell_m / spacing <= 4.0
+    xyz = hills()
+    strip = xyz[np.abs(xyz[:, 0] - 1.5 * xyz[:, 1] - (UTM[0] - 1.5 * UTM[1])) < 4.0]
+    assert 2.0 <= occluder_of(strip).cell_m / spacing <= 4.0
+
+
+def test_blocks_have_the_height_of_their_highest_cell():
+    occluder = occluder_of(hills())
+    for tops, side in ((occluder.block_top, 8), (occluder.large_block_top, 64)):
+        for (r, c), top in np.ndenumerate(tops):
+            block = occluder.height[r * side : (r + 1) * side, c * side : (c + 1) * side]
+            assert top == np.nanmax(block, initial=-np.inf)
+    assert occluder.highest_m == np.nanmax(occluder.height)
+
+
+def test_chunks_their_order_and_what_is_known_of_the_corners_do_not_matter():
+    xyz = hills()
+    whole = occluder_of(xyz)
+    shuffled = xyz[np.random.default_rng(2).permutation(len(xyz))]
+    low, high = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
+    unknown = np.full(2, np.nan), np.full(2, np.nan)
+    wrong = low + 5.0, low + 6.0
+    for corners in ((low, high), unknown, wrong):
+        builder = OccluderBuilder(*corners, len(xyz))
+        for part in np.array_split(shuffled, 9):
+            builder.add(part, np.ones(len(part), np.uint8))
+        same(builder.build(), whole)
+
+
+def test_noise_builds_no_surface():
+    xyz = hills()
+    wrong = np.column_stack([xyz[:20_000, :2], np.full(20_000, 100.0)])
+    classes = np.concatenate([np.ones(len(xyz)), np.tile([7, 18], 10_000)]).astype(np.uint8)
+    both = np.vstack([xyz, wrong])
+    assert occluder_of(both, classes).highest_m < 4.0
+    assert occluder_of(both).highest_m == 100.0
+
+
+def test_memory_is_bounded_over_a_wide_extent(monkeypatch):
+    monkeypatch.setattr(top_surface, "MOST_CELLS", 10_000)
+    rng = np.random.default_rng(3)
+    wide = np.column_stack([rng.uniform(0.0, 1e5, (20_000, 2)), rng.normal(0.0, 1.0, 20_000)])
+    line = wide * [1.0, 0.0, 1.0]
+    for xyz in (wide, line):
+        occluder = occluder_of(xyz)
+        assert occluder.height.size <= 10_000
+        assert np.isfinite(occluder.margin).all() and np.isfinite(occluder.highest_m)
+
+
+@pytest.mark.parametrize("n", [1, 2, 50])
+def test_points_all_in_one_place(n):
+    occluder = occluder_of(np.repeat(UTM[None], n, axis=0))
+    assert np.isnan(occluder.height).all()  # no cell beside it
+    assert occluder.highest_m == -np.inf and (occluder.margin == 0.0).all()
+
+
+def test_nothing_makes_no_surface():
+    assert occluder_of(np.zeros((0, 3))) is None
+    assert occluder_of(UTM[None], np.array([7], np.uint8)) is None

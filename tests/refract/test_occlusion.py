@@ -1,0 +1,327 @@
+"""Which cameras a cloud hides from its own points: shadows known from plane geometry."""
+
+import laspy
+import numba
+import numpy as np
+import pytest
+
+import pcfix
+from pcfix import Cameras, Lens, Settings
+from pcfix.flow.occlusion import occluder_of
+from pcfix.io.views import ViewMatch, read_views
+from pcfix.label.surface import SurfaceAbove
+from pcfix.model import Views, WaterPlane
+from pcfix.refract.learned import Learned
+from pcfix.refract.methods import correct
+from pcfix.refract.occlusion import hidden, in_sight
+from pcfix.simulate.tracing import piercing_points, project, triangulate
+from tests.utils.shared import needs
+
+RENDERED, rendered = needs("rendered_a")
+
+UTM = np.array([512_345.678, 4_987_654.321, 0.0])
+
+
+def to_all(n, k):
+    """Return the views in which each of n points has all of k cameras."""
+    return Views(np.arange(n + 1) * k, np.tile(np.arange(k), n))
+
+
+def hidden_of(xyz, centres, occluder):
+    """Return whether each camera is hidden from each point, shape (n, k)."""
+    n, k = len(xyz), len(centres)
+    return hidden(xyz, centres, to_all(n, k), occluder).reshape(n, k)
+
+
+def ring(incidence_deg, away_m=100.0, k=8):
+    """Return centres around the origin, all at one incidence angle."""
+    azimuth = np.arange(k) * 2.0 * np.pi / k
+    angle = np.radians(incidence_deg)
+    plan = np.column_stack([np.cos(azimuth), np.sin(azimuth)]) * np.sin(angle)
+    return away_m * np.column_stack([plan, np.full(k, np.cos(angle))])
+
+
+def plain(rng, n=60_000, half_m=10.0, slope_deg=0.0, noise_m=0.0):
+    """Return a bed 5 m below zero that falls towards one side, and its noise."""
+    xy = rng.uniform(-half_m, half_m, (n, 2))
+    rise = np.tan(np.radians(slope_deg)) * (xy @ [np.cos(0.5), np.sin(0.5)])
+    return np.column_stack([xy, rise - 5.0 + rng.normal(0.0, 1.0, n) * noise_m])
+
+
+# --- what hides ----------------------------------------------------------------------------------
+
+
+WALL_M, THICK_M = 4.0, 1.0
+
+
+@pytest.fixture(scope="module")
+def walled():
+    """Return a flat bed at zero with a wall along y at x = 0 to 1, and the surface of both."""
+    rng = np.random.default_rng(3)
+    bed = plain(rng, noise_m=0.01) + np.array([0.0, 0.0, 5.0])
+    bed = bed[(bed[:, 0] < 0.0) | (bed[:, 0] > THICK_M)]
+    top = np.column_stack(
+        [rng.uniform([0, -10], [THICK_M, 10], (12_000, 2)), np.full(12_000, WALL_M)]
+    )
+    face = rng.uniform([0, -10, 0], [0, 10, WALL_M], (5_000, 3))
+    return bed, face, occluder_of(np.vstack([bed, top, face]) + UTM)
+
+
+@pytest.mark.parametrize("incidence_deg", [15.0, 30.0, 45.0, 60.0])
+def test_wall_hides_what_lies_in_its_shadow(walled, incidence_deg):
+    bed, _, occluder = walled
+    centres = np.array([[200.0, 0.0, 200.0 / np.tan(np.radians(incidence_deg))]])
+    bed = bed[np.abs(bed[:, 1]) < 8.0]
+    found = hidden_of(bed + UTM, centres + UTM, occluder)[:, 0]
+    # the rays rise towards the camera, so that it is the face at x = 0 that they meet, or miss
+    rise = centres[0, 2] / (centres[0, 0] - bed[:, 0])
+    in_shadow = (bed[:, 0] < 0.0) & (-bed[:, 0] * rise < WALL_M)
+    # the wall's edges are known to a cell; the margin moves the limit by itself over the rise
+    limit = WALL_M / rise
+    sure = np.abs(-bed[:, 0] - limit) > occluder.cell_m + occluder.margin.max() / rise
+    sure &= np.abs(bed[:, 0] - THICK_M) > occluder.cell_m
+    assert occluder.cell_m < 0.3
+    assert (found == in_shadow)[sure].all()
+    assert in_shadow[sure].any()
+
+
+def test_face_of_a_wall_is_seen_from_its_front_but_not_through_the_wall(walled):
+    _, face, occluder = walled
+    face = face[(face[:, 2] < WALL_M - 1.0) & (np.abs(face[:, 1]) < 8.0)]
+    front, back = [-60.0, 0.0, 60.0], [60.0, 0.0, 20.0]
+    found = hidden_of(face + UTM, np.array([front, back]) + UTM, occluder)
+    assert not found[:, 0].any()
+    # the ray to the back rises 1/3: after the 1 m of wall it is still below its top
+    assert found[:, 1].all()
+
+
+def test_ledge_under_water_hides_what_lies_behind_it():
+    rng = np.random.default_rng(4)
+    bed = plain(rng, n=100_000, noise_m=0.01)
+    bed[bed[:, 0] > 2.0, 2] += 2.0
+    occluder = occluder_of(bed)
+    low = bed[(bed[:, 0] < 2.0) & (np.abs(bed[:, 1]) < 5.0)]
+    centre = np.array([[102.0, 0.0, 95.0]])
+    found = hidden_of(low, centre, occluder)[:, 0]
+    edge = low[:, 2] + (2.0 - low[:, 0]) / (102.0 - low[:, 0]) * (95.0 - low[:, 2])
+    cell = occluder.cell_m
+    # the ledge's edge is known to a cell, over which the ray rises by as much; within two cells
+    # of the point nothing is tested
+    sure = (np.abs(edge + 3.0) > cell + 0.05) & (2.0 - low[:, 0] > 2.0 * cell)
+    assert (found == (edge < -3.0))[sure].all()
+    assert found.sum() > 1_000
+
+
+def deck_scene(deck_m=5.0):
+    """Return a river bed 1 m deep under a deck from x = -3 to 3, and their surface."""
+    rng = np.random.default_rng(5)
+    bed = plain(rng, noise_m=0.02) + np.array([0.0, 0.0, 4.0])
+    deck = np.column_stack([rng.uniform([-3, -10], [3, 10], (20_000, 2)), np.full(20_000, deck_m)])
+    deck[:, 2] += rng.normal(0.0, 0.02, len(deck))
+    return bed, occluder_of(np.vstack([bed, deck]))
+
+
+def test_deck_hides_what_is_under_it_but_not_from_the_side():
+    bed, occluder = deck_scene()
+    under = bed[(np.abs(bed[:, 0] - 2.0) < 0.2) & (np.abs(bed[:, 1]) < 8.0)]
+    above, steep, flat = [2.0, 0.0, 80.0], [12.0, 0.0, 80.0], [102.0, 0.0, 50.0]
+    found = hidden_of(under, np.array([above, steep, flat]), occluder)
+    # the steep rays rise 8 a metre and pierce the deck, 6 m up, 0.75 m on, before its edge 1 m on;
+    # the flat ones rise 0.5 a metre
+    assert found[:, 0].all() and found[:, 1].all() and not found[:, 2].any()
+
+
+def test_deck_hides_what_lies_behind_it():
+    bed, occluder = deck_scene()
+    behind = bed[(bed[:, 0] < -4.0) & (bed[:, 0] > -5.0) & (np.abs(bed[:, 1]) < 8.0)]
+    # rises 1 a metre: 3 to 9 m up where the deck is, 6 m up
+    assert hidden_of(behind, np.array([[95.0, 0.0, 99.0]]), occluder).all()
+
+
+def hidden_by_small_steps(point, centre, occluder):
+    """Return whether the ray is below some cell's height at the last of the steps within it."""
+    origin = np.array([occluder.left_m, occluder.bottom_m])
+    here, there = (point[:2] - origin) / occluder.cell_m, (centre[:2] - origin) / occluder.cell_m
+    run = np.linalg.norm(there - here)
+    t = np.arange(2.0, max(run, 2.0005), 1e-3)
+    column, row = np.floor(here[:, None] + np.outer((there - here) / run, t)).astype(int)
+    last = np.append((np.diff(row) != 0) | (np.diff(column) != 0), False)
+    rows, columns = occluder.height.shape
+    last &= (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    margin = occluder.margin[int(here[1]) // 16, int(here[0]) // 16]
+    z = point[2] + t / run * (centre[2] - point[2]) + margin
+    return bool((z[last] < occluder.height[row[last], column[last]]).any())
+
+
+def test_blocks_of_cells_are_passed_without_missing_any():
+    rng = np.random.default_rng(10)
+    xyz = rng.uniform([0, 0, 0], [80, 80, 0], (60_000, 3))
+    xyz[:, 2] = 4.0 * np.sin(xyz[:, 0] / 4.0) * np.sin(xyz[:, 1] / 5.0)
+    xyz[:, 2] += 6.0 * (np.sin(xyz[:, 0] / 1.7) * np.sin(xyz[:, 1] / 1.9) > 0.7)  # crowns
+    occluder = occluder_of(xyz)
+    low = xyz[xyz[:, 2] < 1.0][:400]
+    centres = rng.uniform([-20, -20, 15], [100, 100, 40], (6, 3))
+    found = hidden_of(low, centres, occluder)
+    twin = np.array([[hidden_by_small_steps(p, c, occluder) for c in centres] for p in low])
+    # in steps of 1/1000 of a cell, cells whose corner is cut by less are not seen; a step
+    # rises by some millimetres at most
+    assert (found != twin).mean() < 0.002
+    assert 0.05 < found.mean() < 0.95
+
+
+# --- what does not -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("slope_deg", [0.0, 20.0])
+@pytest.mark.parametrize("noise_in_spacings", [0.0, 0.5, 1.0, 2.0])
+def test_even_bed_hides_nothing_at_45_degrees(slope_deg, noise_in_spacings):
+    rng = np.random.default_rng(6)
+    noise_m = noise_in_spacings * 20.0 / np.sqrt(60_000)
+    bed = plain(rng, slope_deg=slope_deg, noise_m=noise_m)
+    found = hidden_of(bed, ring(45.0), occluder_of(bed))
+    # of noise with 2 spacings, which is far more than clouds have, one ray in 200 may be hidden
+    assert found.mean() < (0.005 if noise_in_spacings else 1e-9)
+
+
+def test_flat_bed_hides_nothing_even_at_80_degrees():
+    bed = plain(np.random.default_rng(7))
+    assert not hidden_of(bed, ring(80.0), occluder_of(bed)).any()
+
+
+def test_flying_points_hide_nothing():
+    rng = np.random.default_rng(8)
+    bed = plain(rng, noise_m=0.02)
+    flying = rng.random(len(bed)) < 0.003
+    cloud = bed.copy()
+    cloud[flying, 2] += rng.uniform(2.0, 15.0, flying.sum())
+    found = hidden_of(bed[~flying], ring(45.0), occluder_of(cloud))
+    # a cell counts with two of them, beside another that has two: one in 1e5
+    assert found.mean() < 1e-3
+
+
+def test_where_nothing_is_known_nothing_hides(walled):
+    _, _, occluder = walled
+    outside = np.array([[-500.0, 0.0, -1.0], [5.0, 40.0, -1.0]]) + UTM
+    assert not hidden_of(outside, np.array([[0.0, 0.0, 50.0]]) + UTM, occluder).any()
+
+
+def test_camera_below_its_point_is_not_judged(walled):
+    bed, _, occluder = walled
+    assert not hidden_of(bed[:100] + UTM, np.array([[0.0, 0.0, -50.0]]) + UTM, occluder).any()
+
+
+@pytest.mark.parametrize("at", [[0.0, 0.0], [1e5, -1e5]])
+def test_point_that_is_alone_or_straight_below_a_camera(at):
+    one = np.array([[*at, -3.0]])
+    for cloud in (one, np.repeat(one, 50, axis=0)):
+        occluder = occluder_of(cloud)
+        assert not hidden_of(one, one + np.array([0.0, 0.0, 50.0]), occluder).any()
+        assert not hidden_of(one, one + np.array([40.0, 0.0, 50.0]), occluder).any()
+
+
+# --- views ---------------------------------------------------------------------------------------
+
+
+def test_views_lose_hidden_cameras_but_a_point_keeps_all_rather_than_one(walled):
+    _, _, occluder = walled
+    centres = np.array([[200.0, 0.0, 100.0], [-20.0, 0.0, 60.0], [-30.0, 0.0, 60.0]]) + UTM
+    xyz = np.array([[-2.0, 0.0, 0.0], [-2.0, 1.0, 0.0], [-9.0, 0.0, 0.0]]) + UTM
+    camera = np.array([0, 1, 2, 1, 0, 2, 0])
+    views = Views(np.array([0, 3, 5, 7]), camera, np.arange(7, dtype=np.float32), "depth-maps")
+    found = in_sight(xyz, centres, views, occluder)
+    # the first camera is in the shadow of the wall for the first two points (8 m at 63 degrees)
+    assert found.start.tolist() == [0, 2, 4, 6]
+    assert found.camera.tolist() == [1, 2, 1, 0, 2, 0]
+    assert found.weight.tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0] and found.kind == "depth-maps"
+
+
+def test_result_does_not_depend_on_threads_or_company(walled):
+    bed, _, occluder = walled
+    xyz, centres = bed[:5_000] + UTM, ring(50.0) + UTM
+    whole = hidden_of(xyz, centres, occluder)
+    before = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        assert (hidden_of(xyz, centres, occluder) == whole).all()
+    finally:
+        numba.set_num_threads(before)
+    parts = [hidden_of(part, centres, occluder) for part in np.array_split(xyz, 7)]
+    assert (np.concatenate(parts) == whole).all() and whole.any()
+
+
+@rendered
+def test_cameras_that_made_a_real_cloud_are_not_called_hidden():
+    cameras = pcfix.read_cameras(RENDERED / "cameras.csv")
+    las = laspy.read(RENDERED / "cloud.las")
+    xyz = np.column_stack([las.x, las.y, las.z])
+    views = read_views(RENDERED / "dense.vis", cameras)
+    match = ViewMatch(views, cameras, points=len(xyz))
+    found = hidden(xyz, cameras.centres, match.for_chunk(xyz, 0), occluder_of(xyz))
+    assert found.mean() < 0.01  # of entries, all of which are of images that saw the point
+
+
+# --- the correction ------------------------------------------------------------------------------
+
+CLIFF_M = 15.0
+LENS = Lens(2_000.0, 4_000.0, 3_000.0, 2_000.0, 1_500.0)
+
+
+def looking_at(centre, target):
+    """Return the rotation of a camera whose axis goes through a target."""
+    z = (target - centre) / np.linalg.norm(target - centre)
+    x = np.cross(z, [0.0, 1.0, 1e-3])
+    x /= np.linalg.norm(x)
+    return np.array([x, np.cross(z, x), z])
+
+
+def cliff_block():
+    """Return obliques from both sides of a cliff: land 15 m high at x < 0, water at x > 0."""
+    targets = np.array([[8.0, y, 0.0] for y in (-24, -12, 0, 12, 24) for _ in range(5)])
+    away = np.tile([-45.0, -30.0, 0.0, 20.0, 40.0], 5)
+    centres = targets + np.column_stack([away, 0.0 * away, np.full(25, 45.0)])
+    rotations = np.array([looking_at(*pair) for pair in zip(centres, targets, strict=True)])
+    return Cameras(tuple(f"c{i}" for i in range(25)), centres, rotations, (LENS,) * 25)
+
+
+def cliff_scene(rng, n=20_000):
+    """Return the true bed, its apparent points, and the cloud with the cliff, by exact tracing."""
+    cameras = cliff_block()
+    true = np.column_stack([rng.uniform([0.3, -15], [16, 15], (n, 2)), np.zeros(n)])
+    true[:, 2] = -1.0 - 0.15 * true[:, 0]
+    point, camera = (side.ravel() for side in np.mgrid[: len(true), : len(cameras)])
+    centres = cameras.centres[camera]
+    surface = piercing_points(true[point], centres, 0.0, 1.34)
+    pixels, _ = project(surface, cameras, camera, LENS)
+    share = surface[:, 0] / (surface[:, 0] - np.minimum(centres[:, 0], -1e-9))
+    over_edge = surface[:, 2] + share * (centres[:, 2] - surface[:, 2]) > CLIFF_M
+    seen = (surface[:, 0] > 0.0) & ((centres[:, 0] > 0.0) | over_edge)
+    seen &= ((pixels > 0.0) & (pixels < [LENS.width, LENS.height])).all(axis=1)
+    counts = np.bincount(point[seen], minlength=len(true))
+    assert counts.min() >= 2
+    start = np.concatenate([[0], np.cumsum(counts)])
+    pixels = pixels[seen] + rng.normal(0.0, 0.3, (seen.sum(), 2))
+    apparent = triangulate(pixels, cameras, camera[seen], start, LENS, true)
+    top = np.column_stack([rng.uniform([-25, -25], [0, 25], (50_000, 2)), np.full(50_000, CLIFF_M)])
+    face = rng.uniform([0.0, -25, 0], [0.0, 25, CLIFF_M], (20_000, 3))
+    cloud = np.vstack([apparent, top, face])
+    return cameras, true, apparent, cloud, Views(start, camera[seen])
+
+
+def test_cliff_spoils_the_bed_below_it_unless_its_shadow_is_known():
+    cameras, true, apparent, cloud, views = cliff_scene(np.random.default_rng(9))
+    water, flat = WaterPlane(0.0), SurfaceAbove(np.zeros(len(true)), np.zeros((len(true), 2)))
+
+    def rms_m(views=None, occluder=None, **words):
+        result = correct(
+            apparent, flat, water, cameras, Settings(**words), views, None,
+            Learned(occluder=occluder),
+        )  # fmt: skip
+        return np.sqrt(((apparent + result.shift_m - true) ** 2).sum(axis=1).mean())
+
+    occluder = occluder_of(cloud)
+    all_in_frame, known, without_hidden = rms_m(), rms_m(views), rms_m(occluder=occluder)
+    # what is left of the error that hidden cameras bring is of rays past the edge, to a cell
+    assert without_hidden - known < 0.2 * (all_in_frame - known)
+    # and the steepest three of the rest are those of the cameras that see it
+    steepest = rms_m(occluder=occluder, max_cameras=3)
+    assert steepest == pytest.approx(rms_m(views, max_cameras=3), rel=0.05)
