@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,14 +12,14 @@ import numpy as np
 from pyproj import CRS
 
 import pcfix
-from pcfix.io.files import check_output, write_text
+from pcfix.io.files import check_output, write_bytes, write_text
 from pcfix.io.las.columns import BATHYMETRIC_POINT
 from pcfix.io.las.sink import LasSink
 
 if TYPE_CHECKING:
     import os
 
-    from pcfix.model import FloatArray
+    from pcfix.model import Cameras, FloatArray, IntArray, Views
     from pcfix.simulate.scene import Scene
 
 GROUND = 2
@@ -27,47 +28,174 @@ FILES = {
     "truth.laz": "the true position of each of its points, row by row",
     "lidar.laz": "a reference cloud with noise, as bathymetric LiDAR gives; 2 land, 40 bed",
     "cameras.csv": "label, x, y, z, yaw, pitch, roll of each image",
-    "sensor.csv": "focal length and sensor size, mm",
-    "scene.json": "water level, refractive index, GSD, and the arguments that made the scene",
+    "sensor.csv": "focal length and sensor size, mm; of a distorted lens pixels and OpenCV's k, p",
+    "scene.json": "water, refractive index, GSD, and the arguments that made the scene",
 }
+"""Files that every scene has."""
+
+VIEWS = {
+    "fused.ply.vis": "the cameras of each point of the cloud, row by row, in COLMAP's layout",
+    "dense.ply": "the cloud with the cameras of each point and their weights, in OpenMVS's layout",
+}
+"""The view list; of depth maps the latter."""
+
+TRUE_CAMERAS = {"true_cameras.csv": "the poses that the images were made with"}
+NEIGHBOURS = {"neighbours.csv": "label of each image and of those it was matched with, best first"}
+PAIRS = {"pairs.npz": "start and pairs: point i has the stereo pairs start[i] to start[i + 1]"}
+
+_FINE_GSD_M = 0.005  # clouds of finer images get steps of 0.1 mm
+
+
+def files_of(scene: Scene) -> dict[str, str]:
+    """Return the names of a scene's files and what is in them."""
+    files = dict(FILES)
+    name = "fused.ply.vis" if scene.views.weight is None else "dense.ply"
+    files[name] = VIEWS[name]
+    if scene.true_cameras is not scene.cameras:
+        files |= TRUE_CAMERAS
+    if scene.neighbours is not None:
+        files |= NEIGHBOURS
+    if scene.pairs is not None:
+        files |= PAIRS
+    return files
 
 
 def write_scene(scene: Scene, out_dir: str | os.PathLike[str], *, overwrite: bool) -> None:
-    """Write the files of `FILES` into a folder, made if need be.
+    """Write the files of `files_of` into a folder, made if need be.
 
     Raises
     ------
     SettingError
         If one of them exists and `overwrite` is not set; then none is written.
     """
-    folder = Path(out_dir)
+    folder, files = Path(out_dir), files_of(scene)
     folder.mkdir(parents=True, exist_ok=True)
-    for name in FILES:
+    for name in files:
         check_output(folder / name, overwrite=overwrite)
-    wet = scene.lidar_xyz[:, 2] < scene.water_level_m
-    classes = np.where(wet, BATHYMETRIC_POINT, GROUND).astype(np.uint8)
-    _write_cloud(folder / "cloud.laz", scene.apparent_xyz, scene.epsg, _colours(scene))
-    _write_cloud(folder / "truth.laz", scene.true_xyz, scene.epsg)
-    _write_cloud(folder / "lidar.laz", scene.lidar_xyz, scene.epsg, classes=classes)
-    write_text(folder / "cameras.csv", _cameras_csv(scene), overwrite=overwrite)
-    sensor = "focal,sensor_x,sensor_y\n" + ",".join(map(str, scene.sensor_mm)) + "\n"
-    write_text(folder / "sensor.csv", sensor, overwrite=overwrite)
+    _write_clouds(scene, folder)
+    texts = {"sensor.csv": _sensor_csv(scene)}
+    texts["cameras.csv"] = _cameras_csv(scene.cameras, scene.yaw_pitch_roll_deg)
+    if "true_cameras.csv" in files:
+        texts["true_cameras.csv"] = _cameras_csv(scene.true_cameras, scene.true_yaw_pitch_roll_deg)
+    if scene.neighbours is not None:
+        texts["neighbours.csv"] = _neighbours_csv(scene.cameras.labels, scene.neighbours)
+    texts["scene.json"] = _facts(scene, files)
+    for name, text in texts.items():
+        write_text(folder / name, text, overwrite=overwrite)
+    if scene.views.weight is None:
+        lists = colmap_vis(scene.views)
+        write_bytes(folder / "fused.ply.vis", lists, overwrite=overwrite)
+    else:
+        cloud = openmvs_ply(scene.apparent_xyz, scene.views)
+        write_bytes(folder / "dense.ply", cloud, overwrite=overwrite)
+    if scene.pairs is not None and scene.pairs_start is not None:
+        arrays = io.BytesIO()
+        np.savez_compressed(arrays, start=scene.pairs_start, pairs=scene.pairs)
+        write_bytes(folder / "pairs.npz", arrays.getvalue(), overwrite=overwrite)
+
+
+def colmap_vis(views: Views) -> bytes:
+    """Return view lists in the layout of COLMAP's ``fused.ply.vis``; see its reader."""
+    counts = np.diff(views.start)
+    words = np.empty(len(counts) + len(views.camera), "<u4")
+    at = views.start[:-1] + np.arange(len(counts))
+    is_count = np.zeros(len(words), bool)
+    is_count[at] = True
+    words[at], words[~is_count] = counts, views.camera
+    return len(counts).to_bytes(8, "little") + words.tobytes()
+
+
+def openmvs_ply(xyz: FloatArray, views: Views) -> bytes:
+    """Return a cloud in the layout of OpenMVS's dense PLY, positions in double precision.
+
+    OpenMVS counts the entries of a list in a byte; here it is four where a byte is too small.
+    """
+    if views.weight is None:
+        raise ValueError("OpenMVS's layout needs weights")
+    counts = np.diff(views.start)
+    name, size = ("uchar", 1) if counts.max(initial=0) < 256 else ("uint", 4)
+    place = 2 * size + 24 + 8 * counts
+    first = np.cumsum(place) - place
+    data = np.empty(int(place.sum()), np.uint8)
+    entry = np.repeat(first, counts) + 4 * (
+        np.arange(len(views.camera)) - np.repeat(views.start[:-1], counts)
+    )
+    second = first + 24 + size + 4 * counts
+    _put(data, first, xyz.astype("<f8"))
+    _put(data, first + 24, counts.astype(f"<u{size}"))
+    _put(data, entry + 24 + size, views.camera.astype("<u4"))
+    _put(data, second, counts.astype(f"<u{size}"))
+    _put(data, entry + 24 + 2 * size + 4 * np.repeat(counts, counts), views.weight.astype("<f4"))
+    head = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(xyz)}",
+        *(f"property double {axis}" for axis in "xyz"),
+        f"property list {name} uint view_indices",
+        f"property list {name} float view_weights",
+        "end_header",
+    ]
+    return ("\n".join(head) + "\n").encode() + data.tobytes()
+
+
+def _put(data: np.ndarray, places: np.ndarray, records: np.ndarray) -> None:
+    """Write each row of records, as bytes, to its place."""
+    raw = np.ascontiguousarray(records).view(np.uint8).reshape(len(records), -1)
+    for byte in range(raw.shape[1] if len(raw) else 0):
+        data[places + byte] = raw[:, byte]
+
+
+def _facts(scene: Scene, files: dict[str, str]) -> str:
+    """Return ``scene.json``; `water` is what ``--water`` takes."""
+    plane = scene.water
+    tilted = f"plane:{plane.a!r},{plane.b!r},{plane.c!r}"
     facts = {
         "made_by": f"pcfix {pcfix.__version__}",
         "crs": f"EPSG:{scene.epsg}",
+        "water": f"{plane.a!r}" if plane.b == plane.c == 0.0 else tilted,
         "water_level_m": scene.water_level_m,
         "refractive_index": scene.refractive_index,
         "gsd_m": scene.gsd_m,
         "arguments": scene.settings,
-        "files": FILES,
+        "files": files,
     }
-    write_text(folder / "scene.json", json.dumps(facts, indent=2) + "\n", overwrite=overwrite)
+    return json.dumps(facts, indent=2) + "\n"
 
 
-def _cameras_csv(scene: Scene) -> str:
+def _sensor_csv(scene: Scene) -> str:
+    lens = None if scene.cameras.lenses is None else scene.cameras.lenses[0]
+    if lens is None or not lens.radial:
+        return "focal,sensor_x,sensor_y\n" + ",".join(map(str, scene.sensor_mm)) + "\n"
+    p1, p2 = lens.tangential
+    values = {"focal_px": lens.focal, "width_px": lens.width, "height_px": lens.height}
+    values |= dict(zip(("k1", "k2", "k3"), lens.radial, strict=True))
+    values |= {"p1": p2, "p2": p1}  # OpenCV counts them the other way round
+    return ",".join(values) + "\n" + ",".join(map(repr, values.values())) + "\n"
+
+
+def _neighbours_csv(labels: tuple[str, ...], neighbours: IntArray) -> str:
+    head = ",".join(["label", *(f"neighbour_{i + 1}" for i in range(neighbours.shape[1]))])
+    rows = [
+        ",".join([label, *(labels[i] if i >= 0 else "" for i in row)])
+        for label, row in zip(labels, neighbours, strict=True)
+    ]
+    return "\n".join([head, *rows]) + "\n"
+
+
+def _write_clouds(scene: Scene, folder: Path) -> None:
+    wet = scene.depth_m(scene.lidar_xyz) > 0.0
+    classes = np.where(wet, BATHYMETRIC_POINT, GROUND).astype(np.uint8)
+    step = 0.001 if scene.gsd_m >= _FINE_GSD_M else 0.0001
+    place = (scene.epsg, step)
+    _write_cloud(folder / "cloud.laz", scene.apparent_xyz, place, _colours(scene))
+    _write_cloud(folder / "truth.laz", scene.true_xyz, place)
+    _write_cloud(folder / "lidar.laz", scene.lidar_xyz, place, classes=classes)
+
+
+def _cameras_csv(cameras: Cameras, yaw_pitch_roll_deg: FloatArray) -> str:
     lines = ["label,x,y,z,yaw,pitch,roll"]
     for label, centre, angles in zip(
-        scene.cameras.labels, scene.cameras.centres, scene.yaw_pitch_roll_deg, strict=True
+        cameras.labels, cameras.centres, yaw_pitch_roll_deg, strict=True
     ):
         numbers = [f"{v:.4f}" for v in centre] + [f"{v:.6f}" for v in angles]
         lines.append(",".join([label, *numbers]))
@@ -76,7 +204,7 @@ def _cameras_csv(scene: Scene) -> str:
 
 def _colours(scene: Scene) -> FloatArray:
     """Return RGB, 16 bit: sand on land, bluer with depth."""
-    depth = np.clip((scene.water_level_m - scene.apparent_xyz[:, 2]) / 10.0, 0.0, 1.0)[:, None]
+    depth = np.clip(scene.depth_m(scene.apparent_xyz) / 10.0, 0.0, 1.0)[:, None]
     sand, sea = np.array([[214, 196, 150]]), np.array([[22, 66, 110]])
     return np.asarray(np.rint(sand + depth * (sea - sand)) * 257.0)
 
@@ -84,18 +212,19 @@ def _colours(scene: Scene) -> FloatArray:
 def _write_cloud(
     path: Path,
     xyz: FloatArray,
-    epsg: int,
+    place: tuple[int, float],
     colours: FloatArray | None = None,
     classes: np.ndarray | None = None,
 ) -> None:
+    epsg, step_m = place
     header = laspy.LasHeader(version="1.4", point_format=6 if colours is None else 7)
-    header.scales = np.full(3, 0.001)
+    header.scales = np.full(3, step_m)
     header.offsets = np.floor(xyz.min(axis=0))
     header.add_crs(CRS.from_epsg(epsg))
     header.generating_software = f"pcfix {pcfix.__version__}"
     points = laspy.ScaleAwarePointRecord.zeros(len(xyz), header=header)
     for axis, name in enumerate("XYZ"):
-        points.array[name] = np.rint((xyz[:, axis] - header.offsets[axis]) / 0.001)
+        points.array[name] = np.rint((xyz[:, axis] - header.offsets[axis]) / step_m)
     points["return_number"][:] = 1
     points["number_of_returns"][:] = 1
     if classes is not None:

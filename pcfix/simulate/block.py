@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.io.cameras.table import rotations_from_yaw_pitch_roll
 from pcfix.model import Cameras, FloatArray, Lens
+from pcfix.simulate.optics import Optics, make_optics
 from pcfix.simulate.terrain import GREATEST_DEPTH_M
 
 FOCAL_MM, SENSOR_MM, SENSOR_PX = 8.8, (13.2, 8.8), (5472, 3648)  # a common survey drone
+FLYING_HEIGHT_M = 80.0
 FORWARD_OVERLAP, SIDE_OVERLAP = 0.8, 0.7
 OBLIQUE_PITCH_DEG = 20.0
 ATTITUDE_SD_DEG = 1.5
+PLACE_SD_M = 0.5  # of a drone; below the usual flying height it shrinks with the height
+_RING_BASES, _RING_SPACINGS = 2.0, 1.5  # steps of a ring of obliques in those of the nadir images
 
 
 class Block(NamedTuple):
@@ -23,34 +28,90 @@ class Block(NamedTuple):
     yaw_pitch_roll_deg: FloatArray
 
 
+@dataclass(frozen=True)
+class Flight:
+    """How a block is flown.
+
+    Attributes
+    ----------
+    height_m : float
+        Above the water.
+    forward_overlap, side_overlap : float
+        Of nadir images at the water surface.
+    optics : Optics
+    sensor : tuple of 3 float
+        Focal length, width and height of the sensor, mm.
+    obliques_deg : float
+        Of oblique images, from straight down.
+    directions : int
+        Headings of obliques, evenly spaced from north; 0 for none.
+    oblique_share : float or None
+        Of the images; None: each direction has a third of the density of nadir images.
+    """
+
+    height_m: float = FLYING_HEIGHT_M
+    forward_overlap: float = FORWARD_OVERLAP
+    side_overlap: float = SIDE_OVERLAP
+    optics: Optics = field(default_factory=lambda: make_optics(FOCAL_MM, SENSOR_MM, SENSOR_PX))
+    sensor: tuple[float, float, float] = (FOCAL_MM, *SENSOR_MM)
+    obliques_deg: float = OBLIQUE_PITCH_DEG
+    directions: int = 0
+    oblique_share: float | None = None
+
+    @property
+    def base_and_spacing_m(self) -> tuple[float, float]:
+        """Distance between nadir images of a strip, and between strips."""
+        focal, *sides = self.sensor
+        width, height = (self.height_m * side / focal for side in sides)
+        return height * (1.0 - self.forward_overlap), width * (1.0 - self.side_overlap)
+
+    @property
+    def gsd_m(self) -> float:
+        """Ground size of a pixel at the water surface."""
+        return self.height_m / self.optics.lens.focal
+
+    @property
+    def has_nadir(self) -> bool:
+        """Whether there are nadir images."""
+        return not (self.directions and self.oblique_share == 1.0)
+
+    @property
+    def ring_m(self) -> tuple[float, float]:
+        """The steps of each direction's obliques along and across the strips."""
+        base, spacing = self.base_and_spacing_m
+        stretch = 1.0
+        if self.has_nadir and self.oblique_share is not None:
+            density = self.oblique_share / (1.0 - self.oblique_share) / self.directions
+            stretch = float(np.sqrt(1.0 / (_RING_BASES * _RING_SPACINGS) / density))
+        return _RING_BASES * base * stretch, _RING_SPACINGS * spacing * stretch
+
+
 def lens() -> Lens:
-    """Return the lens in pixels."""
-    width, height = SENSOR_PX
-    return Lens(FOCAL_MM / SENSOR_MM[0] * width, width, height, width / 2.0, height / 2.0)
+    """Return the default lens in pixels."""
+    return Flight().optics.lens
 
 
 def gsd_m(flying_height_m: float) -> float:
-    """Return the ground size of a pixel at the water surface."""
+    """Return the ground size of the default lens's pixel at the water surface."""
     return flying_height_m / lens().focal
 
 
-def base_and_spacing_m(flying_height_m: float) -> tuple[float, float]:
-    """Return the distance between images of a strip, and between strips."""
-    width, height = (flying_height_m * side / FOCAL_MM for side in SENSOR_MM)
-    return height * (1.0 - FORWARD_OVERLAP), width * (1.0 - SIDE_OVERLAP)
-
-
-def reach_m(cameras: Cameras, water_level_m: float) -> FloatArray:
+def reach_m(
+    cameras: Cameras,
+    water_level_m: float,
+    greatest_depth_m: float = GREATEST_DEPTH_M,
+    optics: Optics | None = None,
+) -> FloatArray:
     """Return how far from below each camera it can see anything, metres, shape (k,).
 
     Generous: the flattest ray of the frame's corner, prolonged as if there were no refraction.
     """
     if cameras.rotations is None:
         return np.full(len(cameras), np.inf)
-    half_diagonal = np.arctan(np.hypot(*SENSOR_MM) / 2.0 / FOCAL_MM)
+    half_diagonal = np.arctan((optics or Flight().optics).reach)
     off_nadir = np.arccos(np.clip(-cameras.rotations[:, 2, 2], -1.0, 1.0))
     flattest = np.minimum(half_diagonal + off_nadir, np.radians(80.0))
-    height = cameras.centres[:, 2] - water_level_m + GREATEST_DEPTH_M
+    height = cameras.centres[:, 2] - water_level_m + greatest_depth_m
     return np.asarray(height * np.tan(flattest))
 
 
@@ -63,29 +124,61 @@ def fly(
     obliques: bool,
     rng: np.random.Generator,
 ) -> Block:
+    """Cover a rectangle from the origin with the default camera's images; see `fly_block`."""
+    flight = Flight(height_m=flying_height_m, directions=4 if obliques else 0)
+    return fly_block((length_m, width_m), water_level_m, flight, rng)
+
+
+def fly_block(
+    extent_m: tuple[float, float], water_level_m: float, flight: Flight, rng: np.random.Generator
+) -> Block:
     """Cover a rectangle from the origin with images; strips run along x."""
-    base, spacing = base_and_spacing_m(flying_height_m)
-    nadir = _grid(length_m, width_m, base, spacing)
-    yaw = np.where(np.rint(nadir[:, 1] / spacing) % 2, 270.0, 90.0)  # to and fro
-    places, angles = [nadir], [np.column_stack([yaw, np.zeros((len(nadir), 2))])]
-    if obliques:
-        back = flying_height_m * np.tan(np.radians(OBLIQUE_PITCH_DEG))
-        for heading in (0.0, 90.0, 180.0, 270.0):
-            away = back * np.array([np.sin(np.radians(heading)), np.cos(np.radians(heading))])
-            ring = _grid(length_m, width_m, 2.0 * base, 1.5 * spacing) - away
-            places.append(ring)
-            angles.append(np.tile([heading, OBLIQUE_PITCH_DEG, 0.0], (len(ring), 1)))
-    plan, attitude = np.vstack(places), np.vstack(angles)
+    plan, attitude = _plan(extent_m, flight)
     attitude = attitude + rng.normal(0.0, ATTITUDE_SD_DEG, attitude.shape)
-    height = water_level_m + flying_height_m + rng.normal(0.0, 0.5, len(plan))
-    centres = np.column_stack([plan + rng.normal(0.0, 0.5, plan.shape), height])
+    sd = PLACE_SD_M * min(1.0, flight.height_m / FLYING_HEIGHT_M)
+    height = water_level_m + flight.height_m + rng.normal(0.0, sd, len(plan))
+    centres = np.column_stack([plan + rng.normal(0.0, sd, plan.shape), height])
     cameras = Cameras(
         labels=tuple(f"IMG_{i + 1:04d}.JPG" for i in range(len(centres))),
         centres=centres,
         rotations=rotations_from_yaw_pitch_roll(*attitude.T),
-        lenses=(lens(),) * len(centres),
+        lenses=(flight.optics.lens,) * len(centres),
     )
     return Block(cameras, attitude)
+
+
+def misplaced(
+    block: Block, position_noise_m: float, attitude_noise_deg: float, rng: np.random.Generator
+) -> Block:
+    """Return the block with noise on every coordinate, and on yaw, pitch and roll."""
+    if position_noise_m == attitude_noise_deg == 0.0:
+        return block
+    k = len(block.cameras)
+    angles = block.yaw_pitch_roll_deg + rng.normal(0.0, attitude_noise_deg, (k, 3))
+    cameras = replace(
+        block.cameras,
+        centres=block.cameras.centres + rng.normal(0.0, position_noise_m, (k, 3)),
+        rotations=rotations_from_yaw_pitch_roll(*angles.T),
+    )
+    return Block(cameras, angles)
+
+
+def _plan(extent_m: tuple[float, float], flight: Flight) -> tuple[FloatArray, FloatArray]:
+    """Return plan positions and yaw, pitch, roll, nadir images first."""
+    base, spacing = flight.base_and_spacing_m
+    places, angles = [], []
+    if flight.has_nadir:
+        nadir = _grid(*extent_m, base, spacing)
+        yaw = np.where(np.rint(nadir[:, 1] / spacing) % 2, 270.0, 90.0)  # to and fro
+        places.append(nadir)
+        angles.append(np.column_stack([yaw, np.zeros((len(nadir), 2))]))
+    back = flight.height_m * np.tan(np.radians(flight.obliques_deg))
+    for heading in 360.0 / max(flight.directions, 1) * np.arange(flight.directions):
+        away = back * np.array([np.sin(np.radians(heading)), np.cos(np.radians(heading))])
+        ring = _grid(*extent_m, *flight.ring_m) - away
+        places.append(ring)
+        angles.append(np.tile([heading, flight.obliques_deg, 0.0], (len(ring), 1)))
+    return np.vstack(places), np.vstack(angles)
 
 
 def _grid(length_m: float, width_m: float, base_m: float, spacing_m: float) -> FloatArray:

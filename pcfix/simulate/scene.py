@@ -1,31 +1,31 @@
-"""A whole scene: shore, images, and the cloud that SfM software would have made of them."""
+"""A whole scene: ground, water, images, and the cloud that software would have made of them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import SettingError
-from pcfix.model import Cameras, FloatArray, Views
-from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, Settings
-from pcfix.simulate.block import FOCAL_MM, SENSOR_MM, base_and_spacing_m, fly, gsd_m, lens, reach_m
-from pcfix.simulate.terrain import Shore
-from pcfix.simulate.tracing import piercing_points, project, triangulate
+from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterPlane
+from pcfix.simulate.block import Block, fly_block, misplaced
+from pcfix.simulate.depth_maps import fuse_depth_maps
+from pcfix.simulate.neighbours import SAMPLE, neighbour_table
+from pcfix.simulate.pairs import match_pairs
+from pcfix.simulate.settings import BlockKind, SceneSettings
+from pcfix.simulate.sight import Rig, see
+from pcfix.simulate.terrain import Terrain
+from pcfix.simulate.tracks import intersect_tracks
+from pcfix.simulate.water import Water, Waves
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-BlockKind = Literal["nadir", "oblique"]
+__all__ = ["BlockKind", "Scene", "SceneSettings", "simulate_scene"]
 
 ORIGIN_M = np.array([410_200.0, 4_650_300.0, 0.0])  # in UTM zone 33 north
 EPSG = 32633
-FLYING_HEIGHT_M = 80.0
-LENGTH_M, WIDTH_M = 120.0, 80.0
-LIDAR_PER_M2, LIDAR_NOISE_M = 2.0, 0.05
-LEAST_VIEWS = 3
-_PAIRS_AT_ONCE = 2_000_000
+_TRACK_PAIRS_AT_ONCE, _DENSE_PAIRS_AT_ONCE = 2_000_000, 50_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,19 +35,38 @@ class Scene:
     Attributes
     ----------
     apparent_xyz, true_xyz : array, shape (n, 3)
-        The cloud as SfM software would place it, and the truth, row by row.
+        The cloud as SfM software would place it, and the truth, row by row. A point that fewer
+        than three images show, or that the matcher found no two agreeing depths for, has no views
+        and is not moved.
     views : Views
-        The cameras that made each point.
+        The cameras that made each point; of depth maps with what each counted for.
     cameras : Cameras
+        Those that the user is given; the cloud is intersected with them.
     yaw_pitch_roll_deg : array, shape (k, 3)
+        Of `cameras`.
     lidar_xyz : array, shape (m, 3)
         A reference cloud of the true surface with noise.
-    water_level_m, refractive_index, gsd_m : float
+    water_level_m : float
+        Of the mean water plane in the middle of the area.
+    refractive_index, gsd_m : float
     sensor_mm : tuple of float
         Focal length, sensor width and height.
     epsg : int
     settings : dict
         The arguments that made it.
+    water : WaterPlane
+        The mean water plane.
+    true_cameras : Cameras
+        Those that the images were made with; the same object as `cameras` where there is no
+        pose noise.
+    true_yaw_pitch_roll_deg : array, shape (k, 3)
+        Of `true_cameras`.
+    neighbours : array, shape (k, c), or None
+        The images that each was matched with, -1 for none; None for a cloud of tracks.
+    pairs : array, shape (p, 2), or None
+        The cameras of each stereo pair, point by point, of a cloud of pairs.
+    pairs_start : array, shape (n + 1,), or None
+        Point i has the pairs from ``pairs_start[i]`` to ``pairs_start[i + 1]``.
     """
 
     apparent_xyz: FloatArray
@@ -62,50 +81,93 @@ class Scene:
     sensor_mm: tuple[float, float, float]
     epsg: int
     settings: dict[str, Any]
+    water: WaterPlane
+    true_cameras: Cameras
+    true_yaw_pitch_roll_deg: FloatArray
+    neighbours: IntArray | None = None
+    pairs: IntArray | None = None
+    pairs_start: IntArray | None = None
+
+    @property
+    def xyz(self) -> FloatArray:
+        """`apparent_xyz`, by a shorter name."""
+        return self.apparent_xyz
+
+    def depth_m(self, xyz: FloatArray) -> FloatArray:
+        """Return the vertical distance of points below the mean water plane, metres."""
+        if self.water.b == self.water.c == 0.0:
+            return np.asarray(self.water.a - xyz[:, 2])
+        # about the scene, as the plane's height at the origin of the coordinates is a large number
+        near = xyz - ORIGIN_M
+        level = self.water.a + self.water.b * ORIGIN_M[0] + self.water.c * ORIGIN_M[1]
+        return np.asarray(level + near[:, :2] @ [self.water.b, self.water.c] - xyz[:, 2])
 
     @property
     def description(self) -> str:
         """One line about the scene."""
         per_point = len(self.views.camera) / len(self.true_xyz)
+        tilt = 100.0 * float(np.hypot(self.water.b, self.water.c))
+        tilted = f" in the middle, tilted by {tilt:.3g} %" if tilt else ""
         return (
             f"{len(self.true_xyz):,} points seen by {per_point:.0f} of {len(self.cameras)} cameras"
-            f" each, GSD {100.0 * self.gsd_m:.1f} cm, water level {self.water_level_m:g} m,"
+            f" each, GSD {self._gsd}, water level {self.water_level_m:g} m{tilted},"
             f" refractive index {self.refractive_index:g}"
         )
+
+    @property
+    def _gsd(self) -> str:
+        return f"{100.0 * self.gsd_m:.1f} cm" if self.gsd_m >= 0.005 else f"{self.gsd_m:.2g} m"
+
+
+class Part(NamedTuple):
+    """Some rows of a cloud, local coordinates."""
+
+    xyz: FloatArray
+    true_xyz: FloatArray
+    views: Views
+    pairs_start: IntArray | None = None
+    pairs: IntArray | None = None
+
+
+class Streams(NamedTuple):
+    """Random numbers: `main` as they always came, and others for what can be switched on."""
+
+    main: np.random.Generator
+    poses: np.random.Generator
+    waves: np.random.Generator
+    detection: np.random.Generator
+    matching: np.random.Generator
+
+    @classmethod
+    def of(cls, seed: int) -> Streams:
+        """Return the streams of a seed, independent of one another."""
+        main = np.random.default_rng(seed)
+        return cls(main, *(np.random.default_rng([seed, i]) for i in range(1, 5)))
 
 
 def simulate_scene(
     points: int = 100_000,
     *,
-    block: BlockKind = "nadir",
-    cameras: int | None = None,
-    refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
-    water_level_m: float = 0.37,
-    image_noise_px: float = 0.5,
-    seed: int = 1,
     progress: Callable[[int, int], None] | None = None,
+    **settings: Any,
 ) -> Scene:
-    """Make a scene with known truth: a shore from land to 12 m deep under a block of images.
+    """Make a scene with known truth: ground and water under a block of images.
 
-    Every point is traced through the level water surface into every image that shows it; the
-    image points get noise; straight rays through them are triangulated with the least
-    reprojection error, as software that knows nothing of water does. Poses and lens are true.
+    Every point is traced through the water surface into every image that shows it; the image
+    points get noise; straight rays through them are intersected, as software that knows nothing
+    of water does. By default: a shore from land to 12 m deep, level water, nadir images, true
+    poses and a true lens, and each point from all its images with the least reprojection error.
 
     Parameters
     ----------
     points : int
         Points of the cloud.
-    block : {"nadir", "oblique"}
-        Strips of nadir images, or obliques of 20 degrees from four sides as well.
-    cameras : int, optional
-        About so many nadir images; the area grows or shrinks with it. Default: 120 m x 80 m.
-    refractive_index, water_level_m : float
-    image_noise_px : float
-        Standard deviation of an image coordinate, pixels.
-    seed : int
-        The same seed gives the same scene.
     progress : callable, optional
         Called with (points done, points in all).
+    **settings
+        Everything else, by the names of `pcfix.simulate.settings.SceneSettings`: block and
+        lens, pose and image noise, waves and tilt of the water, the bed, the kind of cloud,
+        LiDAR, and the seed.
 
     Returns
     -------
@@ -115,105 +177,167 @@ def simulate_scene(
     ------
     SettingError
         If an argument is outside its rule.
+
+    Examples
+    --------
+    >>> import pcfix
+    >>> scene = pcfix.simulate_scene(500, bed="flat", flying_height_m=60, cloud="pairs")
+    >>> scene.pairs.shape[1]
+    2
     """
-    _check(points, block, cameras, image_noise_px, refractive_index)
-    rng = np.random.default_rng(seed)
-    length, width = _extent(cameras)
-    shore = Shore.random(length, width, water_level_m, rng)
-    flown = fly(length, width, water_level_m, FLYING_HEIGHT_M, obliques=block == "oblique", rng=rng)
-    truth = _on(shore, points, rng)
-    parts, done = [], 0
-    at_once = max(1, _PAIRS_AT_ONCE // len(flown.cameras))
-    for first in range(0, points, at_once):
-        part = truth[first : first + at_once]
-        noise = (image_noise_px, rng)
-        parts.append(_observe(part, flown.cameras, water_level_m, refractive_index, noise))
-        done += len(part)
-        if progress is not None:
-            progress(done, points)
-    counts = np.concatenate([np.diff(views.start) for _, views in parts])
-    views = Views(
-        np.concatenate([[0], np.cumsum(counts)]), np.concatenate([v.camera for _, v in parts])
-    )
-    lidar = _on(shore, round(length * width * LIDAR_PER_M2), rng)
-    lidar[:, 2] += rng.normal(0.0, LIDAR_NOISE_M, len(lidar))
+    chosen = SceneSettings(points=points, **settings)
+    streams, extent, flight = Streams.of(chosen.seed), _extent(chosen), chosen.flight
+    plane = chosen.water_plane(extent)
+    terrain = Terrain.random(chosen.bed, extent, plane, chosen.depth_m, streams.main)
+    flown = fly_block(extent, chosen.water_level_m, flight, streams.main)
+    given = misplaced(flown, chosen.position_noise_m, chosen.attitude_noise_deg, streams.poses)
+    rig = _rig(chosen, flown, given, plane, extent, streams)
+    truth = _on(terrain, points, streams.main)
+    table = _neighbours(chosen, truth, rig)
+    parts = _parts(chosen, truth, terrain, rig, table, streams, progress)
+    lidar = _on(terrain, round(extent[0] * extent[1] * chosen.lidar_per_m2), streams.main)
+    lidar[:, 2] += streams.main.normal(0.0, chosen.lidar_noise_m, len(lidar))
+    cameras = _moved(given.cameras)
     return Scene(
-        apparent_xyz=np.vstack([apparent for apparent, _ in parts]) + ORIGIN_M,
-        true_xyz=truth + ORIGIN_M,
-        views=views,
-        cameras=replace(flown.cameras, centres=flown.cameras.centres + ORIGIN_M),
-        yaw_pitch_roll_deg=flown.yaw_pitch_roll_deg,
+        apparent_xyz=np.vstack([part.xyz for part in parts]) + ORIGIN_M,
+        true_xyz=np.vstack([part.true_xyz for part in parts]) + ORIGIN_M,
+        views=_joined_views(parts),
+        cameras=cameras,
+        yaw_pitch_roll_deg=given.yaw_pitch_roll_deg,
         lidar_xyz=lidar + ORIGIN_M,
-        water_level_m=water_level_m,
-        refractive_index=refractive_index,
-        gsd_m=gsd_m(FLYING_HEIGHT_M),
-        sensor_mm=(FOCAL_MM, *SENSOR_MM),
+        water_level_m=chosen.water_level_m,
+        refractive_index=chosen.refractive_index,
+        gsd_m=flight.gsd_m,
+        sensor_mm=flight.sensor,
         epsg=EPSG,
-        settings={
-            "points": points,
-            "block": block,
-            "cameras": cameras,
-            "refractive_index": refractive_index,
-            "water_level_m": water_level_m,
-            "image_noise_px": image_noise_px,
-            "seed": seed,
-        },
+        settings=chosen.as_dict(),
+        water=_in_world(plane),
+        true_cameras=cameras if given is flown else _moved(flown.cameras),
+        true_yaw_pitch_roll_deg=flown.yaw_pitch_roll_deg,
+        neighbours=table,
+        **_joined_pairs(parts),
     )
 
 
-def _check(points: int, block: str, cameras: int | None, noise: float, index: float) -> None:
-    Settings(refractive_index=index)
-    if points < 1:
-        raise SettingError(f"points {points} is less than 1.")
-    if block not in ("nadir", "oblique"):
-        raise SettingError(f"block '{block}' is not one of nadir, oblique.")
-    if cameras is not None and cameras < 9:
-        raise SettingError(f"cameras {cameras} is less than 9: a block needs some overlap.")
-    if noise < 0.0:
-        raise SettingError(f"image noise {noise:g} px is negative.")
-
-
-def _extent(cameras: int | None) -> tuple[float, float]:
+def _extent(chosen: SceneSettings) -> tuple[float, float]:
     """Return length and width of the area that about so many nadir images cover."""
-    if cameras is None:
-        return LENGTH_M, WIDTH_M
-    base, spacing = base_and_spacing_m(FLYING_HEIGHT_M)
-    side = float(np.sqrt(cameras * base * spacing * LENGTH_M / WIDTH_M))
-    length = max(side - 1.5 * base, base)
-    return length, max(cameras * base * spacing / side - 1.5 * spacing, spacing / 2.0)
+    length, width = chosen.area_m
+    if chosen.cameras is None:
+        return length, width
+    base, spacing = chosen.flight.base_and_spacing_m
+    side = float(np.sqrt(chosen.cameras * base * spacing * length / width))
+    reach = max(side - 1.5 * base, base)
+    return reach, max(chosen.cameras * base * spacing / side - 1.5 * spacing, spacing / 2.0)
 
 
-def _on(shore: Shore, count: int, rng: np.random.Generator) -> FloatArray:
+def _rig(
+    chosen: SceneSettings,
+    flown: Block,
+    given: Block,
+    plane: WaterPlane,
+    extent_m: tuple[float, float],
+    streams: Streams,
+) -> Rig:
+    waves = None
+    if chosen.wave_slope_deg > 0.0:
+        count = len(flown.cameras)
+        waves = Waves.random(count, chosen.wave_slope_deg, chosen.wave_length_m, streams.waves)
+    return Rig(
+        true=flown.cameras,
+        given=given.cameras,
+        optics=chosen.optics,
+        water=Water(plane, chosen.refractive_index, waves),
+        lowest_m=chosen.water_level_m
+        - chosen.depth_m
+        - chosen.water_tilt * float(np.hypot(*extent_m)) / 2.0,
+        image_noise_px=chosen.image_noise_px,
+        detection=chosen.detection,
+    )
+
+
+def _on(terrain: Terrain, count: int, rng: np.random.Generator) -> FloatArray:
     """Return random points of the surface, west to east in narrow bands, as matchers write."""
-    plan = rng.uniform(0.0, 1.0, (count, 2)) * [shore.length_m, shore.width_m]
+    plan = rng.uniform(0.0, 1.0, (count, 2)) * [terrain.length_m, terrain.width_m]
     plan = plan[np.lexsort((plan[:, 0], np.floor(plan[:, 1])))]
-    return np.column_stack([plan, shore.height(*plan.T)])
+    return np.column_stack([plan, terrain.height(*plan.T)])
+
+
+def _neighbours(chosen: SceneSettings, truth: FloatArray, rig: Rig) -> IntArray | None:
+    if chosen.cloud == "tracks":
+        return None
+    sample = truth[:: max(1, len(truth) // SAMPLE)][:SAMPLE]
+    every = see(sample, replace(rig, detection=1.0), np.random.default_rng(0))
+    return neighbour_table(sample, every, rig.true.centres, chosen.matched_with)
+
+
+def _parts(
+    chosen: SceneSettings,
+    truth: FloatArray,
+    terrain: Terrain,
+    rig: Rig,
+    table: IntArray | None,
+    streams: Streams,
+    progress: Callable[[int, int], None] | None,
+) -> list[Part]:
+    """Return the cloud in parts that fit into the memory."""
+    pairs = _TRACK_PAIRS_AT_ONCE if table is None else _DENSE_PAIRS_AT_ONCE
+    at_once = max(1, pairs // len(rig.true))
+    parts: list[Part] = []
+    for first in range(0, len(truth), at_once):
+        part = truth[first : first + at_once]
+        parts.append(_observe(part, terrain, rig, table, streams, chosen))
+        if progress is not None:
+            progress(first + len(part), len(truth))
+    return parts
 
 
 def _observe(
     truth: FloatArray,
-    cameras: Cameras,
-    water_level_m: float,
-    refractive_index: float,
-    noise: tuple[float, np.random.Generator],
-) -> tuple[FloatArray, Views]:
-    """Return the apparent points and their views; with too few views a point is not moved."""
-    optics = lens()
-    across = truth[:, None, 0] - cameras.centres[:, 0], truth[:, None, 1] - cameras.centres[:, 1]
-    point, camera = np.nonzero(np.hypot(*across) < reach_m(cameras, water_level_m))
-    surface = piercing_points(
-        truth[point], cameras.centres[camera], water_level_m, refractive_index
+    terrain: Terrain,
+    rig: Rig,
+    table: IntArray | None,
+    streams: Streams,
+    chosen: SceneSettings,
+) -> Part:
+    """Return the cloud that is made of the images of some points."""
+    sight = see(truth, rig, streams.detection)
+    if table is None:
+        xyz = intersect_tracks(truth, sight, rig, streams.main)
+        return Part(xyz, truth, Views(sight.start, sight.camera))
+    if chosen.cloud == "pairs":
+        made = match_pairs(truth, sight, rig, table, streams.matching)
+        return Part(made.xyz, truth, made.views, made.start, made.pairs)
+    bed = truth, terrain.normals(*truth[:, :2].T)
+    return Part(*fuse_depth_maps(bed, sight, rig, table, streams.matching))
+
+
+def _joined_views(parts: list[Part]) -> Views:
+    counts = np.concatenate([np.diff(part.views.start) for part in parts])
+    weights = [part.views.weight for part in parts if part.views.weight is not None]
+    return Views(
+        np.concatenate([[0], np.cumsum(counts)]),
+        np.concatenate([part.views.camera for part in parts]),
+        np.concatenate(weights) if weights else None,
     )
-    pixels, z = project(surface, cameras, camera, optics)
-    inside = (z > 0) & ((pixels >= 0) & (pixels < [optics.width, optics.height])).all(axis=1)
-    count = np.bincount(point[inside], minlength=len(truth))
-    inside &= count[point] >= LEAST_VIEWS
-    point, camera, pixels = point[inside], camera[inside], pixels[inside]
-    pixels = pixels + noise[1].normal(0.0, noise[0], pixels.shape)
-    start = np.concatenate([[0], np.cumsum(np.bincount(point, minlength=len(truth)))])
-    made = np.diff(start) > 0
-    apparent = truth.copy()
-    if made.any():
-        starts = np.concatenate([start[:-1][made], start[-1:]])
-        apparent[made] = triangulate(pixels, cameras, camera, starts, optics, truth[made])
-    return apparent, Views(start, camera)
+
+
+def _joined_pairs(parts: list[Part]) -> dict[str, IntArray]:
+    starts = [part.pairs_start for part in parts if part.pairs_start is not None]
+    pairs = [part.pairs for part in parts if part.pairs is not None]
+    if not pairs:
+        return {}
+    counts = np.concatenate([np.diff(start) for start in starts])
+    return {
+        "pairs": np.concatenate(pairs),
+        "pairs_start": np.concatenate([[0], np.cumsum(counts)]),
+    }
+
+
+def _moved(cameras: Cameras) -> Cameras:
+    """Return cameras in the world's coordinates."""
+    return replace(cameras, centres=cameras.centres + ORIGIN_M)
+
+
+def _in_world(plane: WaterPlane) -> WaterPlane:
+    a = plane.a - plane.b * ORIGIN_M[0] - plane.c * ORIGIN_M[1]
+    return WaterPlane(float(a), plane.b, plane.c)

@@ -1,4 +1,4 @@
-"""From a true point through a level water surface into images, and what SfM makes of it.
+"""From a true point through a plane water surface into images, and what SfM makes of it.
 
 The piercing point of the ray from object to camera is where Fermat's principle puts it: the
 root of Snell's law along the line between their feet, found by a safeguarded Newton iteration.
@@ -51,6 +51,87 @@ def piercing_points(
     surface[wet, :2] = centres[wet, :2] + foot * share[:, None]
     surface[wet, 2] = water_level_m
     return surface
+
+
+def piercing_points_of_planes(
+    points: FloatArray,
+    centres: FloatArray,
+    anchors: FloatArray,
+    normals: FloatArray,
+    refractive_index: float,
+) -> FloatArray:
+    """Return where the light from each point to its camera passes a plane of any attitude.
+
+    The picture is that of `piercing_points` with the plane's normal for the plumb line: the feet
+    of both on the plane, and the root of Snell's law between them.
+
+    Parameters
+    ----------
+    points, centres : array, shape (m, 3)
+    anchors, normals : array, shape (m, 3)
+        A point of each pair's plane and its unit normal, away from the water.
+    refractive_index : float
+
+    Returns
+    -------
+    array, shape (m, 3)
+        A point above its plane is its own "piercing point".
+    """
+    depth = np.einsum("mi,mi->m", anchors - points, normals)
+    wet = depth > 0.0
+    n, depth = normals[wet], depth[wet]
+    height = np.einsum("mi,mi->m", centres[wet] - anchors[wet], n)
+    below_camera = centres[wet] - height[:, None] * n
+    foot = points[wet] + depth[:, None] * n - below_camera
+    reach = np.sqrt(np.einsum("mi,mi->m", foot, foot))
+    along = _root_of_snell(reach, height, depth, refractive_index)
+    share = np.divide(along, reach, out=np.zeros_like(along), where=reach > 0.0)
+    surface = points.copy()
+    surface[wet] = below_camera + foot * share[:, None]
+    return surface
+
+
+def bed_points(
+    centres: FloatArray,
+    directions: FloatArray,
+    water: tuple[FloatArray, FloatArray],
+    bed: tuple[FloatArray, FloatArray],
+    refractive_index: float,
+) -> FloatArray:
+    """Return what each camera sees along a ray: where it meets the bed, bent at the water.
+
+    Parameters
+    ----------
+    centres, directions : array, shape (m, 3)
+        Directions of any length.
+    water, bed : tuple of array, shape (m, 3)
+        A point of each ray's water plane and of its bed plane, and their unit normals. A ray that
+        meets the bed above the water is straight.
+
+    Returns
+    -------
+    array, shape (m, 3)
+    """
+    (anchors, normals), (places, bed_normals) = water, bed
+    straight = _on_plane(centres, directions, places, bed_normals)
+    wet = np.einsum("mi,mi->m", straight - anchors, normals) < 0.0
+    surface = _on_plane(centres[wet], directions[wet], anchors[wet], normals[wet])
+    unit = directions[wet] / np.linalg.norm(directions[wet], axis=1)[:, None]
+    down = np.einsum("mi,mi->m", unit, normals[wet])[:, None]
+    # Snell: the part along the surface shrinks by n, the rest is what a unit vector has left
+    sideways = (unit - down * normals[wet]) / refractive_index
+    rest = np.sqrt(1.0 - np.einsum("mi,mi->m", sideways, sideways))[:, None]
+    bent = sideways - rest * normals[wet]
+    straight[wet] = _on_plane(surface, bent, places[wet], bed_normals[wet])
+    return straight
+
+
+def _on_plane(
+    origins: FloatArray, directions: FloatArray, anchors: FloatArray, normals: FloatArray
+) -> FloatArray:
+    gap = np.einsum("mi,mi->m", anchors - origins, normals)
+    speed = np.einsum("mi,mi->m", directions, normals)
+    return np.asarray(origins + (gap / speed)[:, None] * directions)
 
 
 def _root_of_snell(
@@ -134,6 +215,6 @@ def triangulate(
             )
         step = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
         points += step
-        if np.abs(step).max() < 1e-7:
+        if np.abs(step).max(initial=0.0) < 1e-7:
             break
     return points

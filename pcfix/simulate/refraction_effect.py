@@ -1,0 +1,260 @@
+"""How far refraction puts a point wrong in a pair of vertical images, before any correction.
+
+Remakes Figures 4 to 6 of Skarlatos & Agrafiotis (2018), "A Novel Iterative Water Refraction
+Correction Algorithm for Use in Structure from Motion Photogrammetric Pipeline", JMSE 6(3) 77:
+the error of the apparent depth over the model of two vertical images. Nothing here is shared
+with the correction; that the two agree is for a test to say.
+
+What the paper gives to check against is one pair of numbers: with the SwingletCAM from 100 m, 80 %
+overlap and an apparent depth of 15 m, -8.23 m in the corners of the model and -5.15 m in its
+centre. The reading that is used here:
+
+- The flying height is above the water. The base is the free part of the short side of the
+  footprint *at the water surface* (144.19 m x 108.14 m): 21.63 m.
+- The model is the overlap of the two footprints, taken at the water surface too, and its apparent
+  bed is level: x and y of a corner are 43.26 m and 72.09 m from the centre, and z is -15 m there.
+- n = 1.34; the true point is the midpoint of the shortest line between the two bent rays.
+- The error is the apparent depth minus the true depth, so a minus says: too shallow.
+
+It gives -8.228 m and -5.139 m (with the base rounded to 21.6 m, -8.229 m and -5.139 m): the corner
+as published, the centre 1 cm off. Following the ray of the corner pixel down to the apparent bed
+instead gives -9.17 m in the corner. Taking the base from the footprint at the apparent bed gives
+-5.15 m in the centre, but -8.13 m in the corner. No reading was found that gives both published
+numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pcfix.errors import SettingError
+from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, Settings
+
+if TYPE_CHECKING:
+    from pcfix.model import FloatArray
+
+NODES = 61
+"""Nodes of a model along its flight and across it; odd, so that the centre is one."""
+OVERLAP = 0.8
+APPARENT_DEPTHS_M = (1.0, 2.0, 5.0, 10.0, 15.0)
+
+
+@dataclass(frozen=True)
+class AerialCamera:
+    """A frame camera that looks straight down, the short side of its frame along the flight.
+
+    Attributes
+    ----------
+    name : str
+    focal_mm : float
+    columns, rows : int
+        Pixels across the flight and along it.
+    pixel_um : float
+    """
+
+    name: str
+    focal_mm: float
+    columns: int
+    rows: int
+    pixel_um: float
+
+    def __post_init__(self) -> None:
+        """Check that the camera can take an image."""
+        for what, value in (
+            ("focal length", self.focal_mm), ("number of columns", self.columns),
+            ("number of rows", self.rows), ("pixel size", self.pixel_um),
+        ):  # fmt: skip
+            if not (np.isfinite(value) and value > 0):
+                raise SettingError(f"{what} {value:g} of the camera is not above 0.")
+
+    def footprint_m(self, flying_height_m: float) -> tuple[float, float]:
+        """Return the sides of an image on the water, along the flight and across it."""
+        scale = flying_height_m * self.pixel_um * 1e-3 / self.focal_mm
+        return self.rows * scale, self.columns * scale
+
+
+SWINGLETCAM = AerialCamera("SwingletCAM", 4.3, 4000, 3000, 1.55)
+ULTRACAM = AerialCamera("UltraCamX", 100.5, 14430, 9420, 7.2)
+"""The paper's second camera is an UltraCam of 100.5 mm. The frame is that of the UltraCamX, which
+has this focal length: 103.9 mm x 67.8 mm; the UltraCam Eagle's of 100.5 mm is within 0.3 %."""
+
+FLYING_HEIGHTS_M = {SWINGLETCAM: (50.0, 100.0, 200.0), ULTRACAM: (500.0, 1000.0, 3000.0)}
+"""Above the water. Only the 100 m are known to be the paper's; the others are usual ones."""
+
+
+@dataclass(frozen=True)
+class StereoPair:
+    """Two vertical images of one strip, level with each other; x runs along the flight.
+
+    The origin lies on the water surface, midway between the two.
+    """
+
+    camera: AerialCamera
+    flying_height_m: float
+    overlap: float = OVERLAP
+
+    def __post_init__(self) -> None:
+        """Check that the two images overlap."""
+        if not (np.isfinite(self.flying_height_m) and self.flying_height_m > 0.0):
+            raise SettingError(f"flying height {self.flying_height_m:g} m is not above 0.")
+        if not 0.0 < self.overlap < 1.0:
+            raise SettingError(
+                f"overlap {self.overlap:g} is not between 0 and 1; give a share, as 0.8."
+            )
+
+    @property
+    def base_m(self) -> float:
+        """Distance between the projection centres."""
+        return (1.0 - self.overlap) * self.camera.footprint_m(self.flying_height_m)[0]
+
+    @property
+    def model_m(self) -> tuple[float, float]:
+        """Sides of the overlap on the water, along the flight and across it."""
+        along, across = self.camera.footprint_m(self.flying_height_m)
+        return along - self.base_m, across
+
+    @property
+    def centres(self) -> FloatArray:
+        """Projection centres, metres, shape (2, 3)."""
+        half = self.base_m / 2.0
+        return np.array([[-half, 0.0, self.flying_height_m], [half, 0.0, self.flying_height_m]])
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """The effect of refraction over one model.
+
+    Attributes
+    ----------
+    pair : StereoPair
+    apparent_depth_m, refractive_index : float
+    x_m, y_m : array, shape (nodes,)
+        Along the flight and across it, from the centre of the model.
+    error_m : array, shape (nodes, nodes)
+        Apparent depth minus true depth; a row has one y.
+    shift_m : array, shape (nodes, nodes)
+        How far in plan the apparent point lies from the true one.
+    """
+
+    pair: StereoPair
+    apparent_depth_m: float
+    refractive_index: float
+    x_m: FloatArray
+    y_m: FloatArray
+    error_m: FloatArray
+    shift_m: FloatArray
+
+    @property
+    def centre_m(self) -> float:
+        """The error in the centre of the model."""
+        middle = len(self.x_m) // 2
+        return float(self.error_m[middle, middle])
+
+    @property
+    def corner_m(self) -> float:
+        """The error in a corner; all four are alike."""
+        return float(self.error_m[0, 0])
+
+    @property
+    def mean_m(self) -> float:
+        """The mean error of the nodes."""
+        return float(self.error_m.mean())
+
+
+def effect(
+    pair: StereoPair,
+    apparent_depth_m: float,
+    refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
+    nodes: int = NODES,
+) -> Effect:
+    """Return the error of a level apparent bed over the whole model of a pair.
+
+    Raises
+    ------
+    SettingError
+        If the depth is not above 0, or the refractive index is outside its rule.
+    """
+    Settings(refractive_index=refractive_index)
+    if not (np.isfinite(apparent_depth_m) and apparent_depth_m > 0.0):
+        raise SettingError(f"apparent depth {apparent_depth_m:g} m is not above 0.")
+    along, across = pair.model_m
+    x = np.linspace(-along / 2.0, along / 2.0, nodes | 1)
+    y = np.linspace(-across / 2.0, across / 2.0, nodes | 1)
+    plan = np.stack(np.meshgrid(x, y), axis=-1)
+    apparent = np.dstack([plan, np.full(plan.shape[:2], -apparent_depth_m)])
+    true = true_points(apparent, pair.centres, refractive_index)
+    return Effect(
+        pair=pair,
+        apparent_depth_m=apparent_depth_m,
+        refractive_index=refractive_index,
+        x_m=x,
+        y_m=y,
+        error_m=apparent_depth_m + true[..., 2],
+        shift_m=np.hypot(*np.moveaxis(true[..., :2] - plan, -1, 0)),
+    )
+
+
+def true_points(apparent: FloatArray, centres: FloatArray, refractive_index: float) -> FloatArray:
+    """Return the true points of apparent ones that two images gave.
+
+    The lines of sight to the apparent point are broken at the water, z = 0; the true point is the
+    midpoint of the shortest line between the two in the water.
+
+    Parameters
+    ----------
+    apparent : array, shape (..., 3)
+        Metres, z negative.
+    centres : array, shape (2, 3)
+
+    Returns
+    -------
+    array, shape (..., 3)
+    """
+    (first, a), (second, b) = (_in_water(apparent, c, refractive_index) for c in centres)
+    gap = second - first
+    cosine, along_a, along_b = _dot(a, b), _dot(gap, a), _dot(gap, b)
+    sine2 = 1.0 - cosine**2
+    on_first = first + a * ((along_a - cosine * along_b) / sine2)[..., None]
+    on_second = second + b * ((cosine * along_a - along_b) / sine2)[..., None]
+    return np.asarray((on_first + on_second) / 2.0)
+
+
+def _in_water(apparent: FloatArray, centre: FloatArray, n: float) -> tuple[FloatArray, FloatArray]:
+    """Return where a line of sight meets the water and its unit direction below it.
+
+    At a level surface the horizontal part of the direction shrinks by n: that is Snell's law.
+    """
+    sight = apparent - centre
+    surface = centre + sight * (centre[2] / -sight[..., 2])[..., None]
+    down = sight / np.linalg.norm(sight, axis=-1, keepdims=True) / n
+    down[..., 2] = -np.sqrt(1.0 - down[..., 0] ** 2 - down[..., 1] ** 2)
+    return surface, down
+
+
+def _dot(one: FloatArray, other: FloatArray) -> FloatArray:
+    return np.asarray((one * other).sum(axis=-1))
+
+
+def effects(
+    heights_m: dict[AerialCamera, tuple[float, ...]] | None = None,
+    apparent_depths_m: tuple[float, ...] = APPARENT_DEPTHS_M,
+    *,
+    overlap: float = OVERLAP,
+    refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
+) -> list[Effect]:
+    """Return the effect of every camera, flying height and apparent depth, in this order.
+
+    Parameters
+    ----------
+    heights_m : dict, optional
+        Flying heights above the water of each camera. Default: both cameras of the paper.
+    """
+    return [
+        effect(StereoPair(camera, height, overlap), depth, refractive_index)
+        for camera, heights in (heights_m or FLYING_HEIGHTS_M).items()
+        for height in heights
+        for depth in apparent_depths_m
+    ]

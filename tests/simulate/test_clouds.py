@@ -1,0 +1,215 @@
+"""Every kind of cloud: without refraction the truth comes back, and slow twins agree."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq, least_squares, minimize_scalar
+
+import pcfix
+from pcfix.simulate.scene import ORIGIN_M
+from tests.utils.twins import bend, light_path
+
+KINDS = ("tracks", "pairs", "depth-maps")
+LENS = (-0.06, 0.02, -0.004, 0.0006, -0.0004)
+MICROMETRE = 1e-6
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"distortion": LENS, "tilt_percent": 1.0, "wave_slope_deg": 2.0, "obliques_deg": 35.0},
+        {"bed": "river", "detection": 0.6},
+        {"bed": "steps", "area_m": (4, 2), "flying_height_m": 2.0, "greatest_depth_m": 0.3},
+    ],
+)
+def test_without_refraction_and_noise_the_truth_comes_home(kind, more):
+    scene = pcfix.simulate_scene(
+        150, cloud=kind, refractive_index=1.0, image_noise_px=0.0, lidar_per_m2=0.1, **more
+    )
+    assert np.diff(scene.views.start).mean() > 3
+    assert scene.xyz == pytest.approx(scene.true_xyz, abs=MICROMETRE)
+
+
+class Twin:
+    """A scene in local coordinates, and what it takes to make its points again."""
+
+    def __init__(self, scene):
+        self.n, self.lens = scene.refractive_index, scene.cameras.lenses[0]
+        self.given, self.true = scene.cameras, scene.true_cameras
+        b, c = scene.water.b, scene.water.c
+        self.plane = (scene.water.a + b * ORIGIN_M[0] + c * ORIGIN_M[1], b, c)
+        self.truth, self.xyz = scene.true_xyz - ORIGIN_M, scene.xyz - ORIGIN_M
+
+    def centre(self, cameras, i):
+        return cameras.centres[i] - ORIGIN_M
+
+    def pixels(self, cameras, i, target):
+        x, y, z = cameras.rotations[i] @ (target - self.centre(cameras, i))
+        half = np.array([self.lens.width, self.lens.height]) / 2
+        return half + self.lens.focal * np.array([x, y]) / z
+
+    def image(self, i, point):
+        """Return where the true image i shows a point."""
+        target = point
+        if point[2] < self.plane[0] + self.plane[1] * point[0] + self.plane[2] * point[1]:
+            target = light_path(point, self.centre(self.true, i), self.plane, self.n)
+        return self.pixels(self.true, i, target)
+
+    def in_frame(self, i, point):
+        u, v = self.image(i, point)
+        return 0 <= u < self.lens.width and 0 <= v < self.lens.height
+
+    def straight(self, cameras, point, guess):
+        """Return the point with the least residuals over straight rays of the given cameras."""
+        seen = {i: self.image(i, point) for i in cameras}
+
+        def residuals(at):
+            return np.concatenate([self.pixels(self.given, i, at) - seen[i] for i in cameras])
+
+        tight = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
+        return least_squares(residuals, guess, x_scale=0.01, **tight).x
+
+
+POSES = {"position_noise_m": 0.03, "attitude_noise_deg": 0.02}
+
+
+def views_of(scene, i):
+    return scene.views.camera[scene.views.start[i] : scene.views.start[i + 1]]
+
+
+def test_tracks_agree_with_a_slow_twin():
+    scene = pcfix.simulate_scene(60, image_noise_px=0.0, tilt_percent=1.0, detection=0.7, **POSES)
+    twin = Twin(scene)
+    for i in range(0, 60, 10):
+        slow = twin.straight(views_of(scene, i), twin.truth[i], twin.xyz[i] + 0.1)
+        assert twin.xyz[i] == pytest.approx(slow, abs=1e-5)  # scipy stops at 1e-8 of a focal length
+
+
+def test_pairs_agree_with_a_slow_twin():
+    scene = pcfix.simulate_scene(60, cloud="pairs", image_noise_px=0.0, tilt_percent=1.0, **POSES)
+    twin = Twin(scene)
+    for i in (5, 33, 59):
+        pairs = scene.pairs[scene.pairs_start[i] : scene.pairs_start[i + 1]]
+        assert np.array_equal(np.unique(pairs), views_of(scene, i))
+        shown = [k for k in range(len(scene.cameras)) if twin.in_frame(k, twin.truth[i])]
+        near = {
+            (min(k, j), max(k, j)) for k in shown for j in scene.neighbours[k] if int(j) in shown
+        }
+        assert {tuple(pair) for pair in pairs.tolist()} == near
+        slow = [twin.straight(pair, twin.truth[i], twin.xyz[i] + 0.1) for pair in pairs]
+        # a pair's angle is small, so scipy's last step is larger in z
+        assert twin.xyz[i] == pytest.approx(np.median(slow, axis=0), abs=1e-4)
+
+
+def test_depth_maps_agree_with_a_slow_twin():
+    settings = {"bed": "flat", "image_noise_px": 0.0, "tilt_percent": 1.0, **POSES}
+    scene = pcfix.simulate_scene(60, cloud="depth-maps", **settings)
+    seen_first = pcfix.simulate_scene(60, **settings).true_xyz - ORIGIN_M  # the same ground
+    twin = Twin(scene)
+    bed = (twin.plane[0] - 3.0, *twin.plane[1:])
+    for i in (7, 30):
+        weight = scene.views.weight[scene.views.start[i] : scene.views.start[i + 1]].astype(float)
+        used = views_of(scene, i)
+        axes = twin.given.rotations[used, 2]
+        off = twin.xyz[i] - twin.given.centres[used] + ORIGIN_M
+        # the confidence tells the picked image; depths differ by less than 1 %
+        picked = used[np.argmax(weight * np.einsum("ij,ij->i", axes, off) ** 2)]
+        shown = [k for k in range(len(scene.cameras)) if twin.in_frame(k, seen_first[i])]
+        begun = twin.straight(shown, seen_first[i], twin.xyz[i] + 0.1)
+        place = depth_of(twin, scene, picked, begun, bed)[2]
+        found = [depth_of(twin, scene, k, place, bed) for k in used]
+        confidence = weight * np.array([depth for _, depth, _ in found]) ** 2
+        assert ((confidence > 0.2999) & (confidence < 1.0001)).all()
+        # scipy's minimum of a square is known to the root of its precision, 1e-5 m of depth
+        made = np.average([xyz for _, _, xyz in found], 0, weight)
+        assert twin.xyz[i] == pytest.approx(made, abs=1e-4)
+        seen = np.average([there for there, _, _ in found], 0, weight)
+        assert twin.truth[i] == pytest.approx(seen, abs=1e-4)
+
+
+def crossing(plane, origin, direction):
+    """Return where a ray meets z = a + b x + c y."""
+
+    def gap(s):
+        x, y, z = origin + s * direction
+        return z - plane[0] - plane[1] * x - plane[2] * y
+
+    return origin + brentq(gap, 0.0, 500.0, xtol=1e-13) * direction
+
+
+def depth_of(twin, scene, k, fused, bed):
+    """Return the bed that image k sees through a point, its depth there, and the point of that."""
+    origin = twin.centre(twin.given, k)
+    ray = fused - origin
+    ray = ray / (twin.given.rotations[k][2] @ ray)
+    true_ray = twin.true.rotations[k].T @ twin.given.rotations[k] @ ray
+    true_ray = true_ray / np.linalg.norm(true_ray)
+    surface = crossing(twin.plane, twin.centre(twin.true, k), true_ray)
+    normal = np.array([-twin.plane[1], -twin.plane[2], 1.0])
+    under = bend(true_ray, normal / np.linalg.norm(normal), twin.n)
+    place = crossing(bed, surface, under)
+    others = [j for j in scene.neighbours[k] if twin.in_frame(j, place)]
+    seen = {j: twin.image(j, place) for j in others}
+
+    def misfit(d):
+        at = origin + d * ray
+        return sum(np.sum((twin.pixels(twin.given, j, at) - seen[j]) ** 2) for j in others)
+
+    depth = minimize_scalar(misfit, bracket=(70.0, 80.0), tol=1e-12).x
+    return place, depth, origin + depth * ray
+
+
+def test_depth_maps_see_every_bed_at_about_the_same_place():
+    scene = pcfix.simulate_scene(400, cloud="depth-maps", image_noise_px=0.3, obliques_deg=25.0)
+    made = np.diff(scene.views.start) > 0
+    assert made.mean() > 0.95
+    assert scene.views.weight.min() > 0.0
+    counts = np.diff(scene.views.start)[made]
+    assert counts.min() >= 2
+    land = made & (scene.depth_m(scene.true_xyz) < -0.05)
+    assert np.abs((scene.xyz - scene.true_xyz)[land]).max() < 5 * scene.gsd_m
+    deep = made & (scene.depth_m(scene.true_xyz) > 5.0)
+    ratio = (scene.depth_m(scene.xyz) / scene.depth_m(scene.true_xyz))[deep]
+    # looked at 60 degrees from the plumb line, water seems 0.4 times as deep
+    assert 0.3 < ratio.min() < np.median(ratio) < 1 / 1.34
+
+
+def test_neighbours_look_at_about_ten_degrees():
+    scene = pcfix.simulate_scene(300, cloud="depth-maps", forward_overlap=0.9)
+    best = scene.neighbours[:, 0]
+    assert (best >= 0).all()
+    centres = scene.true_cameras.centres
+    base = np.linalg.norm(centres - centres[best], axis=1)
+    # to the middle of the depths, 85 m below the flight
+    assert 6.0 < np.degrees(2 * np.arctan(np.median(base) / 2 / 85.0)) < 14.0
+    for k, row in enumerate(scene.neighbours):
+        known = row[row >= 0]
+        assert k not in known
+        assert len(set(known)) == len(known)
+
+
+def test_pose_noise_is_as_asked():
+    scene = pcfix.simulate_scene(
+        20, block="oblique", position_noise_m=0.2, attitude_noise_deg=0.3, lidar_per_m2=0
+    )
+    k = len(scene.cameras)
+    off = scene.cameras.centres - scene.true_cameras.centres
+    turned = scene.yaw_pitch_roll_deg - scene.true_yaw_pitch_roll_deg
+    # a standard deviation of 3 k values is known to 1 / sqrt(6 k) of it; four times that
+    assert off.std() == pytest.approx(0.2, rel=4 / math.sqrt(6 * k))
+    assert turned.std() == pytest.approx(0.3, rel=4 / math.sqrt(6 * k))
+    calm = pcfix.simulate_scene(20, block="oblique", lidar_per_m2=0)
+    assert np.array_equal(calm.true_cameras.centres, scene.true_cameras.centres)
+    assert np.array_equal(calm.true_xyz, scene.true_xyz)
+    assert np.array_equal(calm.views.camera, scene.views.camera)
+
+
+def test_detection_is_as_asked_and_leaves_three():
+    every = pcfix.simulate_scene(800, lidar_per_m2=0)
+    some = pcfix.simulate_scene(800, lidar_per_m2=0, detection=0.6)
+    share = len(some.views.camera) / len(every.views.camera)
+    assert share == pytest.approx(0.6, abs=0.02)  # 10,000 draws: 0.005
+    few = pcfix.simulate_scene(800, lidar_per_m2=0, detection=0.05)
+    assert np.diff(few.views.start).min() == 3

@@ -1,0 +1,136 @@
+"""Files of a scene, read back by pcfix's own readers."""
+
+import json
+
+import laspy
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import pcfix
+from pcfix.cli import app
+from pcfix.io.scenes import colmap_vis, files_of, openmvs_ply, write_scene
+from pcfix.io.views import read_views
+from pcfix.model import Views
+
+KINDS = ("tracks", "pairs", "depth-maps")
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def written(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    scene = pcfix.simulate_scene(
+        300,
+        cloud=request.param,
+        tilt_percent=0.7,
+        distortion=(-0.05, 0.02, -0.003, 0.0006, -0.0004),
+        position_noise_m=0.02,
+        lidar_per_m2=0.2,
+    )
+    write_scene(scene, folder, overwrite=False)
+    return scene, folder
+
+
+def test_files_are_those_that_are_listed(written):
+    scene, folder = written
+    assert {path.name for path in folder.iterdir()} == set(files_of(scene))
+    facts = json.loads((folder / "scene.json").read_text())
+    assert set(facts["files"]) == set(files_of(scene))
+    assert facts["arguments"]["tilt_percent"] == 0.7
+    with pytest.raises(pcfix.SettingError, match="exists"):
+        write_scene(scene, folder, overwrite=False)
+
+
+def test_cameras_come_back(written):
+    scene, folder = written
+    for name, cameras in (("cameras", scene.cameras), ("true_cameras", scene.true_cameras)):
+        read = pcfix.read_cameras(folder / f"{name}.csv")
+        assert read.labels == cameras.labels
+        assert read.centres == pytest.approx(cameras.centres, abs=0.6e-4)  # four decimals
+        assert read.rotations == pytest.approx(cameras.rotations, abs=1e-7)  # 1e-6 degrees
+        assert read.lenses[0].radial == cameras.lenses[0].radial
+        assert read.lenses[0].tangential == cameras.lenses[0].tangential
+        assert read.lenses[0].focal == cameras.lenses[0].focal
+
+
+def test_view_list_comes_back(written):
+    scene, folder = written
+    name = "fused.ply.vis" if scene.views.weight is None else "dense.ply"
+    raw = read_views(folder / name, pcfix.read_cameras(folder / "cameras.csv")).raw
+    assert np.array_equal(raw.start, scene.views.start)
+    assert np.array_equal(raw.image, scene.views.camera)
+    if scene.views.weight is not None:
+        assert np.array_equal(raw.weight, scene.views.weight)
+        assert np.array_equal(raw.xyz, scene.xyz)
+
+
+def test_clouds_come_back_in_the_world_frame(written):
+    scene, folder = written
+    for name, xyz in (("cloud", scene.xyz), ("truth", scene.true_xyz), ("lidar", scene.lidar_xyz)):
+        read = laspy.read(folder / f"{name}.laz")
+        assert np.abs(read.xyz - xyz).max() < 0.00051  # steps of a millimetre
+    assert np.array_equal(read.classification == 40, scene.depth_m(scene.lidar_xyz) > 0.0)
+
+
+def test_water_of_the_facts_is_what_the_reader_takes(written):
+    scene, folder = written
+    facts = json.loads((folder / "scene.json").read_text())
+    assert pcfix.read_water(facts["water"]) == scene.water
+
+
+def test_pairs_and_neighbours_come_back(written):
+    scene, folder = written
+    if scene.neighbours is not None:
+        rows = (folder / "neighbours.csv").read_text().splitlines()
+        assert len(rows) == len(scene.cameras) + 1
+        best = scene.cameras.labels[scene.neighbours[0, 0]]
+        assert rows[1].split(",")[:2] == [scene.cameras.labels[0], best]
+    if scene.pairs is not None:
+        arrays = np.load(folder / "pairs.npz")
+        assert np.array_equal(arrays["pairs"], scene.pairs)
+        assert np.array_equal(arrays["start"], scene.pairs_start)
+
+
+@pytest.mark.parametrize("longest", [3, 300])
+def test_lists_of_any_length_and_none(tmp_path, longest):
+    counts = np.array([0, longest, 2, 0])
+    camera = np.concatenate([np.arange(longest), [4, 1]])
+    weight = np.linspace(0.1, 1, longest + 2).astype(np.float32)
+    views = Views(np.concatenate([[0], np.cumsum(counts)]), camera, weight)
+    xyz = np.arange(12.0).reshape(4, 3) + 0.123456789
+    cameras = pcfix.Cameras(tuple(map(str, range(300))), np.zeros((300, 3)))
+    (tmp_path / "dense.ply").write_bytes(openmvs_ply(xyz, views))
+    (tmp_path / "other.vis").write_bytes(colmap_vis(views))
+    for name in ("dense.ply", "other.vis"):
+        raw = read_views(tmp_path / name, cameras).raw
+        assert np.array_equal(raw.start, views.start)
+        assert np.array_equal(raw.image, camera)
+
+
+def test_a_flume_keeps_a_tenth_of_a_millimetre(tmp_path):
+    scene = pcfix.simulate_scene(
+        100, bed="steps", area_m=(4, 2), flying_height_m=2.0, greatest_depth_m=0.3, lidar_per_m2=9
+    )
+    write_scene(scene, tmp_path, overwrite=False)
+    assert np.abs(laspy.read(tmp_path / "cloud.laz").xyz - scene.xyz).max() < 0.000051
+
+
+def test_the_command_says_what_python_says(tmp_path):
+    words = "--points 150 --obliques-deg 35 --area-m 60 40 --bed river --cloud pairs"
+    words += " --wave-slope-deg 1.5 --distortion -0.03 0 0 0 0 --lidar-per-m2 0.5 --quiet"
+    done = CliRunner().invoke(app, ["simulate", str(tmp_path), *words.split()])
+    assert done.exit_code == 0, done.output
+    facts = json.loads((tmp_path / "scene.json").read_text())
+    scene = pcfix.simulate_scene(
+        150,
+        obliques_deg=35.0,
+        area_m=(60, 40),
+        bed="river",
+        cloud="pairs",
+        wave_slope_deg=1.5,
+        distortion=(-0.03, 0, 0, 0, 0),
+        lidar_per_m2=0.5,
+    )
+    assert facts["arguments"] == scene.settings
+    cloud = laspy.read(tmp_path / "cloud.laz")
+    assert np.abs(cloud.xyz - scene.xyz).max() < 0.00051

@@ -1,0 +1,42 @@
+"""The simulated lens against Brown's formula, term by term."""
+
+import numpy as np
+import pytest
+
+import pcfix
+from pcfix.simulate.optics import make_optics
+from tests.utils.twins import image_slowly
+
+CAMERA = (8.8, (13.2, 8.8), (5472, 3648))
+REAL = (-0.08, 0.03, -0.006, 0.0007, -0.0005)
+
+
+def test_distortion_is_brown_s_and_comes_back():
+    optics = make_optics(*CAMERA, REAL)
+    rng = np.random.default_rng(0)
+    ideal = rng.uniform(0, 1, (200, 2)) * [5472, 3648]
+    image = optics.to_image(ideal)
+    for i in range(200):
+        plane = (ideal[i] - [2736, 1824]) / optics.lens.focal
+        slow = image_slowly(optics.lens, np.array([*plane, 1.0]))
+        assert image[i] == pytest.approx(slow, abs=1e-8)  # pixels
+    assert np.abs(image - ideal).max() > 20.0
+    assert optics.to_ideal(image) == pytest.approx(ideal, abs=1e-8)
+
+
+def test_the_frame_is_filled_once():
+    optics = make_optics(*CAMERA, REAL)
+    corner = optics.to_ideal(np.array([[0.0, 0.0], [5472.0, 3648.0]]))
+    assert optics.frames(corner, np.array([[0.0, 0.0], [5471.0, 3647.0]])).all()
+    far = np.array([[2736.0 + 9 * 3648.0, 1824.0]])  # nine focal lengths aside
+    assert not optics.frames(far, np.array([[100.0, 100.0]])).any()
+
+
+def test_a_lens_that_folds_is_refused():
+    with pytest.raises(pcfix.SettingError, match="folds"):
+        make_optics(*CAMERA, (-0.9, 0.0, 0.0, 0.0, 0.0))
+
+
+def test_without_distortion_nothing_is_done():
+    optics, ideal = make_optics(*CAMERA), np.array([[1.0, 2.0]])
+    assert optics.to_image(ideal) is ideal

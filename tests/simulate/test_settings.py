@@ -1,0 +1,133 @@
+"""What a scene can be asked for: blocks, grounds, water, and what is refused."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import pcfix
+from pcfix.cli.simulate import SceneWords
+from pcfix.simulate.settings import SceneSettings
+from pcfix.simulate.terrain import STEPS
+
+FEW = {"points": 200, "lidar_per_m2": 0.2}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"flying_height_m": 0.1}, "flying height 0.1 m is outside"),
+        ({"flying_height_m": float("nan")}, "flying height nan"),
+        ({"flying_height_m": 5.0}, "half the greatest depth"),
+        ({"focal_mm": 0.0}, "focal length"),
+        ({"sensor_mm": (13.2, 4.4)}, "square"),
+        ({"sensor_px": (0, 3)}, "positive"),
+        ({"area_m": (10.0,)}, "2 finite numbers"),
+        ({"distortion": (0.1, 0.2)}, "5 finite numbers"),
+        ({"distortion": (-0.9, 0, 0, 0, 0)}, "folds"),
+        ({"forward_overlap": 1.2}, "forward overlap 1.2 is outside 0.3 to 0.95"),
+        ({"obliques_deg": 80.0}, "obliques 80 deg"),
+        ({"oblique_share": 0.5}, "needs obliques"),
+        ({"position_noise_m": -0.1}, "position noise -0.1 m is negative"),
+        ({"wave_slope_deg": 30.0}, "wave slope"),
+        ({"tilt_percent": 19.0, "area_m": (500, 80)}, "tilt 19 %"),
+        ({"bed": "lake"}, "bed 'lake'"),
+        ({"cloud": "mesh"}, "cloud 'mesh'"),
+        ({"neighbours": 5}, "neighbours belong"),
+        ({"detection": 0.0}, "detection"),
+        ({"seed": -1}, "seed -1"),
+    ],
+)
+def test_bad_settings_are_refused(arguments, words):
+    with pytest.raises(pcfix.SettingError, match=words):
+        pcfix.simulate_scene(**arguments)
+
+
+def test_an_unknown_setting_is_python_s_own_error():
+    with pytest.raises(TypeError, match="wavelength"):
+        pcfix.simulate_scene(10, wavelength=3)
+
+
+def test_the_command_line_has_the_same_defaults():
+    ours = SceneSettings()
+    for field in dataclasses.fields(SceneWords):
+        assert getattr(SceneWords(), field.name) == getattr(ours, field.name)
+
+
+def test_settings_make_the_same_scene_again_after_json():
+    scene = pcfix.simulate_scene(cloud="pairs", distortion=(-0.02, 0, 0, 0, 0), **FEW)
+    again = pcfix.simulate_scene(**json.loads(json.dumps(scene.settings)))
+    assert np.array_equal(scene.xyz, again.xyz)
+
+
+@pytest.mark.parametrize("height", [30.0, 200.0])
+def test_gsd_and_block_follow_height_and_lens(height):
+    scene = pcfix.simulate_scene(flying_height_m=height, focal_mm=10.0, **FEW)
+    assert scene.gsd_m == pytest.approx(height * 13.2e-3 / 5472 / 10e-3)
+    above = scene.cameras.centres[:, 2] - scene.water_level_m
+    assert above == pytest.approx(height, abs=2.5)
+    x = np.unique(np.round(scene.cameras.centres[:, 0]))
+    assert scene.sensor_mm == (10.0, 13.2, 8.8)
+    assert len(x) > 2
+
+
+def looks_down_deg(scene):
+    return np.degrees(np.arccos(-scene.true_cameras.rotations[:, 2, 2]))
+
+
+def test_obliques_have_the_angle_and_the_share_asked_for():
+    scene = pcfix.simulate_scene(obliques_deg=35.0, oblique_share=0.5, area_m=(400, 300), **FEW)
+    off = looks_down_deg(scene)
+    slanted = off > 15.0
+    assert off[slanted].mean() == pytest.approx(35.0, abs=1.0)  # attitudes vary by 1.5 deg
+    # rings reach as far beyond the area as nadir images, with steps of their own
+    assert slanted.mean() == pytest.approx(0.5, abs=0.1)
+    every = pcfix.simulate_scene(obliques_deg=35.0, oblique_share=1.0, oblique_directions=2, **FEW)
+    assert (looks_down_deg(every) > 25.0).all()
+
+
+def test_tilted_water_falls_where_it_should_and_everything_follows():
+    scene = pcfix.simulate_scene(tilt_percent=2.0, tilt_heading_deg=180.0, bed="flat", **FEW)
+    water = scene.water
+    assert (water.b, water.c) == pytest.approx((0.0, 0.02), abs=1e-15)  # falls to the south
+    for xyz, noise in ((scene.true_xyz, 1e-8), (scene.lidar_xyz, 0.3)):
+        assert scene.depth_m(xyz) == pytest.approx(3.0, abs=noise)
+    middle = scene.true_xyz.mean(axis=0)
+    middle[:2] = [410_260.0, 4_650_340.0]
+    level = water.a + water.b * middle[0] + water.c * middle[1]
+    assert level == pytest.approx(0.37, abs=1e-8)
+
+
+def test_beds_have_their_shapes():
+    def depths(bed, **more):
+        scene = pcfix.simulate_scene(3000, bed=bed, lidar_per_m2=0, **more)
+        return scene, scene.depth_m(scene.true_xyz), scene.true_xyz[:, 0] - 410_200.0
+
+    assert np.ptp(depths("flat", greatest_depth_m=4.0)[1]) < 1e-8
+    _, depth, x = depths("slope")
+    assert depth == pytest.approx(6.0 * x / 120.0, abs=1e-8)
+    _, depth, _ = depths("steps", greatest_depth_m=0.3, flying_height_m=2.0, area_m=(4, 2))
+    assert np.unique(np.round(depth, 6)) == pytest.approx(0.3 * np.arange(1, STEPS + 1) / STEPS)
+    river, depth, _ = depths("river")
+    assert 0.02 < (depth < 0).mean() < 0.6
+    assert 2.0 < depth.max() <= 2.5 + 1e-9
+    assert np.hypot(river.water.b, river.water.c) == pytest.approx(0.003)
+    _, depth, _ = depths("shore", greatest_depth_m=5.0)
+    assert depth.min() < -0.5
+    assert 4.5 < depth.max() <= 5.0 + 1e-9
+
+
+def test_lidar_has_the_density_and_the_noise_asked_for():
+    scene = pcfix.simulate_scene(20, bed="flat", lidar_per_m2=1.0, lidar_noise_m=0.2)
+    assert len(scene.lidar_xyz) == 9600
+    assert scene.depth_m(scene.lidar_xyz).std() == pytest.approx(0.2, rel=0.03)
+
+
+def test_waves_and_tilt_are_corrected_on_average():
+    scene = pcfix.simulate_scene(400, tilt_percent=0.5, wave_slope_deg=1.0, lidar_per_m2=0)
+    ours = pcfix.correct_points(scene.xyz, scene.cameras, scene.water, views=scene.views)
+    deep = scene.depth_m(scene.true_xyz) > 2.0
+    error = (ours.xyz - scene.true_xyz)[deep]
+    # a slope of 1 degree turns a ray by 0.34 degrees under water: 6 cm at 10 m, a dozen rays each
+    assert np.abs(error.mean(axis=0)).max() < 0.05
