@@ -32,7 +32,7 @@ if TYPE_CHECKING:
         WaterSurface,
     )
     from pcfix.refract.index import refractive_index
-    from pcfix.settings import Settings
+    from pcfix.settings import ErrorBudget, Settings
     from pcfix.simulate import simulate_scene
 
 __version__ = "0.1.0"
@@ -46,6 +46,7 @@ _HOME = {
     "restore_file": "pcfix.flow.restore",
     "label_file": "pcfix.flow.label",
     "label_points": "pcfix.flow.label",
+    "ErrorBudget": "pcfix.settings",
     "LabelSettings": "pcfix.settings",
     "WaterRaster": "pcfix.model",
     "read_cameras": "pcfix.io.cameras",
@@ -73,6 +74,7 @@ _HOME = {
 __all__ = [
     "Cameras",
     "Correction",
+    "ErrorBudget",
     "GeometryError",
     "InputError",
     "LabelSettings",

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from pcfix.flow.job import Points
     from pcfix.flow.surfaces import CloudView
     from pcfix.model import FloatArray, Summary, WaterSurface
-    from pcfix.settings import LabelSettings, Settings
+    from pcfix.settings import ErrorBudget, LabelSettings, Settings
 
     Stage: TypeAlias = Callable[[Dimensions, Dimensions], bool]
 
@@ -76,6 +76,20 @@ _CORRECT_OPTIONS: dict[str, tuple[type, ...]] = {
     "water_crs": (str,),
     "max_angle": (float,),
     "max_cameras": (int,),
+    "method": (str,),
+    "camera_set": (str,),
+    "views_are": (str,),
+    "occlusion": (str,),
+    "depth_factor": (float,),
+    "check_depths": (str,),
+    "least_r2": (float,),
+    "sigma_image": (float,),
+    "sigma_level": (float,),
+    "sigma_tilt": (float,),
+    "sigma_index": (float,),
+    "sigma_waves": (float,),
+    "sigma_centre": (float,),
+    "sigma_attitude": (float,),
     "uncorrected": (str,),
     "dimensions": (str,),
     "summary": (str,),
@@ -298,7 +312,28 @@ def _settings(options: dict[str, Any]) -> Settings:
         options.get("uncorrected", "withhold"),
         options.get("dimensions", "all"),
         origin,
+        errors=_errors(options),
+        **{name: options[name] for name in _METHOD_OPTIONS if name in options},
     )
+
+
+_METHOD_OPTIONS = ("method", "camera_set", "occlusion", "depth_factor", "least_r2")
+_SIGMAS = {
+    "sigma_image": "image_px",
+    "sigma_level": "level_m",
+    "sigma_tilt": "tilt_deg",
+    "sigma_index": "index",
+    "sigma_waves": "waves_deg",
+    "sigma_centre": "centre_m",
+    "sigma_attitude": "attitude_deg",
+}
+
+
+def _errors(options: dict[str, Any]) -> ErrorBudget:
+    from pcfix.settings import ErrorBudget
+
+    given = {name: options[word] for word, name in _SIGMAS.items() if word in options}
+    return ErrorBudget(**given)
 
 
 def _inputs(options: dict[str, Any]) -> Inputs:

@@ -81,7 +81,8 @@ def pipeline(
     keywords = {"cameras": cameras, "water": water, **words.keywords()}
     settings = pcfix.Settings(
         index_of(words.refractive_index())[0], words.max_angle, words.max_cameras,
-        uncorrected.value, dimensions.value,
+        uncorrected.value, dimensions.value, "", words.method.value, words.camera_set.value,
+        words.occlusion.value, words.depth_factor, words.least_r2, words.errors(),
     )  # fmt: skip
     options = {
         "cameras": str(cameras),

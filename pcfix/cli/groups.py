@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
-from pcfix.cli.words import AngleWords, WaterModels
-from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, LabelSettings
+from pcfix.cli.words import AngleWords, CameraSets, Methods, OnOff, ViewKinds, WaterModels
+from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, LEVEL_M, ErrorBudget, LabelSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -221,6 +221,73 @@ class CorrectionWords(LabelWords, CameraWords):
     max_cameras: Annotated[
         int | None, typer.Option(help="Use so many rays a point, the steepest.")
     ] = None
+    method: Annotated[
+        Methods, typer.Option(help="How the true point follows from the apparent one.")
+    ] = Methods.snell
+    camera_set: Annotated[
+        CameraSets,
+        typer.Option(
+            help="Without --views: every camera whose frame holds the point, or a model of dense"
+            " matching.",
+        ),
+    ] = CameraSets.all
+    views_are: Annotated[
+        ViewKinds,
+        typer.Option(
+            help="Whether --views lists the images whose rays were intersected, or whose depth"
+            " maps were averaged.",
+        ),
+    ] = ViewKinds.auto
+    occlusion: Annotated[
+        OnOff,
+        typer.Option(
+            help="Leave out cameras to which the cloud itself hides the point; auto: where there"
+            " are obliques.",
+        ),
+    ] = OnOff.auto
+    depth_factor: Annotated[
+        float | None,
+        typer.Option(help="With --method factor.", show_default="the refractive index"),
+    ] = None
+    check_depths: Annotated[
+        Path | None,
+        typer.Option(help="With --method regression: CSV x,y,depth of measured depths, m."),
+    ] = None
+    least_r2: Annotated[
+        float,
+        typer.Option("--least-r2", help="A regression with a lower r2 is refused."),
+    ] = 0.5
+    sigma_image: Annotated[
+        float, typer.Option(help="Standard deviation of an image coordinate, px.")
+    ] = ErrorBudget().image_px
+    sigma_level: Annotated[
+        float | None,
+        typer.Option(
+            help="Of the water level, m.", show_default=f"what its fit says, else {LEVEL_M:g}"
+        ),
+    ] = None
+    sigma_tilt: Annotated[
+        float, typer.Option(help="Of the slope of the water surface, degrees.")
+    ] = ErrorBudget().tilt_deg
+    sigma_index: Annotated[float, typer.Option(help="Of the refractive index.")] = (
+        ErrorBudget().index
+    )
+    sigma_waves: Annotated[float, typer.Option(help="Of the slope of the waves, degrees.")] = (
+        ErrorBudget().waves_deg
+    )
+    sigma_centre: Annotated[float, typer.Option(help="Of a projection centre, m.")] = (
+        ErrorBudget().centre_m
+    )
+    sigma_attitude: Annotated[float, typer.Option(help="Of the attitude of an image, degrees.")] = (
+        ErrorBudget().attitude_deg
+    )
+
+    def errors(self) -> ErrorBudget:
+        """Return the standard deviations."""
+        return ErrorBudget(
+            self.sigma_image, self.sigma_level, self.sigma_tilt, self.sigma_index,
+            self.sigma_waves, self.sigma_centre, self.sigma_attitude,
+        )  # fmt: skip
 
     def refractive_index(self) -> float | str:
         """Return what `pcfix.correct_file` takes for it."""
@@ -244,4 +311,12 @@ class CorrectionWords(LabelWords, CameraWords):
             "refractive_index": self.refractive_index(),
             "max_angle_deg": self.max_angle,
             "max_cameras": self.max_cameras,
+            "method": self.method.value,
+            "camera_set": self.camera_set.value,
+            "views_are": self.views_are.value,
+            "occlusion": self.occlusion.value,
+            "depth_factor": self.depth_factor,
+            "check_depths": self.check_depths,
+            "least_r2": self.least_r2,
+            "errors": self.errors(),
         }

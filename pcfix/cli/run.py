@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,6 +16,7 @@ from pcfix.cli.words import (
     WithM3c2,
     progress_bar,
 )
+from pcfix.settings import ErrorBudget
 
 Input = Annotated[
     Path | None, typer.Argument(metavar="INPUT", help="LAS or LAZ cloud.", show_default=False)
@@ -85,5 +87,7 @@ def run(
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as the record of a run keeps it: paths as text."""
+    """Return a value as the record of a run keeps it: paths as text, a budget by its names."""
+    if isinstance(value, ErrorBudget):
+        return asdict(value)
     return str(value) if isinstance(value, Path) else value

@@ -49,6 +49,42 @@ class Dimensions(str, Enum):  # noqa: UP042
     none = "none"
 
 
+class Methods(str, Enum):  # noqa: UP042
+    """How the true point follows from the apparent one."""
+
+    snell = "snell"
+    consistent = "consistent"
+    shan = "shan"
+    butler = "butler"
+    murase = "murase"
+    dietrich = "dietrich"
+    factor = "factor"
+    regression = "regression"
+
+
+class CameraSets(str, Enum):  # noqa: UP042
+    """Which cameras made a point, where no list says it."""
+
+    mvs = "mvs"
+    all = "all"
+
+
+class ViewKinds(str, Enum):  # noqa: UP042
+    """What a view list lists."""
+
+    auto = "auto"
+    tracks = "tracks"
+    depth_maps = "depth-maps"
+
+
+class OnOff(str, Enum):  # noqa: UP042
+    """Whether something is done."""
+
+    auto = "auto"
+    on = "on"
+    off = "off"
+
+
 Input = Annotated[
     Path, typer.Argument(metavar="INPUT", help="LAS or LAZ cloud.", show_default=False)
 ]

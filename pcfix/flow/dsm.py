@@ -19,7 +19,7 @@ import numpy as np
 
 import pcfix
 from pcfix.flow.sorted_points import BLOCK_CELLS, SortedPoints, inside
-from pcfix.grid.cells import cell_numbers
+from pcfix.grid.cells import cell_numbers, cell_uncertainty
 from pcfix.grid.delaunay import triangulated
 from pcfix.grid.holes import fill_holes, margin_cells
 from pcfix.grid.inverse import inverse_distance
@@ -60,7 +60,9 @@ TIN_REACH_CELLS = 3.0
 """Circles around triangles may be as wide as the larger of the two, or as --fill."""
 
 BANDS = {"height": "metre", "count": "", "spread": "metre"}
-HEIGHT, COUNT, SPREAD = 1, 2, 3
+HEIGHT, COUNT, SPREAD, UNCERTAINTY = 1, 2, 3, 4
+WITH_SIGMA = {**BANDS, "uncertainty": "metre"}
+"""Of clouds that have standard errors of Z."""
 
 
 def grid_dsm(
@@ -85,6 +87,10 @@ def grid_dsm(
     (population standard deviation of their heights, m). A cell without a height holds -9999, the
     nodata value, and count 0. A cell with a height and count 0 has no points of its own: its
     height was interpolated, and its spread is nodata.
+
+    A cloud with the dimension ``SigmaZ``, as `pcfix.correct_file` writes it, gives a fourth band,
+    uncertainty: the standard uncertainty of the height (m), the root mean square of the ``SigmaZ``
+    of the cell's corrected points; see `pcfix.grid.cells.cell_uncertainty`. Nodata without any.
 
     Parameters
     ----------
@@ -164,6 +170,23 @@ class _Tally:
     cells: int = 0
     filled: int = 0
     known: int = 0
+    with_sigma: int = 0
+    sigma_sum_m: float = 0.0
+    sigma_max_m: float = 0.0
+
+    def add(self, uncertainty_m: FloatArray) -> None:
+        """Add the uncertainties of some cells, NaN where there are none."""
+        sigma = uncertainty_m[~np.isnan(uncertainty_m)]
+        self.with_sigma += sigma.size
+        self.sigma_sum_m += float(sigma.sum())
+        self.sigma_max_m = max(self.sigma_max_m, float(sigma.max(initial=0.0)))
+
+    def uncertainty_m(self) -> dict[str, float] | None:
+        """Return mean and largest; None where no cell has one."""
+        if not self.with_sigma:
+            return None
+        mean = self.sigma_sum_m / self.with_sigma
+        return {"mean": round(mean, 4), "max": round(self.sigma_max_m, 4)}
 
 
 @dataclass
@@ -183,7 +206,8 @@ class _Run:
         self.near, self.lattice = self.sorted.near, self.sorted.lattice
         plain = folder / "dsm.tif" if cog else draft
         tags = {"PCFIX": json.dumps({"pcfix": pcfix.__version__, **asdict(self.settings)})}
-        with new_raster(plain, self.lattice, self.crs, BANDS, tags=tags) as dsm:
+        bands = WITH_SIGMA if self.sorted.has_sigma else BANDS
+        with new_raster(plain, self.lattice, self.crs, bands, tags=tags) as dsm:
             if self.settings.fill_m is None or self.settings.method == "tin":
                 self.grid(dsm, dsm)
             else:
@@ -193,14 +217,17 @@ class _Run:
         _finish(plain, draft, cog=cog)
 
     def grid(self, heights: DatasetWriter, dsm: DatasetWriter) -> None:
-        """Write heights to one raster, count and spread to another (or the same)."""
+        """Write heights to one raster, the other bands to another (or the same)."""
         done, lattice = 0, self.lattice
         limit = TIN_BLOCK_POINTS if self.settings.method == "tin" else BLOCK_POINTS
         for window in self.sorted.windows(limit):
-            height, count, spread = self.block(window)
+            height, count, spread, uncertainty = self.block(window)
             write_part(heights, height, window, HEIGHT)
             write_part(dsm, count, window, COUNT)
             write_part(dsm, spread, window, SPREAD)
+            if uncertainty is not None:
+                write_part(dsm, uncertainty, window, UNCERTAINTY)
+                self.tally.add(uncertainty)
             known = ~np.isnan(height)
             self.tally.cells += int((count > 0).sum())
             self.tally.filled += int((known & (count == 0)).sum())
@@ -208,8 +235,8 @@ class _Run:
             done += window.height * window.width
             self.report(0.5 + 0.5 * done / (lattice.height * lattice.width))
 
-    def block(self, window: Window) -> tuple[FloatArray, IntArray, FloatArray]:
-        """Return height, count and spread of a window."""
+    def block(self, window: Window) -> tuple[FloatArray, IntArray, FloatArray, FloatArray | None]:
+        """Return height, count, spread and, where it is known, uncertainty of a window."""
         method, size = self.settings.method, self.settings.resolution_m
         margin = {"idw": 1, "tin": int(np.ceil(self.reach_m / size)) + 1}.get(method, 0)
         xyz, cell = self.sorted.points_in(window.grown(margin))
@@ -224,7 +251,10 @@ class _Run:
             height = triangulated(position, z, window, self.reach_m / size, spacing / size)
         else:
             height = getattr(numbers, method).reshape(shape)
-        return height, numbers.points.reshape(shape), numbers.spread.reshape(shape)
+        uncertainty = None
+        if self.sorted.has_sigma:
+            uncertainty = cell_uncertainty(code, xyz[inner, 3], numbers.points.size).reshape(shape)
+        return height, numbers.points.reshape(shape), numbers.spread.reshape(shape), uncertainty
 
     @property
     def reach_m(self) -> float:
@@ -299,6 +329,7 @@ class _Run:
             hole_m=self.reach_m if settings.method == "tin" else settings.fill_m,
             settings=asdict(settings),
             seconds=round(seconds, 3),
+            uncertainty_m=tally.uncertainty_m(),
         )
 
 

@@ -32,6 +32,7 @@ from pcfix.refract.threads import threads
 from pcfix.settings import (
     DEFAULT_REFRACTIVE_INDEX,
     Dimensions,
+    ErrorBudget,
     LabelSettings,
     Settings,
     Uncorrected,
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     from pcfix.io.cameras.formats import Angles
     from pcfix.io.las.columns import Column
     from pcfix.model import FloatArray
+    from pcfix.settings import CameraSet, Method, Occlusion, ViewsAre
 
     AnyPath = str | PathLike[str]
 
@@ -76,6 +78,14 @@ def correct_file(
     refractive_index: float | str = DEFAULT_REFRACTIVE_INDEX,
     max_angle_deg: float | None = None,
     max_cameras: int | None = None,
+    method: Method = "snell",
+    camera_set: CameraSet = "all",
+    views_are: ViewsAre = "auto",
+    occlusion: Occlusion = "auto",
+    depth_factor: float | None = None,
+    check_depths: AnyPath | None = None,
+    least_r2: float = 0.5,
+    errors: ErrorBudget | None = None,
     uncorrected: Uncorrected = "withhold",
     dimensions: Dimensions = "all",
     summary: AnyPath | None = None,
@@ -117,8 +127,14 @@ def correct_file(
     refractive_index : float or str
         A number, or the water: ``fresh``, ``sea``, or salinity, temperature and wavelength as
         ``35,15,0.53`` (PSU, degrees Celsius, micrometres); see `pcfix.refractive_index`.
-    max_angle_deg, max_cameras
+    max_angle_deg, max_cameras, method, camera_set, occlusion, depth_factor, errors
         See `correct_points`.
+    views_are : {"auto", "tracks", "depth-maps"}
+        What the views are; see `pcfix.Views`. auto: what their kind of file says.
+    check_depths : path, optional
+        With the method regression: measured depths; see `pcfix.io.check_depths`.
+    least_r2 : float
+        A regression with a lower coefficient of determination is refused.
     uncorrected : {"withhold", "keep", "drop"}
         What becomes of a submerged point with fewer than two usable rays: unmoved with its
         withheld flag set, unmoved, or left out.
@@ -144,14 +160,17 @@ def correct_file(
     """
     started = time.perf_counter()
     index, index_from = index_of(refractive_index)
-    settings = Settings(index, max_angle_deg, max_cameras, uncorrected, dimensions, index_from)
+    settings = Settings(
+        index, max_angle_deg, max_cameras, uncorrected, dimensions, index_from, method, camera_set,
+        occlusion, depth_factor, least_r2, errors or ErrorBudget(),
+    )  # fmt: skip
     label = LabelSettings(
         connected=connected, least_pool_m2=least_pool_m2, respect_classes=respect_classes
     )
     source = check_input(input)
     inputs = Inputs(
         cameras, water, sensor, angles, cameras_crs, cameras_offset_m, views, water_mask,
-        tide, image_times, water_model, water_crs,
+        tide, image_times, water_model, water_crs, views_are, check_depths,
     )  # fmt: skip
     given = [input, *inputs.paths()]
     target = check_output(output, overwrite=overwrite, inputs=given)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning, SettingError
+from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.surfaces import WaterWords, find_surface
 from pcfix.io.cameras import read_cameras, read_tie_points
 from pcfix.io.cameras.georeference import georeference
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from pcfix.io.cameras.formats import Angles
     from pcfix.io.views import ViewList
     from pcfix.label.mask import WaterMask
-    from pcfix.model import FloatArray, WaterSurface
+    from pcfix.model import FloatArray, TiePoints, WaterSurface
+    from pcfix.settings import ViewsAre
 
     AnyPath = str | PathLike[str]
 
@@ -47,6 +48,10 @@ class Inputs:
         Added to the projection centres, in the axes of the camera file.
     views : path or None
         See `pcfix.io.views.read_views`; the camera file itself for the tracks of its tie points.
+    views_are : {"auto", "tracks", "depth-maps"}
+        What the list means; see `pcfix.model.Views`. auto: what its kind of file says.
+    check_depths : path or None
+        See `pcfix.io.check_depths.read_check_depths`.
     water_mask : path or None
         See `pcfix.io.shorelines.read_water_polygons`.
     tide : path or None
@@ -68,13 +73,15 @@ class Inputs:
     image_times: AnyPath | None = None
     water_model: WaterModel = "auto"
     water_crs: str | None = None
+    views_are: ViewsAre = "auto"
+    check_depths: AnyPath | None = None
 
     def paths(self) -> list[AnyPath]:
         """Return what may be files, which no output may replace."""
         mask = None if self.water_mask is None else file_of(self.water_mask)
         water = file_of(self.water) if isinstance(self.water, str | PathLike) else None
         given = (self.cameras, water, self.sensor, self.views, mask)
-        moving = (self.tide, self.image_times)
+        moving = (self.tide, self.image_times, self.check_depths)
         return [one for one in (*given, *moving) if isinstance(one, str | PathLike)]
 
     def surface(self, view: CloudView | None = None) -> FoundSurface:
@@ -132,7 +139,7 @@ class Inputs:
         if isinstance(self.cameras, Cameras):
             if self.views is None:
                 return self.cameras, None
-            return self.cameras, read_views(self.views, self.cameras)
+            return self.cameras, self._of_kind(read_views(self.views, self.cameras))
         read = self.read() if read is None else read
         way = georeference(
             read, cloud_crs, cameras_crs=self.cameras_crs, offset_m=self.cameras_offset_m,
@@ -145,8 +152,30 @@ class Inputs:
             return cameras, None
         if Path(self.views) == Path(self.cameras):
             ties = read_tie_points(self.cameras, read)
-            return cameras, track_views(Path(self.views), ties, cameras, to_cloud=way.points)
-        return cameras, read_views(self.views, cameras, to_cloud=way.points)
+            tracks = track_views(Path(self.views), ties, cameras, to_cloud=way.points)
+            return cameras, self._of_kind(tracks)
+        return cameras, self._of_kind(read_views(self.views, cameras, to_cloud=way.points))
+
+    def _of_kind(self, views: ViewList) -> ViewList:
+        """Return a view list as what the user says that it is."""
+        return views if self.views_are == "auto" else replace(views, kind=self.views_are)
+
+    def tie_points(self, cloud_crs: str | CRS | None) -> TiePoints | None:
+        """Return the tie points of the camera file in the cloud's CRS, where it has any."""
+        if isinstance(self.cameras, Cameras):
+            return None
+        read = self.read()
+        try:
+            ties = read_tie_points(self.cameras, read)
+        except InputError:
+            return None
+        if not np.isfinite(ties.xyz).all(axis=1).any():
+            return None
+        way = georeference(
+            read, cloud_crs, cameras_crs=self.cameras_crs, offset_m=self.cameras_offset_m,
+            name=str(self.cameras),
+        )  # fmt: skip
+        return replace(ties, xyz=np.ascontiguousarray(way.points(ties.xyz)))
 
 
 def mask_of(

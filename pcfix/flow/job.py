@@ -12,6 +12,7 @@ import numpy as np
 import pcfix
 from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.flow.inputs import mask_of
+from pcfix.flow.learning import Learning
 from pcfix.flow.points import (
     check_above_water,
     correct_checked,
@@ -22,6 +23,7 @@ from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.label.labelling import Labelling, Part
 from pcfix.label.surface import surface_above
 from pcfix.model import Correction, Outcome, Summary, WaterDimension, WaterPlane
+from pcfix.refract.learned import Learned
 from pcfix.report.tally import Tally
 from pcfix.settings import LabelSettings, Settings
 
@@ -84,6 +86,9 @@ class Job:
         self._low, self._high = view.low, view.high
         mask = mask_of(inputs.water_mask, view.crs, view.low, view.high)
         self.labelling = Labelling(label, mask)
+        kind = None if self._list is None else self._list.kind
+        self._learning = Learning(settings, inputs, self.cameras, self.water, view, kind)
+        self.learned = Learned()
         self.restart()
 
     def restart(self) -> None:
@@ -100,11 +105,12 @@ class Job:
             )
 
     def look_around(self, chunks: Callable[[], Iterable[Points]]) -> None:
-        """Learn the surroundings of the points where the labelling needs them."""
+        """Learn what must be known of the whole cloud, before the first chunk is corrected."""
         if self.labelling.looks_around:
             self.labelling.look_around(
                 lambda: parts_of(chunks(), self.water), self._low, self._high
             )
+        self.learned = self._learning.of_cloud(chunks)
 
     def correct(
         self, xyz: FloatArray, heights: FloatArray | None, classes: npt.NDArray[np.uint8]
@@ -124,7 +130,7 @@ class Job:
         label = partial(self.labelling.submerged, classes=classes)
         correction = correct_checked(
             xyz, self.cameras, self.water, self.settings, heights, views, label,
-            self.level_offset_m,
+            self.level_offset_m, self.learned,
         )  # fmt: skip
         self.tally.add(xyz, correction)
         self.meeting.add(xyz, correction)
@@ -232,6 +238,7 @@ class Job:
                 *self.cameras.notes,
                 *([] if views is None else views.warnings()),
                 *self.labelling.notes,
+                *self._learning.notes,
                 *self.found.notes,
                 *self.meeting.notes,
             ],

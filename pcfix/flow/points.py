@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
+from pcfix.flow.learning import learn_of_points
 from pcfix.io.water import read_water
 from pcfix.label.surface import SurfaceAbove, is_submerged, surface_above
 from pcfix.model import (
@@ -19,8 +20,8 @@ from pcfix.model import (
     WaterRaster,
     WaterSurface,
 )
-from pcfix.refract.intersect import intersect
-from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, Settings
+from pcfix.refract.methods import correct
+from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, ErrorBudget, Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcfix.model import BoolArray, FloatArray
+    from pcfix.refract.learned import Learned
+    from pcfix.refract.regression import DepthRegression
+    from pcfix.settings import CameraSet, Method, Occlusion
 
     Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
 
@@ -44,6 +48,12 @@ def correct_points(
     refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
     max_angle_deg: float | None = None,
     max_cameras: int | None = None,
+    method: Method = "snell",
+    camera_set: CameraSet = "all",
+    occlusion: Occlusion = "off",
+    depth_factor: float | None = None,
+    regression: DepthRegression | None = None,
+    errors: ErrorBudget | None = None,
     views: Views | None = None,
     may_be_submerged: npt.ArrayLike | None = None,
     level_offset_m: npt.ArrayLike | None = None,
@@ -67,8 +77,22 @@ def correct_points(
         Default: no limit where cameras have angles, 80 degrees where they have none.
     max_cameras : int, optional
         Use at most so many rays a point, the steepest ones.
+    method : Method, default "snell"
+        How the true point follows from the apparent one; see `pcfix.refract.methods`.
+    camera_set : {"all", "mvs"}
+        Without `views`: every camera whose frame holds the point, or those of a model of dense
+        matching; see `pcfix.refract.matcher`.
+    occlusion : {"off", "on", "auto"}
+        Leave out cameras to which these points themselves hide one; auto: where the block has
+        obliques.
+    depth_factor : float, optional
+        With the method factor: true by apparent depth. Default: the refractive index.
+    regression : DepthRegression, optional
+        With the method regression; see `pcfix.refract.regression`.
+    errors : ErrorBudget, optional
+        From which the standard errors follow. Default: `pcfix.ErrorBudget` as it is.
     views : Views, optional
-        Which cameras made each point. Default: every camera whose frame holds it.
+        Which cameras made each point. Default: as `camera_set` says.
     may_be_submerged : array of bool, shape (n,), optional
         The other points are land, even below the surface; `pcfix.flow.label.label_points` finds
         them. Default: all.
@@ -91,9 +115,10 @@ def correct_points(
 
     Notes
     -----
-    For each camera the line from the projection centre to the apparent point is bent where it
-    pierces the surface (Snell in vector form, Skarlatos & Agrafiotis 2018, eq 10); the true
-    point is the one nearest to all bent rays in the sense of least squares (eq 11, for any
+    With the method snell, for each camera the line from the projection centre to the apparent
+    point is bent where it pierces the surface (Snell in vector form, Skarlatos & Agrafiotis
+    2018, eq 10); the true point is the one nearest to all bent rays in the sense of least squares
+    (eq 11, for any
     number of rays). Nothing is iterated and no sum depends on the number of threads.
 
     Examples
@@ -107,14 +132,20 @@ def correct_points(
     [[0.0, 0.0, -2.703]]
     """
     points = checked_points(xyz)
-    settings = Settings(refractive_index, max_angle_deg, max_cameras)
+    settings = Settings(
+        refractive_index, max_angle_deg, max_cameras, method=method, camera_set=camera_set,
+        occlusion=occlusion, depth_factor=depth_factor, errors=errors or ErrorBudget(),
+    )  # fmt: skip
     surface, dimension = as_surface(water, len(points))
     offset = None if level_offset_m is None else _offsets(level_offset_m, len(cameras))
     check_above_water(cameras, surface, offset)
     if views is not None:
         _check_views(views, len(points), len(cameras))
     label = None if may_be_submerged is None else _only(may_be_submerged, len(points))
-    return correct_checked(points, cameras, surface, settings, dimension, views, label, offset)
+    learned = learn_of_points(points, cameras, settings, regression, views)
+    return correct_checked(
+        points, cameras, surface, settings, dimension, views, label, offset, learned
+    )
 
 
 def _offsets(level_offset_m: npt.ArrayLike, k: int) -> FloatArray:
@@ -193,6 +224,7 @@ def correct_checked(
     views: Views | None = None,
     label: Label | None = None,
     level_offset_m: FloatArray | None = None,
+    learned: Learned | None = None,
 ) -> Correction:
     """Label, refract, and spread the result over all rows: what every door runs."""
     surface = surface_above(water, xyz, dimension)
@@ -200,7 +232,7 @@ def correct_checked(
     rows = np.flatnonzero(submerged)
     above = SurfaceAbove(surface.height_m[rows], surface.slope[rows])
     mine = None if views is None else views.take(rows)
-    found = intersect(xyz[rows], above, water, cameras, settings, mine, level_offset_m)
+    found = correct(xyz[rows], above, water, cameras, settings, mine, level_offset_m, learned)
     shift_x, shift_y, shift_z = found.shift_m.T
     rise = above.slope[:, 0] * shift_x + above.slope[:, 1] * shift_y
 

@@ -16,10 +16,11 @@ from pcfix.io.files import sha256, write_bytes, write_text
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates
 from pcfix.model import WaterPlane
-from pcfix.report.figures import cameras_figure, histogram_figure, map_figure
+from pcfix.report.figures import cameras_figure, histogram_figure, map_figure, tvu_figure
 from pcfix.report.maps import MapsBuilder
 from pcfix.report.page import Layer, Picture, Report, Table, render
-from pcfix.report.text import share
+from pcfix.report.text import errors_of, share
+from pcfix.report.tvu import ORDERS, tvu_sentence
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -28,8 +29,9 @@ if TYPE_CHECKING:
     from pcfix.report.maps import Maps
 
 NEEDED = (*SHIFTS, "WaterDepth", "RayCount")
+SIGMA_Z = "SigmaZ"
 SAMPLE_POINTS = 200_000
-"""Points whose shift goes into the histogram, evenly spread over the file."""
+"""Points whose numbers go into histogram and picture, evenly spread over the file."""
 
 
 def write_report(
@@ -76,7 +78,11 @@ def write_report(
         If the cloud lacks the dimensions.
     """
     maps, sample_m = _read(corrected)
-    pictures = [*_pictures(maps, sample_m, summary, cameras, water), *more[0]]
+    pictures = [
+        *_pictures(maps, sample_m, summary, cameras, water),
+        *_uncertainty_picture(sample_m, summary),
+        *more[0],
+    ]
     report = Report(
         title=f"Refraction correction of {Path(summary.input).name}",
         lead=_lead(summary) + verdict,
@@ -91,7 +97,7 @@ def write_report(
             Layer("Rays", "", maps.rays),
         ],
         pictures=pictures,
-        tables=list(more[1]),
+        tables=[*_orders(summary), *more[1]],
         provenance=[_settings(summary), _files(inputs), _versions()],
     )
     figures = out_dir / "figures"
@@ -104,7 +110,10 @@ def write_report(
 
 
 def _read(path: Path) -> tuple[Maps, FloatArray]:
-    """Return the maps of a corrected cloud, and a sample of its shifts, shape (m, 3)."""
+    """Return the maps of a corrected cloud, and a sample of its points.
+
+    The sample has the shape (m, 5): shift, depth and standard error of Z, zero where none is.
+    """
     with LasSource(path) as source:
         missing = set(NEEDED).difference(source.header.point_format.dimension_names)
         if missing:
@@ -121,7 +130,9 @@ def _read(path: Path) -> tuple[Maps, FloatArray]:
             moved = rays > 0
             depth = np.asarray(points["WaterDepth"])
             builder.add(coordinates(points), depth, shift, rays, moved)
-            sample.append(shift[moved][::every])
+            has = SIGMA_Z in points.array.dtype.names
+            sigma = np.asarray(points[SIGMA_Z]) if has else np.zeros(len(depth))
+            sample.append(np.column_stack([shift, depth, sigma])[moved][::every])
     return builder.maps(), np.vstack(sample)
 
 
@@ -147,7 +158,39 @@ def _facts(s: Summary) -> Table:
         ["Cameras", f"{s.cameras_used} of {s.cameras} see corrected points;"
          f" {s.rays / max(s.corrected, 1):.1f} rays a point"],
     ]  # fmt: skip
+    if s.uncertainty is not None:
+        tvu = s.uncertainty["tvu_95_m"]
+        rows.append(["Uncertainty", f"TVU at 95 % {tvu['mean']:.3f} m on average, formal;"
+                     f" {tvu_sentence(s.uncertainty)}"])  # fmt: skip
     return Table("In short", [], rows)
+
+
+def _uncertainty_picture(sample: FloatArray, s: Summary) -> list[Picture]:
+    """Return TVU over depth, where the cloud has standard errors."""
+    known = sample[:, 4] > 0.0
+    if s.uncertainty is None or not known.any():
+        return []
+    words = (
+        "Total vertical uncertainty at 95 % (1.96 standard errors of Z) over depth, and the"
+        f" largest that the orders of IHO S-44 allow. It is formal: it assumes {errors_of(s)}"
+        " (standard deviations), and no mismatches. S-44 asks for more than the TVU: position,"
+        " features and coverage."
+    )
+    figure = tvu_figure(sample[known, 3], sample[known, 4])
+    return [Picture("uncertainty", "Vertical uncertainty", words, figure)]
+
+
+def _orders(s: Summary) -> list[Table]:
+    """Return the share of the points within each order of IHO S-44."""
+    if s.uncertainty is None:
+        return []
+    shares = s.uncertainty["s44"]
+    rows = [
+        [order.name, f"{order.a_m:g} m", f"{order.b:g}", f"{100.0 * shares[order.name]:.4g} %"]
+        for order in ORDERS
+    ]
+    header = ["order", "a", "b", "points with TVU at 95 % within sqrt(a^2 + (b depth)^2)"]
+    return [Table("Orders of IHO S-44, vertical, formal", header, rows)]
 
 
 def _warnings(s: Summary) -> list[str]:

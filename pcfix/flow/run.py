@@ -26,7 +26,7 @@ from pcfix.io.rasters import open_raster
 from pcfix.model import Summary
 from pcfix.refract.index import index_of
 from pcfix.report.evaluation import evaluation, in_a_sentence
-from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, LabelSettings, Settings
+from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, ErrorBudget, LabelSettings, Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from pcfix.flow.surfaces import WaterModel
     from pcfix.io.cameras.formats import Angles
     from pcfix.report.page import Picture, Table
+    from pcfix.settings import CameraSet, Method, Occlusion, ViewsAre
 
 RECORD = "run.json"
 SECTIONS = 3
@@ -42,6 +43,18 @@ DOD, REFERENCE_DSM = "dod.tif", "reference_dsm.tif"
 CLOUDS = (".las", ".laz")
 POINTS_PER_CELL = 4.0
 """Where no resolution is given, cells hold so many points on average."""
+
+
+_SETTINGS = (
+    "max_angle_deg",
+    "max_cameras",
+    "method",
+    "camera_set",
+    "occlusion",
+    "depth_factor",
+    "least_r2",
+)
+"""Of a request, what goes as it is to `pcfix.Settings` and `correct_file`."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +65,11 @@ class Request:
     ----------
     input, cameras, water, sensor, angles, cameras_crs, cameras_offset_m, views, water_mask,
     tide, image_times, water_model, water_crs, connected, least_pool_m2, respect_classes,
-    refractive_index, max_angle_deg, max_cameras
+    refractive_index, max_angle_deg, max_cameras, method, camera_set, views_are, occlusion,
+    depth_factor, check_depths, least_r2
         See `pcfix.correct_file`; files by their paths.
+    errors : dict or None
+        The values of an `pcfix.ErrorBudget`.
     reference : str or None
         See `pcfix.flow.compare.compare_clouds`.
     resolution_m : float or None
@@ -82,17 +98,36 @@ class Request:
     refractive_index: float | str = DEFAULT_REFRACTIVE_INDEX
     max_angle_deg: float | None = None
     max_cameras: int | None = None
+    method: Method = "snell"
+    camera_set: CameraSet = "all"
+    views_are: ViewsAre = "auto"
+    occlusion: Occlusion = "auto"
+    depth_factor: float | None = None
+    check_depths: str | None = None
+    least_r2: float = 0.5
+    errors: dict[str, float | None] | None = None
     resolution_m: float | None = None
     m3c2: bool = False
 
     def __post_init__(self) -> None:
         """Check the values."""
-        Settings(index_of(self.refractive_index)[0], self.max_angle_deg, self.max_cameras)
+        self.settings()
         self.label()
         if self.resolution_m is not None and not 0.0 < self.resolution_m < math.inf:
             raise SettingError(f"resolution {self.resolution_m:g} is not positive; give metres.")
         if self.m3c2 and self.reference is None:
             raise SettingError("m3c2 compares with a reference; give --reference too.")
+
+    def settings(self) -> Settings:
+        """Return how points are corrected."""
+        index, index_from = index_of(self.refractive_index)
+        values = {name: getattr(self, name) for name in _SETTINGS}
+        return Settings(index, refractive_index_from=index_from, errors=self.budget(), **values)
+
+    def budget(self) -> ErrorBudget:
+        """Return the standard deviations of what goes in."""
+        given: dict[str, Any] = self.errors or {}
+        return ErrorBudget(**given)
 
     def inputs(self) -> dict[str, Any]:
         """Return what `pcfix.flow.inputs.Inputs` takes."""
@@ -110,7 +145,7 @@ class Request:
         """Return the input files, each of which exists."""
         mask = None if self.water_mask is None else str(file_of(self.water_mask))
         names = [self.input, self.cameras, self.sensor, self.views, mask, self.reference]
-        names += [self.tide, self.image_times]
+        names += [self.tide, self.image_times, self.check_depths]
         found = [path for name in names if name is not None for path in files_in(name)]
         return [*found, Path(self.water)] if Path(self.water).is_file() else found
 
@@ -225,8 +260,8 @@ def _correct(
         least_pool_m2=request.least_pool_m2,
         respect_classes=tuple(request.respect_classes),
         refractive_index=request.refractive_index,
-        max_angle_deg=request.max_angle_deg,
-        max_cameras=request.max_cameras,
+        errors=request.budget(),
+        **{name: getattr(request, name) for name in _SETTINGS},
         overwrite=True,
         jobs=jobs,
         progress=progress,

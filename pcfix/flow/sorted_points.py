@@ -32,6 +32,7 @@ BLOCK_CELLS = 1024
 """Longest side of a window; a power of two."""
 BIN_POINTS = 200_000
 """So many points a square of the store has, on average."""
+SIGMA_Z = "SigmaZ"
 FEWEST_A_CELL = 0.9
 """Points, on average where there are any; fewer are worth a warning."""
 
@@ -53,6 +54,8 @@ class SortedPoints:
     near : Occupancy
         How many points there are, and how close together.
     lattice : Lattice
+    has_sigma : bool
+        Whether the cloud has standard errors of Z, as a correction leaves them.
 
     Raises
     ------
@@ -68,11 +71,13 @@ class SortedPoints:
         self._resolution_m = resolution
         area = _header_area_m2(source, resolution)
         corner = cells_of(_header_corner(source), resolution)[0]
-        self._bins = Bins(folder, _side_with(BIN_POINTS, len(source) / area, resolution), corner)
+        self.has_sigma = SIGMA_Z in source.header.point_format.dimension_names
+        side = _side_with(BIN_POINTS, len(source) / area, resolution)
+        self._bins = Bins(folder, side, corner, 4 if self.has_sigma else 3)
         self.near = Occupancy(area, len(source), resolution)
         done = 0
         for points in source.chunks(CHUNK_POINTS):
-            xyz = coordinates(points)[_wanted(points, settings.surface)]
+            xyz = self._numbers(points)[_wanted(points, settings.surface)]
             self.near.add(xyz)
             if len(xyz) and fits(self.near.low, self.near.high, resolution):
                 self._bins.add(cells_of(xyz, resolution), xyz)
@@ -84,6 +89,11 @@ class SortedPoints:
         refuse_size(low, high, resolution, str(source.path))
         _warn_of_fine_cells(self.near.spacing_m, resolution)
         self.lattice = lattice_over(low, high, resolution)
+
+    def _numbers(self, points: laspy.ScaleAwarePointRecord) -> FloatArray:
+        """Return coordinates, and beside them the standard error of Z where there is one."""
+        xyz = coordinates(points)
+        return np.column_stack([xyz, np.asarray(points[SIGMA_Z])]) if self.has_sigma else xyz
 
     def windows(self, limit: int) -> Iterator[Window]:
         """Yield windows that cover the raster, small enough to have about `limit` points."""
@@ -112,7 +122,8 @@ class SortedPoints:
     def points_in(self, window: Window) -> tuple[FloatArray, IntArray]:
         """Return the points of a window, and their columns and rows in the raster.
 
-        The first are metres in the world frame, shape (n, 3), the second have shape (n, 2).
+        The first are metres in the world frame, shape (n, 3), or (n, 4) with the standard error
+        of Z, zero of points that were not corrected; the second have shape (n, 2).
         """
         xyz = self._bins.read(self._stored(window))
         first = [self.lattice.first_column, self.lattice.first_row]

@@ -85,7 +85,7 @@ def chosen_views(
     if views is None:
         return Views(start, place)
     weight = None if views.weight is None else views.weight[place]
-    return Views(start, np.asarray(views.camera)[place], weight)
+    return Views(start, np.asarray(views.camera)[place], weight, views.kind)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)

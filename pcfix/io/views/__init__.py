@@ -7,7 +7,7 @@ lists to the rows of a cloud, chunk by chunk.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
@@ -79,7 +79,7 @@ def read_views(
         do not see its points.
     """
     raw = _moved(_read(check_input(path)), to_cloud)
-    views = _listed(raw, image_orders(raw, cameras, names), _DENSE_SPACINGS)
+    views = _listed(raw, image_orders(raw, cameras, names), "depth-maps")
     if raw.xyz is None:
         return views
     return fitted(views, cameras, raw.xyz, np.arange(len(views)))
@@ -115,13 +115,16 @@ def track_views(
     """
     raw = _moved(tracks.read(path, tie_points), to_cloud)
     order = ImageOrder("the cameras of the tie points", np.arange(len(cameras), dtype=np.int32))
-    views = _listed(raw, (order,), _TRACK_SPACINGS)
+    views = _listed(raw, (order,), "tracks")
     return views if raw.xyz is None else fitted(views, cameras, raw.xyz, np.arange(len(views)))
 
 
-def _listed(raw: RawList, orders: tuple[ImageOrder, ...], spacings: float) -> ViewList:
+def _listed(
+    raw: RawList, orders: tuple[ImageOrder, ...], kind: Literal["tracks", "depth-maps"]
+) -> ViewList:
     spacing = None if raw.xyz is None else spacing_m(raw.xyz)
-    return ViewList(raw, orders, None, spacing, spacings)
+    spacings = _TRACK_SPACINGS if kind == "tracks" else _DENSE_SPACINGS
+    return ViewList(raw, orders, None, spacing, spacings, kind)
 
 
 def _moved(raw: RawList, to_cloud: Transformation | None) -> RawList:

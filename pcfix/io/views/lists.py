@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -68,6 +68,8 @@ class ViewList:
         Between neighbouring points, where there are positions.
     default_spacings : float
         A match by position may be off by so many spacings unless the user says otherwise.
+    kind : {"tracks", "depth-maps"}
+        See `pcfix.model.Views`.
     """
 
     raw: RawList
@@ -75,6 +77,7 @@ class ViewList:
     share_seen: float | None
     spacing_m: float | None
     default_spacings: float
+    kind: Literal["tracks", "depth-maps"]
 
     def __len__(self) -> int:
         return len(self.raw)

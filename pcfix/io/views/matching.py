@@ -202,4 +202,5 @@ class ViewMatch:
         self.report.entries += len(given)
         self.report.unposed_entries += left_out
         self.report.without_camera += int(np.count_nonzero((row >= 0) & (np.diff(start) == 0)))
-        return Views(start, given, None if raw.weight is None else given_weight)
+        known = None if raw.weight is None else given_weight
+        return Views(start, given, known, self._views.kind)
