@@ -290,6 +290,9 @@ class WaterRaster:
 WaterSurface: TypeAlias = WaterPlane | WaterDimension | WaterMesh | WaterRaster
 
 
+ViewKind = Literal["tracks", "depth-maps", "pairs"]
+
+
 @dataclass(frozen=True, eq=False)
 class Views:
     """Which cameras made each of n points: rows of a ragged table.
@@ -298,13 +301,14 @@ class Views:
     `weight`, where the source has one, is what each of them counted for, in the same order.
 
     As `tracks` they are the images whose rays were intersected; as `depth-maps` those whose depth
-    maps, each matched with other images, were averaged.
+    maps, each matched with other images, were averaged; as `pairs` the entries 2i and 2i + 1 of a
+    point are the two images of its stereo pair i, of whose places the point is the median.
     """
 
     start: IntArray
     camera: IntArray
     weight: npt.NDArray[np.float32] | None = None
-    kind: Literal["tracks", "depth-maps"] = "tracks"
+    kind: ViewKind = "tracks"
 
     def take(self, rows: IntArray) -> Views:
         """Return the views of the given points, in that order."""
@@ -367,14 +371,18 @@ class Correction:
     incidence_deg : array, shape (n,)
         The largest incidence angle in air among the rays used.
     sigma_z_m : array, shape (n,)
-        Formal standard error of Z from the scatter of the rays alone. It knows nothing of
-        errors in water level, refractive index or poses.
+        Formal standard error of Z: what the errors in `pcfix.ErrorBudget` come to by the law of
+        propagation. It is as good as the budget, and knows nothing of mismatches, of rays that
+        did not make the point, or of what a method leaves out.
     camera_used : array of bool, shape (k,)
         Which cameras gave at least one ray.
     water_known : array of bool, shape (n,)
         Whether the water surface has a height above the point.
     lowest_water_m : float
         The lowest height of the water surface above any point; infinite where none is known.
+    covariance_m2 : array, shape (n, 6), or None
+        The same for all coordinates: xx, xy, xz, yy, yz, zz; see `pcfix.refract.uncertainty`.
+        None where it was not asked for.
     """
 
     apparent_xyz: FloatArray
@@ -388,6 +396,7 @@ class Correction:
     camera_used: BoolArray
     water_known: BoolArray
     lowest_water_m: float
+    covariance_m2: FloatArray | None = None
 
     @cached_property
     def xyz(self) -> FloatArray:
@@ -433,6 +442,7 @@ class Summary:
     water_fit: dict[str, Any] | None = None
     warnings: list[str] = field(default_factory=list)
     labelling: dict[str, Any] | None = None
+    uncertainty: dict[str, Any] | None = None
 
     @property
     def points_per_s(self) -> float:

@@ -78,6 +78,7 @@ _CORRECT_OPTIONS: dict[str, tuple[type, ...]] = {
     "max_cameras": (int,),
     "method": (str,),
     "camera_set": (str,),
+    "matcher": (str,),
     "views_are": (str,),
     "occlusion": (str,),
     "depth_factor": (float,),
@@ -317,7 +318,7 @@ def _settings(options: dict[str, Any]) -> Settings:
     )
 
 
-_METHOD_OPTIONS = ("method", "camera_set", "occlusion", "depth_factor", "least_r2")
+_METHOD_OPTIONS = ("method", "camera_set", "matcher", "occlusion", "depth_factor", "least_r2")
 _SIGMAS = {
     "sigma_image": "image_px",
     "sigma_level": "level_m",

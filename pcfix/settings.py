@@ -13,8 +13,9 @@ Dimensions = Literal["all", "minimal", "none"]
 Method = Literal[
     "snell", "consistent", "shan", "butler", "murase", "dietrich", "factor", "regression"
 ]
-CameraSet = Literal["mvs", "all"]
+CameraSet = Literal["auto", "mvs", "all"]
 Occlusion = Literal["auto", "on", "off"]
+MatcherKind = Literal["depth-maps", "pairs"]
 ViewsAre = Literal["auto", "tracks", "depth-maps"]
 
 DEFAULT_REFRACTIVE_INDEX = 1.34
@@ -88,9 +89,9 @@ class Settings:
         Which water it is of, in words, where it was not given as a number.
     method : Method
         How the true point follows from the apparent one; see `pcfix.refract.methods`.
-    camera_set : {"mvs", "all"}
+    camera_set : {"auto", "mvs", "all"}
         Which cameras made a point, where no list says it: those of a model of dense matching,
-        or all in whose frame it lies.
+        or all in whose frame it lies; auto: the model with the method consistent, else all.
     occlusion : {"auto", "on", "off"}
         Whether cameras are left out to which the cloud itself hides the point; auto: where some
         are oblique.
@@ -100,6 +101,10 @@ class Settings:
         With the method regression: a fit with a lower coefficient of determination is refused.
     errors : ErrorBudget
         From which the standard errors of the points follow.
+    matcher : {"depth-maps", "pairs"}
+        With camera_set mvs and the method consistent: what the matcher made a point of, the
+        weighted mean of depth maps (`pcfix.refract.depth_maps`) or the median of stereo pairs
+        (`pcfix.refract.stereo_pairs`).
     """
 
     refractive_index: float = DEFAULT_REFRACTIVE_INDEX
@@ -109,11 +114,12 @@ class Settings:
     dimensions: Dimensions = "all"
     refractive_index_from: str = ""
     method: Method = "snell"
-    camera_set: CameraSet = "all"
+    camera_set: CameraSet = "auto"
     occlusion: Occlusion = "auto"
     depth_factor: float | None = None
     least_r2: float = 0.5
     errors: ErrorBudget = ErrorBudget()
+    matcher: MatcherKind = "depth-maps"
 
     def __post_init__(self) -> None:
         """Check every value against its rule."""
@@ -143,6 +149,12 @@ class Settings:
                     f" {', '.join(get_args(allowed))}."
                 )
 
+    @property
+    def models_matcher(self) -> bool:
+        """Whether a model of dense matching stands in for a list of views."""
+        automatic = self.camera_set == "auto" and self.method == "consistent"
+        return automatic or self.camera_set == "mvs"
+
     def _check_depths(self) -> None:
         factor, r2 = self.depth_factor, self.least_r2
         if factor is not None and not 1.0 <= factor <= 3.0:
@@ -161,6 +173,7 @@ _CHOICES = {
     "method": Method,
     "camera_set": CameraSet,
     "occlusion": Occlusion,
+    "matcher": MatcherKind,
 }
 
 

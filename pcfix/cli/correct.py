@@ -83,6 +83,7 @@ def pipeline(
         index_of(words.refractive_index())[0], words.max_angle, words.max_cameras,
         uncorrected.value, dimensions.value, "", words.method.value, words.camera_set.value,
         words.occlusion.value, words.depth_factor, words.least_r2, words.errors(),
+        words.matcher.value,
     )  # fmt: skip
     options = {
         "cameras": str(cameras),

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
-from pcfix.cli.words import AngleWords, CameraSets, Methods, OnOff, ViewKinds, WaterModels
+from pcfix.cli.words import AngleWords, CameraSets, Matchers, Methods, OnOff, ViewKinds, WaterModels
 from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, LEVEL_M, ErrorBudget, LabelSettings
 
 if TYPE_CHECKING:
@@ -228,9 +228,16 @@ class CorrectionWords(LabelWords, CameraWords):
         CameraSets,
         typer.Option(
             help="Without --views: every camera whose frame holds the point, or a model of dense"
-            " matching.",
+            " matching; auto: the model with --method consistent, else all.",
         ),
-    ] = CameraSets.all
+    ] = CameraSets.auto
+    matcher: Annotated[
+        Matchers,
+        typer.Option(
+            help="What that model makes a point of: fused depth maps (OpenMVS, COLMAP), or the"
+            " median of stereo pairs (MicMac, SURE).",
+        ),
+    ] = Matchers.depth_maps
     views_are: Annotated[
         ViewKinds,
         typer.Option(
@@ -313,6 +320,7 @@ class CorrectionWords(LabelWords, CameraWords):
             "max_cameras": self.max_cameras,
             "method": self.method.value,
             "camera_set": self.camera_set.value,
+            "matcher": self.matcher.value,
             "views_are": self.views_are.value,
             "occlusion": self.occlusion.value,
             "depth_factor": self.depth_factor,

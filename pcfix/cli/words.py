@@ -65,8 +65,16 @@ class Methods(str, Enum):  # noqa: UP042
 class CameraSets(str, Enum):  # noqa: UP042
     """Which cameras made a point, where no list says it."""
 
+    auto = "auto"
     mvs = "mvs"
     all = "all"
+
+
+class Matchers(str, Enum):  # noqa: UP042
+    """What a dense matcher makes a point of."""
+
+    depth_maps = "depth-maps"
+    pairs = "pairs"
 
 
 class ViewKinds(str, Enum):  # noqa: UP042

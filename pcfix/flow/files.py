@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from pcfix.io.cameras.formats import Angles
     from pcfix.io.las.columns import Column
     from pcfix.model import FloatArray
-    from pcfix.settings import CameraSet, Method, Occlusion, ViewsAre
+    from pcfix.settings import CameraSet, MatcherKind, Method, Occlusion, ViewsAre
 
     AnyPath = str | PathLike[str]
 
@@ -79,7 +79,8 @@ def correct_file(
     max_angle_deg: float | None = None,
     max_cameras: int | None = None,
     method: Method = "snell",
-    camera_set: CameraSet = "all",
+    camera_set: CameraSet = "auto",
+    matcher: MatcherKind = "depth-maps",
     views_are: ViewsAre = "auto",
     occlusion: Occlusion = "auto",
     depth_factor: float | None = None,
@@ -127,7 +128,7 @@ def correct_file(
     refractive_index : float or str
         A number, or the water: ``fresh``, ``sea``, or salinity, temperature and wavelength as
         ``35,15,0.53`` (PSU, degrees Celsius, micrometres); see `pcfix.refractive_index`.
-    max_angle_deg, max_cameras, method, camera_set, occlusion, depth_factor, errors
+    max_angle_deg, max_cameras, method, camera_set, matcher, occlusion, depth_factor, errors
         See `correct_points`.
     views_are : {"auto", "tracks", "depth-maps"}
         What the views are; see `pcfix.Views`. auto: what their kind of file says.
@@ -162,7 +163,7 @@ def correct_file(
     index, index_from = index_of(refractive_index)
     settings = Settings(
         index, max_angle_deg, max_cameras, uncorrected, dimensions, index_from, method, camera_set,
-        occlusion, depth_factor, least_r2, errors or ErrorBudget(),
+        occlusion, depth_factor, least_r2, errors or ErrorBudget(), matcher,
     )  # fmt: skip
     label = LabelSettings(
         connected=connected, least_pool_m2=least_pool_m2, respect_classes=respect_classes

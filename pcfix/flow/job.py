@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict, astuple
+from dataclasses import asdict, astuple, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -18,10 +18,11 @@ from pcfix.flow.points import (
     correct_checked,
     refuse_under_water,
 )
+from pcfix.flow.view_kinds import kind_of_views
 from pcfix.flow.water_checks import WaterMeeting, check_tilt
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.label.labelling import Labelling, Part
-from pcfix.label.surface import surface_above
+from pcfix.label.surface import is_submerged, surface_above
 from pcfix.model import Correction, Outcome, Summary, WaterDimension, WaterPlane
 from pcfix.refract.learned import Learned
 from pcfix.report.tally import Tally
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
     from pcfix.flow.inputs import Inputs
     from pcfix.flow.surfaces import CloudView
-    from pcfix.model import FloatArray, WaterSurface
+    from pcfix.model import FloatArray, ViewKind, Views, WaterSurface
 
     Points: TypeAlias = tuple[FloatArray, FloatArray | None, npt.NDArray[np.uint8]]
     """Some points: coordinates (n, 3), water heights where those are a dimension, classes."""
@@ -87,8 +88,13 @@ class Job:
         mask = mask_of(inputs.water_mask, view.crs, view.low, view.high)
         self.labelling = Labelling(label, mask)
         kind = None if self._list is None else self._list.kind
-        self._learning = Learning(settings, inputs, self.cameras, self.water, view, kind)
+        self._learning = Learning(
+            settings, inputs, self.cameras, self.water, view, kind, self.level_offset_m
+        )
         self.learned = Learned()
+        self._inputs = inputs
+        self._kind: ViewKind | None = None
+        self._kind_notes: list[str] = []
         self.restart()
 
     def restart(self) -> None:
@@ -126,15 +132,43 @@ class Job:
         classes : array, shape (n,)
             That the points come with.
         """
-        views = None if self._views is None else self._views.for_chunk(xyz, self.tally.points)
+        views = self._views_of(xyz, heights)
         label = partial(self.labelling.submerged, classes=classes)
         correction = correct_checked(
             xyz, self.cameras, self.water, self.settings, heights, views, label,
-            self.level_offset_m, self.learned,
+            self.level_offset_m, self.learned, self._level_sigma_m,
         )  # fmt: skip
         self.tally.add(xyz, correction)
         self.meeting.add(xyz, correction)
         return correction
+
+    def _views_of(self, xyz: FloatArray, heights: FloatArray | None) -> Views | None:
+        """Return the views of the next chunk; the first one tells what the list lists."""
+        if self._views is None:
+            return None
+        views = self._views.for_chunk(xyz, self.tally.points)
+        if self.learned.matcher is None or self._inputs.views_are != "auto":
+            return views
+        if self._kind is None:
+            rows = np.flatnonzero(is_submerged(xyz[:, 2], surface_above(self.water, xyz, heights)))
+            above = surface_above(self.water, xyz[rows], None if heights is None else heights[rows])
+            found = kind_of_views(
+                xyz[rows], above, self.water, self.cameras, self.settings, views.take(rows),
+                self.learned,
+            )  # fmt: skip
+            self._kind = views.kind if found is None else found.kind
+            self._kind_notes = [] if found is None else [str(found)]
+        return replace(views, kind=self._kind)
+
+    def _level_sigma_m(self, xy: FloatArray) -> FloatArray | None:
+        """Return the standard error of the water's height at places, where its fit says one."""
+        found = self.found.evidence
+        if found is None:
+            return None
+        if hasattr(found, "sigma_at"):
+            return np.asarray(found.sigma_at(xy))
+        sigma = getattr(found, "sigma_level_m", None)
+        return None if sigma is None else np.full(len(xy), float(sigma))
 
     def provenance(self) -> dict[str, Any]:
         """Return what a file shall say of its correction."""
@@ -239,11 +273,13 @@ class Job:
                 *([] if views is None else views.warnings()),
                 *self.labelling.notes,
                 *self._learning.notes,
+                *self._kind_notes,
                 *self.found.notes,
                 *self.meeting.notes,
             ],
             labelling=self.labelling.report(),
             water_fit=self.found.as_dict(),
+            uncertainty=tally.uncertainty(),
         )
 
 

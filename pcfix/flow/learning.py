@@ -8,9 +8,10 @@ import numpy as np
 
 from pcfix.errors import SettingError
 from pcfix.label.labelling import Part
-from pcfix.label.surface import surface_above
+from pcfix.label.surface import SurfaceAbove, is_submerged, surface_above
 from pcfix.refract.learned import Learned
 from pcfix.refract.matcher import matcher_of, matcher_of_ties, places_for
+from pcfix.refract.methods import learn_bed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -18,11 +19,10 @@ if TYPE_CHECKING:
     from pcfix.flow.inputs import Inputs
     from pcfix.flow.job import Points
     from pcfix.flow.surfaces import CloudView
-    from pcfix.model import Cameras, FloatArray, Views, WaterSurface
-    from pcfix.refract.matcher import Matcher
+    from pcfix.model import Cameras, FloatArray, TiePoints, ViewKind, Views, WaterSurface
     from pcfix.refract.occlusion import Occluder
     from pcfix.refract.regression import DepthRegression
-    from pcfix.settings import Settings, ViewsAre
+    from pcfix.settings import Settings
 
 
 class Learning:
@@ -39,6 +39,8 @@ class Learning:
         Of the whole cloud.
     views : {"tracks", "depth-maps"} or None
         Of which kind the view list is, if there is one.
+    level_offset_m : array, shape (k,), or None
+        How much higher the water stood at each image.
 
     Raises
     ------
@@ -53,10 +55,12 @@ class Learning:
         cameras: Cameras,
         water: WaterSurface,
         view: CloudView,
-        views: ViewsAre | None,
+        views: ViewKind | None,
+        level_offset_m: FloatArray | None,
     ) -> None:
         self._settings, self._inputs, self._cameras = settings, inputs, cameras
         self._water, self._view, self._views = water, view, views
+        self._level_offset_m = level_offset_m
         self.notes: list[str] = []
         check_method(settings, cameras)
         if (settings.method == "regression") != (inputs.check_depths is not None):
@@ -67,11 +71,8 @@ class Learning:
 
     def of_cloud(self, chunks: Callable[[], Iterable[Points]]) -> Learned:
         """Return what is learned of the whole cloud, whose chunks may be asked for again."""
-        return Learned(
-            regression=self._regression(chunks),
-            occluder=self._occluder(chunks),
-            matcher=self._matcher(chunks),
-        )
+        learned = Learned(regression=self._regression(chunks), occluder=self._occluder(chunks))
+        return self._with_matcher(learned, chunks)
 
     def _regression(self, chunks: Callable[[], Iterable[Points]]) -> DepthRegression | None:
         path = self._inputs.check_depths
@@ -98,34 +99,90 @@ class Learning:
             builder.add(xyz, classes)
         return builder.build()
 
-    def _matcher(self, chunks: Callable[[], Iterable[Points]]) -> Matcher | None:
-        """Return the model of the matcher, by the tie points where the camera file has some."""
+    def _with_matcher(self, learned: Learned, chunks: Callable[[], Iterable[Points]]) -> Learned:
+        """Add the model of the matcher, by the tie points where the camera file has some."""
         if not wants_matcher(self._settings, self._views):
-            return None
-        ties = self._inputs.tie_points(self._view.crs)
-        if ties is not None:
-            return matcher_of_ties(self._cameras, ties)
-        step = max(1, self._view.points // places_for(self._cameras))
-        taken, done = [], 0
-        for xyz, _, _ in chunks():
-            taken.append(xyz[-done % step :: step])
+            return learned
+        step = max(1, self._view.points // BED_POINTS)
+        taken: list[tuple[FloatArray, SurfaceAbove]] = []
+        done = 0
+        for xyz, heights, classes in chunks():
+            rows = np.arange(-done % step, len(xyz), step)
+            rows = rows[~np.isin(classes[rows], NOISE_CLASSES)]
+            above = surface_above(
+                self._water, xyz[rows], None if heights is None else heights[rows]
+            )
+            taken.append((xyz[rows], above))
             done += len(xyz)
-        return matcher_of(self._cameras, np.vstack(taken))
+        xyz = np.vstack([one for one, _ in taken])
+        above = SurfaceAbove(
+            np.concatenate([one.height_m for _, one in taken]),
+            np.vstack([one.slope for _, one in taken]),
+        )
+        ties = self._inputs.tie_points(self._view.crs)
+        some = (self._cameras, self._water, self._settings, self._level_offset_m)
+        return with_matcher(learned, xyz, above, *some, self._views, ties)
 
 
-def wants_matcher(settings: Settings, views: ViewsAre | None) -> bool:
+BED_POINTS = 1_000_000
+"""Of the cloud, evenly spread over its order, tell the bed of the surroundings."""
+
+NOISE_CLASSES = (7, 18)
+
+
+def wants_matcher(settings: Settings, views: ViewKind | None) -> bool:
     """Return whether the images' partners must be known, with views of a kind or without any."""
     if views is None:
-        return settings.camera_set == "mvs"
+        return settings.models_matcher
     return settings.method == "consistent" and views == "depth-maps"
+
+
+def with_matcher(
+    learned: Learned,
+    xyz: FloatArray,
+    surface: SurfaceAbove,
+    cameras: Cameras,
+    water: WaterSurface,
+    settings: Settings,
+    level_offset_m: FloatArray | None,
+    views: ViewKind | None,
+    ties: TiePoints | None = None,
+) -> Learned:
+    """Add the model of the matcher to what was learned, and the bed where no list is given.
+
+    Parameters
+    ----------
+    xyz, surface
+        Points of the whole cloud and the water above them.
+    views : {"tracks", "depth-maps", "pairs"} or None
+        Of which kind the view list is, if there is one.
+    ties : TiePoints, optional
+        Of the block; else the points of the cloud tell what the images have in common.
+    """
+    if ties is not None:
+        matcher = matcher_of_ties(cameras, ties)
+    else:
+        step = max(1, len(xyz) // places_for(cameras))
+        matcher = matcher_of(cameras, np.ascontiguousarray(xyz[::step]))
+    learned = learned._replace(matcher=matcher)
+    fuses = settings.method == "consistent" and settings.matcher == "depth-maps"
+    rows = np.flatnonzero(is_submerged(xyz[:, 2], surface))
+    if views is not None or not fuses or not len(rows):
+        return learned
+    above = SurfaceAbove(surface.height_m[rows], surface.slope[rows])
+    bed = learn_bed(xyz[rows], above, water, cameras, settings, level_offset_m, learned)
+    return learned._replace(bed=bed)
 
 
 def learn_of_points(
     xyz: FloatArray,
+    surface: SurfaceAbove,
     cameras: Cameras,
+    water: WaterSurface,
     settings: Settings,
     regression: DepthRegression | None,
     views: Views | None,
+    level_offset_m: FloatArray | None,
 ) -> Learned:
     """Return what is learned where these points, shape (n, 3), are the whole cloud.
 
@@ -142,19 +199,19 @@ def learn_of_points(
         from pcfix.flow.occlusion import occluder_of, wants_occlusion
 
         occluder = occluder_of(xyz) if wants_occlusion(cameras, settings) else None
-    matcher = None
-    if wants_matcher(settings, None if views is None else views.kind):
-        step = max(1, len(xyz) // places_for(cameras))
-        matcher = matcher_of(cameras, np.ascontiguousarray(xyz[::step]))
-    return Learned(regression=regression, occluder=occluder, matcher=matcher)
+    learned = Learned(regression=regression, occluder=occluder)
+    kind = None if views is None else views.kind
+    if not wants_matcher(settings, kind):
+        return learned
+    return with_matcher(learned, xyz, surface, cameras, water, settings, level_offset_m, kind)
 
 
 def check_method(settings: Settings, cameras: Cameras) -> None:
     """Refuse a method that these cameras are not enough for."""
-    if settings.camera_set == "mvs" and cameras.lenses is None:
+    if settings.camera_set == "mvs" and (cameras.lenses is None or cameras.rotations is None):
         raise SettingError(
-            "camera-set mvs needs the interior orientation of the cameras: give --sensor, or a"
-            " camera file that has it, or use --camera-set all."
+            "camera-set mvs needs the angles and the lens of each image: give --sensor, or a"
+            " camera file that has them, or use --camera-set all."
         )
     if settings.method == "consistent":
         from pcfix.refract.consistent import check_consistent

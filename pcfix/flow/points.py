@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pcfix.model import BoolArray, FloatArray
     from pcfix.refract.learned import Learned
     from pcfix.refract.regression import DepthRegression
-    from pcfix.settings import CameraSet, Method, Occlusion
+    from pcfix.settings import CameraSet, MatcherKind, Method, Occlusion
 
     Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
 
@@ -49,7 +49,8 @@ def correct_points(
     max_angle_deg: float | None = None,
     max_cameras: int | None = None,
     method: Method = "snell",
-    camera_set: CameraSet = "all",
+    camera_set: CameraSet = "auto",
+    matcher: MatcherKind = "depth-maps",
     occlusion: Occlusion = "off",
     depth_factor: float | None = None,
     regression: DepthRegression | None = None,
@@ -79,9 +80,11 @@ def correct_points(
         Use at most so many rays a point, the steepest ones.
     method : Method, default "snell"
         How the true point follows from the apparent one; see `pcfix.refract.methods`.
-    camera_set : {"all", "mvs"}
-        Without `views`: every camera whose frame holds the point, or those of a model of dense
-        matching; see `pcfix.refract.matcher`.
+    camera_set : {"auto", "mvs", "all"}
+        Without `views`: those of a model of dense matching (see `pcfix.refract.matcher`), or every
+        camera whose frame holds the point; auto: the model with the method consistent, else all.
+    matcher : {"depth-maps", "pairs"}
+        What that model makes a point of: fused depth maps, or the median of stereo pairs.
     occlusion : {"off", "on", "auto"}
         Leave out cameras to which these points themselves hide one; auto: where the block has
         obliques.
@@ -135,6 +138,7 @@ def correct_points(
     settings = Settings(
         refractive_index, max_angle_deg, max_cameras, method=method, camera_set=camera_set,
         occlusion=occlusion, depth_factor=depth_factor, errors=errors or ErrorBudget(),
+        matcher=matcher,
     )  # fmt: skip
     surface, dimension = as_surface(water, len(points))
     offset = None if level_offset_m is None else _offsets(level_offset_m, len(cameras))
@@ -142,7 +146,8 @@ def correct_points(
     if views is not None:
         _check_views(views, len(points), len(cameras))
     label = None if may_be_submerged is None else _only(may_be_submerged, len(points))
-    learned = learn_of_points(points, cameras, settings, regression, views)
+    above = surface_above(surface, points, dimension)
+    learned = learn_of_points(points, above, cameras, surface, settings, regression, views, offset)
     return correct_checked(
         points, cameras, surface, settings, dimension, views, label, offset, learned
     )
@@ -225,6 +230,7 @@ def correct_checked(
     label: Label | None = None,
     level_offset_m: FloatArray | None = None,
     learned: Learned | None = None,
+    level_sigma_m: Callable[[FloatArray], FloatArray | None] | None = None,
 ) -> Correction:
     """Label, refract, and spread the result over all rows: what every door runs."""
     surface = surface_above(water, xyz, dimension)
@@ -232,7 +238,10 @@ def correct_checked(
     rows = np.flatnonzero(submerged)
     above = SurfaceAbove(surface.height_m[rows], surface.slope[rows])
     mine = None if views is None else views.take(rows)
-    found = correct(xyz[rows], above, water, cameras, settings, mine, level_offset_m, learned)
+    sigma = None if level_sigma_m is None else level_sigma_m(xyz[rows, :2])
+    found = correct(
+        xyz[rows], above, water, cameras, settings, mine, level_offset_m, learned, sigma
+    )
     shift_x, shift_y, shift_z = found.shift_m.T
     rise = above.slope[:, 0] * shift_x + above.slope[:, 1] * shift_y
 
@@ -253,6 +262,7 @@ def correct_checked(
         sigma_z_m=spread(found.sigma_z_m),
         camera_used=found.camera_used,
         water_known=known,
+        covariance_m2=None if found.covariance_m2 is None else spread(found.covariance_m2),
         lowest_water_m=float(surface.height_m[known].min()) if known.any() else np.inf,
     )
 

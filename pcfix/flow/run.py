@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from pcfix.flow.surfaces import WaterModel
     from pcfix.io.cameras.formats import Angles
     from pcfix.report.page import Picture, Table
-    from pcfix.settings import CameraSet, Method, Occlusion, ViewsAre
+    from pcfix.settings import CameraSet, MatcherKind, Method, Occlusion, ViewsAre
 
 RECORD = "run.json"
 SECTIONS = 3
@@ -50,6 +50,7 @@ _SETTINGS = (
     "max_cameras",
     "method",
     "camera_set",
+    "matcher",
     "occlusion",
     "depth_factor",
     "least_r2",
@@ -65,7 +66,7 @@ class Request:
     ----------
     input, cameras, water, sensor, angles, cameras_crs, cameras_offset_m, views, water_mask,
     tide, image_times, water_model, water_crs, connected, least_pool_m2, respect_classes,
-    refractive_index, max_angle_deg, max_cameras, method, camera_set, views_are, occlusion,
+    refractive_index, max_angle_deg, max_cameras, method, camera_set, matcher, views_are, occlusion,
     depth_factor, check_depths, least_r2
         See `pcfix.correct_file`; files by their paths.
     errors : dict or None
@@ -99,7 +100,8 @@ class Request:
     max_angle_deg: float | None = None
     max_cameras: int | None = None
     method: Method = "snell"
-    camera_set: CameraSet = "all"
+    camera_set: CameraSet = "auto"
+    matcher: MatcherKind = "depth-maps"
     views_are: ViewsAre = "auto"
     occlusion: Occlusion = "auto"
     depth_factor: float | None = None

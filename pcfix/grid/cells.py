@@ -56,6 +56,37 @@ def cell_numbers(cell: IntArray, z: FloatArray, size: int) -> Cells:
     return Cells(count, *(_spread_out(values, filled, size) for values in columns))
 
 
+def cell_uncertainty(cell: IntArray, sigma_m: FloatArray, size: int) -> FloatArray:
+    """Return the standard uncertainty of each cell: the root mean square of its points'.
+
+    It is not divided by the square root of their number. What the points of a cell are wrong by
+    comes in good part from level, index and tilt of the water and from poses, which they share,
+    and which more points do not average out; to take all of it as shared is the cautious side.
+
+    Parameters
+    ----------
+    cell : array of int, shape (k,)
+        The cell of each point, from 0 to size - 1.
+    sigma_m : array, shape (k,)
+        Standard errors, metres; points with none have 0 and do not count.
+    size : int
+        Number of cells, n.
+
+    Returns
+    -------
+    array, shape (n,)
+        Metres; NaN where no point has a standard error.
+    """
+    known = sigma_m > 0.0
+    cell, sigma_m = cell[known], sigma_m[known]
+    order = np.lexsort((sigma_m, cell))
+    count = np.bincount(cell, minlength=size)
+    filled = np.flatnonzero(count)
+    n = count[filled]
+    mean_square = _sums(sigma_m[order] ** 2, np.cumsum(n) - n) / n
+    return _spread_out(np.sqrt(mean_square), filled, size)
+
+
 def _sums(values: FloatArray, first: IntArray) -> FloatArray:
     """Return the sum of each run of values; runs begin at `first`."""
     if not len(values):

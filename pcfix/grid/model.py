@@ -94,6 +94,8 @@ class DsmSummary:
         Width of the widest hole that was bridged.
     settings : dict
     seconds : float
+    uncertainty_m : dict or None
+        Mean and largest standard uncertainty of the cells that have one.
     """
 
     input: str
@@ -114,6 +116,7 @@ class DsmSummary:
     hole_m: float | None
     settings: dict[str, Any]
     seconds: float
+    uncertainty_m: dict[str, float] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""

@@ -24,9 +24,12 @@ class Bins:
         Cells along a square.
     corner : tuple of int
         Column and row of a corner of the squares, counted from x = 0 and y = 0.
+    numbers : int
+        Of each point: its coordinates, and what else belongs to it.
     """
 
-    def __init__(self, folder: Path, side: int, corner: Iterable[int]) -> None:
+    def __init__(self, folder: Path, side: int, corner: Iterable[int], numbers: int = 3) -> None:
+        self._numbers = numbers
         self._folder, self._side = folder, side
         self._corner = np.array(list(corner), np.int64)
         self._points: dict[tuple[int, int], int] = {}
@@ -38,7 +41,7 @@ class Bins:
         ----------
         cell : array, shape (n, 2)
             Columns and rows, counted from x = 0 and y = 0.
-        xyz : array, shape (n, 3)
+        xyz : array, shape (n, numbers)
             Metres, world frame.
         """
         square = (cell - self._corner) // self._side
@@ -56,11 +59,12 @@ class Bins:
 
         Returns
         -------
-        array, shape (n, 3)
+        array, shape (n, numbers)
             Metres, world frame; points of the squares outside the window are among them.
         """
-        parts = [np.fromfile(self._file(place)).reshape(-1, 3) for place in self._touched(cells)]
-        return np.concatenate([np.empty((0, 3)), *parts])
+        places, numbers = self._touched(cells), self._numbers
+        parts = [np.fromfile(self._file(place)).reshape(-1, numbers) for place in places]
+        return np.concatenate([np.empty((0, numbers)), *parts])
 
     def count(self, cells: Window) -> int:
         """Return how many points `read` would return."""

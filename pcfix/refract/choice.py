@@ -37,6 +37,10 @@ TILE = 128
 """Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""
 
 
+ANY_NUMBER = 2**31
+"""A list may name a camera twice, so that there can be more entries than cameras."""
+
+
 def chosen_views(
     xyz: FloatArray,
     surface: SurfaceAbove,
@@ -71,7 +75,7 @@ def chosen_views(
         np.zeros(len(cameras)) if level_offset_m is None else level_offset_m,
         frames_of(cameras) if views is None else no_frames(len(cameras)),
         least_cosine2(settings, cameras),
-        settings.max_cameras or len(cameras),
+        settings.max_cameras or ANY_NUMBER,
         tiles,
         build_tin(water) if isinstance(water, WaterMesh) else None,
         build_field(water) if isinstance(water, WaterRaster) else None,

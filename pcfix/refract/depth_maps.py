@@ -24,7 +24,7 @@ A level bed will do: a slope of it moves the Q_i and the directions a_ij nearly 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numba import njit, prange
@@ -32,6 +32,7 @@ from numba import njit, prange
 from pcfix.model import Outcome
 from pcfix.refract.backward import light_path
 from pcfix.refract.frames import holds
+from pcfix.refract.matcher import Matcher
 from pcfix.refract.rays import refracted
 from pcfix.refract.threads import one_caller
 
@@ -41,26 +42,25 @@ if TYPE_CHECKING:
     from pcfix.refract.frames import Frames
     from pcfix.refract.result import Intersection
 
-MAX_STEPS = 12
-CLOSE_M = 1e-4
-AGREE = 0.01
 MAX_LOOKS = 5
-CLOSE_ENOUGH_M = 0.005
+CLOSE_M = 0.002
+"""Between two looks; what is left is mended in a straight line."""
+
 LEAST_RISE_M = 0.005
 _BLOCK = 64
 _CORRECTED, _NO_CAMERA = int(Outcome.CORRECTED), int(Outcome.NO_CAMERA)
 _ONE_CAMERA = int(Outcome.ONE_CAMERA)
-_MISS, _COUNT, _OUTCOME = 3, 4, 5
+_MISS, OUTCOME = 3, 5
 
 
-def invert_depth_maps(bundle: Bundle, bed_m=None, listed=None) -> Intersection:
+def invert_depth_maps(bundle: Bundle) -> Intersection:
     """Return the true points from which dense matching would have made the apparent ones.
 
     Parameters
     ----------
     bundle : Bundle
-        Its views are the images whose depth maps were fused: those of a list with its weights,
-        or all that may have been. `bundle.learned.matcher` says how they were matched.
+        Its views are the images whose depth maps were fused, with their weights;
+        `bundle.learned.matcher` says how they were matched.
 
     Returns
     -------
@@ -70,35 +70,40 @@ def invert_depth_maps(bundle: Bundle, bed_m=None, listed=None) -> Intersection:
     -----
     The surface above each point is taken as a plane.
     """
-    matcher = bundle.learned.matcher
-    if matcher is None:
-        raise ValueError("a model of the matcher is needed")
     weights = bundle.views.weight
-    listed = bundle.views.kind == "depth-maps" if listed is None else listed
     result = np.zeros((len(bundle.xyz), 6))
     with one_caller():
         _invert(
-            np.ascontiguousarray(bundle.xyz),
-            np.ascontiguousarray(bundle.surface.height_m),
-            bundle.normals(),
-            np.ascontiguousarray(bundle.cameras.centres),
-            bundle.level_offset_m,
-            matcher.inner,
-            matcher.focal_px,
-            matcher.matched,
-            matcher.averaged,
-            matcher.tolerance_px2,
-            bundle.views.start,
-            np.asarray(bundle.views.camera, np.int64),
+            *arrays_of(bundle),
             np.zeros(0) if weights is None else weights.astype(np.float64),
-            bundle.settings.refractive_index,
-            np.zeros(0) if bed_m is None else bed_m,
-            np.inf if listed else AGREE,
             result,
         )
+    return intersection_of(bundle, result)
+
+
+def arrays_of(bundle: Bundle) -> tuple[Any, ...]:
+    """Return what the kernels take of a bundle."""
+    matcher = bundle.learned.matcher
+    if matcher is None:
+        raise ValueError("a model of the matcher is needed")
+    return (
+        np.ascontiguousarray(bundle.xyz),
+        np.ascontiguousarray(bundle.surface.height_m),
+        bundle.normals(),
+        np.ascontiguousarray(bundle.cameras.centres),
+        bundle.level_offset_m,
+        *matcher,
+        bundle.views.start,
+        np.asarray(bundle.views.camera, np.int64),
+        bundle.settings.refractive_index,
+    )
+
+
+def intersection_of(bundle: Bundle, result: FloatArray) -> Intersection:
+    """Return the rows that the kernels wrote as a result."""
     return bundle.result(
         result[:, :3],
-        outcome=result[:, _OUTCOME].astype(np.uint8),
+        outcome=result[:, OUTCOME].astype(np.uint8),
         ray_miss_m=result[:, _MISS],
     )
 
@@ -106,11 +111,13 @@ def invert_depth_maps(bundle: Bundle, bed_m=None, listed=None) -> Intersection:
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _invert(
     xyz: FloatArray, height: FloatArray, normals: FloatArray, centres: FloatArray,
-    offset: FloatArray, frames: Frames, focal_px: FloatArray, matched: IntArray,
-    averaged: IntArray, tolerance: float, start: IntArray, camera: IntArray, weight: FloatArray,
-    n: float, bed: FloatArray, agree: float, result: FloatArray,
+    offset: FloatArray, matched: IntArray, averaged: IntArray, fused: IntArray,
+    focal_px: FloatArray, inner: Frames, tolerance: float, start: IntArray, camera: IntArray,
+    n: float,
+    weight: FloatArray, result: FloatArray,
 ) -> None:  # fmt: skip
     for block in prange((len(xyz) + _BLOCK - 1) // _BLOCK):
+        matcher = Matcher(matched, averaged, fused, focal_px, inner, tolerance)
         share = np.zeros(len(centres))
         seen = np.zeros(len(centres), np.int8)
         touched = np.empty(len(centres), np.int64)
@@ -118,13 +125,13 @@ def _invert(
             up, normal = centres - xyz[i], normals[i]
             listed = camera[start[i] : start[i + 1]]
             given = weight[start[i] : start[i + 1]] if weight.size else weight
-            count = _shares(share, seen, touched, listed, given, up, frames, averaged)
+            count = _shares(
+                share, seen, touched, listed, given, up, matcher.inner, matcher.averaged
+            )
             above = normal[2] * (height[i] - xyz[i, 2] + offset)
             maps = touched[:count]
-            _solve(
-                result[i], maps, share, up, above, normal, frames, focal_px, matched, tolerance, n,
-                bed[i] - xyz[i, 2] if bed.size else np.nan, agree,
-            )  # fmt: skip
+            bed, t, slope = lines(maps, up, above, normal, matcher, n)
+            settle_bed(result[i], maps, share[maps], t, slope, bed, up, above, normal, matcher, n)
             for q in range(count):
                 share[touched[q]], seen[touched[q]] = 0.0, 0
 
@@ -166,129 +173,92 @@ def _shares(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _solve(
-    row: FloatArray, maps: IntArray, share: FloatArray, up: FloatArray, above: FloatArray,
-    normal: FloatArray, frames: Frames, focal_px: FloatArray, matched: IntArray,
-    tolerance: float, n: float, start: float, agree: float,
-) -> None:  # fmt: skip
-    """Find the height of the bed at which the fused depths give the apparent point.
+def lines(
+    maps: IntArray, up: FloatArray, above: FloatArray, normal: FloatArray, matcher: Matcher,
+    n: float,
+) -> tuple[float, FloatArray, FloatArray]:  # fmt: skip
+    """Return how the depth of each map changes with the height of the bed, nearly in a line.
 
-    Each depth map's t is nearly linear in the height: two heights tell where it is zero, and
-    how it changes. Those maps that agree with P are then fused; a last look at the solution mends
-    what is not linear.
+    Returns
+    -------
+    bed : float
+        A likely height of the bed, relative to the apparent point, metres.
+    t, slope : array, shape (maps,)
+        How far beyond the apparent point the map has that bed, relative to the distance from the
+        camera, and the change of it with the height, 1/m. NaN where it has none.
     """
     deep = -above.mean() / normal[2] * (n - 1.0)
-    bed = 1.1 * deep if np.isnan(start) else start
-    k = maps.size
-    one, two, work = np.empty((k, 5)), np.empty((k, 5)), np.empty((matched.shape[1], 3))
-    rise = min(0.1 * deep, -LEAST_RISE_M)
-    for q in range(k):
-        _look(
-            one[q], maps[q], bed, up, above, normal, frames, focal_px, matched, tolerance, n, work
-        )
-        _look(
-            two[q], maps[q], bed + rise, up, above, normal, frames, focal_px, matched, tolerance,
-            n, work,
-        )  # fmt: skip
-    slope = (two[:, 0] - one[:, 0]) / rise
-    for q in range(k):
+    bed, rise = 1.1 * deep, min(0.1 * deep, -LEAST_RISE_M)
+    t, slope = np.empty(maps.size), np.empty(maps.size)
+    out, work = np.empty(5), np.empty((matcher.matched.shape[1], 3))
+    for q in range(maps.size):
+        _look(out, maps[q], bed, up, above, normal, matcher, n, work)
+        t[q] = out[0]
+        _look(out, maps[q], bed + rise, up, above, normal, matcher, n, work)
+        slope[q] = (out[0] - t[q]) / rise
         usual = 1.0 / (n * up[maps[q], 2])
-        if not 0.5 < -slope[q] / usual < 2.0 and slope[q] == slope[q]:
-            slope[q] = -usual  # another pair of images was the best one
-    weight = share[maps]
-    weight[np.isnan(slope)] = 0.0
-    if np.isnan(start) and agree < np.inf:
-        height = _most_supported(one[:, 0], slope, weight, agree)
-    else:
-        height = 0.0
-    for _ in range(MAX_STEPS):
-        step = _step(one[:, 0], slope, weight, height, agree)
-        height += step
-        if not abs(step) > CLOSE_M:
-            break
-    if np.isnan(height):
-        row[_OUTCOME] = _NO_CAMERA if k == 0 else _ONE_CAMERA
-        return
-    bed, step = bed + height, 0.0
-    for _ in range(MAX_LOOKS):
-        bed += step
-        for q in range(k):
-            if weight[q] > 0.0:
-                _look(
-                    one[q], maps[q], bed, up, above, normal, frames, focal_px, matched,
-                    tolerance, n, work,
-                )  # fmt: skip
-        step = _step(one[:, 0], slope, weight, 0.0, agree)
-        if not abs(step) > CLOSE_ENOUGH_M:
-            break
-    if np.isnan(step):
-        row[_OUTCOME] = _ONE_CAMERA
-        return
-    row[2] = bed + step
-    sums = np.zeros(5)
-    for q in range(k):
-        w = weight[q] * _agreement(one[q, 0] + slope[q] * step, agree)
-        if not w > 0.0:
-            continue
-        x, y = one[q, 1] + step * one[q, 3], one[q, 2] + step * one[q, 4]
-        sums += np.array([w, w * x, w * y, w * (x * x + y * y), 1.0])
-    if not sums[0] > 0.0:
-        row[_OUTCOME] = _ONE_CAMERA
-        return
-    row[0], row[1] = sums[1] / sums[0], sums[2] / sums[0]
-    row[_MISS] = np.sqrt(max(sums[3] / sums[0] - row[0] ** 2 - row[1] ** 2, 0.0))
-    row[_COUNT], row[_OUTCOME] = sums[4], _CORRECTED
+        if slope[q] == slope[q] and not 0.5 < -slope[q] / usual < 2.0:
+            slope[q] = -usual  # another pair of images was the best one there
+    return bed, t, slope
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _agreement(t: float, agree: float) -> float:
-    """Return how likely a depth that is off by t, relative, is fused: the limit is a soft one.
-
-    The software compares with one depth, not with the mean that becomes the point.
-    """
-    return max(0.0, min(1.0, 2.5 - 2.0 * abs(t) / agree))
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _step(
-    t: FloatArray, slope: FloatArray, weight: FloatArray, height: float, agree: float
-) -> float:
-    """Return how far up the bed must go so that the depths that agree have a mean of zero."""
+def balance(t: FloatArray, slope: FloatArray, weight: FloatArray) -> float:
+    """Return how far up the bed must go so that the weighted mean of the depths is zero."""
     total, change = 0.0, 0.0
     for q in range(t.size):
-        if weight[q] > 0.0:
-            off = t[q] + slope[q] * height
-            w = weight[q] * _agreement(off, agree)
-            total, change = total + w * off, change + w * slope[q]
+        if weight[q] > 0.0 and slope[q] == slope[q]:
+            total, change = total + weight[q] * t[q], change + weight[q] * slope[q]
     return -total / change
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _most_supported(t: FloatArray, slope: FloatArray, weight: FloatArray, agree: float) -> float:
-    """Return the height at which most depth maps, by weight, agree with the point."""
-    best, most = 0.0, -1.0
-    for p in range(t.size):
-        if not weight[p] > 0.0:
-            continue
-        height = -t[p] / slope[p]
-        support = 0.0
-        for q in range(t.size):
+def settle_bed(
+    row: FloatArray, maps: IntArray, weight: FloatArray, t: FloatArray, slope: FloatArray,
+    bed: float, up: FloatArray, above: FloatArray, normal: FloatArray, matcher: Matcher, n: float,
+) -> None:  # fmt: skip
+    """Find the height of the bed at which the fused depths give the apparent point, and write it.
+
+    From where the lines say, and looked at again until they need not be mended.
+    """
+    row[OUTCOME] = _NO_CAMERA if maps.size == 0 else _ONE_CAMERA
+    step = balance(t, slope, weight)
+    looks, work = np.empty((maps.size, 5)), np.empty((matcher.matched.shape[1], 3))
+    for _ in range(MAX_LOOKS):
+        if not np.isfinite(step):
+            return
+        bed += step
+        for q in range(maps.size):
             if weight[q] > 0.0:
-                support += weight[q] * _agreement(t[q] + slope[q] * height, agree)
-        if support > most:
-            best, most = height, support
-    return best
+                _look(looks[q], maps[q], bed, up, above, normal, matcher, n, work)
+            else:
+                looks[q, 0] = 0.0
+        step = balance(looks[:, 0], slope, weight)
+        if abs(step) < CLOSE_M:
+            break
+    total, x, y, squares, count = 0.0, 0.0, 0.0, 0.0, 0.0
+    for q in range(maps.size):
+        if weight[q] > 0.0 and slope[q] == slope[q]:
+            w, px = weight[q], looks[q, 1] + step * looks[q, 3]
+            py = looks[q, 2] + step * looks[q, 4]
+            total, x, y = total + w, x + w * px, y + w * py
+            squares, count = squares + w * (px * px + py * py), count + 1.0
+    if not (np.isfinite(step) and np.isfinite(squares)):
+        return
+    row[0], row[1], row[2] = x / total, y / total, bed + step
+    row[_MISS] = np.sqrt(max(squares / total - row[0] ** 2 - row[1] ** 2, 0.0))
+    row[OUTCOME] = _CORRECTED
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _look(
     out: FloatArray, c: int, bed: float, up: FloatArray, above: FloatArray, normal: FloatArray,
-    frames: Frames, focal_px: FloatArray, matched: IntArray, tolerance: float, n: float,
-    work: FloatArray,
+    matcher: Matcher, n: float, work: FloatArray,
 ) -> None:  # fmt: skip
     """Say where the depth map of image c has a bed at a height relative to the apparent point.
 
-    Writes how far beyond P, relative to the distance from the camera, and the place on the bed.
+    Writes how far beyond P, relative to the distance from the camera, the place on the bed, and how
+    that moves with the height.
     """
     ex, ey, ez = up[c, 0], up[c, 1], up[c, 2]
     length2 = ex * ex + ey * ey + ez * ez
@@ -303,7 +273,7 @@ def _look(
     length = np.sqrt(length2)
     t = _depth(
         c, out[1], out[2], bed, -ex / length, -ey / length, -ez / length, up, above, normal,
-        frames, focal_px, matched, tolerance, n, work,
+        matcher, n, work,
     )  # fmt: skip
     out[0] = t / length
 
@@ -311,8 +281,7 @@ def _look(
 @njit(cache=True, error_model="numpy", nogil=True)
 def _depth(
     c: int, qx: float, qy: float, qz: float, ux: float, uy: float, uz: float, up: FloatArray,
-    above: FloatArray, normal: FloatArray, frames: Frames, focal_px: FloatArray,
-    matched: IntArray, tolerance: float, n: float, work: FloatArray,
+    above: FloatArray, normal: FloatArray, matcher: Matcher, n: float, work: FloatArray,
 ) -> float:  # fmt: skip
     """Return how far beyond P, m along its ray u, the depth map of image c has the bed at Q.
 
@@ -320,20 +289,20 @@ def _depth(
     """
     count = 0
     nx, ny, nz = normal[0], normal[1], normal[2]
-    for j in matched[c]:
+    for j in matcher.matched[c]:
         if j < 0:
             break
         ex, ey, ez = up[j, 0], up[j, 1], up[j, 2]
         k, _, _, _, sx, sy, sz = light_path(qx, qy, qz, ex, ey, ez, nx, ny, nz, above[j], n)
         ax, ay, az = k * sx - nx, k * sy - ny, k * sz - nz
-        if not (k == k and holds(frames, j, -ax, -ay, -az)):
+        if not (k == k and holds(matcher.inner, j, -ax, -ay, -az)):
             continue
         size = 1.0 / np.sqrt(ax * ax + ay * ay + az * az)
         ax, ay, az = ax * size, ay * size, az * size
         along, turn = -(ex * ax + ey * ay + ez * az), ux * ax + uy * ay + uz * az
         px, py, pz = -ex - along * ax, -ey - along * ay, -ez - along * az
         gx, gy, gz = ux - turn * ax, uy - turn * ay, uz - turn * az
-        scale = focal_px[j] ** 2 / (ex * ex + ey * ey + ez * ez)
+        scale = matcher.focal_px[j] ** 2 / (ex * ex + ey * ey + ez * ez)
         work[count, 0] = scale * (px * px + py * py + pz * pz)
         work[count, 1] = scale * (px * gx + py * gy + pz * gz)
         work[count, 2] = scale * (gx * gx + gy * gy + gz * gz)
@@ -342,7 +311,7 @@ def _depth(
         return np.nan
     if count == 1:
         return -work[0, 1] / work[0, 2]
-    return _best_pairs(work[:count], tolerance)
+    return _best_pairs(work[:count], matcher.tolerance_px2)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -21,7 +21,15 @@ from numba import njit, prange
 from pcfix.label.raster import build_field
 from pcfix.label.tin import build_tin, locate
 from pcfix.model import Outcome, WaterMesh, WaterRaster
-from pcfix.refract.choice import TILE, choose, gather, least_cosine2, near_cameras, spatial_order
+from pcfix.refract.choice import (
+    ANY_NUMBER,
+    TILE,
+    choose,
+    gather,
+    least_cosine2,
+    near_cameras,
+    spatial_order,
+)
 from pcfix.refract.frames import (
     ALL,
     NOT_DISTORTED,
@@ -122,7 +130,7 @@ def intersect(
             _all_in_frame(*common)
         else:
             rows = None if views is None else (views.start, views.camera)
-            _chosen(*common, tin, field, rows, settings.max_cameras or len(cameras))
+            _chosen(*common, tin, field, rows, settings.max_cameras or ANY_NUMBER)
     return Intersection(
         shift_m=result[:, :3],
         outcome=result[:, _OUTCOME].astype(np.uint8),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
+    from pcfix.refract.bed import Bed
     from pcfix.refract.matcher import Matcher
     from pcfix.refract.occlusion import Occluder
     from pcfix.refract.regression import DepthRegression
@@ -21,8 +22,11 @@ class Learned(NamedTuple):
         The cloud's own surface, which hides points from cameras.
     matcher : Matcher or None
         Which images were matched with which.
+    bed : Bed or None
+        What fused points of one place have in common.
     """
 
     regression: DepthRegression | None = None
     occluder: Occluder | None = None
     matcher: Matcher | None = None
+    bed: Bed | None = None

@@ -29,6 +29,10 @@ MATCHED, AVERAGED, NEIGHBOURS = 5, 8, 12
 BEST_ANGLE_DEG, NARROW_DEG, WIDE_DEG = 12.0, 4.56, 8.4
 LEAST_ANGLE_DEG, LARGEST_ANGLE_DEG = 3.0, 65.0
 LEAST_ANGLE_WEIGHT = 0.1
+REPEATED_DEG = 45.0
+"""Features are found again in an image under another angle with the share exp(-(angle / this)^2),
+so that nadir and oblique images have few tie points in common."""
+
 TOLERANCE_PX2 = 0.1
 CELLS = 16
 LEAST_PLACES, PLACES_AN_IMAGE = 4000, 10
@@ -48,6 +52,8 @@ class Matcher(NamedTuple):
         The images that each one was compared with, best first; -1 after the last.
     averaged : array, shape (k, 8)
         The images whose depth maps were averaged into its own.
+    fused : array, shape (k, 12)
+        The images whose depth maps may be fused with its own.
     focal_px : array, shape (k,)
         Pixels a radian.
     tolerance_px2 : float
@@ -59,6 +65,7 @@ class Matcher(NamedTuple):
 
     matched: IntArray
     averaged: IntArray
+    fused: IntArray
     focal_px: FloatArray
     inner: Frames
     tolerance_px2: float = TOLERANCE_PX2
@@ -74,7 +81,7 @@ def matcher_of(cameras: Cameras, places: FloatArray) -> Matcher:
     places : array, shape (p, 3)
         Some thousand places of the scene, as the software had them, metres, world frame.
     """
-    return _matcher(cameras, places, *_images(cameras, places))
+    return _matcher(cameras, places, *_images(cameras, places), tracked=False)
 
 
 def matcher_of_ties(cameras: Cameras, ties: TiePoints) -> Matcher:
@@ -93,7 +100,7 @@ def matcher_of_ties(cameras: Cameras, ties: TiePoints) -> Matcher:
     saw = np.zeros((len(cameras), len(rows)), np.bool_)
     saw[views.camera, owner] = True
     cell, depth = _images(cameras, places)
-    return _matcher(cameras, places, np.where(saw, cell, -1), depth)
+    return _matcher(cameras, places, np.where(saw, cell, -1), depth, tracked=True)
 
 
 def places_for(cameras: Cameras) -> int:
@@ -101,12 +108,14 @@ def places_for(cameras: Cameras) -> int:
     return max(LEAST_PLACES, PLACES_AN_IMAGE * len(cameras))
 
 
-def _matcher(cameras: Cameras, places: FloatArray, cell: IntArray, depth: FloatArray) -> Matcher:
+def _matcher(
+    cameras: Cameras, places: FloatArray, cell: IntArray, depth: FloatArray, *, tracked: bool
+) -> Matcher:
     seen = cell >= 0
     start = np.concatenate([[0], np.cumsum(seen.sum(axis=1))])
     place = np.nonzero(seen)[1]
     with one_caller():
-        score = _scores(places, cameras.centres, cell, depth, start, place)
+        score = _scores(places, cameras.centres, cell, depth, start, place, tracked)
     most = min(NEIGHBOURS, len(cameras))
     best = np.argsort(-score, axis=1, kind="stable")[:, :most]
     best = np.where(np.take_along_axis(score, best, axis=1) > 0.0, best, -1)
@@ -115,6 +124,7 @@ def _matcher(cameras: Cameras, places: FloatArray, cell: IntArray, depth: FloatA
     return Matcher(
         matched=np.ascontiguousarray(table[:, :MATCHED]),
         averaged=np.ascontiguousarray(table[:, :AVERAGED]),
+        fused=table,
         focal_px=focal_px(cameras),
         inner=frames_of(without_border(cameras)),
     )
@@ -161,7 +171,7 @@ def _images(cameras: Cameras, places: FloatArray) -> tuple[IntArray, FloatArray]
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _scores(
     places: FloatArray, centres: FloatArray, cell: IntArray, depth: FloatArray,
-    start: IntArray, place: IntArray,
+    start: IntArray, place: IntArray, tracked: bool,
 ) -> FloatArray:  # fmt: skip
     """Return how good a partner each image j is for the reference i, shape (k, k)."""
     k = len(centres)
@@ -173,17 +183,19 @@ def _scores(
             if j == i:
                 continue
             covered[:] = False
-            total, angles, scales, common = 0.0, 0.0, 0.0, 0
+            total, angles, scales, common = 0.0, 0.0, 0.0, 0.0
             for p in mine:
                 if cell[j, p] < 0:
                     continue
                 covered[cell[i, p]] = True
                 angle = _angle_deg(centres[i], centres[j], places[p])
                 scale = depth[j, p] / depth[i, p]
-                total += _angle_weight(angle) * _scale_weight(scale)
-                angles, scales, common = angles + angle, scales + scale, common + 1
+                found = 1.0 if tracked else np.exp(-((angle / REPEATED_DEG) ** 2))
+                total += found * _angle_weight(angle) * _scale_weight(scale)
+                angles, scales = angles + found * angle, scales + found * scale
+                common += found
             area = covered.sum() / (CELLS * CELLS)
-            if common < LEAST_COMMON or area < LEAST_AREA:
+            if covered.sum() < LEAST_COMMON or area < LEAST_AREA:
                 continue
             if not LEAST_ANGLE_DEG <= angles / common <= LARGEST_ANGLE_DEG:
                 continue

@@ -12,14 +12,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.refract.bed import Bed, bed_of
 from pcfix.refract.bundles import Bundle
 from pcfix.refract.choice import chosen_views, spatial_order
 from pcfix.refract.depth_maps import invert_depth_maps
+from pcfix.refract.fusion import invert_fusion, likely_beds
 from pcfix.refract.intersect import intersect
 from pcfix.refract.learned import Learned
 from pcfix.refract.matcher import steepest_and_partners, without_border
 from pcfix.refract.occlusion import in_sight
 from pcfix.refract.result import Intersection
+from pcfix.refract.stereo_pairs import cameras_of_pairs, invert_pairs
 from pcfix.refract.uncertainty import with_uncertainty
 
 if TYPE_CHECKING:
@@ -44,6 +47,12 @@ _HOMES = {
     "regression": "pcfix.refract.regression",
 }
 """Where each method is: a function of its own name that takes a `Bundle`."""
+
+_OF_MATCHERS: dict[str, Callable[[Bundle], Intersection]] = {
+    "depth-maps": invert_depth_maps,
+    "pairs": invert_pairs,
+}
+"""What `consistent` is for the kinds of dense clouds."""
 
 
 def correct(
@@ -73,12 +82,14 @@ def correct(
         One row per input point, in the same order.
     """
     learned = learned or Learned()
+    method, pairs = _method(settings, views, learned), None
+    if views is not None and views.kind == "pairs":
+        views, pairs = cameras_of_pairs(views), views
     if settings.method == "snell" and learned == Learned(regression=learned.regression):
         found = intersect(xyz, surface, water, cameras, settings, views, level_offset_m)
         return with_uncertainty(
             found, xyz, surface, cameras, settings, views, level_offset_m, learned, level_sigma_m
         )
-    method = _method(settings, views, learned)
     offset = np.zeros(len(cameras)) if level_offset_m is None else level_offset_m
     order = spatial_order(xyz)
     parts = []
@@ -87,22 +98,62 @@ def correct(
         mine = None if views is None else views.take(rows)
         chosen = _cameras_of(xyz[rows], above, water, cameras, settings, mine, offset, learned)
         bundle = Bundle(xyz[rows], above, water, cameras, chosen, settings, offset, learned)
+        if method is invert_pairs and pairs is not None:
+            found = invert_pairs(bundle, pairs.take(rows))
+        else:
+            found = method(bundle)
         sigma = level_sigma_m[rows] if isinstance(level_sigma_m, np.ndarray) else level_sigma_m
         parts.append(
             with_uncertainty(
-                method(bundle), xyz[rows], above, cameras, settings, chosen, offset, learned, sigma
+                found, xyz[rows], above, cameras, settings, chosen, offset, learned, sigma
             )
         )
     return _joined(parts, order, len(cameras))
 
 
+def learn_bed(
+    xyz: FloatArray,
+    surface: SurfaceAbove,
+    water: WaterSurface,
+    cameras: Cameras,
+    settings: Settings,
+    level_offset_m: FloatArray | None,
+    learned: Learned,
+) -> Bed | None:
+    """Return the bed that fused points of a whole cloud have in common, of a sample of them.
+
+    Parameters
+    ----------
+    xyz, surface, water, cameras, settings, level_offset_m, learned
+        As of `correct`. None where no image sees a point.
+    """
+    offset = np.zeros(len(cameras)) if level_offset_m is None else level_offset_m
+    likely = []
+    order = spatial_order(xyz)
+    for rows in _batches(order):
+        above = type(surface)(surface.height_m[rows], surface.slope[rows])
+        chosen = _cameras_of(xyz[rows], above, water, cameras, settings, None, offset, learned)
+        bundle = Bundle(xyz[rows], above, water, cameras, chosen, settings, offset, learned)
+        likely.append(likely_beds(bundle))
+    most = max(part.shape[1] for part in likely)
+    table = np.full((len(xyz), most), np.nan, np.float32)
+    done = 0
+    for part in likely:
+        table[done : done + len(part), : part.shape[1]] = part
+        done += len(part)
+    return bed_of(xyz[order], table) if np.isfinite(table).any() else None
+
+
 def _method(
     settings: Settings, views: Views | None, learned: Learned
 ) -> Callable[[Bundle], Intersection]:
-    """Return the function that corrects; what a list of depth maps needs is not triangulation."""
-    fused = learned.matcher is not None if views is None else views.kind == "depth-maps"
-    if settings.method == "consistent" and fused:
-        return invert_depth_maps
+    """Return the function that corrects; what a dense matcher made is not triangulated at once."""
+    modelled = "tracks" if learned.matcher is None else settings.matcher
+    kind = modelled if views is None else views.kind
+    if settings.method == "consistent" and views is None and kind == "depth-maps":
+        return invert_fusion
+    if settings.method == "consistent" and kind in _OF_MATCHERS:
+        return _OF_MATCHERS[kind]
     found: Callable[[Bundle], Intersection] = getattr(
         import_module(_HOMES[settings.method]), settings.method
     )

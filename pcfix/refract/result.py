@@ -12,7 +12,11 @@ if TYPE_CHECKING:
 
 
 class Intersection(NamedTuple):
-    """The result for m submerged points; see `pcfix.Correction` for the meaning of each."""
+    """The result for m submerged points; see `pcfix.Correction` for the meaning of each.
+
+    The methods themselves leave `sigma_z_m` and `covariance_m2` open, but for `intersect`, whose
+    `sigma_z_m` is that of the scatter of the rays; `pcfix.refract.methods.correct` fills both.
+    """
 
     shift_m: FloatArray
     outcome: npt.NDArray[np.uint8]
@@ -22,3 +26,4 @@ class Intersection(NamedTuple):
     incidence_deg: FloatArray
     camera_used: BoolArray
     pairs_tested: int
+    covariance_m2: FloatArray | None = None

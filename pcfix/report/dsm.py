@@ -32,6 +32,12 @@ def dsm_text(summary: DsmSummary) -> str:
             f" across holes up to {s.hole_m:.3g} m"
         )
     lines.append(f"empty        {s.empty:,} cells ({share(s.empty, total)})")
+    if s.uncertainty_m is not None:
+        sigma = s.uncertainty_m
+        lines.append(
+            f"uncertainty  of the bed's cells, formal, standard: mean {sigma['mean']:.3f} m,"
+            f" largest {sigma['max']:.3f} m (band 4)"
+        )
     if s.hillshade is not None:
         lines.append(f"hillshade    {s.hillshade}")
     return "\n".join(lines)

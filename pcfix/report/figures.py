@@ -110,6 +110,43 @@ def cameras_figure(
     return figure
 
 
+def tvu_figure(depth_m: FloatArray, sigma_z_m: FloatArray) -> Figure:
+    """Draw TVU at 95 % over depth, and the largest of the orders of IHO S-44 up to one above it.
+
+    Parameters
+    ----------
+    depth_m, sigma_z_m : array, shape (m,)
+        Depths and standard errors of Z of some points.
+    """
+    from pcfix.report.tvu import COVERAGE_95, ORDERS, largest_tvu_m
+
+    figure, axes = new_figure()
+    tvu = COVERAGE_95 * sigma_z_m
+    deepest = float(max(depth_m.max(), 1e-3))
+    edges = np.linspace(0.0, deepest * (1.0 + 1e-9), 31)
+    slot = np.clip(np.digitize(depth_m, edges) - 1, 0, 29)
+    filled = [i for i in range(30) if (slot == i).any()]
+    low, middle, high = np.array([np.percentile(tvu[slot == i], [5, 50, 95]) for i in filled]).T
+    centres = 0.5 * (edges[:-1] + edges[1:])[filled]
+    axes.fill_between(
+        centres, low, high, color=WATER, alpha=0.6, linewidth=0.0, label="90 % of the points"
+    )
+    axes.plot(centres, middle, color=AFTER, label="median")
+    depths = np.linspace(0.0, deepest, 100)
+    for order, style in zip(ORDERS, ("-", "--", "-.", ":"), strict=True):
+        largest = largest_tvu_m(order, depths)
+        name = order.name if order.name[0].isalpha() else f"order {order.name}"
+        axes.plot(depths, largest, style, color=BEFORE, label=f"IHO S-44 {name}")
+        if largest[0] > high.max():
+            break  # the laxer ones would only press the points down
+    axes.set_xlim(0.0, deepest)
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("Depth (m)")
+    axes.set_ylabel("TVU at 95 % (m)")
+    axes.legend(loc="best")
+    return figure
+
+
 def histogram_figure(groups: dict[str, FloatArray], label: str, *, gaussian: bool = True) -> Figure:
     """Draw the distribution of one or two groups of values, each with its Gaussian if asked."""
     figure, axes = new_figure()

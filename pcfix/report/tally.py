@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pcfix.model import Outcome
+from pcfix.report.tvu import UncertaintyTally
 
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, Correction, FloatArray
@@ -22,7 +23,7 @@ REASONS = {
 
 
 class Tally:
-    """Counts, extremes and a histogram of the shift in Z, over all chunks so far."""
+    """Counts, extremes, and histograms of shift and standard error in Z, over all chunks so far."""
 
     def __init__(self, cameras: int) -> None:
         self.points = 0
@@ -36,6 +37,7 @@ class Tally:
         self.low: FloatArray = np.full(3, np.inf)
         self.high: FloatArray = np.full(3, -np.inf)
         self.lowest_water_m = np.inf
+        self._uncertainty = UncertaintyTally()
 
     def add(self, apparent: FloatArray, correction: Correction) -> None:
         """Add one chunk: the apparent points, shape (n, 3), and their correction."""
@@ -59,6 +61,7 @@ class Tally:
             self._shift_sum_m += float(shift.sum())
             bins = np.rint((np.clip(shift, -_REACH_M, _REACH_M) + _REACH_M) / _BIN_M)
             self._shift_bins += np.bincount(bins.astype(int), minlength=len(self._shift_bins))
+            self._uncertainty.add(correction.sigma_z_m[moved], depth)
 
     @property
     def submerged(self) -> int:
@@ -91,6 +94,10 @@ class Tally:
             for share in (0.05, 0.95)
         )
         return _rounded(mean=self._shift_sum_m / self.corrected, p5=p5, p95=p95)
+
+    def uncertainty(self) -> dict[str, Any] | None:
+        """Return standard error of Z, TVU and orders; see `UncertaintyTally.as_dict`."""
+        return self._uncertainty.as_dict()
 
 
 def _rounded(**values: float) -> dict[str, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from pcfix.report.tvu import budget_words, tvu_sentence
 from pcfix.settings import DEFAULT_REFRACTIVE_INDEX
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ def summary_text(summary: Summary) -> str:
         f"water        {s.water}, refractive index {s.settings['refractive_index']:.6g}",
         *_index(s),
         *_water_fit(s),
+        *_uncertainty(s),
     ]
     return "\n".join([*lines, *left_out_lines(s.labelling)])
 
@@ -74,6 +76,27 @@ def _water_fit(s: Summary) -> list[str]:
         f"  fitted     {fit['model']}{used}; standard error of the level {sigma:.3f} m, of the bed"
         f" by it {BED_PER_LEVEL * sigma:.3f} m"
     ]
+
+
+def _uncertainty(s: Summary) -> list[str]:
+    """Say how good the heights are, if the budget is right and nothing else is wrong."""
+    found = s.uncertainty
+    if found is None:
+        return []
+    sigma, tvu = found["sigma_z_m"], found["tvu_95_m"]
+    return [
+        f"uncertainty  standard error of Z mean {sigma['mean']:.3f} m, 95 % of the points below"
+        f" {sigma['p95']:.3f} m; TVU at 95 % mean {tvu['mean']:.3f} m",
+        f"  IHO S-44   {tvu_sentence(found)}",
+        f"  formal     it assumes {errors_of(s)} (standard deviations)",
+        "             and no mismatches; S-44 asks for more than the TVU",
+    ]
+
+
+def errors_of(s: Summary) -> str:
+    """Return the budget of a run in words."""
+    fitted = None if s.water_fit is None else s.water_fit["sigma_level_m"]
+    return budget_words(s.settings["errors"], fitted)
 
 
 def left_out_lines(labelling: dict[str, Any] | None) -> list[str]:

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 import rasterio
@@ -17,6 +18,7 @@ from pcfix.flow import dsm as flow
 from pcfix.flow import sorted_points
 from pcfix.flow.dsm import grid_dsm
 from pcfix.io.rasters import read_raster
+from pcfix.report.dsm import dsm_text
 from tests.grid.clouds import EAST, NORTH, awkward, scattered, write
 from tests.utils.shared import ROOT
 
@@ -116,6 +118,50 @@ def test_a_plane_between_scattered_points(tmp_path):
     known = ~np.isnan(found)
     assert known[1:-1, 1:-1].all()
     np.testing.assert_allclose(found[known], sloping(x, y)[known], rtol=0, atol=5.1e-4)
+
+
+def with_sigma(path, xyz, sigma):
+    """Write a cloud with the dimension that a correction leaves, in tenths of a millimetre."""
+    las = laspy.read(write(path, xyz))
+    las.add_extra_dim(
+        laspy.ExtraBytesParams("SigmaZ", "uint16", scales=np.array([1e-4]), offsets=np.zeros(1))
+    )
+    las["SigmaZ"] = sigma
+    las.write(path)
+    return path
+
+
+@pytest.mark.parametrize("method", ["mean", "tin"])
+def test_uncertainty_is_the_root_mean_square_of_the_points(tmp_path, method):
+    xyz = scattered(4000, 20.0, 15.0)
+    sigma = np.round(np.random.default_rng(1).uniform(0.01, 0.3, 4000), 4)
+    sigma[xyz[:, 0] < EAST + 8.0] = 0.0  # land
+    path = with_sigma(tmp_path / "cloud.las", xyz, sigma)
+    summary = grid_dsm(path, tmp_path / "d.tif", resolution_m=1.0, method=method)
+    with rasterio.open(tmp_path / "d.tif") as dsm:
+        assert dsm.descriptions == ("height", "count", "spread", "uncertainty")
+        found = dsm.read(4)
+    expected = np.full((15, 20), np.nan)
+    for row in range(15):
+        for column in range(8, 20):
+            x, y = xyz[:, 0] - EAST - column, NORTH + 15.0 - row - xyz[:, 1]
+            own = sigma[(x >= 0) & (x < 1) & (y > 0) & (y <= 1)]
+            expected[row, column] = np.sqrt((own**2).mean())
+    assert (found[:, :8] == -9999.0).all()
+    np.testing.assert_allclose(found[:, 8:], expected[:, 8:], rtol=1e-6)  # float32
+    known = expected[:, 8:]
+    assert summary.uncertainty_m["mean"] == pytest.approx(known.mean(), abs=5e-5)
+    assert summary.uncertainty_m["max"] == pytest.approx(known.max(), abs=5e-5)
+    assert "band 4" in dsm_text(summary)
+
+
+def test_a_cloud_without_standard_errors_has_no_such_band(tmp_path):
+    summary = grid_dsm(
+        write(tmp_path / "c.las", scattered(500, 5.0, 5.0)), tmp_path / "d.tif", resolution_m=1.0
+    )
+    assert summary.uncertainty_m is None
+    with rasterio.open(tmp_path / "d.tif") as dsm:
+        assert dsm.count == 3
 
 
 @pytest.mark.parametrize("cog", [False, True])

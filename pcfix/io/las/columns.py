@@ -52,7 +52,7 @@ COLUMNS = (
     Column("ShiftZ", "int16", "int32", 0.0, "true minus apparent Z"),
     Column("WaterDepth", "uint16", "uint32", 0.001, "below the water surface, m"),
     Column("RayMiss", "uint16", "uint32", 0.0001, "rms distance from the rays, m", True),
-    Column("SigmaZ", "uint16", "uint32", 0.0001, "formal, scatter of rays only, m", True),
+    Column("SigmaZ", "uint16", "uint32", 0.0001, "formal standard error of Z, m", True),
     Column("Incidence", "uint16", "uint16", 0.1, "largest angle in air, deg"),
     Column("RayCount", "uint16", "uint16", 1.0, "rays intersected", True),
     Column("SourceClass", "uint8", "uint8", 1.0, "class before the correction"),

@@ -1,0 +1,209 @@
+"""Which depth maps were fused into a point, where no list says it.
+
+The software takes one image's pixel, the seed, and fuses with it the depth maps of its neighbours
+that agree; what they showed is used up, and later seeds fuse what is left. So the points of a place
+come from a few groups of images, and each group has the bed at another apparent height: where
+there are obliques, a metre apart under deep water.
+
+For each image that sees the point the model fuses what would agree with it as the seed, and says
+at which height the bed would lie if that group had made the point: the likely beds. Neighbouring
+points are of different groups, and only the true bed is among the likely ones of all; so the
+height that most points around can have come from, the bed of the surroundings
+(`pcfix.refract.bed`), tells which group made each of them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit, prange
+
+from pcfix.refract.depth_maps import arrays_of, balance, intersection_of, lines, settle_bed
+from pcfix.refract.matcher import Matcher
+from pcfix.refract.threads import one_caller
+
+if TYPE_CHECKING:
+    from pcfix.model import FloatArray, IntArray
+    from pcfix.refract.bundles import Bundle
+    from pcfix.refract.frames import Frames
+    from pcfix.refract.result import Intersection
+
+AGREE = 0.01
+"""Depths that differ by less, relative, are fused."""
+
+AVERAGED_WITHIN = 0.012
+"""Depths of neighbouring maps that differ by less are averaged, before."""
+
+MAX_ROUNDS = 6
+CLOSE_M = 1e-3
+_BLOCK = 64
+
+
+def invert_fusion(bundle: Bundle) -> Intersection:
+    """Return the true points from which fused depth maps would have made the apparent ones.
+
+    Parameters
+    ----------
+    bundle : Bundle
+        Its views are all images that see each point. `bundle.learned` has the matcher and, if
+        it was learned, the bed of the surroundings; without it the largest group made the point.
+
+    Returns
+    -------
+    Intersection
+    """
+    bed = bundle.learned.bed
+    around = np.full(len(bundle.xyz), np.nan) if bed is None else bed.height_at(bundle.xyz[:, :2])
+    result = np.zeros((len(bundle.xyz), 6))
+    with one_caller():
+        _invert(*arrays_of(bundle), around, result)
+    return intersection_of(bundle, result)
+
+
+def likely_beds(bundle: Bundle) -> FloatArray:
+    """Return the heights of the bed that different groups of images would have made points of.
+
+    Returns
+    -------
+    array of float32, shape (m, most views)
+        Relative to each apparent point, metres; NaN where there is none.
+    """
+    likely = np.full((len(bundle.xyz), max(1, bundle.counts.max(initial=0))), np.nan, np.float32)
+    with one_caller():
+        _likely(*arrays_of(bundle), likely)
+    return likely
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _likely(
+    xyz: FloatArray, height: FloatArray, normals: FloatArray, centres: FloatArray,
+    offset: FloatArray, matched: IntArray, averaged: IntArray, fused: IntArray,
+    focal_px: FloatArray, inner: Frames, tolerance: float, start: IntArray, camera: IntArray,
+    n: float,
+    likely: FloatArray,
+) -> None:  # fmt: skip
+    for block in prange((len(xyz) + _BLOCK - 1) // _BLOCK):
+        matcher = Matcher(matched, averaged, fused, focal_px, inner, tolerance)
+        place = np.full(len(centres), -1)
+        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(xyz))):
+            maps = camera[start[i] : start[i + 1]]
+            up, normal = centres - xyz[i], normals[i]
+            above = normal[2] * (height[i] - xyz[i, 2] + offset)
+            bed, t, slope = lines(maps, up, above, normal, matcher, n)
+            weight = np.empty(maps.size)
+            _set(place, maps)
+            for seed in range(maps.size):
+                if slope[seed] == slope[seed]:
+                    rise, _ = _group(weight, seed, maps, place, t, slope, up, matcher)
+                    likely[i, seed] = bed + rise
+            place[maps] = -1
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _invert(
+    xyz: FloatArray, height: FloatArray, normals: FloatArray, centres: FloatArray,
+    offset: FloatArray, matched: IntArray, averaged: IntArray, fused: IntArray,
+    focal_px: FloatArray, inner: Frames, tolerance: float, start: IntArray, camera: IntArray,
+    n: float,
+    around: FloatArray, result: FloatArray,
+) -> None:  # fmt: skip
+    for block in prange((len(xyz) + _BLOCK - 1) // _BLOCK):
+        matcher = Matcher(matched, averaged, fused, focal_px, inner, tolerance)
+        place = np.full(len(centres), -1)
+        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(xyz))):
+            maps = camera[start[i] : start[i + 1]]
+            up, normal = centres - xyz[i], normals[i]
+            above = normal[2] * (height[i] - xyz[i, 2] + offset)
+            bed, t, slope = lines(maps, up, above, normal, matcher, n)
+            weight = np.zeros(maps.size)
+            _set(place, maps)
+            seed = _best_seed(
+                weight, maps, place, t, slope, up, matcher, around[i] - xyz[i, 2] - bed
+            )
+            if seed >= 0:
+                _group(weight, seed, maps, place, t, slope, up, matcher)
+            place[maps] = -1
+            settle_bed(result[i], maps, weight, t, slope, bed, up, above, normal, matcher, n)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _set(place: IntArray, maps: IntArray) -> None:
+    for q in range(maps.size):
+        place[maps[q]] = q
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _best_seed(
+    weight: FloatArray, maps: IntArray, place: IntArray, t: FloatArray, slope: FloatArray,
+    up: FloatArray, matcher: Matcher, wanted: float,
+) -> int:  # fmt: skip
+    """Return the seed whose group has the bed nearest to the wanted height, or the largest one."""
+    best, least = -1, np.inf
+    for seed in range(maps.size):
+        if slope[seed] != slope[seed]:
+            continue
+        rise, members = _group(weight, seed, maps, place, t, slope, up, matcher)
+        misfit = -float(members) if wanted != wanted else abs(rise - wanted)
+        if misfit < least:
+            best, least = seed, misfit
+    return best
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _group(
+    weight: FloatArray, seed: int, maps: IntArray, place: IntArray, t: FloatArray,
+    slope: FloatArray, up: FloatArray, matcher: Matcher,
+) -> tuple[float, int]:  # fmt: skip
+    """Return the height of the bed if the group of a seed made the point, and the group's size.
+
+    Also sets what each depth map counts for in it.
+    """
+    rise, members = -t[seed] / slope[seed], 0
+    now = np.empty(maps.size)
+    for _ in range(MAX_ROUNDS):
+        for q in range(maps.size):
+            now[q] = t[q] + slope[q] * rise
+        weight[:] = 0.0
+        members = 0
+        middle = _averaged(maps[seed], seed, now, place, matcher)
+        members += _fuse(weight, seed, maps, now, middle, place, up, matcher)
+        for c in matcher.fused[maps[seed]]:
+            if c >= 0 and place[c] >= 0:
+                members += _fuse(weight, place[c], maps, now, middle, place, up, matcher)
+        step = balance(now, slope, weight)
+        rise += step
+        if not abs(step) > CLOSE_M:
+            break
+    return rise, members
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _averaged(camera: int, q: int, now: FloatArray, place: IntArray, matcher: Matcher) -> float:
+    """Return a depth after averaging with the neighbouring maps that agree."""
+    total, count = now[q], 1.0
+    for a in matcher.averaged[camera]:
+        if a >= 0 and place[a] >= 0 and abs(now[place[a]] - now[q]) < AVERAGED_WITHIN:
+            total, count = total + now[place[a]], count + 1.0
+    return total / count
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _fuse(
+    weight: FloatArray, q: int, maps: IntArray, now: FloatArray, middle: float, place: IntArray,
+    up: FloatArray, matcher: Matcher,
+) -> int:  # fmt: skip
+    """Fuse one depth map if it agrees: its weight goes evenly to the maps it was averaged with."""
+    camera = maps[q]
+    if not abs(_averaged(camera, q, now, place, matcher) - middle) < AGREE:
+        return 0
+    count = 1.0
+    for a in matcher.averaged[camera]:
+        if a >= 0 and place[a] >= 0 and abs(now[place[a]] - now[q]) < AVERAGED_WITHIN:
+            count += 1.0
+    each = 1.0 / ((up[camera] * up[camera]).sum() * count)
+    weight[q] += each
+    for a in matcher.averaged[camera]:
+        if a >= 0 and place[a] >= 0 and abs(now[place[a]] - now[q]) < AVERAGED_WITHIN:
+            weight[place[a]] += each
+    return 1

@@ -1,0 +1,520 @@
+"""The method consistent: truth forwards through water and SfM, and back; twins, noise, bits."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pcfix.errors import PcfixWarning, SettingError
+from pcfix.label.surface import surface_above
+from pcfix.model import Cameras, Lens, Outcome, Views, WaterMesh, WaterPlane, WaterRaster
+from pcfix.refract.consistent import check_consistent
+from pcfix.refract.image_jacobian import image_and_gradients
+from pcfix.refract.lens import coefficients
+from pcfix.refract.methods import correct
+from pcfix.settings import Settings
+from pcfix.simulate.tracing import triangulate
+from tests.utils.consistent_twin import (
+    found_by_full_triangulation,
+    image_in,
+    images_through_level,
+    path_under,
+    refractive_least_squares,
+    seen_through_water,
+    triangulated_straight,
+)
+from tests.utils.twins import image_slowly
+
+UTM = np.array([512_345.0, 4_987_654.0, 0.0])
+MICROMETRE, NANOMETRE = 1e-6, 1e-9
+N_WATER, HEIGHT_M = 1.34, 80.0
+PLAIN = Lens(3600.0, 5472.0, 3648.0, 2736.0, 1824.0)
+GSD_M = HEIGHT_M / PLAIN.focal
+DISTORTED = replace(
+    PLAIN,
+    radial=(-0.12, 0.05, -0.01),
+    tangential=(1e-3, -6e-4),
+    b1=1.5,
+    b2=-0.4,
+    principal_x=2750.0,
+)
+FISHEYE = replace(PLAIN, focal=2200.0, projection="equidistant", radial=(0.02, -0.004))
+DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+def looking(centres, tilts_deg, headings_deg, lens=PLAIN):
+    """Return cameras tilted from nadir towards a heading (from east, counterclockwise)."""
+    rotations = []
+    for tilt, heading in zip(tilts_deg, headings_deg, strict=True):
+        axis = np.array([np.sin(np.radians(heading)), -np.cos(np.radians(heading)), 0.0])
+        rotations.append(DOWN @ Rotation.from_rotvec(np.radians(tilt) * axis).as_matrix().T)
+    names = tuple(map(str, range(len(centres))))
+    return Cameras(names, np.asarray(centres, float), np.array(rotations), (lens,) * len(names))
+
+
+def nadir_block(rng, lens=PLAIN):
+    x, y = np.meshgrid(np.arange(-60.0, 61.0, 16.0), np.arange(-60.0, 61.0, 30.0))
+    centres = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, HEIGHT_M)])
+    centres += rng.normal(0, 0.5, centres.shape)
+    return looking(centres, rng.normal(0, 1.5, x.size), rng.uniform(0, 360, x.size), lens)
+
+
+def oblique_block(rng, lens=PLAIN):
+    """Return a nadir block with obliques of 35 degrees from four sides."""
+    nadir, parts = nadir_block(rng, lens), []
+    for heading in (0.0, 90.0, 180.0, 270.0):
+        x, y = np.meshgrid([-20.0, 20.0], [-20.0, 20.0])
+        back = (
+            -HEIGHT_M
+            * np.tan(np.radians(35.0))
+            * Rotation.from_euler("z", heading, degrees=True).apply([1.0, 0.0, 0.0])
+        )
+        centres = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, HEIGHT_M)]) + back
+        parts.append(looking(centres, np.full(x.size, 35.0), np.full(x.size, heading), lens))
+    every = [nadir, *parts]
+    names = tuple(map(str, range(sum(map(len, every)))))
+    return Cameras(
+        names,
+        np.vstack([part.centres for part in every]),
+        np.vstack([part.rotations for part in every]),
+        (lens,) * len(names),
+    )
+
+
+BLOCKS = {"nadir": nadir_block, "oblique": oblique_block}
+
+
+def moved(cameras, by):
+    return replace(cameras, centres=cameras.centres + by)
+
+
+def views_of(lists):
+    start = np.concatenate([[0], np.cumsum([len(mine) for mine in lists])]).astype(np.int64)
+    return Views(start, np.concatenate(lists).astype(np.int64))
+
+
+def run(points, cameras, water, views, *, method="consistent", n=N_WATER, offset=None):
+    settings = Settings(method=method, refractive_index=n)
+    above = surface_above(water, points)
+    return correct(points, above, water, cameras, settings, views, offset)
+
+
+def bed(count, seed=3, spread=20.0):
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.uniform(-spread, spread, (count, 2)), rng.uniform(-9, -1, count)])
+
+
+def in_frame(points, cameras, most=8, seed=5):
+    """Return for each point some cameras whose frame holds it."""
+    rng, lists = np.random.default_rng(seed), []
+    for point in points:
+        mine = []
+        for c, lens in enumerate(cameras.lenses):
+            u, v = image_in(cameras, c, point)
+            if 0 < u < lens.width and 0 < v < lens.height:
+                mine.append(c)
+        lists.append(np.sort(rng.permutation(mine)[:most]))
+    return lists
+
+
+def apparent_of(points, cameras, lists, planes_of, n=N_WATER):
+    """Return what SfM makes of true points, all by the slow twins; planes for each camera."""
+    found = []
+    for point, mine in zip(points, lists, strict=True):
+        seen = seen_through_water(point, cameras, mine, [planes_of[c] for c in mine], n)
+        found.append(triangulated_straight(seen, cameras, mine, point))
+    return np.array(found)
+
+
+def in_utm(plane):
+    a, b, c = plane
+    return WaterPlane(a - b * UTM[0] - c * UTM[1], b, c)
+
+
+def as_raster(plane, half=60.0, cell=1.0):
+    a, b, c = plane
+    at = np.arange(-half + cell / 2, half, cell)
+    heights = a + b * at[None, :] + c * at[::-1, None]
+    return WaterRaster(heights, UTM[0] - half, UTM[1] + half, (cell, cell))
+
+
+def as_mesh(plane, half=60.0, count=25):
+    a, b, c = plane
+    at = np.linspace(-half, half, count)
+    x, y = (grid.ravel() for grid in np.meshgrid(at, at))
+    i = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)).ravel()
+    triangles = np.vstack(
+        [np.column_stack([i, i + 1, i + count]), np.column_stack([i + 1, i + count + 1, i + count])]
+    )
+    return WaterMesh(np.column_stack([x, y, a + b * x + c * y]) + UTM, triangles)
+
+
+LEVEL, TILTED = (0.4, 0.0, 0.0), (0.4, 0.03, -0.02)
+CASES = {
+    "nadir": ("nadir", PLAIN, LEVEL),
+    "oblique": ("oblique", PLAIN, LEVEL),
+    "tilted": ("oblique", PLAIN, TILTED),
+    "distorted": ("oblique", DISTORTED, LEVEL),
+    "fisheye": ("nadir", FISHEYE, TILTED),
+}
+
+
+@pytest.fixture(scope="module", params=CASES)
+def exact(request):
+    """Return a noise-free scene about the origin: cameras, plane, truth, apparent, lists."""
+    block, lens, plane = CASES[request.param]
+    cameras, truth = BLOCKS[block](np.random.default_rng(1), lens), bed(12)
+    lists = in_frame(truth, cameras)
+    return cameras, plane, truth, apparent_of(truth, cameras, lists, [plane] * len(cameras)), lists
+
+
+@pytest.mark.parametrize("shape", [in_utm, as_mesh, as_raster])
+def test_the_truth_comes_home(exact, shape):
+    cameras, plane, truth, apparent, lists = exact
+    result = run(apparent + UTM, moved(cameras, UTM), shape(plane), views_of(lists))
+    assert (result.outcome == Outcome.CORRECTED).all()
+    # the iteration ends at a tenth of it
+    assert apparent + result.shift_m == pytest.approx(truth, abs=MICROMETRE)
+
+
+def test_snell_does_not_come_home(exact):
+    cameras, plane, truth, apparent, lists = exact
+    result = run(
+        apparent + UTM, moved(cameras, UTM), in_utm(plane), views_of(lists), method="snell"
+    )
+    # half a pixel on the ground and more: the scenes test something
+    assert np.abs(apparent + result.shift_m - truth).max() > 0.01
+
+
+def test_twin_that_triangulates_fully_agrees(exact):
+    # points moved from where a noise-free point can be: the residuals are some pixels
+    cameras, plane, truth, apparent, lists = exact
+    shifted = apparent + np.random.default_rng(2).normal(0, 0.03, apparent.shape)
+    result = run(shifted + UTM, moved(cameras, UTM), in_utm(plane), views_of(lists))
+    for i in range(0, 12, 4):
+        planes = [plane] * len(lists[i])
+        expected = found_by_full_triangulation(
+            shifted[i], cameras, lists[i], planes, N_WATER, truth[i]
+        )
+        # a triangulation by scipy is good to 1e-7 m, and the root is found through it
+        assert shifted[i] + result.shift_m[i] == pytest.approx(expected, abs=2 * MICROMETRE)
+
+
+def test_index_of_one_changes_nothing(exact):
+    cameras, plane, _, apparent, lists = exact
+    result = run(apparent + UTM, moved(cameras, UTM), in_utm(plane), views_of(lists), n=1.0)
+    # a metre of UTM is known to 1e-9, and the geometry multiplies it by no more than a few
+    assert np.abs(result.shift_m).max() < 3 * NANOMETRE
+    here = run(apparent, cameras, WaterPlane(*plane), views_of(lists), n=1.0)
+    assert np.abs(here.shift_m).max() < NANOMETRE
+
+
+def test_two_symmetrical_cameras_need_no_triangulation():
+    # all is in one plane: tan(r) = x / D, tan(i) = x / D', and sin(i) = n sin(r)
+    cameras = looking([[-20.0, 0, 70], [20.0, 0, 70]], [15.0, 15.0], [0.0, 180.0])
+    depth = 4.0
+    way = images_through_level(np.array([[0, 0, -depth]] * 2), cameras, np.array([0, 1]), 0.0, 1.34)
+    tangent = np.tan(np.radians(15.0) + np.arctan((way[0, 0] - PLAIN.principal_x) / PLAIN.focal))
+    apparent = np.array([[0.0, 0.0, 70.0 - 20.0 / tangent]])
+    result = run(apparent, cameras, WaterPlane(0.0), views_of([[0, 1]]))
+    assert (apparent + result.shift_m)[0] == pytest.approx([0, 0, -depth], abs=MICROMETRE)
+    assert result.ray_miss_m[0] == pytest.approx(0.0, abs=MICROMETRE)
+
+
+def test_straight_below_the_camera_depth_grows_by_the_index():
+    narrow = looking([[-0.5, 0, 70], [0.5, 0, 70]], [0.0, 0.0], [0.0, 0.0])
+    result = run(np.array([[0.0, 0.0, -3.0]]), narrow, WaterPlane(0.0), views_of([[0, 1]]))
+    # angles of half a degree: their squares are below 1e-4
+    assert result.shift_m[0] == pytest.approx([0, 0, -0.34 * 3.0], abs=3e-4)
+
+
+def test_each_camera_has_its_own_level():
+    cameras, truth = oblique_block(np.random.default_rng(1)), bed(10, seed=8)
+    truth[:5, 2] = np.linspace(0.05, 0.3, 5)  # above the water of some cameras
+    offset = np.where(np.arange(len(cameras)) % 2, 0.3, -0.3)
+    planes = [(0.4 + up, 0.01, 0.0) for up in offset]
+    lists = in_frame(truth, cameras)
+    apparent = apparent_of(truth, cameras, lists, planes)
+    water = in_utm((0.4, 0.01, 0.0))
+    result = run(apparent + UTM, moved(cameras, UTM), water, views_of(lists), offset=offset)
+    assert apparent + result.shift_m == pytest.approx(truth, abs=MICROMETRE)
+
+
+def test_waves():
+    def waves(x, y):
+        return 0.4 + 0.15 * np.sin(x / 4.0) * np.cos(y / 3.0)
+
+    cameras, truth = oblique_block(np.random.default_rng(1)), bed(25, seed=9)
+    truth[:, 2] = truth[:, 2] / 2.0 - 0.5
+    lists, apparent = in_frame(truth, cameras), []
+    for point, mine in zip(truth, lists, strict=True):
+        ways = [path_under(waves, point, cameras.centres[c], N_WATER) for c in mine]
+        seen = np.array([image_in(cameras, c, way) for c, way in zip(mine, ways, strict=True)])
+        apparent.append(triangulated_straight(seen, cameras, mine, point))
+    at = np.arange(-59.875, 60.0, 0.25)
+    water = WaterRaster(waves(at[None, :], at[::-1, None]), UTM[0] - 60, UTM[1] + 60, (0.25, 0.25))
+    miss = {}
+    for method in ("snell", "consistent"):
+        result = run(
+            np.array(apparent) + UTM, moved(cameras, UTM), water, views_of(lists), method=method
+        )
+        assert (result.outcome == Outcome.CORRECTED).all()
+        miss[method] = np.linalg.norm(apparent + result.shift_m - truth, axis=1)
+    # slopes of the raster are off by up to 0.0035, a ray of 5 m by 4 mm, and eight average
+    assert miss["consistent"].max() < 4e-3
+    assert miss["snell"].max() > 0.02
+
+
+# with noise
+
+
+def every_view(truth, cameras, plane_level, rng, noise_px):
+    """Return noisy image points of all cameras that show each true point through level water."""
+    size, margin = np.array([PLAIN.width, PLAIN.height]), 300.0  # refraction is a few dozen pixels
+    ray = truth[:, None] - cameras.centres
+    x, y, z = np.einsum("kij,nkj->ink", cameras.rotations, ray)
+    straight = PLAIN.focal * np.stack([x / z, y / z], axis=2)
+    point, camera = np.nonzero((np.abs(straight) < size / 2 + margin).all(axis=2))
+    pixels = images_through_level(truth[point], cameras, camera, plane_level, N_WATER)
+    inside = ((pixels > 0) & (pixels < size)).all(axis=1)
+    views = Views(
+        np.concatenate([[0], np.cumsum(np.bincount(point[inside], minlength=len(truth)))]),
+        camera[inside],
+    )
+    return views, pixels[inside] + rng.normal(0.0, noise_px, (inside.sum(), 2))
+
+
+def turned(cameras, points, turn):
+    """Return a scene turned about the origin: with it the level water is a tilted plane."""
+    rotations = cameras.rotations @ turn.T
+    return replace(cameras, centres=cameras.centres @ turn.T, rotations=rotations), points @ turn.T
+
+
+SAMPLE, COUNT = 1_500, 20_000
+
+
+@lru_cache
+def noisy(block):
+    """Return a scene through level water at 0 m with half a pixel of noise, and its floor."""
+    rng = np.random.default_rng(11)
+    cameras, truth = BLOCKS[block](rng), bed(COUNT)
+    views, pixels = every_view(truth, cameras, 0.0, rng, 0.5)
+    apparent = triangulate(pixels, cameras, views.camera, views.start, PLAIN, truth)
+    start = views.start[: SAMPLE + 1]
+    sample = (pixels[: start[-1]], start, views.camera[: start[-1]])
+    floor = refractive_least_squares(*sample, cameras, 0.0, N_WATER, truth[:SAMPLE])
+    return cameras, truth, apparent, views, floor
+
+
+@pytest.mark.parametrize("scene", ["nadir", "oblique", "river"])
+def test_noise_floor(scene):
+    cameras, truth, apparent, views, floor = noisy("nadir" if scene == "nadir" else "oblique")
+    turn, plane = np.eye(3), (0.0, 0.0, 0.0)
+    if scene == "river":  # a fall of 1 in 100, slantwise
+        turn = Rotation.from_rotvec([0.006, 0.008, 0.0]).as_matrix()
+        up = turn[:, 2]
+        plane = (0.0, -up[0] / up[2], -up[1] / up[2])
+    there, points = turned(cameras, apparent, turn)
+    result = run(points + UTM, moved(there, UTM), in_utm(plane), views)
+    assert (result.outcome == Outcome.CORRECTED).all()
+    error = result.shift_m @ turn + apparent - truth
+    # 20,000 points whose errors are half a GSD tell the bias to 0.004 GSD
+    assert np.abs(error.mean(axis=0)).max() < 0.05 * GSD_M
+    below = floor - truth[:SAMPLE]
+    ratio = np.sqrt((error[:SAMPLE] ** 2).mean(axis=0) / (below**2).mean(axis=0))
+    assert ratio.max() < 1.05
+
+
+# the same bits, and what cannot be done
+
+
+@pytest.fixture(scope="module")
+def many():
+    rng = np.random.default_rng(12)
+    cameras, truth = oblique_block(rng), bed(400)
+    views, pixels = every_view(truth, cameras, 0.4, rng, 0.5)
+    apparent = triangulate(pixels, cameras, views.camera, views.start, PLAIN, truth)
+    return apparent + UTM, moved(cameras, UTM), in_utm(LEVEL), views
+
+
+def same(one, other, rows=slice(None)):
+    for name in ("shift_m", "outcome", "ray_count", "ray_miss_m", "incidence_deg", "sigma_z_m"):
+        assert np.array_equal(getattr(one, name)[rows], getattr(other, name)), name
+
+
+def test_bits_do_not_depend_on_neighbours_or_threads(many):
+    points, cameras, water, views = many
+    whole = run(points, cameras, water, views)
+    rows = np.random.default_rng(1).permutation(400)[:130]
+    same(whole, run(points[rows], cameras, water, views.take(rows)), rows)
+    for row in (0, 77, 399):
+        alone = np.array([row])
+        same(whole, run(points[alone], cameras, water, views.take(alone)), alone)
+    numba.set_num_threads(1)
+    try:
+        same(whole, run(points, cameras, water, views))
+    finally:
+        numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+
+
+def eight_under_waves():
+    """Return shifts under level water and under a raster with waves, wide enough for creases."""
+    cameras, points = moved(oblique_block(np.random.default_rng(1)), UTM), bed(8) + UTM
+    at = np.arange(-59.5, 60.0)
+    heights = 0.4 + 0.15 * np.sin(at[None, :] / 4.0) * np.cos(at[::-1, None] / 3.0)
+    waves = WaterRaster(heights, UTM[0] - 60, UTM[1] + 60, (1.0, 1.0))
+    views = views_of([[0, 5, 11, 17, 23, 30, 41, 50]] * 8)
+    return np.array(
+        [run(points, cameras, water, views).shift_m for water in (in_utm(LEVEL), waves)]
+    )
+
+
+def test_compiled_and_interpreted_agree(tmp_path):
+    program = (
+        "import numpy as np; from tests.refract.test_consistent import eight_under_waves;"
+        f" np.save({str(tmp_path / 'out.npy')!r}, eight_under_waves())"
+    )
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    root = Path(__file__).parents[2]
+    subprocess.run([sys.executable, "-c", program], check=True, env=environment, cwd=root)
+    # the compiler may round a product and a sum at once; the last step may be 1e-7 m
+    assert np.load(tmp_path / "out.npy") == pytest.approx(eight_under_waves(), abs=MICROMETRE)
+
+
+def test_what_goes_with_the_shift_is_as_of_snell(many):
+    points, cameras, water, views = many
+    one, other = (
+        run(points, cameras, water, views),
+        run(points, cameras, water, views, method="snell"),
+    )
+    assert np.array_equal(one.outcome, other.outcome)
+    assert np.array_equal(one.ray_count, other.ray_count)
+    assert np.array_equal(one.camera_used, other.camera_used)
+    assert one.incidence_deg == pytest.approx(other.incidence_deg, abs=1e-9)
+    # the solution of snell is the nearest to the refracted rays, nothing else can be nearer
+    assert (one.ray_miss_m >= other.ray_miss_m - NANOMETRE).all()
+
+
+def test_ray_miss_is_the_distance_from_the_refracted_rays(many):
+    points, cameras, water, views = many
+    result = run(points, cameras, water, views)
+    for i in (5, 105, 205):
+        mine = views.camera[views.start[i] : views.start[i + 1]]
+        squares = []
+        for centre in cameras.centres[mine]:
+            down = (points[i] - centre) / np.linalg.norm(points[i] - centre)
+            pierced = centre + down * (centre[2] - water.a) / -down[2]
+            side = np.hypot(*down[:2])
+            bent = np.append(down[:2] / N_WATER, -np.sqrt(1.0 - (side / N_WATER) ** 2))
+            away = points[i] + result.shift_m[i] - pierced
+            squares.append(np.sum(np.cross(away, bent) ** 2))
+        # coordinates of UTM are known to 1e-9 m
+        assert result.ray_miss_m[i] == pytest.approx(np.sqrt(np.mean(squares)), abs=MICROMETRE)
+
+
+def test_views_that_are_all_one_camera():
+    places = [[-20.0, 0, 70], [20.0, 0, 70], [0.0, 20, 70]]
+    cameras = looking(places, [15.0, 15.0, 15.0], [0.0, 180.0, 270.0])
+    points = np.array([[0.0, 0, -1], [1.0, 0, -2], [0.5, 0.5, -3], [0.0, 1, -2]])
+    result = run(points, cameras, WaterPlane(0.0), views_of([[0, 1], [1, 1, 1], [0], [0, 0, 1]]))
+    one, done = Outcome.ONE_CAMERA, Outcome.CORRECTED
+    assert result.outcome.tolist() == [done, one, one, done]
+    assert result.ray_count.tolist() == [2, 0, 0, 3]
+    assert (result.shift_m[1:3] == 0.0).all()
+
+
+def test_cameras_at_one_place_are_parallel():
+    cameras = looking([[0.0, 0, 70], [0.0, 0, 70]], [0.0, 10.0], [0.0, 0.0])
+    result = run(np.array([[1.0, 2, -3]]), cameras, WaterPlane(0.0), views_of([[0, 1]]))
+    assert result.outcome.tolist() == [Outcome.PARALLEL_RAYS]
+    assert (result.shift_m == 0.0).all()
+
+
+def test_no_points_at_all():
+    cameras = looking([[0.0, 0, 70], [9.0, 0, 70]], [0.0, 0.0], [0.0, 0.0])
+    result = run(
+        np.zeros((0, 3)), cameras, WaterPlane(0.0), Views(np.zeros(1, int), np.zeros(0, int))
+    )
+    assert result.shift_m.shape == (0, 3)
+
+
+def test_points_without_a_solution_keep_that_of_snell():
+    # the second camera looks away: it has no image of the point
+    cameras = looking([[-20.0, 0, 70], [20.0, 0, 70]], [15.0, 170.0], [0.0, 0.0])
+    points, views = np.array([[0.0, 0, -3], [0.0, 1, -2]]), views_of([[0, 1], [0, 1]])
+    with pytest.warns(PcfixWarning, match="no solution for 2 of 2 points"):
+        result = run(points, cameras, WaterPlane(0.0), views)
+    expected = run(points, cameras, WaterPlane(0.0), views, method="snell")
+    assert (result.outcome == Outcome.CORRECTED).all()
+    assert result.shift_m == pytest.approx(expected.shift_m, abs=NANOMETRE)
+
+
+def test_cameras_without_angles_or_lenses_are_refused():
+    cameras = looking([[-20.0, 0, 70], [20.0, 0, 70]], [15.0, 15.0], [0.0, 180.0])
+    check_consistent(cameras)
+    with pytest.raises(SettingError, match=r"no lenses: .* --method snell"):
+        check_consistent(replace(cameras, lenses=None))
+    bare = replace(cameras, lenses=None, rotations=None)
+    with pytest.raises(SettingError, match="no angles and no lenses"):
+        run(np.array([[0.0, 0, -3]]), bare, WaterPlane(0.0), views_of([[0, 1]]))
+
+
+# derivatives of lenses
+
+BROWN = {
+    "radial": (-0.05, 0.02),
+    "tangential": (1e-3, -6e-4, 0.1),
+    "b1": 2.0,
+    "b2": -1.0,
+    "b3": 0.5,
+}
+LENSES = {
+    "perspective": PLAIN,
+    "brown": replace(PLAIN, **BROWN, denominator=(0.01,), thin_prism=(1e-3, 0.0, -1e-3, 2e-4)),
+    "inverse": replace(PLAIN, **BROWN, inverse=True),
+    "off centre": replace(PLAIN, **BROWN, distortion_centre=(0.01, -0.02)),
+    "in turn": replace(PLAIN, projection="equidistant", **BROWN, in_turn=True),
+    "equidistant": replace(PLAIN, projection="equidistant"),
+    "equisolid": replace(PLAIN, projection="equisolid", **BROWN),
+    "polynomial": replace(PLAIN, projection="polynomial", shape=(0.0, 1.5, 0.1, -0.05)),
+    "fov": replace(PLAIN, projection="fov", shape=(0.9,)),
+    "dual": replace(PLAIN, projection="dual", shape=(0.6,)),
+    "division": replace(PLAIN, projection="division", shape=(-0.2,)),
+    "division, beyond": replace(PLAIN, projection="division", shape=(0.1,)),
+    "eucm": replace(PLAIN, projection="eucm", shape=(0.55, 1.1)),
+}
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_gradients_of_the_image_are_differences_of_the_formulas(name):
+    lens, step = LENSES[name], 1e-5
+    ahead = np.array([0.0, 0.0, 1.0])
+    for direction in ahead + np.random.default_rng(4).uniform(-0.4, 0.4, (6, 3)):
+        u, v, gradients = image_and_gradients(coefficients(lens), *direction)
+        # the formulas are in pixels of thousands
+        assert (u, v) == pytest.approx(image_slowly(lens, direction), abs=1e-6)
+        for axis in range(3):
+            aside = np.zeros(3)
+            aside[axis] = step
+            ends = [image_slowly(lens, direction + way * aside) for way in (1, -1)]
+            slope = np.subtract(*ends) / (2 * step)
+            # differences of 1e-5: 1e-10 by curvature, 1e-11 / 1e-5 by rounding, of thousands
+            assert [gradients[axis], gradients[3 + axis]] == pytest.approx(slope, abs=2e-4)
+
+
+@pytest.mark.parametrize(
+    "name", ["perspective", "equidistant", "polynomial", "fov", "dual", "eucm"]
+)
+def test_gradients_on_the_axis_are_those_beside_it(name):
+    if name == "perspective":
+        return
+    lens = LENSES[name]
+    on, beside = (image_and_gradients(coefficients(lens), x, 0.0, 1.0)[2] for x in (0.0, 1e-7))
+    assert on == pytest.approx(beside, abs=1e-2)

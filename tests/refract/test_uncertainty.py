@@ -1,0 +1,248 @@
+"""The covariance of corrected points against repeated simulations with errors that are known.
+
+The truth: light is traced from points on the bed through a water surface that lies elsewhere,
+leans, is of another index or has waves, into cameras that stand elsewhere and are turned; noise
+is added to the images, and straight rays are intersected there with the poses that are believed.
+None of it is shared with the correction.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pcfix.label.surface import SurfaceAbove, surface_above
+from pcfix.model import Lens, Outcome, WaterPlane
+from pcfix.refract.intersect import intersect
+from pcfix.refract.methods import correct
+from pcfix.refract.regression import DepthRegression
+from pcfix.refract.uncertainty import (
+    NOMINAL_WIDTH_PX,
+    covariances,
+    focal_px,
+)
+from pcfix.settings import LEVEL_M, ErrorBudget, Settings
+from tests.utils.normalised import INDEX, apparent, block, views_of
+
+NONE = ErrorBudget(image_px=0.0, level_m=0.0, index=0.0)
+SOURCES = {
+    "image": replace(NONE, image_px=0.7),
+    "level": replace(NONE, level_m=0.05),
+    "tilt": replace(NONE, tilt_deg=0.1),
+    "index": replace(NONE, index=0.004),
+    "waves": replace(NONE, waves_deg=0.5),
+    "centre": replace(NONE, centre_m=0.02),
+    "attitude": replace(NONE, attitude_deg=0.02),
+    "all": ErrorBudget(0.5, 0.03, 0.05, 0.003, 0.3, 0.01, 0.01),
+}
+LEVEL = WaterPlane(0.0)
+VARIANCES = [0, 3, 5]
+SIZEABLE_M = 0.001
+"""Smaller standard errors (those in plan by level and index, which hardly move a point sideways)
+are not held to 10 %: that is the rounding of a LAS file."""
+
+
+def scene(tilt_deg, points=12, seed=0):
+    rng = np.random.default_rng(seed)
+    plan, z = rng.uniform(-12.0, 12.0, (points, 2)), rng.uniform(-8.0, -2.0, points)
+    return np.column_stack([plan, z]), block(tilt_deg), rng
+
+
+def flat(points):
+    return SurfaceAbove(np.zeros(points), np.zeros((points, 2)))
+
+
+def solved(xyz, cameras, settings):
+    views = views_of(len(xyz), cameras)
+    return correct(xyz, flat(len(xyz)), LEVEL, cameras, settings, views)
+
+
+def normalised(method, tilt_deg, errors, draws=700, points=3):
+    """Return the errors of many draws over their standard errors, shape (draws, points, 3).
+
+    They are counted from where the correction puts points without any error: what a method is
+    off by then is its bias, and no standard error says anything about that.
+    """
+    bed, cameras, rng = scene(tilt_deg, points)
+    settings = Settings(method=method, errors=errors)
+    quiet = apparent(bed, cameras, NONE, rng)
+    nominal = solved(quiet, cameras, settings)
+    noisy = np.concatenate([apparent(bed, cameras, errors, rng) for _ in range(draws)])
+    found = noisy + solved(noisy, cameras, settings).shift_m
+    error = found.reshape(draws, len(bed), 3) - (quiet + nominal.shift_m)
+    sigma = np.sqrt(nominal.covariance_m2[:, VARIANCES])
+    assert (nominal.sigma_z_m == sigma[:, 2]).all()
+    return np.where(sigma > SIZEABLE_M, error / sigma, np.nan)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 35.0], ids=["nadir", "oblique"])
+@pytest.mark.parametrize(
+    ("method", "source"), [*(("snell", s) for s in SOURCES), ("consistent", "all")]
+)
+def test_normalised_errors_have_unit_deviation(method, source, tilt_deg):
+    ratio = normalised(method, tilt_deg, SOURCES[source])
+    # 700 draws of what all points share fix a standard deviation to 3 % (one in root 1400)
+    z = float(np.sqrt((ratio[:, :, 2] ** 2).mean()))
+    assert 0.9 < z < 1.1
+    for axis in range(2):
+        known = ratio[:, :, axis][np.isfinite(ratio[:, :, axis])]
+        assert known.size == 0 or 0.9 < np.sqrt((known**2).mean()) < 1.1
+
+
+def test_normalised_errors_of_consistent_are_not_biased():
+    ratio = normalised("consistent", 35.0, SOURCES["image"], draws=100, points=12)
+    # 12 points x 100 independent draws: a mean is known to 1/35; the rest is of second order
+    assert np.abs(ratio.mean(axis=(0, 1))).max() < 0.1
+
+
+@pytest.mark.parametrize("plane", [WaterPlane(0.0), WaterPlane(0.1, 0.004, -0.006)])
+def test_common_errors_are_the_derivatives_of_the_intersection(plane):
+    # finite differences of the intersection itself, every camera in frame; 1 % in z as the turn of
+    # M times the distance of a ray from the point is left out
+    bed, cameras, _ = scene(35.0, points=300)
+    step = 1e-4
+
+    def found(water=plane, index=INDEX):
+        above = surface_above(water, bed)
+        settings = Settings(refractive_index=index)
+        return intersect(bed, above, water, cameras, settings)
+
+    base = found()
+    moved = base.outcome == Outcome.CORRECTED
+    x, y = cameras.centres[:, :2].mean(axis=0)
+
+    def tilted(b, c):
+        return replace(plane, a=plane.a - b * x - c * y, b=plane.b + b, c=plane.c + c)
+
+    changes = {
+        "level_m": [({"water": replace(plane, a=plane.a + s)}) for s in (step, -step)],
+        "index": [({"index": INDEX + s}) for s in (step, -step)],
+    }
+    for name, (up, down) in changes.items():
+        slope = (found(**up).shift_m - found(**down).shift_m)[moved, 2] / (2.0 * step)
+        errors = replace(NONE, **{name: 1.0})
+        cov = covariances(
+            bed, base.shift_m, surface_above(plane, bed), cameras, Settings(errors=errors)
+        )
+        np.testing.assert_allclose(np.sqrt(cov[moved, 5]), np.abs(slope), rtol=0.01)
+    both = 0.0
+    for direction in ((1.0, 0.0), (0.0, 1.0)):
+        up, down = (tilted(*(s * np.array(direction))) for s in (step, -step))
+        both += ((found(up).shift_m - found(down).shift_m)[moved, 2] / (2.0 * step)) ** 2
+    errors = replace(NONE, tilt_deg=math.degrees(1.0))
+    cov = covariances(
+        bed, base.shift_m, surface_above(plane, bed), cameras, Settings(errors=errors)
+    )
+    # in units of slope; near the middle of the block, where little is left, the mean counts
+    assert np.sqrt(cov[moved, 5].mean()) == pytest.approx(np.sqrt(both.mean()), rel=0.02)
+
+
+def test_a_covariance_is_symmetric_and_positive():
+    bed, cameras, _ = scene(35.0, points=200)
+    found = intersect(bed, flat(200), LEVEL, cameras, Settings())
+    cov = covariances(bed, found.shift_m, flat(200), cameras, Settings(errors=SOURCES["all"]))
+    full = cov[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    assert (np.linalg.eigvalsh(full) > 0.0).all()
+
+
+def test_variances_of_sources_add_up():
+    bed, cameras, _ = scene(35.0, points=50)
+    found = intersect(bed, flat(50), LEVEL, cameras, Settings())
+    all_of_them = SOURCES["all"]
+
+    def cov(errors):
+        return covariances(bed, found.shift_m, flat(50), cameras, Settings(errors=errors))
+
+    parts = [
+        cov(replace(NONE, **{name: getattr(all_of_them, name)}))
+        for name in ("image_px", "level_m", "tilt_deg", "index", "waves_deg", "centre_m",
+                     "attitude_deg")
+    ]  # fmt: skip
+    # rounding only, relative to the variance in z
+    np.testing.assert_allclose(sum(parts), cov(all_of_them), rtol=0, atol=1e-9 * parts[0].max())
+
+
+def test_both_kernels_agree_to_the_bit():
+    bed, cameras, _ = scene(0.0, points=500)
+    found = intersect(bed, flat(500), LEVEL, cameras, Settings())
+    seen = found.ray_count == len(cameras)
+    assert seen.sum() > 300
+    for errors in (ErrorBudget(), SOURCES["all"]):
+        settings = Settings(errors=errors)
+        every = covariances(bed, found.shift_m, flat(500), cameras, settings)
+        views = views_of(500, cameras)
+        listed = covariances(bed, found.shift_m, flat(500), cameras, settings, views)
+        assert (every[seen] == listed[seen]).all()
+
+
+def test_the_result_does_not_depend_on_the_other_points():
+    bed, cameras, _ = scene(35.0, points=700)
+    found = intersect(bed, flat(700), LEVEL, cameras, Settings())
+    whole = covariances(bed, found.shift_m, flat(700), cameras, Settings())
+    some = slice(100, 333)
+    part = covariances(bed[some], found.shift_m[some], flat(233), cameras, Settings())
+    assert (whole[some] == part).all()
+
+
+def test_level_is_the_users_else_the_fits_else_a_default():
+    bed, cameras, _ = scene(0.0, points=20)
+    found = intersect(bed, flat(20), LEVEL, cameras, Settings())
+
+    def sigma(given, stated=None):
+        settings = Settings(errors=replace(NONE, level_m=stated))
+        args = bed, found.shift_m, flat(20), cameras, settings
+        return np.sqrt(covariances(*args, level_sigma_m=given)[:, 5])
+
+    one = sigma(None, 1.0)
+    np.testing.assert_allclose(sigma(None), LEVEL_M * one)
+    np.testing.assert_allclose(sigma(0.3), 0.3 * one)
+    each = np.linspace(0.01, 0.2, 20)
+    np.testing.assert_allclose(sigma(each), each * one)
+    np.testing.assert_allclose(sigma(each, 0.05), 0.05 * one)
+    each[3] = np.nan  # a fit without a point to spare
+    assert sigma(each)[3] == pytest.approx(LEVEL_M * one[3])
+
+
+def test_points_without_a_solution_have_none():
+    bed, cameras, _ = scene(0.0, points=3)
+    bed[1] = [500.0, 500.0, -3.0]  # out of every frame
+    found = correct(bed, flat(3), LEVEL, cameras, Settings())
+    assert (found.covariance_m2[1] == 0.0).all() and found.sigma_z_m[1] == 0.0
+    assert (found.sigma_z_m[[0, 2]] > 0.0).all()
+    assert covariances(bed[:0], bed[:0], flat(0), cameras, Settings()).shape == (0, 6)
+
+
+def test_it_is_skipped_where_nobody_reads_it():
+    bed, cameras, _ = scene(0.0, points=3)
+    found = correct(bed, flat(3), LEVEL, cameras, Settings(dimensions="minimal"))
+    assert found.covariance_m2 is None and (found.sigma_z_m == 0.0).all()
+
+
+def test_focal_lengths_in_pixels():
+    lens = Lens(8.8, 13.2, 8.8, 6.6, 4.4, unit="mm")
+    assert focal_px(replace(lens, pixel_size_mm=0.0024)) == pytest.approx(8.8 / 0.0024)
+    assert focal_px(lens) == pytest.approx(8.8 / 13.2 * NOMINAL_WIDTH_PX)
+
+
+@pytest.mark.parametrize("method", ["shan", "factor", "murase"])
+def test_other_methods_get_the_same_budget(method):
+    bed, cameras, rng = scene(0.0, points=15)
+    quiet = apparent(bed, cameras, NONE, rng)
+    sigma = [solved(quiet, cameras, Settings(method=name)).sigma_z_m for name in (method, "snell")]
+    # an approximation for them; they place these points to some decimetres alike
+    np.testing.assert_allclose(sigma[0], sigma[1], rtol=0.1)
+
+
+def test_a_regression_has_the_error_of_its_predictions():
+    from pcfix.refract.learned import Learned
+
+    bed, cameras, _ = scene(0.0, points=5)
+    line = DepthRegression(0.0, 1.4, 0.01, 0.01, 0.99, 0.08, 0.11, 20, 1.0, 9.0)
+    found = correct(
+        bed, flat(5), LEVEL, cameras, Settings(method="regression"),
+        views_of(5, cameras), learned=Learned(regression=line),
+    )  # fmt: skip
+    np.testing.assert_allclose(found.sigma_z_m, 0.11)

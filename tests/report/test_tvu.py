@@ -1,0 +1,114 @@
+"""Standard errors in the terms of IHO S-44: shares by hand, words that say what was assumed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+
+import pcfix
+from pcfix.report.figures import png_of, tvu_figure
+from pcfix.report.text import summary_text
+from pcfix.report.tvu import (
+    ORDERS,
+    UncertaintyTally,
+    budget_words,
+    largest_tvu_m,
+    strictest_order,
+    tvu_sentence,
+)
+from pcfix.settings import ErrorBudget
+
+# Edition 6, table 1: the largest TVU at the surface and at 40 m, m, by hand
+BY_HAND = {
+    "Exclusive": (0.15, 0.3354),
+    "Special": (0.25, 0.3905),
+    "1a/1b": (0.5, 0.7214),
+    "2": (1.0, 1.3588),
+}
+
+
+@pytest.mark.parametrize("order", ORDERS, ids=lambda order: order.name)
+def test_largest_tvu_is_that_of_the_standard(order):
+    found = largest_tvu_m(order, np.array([0.0, 40.0]))
+    np.testing.assert_allclose(found, BY_HAND[order.name], atol=5e-5)  # as it is printed there
+
+
+def tally_of(sigma, depth, parts=1):
+    tally = UncertaintyTally()
+    for some in np.array_split(np.arange(len(sigma)), parts):
+        tally.add(sigma[some], depth[some])
+    return tally.as_dict()
+
+
+def test_shares_and_percentiles():
+    # 1.96 sigma: 0.098, 0.196, 0.294, 0.588, 1.176 m, all at 0 m
+    found = tally_of(np.array([0.05, 0.1, 0.15, 0.3, 0.6]), np.zeros(5))
+    assert found["s44"] == {"Exclusive": 0.2, "Special": 0.4, "1a/1b": 0.6, "2": 0.8}
+    assert found["sigma_z_m"] == {"mean": 0.24, "p5": 0.05, "p50": 0.15, "p95": 0.6, "max": 0.6}
+    assert found["tvu_95_m"]["mean"] == pytest.approx(1.96 * 0.24, abs=5e-5)
+    json.dumps(found)
+
+
+def test_depth_allows_more():
+    found = tally_of(np.full(2, 0.1), np.array([0.0, 20.0]))  # TVU 0.196 m; 0.2121 m at 20 m
+    assert found["s44"]["Exclusive"] == 0.5
+
+
+def test_chunks_do_not_matter():
+    rng = np.random.default_rng(0)
+    sigma, depth = rng.gamma(2.0, 0.05, 10_000), rng.uniform(0.0, 10.0, 10_000)
+    assert tally_of(sigma, depth) == tally_of(sigma, depth, parts=7)
+    p95 = tally_of(sigma, depth)["sigma_z_m"]["p95"]
+    assert p95 == pytest.approx(np.percentile(sigma, 95), abs=0.001)  # a bin
+
+
+def test_nothing_is_said_without_standard_errors():
+    assert UncertaintyTally().as_dict() is None
+    assert tally_of(np.zeros(3), np.ones(3)) is None
+
+
+def test_the_strictest_order_holds_95_percent():
+    shares = {"Exclusive": 0.5, "Special": 0.9499, "1a/1b": 0.95, "2": 1.0}
+    assert strictest_order({"s44": shares}) == "1a/1b"
+    assert "95 % of the points" in tvu_sentence({"s44": shares})
+    assert "order 1a/1b" in tvu_sentence({"s44": shares})
+    none = {"s44": dict.fromkeys(shares, 0.0)}
+    assert strictest_order(none) is None
+    assert "fewer than 95 %" in tvu_sentence(none)
+
+
+def test_words_name_what_was_assumed():
+    errors = ErrorBudget()
+    assert "level 0.020 m (assumed)" in budget_words(asdict(errors))
+    assert "level 0.007 m (fitted)" in budget_words(asdict(errors), 0.007)
+    assert "level 0.020 m (assumed)" in budget_words(asdict(errors), float("nan"))
+    assert "level 0.100 m," in budget_words(asdict(replace(errors, level_m=0.1)), 0.007)
+    assert "waves" not in budget_words(asdict(errors))
+    assert "waves 2 deg" in budget_words(asdict(replace(errors, waves_deg=2.0)))
+
+
+def test_the_picture_can_be_drawn():
+    rng = np.random.default_rng(0)
+    for points in (1, 500):
+        depth, sigma = rng.uniform(0.0, 8.0, points), rng.uniform(0.01, 0.2, points)
+        assert png_of(tvu_figure(depth, sigma), 40).startswith(b"\x89PNG")
+
+
+def test_a_run_says_what_it_assumed(tmp_path):
+    scene = Path(__file__).parents[2] / "samples" / "scene"
+    cloud, cameras = scene / "cloud.laz", scene / "cameras.csv"
+    summary = pcfix.correct_file(
+        cloud, tmp_path / "c.laz", cameras=cameras, water=0.37, dimensions="all"
+    )
+    tally = UncertaintyTally()
+    written = laspy.read(tmp_path / "c.laz")
+    moved = np.asarray(written["RayCount"]) > 0
+    tally.add(np.asarray(written["SigmaZ"])[moved], np.asarray(written["WaterDepth"])[moved])
+    text = summary_text(replace(summary, uncertainty=tally.as_dict()))
+    assert "TVU at 95 %" in text and "it assumes image 0.5 px, level 0.020 m (assumed)" in text
+    assert "uncertainty" not in summary_text(replace(summary, uncertainty=None))

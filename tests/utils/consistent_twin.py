@@ -1,0 +1,127 @@
+"""Slow twins of the method `consistent`: forwards through water into images, and what SfM makes.
+
+Nothing of `pcfix.refract` is used. Light crosses a plane where Fermat's principle has it
+(`tests.utils.twins.light_path`, scipy) and images by the formulas of the lens term by term; the
+triangulations, straight and refractive, are general least squares over image residuals.
+"""
+
+import numpy as np
+from scipy.optimize import least_squares, root
+
+from pcfix.simulate.tracing import piercing_points
+from tests.utils.twins import image_slowly, light_path
+
+
+def image_in(cameras, c, target):
+    """Return u, v of a place in the world, straight, in camera c."""
+    return np.array(
+        image_slowly(cameras.lenses[c], cameras.rotations[c] @ (target - cameras.centres[c]))
+    )
+
+
+def seen_through_water(point, cameras, mine, planes, n):
+    """Return the images of a true point; `planes` are (a, b, c), one for each of the cameras.
+
+    A plane below the point lets its light go straight.
+    """
+    seen = []
+    for c, (a, b, d) in zip(mine, planes, strict=True):
+        wet = point[2] < a + b * point[0] + d * point[1]
+        way = light_path(point, cameras.centres[c], (a, b, d), n) if wet else point
+        seen.append(image_in(cameras, c, way))
+    return np.array(seen)
+
+
+def triangulated_straight(seen, cameras, mine, start):
+    """Return the point with the least squared residuals of straight rays in the images."""
+
+    def residuals(shift):
+        images = [image_in(cameras, c, start + shift) for c in mine]
+        return (np.array(images) - seen).ravel()
+
+    found = least_squares(
+        residuals, np.zeros(3), jac="3-point", x_scale=0.1, xtol=1e-15, ftol=1e-15, gtol=1e-15
+    )
+    return start + found.x
+
+
+def found_by_full_triangulation(apparent, cameras, mine, planes, n, start):
+    """Return Q with F(Q) = P: every step triangulates anew, and scipy looks for the root."""
+
+    def miss(shift):
+        seen = seen_through_water(start + shift, cameras, mine, planes, n)
+        return triangulated_straight(seen, cameras, mine, apparent) - apparent
+
+    return start + root(miss, np.zeros(3), tol=1e-9).x
+
+
+def path_under(surface, point, centre, n, step=1e-5):
+    """Return where light leaves the water under a smooth z = surface(x, y): Fermat by scipy."""
+
+    def crossing(xy):
+        return np.array([xy[0], xy[1], surface(xy[0], xy[1])])
+
+    def gradient(xy):
+        air, water = crossing(xy) - centre, crossing(xy) - point
+        slopes = [
+            (
+                surface(xy[0] + step * i, xy[1] + step * j)
+                - surface(xy[0] - step * i, xy[1] - step * j)
+            )
+            / (2 * step)
+            for i, j in ((1, 0), (0, 1))
+        ]
+        along = np.array([[1.0, 0.0, slopes[0]], [0.0, 1.0, slopes[1]]])
+        return along @ (air / np.linalg.norm(air) + n * water / np.linalg.norm(water))
+
+    height, depth = centre[2] - surface(*point[:2]), surface(*point[:2]) - point[2]
+    share = depth / n / (height + depth / n)
+    found = root(gradient, point[:2] + share * (centre - point)[:2], tol=1e-13)
+    assert np.abs(gradient(found.x)).max() < 1e-9
+    return crossing(found.x)
+
+
+def refractive_least_squares(pixels, start_of, camera, cameras, level_m, n, guess):
+    """Return the points whose images through level water are nearest to the given ones.
+
+    The floor for noisy images: nothing unbiased is better. Gauss-Newton for all points at once,
+    with derivatives from differences over 0.1 mm; one lens without distortion.
+
+    Parameters
+    ----------
+    pixels : array, shape (rays, 2)
+    start_of : array, shape (n + 1,)
+        First ray of each point.
+    camera : array, shape (rays,)
+    guess : array, shape (n, 3)
+    """
+    owner = np.repeat(np.arange(len(guess)), np.diff(start_of))
+    points, step = guess.copy(), 1e-4
+    for _ in range(8):
+        residual = pixels - images_through_level(points[owner], cameras, camera, level_m, n)
+        slopes = []
+        for axis in range(3):
+            aside = np.zeros(3)
+            aside[axis] = step
+            ends = [
+                images_through_level(points[owner] + way * aside, cameras, camera, level_m, n)
+                for way in (1, -1)
+            ]
+            slopes.append((ends[0] - ends[1]) / (2 * step))
+        slope = np.stack(slopes, axis=2)
+        normal = np.add.reduceat(np.einsum("rki,rkj->rij", slope, slope), start_of[:-1])
+        right = np.add.reduceat(np.einsum("rki,rk->ri", slope, residual), start_of[:-1])
+        moved = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+        points += moved
+    assert np.abs(moved).max() < 1e-6
+    return points
+
+
+def images_through_level(points, cameras, camera, level_m, n):
+    """Return u, v of true points through level water, one camera each, no distortion."""
+    lens = cameras.lenses[0]
+    way = piercing_points(points, cameras.centres[camera], level_m, n)
+    x, y, z = np.einsum("rij,rj->ir", cameras.rotations[camera], way - cameras.centres[camera])
+    return np.column_stack(
+        [lens.principal_x + lens.focal * x / z, lens.principal_y + lens.focal * y / z]
+    )

@@ -1,0 +1,113 @@
+"""A scene of a few points in which every input of a correction can be wrong by a known amount."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pcfix.model import Cameras, Lens, Views
+from pcfix.simulate.tracing import piercing_points, project, triangulate
+
+if TYPE_CHECKING:
+    from pcfix.model import FloatArray
+    from pcfix.settings import ErrorBudget
+
+LENS = Lens(3600.0, 5400.0, 3600.0, 2700.0, 1800.0)
+HEIGHT_M = 60.0
+INDEX = 1.34
+
+
+def block(tilt_deg: float) -> Cameras:
+    """Return a cross of cameras 60 m above the water that look at its middle, or nearly."""
+    if tilt_deg == 0.0:
+        places = [(x, y) for x in (-24.0, -8.0, 8.0, 24.0) for y in (-20.0, 0.0, 20.0)]
+        rotations = [np.diag([1.0, -1.0, -1.0])] * len(places)
+    else:
+        back = HEIGHT_M * math.tan(math.radians(tilt_deg))
+        places, rotations = [], []
+        for heading in np.radians([0.0, 90.0, 180.0, 270.0]):
+            for side in (-12.0, 0.0, 12.0):
+                ahead = np.array([math.sin(heading), math.cos(heading)])
+                right = np.array([ahead[1], -ahead[0]])
+                places.append(tuple(side * right - back * ahead))
+                rotations.append(_looking(ahead, right, math.radians(tilt_deg)))
+    centres = np.array([(x, y, HEIGHT_M) for x, y in places])
+    labels = tuple(map(str, range(len(centres))))
+    return Cameras(labels, centres, np.array(rotations), (LENS,) * len(centres))
+
+
+def _looking(ahead: FloatArray, right: FloatArray, off_nadir: float) -> FloatArray:
+    """Return the rotation of a camera that looks `off_nadir` (rad) from straight down."""
+    z = np.array([*(math.sin(off_nadir) * ahead), -math.cos(off_nadir)])
+    x = np.array([*right, 0.0])
+    return np.array([x, np.cross(z, x), z])
+
+
+def views_of(points: int, cameras: Cameras) -> Views:
+    """Return views in which every camera sees every point."""
+    k = len(cameras)
+    return Views(np.arange(points + 1) * k, np.tile(np.arange(k), points))
+
+
+def apparent(
+    bed: FloatArray, cameras: Cameras, sigma: ErrorBudget, rng: np.random.Generator
+) -> FloatArray:
+    """Return what SfM software makes of points on the bed, one draw of all errors, shape (m, 3).
+
+    It believes in `cameras`, and the correction later in a level surface at 0 and in `INDEX`; the
+    light goes by what is drawn. The water leans about the middle of the cameras, waves lean about
+    where the light pierces them.
+    """
+    m, k = len(bed), len(cameras)
+    n = INDEX + sigma.index * rng.normal()
+    level = (sigma.level_m or 0.0) * rng.normal()
+    turn = math.radians(sigma.attitude_deg) * rng.normal(size=(k, 3))
+    true = Cameras(
+        cameras.labels,
+        cameras.centres + sigma.centre_m * rng.normal(size=(k, 3)),
+        Rotation.from_rotvec(turn).as_matrix() @ cameras.rotations,
+        cameras.lenses,
+    )
+    views = views_of(m, cameras)
+    owner = np.repeat(np.arange(m), k)
+    points, centres = bed[owner], true.centres[views.camera]
+    pivot = np.array([*cameras.centres[:, :2].mean(axis=0), level])
+    slope = np.tile(math.radians(sigma.tilt_deg) * rng.normal(size=2), (m * k, 1))
+    surface = through_tilted(points, centres, pivot, slope, n)
+    if sigma.waves_deg:
+        # the waves lean about where the light pierces the surface, which hardly moves by that
+        waves = math.radians(sigma.waves_deg) * rng.normal(size=(m * k, 2))
+        for _ in range(3):
+            surface = through_tilted(points, centres, surface, slope + waves, n, pivot, slope)
+    pixels, _ = project(surface, true, views.camera, LENS)
+    pixels += sigma.image_px * rng.normal(size=pixels.shape)
+    return triangulate(pixels, cameras, views.camera, views.start, LENS, bed * [1, 1, 0.75])
+
+
+def through_tilted(
+    points: FloatArray,
+    centres: FloatArray,
+    about: FloatArray,
+    slope: FloatArray,
+    n: float,
+    pivot: FloatArray | None = None,
+    mean_slope: FloatArray | None = None,
+) -> FloatArray:
+    """Return where light pierces planes of the given slopes (m, 2) through `about`.
+
+    Turned so that the plane is upright, with camera and point, it is a level surface.
+    With a pivot, `about` gives the places only: their height is that of the mean surface there.
+    """
+    about = np.broadcast_to(about, points.shape).copy()
+    if pivot is not None and mean_slope is not None:
+        about[:, 2] = pivot[2] + (mean_slope * (about[:, :2] - pivot[:2])).sum(axis=1)
+    # the turn that makes the normal (-b, -c, 1) upright
+    axis = np.column_stack([-slope[:, 1], slope[:, 0], np.zeros(len(slope))])
+    steep = np.hypot(*slope.T)
+    scale = np.divide(np.arctan(steep), steep, out=np.ones_like(steep), where=steep > 0.0)
+    upright = Rotation.from_rotvec(axis * scale[:, None])
+    found = piercing_points(upright.apply(points - about), upright.apply(centres - about), 0.0, n)
+    return upright.inv().apply(found) + about
