@@ -103,7 +103,7 @@ class Learning:
         """Add the model of the matcher, by the tie points where the camera file has some."""
         if not wants_matcher(self._settings, self._views):
             return learned
-        step = max(1, self._view.points // BED_POINTS)
+        step = max(1, self._view.points // _bed_points(self._view))
         taken: list[tuple[FloatArray, SurfaceAbove]] = []
         done = 0
         for xyz, heights, classes in chunks():
@@ -124,8 +124,15 @@ class Learning:
         return with_matcher(learned, xyz, above, *some, self._views, ties)
 
 
-BED_POINTS = 1_000_000
+BED_POINTS_A_M2 = 5.0
+FEWEST_BED_POINTS, MOST_BED_POINTS = 250_000, 1_000_000
 """Of the cloud, evenly spread over its order, tell the bed of the surroundings."""
+
+
+def _bed_points(view: CloudView) -> int:
+    area_m2 = float(np.prod(np.maximum(np.subtract(view.high, view.low)[:2], 1.0)))
+    return int(np.clip(BED_POINTS_A_M2 * area_m2, FEWEST_BED_POINTS, MOST_BED_POINTS))
+
 
 NOISE_CLASSES = (7, 18)
 

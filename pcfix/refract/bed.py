@@ -20,6 +20,8 @@ POINTS_A_CELL = 20.0
 WIDTH_M = 0.2
 """Standard deviation of the likely beds of one place: relief within a cell, and noise."""
 
+FAR_OFF_M = 0.4
+REACH = 2
 MOST_CELLS = 4_000_000
 _STEPS = 2.0
 
@@ -73,7 +75,33 @@ def bed_of(xyz: FloatArray, likely_m: FloatArray) -> Bed:
         _vote(order, start, np.ascontiguousarray(xyz[:, 2]), likely_m, found)
     height = np.full(rows * columns, np.nan)
     height[filled] = found
-    return Bed(height.reshape(rows, columns), float(low[0]), float(low[1]), cell)
+    grid = _without_outliers(height.reshape(rows, columns))
+    return Bed(grid, float(low[0]), float(low[1]), cell)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _without_outliers(height: FloatArray) -> FloatArray:
+    """Return heights in which a cell far off the median of its 5 x 5 surroundings is that median.
+
+    Where only one group of images sees the bed, several heights have all votes.
+    """
+    rows, columns = height.shape
+    smooth = height.copy()
+    around = np.empty((2 * REACH + 1) ** 2)
+    for r in range(rows):
+        for c in range(columns):
+            if height[r, c] != height[r, c]:
+                continue
+            count = 0
+            for i in range(max(0, r - REACH), min(rows, r + REACH + 1)):
+                for j in range(max(0, c - REACH), min(columns, c + REACH + 1)):
+                    if height[i, j] == height[i, j]:
+                        around[count] = height[i, j]
+                        count += 1
+            middle = np.median(around[:count])
+            if abs(height[r, c] - middle) > FAR_OFF_M:
+                smooth[r, c] = middle
+    return smooth
 
 
 def _cell_m(xy: FloatArray, low: FloatArray, high: FloatArray) -> float:

@@ -36,7 +36,7 @@ AVERAGED_WITHIN = 0.012
 """Depths of neighbouring maps that differ by less are averaged, before."""
 
 MAX_ROUNDS = 6
-CLOSE_M = 1e-3
+CLOSE_M = 2e-3
 _BLOCK = 64
 
 
@@ -165,9 +165,8 @@ def _group(
         for q in range(maps.size):
             now[q] = t[q] + slope[q] * rise
         weight[:] = 0.0
-        members = 0
-        middle = _averaged(maps[seed], seed, now, place, matcher)
-        members += _fuse(weight, seed, maps, now, middle, place, up, matcher)
+        middle, _ = _averaged(maps[seed], seed, now, place, matcher)
+        members = _fuse(weight, seed, maps, now, middle, place, up, matcher)
         for c in matcher.fused[maps[seed]]:
             if c >= 0 and place[c] >= 0:
                 members += _fuse(weight, place[c], maps, now, middle, place, up, matcher)
@@ -179,13 +178,15 @@ def _group(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _averaged(camera: int, q: int, now: FloatArray, place: IntArray, matcher: Matcher) -> float:
-    """Return a depth after averaging with the neighbouring maps that agree."""
+def _averaged(
+    camera: int, q: int, now: FloatArray, place: IntArray, matcher: Matcher
+) -> tuple[float, float]:
+    """Return a depth after averaging with the maps around that agree, and their number."""
     total, count = now[q], 1.0
     for a in matcher.averaged[camera]:
         if a >= 0 and place[a] >= 0 and abs(now[place[a]] - now[q]) < AVERAGED_WITHIN:
             total, count = total + now[place[a]], count + 1.0
-    return total / count
+    return total / count, count
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -195,13 +196,10 @@ def _fuse(
 ) -> int:  # fmt: skip
     """Fuse one depth map if it agrees: its weight goes evenly to the maps it was averaged with."""
     camera = maps[q]
-    if not abs(_averaged(camera, q, now, place, matcher) - middle) < AGREE:
+    depth, count = _averaged(camera, q, now, place, matcher)
+    if not abs(depth - middle) < AGREE:
         return 0
-    count = 1.0
-    for a in matcher.averaged[camera]:
-        if a >= 0 and place[a] >= 0 and abs(now[place[a]] - now[q]) < AVERAGED_WITHIN:
-            count += 1.0
-    each = 1.0 / ((up[camera] * up[camera]).sum() * count)
+    each = 1.0 / ((up[camera, 0] ** 2 + up[camera, 1] ** 2 + up[camera, 2] ** 2) * count)
     weight[q] += each
     for a in matcher.averaged[camera]:
         if a >= 0 and place[a] >= 0 and abs(now[place[a]] - now[q]) < AVERAGED_WITHIN:
