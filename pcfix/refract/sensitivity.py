@@ -1,246 +1,389 @@
 r"""One ray's part in how a corrected point moves with whatever it was made from.
 
-Picture one ray in the frame of the surface above the point: N is up, the other two axes lie in
-the surface. From the apparent point P to the projection centre is e, of length L, with the height
-H above P and (a, b), of length rho, across. The surface is h above P; the true point lies y below
-it. With r = 1 / n and kappa = sqrt(L^2 - r^2 (L^2 - H^2)) the refracted ray is t = -(r a, r b,
-kappa) / L, and at depth y it is m (a, b) away from P, with
+Picture one ray in the frame of the surface above the apparent point P: N is up, the other two axes
+lie in the surface. From P to the projection centre is e, of length L, with the height H above P
+and d = e - H N, of length rho, across. The surface is h above P; the true point Q lies y below it.
+With r = 1 / n and kappa = sqrt(L^2 - r^2 rho^2) the refracted ray is t = -(r d + kappa N) / L, and
+at depth y it is m d away from P, with
 
     m = h / H - y r / kappa.
 
-All that can be wrong moves this place, at a fixed y, by some delta. The intersection of eq 11 of
-Skarlatos & Agrafiotis 2018 then moves by (sum M)^-1 sum M delta, with M = I - t t'. Differentiated
-(E = M (a, b, 0) throughout):
+All that can be wrong moves this place, at a fixed y, by some delta across:
 
-=================  ============================================================================
-by                 M delta
-=================  ============================================================================
-P across, p        (1 - m) M p + beta ((a, b).p) E,  beta = -y r (1 - r^2) / kappa^3
-P up               alpha E,  alpha = -(1 - h/H) / H - y r H / kappa^3
-h                  (1 / H - r / kappa) E
-n                  y r^2 L^2 / kappa^3 E
-slope, N + tau     -y (1 - r H / kappa) M tau + (gamma + m r / kappa) ((a, b).tau) E,
-                   gamma = y r^3 H / kappa^3 - h / H^2 (about the place above P)
-=================  ============================================================================
+=====================  ========================================================================
+by                     delta
+=====================  ========================================================================
+P across, p            D p = (1 - m) p + beta (d.p) d,  beta = -y r (1 - r^2) / kappa^3
+P up                   -D d / H
+h                      (1 / H - r / kappa) d
+n                      y r^2 L^2 / kappa^3 d
+slope, N + tau         -y (1 - r H / kappa) tau + (gamma + m r / kappa) (d.tau) d,
+                       gamma = y r^3 H / kappa^3 - h / H^2 (about the place above P)
+=====================  ========================================================================
 
-What is left out is the turn of M times the distance of a ray from the point, which is of second
-order.
+What a delta of each ray does to Q depends on what Q is the least of.
 
-The functions hold arithmetic only, see `pcfix.refract.rays`.
+*In space* (`snell`) that is the squared distances from the refracted rays, eq 11 of Skarlatos &
+Agrafiotis 2018. With M = I - t t'
+
+    dQ = (sum M)^-1 sum M delta,    M d = E = (kappa^2 d - r kappa rho^2 N) / L^2.
+
+*In images* (`consistent`) the residuals are those at P: sum J' (x(Q) - pi(P)) = 0. A Q that is off
+its ray, by T Q = Q - (N.Q) (N + (r / kappa) d) at its own depth, is seen where P would be after a
+move of D^-1 T Q. With W = J'J and S = W D^-1, D^-1 across as in the table,
+
+    dQ = (sum S T)^-1 sum S delta,    S d = -H W N / (1 - m + beta rho^2)
+
+as W e = 0. Q does not depend on P but through pi(P): dQ / dP = (sum S T)^-1 sum W.
+
+What is left out is the turn of M, and of J, times the residual, which is of second order.
+
+The functions hold arithmetic only, see `pcfix.refract.rays`; all sums are in the world frame.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numba import njit
 
 from pcfix.refract.choice import TILE
+from pcfix.refract.rays import refracted
 
 if TYPE_CHECKING:
     from pcfix.model import FloatArray, IntArray
 
-# Runs of `TILE` numbers in `tile`: those of `pcfix.refract.choice.gather`, then these.
-UX, UZ, VX, VY, VZ, BELOW = range(7, 13)
-RUNS = 13
+Six: TypeAlias = tuple[float, float, float, float, float, float]
+"""A symmetric matrix: xx, xy, xz, yy, yz, zz."""
+Seen: TypeAlias = tuple[
+    float, float, float, float, float, float, float, float, float, float, float, float
+]
 
-# Runs of `TILE` numbers in `sums`.
+# Runs of `TILE` numbers in `tile`: those of `pcfix.refract.choice.gather`, then y - h.
+BELOW = 7
+TILE_RUNS = 8
+
+# Runs of `TILE` numbers in `sums`. Matrices of nine row by row.
 RAYS = 0
-TT = 1  # xx, xy, xz, yy, yz of t t'
-BY_P = 6  # three columns
-BY_N = 15
-BY_LEVEL = 18
-SIGHT = 21  # xx, xy, xz, yy, yz, zz of the normal matrix of the straight rays, world frame
-BY_TILT = 27  # two columns
-NOISE = 33  # six, world frame
-SUMS = 39
+BY_LEVEL = 1  # three: M delta or S delta
+BY_N = 4
+SIGHT = 7  # six: W
+BY_Q = 13  # nine of S T, or the first five of t t'
+BY_P = 22  # nine of M delta
+BY_TILT = 31  # nine, to be multiplied by tau
+NOISE = 40  # six
+SUMS = 46
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def add_frames(tile: FloatArray, shift: FloatArray, rows: IntArray) -> None:
-    """Add to a tile the axes in the surface, and how far below P the true point lies."""
+def add_below(tile: FloatArray, shift: FloatArray, rows: IntArray) -> None:
+    """Add to a tile how far below P the true point lies, along the normal of the surface."""
     for j in range(rows.size):
         nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-        scale = 1.0 / np.sqrt(nx * nx + nz * nz)
-        ux, uz = nz * scale, -nx * scale
-        tile[UX * TILE + j], tile[UZ * TILE + j] = ux, uz
-        tile[VX * TILE + j] = ny * uz
-        tile[VY * TILE + j] = nz * ux - nx * uz
-        tile[VZ * TILE + j] = -ny * ux
         i = rows[j]
         tile[BELOW * TILE + j] = -(nx * shift[i, 0] + ny * shift[i, 1] + nz * shift[i, 2])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def add_rays(
-    sums: FloatArray, tile: FloatArray, marks: FloatArray,
-    centre: FloatArray, axis: FloatArray, focal_px: float, offset: float,
+def _seen(
+    tile: FloatArray, j: int, mark: float, centre: tuple[float, float, float], offset: float,
     least_cosine2: float, r: float,
-) -> None:  # fmt: skip
-    """Add one camera's rays to the sums of a tile's points with a mark above zero.
+) -> Seen:  # fmt: skip
+    """Return how often a ray counts; e, N, H, L^2, h, y and r where the light bends.
 
-    The normal matrix of a straight ray is that of a central projection with the optical axis z,
-    J'J = (f / Z)^2 (I + (z e' + e z') / Z + L^2 / Z^2 z z') with Z = -z.e; without an axis
-    (zeros) it is that of angles, (f / L)^2 (I - e e' / L^2).
+    A ray that is not used gets heights and lengths that do no harm.
     """
-    cx, cy, cz = centre[0], centre[1], centre[2]
-    zx, zy, zz = axis[0], axis[1], axis[2]
-    flat = zx != 0.0 or zy != 0.0 or zz != 0.0
-    square = focal_px * focal_px
-    for j in range(marks.size):
-        z = tile[2 * TILE + j]
-        ex, ey, ez = cx - tile[j], cy - tile[TILE + j], cz - z
-        nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-        height = nx * ex + ny * ey + nz * ez
-        h = nz * (tile[3 * TILE + j] - (z - offset))
-        length2 = ex * ex + ey * ey + ez * ez
-        use = (marks[j] > 0.0) & (height > h) & (height * height >= least_cosine2 * length2)
-        one = 1.0 if use else 0.0
-        # a ray that is not used adds zeros
-        height = height if use else 1.0
-        length2 = length2 if use else 1.0
-        a = tile[UX * TILE + j] * ex + tile[UZ * TILE + j] * ez
-        b = tile[VX * TILE + j] * ex + tile[VY * TILE + j] * ey + tile[VZ * TILE + j] * ez
-        a, b = a * one, b * one
-        y = h + tile[BELOW * TILE + j]
-        bend = r if h > 0.0 else 1.0
-        rho2 = a * a + b * b
-        kappa2 = height * height + (1.0 - bend * bend) * rho2
-        inv2 = 1.0 / length2
-        inv_h = 1.0 / height
-        inv_k2 = 1.0 / kappa2
-        inv_k = np.sqrt(inv_k2)
-        f = h * inv_h
-        lean = bend * inv_k
-        m = f - y * lean
-        ta, tb = bend * a * inv2, bend * b * inv2
-        kappa = kappa2 * inv_k
-        across_x, across_y, across_z = (
-            kappa2 * a * inv2,
-            kappa2 * b * inv2,
-            -kappa * ta * a - kappa * tb * b,
-        )
-        xx, xy, xz = bend * a * ta, bend * a * tb, kappa * ta
-        yy, yz = bend * b * tb, kappa * tb
-        beta = -y * lean * (1.0 - bend * bend) * inv_k2
-        alpha = -(1.0 - f) * inv_h - y * lean * height * inv_k2
-        by_n = y * bend * lean * length2 * inv_k2 if h > 0.0 else 0.0
-        by_level = inv_h - lean
-        away = (1.0 - m) * one
-        sums[RAYS * TILE + j] += one
-        sums[TT * TILE + j] += xx
-        sums[(TT + 1) * TILE + j] += xy
-        sums[(TT + 2) * TILE + j] += xz
-        sums[(TT + 3) * TILE + j] += yy
-        sums[(TT + 4) * TILE + j] += yz
-        sums[BY_P * TILE + j] += away * (1.0 - xx) + beta * a * across_x
-        sums[(BY_P + 1) * TILE + j] += beta * a * across_y - away * xy
-        sums[(BY_P + 2) * TILE + j] += beta * a * across_z - away * xz
-        sums[(BY_P + 3) * TILE + j] += beta * b * across_x - away * xy
-        sums[(BY_P + 4) * TILE + j] += away * (1.0 - yy) + beta * b * across_y
-        sums[(BY_P + 5) * TILE + j] += beta * b * across_z - away * yz
-        sums[(BY_P + 6) * TILE + j] += alpha * across_x
-        sums[(BY_P + 7) * TILE + j] += alpha * across_y
-        sums[(BY_P + 8) * TILE + j] += alpha * across_z
-        sums[BY_N * TILE + j] += by_n * across_x
-        sums[(BY_N + 1) * TILE + j] += by_n * across_y
-        sums[(BY_N + 2) * TILE + j] += by_n * across_z
-        sums[BY_LEVEL * TILE + j] += by_level * across_x
-        sums[(BY_LEVEL + 1) * TILE + j] += by_level * across_y
-        sums[(BY_LEVEL + 2) * TILE + j] += by_level * across_z
-        forward = zx * ex + zy * ey + zz * ez if use and flat else -1.0
-        inv_z = -1.0 / forward if flat else 0.0
-        w0 = square * (inv_z * inv_z if flat else inv2) * one
-        w1 = w0 * inv_z
-        w2 = w1 * inv_z * length2
-        w3 = 0.0 if flat else -w0 * inv2
-        sums[SIGHT * TILE + j] += w0 + 2.0 * w1 * zx * ex + w2 * zx * zx + w3 * ex * ex
-        sums[(SIGHT + 1) * TILE + j] += w1 * (zx * ey + zy * ex) + w2 * zx * zy + w3 * ex * ey
-        sums[(SIGHT + 2) * TILE + j] += w1 * (zx * ez + zz * ex) + w2 * zx * zz + w3 * ex * ez
-        sums[(SIGHT + 3) * TILE + j] += w0 + 2.0 * w1 * zy * ey + w2 * zy * zy + w3 * ey * ey
-        sums[(SIGHT + 4) * TILE + j] += w1 * (zy * ez + zz * ey) + w2 * zy * zz + w3 * ey * ez
-        sums[(SIGHT + 5) * TILE + j] += w0 + 2.0 * w1 * zz * ez + w2 * zz * zz + w3 * ez * ez
+    z = tile[2 * TILE + j]
+    ex, ey, ez = centre[0] - tile[j], centre[1] - tile[TILE + j], centre[2] - z
+    nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+    height = nx * ex + ny * ey + nz * ez
+    h = nz * (tile[3 * TILE + j] - (z - offset))
+    length2 = ex * ex + ey * ey + ez * ez
+    use = (mark > 0.0) & (height > h) & (height * height >= least_cosine2 * length2)
+    one = mark if use else 0.0
+    height = height if use else 1.0
+    length2 = length2 if use else 1.0
+    bend = r if h > 0.0 else 1.0
+    return one, ex, ey, ez, nx, ny, nz, height, length2, h, h + tile[BELOW * TILE + j], bend
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def add_rare(
+def _bent(
+    height: float, length2: float, h: float, y: float, bend: float
+) -> tuple[float, float, float, float, float, float, float]:
+    """Return kappa, 1 / H, 1 / L^2, r / kappa, 1 - m, beta, and delta by n over d."""
+    kappa = np.sqrt(length2 - bend * bend * (length2 - height * height))
+    share = 1.0 / (length2 * height * kappa)  # one division for three
+    inv_k, inv_h, inv2 = share * length2 * height, share * length2 * kappa, share * height * kappa
+    lean = bend * inv_k
+    fall = y * lean * inv_k * inv_k
+    by_n = fall * bend * length2 if bend < 1.0 else 0.0
+    return (
+        kappa, inv_h, inv2, lean, 1.0 - h * inv_h + y * lean, fall * (bend * bend - 1.0), by_n
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _weight(
+    one: float, ex: float, ey: float, ez: float, length2: float,
+    axis: tuple[float, float, float], square: float,
+) -> Six:  # fmt: skip
+    """Return J'J of a camera whose squared focal length (px) is `square`, at P.
+
+    With the optical axis z and Z = -z.e it is (f / Z)^2 (I + x z' + z x'), x = e / Z +
+    L^2 / (2 Z^2) z; without an axis (zeros), of angles, (f / L)^2 (I - e e' / L^2).
+    """
+    zx, zy, zz = axis
+    flat = zx != 0.0 or zy != 0.0 or zz != 0.0
+    deep = -(zx * ex + zy * ey + zz * ez) if flat else length2
+    inv = 1.0 / deep if one > 0.0 else 0.0
+    w = one * square * (inv * inv if flat else inv)
+    a = inv if flat else -0.5 * inv
+    b = 0.5 * length2 * inv * inv if flat else 0.0
+    zx, zy, zz = zx if flat else ex, zy if flat else ey, zz if flat else ez
+    x, y, z = w * (a * ex + b * zx), w * (a * ey + b * zy), w * (a * ez + b * zz)
+    return (
+        w + 2.0 * x * zx, x * zy + zx * y, x * zz + zx * z,
+        w + 2.0 * y * zy, y * zz + zy * z, w + 2.0 * z * zz,
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _times(m: Six, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return a symmetric matrix times a vector."""
+    return (
+        m[0] * x + m[1] * y + m[2] * z,
+        m[1] * x + m[3] * y + m[4] * z,
+        m[2] * x + m[4] * y + m[5] * z,
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _add_three(sums: FloatArray, at: int, c: float, x: float, y: float, z: float) -> None:
+    sums[at] += c * x
+    sums[at + TILE] += c * y
+    sums[at + 2 * TILE] += c * z
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _add_six(sums: FloatArray, at: int, m: Six) -> None:
+    sums[at] += m[0]
+    sums[at + TILE] += m[1]
+    sums[at + 2 * TILE] += m[2]
+    sums[at + 3 * TILE] += m[3]
+    sums[at + 4 * TILE] += m[4]
+    sums[at + 5 * TILE] += m[5]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _add_nine(
+    sums: FloatArray, at: int, c: float, m: Six, gx: float, gy: float, gz: float,
+    qx: float, qy: float, qz: float,
+) -> None:  # fmt: skip
+    """Add c m + g q'."""
+    sums[at] += c * m[0] + gx * qx
+    sums[at + TILE] += c * m[1] + gx * qy
+    sums[at + 2 * TILE] += c * m[2] + gx * qz
+    sums[at + 3 * TILE] += c * m[1] + gy * qx
+    sums[at + 4 * TILE] += c * m[3] + gy * qy
+    sums[at + 5 * TILE] += c * m[4] + gy * qz
+    sums[at + 6 * TILE] += c * m[2] + gz * qx
+    sums[at + 7 * TILE] += c * m[4] + gz * qy
+    sums[at + 8 * TILE] += c * m[5] + gz * qz
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _in_space(
+    one: float, ex: float, ey: float, ez: float, nx: float, ny: float, nz: float, height: float,
+    length2: float, bend: float, kappa: float, inv2: float,
+) -> tuple[Six, float, float, float]:  # fmt: skip
+    """Return t t' and E."""
+    dx, dy, dz = refracted(ex, ey, ez, length2, nx, ny, nz, height, bend)
+    one = one * inv2
+    tx, ty, tz = one * dx, one * dy, one * dz
+    along = kappa * kappa * one
+    up = along * height + bend * kappa * (length2 - height * height) * one
+    return (
+        (dx * tx, dx * ty, dx * tz, dy * ty, dy * tz, dz * tz),
+        along * ex - up * nx,
+        along * ey - up * ny,
+        along * ez - up * nz,
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def add_in_space(
     sums: FloatArray, tile: FloatArray, marks: FloatArray,
     centre: FloatArray, axis: FloatArray, focal_px: float, offset: float,
     least_cosine2: float, r: float,
-    centre_m: float, attitude: float, waves: float, image_px: float,
 ) -> None:  # fmt: skip
-    """Add what only a budget with tilt, waves or errors of pose needs.
-
-    An error that moves the straight ray at P by z, of covariance S, moves its image by J z and
-    adds W S W to the noise of the normal equations, W = J'J. A turned camera has S = attitude^2
-    L^2 times what is across the ray, a moved one centre_m^2. A wave of slope tau at the piercing
-    point moves the refracted ray at depth y by -c (tau + r^2 / kappa^2 (a, b) ((a, b).tau)), with
-    c = y (1 - r H / kappa); back at P, which moves the refracted ray by (1 - m) and beta as in the
-    table above, that is c_t across (a, b) and c_r along.
-    """
-    cx, cy, cz = centre[0], centre[1], centre[2]
-    zx, zy, zz = axis[0], axis[1], axis[2]
-    flat = zx != 0.0 or zy != 0.0 or zz != 0.0
+    """Add one camera's rays to the sums of a tile's points, as often as their marks say."""
+    place, view = (centre[0], centre[1], centre[2]), (axis[0], axis[1], axis[2])
     square = focal_px * focal_px
     for j in range(marks.size):
-        z = tile[2 * TILE + j]
-        ex, ey, ez = cx - tile[j], cy - tile[TILE + j], cz - z
-        nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-        height = nx * ex + ny * ey + nz * ez
-        h = nz * (tile[3 * TILE + j] - (z - offset))
-        length2 = ex * ex + ey * ey + ez * ez
-        if not ((marks[j] > 0.0) & (height > h) & (height * height >= least_cosine2 * length2)):
-            continue
-        a = tile[UX * TILE + j] * ex + tile[UZ * TILE + j] * ez
-        b = tile[VX * TILE + j] * ex + tile[VY * TILE + j] * ey + tile[VZ * TILE + j] * ez
-        y = h + tile[BELOW * TILE + j]
-        bend = r if h > 0.0 else 1.0
-        rho2 = a * a + b * b
-        kappa2 = height * height + (1.0 - bend * bend) * rho2
-        kappa = np.sqrt(kappa2)
-        lean = bend / kappa
-        m = h / height - y * lean
-        inv2 = 1.0 / length2
-        ta, tb = bend * a * inv2, bend * b * inv2
-        across_x, across_y = kappa2 * a * inv2, kappa2 * b * inv2
-        across_z = -kappa * (ta * a + tb * b)
-        turn = -y * (1.0 - height * lean)
-        along = y * bend * bend * lean * height / kappa2 - h / (height * height) + m * lean
-        sums[BY_TILT * TILE + j] += turn * (1.0 - bend * a * ta) + along * a * across_x
-        sums[(BY_TILT + 1) * TILE + j] += along * a * across_y - turn * bend * a * tb
-        sums[(BY_TILT + 2) * TILE + j] += along * a * across_z - turn * kappa * ta
-        sums[(BY_TILT + 3) * TILE + j] += along * b * across_x - turn * bend * a * tb
-        sums[(BY_TILT + 4) * TILE + j] += turn * (1.0 - bend * b * tb) + along * b * across_y
-        sums[(BY_TILT + 5) * TILE + j] += along * b * across_z - turn * kappa * tb
-
-        inv_z = -1.0 / (zx * ex + zy * ey + zz * ez) if flat else 0.0
-        w0 = square * (inv_z * inv_z if flat else inv2)
-        w1 = w0 * inv_z
-        w2 = w1 * inv_z * length2
-        w3 = 0.0 if flat else -w0 * inv2
-        xx = w0 + 2.0 * w1 * zx * ex + w2 * zx * zx + w3 * ex * ex
-        xy = w1 * (zx * ey + zy * ex) + w2 * zx * zy + w3 * ex * ey
-        xz = w1 * (zx * ez + zz * ex) + w2 * zx * zz + w3 * ex * ez
-        yy = w0 + 2.0 * w1 * zy * ey + w2 * zy * zy + w3 * ey * ey
-        yz = w1 * (zy * ez + zz * ey) + w2 * zy * zz + w3 * ey * ez
-        wz = w0 + 2.0 * w1 * zz * ez + w2 * zz * zz + w3 * ez * ez
-        beta = -y * lean * (1.0 - bend * bend) / kappa2
-        c_t = turn / (1.0 - m)
-        c_r = c_t * (1.0 + bend * bend * rho2 / kappa2) / (1.0 + beta * rho2 / (1.0 - m))
-        c_t, c_r = waves * waves * c_t * c_t, waves * waves * c_r * c_r
-        g0 = image_px * image_px
-        g1 = attitude * attitude * length2 + centre_m * centre_m + c_t
-        # W (a, b) = -H W N, as W e = 0; straight down there is no along
-        g2 = (c_r - c_t) * height * height / rho2 - c_t if rho2 > 1e-12 * length2 else -c_t
-        ux, uy, uz = (
-            xx * nx + xy * ny + xz * nz,
-            xy * nx + yy * ny + yz * nz,
-            xz * nx + yz * ny + wz * nz,
+        one, ex, ey, ez, nx, ny, nz, height, length2, h, y, bend = _seen(
+            tile, j, marks[j], place, offset, least_cosine2, r
         )
-        sums[NOISE * TILE + j] += g0 * xx + g1 * (xx * xx + xy * xy + xz * xz) + g2 * ux * ux
-        sums[(NOISE + 1) * TILE + j] += g0 * xy + g1 * (xx * xy + xy * yy + xz * yz) + g2 * ux * uy
-        sums[(NOISE + 2) * TILE + j] += g0 * xz + g1 * (xx * xz + xy * yz + xz * wz) + g2 * ux * uz
-        sums[(NOISE + 3) * TILE + j] += g0 * yy + g1 * (xy * xy + yy * yy + yz * yz) + g2 * uy * uy
-        sums[(NOISE + 4) * TILE + j] += g0 * yz + g1 * (xy * xz + yy * yz + yz * wz) + g2 * uy * uz
-        sums[(NOISE + 5) * TILE + j] += g0 * wz + g1 * (xz * xz + yz * yz + wz * wz) + g2 * uz * uz
+        kappa, inv_h, inv2, lean, away, beta, by_n = _bent(height, length2, h, y, bend)
+        tt, gx, gy, gz = _in_space(
+            one, ex, ey, ez, nx, ny, nz, height, length2, bend, kappa, inv2
+        )  # fmt: skip
+        # M D (p - (N.p) e / H), where M e = (1 - r H / kappa) E
+        up = (away * (lean * height - 1.0) - beta * length2) * inv_h
+        away *= one
+        sums[RAYS * TILE + j] += one
+        _add_three(sums, BY_Q * TILE + j, 1.0, tt[0], tt[1], tt[2])
+        sums[(BY_Q + 3) * TILE + j] += tt[3]
+        sums[(BY_Q + 4) * TILE + j] += tt[4]
+        m = (away - away * tt[0], -away * tt[1], -away * tt[2],
+             away - away * tt[3], -away * tt[4], away - away * tt[5])  # fmt: skip
+        qx, qy, qz = up * nx + beta * ex, up * ny + beta * ey, up * nz + beta * ez
+        _add_nine(sums, BY_P * TILE + j, 1.0, m, gx, gy, gz, qx, qy, qz)
+        _add_three(sums, BY_LEVEL * TILE + j, inv_h - lean, gx, gy, gz)
+        _add_three(sums, BY_N * TILE + j, by_n, gx, gy, gz)
+        _add_six(sums, SIGHT * TILE + j, _weight(one, ex, ey, ez, length2, view, square))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def add_in_images(
+    sums: FloatArray, tile: FloatArray, marks: FloatArray,
+    centre: FloatArray, axis: FloatArray, focal_px: float, offset: float,
+    least_cosine2: float, r: float,
+) -> None:  # fmt: skip
+    """Add one camera's rays to the sums of a tile's points, as often as their marks say.
+
+    S T = W / (1 - m) + W N (u N + v e)', with c = 1 - m + beta rho^2, v = H beta / ((1 - m) c) and
+    u = (r H / kappa) / c - 1 / (1 - m) - H v.
+    """
+    place, view = (centre[0], centre[1], centre[2]), (axis[0], axis[1], axis[2])
+    square = focal_px * focal_px
+    for j in range(marks.size):
+        one, ex, ey, ez, nx, ny, nz, height, length2, h, y, bend = _seen(
+            tile, j, marks[j], place, offset, least_cosine2, r
+        )
+        _, inv_h, _, lean, away, beta, by_n = _bent(height, length2, h, y, bend)
+        w = _weight(one, ex, ey, ez, length2, view, square)
+        gx, gy, gz = _times(w, nx, ny, nz)
+        inner, outer = _inverse(height, length2, away, beta)
+        v = height * beta * inner * outer
+        u = lean * height * outer - inner - height * v
+        qx, qy, qz = u * nx + v * ex, u * ny + v * ey, u * nz + v * ez
+        sums[RAYS * TILE + j] += one
+        _add_nine(sums, BY_Q * TILE + j, inner, w, gx, gy, gz, qx, qy, qz)
+        scale = -height * outer
+        _add_three(sums, BY_LEVEL * TILE + j, scale * (inv_h - lean), gx, gy, gz)
+        _add_three(sums, BY_N * TILE + j, scale * by_n, gx, gy, gz)
+        _add_six(sums, SIGHT * TILE + j, w)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _inverse(height: float, length2: float, away: float, beta: float) -> tuple[float, float]:
+    """Return what D^-1 does to p across d, and along it."""
+    outer = away + beta * (length2 - height * height)
+    share = 1.0 / (away * outer)
+    return share * outer, share * away
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _turned(
+    height: float, inv_h: float, h: float, y: float, bend: float, inv_k: float, lean: float
+) -> tuple[float, float]:
+    """Return delta by the slope as a (tau) + b (d.tau) d: a and b."""
+    along = y * bend * bend * lean * height * inv_k * inv_k
+    along += (h * inv_h - y * lean) * lean - h * inv_h * inv_h
+    return -y * (1.0 - height * lean), along
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def add_tilt(
+    sums: FloatArray, tile: FloatArray, marks: FloatArray,
+    centre: FloatArray, axis: FloatArray, focal_px: float, offset: float,
+    least_cosine2: float, r: float, in_images: bool,
+) -> None:  # fmt: skip
+    """Add how the slope of the water moves each of one camera's rays, M delta or S delta.
+
+    S delta = (a W + (a beta - (1 - m) b) H / c W N d') / (1 - m) tau, c as above, with the a and b
+    of `_turned`; d.tau = e.tau.
+    """
+    place, view = (centre[0], centre[1], centre[2]), (axis[0], axis[1], axis[2])
+    square = focal_px * focal_px
+    for j in range(marks.size):
+        one, ex, ey, ez, nx, ny, nz, height, length2, h, y, bend = _seen(
+            tile, j, marks[j], place, offset, least_cosine2, r
+        )
+        kappa, inv_h, inv2, lean, away, beta, _ = _bent(height, length2, h, y, bend)
+        turn, along = _turned(height, inv_h, h, y, bend, 1.0 / kappa, lean)
+        if in_images:
+            w = _weight(one, ex, ey, ez, length2, view, square)
+            gx, gy, gz = _times(w, nx, ny, nz)
+            inner, outer = _inverse(height, length2, away, beta)
+            along = (turn * beta * inner - along) * height * outer
+            turn *= inner
+        else:
+            tt, gx, gy, gz = _in_space(
+                one, ex, ey, ez, nx, ny, nz, height, length2, bend, kappa, inv2
+            )  # fmt: skip
+            w = (one - tt[0], -tt[1], -tt[2], one - tt[3], -tt[4], one - tt[5])
+        _add_nine(
+            sums, BY_TILT * TILE + j, turn, w, gx, gy, gz, along * ex, along * ey, along * ez
+        )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def add_noise(
+    sums: FloatArray, tile: FloatArray, marks: FloatArray,
+    centre: FloatArray, axis: FloatArray, focal_px: float, offset: float,
+    least_cosine2: float, r: float,
+    image_px: float, centre_m: float, attitude: float, waves: float,
+) -> None:  # fmt: skip
+    """Add the noise of one camera's rays to the normal equations of the straight rays.
+
+    An error that moves the straight ray at P by z, of covariance C, moves its image by J z and
+    adds W C W. A turned camera has C = attitude^2 L^2 times what is across the ray, a moved one
+    centre_m^2. A wave of slope tau at the piercing point moves the refracted ray at depth y by
+    -y (1 - r H / kappa) (tau + r^2 / kappa^2 d (d.tau)); D^-1 of that is what moves P, by c_t
+    across d and c_r along.
+    """
+    place, view = (centre[0], centre[1], centre[2]), (axis[0], axis[1], axis[2])
+    square = focal_px * focal_px
+    for j in range(marks.size):
+        one, ex, ey, ez, nx, ny, nz, height, length2, h, y, bend = _seen(
+            tile, j, marks[j], place, offset, least_cosine2, r
+        )
+        kappa, _, _, lean, away, beta, _ = _bent(height, length2, h, y, bend)
+        w = _weight(one, ex, ey, ez, length2, view, square)
+        gx, gy, gz = _times(w, nx, ny, nz)
+        inner, outer = _inverse(height, length2, away, beta)
+        across = waves * y * (1.0 - height * lean)
+        bow = bend * bend / (kappa * kappa)
+        c_t = across * inner
+        c_r = across * outer * (1.0 + bow * (length2 - height * height))
+        # (c_r^2 - c_t^2) / rho^2, also straight down; W d = -H W N
+        more = across * outer * (bow - beta * inner) * (c_r + c_t)
+        by_place = attitude * attitude * length2 + centre_m * centre_m + c_t * c_t
+        by_normal = more * height * height - c_t * c_t
+        ww = _squared(w)
+        noise = (
+            image_px * image_px * w[0] + by_place * ww[0] + by_normal * gx * gx,
+            image_px * image_px * w[1] + by_place * ww[1] + by_normal * gx * gy,
+            image_px * image_px * w[2] + by_place * ww[2] + by_normal * gx * gz,
+            image_px * image_px * w[3] + by_place * ww[3] + by_normal * gy * gy,
+            image_px * image_px * w[4] + by_place * ww[4] + by_normal * gy * gz,
+            image_px * image_px * w[5] + by_place * ww[5] + by_normal * gz * gz,
+        )
+        _add_six(sums, NOISE * TILE + j, noise)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _squared(m: Six) -> Six:
+    """Return the square of a symmetric matrix."""
+    xx, xy, xz, yy, yz, zz = m
+    return (
+        xx * xx + xy * xy + xz * xz,
+        xx * xy + xy * yy + xz * yz,
+        xx * xz + xy * yz + xz * zz,
+        xy * xy + yy * yy + yz * yz,
+        xy * xz + yy * yz + yz * zz,
+        xz * xz + yz * yz + zz * zz,
+    )

@@ -19,14 +19,22 @@ the images (px), which is how the noise really went in.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit, prange
 
 from pcfix.model import Outcome
 from pcfix.refract import sensitivity as s
-from pcfix.refract.choice import TILE, choose, gather, least_cosine2, near_cameras, spatial_order
+from pcfix.refract.choice import (
+    ANY_NUMBER,
+    TILE,
+    choose,
+    gather,
+    least_cosine2,
+    near_cameras,
+    spatial_order,
+)
 from pcfix.refract.frames import (
     ALL,
     NOT_DISTORTED,
@@ -57,8 +65,20 @@ NOMINAL_WIDTH_PX = 5472.0
 """Of lenses in millimetres whose pixel size is not known: the same camera's longer side."""
 
 
+Three: TypeAlias = tuple[float, float, float]
+Four: TypeAlias = tuple[float, float, float, float]
+Nine: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
+"""A matrix, row by row."""
+
+MIN_DETERMINANT = 1e-6
+"""As of `pcfix.refract.rays.nearest_point`, of half the trace cubed: k^3 for k rays in space."""
+
+
 class _Budget(NamedTuple):
-    """Standard deviations, angles in radians; the place about which the water tilts."""
+    """Standard deviations, angles in radians; the place about which the water tilts.
+
+    `in_images` says which residuals the correction makes least, see `pcfix.refract.sensitivity`.
+    """
 
     image_px: float
     refractive_index: float
@@ -68,6 +88,7 @@ class _Budget(NamedTuple):
     attitude: float
     pivot_x: float
     pivot_y: float
+    in_images: bool
 
 
 def covariances(
@@ -137,7 +158,7 @@ def covariances(
             _all_in_frame(*common)
         else:
             rows = None if views is None else (views.start, views.camera)
-            _chosen(*common, rows, settings.max_cameras or len(cameras))
+            _chosen(*common, rows, settings.max_cameras or ANY_NUMBER)
     return result
 
 
@@ -195,6 +216,7 @@ def _budget(settings: Settings, cameras: Cameras) -> _Budget:
         attitude=math.radians(errors.attitude_deg),
         pivot_x=x,
         pivot_y=y,
+        in_images=settings.method == "consistent",
     )
 
 
@@ -266,10 +288,10 @@ def _all_in_frame(
     """Every camera whose frame holds the point; see `pcfix.refract.intersect`."""
     for t in prange((len(order) + TILE - 1) // TILE):
         rows = order[t * TILE : (t + 1) * TILE]
-        tile, sums = np.empty(s.RUNS * TILE), np.zeros(s.SUMS * TILE)
+        tile, sums = np.empty(s.TILE_RUNS * TILE), np.zeros(s.SUMS * TILE)
         marks = np.empty(rows.size)
         low, high = gather(tile, rows, xyz, surface, slope)
-        s.add_frames(tile, shift, rows)
+        s.add_below(tile, shift, rows)
         for c in range(len(centres)):
             if _mark_camera(marks, tile, frames, c, centres[c], low, high):
                 _add(
@@ -286,33 +308,47 @@ def _chosen(
     offset: FloatArray, frames: Frames, least_cosine2: float, r: float, budget: _Budget,
     result: FloatArray, views: tuple[IntArray, IntArray] | None, most: int,
 ) -> None:  # fmt: skip
-    """Chosen cameras per point."""
+    """Chosen cameras per point; those of a tile one after the other, as if by frames."""
     for t in prange((len(order) + TILE - 1) // TILE):
         rows = order[t * TILE : (t + 1) * TILE]
-        tile, sums = np.empty(s.RUNS * TILE), np.zeros(s.SUMS * TILE)
-        marks = np.ones(rows.size)
+        tile, sums = np.empty(s.TILE_RUNS * TILE), np.zeros(s.SUMS * TILE)
         low, high = gather(tile, rows, xyz, surface, slope)
-        s.add_frames(tile, shift, rows)
-        near = near_cameras(frames, centres, low, high)
+        s.add_below(tile, shift, rows)
+        if views is None:
+            near = near_cameras(frames, centres, low, high)
+        else:
+            near = _listed(views[0], views[1], rows, len(centres))
+        place = np.zeros(len(centres), np.int64)
+        place[near] = np.arange(near.size)
+        marks = np.zeros((near.size, rows.size))
         for j in range(rows.size):
-            candidates = near
+            mine = near
             if views is not None:
-                candidates = views[1][views[0][rows[j]] : views[0][rows[j] + 1]].astype(np.int64)
-            kept = choose(
-                candidates, tile, j, centres, offset, frames, least_cosine2, most, None, None, -1
-            )
-            for c in candidates[kept]:
-                _add(
-                    sums[j:], tile[j:], marks[:1], centres[c], axes[c], focal[c], offset[c],
-                    least_cosine2, r, budget,
-                )  # fmt: skip
+                mine = views[1][views[0][rows[j]] : views[0][rows[j] + 1]].astype(np.int64)
+            if views is None or most < mine.size:
+                mine = mine[
+                    choose(mine, tile, j, centres, offset, frames, least_cosine2, most,
+                           None, None, -1)
+                ]  # fmt: skip
+            for c in mine:
+                marks[place[c], j] += 1.0
+        for at in range(near.size):
+            c = near[at]
+            _add(
+                sums, tile, marks[at], centres[c], axes[c], focal[c], offset[c],
+                least_cosine2, r, budget,
+            )  # fmt: skip
         _finish_tile(result, rows, sums, tile, level_sigma, budget)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _rare(budget: _Budget) -> bool:
-    """Whether more than image noise, level and index counts."""
-    return max(max(budget.tilt, budget.waves), max(budget.centre_m, budget.attitude)) > 0.0
+def _listed(start: IntArray, camera: IntArray, rows: IntArray, k: int) -> IntArray:
+    """Return the cameras that the lists of some points name, in their order."""
+    named = np.zeros(k, np.bool_)
+    for i in rows:
+        for at in range(start[i], start[i + 1]):
+            named[camera[at]] = True
+    return np.flatnonzero(named)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -322,18 +358,25 @@ def _add(
     least_cosine2: float, r: float, budget: _Budget,
 ) -> None:  # fmt: skip
     """Add one camera's rays to the points of a tile that have a mark."""
-    s.add_rays(
-        sums, tile, marks, centre, axis, focal, offset, least_cosine2, r
-    )  # fmt: skip
-    if _rare(budget):
-        s.add_rare(
+    if budget.in_images:
+        s.add_in_images(sums, tile, marks, centre, axis, focal, offset, least_cosine2, r)
+    else:
+        s.add_in_space(sums, tile, marks, centre, axis, focal, offset, least_cosine2, r)
+    if budget.tilt > 0.0:
+        s.add_tilt(
+            sums, tile, marks, centre, axis, focal, offset, least_cosine2, r, budget.in_images
+        )  # fmt: skip
+    if _per_image(budget):
+        s.add_noise(
             sums, tile, marks, centre, axis, focal, offset, least_cosine2, r,
-            budget.centre_m, budget.attitude, budget.waves, budget.image_px,
+            budget.image_px, budget.centre_m, budget.attitude, budget.waves,
         )  # fmt: skip
 
 
-MIN_DETERMINANT = 1e-6
-"""As of `pcfix.refract.rays.nearest_point`."""
+@njit(cache=True, error_model="numpy", nogil=True)
+def _per_image(budget: _Budget) -> bool:
+    """Whether rays differ by more than the noise of image coordinates."""
+    return max(budget.waves, max(budget.centre_m, budget.attitude)) > 0.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -342,139 +385,172 @@ def _finish_tile(
     level_sigma: FloatArray, budget: _Budget,
 ) -> None:  # fmt: skip
     """Turn the sums of a tile into covariances."""
-    frame, by_p = np.zeros((3, 3)), np.empty((3, 3))
-    normal, sight, noise = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    work, total = np.empty((3, 3)), np.empty((3, 3))
-    columns = np.zeros((4, 3))
+    out, sigma = np.empty(6 * TILE), level_sigma[rows]
+    if not _per_image(budget):
+        for at in range(6 * TILE):
+            sums[s.NOISE * TILE + at] = budget.image_px**2 * sums[s.SIGHT * TILE + at]
+    if budget.in_images:
+        for j in range(rows.size):
+            solved, by_delta = _solved_in_images(sums, j)
+            _write(out, j, solved, by_delta, by_delta, sums, tile, sigma[j], budget)
+    else:
+        for j in range(rows.size):
+            solved, by_delta, by_noise = _solved_in_space(sums, j)
+            _write(out, j, solved, by_delta, by_noise, sums, tile, sigma[j], budget)
     for j in range(rows.size):
-        k = sums[s.RAYS * TILE + j]
-        if k < 2.0:
-            continue
-        at = s.TT * TILE + j
-        xx, xy, xz = sums[at], sums[at + TILE], sums[at + 2 * TILE]
-        yy, yz = sums[at + 3 * TILE], sums[at + 4 * TILE]
-        det = _invert(normal, k - xx, -xy, -xz, k - yy, -yz, xx + yy)
-        if not det >= MIN_DETERMINANT * k * k * k:
-            continue
-        at = s.SIGHT * TILE + j
-        if not _invert_run(sight, sums, at) > 0.0:
-            continue
-        _frame(frame, tile, j)
-        for i in range(3):
-            for p in range(3):
-                work[i, p] = sums[(s.BY_P + 3 * p + i) * TILE + j]
-        # dQ/dP, its left side in the frame of the surface, its right side turned to the world's
-        _multiply(by_p, normal, work, False)
-        _multiply(work, by_p, frame, False)
-        if _rare(budget):
-            _square_run(noise, sums, s.NOISE * TILE + j)
-            _multiply(by_p, sight, noise, False)
-            _multiply(noise, by_p, sight, False)
-        else:
-            noise[:] = budget.image_px * budget.image_px * sight
-        _multiply(by_p, work, noise, False)
-        _multiply(total, by_p, work, True)
-        _common(columns, sums, tile, j, normal, level_sigma[rows[j]], budget)
-        for column in range(4 if budget.tilt > 0.0 else 2):
-            for i in range(3):
-                for p in range(3):
-                    total[i, p] += columns[column, i] * columns[column, p]
-        # from the frame of the surface to the world's
-        for i in range(3):
-            for p in range(3):
-                by_p[i, p] = (
-                    total[i, 0] * frame[0, p]
-                    + total[i, 1] * frame[1, p]
-                    + total[i, 2] * frame[2, p]
-                )
-        row = result[rows[j]]
-        at = 0
-        for i in range(3):
-            for p in range(i, 3):
-                row[at] = (
-                    frame[0, i] * by_p[0, p] + frame[1, i] * by_p[1, p] + frame[2, i] * by_p[2, p]
-                )
-                at += 1
+        for at in range(6):
+            result[rows[j], at] = out[at * TILE + j]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _common(
-    columns: FloatArray, sums: FloatArray, tile: FloatArray, j: int, normal: FloatArray,
-    level_sigma: float, budget: _Budget,
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _solved_in_images(sums: FloatArray, j: int) -> tuple[bool, Nine]:
+    """Return whether the rays fix a point, and the inverse of sum S T.
+
+    Q moves by that times the right side of the normal equations of P, and times sum S delta.
+    """
+    m = _nine(sums, s.BY_Q * TILE + j)
+    det, inverse = _inverted(m)
+    half = 0.5 * (m[0] + m[4] + m[8])
+    return (sums[j] >= 2.0) & (det >= MIN_DETERMINANT * half * half * half), inverse
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _solved_in_space(sums: FloatArray, j: int) -> tuple[bool, Nine, Nine]:
+    """Return whether the rays fix a point, and by what it moves.
+
+    That is (sum M)^-1 times sum M delta, and (sum M)^-1 (sum M D) (sum W)^-1 times the right side
+    of the normal equations of P.
+    """
+    k, at = sums[j], s.BY_Q * TILE + j
+    xx, xy, xz = sums[at], sums[at + TILE], sums[at + 2 * TILE]
+    yy, yz = sums[at + 3 * TILE], sums[at + 4 * TILE]
+    det, by_delta = _inverted((k - xx, -xy, -xz, -xy, k - yy, -yz, -xz, -yz, xx + yy))
+    full, by_sight = _inverted(_full(_six(sums, s.SIGHT * TILE + j)))
+    by_p = _product(by_delta, _nine(sums, s.BY_P * TILE + j))
+    solved = (k >= 2.0) & (det >= MIN_DETERMINANT * k * k * k) & (full > 0.0)
+    return solved, by_delta, _product(by_p, by_sight)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _write(
+    out: FloatArray, j: int, solved: bool, by_delta: Nine, by_noise: Nine, sums: FloatArray,
+    tile: FloatArray, level_sigma: float, budget: _Budget,
 ) -> None:  # fmt: skip
-    """Write how a point moves by one standard deviation of level, index and both tilts, in rows.
+    """Write the covariance of a point: of its noise, and of each common error a column squared."""
+    b = by_noise
+    noise = _product(_product(b, _full(_six(sums, s.NOISE * TILE + j))), (
+        b[0], b[3], b[6], b[1], b[4], b[7], b[2], b[5], b[8]
+    ))  # fmt: skip
+    level, index, u, v = _columns(by_delta, sums, tile, j, level_sigma, budget)
+    x, y, z = (
+        (level[0], index[0], u[0], v[0]),
+        (level[1], index[1], u[1], v[1]),
+        (level[2], index[2], u[2], v[2]),
+    )
+    out[j] = noise[0] + _dot(x, x) if solved else 0.0
+    out[TILE + j] = noise[1] + _dot(x, y) if solved else 0.0
+    out[2 * TILE + j] = noise[2] + _dot(x, z) if solved else 0.0
+    out[3 * TILE + j] = noise[4] + _dot(y, y) if solved else 0.0
+    out[4 * TILE + j] = noise[5] + _dot(y, z) if solved else 0.0
+    out[5 * TILE + j] = noise[8] + _dot(z, z) if solved else 0.0
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _dot(x: Four, y: Four) -> float:
+    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2] + x[3] * y[3]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _columns(
+    by_delta: Nine, sums: FloatArray, tile: FloatArray, j: int, level_sigma: float, budget: _Budget
+) -> tuple[Three, Three, Three, Three]:
+    """Return how a point moves by one standard deviation of level, index and both tilts.
 
     A tilt also raises the water above the point, by its distance from the pivot.
     """
-    up = tile[6 * TILE + j]
-    away = tile[j] - budget.pivot_x, tile[TILE + j] - budget.pivot_y
-    for i in range(3):
-        by_level, by_n, by_u, by_v = 0.0, 0.0, 0.0, 0.0
-        for p in range(3):
-            g = normal[i, p]
-            by_level += g * up * sums[(s.BY_LEVEL + p) * TILE + j]
-            by_n += g * sums[(s.BY_N + p) * TILE + j]
-        columns[0, i] = level_sigma * by_level
-        columns[1, i] = budget.refractive_index * by_n
-        if budget.tilt == 0.0:
-            continue
-        for p in range(3):
-            # the normal leans away from where the slope rises
-            g = normal[i, p]
-            by_u -= g * sums[(s.BY_TILT + p) * TILE + j]
-            by_v -= g * sums[(s.BY_TILT + 3 + p) * TILE + j]
-        columns[2, i] = budget.tilt * (by_u + away[0] * by_level)
-        columns[3, i] = budget.tilt * (by_v + away[1] * by_level)
+    nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+    scale = 1.0 / np.sqrt(nx * nx + nz * nz)
+    ux, uz = nz * scale, -nx * scale
+    by_tilt = _nine(sums, s.BY_TILT * TILE + j)
+    by_level, by_n = _three(sums, s.BY_LEVEL * TILE + j), _three(sums, s.BY_N * TILE + j)
+    level = _scaled(nz, by_level)
+    away_u, away_v = tile[j] - budget.pivot_x, tile[TILE + j] - budget.pivot_y
+    # the normal leans away from where the slope rises
+    u = _plus(_times(by_tilt, (-ux, 0.0, -uz)), _scaled(away_u, level))
+    v = _plus(_times(by_tilt, (-ny * uz, nx * uz - nz * ux, ny * ux)), _scaled(away_v, level))
+    return (
+        _scaled(level_sigma, _times(by_delta, level)),
+        _scaled(budget.refractive_index, _times(by_delta, by_n)),
+        _scaled(budget.tilt, _times(by_delta, u)),
+        _scaled(budget.tilt, _times(by_delta, v)),
+    )
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _frame(frame: FloatArray, tile: FloatArray, j: int) -> None:
-    """Write the axes of the surface above a point, in rows."""
-    frame[0, 0], frame[0, 2] = tile[s.UX * TILE + j], tile[s.UZ * TILE + j]
-    frame[1, 0], frame[1, 1] = tile[s.VX * TILE + j], tile[s.VY * TILE + j]
-    frame[1, 2] = tile[s.VZ * TILE + j]
-    for axis in range(3):
-        frame[2, axis] = tile[(4 + axis) * TILE + j]
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _three(sums: FloatArray, at: int) -> Three:
+    return sums[at], sums[at + TILE], sums[at + 2 * TILE]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _multiply(out: FloatArray, a: FloatArray, b: FloatArray, turned: bool) -> None:
-    """Write the product of a and b, or of a and b transposed, shape (3, 3)."""
-    for i in range(3):
-        for p in range(3):
-            if turned:
-                out[i, p] = a[i, 0] * b[p, 0] + a[i, 1] * b[p, 1] + a[i, 2] * b[p, 2]
-            else:
-                out[i, p] = a[i, 0] * b[0, p] + a[i, 1] * b[1, p] + a[i, 2] * b[2, p]
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _square_run(out: FloatArray, sums: FloatArray, at: int) -> None:
-    """Write the symmetric matrix whose six elements lie in runs from `at`."""
-    out[0, 0], out[0, 1], out[0, 2] = sums[at], sums[at + TILE], sums[at + 2 * TILE]
-    out[1, 0], out[1, 1], out[1, 2] = out[0, 1], sums[at + 3 * TILE], sums[at + 4 * TILE]
-    out[2, 0], out[2, 1], out[2, 2] = out[0, 2], out[1, 2], sums[at + 5 * TILE]
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _invert_run(out: FloatArray, sums: FloatArray, at: int) -> float:
-    """Invert the symmetric matrix whose six elements lie in runs from `at`; return its det."""
-    return _invert(
-        out, sums[at], sums[at + TILE], sums[at + 2 * TILE], sums[at + 3 * TILE],
-        sums[at + 4 * TILE], sums[at + 5 * TILE],
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _six(sums: FloatArray, at: int) -> s.Six:
+    return (
+        sums[at], sums[at + TILE], sums[at + 2 * TILE],
+        sums[at + 3 * TILE], sums[at + 4 * TILE], sums[at + 5 * TILE],
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _invert(
-    out: FloatArray, xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
-) -> float:
-    """Write the inverse of a symmetric matrix, shape (3, 3); return its determinant."""
-    c00, c01, c02 = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
-    c11, c12, c22 = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
-    det = xx * c00 + xy * c01 + xz * c02
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _nine(sums: FloatArray, at: int) -> Nine:
+    return (
+        sums[at], sums[at + TILE], sums[at + 2 * TILE],
+        sums[at + 3 * TILE], sums[at + 4 * TILE], sums[at + 5 * TILE],
+        sums[at + 6 * TILE], sums[at + 7 * TILE], sums[at + 8 * TILE],
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _full(m: s.Six) -> Nine:
+    return m[0], m[1], m[2], m[1], m[3], m[4], m[2], m[4], m[5]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _scaled(c: float, x: Three) -> Three:
+    return c * x[0], c * x[1], c * x[2]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _plus(x: Three, y: Three) -> Three:
+    return x[0] + y[0], x[1] + y[1], x[2] + y[2]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _times(m: Nine, x: Three) -> Three:
+    """Return a matrix times a vector."""
+    return (
+        m[0] * x[0] + m[1] * x[1] + m[2] * x[2],
+        m[3] * x[0] + m[4] * x[1] + m[5] * x[2],
+        m[6] * x[0] + m[7] * x[1] + m[8] * x[2],
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _product(a: Nine, b: Nine) -> Nine:
+    """Return a matrix times a matrix."""
+    x, y, z = (
+        _times(a, (b[0], b[3], b[6])), _times(a, (b[1], b[4], b[7])), _times(a, (b[2], b[5], b[8]))
+    )  # fmt: skip
+    return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _inverted(m: Nine) -> tuple[float, Nine]:
+    """Return the determinant of a matrix and its inverse, which without one is meaningless."""
+    a, b, c, d, e, f, g, h, i = m
+    x, y, z = e * i - f * h, f * g - d * i, d * h - e * g
+    det = a * x + b * y + c * z
     inv = 1.0 / det
-    out[0, 0], out[0, 1], out[0, 2] = inv * c00, inv * c01, inv * c02
-    out[1, 0], out[1, 1], out[1, 2] = inv * c01, inv * c11, inv * c12
-    out[2, 0], out[2, 1], out[2, 2] = inv * c02, inv * c12, inv * c22
-    return float(det)
+    return det, (
+        inv * x, inv * (c * h - b * i), inv * (b * f - c * e),
+        inv * y, inv * (a * i - c * g), inv * (c * d - a * f),
+        inv * z, inv * (b * g - a * h), inv * (a * e - b * d),
+    )  # fmt: skip

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pcfix.compare.truth import errors_against_truth
+from pcfix.flow.points import correct_points
 from pcfix.flow.run import Request, run_all
 from pcfix.io.las.source import read_xyz
 from pcfix.io.scenes import write_scene
@@ -58,7 +59,8 @@ def _table(scene: Scene, folder: Path, overwrite: bool) -> str:
     rows = [
         ("as it came", scene.apparent_xyz),
         (f"depth times {scene.refractive_index:g}", times_n),
-        ("pcfix correct", _corrected(scene, folder, overwrite)),
+        ("snell, every camera", _by_snell(scene)),
+        ("consistent, own cameras", _corrected(scene, folder, overwrite)),
     ]
     head = f"error of {deep.sum():,} bed points"
     lines = [f"{head:<30}{'mean Z':>20}{'RMSE Z':>20}{'RMSE XY':>20}"]
@@ -69,6 +71,13 @@ def _table(scene: Scene, folder: Path, overwrite: bool) -> str:
     return "\n".join(lines)
 
 
+def _by_snell(scene: Scene) -> FloatArray:
+    """Return what ``pcfix correct`` makes of the cloud without any option."""
+    return correct_points(
+        scene.apparent_xyz, scene.cameras, scene.water, refractive_index=scene.refractive_index
+    ).xyz
+
+
 def _corrected(scene: Scene, folder: Path, overwrite: bool) -> FloatArray:
     """Run all steps on the scene's files and read the corrected cloud."""
     request = Request(
@@ -77,6 +86,9 @@ def _corrected(scene: Scene, folder: Path, overwrite: bool) -> FloatArray:
         water=str(scene.water_level_m),
         reference=str(folder / "lidar.laz"),
         refractive_index=scene.refractive_index,
+        method="consistent",
+        views=str(folder / "fused.ply.vis"),
+        views_are="tracks",
     )
     run_all(request, folder / REPORT, overwrite=overwrite)
     return read_xyz(folder / REPORT / "corrected.laz")

@@ -1,22 +1,33 @@
-"""A cloud of fused depth maps, as OpenMVS and COLMAP make it.
+"""A cloud of fused depth maps, as OpenMVS makes it.
 
-Every image is a reference: along a ray of its own it has a depth, the one with the least residuals
-in its neighbours, where each shows with noise what the reference sees there. One reference of a
-point is picked by chance; its depth gives the place to which all references of the point look.
-Depths that agree within 1 % with this place are fused: the weighted mean of the points on their
-own rays, with weights confidence / depth^2 and a random confidence.
+Every image is a reference. Along a ray of its own it has the depth at which the two best of its
+partners agree best: each shows what the reference sees there at a place of its image, with noise,
+and its cost of a depth is the squared distance from that place, pixels^2. A depth is scored by the
+mean of its two lowest costs, so that the best depth is that of the pair of partners whose least
+squares are smallest. Each depth is then averaged with those of up to eight neighbouring maps that
+see the same place, where they agree within 1.2 %.
+
+Then depth maps are fused. Images are taken in the order of how many others they have tie points in
+common with. An image whose depth is not used up is a seed: with it are fused those of its up to
+twelve neighbours that agree within 1 % and are not used up, and if there are three they are used
+up, with the neighbours' depths that lie behind the seed. So a place can make several points, of
+different images; one of them, picked by chance, is returned: the mean of points on each image's
+own ray, with the weights 1 / depth^2.
 
 What a reference sees is on the bed, which near a point is taken as the tangent plane of the true
 surface: refraction lets the rays of different images through one apparent place meet different
-places of the bed. The true point is the same weighted mean of those places, so it lies on the
-tangent plane.
+places of the bed. The true point is the mean of the places that all depths in the mean belong to,
+with the shares that they have, so it lies on the tangent plane.
 
-The fused point itself lies a few centimetres beside the rays where the images are all on one
-side: rays that pass it and also have it for their mean do not exist in general.
+Costs have a noise of their own, since a patch of texture does not match quite as well as its
+distance says; so of two pairs with nearly the same squares either may be taken. It is one of
+`COST_NOISE` times the variance of the image noise: 0.1 pixels^2 of a pair at half a pixel.
 
-Departures from the programs: rays are not rounded to pixels, the local water plane of each image
-(see `pcfix.simulate.water`) is that at the point for which the picture was begun, and a point is
-fused once, not from whatever other points have left.
+Departures from the program: costs are squares of distances, not correlations of patches, which are
+squares to first order; rays are not rounded to pixels; all confidences are alike, as in the
+program they nearly are in the end; the map that a neighbour has near a place is a plane, parallel
+to the bed; and the local water plane of each image (see `pcfix.simulate.water`) is that at the
+point for which the picture was begun.
 """
 
 from __future__ import annotations
@@ -30,13 +41,18 @@ from pcfix.simulate.tracing import bed_points, piercing_points_of_planes, projec
 from pcfix.simulate.tracks import straight
 
 if TYPE_CHECKING:
-    from pcfix.model import Cameras, FloatArray, IntArray, Lens
+    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens
+    from pcfix.simulate.neighbours import Partners
     from pcfix.simulate.sight import Rig, Sight
 
+AVERAGED_WITHIN = 0.012
 AGREE = 0.01
-LEAST_NEIGHBOURS = 2
-LEAST_FUSED = 2
-LEAST_CONFIDENCE = 0.3
+LEAST_PARTNERS = 2
+LEAST_FUSED = 3
+LEAST_COVER = 2
+COST_NOISE = 0.28
+"""Scale of Gumbel's distribution of one cost; a sum of two varies like one of 0.4."""
+
 _STEPS = 20
 _CONVERGED_M = 1e-9
 
@@ -50,40 +66,54 @@ class DepthCloud(NamedTuple):
 
 
 class Matching(NamedTuple):
-    """What the depths of all references are found with.
+    """What the depths of all m references, the rows of `sight`, are found with.
 
-    `water` has an anchor and a normal for each row of `sight`; `bed` for each point. Edge e
-    compares the reference row ``reference[e]`` with the row ``neighbour[e]``, where its image
-    point has the error ``noise[e]`` in pixels; edges are sorted by reference.
+    `water` has an anchor and a normal for each row of `sight`; `bed` for each point. Partners and
+    neighbours are rows of `sight` too, -1 for none, shape (m, c), (m, 8) and (m, 12). Partner j of
+    row i shows a place with the error ``noise_px[i, j]`` and counts with ``cost_px2[i, j]`` more.
     """
 
     sight: Sight
     rig: Rig
     water: tuple[FloatArray, FloatArray]
     bed: tuple[FloatArray, FloatArray]
-    reference: IntArray
-    neighbour: IntArray
-    noise: FloatArray
+    partner: IntArray
+    averaged: IntArray
+    fused: IntArray
+    known: IntArray
+    noise_px: FloatArray
+    cost_px2: FloatArray
 
 
-class Depths(NamedTuple):
-    """Of some references: depth (m,), the point there and the place of the bed, both (m, 3)."""
+class Maps(NamedTuple):
+    """Of m references: their rays, the depth along each before and after averaging, and the bed.
 
+    Depths are along the optical axis, NaN where there is none; rays have the component 1 there.
+    `seen` is the place of the bed, `shown` the mean of those of all depths in the averaged one.
+    """
+
+    origin: FloatArray
+    ray: FloatArray
     depth: FloatArray
-    xyz: FloatArray
-    bed: FloatArray
+    averaged: FloatArray
+    seen: FloatArray
+    shown: FloatArray
+
+    def points(self, rows: IntArray, depth: FloatArray) -> FloatArray:
+        """Return the points at depths along some rays."""
+        return np.asarray(self.origin[rows] + depth[:, None] * self.ray[rows])
 
 
 def fuse_depth_maps(
     bed: tuple[FloatArray, FloatArray],
     sight: Sight,
     rig: Rig,
-    table: IntArray,
+    partners: Partners,
     rng: np.random.Generator,
 ) -> DepthCloud:
-    """Return the fused point of each place of the bed.
+    """Return a fused point of each place of the bed.
 
-    A point for which fewer than two depths agree stays where it is and has no cameras.
+    A place of which fewer than three depth maps agree stays where it is and has no cameras.
 
     Parameters
     ----------
@@ -91,70 +121,256 @@ def fuse_depth_maps(
         Points of the true surface, and its unit normals.
     sight : Sight
     rig : Rig
-    table : array, shape (k, c)
-        Neighbours of each camera, -1 for none.
+    partners : Partners
     rng : Generator
-        Of noise and confidence.
+        Of noise, and of which point of a place is taken.
     """
-    matching = _matching(bed, sight, rig, table, rng)
-    confidence = rng.uniform(LEAST_CONFIDENCE, 1.0, len(sight.point))
+    matching = _matching(bed, sight, rig, partners, rng)
+    luck = rng.uniform(0.0, 1.0, len(sight.point))
     place = straight(bed[0], sight, rig, sight.ideal)
-    usable = np.unique(matching.reference)
-    picked = usable[_picked(sight.point[usable], confidence[usable])]
-    place[sight.point[picked]] = reference_depths(matching, place, picked).xyz
-    found = reference_depths(matching, place, usable)
-    agree = _agree(matching, place, usable, found.depth)
-    references, found = usable[agree], Depths(*(part[agree] for part in found))
-    point = sight.point[references]
-    weight = confidence[references] / found.depth**2
-    fused, true = (_means(v, weight, point, bed[0]) for v in (found.xyz, found.bed))
+    maps = depth_maps(matching, place)
+    seed, group = _groups(matching, maps, luck)
+    made = np.flatnonzero(seed >= 0)
+    place[made] = maps.points(seed[made], maps.averaged[seed[made]])
+    maps = depth_maps(matching, place)
+    rows = np.flatnonzero((group >= 0) & (group == seed[sight.point]))
+    rows = rows[_at(matching, maps, rows, place)]
+    rows = rows[np.bincount(sight.point[rows], minlength=len(seed))[sight.point[rows]] >= LEAST_FUSED]
+    point, weight = sight.point[rows], 1.0 / maps.averaged[rows] ** 2
+    xyz = maps.points(rows, maps.averaged[rows])
+    fused, true = (_means(v, weight, point, bed[0]) for v in (xyz, maps.shown[rows]))
     count = np.bincount(point, minlength=len(fused))
-    views = Views(
-        np.concatenate([[0], np.cumsum(count)]),
-        sight.camera[references],
-        weight.astype(np.float32),
-    )
-    return DepthCloud(fused, true, views)
+    start = np.concatenate([[0], np.cumsum(count)])
+    return DepthCloud(fused, true, Views(start, sight.camera[rows], weight.astype(np.float32)))
 
 
 def _matching(
     bed: tuple[FloatArray, FloatArray],
     sight: Sight,
     rig: Rig,
-    table: IntArray,
+    partners: Partners,
     rng: np.random.Generator,
 ) -> Matching:
-    neighbour = sight.rows(len(table))[sight.point[:, None], table[sight.camera]]
-    there = (neighbour >= 0) & (table[sight.camera] >= 0)
-    there &= there.sum(axis=1, keepdims=True) >= LEAST_NEIGHBOURS
-    reference, slot = np.nonzero(there)
+    rows = sight.rows(len(rig.true))
+
+    def there(table: IntArray) -> IntArray:
+        mine = table[sight.camera]
+        return np.where(mine >= 0, rows[sight.point[:, None], mine], -1)
+
+    partner = there(partners.matched)
+    partner[(partner >= 0).sum(axis=1) < LEAST_PARTNERS] = -1
     points, centres = bed[0][sight.point], rig.true.centres[sight.camera]
     return Matching(
         sight,
         rig,
         rig.water.tangent_planes(points, centres, sight.camera),
         bed,
-        reference,
-        neighbour[reference, slot],
-        rng.normal(0.0, rig.image_noise_px, (len(reference), 2)),
+        partner,
+        there(partners.averaged),
+        there(partners.fused),
+        partners.known,
+        rng.normal(0.0, rig.image_noise_px, (*partner.shape, 2)),
+        rng.gumbel(0.0, COST_NOISE * rig.image_noise_px**2, partner.shape),
     )
 
 
-def _picked(point: IntArray, confidence: FloatArray) -> IntArray:
-    """Return the row with the greatest confidence of each point; rows are sorted by point."""
-    order = np.lexsort((confidence, point))
-    last = np.append(point[1:] != point[:-1], True)[: len(point)]
-    return np.asarray(order[last])
+def depth_maps(matching: Matching, place: FloatArray) -> Maps:
+    """Return the depths that all references have along their rays through a place of each point.
 
-
-def _agree(matching: Matching, place: FloatArray, rows: IntArray, depth: FloatArray) -> np.ndarray:
-    """Return which references have the depth of their point's place, where two at least have."""
+    Parameters
+    ----------
+    matching : Matching
+    place : array, shape (n, 3)
+    """
     sight, rig = matching.sight, matching.rig
-    point, camera = sight.point[rows], sight.camera[rows]
-    _, expected = project(place[point], rig.given, camera, rig.optics.lens)
-    agree = np.abs(depth - expected) <= AGREE * expected
-    agree &= np.bincount(point[agree], minlength=len(place))[point] >= LEAST_FUSED
-    return np.asarray(agree)
+    point, camera, lens = sight.point, sight.camera, rig.optics.lens
+    pixels, depth = project(place[point], rig.given, camera, lens)
+    seen = bed_points(
+        rig.true.centres[camera],
+        _rays(pixels, rig.true, camera, lens),
+        matching.water,
+        (matching.bed[0][point], matching.bed[1][point]),
+        rig.water.refractive_index,
+    )
+    origin, ray = rig.given.centres[camera], _rays(pixels, rig.given, camera, lens)
+    depth = _depths(matching, (origin, ray, depth), seen)
+    maps = Maps(origin, ray, depth, depth, seen, seen)
+    averaged, shown = _averaged(matching, maps)
+    return maps._replace(averaged=averaged, shown=shown)
+
+
+def _rays(pixels: FloatArray, cameras: Cameras, camera: IntArray, lens: Lens) -> FloatArray:
+    """Return directions in the world whose component along the optical axis is 1, (m, 3)."""
+    if cameras.rotations is None:
+        raise ValueError("rays need cameras with angles")
+    plane = (pixels - [lens.principal_x, lens.principal_y]) / lens.focal
+    inside = np.column_stack([plane, np.ones(len(plane))])
+    return np.asarray(np.einsum("mij,mi->mj", cameras.rotations[camera], inside))
+
+
+def _depths(
+    matching: Matching, rays: tuple[FloatArray, FloatArray, FloatArray], seen: FloatArray
+) -> FloatArray:
+    """Return the depth of the best pair of partners along each ray, from a first depth."""
+    reference, slot = np.nonzero(matching.partner >= 0)
+    row = matching.partner[reference, slot]
+    measured = _measured(matching, row, seen[reference], matching.noise_px[reference, slot])
+    edges = reference, measured, matching.sight.camera[row]
+    origin, ray, depth = rays
+    depth = _least_squares(rays, edges, matching.rig)
+    residual, slope = _residuals((origin, ray, depth), edges, matching.rig)
+    shape = matching.partner.shape
+    squares, right, curved = np.full(shape, np.inf), np.zeros(shape), np.ones(shape)
+    squares[reference, slot] = (residual**2).sum(axis=1) + matching.cost_px2[reference, slot]
+    right[reference, slot] = (slope * residual).sum(axis=1)
+    curved[reference, slot] = (slope**2).sum(axis=1)
+    best = _best_pair(squares, right, curved)
+    taken = (best[reference] == slot[:, None]).any(axis=1)
+    pair = reference[taken], measured[taken], edges[2][taken]
+    return _least_squares((origin, ray, depth), pair, matching.rig)
+
+
+def _best_pair(squares: FloatArray, right: FloatArray, curved: FloatArray) -> IntArray:
+    """Return the two slots of each row whose sum of squares can become least, shape (m, 2).
+
+    Squares are those at a depth close to all; `right` and `curved` say how they change with it:
+    the least of a pair is its sum - (sum of right)^2 / sum of curved.
+    """
+    one, other = np.triu_indices(squares.shape[1], 1)
+    gain = (right[:, one] + right[:, other]) ** 2 / (curved[:, one] + curved[:, other])
+    best = np.argmin(squares[:, one] + squares[:, other] - gain, axis=1)
+    return np.column_stack([one[best], other[best]])
+
+
+def _measured(
+    matching: Matching, row: IntArray, seen: FloatArray, noise_px: FloatArray
+) -> FloatArray:
+    """Return where the images of some rows of `sight` show places of the bed, ideal pixels."""
+    rig, camera = matching.rig, matching.sight.camera[row]
+    anchors, normals = (part[row] for part in matching.water)
+    centres, n = rig.true.centres[camera], rig.water.refractive_index
+    surface = piercing_points_of_planes(seen, centres, anchors, normals, n)
+    ideal, _ = project(surface, rig.true, camera, rig.optics.lens)
+    return rig.optics.to_ideal(rig.optics.to_image(ideal) + noise_px)
+
+
+def _least_squares(
+    rays: tuple[FloatArray, FloatArray, FloatArray],
+    edges: tuple[IntArray, FloatArray, IntArray],
+    rig: Rig,
+) -> FloatArray:
+    """Return the depths along rays with least squared residuals in other images, by Gauss-Newton.
+
+    `rays` are origin, direction and a first depth; `edges` the ray, measured pixels and camera.
+    A ray without edges gets NaN.
+    """
+    origin, ray, depth = rays
+    for _ in range(_STEPS):
+        residual, slope = _residuals((origin, ray, depth), edges, rig)
+        right = np.bincount(edges[0], (slope * residual).sum(axis=1), len(depth))
+        curved = np.bincount(edges[0], (slope**2).sum(axis=1), len(depth))
+        step = np.divide(right, curved, out=np.full(len(depth), np.nan), where=curved > 0.0)
+        depth = depth + step
+        if np.nanmax(np.abs(step), initial=0.0) < _CONVERGED_M:
+            break
+    return np.asarray(depth)
+
+
+def _residuals(
+    rays: tuple[FloatArray, FloatArray, FloatArray],
+    edges: tuple[IntArray, FloatArray, IntArray],
+    rig: Rig,
+) -> tuple[FloatArray, FloatArray]:
+    """Return measured minus predicted pixels, and how the predicted move with the depth."""
+    (origin, ray, depth), (owner, measured, camera) = rays, edges
+    lens, rotations = rig.optics.lens, rig.given.rotations
+    if rotations is None:
+        raise ValueError("depths need cameras with angles")
+    turned = np.einsum("mij,mj->mi", rotations[camera], ray[owner])
+    xyz = (origin + depth[:, None] * ray)[owner]
+    seen, z = project(xyz, rig.given, camera, lens)
+    offset = (seen - [lens.principal_x, lens.principal_y]) / lens.focal
+    slope = (lens.focal / z)[:, None] * (turned[:, :2] - offset * turned[:, 2:])
+    return measured - seen, slope
+
+
+def _averaged(matching: Matching, maps: Maps) -> tuple[FloatArray, FloatArray]:
+    """Return the mean depths of each and its neighbouring maps, and the mean places of the bed.
+
+    A depth is dropped if less than two neighbours see its place, if none agrees, or if as many
+    disagree as agree, itself among them.
+    """
+    rows = np.arange(len(maps.depth))
+    total, shown, agreeing = maps.depth.copy(), maps.seen.copy(), np.ones(len(rows))
+    disagreeing = np.zeros(len(rows))
+    for neighbour in matching.averaged.T:
+        depth = _met(matching, maps, maps.depth, neighbour, maps.ray)
+        agrees = np.abs(depth - maps.depth) < AVERAGED_WITHIN * maps.depth
+        total[agrees] += depth[agrees]
+        shown[agrees] += maps.seen[neighbour[agrees]]
+        agreeing += agrees
+        disagreeing += np.isfinite(depth) & ~agrees
+    kept = (agreeing > 1.0) & (agreeing > disagreeing) & (agreeing + disagreeing > LEAST_COVER)
+    depth = np.where(kept, total / agreeing, np.nan)
+    return depth, shown / agreeing[:, None]
+
+
+def _met(
+    matching: Matching, maps: Maps, depth: FloatArray, other: IntArray, ray: FloatArray
+) -> FloatArray:
+    """Return at what length rays from all origins meet the map of another row, NaN for none.
+
+    There the other map is a plane parallel to the bed, through its own point at its depth.
+    """
+    met = np.full(len(ray), np.nan)
+    rows = np.flatnonzero(other >= 0)
+    there = maps.points(other[rows], depth[other[rows]])
+    normal = matching.bed[1][matching.sight.point[rows]]
+    gap = np.einsum("mi,mi->m", there - maps.origin[rows], normal)
+    met[rows] = gap / np.einsum("mi,mi->m", ray[rows], normal)
+    return met
+
+
+def _groups(matching: Matching, maps: Maps, luck: FloatArray) -> tuple[IntArray, IntArray]:
+    """Return the seed of the luckiest point of each place, and the seed that used up each row.
+
+    Both are rows of `sight`, -1 where there is none.
+    """
+    sight = matching.sight
+    chosen, group = np.full(len(sight.start) - 1, -1), np.full(len(sight.point), -1)
+    free = np.isfinite(maps.averaged)
+    for camera in np.argsort(-matching.known, kind="stable"):
+        seeds = np.flatnonzero((sight.camera == camera) & free)
+        there = matching.fused[seeds]
+        distance = _beyond(matching, maps, seeds, there)
+        usable = (there >= 0) & free[there]
+        members = usable & (np.abs(distance) < AGREE)
+        kept = 1 + members.sum(axis=1) >= LEAST_FUSED
+        behind = usable & (distance >= AGREE)
+        free[there[(members | behind) & kept[:, None]]] = False
+        seeds, there, members = seeds[kept], there[kept], members[kept]
+        free[seeds] = False
+        group[seeds] = seeds
+        group[there[members]] = np.repeat(seeds, members.sum(axis=1))
+        point = sight.point[seeds]
+        luckier = (chosen[point] < 0) | (luck[seeds] > luck[chosen[point]])
+        chosen[point[luckier]] = seeds[luckier]
+    return chosen, group
+
+
+def _beyond(matching: Matching, maps: Maps, seeds: IntArray, there: IntArray) -> FloatArray:
+    """Return how far beyond the points of seeds the maps of other rows are, relative, (s, 12)."""
+    at = maps.points(seeds, maps.averaged[seeds])[:, None]
+    normal = matching.bed[1][matching.sight.point[seeds]][:, None]
+    reach = (maps.averaged[there][..., None] * maps.ray[there] * normal).sum(axis=2)
+    return np.asarray(reach / ((at - maps.origin[there]) * normal).sum(axis=2) - 1.0)
+
+
+def _at(matching: Matching, maps: Maps, rows: IntArray, place: FloatArray) -> BoolArray:
+    """Return which rows have the depth of their point's place."""
+    point, camera = matching.sight.point[rows], matching.sight.camera[rows]
+    _, z = project(place[point], matching.rig.given, camera, matching.rig.optics.lens)
+    return np.asarray(np.abs(maps.averaged[rows] - z) < AGREE * z)
 
 
 def _means(
@@ -168,83 +384,3 @@ def _means(
         apart = weight * (values[:, axis] - otherwise[point, axis])
         means[made, axis] += np.bincount(point, apart, len(otherwise))[made] / total[made]
     return means
-
-
-def reference_depths(matching: Matching, place: FloatArray, rows: IntArray) -> Depths:
-    """Return the depth that each reference finds along its ray through a place.
-
-    Parameters
-    ----------
-    matching : Matching
-    place : array, shape (n, 3)
-        Of each point.
-    rows : array, shape (m,)
-        References: sorted rows of ``matching.sight`` that have edges.
-    """
-    sight, rig = matching.sight, matching.rig
-    point, camera, lens = sight.point[rows], sight.camera[rows], rig.optics.lens
-    pixels, depth = project(place[point], rig.given, camera, lens)
-    seen = bed_points(
-        rig.true.centres[camera],
-        _rays(pixels, rig.true, camera, lens),
-        (matching.water[0][rows], matching.water[1][rows]),
-        (matching.bed[0][point], matching.bed[1][point]),
-        rig.water.refractive_index,
-    )
-    number = np.full(len(sight.point), -1)
-    number[rows] = np.arange(len(rows))
-    edges = np.flatnonzero(number[matching.reference] >= 0)
-    owner, other = number[matching.reference[edges]], sight.camera[matching.neighbour[edges]]
-    measured = _measured(matching, edges, seen[owner])
-    origin, ray = rig.given.centres[camera], _rays(pixels, rig.given, camera, lens)
-    depth = _best_depths((origin, ray, depth), owner, (measured, other), rig)
-    return Depths(depth, origin + depth[:, None] * ray, seen)
-
-
-def _measured(matching: Matching, edges: IntArray, seen: FloatArray) -> FloatArray:
-    """Return where the neighbour of each edge shows a place of the bed, ideal pixels."""
-    rig, row = matching.rig, matching.neighbour[edges]
-    camera = matching.sight.camera[row]
-    anchors, normals = (part[row] for part in matching.water)
-    centres, n = rig.true.centres[camera], rig.water.refractive_index
-    surface = piercing_points_of_planes(seen, centres, anchors, normals, n)
-    ideal, _ = project(surface, rig.true, camera, rig.optics.lens)
-    return rig.optics.to_ideal(rig.optics.to_image(ideal) + matching.noise[edges])
-
-
-def _rays(pixels: FloatArray, cameras: Cameras, camera: IntArray, lens: Lens) -> FloatArray:
-    """Return directions in the world whose component along the optical axis is 1, (m, 3)."""
-    if cameras.rotations is None:
-        raise ValueError("rays need cameras with angles")
-    plane = (pixels - [lens.principal_x, lens.principal_y]) / lens.focal
-    inside = np.column_stack([plane, np.ones(len(plane))])
-    return np.asarray(np.einsum("mij,mi->mj", cameras.rotations[camera], inside))
-
-
-def _best_depths(
-    rays: tuple[FloatArray, FloatArray, FloatArray],
-    owner: IntArray,
-    measured: tuple[FloatArray, IntArray],
-    rig: Rig,
-) -> FloatArray:
-    """Return the depths along rays with least squared residuals in other images, by Gauss-Newton.
-
-    `rays` are origin, direction and a first depth; edge e belongs to the ray ``owner[e]`` and has
-    measured pixels and a camera.
-    """
-    (origin, ray, depth), (pixels, camera) = rays, measured
-    lens, rotations = rig.optics.lens, rig.given.rotations
-    if rotations is None:
-        raise ValueError("depths need cameras with angles")
-    turned = np.einsum("mij,mj->mi", rotations[camera], ray[owner])
-    for _ in range(_STEPS):
-        xyz = (origin + depth[:, None] * ray)[owner]
-        seen, z = project(xyz, rig.given, camera, lens)
-        offset = (seen - [lens.principal_x, lens.principal_y]) / lens.focal
-        slope = (lens.focal / z)[:, None] * (turned[:, :2] - offset * turned[:, 2:])
-        right = np.bincount(owner, (slope * (pixels - seen)).sum(axis=1), len(depth))
-        step = right / np.bincount(owner, (slope**2).sum(axis=1), len(depth))
-        depth = depth + step
-        if np.abs(step).max(initial=0.0) < _CONVERGED_M:
-            break
-    return np.asarray(depth)

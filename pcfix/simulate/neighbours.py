@@ -2,18 +2,52 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from pcfix.model import FloatArray, IntArray
+    from pcfix.model import Cameras, FloatArray, IntArray
+    from pcfix.simulate.optics import Optics
     from pcfix.simulate.sight import Sight
 
 SAMPLE = 1000
 """Points that overlap and angles are judged by."""
 
 OPTIMAL_DEG, SPREAD_BELOW_DEG, SPREAD_ABOVE_DEG = 10.0, 4.0, 10.0
+
+TIES = 4000
+"""Tie points that OpenMVS's choice is made by; ten for each image where that is more."""
+
+FOUND_AGAIN_DEG = 45.0
+BEST_DEG, BELOW_DEG, ABOVE_DEG, LEAST_WEIGHT = 12.0, 0.38 * 12.0, 0.70 * 12.0, 0.1
+FARTHER = 1.6
+CELLS = 16
+LEAST_COMMON, LEAST_AREA, LEAST_LEFT = 3, 0.05, 9
+SCALES, ANGLES_DEG = (0.2, 3.2), (3.0, 65.0)
+MOST, AVERAGED = 12, 8
+LEAST_SCORE = 0.03
+
+
+class Partners(NamedTuple):
+    """What OpenMVS would use of the other images, for each of k; best first, -1 for none.
+
+    Attributes
+    ----------
+    matched : array, shape (k, c)
+        Those that the depth map is matched with.
+    averaged : array, shape (k, 8)
+        Those whose depth maps are averaged into it.
+    fused : array, shape (k, 12)
+        Those whose depth maps may be fused with it.
+    known : array, shape (k,)
+        How many images have tie points in common with it; the fusion begins with the most.
+    """
+
+    matched: IntArray
+    averaged: IntArray
+    fused: IntArray
+    known: IntArray
 
 
 def neighbour_table(truth: FloatArray, sight: Sight, centres: FloatArray, count: int) -> IntArray:
@@ -44,3 +78,121 @@ def neighbour_table(truth: FloatArray, sight: Sight, centres: FloatArray, count:
     table = np.full((k, count), -1)
     table[:, : best.shape[1]] = np.where(np.take_along_axis(score, best, axis=1) > 0.0, best, -1)
     return table
+
+
+def openmvs_partners(
+    ties: FloatArray,
+    sight: Sight,
+    cameras: Cameras,
+    optics: Optics,
+    count: int,
+    rng: np.random.Generator,
+) -> Partners:
+    """Return the partners that OpenMVS 2.3 would choose (`Scene::SelectNeighborViews`).
+
+    Each tie point is a feature of one image, found again in others with a probability that falls
+    with the angle to it, so that nadir and oblique images have few in common. Left out is the
+    weight of the region of interest, and the least score, as it counts tie points.
+
+    Parameters
+    ----------
+    ties : array, shape (p, 3)
+        Tie points where the software has them.
+    sight : Sight
+        Of the same points: the images that show them.
+    cameras : Cameras
+    optics : Optics
+    count : int
+        Partners that a depth map is matched with.
+    rng : Generator
+        Of which features are found again.
+    """
+    if cameras.rotations is None:
+        raise ValueError("partners need cameras with angles")
+    k = len(cameras)
+    cell = _cells(sight, optics, k)
+    cell[_lost(ties, sight, cameras.centres, rng)] = -1
+    depth = np.einsum("ki,kpi->kp", cameras.rotations[:, 2], ties - cameras.centres[:, None])
+    table, known = np.full((k, max(MOST, count)), -1), np.zeros(k, int)
+    matched = np.full((k, count), -1)
+    for i in range(k):
+        mine = np.flatnonzero(cell[i] >= 0)
+        common = cell[:, mine] >= 0
+        common[i] = False
+        angle = _angles_deg(cameras.centres, i, ties[mine])
+        scale = depth[:, mine] / depth[i, mine]
+        area = _shares_of_cells(common, cell[i, mine])
+        score = (common * _weights(angle, scale)).sum(axis=1) * np.maximum(area, 0.01)
+        order = np.argsort(-score, kind="stable")
+        order = order[common.sum(axis=1)[order] >= LEAST_COMMON]
+        good = (area >= LEAST_AREA) & _within(common, scale, SCALES)
+        good &= _within(common, angle, ANGLES_DEG)
+        kept = _filtered(order, good)[: table.shape[1]]
+        table[i, : len(kept)], known[i] = kept, len(order)
+        strong = kept[:count][score[kept[:count]] >= LEAST_SCORE * score[kept[:1]]]
+        matched[i, : len(strong)] = strong
+    return Partners(matched, table[:, :AVERAGED], table[:, :MOST], known)
+
+
+def _cells(sight: Sight, optics: Optics, k: int) -> IntArray:
+    """Return in which cell of each image each point lies, shape (k, p), -1 where it is not."""
+    lens = optics.lens
+    cell = np.full((k, len(sight.start) - 1), -1)
+    share = optics.to_image(sight.ideal) / [lens.width, lens.height]
+    column, row = np.clip((CELLS * share).astype(int), 0, CELLS - 1).T
+    cell[sight.camera, sight.point] = row * CELLS + column
+    return cell
+
+
+def _lost(
+    ties: FloatArray, sight: Sight, centres: FloatArray, rng: np.random.Generator
+) -> tuple[IntArray, IntArray]:
+    """Return cameras and points where a feature is not found again."""
+    count = np.diff(sight.start)
+    luck = rng.uniform(0.0, 1.0, len(ties))
+    home = sight.start[:-1] + (luck * count).astype(int)
+    first = np.minimum(home, max(0, len(sight.camera) - 1))[sight.point]
+    ray = centres[sight.camera] - ties[sight.point]
+    ray /= np.linalg.norm(ray, axis=1)[:, None]
+    cosine = np.einsum("mi,mi->m", ray, ray[first])
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    gone = rng.uniform(0.0, 1.0, len(ray)) > np.exp(-((angle / FOUND_AGAIN_DEG) ** 2))
+    return sight.camera[gone], sight.point[gone]
+
+
+def _angles_deg(centres: FloatArray, i: int, places: FloatArray) -> FloatArray:
+    """Return the angles at places between the rays to image i and to every other, (k, m)."""
+    rays = centres[:, None] - places
+    rays /= np.linalg.norm(rays, axis=2)[:, :, None]
+    cosine = np.einsum("kmi,mi->km", rays, rays[i])
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def _weights(angle_deg: FloatArray, scale: FloatArray) -> FloatArray:
+    spread = np.where(angle_deg < BEST_DEG, BELOW_DEG, ABOVE_DEG)
+    bell = np.exp(-0.5 * ((angle_deg - BEST_DEG) / spread) ** 2)
+    coarse = np.where(scale > FARTHER, (FARTHER / scale) ** 2, np.minimum(scale, 1.0) ** 2)
+    return np.asarray(np.maximum(bell, LEAST_WEIGHT) * coarse)
+
+
+def _shares_of_cells(common: np.ndarray, cell: IntArray) -> FloatArray:
+    """Return what share of the reference's cells holds points in common with each image, (k,)."""
+    holds = np.zeros((len(cell), CELLS * CELLS))
+    holds[np.arange(len(cell)), cell] = 1.0
+    return np.asarray((common.astype(float) @ holds > 0.0).sum(axis=1) / CELLS**2)
+
+
+def _within(common: np.ndarray, values: FloatArray, limits: tuple[float, float]) -> np.ndarray:
+    mean = (common * values).sum(axis=1) / np.maximum(common.sum(axis=1), 1)
+    return np.asarray((mean >= limits[0]) & (mean <= limits[1]))
+
+
+def _filtered(order: IntArray, good: np.ndarray) -> IntArray:
+    """Drop bad candidates from the worst up, while more than nine remain."""
+    kept = list(order)
+    for candidate in order[::-1]:
+        if len(kept) <= LEAST_LEFT:
+            break
+        if not good[candidate]:
+            kept.remove(candidate)
+    return np.array(kept, int)

@@ -10,12 +10,12 @@ import numpy as np
 from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterPlane
 from pcfix.simulate.block import Block, fly_block, misplaced
 from pcfix.simulate.depth_maps import fuse_depth_maps
-from pcfix.simulate.neighbours import SAMPLE, neighbour_table
+from pcfix.simulate.neighbours import SAMPLE, TIES, Partners, neighbour_table, openmvs_partners
 from pcfix.simulate.pairs import match_pairs
 from pcfix.simulate.settings import BlockKind, SceneSettings
 from pcfix.simulate.sight import Rig, see
 from pcfix.simulate.terrain import Terrain
-from pcfix.simulate.tracks import intersect_tracks
+from pcfix.simulate.tracks import intersect_tracks, straight
 from pcfix.simulate.water import Water, Waves
 
 if TYPE_CHECKING:
@@ -193,8 +193,8 @@ def simulate_scene(
     given = misplaced(flown, chosen.position_noise_m, chosen.attitude_noise_deg, streams.poses)
     rig = _rig(chosen, flown, given, plane, extent, streams)
     truth = _on(terrain, points, streams.main)
-    table = _neighbours(chosen, truth, rig)
-    parts = _parts(chosen, truth, terrain, rig, table, streams, progress)
+    partners = _partners(chosen, truth, terrain, rig)
+    parts = _parts(chosen, truth, terrain, rig, partners, streams, progress)
     lidar = _on(terrain, round(extent[0] * extent[1] * chosen.lidar_per_m2), streams.main)
     lidar[:, 2] += streams.main.normal(0.0, chosen.lidar_noise_m, len(lidar))
     cameras = _moved(given.cameras)
@@ -214,7 +214,7 @@ def simulate_scene(
         water=_in_world(plane),
         true_cameras=cameras if given is flown else _moved(flown.cameras),
         true_yaw_pitch_roll_deg=flown.yaw_pitch_roll_deg,
-        neighbours=table,
+        neighbours=partners.matched if isinstance(partners, Partners) else partners,
         **_joined_pairs(parts),
     )
 
@@ -262,12 +262,21 @@ def _on(terrain: Terrain, count: int, rng: np.random.Generator) -> FloatArray:
     return np.column_stack([plan, terrain.height(*plan.T)])
 
 
-def _neighbours(chosen: SceneSettings, truth: FloatArray, rig: Rig) -> IntArray | None:
+def _partners(
+    chosen: SceneSettings, truth: FloatArray, terrain: Terrain, rig: Rig
+) -> Partners | IntArray | None:
+    """Return what the kind of cloud needs of which images are matched with which."""
     if chosen.cloud == "tracks":
         return None
-    sample = truth[:: max(1, len(truth) // SAMPLE)][:SAMPLE]
-    every = see(sample, replace(rig, detection=1.0), np.random.default_rng(0))
-    return neighbour_table(sample, every, rig.true.centres, chosen.matched_with)
+    rng, sure = np.random.default_rng(0), replace(rig, detection=1.0)
+    if chosen.cloud == "pairs":
+        sample = truth[:: max(1, len(truth) // SAMPLE)][:SAMPLE]
+        every = see(sample, sure, rng)
+        return neighbour_table(sample, every, rig.true.centres, chosen.matched_with)
+    sample = _on(terrain, max(TIES, 10 * len(rig.true)), rng)
+    every = see(sample, sure, rng)
+    ties = straight(sample, every, rig, every.ideal)
+    return openmvs_partners(ties, every, rig.given, rig.optics, chosen.matched_with, rng)
 
 
 def _parts(
@@ -275,17 +284,17 @@ def _parts(
     truth: FloatArray,
     terrain: Terrain,
     rig: Rig,
-    table: IntArray | None,
+    partners: Partners | IntArray | None,
     streams: Streams,
     progress: Callable[[int, int], None] | None,
 ) -> list[Part]:
     """Return the cloud in parts that fit into the memory."""
-    pairs = _TRACK_PAIRS_AT_ONCE if table is None else _DENSE_PAIRS_AT_ONCE
+    pairs = _TRACK_PAIRS_AT_ONCE if partners is None else _DENSE_PAIRS_AT_ONCE
     at_once = max(1, pairs // len(rig.true))
     parts: list[Part] = []
     for first in range(0, len(truth), at_once):
         part = truth[first : first + at_once]
-        parts.append(_observe(part, terrain, rig, table, streams, chosen))
+        parts.append(_observe(part, terrain, rig, partners, streams))
         if progress is not None:
             progress(first + len(part), len(truth))
     return parts
@@ -295,20 +304,19 @@ def _observe(
     truth: FloatArray,
     terrain: Terrain,
     rig: Rig,
-    table: IntArray | None,
+    partners: Partners | IntArray | None,
     streams: Streams,
-    chosen: SceneSettings,
 ) -> Part:
     """Return the cloud that is made of the images of some points."""
     sight = see(truth, rig, streams.detection)
-    if table is None:
+    if partners is None:
         xyz = intersect_tracks(truth, sight, rig, streams.main)
         return Part(xyz, truth, Views(sight.start, sight.camera))
-    if chosen.cloud == "pairs":
-        made = match_pairs(truth, sight, rig, table, streams.matching)
-        return Part(made.xyz, truth, made.views, made.start, made.pairs)
-    bed = truth, terrain.normals(*truth[:, :2].T)
-    return Part(*fuse_depth_maps(bed, sight, rig, table, streams.matching))
+    if isinstance(partners, Partners):
+        bed = truth, terrain.normals(*truth[:, :2].T)
+        return Part(*fuse_depth_maps(bed, sight, rig, partners, streams.matching))
+    made = match_pairs(truth, sight, rig, partners, streams.matching)
+    return Part(made.xyz, truth, made.views, made.start, made.pairs)
 
 
 def _joined_views(parts: list[Part]) -> Views:

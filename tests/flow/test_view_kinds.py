@@ -1,0 +1,82 @@
+"""Which kind of list it is, told by how smooth the bed comes out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pcfix
+from pcfix.flow.view_kinds import PATCHES, kind_of_views
+from pcfix.io.views import ViewMatch, read_views
+from pcfix.label.surface import surface_above
+from pcfix.model import Views, WaterPlane
+from pcfix.refract.learned import Learned
+from pcfix.refract.matcher import matcher_of
+from pcfix.settings import Settings
+from pcfix.simulate.scene import simulate_scene
+from tests.utils.shared import needs
+
+RENDERED, rendered = needs("rendered_a")
+
+
+def kind_of(xyz, cameras, water, views, n=1.34):
+    settings = Settings(method="consistent", refractive_index=n, dimensions="none")
+    learned = Learned(matcher=matcher_of(cameras, xyz))
+    above = surface_above(water, xyz)
+    return kind_of_views(xyz, above, water, cameras, settings, views, learned)
+
+
+def under_water(cloud, points=3000, **settings):
+    scene = simulate_scene(points, cloud=cloud, lidar_per_m2=0.0, **settings)
+    return scene, np.flatnonzero(scene.depth_m(scene.xyz) > 0.0)
+
+
+BLOCKS = {
+    "nadir": {"detection": 0.6},
+    "obliques": {"detection": 0.6, "obliques_deg": 35.0, "area_m": (70.0, 50.0)},
+}
+
+
+@pytest.mark.parametrize("block", BLOCKS)
+@pytest.mark.parametrize("cloud", ["tracks", "depth-maps"])
+def test_a_simulated_list_is_told(cloud, block):
+    scene, rows = under_water(cloud, **BLOCKS[block])
+    views = scene.views.take(rows)
+    found = kind_of(scene.xyz[rows], scene.cameras, scene.water, views)
+    assert found.kind == cloud
+    right, wrong = found.tracks_m, found.depth_maps_m
+    if cloud == "depth-maps":
+        right, wrong = wrong, right
+    assert right < wrong
+    assert f"{100 * right:.1f} cm" in str(found) and "--views-are" in str(found)
+    # what the list was taken for before does not matter
+    other = replace(views, kind="depth-maps")
+    assert kind_of(scene.xyz[rows], scene.cameras, scene.water, other) == found
+
+
+def test_too_few_points_tell_nothing():
+    scene, rows = under_water("tracks", 800, bed="flat")
+    rows = rows[: PATCHES - 1]
+    views = scene.views.take(rows)
+    assert kind_of(scene.xyz[rows], scene.cameras, scene.water, views) is None
+
+
+def test_points_of_one_image_do_not_count():
+    scene, rows = under_water("tracks", 800, bed="flat")
+    first = scene.views.camera[scene.views.start[rows]]
+    views = Views(np.arange(len(rows) + 1), first)
+    assert len(rows) > PATCHES
+    assert kind_of(scene.xyz[rows], scene.cameras, scene.water, views) is None
+
+
+@rendered
+def test_the_list_of_a_real_dense_cloud_is_one_of_depth_maps():
+    import laspy
+
+    local = pcfix.read_cameras(RENDERED / "colmap")
+    cameras = replace(local, centres=local.centres + np.loadtxt(RENDERED / "offset.txt"))
+    xyz = np.ascontiguousarray(laspy.read(RENDERED / "cloud.las").xyz)
+    match = ViewMatch(read_views(RENDERED / "dense.vis", cameras), cameras, points=len(xyz))
+    rows = np.flatnonzero(xyz[:, 2] < 0.37)
+    views = match.for_chunk(xyz, 0).take(rows)
+    assert kind_of(xyz[rows], cameras, WaterPlane(0.37), views).kind == "depth-maps"

@@ -1,0 +1,114 @@
+"""Which images are matched with which: loops over the formula, and what real software chose."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pcfix
+from pcfix.io.cameras import read_tie_points
+from pcfix.model import TiePoints, Views
+from pcfix.refract.matcher import REPEATED_DEG, matcher_of, matcher_of_ties, without_border
+from tests.utils.depth_map_twin import in_frame, looking, scores_slowly
+from tests.utils.shared import needs
+
+RENDERED, rendered = needs("rendered_a")
+
+
+def block(rng):
+    """Return fourteen nadir and six oblique images, and places that they see."""
+    grid = np.stack(np.meshgrid(np.arange(-40, 41, 14.0), [-18.0, 16.0]), axis=2).reshape(-1, 2)
+    nadir = np.column_stack([grid, np.full(len(grid), 70.0)]) + rng.normal(0, 1.5, (len(grid), 3))
+    far = [[-70, 0, 66], [68, 8, 70], [3, -66, 69], [-5, 71, 72], [-60, 30, 110], [20, 60, 30]]
+    centres = np.vstack([nadir, np.array(far, float)])
+    tilts = [*rng.uniform(0, 3, len(nadir)), 35, 35, 35, 35, 30, 50]
+    headings = [*rng.uniform(0, 360, len(nadir)), 0, 180, 90, 270, 330, 250]
+    places = np.column_stack([rng.uniform(-45, 45, (220, 2)), rng.uniform(-6, 3, 220)])
+    return looking(centres, tilts, headings), places
+
+
+def table_of(score, columns):
+    """Return the best columns of each row of scores, -1 where a score is zero."""
+    best = np.argsort(-score, axis=1, kind="stable")[:, :columns]
+    return np.where(np.take_along_axis(score, best, axis=1) > 0.0, best, -1)
+
+
+def test_places_give_the_partners_of_the_formula():
+    cameras, places = block(np.random.default_rng(1))
+    found = matcher_of(cameras, places)
+    slow = scores_slowly(cameras, places, in_frame(cameras, places), REPEATED_DEG)
+    assert (slow[:, -2:] == 0.0).any() and (slow > 0.0).any(axis=1).all()
+    for table, columns in ((found.matched, 5), (found.averaged, 8), (found.fused, 12)):
+        assert np.array_equal(table, table_of(slow, columns))
+
+
+def test_ties_give_the_partners_of_the_formula():
+    rng = np.random.default_rng(2)
+    cameras, places = block(rng)
+    places[7] = np.nan  # a tie point without coordinates
+    seen = in_frame(cameras, places) & (rng.uniform(0, 1, (len(cameras), len(places))) < 0.5)
+    point, camera = np.nonzero(seen.T)
+    start = np.concatenate([[0], np.cumsum(np.bincount(point, minlength=len(places)))])
+    ties = TiePoints(places, Views(start, camera), np.zeros((len(camera), 2)))
+    slow = scores_slowly(cameras, places, seen)
+    assert np.array_equal(matcher_of_ties(cameras, ties).fused, table_of(slow, 12))
+
+
+def test_few_images_leave_the_rest_of_the_table_empty():
+    cameras = looking([[0.0, 0, 70], [15, 0, 70], [400, 0, 70]], [0.0] * 3, [0.0] * 3)
+    places = np.random.default_rng(3).uniform(-20, 20, (300, 3)) * [1, 1, 0.1]
+    found = matcher_of(cameras, places)
+    assert found.matched.tolist() == [[1] + [-1] * 4, [0] + [-1] * 4, [-1] * 5]
+    assert found.averaged.shape == (3, 8) and found.fused.shape == (3, 12)
+    assert found.focal_px.tolist() == [3600.0] * 3
+
+
+def test_a_lens_in_millimetres_has_the_same_border():
+    cameras, _ = block(np.random.default_rng(4))
+    lens = cameras.lenses[0]
+    mm = 13.2 / 4000  # a pixel, where an image is taken as 4000 wide
+    values = {
+        name: getattr(lens, name) * 13.2 / lens.width
+        for name in ("focal", "width", "height", "principal_x", "principal_y")
+    }
+    in_mm = replace(cameras, lenses=(replace(lens, unit="mm", **values),) * len(cameras))
+    narrow = without_border(in_mm).lenses[0]
+    assert narrow.width == pytest.approx(13.2 - 16 * mm)
+    assert narrow.principal_x == pytest.approx(6.6 - 8 * mm)
+    in_px = without_border(cameras).lenses[0]
+    assert (in_px.width, in_px.height) == (lens.width - 16, lens.height - 16)
+
+
+def real_block():
+    local = pcfix.read_cameras(RENDERED / "colmap")
+    offset = np.loadtxt(RENDERED / "offset.txt")
+    rows = {name.rpartition(".")[0]: i for i, name in enumerate(local.labels)}
+    partners = {}
+    for line in (RENDERED / "neighbours.txt").read_text().splitlines():
+        if not line.startswith("#"):
+            mine, *others = (rows[name.rpartition(".")[0]] for name in line.split())
+            partners[mine] = others
+    return local, replace(local, centres=local.centres + offset), partners
+
+
+def share_found(matched, partners):
+    found = sum(len(set(matched[i].tolist()) & set(row)) for i, row in partners.items())
+    return found / sum(map(len, partners.values()))
+
+
+@rendered
+def test_real_partners_are_found_from_the_cloud():
+    import laspy
+
+    _, cameras, partners = real_block()
+    xyz = np.ascontiguousarray(laspy.read(RENDERED / "cloud.las").xyz[::60])
+    # 147 of 160; the software went by tie points, and the cloud is denser where texture is good
+    assert share_found(matcher_of(cameras, xyz).matched, partners) >= 0.88
+
+
+@rendered
+def test_real_partners_are_found_from_tie_points():
+    local, _, partners = real_block()
+    ties = read_tie_points(RENDERED / "colmap", local)
+    # 156 of 160, from a seventh of the tie points that the software had
+    assert share_found(matcher_of_ties(local, ties).matched, partners) >= 0.95

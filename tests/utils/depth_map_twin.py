@@ -1,0 +1,156 @@
+"""Slow twins of dense matching: partners by loops, depths by scipy, maps fused by bisection.
+
+Light is traced by `pcfix.simulate.tracing`; nothing of `pcfix.refract` is used.
+"""
+
+from itertools import combinations
+
+import numpy as np
+from scipy.optimize import brentq, minimize_scalar
+from scipy.spatial.transform import Rotation
+
+from pcfix.model import Cameras, Lens
+from pcfix.simulate.tracing import bed_points, piercing_points_of_planes
+
+LENS = Lens(3600.0, 5472.0, 3648.0, 2736.0, 1824.0)
+DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+def looking(centres, tilts_deg, headings_deg, lens=LENS):
+    """Return cameras tilted from nadir towards a heading (from east, counterclockwise)."""
+    rotations = []
+    for tilt, heading in zip(tilts_deg, headings_deg, strict=True):
+        axis = np.array([np.sin(np.radians(heading)), -np.cos(np.radians(heading)), 0.0])
+        rotations.append(DOWN @ Rotation.from_rotvec(np.radians(tilt) * axis).as_matrix().T)
+    names = tuple(map(str, range(len(centres))))
+    return Cameras(names, np.asarray(centres, float), np.array(rotations), (lens,) * len(names))
+
+
+def pixel(cameras, c, target):
+    """Return u, v of a place, straight, of a lens without distortion."""
+    x, y, z = cameras.rotations[c] @ (target - cameras.centres[c])
+    lens = cameras.lenses[c]
+    return np.array([lens.principal_x + lens.focal * x / z, lens.principal_y + lens.focal * y / z])
+
+
+def plane_of(plane):
+    """Return a point and the unit normal of z = a + b x + c y, as rows of arrays."""
+    a, b, c = plane
+    normal = np.array([-b, -c, 1.0]) / np.sqrt(1.0 + b * b + c * c)
+    return np.array([[0.0, 0.0, a]]), normal[None]
+
+
+def leaves_water(q, centre, plane, n):
+    """Return where the light from q to a camera leaves the water."""
+    return piercing_points_of_planes(q[None], centre[None], *plane_of(plane), n)[0]
+
+
+def on_bed(centre, towards, plane, bed, n):
+    """Return what a camera sees of a bed in the direction of a place."""
+    way = (towards - centre)[None]
+    return bed_points(centre[None], way, plane_of(plane), plane_of(bed), n)[0]
+
+
+def costs_of(p, u, q, cameras, partners, planes, n, metric):
+    """Return for each partner its squared residual, px^2, as a function of the way t beyond p.
+
+    In pixels, or as angles times the focal length as seen from the distance of p.
+    """
+
+    def one(j):
+        centre, focal = cameras.centres[j], cameras.lenses[j].focal
+        out = leaves_water(q, centre, planes[j], n)
+        if metric == "pixels":
+            there = pixel(cameras, j, out)
+            return lambda t: float(((pixel(cameras, j, p + t * u) - there) ** 2).sum())
+        ray = (out - centre) / np.linalg.norm(out - centre)
+        scale = focal**2 / ((p - centre) ** 2).sum()
+        return lambda t: float(scale * (np.cross(p + t * u - centre, ray) ** 2).sum())
+
+    return [one(j) for j in partners]
+
+
+def slow_depth(costs, tolerance):
+    """Return t at which pairs agree best: the mean over pairs, weighted by exp(-squares / tol)."""
+    found = []
+    for one, other in combinations(costs, 2):
+
+        def both(t, one=one, other=other):
+            return one(t) + other(t)
+
+        at = minimize_scalar(both, bracket=(-0.5, 0.5), options={"xtol": 1e-11}).x
+        found.append((both(at), at))
+    squares, at = np.array(found).T
+    return float(np.average(at, weights=np.exp((squares.min() - squares) / tolerance)))
+
+
+def fused_slowly(start, maps, weights, cameras, matched, planes, bed, n, tolerance, metric):
+    """Return the fused point of a bed on the plumb line of a start, and what it shows.
+
+    At the height at which the weighted ways along the rays add up to nothing up or down; the
+    plane of the bed is (a, b, c) of z = a + b x + c y.
+    """
+
+    def ways(z):
+        p = np.array([*start[:2], z])
+        total, shown = 0.0, []
+        for c, w in zip(maps, weights, strict=True):
+            u = (p - cameras.centres[c]) / np.linalg.norm(p - cameras.centres[c])
+            q = on_bed(cameras.centres[c], p, planes[c], bed, n)
+            costs = costs_of(p, u, q, cameras, matched[c], planes, n, metric)
+            total += w * u[2] * slow_depth(costs, tolerance)
+            shown.append(q)
+        return total, np.average(shown, 0, weights)
+
+    z = brentq(lambda z: ways(z)[0], start[2] - 3.0, start[2] + 3.0, xtol=1e-7)
+    return np.array([*start[:2], z]), ways(z)[1]
+
+
+def scores_slowly(cameras, places, seen, found_again_deg=None):
+    """Return OpenMVS's score of each image j as a partner of i, place by place, shape (k, k).
+
+    `seen` says which image has which place; with `found_again_deg` a place counts for two images
+    with the share exp(-(angle / that)^2).
+    """
+    k = len(cameras)
+    score = np.zeros((k, k))
+    for i in range(k):
+        for j in range(k):
+            if j == i:
+                continue
+            total, angles, scales, share_of_all, cells = 0.0, 0.0, 0.0, 0.0, set()
+            for p in np.flatnonzero(seen[i] & seen[j]):
+                a, b = cameras.centres[i] - places[p], cameras.centres[j] - places[p]
+                cosine = a @ b / np.linalg.norm(a) / np.linalg.norm(b)
+                angle = np.degrees(np.arccos(cosine))
+                r = (cameras.rotations[j][2] @ b) / (cameras.rotations[i][2] @ a)
+                spread = 0.38 * 12 if angle < 12 else 0.70 * 12
+                bell = max(np.exp(-((angle - 12) ** 2) / (2 * spread**2)), 0.1)
+                coarse = (1.6 / r) ** 2 if r > 1.6 else min(r, 1.0) ** 2
+                share = 1.0
+                if found_again_deg is not None:
+                    share = np.exp(-((angle / found_again_deg) ** 2))
+                total += share * bell * coarse
+                angles, scales = angles + share * angle, scales + share * r
+                share_of_all += share
+                u, v = pixel(cameras, i, places[p])
+                lens = cameras.lenses[i]
+                cells.add((int(16 * u / lens.width), int(16 * v / lens.height)))
+            area = len(cells) / 256
+            if len(cells) < 3 or area < 0.05:
+                continue
+            if 3 <= angles / share_of_all <= 65 and 0.2 <= scales / share_of_all <= 3.2:
+                score[i, j] = total * area
+    return score
+
+
+def in_frame(cameras, places):
+    """Return which image has which place, straight, shape (k, p)."""
+    seen = np.zeros((len(cameras), len(places)), bool)
+    for c in range(len(cameras)):
+        lens = cameras.lenses[c]
+        for p, place in enumerate(places):
+            u, v = pixel(cameras, c, place)
+            front = cameras.rotations[c][2] @ (place - cameras.centres[c]) > 0
+            seen[c, p] = front and 0 <= u < lens.width and 0 <= v < lens.height
+    return seen
