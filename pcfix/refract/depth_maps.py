@@ -50,7 +50,7 @@ LEAST_RISE_M = 0.005
 _BLOCK = 64
 _CORRECTED, _NO_CAMERA = int(Outcome.CORRECTED), int(Outcome.NO_CAMERA)
 _ONE_CAMERA = int(Outcome.ONE_CAMERA)
-_MISS, OUTCOME = 3, 5
+_MISS, AMBIGUITY, OUTCOME = 3, 4, 5
 
 
 def invert_depth_maps(bundle: Bundle) -> Intersection:
@@ -100,12 +100,14 @@ def arrays_of(bundle: Bundle) -> tuple[Any, ...]:
 
 
 def intersection_of(bundle: Bundle, result: FloatArray) -> Intersection:
-    """Return the rows that the kernels wrote as a result."""
-    return bundle.result(
+    """Return the rows that the kernels wrote as a result; its `sigma_z_m` is the ambiguity."""
+    found = bundle.result(
         result[:, :3],
         outcome=result[:, OUTCOME].astype(np.uint8),
         ray_miss_m=result[:, _MISS],
     )
+    moved = found.outcome == _CORRECTED
+    return found._replace(sigma_z_m=np.where(moved, result[:, AMBIGUITY], 0.0))
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)

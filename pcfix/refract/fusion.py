@@ -19,7 +19,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit, prange
 
-from pcfix.refract.depth_maps import arrays_of, balance, intersection_of, lines, settle_bed
+from pcfix.refract.bed import WIDTH_M
+from pcfix.refract.depth_maps import (
+    AMBIGUITY,
+    arrays_of,
+    balance,
+    intersection_of,
+    lines,
+    settle_bed,
+)
 from pcfix.refract.matcher import Matcher
 from pcfix.refract.threads import one_caller
 
@@ -118,7 +126,7 @@ def _invert(
             bed, t, slope = lines(maps, up, above, normal, matcher, n)
             weight = np.zeros(maps.size)
             _set(place, maps)
-            seed = _best_seed(
+            seed, result[i, AMBIGUITY] = _best_seed(
                 weight, maps, place, t, slope, up, matcher, around[i] - xyz[i, 2] - bed
             )
             if seed >= 0:
@@ -137,17 +145,28 @@ def _set(place: IntArray, maps: IntArray) -> None:
 def _best_seed(
     weight: FloatArray, maps: IntArray, place: IntArray, t: FloatArray, slope: FloatArray,
     up: FloatArray, matcher: Matcher, wanted: float,
-) -> int:  # fmt: skip
-    """Return the seed whose group has the bed nearest to the wanted height, or the largest one."""
+) -> tuple[int, float]:  # fmt: skip
+    """Return the seed whose group has the bed nearest to the wanted height, or the largest one.
+
+    And how far apart (m, standard deviation) the beds are of the groups that it can have been.
+    """
     best, least = -1, np.inf
+    total, first, second = 0.0, 0.0, 0.0
     for seed in range(maps.size):
         if slope[seed] != slope[seed]:
             continue
         rise, members = _group(weight, seed, maps, place, t, slope, up, matcher)
-        misfit = -float(members) if wanted != wanted else abs(rise - wanted)
+        known = wanted == wanted
+        misfit = abs(rise - wanted) if known else -float(members)
         if misfit < least:
             best, least = seed, misfit
-    return best
+        likely = np.exp(-0.5 * (misfit / WIDTH_M) ** 2) if known else 1.0
+        total += likely
+        first, second = first + likely * rise, second + likely * rise * rise
+    if not total > 0.0:
+        return best, abs(least) if best >= 0 else 0.0
+    mean = first / total
+    return best, np.sqrt(max(second / total - mean * mean, 0.0))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -103,12 +103,20 @@ def correct(
         else:
             found = method(bundle)
         sigma = level_sigma_m[rows] if isinstance(level_sigma_m, np.ndarray) else level_sigma_m
-        parts.append(
-            with_uncertainty(
-                found, xyz[rows], above, cameras, settings, chosen, offset, learned, sigma
-            )
+        known = with_uncertainty(
+            found, xyz[rows], above, cameras, settings, chosen, offset, learned, sigma
         )
+        parts.append(_with_ambiguity(known, found) if method is invert_fusion else known)
     return _joined(parts, order, len(cameras))
+
+
+def _with_ambiguity(known: Intersection, found: Intersection) -> Intersection:
+    """Add to the error of Z that of not knowing which group of images made the point."""
+    if known.covariance_m2 is None:
+        return known
+    covariance = known.covariance_m2.copy()
+    covariance[:, 5] += found.sigma_z_m**2
+    return known._replace(covariance_m2=covariance, sigma_z_m=np.sqrt(covariance[:, 5]))
 
 
 def learn_bed(

@@ -315,15 +315,15 @@ def test_maps_are_found_where_no_list_tells_them(name, most, monkeypatch):
 
 def test_the_bed_is_at_the_height_that_all_points_can_have_come_from():
     rng = np.random.default_rng(6)
-    xyz = np.column_stack([rng.uniform(0, 30, (4000, 2)), rng.normal(-4, 0.5, 4000)])
+    xyz = np.column_stack([rng.uniform(0, 30, (60_000, 2)), rng.normal(-4, 0.5, 60_000)])
     bed = -6.0 - 0.02 * xyz[:, 0]
-    likely = rng.uniform(-4, 2, (4000, 6)).astype(np.float32)
-    right = rng.integers(0, 6, 4000)
-    likely[np.arange(4000), right] = bed - xyz[:, 2]
+    likely = rng.uniform(-4, 2, (60_000, 6)).astype(np.float32)
+    right = rng.integers(0, 6, 60_000)
+    likely[np.arange(60_000), right] = bed - xyz[:, 2]
     likely[rng.uniform(0, 1, likely.shape) < 0.1] = np.nan  # also some of the right ones
     found = bed_of(xyz, likely)
-    assert 1.5 < found.cell_m < 3.5  # twenty points in 20 / 4.4 m2
-    # votes are counted at every half of `WIDTH_M`, and cells fall by 5 cm
+    assert 15 < 60_000 / 30**2 * found.cell_m**2 < 25  # points a cell
+    # votes are counted at every half of `WIDTH_M`, and cells fall by 1 cm
     close = np.abs(found.height_at(xyz[:, :2]) - bed) < WIDTH_M
     assert close.mean() > 0.97
 
@@ -402,7 +402,8 @@ def rendered_errors_gsd(**choices):
         heights, place = raster.read(1).astype(float), ~raster.transform
 
     def truth(at):
-        column, row = place * (at[:, 0], at[:, 1])
+        column = place.a * at[:, 0] + place.b * at[:, 1] + place.c
+        row = place.d * at[:, 0] + place.e * at[:, 1] + place.f
         return map_coordinates(heights, np.array([row - 0.5, column - 0.5]), order=1, cval=np.nan)
 
     found = xyz + result.shift_m
