@@ -106,11 +106,15 @@ def _without_outliers(height: FloatArray) -> FloatArray:
 
 def _cell_m(xy: FloatArray, low: FloatArray, high: FloatArray) -> float:
     """Return the side of cells that hold so many points on average where there are any."""
-    side = max(float((high - low).max()), 1.0) / 128.0
-    at = np.floor((xy - low) / side).astype(np.int64)
-    area = len(np.unique(at[:, 1] * 1000 + at[:, 0])) * side * side
     least = float(np.sqrt(np.prod(np.maximum(high - low, 1.0)) / MOST_CELLS))
-    return max(float(np.sqrt(POINTS_A_CELL * area / len(xy))), least)
+    side = max(
+        float(np.sqrt(np.prod(np.maximum(high - low, 1.0)) * POINTS_A_CELL / len(xy))), least
+    )
+    for _ in range(3):
+        at = np.floor((xy - low) / side).astype(np.int64)
+        filled = len(np.unique(at[:, 1] * (at[:, 0].max() + 1) + at[:, 0]))
+        side = max(side * float(np.sqrt(POINTS_A_CELL * filled / len(xy))), least)
+    return side
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)

@@ -36,8 +36,8 @@ from pcfix.label.raster import build_field
 from pcfix.label.tin import build_tin, locate
 from pcfix.model import Outcome, WaterMesh, WaterRaster
 from pcfix.refract.backward import light_path, settle, slope_of_path
-from pcfix.refract.image_jacobian import image_and_gradients, lens_table
-from pcfix.refract.lens import image_of
+from pcfix.refract.image_jacobian import image_and_gradients
+from pcfix.refract.lens import image_of, lens_table
 from pcfix.refract.piercing import pierce_mesh, pierce_raster
 from pcfix.refract.rays import line_terms, nearest_point, refracted
 from pcfix.refract.result import Intersection

@@ -47,6 +47,10 @@ CLOSE_M = 0.002
 """Between two looks; what is left is mended in a straight line."""
 
 LEAST_RISE_M = 0.005
+AVERAGED_WITHIN = 0.012
+"""Depths of neighbouring maps that differ by less, relative, are averaged before the fusion."""
+
+_ROUNDS = 4
 _BLOCK = 64
 _CORRECTED, _NO_CAMERA = int(Outcome.CORRECTED), int(Outcome.NO_CAMERA)
 _ONE_CAMERA = int(Outcome.ONE_CAMERA)
@@ -120,58 +124,83 @@ def _invert(
 ) -> None:  # fmt: skip
     for block in prange((len(xyz) + _BLOCK - 1) // _BLOCK):
         matcher = Matcher(matched, averaged, fused, focal_px, inner, tolerance)
-        share = np.zeros(len(centres))
-        seen = np.zeros(len(centres), np.int8)
-        touched = np.empty(len(centres), np.int64)
+        place = np.full(len(centres), ABSENT)
+        found = np.empty(len(centres), np.int64)
         for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(xyz))):
             up, normal = centres - xyz[i], normals[i]
             listed = camera[start[i] : start[i + 1]]
             given = weight[start[i] : start[i + 1]] if weight.size else weight
-            count = _shares(
-                share, seen, touched, listed, given, up, matcher.inner, matcher.averaged
-            )
+            maps = found[: _with_neighbours(found, place, listed, up, matcher)]
             above = normal[2] * (height[i] - xyz[i, 2] + offset)
-            maps = touched[:count]
             bed, t, slope = lines(maps, up, above, normal, matcher, n)
-            settle_bed(result[i], maps, share[maps], t, slope, bed, up, above, normal, matcher, n)
-            for q in range(count):
-                share[touched[q]], seen[touched[q]] = 0.0, 0
+            counts, step = np.zeros(maps.size), 0.0
+            for _ in range(_ROUNDS):
+                _share(counts, place, listed, given, up, t + slope * step, matcher)
+                step = balance(t, slope, counts)
+            settle_bed(result[i], maps, counts, t, slope, bed, up, above, normal, matcher, n)
+            place[maps] = ABSENT
+            for c in listed:
+                for a in matcher.averaged[c]:
+                    if a >= 0:
+                        place[a] = ABSENT
+
+
+ABSENT, _OUTSIDE = -1, -2
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _shares(
-    share: FloatArray, seen: IntArray, touched: IntArray, listed: IntArray, given: FloatArray,
-    up: FloatArray, frames: Frames, averaged: IntArray,
-) -> int:  # fmt: skip
-    """Set what each depth map counts for in the point; return how many do.
+def _with_neighbours(
+    found: IntArray, place: IntArray, listed: IntArray, up: FloatArray, matcher: Matcher
+) -> int:
+    """Gather the listed images and those in frame that their depths were averaged with.
 
-    A fused map counts by its weight, that of the matcher or one by its squared distance, and
-    shares it evenly with the maps it was averaged with before. `seen` keeps the frame test: 1 in
-    frame, 2 not.
+    Returns how many they are. `place` says where each image is among them.
     """
     count = 0
+    for c in listed:
+        if place[c] < 0:
+            place[c], found[count] = count, c
+            count += 1
+        for a in matcher.averaged[c]:
+            if a < 0:
+                break
+            if place[a] == ABSENT:
+                place[a] = _OUTSIDE
+                if holds(matcher.inner, a, up[a, 0], up[a, 1], up[a, 2]):
+                    place[a], found[count] = count, a
+                    count += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _share(
+    counts: FloatArray, place: IntArray, listed: IntArray, given: FloatArray, up: FloatArray,
+    now: FloatArray, matcher: Matcher,
+) -> None:  # fmt: skip
+    """Set what each depth map counts for in the point, with their depths as they are now.
+
+    A fused map counts by its weight, that of the matcher or one by its squared distance, and
+    shares it evenly with the maps it was averaged with before.
+    """
+    counts[:] = 0.0
     for k in range(listed.size):
         c = listed[k]
         w = given[k] if given.size else 1.0 / (up[c] * up[c]).sum()
-        members = 1
-        for a in averaged[c]:
-            if a < 0:
-                break
-            if seen[a] == 0:
-                held = holds(frames, a, up[a, 0], up[a, 1], up[a, 2])
-                seen[a] = 1 if held else 2
-                touched[count] = a
-                count += 1
-            members += seen[a] == 1
-        if seen[c] == 0:
-            touched[count] = c
-            count += 1
-        seen[c] = 1
-        share[c] += w / members
-        for a in averaged[c]:
-            if a >= 0 and seen[a] == 1:
-                share[a] += w / members
-    return count
+        own, members = place[c], 1.0
+        for a in matcher.averaged[c]:
+            members += averages(own, a, now, place)
+        counts[own] += w / members
+        for a in matcher.averaged[c]:
+            if averages(own, a, now, place):
+                counts[place[a]] += w / members
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def averages(own: int, a: int, now: FloatArray, place: IntArray) -> bool:
+    """Whether a depth is averaged with that of image a: both show the place, nearly alike."""
+    if a < 0 or place[a] < 0:
+        return False
+    return bool(abs(now[place[a]] - now[own]) < AVERAGED_WITHIN)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 
 from pcfix.refract.frame_shapes import frame_shape
-from pcfix.refract.lens import coefficients, image_of
+from pcfix.refract.lens import image_of, lens_table
 from pcfix.refract.places import (
     B2,
     B3,
@@ -38,7 +38,7 @@ from pcfix.refract.places import (
 )
 
 if TYPE_CHECKING:
-    from pcfix.model import Cameras, FloatArray, IntArray, Lens
+    from pcfix.model import Cameras, FloatArray, IntArray
 
 Plane: TypeAlias = tuple[float, float, float]
 Pyramid: TypeAlias = tuple[Plane, Plane, Plane, Plane]
@@ -97,27 +97,17 @@ def frames_of(cameras: Cameras) -> Frames:
     if cameras.lenses is None:
         front = np.repeat(rotations[:, 2:3], 4, axis=1)
         return no_frames(len(cameras))._replace(planes=front)
-    rows: dict[Lens, int] = {}
-    row = np.array([rows.setdefault(lens, len(rows)) for lens in cameras.lenses])
-    shapes = [frame_shape(lens) for lens in rows]
+    row, lenses = lens_table(cameras.lenses)
+    shapes = [frame_shape(lens) for lens in dict.fromkeys(cameras.lenses)]
     widest = np.array([shape.widest for shape in shapes])
     return Frames(
         planes=np.ascontiguousarray(np.array([s.planes for s in shapes])[row] @ rotations),
         row=np.where(np.array([s.distorted for s in shapes])[row], row, NOT_DISTORTED),
         cone=np.column_stack([rotations[:, 2], widest[row]]),
         reach=np.array([s.reach for s in shapes])[row],
-        lenses=_table(list(rows)),
+        lenses=lenses,
         rotations=rotations,
     )
-
-
-def _table(lenses: list[Lens]) -> FloatArray:
-    """Return the coefficients of lenses, one row each, padded with zeros."""
-    rows = [coefficients(lens) for lens in lenses]
-    table = np.zeros((len(rows), max(map(len, rows))))
-    for i, row in enumerate(rows):
-        table[i, : len(row)] = row
-    return table
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -23,6 +23,7 @@ from pcfix.refract.bed import WIDTH_M
 from pcfix.refract.depth_maps import (
     AMBIGUITY,
     arrays_of,
+    averages,
     balance,
     intersection_of,
     lines,
@@ -39,9 +40,6 @@ if TYPE_CHECKING:
 
 AGREE = 0.01
 """Depths that differ by less, relative, are fused."""
-
-AVERAGED_WITHIN = 0.012
-"""Depths of neighbouring maps that differ by less are averaged, before."""
 
 MAX_ROUNDS = 6
 CLOSE_M = 2e-3
@@ -203,7 +201,7 @@ def _averaged(
     """Return a depth after averaging with the maps around that agree, and their number."""
     total, count = now[q], 1.0
     for a in matcher.averaged[camera]:
-        if a >= 0 and place[a] >= 0 and abs(now[place[a]] - now[q]) < AVERAGED_WITHIN:
+        if averages(q, a, now, place):
             total, count = total + now[place[a]], count + 1.0
     return total / count, count
 
@@ -221,6 +219,6 @@ def _fuse(
     each = 1.0 / ((up[camera, 0] ** 2 + up[camera, 1] ** 2 + up[camera, 2] ** 2) * count)
     weight[q] += each
     for a in matcher.averaged[camera]:
-        if a >= 0 and place[a] >= 0 and abs(now[place[a]] - now[q]) < AVERAGED_WITHIN:
+        if averages(q, a, now, place):
             weight[place[a]] += each
     return 1

@@ -13,11 +13,10 @@ from numba import njit
 
 from pcfix.refract import places
 from pcfix.refract.brown import distorted, jacobian, undistorted
-from pcfix.refract.lens import coefficients
 from pcfix.refract.projections import CODES, RIGHT_ANGLE, radius
 
 if TYPE_CHECKING:
-    from pcfix.model import FloatArray, IntArray, Lens
+    from pcfix.model import FloatArray
 
 Gradients: TypeAlias = tuple[float, float, float, float, float, float]
 """Of two numbers by three others: a_x, a_y, a_z, b_x, b_y, b_z."""
@@ -32,25 +31,6 @@ _PERSPECTIVE, _EQUIDISTANT, _EQUISOLID = (
 _POLYNOMIAL, _FOV, _DUAL = (CODES[name] for name in ("polynomial", "fov", "dual"))
 _DIVISION, _EUCM = CODES["division"], CODES["eucm"]
 _NOWHERE = (np.nan,) * 6
-
-
-def lens_table(lenses: tuple[Lens, ...]) -> tuple[IntArray, FloatArray]:
-    """Return the coefficients of k lenses for kernels, equal lenses once.
-
-    Returns
-    -------
-    row : array, shape (k,)
-        Where the lens of each camera is in the table.
-    table : array, shape (l, ...)
-        See `pcfix.refract.places`; padded with zeros.
-    """
-    rows: dict[Lens, int] = {}
-    row = np.array([rows.setdefault(lens, len(rows)) for lens in lenses])
-    each = [coefficients(lens) for lens in rows]
-    table = np.zeros((len(each), max(map(len, each))))
-    for i, numbers in enumerate(each):
-        table[i, : len(numbers)] = numbers
-    return row, table
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

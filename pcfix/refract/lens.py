@@ -18,7 +18,7 @@ from pcfix.refract.brown import distorted, largest_disc, undistorted
 from pcfix.refract.projections import CODES, angle, largest_angle, largest_radius, radius
 
 if TYPE_CHECKING:
-    from pcfix.model import FloatArray, Lens
+    from pcfix.model import FloatArray, IntArray, Lens
 
 _KIND, _LARGEST_ANGLE, _INVERSE = places.KIND, places.LARGEST_ANGLE, places.INVERSE
 _CENTRE_X, _CENTRE_Y = places.CENTRE_X, places.CENTRE_Y
@@ -83,6 +83,25 @@ def coefficients(lens: Lens) -> FloatArray:
     c[places.DISC] = largest_disc(lens, c)
     c.setflags(write=False)
     return c
+
+
+def lens_table(lenses: tuple[Lens, ...]) -> tuple[IntArray, FloatArray]:
+    """Return the coefficients of k lenses for kernels, equal lenses once.
+
+    Returns
+    -------
+    row : array, shape (k,)
+        Where the lens of each camera is in the table.
+    table : array, shape (l, ...)
+        See `pcfix.refract.places`; padded with zeros.
+    """
+    rows: dict[Lens, int] = {}
+    row = np.array([rows.setdefault(lens, len(rows)) for lens in lenses])
+    each = [coefficients(lens) for lens in rows]
+    table = np.zeros((len(each), max(map(len, each))))
+    for i, numbers in enumerate(each):
+        table[i, : len(numbers)] = numbers
+    return row, table
 
 
 def _with_tail(c: FloatArray, lens: Lens) -> FloatArray:

@@ -35,7 +35,8 @@ from pcfix.errors import PcfixWarning
 from pcfix.model import Outcome, Views
 from pcfix.refract.backward import light_path
 from pcfix.refract.consistent import check_consistent
-from pcfix.refract.image_jacobian import image_and_gradients, lens_table
+from pcfix.refract.image_jacobian import image_and_gradients
+from pcfix.refract.lens import lens_table
 from pcfix.refract.places import KIND
 from pcfix.refract.projections import CODES
 from pcfix.refract.rays import MIN_DETERMINANT, line_terms, nearest_point, refracted

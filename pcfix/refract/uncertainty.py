@@ -5,15 +5,16 @@ first: the SfM software intersects straight rays by least squares in the images,
 
     Cov P = K^-1 R K^-1,   K = sum J'J,   R = sum J' Cov(image) J.
 
-The correction then carries P to Q; its derivative dQ/dP is that of the intersection of the
-refracted rays, see `pcfix.refract.sensitivity`. Errors common to all rays (level, index and tilt of
-the water) come in only there, each with a column of its own:
+The correction then carries P to Q; its derivative dQ/dP is that of the method, see
+`pcfix.refract.sensitivity`. Errors common to all rays (level, index and tilt of the water) come in
+only there, each with a column of its own:
 
     Cov Q = dQ/dP Cov P dQ/dP' + sum over the common ones of sigma^2 g g'.
 
-It is the same to first order as intersecting refracted rays of which each is displaced, but for
-the weights: there every ray would count by its distance (m) from the point, here as it does in
-the images (px), which is how the noise really went in.
+`consistent` undoes that adjustment, so that dQ/dP = (sum S T)^-1 K, and K cancels out: noise comes
+through as if the refracted rays had been adjusted in the images. The other methods have the
+derivative of `snell`, which weighs rays by their distance (m) from the point; the more the lengths
+of the rays differ, the more the two do.
 """
 
 from __future__ import annotations
@@ -24,17 +25,9 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 from numba import njit, prange
 
-from pcfix.model import Outcome
+from pcfix.model import Outcome, WaterPlane
 from pcfix.refract import sensitivity as s
-from pcfix.refract.choice import (
-    ANY_NUMBER,
-    TILE,
-    choose,
-    gather,
-    least_cosine2,
-    near_cameras,
-    spatial_order,
-)
+from pcfix.refract.choice import TILE, chosen_views, gather, least_cosine2, spatial_order
 from pcfix.refract.frames import (
     ALL,
     NOT_DISTORTED,
@@ -45,7 +38,6 @@ from pcfix.refract.frames import (
     judge,
     mark,
     may_hold,
-    no_frames,
     pyramid,
 )
 from pcfix.refract.threads import one_caller
@@ -128,17 +120,21 @@ def covariances(
     -----
     First order. A mesh or raster is taken as its plane above the point. Every ray of a point is
     taken to have made it, by an adjustment in image residuals; noise is of the size of a pixel in
-    the middle of the image, lens distortion aside. For methods that move points along the
-    vertical only it is an approximation: that of the intersection. A tilt turns the water about
-    the middle of the projection centres.
+    the middle of the image, lens distortion aside. A tilt turns the water about the middle of the
+    projection centres.
+
+    It is an approximation for methods that move points along the vertical only (they get that of
+    `snell`), and where `consistent` inverts a dense matcher (depth maps, stereo pairs, their
+    models), which gets that of one adjustment of all its images.
     """
     if not len(xyz):
         return np.zeros((0, 6))
-    order = spatial_order(xyz)
+    if settings.max_cameras is not None:
+        plane = WaterPlane(0.0)  # only what is not a plane is looked at
+        views = chosen_views(xyz, surface, plane, cameras, settings, views, level_offset_m)
     result = np.zeros((len(xyz), 6))
-    least = least_cosine2(settings, cameras)
-    common = (
-        order,
+    points = (
+        spatial_order(xyz),
         np.ascontiguousarray(xyz),
         np.ascontiguousarray(shift_m),
         np.ascontiguousarray(surface.height_m),
@@ -147,18 +143,18 @@ def covariances(
         np.ascontiguousarray(cameras.centres),
         *_focal_lengths(cameras),
         np.zeros(len(cameras)) if level_offset_m is None else level_offset_m,
-        frames_of(cameras) if views is None else no_frames(len(cameras)),
-        least,
+    )
+    rest = (
+        least_cosine2(settings, cameras),
         1.0 / settings.refractive_index,
         _budget(settings, cameras),
         result,
     )
     with one_caller():
-        if views is None and settings.max_cameras is None:
-            _all_in_frame(*common)
+        if views is None:
+            _all_in_frame(*points, frames_of(cameras), *rest)
         else:
-            rows = None if views is None else (views.start, views.camera)
-            _chosen(*common, rows, settings.max_cameras or ANY_NUMBER)
+            _of_lists(*points, views.start, views.camera, *rest)
     return result
 
 
@@ -302,38 +298,27 @@ def _all_in_frame(
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def _chosen(
+def _of_lists(
     order: IntArray, xyz: FloatArray, shift: FloatArray, surface: FloatArray, slope: FloatArray,
     level_sigma: FloatArray, centres: FloatArray, axes: FloatArray, focal: FloatArray,
-    offset: FloatArray, frames: Frames, least_cosine2: float, r: float, budget: _Budget,
-    result: FloatArray, views: tuple[IntArray, IntArray] | None, most: int,
+    offset: FloatArray, start: IntArray, camera: IntArray, least_cosine2: float, r: float,
+    budget: _Budget, result: FloatArray,
 ) -> None:  # fmt: skip
-    """Chosen cameras per point; those of a tile one after the other, as if by frames."""
+    """Take the cameras of lists; those of a tile come one after the other, as by their frames."""
     for t in prange((len(order) + TILE - 1) // TILE):
         rows = order[t * TILE : (t + 1) * TILE]
         tile, sums = np.empty(s.TILE_RUNS * TILE), np.zeros(s.SUMS * TILE)
-        low, high = gather(tile, rows, xyz, surface, slope)
+        gather(tile, rows, xyz, surface, slope)
         s.add_below(tile, shift, rows)
-        if views is None:
-            near = near_cameras(frames, centres, low, high)
-        else:
-            near = _listed(views[0], views[1], rows, len(centres))
+        named = _named(start, camera, rows, len(centres))
         place = np.zeros(len(centres), np.int64)
-        place[near] = np.arange(near.size)
-        marks = np.zeros((near.size, rows.size))
+        place[named] = np.arange(named.size)
+        marks = np.zeros((named.size, rows.size))
         for j in range(rows.size):
-            mine = near
-            if views is not None:
-                mine = views[1][views[0][rows[j]] : views[0][rows[j] + 1]].astype(np.int64)
-            if views is None or most < mine.size:
-                mine = mine[
-                    choose(mine, tile, j, centres, offset, frames, least_cosine2, most,
-                           None, None, -1)
-                ]  # fmt: skip
-            for c in mine:
-                marks[place[c], j] += 1.0
-        for at in range(near.size):
-            c = near[at]
+            for at in range(start[rows[j]], start[rows[j] + 1]):
+                marks[place[camera[at]], j] += 1.0
+        for at in range(named.size):
+            c = named[at]
             _add(
                 sums, tile, marks[at], centres[c], axes[c], focal[c], offset[c],
                 least_cosine2, r, budget,
@@ -342,7 +327,7 @@ def _chosen(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _listed(start: IntArray, camera: IntArray, rows: IntArray, k: int) -> IntArray:
+def _named(start: IntArray, camera: IntArray, rows: IntArray, k: int) -> IntArray:
     """Return the cameras that the lists of some points name, in their order."""
     named = np.zeros(k, np.bool_)
     for i in rows:
@@ -377,6 +362,10 @@ def _add(
 def _per_image(budget: _Budget) -> bool:
     """Whether rays differ by more than the noise of image coordinates."""
     return max(budget.waves, max(budget.centre_m, budget.attitude)) > 0.0
+
+
+# What follows `_finish_tile` is inlined: with calls left in it the loop over the points of a tile
+# is not vectorised, and takes five times as long.
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -50,6 +50,7 @@ AGREE = 0.01
 LEAST_PARTNERS = 2
 LEAST_FUSED = 3
 LEAST_COVER = 2
+MOST_OFF = 0.3
 COST_NOISE = 0.28
 """Scale of Gumbel's distribution of one cost; a sum of two varies like one of 0.4."""
 
@@ -135,7 +136,8 @@ def fuse_depth_maps(
     maps = depth_maps(matching, place)
     rows = np.flatnonzero((group >= 0) & (group == seed[sight.point]))
     rows = rows[_at(matching, maps, rows, place)]
-    rows = rows[np.bincount(sight.point[rows], minlength=len(seed))[sight.point[rows]] >= LEAST_FUSED]
+    count = np.bincount(sight.point[rows], minlength=len(seed))
+    rows = rows[count[sight.point[rows]] >= LEAST_FUSED]
     point, weight = sight.point[rows], 1.0 / maps.averaged[rows] ** 2
     xyz = maps.points(rows, maps.averaged[rows])
     fused, true = (_means(v, weight, point, bed[0]) for v in (xyz, maps.shown[rows]))
@@ -216,8 +218,8 @@ def _depths(
     row = matching.partner[reference, slot]
     measured = _measured(matching, row, seen[reference], matching.noise_px[reference, slot])
     edges = reference, measured, matching.sight.camera[row]
-    origin, ray, depth = rays
-    depth = _least_squares(rays, edges, matching.rig)
+    origin, ray, first = rays
+    depth = _plausible(_least_squares(rays, edges, matching.rig), first)
     residual, slope = _residuals((origin, ray, depth), edges, matching.rig)
     shape = matching.partner.shape
     squares, right, curved = np.full(shape, np.inf), np.zeros(shape), np.ones(shape)
@@ -227,7 +229,12 @@ def _depths(
     best = _best_pair(squares, right, curved)
     taken = (best[reference] == slot[:, None]).any(axis=1)
     pair = reference[taken], measured[taken], edges[2][taken]
-    return _least_squares((origin, ray, depth), pair, matching.rig)
+    return _plausible(_least_squares((origin, ray, depth), pair, matching.rig), first)
+
+
+def _plausible(depth: FloatArray, first: FloatArray) -> FloatArray:
+    """Return depths without those that no search would go to: the images do not agree anywhere."""
+    return np.where(np.abs(depth - first) < MOST_OFF * first, depth, np.nan)
 
 
 def _best_pair(squares: FloatArray, right: FloatArray, curved: FloatArray) -> IntArray:

@@ -36,8 +36,8 @@ class Scene:
     ----------
     apparent_xyz, true_xyz : array, shape (n, 3)
         The cloud as SfM software would place it, and the truth, row by row. A point that fewer
-        than three images show, or that the matcher found no two agreeing depths for, has no views
-        and is not moved.
+        than three images show, or for which fewer than three depth maps agree, has no views and is
+        not moved.
     views : Views
         The cameras that made each point; of depth maps with what each counted for.
     cameras : Cameras

@@ -26,7 +26,7 @@ def kind_of(xyz, cameras, water, views, n=1.34):
     return kind_of_views(xyz, above, water, cameras, settings, views, learned)
 
 
-def under_water(cloud, points=3000, **settings):
+def under_water(cloud, points=1200, **settings):
     scene = simulate_scene(points, cloud=cloud, lidar_per_m2=0.0, **settings)
     return scene, np.flatnonzero(scene.depth_m(scene.xyz) > 0.0)
 
@@ -77,6 +77,6 @@ def test_the_list_of_a_real_dense_cloud_is_one_of_depth_maps():
     cameras = replace(local, centres=local.centres + np.loadtxt(RENDERED / "offset.txt"))
     xyz = np.ascontiguousarray(laspy.read(RENDERED / "cloud.las").xyz)
     match = ViewMatch(read_views(RENDERED / "dense.vis", cameras), cameras, points=len(xyz))
-    rows = np.flatnonzero(xyz[:, 2] < 0.37)
+    rows = np.flatnonzero(xyz[:, 2] < 0.37)[::5]
     views = match.for_chunk(xyz, 0).take(rows)
     assert kind_of(xyz[rows], cameras, WaterPlane(0.37), views).kind == "depth-maps"

@@ -387,7 +387,7 @@ def rendered_cloud():
     cameras = replace(local, centres=local.centres + np.loadtxt(RENDERED / "offset.txt"))
     xyz = np.ascontiguousarray(laspy.read(RENDERED / "cloud.las").xyz)
     match = ViewMatch(read_views(RENDERED / "dense.vis", cameras), cameras, points=len(xyz))
-    rows = np.arange(0, len(xyz), 5)
+    rows = np.arange(0, len(xyz), 6)
     return xyz[rows], cameras, match.for_chunk(xyz, 0).take(rows)
 
 

@@ -9,6 +9,7 @@ import pcfix
 from pcfix.io.cameras import read_tie_points
 from pcfix.model import TiePoints, Views
 from pcfix.refract.matcher import REPEATED_DEG, matcher_of, matcher_of_ties, without_border
+from pcfix.simulate.scene import simulate_scene
 from tests.utils.depth_map_twin import in_frame, looking, scores_slowly
 from tests.utils.shared import needs
 
@@ -77,6 +78,16 @@ def test_a_lens_in_millimetres_has_the_same_border():
     assert narrow.principal_x == pytest.approx(6.6 - 8 * mm)
     in_px = without_border(cameras).lenses[0]
     assert (in_px.width, in_px.height) == (lens.width - 16, lens.height - 16)
+
+
+@pytest.mark.parametrize("obliques", [{}, {"obliques_deg": 35.0, "oblique_share": 0.5}])
+def test_simulated_partners_are_found_from_the_cloud(obliques):
+    """The simulator has the formula of its own, for features that are found again by chance."""
+    area = {"area_m": (70.0, 50.0), "lidar_per_m2": 0.0}
+    scene = simulate_scene(600, cloud="depth-maps", **area, **obliques)
+    found = matcher_of(scene.cameras, scene.xyz).matched
+    partners = {i: [j for j in row if j >= 0] for i, row in enumerate(scene.neighbours.tolist())}
+    assert share_found(found, partners) > 0.85  # 0.95 and 0.92 of larger blocks with more points
 
 
 def real_block():

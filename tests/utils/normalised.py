@@ -53,38 +53,52 @@ def views_of(points: int, cameras: Cameras) -> Views:
 
 
 def apparent(
-    bed: FloatArray, cameras: Cameras, sigma: ErrorBudget, rng: np.random.Generator
+    bed: FloatArray, cameras: Cameras, sigma: ErrorBudget, rng: np.random.Generator, draws: int = 1
 ) -> FloatArray:
-    """Return what SfM software makes of points on the bed, one draw of all errors, shape (m, 3).
+    """Return what SfM software makes of m points on the bed, shape (draws * m, 3).
 
-    It believes in `cameras`, and the correction later in a level surface at 0 and in `INDEX`; the
-    light goes by what is drawn. The water leans about the middle of the cameras, waves lean about
-    where the light pierces them.
+    Each draw has errors of its own, and m rows. The software believes in `cameras`, and the
+    correction later in a level surface at 0 and in `INDEX`; the light goes by what is drawn. The
+    water leans about the middle of the cameras, waves lean about where the light pierces them.
     """
     m, k = len(bed), len(cameras)
-    n = INDEX + sigma.index * rng.normal()
-    level = (sigma.level_m or 0.0) * rng.normal()
-    turn = math.radians(sigma.attitude_deg) * rng.normal(size=(k, 3))
-    true = Cameras(
-        cameras.labels,
-        cameras.centres + sigma.centre_m * rng.normal(size=(k, 3)),
-        Rotation.from_rotvec(turn).as_matrix() @ cameras.rotations,
-        cameras.lenses,
-    )
-    views = views_of(m, cameras)
-    owner = np.repeat(np.arange(m), k)
-    points, centres = bed[owner], true.centres[views.camera]
-    pivot = np.array([*cameras.centres[:, :2].mean(axis=0), level])
-    slope = np.tile(math.radians(sigma.tilt_deg) * rng.normal(size=2), (m * k, 1))
-    surface = through_tilted(points, centres, pivot, slope, n)
+    # the rays of one draw after those of the other, each with cameras of its own
+    per_ray = np.repeat(np.arange(draws), m * k)
+    camera = np.tile(np.tile(np.arange(k), m), draws)
+    points = np.tile(np.repeat(bed, k, axis=0), (draws, 1))
+    n = (INDEX + sigma.index * rng.normal(size=draws))[per_ray]
+    level = ((sigma.level_m or 0.0) * rng.normal(size=draws))[per_ray]
+    tilt = (math.radians(sigma.tilt_deg) * rng.normal(size=(draws, 2)))[per_ray]
+    true = _misplaced(cameras, sigma, rng, draws)
+    seen_by = per_ray * k + camera
+    centres = true.centres[seen_by]
+    middle = np.tile(cameras.centres[:, :2].mean(axis=0), (len(n), 1))
+    pivot = np.column_stack([middle, level])
+    surface = through_tilted(points, centres, pivot, tilt, n)
     if sigma.waves_deg:
         # the waves lean about where the light pierces the surface, which hardly moves by that
-        waves = math.radians(sigma.waves_deg) * rng.normal(size=(m * k, 2))
+        waves = math.radians(sigma.waves_deg) * rng.normal(size=(len(n), 2))
         for _ in range(3):
-            surface = through_tilted(points, centres, surface, slope + waves, n, pivot, slope)
-    pixels, _ = project(surface, true, views.camera, LENS)
+            surface = through_tilted(points, centres, surface, tilt + waves, n, pivot, tilt)
+    pixels, _ = project(surface, true, seen_by, LENS)
     pixels += sigma.image_px * rng.normal(size=pixels.shape)
-    return triangulate(pixels, cameras, views.camera, views.start, LENS, bed * [1, 1, 0.75])
+    start = np.arange(draws * m + 1) * k
+    guess = np.tile(bed * [1, 1, 0.75], (draws, 1))
+    return triangulate(pixels, cameras, camera, start, LENS, guess)
+
+
+def _misplaced(
+    cameras: Cameras, sigma: ErrorBudget, rng: np.random.Generator, draws: int
+) -> Cameras:
+    """Return where the cameras really were, draw after draw."""
+    count = draws * len(cameras)
+    turn = Rotation.from_rotvec(math.radians(sigma.attitude_deg) * rng.normal(size=(count, 3)))
+    return Cameras(
+        tuple(map(str, range(count))),
+        np.tile(cameras.centres, (draws, 1)) + sigma.centre_m * rng.normal(size=(count, 3)),
+        turn.as_matrix() @ np.tile(cameras.rotations, (draws, 1, 1)),
+        cameras.lenses * draws,
+    )
 
 
 def through_tilted(
@@ -92,7 +106,7 @@ def through_tilted(
     centres: FloatArray,
     about: FloatArray,
     slope: FloatArray,
-    n: float,
+    n: FloatArray,
     pivot: FloatArray | None = None,
     mean_slope: FloatArray | None = None,
 ) -> FloatArray:
@@ -101,9 +115,9 @@ def through_tilted(
     Turned so that the plane is upright, with camera and point, it is a level surface.
     With a pivot, `about` gives the places only: their height is that of the mean surface there.
     """
-    about = np.broadcast_to(about, points.shape).copy()
+    about = about.copy()
     if pivot is not None and mean_slope is not None:
-        about[:, 2] = pivot[2] + (mean_slope * (about[:, :2] - pivot[:2])).sum(axis=1)
+        about[:, 2] = pivot[:, 2] + (mean_slope * (about - pivot)[:, :2]).sum(axis=1)
     # the turn that makes the normal (-b, -c, 1) upright
     axis = np.column_stack([-slope[:, 1], slope[:, 0], np.zeros(len(slope))])
     steep = np.hypot(*slope.T)
