@@ -98,7 +98,7 @@ def consistent(bundle: Bundle) -> Intersection:
     -------
     Intersection
         `ray_miss_m` is the distance from the refracted rays of the apparent point, as of `snell`;
-        `sigma_z_m` is that of `snell`. A point whose views are all one camera is `ONE_CAMERA`.
+        `sigma_z_m` is the scatter of these. A point whose views are all one camera is `ONE_CAMERA`.
         Light bends for a camera whose water stood above the true point; `snell` asks the
         apparent one.
 

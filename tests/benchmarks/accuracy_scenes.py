@@ -56,7 +56,7 @@ class Case:
     error : callable
         Of points, shape (m, 3), and their rows: result minus truth, metres; x and y are NaN
         where only the true surface is known.
-    floor : array, shape (p, 3), or None
+    floor : array, shape (p, 3), or None where the images of a list did not make the point
         Errors of points that are triangulated through the water from fresh image points.
     """
 
@@ -100,7 +100,7 @@ def simulated(name: str, points: int, seed: int) -> Case:
         bed=scene.true_xyz,
         error=lambda xyz, rows: xyz - scene.true_xyz[rows],
         knowledge={**knowledge, **BY_FRAME},
-        floor=_floor(scene, measured, seed),
+        floor=None if kind == "depth-maps" else _floor(scene, measured, seed),
     )
 
 

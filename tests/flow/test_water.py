@@ -135,9 +135,12 @@ def test_every_door_takes_shoreline_points(tmp_path):
     xy = rng.uniform(low[:2], high[:2], (20, 2))
     path = write_points(tmp_path / "shore.csv", np.column_stack([xy, np.full(20, LEVEL_M)]))
     water = ["--water", path, "--water-crs", CRS]
-    said = invoke("correct", CLOUD, tmp_path / "a.las", "--cameras", CAMERAS, *water)
+    # a fit says how well it knows the level, a number does not
+    known = ["--sigma-level", 0.02]
+    said = invoke("correct", CLOUD, tmp_path / "a.las", "--cameras", CAMERAS, *water, *known)
     assert "fitted     level, 20 of 20 points" in said
-    pcfix.correct_file(CLOUD, tmp_path / "b.las", cameras=CAMERAS, water=LEVEL_M)
+    errors = pcfix.ErrorBudget(level_m=0.02)
+    pcfix.correct_file(CLOUD, tmp_path / "b.las", cameras=CAMERAS, water=LEVEL_M, errors=errors)
     one, other = (laspy.read(tmp_path / name).points.array for name in ("a.las", "b.las"))
     np.testing.assert_array_equal(one, other)
     invoke("label", CLOUD, tmp_path / "c.las", *water)

@@ -61,7 +61,7 @@ def test_every_picture_says_what_it_shows_and_is_a_file_too(report):
     folder, _ = report
     pictures = Elements((folder / "report.html").read_text()).all("img")
     files = sorted((folder / "figures").glob("*.png"))
-    assert len(pictures) == len(files) == 4
+    assert len(pictures) == len(files) == 5
     assert all(len(picture["alt"]) > 20 for picture in pictures)
     for path in files:
         assert path.read_bytes().startswith(b"\x89PNG")
