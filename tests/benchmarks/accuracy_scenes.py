@@ -99,9 +99,16 @@ def simulated(name: str, points: int, seed: int) -> Case:
         measured=measured,
         bed=scene.true_xyz,
         error=lambda xyz, rows: xyz - scene.true_xyz[rows],
-        knowledge={**knowledge, **BY_FRAME},
+        knowledge={**knowledge, **_by_frame(scene)},
         floor=None if kind == "depth-maps" else _floor(scene, measured, seed),
     )
+
+
+def _by_frame(scene: Any) -> dict[str, dict[str, Any]]:
+    """Return the knowledge of cameras without a list; the model is of the scene's own matcher."""
+    if scene.pairs is None:
+        return BY_FRAME
+    return {**BY_FRAME, "mvs": {**BY_FRAME["mvs"], "matcher": "pairs"}}
 
 
 def measured_of(scene: Any) -> np.ndarray:
