@@ -54,7 +54,9 @@ _ROUNDS = 4
 _BLOCK = 64
 _CORRECTED, _NO_CAMERA = int(Outcome.CORRECTED), int(Outcome.NO_CAMERA)
 _ONE_CAMERA = int(Outcome.ONE_CAMERA)
-_MISS, AMBIGUITY, OUTCOME = 3, 4, 5
+_MISS, AMBIGUITY, OUTCOME, _COUNT = 3, 4, 5, 6
+COLUMNS = 7
+"""Of what the kernels write: the shift, and these."""
 
 
 def invert_depth_maps(bundle: Bundle) -> Intersection:
@@ -75,7 +77,7 @@ def invert_depth_maps(bundle: Bundle) -> Intersection:
     The surface above each point is taken as a plane.
     """
     weights = bundle.views.weight
-    result = np.zeros((len(bundle.xyz), 6))
+    result = np.zeros((len(bundle.xyz), COLUMNS))
     with one_caller():
         _invert(
             *arrays_of(bundle),
@@ -104,14 +106,20 @@ def arrays_of(bundle: Bundle) -> tuple[Any, ...]:
 
 
 def intersection_of(bundle: Bundle, result: FloatArray) -> Intersection:
-    """Return the rows that the kernels wrote as a result; its `sigma_z_m` is the ambiguity."""
+    """Return the rows that the kernels wrote as a result; its `sigma_z_m` is the ambiguity.
+
+    The rays are those of the depth maps that count, averaged ones included.
+    """
     found = bundle.result(
         result[:, :3],
         outcome=result[:, OUTCOME].astype(np.uint8),
         ray_miss_m=result[:, _MISS],
     )
     moved = found.outcome == _CORRECTED
-    return found._replace(sigma_z_m=np.where(moved, result[:, AMBIGUITY], 0.0))
+    return found._replace(
+        sigma_z_m=np.where(moved, result[:, AMBIGUITY], 0.0),
+        ray_count=np.where(moved, result[:, _COUNT], 0).astype(np.int32),
+    )
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
@@ -278,7 +286,7 @@ def settle_bed(
         return
     row[0], row[1], row[2] = x / total, y / total, bed + step
     row[_MISS] = np.sqrt(max(squares / total - row[0] ** 2 - row[1] ** 2, 0.0))
-    row[OUTCOME] = _CORRECTED
+    row[OUTCOME], row[_COUNT] = _CORRECTED, count
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

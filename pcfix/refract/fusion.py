@@ -22,6 +22,7 @@ from numba import njit, prange
 from pcfix.refract.bed import WIDTH_M
 from pcfix.refract.depth_maps import (
     AMBIGUITY,
+    COLUMNS,
     arrays_of,
     averages,
     balance,
@@ -61,7 +62,7 @@ def invert_fusion(bundle: Bundle) -> Intersection:
     """
     bed = bundle.learned.bed
     around = np.full(len(bundle.xyz), np.nan) if bed is None else bed.height_at(bundle.xyz[:, :2])
-    result = np.zeros((len(bundle.xyz), 6))
+    result = np.zeros((len(bundle.xyz), COLUMNS))
     with one_caller():
         _invert(*arrays_of(bundle), around, result)
     return intersection_of(bundle, result)
