@@ -297,11 +297,12 @@ def test_known_maps_of_a_block_are_undone(name, most):
     assert rms(error) < 0.4 * rms(errors_gsd(name, method="snell", views=views))
 
 
-@pytest.mark.parametrize(("name", "most"), [("nadir", 3.4), ("half oblique", 13.0)])
+@pytest.mark.parametrize(("name", "most"), [("nadir", 3.0), ("half oblique", 9.0)])
 def test_maps_are_found_where_no_list_tells_them(name, most, monkeypatch):
     error = errors_gsd(name, method="consistent", camera_set="mvs")
-    assert rms(error) < most  # 2.7 and 10.1 GSD
-    assert abs(error.mean()) < 3.0  # 0.9 and 1.9
+    assert rms(error) < most  # 2.4 and 7.3 GSD
+    # 1.2 and 3.9: with fewer wild points the bias of the wrong groups shows
+    assert abs(error.mean()) < 4.5
     for choices in ({"camera_set": "mvs"}, {"camera_set": "all"}):
         assert rms(error) < 0.6 * rms(errors_gsd(name, method="snell", **choices))
     monkeypatch.setattr("pcfix.flow.learning.learn_bed", lambda *_: None)
@@ -351,10 +352,10 @@ def test_nothing_is_known_outside_and_where_no_group_is():
     assert found.height_at(xy).tolist()[:1] == [1.0]
     assert found.height_at(xy)[2:4].tolist() == [3.0, 4.0]
     assert np.isnan(found.height_at(xy)[[1, 4, 5, 6]]).all()
-    xyz = np.array([[0.0, 0, 0], [50, 0, 0]])
-    likely = np.array([[-1.0], [np.nan]], np.float32)
+    xyz = np.repeat([[0.0, 0, 0], [50, 0, 0]], 40, axis=0)
+    likely = np.repeat([[-1.0], [np.nan]], 40, axis=0).astype(np.float32)
     heights = bed_of(xyz, likely).height_at(xyz[:, :2])
-    assert heights[0] == -1.0 and np.isnan(heights[1])
+    assert (heights[:40] == -1.0).all() and np.isnan(heights[40:]).all()
 
 
 def test_points_without_a_bed_are_still_corrected():
