@@ -7,6 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.errors import SettingError
+from pcfix.flow.occlusion import (
+    NOISE_CLASSES,
+    OccluderBuilder,
+    occluder_of,
+    wants_occlusion,
+)
 from pcfix.label.labelling import Part
 from pcfix.label.surface import SurfaceAbove, is_submerged, surface_above
 from pcfix.refract.learned import Learned
@@ -85,12 +91,15 @@ class Learning:
             for xyz, heights, classes in chunks()
         )
         found = learn_regression(path, parts, self._settings)
-        self.notes += found.notes
+        again = "" if found.cv_rmse_m is None else f", cross-validated {found.cv_rmse_m:.3f} m"
+        self.notes += [
+            f"Regression: {found}; standard errors {found.intercept_se_m:.3f} m and"
+            f" {found.slope_se:.3f}, RMSE {found.rmse_m:.3f} m{again}.",
+            *found.notes,
+        ]
         return found
 
     def _occluder(self, chunks: Callable[[], Iterable[Points]]) -> Occluder | None:
-        from pcfix.flow.occlusion import OccluderBuilder, wants_occlusion
-
         listed = self._views is not None and self._settings.occlusion == "auto"
         if listed or not wants_occlusion(self._cameras, self._settings):
             return None  # listed cameras did see their points
@@ -132,9 +141,6 @@ FEWEST_BED_POINTS, MOST_BED_POINTS = 250_000, 1_000_000
 def _bed_points(view: CloudView) -> int:
     area_m2 = float(np.prod(np.maximum(np.subtract(view.high, view.low)[:2], 1.0)))
     return int(np.clip(BED_POINTS_A_M2 * area_m2, FEWEST_BED_POINTS, MOST_BED_POINTS))
-
-
-NOISE_CLASSES = (7, 18)
 
 
 def wants_matcher(settings: Settings, views: ViewKind | None) -> bool:
@@ -203,8 +209,6 @@ def learn_of_points(
         raise SettingError("method regression needs a regression; fit one of check depths first.")
     occluder = None
     if settings.occlusion == "on" or (settings.occlusion == "auto" and views is None):
-        from pcfix.flow.occlusion import occluder_of, wants_occlusion
-
         occluder = occluder_of(xyz) if wants_occlusion(cameras, settings) else None
     learned = Learned(regression=regression, occluder=occluder)
     kind = None if views is None else views.kind

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pcfix.refract.occlusion import Occluder
     from pcfix.settings import Settings
 
-WITHOUT = (7, 18)
+NOISE_CLASSES = (7, 18)
 """ASPRS classes of low and high noise, which hide nothing."""
 OBLIQUE_DEG = 15.0
 """An image whose axis is farther off the nadir is an oblique. The axes of stabilised nadir blocks
@@ -60,7 +60,7 @@ class OccluderBuilder:
             Apparent points, metres, world frame.
         classes : array, shape (n,), optional
         """
-        self._surface.add(xyz if classes is None else xyz[~np.isin(classes, WITHOUT)])
+        self._surface.add(xyz if classes is None else xyz[~np.isin(classes, NOISE_CLASSES)])
 
     def build(self) -> Occluder | None:
         """Return the surface; None where there was no point."""

@@ -4,7 +4,7 @@ For each image the others are scored by the places that both see: by the angle b
 rays, best at some 12 degrees, by their distances, as a finer image is compared badly with a
 coarser one, and by how much of the image the common places cover. This is the rule of
 OpenMVS (`Scene::SelectNeighborViews`); COLMAP's and those of other patch matchers differ in the
-constants. On a real block it finds 92 % of the partners from places of the dense cloud and 98 %
+constants. On a real block it finds 91 % of the partners from places of the dense cloud and 98 %
 from the tie points that the matcher itself went by.
 """
 
