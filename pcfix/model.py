@@ -339,6 +339,43 @@ class TiePoints:
     image_xy: FloatArray
 
 
+@dataclass(frozen=True, eq=False)
+class GroundControl:
+    """Surveyed points and where the images show them.
+
+    Attributes
+    ----------
+    names : tuple of str, length m
+    xyz : array, shape (m, 3)
+        Surveyed coordinates, metres, in `crs`.
+    sigma_m : array, shape (m, 3)
+        Their standard deviations along x, y, z.
+    is_check : array of bool, shape (m,)
+        Points that are held out of an adjustment, to check it.
+    under_water : array of bool, shape (m,)
+        Points of which the survey says that they lie under water.
+    point, camera : array of int, shape (o,)
+        Row of `names` and row of the cameras of each measurement in an image.
+    image_xy : array, shape (o, 2)
+        Where, in the unit of the lens, from the upper left corner of the image.
+    sigma_px : array, shape (o,)
+        Standard deviations of u and v.
+    crs : str or None
+        None where the source does not say.
+    """
+
+    names: tuple[str, ...]
+    xyz: FloatArray
+    sigma_m: FloatArray
+    is_check: BoolArray
+    under_water: BoolArray
+    point: IntArray
+    camera: IntArray
+    image_xy: FloatArray
+    sigma_px: FloatArray
+    crs: str | None = None
+
+
 class Outcome(IntEnum):
     """What became of a point, and why."""
 
@@ -347,11 +384,15 @@ class Outcome(IntEnum):
     NO_CAMERA = 2
     ONE_CAMERA = 3
     PARALLEL_RAYS = 4
+    NOT_CARRIED = 5
+    """Under water or not, it could not be taken from the old cameras to adjusted ones."""
 
 
 @dataclass(frozen=True, eq=False)
 class Correction:
     """The result for n points, one row per input point; zero on land.
+
+    Where the points were made with cameras that were adjusted since, land has a shift too.
 
     Attributes
     ----------
@@ -402,18 +443,29 @@ class Correction:
     def xyz(self) -> FloatArray:
         """True points, metres, world frame; land and uncorrected points as they came."""
         xyz = self.apparent_xyz.copy()
-        xyz[self.corrected] += self.shift_m[self.corrected]
+        xyz[self.moved] += self.shift_m[self.moved]
         return xyz
 
     @property
     def submerged(self) -> BoolArray:
         """Points below the water surface."""
-        return np.asarray(self.outcome != Outcome.LAND)
+        return np.asarray((self.outcome != Outcome.LAND) & (self.outcome != Outcome.NOT_CARRIED))
 
     @property
     def corrected(self) -> BoolArray:
-        """Points that were moved."""
+        """Points that refraction was taken out of."""
         return np.asarray(self.outcome == Outcome.CORRECTED)
+
+    @property
+    def uncorrected(self) -> BoolArray:
+        """Points that should have been moved and could not."""
+        return np.asarray(self.outcome > Outcome.CORRECTED)
+
+    @cached_property
+    def moved(self) -> BoolArray:
+        """Points with a shift: the corrected ones, and land that adjusted cameras took along."""
+        x, y, z = self.shift_m.T  # axis by axis: numpy is slow along the short one
+        return np.asarray(self.corrected | (x != 0.0) | (y != 0.0) | (z != 0.0))
 
 
 @dataclass(frozen=True)
@@ -443,6 +495,7 @@ class Summary:
     warnings: list[str] = field(default_factory=list)
     labelling: dict[str, Any] | None = None
     uncertainty: dict[str, Any] | None = None
+    carried: dict[str, Any] | None = None
 
     @property
     def points_per_s(self) -> float:
@@ -450,7 +503,12 @@ class Summary:
         return self.points / max(self.seconds, 1e-9)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON; `labelling` where it had rules."""
-        values = {name: value for name, value in vars(self).items() if name != "labelling"}
-        more = {} if self.labelling is None else {"labelling": self.labelling}
+        """Return plain values, ready for JSON.
+
+        `labelling` is there where it had rules, `carried` where the cloud was taken from old
+        cameras to adjusted ones.
+        """
+        some = ("labelling", "carried")
+        values = {name: value for name, value in vars(self).items() if name not in some}
+        more = {name: getattr(self, name) for name in some if getattr(self, name) is not None}
         return {**values, **more, "points_per_s": round(self.points_per_s)}

@@ -61,6 +61,7 @@ _CORRECT_OPTIONS: dict[str, tuple[type, ...]] = {
     "angles": (str,),
     "cameras_crs": (str,),
     "cameras_offset": (str,),
+    "adjusted_from": (str,),
     "views": (str,),
     "water_mask": (str,),
     "connected": (bool,),

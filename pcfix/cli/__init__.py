@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 import pcfix
+from pcfix.cli.adjust import adjust
 from pcfix.cli.cameras import cameras
 from pcfix.cli.clean import clean
 from pcfix.cli.compare import compare
@@ -30,7 +31,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 COMMANDS = (
-    run, correct, label, clean, dsm, compare, cameras, water, restore, simulate, pipeline,
+    run, correct, adjust, label, clean, dsm, compare, cameras, water, restore, simulate, pipeline,
 )  # fmt: skip
 for command in COMMANDS:
     app.command(no_args_is_help=True)(command)

@@ -14,11 +14,13 @@ from pcfix.cli.words import (
     Jobs,
     Output,
     Overwrite,
+    PortOption,
     Quiet,
     SummaryOption,
     Uncorrected,
     UncorrectedOption,
     WaterOption,
+    WaterUnlessPort,
     progress_bar,
 )
 
@@ -29,7 +31,8 @@ def correct(
     input: Input,
     output: Output,
     cameras: CamerasOption,
-    water: WaterOption,
+    water: WaterUnlessPort = None,
+    port: PortOption = None,
     uncorrected: UncorrectedOption = Uncorrected.withhold,
     dimensions: DimensionsOption = Dimensions.all,
     summary: SummaryOption = None,
@@ -38,6 +41,8 @@ def correct(
     jobs: Jobs = None,
 ) -> None:
     """Move the points below the water surface to where they are."""
+    if water is None and port is None:
+        raise typer.BadParameter("--water is needed, or --port for a cloud taken under water")
     from pcfix.report.text import summary_text
 
     with progress_bar("Correcting", quiet) as progress:
@@ -46,6 +51,7 @@ def correct(
             output,
             cameras=cameras,
             water=water,
+            port=port,
             **words.keywords(),
             uncorrected=uncorrected.value,
             dimensions=dimensions.value,

@@ -181,6 +181,13 @@ class LabelWords(WaterFitWords):
 class CorrectionWords(LabelWords, CameraWords):
     """How cameras are read, rays chosen, and points left out."""
 
+    adjusted_from: Annotated[
+        Path | None,
+        typer.Option(
+            help="The cameras that the cloud was made with, where --cameras are the same images"
+            " adjusted since: first the whole cloud, land too, is taken from those to these.",
+        ),
+    ] = None
     views: Annotated[
         Path | None,
         typer.Option(
@@ -314,6 +321,7 @@ class CorrectionWords(LabelWords, CameraWords):
             "least_pool_m2": label.least_pool_m2,
             "respect_classes": label.respect_classes,
             **super().keywords(),
+            "adjusted_from": self.adjusted_from,
             "views": self.views,
             "refractive_index": self.refractive_index(),
             "max_angle_deg": self.max_angle,

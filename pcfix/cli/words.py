@@ -112,12 +112,21 @@ CamerasOption = Annotated[
         " Bundler, VisualSFM, BlocksExchange, RealityCapture, or a CSV table.",
     ),
 ]
-WaterOption = Annotated[
-    str,
+_WATER = typer.Option(
+    "--water",
+    help="A level (0.37), plane:a,b,c, dim:NAME, a mesh (.obj, .ply), a raster (.tif),"
+    " shoreline points (.csv, .gpkg, .shp, .geojson, .wkt), or auto.",
+)
+WaterOption = Annotated[str, _WATER]
+WaterUnlessPort = Annotated[str | None, _WATER]
+PortOption = Annotated[
+    str | None,
     typer.Option(
-        "--water",
-        help="A level (0.37), plane:a,b,c, dim:NAME, a mesh (.obj, .ply), a raster (.tif),"
-        " shoreline points (.csv, .gpkg, .shp, .geojson, .wkt), or auto.",
+        "--port",
+        metavar="SPEC",
+        help="Instead of --water, for a cloud taken under water: the port of the cameras' housing,"
+        " flat:distance=M[,thickness=M,glass=N,nx=,ny=] or"
+        " dome:radius=M[,thickness=M,glass=N,x=M,y=M,z=M], seen from the projection centre.",
     ),
 ]
 UncorrectedOption = Annotated[

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, SettingError
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.points import CHUNK_POINTS
 from pcfix.flow.surfaces import view_of
@@ -19,11 +19,14 @@ from pcfix.io.las.source import LasSource, coordinates
 from pcfix.label.surface import surface_above
 from pcfix.model import WaterDimension
 from pcfix.refract.visibility import cameras_in_sight
+from pcfix.settings import DEFAULT_REFRACTIVE_INDEX
 
 if TYPE_CHECKING:
     from os import PathLike
 
-    from pcfix.model import Cameras, FloatArray, Lens
+    from pcfix.adjust.diagnosis import Diagnosis
+    from pcfix.flow.surfaces import CloudView
+    from pcfix.model import Cameras, FloatArray, Lens, WaterSurface
 
     AnyPath = str | PathLike[str]
 
@@ -117,6 +120,10 @@ class CamerasReport:
         Mean height of the water.
     problem : str
         Why `cameras` are not in a map and so have no heights; empty where they are.
+    diagnosis : Diagnosis or None
+        Whether the poses have absorbed the refraction; None without a cloud or water.
+    remedy : str
+        The command that mends them.
     """
 
     path: str
@@ -132,6 +139,8 @@ class CamerasReport:
     sample_xyz: FloatArray
     level_m: float | None
     problem: str = ""
+    diagnosis: Diagnosis | None = None
+    remedy: str = ""
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
@@ -149,6 +158,7 @@ class CamerasReport:
             "problem": self.problem,
             "gnss": None if self.gnss is None else asdict(self.gnss),
             "fit": fit,
+            "refraction": None if self.diagnosis is None else self.diagnosis.as_dict(),
             "notes": list(self.cameras.notes),
         }
 
@@ -158,6 +168,11 @@ def check_cameras(
     cloud: AnyPath | None = None,
     *,
     water: AnyPath | float | None = None,
+    gnss: AnyPath | None = None,
+    gcps: AnyPath | None = None,
+    lens: AnyPath | None = None,
+    reference: AnyPath | None = None,
+    refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
     plot: AnyPath | None = None,
     overwrite: bool = False,
     **words: Any,
@@ -171,7 +186,19 @@ def check_cameras(
     cloud : path, optional
         LAS or LAZ that was made from these images.
     water : float, str or path, optional
-        See `pcfix.read_water`; for the height above the water and the GSD there.
+        See `pcfix.read_water`; for the height above the water and the GSD there, and, with a
+        cloud, whether the poses have absorbed the refraction; see `pcfix.adjust.diagnosis`.
+    gnss : path, optional
+        See `pcfix.io.gnss_positions.read_gnss`; instead of what the camera file has.
+    gcps : path, optional
+        See `pcfix.io.ground_control.read_ground_control`.
+    lens : path, optional
+        The calibration of the camera: one of Metashape's, or a table as of `sensor`. Default: the
+        one that a file of Metashape says to have begun with.
+    reference : path, optional
+        A survey of land or bed: see `pcfix.io.references.read_reference`.
+    refractive_index : float
+        Of the water, relative to air.
     plot : path, optional
         PNG of the block in plan and from the side.
     overwrite : bool
@@ -188,8 +215,11 @@ def check_cameras(
     PcfixError
         If a file cannot be read, or the two CRS cannot be reconciled.
     """
+    evidence = (gnss, gcps, lens, reference)
     if plot is not None:
-        check_output(plot, overwrite=overwrite, inputs=[p for p in (path, cloud) if p is not None])
+        given = [p for p in (path, cloud, *evidence) if p is not None]
+        check_output(plot, overwrite=overwrite, inputs=given)
+    _check_enough(cloud, water, gcps, lens, reference)
     inputs = Inputs(path, 0.0 if water is None else water, **words)
     read = inputs.read()
     crs, xyz, heights = None, np.zeros((0, 3)), None
@@ -203,6 +233,18 @@ def check_cameras(
         cameras, problem = inputs.block(crs, read)[0], ""
     else:
         cameras, problem = _without_cloud(inputs, read)
+    if gnss is not None:
+        from pcfix.io.gnss_positions import read_gnss
+
+        cameras = read_gnss(gnss, cameras)
+    diagnosis, remedy = None, ""
+    if view is not None and surface is not None:
+        diagnosis = _diagnosis(
+            inputs, cameras, view, surface, refractive_index, gcps, lens, reference
+        )
+        from pcfix.flow.diagnosis import command_of
+
+        remedy = command_of(inputs, view.name, gnss=gnss, gcps=gcps, lens=lens)
     level = None
     if surface is not None and not (isinstance(surface, WaterDimension) and heights is None):
         at = cameras.centres if heights is None else xyz
@@ -215,6 +257,7 @@ def check_cameras(
         None if above is None else (float(above.min()), float(above.mean()), float(above.max())),
         None if problem else _tilt_deg(cameras), _gnss(cameras, str(path)),
         None if cloud is None else _fit(cameras, str(cloud), xyz, crs), xyz, level, problem,
+        diagnosis, remedy,
     )  # fmt: skip
     if plot is not None:
         from pcfix.report.cameras import block_figure
@@ -222,6 +265,46 @@ def check_cameras(
 
         write_bytes(plot, png_of(block_figure(report)), overwrite=overwrite)
     return report
+
+
+def _check_enough(
+    cloud: AnyPath | None, water: AnyPath | float | None,
+    gcps: AnyPath | None, lens: AnyPath | None, reference: AnyPath | None,
+) -> None:  # fmt: skip
+    """Refuse evidence on the refraction without the cloud and the water that it is about."""
+    for name, value in (("gcps", gcps), ("lens", lens), ("reference", reference)):
+        if value is not None and (cloud is None or water is None):
+            raise SettingError(
+                f"{name} {value}: tells whether the poses have absorbed the refraction; give cloud"
+                " and water too."
+            )
+
+
+def _diagnosis(
+    inputs: Inputs, cameras: Cameras, view: CloudView, water: WaterSurface,
+    refractive_index: float, gcps: AnyPath | None, lens: AnyPath | None,
+    reference: AnyPath | None,
+) -> Diagnosis:  # fmt: skip
+    """Look for all signs that the poses have absorbed the refraction."""
+    from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, ties_of
+    from pcfix.flow.survey_signs import Evidence
+    from pcfix.io.ground_control import read_ground_control
+    from pcfix.io.references import check_same_crs, read_reference
+
+    path = str(inputs.cameras)
+    survey = None if reference is None else read_reference(reference)
+    if survey is not None:
+        crs = None if isinstance(view.crs, str) else view.crs
+        check_same_crs(view.name, crs, survey.name, survey.crs)
+    control = None if gcps is None else read_ground_control(gcps, cameras)
+    focal = given_focal_lengths(path) if lens is None else focal_length_of(lens)
+    ties = ties_of(inputs, view.crs)
+    return diagnose(
+        Evidence(
+            cameras, path, water, refractive_index,
+            ties=ties, view=view, control=control, calibrated=focal, reference=survey,
+        )
+    )  # fmt: skip
 
 
 def _without_cloud(inputs: Inputs, read: Cameras) -> tuple[Cameras, str]:

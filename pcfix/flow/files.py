@@ -27,6 +27,7 @@ from pcfix.io.las.headers import corrected_header, corrected_identity, output_ev
 from pcfix.io.las.sink import LasSink, check_suffix
 from pcfix.io.las.source import LasSource, centring_steps, coordinates
 from pcfix.model import Cameras, Correction, Summary, WaterDimension, WaterSurface
+from pcfix.ports import port_of
 from pcfix.refract.index import index_of
 from pcfix.refract.threads import threads
 from pcfix.settings import (
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from pcfix.io.cameras.formats import Angles
     from pcfix.io.las.columns import Column
     from pcfix.model import FloatArray
+    from pcfix.ports import Port
     from pcfix.settings import CameraSet, MatcherKind, Method, Occlusion, ViewsAre
 
     AnyPath = str | PathLike[str]
@@ -61,11 +63,13 @@ def correct_file(
     output: AnyPath,
     *,
     cameras: Cameras | AnyPath,
-    water: WaterSurface | float | AnyPath,
+    water: WaterSurface | float | AnyPath | None = None,
+    port: Port | str | None = None,
     sensor: AnyPath | None = None,
     angles: Angles | None = None,
     cameras_crs: str | None = None,
     cameras_offset_m: tuple[float, float, float] | None = None,
+    adjusted_from: Cameras | AnyPath | None = None,
     views: AnyPath | None = None,
     water_model: WaterModel = "auto",
     water_crs: str | None = None,
@@ -105,6 +109,10 @@ def correct_file(
         See `pcfix.read_cameras`.
     water : WaterSurface, float, str or path
         See `pcfix.read_water`; besides, shoreline points in a vector file, or ``auto``.
+    port : Port or str
+        Instead of the water, for a cloud that was taken under water: the port of the cameras'
+        housing, as ``flat:distance=0.02,thickness=0.008``; see `pcfix.ports.port_of`. All points
+        count as under water. As no surface is known, ``WaterDepth`` is 0.001 m, the least.
     sensor, angles
         See `pcfix.read_cameras`.
     cameras_crs : str, optional
@@ -112,6 +120,12 @@ def correct_file(
         their file says, else the cloud's.
     cameras_offset_m : tuple of 3 float, optional
         Added to the projection centres, in the axes of their file.
+    adjusted_from : Cameras or path, optional
+        The cameras that the cloud was made with, where `cameras` are the same images adjusted
+        since: all points, land too, are first taken from those to these; see
+        `pcfix.flow.carrying`. `views` are theirs then. `cameras_crs` and `cameras_offset_m` count
+        for whichever of the two files does not say where it lies; see
+        `pcfix.flow.old_cameras.told_apart`.
     views : path, optional
         Which cameras made each point; see `pcfix.io.views.read_views`. The camera file itself
         stands for the tracks of its tie points. Default: every camera whose frame holds it.
@@ -172,6 +186,7 @@ def correct_file(
     inputs = Inputs(
         cameras, water, sensor, angles, cameras_crs, cameras_offset_m, views, water_mask,
         tide, image_times, water_model, water_crs, views_are, check_depths,
+        port_of(port) if isinstance(port, str) else port, adjusted_from,
     )  # fmt: skip
     given = [input, *inputs.paths()]
     target = check_output(output, overwrite=overwrite, inputs=given)
@@ -195,7 +210,14 @@ def job_for(
     view = view_of(path)
     with LasSource(path) as source:
         step = float(max(source.header.scales))
-    return Job(str(path), settings, inputs, view=view, step_m=step, label=label or LabelSettings())
+    label = label or LabelSettings()
+    if inputs.port is not None:
+        from pcfix.flow.port_job import PortJob
+
+        return PortJob(
+            str(path), settings, inputs, inputs.port, view=view, step_m=step, label=label
+        )
+    return Job(str(path), settings, inputs, view=view, step_m=step, label=label)
 
 
 def file_points(path: Path, water: WaterSurface, jobs: int | None = None) -> Iterator[Points]:
@@ -255,7 +277,7 @@ def _write(
                 new = shifted(points, header, moved + np.array(steps))
                 _mark(new, columns, correction, moved, job.settings)
                 if job.settings.uncorrected == "drop":
-                    new = new[~(correction.submerged & ~correction.corrected)]
+                    new = new[~correction.uncorrected]
                 sink.write(new)
                 if progress is not None:
                     progress(job.tally.points, len(source))
@@ -278,8 +300,8 @@ def _mark(
 ) -> None:
     """Fill the new dimensions, then set classes and flags."""
     withheld = np.asarray(new["withheld"]).astype(bool)
-    fill(new, columns, correction, moved, changed_rows(correction, withheld))
+    withhold = settings.uncorrected == "withhold"
+    fill(new, columns, correction, moved, changed_rows(correction, withheld, withhold=withhold))
     new.array["classification"][correction.corrected] = BATHYMETRIC_POINT
-    if settings.uncorrected == "withhold":
-        stuck = correction.submerged & ~correction.corrected
-        new["withheld"][:] = (withheld | stuck).astype(np.uint8)
+    if withhold:
+        new["withheld"][:] = (withheld | correction.uncorrected).astype(np.uint8)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from pcfix.io.views import ViewList
     from pcfix.label.mask import WaterMask
     from pcfix.model import FloatArray, TiePoints, WaterSurface
+    from pcfix.ports import Port
     from pcfix.settings import ViewsAre
 
     AnyPath = str | PathLike[str]
@@ -58,11 +59,17 @@ class Inputs:
         See `pcfix.io.tides.read_tide`: each image gets its own level, the water shifted along the
         vertical; the water is that of the images' mean level.
     image_times : path or None
-        See `pcfix.io.image_times.read_image_times`. Default, with a tide: the camera file.
+        See `pcfix.io.image_times.read_image_times`. Default, with a tide: the camera file, of
+        two the one that the cloud was made with.
+    port : Port or None
+        Of the housing of cameras under water, instead of `water`.
+    adjusted_from : Cameras, path or None
+        Which the cloud was made with, where `cameras` were adjusted since. Views, offset and CRS
+        are then told apart by `pcfix.flow.old_cameras`.
     """
 
     cameras: Cameras | AnyPath
-    water: WaterSurface | float | AnyPath
+    water: WaterSurface | float | AnyPath | None
     sensor: AnyPath | None = None
     angles: Angles | None = None
     cameras_crs: str | None = None
@@ -75,17 +82,34 @@ class Inputs:
     water_crs: str | None = None
     views_are: ViewsAre = "auto"
     check_depths: AnyPath | None = None
+    port: Port | None = None
+    adjusted_from: Cameras | AnyPath | None = None
+
+    def __post_init__(self) -> None:
+        """Check that the light bends somewhere, and at one place only."""
+        if self.water is None and self.port is None:
+            raise SettingError(
+                "water is missing: give the water surface, or the port of a cloud that was taken"
+                " under water."
+            )
+        if self.water is not None and self.port is not None:
+            raise SettingError(
+                "water and port exclude each other: a camera in a housing sees no water surface;"
+                " leave out the water for a cloud that was taken under water, else the port."
+            )
 
     def paths(self) -> list[AnyPath]:
         """Return what may be files, which no output may replace."""
         mask = None if self.water_mask is None else file_of(self.water_mask)
         water = file_of(self.water) if isinstance(self.water, str | PathLike) else None
-        given = (self.cameras, water, self.sensor, self.views, mask)
+        given = (self.cameras, water, self.sensor, self.views, mask, self.adjusted_from)
         moving = (self.tide, self.image_times, self.check_depths)
         return [one for one in (*given, *moving) if isinstance(one, str | PathLike)]
 
     def surface(self, view: CloudView | None = None) -> FoundSurface:
         """Return the water surface over a cloud; see `pcfix.flow.surfaces.find_surface`."""
+        if self.water is None:
+            raise SettingError("there is no water surface before a port.")
         return find_surface(WaterWords(self.water, self.water_model, self.water_crs), view)
 
     def level_offset_m(self, cameras: Cameras) -> FloatArray | None:
@@ -103,7 +127,8 @@ class Inputs:
         from pcfix.io.image_times import read_image_times
         from pcfix.io.tides import level_offsets, read_tide
 
-        given = self.cameras if self.image_times is None else self.image_times
+        own = self.cameras if self.adjusted_from is None else self.adjusted_from
+        given = own if self.image_times is None else self.image_times
         if isinstance(given, Cameras):
             raise SettingError("a tide needs image-times: when each image was taken.")
         times = read_image_times(given, cameras.labels)

@@ -11,8 +11,11 @@ import numpy as np
 
 import pcfix
 from pcfix.errors import GeometryError, PcfixWarning
+from pcfix.flow.carrying import Carrying
+from pcfix.flow.diagnosis import diagnose_in_passing
 from pcfix.flow.inputs import mask_of
 from pcfix.flow.learning import Learning
+from pcfix.flow.old_cameras import old_tie_points, read_blocks
 from pcfix.flow.points import (
     check_above_water,
     correct_checked,
@@ -29,13 +32,16 @@ from pcfix.report.tally import Tally
 from pcfix.settings import LabelSettings, Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Iterator
 
     import numpy.typing as npt
 
     from pcfix.flow.inputs import Inputs
+    from pcfix.flow.points import Label
     from pcfix.flow.surfaces import CloudView
-    from pcfix.model import FloatArray, ViewKind, Views, WaterSurface
+    from pcfix.io.views import ViewMatch
+    from pcfix.model import FloatArray, TiePoints, ViewKind, Views, WaterSurface
+    from pcfix.refract.made_with import MadeWith
 
     Points: TypeAlias = tuple[FloatArray, FloatArray | None, npt.NDArray[np.uint8]]
     """Some points: coordinates (n, 3), water heights where those are a dimension, classes."""
@@ -77,11 +83,13 @@ class Job:
         label: LabelSettings = PLAIN,
     ) -> None:
         self.name, self.settings = name, settings
-        self.cameras, self._list = inputs.block(view.crs)
+        self.cameras, self._list, self._listed, pair = read_blocks(inputs, view.crs)
+        self.carrying = None if pair is None else Carrying(pair)
         self.found = inputs.surface(view)
         self.water = self.found.surface
         self.level_offset_m = inputs.level_offset_m(self.cameras)
         self._points, self._step_m, self._crs = view.points, step_m, view.crs
+        self._view, self._bent = view, [""]
         check_above_water(self.cameras, self.water, self.level_offset_m)
         check_tilt(self.water)
         self._low, self._high = view.low, view.high
@@ -89,8 +97,9 @@ class Job:
         self.labelling = Labelling(label, mask)
         kind = None if self._list is None else self._list.kind
         self._learning = Learning(
-            settings, inputs, self.cameras, self.water, view, kind, self.level_offset_m
-        )
+            settings, inputs, self.cameras, self.water, view, kind, self.level_offset_m,
+            None if pair is None else self._old_ties,
+        )  # fmt: skip
         self.learned = Learned()
         self._inputs = inputs
         self._kind: ViewKind | None = None
@@ -102,21 +111,51 @@ class Job:
         self.tally = Tally(len(self.cameras))
         self.meeting = WaterMeeting(self.water)
         self.labelling.restart()
-        self._views = None
-        if self._list is not None:
-            from pcfix.io.views import ViewMatch
+        if self.carrying is not None:
+            self.carrying.restart()
+        self._views = self._view_match()
 
-            self._views = ViewMatch(
-                self._list, self.cameras, points=self._points, step_m=self._step_m
-            )
+    def _view_match(self) -> ViewMatch | None:
+        """Return the view list and the cloud from its first row on."""
+        if self._list is None:
+            return None
+        from pcfix.io.views import ViewMatch
+
+        return ViewMatch(self._list, self._listed, points=self._points, step_m=self._step_m)
 
     def look_around(self, chunks: Callable[[], Iterable[Points]]) -> None:
         """Learn what must be known of the whole cloud, before the first chunk is corrected."""
+        around = chunks if self.carrying is None else partial(self._carried, chunks, self.carrying)
         if self.labelling.looks_around:
             self.labelling.look_around(
-                lambda: parts_of(chunks(), self.water), self._low, self._high
+                lambda: parts_of(around(), self.water), self._low, self._high
             )
-        self.learned = self._learning.of_cloud(chunks)
+        came = None if self.carrying is None else partial(self._came, chunks, self.carrying)
+        self.learned = self._learning.of_cloud(around, came)
+
+    def _carried(
+        self, chunks: Callable[[], Iterable[Points]], carrying: Carrying
+    ) -> Iterator[Points]:
+        """Yield the whole cloud as it lies with the adjusted cameras."""
+        match, row = self._view_match(), 0
+        for xyz, heights, classes in chunks():
+            listed = None if match is None else match.for_chunk(xyz, row)
+            yield carrying.step(xyz, listed).xyz, heights, classes
+            row += len(xyz)
+
+    def _came(
+        self, chunks: Callable[[], Iterable[Points]], carrying: Carrying
+    ) -> Iterator[MadeWith]:
+        """Yield what made the points of the whole cloud."""
+        for xyz, _, _ in chunks():
+            yield carrying.made_with(xyz)
+
+    def _old_ties(self) -> TiePoints | None:
+        """Return the tie points of the old model, else those of the adjusted one taken back."""
+        if self.carrying is None:
+            return None
+        ties, are_old = old_tie_points(self._inputs, self.carrying.pair, self._crs)
+        return ties if ties is None or are_old else self.carrying.of_new_ties(ties)
 
     def correct(
         self, xyz: FloatArray, heights: FloatArray | None, classes: npt.NDArray[np.uint8]
@@ -132,21 +171,34 @@ class Job:
         classes : array, shape (n,)
             That the points come with.
         """
-        views = self._views_of(xyz, heights)
-        label = partial(self.labelling.submerged, classes=classes)
+        views = None if self._views is None else self._views.for_chunk(xyz, self.tally.points)
+        label: Label = partial(self.labelling.submerged, classes=classes)
+        step, made_with = None, None
+        if self.carrying is not None:
+            step, made_with = self.carrying.step(xyz, views), self.carrying.made_with(xyz)
+            xyz, views, label = step.xyz, step.views, step.rule(label)
+        views = self._of_kind(views, xyz, heights, made_with)
         correction = correct_checked(
             xyz, self.cameras, self.water, self.settings, heights, views, label,
-            self.level_offset_m, self.learned, self._level_sigma_m,
+            self.level_offset_m, self.learned, self._level_sigma_m, made_with,
         )  # fmt: skip
+        if self.carrying is not None and step is not None:
+            correction = step.whole(correction)
+            self.carrying.add(step, correction)
         self.tally.add(xyz, correction)
         self.meeting.add(xyz, correction)
         return correction
 
-    def _views_of(self, xyz: FloatArray, heights: FloatArray | None) -> Views | None:
-        """Return the views of the next chunk; the first one tells what the list lists."""
-        if self._views is None:
+    def _of_kind(
+        self,
+        views: Views | None,
+        xyz: FloatArray,
+        heights: FloatArray | None,
+        made_with: MadeWith | None,
+    ) -> Views | None:
+        """Return the views of a chunk as what they are; the first one tells what the list lists."""
+        if views is None:
             return None
-        views = self._views.for_chunk(xyz, self.tally.points)
         if self.learned.matcher is None or self._inputs.views_are != "auto":
             return views
         if self._kind is None:
@@ -154,7 +206,7 @@ class Job:
             above = surface_above(self.water, xyz[rows], None if heights is None else heights[rows])
             found = kind_of_views(
                 xyz[rows], above, self.water, self.cameras, self.settings, views.take(rows),
-                self.learned,
+                self.learned, None if made_with is None else made_with.take(rows),
             )  # fmt: skip
             self._kind = views.kind if found is None else found.kind
             self._kind_notes = [] if found is None else [str(found)]
@@ -183,6 +235,7 @@ class Job:
             "cameras_source": self.cameras.source,
             "views": None if self._list is None else str(self._list.raw.path),
             **self._labelling_words(),
+            **({} if self.carrying is None else self.carrying.words()),
         }
 
     def _water_words(self) -> str:
@@ -211,10 +264,9 @@ class Job:
             If no point lies below the water, or no camera sees one that does.
         """
         tally = self.tally
-        if self._views is not None:
-            self._views.report.check()
-            for sentence in self._views.report.warnings():
-                warnings.warn(sentence, PcfixWarning, stacklevel=2)
+        self._check_views()
+        if self.carrying is not None:
+            self.carrying.check(self.name)
         self.labelling.check(self.name)
         self.meeting.check_submerged(self.name)
         if isinstance(self.water, WaterDimension):
@@ -231,6 +283,19 @@ class Job:
                 f" {tally.submerged:,} submerged points; check that cameras and cloud have the"
                 " same CRS, and that pitch 0 means straight down." + self._likely_mistake()
             )
+        self._bent = [
+            diagnose_in_passing(
+                self._inputs, self.cameras, self.water, self.settings.refractive_index, self._view
+            )
+        ]
+
+    def _check_views(self) -> None:
+        """Refuse views that do not belong to the cloud, and warn of those that hardly do."""
+        if self._views is None:
+            return
+        self._views.report.check()
+        for sentence in self._views.report.warnings():
+            warnings.warn(sentence, PcfixWarning, stacklevel=3)
 
     def _likely_mistake(self) -> str:
         """Return what is likely wrong with cameras that do not see the cloud, as a sentence."""
@@ -240,6 +305,31 @@ class Job:
 
     def summary(self, input: str, output: str, seconds: float) -> Summary:
         """Return the numbers of all chunks."""
+        notes = [
+            *self.labelling.notes,
+            *self._learning.notes,
+            *self._kind_notes,
+            *self.found.notes,
+            *self.meeting.notes,
+            *filter(None, self._bent),
+        ]
+        return self._summary(
+            input,
+            output,
+            seconds,
+            depth_m=self.tally.depth_m(),
+            water=self._water_words(),
+            settings=asdict(self.settings),
+            notes=notes,
+            water_fit=self.found.as_dict(),
+            uncertainty=self.tally.uncertainty(),
+            carried=None if self.carrying is None else self.carrying.as_dict(),
+        )
+
+    def _summary(
+        self, input: str, output: str, seconds: float, *, notes: list[str], **more: Any
+    ) -> Summary:
+        """Return what every kind of correction tells of its chunks, and some more."""
         tally = self.tally
         unused = [
             label
@@ -247,6 +337,7 @@ class Job:
             if not used
         ]
         uncorrected = tally.uncorrected()
+        stuck = sum(uncorrected.values()) + int(tally.outcomes[Outcome.NOT_CARRIED])
         views = None if self._views is None else self._views.report
         return Summary(
             input=input,
@@ -256,30 +347,22 @@ class Job:
             submerged=tally.submerged,
             corrected=tally.corrected,
             uncorrected=uncorrected,
-            dropped=sum(uncorrected.values()) if self.settings.uncorrected == "drop" else 0,
+            dropped=stuck if self.settings.uncorrected == "drop" else 0,
             water_unknown=tally.water_unknown,
-            depth_m=tally.depth_m(),
             shift_z_m=tally.shift_z_m(),
             rays=tally.rays,
             cameras=len(self.cameras),
             cameras_used=len(self.cameras) - len(unused),
             cameras_unused=unused,
-            water=self._water_words(),
-            settings=asdict(self.settings),
             seconds=round(seconds, 3),
             views=None if views is None else views.as_dict(),
             warnings=[
                 *self.cameras.notes,
                 *([] if views is None else views.warnings()),
-                *self.labelling.notes,
-                *self._learning.notes,
-                *self._kind_notes,
-                *self.found.notes,
-                *self.meeting.notes,
+                *notes,
             ],
             labelling=self.labelling.report(),
-            water_fit=self.found.as_dict(),
-            uncertainty=tally.uncertainty(),
+            **more,
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import repeat
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +17,7 @@ from pcfix.flow.occlusion import (
 from pcfix.label.labelling import Part
 from pcfix.label.surface import SurfaceAbove, is_submerged, surface_above
 from pcfix.refract.learned import Learned
+from pcfix.refract.made_with import MadeWith
 from pcfix.refract.matcher import matcher_of, matcher_of_ties, places_for
 from pcfix.refract.methods import learn_bed
 
@@ -47,6 +49,9 @@ class Learning:
         Of which kind the view list is, if there is one.
     level_offset_m : array, shape (k,), or None
         How much higher the water stood at each image.
+    ties : callable, optional
+        Returns the tie points of the block, of the cameras that made the cloud. Default: those of
+        the camera file.
 
     Raises
     ------
@@ -63,7 +68,9 @@ class Learning:
         view: CloudView,
         views: ViewKind | None,
         level_offset_m: FloatArray | None,
+        ties: Callable[[], TiePoints | None] | None = None,
     ) -> None:
+        self._ties = ties or (lambda: inputs.tie_points(view.crs))
         self._settings, self._inputs, self._cameras = settings, inputs, cameras
         self._water, self._view, self._views = water, view, views
         self._level_offset_m = level_offset_m
@@ -75,10 +82,17 @@ class Learning:
                 " are of no use without it; give both, or neither."
             )
 
-    def of_cloud(self, chunks: Callable[[], Iterable[Points]]) -> Learned:
-        """Return what is learned of the whole cloud, whose chunks may be asked for again."""
+    def of_cloud(
+        self,
+        chunks: Callable[[], Iterable[Points]],
+        came: Callable[[], Iterable[MadeWith]] | None = None,
+    ) -> Learned:
+        """Return what is learned of the whole cloud, whose chunks may be asked for again.
+
+        And, chunk by chunk, what made the points, where that are not these cameras.
+        """
         learned = Learned(regression=self._regression(chunks), occluder=self._occluder(chunks))
-        return self._with_matcher(learned, chunks)
+        return self._with_matcher(learned, chunks, came)
 
     def _regression(self, chunks: Callable[[], Iterable[Points]]) -> DepthRegression | None:
         path = self._inputs.check_depths
@@ -108,29 +122,39 @@ class Learning:
             builder.add(xyz, classes)
         return builder.build()
 
-    def _with_matcher(self, learned: Learned, chunks: Callable[[], Iterable[Points]]) -> Learned:
+    def _with_matcher(
+        self,
+        learned: Learned,
+        chunks: Callable[[], Iterable[Points]],
+        came: Callable[[], Iterable[MadeWith]] | None,
+    ) -> Learned:
         """Add the model of the matcher, by the tie points where the camera file has some."""
         if not wants_matcher(self._settings, self._views):
             return learned
         step = max(1, self._view.points // _bed_points(self._view))
         taken: list[tuple[FloatArray, SurfaceAbove]] = []
+        made: list[MadeWith] = []
         done = 0
-        for xyz, heights, classes in chunks():
+        makers = repeat(None) if came is None else came()
+        for (xyz, heights, classes), made_with in zip(chunks(), makers, strict=False):
             rows = np.arange(-done % step, len(xyz), step)
             rows = rows[~np.isin(classes[rows], NOISE_CLASSES)]
             above = surface_above(
                 self._water, xyz[rows], None if heights is None else heights[rows]
             )
             taken.append((xyz[rows], above))
+            if made_with is not None:
+                made.append(made_with.take(rows))
             done += len(xyz)
         xyz = np.vstack([one for one, _ in taken])
         above = SurfaceAbove(
             np.concatenate([one.height_m for _, one in taken]),
             np.vstack([one.slope for _, one in taken]),
         )
-        ties = self._inputs.tie_points(self._view.crs)
+        ties = self._ties()
         some = (self._cameras, self._water, self._settings, self._level_offset_m)
-        return with_matcher(learned, xyz, above, *some, self._views, ties)
+        maker = MadeWith(np.vstack([one.xyz for one in made]), made[0].cameras) if made else None
+        return with_matcher(learned, xyz, above, *some, self._views, ties, maker)
 
 
 BED_POINTS_A_M2 = 5.0
@@ -160,6 +184,7 @@ def with_matcher(
     level_offset_m: FloatArray | None,
     views: ViewKind | None,
     ties: TiePoints | None = None,
+    made_with: MadeWith | None = None,
 ) -> Learned:
     """Add the model of the matcher to what was learned, and the bed where no list is given.
 
@@ -171,19 +196,23 @@ def with_matcher(
         Of which kind the view list is, if there is one.
     ties : TiePoints, optional
         Of the block; else the points of the cloud tell what the images have in common.
+    made_with : MadeWith, optional
+        What made the points, where that are not these cameras; the tie points are theirs.
     """
+    places, matched = made_with or (xyz, cameras)
     if ties is not None:
-        matcher = matcher_of_ties(cameras, ties)
+        matcher = matcher_of_ties(matched, ties)
     else:
-        step = max(1, len(xyz) // places_for(cameras))
-        matcher = matcher_of(cameras, np.ascontiguousarray(xyz[::step]))
+        step = max(1, len(xyz) // places_for(matched))
+        matcher = matcher_of(matched, np.ascontiguousarray(places[::step]))
     learned = learned._replace(matcher=matcher)
     fuses = settings.method == "consistent" and settings.matcher == "depth-maps"
     rows = np.flatnonzero(is_submerged(xyz[:, 2], surface))
     if views is not None or not fuses or not len(rows):
         return learned
     above = SurfaceAbove(surface.height_m[rows], surface.slope[rows])
-    bed = learn_bed(xyz[rows], above, water, cameras, settings, level_offset_m, learned)
+    made = None if made_with is None else made_with.take(rows)
+    bed = learn_bed(xyz[rows], above, water, cameras, settings, level_offset_m, learned, made)
     return learned._replace(bed=bed)
 
 
@@ -196,6 +225,7 @@ def learn_of_points(
     regression: DepthRegression | None,
     views: Views | None,
     level_offset_m: FloatArray | None,
+    made_with: MadeWith | None = None,
 ) -> Learned:
     """Return what is learned where these points, shape (n, 3), are the whole cloud.
 
@@ -214,7 +244,8 @@ def learn_of_points(
     kind = None if views is None else views.kind
     if not wants_matcher(settings, kind):
         return learned
-    return with_matcher(learned, xyz, surface, cameras, water, settings, level_offset_m, kind)
+    some = (cameras, water, settings, level_offset_m, kind)
+    return with_matcher(learned, xyz, surface, *some, made_with=made_with)
 
 
 def check_method(settings: Settings, cameras: Cameras) -> None:

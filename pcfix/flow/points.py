@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
+from pcfix.flow.carrying import Carrying
 from pcfix.flow.learning import learn_of_points
+from pcfix.flow.old_cameras import paired
 from pcfix.io.water import read_water
 from pcfix.label.surface import SurfaceAbove, is_submerged, surface_above
 from pcfix.model import (
@@ -20,7 +22,8 @@ from pcfix.model import (
     WaterRaster,
     WaterSurface,
 )
-from pcfix.refract.methods import correct
+from pcfix.refract.made_with import MadeWith
+from pcfix.refract.methods import correct, shift_of_land
 from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, ErrorBudget, Settings
 
 if TYPE_CHECKING:
@@ -58,6 +61,7 @@ def correct_points(
     views: Views | None = None,
     may_be_submerged: npt.ArrayLike | None = None,
     level_offset_m: npt.ArrayLike | None = None,
+    adjusted_from: Cameras | None = None,
 ) -> Correction:
     """Correct apparent points for refraction at the water surface.
 
@@ -95,7 +99,8 @@ def correct_points(
     errors : ErrorBudget, optional
         From which the standard errors follow. Default: `pcfix.ErrorBudget` as it is.
     views : Views, optional
-        Which cameras made each point. Default: as `camera_set` says.
+        Which cameras made each point, rows of `adjusted_from` where that is given, else of
+        `cameras`. Default: as `camera_set` says.
     may_be_submerged : array of bool, shape (n,), optional
         The other points are land, even below the surface; `pcfix.flow.label.label_points` finds
         them. Default: all.
@@ -103,6 +108,10 @@ def correct_points(
         How much higher than `water` the surface stood when each camera took its image, as
         `pcfix.io.tides.level_offsets` finds it. Each ray bends at its own surface; which points
         are submerged, and how deep, goes by `water`. Default: zero.
+    adjusted_from : Cameras, optional
+        Those that the points were made with, in the same frame, where `cameras` are the same
+        images (matched by their labels) adjusted since. All points, land too, are first taken
+        from those to these; see `pcfix.flow.carrying`.
 
     Returns
     -------
@@ -144,13 +153,23 @@ def correct_points(
     offset = None if level_offset_m is None else _offsets(level_offset_m, len(cameras))
     check_above_water(cameras, surface, offset)
     if views is not None:
-        _check_views(views, len(points), len(cameras))
+        _check_views(views, len(points), len(adjusted_from or cameras))
     label = None if may_be_submerged is None else _only(may_be_submerged, len(points))
+    step, made_with = None, None
+    if adjusted_from is not None:
+        pair = paired(adjusted_from, cameras)
+        step = Carrying(pair).step(points, views)
+        made_with = MadeWith(points, pair.old)
+        points, views, label = step.xyz, step.views, step.rule(label)
     above = surface_above(surface, points, dimension)
-    learned = learn_of_points(points, above, cameras, surface, settings, regression, views, offset)
-    return correct_checked(
-        points, cameras, surface, settings, dimension, views, label, offset, learned
+    learned = learn_of_points(
+        points, above, cameras, surface, settings, regression, views, offset, made_with
     )
+    found = correct_checked(
+        points, cameras, surface, settings, dimension, views, label, offset, learned,
+        made_with=made_with,
+    )  # fmt: skip
+    return found if step is None else step.whole(found)
 
 
 def _offsets(level_offset_m: npt.ArrayLike, k: int) -> FloatArray:
@@ -231,6 +250,7 @@ def correct_checked(
     level_offset_m: FloatArray | None = None,
     learned: Learned | None = None,
     level_sigma_m: Callable[[FloatArray], FloatArray | None] | None = None,
+    made_with: MadeWith | None = None,
 ) -> Correction:
     """Label, refract, and spread the result over all rows: what every door runs."""
     surface = surface_above(water, xyz, dimension)
@@ -239,9 +259,11 @@ def correct_checked(
     above = SurfaceAbove(surface.height_m[rows], surface.slope[rows])
     mine = None if views is None else views.take(rows)
     sigma = None if level_sigma_m is None else level_sigma_m(xyz[rows, :2])
+    made = None if made_with is None else made_with.take(rows)
     found = correct(
-        xyz[rows], above, water, cameras, settings, mine, level_offset_m, learned, sigma
+        xyz[rows], above, water, cameras, settings, mine, level_offset_m, learned, sigma, made
     )
+    land = _land_shift(xyz, submerged, cameras, settings, views, learned, made_with)
     shift_x, shift_y, shift_z = found.shift_m.T
     rise = above.slope[:, 0] * shift_x + above.slope[:, 1] * shift_y
 
@@ -253,7 +275,7 @@ def correct_checked(
     known = np.isfinite(surface.height_m)
     return Correction(
         apparent_xyz=xyz,
-        shift_m=spread(found.shift_m),
+        shift_m=spread(found.shift_m) + land,
         outcome=spread(found.outcome),
         ray_count=spread(found.ray_count),
         ray_miss_m=spread(found.ray_miss_m),
@@ -265,6 +287,25 @@ def correct_checked(
         covariance_m2=None if found.covariance_m2 is None else spread(found.covariance_m2),
         lowest_water_m=float(surface.height_m[known].min()) if known.any() else np.inf,
     )
+
+
+def _land_shift(
+    xyz: FloatArray,
+    submerged: BoolArray,
+    cameras: Cameras,
+    settings: Settings,
+    views: Views | None,
+    learned: Learned | None,
+    made_with: MadeWith | None,
+) -> FloatArray | float:
+    """Return the shift of points made with other cameras, shape (n, 3), zero where submerged."""
+    if made_with is None:
+        return 0.0
+    shift = np.zeros((len(xyz), 3))
+    rows = np.flatnonzero(~submerged)
+    mine = None if views is None else views.take(rows)
+    shift[rows] = shift_of_land(xyz[rows], cameras, settings, mine, learned, made_with.take(rows))
+    return shift
 
 
 def check_above_water(

@@ -137,10 +137,18 @@ def _read(path: Path) -> tuple[Maps, FloatArray]:
 
 
 def _lead(s: Summary) -> str:
+    mean = s.shift_z_m["mean"]
+    way = "higher" if mean > 0.0 else "deeper"
+    land = ""
+    if s.carried is not None:
+        land = (
+            f" First the whole cloud, land too, was taken from the cameras that made it to the"
+            f" adjusted ones, which moved it by {s.carried['shift_m']['rms']:.2f} m (rms)."
+        )
     return (
         f"{s.corrected:,} of {s.points:,} points lay under water and were moved to where the bed"
-        f" is: {-s.shift_z_m['mean']:.2f} m deeper on average, down to a depth of"
-        f" {s.depth_m['max']:.2f} m."
+        f" is: {abs(mean):.2f} m {way} on average, down to a depth of"
+        f" {s.depth_m['max']:.2f} m.{land}"
     )
 
 

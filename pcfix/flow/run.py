@@ -15,6 +15,7 @@ from pcfix.flow.compare import compare_clouds
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.files import correct_file
 from pcfix.flow.inputs import Inputs, file_of
+from pcfix.flow.old_cameras import read_blocks
 from pcfix.flow.report import write_report
 from pcfix.flow.steps import Record, read_record
 from pcfix.flow.surfaces import view_of
@@ -64,10 +65,10 @@ class Request:
 
     Attributes
     ----------
-    input, cameras, water, sensor, angles, cameras_crs, cameras_offset_m, views, water_mask,
-    tide, image_times, water_model, water_crs, connected, least_pool_m2, respect_classes,
-    refractive_index, max_angle_deg, max_cameras, method, camera_set, matcher, views_are, occlusion,
-    depth_factor, check_depths, least_r2
+    input, cameras, water, sensor, angles, cameras_crs, cameras_offset_m, adjusted_from, views,
+    water_mask, tide, image_times, water_model, water_crs, connected, least_pool_m2,
+    respect_classes, refractive_index, max_angle_deg, max_cameras, method, camera_set, matcher,
+    views_are, occlusion, depth_factor, check_depths, least_r2
         See `pcfix.correct_file`; files by their paths.
     errors : dict or None
         The values of an `pcfix.ErrorBudget`.
@@ -86,6 +87,7 @@ class Request:
     angles: Angles | None = None
     cameras_crs: str | None = None
     cameras_offset_m: tuple[float, float, float] | None = None
+    adjusted_from: str | None = None
     views: str | None = None
     water_mask: str | None = None
     tide: str | None = None
@@ -132,8 +134,9 @@ class Request:
         return ErrorBudget(**given)
 
     def inputs(self) -> dict[str, Any]:
-        """Return what `pcfix.flow.inputs.Inputs` takes."""
-        return {field.name: getattr(self, field.name) for field in fields(Inputs)}
+        """Return what `pcfix.flow.inputs.Inputs` takes; a run is about a water surface, no port."""
+        names = [field.name for field in fields(Inputs) if field.name != "port"]
+        return {name: getattr(self, name) for name in names}
 
     def label(self) -> LabelSettings:
         """Return the rules by which points are left out."""
@@ -147,7 +150,7 @@ class Request:
         """Return the input files, each of which exists."""
         mask = None if self.water_mask is None else str(file_of(self.water_mask))
         names = [self.input, self.cameras, self.sensor, self.views, mask, self.reference]
-        names += [self.tide, self.image_times, self.check_depths]
+        names += [self.tide, self.image_times, self.check_depths, self.adjusted_from]
         found = [path for name in names if name is not None for path in files_in(name)]
         return [*found, Path(self.water)] if Path(self.water).is_file() else found
 
@@ -356,7 +359,7 @@ def _report(
         with LasSource(files.corrected) as source:
             water = own_water(source)
         view = view_of(files.corrected)
-        cameras, _ = inputs_again.block(view.crs)
+        cameras = read_blocks(inputs_again, view.crs).cameras
     page = write_report(
         files.corrected,
         files.folder,

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from pcfix.label.surface import SurfaceAbove
     from pcfix.model import Cameras, FloatArray, IntArray, WaterSurface
     from pcfix.refract.learned import Learned
+    from pcfix.refract.made_with import MadeWith
     from pcfix.settings import Settings
 
 PATCHES, PATCH_POINTS = 300, 12
@@ -52,12 +53,13 @@ def kind_of_views(
     settings: Settings,
     views: Views,
     learned: Learned,
+    made_with: MadeWith | None = None,
 ) -> KindFound | None:
     """Return which kind of list gives the smoother bed; None where there are too few points.
 
     Parameters
     ----------
-    xyz, surface, water, cameras, settings, views, learned
+    xyz, surface, water, cameras, settings, views, learned, made_with
         As of `pcfix.refract.methods.correct`; submerged points.
     """
     listed = np.flatnonzero(np.diff(views.start) >= 2)
@@ -68,10 +70,13 @@ def kind_of_views(
     place = place.reshape(patch.shape)
     above = type(surface)(surface.height_m[rows], surface.slope[rows])
     some = views.take(rows)
+    made = None if made_with is None else made_with.take(rows)
     scatter = []
     for kind in ("tracks", "depth-maps"):
         as_kind = Views(some.start, some.camera, some.weight, kind)
-        found = correct(xyz[rows], above, water, cameras, settings, as_kind, None, learned)
+        found = correct(
+            xyz[rows], above, water, cameras, settings, as_kind, None, learned, made_with=made
+        )
         true = np.where(
             (found.outcome == Outcome.CORRECTED)[:, None], xyz[rows] + found.shift_m, np.nan
         )

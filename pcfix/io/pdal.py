@@ -17,6 +17,7 @@ from pcfix.io.las.columns import (
     changed_rows,
     column_scale,
     in_steps,
+    rows_of,
     shift_steps,
 )
 
@@ -106,16 +107,17 @@ class Results:
         moved = shift_steps(correction, scales)
         for i, axis in enumerate("XYZ"):
             # land keeps its bits, negative zero included
-            out[axis][rows][correction.corrected] += moved[correction.corrected, i] * scales[i]
-        changed = changed_rows(correction, self._flags.withheld[rows])
+            out[axis][rows][correction.moved] += moved[correction.moved, i] * scales[i]
+        changed = changed_rows(correction, self._flags.withheld[rows], withhold=withhold)
         for column in self._columns:
-            values = in_steps(column, correction, moved, classes, changed)
-            out[column.name][rows][changed] = values * column_scale(column, scales)
+            mine = rows_of(column, correction, changed)
+            values = in_steps(column, correction, moved, classes, mine)
+            out[column.name][rows][mine] = values * column_scale(column, scales)
         out["Classification"][rows][correction.corrected] = BATHYMETRIC_POINT
         if OUTCOME in out:
             out[OUTCOME][rows] = correction.outcome
         if withhold:
-            self._flags.withheld[rows] |= correction.submerged & ~correction.corrected
+            self._flags.withheld[rows] |= correction.uncorrected
 
     @property
     def dimensions(self) -> Dimensions:

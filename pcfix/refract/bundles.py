@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from pcfix.label.surface import SurfaceAbove
     from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Views, WaterSurface
     from pcfix.refract.learned import Learned
+    from pcfix.refract.made_with import MadeWith
     from pcfix.settings import Settings
 
 
@@ -35,6 +36,8 @@ class Bundle(NamedTuple):
     level_offset_m : array, shape (k,)
         How much higher the water stood for each camera.
     learned : Learned
+    made_with : MadeWith or None
+        Where a dense matcher had other cameras than these, and the points elsewhere.
     """
 
     xyz: FloatArray
@@ -45,6 +48,7 @@ class Bundle(NamedTuple):
     settings: Settings
     level_offset_m: FloatArray
     learned: Learned
+    made_with: MadeWith | None = None
 
     @property
     def counts(self) -> IntArray:

@@ -24,7 +24,7 @@ A level bed will do: a slope of it moves the Q_i and the directions a_ij nearly 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -32,6 +32,7 @@ from numba import njit, prange
 from pcfix.model import Outcome
 from pcfix.refract.backward import light_path
 from pcfix.refract.frames import holds
+from pcfix.refract.made_with import Images, as_made, as_now, images_of
 from pcfix.refract.matcher import Matcher
 from pcfix.refract.rays import refracted
 from pcfix.refract.threads import one_caller
@@ -87,17 +88,61 @@ def invert_depth_maps(bundle: Bundle) -> Intersection:
     return intersection_of(bundle, result)
 
 
+class Sight(NamedTuple):
+    """What the k images have of one apparent point, for kernels.
+
+    Attributes
+    ----------
+    up : array, shape (k, 3)
+        From the point to the projection centres, metres, world frame.
+    made : array, shape (k, 3)
+        The same as the matcher had them, and the point; `up` itself where it is not corrected with
+        other cameras.
+    above : array, shape (k,)
+        Height of the water of each image over the point, along the normal, metres.
+    normal : array, shape (3,)
+        Of the water, upward.
+    images : Images
+    matcher : Matcher
+    n : float
+        Refractive index.
+    """
+
+    up: FloatArray
+    made: FloatArray
+    above: FloatArray
+    normal: FloatArray
+    images: Images
+    matcher: Matcher
+    n: float
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def sight_of(
+    point: FloatArray, made_point: FloatArray, centres: FloatArray, height: float,
+    normal: FloatArray, offset: FloatArray, images: Images, matcher: Matcher, n: float,
+) -> Sight:  # fmt: skip
+    """Return what the images have of a point, shape (3,), with the water above it."""
+    up = centres - point
+    made = images.centres - made_point if len(images.centres) else up
+    above = normal[2] * (height - point[2] + offset)
+    return Sight(up, made, above, normal, images, matcher, n)
+
+
 def arrays_of(bundle: Bundle) -> tuple[Any, ...]:
     """Return what the kernels take of a bundle."""
     matcher = bundle.learned.matcher
     if matcher is None:
         raise ValueError("a model of the matcher is needed")
+    made_xyz = bundle.xyz if bundle.made_with is None else bundle.made_with.xyz
     return (
         np.ascontiguousarray(bundle.xyz),
+        np.ascontiguousarray(made_xyz),
         np.ascontiguousarray(bundle.surface.height_m),
         bundle.normals(),
         np.ascontiguousarray(bundle.cameras.centres),
         bundle.level_offset_m,
+        images_of(bundle.made_with, bundle.cameras),
         *matcher,
         bundle.views.start,
         np.asarray(bundle.views.camera, np.int64),
@@ -124,10 +169,10 @@ def intersection_of(bundle: Bundle, result: FloatArray) -> Intersection:
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _invert(
-    xyz: FloatArray, height: FloatArray, normals: FloatArray, centres: FloatArray,
-    offset: FloatArray, matched: IntArray, averaged: IntArray, fused: IntArray,
-    focal_px: FloatArray, inner: Frames, tolerance: float, start: IntArray, camera: IntArray,
-    n: float,
+    xyz: FloatArray, made_xyz: FloatArray, height: FloatArray, normals: FloatArray,
+    centres: FloatArray, offset: FloatArray, images: Images, matched: IntArray,
+    averaged: IntArray, fused: IntArray, focal_px: FloatArray, inner: Frames, tolerance: float,
+    start: IntArray, camera: IntArray, n: float,
     weight: FloatArray, result: FloatArray,
 ) -> None:  # fmt: skip
     for block in prange((len(xyz) + _BLOCK - 1) // _BLOCK):
@@ -135,17 +180,18 @@ def _invert(
         place = np.full(len(centres), ABSENT)
         found = np.empty(len(centres), np.int64)
         for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(xyz))):
-            up, normal = centres - xyz[i], normals[i]
+            sight = sight_of(
+                xyz[i], made_xyz[i], centres, height[i], normals[i], offset, images, matcher, n
+            )
             listed = camera[start[i] : start[i + 1]]
             given = weight[start[i] : start[i + 1]] if weight.size else weight
-            maps = found[: _with_neighbours(found, place, listed, up, matcher)]
-            above = normal[2] * (height[i] - xyz[i, 2] + offset)
-            bed, t, slope = lines(maps, up, above, normal, matcher, n)
+            maps = found[: _with_neighbours(found, place, listed, sight.made, matcher)]
+            bed, t, slope = lines(maps, sight)
             counts, step = np.zeros(maps.size), 0.0
             for _ in range(_ROUNDS):
-                _share(counts, place, listed, given, up, t + slope * step, matcher)
+                _share(counts, place, listed, given, sight.made, t + slope * step, matcher)
                 step = balance(t, slope, counts)
-            settle_bed(result[i], maps, counts, t, slope, bed, up, above, normal, matcher, n)
+            settle_bed(result[i], maps, counts, t, slope, bed, sight)
             place[maps] = ABSENT
             for c in listed:
                 for a in matcher.averaged[c]:
@@ -158,7 +204,7 @@ ABSENT, _OUTSIDE = -1, -2
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _with_neighbours(
-    found: IntArray, place: IntArray, listed: IntArray, up: FloatArray, matcher: Matcher
+    found: IntArray, place: IntArray, listed: IntArray, made: FloatArray, matcher: Matcher
 ) -> int:
     """Gather the listed images and those in frame that their depths were averaged with.
 
@@ -174,7 +220,7 @@ def _with_neighbours(
                 break
             if place[a] == ABSENT:
                 place[a] = _OUTSIDE
-                if holds(matcher.inner, a, up[a, 0], up[a, 1], up[a, 2]):
+                if holds(matcher.inner, a, made[a, 0], made[a, 1], made[a, 2]):
                     place[a], found[count] = count, a
                     count += 1
     return count
@@ -182,7 +228,7 @@ def _with_neighbours(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _share(
-    counts: FloatArray, place: IntArray, listed: IntArray, given: FloatArray, up: FloatArray,
+    counts: FloatArray, place: IntArray, listed: IntArray, given: FloatArray, made: FloatArray,
     now: FloatArray, matcher: Matcher,
 ) -> None:  # fmt: skip
     """Set what each depth map counts for in the point, with their depths as they are now.
@@ -193,7 +239,7 @@ def _share(
     counts[:] = 0.0
     for k in range(listed.size):
         c = listed[k]
-        w = given[k] if given.size else 1.0 / (up[c] * up[c]).sum()
+        w = given[k] if given.size else 1.0 / (made[c] * made[c]).sum()
         own, members = place[c], 1.0
         for a in matcher.averaged[c]:
             members += averages(own, a, now, place)
@@ -212,10 +258,7 @@ def averages(own: int, a: int, now: FloatArray, place: IntArray) -> bool:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def lines(
-    maps: IntArray, up: FloatArray, above: FloatArray, normal: FloatArray, matcher: Matcher,
-    n: float,
-) -> tuple[float, FloatArray, FloatArray]:  # fmt: skip
+def lines(maps: IntArray, sight: Sight) -> tuple[float, FloatArray, FloatArray]:
     """Return how the depth of each map changes with the height of the bed, nearly in a line.
 
     Returns
@@ -226,16 +269,16 @@ def lines(
         How far beyond the apparent point the map has that bed, relative to the distance from the
         camera, and the change of it with the height, 1/m. NaN where it has none.
     """
-    deep = -above.mean() / normal[2] * (n - 1.0)
+    deep = -sight.above.mean() / sight.normal[2] * (sight.n - 1.0)
     bed, rise = 1.1 * deep, min(0.1 * deep, -LEAST_RISE_M)
     t, slope = np.empty(maps.size), np.empty(maps.size)
-    out, work = np.empty(5), np.empty((matcher.matched.shape[1], 3))
+    out, work = np.empty(5), np.empty((sight.matcher.matched.shape[1], 3))
     for q in range(maps.size):
-        _look(out, maps[q], bed, up, above, normal, matcher, n, work)
+        _look(out, maps[q], bed, sight, work)
         t[q] = out[0]
-        _look(out, maps[q], bed + rise, up, above, normal, matcher, n, work)
+        _look(out, maps[q], bed + rise, sight, work)
         slope[q] = (out[0] - t[q]) / rise
-        usual = 1.0 / (n * up[maps[q], 2])
+        usual = 1.0 / (sight.n * sight.made[maps[q], 2])
         if slope[q] == slope[q] and not 0.5 < -slope[q] / usual < 2.0:
             slope[q] = -usual  # another pair of images was the best one there
     return bed, t, slope
@@ -254,7 +297,7 @@ def balance(t: FloatArray, slope: FloatArray, weight: FloatArray) -> float:
 @njit(cache=True, error_model="numpy", nogil=True)
 def settle_bed(
     row: FloatArray, maps: IntArray, weight: FloatArray, t: FloatArray, slope: FloatArray,
-    bed: float, up: FloatArray, above: FloatArray, normal: FloatArray, matcher: Matcher, n: float,
+    bed: float, sight: Sight,
 ) -> None:  # fmt: skip
     """Find the height of the bed at which the fused depths give the apparent point, and write it.
 
@@ -262,14 +305,14 @@ def settle_bed(
     """
     row[OUTCOME] = _NO_CAMERA if maps.size == 0 else _ONE_CAMERA
     step = balance(t, slope, weight)
-    looks, work = np.empty((maps.size, 5)), np.empty((matcher.matched.shape[1], 3))
+    looks, work = np.empty((maps.size, 5)), np.empty((sight.matcher.matched.shape[1], 3))
     for _ in range(MAX_LOOKS):
         if not np.isfinite(step):
             return
         bed += step
         for q in range(maps.size):
             if weight[q] > 0.0:
-                _look(looks[q], maps[q], bed, up, above, normal, matcher, n, work)
+                _look(looks[q], maps[q], bed, sight, work)
             else:
                 looks[q, 0] = 0.0
         step = balance(looks[:, 0], slope, weight)
@@ -290,54 +333,76 @@ def settle_bed(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _look(
-    out: FloatArray, c: int, bed: float, up: FloatArray, above: FloatArray, normal: FloatArray,
-    matcher: Matcher, n: float, work: FloatArray,
-) -> None:  # fmt: skip
+def _look(out: FloatArray, c: int, bed: float, sight: Sight, work: FloatArray) -> None:
     """Say where the depth map of image c has a bed at a height relative to the apparent point.
 
     Writes how far beyond P, relative to the distance from the camera, the place on the bed, and how
     that moves with the height.
     """
-    ex, ey, ez = up[c, 0], up[c, 1], up[c, 2]
+    normal = sight.normal
+    ax, ay, az, ex, ey, ez, above = _ray(c, sight)
     length2 = ex * ex + ey * ey + ez * ez
     across = normal[0] * ex + normal[1] * ey + normal[2] * ez
-    wet = above[c] > 0.0
-    f = above[c] / across if wet else 0.0
-    bend = 1.0 / n if wet else 1.0
+    wet = sight.above[c] > 0.0
+    f = above / across if wet else 0.0
+    bend = 1.0 / sight.n if wet else 1.0
     dx, dy, dz = refracted(ex, ey, ez, length2, normal[0], normal[1], normal[2], across, bend)
-    s = (bed - f * ez) / dz
-    out[1], out[2] = f * ex + s * dx, f * ey + s * dy
+    ax, ay, az = ax + f * ex, ay + f * ey, az + f * ez
+    s = (bed - az) / dz
+    out[1], out[2] = ax + s * dx, ay + s * dy
     out[3], out[4] = dx / dz, dy / dz
-    length = np.sqrt(length2)
+    made = sight.made[c]
+    length = np.sqrt(made[0] * made[0] + made[1] * made[1] + made[2] * made[2])
     t = _depth(
-        c, out[1], out[2], bed, -ex / length, -ey / length, -ez / length, up, above, normal,
-        matcher, n, work,
-    )  # fmt: skip
+        c, out[1], out[2], bed, -made[0] / length, -made[1] / length, -made[2] / length, sight, work
+    )
     out[0] = t / length
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def _ray(c: int, sight: Sight) -> tuple[float, float, float, float, float, float, float]:
+    """Return the ray on which image c shows the point.
+
+    Where it passes the point, relative to it, the way from there to the projection centre, and how
+    high the water is over there.
+    """
+    up = sight.up[c]
+    if len(sight.images.centres) == 0:
+        return 0.0, 0.0, 0.0, up[0], up[1], up[2], sight.above[c]
+    made, normal = sight.made[c], sight.normal
+    dx, dy, dz = as_now(sight.images, c, -made[0], -made[1], -made[2])
+    along = (up[0] * dx + up[1] * dy + up[2] * dz) / (dx * dx + dy * dy + dz * dz)
+    ex, ey, ez = along * dx, along * dy, along * dz
+    ax, ay, az = up[0] - ex, up[1] - ey, up[2] - ez
+    above = sight.above[c] - (normal[0] * ax + normal[1] * ay + normal[2] * az)
+    return ax, ay, az, ex, ey, ez, above
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def _depth(
-    c: int, qx: float, qy: float, qz: float, ux: float, uy: float, uz: float, up: FloatArray,
-    above: FloatArray, normal: FloatArray, matcher: Matcher, n: float, work: FloatArray,
+    c: int, qx: float, qy: float, qz: float, ux: float, uy: float, uz: float, sight: Sight,
+    work: FloatArray,
 ) -> float:  # fmt: skip
     """Return how far beyond P, m along its ray u, the depth map of image c has the bed at Q.
 
-    NaN where none of the images that it was matched with sees Q.
+    NaN where none of the images that it was matched with sees Q. The light goes as it does; where
+    it seems to come from, and P and u, are as the matcher had them.
     """
-    count = 0
-    nx, ny, nz = normal[0], normal[1], normal[2]
+    count, matcher = 0, sight.matcher
+    nx, ny, nz = sight.normal[0], sight.normal[1], sight.normal[2]
     for j in matcher.matched[c]:
         if j < 0:
             break
-        ex, ey, ez = up[j, 0], up[j, 1], up[j, 2]
-        k, _, _, _, sx, sy, sz = light_path(qx, qy, qz, ex, ey, ez, nx, ny, nz, above[j], n)
-        ax, ay, az = k * sx - nx, k * sy - ny, k * sz - nz
+        ex, ey, ez = sight.up[j, 0], sight.up[j, 1], sight.up[j, 2]
+        k, _, _, _, sx, sy, sz = light_path(
+            qx, qy, qz, ex, ey, ez, nx, ny, nz, sight.above[j], sight.n
+        )
+        ax, ay, az = as_made(sight.images, j, k * sx - nx, k * sy - ny, k * sz - nz)
         if not (k == k and holds(matcher.inner, j, -ax, -ay, -az)):
             continue
         size = 1.0 / np.sqrt(ax * ax + ay * ay + az * az)
         ax, ay, az = ax * size, ay * size, az * size
+        ex, ey, ez = sight.made[j, 0], sight.made[j, 1], sight.made[j, 2]
         along, turn = -(ex * ax + ey * ay + ez * az), ux * ax + uy * ay + uz * az
         px, py, pz = -ex - along * ax, -ey - along * ay, -ez - along * az
         gx, gy, gz = ux - turn * ax, uy - turn * ay, uz - turn * az

@@ -29,6 +29,7 @@ from pcfix.refract.depth_maps import (
     intersection_of,
     lines,
     settle_bed,
+    sight_of,
 )
 from pcfix.refract.matcher import Matcher
 from pcfix.refract.threads import one_caller
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from pcfix.model import FloatArray, IntArray
     from pcfix.refract.bundles import Bundle
     from pcfix.refract.frames import Frames
+    from pcfix.refract.made_with import Images
     from pcfix.refract.result import Intersection
 
 AGREE = 0.01
@@ -84,10 +86,10 @@ def likely_beds(bundle: Bundle) -> FloatArray:
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _likely(
-    xyz: FloatArray, height: FloatArray, normals: FloatArray, centres: FloatArray,
-    offset: FloatArray, matched: IntArray, averaged: IntArray, fused: IntArray,
-    focal_px: FloatArray, inner: Frames, tolerance: float, start: IntArray, camera: IntArray,
-    n: float,
+    xyz: FloatArray, made_xyz: FloatArray, height: FloatArray, normals: FloatArray,
+    centres: FloatArray, offset: FloatArray, images: Images, matched: IntArray,
+    averaged: IntArray, fused: IntArray, focal_px: FloatArray, inner: Frames, tolerance: float,
+    start: IntArray, camera: IntArray, n: float,
     likely: FloatArray,
 ) -> None:  # fmt: skip
     for block in prange((len(xyz) + _BLOCK - 1) // _BLOCK):
@@ -95,24 +97,25 @@ def _likely(
         place = np.full(len(centres), -1)
         for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(xyz))):
             maps = camera[start[i] : start[i + 1]]
-            up, normal = centres - xyz[i], normals[i]
-            above = normal[2] * (height[i] - xyz[i, 2] + offset)
-            bed, t, slope = lines(maps, up, above, normal, matcher, n)
+            sight = sight_of(
+                xyz[i], made_xyz[i], centres, height[i], normals[i], offset, images, matcher, n
+            )
+            bed, t, slope = lines(maps, sight)
             weight = np.empty(maps.size)
             _set(place, maps)
             for seed in range(maps.size):
                 if slope[seed] == slope[seed]:
-                    rise, _ = _group(weight, seed, maps, place, t, slope, up, matcher)
+                    rise, _ = _group(weight, seed, maps, place, t, slope, sight.made, matcher)
                     likely[i, seed] = bed + rise
             place[maps] = -1
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _invert(
-    xyz: FloatArray, height: FloatArray, normals: FloatArray, centres: FloatArray,
-    offset: FloatArray, matched: IntArray, averaged: IntArray, fused: IntArray,
-    focal_px: FloatArray, inner: Frames, tolerance: float, start: IntArray, camera: IntArray,
-    n: float,
+    xyz: FloatArray, made_xyz: FloatArray, height: FloatArray, normals: FloatArray,
+    centres: FloatArray, offset: FloatArray, images: Images, matched: IntArray,
+    averaged: IntArray, fused: IntArray, focal_px: FloatArray, inner: Frames, tolerance: float,
+    start: IntArray, camera: IntArray, n: float,
     around: FloatArray, result: FloatArray,
 ) -> None:  # fmt: skip
     for block in prange((len(xyz) + _BLOCK - 1) // _BLOCK):
@@ -120,18 +123,19 @@ def _invert(
         place = np.full(len(centres), -1)
         for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(xyz))):
             maps = camera[start[i] : start[i + 1]]
-            up, normal = centres - xyz[i], normals[i]
-            above = normal[2] * (height[i] - xyz[i, 2] + offset)
-            bed, t, slope = lines(maps, up, above, normal, matcher, n)
+            sight = sight_of(
+                xyz[i], made_xyz[i], centres, height[i], normals[i], offset, images, matcher, n
+            )
+            bed, t, slope = lines(maps, sight)
             weight = np.zeros(maps.size)
             _set(place, maps)
             seed, result[i, AMBIGUITY] = _best_seed(
-                weight, maps, place, t, slope, up, matcher, around[i] - xyz[i, 2] - bed
+                weight, maps, place, t, slope, sight.made, matcher, around[i] - xyz[i, 2] - bed
             )
             if seed >= 0:
-                _group(weight, seed, maps, place, t, slope, up, matcher)
+                _group(weight, seed, maps, place, t, slope, sight.made, matcher)
             place[maps] = -1
-            settle_bed(result[i], maps, weight, t, slope, bed, up, above, normal, matcher, n)
+            settle_bed(result[i], maps, weight, t, slope, bed, sight)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -143,7 +147,7 @@ def _set(place: IntArray, maps: IntArray) -> None:
 @njit(cache=True, error_model="numpy", nogil=True)
 def _best_seed(
     weight: FloatArray, maps: IntArray, place: IntArray, t: FloatArray, slope: FloatArray,
-    up: FloatArray, matcher: Matcher, wanted: float,
+    made: FloatArray, matcher: Matcher, wanted: float,
 ) -> tuple[int, float]:  # fmt: skip
     """Return the seed whose group has the bed nearest to the wanted height, or the largest one.
 
@@ -154,7 +158,7 @@ def _best_seed(
     for seed in range(maps.size):
         if slope[seed] != slope[seed]:
             continue
-        rise, members = _group(weight, seed, maps, place, t, slope, up, matcher)
+        rise, members = _group(weight, seed, maps, place, t, slope, made, matcher)
         known = wanted == wanted
         misfit = abs(rise - wanted) if known else -float(members)
         if misfit < least:
@@ -171,7 +175,7 @@ def _best_seed(
 @njit(cache=True, error_model="numpy", nogil=True)
 def _group(
     weight: FloatArray, seed: int, maps: IntArray, place: IntArray, t: FloatArray,
-    slope: FloatArray, up: FloatArray, matcher: Matcher,
+    slope: FloatArray, made: FloatArray, matcher: Matcher,
 ) -> tuple[float, int]:  # fmt: skip
     """Return the height of the bed if the group of a seed made the point, and the group's size.
 
@@ -184,10 +188,10 @@ def _group(
             now[q] = t[q] + slope[q] * rise
         weight[:] = 0.0
         middle, _ = _averaged(maps[seed], seed, now, place, matcher)
-        members = _fuse(weight, seed, maps, now, middle, place, up, matcher)
+        members = _fuse(weight, seed, maps, now, middle, place, made, matcher)
         for c in matcher.fused[maps[seed]]:
             if c >= 0 and place[c] >= 0:
-                members += _fuse(weight, place[c], maps, now, middle, place, up, matcher)
+                members += _fuse(weight, place[c], maps, now, middle, place, made, matcher)
         step = balance(now, slope, weight)
         rise += step
         if not abs(step) > CLOSE_M:
@@ -210,14 +214,14 @@ def _averaged(
 @njit(cache=True, error_model="numpy", nogil=True)
 def _fuse(
     weight: FloatArray, q: int, maps: IntArray, now: FloatArray, middle: float, place: IntArray,
-    up: FloatArray, matcher: Matcher,
+    made: FloatArray, matcher: Matcher,
 ) -> int:  # fmt: skip
     """Fuse one depth map if it agrees: its weight goes evenly to the maps it was averaged with."""
     camera = maps[q]
     depth, count = _averaged(camera, q, now, place, matcher)
     if not abs(depth - middle) < AGREE:
         return 0
-    each = 1.0 / ((up[camera, 0] ** 2 + up[camera, 1] ** 2 + up[camera, 2] ** 2) * count)
+    each = 1.0 / ((made[camera, 0] ** 2 + made[camera, 1] ** 2 + made[camera, 2] ** 2) * count)
     weight[q] += each
     for a in matcher.averaged[camera]:
         if averages(q, a, now, place):

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.label.surface import SurfaceAbove
+from pcfix.model import WaterPlane
 from pcfix.refract.bed import Bed, bed_of
 from pcfix.refract.bundles import Bundle
 from pcfix.refract.choice import chosen_views, spatial_order
@@ -28,8 +30,8 @@ from pcfix.refract.uncertainty import with_uncertainty
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from pcfix.label.surface import SurfaceAbove
     from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterSurface
+    from pcfix.refract.made_with import MadeWith
     from pcfix.refract.occlusion import Occluder
     from pcfix.settings import Settings
 
@@ -65,6 +67,7 @@ def correct(
     level_offset_m: FloatArray | None = None,
     learned: Learned | None = None,
     level_sigma_m: FloatArray | float | None = None,
+    made_with: MadeWith | None = None,
 ) -> Intersection:
     """Correct submerged points by the method that the settings name.
 
@@ -75,6 +78,10 @@ def correct(
     learned : Learned, optional
     level_sigma_m : array, shape (m,), or float, optional
         As of `pcfix.refract.uncertainty.covariances`.
+    made_with : MadeWith, optional
+        The points as they came and the cameras they came from, where `xyz` are the same points
+        carried to `cameras` (`pcfix.adjust.carry`). What undoes dense matching goes by it; the
+        matcher learned is one of those cameras then.
 
     Returns
     -------
@@ -97,7 +104,8 @@ def correct(
         above = type(surface)(surface.height_m[rows], surface.slope[rows])
         mine = None if views is None else views.take(rows)
         chosen = _cameras_of(xyz[rows], above, water, cameras, settings, mine, offset, learned)
-        bundle = Bundle(xyz[rows], above, water, cameras, chosen, settings, offset, learned)
+        made = None if made_with is None else made_with.take(rows)
+        bundle = Bundle(xyz[rows], above, water, cameras, chosen, settings, offset, learned, made)
         if method is invert_pairs and pairs is not None:
             found = invert_pairs(bundle, pairs.take(rows))
         else:
@@ -107,7 +115,43 @@ def correct(
             found, xyz[rows], above, cameras, settings, chosen, offset, learned, sigma
         )
         parts.append(_with_ambiguity(known, found) if method is invert_fusion else known)
-    return _joined(parts, order, len(cameras))
+    return joined(parts, order, len(cameras))
+
+
+def shift_of_land(
+    xyz: FloatArray,
+    cameras: Cameras,
+    settings: Settings,
+    views: Views | None,
+    learned: Learned | None,
+    made_with: MadeWith,
+) -> FloatArray:
+    """Return how far points on land are from where a dense matcher would have had them.
+
+    Carried by all their images alike, they lie where straight rays meet best; a dense matcher
+    would have made them of some images' depths. That is undone as on the bed, without water.
+
+    Parameters
+    ----------
+    xyz, cameras, settings, views, learned, made_with
+        As of `correct`.
+
+    Returns
+    -------
+    array, shape (m, 3)
+        Metres; zero for other methods than those that go by `made_with`.
+    """
+    learned = learned or Learned()
+    if _method(settings, views, learned) not in (invert_fusion, *_OF_MATCHERS.values()):
+        return np.zeros((len(xyz), 3))
+    at_themselves = SurfaceAbove(xyz[:, 2].copy(), np.zeros((len(xyz), 2)))
+    straight = replace(settings, refractive_index=1.0, dimensions="none")
+    # the bed of the surroundings tells nothing of land: the largest group made the point
+    found = correct(
+        xyz, at_themselves, WaterPlane(0.0), cameras, straight, views, None,
+        learned._replace(bed=None), made_with=made_with,
+    )  # fmt: skip
+    return found.shift_m
 
 
 def _with_ambiguity(known: Intersection, found: Intersection) -> Intersection:
@@ -127,12 +171,13 @@ def learn_bed(
     settings: Settings,
     level_offset_m: FloatArray | None,
     learned: Learned,
+    made_with: MadeWith | None = None,
 ) -> Bed | None:
     """Return the bed that fused points of a whole cloud have in common, of a sample of them.
 
     Parameters
     ----------
-    xyz, surface, water, cameras, settings, level_offset_m, learned
+    xyz, surface, water, cameras, settings, level_offset_m, learned, made_with
         As of `correct`. None where no image sees a point.
     """
     offset = np.zeros(len(cameras)) if level_offset_m is None else level_offset_m
@@ -141,7 +186,8 @@ def learn_bed(
     for rows in _batches(order):
         above = type(surface)(surface.height_m[rows], surface.slope[rows])
         chosen = _cameras_of(xyz[rows], above, water, cameras, settings, None, offset, learned)
-        bundle = Bundle(xyz[rows], above, water, cameras, chosen, settings, offset, learned)
+        made = None if made_with is None else made_with.take(rows)
+        bundle = Bundle(xyz[rows], above, water, cameras, chosen, settings, offset, learned, made)
         likely.append(likely_beds(bundle))
     most = max(part.shape[1] for part in likely)
     table = np.full((len(xyz), most), np.nan, np.float32)
@@ -228,7 +274,7 @@ def _batches(order: IntArray) -> Iterator[IntArray]:
         yield order[first : first + POINTS_AT_ONCE]
 
 
-def _joined(parts: list[Intersection], order: IntArray, k: int) -> Intersection:
+def joined(parts: list[Intersection], order: IntArray, k: int) -> Intersection:
     """Return the results of batches as one, back in the order of the points."""
 
     def back(name: str) -> Any:

@@ -37,6 +37,7 @@ from pcfix.refract.backward import light_path
 from pcfix.refract.consistent import check_consistent
 from pcfix.refract.image_jacobian import image_and_gradients
 from pcfix.refract.lens import lens_table
+from pcfix.refract.made_with import Images, as_made, images_of
 from pcfix.refract.places import KIND
 from pcfix.refract.projections import CODES
 from pcfix.refract.rays import MIN_DETERMINANT, line_terms, nearest_point, refracted
@@ -59,17 +60,21 @@ _PARALLEL, _CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
 # Columns of the result.
 _MISS, _OUTCOME, _FOUND, _WIDTH = 3, 4, 5, 6
 
-# Columns of a ray: e, the height of its water over P, how its scale changes (g of `_meet`), and of
-# the image of Q G'G (xx, xy, xz, yy, yz, zz), G'G e, |G e|^2.
-_ABOVE, _BY_PLACE, _SQUARE, _RIGHT, _RAY_WIDTH = 3, 4, 7, 13, 17
+# Columns of a ray: e, the height of its water over P, e as the matcher had it, how its scale
+# changes (g of `_meet`), and of the image of Q G'G (xx, xy, xz, yy, yz, zz), G'G e, |G e|^2.
+_ABOVE, _MADE, _BY_PLACE, _SQUARE, _RIGHT, _RAY_WIDTH = 3, 4, 7, 10, 16, 20
 
 
 class _Images(NamedTuple):
-    """Rotations, shape (k, 3, 3), the lens of each camera as a row of `lenses`, and n."""
+    """Those of the matcher: rotations, shape (k, 3, 3), the lens of each as a row of `lenses`.
+
+    `both` has them as they were and as they are now; n.
+    """
 
     rotations: FloatArray
     row: IntArray
     lenses: FloatArray
+    both: Images
     refractive_index: float
 
 
@@ -154,18 +159,21 @@ def _inverted(bundle: Bundle, pairs: Views | None, used: BoolArray) -> FloatArra
     cameras, matcher = bundle.cameras, bundle.learned.matcher
     if pairs is None and matcher is None:
         raise ValueError("pairs or a model of the matcher are needed")
-    row, table = lens_table(cameras.lenses or ())
-    rotations = np.ascontiguousarray(cameras.rotations, np.float64)
+    made_xyz, made = bundle.made_with or (bundle.xyz, cameras)
+    row, table = lens_table(made.lenses or ())
+    rotations = np.ascontiguousarray(made.rotations, np.float64)
+    both = images_of(bundle.made_with, cameras)
     listed = None if pairs is None else (pairs.start, np.asarray(pairs.camera, np.int64))
     result = np.zeros((len(bundle.xyz), _WIDTH))
     with one_caller():
         _invert(
             np.ascontiguousarray(bundle.xyz),
+            np.ascontiguousarray(made_xyz),
             np.ascontiguousarray(bundle.surface.height_m),
             bundle.normals(),
             np.ascontiguousarray(cameras.centres),
             np.ascontiguousarray(bundle.level_offset_m, np.float64),
-            _Images(rotations, row, table, bundle.settings.refractive_index),
+            _Images(rotations, row, table, both, bundle.settings.refractive_index),
             np.asarray(bundle.views.start, np.int64),
             np.asarray(bundle.views.camera, np.int64),
             listed,
@@ -178,8 +186,8 @@ def _inverted(bundle: Bundle, pairs: Views | None, used: BoolArray) -> FloatArra
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _invert(
-    xyz: FloatArray, height: FloatArray, normals: FloatArray, centres: FloatArray,
-    offset: FloatArray, images: _Images, start: IntArray, camera: IntArray,
+    xyz: FloatArray, made_xyz: FloatArray, height: FloatArray, normals: FloatArray,
+    centres: FloatArray, offset: FloatArray, images: _Images, start: IntArray, camera: IntArray,
     listed: tuple[IntArray, IntArray] | None, matched: IntArray, used: BoolArray,
     result: FloatArray,
 ) -> None:  # fmt: skip
@@ -201,6 +209,9 @@ def _invert(
             for j in range(mine.size):
                 place[mine[j]] = j
                 rays[j, :3] = centres[mine[j]] - xyz[i]
+                rays[j, _MADE:_BY_PLACE] = rays[j, :3]
+                if len(images.both.centres):
+                    rays[j, _MADE:_BY_PLACE] = images.both.centres[mine[j]] - made_xyz[i]
                 _scale(rays[j], images, mine[j])
                 rays[j, _ABOVE] = normals[i, 2] * (height[i] - xyz[i, 2] + offset[mine[j]])
             if listed is not None:
@@ -226,12 +237,12 @@ def _scale(ray: FloatArray, images: _Images, c: int) -> None:
 
     In perspective that is the distance along the axis, in other projections that from the centre.
     """
-    axis, ahead, size2 = images.rotations[c, 2], 0.0, 0.0
+    axis, made, ahead, size2 = images.rotations[c, 2], ray[_MADE:], 0.0, 0.0
     for i in range(3):
-        ahead, size2 = ahead - axis[i] * ray[i], size2 + ray[i] * ray[i]
+        ahead, size2 = ahead - axis[i] * made[i], size2 + made[i] * made[i]
     flat = images.lenses[images.row[c], KIND] == _PERSPECTIVE and ahead > 0.0
     for i in range(3):
-        ray[_BY_PLACE + i] = axis[i] / ahead if flat else -ray[i] / size2
+        ray[_BY_PLACE + i] = axis[i] / ahead if flat else -made[i] / size2
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -430,14 +441,15 @@ def _median_of_pairs(
 def _see(ray: FloatArray, q: FloatArray, c: int, normal: FloatArray, images: _Images) -> None:
     """Write what the image of Q says about places: G'G, G'G e and |G e|^2.
 
-    w is scaled to be as far away as P, so that G is that of there.
+    w, as the matcher had it, is scaled to be as far away as P, so that G is that of there.
     """
     ex, ey, ez = ray[0], ray[1], ray[2]
     nx, ny, nz = normal[0], normal[1], normal[2]
     k, _, _, _, sx, sy, sz = light_path(
         q[0], q[1], q[2], ex, ey, ez, nx, ny, nz, ray[_ABOVE], images.refractive_index
     )
-    wx, wy, wz = k * sx - nx, k * sy - ny, k * sz - nz
+    wx, wy, wz = as_made(images.both, c, k * sx - nx, k * sy - ny, k * sz - nz)
+    ex, ey, ez = ray[_MADE], ray[_MADE + 1], ray[_MADE + 2]
     at = _BY_PLACE
     far = 1.0 / (wx * ray[at] + wy * ray[at + 1] + wz * ray[at + 2])
     wx, wy, wz = far * wx, far * wy, far * wz

@@ -50,7 +50,7 @@ def cameras_text(report: CamerasReport) -> str:
         lines.append(f"tilt         median {median:.1f}, largest {largest:.1f} degrees")
     if r.gnss is not None:
         lines += _gnss(r.gnss)
-    return "\n".join([*lines, *_fit(r)])
+    return "\n".join([*lines, *_fit(r), *_refraction(r)])
 
 
 def _sensor(s: Sensor) -> str:
@@ -95,6 +95,22 @@ def _fit(report: CamerasReport) -> list[str]:
     if fit.below_ground:
         lines.append(f"below ground {fit.below_ground} cameras")
     return [*lines, f"fit          {fit.verdict or 'cameras and cloud fit'}"]
+
+
+def _refraction(report: CamerasReport) -> list[str]:
+    """Say what each sign tells of absorbed refraction, and what they come to."""
+    found = report.diagnosis
+    if found is None:
+        return []
+    says = {True: "absorbed", False: "not absorbed", None: "open"}
+    lines = ["", "Have the poses absorbed the refraction?"]
+    lines += [f"{sign.name:<14} {says[sign.speaks] + ':':<13} {sign.words}" for sign in found.signs]
+    if found.absorbed:
+        return [*lines, f"{'verdict':<14} {found.sentence(report.remedy)}"]
+    if found.absorbed is False and found.decided_by is not None:
+        return [*lines, f"{'verdict':<14} no, by {found.decided_by.name}"]
+    needs = "tie points, GNSS positions, control points or a reference would tell"
+    return [*lines, f"{'verdict':<14} not known; {needs}"]
 
 
 def block_figure(report: CamerasReport) -> Figure:

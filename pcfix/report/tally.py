@@ -66,7 +66,8 @@ class Tally:
     @property
     def submerged(self) -> int:
         """Points below the surface so far."""
-        return int(self.outcomes.sum() - self.outcomes[Outcome.LAND])
+        neither = self.outcomes[Outcome.LAND] + self.outcomes[Outcome.NOT_CARRIED]
+        return int(self.outcomes.sum() - neither)
 
     @property
     def corrected(self) -> int:

@@ -23,19 +23,23 @@ def summary_text(summary: Summary) -> str:
         f"submerged    {s.submerged:,} ({share(s.submerged, s.points)} of the points)",
         f"corrected    {s.corrected:,} ({share(s.corrected, s.submerged)} of the submerged)",
     ]
-    fate = {"withhold": "unmoved, withheld", "keep": "unmoved", "drop": "dropped"}
+    lines[2:2] = _carried(s)
     for reason, count in s.uncorrected.items():
         if count:
-            lines.append(f"  not        {count:,}: {reason} ({fate[s.settings['uncorrected']]})")
+            lines.append(f"  not        {count:,}: {reason} ({_FATE[s.settings['uncorrected']]})")
     if s.water_unknown:
         lines.append(f"no surface   {s.water_unknown:,} points have no known water above them")
     if s.depth_m:
-        depth, shift = s.depth_m, s.shift_z_m
-        lines += [
-            f"depth        {depth['min']:.2f} to {depth['max']:.2f} m, mean {depth['mean']:.2f} m",
+        depth = s.depth_m
+        lines.append(
+            f"depth        {depth['min']:.2f} to {depth['max']:.2f} m, mean {depth['mean']:.2f} m"
+        )
+    if s.shift_z_m:
+        shift = s.shift_z_m
+        lines.append(
             f"shift in Z   mean {shift['mean']:.3f} m, 5 % {shift['p5']:.3f} m,"
-            f" 95 % {shift['p95']:.3f} m",
-        ]
+            f" 95 % {shift['p95']:.3f} m"
+        )
     unused = len(s.cameras_unused)
     names = ", ".join(s.cameras_unused[:5]) + (", ..." if unused > 5 else "")
     lines += [
@@ -48,6 +52,29 @@ def summary_text(summary: Summary) -> str:
         *_uncertainty(s),
     ]
     return "\n".join([*lines, *left_out_lines(s.labelling)])
+
+
+_FATE = {"withhold": "unmoved, withheld", "keep": "unmoved", "drop": "dropped"}
+
+
+def _carried(s: Summary) -> list[str]:
+    """Say that land moved too, and how far."""
+    found = s.carried
+    if found is None:
+        return []
+    shift = found["shift_m"]
+    lines = [
+        f"carried      {found['points']:,} ({share(found['points'], s.points)} of the points),"
+        f" {found['land']:,} of them land, from the old cameras to the adjusted ones: by"
+        f" {shift['rms']:.3f} m rms, {shift['max']:.3f} m at most, mean in Z"
+        f" {shift['mean_z']:+.3f} m; shifts below count from before it"
+    ]
+    if found["not_carried"]:
+        lines.append(
+            f"  not        {found['not_carried']:,}: {found['not_carried_reason']}"
+            f" ({_FATE[s.settings['uncorrected']]})"
+        )
+    return lines
 
 
 def _index(s: Summary) -> list[str]:

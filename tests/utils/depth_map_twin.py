@@ -1,6 +1,7 @@
 """Slow twins of dense matching: partners by loops, depths by scipy, maps fused by bisection.
 
-Light is traced by `pcfix.simulate.tracing`; nothing of `pcfix.refract` is used.
+Light is traced by `pcfix.simulate.tracing`; nothing of `pcfix.refract` is used. The matcher may
+have had other cameras, `made`, than those that took the images; both have the places in the images.
 """
 
 from itertools import combinations
@@ -33,6 +34,13 @@ def pixel(cameras, c, target):
     return np.array([lens.principal_x + lens.focal * x / z, lens.principal_y + lens.focal * y / z])
 
 
+def way_of(cameras, c, image):
+    """Return the unit direction in which a camera sees a place in its image."""
+    lens = cameras.lenses[c]
+    way = [*((image - [lens.principal_x, lens.principal_y]) / lens.focal), 1.0]
+    return cameras.rotations[c].T @ way / np.linalg.norm(way)
+
+
 def plane_of(plane):
     """Return a point and the unit normal of z = a + b x + c y, as rows of arrays."""
     a, b, c = plane
@@ -51,19 +59,19 @@ def on_bed(centre, towards, plane, bed, n):
     return bed_points(centre[None], way, plane_of(plane), plane_of(bed), n)[0]
 
 
-def costs_of(p, u, q, cameras, partners, planes, n, metric):
+def costs_of(p, u, q, cameras, partners, planes, n, metric, made=None):
     """Return for each partner its squared residual, px^2, as a function of the way t beyond p.
 
     In pixels, or as angles times the focal length as seen from the distance of p.
     """
+    made = made or cameras
 
     def one(j):
-        centre, focal = cameras.centres[j], cameras.lenses[j].focal
-        out = leaves_water(q, centre, planes[j], n)
+        centre, focal = made.centres[j], made.lenses[j].focal
+        there = pixel(cameras, j, leaves_water(q, cameras.centres[j], planes[j], n))
         if metric == "pixels":
-            there = pixel(cameras, j, out)
-            return lambda t: float(((pixel(cameras, j, p + t * u) - there) ** 2).sum())
-        ray = (out - centre) / np.linalg.norm(out - centre)
+            return lambda t: float(((pixel(made, j, p + t * u) - there) ** 2).sum())
+        ray = way_of(made, j, there)
         scale = focal**2 / ((p - centre) ** 2).sum()
         return lambda t: float(scale * (np.cross(p + t * u - centre, ray) ** 2).sum())
 
@@ -84,20 +92,25 @@ def slow_depth(costs, tolerance):
     return float(np.average(at, weights=np.exp((squares.min() - squares) / tolerance)))
 
 
-def fused_slowly(start, maps, weights, cameras, matched, planes, bed, n, tolerance, metric):
+def fused_slowly(
+    start, maps, weights, cameras, matched, planes, bed, n, tolerance, metric, made=None
+):
     """Return the fused point of a bed on the plumb line of a start, and what it shows.
 
     At the height at which the weighted ways along the rays add up to nothing up or down; the
     plane of the bed is (a, b, c) of z = a + b x + c y.
     """
+    made = made or cameras
 
     def ways(z):
         p = np.array([*start[:2], z])
         total, shown = 0.0, []
         for c, w in zip(maps, weights, strict=True):
-            u = (p - cameras.centres[c]) / np.linalg.norm(p - cameras.centres[c])
-            q = on_bed(cameras.centres[c], p, planes[c], bed, n)
-            costs = costs_of(p, u, q, cameras, matched[c], planes, n, metric)
+            u = (p - made.centres[c]) / np.linalg.norm(p - made.centres[c])
+            centre = cameras.centres[c]
+            way = way_of(cameras, c, pixel(made, c, p))
+            q = on_bed(centre, centre + way, planes[c], bed, n)
+            costs = costs_of(p, u, q, cameras, matched[c], planes, n, metric, made)
             total += w * u[2] * slow_depth(costs, tolerance)
             shown.append(q)
         return total, np.average(shown, 0, weights)

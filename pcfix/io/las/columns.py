@@ -125,7 +125,7 @@ def fill(
     moved: npt.NDArray[np.int64],
     rows: BoolArray,
 ) -> None:
-    """Write the columns of the given rows; the others keep zero.
+    """Write the columns of the given rows, and the shift of all; the others keep zero.
 
     Raises
     ------
@@ -136,7 +136,8 @@ def fill(
     for column in columns:
         target = points.array[column.name]
         limits = np.iinfo(target.dtype)
-        value = in_steps(column, correction, moved, classes, rows)
+        mine = rows_of(column, correction, rows)
+        value = in_steps(column, correction, moved, classes, mine)
         if column.saturates:
             value = np.minimum(value, limits.max)
         if value.size and (value.min() < limits.min or value.max() > limits.max):
@@ -148,23 +149,30 @@ def fill(
                 " the cloud has points far below the water; remove them, or write it with a"
                 " coarser scale."
             )
-        target[rows] = value
+        target[mine] = value
 
 
-def changed_rows(correction: Correction, withheld: BoolArray) -> BoolArray:
+def rows_of(column: Column, correction: Correction, changed: BoolArray) -> BoolArray:
+    """Return the rows that get values of a column: the changed ones, and for shifts all moved."""
+    return changed | correction.moved if column.name in SHIFTS else changed
+
+
+def changed_rows(correction: Correction, withheld: BoolArray, *, withhold: bool) -> BoolArray:
     """Return the rows that get values: corrected ones, and uncorrected ones not yet withheld.
 
     An uncorrected point that came withheld is left wholly as it was, so that `restore` can tell
-    it from one that pcfix withheld.
+    it from one that pcfix withheld; by the same mark, a depth, it tells those that are withheld
+    because they could not be carried over.
     """
-    return correction.corrected | (correction.submerged & ~withheld)
+    marked = correction.uncorrected if withhold else correction.submerged
+    return correction.corrected | (marked & ~withheld)
 
 
 def is_corrected(points: laspy.ScaleAwarePointRecord) -> BoolArray:
-    """Return which rows of an output file were moved."""
+    """Return which rows of an output file refraction was taken out of."""
     return np.asarray(points.array["RayCount"] > 0)
 
 
 def is_marked_uncorrected(points: laspy.ScaleAwarePointRecord) -> BoolArray:
-    """Return which rows of an output file pcfix found submerged and could not move."""
+    """Return which rows of an output file pcfix should have moved and could not."""
     return np.asarray((points.array["RayCount"] == 0) & (points.array["WaterDepth"] > 0))

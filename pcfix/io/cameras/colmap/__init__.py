@@ -7,8 +7,10 @@ pose of every image in rigs also. Definition: https://colmap.github.io/format.ht
 A pose is a unit quaternion, scalar first, and a translation, both world to camera, in OpenCV
 axes: ``x_cam = R x + t``, so the projection centre is ``-R' t``. Pixels start at the upper left
 corner of the upper left pixel. The world is that of the alignment, if there was one, often minus an
-offset; the files do not tell, so the CRS is None. Lenses are in `models`, priors of the positions
-in `priors`.
+offset; the files do not tell, so the CRS is None, unless ``georeference.json`` of pcfix lies beside
+them (``crs``, ``offset_m``, ``written_by``; see `place`): its offset is then added to centres and
+tie points, and its CRS is theirs. Lenses are in `models`, priors of the positions in `priors`;
+`writing` writes such models.
 
 Images keep the order of the file. An image point belongs to the point in space whose identifier it
 has, -1 for none; ``points3D`` lists the same as tracks.
@@ -26,6 +28,7 @@ from pcfix.errors import InputError
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.colmap import binary, text
 from pcfix.io.cameras.colmap.models import lens
+from pcfix.io.cameras.colmap.place import read_place
 from pcfix.io.cameras.colmap.priors import read_priors
 from pcfix.model import Cameras, Lens, TiePoints
 
@@ -80,11 +83,16 @@ def read(source: Source) -> Cameras:
     rotations = np.array([checks.quaternion(path, i.name, np.array(i.pose[:4])) for i in posed])
     labels = tuple(image.name for image in posed)
     gnss, notes = read_priors(model.folder, labels)
+    place = read_place(model.folder)
+    if place is not None and gnss is not None and gnss.crs is None:
+        gnss = None  # of the model that the database made, which this one may not be
+    centres = -np.einsum("kji,kj->ki", rotations, poses[:, 4:])
     return Cameras(
         labels=labels,
-        centres=-np.einsum("kji,kj->ki", rotations, poses[:, 4:]),
+        centres=centres if place is None else centres + place.offset_m,
         rotations=rotations,
         lenses=_lenses(model, cameras, posed),
+        crs=None if place is None else place.crs,
         notes=(*_others(model), *notes),
         gnss=gnss,
         unposed=tuple(image.name for image in images if not image.posed),
@@ -107,7 +115,9 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     row = _rows_of(points.identifiers, seen)
     known = row >= 0
     xy = np.concatenate([image.xy for image in images])[known]
-    return tracks.tie_points(points.xyz, row[known], camera[known], xy)
+    place = read_place(model.folder)
+    xyz = points.xyz if place is None else points.xyz + place.offset_m
+    return tracks.tie_points(xyz, row[known], camera[known], xy)
 
 
 def _rows_of(identifiers: IntArray, wanted: IntArray) -> IntArray:

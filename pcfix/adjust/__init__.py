@@ -1,0 +1,1 @@
+"""Refractive bundle adjustment: poses, lens, points and the water from what the images measured."""

@@ -1,0 +1,175 @@
+"""A block of images as it goes into an adjustment, and what may move in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from pcfix.adjust.state import CODES
+
+if TYPE_CHECKING:
+    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens, WaterSurface
+    from pcfix.refract.port import Port
+
+Poses = Literal["free", "fixed", "similarity"]
+Robust = Literal["squares", "huber", "cauchy"]
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Images, points and what was measured; all in one frame, metres, Z up.
+
+    Attributes
+    ----------
+    cameras : Cameras
+        Start values of the exterior and interior orientation.
+    xyz : array, shape (m, 3)
+        Start values of the true points.
+    start : array of int, shape (m + 1,)
+        The observations of point i are ``start[i]:start[i + 1]``.
+    camera : array of int, shape (o,)
+        Row of the cameras.
+    image_xy : array, shape (o, 2)
+        Where the image shows the point, unit of the lens, from the upper left corner.
+    sigma_px : array, shape (o,)
+        Standard deviation of u and v; infinite where an observation does not count.
+    water : WaterPlane, WaterMesh, WaterRaster or None
+        None on a block without water.
+    refractive_index : float
+    wet : array of bool, shape (m,)
+        Which points may be under water; they are while they lie below it.
+    surveyed_xyz, surveyed_sigma_m : array, shape (m, 3)
+        Of control points, from the survey; NaN and infinite for the others.
+    gnss_xyz, gnss_sigma_m : array, shape (k, 3)
+        Of the projection centres; NaN and infinite where there is none.
+    port : Port or None
+        A housing port as the refracting surface, instead of water.
+    control_names : tuple of str
+        Of the surveyed points, which are the last ones of `xyz`.
+    is_check : array of bool, shape (len(control_names),)
+        Which of them are held out, to check the result.
+    """
+
+    cameras: Cameras
+    xyz: FloatArray
+    start: IntArray
+    camera: IntArray
+    image_xy: FloatArray
+    sigma_px: FloatArray
+    water: WaterSurface | None
+    refractive_index: float
+    wet: BoolArray
+    surveyed_xyz: FloatArray
+    surveyed_sigma_m: FloatArray
+    gnss_xyz: FloatArray
+    gnss_sigma_m: FloatArray
+    port: Port | None = None
+    control_names: tuple[str, ...] = ()
+    is_check: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
+
+    @property
+    def owner(self) -> IntArray:
+        """Row of the point of each observation."""
+        return np.repeat(np.arange(len(self.xyz)), np.diff(self.start))
+
+    @property
+    def is_surveyed(self) -> BoolArray:
+        """Which points are control points."""
+        return np.asarray(np.isfinite(self.surveyed_sigma_m).any(axis=1))
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """What may move: zero fixes a number, infinity frees it, else it is a standard deviation.
+
+    Attributes
+    ----------
+    poses : {"free", "fixed", "similarity"}
+        `similarity` moves, turns and scales them all together.
+    fixed_images : tuple of str
+        Labels of images that keep their pose.
+    lens : tuple of str
+        Parameters of each sensor that are free: f, cx, cy, b1, b2, k1 ... k8, p1, p2.
+    lens_sigma : dict
+        Standard deviations of some of them about their start values, in their unit.
+    level_sigma_m, tilt_sigma, index_sigma : float
+        Of the water level, its slopes, and the refractive index.
+    free_network : bool
+        The datum is that of the start values: the projection centres keep mean place, mean
+        direction and mean scale.
+    """
+
+    poses: Poses = "free"
+    fixed_images: tuple[str, ...] = ()
+    lens: tuple[str, ...] = ("f",)
+    lens_sigma: dict[str, float] = field(default_factory=dict)
+    level_sigma_m: float = 0.0
+    tilt_sigma: float = 0.0
+    index_sigma: float = 0.0
+    free_network: bool = False
+
+    @property
+    def water_sigma(self) -> tuple[float, float, float, float]:
+        """Of a, b, c and n."""
+        return self.level_sigma_m, self.tilt_sigma, self.tilt_sigma, self.index_sigma
+
+
+def sensor_groups(lenses: tuple[Lens, ...]) -> tuple[IntArray, list[list[int]]]:
+    """Return which sensor each of k lenses is of, and the rows of each sensor.
+
+    Images with a calibration each of one sensor and frame share what is added to it.
+    """
+    rows: dict[tuple[object, ...], list[int]] = {}
+    for i, lens in enumerate(lenses):
+        key = (lens.sensor, lens.width, lens.height, lens.projection, lens.inverse)
+        rows.setdefault(key, []).append(i)
+    if _several_lenses(lenses, rows):
+        rows = {}
+        for i, lens in enumerate(lenses):
+            rows.setdefault((lens,), []).append(i)
+    group = np.zeros(len(lenses), np.int64)
+    for number, mine in enumerate(rows.values()):
+        group[mine] = number
+    return group, list(rows.values())
+
+
+FEW_IMAGES = 5.0
+"""Images a lens, in the mean, below which lenses of one sensor share what is added to them."""
+
+
+def _several_lenses(lenses: tuple[Lens, ...], rows: dict[tuple[object, ...], list[int]]) -> bool:
+    """Whether there are several lenses of one sensor, each with images enough for its own."""
+    distinct = len(set(lenses))
+    return distinct > len(rows) and len(lenses) / distinct >= FEW_IMAGES
+
+
+def usable_codes(lens: Lens, names: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the codes of those parameters that the formula of a lens has."""
+    codes = tuple(CODES[name] for name in names)
+    if lens.in_turn:
+        return tuple(code for code in codes if code < CODES["p1"])
+    return codes
+
+
+def moved_lens(lens: Lens, codes: tuple[int, ...], by: FloatArray) -> Lens:
+    """Return a lens with something added to some of its parameters."""
+    changes: dict[str, float | tuple[float, ...]] = {}
+    radial, tangential = list(lens.radial), list(lens.tangential)
+    plain = {
+        CODES["f"]: "focal", CODES["cx"]: "principal_x", CODES["cy"]: "principal_y",
+        CODES["b1"]: "b1", CODES["b2"]: "b2",
+    }  # fmt: skip
+    for code, step in zip(codes, by.tolist(), strict=True):
+        if code in plain:
+            changes[plain[code]] = getattr(lens, plain[code]) + step
+        elif code >= CODES["k1"]:
+            place = code - CODES["k1"]
+            radial += [0.0] * (place + 1 - len(radial))
+            radial[place] += step
+        else:
+            place = code - CODES["p1"]
+            tangential += [0.0] * (2 - len(tangential))
+            tangential[place] += step
+    return replace(lens, **changes, radial=tuple(radial), tangential=tuple(tangential))  # type: ignore[arg-type]

@@ -1,0 +1,229 @@
+"""A block from what there is: tie points or the cloud, surveyed points, GNSS positions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from pcfix.adjust.block import Block
+from pcfix.errors import GeometryError, SettingError
+from pcfix.label.surface import surface_above
+from pcfix.model import TiePoints, Views, WaterDimension
+from pcfix.refract.lens import project
+
+if TYPE_CHECKING:
+    from pcfix.model import BoolArray, Cameras, FloatArray, GroundControl, IntArray, WaterSurface
+    from pcfix.ports import Port
+
+LEAST_VIEWS = 2
+LEAST_ANGLE_DEG = 2.0
+"""Between the rays of a tie point: a point of less is hardly known, and tells hardly anything."""
+
+TIE_POINTS = 150_000
+"""At most; more tell nothing new, as their number beats down the noise of single images only."""
+
+FIRST_SIGMA_PX = 1.0
+"""Of measured tie points, until the adjustment itself has told it."""
+
+
+class Datum(NamedTuple):
+    """GNSS positions in the block's frame, shape (k, 3); NaN and infinite where there is none."""
+
+    xyz: FloatArray
+    sigma_m: FloatArray
+
+
+def no_datum(k: int) -> Datum:
+    """Return the datum of a block without GNSS."""
+    return Datum(np.full((k, 3), np.nan), np.full((k, 3), np.inf))
+
+
+def block_of(
+    cameras: Cameras,
+    ties: TiePoints,
+    sigma_px: float,
+    water: WaterSurface | None,
+    refractive_index: float,
+    gnss: Datum,
+    control: GroundControl | None = None,
+    wet: BoolArray | None = None,
+    port: Port | None = None,
+) -> Block:
+    """Return the block of tie points and surveyed points.
+
+    Parameters
+    ----------
+    cameras : Cameras
+    ties : TiePoints
+        Apparent points, in the frame of the cameras.
+    sigma_px : float
+        Of their image places.
+    water, refractive_index, port
+        See `pcfix.adjust.block.Block`.
+    gnss : Datum
+    control : GroundControl, optional
+        In the frame of the cameras. Points to check with get no weight.
+    wet : array of bool, shape (m,), optional
+        Which tie points may be under water; all by default.
+
+    Raises
+    ------
+    SettingError
+        If the water is a dimension of the cloud, which tie points do not have.
+    GeometryError
+        If a control point lies under water and the survey does not say so.
+    """
+    if isinstance(water, WaterDimension):
+        raise SettingError(
+            f"water {water} is known at the points of the cloud only; an adjustment needs the water"
+            " as a level, plane, raster, mesh or shoreline."
+        )
+    m = len(ties.xyz)
+    xyz = true_start(ties.xyz, water, refractive_index, wet)
+    parts = [
+        (
+            xyz,
+            ties.views.start,
+            ties.views.camera,
+            ties.image_xy,
+            np.full(len(ties.views.camera), sigma_px),
+        )
+    ]
+    names: tuple[str, ...] = ()
+    is_check = np.zeros(0, np.bool_)
+    if control is not None:
+        _check_under_water(control, water)
+        names, is_check = control.names, control.is_check
+        parts.append(_control_part(control))
+    allowed = np.ones(m, np.bool_) if wet is None else wet
+    surveyed_xyz, surveyed_sigma = np.full((m, 3), np.nan), np.full((m, 3), np.inf)
+    if control is not None:
+        held = np.where(is_check[:, None], np.inf, control.sigma_m)
+        surveyed_xyz = np.vstack([surveyed_xyz, control.xyz])
+        surveyed_sigma = np.vstack([surveyed_sigma, held])
+        allowed = np.concatenate([allowed, control.under_water])
+    starts = [parts[0][1]] + [part[1][1:] + parts[0][1][-1] for part in parts[1:]]
+    return Block(
+        cameras=cameras,
+        xyz=np.vstack([part[0] for part in parts]),
+        start=np.concatenate(starts),
+        camera=np.concatenate([part[2] for part in parts]),
+        image_xy=np.vstack([part[3] for part in parts]),
+        sigma_px=np.concatenate([part[4] for part in parts]),
+        water=water,
+        refractive_index=refractive_index,
+        wet=allowed,
+        surveyed_xyz=surveyed_xyz,
+        surveyed_sigma_m=surveyed_sigma,
+        gnss_xyz=gnss.xyz,
+        gnss_sigma_m=gnss.sigma_m,
+        port=port,
+        control_names=names,
+        is_check=is_check,
+    )
+
+
+def _control_part(
+    control: GroundControl,
+) -> tuple[FloatArray, IntArray, IntArray, FloatArray, FloatArray]:
+    order = np.argsort(control.point, kind="stable")
+    counts = np.bincount(control.point, minlength=len(control.names))
+    start = np.concatenate([[0], np.cumsum(counts)])
+    point = control.point[order]
+    sigma = np.where(control.is_check[point], np.inf, control.sigma_px[order])
+    return control.xyz, start, control.camera[order], control.image_xy[order], sigma
+
+
+def _check_under_water(control: GroundControl, water: WaterSurface | None) -> None:
+    if water is None:
+        return
+    level = surface_above(water, control.xyz).height_m
+    deep = (control.xyz[:, 2] < level - 3.0 * control.sigma_m[:, 2]) & ~control.under_water
+    if deep.any():
+        i = int(np.argmax(deep))
+        raise GeometryError(
+            f"control point {control.names[i]}: its height {control.xyz[i, 2]:.3f} m is below the"
+            f" water surface ({level[i]:.3f} m), and the survey does not say that it lies under"
+            " water: add a column under_water with yes to the file, or check height datum and"
+            " level."
+        )
+
+
+def true_start(
+    xyz: FloatArray, water: WaterSurface | None, n: float, wet: BoolArray | None = None
+) -> FloatArray:
+    """Return apparent points with their depths times n, where a true point may be looked for."""
+    if water is None:
+        return xyz.copy()
+    level = surface_above(water, xyz).height_m
+    below = level > xyz[:, 2]
+    if wet is not None:
+        below &= wet
+    moved = xyz.copy()
+    moved[below, 2] = level[below] - n * (level[below] - xyz[below, 2])
+    return moved
+
+
+def usable_ties(
+    ties: TiePoints, cameras: Cameras, most: int = TIE_POINTS, seed: int = 0
+) -> TiePoints:
+    """Return the tie points that can be adjusted.
+
+    Those with a place in space, two images or more, and rays that meet at an angle; a random part
+    of them where they are very many.
+    """
+    counts = np.diff(ties.views.start)
+    good = np.isfinite(ties.xyz).all(axis=1) & (counts >= LEAST_VIEWS)
+    good &= _ray_angle_deg(ties, cameras) >= LEAST_ANGLE_DEG
+    rows = np.flatnonzero(good)
+    if len(rows) > most:
+        rows = np.sort(np.random.default_rng(seed).choice(rows, most, replace=False))
+    return taken(ties, rows)
+
+
+def taken(ties: TiePoints, rows: IntArray) -> TiePoints:
+    """Return some of the tie points, in the given order."""
+    first, counts = ties.views.start[rows], np.diff(ties.views.start)[rows]
+    begin = np.cumsum(counts) - counts
+    where = np.repeat(first - begin, counts) + np.arange(counts.sum())
+    return TiePoints(ties.xyz[rows], ties.views.take(rows), ties.image_xy[where])
+
+
+def _ray_angle_deg(ties: TiePoints, cameras: Cameras) -> FloatArray:
+    """Return about the largest angle between the rays of each point: twice that to their mean."""
+    owner = np.repeat(np.arange(len(ties.xyz)), np.diff(ties.views.start))
+    ray = cameras.centres[ties.views.camera] - ties.xyz[owner]
+    ray /= np.linalg.norm(ray, axis=1)[:, None]
+    mean = np.zeros((len(ties.xyz), 3))
+    np.add.at(mean, owner, ray)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
+    cosine = np.full(len(mean), 1.0)
+    np.minimum.at(cosine, owner, np.einsum("oi,oi->o", ray, mean[owner]))
+    return 2.0 * np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def ties_of_cloud(xyz: FloatArray, views: Views, cameras: Cameras) -> TiePoints:
+    """Return apparent points as tie points: where the cameras image them, straight.
+
+    Parameters
+    ----------
+    xyz : array, shape (m, 3)
+    views : Views
+        Which cameras made them, or hold them in frame.
+    cameras : Cameras
+    """
+    if cameras.lenses is None or cameras.rotations is None:
+        raise GeometryError("an adjustment needs cameras with angles and lenses.")
+    owner = np.repeat(np.arange(len(xyz)), np.diff(views.start))
+    image = np.empty((len(owner), 2))
+    for c in range(len(cameras)):
+        mine = views.camera == c
+        ahead = (xyz[owner[mine]] - cameras.centres[c]) @ cameras.rotations[c].T
+        image[mine] = project(cameras.lenses[c], ahead)
+    seen = np.isfinite(image).all(axis=1)
+    counts = np.bincount(owner[seen], minlength=len(xyz))
+    start = np.concatenate([[0], np.cumsum(counts)])
+    tracks = Views(start, np.asarray(views.camera)[seen])
+    rows = np.flatnonzero(counts >= LEAST_VIEWS)
+    return taken(TiePoints(xyz, tracks, image[seen]), rows)

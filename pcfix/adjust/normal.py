@@ -1,0 +1,410 @@
+r"""The normal equations of a block, reduced to the poses: what the kernels sum up.
+
+With the residual r = image measured minus computed, weighted, and the Jacobians J (pose), G (what
+all share: lens, water, similarity) and B (point) of one observation, a point contributes
+
+    U = J'J,  U_g = J'G,  U_gg = G'G,  V = sum B'B,  W = J'B,  W_g = sum G'B
+
+and, as each point is seen by few cameras, it is eliminated where it is met (Schur):
+
+    S_ij -= W_i V^-1 W_j',   S_ig -= W_i V^-1 W_g',   S_gg -= W_g V^-1 W_g'
+
+Only pairs of cameras that share a point have a block in S; the cost is linear in the points. The
+points go in a fixed number of parts with sums of their own, so that the bits do not depend on the
+number of threads.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numba import njit, prange
+
+from pcfix.adjust.observe import (
+    POINT,
+    WATER,
+    WIDTH,
+    image,
+    image_and_all_gradients,
+    lens_gradients,
+)
+from pcfix.refract.threads import one_caller
+
+if TYPE_CHECKING:
+    from pcfix.adjust.state import Columns, Seen, State, Surface
+    from pcfix.model import FloatArray, IntArray
+
+PARTS = 8
+LOST = 1e6
+"""What an observation costs whose point got out of sight, in its weighted square."""
+
+SQUARES, HUBER, CAUCHY = range(3)
+
+
+class Loss(NamedTuple):
+    """How residuals count: the kind, and where it begins to bend, in standard deviations."""
+
+    kind: int = SQUARES
+    scale: float = 1.0
+
+
+class PointPriors(NamedTuple):
+    """Surveyed points: where, and the inverse variances along x, y, z; zero for the others."""
+
+    xyz: FloatArray
+    weight: FloatArray
+
+
+class Sums(NamedTuple):
+    """The reduced normal equations before damping.
+
+    blocks : shape (slots, 6, 6), S_ij of the pairs of `slot`, i <= j.
+    border : shape (k, 6, g); corner : shape (g, g).
+    poses, shared : shape (k, 6) and (g,), the right sides.
+    diagonal, shared_diagonal : of U and U_gg, for the damping.
+    """
+
+    blocks: FloatArray
+    border: FloatArray
+    corner: FloatArray
+    poses: FloatArray
+    shared: FloatArray
+    diagonal: FloatArray
+    shared_diagonal: FloatArray
+
+
+def pair_slots(seen: Seen, cameras: int) -> tuple[IntArray, IntArray]:
+    """Return which block each pair of cameras has.
+
+    Returns
+    -------
+    slot : array, shape (k, k)
+        -1 where two cameras share no point.
+    pairs : array, shape (slots, 2)
+        i <= j.
+    """
+    share = np.zeros((cameras, cameras), np.bool_)
+    _mark(share, seen.start, seen.camera)
+    np.fill_diagonal(share, True)
+    i, j = np.nonzero(np.triu(share))
+    slot = np.full((cameras, cameras), -1, np.int32)
+    slot[i, j] = slot[j, i] = np.arange(len(i))
+    return slot, np.column_stack([i, j])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _mark(share: FloatArray, start: IntArray, camera: IntArray) -> None:
+    for p in range(len(start) - 1):
+        for a in range(start[p], start[p + 1]):
+            for b in range(start[p], start[p + 1]):
+                share[camera[a], camera[b]] = True
+
+
+def normal_equations(
+    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
+    loss: Loss, damping: float, slots: tuple[IntArray, IntArray], pivot: FloatArray,
+) -> Sums:  # fmt: skip
+    """Return the reduced normal equations at a state.
+
+    Parameters
+    ----------
+    damping : float
+        Levenberg-Marquardt's factor on the diagonal of V; that of the poses is added later.
+    pivot : array, shape (3,)
+        About which a similarity turns and scales, block frame.
+    """
+    slot, pairs = slots
+    k, g = len(state.centres), columns.count
+    sums = (
+        np.zeros((PARTS, len(pairs), 6, 6)), np.zeros((PARTS, k, 6, g)), np.zeros((PARTS, g, g)),
+        np.zeros((PARTS, k, 6)), np.zeros((PARTS, g)),
+        np.zeros((PARTS, k, 6)), np.zeros((PARTS, g)),
+    )  # fmt: skip
+    with one_caller():
+        _sum_up(
+            state, seen, surface, columns, priors, loss.kind, loss.scale, damping, slot, pivot,
+            *sums,
+        )  # fmt: skip
+    return Sums(*(part.sum(axis=0) for part in sums))
+
+
+def point_steps(
+    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
+    loss: Loss, damping: float, pivot: FloatArray, poses: FloatArray, shared: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """Return how the points move, given how the poses and what they share do, shape (m, 3)."""
+    steps = np.zeros((len(state.xyz), 3))
+    with one_caller():
+        _point_steps(
+            state, seen, surface, columns, priors, loss.kind, loss.scale, damping, pivot,
+            poses, shared, steps,
+        )  # fmt: skip
+    return steps
+
+
+def residuals(state: State, seen: Seen, surface: Surface) -> FloatArray:
+    """Return measured minus computed places in the images, shape (o, 2), in their unit.
+
+    NaN where the camera does not image the point.
+    """
+    found = np.empty((len(seen.camera), 2))
+    with one_caller():
+        _residuals(state, seen, surface, found)
+    return found
+
+
+def cost_of(squares: FloatArray, loss: Loss) -> float:
+    """Return the sum of what weighted squared residuals cost; NaN ones cost `LOST`."""
+    lost = np.isnan(squares)
+    s = np.where(lost, 0.0, squares)
+    c2 = loss.scale * loss.scale
+    if loss.kind == HUBER:
+        s = np.where(s <= c2, s, 2.0 * loss.scale * np.sqrt(s) - c2)
+    elif loss.kind == CAUCHY:
+        s = c2 * np.log1p(s / c2)
+    return float(s.sum() + LOST * lost.sum())
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _influence(square: float, kind: int, scale: float) -> float:
+    """Return the derivative of the loss by the square: the weight of the observation."""
+    if kind == HUBER:
+        return 1.0 if square <= scale * scale else scale / np.sqrt(square)
+    if kind == CAUCHY:
+        return 1.0 / (1.0 + square / (scale * scale))
+    return 1.0
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _residuals(state: State, seen: Seen, surface: Surface, found: FloatArray) -> None:
+    for part in prange(PARTS):
+        m = len(state.xyz)
+        light, plane = np.empty((3, 12)), np.empty(4)
+        for p in range(part * m // PARTS, (part + 1) * m // PARTS):
+            for o in range(seen.start[p], seen.start[p + 1]):
+                c = seen.camera[o]
+                u, v = image(
+                    state.xyz[p], seen.wet[p], state.centres[c], state.rotations[c],
+                    state.lenses[seen.lens_row[c]], state.water, surface, light, plane,
+                )  # fmt: skip
+                found[o, 0], found[o, 1] = seen.image_xy[o, 0] - u, seen.image_xy[o, 1] - v
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _linearise(
+    state: State, seen: Seen, surface: Surface, columns: Columns, kind: int, scale: float,
+    pivot: FloatArray, p: int, o: int, light: FloatArray, plane: FloatArray, ahead: FloatArray,
+    own: FloatArray, shared: FloatArray, r: FloatArray,
+) -> bool:  # fmt: skip
+    """Fill in the weighted residual and Jacobians of one observation; whether it counts."""
+    c = seen.camera[o]
+    if seen.weight[o] == 0.0:
+        return False
+    u, v = image_and_all_gradients(
+        state.xyz[p], seen.wet[p], state.centres[c], state.rotations[c],
+        state.lenses[seen.lens_row[c]], state.water, surface, light, plane, ahead, own,
+    )  # fmt: skip
+    r[0], r[1] = seen.image_xy[o, 0] - u, seen.image_xy[o, 1] - v
+    w = seen.weight[o]
+    square = w * w * (r[0] * r[0] + r[1] * r[1])
+    if not square < np.inf:
+        return False
+    w *= np.sqrt(_influence(square, kind, scale))
+    group = seen.group[c]
+    first, last = columns.lens[group], columns.lens[group + 1]
+    shared[:] = 0.0
+    if last > first:
+        lens_gradients(
+            state.lenses[seen.lens_row[c]], ahead, columns.code[first:last], shared[:, first:last]
+        )
+    for i in range(4):
+        if columns.water[i] >= 0:
+            shared[0, columns.water[i]] = own[0, WATER + i]
+            shared[1, columns.water[i]] = own[1, WATER + i]
+    if columns.similarity >= 0:
+        _similarity_gradients(state, c, own, pivot, shared, columns.similarity)
+    r *= w
+    own *= w
+    shared *= w
+    return True
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _similarity_gradients(
+    state: State, c: int, own: FloatArray, pivot: FloatArray, shared: FloatArray, at: int
+) -> None:
+    """Fill in the derivatives by a shift, a turn phi and a scale of all poses together.
+
+    C moves by t + phi x d + s d with d = C - pivot, and R by exp(-R phi) R. The poses do not move
+    on their own then.
+    """
+    r = state.rotations[c]
+    dx = state.centres[c, 0] - pivot[0]
+    dy = state.centres[c, 1] - pivot[1]
+    dz = state.centres[c, 2] - pivot[2]
+    for row in range(2):
+        cx, cy, cz = own[row, 3], own[row, 4], own[row, 5]
+        shared[row, at], shared[row, at + 1], shared[row, at + 2] = cx, cy, cz
+        turn = (dy * cz - dz * cy, dz * cx - dx * cz, dx * cy - dy * cx)
+        for i in range(3):
+            rolled = r[0, i] * own[row, 0] + r[1, i] * own[row, 1] + r[2, i] * own[row, 2]
+            shared[row, at + 3 + i] = turn[i] - rolled
+        shared[row, at + 6] = dx * cx + dy * cy + dz * cz
+        for i in range(6):
+            own[row, i] = 0.0
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _point_block(
+    v: FloatArray, rhs: FloatArray, priors: PointPriors, xyz: FloatArray, p: int, damping: float
+) -> bool:
+    """Add prior and damping to V and its right side, and invert V in place."""
+    for i in range(3):
+        weight = priors.weight[p, i]
+        v[i, i] += weight
+        if weight > 0.0:
+            rhs[i] += weight * (priors.xyz[p, i] - xyz[i])
+    for i in range(3):
+        v[i, i] += damping * v[i, i]
+    a, b, c = v[0, 0], v[0, 1], v[0, 2]
+    d, e, f = v[1, 1], v[1, 2], v[2, 2]
+    det = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    if not det > 1e-14 * a * d * f:
+        return False
+    v[0, 0], v[1, 1], v[2, 2] = (d * f - e * e) / det, (a * f - c * c) / det, (a * d - b * b) / det
+    v[0, 1] = v[1, 0] = (c * e - b * f) / det
+    v[0, 2] = v[2, 0] = (b * e - c * d) / det
+    v[1, 2] = v[2, 1] = (b * c - a * e) / det
+    return True
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _sum_up(
+    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors, kind: int,
+    scale: float, damping: float, slot: IntArray, pivot: FloatArray,
+    blocks: FloatArray, border: FloatArray, corner: FloatArray, poses: FloatArray,
+    shared_right: FloatArray, diagonal: FloatArray, shared_diagonal: FloatArray,
+) -> None:  # fmt: skip
+    for part in prange(PARTS):
+        m, g = len(state.xyz), columns.count
+        most = 1
+        for p in range(part * m // PARTS, (part + 1) * m // PARTS):
+            most = max(most, seen.start[p + 1] - seen.start[p])
+        light, plane, ahead = np.empty((3, 12)), np.empty(4), np.empty(3)
+        own, shared, r = np.empty((2, WIDTH)), np.zeros((2, g)), np.empty(2)
+        v, rhs, w_g = np.empty((3, 3)), np.empty(3), np.empty((g, 3))
+        w, y, who = np.empty((most, 6, 3)), np.empty((6, 3)), np.empty(most, np.int64)
+        for p in range(part * m // PARTS, (part + 1) * m // PARTS):
+            v[:], rhs[:], w_g[:], count = 0.0, 0.0, 0.0, 0
+            for o in range(seen.start[p], seen.start[p + 1]):
+                if not _linearise(
+                    state, seen, surface, columns, kind, scale, pivot, p, o,
+                    light, plane, ahead, own, shared, r,
+                ):  # fmt: skip
+                    continue
+                c = seen.camera[o]
+                who[count] = c
+                u = blocks[part, slot[c, c]]
+                for i in range(6):
+                    for j in range(6):
+                        u[i, j] += own[0, i] * own[0, j] + own[1, i] * own[1, j]
+                    for j in range(g):
+                        border[part, c, i, j] += own[0, i] * shared[0, j] + own[1, i] * shared[1, j]
+                    diagonal[part, c, i] += own[0, i] * own[0, i] + own[1, i] * own[1, i]
+                    poses[part, c, i] += own[0, i] * r[0] + own[1, i] * r[1]
+                    for j in range(3):
+                        w[count, i, j] = (
+                            own[0, i] * own[0, POINT + j] + own[1, i] * own[1, POINT + j]
+                        )
+                for i in range(g):
+                    for j in range(g):
+                        corner[part, i, j] += (
+                            shared[0, i] * shared[0, j] + shared[1, i] * shared[1, j]
+                        )
+                    shared_diagonal[part, i] += shared[0, i] ** 2 + shared[1, i] ** 2
+                    shared_right[part, i] += shared[0, i] * r[0] + shared[1, i] * r[1]
+                    for j in range(3):
+                        w_g[i, j] += (
+                            shared[0, i] * own[0, POINT + j] + shared[1, i] * own[1, POINT + j]
+                        )
+                for i in range(3):
+                    for j in range(3):
+                        v[i, j] += (
+                            own[0, POINT + i] * own[0, POINT + j]
+                            + own[1, POINT + i] * own[1, POINT + j]
+                        )
+                    rhs[i] += own[0, POINT + i] * r[0] + own[1, POINT + i] * r[1]
+                count += 1
+            if count == 0 or not _point_block(v, rhs, priors, state.xyz[p], p, damping):
+                continue
+            for a in range(count):
+                c = who[a]
+                for i in range(6):
+                    for j in range(3):
+                        y[i, j] = w[a, i, 0] * v[0, j] + w[a, i, 1] * v[1, j] + w[a, i, 2] * v[2, j]
+                    poses[part, c, i] -= y[i, 0] * rhs[0] + y[i, 1] * rhs[1] + y[i, 2] * rhs[2]
+                    for j in range(g):
+                        border[part, c, i, j] -= (
+                            y[i, 0] * w_g[j, 0] + y[i, 1] * w_g[j, 1] + y[i, 2] * w_g[j, 2]
+                        )
+                for b in range(count):
+                    if who[b] < c or (who[b] == c and b < a):
+                        continue
+                    s = blocks[part, slot[c, who[b]]]
+                    for i in range(6):
+                        for j in range(6):
+                            s[i, j] -= (
+                                y[i, 0] * w[b, j, 0] + y[i, 1] * w[b, j, 1] + y[i, 2] * w[b, j, 2]
+                            )
+                    if who[b] == c and b > a:
+                        for i in range(6):
+                            for j in range(6):
+                                s[j, i] -= (
+                                    y[i, 0] * w[b, j, 0]
+                                    + y[i, 1] * w[b, j, 1]
+                                    + y[i, 2] * w[b, j, 2]
+                                )
+            for i in range(g):
+                y0 = w_g[i, 0] * v[0, 0] + w_g[i, 1] * v[1, 0] + w_g[i, 2] * v[2, 0]
+                y1 = w_g[i, 0] * v[0, 1] + w_g[i, 1] * v[1, 1] + w_g[i, 2] * v[2, 1]
+                y2 = w_g[i, 0] * v[0, 2] + w_g[i, 1] * v[1, 2] + w_g[i, 2] * v[2, 2]
+                shared_right[part, i] -= y0 * rhs[0] + y1 * rhs[1] + y2 * rhs[2]
+                for j in range(g):
+                    corner[part, i, j] -= y0 * w_g[j, 0] + y1 * w_g[j, 1] + y2 * w_g[j, 2]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _point_steps(
+    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors, kind: int,
+    scale: float, damping: float, pivot: FloatArray, poses: FloatArray, moved: FloatArray,
+    steps: FloatArray,
+) -> None:  # fmt: skip
+    for part in prange(PARTS):
+        m, g = len(state.xyz), columns.count
+        light, plane, ahead = np.empty((3, 12)), np.empty(4), np.empty(3)
+        own, shared, r = np.empty((2, WIDTH)), np.zeros((2, g)), np.empty(2)
+        v, rhs = np.empty((3, 3)), np.empty(3)
+        for p in range(part * m // PARTS, (part + 1) * m // PARTS):
+            v[:], rhs[:], count = 0.0, 0.0, 0
+            for o in range(seen.start[p], seen.start[p + 1]):
+                if not _linearise(
+                    state, seen, surface, columns, kind, scale, pivot, p, o,
+                    light, plane, ahead, own, shared, r,
+                ):  # fmt: skip
+                    continue
+                c = seen.camera[o]
+                for row in range(2):
+                    left = r[row]
+                    for i in range(6):
+                        left -= own[row, i] * poses[c, i]
+                    for i in range(g):
+                        left -= shared[row, i] * moved[i]
+                    for i in range(3):
+                        rhs[i] += own[row, POINT + i] * left
+                        for j in range(3):
+                            v[i, j] += own[row, POINT + i] * own[row, POINT + j]
+                count += 1
+            if count and _point_block(v, rhs, priors, state.xyz[p], p, damping):
+                for i in range(3):
+                    steps[p, i] = v[i, 0] * rhs[0] + v[i, 1] * rhs[1] + v[i, 2] * rhs[2]

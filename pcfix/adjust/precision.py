@@ -1,0 +1,291 @@
+"""How well an adjustment determines its unknowns: covariances, standard errors, correlations.
+
+The inverse of the reduced normal matrix S is the covariance of poses and shared unknowns for
+observations of unit weight, as the points were eliminated and not left out (Triggs et al. 2000,
+section 6). All is scaled by the a-posteriori variance of unit weight. The datum is that of the
+priors; in a free network that of the start values.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from pcfix.adjust.reduced import solver
+from pcfix.adjust.separability import strong_correlations, undetermined, weakest
+from pcfix.adjust.solve import similarity_gradients
+from pcfix.adjust.undamped import Undamped, point_covariances, undamped
+from pcfix.errors import GeometryError
+
+if TYPE_CHECKING:
+    from pcfix.adjust.reduced import Reduced
+    from pcfix.adjust.solve import Problem, Solution
+    from pcfix.model import FloatArray
+
+__all__ = [
+    "BLOCK_MOTIONS",
+    "Precision",
+    "SharedUnknown",
+    "precision_of",
+    "strong_correlations",
+    "undetermined",
+    "weakest",
+]
+
+DENSE_UP_TO = 12_000
+"""Unknowns up to which the whole inverse is computed (1.2 GB)."""
+
+QUICK = 1000
+"""Unknowns up to which memory does not matter and LAPACK's dpotri costs more than a plain inverse:
+on busy cores its threads wait for one another for a third of a second."""
+
+SINGULAR = 1e-13
+"""Reciprocal condition of the scaled matrix below which nothing in the inverse can be trusted."""
+
+BLOCK_MOTIONS = (
+    "the mean height of the projection centres",
+    "the mean tilt of the projection centres along x",
+    "the mean tilt of the projection centres along y",
+)
+
+
+class SharedUnknown(NamedTuple):
+    """One of the unknowns that all points share.
+
+    name : str
+        See `pcfix.adjust.solve.Problem.names`. The level is that at the origin of the block,
+        below the middle of the projection centres.
+    added : float
+        To its start value.
+    sigma : float
+        Standard error, in its unit: pixels, metres, slopes without unit, radians.
+    """
+
+    name: str
+    added: float
+    sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class Precision:
+    """What the observations say about how well everything is known.
+
+    Attributes
+    ----------
+    sigma0 : float
+        By whose square the covariances are scaled.
+    pose_covariance : array, shape (k, 6, 6)
+        Of the small turn of each camera about the axes of its own frame (radians), and of its
+        centre in the world frame (metres). Zero where a pose is fixed.
+    shared : tuple of SharedUnknown, length g
+    correlation : array, shape (g, g)
+        Of the shared unknowns.
+    block_correlation : array, shape (g, 3)
+        Of the shared unknowns with `BLOCK_MOTIONS`; zero where these are fixed.
+    point_covariance_m2 : array, shape (m, 6), or None
+        xx, xy, xz, yy, yz, zz, world frame; NaN of points that their observations do not fix.
+        None where there are too many unknowns.
+    notes : tuple of str
+        What was left out.
+    """
+
+    sigma0: float
+    pose_covariance: FloatArray
+    shared: tuple[SharedUnknown, ...]
+    correlation: FloatArray
+    block_correlation: FloatArray
+    point_covariance_m2: FloatArray | None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def centre_sigma_m(self) -> FloatArray:
+        """Standard errors of the projection centres along x, y, z, shape (k, 3), metres."""
+        return np.asarray(np.sqrt(np.einsum("kii->ki", self.pose_covariance)[:, 3:]))
+
+    @property
+    def angle_sigma_deg(self) -> FloatArray:
+        """Standard errors of turns about the axes of each camera's frame, shape (k, 3)."""
+        return np.asarray(np.degrees(np.sqrt(np.einsum("kii->ki", self.pose_covariance)[:, :3])))
+
+    @property
+    def point_sigma_m(self) -> FloatArray | None:
+        """Standard errors of the points along x, y, z, shape (m, 3), metres."""
+        covariance = self.point_covariance_m2
+        return None if covariance is None else np.sqrt(covariance[:, [0, 3, 5]])
+
+    def sigma_of(self, name: str) -> float | None:
+        """Return the standard error of a shared unknown; None where it is fixed."""
+        return next((row.sigma for row in self.shared if row.name == name), None)
+
+
+def precision_of(problem: Problem, solution: Solution, sigma0: float = 1.0) -> Precision:
+    """Return covariances and correlations at a solution.
+
+    Parameters
+    ----------
+    problem : Problem
+        Outliers without weight.
+    solution : Solution
+    sigma0 : float
+        A-posteriori standard deviation of unit weight; 1 for what the given ones say.
+
+    Raises
+    ------
+    GeometryError
+        If the block does not determine its unknowns; says which.
+    """
+    equations = undamped(problem, solution)
+    size, k = len(equations.reduced.active), len(solution.state.centres)
+    asked = _asked(problem, solution)[equations.reduced.active]
+    variance = sigma0 * sigma0
+    notes = _left_out(equations)
+    points = None
+    if size <= DENSE_UP_TO:
+        inverse = _inverse(equations, solution)
+        of_asked = asked.T @ inverse @ asked
+        poses = _pose_blocks(problem, solution, equations.reduced, inverse)
+        points = variance * point_covariances(equations, solution, inverse)
+    else:
+        of_asked, poses = _by_parts(equations, solution, asked)
+        notes += (
+            f"The covariances of the points were left out: {size:,} unknowns of poses, lens and"
+            f" water are more than {DENSE_UP_TO:,}.",
+        )
+    g = problem.columns.count
+    correlation = _correlations(of_asked)
+    sigma = np.sqrt(np.diag(of_asked)[:g]) * sigma0
+    rows = zip(problem.names, solution.shared.tolist(), sigma.tolist(), strict=True)
+    return Precision(
+        sigma0, variance * poses.reshape(k, 6, 6), tuple(SharedUnknown(*row) for row in rows),
+        correlation[:g, :g], correlation[:g, g:], points, notes,
+    )  # fmt: skip
+
+
+def _left_out(equations: Undamped) -> tuple[str, ...]:
+    loose = int((~equations.is_fixed).sum())
+    if loose == 0:
+        return ()
+    return (f"{loose:,} points that their images do not fix have no covariance.",)
+
+
+def _asked(problem: Problem, solution: Solution) -> FloatArray:
+    """Return what shared unknowns and block motions are of all unknowns, shape (u, g + 3)."""
+    k, g = len(solution.state.centres), problem.columns.count
+    rows = np.zeros((6 * k + g, g + 3))
+    rows[6 * k :, :g] = np.eye(g)
+    away = solution.state.centres - solution.state.centres.mean(axis=0)
+    fit = np.linalg.pinv(np.column_stack([np.ones(k), away[:, :2]]), rcond=1e-6)
+    if problem.columns.similarity < 0:
+        rows[5 : 6 * k : 6, g:] = fit.T
+        return rows
+    at = 6 * k + problem.columns.similarity
+    rows[at : at + 7, g:] = np.einsum("ak,kb->ba", fit, _centre_gradients(problem, solution)[:, 2])
+    return rows
+
+
+def _centre_gradients(problem: Problem, solution: Solution) -> FloatArray:
+    return similarity_gradients(solution.state.centres - problem.pivot)
+
+
+def _inverse(equations: Undamped, solution: Solution) -> FloatArray:
+    """Return the whole inverse, by Cholesky's method with a unit diagonal."""
+    from scipy.linalg import lapack
+
+    matrix = equations.reduced.matrix
+    if matrix.shape[0] == 0:
+        return np.zeros((0, 0))
+    a = np.array(matrix if isinstance(matrix, np.ndarray) else matrix.toarray(), order="F")
+    diagonal = a.diagonal()
+    if not (diagonal > 0.0).all():
+        raise _singular(equations, solution)
+    scale = 1.0 / np.sqrt(diagonal)
+    a *= scale
+    a *= scale[:, None]
+    norm = lapack.dlange("1", a)  # type: ignore[call-arg]
+    factor, failed = lapack.dpotrf(a, lower=1, overwrite_a=len(a) > QUICK)
+    if failed:
+        raise _singular(equations, solution)
+    a = _inverted(a, factor)
+    if not norm * lapack.dlange("1", a) * SINGULAR < 1.0:  # type: ignore[call-arg]
+        raise _singular(equations, solution)
+    a *= scale
+    a *= scale[:, None]
+    return np.asarray(a)
+
+
+def _inverted(a: FloatArray, factor: FloatArray) -> FloatArray:
+    """Return the inverse, of a large matrix in the place of its factor."""
+    from scipy.linalg import lapack
+
+    if len(a) <= QUICK:
+        inverse = np.linalg.inv(a)
+        return np.asarray(0.5 * (inverse + inverse.T))
+    found, _ = lapack.dpotri(factor, lower=1, overwrite_c=1)
+    for i in range(1, len(found)):
+        found[:i, i] = found[i, :i]
+    return np.asarray(found)
+
+
+def _singular(equations: Undamped, solution: Solution) -> GeometryError:
+    return GeometryError(
+        "the normal equations are singular: " + weakest(equations.problem, solution)
+    )
+
+
+def _pose_blocks(
+    problem: Problem, solution: Solution, reduced: Reduced, inverse: FloatArray
+) -> FloatArray:
+    """Return the covariance of each pose, shape (k, 6, 6)."""
+    k = len(solution.state.centres)
+    poses = np.zeros((k, 6, 6))
+    if problem.columns.similarity >= 0:
+        at = problem.columns.similarity
+        by = _pose_gradients(problem, solution)
+        return np.asarray(by @ inverse[at : at + 7, at : at + 7] @ by.transpose(0, 2, 1))
+    place = np.full(len(problem.moves), -1)
+    place[reduced.active] = np.arange(len(reduced.active))
+    first = place[: 6 * k : 6]
+    rows = first[first >= 0][:, None] + np.arange(6)
+    poses[first >= 0] = inverse[rows[:, :, None], rows[:, None, :]]
+    return poses
+
+
+def _pose_gradients(problem: Problem, solution: Solution) -> FloatArray:
+    """Return how each pose moves with a similarity, shape (k, 6, 7)."""
+    by = np.zeros((len(solution.state.centres), 6, 7))
+    by[:, :3, 3:6] = -solution.state.rotations
+    by[:, 3:] = _centre_gradients(problem, solution)
+    return by
+
+
+def _by_parts(
+    equations: Undamped, solution: Solution, asked: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return covariances of what is asked for and of each pose, without the whole inverse."""
+    reduced, k = equations.reduced, len(solution.state.centres)
+    solve_for = solver(reduced)
+    if solve_for is None:
+        raise _singular(equations, solution)
+    of_asked = asked.T @ solve_for(asked)
+    poses = np.zeros((k, 6, 6))
+    first = np.searchsorted(reduced.active, 6 * np.arange(k))
+    moves = np.flatnonzero(reduced.active[np.minimum(first, len(asked) - 1)] == 6 * np.arange(k))
+    for part in np.array_split(moves, max(1, len(moves) // 32)):
+        rows = first[part][:, None] + np.arange(6)
+        unit = np.zeros((len(asked), rows.size))
+        unit[rows.ravel(), np.arange(rows.size)] = 1.0
+        found = solve_for(unit).reshape(len(asked), len(part), 6)
+        poses[part] = found[rows, np.arange(len(part))[:, None]]
+    if not (np.diag(of_asked) >= 0.0).all() or not (np.einsum("kii->ki", poses) >= 0.0).all():
+        raise _singular(equations, solution)
+    return np.asarray(of_asked), poses
+
+
+def _correlations(covariance: FloatArray) -> FloatArray:
+    """Return correlations; zero with what is fixed, whose variance is zero."""
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    known = sigma > 0.0
+    scale = np.where(known, 1.0 / np.where(known, sigma, 1.0), 0.0)
+    return np.asarray(covariance * scale * scale[:, None])

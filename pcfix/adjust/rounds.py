@@ -1,0 +1,337 @@
+"""Tie points adjusted: their noise estimated, outliers out, which lens parameters may move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pcfix.adjust.block import Block, Unknowns, usable_codes
+from pcfix.adjust.gather import LEAST_VIEWS
+from pcfix.adjust.normal import residuals
+from pcfix.adjust.precision import precision_of
+from pcfix.adjust.result import Adjusted, ControlRow, Source
+from pcfix.adjust.solve import (
+    LogRow,
+    Problem,
+    Solution,
+    gnss_weights,
+    prepare,
+    solve,
+    solved_cameras,
+    water_of,
+)
+from pcfix.adjust.state import CODES, K1
+from pcfix.errors import GeometryError
+from pcfix.label.surface import surface_above
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pcfix.adjust.precision import Precision
+    from pcfix.model import BoolArray, FloatArray, Lens
+
+    Progress = Callable[[LogRow], None]
+
+ROUGHLY = 1e-4
+"""Gain of a step, relative, below which the first, robust rounds end."""
+
+OUTLIER_SIGMAS = 4.0
+"""Residuals longer than this many standard deviations are left out: three good ones in 10,000."""
+
+SCALE_SIGMAS = 2.0
+MAD_TO_SIGMA = 1.4826
+OUTLIER_ROUNDS = 3
+WEAK_PX = 2.0
+"""Standard error of the image at the corner of the frame above which a lens parameter is left as
+it was; the focal length always moves."""
+
+
+@dataclass(frozen=True)
+class Rounds:
+    """How the rounds go.
+
+    Attributes
+    ----------
+    sigma_px : float or None
+        Of the tie points; None to estimate it.
+    outliers : bool
+        Whether to look for them.
+    drop_weak : bool
+        Whether lens parameters that the block does not determine are left as they were.
+    """
+
+    sigma_px: float | None = None
+    outliers: bool = True
+    drop_weak: bool = True
+
+
+def adjust_ties(
+    block: Block,
+    unknowns: Unknowns,
+    rounds: Rounds | None = None,
+    progress: Progress | None = None,
+) -> Adjusted:
+    """Adjust a block of measured tie points.
+
+    Parameters
+    ----------
+    block : Block
+    unknowns : Unknowns
+    rounds : Rounds, optional
+    progress : callable, optional
+        Called with each `LogRow`.
+
+    Raises
+    ------
+    GeometryError
+        If the block lacks a datum, does not converge, or its unknowns cannot be told apart.
+    """
+    rounds = rounds or Rounds()
+    check_datum(block, unknowns)
+    notes: list[str] = []
+    problem, now = prepare(block, unknowns)
+    if rounds.outliers or rounds.sigma_px is None:
+        now = solve(problem, now, "huber", SCALE_SIGMAS, 1, progress, ROUGHLY)
+    if rounds.sigma_px is None:
+        problem = with_sigma(problem, noise_px(problem, now))
+    if rounds.outliers:
+        for number in range(OUTLIER_ROUNDS):
+            robust = "cauchy" if number == 0 else "squares"
+            now = solve(problem, now, robust, SCALE_SIGMAS, 2 + number, progress, ROUGHLY)
+            problem, dropped = without_outliers(problem, now)
+            if rounds.sigma_px is None:
+                problem = with_sigma(problem, noise_px(problem, now))
+            if number and not dropped:
+                break
+    now = solve(problem, now, "squares", 1.0, 9, progress)
+    precision = precision_of(problem, now, sigma0_of(problem, now))
+    if rounds.drop_weak:
+        weak = weak_lens_parameters(problem, precision)
+        if weak:
+            notes.append(
+                f"the block does not determine {', '.join(weak)} of the lens; left as they were."
+            )
+            kept = tuple(name for name in unknowns.lens if name not in weak)
+            fewer = replace(unknowns, lens=kept)
+            weight = problem.seen.weight
+            problem, start = prepare(block, fewer)
+            problem.seen = problem.seen._replace(weight=weight)
+            start = replace(start, state=start.state._replace(xyz=now.state.xyz), log=now.log)
+            now = solve(problem, start, "squares", 1.0, 10, progress)
+            precision = precision_of(problem, now, sigma0_of(problem, now))
+    return adjusted_of(problem, now, precision, notes, "tie points", "direct")
+
+
+def check_datum(block: Block, unknowns: Unknowns) -> None:
+    """Check that something says where the block is.
+
+    Raises
+    ------
+    GeometryError
+        If neither GNSS, nor control points, nor fixed images, nor the wish for a free network do.
+    """
+    if unknowns.free_network or unknowns.poses == "fixed":
+        return
+    gnss = int((gnss_weights(block) > 0.0).all(axis=1).sum())
+    control = _control_in_images(block)
+    fixed = len(set(unknowns.fixed_images) & set(block.cameras.labels))
+    if gnss + control >= 3 or fixed >= 2:
+        return
+    raise GeometryError(
+        "nothing says where the block is, how it lies and how large it is: there are"
+        f" {gnss} GNSS positions, {control} control points in two images or more and {fixed} fixed"
+        " images; shift in plan, turn and scale stay undetermined, and with them the heights."
+        " Give --gnss or --gcps with three points at least, or --datum free to keep mean place,"
+        " direction and scale of the old projection centres."
+    )
+
+
+def _control_in_images(block: Block) -> int:
+    counts = np.diff(block.start)
+    return int((block.is_surveyed & (counts >= LEAST_VIEWS)).sum())
+
+
+def noise_px(problem: Problem, now: Solution) -> float:
+    """Return the standard deviation of the tie points' image places, from their residuals.
+
+    The median is not moved by outliers; what the points themselves take up is put back by the
+    share of the redundancy.
+    """
+    ties, used = _of_ties(problem), problem.seen.weight > 0.0
+    rows = ties & used
+    r = residuals(now.state, problem.seen, problem.surface)[rows]
+    r = r[np.isfinite(r).all(axis=1)]
+    points = len(np.unique(problem.block.owner[rows]))
+    share = max(1.0 - 3.0 * points / max(2.0 * len(r), 1.0), 0.05)
+    return float(max(MAD_TO_SIGMA * np.median(np.abs(r)) / np.sqrt(share), 1e-6))
+
+
+def _of_ties(problem: Problem) -> BoolArray:
+    """Return which observations are of tie points."""
+    m = len(problem.block.xyz) - len(problem.block.control_names)
+    return np.asarray(problem.block.owner < m)
+
+
+def with_sigma(problem: Problem, sigma_px: float) -> Problem:
+    """Return the problem with another standard deviation of the tie points."""
+    weight = problem.seen.weight.copy()
+    mine = _of_ties(problem) & (weight > 0.0)
+    weight[mine] = 1.0 / sigma_px
+    return replace(problem, seen=problem.seen._replace(weight=weight))
+
+
+def without_outliers(problem: Problem, now: Solution) -> tuple[Problem, int]:
+    """Return the problem without observations that are too far off, and how many they are.
+
+    Residuals are counted in their own standard deviation. A point that keeps fewer than two
+    observations is left out whole. Marks of control points stay: a surveyor should see them.
+    """
+    seen = problem.seen
+    r = residuals(now.state, seen, problem.surface)
+    length = np.hypot(r[:, 0], r[:, 1]) * seen.weight
+    ties = _of_ties(problem)
+    bad = ties & (seen.weight > 0.0) & ~(length <= OUTLIER_SIGMAS)
+    weight = np.where(bad, 0.0, seen.weight)
+    left = np.bincount(problem.block.owner, weight > 0.0, minlength=len(problem.block.xyz))
+    weight[ties & (left[problem.block.owner] < LEAST_VIEWS)] = 0.0
+    dropped = int(((seen.weight > 0.0) & (weight == 0.0)).sum())
+    return replace(problem, seen=seen._replace(weight=weight)), dropped
+
+
+def sigma0_of(problem: Problem, now: Solution) -> float:
+    """Return the a-posteriori standard deviation of unit weight."""
+    return float(np.sqrt(now.cost / max(redundancy_of(problem), 1)))
+
+
+def redundancy_of(problem: Problem) -> int:
+    """Return the number of observations, those of the unknowns included, minus unknowns."""
+    block, seen = problem.block, problem.seen
+    used = seen.weight > 0.0
+    points = len(np.unique(block.owner[used]))
+    priors = int((gnss_weights(block) > 0.0).sum() + (problem.priors.weight > 0.0).sum())
+    sigma = [*problem.unknowns.lens_sigma.values(), *problem.unknowns.water_sigma]
+    priors += sum(0.0 < value < np.inf for value in sigma)
+    datum = 7 if problem.unknowns.free_network else 0
+    return int(2 * used.sum() + priors + datum - 3 * points - problem.moves.sum())
+
+
+def weak_lens_parameters(problem: Problem, precision: Precision) -> list[str]:
+    """Return which lens parameters, the focal length apart, the block hardly determines."""
+    weak = []
+    columns = problem.columns
+    lenses = problem.block.cameras.lenses or ()
+    for i, rows in enumerate(problem.groups):
+        for at in range(columns.lens[i], columns.lens[i + 1]):
+            code = int(columns.code[at])
+            name = next(name for name, value in CODES.items() if value == code)
+            effect = precision.shared[at].sigma * effect_at_corner(lenses[rows[0]], code)
+            if name != "f" and effect > WEAK_PX and name not in weak:
+                weak.append(name)
+    return weak
+
+
+def effect_at_corner(lens: Lens, code: int) -> float:
+    """Return by how much the image moves at the corner of the frame with a lens parameter."""
+    r = 0.5 * np.hypot(lens.width, lens.height) / lens.focal
+    if code in (CODES["cx"], CODES["cy"]):
+        return 1.0
+    if code >= K1:
+        return float(lens.focal * r ** (2 * (code - K1) + 3))
+    if code in (CODES["p1"], CODES["p2"]):
+        return float(3.0 * lens.focal * r * r)
+    return float(r)
+
+
+def default_lens(lenses: tuple[Lens, ...]) -> tuple[str, ...]:
+    """Return the parameters that may move where the user names none: those that the lenses have."""
+    names = ["f", "cx", "cy"]
+    for lens in lenses:
+        for i, value in enumerate(lens.radial[:4]):
+            if value and f"k{i + 1}" not in names:
+                names.append(f"k{i + 1}")
+        for i, value in enumerate(lens.tangential[:2]):
+            if value and f"p{i + 1}" not in names:
+                names.append(f"p{i + 1}")
+    known = {
+        name
+        for name, code in CODES.items()
+        if any(code in usable_codes(one, (name,)) for one in lenses)
+    }
+    return tuple(name for name in names if name in known)
+
+
+def adjusted_of(
+    problem: Problem, now: Solution, precision: Precision | None, notes: list[str],
+    source: Source, engine: str,
+) -> Adjusted:  # fmt: skip
+    """Return what a solution says, with check points intersected."""
+    block = problem.block
+    state = now.state
+    xyz = state.xyz + problem.origin
+    xyz = with_checks(problem, now, xyz)
+    shown = state._replace(xyz=xyz - problem.origin)
+    r = residuals(shown, problem.seen, problem.surface)
+    water = water_of(problem, state)
+    level = np.full(len(xyz), -np.inf) if water is None else surface_above(water, xyz).height_m
+    cameras = solved_cameras(problem, now)
+    off = cameras.centres - block.gnss_xyz
+    return Adjusted(
+        block=block,
+        unknowns=problem.unknowns,
+        cameras=cameras,
+        water=water,
+        refractive_index=float(state.water[3]),
+        xyz=xyz,
+        residual_px=r,
+        used=problem.seen.weight > 0.0,
+        is_wet=np.asarray((xyz[:, 2] < level) & block.wet),
+        sigma0=sigma0_of(problem, now),
+        redundancy=redundancy_of(problem),
+        rounds=now.log,
+        source=source,
+        engine=engine,
+        precision=precision,
+        gnss_residual_m=np.where(gnss_weights(block) > 0.0, off, np.nan),
+        control=_control_rows(block, xyz, r),
+        notes=notes,
+    )
+
+
+def with_checks(problem: Problem, now: Solution, xyz: FloatArray) -> FloatArray:
+    """Return the points, those to check with intersected from the adjusted cameras."""
+    block = problem.block
+    first = len(block.xyz) - len(block.control_names)
+    rows = first + np.flatnonzero(block.is_check)
+    rows = rows[np.diff(block.start)[rows] >= LEAST_VIEWS]
+    if len(rows) == 0:
+        return xyz
+    fixed = replace(problem.unknowns, poses="fixed", lens=(), level_sigma_m=0.0, tilt_sigma=0.0,
+                    index_sigma=0.0, free_network=False)  # fmt: skip
+    only = np.isin(block.owner, rows)
+    whole = replace(block, cameras=solved_cameras(problem, now), xyz=xyz,
+                    water=water_of(problem, now.state), refractive_index=float(now.state.water[3]),
+                    sigma_px=np.where(only, 1.0, np.inf))  # fmt: skip
+    part, start = prepare(whole, fixed)
+    found = solve(part, start)
+    moved = xyz.copy()
+    moved[rows] = found.state.xyz[rows] + part.origin
+    return moved
+
+
+def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlRow]:
+    first = len(block.xyz) - len(block.control_names)
+    rows = []
+    for i, name in enumerate(block.control_names):
+        p = first + i
+        mine = r[block.start[p] : block.start[p + 1]]
+        mine = mine[np.isfinite(mine).all(axis=1)]
+        check = bool(block.is_check[i])
+        known = block.surveyed_xyz[p]
+        if check and len(mine) < LEAST_VIEWS:
+            continue
+        dx, dy, dz = (xyz[p] - known).tolist()
+        rms = float(np.sqrt((mine * mine).mean())) if len(mine) else float("nan")
+        rows.append(ControlRow(name, "check" if check else "control", dx, dy, dz, rms, len(mine)))
+    return rows

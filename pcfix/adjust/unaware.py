@@ -1,0 +1,358 @@
+r"""Poses mended from nothing but the cloud that they made: an unaware adjustment undone.
+
+An ordinary bundle adjustment that knew nothing of the water came to rest where its residuals r no
+longer pulled at any of its unknowns:
+
+    sum J'r = 0 for every image,   sum G'r = 0 for the lens,   sum B'r = 0 for every point
+
+with the Jacobians J, G and B of its own straight collinearity, at its own solution. That is all
+that is known of the images where tie points are missing: not the residuals, but that they are
+orthogonal to these columns. So the true poses and points are looked for whose images through the
+water, pi(Q), give r = pi(Q) - pi_old(P) with
+
+    J_old' r = 0,   G_old' r = 0,   B_old' r = 0
+
+as many equations as unknowns (Petrov and Galerkin's way: the residual is tested with other columns
+than those that move it). They leave out the shift, turn and scale of the block, which GNSS
+positions or control points decide. Taking pi_old(P) for measurements instead, and minimising r,
+pulls the solution back to where the old one was, the more the better the images count.
+
+Points of the apparent cloud stand for the tie points of that adjustment, which were spread in much
+the same way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numba import njit, prange
+
+from pcfix.adjust.normal import PARTS, _linearise, _point_block
+from pcfix.adjust.observe import POINT, WATER, WIDTH, image_and_all_gradients, lens_gradients
+from pcfix.adjust.solve import LogRow, Problem, Solution, _counts, _moved, priors_at
+from pcfix.errors import GeometryError
+from pcfix.refract.threads import one_caller
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pcfix.adjust.normal import PointPriors
+    from pcfix.adjust.state import Columns, Seen, State, Surface
+    from pcfix.model import BoolArray, FloatArray, IntArray
+
+MAX_STEPS = 25
+CLOSE_M = 1e-7
+LARGE_STEP_M = 1e4
+
+
+class Tests(NamedTuple):
+    """The columns that residuals are orthogonal to, one row per observation.
+
+    pose : shape (o, 2, 6); shared : shape (o, 2, g); point : shape (o, 2, 3).
+    """
+
+    pose: FloatArray
+    shared: FloatArray
+    point: FloatArray
+
+
+def straight_columns(problem: Problem, start: Solution, apparent_xyz: FloatArray) -> Tests:
+    """Return the Jacobians of the straight collinearity at the old solution.
+
+    Parameters
+    ----------
+    apparent_xyz : array, shape (m, 3)
+        The points that the old adjustment saw, block frame.
+    """
+    seen, columns = problem.seen, problem.columns
+    o, g = len(seen.camera), columns.count
+    found = Tests(np.zeros((o, 2, 6)), np.zeros((o, 2, g)), np.zeros((o, 2, 3)))
+    dry = seen._replace(wet=np.zeros(len(seen.wet), np.bool_))
+    state = start.state._replace(xyz=np.ascontiguousarray(apparent_xyz))
+    with one_caller():
+        _columns(state, dry, problem.surface, columns, *found)
+    return found
+
+
+def solve_unaware(
+    problem: Problem,
+    start: Solution,
+    tests: Tests,
+    is_tested: BoolArray,
+    progress: Callable[[LogRow], None] | None = None,
+) -> Solution:
+    """Find poses, lens and points at which the residuals are orthogonal to the old columns.
+
+    Parameters
+    ----------
+    problem, start : Problem, Solution
+        Of `pcfix.adjust.solve.prepare`; observations of the cloud are where the old cameras image
+        the apparent points.
+    tests : Tests
+    is_tested : array of bool, shape (m,)
+        Points of the cloud. The others, control points, are adjusted by least squares.
+
+    Raises
+    ------
+    GeometryError
+        If the equations are singular or Newton's steps do not shrink.
+    """
+    now, log, before = start, list(start.log), np.inf
+    for step in range(MAX_STEPS):
+        poses, shared, points = _newton(problem, now, tests, is_tested)
+        moved = _moved(problem, now, poses, shared, points)
+        size = float(np.abs(points).max(initial=0.0)) if np.isfinite(points).all() else np.inf
+        if moved is None or not size < LARGE_STEP_M:
+            raise GeometryError(
+                "the poses cannot be mended from the cloud: the steps grow without bound; give"
+                " tie points, GNSS positions of more images, or control points."
+            )
+        now = moved
+        row = LogRow(1, step + 1, _squares(problem, now), 0.0, *_counts(problem, now))
+        log.append(row)
+        if progress is not None:
+            progress(row)
+        if size < CLOSE_M:
+            return replace(now, cost=row.cost, log=log)
+        before = size
+    raise GeometryError(
+        f"the poses cannot be mended from the cloud: after {MAX_STEPS} steps points still move by"
+        f" {before:.2g} m; give tie points, GNSS positions of more images, or control points."
+    )
+
+
+def _squares(problem: Problem, now: Solution) -> float:
+    """Return the weighted squares of what is not tested: GNSS, surveyed points, priors."""
+    priors = problem.priors
+    points = float((priors.weight * (priors.xyz - now.state.xyz) ** 2).sum())
+    return points + priors_at(problem, now).cost
+
+
+def _newton(
+    problem: Problem, now: Solution, tests: Tests, is_tested: BoolArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    k, g = len(now.state.centres), problem.columns.count
+    size = 6 * k + g
+    parts = PARTS if size <= 3000 else 2
+    matrix, right = np.zeros((parts, size, size)), np.zeros((parts, size))
+    common = (
+        now.state, problem.seen, problem.surface, problem.columns, problem.priors,
+        problem.pivot, *tests, is_tested,
+    )  # fmt: skip
+    with one_caller():
+        _sum_tested(*common, matrix, right)
+    total, side = matrix.sum(axis=0), right.sum(axis=0)
+    del matrix
+    extra = priors_at(problem, now)
+    total += extra.matrix if extra.matrix.ndim == 2 else np.diag(extra.matrix)
+    side += extra.right
+    step = np.zeros(size)
+    active = np.flatnonzero(problem.moves)
+    scale = 1.0 / np.sqrt(np.maximum(np.abs(total.diagonal()[active]), 1e-300))
+    try:
+        from scipy.linalg import solve as solve_full
+
+        part = total[np.ix_(active, active)] * scale * scale[:, None]
+        step[active] = scale * solve_full(part, scale * side[active])
+    except np.linalg.LinAlgError:
+        raise GeometryError(
+            "the poses cannot be mended from the cloud: the equations are singular; GNSS positions"
+            " of three images or more, or three control points, are needed."
+        ) from None
+    poses, shared = step[: 6 * k].reshape(k, 6), step[6 * k :]
+    points = np.zeros((len(now.state.xyz), 3))
+    with one_caller():
+        _tested_points(*common, poses, shared, points)
+    return poses, shared, points
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _columns(
+    state: State, seen: Seen, surface: Surface, columns: Columns,
+    pose: FloatArray, shared: FloatArray, point: FloatArray,
+) -> None:  # fmt: skip
+    for part in prange(PARTS):
+        m = len(state.xyz)
+        light, plane, ahead, own = np.empty((3, 12)), np.empty(4), np.empty(3), np.empty((2, WIDTH))
+        for p in range(part * m // PARTS, (part + 1) * m // PARTS):
+            for o in range(seen.start[p], seen.start[p + 1]):
+                c = seen.camera[o]
+                lens = state.lenses[seen.lens_row[c]]
+                image_and_all_gradients(
+                    state.xyz[p], False, state.centres[c], state.rotations[c], lens,
+                    state.water, surface, light, plane, ahead, own,
+                )  # fmt: skip
+                pose[o] = own[:, :POINT]
+                point[o] = own[:, POINT:WATER]
+                first, last = columns.lens[seen.group[c]], columns.lens[seen.group[c] + 1]
+                if last > first:
+                    lens_gradients(lens, ahead, columns.code[first:last], shared[o][:, first:last])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _inverted(v: FloatArray) -> bool:
+    """Replace a matrix of 3 x 3 by its inverse; whether it has one."""
+    a, b, c = v[0, 0], v[0, 1], v[0, 2]
+    d, e, f = v[1, 0], v[1, 1], v[1, 2]
+    g, h, i = v[2, 0], v[2, 1], v[2, 2]
+    det = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    if not abs(det) > 1e-12 * abs(a * e * i):
+        return False
+    v[0, 0], v[0, 1], v[0, 2] = (e * i - f * h) / det, (c * h - b * i) / det, (b * f - c * e) / det
+    v[1, 0], v[1, 1], v[1, 2] = (f * g - d * i) / det, (a * i - c * g) / det, (c * d - a * f) / det
+    v[2, 0], v[2, 1], v[2, 2] = (d * h - e * g) / det, (b * g - a * h) / det, (a * e - b * d) / det
+    return True
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _gather(
+    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
+    pivot: FloatArray, pose: FloatArray, shared: FloatArray, point: FloatArray, tested: bool,
+    p: int, right: FloatArray, left: FloatArray, r: FloatArray, who: IntArray,
+    v: FloatArray, rhs: FloatArray,
+) -> int:  # fmt: skip
+    """Fill in the columns of a point's observations and V, inverted; how many count.
+
+    Columns of `right` and `left`: pose, point, shared. The block V and its right side are B_l'B
+    and B_l'r.
+    """
+    g = columns.count
+    light, plane, ahead = np.empty((3, 12)), np.empty(4), np.empty(3)
+    own, common = np.empty((2, WIDTH)), np.zeros((2, g))
+    v[:], rhs[:], count = 0.0, 0.0, 0
+    for o in range(seen.start[p], seen.start[p + 1]):
+        if not _linearise(
+            state, seen, surface, columns, 0, 1.0, pivot, p, o,
+            light, plane, ahead, own, common, r[count],
+        ):  # fmt: skip
+            continue
+        right[count, :, :WATER] = own[:, :WATER]
+        right[count, :, WATER:] = common
+        if tested:
+            w = seen.weight[o]
+            left[count, :, :POINT] = w * pose[o]
+            left[count, :, POINT:WATER] = w * point[o]
+            left[count, :, WATER:] = w * shared[o]
+        else:
+            left[count] = right[count]
+        for i in range(3):
+            for a in range(2):
+                rhs[i] += left[count, a, POINT + i] * r[count, a]
+                for j in range(3):
+                    v[i, j] += left[count, a, POINT + i] * right[count, a, POINT + j]
+        who[count] = seen.camera[o]
+        count += 1
+    if count == 0:
+        return 0
+    if tested:
+        return count if _inverted(v) else 0
+    return count if _point_block(v, rhs, priors, state.xyz[p], p, 0.0) else 0
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _most(start: IntArray, first: int, last: int) -> int:
+    most = 1
+    for p in range(first, last):
+        most = max(most, start[p + 1] - start[p])
+    return most
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _sum_tested(
+    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
+    pivot: FloatArray, pose: FloatArray, shared: FloatArray, point: FloatArray,
+    is_tested: BoolArray, matrix: FloatArray, side: FloatArray,
+) -> None:  # fmt: skip
+    parts = len(matrix)
+    for part in prange(parts):
+        m, g, k = len(state.xyz), columns.count, len(state.centres)
+        first, last = part * m // parts, (part + 1) * m // parts
+        most = _most(seen.start, first, last)
+        right, left = np.empty((most, 2, WATER + g)), np.empty((most, 2, WATER + g))
+        r, who = np.empty((most, 2)), np.empty(most, np.int64)
+        v, rhs = np.empty((3, 3)), np.empty(3)
+        size = 6 * most + g
+        column = np.empty(size, np.int64)
+        w_right, w_left = np.empty((3, size)), np.empty((size, 3))
+        for p in range(first, last):
+            count = _gather(
+                state, seen, surface, columns, priors, pivot, pose, shared, point, is_tested[p],
+                p, right, left, r, who, v, rhs,
+            )  # fmt: skip
+            if count == 0:
+                continue
+            used = 6 * count + g
+            w_right[:, :used], w_left[:used] = 0.0, 0.0
+            for i in range(g):
+                column[6 * count + i] = 6 * k + i
+            for o in range(count):
+                for i in range(6):
+                    column[6 * o + i] = 6 * who[o] + i
+                _add_direct(matrix[part], side[part], right[o], left[o], r[o], 6 * who[o], 6 * k, g)
+                for a in range(2):
+                    for j in range(3):
+                        bl, br = left[o, a, POINT + j], right[o, a, POINT + j]
+                        for i in range(6):
+                            w_left[6 * o + i, j] += left[o, a, i] * br
+                            w_right[j, 6 * o + i] += bl * right[o, a, i]
+                        for i in range(g):
+                            w_left[6 * count + i, j] += left[o, a, WATER + i] * br
+                            w_right[j, 6 * count + i] += bl * right[o, a, WATER + i]
+            for i in range(used):
+                y0 = w_left[i, 0] * v[0, 0] + w_left[i, 1] * v[1, 0] + w_left[i, 2] * v[2, 0]
+                y1 = w_left[i, 0] * v[0, 1] + w_left[i, 1] * v[1, 1] + w_left[i, 2] * v[2, 1]
+                y2 = w_left[i, 0] * v[0, 2] + w_left[i, 1] * v[1, 2] + w_left[i, 2] * v[2, 2]
+                side[part, column[i]] -= y0 * rhs[0] + y1 * rhs[1] + y2 * rhs[2]
+                row = matrix[part, column[i]]
+                for j in range(used):
+                    row[column[j]] -= y0 * w_right[0, j] + y1 * w_right[1, j] + y2 * w_right[2, j]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _add_direct(
+    matrix: FloatArray, side: FloatArray, right: FloatArray, left: FloatArray, r: FloatArray,
+    at: int, border: int, g: int,
+) -> None:  # fmt: skip
+    """Add what one observation gives to the unknowns that are not its point."""
+    for a in range(2):
+        for i in range(6 + g):
+            row, value = (at + i, left[a, i]) if i < 6 else (border + i - 6, left[a, WATER + i - 6])
+            side[row] += value * r[a]
+            for j in range(6):
+                matrix[row, at + j] += value * right[a, j]
+            for j in range(g):
+                matrix[row, border + j] += value * right[a, WATER + j]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _tested_points(
+    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
+    pivot: FloatArray, pose: FloatArray, shared: FloatArray, point: FloatArray,
+    is_tested: BoolArray, poses: FloatArray, moved: FloatArray, steps: FloatArray,
+) -> None:  # fmt: skip
+    for part in prange(PARTS):
+        m, g = len(state.xyz), columns.count
+        first, last = part * m // PARTS, (part + 1) * m // PARTS
+        most = _most(seen.start, first, last)
+        right, left = np.empty((most, 2, WATER + g)), np.empty((most, 2, WATER + g))
+        r, who = np.empty((most, 2)), np.empty(most, np.int64)
+        v, rhs = np.empty((3, 3)), np.empty(3)
+        for p in range(first, last):
+            count = _gather(
+                state, seen, surface, columns, priors, pivot, pose, shared, point, is_tested[p],
+                p, right, left, r, who, v, rhs,
+            )  # fmt: skip
+            for o in range(count):
+                for a in range(2):
+                    change = 0.0
+                    for i in range(6):
+                        change += right[o, a, i] * poses[who[o], i]
+                    for i in range(g):
+                        change += right[o, a, WATER + i] * moved[i]
+                    for i in range(3):
+                        rhs[i] -= left[o, a, POINT + i] * change
+            if count:
+                for i in range(3):
+                    steps[p, i] = v[i, 0] * rhs[0] + v[i, 1] * rhs[1] + v[i, 2] * rhs[2]

@@ -1,0 +1,260 @@
+"""Two models of one block: the cameras that a cloud was made with, and the adjusted ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from pcfix.errors import GeometryError, SettingError
+from pcfix.io.labels import match_labels
+from pcfix.model import Cameras, Views
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+    from pcfix.flow.inputs import Inputs
+    from pcfix.io.views import ViewList
+    from pcfix.model import FloatArray, IntArray, Lens, TiePoints
+
+LOCAL = "local"
+SAME_SHAPE = 0.002
+"""Of the ratio of an image's sides. Undistorted images differ by more from those that they were
+made of, unless they have the very same size; sides in millimetres are rounded by less."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Old and adjusted cameras of the same k images, row by row.
+
+    Attributes
+    ----------
+    old, new : Cameras
+        In the cloud's CRS, with angles and lenses; the lenses of an image in one unit.
+    row : array, shape (o,)
+        The row here of each of the old cameras as they were read, -1 where it was not adjusted.
+    left_out : tuple of str
+        Images of the old model that were not adjusted.
+    """
+
+    old: Cameras
+    new: Cameras
+    row: IntArray
+    left_out: tuple[str, ...]
+
+    def renumbered(self, views: Views) -> Views:
+        """Return views of the old cameras as they were read as views of the rows here."""
+        return _renumbered(views, self.row)[0]
+
+
+def paired(old: Cameras, new: Cameras) -> Pair:
+    """Match the images of two models by their names.
+
+    Parameters
+    ----------
+    old, new : Cameras
+        In the cloud's CRS.
+
+    Raises
+    ------
+    GeometryError
+        If `new` has images that `old` does not have, one name could be several, or the images
+        have not the same shape.
+    SettingError
+        If one has no angles or no lenses.
+    """
+    for cameras, which in ((old, "adjusted-from"), (new, "cameras")):
+        if cameras.rotations is None or cameras.lenses is None:
+            raise SettingError(
+                f"{which}: has no {'angles' if cameras.rotations is None else 'lens'}, without"
+                " which a point has no place in the image; give the model itself, or --sensor."
+            )
+    place = _rows(old.labels, new.labels)
+    row = np.full(len(old), -1)
+    row[place] = np.arange(len(new))
+    left_out = tuple(label for label, at in zip(old.labels, row, strict=True) if at < 0)
+    return Pair(_taken(old, place, new), new, row, left_out)
+
+
+def _rows(old: tuple[str, ...], new: tuple[str, ...]) -> IntArray:
+    """Return the row in the old labels of each new one."""
+    if old == new:  # then even repeated names are clear
+        return np.arange(len(new))
+    if len(set(new)) < len(new):
+        twice = next(label for label in new if new.count(label) > 1)
+        raise GeometryError(
+            f"cameras: there are several images {twice}, and adjusted-from has not the same images"
+            " in the same order; give every image a name of its own."
+        )
+    row, unclear = match_labels(new, old)
+    if unclear:
+        raise GeometryError(
+            f"adjusted-from: image {unclear[0]} could be several there; give every image a name of"
+            " its own."
+        )
+    if (row < 0).any():
+        unknown = [label for label, at in zip(new, row, strict=True) if at < 0]
+        raise GeometryError(
+            f"adjusted-from: has no image {unknown[0]}, which the cameras have"
+            f" ({len(unknown)} of {len(new)} are unknown there; its first is {old[0]}); give the"
+            " model that these cameras were adjusted from."
+        )
+    return row
+
+
+def _taken(old: Cameras, place: IntArray, new: Cameras) -> Cameras:
+    """Return some rows of the old cameras, each lens in the unit of the new one."""
+    lenses: list[Lens] = []
+    for i, lens in zip(place, new.lenses or (), strict=True):
+        lenses.append(_in_unit_of(lens, (old.lenses or ())[i], old.labels[i]))
+    return replace(
+        old,
+        labels=tuple(old.labels[i] for i in place),
+        centres=old.centres[place],
+        rotations=None if old.rotations is None else old.rotations[place],
+        lenses=tuple(lenses),
+        gnss=None,
+    )
+
+
+def _in_unit_of(new: Lens, old: Lens, label: str) -> Lens:
+    """Return an old lens in the unit of the new one, whose image has the same shape."""
+    factor = new.width / old.width
+    if not abs(factor * old.height / new.height - 1.0) <= SAME_SHAPE:
+        raise GeometryError(
+            f"adjusted-from: image {label} has {old.width:g} x {old.height:g} {old.unit} there, but"
+            f" {new.width:g} x {new.height:g} {new.unit} in the cameras; these are not the same"
+            " images (one of them undistorted?); give the model that the cameras were adjusted"
+            " from."
+        )
+    if factor == 1.0:
+        return old
+    lengths = ("focal", "width", "height", "principal_x", "principal_y", "b1", "b2", "b3")
+    scaled = {name: factor * getattr(old, name) for name in lengths}
+    return replace(old, unit=new.unit, **scaled)
+
+
+def _renumbered(views: Views, row: IntArray) -> tuple[Views, IntArray]:
+    """Return views of other numbers, without entries of negative ones, and which entries stayed."""
+    camera = row[np.asarray(views.camera)]
+    stays = camera >= 0
+    if views.kind == "pairs":
+        stays = np.repeat(stays[::2] & stays[1::2], 2)
+    entry = np.flatnonzero(stays)
+    start = np.concatenate([[0], np.cumsum(stays)])[views.start]
+    weight = None if views.weight is None else views.weight[entry]
+    return Views(start, camera[entry], weight, views.kind), entry
+
+
+class Blocks(NamedTuple):
+    """What a correction has of cameras.
+
+    cameras : the ones to correct with; views : the list of the cloud, where there is one; listed :
+    the cameras that it counts, which made the cloud; pair : where the two are not the same.
+    """
+
+    cameras: Cameras
+    views: ViewList | None
+    listed: Cameras
+    pair: Pair | None
+
+
+def read_blocks(inputs: Inputs, cloud_crs: str | CRS | None) -> Blocks:
+    """Return cameras in the cloud's CRS, and the view list, confirmed by those that made the cloud.
+
+    Parameters
+    ----------
+    inputs : Inputs
+    cloud_crs : str, CRS or None
+
+    Raises
+    ------
+    PcfixError
+        If a file cannot be read or does not fit, or the two models are not of one block.
+    """
+    if inputs.adjusted_from is None:
+        cameras, views = inputs.block(cloud_crs)
+        return Blocks(cameras, views, cameras, None)
+    old, new = told_apart(inputs)
+    listed, views = old.block(cloud_crs)
+    cameras, _ = new.block(cloud_crs)
+    return Blocks(cameras, views, listed, paired(listed, cameras))
+
+
+def told_apart(inputs: Inputs) -> tuple[Inputs, Inputs]:
+    """Return the inputs with the old cameras and those with the new ones.
+
+    A CRS and an offset of the cameras are of those of the two files that do not say where they
+    lie themselves, or of both if both do. Where neither does, the offset is of those with which
+    the two agree best.
+
+    Raises
+    ------
+    PcfixError
+        If a file cannot be read, or the views are tracks of the adjusted model.
+    """
+    _refuse_adjusted_tracks(inputs)
+    made_with = inputs.cameras if inputs.adjusted_from is None else inputs.adjusted_from
+    old = replace(inputs, cameras=made_with, adjusted_from=None)
+    new = replace(inputs, views=None, adjusted_from=None)
+    if inputs.cameras_crs is None and inputs.cameras_offset_m is None:
+        return old, new
+    read = old.read(), new.read()
+    tied = [
+        isinstance(given.cameras, Cameras) or cameras.crs not in (None, LOCAL)
+        for given, cameras in zip((old, new), read, strict=True)
+    ]
+    silent = [not one or all(tied) for one in tied]
+    old, new = (
+        one if is_silent else replace(one, cameras_crs=None, cameras_offset_m=None)
+        for one, is_silent in zip((old, new), silent, strict=True)
+    )
+    if inputs.cameras_offset_m is not None and not any(tied):
+        moves = _who_moves(*read, np.array(inputs.cameras_offset_m))
+        old, new = (
+            one if moved else replace(one, cameras_offset_m=None)
+            for one, moved in zip((old, new), moves, strict=True)
+        )
+    return old, new
+
+
+def _refuse_adjusted_tracks(inputs: Inputs) -> None:
+    """Refuse the tracks of the adjusted model as views of the cloud."""
+    given = (inputs.views, inputs.cameras, inputs.adjusted_from)
+    views, cameras, old = (None if isinstance(one, Cameras) else one for one in given)
+    if views is None or cameras is None or Path(views) != Path(cameras):
+        return
+    if old is None or Path(old) != Path(cameras):
+        raise SettingError(
+            f"views: the tie points of {cameras} are where the adjustment put them, not where the"
+            " cloud has its points; give the model of adjusted-from, or the list of the cloud."
+        )
+
+
+def _who_moves(old: Cameras, new: Cameras, offset_m: FloatArray) -> tuple[bool, bool]:
+    """Return whether an offset is for the old centres and for the new ones, shapes (k, 3)."""
+    apart = new.centres - old.centres[_rows(old.labels, new.labels)]
+    ways = {
+        (True, True): apart,
+        (True, False): apart - offset_m,
+        (False, True): apart + offset_m,
+    }
+    return min(ways, key=lambda way: float(np.median(np.linalg.norm(ways[way], axis=1))))
+
+
+def old_tie_points(
+    inputs: Inputs, pair: Pair, cloud_crs: str | CRS | None
+) -> tuple[TiePoints | None, bool]:
+    """Return tie points that count the rows of a pair, and whether they are the old model's.
+
+    Those of the old model, where the old cameras have them, tell best which images the cloud was
+    made with; else those of the new one.
+    """
+    old, new = told_apart(inputs)
+    ties = old.tie_points(cloud_crs)
+    if ties is None:
+        return new.tie_points(cloud_crs), False
+    views, entry = _renumbered(ties.views, pair.row)
+    return replace(ties, views=views, image_xy=ties.image_xy[entry]), True

@@ -1,0 +1,268 @@
+"""Files of surveyed points and their marks in images, as rows: one mark a row.
+
+A table has a header line and the columns
+
+- name (or point, gcp, marker, ...), image, u, v: pixels from the upper left corner of the image;
+- x, y, z (or easting, northing, height; longitude, latitude, height in degrees of WGS 84);
+- where known sx, sy, sz, or one column sigma, in metres; su, sv, or one column sigma_px; role (or
+  type): control or check; under_water: yes or no; crs. A comment before the header may state the
+  CRS too: ``# CRS: EPSG:32636``.
+
+OpenDroneMap's ``gcp_list.txt`` has no header: its first line is a CRS (EPSG code, ``WGS84 UTM 36N``
+or a PROJ string), the others are x, y, z, u, v, image and, where given, the name of the point.
+Points without a name are told apart by their coordinates. Its pixels are taken to count from the
+corner too; its documentation does not say.
+
+Reference: "Ground Control Points" in the manual of OpenDroneMap, https://docs.opendronemap.org/gcp.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pcfix.errors import InputError
+from pcfix.io.cameras.odm.crs import named_crs
+from pcfix.io.cameras.table.columns import read_columns
+from pcfix.io.cameras.table.headers import headers, is_header
+from pcfix.io.cameras.table.positions import centres, crs
+from pcfix.io.tables import number, read_lines
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pcfix.io.cameras.table.columns import Columns
+    from pcfix.model import BoolArray, FloatArray
+
+SPELLINGS: dict[str, tuple[str, ...]] = {
+    "point": (
+        *("point", "name", "gcp", "gcp_name", "gcp_id", "gcp_label", "marker", "point_name"),
+        *("point_id", "pointid", "id", "label"),
+    ),
+    "label": (
+        *("image", "image_name", "imagename", "filename", "file_name", "file", "photo", "photoid"),
+        *("photo_id", "photo_name", "photoname", "picture", "image_label", "sourcefile"),
+    ),
+    "u": ("u", "u_px", "im_x", "image_x", "image_u", "pixel_x", "pixelx"),
+    "v": ("v", "v_px", "im_y", "image_y", "image_v", "pixel_y", "pixely"),
+    "sigma_x": ("sx", "sigma_x", "accuracy_x", "sxy", "sigma", "sxyz", "accuracy"),
+    "sigma_y": ("sy", "sigma_y", "accuracy_y", "sxy", "sigma", "sxyz", "accuracy"),
+    "sigma_z": ("sz", "sigma_z", "accuracy_z", "sigma", "sxyz", "accuracy"),
+    "sigma_u": ("su", "sigma_u", "sigma_px", "sigma_uv"),
+    "sigma_v": ("sv", "sigma_v", "sigma_px", "sigma_uv"),
+    "role": ("role", "type"),
+    "under_water": ("under_water", "underwater", "submerged"),
+    "crs": ("crs", "srs"),
+}
+"""What a column is, and its names; where several are there, the first counts."""
+CHECK = ("check", "check_point", "checkpoint", "cp", "chk")
+CONTROL = ("", "control", "control_point", "controlpoint", "gcp", "3d_gcp", "ground_control_point")
+YES, NO = ("yes", "y", "true", "1"), ("", "no", "n", "false", "0")
+PIXELS = ("", "px", "pixel", "pixels", "pix")
+_LEAST_ODM = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Marks:
+    """Marks of points in images, n of them, with what the file says of the point in each row.
+
+    Attributes
+    ----------
+    path : Path
+    point, image : list of str
+    xyz, sigma_m : array, shape (n, 3)
+        In `crs`; metres. NaN where no standard deviation is stated.
+    uv : array, shape (n, 2)
+    sigma_px : array, shape (n,)
+        NaN where none is stated.
+    is_check, under_water : array of bool, shape (n,)
+    where : list of str
+        The place of each row in the file.
+    crs : str or None
+    """
+
+    path: Path
+    point: list[str]
+    image: list[str]
+    xyz: FloatArray
+    sigma_m: FloatArray
+    uv: FloatArray
+    sigma_px: FloatArray
+    is_check: BoolArray
+    under_water: BoolArray
+    where: list[str]
+    crs: str | None
+
+    def at(self, row: int) -> str:
+        """Return file, place, point and image of a row, for messages."""
+        return f"{self.path}: {self.where[row]}: point {self.point[row]}, image {self.image[row]}"
+
+
+def read_marks(path: Path) -> Marks:
+    """Read a table of marks or OpenDroneMap's ``gcp_list.txt``.
+
+    Raises
+    ------
+    InputError
+        If it is neither, or a field is not what it should be.
+    """
+    lines = read_lines(path)
+    rows = _odm_rows(path, lines)
+    if rows is None and not any(is_header(header.names) for header in headers(lines)):
+        raise InputError(
+            f"{path}: is neither a table of marks nor OpenDroneMap's gcp_list.txt; line 1 must name"
+            " the columns name, x, y, z, image, u, v, or be a CRS above rows of x, y, z, u, v,"
+            " image."
+        )
+    return _from_table(path) if rows is None else _from_odm(path, rows)
+
+
+def _from_table(path: Path) -> Marks:
+    columns = _with_roles(read_columns(path))
+    system, doubt = crs(columns)
+    if doubt:
+        raise InputError(
+            f"{path}: its CRS '{columns.crs}' is not one that PROJ knows; give an EPSG code."
+        )
+    sigma = columns.where_there(("sigma_x", "sigma_y", "sigma_z"))
+    sigma_uv = columns.where_there(("sigma_u", "sigma_v"))
+    _refuse_not_positive(columns, "standard deviation", np.column_stack([sigma, sigma_uv]))
+    return Marks(
+        path=path,
+        point=_names(columns),
+        image=columns.labels,
+        xyz=centres(columns, needed=True),
+        sigma_m=sigma,
+        uv=columns.of(("u", "v")),
+        sigma_px=np.sqrt((sigma_uv**2).mean(axis=1)),
+        is_check=_flags(columns, "role", CHECK, CONTROL, "control or check"),
+        under_water=_flags(columns, "under_water", YES, NO, "yes or no"),
+        where=[f"line {line}" for line in columns.table.line],
+        crs=system,
+    )
+
+
+def _with_roles(columns: Columns) -> Columns:
+    """Return columns with the places that they have in a table of marks."""
+    header = columns.table.header
+    place = {role: i for role, i in columns.place.items() if role in _POSITION}
+    for role, spellings in SPELLINGS.items():
+        there = [header.index(name) for name in spellings if name in header]
+        if there:
+            place[role] = there[0]
+    missing = [_PLAIN.get(role, role) for role in ("point", "label", "u", "v") if role not in place]
+    if missing:
+        raise InputError(
+            f"{columns.path}: the header must name the columns name, x, y, z, image, u, v;"
+            f" {', '.join(missing)} missing (it has: {', '.join(header)})."
+        )
+    for role in "uv":
+        if columns.unit[place[role]] not in PIXELS:
+            raise InputError(
+                f"{columns.path}: column {header[place[role]]} is in"
+                f" '{columns.unit[place[role]]}'; give pixels from the upper left corner."
+            )
+    found = replace(columns, place=place)
+    return replace(found, crs=_one_crs(found)) if "crs" in place else found
+
+
+_POSITION = ("x", "y", "z", "longitude", "latitude")
+_PLAIN = {"point": "name", "label": "image"}
+
+
+def _one_crs(columns: Columns) -> str | None:
+    stated = {text for text in _texts(columns, "crs") if text}
+    if len(stated) > 1:
+        raise InputError(
+            f"{columns.path}: states {len(stated)} CRS ({', '.join(sorted(stated)[:3])}); bring all"
+            " points to one."
+        )
+    return stated.pop() if stated else columns.crs
+
+
+def _texts(columns: Columns, role: str) -> list[str]:
+    return [row[columns.place[role]] for row in columns.table.rows]
+
+
+def _names(columns: Columns) -> list[str]:
+    names = _texts(columns, "point")
+    if "" in names:
+        line = columns.table.line[names.index("")]
+        raise InputError(f"{columns.path}: line {line}: the point has no name.")
+    return names
+
+
+def _flags(
+    columns: Columns, role: str, true: tuple[str, ...], false: tuple[str, ...], words: str
+) -> BoolArray:
+    """Return whether each row says one thing or the other; the latter where nothing is said."""
+    if role not in columns.place:
+        return np.zeros(len(columns.table.rows), bool)
+    found = [text.strip().lower().replace(" ", "_") for text in _texts(columns, role)]
+    for i, text in enumerate(found):
+        if text not in true and text not in false:
+            raise InputError(
+                f"{columns.where(i)}, column {columns.name(role)}: '{text}' is neither {words}."
+            )
+    return np.array([text in true for text in found])
+
+
+def _refuse_not_positive(columns: Columns, what: str, values: FloatArray) -> None:
+    bad = (values <= 0.0).any(axis=1)
+    if bad.any():
+        i = int(np.argmax(bad))
+        value = values[i][values[i] <= 0.0][0]
+        raise InputError(f"{columns.where(i)}: the {what} {value:g} must be positive.")
+
+
+def _odm_rows(path: Path, lines: list[str]) -> list[tuple[int, list[str]]] | None:
+    """Return line number and fields of the rows of gcp_list.txt, None where it is none."""
+    numbered = [(i, line.split()) for i, line in enumerate(lines, start=1) if line.strip()]
+    rows = [(i, fields) for i, fields in numbered[1:] if not fields[0].startswith("#")]
+    if not rows or len(rows[0][1]) < _LEAST_ODM - 1:
+        return None
+    first = [number(field) for field in rows[0][1][:5]]
+    if np.isnan([value for i, value in enumerate(first) if i != 2]).any():  # z may be NaN
+        return None
+    for i, fields in rows:
+        if len(fields) < _LEAST_ODM:
+            raise InputError(
+                f"{path}: line {i} has {len(fields)} fields; give x, y, z, u, v, image and the name"
+                " of the point."
+            )
+    return rows
+
+
+def _from_odm(path: Path, rows: list[tuple[int, list[str]]]) -> Marks:
+    values = np.array([[number(field) for field in fields[:5]] for _, fields in rows])
+    if not np.isfinite(values).all():
+        i, k = np.argwhere(~np.isfinite(values))[0]
+        what = ("x", "y", "z", "u", "v")[k]
+        raise InputError(
+            f"{path}: line {rows[i][0]}: {what} '{rows[i][1][k]}' is not a finite number."
+        )
+    by_place = {place: f"GCP {i + 1}" for i, place in enumerate(dict.fromkeys(_places(values)))}
+    names = [
+        fields[_LEAST_ODM] if len(fields) > _LEAST_ODM else by_place[place]
+        for (_, fields), place in zip(rows, _places(values), strict=True)
+    ]
+    no = np.zeros(len(rows), bool)
+    return Marks(
+        path=path,
+        point=names,
+        image=[fields[5] for _, fields in rows],
+        xyz=values[:, :3],
+        sigma_m=np.full((len(rows), 3), np.nan),
+        uv=values[:, 3:],
+        sigma_px=np.full(len(rows), np.nan),
+        is_check=no,
+        under_water=no,
+        where=[f"line {i}" for i, _ in rows],
+        crs=named_crs(path),
+    )
+
+
+def _places(values: FloatArray) -> list[tuple[float, ...]]:
+    return [tuple(row) for row in values[:, :3].tolist()]

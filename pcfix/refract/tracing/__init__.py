@@ -1,0 +1,1 @@
+"""Refractive collinearity: from an object point through the water to the projection centre."""

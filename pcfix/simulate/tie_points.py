@@ -1,0 +1,235 @@
+"""A block of images as it goes into a bundle adjustment: tie points, GNSS and control, with truth.
+
+The light is traced by `pcfix.simulate.tracing`, the lens is that of `pcfix.simulate.optics`:
+nothing here is shared with the adjustment. Everything measured is there twice, exact and with
+noise, and `TieScene.measured` draws the noise anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pcfix.model import Cameras, GnssPositions, GroundControl, TiePoints, Views
+from pcfix.simulate.block import Block, fly_block, misplaced
+from pcfix.simulate.scene import ORIGIN_M, Streams, _extent, _in_world, _moved, _on, _rig
+from pcfix.simulate.settings import SceneSettings
+from pcfix.simulate.sight import see
+from pcfix.simulate.terrain import Terrain
+
+if TYPE_CHECKING:
+    from pcfix.model import BoolArray, FloatArray, WaterPlane
+    from pcfix.simulate.sight import Rig, Sight
+
+_CANDIDATES = 4000
+_LEAST_TIES = 8
+"""An image with fewer tie points is left out of the block."""
+
+_CLEAR_M = 0.1
+"""Control and check points keep so far from the water surface, as people place them."""
+
+
+@dataclass(frozen=True)
+class TieNoise:
+    """Standard deviations of what is measured: images, GNSS positions, surveyed points.
+
+    What has none is stated with the default, as no observation is infinitely precise.
+    """
+
+    image_px: float = 0.5
+    gnss_m: float = 0.03
+    survey_m: float = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class TieScene:
+    """What `simulate_tie_points` made; metres, UTM.
+
+    Attributes
+    ----------
+    true_cameras : Cameras
+        With which the images were made.
+    cameras : Cameras
+        The same with pose noise, and with GNSS positions: where an adjustment begins.
+    truth : array, shape (m, 3)
+        True points.
+    views : Views
+        The images that show each, three at least.
+    exact_xy : array, shape (o, 2)
+        Where, without noise, pixels.
+    ties : TiePoints
+        The same with noise; its points are the true ones.
+    is_wet : array of bool, shape (m,)
+        Which of them lie under water.
+    control : GroundControl
+        Control points on land; check points on land and under water. Survey and images with noise.
+    control_truth : array, shape (q, 3)
+    control_exact_xy : array, shape (r, 2)
+    water : WaterPlane
+    refractive_index : float
+    noise : TieNoise
+    settings : dict
+        The arguments that made it.
+    """
+
+    true_cameras: Cameras
+    cameras: Cameras
+    truth: FloatArray
+    views: Views
+    exact_xy: FloatArray
+    ties: TiePoints
+    is_wet: BoolArray
+    control: GroundControl
+    control_truth: FloatArray
+    control_exact_xy: FloatArray
+    water: WaterPlane
+    refractive_index: float
+    noise: TieNoise
+    settings: dict[str, Any]
+
+    def measured(self, rng: np.random.Generator) -> TieScene:
+        """Return the scene with all noise drawn anew; poses, points and start values stay."""
+        image_px, k = self.noise.image_px, len(self.cameras)
+        image = self.exact_xy + rng.normal(0.0, image_px, self.exact_xy.shape)
+        marks = self.control_exact_xy + rng.normal(0.0, image_px, self.control_exact_xy.shape)
+        survey = self.control_truth + rng.normal(0.0, self.noise.survey_m, self.control_truth.shape)
+        gnss = self.true_cameras.centres + rng.normal(0.0, self.noise.gnss_m, (k, 3))
+        stated = self.noise.gnss_m or TieNoise.gnss_m
+        positions = GnssPositions(gnss, np.full((k, 3), stated), None)
+        return replace(
+            self,
+            cameras=replace(self.cameras, gnss=positions),
+            ties=TiePoints(self.truth, self.views, image),
+            control=replace(self.control, xyz=survey, image_xy=marks),
+        )
+
+
+def simulate_tie_points(
+    points: int = 400,
+    *,
+    gnss_noise_m: float = 0.03,
+    survey_noise_m: float = 0.01,
+    control: int = 6,
+    checks: int = 6,
+    **settings: Any,
+) -> TieScene:
+    """Make a block of images with tie points above and below the water.
+
+    Parameters
+    ----------
+    points : int
+        Tie points that are tried; those in fewer than three images are left out.
+    gnss_noise_m : float
+        Standard deviation of each coordinate of the GNSS positions.
+    survey_noise_m : float
+        Of each coordinate of the control and check points.
+    control, checks : int
+        Control points on land, and check points, every other one under water where there is
+        some; spread over the area.
+    **settings
+        Those of `pcfix.simulate.settings.SceneSettings` about block, lens, noise of start poses and
+        images, water, bed and seed.
+
+    Returns
+    -------
+    TieScene
+
+    Raises
+    ------
+    SettingError
+        If an argument is outside its rule.
+    """
+    chosen = SceneSettings(points=points, **settings)
+    streams, extent = Streams.of(chosen.seed), _extent(chosen)
+    plane = chosen.water_plane(extent)
+    terrain = Terrain.random(chosen.bed, extent, plane, chosen.depth_m, streams.main)
+    flown = fly_block(extent, chosen.water_level_m, chosen.flight, streams.main)
+    given = misplaced(flown, chosen.position_noise_m, chosen.attitude_noise_deg, streams.poses)
+    rig = _rig(chosen, flown, given, plane, extent, streams)
+    truth, ties = _seen(_on(terrain, points, streams.main), rig, streams)
+    enough = np.bincount(ties.camera, minlength=len(rig.true)) >= _LEAST_TIES
+    if not enough.all():
+        flown, given = _only(flown, enough), _only(given, enough)
+        rig = replace(rig, true=flown.cameras, given=given.cameras)
+        truth, ties = _seen(truth, rig, streams)
+    places = _on(terrain, _CANDIDATES, streams.main)
+    places = places[_spread(places, _above(places, plane), control, checks)]
+    surveyed, marks = _seen(places, rig, streams)
+    made = TieScene(
+        true_cameras=_moved(flown.cameras), cameras=_moved(given.cameras),
+        truth=truth + ORIGIN_M, views=Views(ties.start, ties.camera),
+        exact_xy=rig.optics.to_image(ties.ideal),
+        ties=TiePoints(truth, Views(ties.start, ties.camera), ties.ideal),
+        is_wet=_above(truth, plane) < 0.0,
+        control=_control(surveyed, marks, _above(surveyed, plane) < 0.0, control, chosen),
+        control_truth=surveyed + ORIGIN_M, control_exact_xy=rig.optics.to_image(marks.ideal),
+        water=_in_world(plane), refractive_index=chosen.refractive_index,
+        noise=TieNoise(chosen.image_noise_px, gnss_noise_m, survey_noise_m),
+        settings=chosen.as_dict(),
+    )  # fmt: skip
+    control_sigma = np.full(surveyed.shape, survey_noise_m or TieNoise.survey_m)
+    made = replace(made, control=replace(made.control, sigma_m=control_sigma))
+    return made.measured(np.random.default_rng([chosen.seed, 9]))
+
+
+def _only(block: Block, keep: BoolArray) -> Block:
+    """Return a block without some of its images; obliques may look beside the area."""
+    cameras, rows = block.cameras, np.flatnonzero(keep)
+    if cameras.rotations is None or cameras.lenses is None:
+        raise ValueError("a simulated block has angles and lenses")
+    fewer = Cameras(
+        tuple(cameras.labels[i] for i in rows), cameras.centres[rows], cameras.rotations[rows],
+        tuple(cameras.lenses[i] for i in rows),
+    )  # fmt: skip
+    return Block(fewer, block.yaw_pitch_roll_deg[rows])
+
+
+def _above(xyz: FloatArray, plane: WaterPlane) -> FloatArray:
+    """Return heights above the water, local coordinates."""
+    return np.asarray(xyz[:, 2] - (plane.a + xyz[:, :2] @ [plane.b, plane.c]))
+
+
+def _seen(xyz: FloatArray, rig: Rig, streams: Streams) -> tuple[FloatArray, Sight]:
+    """Return those points that enough images show, and where."""
+    sight = see(xyz, rig, streams.detection)
+    made = sight.made
+    start = np.concatenate([sight.start[:-1][made], sight.start[-1:]])
+    point = np.repeat(np.arange(int(made.sum())), np.diff(start))
+    return xyz[made], replace(sight, start=start, point=point)
+
+
+def _spread(xyz: FloatArray, above: FloatArray, control: int, checks: int) -> FloatArray:
+    """Return rows of control points on land and of check points, each far from those before."""
+    land, wet = np.flatnonzero(above > _CLEAR_M), np.flatnonzero(above < -_CLEAR_M)
+    under = min(checks // 2, len(wet))
+    on_land = _far_apart(xyz[land], control + checks - under)
+    return np.concatenate([land[on_land], wet[_far_apart(xyz[wet], under)]])
+
+
+def _far_apart(xyz: FloatArray, count: int) -> FloatArray:
+    """Return rows of points of which each is the farthest in plan from those before it."""
+    rows: list[int] = []
+    if len(xyz) == 0:
+        return np.zeros(0, np.int64)
+    away = np.linalg.norm(xyz[:, :2] - xyz[:, :2].mean(axis=0), axis=1)
+    for _ in range(min(count, len(xyz))):
+        rows.append(int(np.argmax(away)))
+        near = np.linalg.norm(xyz[:, :2] - xyz[rows[-1], :2], axis=1)
+        away = near if len(rows) == 1 else np.minimum(away, near)
+    return np.array(rows, np.int64)
+
+
+def _control(
+    xyz: FloatArray, marks: Sight, wet: BoolArray, control: int, chosen: SceneSettings
+) -> GroundControl:
+    """Return surveyed points, the first so many on land as control, without noise yet."""
+    rank = np.arange(len(xyz))
+    is_check = wet | (rank >= control)
+    names = tuple(f"{'CP' if check else 'GCP'}{i + 1}" for i, check in enumerate(is_check))
+    return GroundControl(
+        names, xyz + ORIGIN_M, np.zeros(xyz.shape), is_check, wet,
+        marks.point, marks.camera, marks.ideal,
+        np.full(len(marks.point), chosen.image_noise_px or TieNoise.image_px),
+    )  # fmt: skip

@@ -1,0 +1,134 @@
+"""Points taken from old cameras to adjusted ones, by straight rays."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from pcfix.adjust.carry import carry
+from pcfix.model import Cameras, Lens, Views
+
+DOWN = np.diag([1.0, -1.0, -1.0])
+STEP_M = 1e-6
+"""Of the last step of the iteration, whose error is far below it."""
+
+
+def lens_of(focal=1500.0, k1=-0.05):
+    return Lens(focal, 2000.0, 1500.0, 1003.0, 746.0, radial=(k1, 0.01))
+
+
+@pytest.fixture
+def cameras():
+    """Return twelve images from 60 m, tilted by some degrees each."""
+    rng = np.random.default_rng(5)
+    x, y = (grid.ravel() for grid in np.meshgrid([0.0, 20.0, 40.0, 60.0], [0.0, 20.0, 40.0]))
+    centres = np.column_stack([x, y, 60.0 + rng.normal(0.0, 1.0, 12)])
+    tilt = Rotation.from_rotvec(rng.normal(0.0, 0.05, (12, 3))).as_matrix()
+    labels = tuple(f"i{i}" for i in range(12))
+    return Cameras(labels, centres, tilt @ DOWN, (lens_of(),) * 12)
+
+
+@pytest.fixture
+def points():
+    return np.random.default_rng(6).uniform((5.0, 5.0, -8.0), (55.0, 35.0, 6.0), (300, 3))
+
+
+def everybody(n, k):
+    return Views(np.arange(0, n * k + 1, k), np.tile(np.arange(k), n))
+
+
+def images_of(xyz, cameras):
+    """Project one point into all cameras by the formulas of `Lens`, shape (k, 2)."""
+    found = []
+    for centre, rotation, lens in zip(
+        cameras.centres, cameras.rotations, cameras.lenses, strict=True
+    ):
+        x, y, z = rotation @ (xyz - centre)
+        x, y = x / z, y / z
+        r2 = x * x + y * y
+        factor = 1.0 + lens.radial[0] * r2 + lens.radial[1] * r2 * r2
+        found.append(
+            [lens.principal_x + lens.focal * x * factor, lens.principal_y + lens.focal * y * factor]
+        )
+    return np.array(found)
+
+
+def met(images, cameras, start):
+    """Return where rays through image places meet: the least squares of the residuals in pixels."""
+    found = least_squares(
+        lambda xyz: (images_of(xyz, cameras) - images).ravel(), start, xtol=1e-15, ftol=1e-15,
+        gtol=1e-15, x_scale=1.0, method="lm",
+    )  # fmt: skip
+    return found.x
+
+
+def disturbed(cameras, rng):
+    """Return what an adjustment may have made of them: other centres, angles and lens."""
+    turn = Rotation.from_rotvec(rng.normal(0.0, 5e-4, (len(cameras), 3))).as_matrix()
+    return replace(
+        cameras,
+        centres=cameras.centres + rng.normal(0.0, 0.1, (len(cameras), 3)) + [0.1, -0.2, 0.3],
+        rotations=turn @ cameras.rotations,
+        lenses=(lens_of(1494.0, -0.052),) * len(cameras),
+    )
+
+
+def test_the_same_cameras_move_nothing(cameras, points):
+    shift, moved = carry(points, everybody(len(points), 12), cameras, cameras)
+    assert moved.all()
+    assert np.abs(shift).max() < STEP_M
+
+
+def test_the_cloud_follows_a_similarity(cameras, points):
+    turn = Rotation.from_rotvec([0.01, -0.02, 0.5]).as_matrix()
+
+    def taken(xyz):
+        return 1.003 * xyz @ turn.T + [12.0, -3.0, 0.7]
+
+    new = replace(cameras, centres=taken(cameras.centres), rotations=cameras.rotations @ turn.T)
+    shift, moved = carry(points, everybody(len(points), 12), cameras, new)
+    assert moved.all()
+    assert np.abs(points + shift - taken(points)).max() < STEP_M
+
+
+def test_it_is_the_least_squares_of_the_image_places(cameras, points):
+    new = disturbed(cameras, np.random.default_rng(1))
+    some = points[:20]
+    shift, moved = carry(some, everybody(20, 12), cameras, new)
+    assert moved.all()
+    for xyz, found in zip(some, some + shift, strict=True):
+        assert np.abs(found - met(images_of(xyz, cameras), new, xyz)).max() < 2.0 * STEP_M
+
+
+def test_points_of_disturbed_cameras_come_home(cameras, points):
+    """The disturbed cameras' points are where their own straight rays nearly meet."""
+    old = disturbed(cameras, np.random.default_rng(2))
+    some = points[:40]
+    made = np.array([met(images_of(xyz, cameras), old, xyz) for xyz in some])
+    shift, moved = carry(made, everybody(40, 12), old, cameras)
+    assert moved.all()
+    away = np.sqrt(((made - some) ** 2).sum(axis=1).mean())
+    left = np.sqrt(((made + shift - some) ** 2).sum(axis=1).mean())
+    assert away > 0.2
+    # what is lost is the residual of the old rays (1 px) times the change of the gradients
+    assert left < 0.01 * away
+
+
+def test_points_that_cannot_be_intersected_stay(cameras, points):
+    twice = Views(np.array([0, 0, 1, 3]), np.array([4, 7, 7]))
+    shift, moved = carry(points[:3], twice, cameras, disturbed(cameras, np.random.default_rng(3)))
+    assert not moved.any()
+    assert not shift.any()
+
+
+def test_a_camera_that_looks_elsewhere_does_not_count(cameras, points):
+    new = disturbed(cameras, np.random.default_rng(4))
+    away = cameras.rotations.copy()
+    away[0] = DOWN @ away[0]  # looks up
+    old = replace(cameras, rotations=away)
+    with_it = carry(points, everybody(len(points), 12), old, new)
+    rest = Views(np.arange(0, 11 * len(points) + 1, 11), np.tile(np.arange(1, 12), len(points)))
+    without = carry(points, rest, cameras, new)
+    assert np.array_equal(with_it.shift_m, without.shift_m)

@@ -1,0 +1,145 @@
+"""Poses that absorbed the refraction are told from true ones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pcfix.adjust.diagnosis import (
+    Sign,
+    bed_sign,
+    control_sign,
+    diagnosis_of,
+    focal_sign,
+    gnss_is_suspicious,
+    gnss_sign,
+    land_sign,
+    tie_point_sign,
+)
+from pcfix.adjust.fixed_poses import intersect_fixed
+from pcfix.adjust.likely_error import deeper, mended
+from pcfix.adjust.solve import similarity_gradients
+from pcfix.model import WaterPlane
+from tests.utils.bent_blocks import GNSS_M, LEVEL_M, N, TrueBlock
+
+WATER = WaterPlane(LEVEL_M)
+
+
+def tie_sign(true, cameras, n=N):
+    straight = intersect_fixed(true.block(cameras, None))
+    depth = LEVEL_M - straight.xyz[:, 2]
+    wet = depth > 0
+    begin = deeper(straight.xyz, np.full(len(depth), LEVEL_M), wet, n)
+    block = replace(true.block(cameras, WATER, wet), xyz=begin, refractive_index=n)
+    return tie_point_sign(straight, intersect_fixed(block), depth), straight.xyz
+
+
+def gnss_signs(cameras, apparent):
+    off = cameras.centres - cameras.gnss.xyz
+    sigma = np.full(off.shape, GNSS_M)
+    by = similarity_gradients(cameras.centres - cameras.centres.mean(axis=0))
+    found = mended(apparent, cameras, WATER, N)
+    assert len(found.row) == len(cameras)
+    predicted = cameras.centres - found.cameras.centres
+    return (
+        gnss_is_suspicious(cameras.centres, off, sigma, by),
+        gnss_sign(off, sigma, by, found, predicted),
+        found,
+    )
+
+
+@pytest.mark.parametrize("seed", [1])
+@pytest.mark.parametrize("poses", ["true", "adjusted with water"])
+def test_right_poses_are_called_right(seed, poses):
+    true = TrueBlock(seed)
+    cameras = true.cameras if poses == "true" else true.adjusted(WATER)
+    sign, apparent = tie_sign(true, cameras)
+    assert sign.speaks is False
+    # 50 blocks with true poses gave 0.01 to 0.07
+    assert abs(sign.figures["share"]) < 0.15
+    suspicious, by_gnss, _ = gnss_signs(cameras, apparent)
+    assert not suspicious
+    assert by_gnss.speaks is not True
+    assert abs(by_gnss.figures["share"]) < 4.0 * by_gnss.figures["sigma_share"]
+
+
+@pytest.mark.parametrize("seed", [1])
+def test_poses_of_an_ordinary_adjustment_are_found_out(seed):
+    true = TrueBlock(seed)
+    bent = true.adjusted()
+    sign, apparent = tie_sign(true, bent)
+    assert sign.speaks is True
+    figures = sign.figures
+    assert figures["wet_refracted_px"] > figures["wet_straight_px"]
+    suspicious, by_gnss, found = gnss_signs(bent, apparent)
+    assert suspicious
+    assert by_gnss.speaks is True
+    # what the land is off in truth: the straight intersection against the true points; the
+    # prediction does not know the GNSS, which placed the block as a whole, hence a third
+    land = true.xyz[:, 2] > 0.5
+    off = np.sqrt(np.nanmean((true.xyz[land, 2] - apparent[land, 2]) ** 2))
+    assert np.sqrt(np.mean(found.land_m**2)) == pytest.approx(off, rel=0.34)
+    assert by_gnss.size_m == pytest.approx(np.sqrt(np.mean(found.land_m**2)))
+
+
+def test_without_refraction_nothing_is_said():
+    true = TrueBlock(3, n=1.0)
+    sign, _ = tie_sign(true, true.cameras, n=1.0)
+    assert sign.speaks is None
+
+
+def test_a_random_error_of_the_poses_is_not_taken_for_refraction():
+    true = TrueBlock(4)
+    rng = np.random.default_rng(4)
+    centres = true.cameras.centres + rng.normal(0.0, 0.1, true.cameras.centres.shape)
+    moved = replace(true.cameras, centres=centres)
+    sign, apparent = tie_sign(true, moved)
+    assert sign.speaks is not True
+    assert gnss_signs(moved, apparent)[1].speaks is not True
+
+
+def test_few_points_under_water_say_nothing():
+    true = TrueBlock(5, points=30, strips=(3, 3))
+    sign, _ = tie_sign(true, true.cameras)
+    assert sign.speaks is None
+
+
+def test_land_counts_beyond_chance_and_two_gsd():
+    rng = np.random.default_rng(0)
+    low = land_sign(rng.normal(-0.96, 0.1, 200), 0.05, "a survey")
+    assert low.speaks is True
+    assert low.size_m == pytest.approx(0.96, abs=0.03)  # 4 standard errors of a median
+    assert land_sign(rng.normal(-0.05, 0.1, 200), 0.05, "a survey").speaks is None
+    assert land_sign(np.array([-1.0, np.nan]), 0.05, "a survey").speaks is None
+
+
+def test_a_bed_of_nearly_its_true_depth_was_not_refracted():
+    true = np.linspace(2.0, 8.0, 40)
+    assert bed_sign(true / 1.4, true, N).speaks is False
+    assert bed_sign(0.97 * true, true, N).speaks is True
+    assert bed_sign(0.97 * true[:2], true[:2], N).speaks is None
+
+
+def test_control_points_and_focal_length():
+    rng = np.random.default_rng(0)
+    assert control_sign(rng.normal(0, 0.5, (30, 2)), np.full(30, 0.5), 0.05).speaks is None
+    off = control_sign(rng.normal(0, 12.0, (30, 2)), np.full(30, 0.5), 0.05)
+    assert off.speaks is True
+    assert off.size_m == pytest.approx(0.6, rel=0.3)  # 12 px of 5 cm, 30 marks
+    short = focal_sign(np.array([1496.5, 1500.0]), np.array([1500.0, 1500.0]), 75.0)
+    assert short.speaks is True
+    assert short.size_m == pytest.approx(75.0 * 3.5 / 1500.0)
+    assert focal_sign(np.array([1501.0]), np.array([1500.0]), 75.0).speaks is None
+
+
+def test_the_sign_that_tells_most_decides():
+    land = land_sign(np.full(9, -1.0), 0.05, "a survey")
+    ties = Sign("tie points", "they fit", {}, speaks=False)
+    assert diagnosis_of([land]).absorbed is True
+    assert diagnosis_of([land, ties]).absorbed is False
+    assert diagnosis_of([land, ties]).sentence("x") == ""
+    unsure = replace(ties, speaks=None)
+    assert diagnosis_of([unsure, land]).decided_by is land
+    assert "1 m" in diagnosis_of([land]).sentence("pcfix adjust a b")
+    assert diagnosis_of([land]).sentence("pcfix adjust a b").endswith("pcfix adjust a b")
+    assert diagnosis_of([]).absorbed is None

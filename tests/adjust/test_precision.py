@@ -1,0 +1,259 @@
+"""Covariances against the full inverse of the slow twin, and against what repeats scatter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pcfix.adjust.block import Unknowns
+from pcfix.adjust.precision import precision_of, strong_correlations, undetermined
+from pcfix.adjust.solve import prepare, solve
+from pcfix.errors import GeometryError
+from pcfix.refract.threads import threads
+from pcfix.simulate.tie_points import simulate_tie_points
+from tests.utils.adjust_twin import Twin
+from tests.utils.tie_blocks import block_of, clear_of_the_waterline
+
+FREE = np.inf
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """Blocks of a hundred observations spend more on waking a second thread than it does."""
+    with threads(1):
+        yield
+
+
+REPEATS = 120
+TINY = {
+    "area_m": (25, 20), "greatest_depth_m": 6, "forward_overlap": 0.6, "side_overlap": 0.5,
+    "obliques_deg": 25, "oblique_directions": 2, "oblique_share": 0.3, "position_noise_m": 0.05,
+    "attitude_noise_deg": 0.05,
+}  # fmt: skip
+
+
+@cache
+def tiny(points=14, **settings):
+    return simulate_tie_points(points, **(TINY | {"seed": 2} | settings))
+
+
+def adjusted(block, unknowns):
+    problem, start = prepare(block, unknowns)
+    return problem, solve(problem, start)
+
+
+def blocks_of(covariance, size):
+    """Return the square blocks on the diagonal."""
+    count = len(covariance) // size
+    i = np.arange(count)
+    return covariance.reshape(count, size, count, size)[i, :, i, :]
+
+
+@pytest.mark.parametrize("poses", ["free", "fixed"])
+@pytest.mark.parametrize("tilt", [None, 2.0], ids=["level", "tilted"])
+def test_same_as_the_full_inverse(poses, tilt):
+    """The twin inverts the normal matrix of everything, its Jacobian by differences."""
+    made = tiny(tilt_percent=tilt)
+    block = block_of(made, control=True)
+    if poses == "fixed":
+        nothing = np.full(block.gnss_xyz.shape, np.nan)
+        block = replace(block, gnss_xyz=nothing, gnss_sigma_m=np.full(nothing.shape, np.inf))
+    unknowns = Unknowns(
+        poses=poses, lens=("f",), level_sigma_m=FREE, tilt_sigma=FREE, index_sigma=0.01
+    )
+    problem, found = adjusted(block, unknowns)
+    precision = precision_of(problem, found, sigma0=2.0)
+    # the twin is differentiated at the solution of the adjustment
+    state, cameras = found.state, block.cameras
+    there = replace(
+        block,
+        cameras=replace(cameras, centres=state.centres + problem.origin, rotations=state.rotations),
+        xyz=state.xyz + problem.origin,
+    )
+    twin = Twin(there, tuple(problem.names), poses == "free", 0.01)
+    x = twin.start()
+    x[twin.poses : twin.poses + len(found.shared)] = found.shared
+    covariance = 4.0 * twin.covariance(x)
+    g = twin.poses + len(found.shared)
+    wanted = np.sqrt(np.diag(covariance)[twin.poses : g])
+    # 0.2 percent: what differences of an ill-conditioned Jacobian are good to
+    np.testing.assert_allclose([row.sigma for row in precision.shared], wanted, rtol=2e-3)
+    shared = covariance[twin.poses : g, twin.poses : g]
+    np.testing.assert_allclose(precision.correlation, shared / np.outer(wanted, wanted), atol=2e-3)
+    points = blocks_of(covariance[g:, g:], 3)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    near = 2e-3 * points.max(axis=1, keepdims=True)
+    assert (np.abs(precision.point_covariance_m2 - points) < near).all()
+    if poses == "fixed":
+        assert not precision.pose_covariance.any()
+        return
+    ours, theirs = precision.pose_covariance, blocks_of(covariance[: twin.poses, : twin.poses], 6)
+    unit = np.sqrt(np.einsum("kii->ki", theirs))
+    unit = unit[:, :, None] * unit[:, None, :]
+    assert np.abs((ours - theirs) / unit).max() < 2e-3
+    assert precision.centre_sigma_m == pytest.approx(np.sqrt(ours[:, [3, 4, 5], [3, 4, 5]]))
+
+
+@cache
+def repeats():
+    """Return errors over standard errors of many draws of all noise, by kind of unknown."""
+    made = simulate_tie_points(
+        60, seed=5, area_m=(25, 20), greatest_depth_m=6, forward_overlap=0.6, side_overlap=0.5,
+        obliques_deg=30, oblique_directions=2, oblique_share=0.4,
+    )  # fmt: skip
+    made = clear_of_the_waterline(made, 0.3)
+    unknowns = Unknowns(lens=("f",), level_sigma_m=FREE, index_sigma=FREE)
+    rng, rows, m = np.random.default_rng(11), [], len(made.truth)
+    for _ in range(REPEATS):
+        problem, found = adjusted(block_of(made.measured(rng), control=True), unknowns)
+        precision = precision_of(problem, found)
+        state = found.state
+        turn = state.rotations @ made.true_cameras.rotations.transpose(0, 2, 1)
+        centres = state.centres + problem.origin - made.true_cameras.centres
+        off = np.column_stack([Rotation.from_matrix(turn).as_rotvec(), centres])
+        off = off / np.sqrt(np.einsum("kii->ki", precision.pose_covariance))
+        xyz = (state.xyz[:m] + problem.origin - made.truth) / precision.point_sigma_m[:m]
+        by = np.array([row.added / row.sigma for row in precision.shared])
+        together = by @ np.linalg.solve(precision.correlation, by) / len(by)
+        rows.append({
+            "angles": off[:, :3], "centres": off[:, 3:], "land": xyz[~made.is_wet],
+            "bed": xyz[made.is_wet], "f, level and index": np.sqrt(together), "cost": found.cost,
+        } | dict(zip(problem.names, by, strict=True)))  # fmt: skip
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}, problem
+
+
+@pytest.mark.parametrize("kind", ["angles", "centres", "land", "bed", "f, level and index"])
+def test_normalised_errors_are_as_large_as_they_should_be(kind):
+    """Three numbers over so many repeats, with their correlations: 4 percent, others less."""
+    assert 0.9 < np.sqrt((repeats()[0][kind] ** 2).mean()) < 1.1
+
+
+@pytest.mark.parametrize("kind", ["f", "level", "index"])
+def test_normalised_error_of_one_unknown(kind):
+    """Of a standard deviation from so many repeats the standard error is 6 percent."""
+    assert 0.82 < np.sqrt((repeats()[0][kind] ** 2).mean()) < 1.18
+
+
+def test_the_cost_is_the_redundancy():
+    """The weighted squares add up to observations minus unknowns, so that sigma0 is one."""
+    errors, problem = repeats()
+    block = problem.block
+    observations = 2 * len(block.camera)
+    for sigma in (block.surveyed_sigma_m, block.gnss_sigma_m):
+        observations += np.isfinite(sigma).sum()
+    unknowns = problem.moves.sum() + 3 * len(block.xyz)
+    # its variance is twice the redundancy
+    allowed = 4.0 * np.sqrt(2.0 * (observations - unknowns) / REPEATS)
+    assert abs(errors["cost"].mean() - (observations - unknowns)) < allowed
+
+
+def test_similarity_covariances_are_what_repeats_scatter():
+    made, rng = tiny(20), np.random.default_rng(3)
+    errors = []
+    for _ in range(60):
+        block = block_of(made.measured(rng), control=True, cameras=made.true_cameras)
+        problem, found = adjusted(block, Unknowns(poses="similarity", lens=()))
+        precision = precision_of(problem, found)
+        off = found.state.centres + problem.origin - made.true_cameras.centres
+        turn = found.state.rotations @ made.true_cameras.rotations.transpose(0, 2, 1)
+        angles = np.degrees(Rotation.from_matrix(turn).as_rotvec())
+        errors.append(
+            np.hstack([off / precision.centre_sigma_m, angles / precision.angle_sigma_deg])
+        )
+    # seven numbers over 60 repeats: 4 percent
+    assert 0.9 < np.sqrt((np.array(errors) ** 2).mean()) < 1.1
+
+
+def why_singular(block, unknowns):
+    with pytest.raises(GeometryError) as caught:
+        problem, found = adjusted(block, unknowns)
+        precision_of(problem, found)
+    return str(caught.value)
+
+
+def test_no_datum_is_said():
+    made = tiny()
+    block = block_of(made, gnss=False)
+    words = why_singular(block, Unknowns(lens=()))
+    assert "shift along x, shift along y, turn about the vertical and scale of the block" in words
+    assert "GNSS" in words and "control points" in words
+    words = why_singular(block, Unknowns(lens=(), level_sigma_m=FREE, tilt_sigma=FREE))
+    assert "shift in height, turn about x, turn about y, turn about the vertical" in words
+
+
+def test_water_is_not_observed_by_points_on_land():
+    made = tiny()
+    block = block_of(made, control=True)
+    dry = replace(block, wet=np.zeros(len(block.xyz), bool))
+    words = why_singular(dry, Unknowns(lens=("f",), level_sigma_m=FREE, index_sigma=FREE))
+    assert "the water level and the refractive index (no point lies under water)" in words
+
+
+def test_an_image_without_tie_points_is_named():
+    made = tiny()
+    block = block_of(made)
+    block = replace(block, sigma_px=np.where(block.camera == 2, np.inf, block.sigma_px))
+    assert made.cameras.labels[2] in why_singular(block, Unknowns(lens=()))
+
+
+def test_a_point_of_one_image_tells_nothing_and_has_no_covariance():
+    made = tiny()
+    block = block_of(made)
+    sigma = block.sigma_px.copy()
+    sigma[block.start[4] + 1 : block.start[5]] = np.inf  # one image of point 4 is left
+    problem, found = adjusted(replace(block, sigma_px=sigma), Unknowns(lens=()))
+    precision = precision_of(problem, found)
+    sigma[block.start[4]] = np.inf
+    problem, found = adjusted(replace(block, sigma_px=sigma), Unknowns(lens=()))
+    without = precision_of(problem, found)
+    assert np.isnan(precision.point_covariance_m2[4]).all()
+    assert np.isnan(precision.point_covariance_m2).sum() == 6
+    assert "1 points" in precision.notes[0]
+    np.testing.assert_allclose(precision.centre_sigma_m, without.centre_sigma_m, rtol=1e-6)
+
+
+def test_mulsows_limitation():
+    """Over an evenly sloping bed, straight down, level, tilt and index move the bed alike.
+
+    The depth grows with x, and with it what an error of the index does: so does a tilt along x.
+    """
+    made = simulate_tie_points(
+        150, bed="shore", greatest_depth_m=3, area_m=(40, 30), forward_overlap=0.7,
+        side_overlap=0.6, seed=4,
+    )  # fmt: skip
+    block, sigma = block_of(made, control=True), {}
+    for name, free in (
+        ("level", {"level_sigma_m": FREE}),
+        ("index", {"index_sigma": FREE}),
+        ("all", {"level_sigma_m": FREE, "tilt_sigma": FREE, "index_sigma": FREE}),
+    ):
+        unknowns = Unknowns(lens=("f",), **free)
+        precision = precision_of(*adjusted(block, unknowns))
+        sigma[name] = precision
+    every = sigma["all"]
+    said = strong_correlations(every)
+    assert "the water level and the tilt of the water along x move the bed alike" in said[0]
+    assert any("the water level and the refractive index move the bed alike" in w for w in said)
+    for name in ("level", "index"):
+        assert every.sigma_of(name) > 2.0 * sigma[name].sigma_of(name)
+    assert strong_correlations(sigma["level"]) == []
+    assert "the water level is undetermined" in undetermined(every, unknowns)[0]
+
+
+def test_by_parts_is_the_same_as_the_whole_inverse(monkeypatch):
+    made = tiny()
+    block = block_of(made, control=True)
+    fixed = Unknowns(lens=("f",), level_sigma_m=FREE, fixed_images=made.cameras.labels[1:3])
+    problem, found = adjusted(block, fixed)
+    whole = precision_of(problem, found)
+    monkeypatch.setattr("pcfix.adjust.precision.DENSE_UP_TO", 0)
+    parts = precision_of(problem, found)
+    assert parts.point_covariance_m2 is None
+    assert "covariances of the points were left out" in parts.notes[0]
+    # two solutions of one system with a condition of about 1e8
+    np.testing.assert_allclose(parts.pose_covariance, whole.pose_covariance, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(parts.correlation, whole.correlation, atol=1e-6)
+    assert not whole.pose_covariance[1:3].any()

@@ -1,0 +1,246 @@
+"""The adjustment on simulated blocks: it comes home, and it is what scipy makes of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numba
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pcfix.adjust.block import Unknowns
+from pcfix.adjust.precision import precision_of, undetermined
+from pcfix.adjust.solve import prepare, solve, solved_cameras, water_of
+from pcfix.model import WaterPlane
+from pcfix.refract.threads import threads
+from pcfix.simulate.tie_points import simulate_tie_points
+from tests.utils.adjust_twin import Twin
+from tests.utils.tie_blocks import block_of
+
+FREE = np.inf
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """Blocks of a few hundred observations spend more on waking a second thread than it does."""
+    with threads(1):
+        yield
+
+
+HOME_M = 1e-6
+"""Without noise: Newton's steps end where the cost is rounding, 1e-9 m or better."""
+
+SMALL = {"area_m": (50, 40), "greatest_depth_m": 5, "position_noise_m": 0.5,
+         "attitude_noise_deg": 0.3}  # fmt: skip
+
+
+OBLIQUE = {"block": "oblique", "obliques_deg": 30, "oblique_directions": 2, "oblique_share": 0.4}
+WIDE = OBLIQUE | {"flying_height_m": 60}
+
+
+@cache
+def scene(points=80, **settings):
+    return simulate_tie_points(points, **(SMALL | settings))
+
+
+def adjusted(block, unknowns):
+    problem, start = prepare(block, unknowns)
+    return problem, solve(problem, start)
+
+
+def misses(made, problem, found):
+    """Return the largest errors of projection centres (m), angles (rad) and points (m)."""
+    cameras = solved_cameras(problem, found)
+    turn = cameras.rotations @ made.true_cameras.rotations.transpose(0, 2, 1)
+    ties = found.state.xyz[: len(made.truth)] + problem.origin
+    return (
+        np.abs(cameras.centres - made.true_cameras.centres).max(),
+        np.linalg.norm(Rotation.from_matrix(turn).as_rotvec(), axis=1).max(),
+        np.abs(ties - made.truth).max(),
+    )
+
+
+def disturbed(made, seed=3, by_m=0.3):
+    """Return wrong start values of the points."""
+    return made.truth + np.random.default_rng(seed).normal(0.0, by_m, made.truth.shape)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"tilt_percent": 2.0}, OBLIQUE],
+    ids=["nadir", "tilted water", "obliques"],
+)
+def test_comes_home_with_gnss(settings):
+    made = scene(**settings)
+    block = block_of(made, exact=True, start_xyz=disturbed(made))
+    problem, found = adjusted(block, Unknowns(lens=()))
+    assert max(misses(made, problem, found)) < HOME_M
+
+
+def test_comes_home_with_control_points_alone():
+    made = scene()
+    block = block_of(made, exact=True, gnss=False, control=True, start_xyz=disturbed(made))
+    problem, found = adjusted(block, Unknowns(lens=()))
+    assert max(misses(made, problem, found)) < HOME_M
+
+
+def test_comes_home_with_a_distorted_lens_level_tilt_and_index_free():
+    lens = (-0.05, 0.02, -0.004, 1e-3, -5e-4)
+    made = scene(distortion=lens, **OBLIQUE)
+    right = made.true_cameras.lenses[0]
+    wrong = replace(right, focal=right.focal + 20.0, principal_x=right.principal_x - 5.0)
+    cameras = replace(made.cameras, lenses=(wrong,) * len(made.cameras))
+    block = block_of(
+        made, exact=True, control=True, cameras=cameras, start_xyz=disturbed(made),
+        water=WaterPlane(made.water.a + 0.3), index=1.33,
+    )  # fmt: skip
+    unknowns = Unknowns(
+        lens=("f", "cx", "cy"), level_sigma_m=FREE, tilt_sigma=FREE, index_sigma=FREE
+    )
+    problem, found = adjusted(block, unknowns)
+    assert max(misses(made, problem, found)) < HOME_M
+    assert abs(found.lenses[0].focal - right.focal) < 1e-5  # px
+    assert abs(found.state.water[3] - made.refractive_index) < 1e-7
+    x, y = problem.origin[:2]
+    plane = water_of(problem, found.state)
+    assert abs(plane.a + plane.b * x + plane.c * y - made.water.a) < HOME_M
+
+
+def test_one_fixed_image_and_the_scale_by_a_second():
+    """A fixed image and the place of another are a datum; the water level tells the height."""
+    made = scene()
+    k = len(made.cameras)
+    first = made.cameras.labels[0]
+    poses = [np.where(np.arange(k)[:, None] == 0, made.true_cameras.centres, made.cameras.centres)]
+    turns = np.where(
+        np.arange(k)[:, None, None] == 0, made.true_cameras.rotations, made.cameras.rotations
+    )
+    cameras = replace(made.cameras, centres=poses[0], rotations=turns)
+    block = block_of(made, exact=True, cameras=cameras)
+    only = np.arange(k) == k - 1
+    block = replace(
+        block,
+        gnss_xyz=np.where(only[:, None], block.gnss_xyz, np.nan),
+        gnss_sigma_m=np.where(only[:, None], block.gnss_sigma_m, np.inf),
+    )
+    problem, found = adjusted(block, Unknowns(lens=(), fixed_images=(first,)))
+    assert max(misses(made, problem, found)) < HOME_M
+    assert (found.state.centres[0] + problem.origin == made.true_cameras.centres[0]).all()
+
+
+def test_free_network_keeps_the_mean_of_the_start():
+    """With the water level fixed, the images tell height and tilt; the rest is the start's."""
+    made = scene()
+    block = block_of(made, exact=True, gnss=False)
+    problem, found = adjusted(block, Unknowns(lens=(), free_network=True))
+    moved = found.state.centres + problem.origin - made.cameras.centres
+    assert np.abs(moved[:, :2].mean(axis=0)).max() < 1e-6  # m: what the network holds
+    # the network is the true one but for a turn about the vertical, a shift in plan and a scale
+    # about the water
+    a = made.true_cameras.centres - [*made.true_cameras.centres.mean(axis=0)[:2], made.water.a]
+    b = found.state.centres + problem.origin
+    b = b - [*b.mean(axis=0)[:2], made.water.a]
+    s = np.sqrt((b * b).sum() / (a * a).sum())
+    over, across = (a[:, :2] * b[:, :2]).sum(), a[:, 0] @ b[:, 1] - a[:, 1] @ b[:, 0]
+    turn = Rotation.from_euler("z", np.arctan2(across, over)).as_matrix()
+    np.testing.assert_allclose(b, s * a @ turn.T, atol=HOME_M)
+
+
+def test_level_is_found_within_two_centimetres():
+    made = scene(1500, **WIDE)
+    assert 0.1 < made.is_wet.mean() < 0.9
+    start = WaterPlane(made.water.a + 0.25)
+    block = block_of(made, control=True, water=start)
+    problem, found = adjusted(block, Unknowns(lens=("f",), level_sigma_m=FREE))
+    precision = precision_of(problem, found)
+    level = water_of(problem, found.state).a
+    assert abs(level - made.water.a) < 0.02  # m, what is asked for
+    assert precision.sigma_of("level") < 0.02
+    assert undetermined(precision, problem.unknowns) == []
+
+
+def test_tilt_is_found():
+    made = scene(1500, tilt_percent=1.0, **WIDE)
+    x, y = np.round(made.cameras.centres.mean(axis=0))[:2]
+    level = made.water.a + made.water.b * x + made.water.c * y
+    block = block_of(made, control=True, water=WaterPlane(level))
+    problem, found = adjusted(block, Unknowns(lens=(), level_sigma_m=FREE, tilt_sigma=FREE))
+    plane, precision = water_of(problem, found.state), precision_of(problem, found)
+    for name, miss in (("tilt_x", plane.b - made.water.b), ("tilt_y", plane.c - made.water.c)):
+        assert abs(miss) < 3.5 * precision.sigma_of(name) < 0.002  # m/m
+    assert abs(plane.a + plane.b * x + plane.c * y - level) < 0.02  # m
+
+
+@pytest.mark.parametrize("points", [100, 1500])
+def test_index_is_found_within_0_005_or_said_to_be_undetermined(points):
+    made = scene(points, **(WIDE if points > 100 else {}))
+    block = block_of(made, control=True, index=1.33)
+    problem, found = adjusted(block, Unknowns(lens=(), index_sigma=FREE))
+    precision = precision_of(problem, found)
+    notes = undetermined(precision, problem.unknowns)
+    miss = abs(found.state.water[3] - made.refractive_index)
+    if points > 100:
+        assert miss < 0.005
+        assert notes == []
+    else:
+        assert precision.sigma_of("index") > 0.005
+        assert "the refractive index is undetermined" in notes[0]
+
+
+def test_fixed_poses_intersect_forward():
+    made = scene()
+    block = block_of(made, exact=True, cameras=made.true_cameras, start_xyz=disturbed(made))
+    problem, found = adjusted(block, Unknowns(poses="fixed", lens=()))
+    assert max(misses(made, problem, found)) < HOME_M
+    np.testing.assert_array_equal(found.state.centres + problem.origin, made.true_cameras.centres)
+
+
+def test_similarity_brings_a_displaced_block_home():
+    made = scene()
+    true, pivot = made.true_cameras, made.true_cameras.centres.mean(axis=0)
+    turn = Rotation.from_rotvec([0.004, -0.006, 0.02]).as_matrix()
+    centres = pivot + [1.5, -0.8, 0.6] + 1.01 * (true.centres - pivot) @ turn.T
+    cameras = replace(made.cameras, centres=centres, rotations=true.rotations @ turn.T)
+    for given in ({"gnss": True}, {"gnss": False, "control": True}):
+        block = block_of(made, exact=True, cameras=cameras, start_xyz=disturbed(made), **given)
+        problem, found = adjusted(block, Unknowns(poses="similarity", lens=()))
+        assert max(misses(made, problem, found)) < HOME_M
+
+
+def test_the_threads_do_not_change_a_bit():
+    made = scene()
+    unknowns = Unknowns(lens=("f",), level_sigma_m=FREE, index_sigma=FREE)
+    block, before, states = block_of(made, control=True), numba.get_num_threads(), []
+    try:
+        for count in (1, min(2, numba.config.NUMBA_NUM_THREADS)):
+            numba.set_num_threads(count)
+            problem, found = adjusted(block, unknowns)
+            points = precision_of(problem, found).point_covariance_m2
+            states.append((*found.state, found.shared, points))
+    finally:
+        numba.set_num_threads(before)
+    for one, two in zip(*states, strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+@pytest.mark.parametrize("tilt", [None, 2.0], ids=["level", "tilted"])
+def test_same_as_scipy_with_the_simulators_tracing(tilt):
+    made = simulate_tie_points(
+        11, seed=2, area_m=(25, 20), greatest_depth_m=6, position_noise_m=0.1,
+        attitude_noise_deg=0.1, forward_overlap=0.6, side_overlap=0.5, obliques_deg=25,
+        oblique_directions=2, oblique_share=0.3, tilt_percent=tilt,
+    )  # fmt: skip
+    block = block_of(made, control=True)
+    problem, found = adjusted(block, Unknowns(lens=("f",), level_sigma_m=FREE, index_sigma=0.005))
+    twin = Twin(block, ("f", "level", "index"), index_sigma=0.005)
+    x = twin.solve()
+    centres, rotations, added, xyz = twin.parts(x)
+    assert abs((twin.residuals(x) ** 2).sum() - found.cost) < 1e-6  # of about 250
+    # m: a thousandth of the standard errors and less; both stop where the cost no longer changes
+    np.testing.assert_allclose(found.state.centres, centres, atol=1e-5)
+    np.testing.assert_allclose(found.state.xyz, xyz, atol=1e-5)
+    np.testing.assert_allclose(found.state.rotations, rotations, atol=1e-6)
+    names = dict(zip(problem.names, found.shared, strict=True))
+    assert names == pytest.approx(added, abs=1e-4)

@@ -1,0 +1,353 @@
+"""A cloud of old cameras, corrected with adjusted ones, through every door."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import laspy
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import pcfix
+from pcfix.errors import GeometryError, PcfixWarning, SettingError
+from pcfix.flow.inputs import Inputs
+from pcfix.flow.old_cameras import paired, told_apart
+from pcfix.flow.run import Request, request_of
+from pcfix.model import Cameras, Outcome, Views
+from pcfix.report.text import summary_text
+from tests.utils.clouds import (
+    CAMERA_HEIGHT_M,
+    EAST_M,
+    NORTH_M,
+    SCALES,
+    SIDE_M,
+    WATER_M,
+    cameras_csv,
+    framed_block,
+    read_raw,
+    write_cloud,
+)
+from tests.utils.shared import ROOT, needs
+
+FREE, free = needs("rendered_a_free")
+TRUE, true = needs("rendered_a")
+
+MIDDLE = np.array([EAST_M + SIDE_M / 2, NORTH_M + SIDE_M / 2, WATER_M])
+TURN = Rotation.from_rotvec([0.004, -0.003, 0.05]).as_matrix()
+
+
+def similar(xyz):
+    """Return points turned, stretched and shifted by about two metres."""
+    return MIDDLE + 1.002 * (xyz - MIDDLE) @ TURN.T + [0.9, -0.6, -1.5]
+
+
+def adjusted(old):
+    return replace(old, centres=similar(old.centres), rotations=old.rotations @ TURN.T)
+
+
+@pytest.fixture
+def old():
+    return framed_block()
+
+
+@pytest.fixture
+def cloud(tmp_path):
+    return write_cloud(tmp_path / "cloud.las", 7)
+
+
+def correct(cloud, **more):
+    output = cloud.with_name("out.las")
+    told = pcfix.correct_file(cloud, output, water=WATER_M, overwrite=True, **more)
+    return told, laspy.read(cloud), laspy.read(output)
+
+
+def shift_of(las):
+    return np.column_stack([np.array(las.points.array[f"Shift{a}"]) for a in "XYZ"]).astype(int)
+
+
+def test_cameras_that_did_not_move_change_nothing(cloud, old):
+    told, _, carried = correct(cloud, cameras=old, adjusted_from=old)
+    _, before, plain = correct(cloud, cameras=old)
+    # the last step of the intersection may be 1e-6 m: a thousandth of one of the file's
+    assert np.abs(shift_of(carried) - shift_of(plain)).max() <= 1
+    land = np.array(before.z) > WATER_M + 0.01
+    assert land.sum() > 900
+    assert not shift_of(carried)[land].any()
+    assert told.carried["shift_m"]["max"] == 0.0
+    seen = told.carried["not_carried"]
+    assert told.carried["points"] + seen + sum(told.uncorrected.values()) == len(before)
+
+
+def test_land_and_bed_follow_the_cameras(cloud, old):
+    new = adjusted(old)
+    told, before, after = correct(cloud, cameras=new, adjusted_from=old)
+    came = np.array(before.xyz)
+    expected = pcfix.correct_points(similar(came), new, WATER_M)
+    stuck = np.array(after.RayCount) == 0
+    land = expected.outcome == Outcome.LAND
+    # what is under water is decided where the points are taken to
+    sank = land != (came[:, 2] > WATER_M)
+    assert sank.sum() > 30
+    went = np.array(after.xyz) - expected.xyz
+    carried = (land & shift_of(after).any(axis=1)) | ~stuck
+    assert carried.sum() > 500  # of 2000: the frames leave gaps
+    # half a step of the file
+    assert (np.abs(went[carried]) <= 0.5 * np.array(SCALES) + 2e-6).all()
+    assert (np.array(after.classification)[~stuck] == 40).all()
+    assert np.array_equal(
+        np.array(after.classification)[land], np.array(before.classification)[land]
+    )
+    assert not np.array(after.RayCount)[land].any()
+    assert not np.array(after.SourceClass)[land & carried].any()
+    assert told.carried["land"] == (land & carried).sum()
+    way = np.linalg.norm(similar(came) - came, axis=1)[carried]
+    assert told.carried["points"] == carried.sum()
+    assert told.carried["shift_m"]["rms"] == pytest.approx(np.sqrt((way**2).mean()), abs=1e-4)
+    assert told.carried["shift_m"]["max"] == pytest.approx(way.max(), abs=1e-4)
+    assert f"{told.carried['land']:,} of them land" in summary_text(told)
+
+
+def test_points_that_no_two_old_cameras_see_stay_and_are_withheld(cloud, old):
+    told, before, after = correct(cloud, cameras=adjusted(old), adjusted_from=old)
+    result = pcfix.correct_points(before.xyz, adjusted(old), WATER_M, adjusted_from=old)
+    behind = result.outcome == Outcome.NOT_CARRIED
+    assert told.carried["not_carried"] == behind.sum() > 10
+    assert not shift_of(after)[behind].any()
+    assert np.array(after.withheld)[behind].all()
+    assert np.array_equal(
+        np.array(after.classification)[behind], np.array(before.classification)[behind]
+    )
+    assert "fewer than two old cameras image them (unmoved, withheld)" in summary_text(told)
+    told, _, after = correct(cloud, cameras=adjusted(old), adjusted_from=old, uncorrected="drop")
+    assert len(after) == len(before) - told.dropped
+    assert told.dropped == behind.sum() + sum(told.uncorrected.values())
+    _, _, after = correct(cloud, cameras=adjusted(old), adjusted_from=old, uncorrected="keep")
+    assert np.array_equal(after.withheld, before.withheld)
+    assert not np.array(after.WaterDepth)[behind].any()
+
+
+@pytest.mark.parametrize("number", [1, 7])
+def test_restored_to_the_bit(tmp_path, old, number):
+    cloud = write_cloud(tmp_path / "cloud.las", number)
+    correct(cloud, cameras=adjusted(old), adjusted_from=old)
+    pcfix.restore_file(tmp_path / "out.las", tmp_path / "back.las")
+    before, back = read_raw(cloud), read_raw(tmp_path / "back.las")
+    assert np.array_equal(before.points, back.points)
+
+
+def test_the_doors_agree(cloud, old, tmp_path):
+    """The program, files, arrays, and the stage of PDAL as a function of arrays."""
+    from tests.pdal_stage.test_arrays import arrays_of, metadata_of, run
+
+    for name, cameras in (
+        ("old", old),
+        ("new", replace(old, centres=old.centres + np.array([0.4, 0.2, 0.9]))),
+    ):
+        (tmp_path / name).mkdir()
+        cameras_csv(tmp_path / name / "cameras.csv", cameras, angles=True)
+        (tmp_path / name / "sensor.csv").write_text("focal,sensor_x,sensor_y\n24,24,9.6\n")
+    paths = {
+        "cameras": str(tmp_path / "new" / "cameras.csv"),
+        "adjusted_from": str(tmp_path / "old" / "cameras.csv"),
+    }
+    _, before, after = correct(cloud, **paths)
+    words = [f"--{key.replace('_', '-')}={value}" for key, value in paths.items()]
+    program = [sys.executable, "-m", "pcfix"]
+    subprocess.run(
+        [*program, "correct", cloud, tmp_path / "cli.las", "--water", str(WATER_M), "-q", *words],
+        check=True,
+    )
+    assert (tmp_path / "cli.las").read_bytes() == (tmp_path / "out.las").read_bytes()
+    outs, _ = run("correct", arrays_of(before), metadata_of(before.header), water=WATER_M, **paths)
+    for axis in "XYZ":
+        scale, offset = (getattr(after.header, f"{axis.lower()}_{w}") for w in ("scale", "offset"))
+        assert np.array_equal(np.rint((outs[axis] - offset) / scale), after[axis])
+        assert np.array_equal(outs[f"Shift{axis}"], np.array(after[f"Shift{axis}"], np.float32))
+    assert np.array_equal(outs["Classification"], np.array(after.classification))
+    assert np.array_equal(outs["ClassFlags"] & 4 != 0, np.array(after.withheld) != 0)
+    result = pcfix.correct_points(
+        before.xyz, pcfix.read_cameras(paths["cameras"]), WATER_M,
+        adjusted_from=pcfix.read_cameras(paths["adjusted_from"]),
+    )  # fmt: skip
+    assert np.array_equal(np.rint(result.shift_m / SCALES), shift_of(after))
+    done = subprocess.run(
+        [*program, "pipeline", cloud, "o.las", "--water", str(WATER_M), *words],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    stage = json.loads(done.stdout)["pipeline"][1]
+    assert stage["pdalargs"]["adjusted_from"] == paths["adjusted_from"]
+
+
+def test_chunks_leave_no_trace(cloud, old, tmp_path, monkeypatch):
+    correct(cloud, cameras=adjusted(old), adjusted_from=old)
+    whole = (tmp_path / "out.las").read_bytes()
+    monkeypatch.setattr("pcfix.flow.files.CHUNK_POINTS", 333)
+    monkeypatch.setattr("pcfix.flow.carrying.POINTS_AT_ONCE", 100)
+    correct(cloud, cameras=adjusted(old), adjusted_from=old, jobs=1)
+    assert (tmp_path / "out.las").read_bytes() == whole
+
+
+def test_views_count_the_old_cameras(old):
+    """They come in another order there, and under whole paths; one was not adjusted."""
+    rng = np.random.default_rng(3)
+    xyz = rng.uniform((EAST_M, NORTH_M, 5.0), (EAST_M + SIDE_M, NORTH_M + SIDE_M, 11.0), (200, 3))
+    listed = np.array([rng.choice(9, 4, replace=False) for _ in xyz])
+    views = Views(np.arange(0, 801, 4), listed.ravel())
+    new = adjusted(old)
+    straight = pcfix.correct_points(similar(xyz), new, WATER_M, views=views, method="snell")
+    order = rng.permutation(9)
+    shuffled = Cameras(
+        (*(f"C:\\flight\\{old.labels[i]}.JPG" for i in order), "another"),
+        np.vstack([old.centres[order], MIDDLE[None] + np.array([0.0, 0.0, 75.0])]),
+        np.concatenate([old.rotations[order], old.rotations[:1]]),
+        (*(old.lenses[i] for i in order), old.lenses[0]),
+    )
+    place = np.argsort(order)
+    theirs = Views(views.start, place[views.camera])
+    found = pcfix.correct_points(xyz, new, WATER_M, adjusted_from=shuffled, views=theirs)
+    corrected = straight.corrected
+    assert np.array_equal(found.corrected, corrected)
+    assert corrected.sum() > 150
+    assert np.abs(found.xyz - straight.xyz)[corrected].max() < 1e-5  # m; carried to 1e-6
+    assert np.array_equal(found.ray_count, straight.ray_count)
+    # an image that was not adjusted leaves the lists
+    fewer = replace(
+        new, labels=new.labels[1:], centres=new.centres[1:], rotations=new.rotations[1:],
+        lenses=new.lenses[1:],
+    )  # fmt: skip
+    found = pcfix.correct_points(xyz, fewer, WATER_M, adjusted_from=shuffled, views=theirs)
+    has = (listed == 0).any(axis=1) & found.corrected & corrected
+    assert np.array_equal(found.ray_count[has], straight.ray_count[has] - 1)
+
+
+def test_a_lens_in_millimetres_fits_one_in_pixels(cloud, old):
+    px = tuple(
+        replace(lens, focal=6000.0, width=6000.0, height=2400.0, principal_x=3000.0,
+                principal_y=1200.0, unit="px")
+        for lens in old.lenses
+    )  # fmt: skip
+    _, _, one = correct(cloud, cameras=adjusted(old), adjusted_from=old)
+    _, _, other = correct(cloud, cameras=replace(adjusted(old), lenses=px), adjusted_from=old)
+    assert np.abs(shift_of(one) - shift_of(other)).max() <= 1  # step of the file
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "words"),
+    [
+        ({"labels": tuple("abcdefghi")}, GeometryError, "has no image c0"),
+        ({"rotations": None, "lenses": None}, SettingError, "adjusted-from: has no angles"),
+        ({"lenses": None}, SettingError, "adjusted-from: has no lens"),
+        ({"centres": 40.0}, GeometryError, "40.00 m from where the adjusted ones do"),
+        ({"labels": ("a/c0.jpg", "b/c0.jpg", *(f"c{i}" for i in range(2, 9)))},
+         GeometryError, "could be several"),
+    ],
+)  # fmt: skip
+def test_models_that_are_not_of_one_block_are_refused(cloud, old, change, kind, words):
+    if "centres" in change:
+        change = {"centres": old.centres + np.array([change["centres"], 0.0, 0.0])}
+    with pytest.raises(kind) as raised:
+        correct(cloud, cameras=old, adjusted_from=replace(old, **change))
+    assert words in str(raised.value)
+    assert not cloud.with_name("out.las").exists()
+
+
+def test_undistorted_images_are_refused(old):
+    cut = tuple(replace(lens, height=9.5) for lens in old.lenses)
+    with pytest.raises(GeometryError, match="not the same images"):
+        paired(replace(old, lenses=cut), old)
+
+
+def test_one_image_far_off_is_warned_of(cloud, old):
+    centres = old.centres.copy()
+    centres[4] += [0.2 * CAMERA_HEIGHT_M, 0.0, 0.0]
+    with pytest.warns(PcfixWarning, match="1 of 9 images were moved by more than a tenth"):
+        correct(cloud, cameras=old, adjusted_from=replace(old, centres=centres))
+
+
+def test_a_port_and_the_tracks_of_the_adjusted_model_are_refused(cloud, old, tmp_path):
+    with pytest.raises(SettingError, match="adjusted-from is of no use with a port"):
+        pcfix.correct_file(
+            cloud, tmp_path / "o.las", cameras=old, adjusted_from=old, port="flat:distance=0.02"
+        )
+    given = Inputs("new", WATER_M, views="new", adjusted_from="old")
+    with pytest.raises(SettingError, match="not where the cloud has its points"):
+        told_apart(given)
+
+
+@pytest.mark.parametrize("local", ["old", "new", "both", "neither"])
+@pytest.mark.parametrize("said", [False, True])
+def test_an_offset_is_for_the_file_that_does_not_say_where_it_lies(tmp_path, old, local, said):
+    offset = np.array([EAST_M, NORTH_M, 0.0])
+    (tmp_path / "sensor.csv").write_text("focal,sensor_x,sensor_y\n24,24,9.6\n")
+    for name, moved in (("old", 0.0), ("new", 0.5)):
+        away = offset if local in (name, "both") else 0.0
+        table = cameras_csv(
+            tmp_path / f"{name}.csv", replace(old, centres=old.centres - away + moved), angles=True
+        )
+        if said and local not in (name, "both"):
+            table.write_text("# CoordinateSystem: EPSG:32633\n" + table.read_text())
+    inputs = Inputs(
+        tmp_path / "new.csv", WATER_M, adjusted_from=tmp_path / "old.csv",
+        cameras_offset_m=tuple(offset),
+    )  # fmt: skip
+    before, after = told_apart(inputs)
+    if local == "neither":  # then it is of both, as it is of one file that says its CRS
+        assert before.cameras_offset_m == after.cameras_offset_m == tuple(offset)
+        return
+    assert (before.cameras_offset_m is not None) == (local in ("old", "both"))
+    assert (after.cameras_offset_m is not None) == (local in ("new", "both"))
+
+
+def test_a_run_keeps_it(tmp_path):
+    scene = ROOT / "samples" / "scene"
+    words = ["--cameras", scene / "cameras.csv", "--adjusted-from", scene / "cameras.csv"]
+    program = [sys.executable, "-m", "pcfix", "run", "-q"]
+    subprocess.run(
+        [*program, scene / "cloud.laz", tmp_path / "a", "--water", "0.37", *words], check=True
+    )
+    record = tmp_path / "a" / "run.json"
+    request = request_of(record)
+    assert isinstance(request, Request)
+    assert request.adjusted_from == str(scene / "cameras.csv")
+    assert json.loads(record.read_text())["steps"]["correct"]["result"]["carried"]["land"] > 0
+    assert "land too, was taken" in (tmp_path / "a" / "report.html").read_text()
+
+
+@free
+@true
+@pytest.mark.parametrize("views", [None, "dense.vis"])
+def test_a_block_that_had_swallowed_the_water(tmp_path, views):
+    """With true poses; before, land lies 19 GSD (of 5 cm) too low and the bed is 27 off."""
+    told = pcfix.correct_file(
+        FREE / "cloud.las", tmp_path / "out.las", cameras=TRUE / "colmap", water=0.37,
+        adjusted_from=FREE / "sparse", cameras_offset_m=tuple(np.loadtxt(FREE / "offset.txt")),
+        views=None if views is None else FREE / views,
+    )  # fmt: skip
+    las = laspy.read(tmp_path / "out.las")
+    bed, land = errors_gsd(las)
+    assert told.carried["points"] == told.points
+    # the noise of the matcher: with the true cameras from the start it leaves as much
+    assert np.sqrt((land**2).mean()) < 0.7
+    assert np.sqrt((bed**2).mean()) < 0.95
+    assert told.carried["shift_m"]["mean_z"] > 1.0
+    pcfix.restore_file(tmp_path / "out.las", tmp_path / "back.las")
+    assert (tmp_path / "back.las").read_bytes() == (FREE / "cloud.las").read_bytes()
+
+
+def errors_gsd(las):
+    """Return height errors against the true surface, bed and land apart, in GSD of 5 cm."""
+    import rasterio
+    from scipy.interpolate import RegularGridInterpolator
+
+    with rasterio.open(TRUE / "truth_dsm.tif") as truth:
+        heights, way = truth.read(1).astype(float), truth.transform
+    rows = (np.arange(len(heights)) + 0.5, np.arange(heights.shape[1]) + 0.5)
+    at = RegularGridInterpolator(rows, heights, bounds_error=False)
+    xyz = np.array(las.xyz)
+    column, row = (xyz[:, 0] - way.c) / way.a, (xyz[:, 1] - way.f) / way.e
+    z = at(np.column_stack([row, column]))
+    error = (xyz[:, 2] - z) / 0.05
+    known = np.isfinite(error)
+    return error[known & (z < 0.27)], error[known & (z > 0.47)]

@@ -1,0 +1,139 @@
+"""Bent poses through the doors: one warning in a correction, all signs in `pcfix cameras`."""
+
+import json
+import warnings
+
+import pytest
+from typer.testing import CliRunner
+
+import pcfix
+from pcfix.cli import app
+from pcfix.errors import PcfixWarning, SettingError
+from pcfix.flow.cameras import check_cameras
+from pcfix.flow.diagnosis import command_of
+from pcfix.flow.inputs import Inputs
+from pcfix.report.cameras import cameras_text
+from tests.utils.shared import ROOT, needs
+
+SCENE = ROOT / "samples" / "scene"
+TRUE, rendered = needs("rendered_a")
+BENT, bent = needs("rendered_a_free")
+OFFSET_M = (319900.0, 3842700.0, 0.0)
+LEVEL_M = 0.37
+
+
+def said(source, output, **given):
+    """Return what a correction warns of."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        summary = pcfix.correct_file(source, output, **given)
+    texts = [str(one.message) for one in caught if issubclass(one.category, PcfixWarning)]
+    return [text for text in texts if "absorbed" in text], summary
+
+
+@bent
+def test_a_correction_with_bent_poses_warns_once(tmp_path):
+    model = BENT / "sparse"
+    found, summary = said(
+        BENT / "cloud.las", tmp_path / "out.laz", cameras=model, cameras_offset_m=OFFSET_M,
+        water=LEVEL_M,
+    )  # fmt: skip
+    assert len(found) == 1
+    assert f"pcfix adjust {model} OUT --water 0.37 --cloud {BENT / 'cloud.las'}" in found[0]
+    # the land lies 0.96 m too low; the block's own centres tell most of it
+    assert 0.6 < float(found[0].split("likely error is ")[1].split(" m")[0]) < 1.3
+    assert found[0] in summary.warnings
+
+
+@rendered
+def test_a_correction_with_true_poses_does_not(tmp_path):
+    found, _ = said(
+        TRUE / "cloud.las", tmp_path / "out.laz", cameras=TRUE / "colmap",
+        cameras_offset_m=OFFSET_M, water=LEVEL_M,
+    )  # fmt: skip
+    assert found == []
+
+
+def test_the_sample_does_not(tmp_path):
+    level = json.loads((SCENE / "scene.json").read_text())["water_level_m"]
+    found, _ = said(
+        SCENE / "cloud.laz", tmp_path / "out.laz", cameras=SCENE / "cameras.csv", water=level
+    )
+    assert found == []
+
+
+@bent
+@pytest.mark.filterwarnings("ignore:.*names no CRS")
+def test_every_sign_speaks_of_bent_poses():
+    report = check_cameras(
+        BENT / "sparse", BENT / "cloud.las", water=LEVEL_M, cameras_offset_m=OFFSET_M,
+        gnss=BENT / "gnss.csv", gcps=BENT / "gcps.csv", reference=TRUE / "lidar.laz",
+    )  # fmt: skip
+    signs = report.as_dict()["refraction"]["signs"]
+    assert {sign["name"] for sign in signs} == {
+        "tie points", "GNSS", "bed", "land", "control points"
+    }  # fmt: skip
+    assert all(sign["absorbed"] for sign in signs)
+    # the README of the data: the land is 0.96 m too low
+    assert report.as_dict()["refraction"]["likely_error_m"] == pytest.approx(0.96, abs=0.05)
+    text = cameras_text(report)
+    assert "verdict        The poses have absorbed the refraction" in text
+    assert "--gcps" in text
+
+
+@bent
+def test_poses_and_gnss_are_enough():
+    report = check_cameras(
+        BENT / "cameras.xml", BENT / "cloud.las", water=LEVEL_M, gnss=BENT / "gnss.csv"
+    )
+    assert report.diagnosis.decided_by.name == "GNSS"
+    assert report.diagnosis.absorbed is True
+
+
+@bent
+@pytest.mark.filterwarnings("ignore:.*names no CRS")
+def test_no_sign_speaks_of_true_poses():
+    report = check_cameras(
+        TRUE / "colmap", TRUE / "cloud.las", water=LEVEL_M, cameras_offset_m=OFFSET_M,
+        gnss=BENT / "gnss.csv", gcps=BENT / "gcps.csv", reference=TRUE / "lidar.laz",
+    )  # fmt: skip
+    assert report.diagnosis.absorbed is False
+    assert not any(sign.speaks for sign in report.diagnosis.signs)
+    assert report.as_dict()["refraction"]["likely_error_m"] is None
+
+
+@bent
+def test_a_calibration_tells(tmp_path):
+    lens = tmp_path / "lens.csv"
+    # true: 1500 px
+    lens.write_text("focal_px,width_px,height_px\n1500,1600,1200\n")
+    report = check_cameras(BENT / "cameras.xml", BENT / "cloud.las", water=LEVEL_M, lens=lens)
+    assert report.diagnosis.decided_by.name == "focal length"
+    # 3.48 px of 1500, at 76 m
+    assert report.diagnosis.size[0] == pytest.approx(0.176, abs=0.01)
+
+
+def test_evidence_needs_cloud_and_water():
+    with pytest.raises(SettingError, match="give cloud and water too"):
+        check_cameras(SCENE / "cameras.csv", gcps="gcps.csv")
+    result = CliRunner().invoke(app, ["cameras", str(SCENE / "cameras.csv"), "--lens", "a.csv"])
+    assert result.exit_code == 1
+
+
+def test_the_command_names_what_was_given():
+    inputs = Inputs("my model", 0.5, cameras_offset_m=(1.0, 2.0, 3.0), cameras_crs="EPSG:25830")
+    command = command_of(inputs, "cloud.laz", gnss="gnss.csv", gcps=None)
+    assert command == (
+        "pcfix adjust 'my model' OUT --water 0.5 --cloud cloud.laz --cameras-crs EPSG:25830"
+        " --gnss gnss.csv --cameras-offset 1,2,3"
+    )
+
+
+@bent
+def test_the_command_line_says_so():
+    words = ["cameras", str(BENT / "cameras.xml"), "--cloud", str(BENT / "cloud.las")]
+    words += ["--water", "0.37", "--gnss", str(BENT / "gnss.csv")]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0
+    assert "GNSS           absorbed:" in result.stdout
+    assert "pcfix adjust" in result.stdout

@@ -1,0 +1,234 @@
+"""Positions of the GNSS from a file, and in the frame of the cameras."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pyproj import CRS, Transformer
+
+from pcfix.errors import InputError, PcfixWarning
+from pcfix.io.cameras import read_cameras
+from pcfix.io.cameras.georeference import bring_to
+from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
+from pcfix.model import Cameras, GnssPositions
+from tests.utils.shared import needs
+
+FREE, free = needs("rendered_a_free")
+SAMPLES, samples = needs("cameras")
+
+XYZ = np.array([[500010.0, 4000010.0, 82.5], [500030.5, 4000020.25, 81.75]])
+
+
+def block(crs="EPSG:32636", labels=("a.jpg", "b.jpg"), **more):
+    adjusted = XYZ[: len(labels)] + np.array([0.1, -0.2, 0.3])
+    return Cameras(labels, adjusted, crs=crs, **more)
+
+
+def write(tmp_path, text, name="gnss.csv"):
+    path = tmp_path / name
+    path.write_text(text)
+    return path
+
+
+@free
+def test_rendered_a_free_is_out_as_its_readme_says():
+    cameras = read_cameras(FREE / "sparse")
+    cameras = bring_to(cameras, "EPSG:32636", offset_m=(319900.0, 3842700.0, 0.0))
+    found = gnss_in_frame_of(read_gnss(FREE / "gnss.csv", cameras))
+    apart = cameras.centres - found.xyz
+    # centres are 0.17 m out, and the GNSS 3 cm along each axis
+    assert np.sqrt((apart**2).sum(axis=1).mean()) == pytest.approx(0.17, abs=0.01)
+    assert (found.sigma_m == 0.03).all()
+    assert found.reason == ""
+
+
+@pytest.mark.parametrize(
+    ("head", "rows"),
+    [
+        ("image,x,y,z,sx,sy,sz", "{i},{x},{y},{z},0.01,0.02,0.03"),
+        ("Label;Easting;Northing;Height;Sigma_X;Sigma_Y;Sigma_Z", "{i};{x};{y};{z};.01;.02;.03"),
+        (
+            "#Label,X/Easting,Y/Northing,Z/Altitude,Accuracy_X (m),Accuracy_Y (m),Accuracy_Z (m)",
+            "{i},{x},{y},{z},0.01,0.02,0.03",
+        ),
+    ],
+)
+@pytest.mark.parametrize("names", [("a.jpg", "b.jpg"), ("B", "A"), ("x/a.jpg", "x/b.jpg")])
+def test_tables_in_the_cameras_frame(tmp_path, head, rows, names):
+    order = [0, 1] if names[0] != "B" else [1, 0]
+    lines = [
+        rows.format(i=name, x=XYZ[i, 0], y=XYZ[i, 1], z=XYZ[i, 2])
+        for name, i in zip(names, order, strict=True)
+    ]
+    cameras = read_gnss(write(tmp_path, "\n".join([head, *lines])), block())
+    assert cameras.gnss.xyz.tolist() == XYZ.tolist()
+    assert cameras.gnss.sigma_m.tolist() == [[0.01, 0.02, 0.03]] * 2
+    assert cameras.gnss.crs is None
+    found = gnss_in_frame_of(cameras)
+    assert found.xyz == pytest.approx(XYZ, abs=1e-9)
+
+
+def degrees(crs="EPSG:4979"):
+    to = Transformer.from_crs(CRS("EPSG:32636").to_3d(), crs, always_xy=True)
+    return np.column_stack(to.transform(*XYZ.T))
+
+
+def test_longitude_latitude_height(tmp_path):
+    rows = [f"{n},{y!r},{x!r},{z!r}" for n, (x, y, z) in zip("ab", degrees().tolist(), strict=True)]
+    cameras = read_gnss(write(tmp_path, "\n".join(["image,lat,lon,height", *rows])), block())
+    assert cameras.gnss.crs == "EPSG:4326"
+    assert np.isnan(cameras.gnss.sigma_m).all()
+    found = gnss_in_frame_of(cameras)
+    assert found.xyz == pytest.approx(XYZ, abs=1e-6)
+    assert np.isnan(found.sigma_m).all()
+    assert found.reason == ""
+
+
+def test_geo_txt_of_odm(tmp_path):
+    rows = [
+        f"{n}.jpg {x!r} {y!r} {z!r} 0 0 0 0.02 0.05"
+        for n, (x, y, z) in zip("ab", degrees().tolist(), strict=True)
+    ]
+    path = write(tmp_path, "\n".join(["EPSG:4326", *rows]), "geo.txt")
+    found = gnss_in_frame_of(read_gnss(path, block()))
+    assert found.xyz == pytest.approx(XYZ, abs=1e-6)
+    assert found.sigma_m.tolist() == [[0.02, 0.02, 0.05]] * 2
+
+
+def test_images_json_of_odm(tmp_path):
+    images = [
+        {"filename": f"{n}.jpg", "longitude": x, "latitude": y, "altitude": z, "gps_xy_stddev": 0.5}
+        for n, (x, y, z) in zip("ab", degrees().tolist(), strict=True)
+    ]
+    found = gnss_in_frame_of(read_gnss(write(tmp_path, json.dumps(images), "images.json"), block()))
+    assert found.xyz == pytest.approx(XYZ, abs=1e-6)
+    assert found.sigma_m[0] == pytest.approx([0.5, 0.5, np.nan], nan_ok=True)
+
+
+def test_the_user_says_which_crs(tmp_path):
+    to_35 = Transformer.from_crs("EPSG:32636", "EPSG:32635", always_xy=True)
+    x, y = (each.tolist() for each in to_35.transform(XYZ[:, 0], XYZ[:, 1]))
+    rows = [f"{n}.jpg,{x[i]!r},{y[i]!r},{XYZ[i, 2]}" for i, n in enumerate("ab")]
+    path = write(tmp_path, "\n".join(["image,x,y,z", *rows]))
+    found = gnss_in_frame_of(read_gnss(path, block(), crs="EPSG:32635"))
+    assert found.xyz == pytest.approx(XYZ, abs=1e-6)
+    with pytest.raises(InputError, match=r"gnss.csv: the CRS 'EPSG:1' is not one"):
+        read_gnss(path, block(), crs="EPSG:1")
+
+
+def test_heights_that_cannot_be_compared(tmp_path):
+    rows = [
+        f"{n},{y!r},{x!r},{z!r},0.1" for n, (x, y, z) in zip("ab", degrees().tolist(), strict=True)
+    ]
+    text = "\n".join(["image,lat,lon,ellipsoidal_height,sigma", *rows])
+    cameras = read_gnss(write(tmp_path, text), block("EPSG:32636+5773"))
+    found = gnss_in_frame_of(cameras, "a.xml")
+    assert found.xyz[:, :2] == pytest.approx(XYZ[:, :2], abs=1e-6)
+    assert np.isnan(found.xyz[:, 2]).all()
+    assert np.isnan(found.sigma_m[:, 2]).all()
+    assert (found.sigma_m[:, :2] == 0.1).all()
+    assert "without the grid us_nga_egm96_15.tif" in found.reason
+
+
+def test_images_without_a_position_and_others(tmp_path):
+    path = write(
+        tmp_path, "image,x,y,z\nb.jpg,500001,4000002,3\na.jpg,,,\nq.jpg,4,5,6\nu.jpg,7,8,9\n"
+    )
+    with pytest.warns(PcfixWarning) as given:
+        cameras = read_gnss(path, block(unposed=("u",)))
+    assert np.isnan(cameras.gnss.xyz[0]).all()
+    assert cameras.gnss.xyz[1].tolist() == [500001.0, 4000002.0, 3.0]
+    assert [str(one.message) for one in given] == list(cameras.notes)
+    assert "gnss.csv: 1 of 2 images have a position by GNSS." in cameras.notes[0]
+    assert "1 positions are of images that are not in the model (q.jpg)" in cameras.notes[1]
+    assert np.isnan(gnss_in_frame_of(cameras).xyz).tolist() == [[True] * 3, [False] * 3]
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("image,x,y,z\nq.jpg,1,2,3\n", "no position is of an image of the block, which has 2"),
+        ("image,x,y,z\na.jpg,,,\n", "no position is of an image of the block"),
+        ("image,x,y,z\na.jpg,1,2,3\na.jpg,1,2,4\n", "image a.jpg has two positions"),
+        ("image,x,y,z\na.jpg,4000010,500010,80\n", "its positions lie 4,950 km from the block"),
+        ("image,x,y,z,sx,sy,sz\na.jpg,1,2,3,0,1,1\n", "image a.jpg: the standard deviation 0 m"),
+        ("image,x,y,z\na.jpg,1,2,three\n", "'three' is not a finite number"),
+        ("image,x,y\na.jpg,1,2\n", "z missing"),
+        ("image,x_est,y_est,z_est\na.jpg,1,2,3\n", "has no measured positions"),
+    ],
+)
+def test_files_that_are_of_no_use(tmp_path, text, word):
+    with pytest.raises(InputError, match=word) as error:
+        read_gnss(write(tmp_path, text), block())
+    assert "gnss.csv" in str(error.value)
+
+
+def test_a_name_of_two_images(tmp_path):
+    path = write(tmp_path, "image,x,y,z\na.jpg,1,2,3\n")
+    with pytest.raises(InputError, match=r"image a.jpg: the name could be that of several"):
+        read_gnss(path, block(labels=("1/a.jpg", "2/a.jpg")))
+
+
+def test_cameras_that_positions_cannot_join():
+    assert "has no positions" in gnss_in_frame_of(block(), "a.xml").reason
+    gnss = GnssPositions(degrees(), np.full((2, 3), np.nan), "EPSG:4979")
+    for crs in ("EPSG:4978", "EPSG:4979", "ENU:1,2,3"):
+        found = gnss_in_frame_of(block(crs, gnss=gnss), "a.xml")
+        assert np.isnan(found.xyz).all()
+        assert found.reason.startswith(f"a.xml: {crs} is no map in metres")
+    enu = replace(gnss, xyz=XYZ, crs="ENU:1,2,3")
+    assert gnss_in_frame_of(block("ENU:1,2,3", gnss=enu)).xyz == pytest.approx(XYZ, abs=1e-9)
+    local = gnss_in_frame_of(block("local", gnss=gnss), "a.xml")
+    assert "not both tied to the earth" in local.reason
+
+
+WITH_GNSS = {  # the map, images with a position, largest distance in plan, m, that they state
+    "metashape/easyidp_wheat_psx/wheat_tanashi.psx": ("EPSG:32654", 138, 10.0),
+    "metashape/micasense_rig/markers_micasenses_rededge.xml": ("EPSG:25830", 173, 10.0),
+    "metashape/uclm_sorolla/markers.xml": ("EPSG:25830", 16, 10.0),
+    "odm/hectorsosa": ("EPSG:32616", 40, 10.0),
+    "odm/testerarm_sub0": ("EPSG:32615", 7, 10.0),
+    "odm/orthority_odm": ("EPSG:32651", 4, 10.0),
+    "opensfm/berlin": ("EPSG:32633", 3, 30.0),
+}
+
+
+@samples
+@pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
+@pytest.mark.parametrize("name", ["odm/hectorsosa", "metashape/uclm_sorolla/markers.xml"])
+def test_another_camera_file_may_hold_them(name):
+    kept = read_cameras(SAMPLES / name)
+    found = read_gnss(SAMPLES / name, replace(kept, gnss=None)).gnss
+    assert found.xyz.tolist() == kept.gnss.xyz.tolist()
+    assert found.sigma_m == pytest.approx(kept.gnss.sigma_m, nan_ok=True)
+    assert found.crs == kept.gnss.crs
+
+
+@samples
+@pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
+@pytest.mark.parametrize("name", WITH_GNSS)
+def test_positions_of_a_sample_are_where_proj_puts_them(name):
+    crs, images, apart_m = WITH_GNSS[name]
+    # heights are not looked at here, so no grid is needed
+    flat = crs if "sorolla" in name else None
+    cameras = bring_to(read_cameras(SAMPLES / name), crs, cameras_crs=flat)
+    found = gnss_in_frame_of(cameras, name)
+    there = np.isfinite(found.xyz[:, :2]).all(axis=1)
+    assert there.sum() == images
+    expected = plan_of(cameras.gnss, crs)[there]
+    assert found.xyz[there, :2] == pytest.approx(expected, abs=1e-3)
+    assert np.hypot(*(cameras.centres[there, :2] - expected).T).max() < apart_m
+
+
+def plan_of(gnss, crs):
+    """Return x and y of positions, without any code of pcfix."""
+    xyz = gnss.xyz.T
+    if gnss.crs.startswith("ENU:"):
+        lat, lon, height = gnss.crs[4:].split(",")
+        place = f"+proj=topocentric +ellps=WGS84 +lat_0={lat} +lon_0={lon} +h_0={height}"
+        xyz = Transformer.from_pipeline(place).transform(*xyz, direction="INVERSE")
+        xyz = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*xyz)
+    source = CRS("EPSG:4326" if gnss.crs.startswith("ENU:") else gnss.crs)
+    source = source.sub_crs_list[0] if source.is_compound else source.to_2d()
+    return np.column_stack(Transformer.from_crs(source, crs, always_xy=True).transform(*xyz[:2]))

@@ -1,0 +1,373 @@
+"""Ground control: surveyed points and their marks in images."""
+
+import numpy as np
+import pytest
+from pyproj import CRS, Transformer
+
+from pcfix.errors import InputError, PcfixWarning
+from pcfix.io.cameras import read_cameras
+from pcfix.io.cameras.georeference import bring_to
+from pcfix.io.ground_control import read_ground_control
+from pcfix.model import Cameras, Lens
+from pcfix.refract.lens import project
+from tests.utils.reprojection import check_file
+from tests.utils.shared import needs
+
+FREE, free = needs("rendered_a_free")
+SOROLLA, sorolla = needs("cameras", "metashape", "uclm_sorolla")
+RIG, rig = needs("cameras", "metashape", "micasense_rig")
+
+LENS = Lens(1000.0, 1600.0, 1200.0, 800.0, 600.0)
+XYZ = {"G1": (500010.0, 4000010.0, 2.5), "G2": (500030.5, 4000020.25, -1.75)}
+HEAD = "name,x,y,z,image,u,v"
+ROWS = [
+    "G1,500010,4000010,2.5,a.jpg,100,200",
+    "G1,500010.0,4000010,2.50,b.jpg,1600,0",
+    "G2,500030.5,4000020.25,-1.75,b.jpg,0.5,1199.5",
+]
+
+
+def block(crs="EPSG:32636", labels=("a.jpg", "b.jpg", "c.jpg"), **more):
+    k = len(labels)
+    centres = np.array([500000.0, 4000000.0, 80.0]) + 10.0 * np.arange(k)[:, None]
+    down = np.broadcast_to(np.diag([1.0, -1.0, -1.0]), (k, 3, 3))
+    return Cameras(labels, centres, down, (LENS,) * k, crs, **more)
+
+
+def write(tmp_path, *rows, head=HEAD, name="gcps.csv"):
+    path = tmp_path / name
+    path.write_text("\n".join([head, *rows]) + "\n")
+    return path
+
+
+def read(tmp_path, *rows, head=HEAD, cameras=None, crs="EPSG:32636", **more):
+    return read_ground_control(
+        write(tmp_path, *rows, head=head), cameras or block(), crs=crs, **more
+    )
+
+
+def fails(tmp_path, rows, *words, **more):
+    with pytest.raises(InputError) as error:
+        read(tmp_path, *rows, **more)
+    for word in ("gcps.csv", *words):
+        assert word in str(error.value)
+
+
+@free
+def test_rendered_a_free_lies_where_its_marks_say():
+    cameras = read_cameras(FREE / "sparse")
+    cameras = bring_to(cameras, "EPSG:32636", offset_m=(319900.0, 3842700.0, 0.0))
+    with pytest.warns(PcfixWarning, match=r"gcps.csv: names no CRS; taken to be in the cloud's"):
+        found = read_ground_control(FREE / "gcps.csv", cameras)
+    lines = (FREE / "gcps.csv").read_text().splitlines()[1:]
+    assert found.names == tuple(f"G{i}" for i in range(1, 10))
+    assert len(found.point) == len(found.camera) == len(found.sigma_px) == len(lines)
+    assert found.xyz[0] == pytest.approx([319946.934, 3842803.007, 1.656], abs=0)
+    assert found.image_xy[0] == pytest.approx([622.633, 823.400], abs=0)
+    assert cameras.labels[found.camera[0]] == "A001.JPG"
+    # the block lies 19 GSD too low, and half of it is seen obliquely from 75 m
+    assert misses_px(found, cameras).max() < 40.0
+    assert found.sigma_m == pytest.approx(0.01)
+    assert found.sigma_px == pytest.approx(0.5)
+    assert not found.is_check.any()
+    assert not found.under_water.any()
+
+
+@sorolla
+@pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
+def test_markers_of_metashape():
+    path = SOROLLA / "markers_25830-5782.xml"
+    cameras = bring_to(read_cameras(path), "EPSG:25830", cameras_crs="EPSG:25830")
+    found = read_ground_control(path, cameras)
+    surveyed = np.loadtxt(SOROLLA / "gcp_25830-5782.csv", delimiter=";")
+    assert found.names == tuple(str(int(name)) for name in surveyed[:, 0])
+    assert found.xyz == pytest.approx(surveyed[:, 1:], abs=1e-3)
+    assert (found.sigma_m == 0.005).all()
+    assert (found.sigma_px == 0.5).all()
+    assert not found.is_check.any()
+    assert len(found.point) == path.read_text().count('pinned="true"')
+    marks = zip(found.camera, found.image_xy.round(1).tolist(), strict=True)
+    here = {(cameras.labels[camera], *uv) for camera, uv in marks}
+    listed = check_file(SOROLLA)["observations"]
+    assert {(o["image"], round(o["u"], 1), round(o["v"], 1)) for o in listed} <= here
+
+
+def misses_px(found, cameras):
+    """Return how far from its mark each point is imaged."""
+    misses = []
+    for point, camera, uv in zip(found.point, found.camera, found.image_xy, strict=True):
+        ray = cameras.rotations[camera] @ (found.xyz[point] - cameras.centres[camera])
+        misses.append(np.hypot(*(project(cameras.lenses[camera], ray[None])[0] - uv)))
+    return np.array(misses)
+
+
+@rig
+@pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
+def test_markers_of_a_rig():
+    path = RIG / "markers_micasenses_rededge.xml"
+    cameras = bring_to(read_cameras(path), "EPSG:25830")
+    found = read_ground_control(path, cameras)
+    assert found.xyz[found.names.index("101")].tolist() == [592145.479, 4347051.82, 727.819]
+    assert (found.sigma_m == 0.005).all()
+    # a block held by its GNSS alone, 2 m beside the survey
+    assert np.median(misses_px(found, cameras)) < 30.0
+
+
+def test_unticked_markers_are_check_points(tmp_path):
+    path = tmp_path / "markers.xml"
+    path.write_text(MARKERS)
+    with pytest.warns(PcfixWarning, match="measurements are in images without a pose"):
+        found = read_ground_control(path, block(unposed=("z.jpg",)))
+    assert found.names == ("P1", "P2")
+    assert found.is_check.tolist() == [False, True]
+    assert found.sigma_m.tolist() == [[0.02, 0.02, 0.05], [0.03] * 3]
+    assert found.sigma_px.tolist() == [0.25] * 3
+    assert found.camera.tolist() == [0, 1, 1]
+    assert found.image_xy.tolist() == [[10.5, 20.25], [30, 40], [50, 60]]
+    assert found.crs == "EPSG:32636"
+    path.write_text(MARKERS.replace('marker_id="', 'marker_id="9'))
+    with pytest.raises(InputError, match=r"markers.xml: has no marker with surveyed coordinates"):
+        read_ground_control(path, block())
+
+
+MARKERS = """<document version="2.0.0"><chunk label="c"><sensors/><cameras>
+<camera id="4" label="a.jpg"/><camera id="5" label="b"/><camera id="6" label="z.jpg"/></cameras>
+<markers>
+<marker id="1" label="P1"><reference x="500010" y="4000010" z="2.5" sxy="0.02" sz="0.05"/></marker>
+<group><marker id="2" label="P2">
+<reference x="500020" y="4000010" z="1" enabled="false"/></marker></group>
+<marker id="3" label="tie"/></markers>
+<reference>EPSG:4326</reference><marker_reference>EPSG:32636</marker_reference>
+<settings><property name="accuracy_markers" value="0.03"/>
+<property name="accuracy_projections" value="0.25"/></settings>
+<frames><frame id="0"><markers>
+<marker marker_id="1"><location camera_id="4" pinned="true" x="10.5" y="20.25"/>
+<location camera_id="5" pinned="true" x="30" y="40"/><location camera_id="6" x="1" y="1"/></marker>
+<marker marker_id="2"><location camera_id="5" x="50" y="60"/>
+<location camera_id="4" pinned="false" x="5" y="6"/></marker>
+<marker marker_id="3"><location camera_id="5" x="50" y="60"/></marker>
+</markers></frame></frames></chunk></document>
+"""
+
+
+def test_a_table(tmp_path):
+    found = read(tmp_path, *ROWS)
+    assert found.names == ("G1", "G2")
+    assert found.xyz.tolist() == [list(XYZ["G1"]), list(XYZ["G2"])]
+    assert found.point.tolist() == [0, 0, 1]
+    assert found.camera.tolist() == [0, 1, 1]
+    assert found.image_xy.tolist() == [[100.0, 200.0], [1600.0, 0.0], [0.5, 1199.5]]
+    assert found.crs == "EPSG:32636"
+
+
+def test_what_a_table_may_say_beside(tmp_path):
+    head = (
+        "Point;Easting [m];Northing [m];Height_(m);Photo;u_px;v_px;sx;sy;sz;su;sv;Type;under water"
+    )
+    rows = [
+        "G10;500010;4000010;2.5;a;100;200;0.02;0.03;0.05;0.3;0.4;check point;yes",
+        "G9;500030;4000020;-1.75;b;100;200;;;;;;Control;0",
+    ]
+    found = read(tmp_path, *rows, head=head, sigma_m=0.04, sigma_px=0.7)
+    assert found.names == ("G10", "G9")  # the order of the file
+    assert found.sigma_m.tolist() == [[0.02, 0.03, 0.05], [0.04] * 3]
+    assert found.sigma_px == pytest.approx([np.sqrt((0.09 + 0.16) / 2.0), 0.7])
+    assert found.is_check.tolist() == [True, False]
+    assert found.under_water.tolist() == [True, False]
+
+
+def test_one_column_of_standard_deviations(tmp_path):
+    rows = [f"{row},0.02,0.25" for row in ROWS]
+    found = read(tmp_path, *rows, head=f"{HEAD},sigma,sigma_px")
+    assert found.sigma_m.tolist() == [[0.02] * 3] * 2
+    assert found.sigma_px.tolist() == [0.25] * 3
+
+
+@pytest.mark.parametrize("how", ["comment", "column", "option"])
+def test_its_own_crs(tmp_path, how):
+    to_35 = Transformer.from_crs("EPSG:32636", "EPSG:32635", always_xy=True)
+    rows, more = [], ",EPSG:32635" if how == "column" else ""
+    for row in ROWS:
+        name, x, y, *rest = row.split(",")
+        x, y = to_35.transform(float(x), float(y))
+        rows.append(",".join([name, f"{x:.5f}", f"{y:.5f}", *rest]) + more)
+    head = HEAD + (",crs" if how == "column" else "")
+    if how == "comment":
+        head = f"# CRS: EPSG:32635\n{head}"
+    found = read(tmp_path, *rows, head=head, crs="EPSG:32635" if how == "option" else None)
+    # written to 0.01 mm
+    assert found.xyz == pytest.approx(np.array(list(XYZ.values())), abs=2e-5)
+    assert found.crs == "EPSG:32636"
+
+
+def test_longitude_and_latitude(tmp_path):
+    to_degrees = Transformer.from_crs("EPSG:32636", "EPSG:4326", always_xy=True)
+    lon, lat = to_degrees.transform(*XYZ["G1"][:2])
+    head = "name,latitude,longitude,ellipsoidal_height,image,u,v"
+    path = write(tmp_path, f"G1,{lat:.11f},{lon:.11f},2.5,a.jpg,100,200", head=head)
+    with pytest.warns(PcfixWarning, match="has ellipsoidal heights"):
+        found = read_ground_control(path, block())
+    assert found.xyz[0] == pytest.approx(XYZ["G1"], abs=2e-6)
+
+
+def test_heights_of_another_datum_need_their_grid(tmp_path):
+    ellipsoidal = block(CRS("EPSG:32636").to_3d().to_wkt())
+    more = {"crs": "EPSG:32636+5773", "cameras": ellipsoidal}
+    fails(tmp_path, ROWS, "EGM96 height", "without the grid us_nga_egm96_15.tif", **more)
+
+
+@pytest.mark.parametrize(
+    "first", ["EPSG:32636", "WGS84 UTM 36N", "+proj=utm +zone=36 +datum=WGS84"]
+)
+@pytest.mark.parametrize("named", [True, False])
+def test_gcp_list_of_odm(tmp_path, first, named):
+    rows = []
+    for row in ROWS:
+        name, x, y, z, image, u, v = row.split(",")
+        rows.append(f"{x}\t{y} {z} {u} {v} {image}" + (f" {name} more" if named else ""))
+    path = write(tmp_path, "", *rows, head=first, name="gcp_list.txt")
+    found = read_ground_control(path, block())
+    assert found.names == (("G1", "G2") if named else ("GCP 1", "GCP 2"))
+    assert found.xyz == pytest.approx(np.array(list(XYZ.values())), abs=1e-6)
+    assert found.camera.tolist() == [0, 1, 1]
+    assert found.image_xy.tolist() == [[100.0, 200.0], [1600.0, 0.0], [0.5, 1199.5]]
+
+
+@pytest.mark.parametrize(
+    ("line", "word"),
+    [
+        ("500010 4000010 nan 1 2 a.jpg", "z 'nan' is not a finite number"),
+        ("500010 4000010 2 1 2", "has 5 fields"),
+    ],
+)
+def test_gcp_list_with_a_bad_line(tmp_path, line, word):
+    rows = ["500010 4000010 2.5 1 2 b.jpg", line]
+    path = write(tmp_path, *rows, head="EPSG:32636", name="gcp_list.txt")
+    with pytest.raises(InputError, match=f"gcp_list.txt: line 3.* {word}"):
+        read_ground_control(path, block())
+
+
+@pytest.mark.parametrize("labels", [("A", "B"), ("x/a.jpg", "y\\b.jpg"), ("a.tif", "b.tif")])
+def test_images_may_lack_folder_and_extension(tmp_path, labels):
+    assert read(tmp_path, *ROWS, cameras=block(labels=labels)).camera.tolist() == [0, 1, 1]
+
+
+def test_images_that_are_not_in_the_model(tmp_path):
+    rows = [*ROWS, "G2,500030.5,4000020.25,-1.75,z.jpg,5,6"]
+    words = ("line 5: point G2, image z.jpg: measured in images that are not in the model: z.jpg,"
+             " 1 of 4 measurements", "the model has 3 images")  # fmt: skip
+    fails(tmp_path, rows, *words)
+
+
+def test_an_image_that_could_be_two(tmp_path):
+    fails(tmp_path, ROWS, "line 2", "a.jpg: the name could be that of several",
+          cameras=block(labels=("1/a.jpg", "2/a.jpg", "b.jpg")))  # fmt: skip
+
+
+def test_images_without_a_pose_are_left_out(tmp_path):
+    rows = [*ROWS, "G3,500030,4000020,-1,z.jpg,5,6", "G1,500010,4000010,2.5,Z,5,6"]
+    with pytest.warns(PcfixWarning) as given:
+        found = read(tmp_path, *rows, cameras=block(unposed=("z.jpg",)))
+    assert found.names == ("G1", "G2")
+    assert len(found.point) == 3
+    texts = [str(one.message) for one in given]
+    assert "2 of 5 measurements are in images without a pose" in texts[0]
+    assert "no image with a pose shows G3; left out." in texts[1]
+
+
+def test_no_image_with_a_pose(tmp_path):
+    cameras = block(labels=("q",), unposed=("a.jpg", "b.jpg"))
+    fails(tmp_path, ROWS, "all its images are without a pose", cameras=cameras)
+
+
+@pytest.mark.parametrize(
+    ("row", "word"),
+    [
+        ("G1,500010,4000010,2.6,c.jpg,1,2", "line 5: point G1, image c.jpg: the coordinates"),
+        ("G1,500010,4000010,2.5,a.jpg,1,2", "measured in this image at line 2 already"),
+        ("G1,500010,4000010,2.5,A,1,2", "could be that of several images"),
+        (
+            "G3,500010,4000010,2.5,c.jpg,1600.1,2",
+            "measured at 1600.1, 2, outside the image of 1600",
+        ),
+        ("G3,500010,4000010,2.5,c.jpg,1,-0.5", "outside the image"),
+        ("G3,500010,4000010,,c.jpg,1,5", "line 5"),
+        ("G3,500010,4000010,1,c.jpg,one,5", "'one' is not a finite number"),
+        (",500010,4000010,1,c.jpg,1,5", "line 5: the point has no name"),
+        ("G3,500010,4000010,1,,1,5", "line 5: the image has no name"),
+        ("G3,500010,4000010,1,c.jpg,1", "line 5 has 6 fields"),
+    ],
+)
+def test_bad_rows(tmp_path, row, word):
+    fails(tmp_path, [*ROWS, row], word)
+
+
+@pytest.mark.parametrize(
+    ("column", "values", "word"),
+    [
+        (
+            "sigma",
+            "0.01 0.02 0.01",
+            "the standard deviations of this point are not those of line 2",
+        ),
+        ("sigma", "0 0 1", "the standard deviation 0 must be positive"),
+        ("sigma_px", "1 -1 1", "the standard deviation -1 must be positive"),
+        ("role", "check control check", "the roles of this point are not those of line 2"),
+        ("role", "tie tie tie", "'tie' is neither control or check"),
+        ("under_water", "yes no yes", "the words on water of this point"),
+        ("under_water", "maybe no yes", "'maybe' is neither yes or no"),
+        ("crs", "EPSG:32636 EPSG:32635 EPSG:32636", "states 2 CRS"),
+        ("crs", "EPSG:1 EPSG:1 EPSG:1", "its CRS 'EPSG:1' is not one"),
+    ],
+)
+def test_bad_columns(tmp_path, column, values, word):
+    rows = [f"{row},{value}" for row, value in zip(ROWS, values.split(), strict=True)]
+    fails(tmp_path, rows, word, head=f"{HEAD},{column}", crs=None)
+
+
+@pytest.mark.parametrize("head", ["name,x,y,z", "name,x,y,z,image,u"])
+def test_missing_columns(tmp_path, head):
+    rows = [",".join(ROWS[0].split(",")[: head.count(",") + 1])]
+    fails(tmp_path, rows, "the header must name the columns name, x, y, z, image, u, v", head=head)
+
+
+def test_cameras_that_marks_cannot_belong_to(tmp_path):
+    bare = Cameras(("a.jpg", "b.jpg"), np.zeros((2, 3)))
+    fails(tmp_path, ROWS, "marks in images need lenses", cameras=bare)
+    in_mm = Lens(3.6, 3.8, 2.8, 1.9, 1.4, unit="mm")
+    turn = np.broadcast_to(np.eye(3), (2, 3, 3))
+    film = Cameras(("a.jpg", "b.jpg"), np.zeros((2, 3)), turn, (in_mm,) * 2)
+    fails(tmp_path, ROWS, "the lens of the image is in mm", cameras=film)
+    fails(tmp_path, ROWS, "the cameras in a local frame", cameras=block("local"))
+    fails(tmp_path, ROWS, "east, north, up", cameras=block("ENU:1,2,3"))
+    assert read(tmp_path, *ROWS, cameras=block("local"), crs="local").crs == "local"
+    assert read(tmp_path, *ROWS, cameras=block(None), crs=None).crs is None
+
+
+def test_points_of_elsewhere(tmp_path):
+    rows = [row.replace("500010", "900010") for row in ROWS]
+    fails(tmp_path, rows, "point G1", "lies 400 km from the block; check the CRS")
+    rows = ["G1,4000010,500010,2.5,a.jpg,1,2"]
+    fails(tmp_path, rows, "km from the block; x and y are swapped")
+    local = block("local")
+    assert read(tmp_path, *rows, cameras=local, crs="local").xyz.tolist() == [
+        [4000010, 500010, 2.5]
+    ]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "G1,500010,4000010,2.5,a.jpg,1,2\n", "{}", "\0\1\2", "EPSG:32636\n"]
+)
+def test_no_table_at_all(tmp_path, text):
+    path = tmp_path / "gcps.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"gcps.csv: is neither a table of marks nor OpenDroneMap"):
+        read_ground_control(path, block())
+    with pytest.raises(InputError, match="there is no such file"):
+        read_ground_control(tmp_path / "none.csv", block())
+
+
+def test_a_first_line_that_is_no_crs(tmp_path):
+    path = write(tmp_path, "500010 4000010 2.5 1 2 a.jpg", head="UTM 36", name="gcp_list.txt")
+    with pytest.raises(InputError, match=r"gcp_list.txt: 'UTM 36' names no CRS"):
+        read_ground_control(path, block())

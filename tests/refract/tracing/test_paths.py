@@ -1,0 +1,291 @@
+"""The four backward tracers against brentq on planes, Snell forwards and Fermat by scipy."""
+
+import math
+
+import numba
+import numpy as np
+import pytest
+from scipy.interpolate import RegularGridInterpolator
+from scipy.optimize import minimize_scalar
+
+from pcfix.errors import SettingError
+from pcfix.model import WaterDimension, WaterMesh, WaterPlane, WaterRaster
+from pcfix.refract.tracing.paths import METHODS, trace
+from tests.utils.tracing_twin import direction, through_plane, through_surface
+from tests.utils.twins import bend
+
+INDEX = 1.34
+UTM = np.array([512_345.0, 4_987_654.0, 0.0])
+HALF = 60.0  # metres from the middle to the edge of rasters and meshes
+
+each_method = pytest.mark.parametrize("method", METHODS)
+
+
+def pairs(count, seed=0, steepest_deg=65.0, low=-8.0, high=-0.5):
+    """Return points under a level of zero, and a camera for each."""
+    rng = np.random.default_rng(seed)
+    points = np.column_stack([rng.uniform(-15, 15, (count, 2)), rng.uniform(low, high, count)])
+    height = rng.uniform(15.0, 50.0, count)
+    aside = height * np.tan(np.radians(rng.uniform(0.0, steepest_deg, count)))
+    angle = rng.uniform(0.0, 2.0 * np.pi, count)
+    centres = np.column_stack([aside * np.cos(angle), aside * np.sin(angle), height])
+    centres[:, :2] += points[:, :2]
+    return points, centres
+
+
+def waves(slope_deg):
+    """Return z(x, y) of crossing waves 6 m long."""
+    wave = 2.0 * math.pi / 6.0
+    high = 0.5 * math.tan(math.radians(slope_deg)) / wave
+    return lambda x, y: high * (np.sin(wave * x) + np.sin(wave * y + 0.7))
+
+
+def raster(surface, cell=0.5, origin=(0.0, 0.0)):
+    x = np.arange(-HALF + cell / 2, HALF, cell)
+    return WaterRaster(
+        surface(x[None, :], x[::-1, None]), origin[0] - HALF, origin[1] + HALF, (cell, cell)
+    )
+
+
+def bilinear(water):
+    """Return scipy's z(x, y) of a raster."""
+    cell = water.cell_m[0]
+    x = water.left_m + cell / 2 + cell * np.arange(water.height_m.shape[1])
+    y = water.top_m - cell / 2 - cell * np.arange(water.height_m.shape[0])
+    found = RegularGridInterpolator((y[::-1], x), water.height_m[::-1])
+    return lambda x, y: float(found([[y, x]])[0])
+
+
+def folded(slope):
+    """Return two facets that meet in a crease along y: a trough where the slope is positive."""
+    corners = [[x, y, slope * abs(x)] for x in (-HALF, 0.0, HALF) for y in (-HALF, HALF)]
+    triangles = [[0, 2, 1], [1, 2, 3], [2, 4, 3], [3, 4, 5]]
+    return WaterMesh(np.array(corners), np.array(triangles))
+
+
+def normal_at(surface, x, y, d=1e-5):
+    """Return the normal by differences inside a patch; None across the edge of one."""
+    east, west = surface(x + d, y) - surface(x, y), surface(x, y) - surface(x - d, y)
+    north, south = surface(x, y + d) - surface(x, y), surface(x, y) - surface(x, y - d)
+    if max(abs(east - west), abs(north - south)) > 1e-3 * d:
+        return None
+    normal = np.array([-(east + west) / (2 * d), -(north + south) / (2 * d), 1.0])
+    return normal / np.linalg.norm(normal)
+
+
+@each_method
+@pytest.mark.parametrize("plane", [(0.0, 0.0, 0.0), (0.3, 0.02, -0.01), (-0.2, 0.0, 0.1)])
+def test_paths_through_planes_are_those_of_brentq(method, plane):
+    points, centres = pairs(60)
+    points[:, 2] += plane[0] + points[:, :2] @ plane[1:]
+    found = trace(points, centres, WaterPlane(*plane), INDEX, method=method)
+    assert found.converged.all()
+    assert not found.on_crease.any()
+    for p, c, a, d in zip(points, centres, found.piercing_xyz, found.direction, strict=True):
+        truth = through_plane(p, c, plane, INDEX)
+        # a miss of 1e-9 m at the point is less than that at the surface, up to grazing light
+        np.testing.assert_allclose(a, truth, rtol=0.0, atol=3e-9)
+        np.testing.assert_allclose(d, direction(truth, c), rtol=0.0, atol=1e-9)
+
+
+@each_method
+@pytest.mark.parametrize("incidence_deg", [0.0, 30.0, 80.0, 89.0])
+def test_light_that_was_bent_forwards_comes_back(method, incidence_deg):
+    i = math.radians(incidence_deg)
+    leaves = np.array([40.0 * math.tan(i), 0.0, 0.0])
+    down = bend(np.array([math.sin(i), 0.0, -math.cos(i)]), np.array([0.0, 0.0, 1.0]), INDEX)
+    point = leaves + 6.0 * down
+    found = trace(point, [0.0, 0.0, 40.0], WaterPlane(0.0), INDEX, method=method)
+    # at 89 degrees a miss of 1e-9 m is 1e-9 / cos^2 of the incidence at the surface
+    np.testing.assert_allclose(found.piercing_xyz[0], leaves, rtol=0.0, atol=4e-6)
+
+
+@each_method
+@pytest.mark.parametrize("slope_deg", [1.0, 5.0])
+def test_paths_under_waves_obey_snell(method, slope_deg):
+    water = raster(waves(slope_deg))
+    surface = bilinear(water)
+    points, centres = pairs(80, steepest_deg=45.0)
+    found = trace(points, centres, water, INDEX, method=method)
+    assert found.converged.all()
+    tested = 0
+    for i in np.flatnonzero(~found.on_crease):
+        a = found.piercing_xyz[i]
+        # heights of the raster are smooth to 1e-12 m
+        assert abs(surface(a[0], a[1]) - a[2]) < 1e-9
+        normal = normal_at(surface, a[0], a[1])
+        if normal is None:
+            continue
+        down = bend(direction(a, centres[i]), normal, INDEX)
+        miss = (points[i] - a) - ((points[i] - a) @ down) * down
+        # the normal by differences over 1e-5 m is good to 1e-9, times 8 m of water
+        assert np.linalg.norm(miss) < 5e-8
+        tested += 1
+    assert tested > 50
+
+
+@each_method
+def test_a_path_through_a_crease_is_the_shortest(method):
+    water = raster(waves(12.0), cell=1.0)
+    surface = bilinear(water)
+    points, centres = pairs(150, seed=4, steepest_deg=40.0)
+    found = trace(points, centres, water, INDEX, method=method)
+    creases = np.flatnonzero(found.on_crease)
+    assert len(creases) > 3
+
+    def length(a, i):
+        return np.linalg.norm(a - centres[i]) + INDEX * np.linalg.norm(a - points[i])
+
+    for i in creases:
+        a = found.piercing_xyz[i]
+        nearby = a[:2] + np.array([[0.0, 0.0], [2e-3, 1e-3], [-1e-3, 2e-3]])
+        other = through_surface(points[i], centres[i], surface, INDEX, nearby)
+        # a crease is met to 1e-7 m, across it the length changes by 0.1 a metre
+        assert length(a, i) < length(other, i) + 1e-8
+
+
+@each_method
+def test_light_through_a_trough_leaves_in_its_crease(method):
+    point, centre = np.array([0.001, 0.0, -5.0]), np.array([0.0, 20.0, 30.0])
+    water = folded(0.05)
+    found = trace(point, centre, water, INDEX, method=method)
+    assert found.converged[0]
+    assert found.on_crease[0]
+
+    def length(y):
+        a = np.array([0.0, y, 0.0])
+        return np.linalg.norm(a - centre) + INDEX * np.linalg.norm(a - point)
+
+    y = minimize_scalar(length, bounds=(0.0, 5.0), method="bounded", options={"xatol": 1e-9}).x
+    # across, the crease is sharp; along it lengths of 40 m in doubles are flat within 1e-6 m
+    np.testing.assert_allclose(found.piercing_xyz[0], [0.0, y, 0.0], rtol=0.0, atol=3e-6)
+    # the plane there would bend the light so: the path goes through it as through a plane
+    b, c = found.slope[0]
+    a = found.piercing_xyz[0]
+    through = through_plane(point, centre, (a[2] - b * a[0] - c * a[1], b, c), INDEX)
+    np.testing.assert_allclose(through, a, rtol=0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize("method", METHODS[:3])
+def test_without_narrowing_no_ray_is_no_path(method):
+    found = trace([0.001, 0, -5], [0, 20, 30], folded(0.05), INDEX, method=method, narrow=False)
+    assert not found.converged[0]
+    assert np.isnan(found.direction).all()
+
+
+def test_scattershot_takes_the_quickest_of_several_paths():
+    # under a ridge two rays hit the point; the one from the camera's side is the shorter
+    water, point, centre = folded(-0.3), np.array([0.0, 0.0, -9.0]), np.array([0.5, 3.0, 30.0])
+    found = trace(point, centre, water, INDEX, method="scattershot")
+
+    def surface(x, y):
+        return -0.3 * abs(x)
+
+    starts = np.array([[-1.0, 0.0], [1.0, 0.0], [-0.1, 1.0], [0.1, 1.0]])
+    truth = through_surface(point, centre, surface, INDEX, starts)
+    assert truth[0] > 0.1
+    # the length is flat within 1e-6 m of the truth, where Nelder-Mead ends
+    np.testing.assert_allclose(found.piercing_xyz[0], truth, rtol=0.0, atol=5e-6)
+
+
+@each_method
+def test_a_plane_as_raster_or_mesh_is_that_plane_far_from_the_origin(method):
+    plane = (0.3, 0.02, -0.01)
+    points, centres = pairs(40, steepest_deg=40.0)
+    points[:, 2] += plane[0] + points[:, :2] @ plane[1:]
+
+    def surface(x, y):
+        return plane[0] + plane[1] * x + plane[2] * y
+
+    corners = np.array([[x, y, surface(x, y)] for x in (-HALF, HALF) for y in (-HALF, HALF)])
+    mesh = WaterMesh(corners + UTM, np.array([[0, 2, 1], [1, 2, 3]]))
+    moved = WaterPlane(
+        plane[0] - plane[1] * UTM[0] - plane[2] * UTM[1], plane[1], plane[2]
+    )  # a of 40 km: good to 1e-11 m
+    for water in (raster(surface, origin=UTM), mesh, moved):
+        found = trace(points + UTM, centres + UTM, water, INDEX, method=method)
+        for p, c, d in zip(points, centres, found.direction, strict=True):
+            truth = direction(through_plane(p, c, plane, INDEX), c)
+            # northings of 5e6 m are good to 1e-9 m, seen from 15 m
+            np.testing.assert_allclose(d, truth, rtol=0.0, atol=1e-9)
+
+
+@each_method
+def test_without_refraction_light_goes_straight(method):
+    points, centres = pairs(20, steepest_deg=45.0)
+    found = trace(points, centres, raster(waves(5.0)), 1.0, method=method)
+    straight = (points - centres) / np.linalg.norm(points - centres, axis=1)[:, None]
+    np.testing.assert_allclose(found.direction, straight, rtol=0.0, atol=1e-9)
+
+
+@each_method
+@pytest.mark.parametrize("water", [WaterPlane(0.0), raster(waves(2.0)), folded(0.01)])
+def test_points_above_the_water_and_beside_it_are_seen_straight(method, water):
+    points = np.array([[1.0, 2.0, 4.0], [500.0, 2.0, -4.0]])
+    if isinstance(water, WaterPlane):
+        points = points[:1]
+    centre = np.array([5.0, 3.0, 40.0])
+    found = trace(points, centre, water, INDEX, method=method)
+    assert found.converged.all()
+    assert not found.iterations.any()
+    np.testing.assert_array_equal(found.piercing_xyz, points)
+    straight = (points - centre) / np.linalg.norm(points - centre, axis=1)[:, None]
+    np.testing.assert_allclose(found.direction, straight, rtol=0.0, atol=1e-15)
+
+
+@each_method
+def test_what_cannot_be_seen_is_lost_and_hurts_no_other(method):
+    points = np.array([[0.0, 0.0, -3.0], [0.0, 0.0, -3.0], [59.9, 0.0, -9.0], [np.nan, 0.0, -1.0]])
+    centres = np.array([[1, 0, 30.0], [1, 0, -0.5], [120, 0, 20.0], [1, 0, 30.0]])
+    found = trace(points, centres, raster(waves(1.0)), INDEX, method=method)
+    # seen; camera in the water; leaves beyond the edge; no point
+    assert found.converged.tolist() == [True, False, False, False]
+    assert np.isnan(found.direction[1:]).all()
+    assert np.isfinite(found.direction[0]).all()
+
+
+@each_method
+def test_a_camera_lower_than_the_water_over_the_point_sees_it_through_a_tilted_plane(method):
+    plane = (0.0, 0.1, 0.0)
+    point, centre = np.array([30.0, 0.0, 1.0]), np.array([5.0, 0.0, 2.5])
+    found = trace(point, centre, WaterPlane(*plane), INDEX, method=method)
+    truth = through_plane(point, centre, plane, INDEX)
+    # a miss of 1e-9 m, grazing at 85 degrees
+    np.testing.assert_allclose(found.piercing_xyz[0], truth, rtol=0.0, atol=1e-6)
+
+
+@each_method
+def test_any_number_of_threads_gives_the_same_bits(method):
+    points, centres = pairs(200, steepest_deg=45.0)
+    water = raster(waves(4.0))
+    many = trace(points, centres, water, INDEX, method=method)
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        one = trace(points, centres, water, INDEX, method=method)
+    finally:
+        numba.set_num_threads(before)
+    np.testing.assert_array_equal(many.piercing_xyz, one.piercing_xyz)
+    np.testing.assert_array_equal(many.iterations, one.iterations)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"method": "newton"}, "none of kotowski, afrt, mdfrt, scattershot"),
+        ({"refractive_index": 0.75}, "below 1"),
+        ({"refractive_index": math.nan}, "below 1"),
+        ({"points": np.zeros((4, 3))}, r"shape \(4, 3\)"),
+        ({"points": np.zeros((2, 2))}, "do not make pairs"),
+        ({"surface": WaterDimension("w_surf")}, "plane, raster or mesh"),
+    ],
+)
+def test_what_does_not_fit_is_refused(change, says):
+    given = {
+        "points": np.zeros((3, 3)),
+        "centres": np.ones((3, 3)),
+        "surface": WaterPlane(0.0),
+        "refractive_index": INDEX,
+    }
+    with pytest.raises(SettingError, match=says):
+        trace(**(given | change))

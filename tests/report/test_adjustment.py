@@ -1,0 +1,295 @@
+"""The report of an adjustment: its numbers are those of a calculation by hand."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from pcfix.adjust.block import Block, Unknowns
+from pcfix.adjust.precision import Precision, SharedUnknown
+from pcfix.adjust.result import Adjusted, ControlRow
+from pcfix.adjust.solve import LogRow
+from pcfix.model import Cameras, Lens, WaterPlane, WaterRaster
+from pcfix.report.adjustment import (
+    Before,
+    adjustment_dict,
+    adjustment_figures,
+    adjustment_page,
+    adjustment_text,
+    before_of,
+)
+from tests.utils.browser import needs_browser, open_page
+
+FOCAL, HEIGHT, LEVEL = 1000.0, 50.0, 0.5
+EAST, NORTH = 320000.0, 3842000.0
+DOWN = np.diag([1.0, -1.0, -1.0])
+"""World to camera of a camera that looks straight down, its upper edge in the north."""
+
+VOID = {"meta", "link", "img", "br", "input", "hr"}
+
+
+def lens(focal=FOCAL):
+    return Lens(
+        focal=focal, width=1600.0, height=1200.0, principal_x=800.0, principal_y=600.0,
+        sensor="S", unit="px",
+    )  # fmt: skip
+
+
+def cameras(focal=FOCAL, shift=(0.0, 0.0, 0.0)):
+    centres = np.array([[EAST, NORTH, HEIGHT], [EAST + 10.0, NORTH, HEIGHT],
+                        [EAST, NORTH + 12.0, HEIGHT]])  # fmt: skip
+    return Cameras(
+        ("a.jpg", "b.jpg", "c.jpg"), centres + np.array(shift), np.array([DOWN] * 3),
+        (lens(focal),) * 3, "EPSG:25833",
+    )  # fmt: skip
+
+
+def points(m=24):
+    """Return m points under the cameras: a third on land, the others down to 3.5 m of depth."""
+    rng = np.random.default_rng(3)
+    xy = rng.uniform([EAST - 5.0, NORTH - 5.0], [EAST + 15.0, NORTH + 15.0], (m, 2))
+    z = np.where(np.arange(m) % 3 == 0, 1.5, np.linspace(0.2, -3.0, m))
+    return np.column_stack([xy, z])
+
+
+def pinhole(xyz, block_cameras):
+    """Return the images of each point in all cameras, straight rays, point by point."""
+    rows = [
+        [lens_.principal_x, lens_.principal_y] + lens_.focal * local[:2] / local[2]
+        for p in xyz
+        for c, r, lens_ in zip(
+            block_cameras.centres, block_cameras.rotations, block_cameras.lenses, strict=True
+        )
+        for local in [r @ (p - c)]
+    ]
+    return np.array(rows)
+
+
+def make_block(xyz, images, before, refractive_index=1.34):
+    m, k = len(xyz), 3
+    return Block(
+        before, xyz, np.arange(m + 1) * k, np.tile(np.arange(k), m), images, np.full(m * k, 0.3),
+        WaterPlane(LEVEL), refractive_index, np.ones(m, bool), np.full((m, 3), np.nan),
+        np.full((m, 3), np.inf), before.centres + 0.01, np.full((k, 3), 0.03),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def adjusted():
+    """Return 24 points in three images with residuals of 0.3 on land and 0.4 px under water."""
+    xyz, after, before = points(), cameras(1002.0, (0.0, 0.0, 0.3)), cameras()
+    is_wet = xyz[:, 2] < LEVEL
+    residual = np.where(is_wet, 0.4, 0.3).repeat(3)[:, None] * np.array([1.0, -1.0])
+    used = np.ones(72, bool)
+    used[[1, 40]] = False
+    residual[~used] = 30.0
+    rounds = [LogRow(1, 1, 900.0, 1e-4, 72, 2.5), LogRow(1, 2, 400.0, 1e-5, 72, 0.9),
+              LogRow(2, 1, 100.0, 1e-4, 70, 0.37)]  # fmt: skip
+    control = [
+        ControlRow("G1", "control", 0.010, -0.020, 0.030, 0.5, 3),
+        ControlRow("G2", "control", 0.010, 0.020, -0.050, 0.7, 2),
+        ControlRow("C1", "check", -0.040, 0.000, 0.060, 0.8, 3),
+    ]
+    gnss = np.array([[0.01, 0.02, 0.03], [0.05, -0.02, 0.09], [np.nan] * 3])
+    return Adjusted(
+        make_block(xyz, pinhole(xyz, before), before), Unknowns(level_sigma_m=0.1), after,
+        WaterPlane(LEVEL + 0.02), 1.34, xyz, residual, used, is_wet, 1.234, 60, rounds,
+        "tie points", "direct", make_precision(len(xyz)), gnss, control, ["something <decided>"],
+    )  # fmt: skip
+
+
+def make_precision(m):
+    pose = np.zeros((3, 6, 6))
+    pose[:2, range(6), range(6)] = [1e-6, 4e-6, 9e-6, 1e-4, 4e-4, 9e-4]
+    pose[1] *= 4.0
+    shared = SharedUnknown("f", 2.0, 0.25), SharedUnknown("level", 0.02, 0.004)
+    # of every point: 1, 2 and 3 cm
+    covariance = np.tile([1e-4, 0.0, 0.0, 4e-4, 0.0, 9e-4], (m, 1))
+    correlation = np.array([[1.0, -0.6], [-0.6, 1.0]])
+    return Precision(1.234, pose, shared, correlation, np.zeros((2, 3)), covariance)
+
+
+def before_px(adjusted):
+    """Return residuals before that are 1.2 px on land and 2.4 px under water."""
+    size = np.where(adjusted.is_wet, 2.4, 1.2).repeat(3)[:, None]
+    return Before(adjusted.xyz - [0.0, 0.0, 1.0], size * np.array([1.0, 1.0]))
+
+
+def test_text_says_what_was_calculated_by_hand(adjusted):
+    text = adjustment_text(adjusted, before_px(adjusted))
+    land, wet = (re.search(rf"  {name} .*", text)[0].split() for name in ("on land", "under water"))
+    # the rms of a coordinate: every one is 0.3 px on land, 0.4 px under water
+    assert land[2:6] == ["8", "23", "1.200", "0.300"]
+    assert wet[2:6] == ["16", "47", "2.400", "0.400"]
+    assert "70 used, 2 left out (2.8 %)" in text
+    assert "sigma0       1.234, redundancy 60; 2 rounds, 3 steps (direct)" in text
+    assert "focal length 1000.00 -> 1002.00 px (+2.00, standard error 0.25)" in text
+    assert "water level  0.500 -> 0.520 m (+0.020, standard error 0.004)" in text
+    assert "index        1.34, fixed" in text
+    assert "0.0100, 0.0200, 0.0300" in text  # standard errors of the points
+    # rms of (0.01, 0.05), (0.02, 0.02), (0.03, 0.09); the longest is that of b.jpg
+    assert "rms 0.036, 0.020, 0.067 m; largest 0.105 m (b.jpg)" in text
+    # rms of (0.03, 0.05) in height: sqrt(0.0017) = 0.0412
+    assert "rms 0.010, 0.020, 0.041 m, 0.61 px" in text
+    assert "C1            -0.040   +0.000   +0.060 m    0.80 px, 3 images" in text
+    assert "note         Something <decided>" in text
+    assert "nan" not in text.lower() and "none" not in text.lower()
+
+
+def test_residuals_on_the_ground_are_those_of_similar_triangles(adjusted):
+    found = adjustment_dict(adjusted)["residuals"]["land"]["rms_m"]
+    total = count = 0.0
+    for p in np.flatnonzero(~adjusted.is_wet):
+        for c in range(3):
+            if adjusted.used[3 * p + c]:
+                away = np.linalg.norm(adjusted.xyz[p] - adjusted.cameras.centres[c])
+                total += 2.0 * (0.3 * away / 1002.0) ** 2
+                count += 2.0
+    assert found == pytest.approx(np.sqrt(total / count), rel=1e-12)
+
+
+def test_values_are_plain_and_documented(adjusted):
+    values = adjustment_dict(adjusted, before_px(adjusted))
+    json.dumps(values, allow_nan=False)
+    documented = re.findall(r"^ {8}([a-z_0-9, ]+) : ", adjustment_dict.__doc__, re.M)
+    assert {name for row in documented for name in row.split(", ")} - {"adjusted", "before"} == set(
+        values
+    )
+    assert values["precision"]["images"] == 2
+    # standard errors 1, 2, 3 cm of one pose, twice these of the other
+    assert values["precision"]["centre_mean_m"] == pytest.approx([0.015, 0.03, 0.045])
+    assert values["precision"]["angle_largest_deg"] == pytest.approx(
+        np.degrees([0.002, 0.004, 0.006])
+    )
+    assert values["poses"]["moved_rms_m"] == pytest.approx(0.3)
+    assert values["poses"]["turned_largest_deg"] == 0.0
+
+
+def test_classes_of_depth_hold_every_observation_under_water(adjusted):
+    bins = adjustment_dict(adjusted)["depth_bins"]
+    assert sum(b["observations"] for b in bins) == 47
+    assert bins[0]["from_m"] == 0.0
+    # the deepest point is 3.52 m below the water
+    assert bins[-1]["from_m"] <= 3.52 < bins[-1]["to_m"]
+    assert all(b["rms_px"] == pytest.approx(0.4) for b in bins)
+
+
+class Tree(HTMLParser):
+    """Checks that tags close in turn, and keeps what a reader sees."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.said, self.pictures = [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        if tag == "img":
+            self.pictures.append(dict(attrs))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] not in ("script", "style"):
+            self.said.append(data)
+
+
+def bare(adjusted):
+    """Return what is least: no water, nothing beside the images, one step."""
+    block = replace(adjusted.block, water=None)
+    return replace(
+        adjusted, block=block, water=None, is_wet=np.zeros(len(adjusted.xyz), bool), control=[],
+        precision=None, gnss_residual_m=np.full((3, 3), np.nan), notes=[],
+        rounds=adjusted.rounds[:1], unknowns=Unknowns(poses="fixed", lens=()),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["whole", "bare"])
+def test_page_is_whole_and_says_nothing_unknown(adjusted, kind):
+    before = before_px(adjusted) if kind == "whole" else None
+    it = adjusted if kind == "whole" else bare(adjusted)
+    pictures = adjustment_figures(it, before)
+    tree = Tree(adjustment_page(it, before, pictures=pictures))
+    assert tree.open == []
+    said = " ".join(tree.said)
+    assert not re.search(r"\bnan\b|\bNone\b|\binf\b", said)
+    assert "70 observations fit within 0." in said
+    assert all(len(p["alt"]) > 20 and p["src"].startswith("data:") for p in tree.pictures)
+    names = [picture.name for picture in pictures]
+    assert len(tree.pictures) == len(names)
+    if kind == "whole":
+        assert names == ["block", "residuals_by_depth", "residual_vectors", "section", "rounds"]
+        assert "Something <decided>" in said
+
+
+def test_text_without_anything_beside_the_images(adjusted):
+    text = adjustment_text(bare(adjusted))
+    assert "poses fixed" in text and "lens         fixed" in text and "water        none" in text
+    assert not re.search(r"GNSS|control|check|under water {2}|nan", text)
+
+
+def test_what_was_held_out_does_not_count_as_left_out(adjusted):
+    """The last point is a check point: none of its three images is used."""
+    used = adjusted.used.copy()
+    used[-3:] = False
+    used[3:6] = False  # a tie point that is left out wholly
+    block = replace(adjusted.block, control_names=("G1", "C1"), is_check=np.array([False, True]))
+    values = adjustment_dict(replace(adjusted, block=block, used=used))
+    assert values["points"] | {"control": 0, "check": 0} == {
+        "all": 22, "land": 8, "water": 14, "left_out": 1, "control": 0, "check": 0,
+    }  # fmt: skip
+    assert values["observations"] == {
+        "used": 64, "left_out": 5, "of_check_points": 3, "out_of_sight": 0
+    }  # fmt: skip
+    assert sum(values["residuals"][key]["points"] for key in ("land", "water")) == 22
+
+
+def test_level_of_a_raster_is_its_mean_over_the_points(adjusted):
+    def raster(height):
+        return WaterRaster(np.full((3, 3), height), EAST - 50.0, NORTH + 50.0, (50.0, 50.0))
+
+    it = replace(adjusted, block=replace(adjusted.block, water=raster(0.5)), water=raster(0.53))
+    text = adjustment_text(it)
+    assert "water level  0.500 -> 0.530 m (+0.030, standard error 0.004)" in text
+    assert "tilt" not in text
+
+
+def test_similarity_tells_shift_turn_and_scale(adjusted):
+    shared = (*adjusted.precision.shared, SharedUnknown("shift z", 0.31, 0.02))
+    precision = replace(adjusted.precision, shared=shared, correlation=np.eye(3),
+                        block_correlation=np.zeros((3, 3)))  # fmt: skip
+    free = Unknowns(poses="similarity", level_sigma_m=0.1)
+    page = adjustment_page(replace(adjusted, precision=precision, unknowns=free), pictures=[])
+    row = re.search(r"<td>shift z</td>(.*?)</tr>", page)[1]
+    assert re.findall(r"<td>(.*?)</td>", row) == ["", "", "+0.31", "0.02", "m"]
+
+
+def test_before_intersects_what_the_images_show(adjusted):
+    """n = 1: straight rays meet at the truth, whatever the survey says of a control point."""
+    truth = points()
+    start = truth + np.array([0.3, -0.2, 0.4])
+    block = make_block(start, pinhole(truth, cameras()), cameras(), 1.0)
+    block.image_xy[40] += 25.0  # the outlier, left out
+    block.surveyed_xyz[4] = truth[4] + 1.0
+    block.surveyed_sigma_m[4] = 0.001
+    found = before_of(replace(adjusted, block=block))
+    # observations are exact: what is left is Newton's last step, and coordinates of 4e6 m
+    np.testing.assert_allclose(found.xyz, truth, atol=1e-6)
+    assert np.abs(found.residual_px[adjusted.used]).max() < 1e-4
+    assert found.residual_px[40] == pytest.approx([25.0, 25.0], abs=1e-4)
+
+
+@needs_browser
+def test_page_opens_without_an_error(adjusted, tmp_path):
+    page = tmp_path / "adjustment.html"
+    page.write_text(adjustment_page(adjusted, before_px(adjusted), pictures=[]))
+    opened = open_page(page, tmp_path / "profile")
+    assert "Change in height" in opened.stdout
+    assert not re.search(r"CONSOLE.*(Error|error)", opened.stderr)

@@ -1,0 +1,82 @@
+"""Blocks for an adjustment, made of the simulator's scenes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pcfix.adjust.block import Block
+from pcfix.model import TiePoints
+
+if TYPE_CHECKING:
+    from pcfix.simulate.tie_points import TieScene
+
+
+def block_of(
+    scene: TieScene,
+    *,
+    gnss: bool = True,
+    control: bool = False,
+    cameras=None,
+    water=None,
+    index=None,
+    exact: bool = False,
+    start_xyz=None,
+    sigma_px=None,
+    checks: bool = False,
+) -> Block:
+    """Return a scene as a block: tie points, then control points, check points without survey."""
+    cameras = scene.cameras if cameras is None else cameras
+    rows = np.flatnonzero(control & ~scene.control.is_check | checks & scene.control.is_check)
+    marks = [np.flatnonzero(scene.control.point == row) for row in rows]
+    each = np.concatenate([np.zeros(0, int), *marks]).astype(int)
+    counts = [len(mine) for mine in marks]
+    start = np.concatenate([scene.views.start, scene.views.start[-1] + np.cumsum(counts)])
+    ties = scene.exact_xy if exact else scene.ties.image_xy
+    seen = scene.control_exact_xy if exact else scene.control.image_xy
+    xyz = scene.truth if start_xyz is None else start_xyz
+    m, q, k = len(xyz), len(rows), len(cameras)
+    survey = scene.control_truth if exact else scene.control.xyz
+    sigma = np.where(scene.control.is_check[rows, None], np.inf, scene.control.sigma_m[rows])
+    positions = scene.cameras.gnss
+    place = scene.true_cameras.centres if exact else positions.xyz
+    return Block(
+        cameras=replace(cameras, gnss=None),
+        xyz=np.vstack([xyz, scene.control_truth[rows]]),
+        start=start.astype(np.int64),
+        camera=np.concatenate([scene.views.camera, scene.control.camera[each]]),
+        image_xy=np.vstack([ties, seen[each]]),
+        sigma_px=np.full(
+            len(scene.views.camera) + len(each), sigma_px or scene.noise.image_px or 0.5
+        ),
+        water=scene.water if water is None else water,
+        refractive_index=scene.refractive_index if index is None else index,
+        wet=np.ones(m + q, bool),
+        surveyed_xyz=np.vstack([np.full((m, 3), np.nan), survey[rows]]),
+        surveyed_sigma_m=np.vstack([np.full((m, 3), np.inf), sigma]),
+        gnss_xyz=place if gnss else np.full((k, 3), np.nan),
+        gnss_sigma_m=positions.sigma_m if gnss else np.full((k, 3), np.inf),
+    )
+
+
+def clear_of_the_waterline(scene: TieScene, by_m: float) -> TieScene:
+    """Return a scene without the tie points that are nearer to the water plane.
+
+    The image of a point has a kink where it goes under, which has no normal equations.
+    """
+    water = scene.water
+    level = water.a + scene.truth[:, :2] @ [water.b, water.c]
+    rows = np.flatnonzero(np.abs(scene.truth[:, 2] - level) > by_m)
+    views, start = scene.views.take(rows), scene.views.start
+    seen = np.concatenate([np.arange(start[row], start[row + 1]) for row in rows])
+    ties = TiePoints(scene.truth[rows], views, scene.ties.image_xy[seen])
+    return replace(
+        scene,
+        truth=scene.truth[rows],
+        views=views,
+        exact_xy=scene.exact_xy[seen],
+        ties=ties,
+        is_wet=scene.is_wet[rows],
+    )
