@@ -20,7 +20,7 @@ import numpy as np
 from pcfix.adjust.colmap_lens import Flags, camera_for
 from pcfix.adjust.colmap_model import Plan, adjusted, load_pycolmap
 from pcfix.adjust.normal import Loss
-from pcfix.adjust.solve import LOSSES, LogRow, Problem, Solution, _cost, _counts, gnss_weights
+from pcfix.adjust.solve import LOSSES, LogRow, Problem, Solution, cost_at, counts_of, gnss_weights
 from pcfix.adjust.state import CODES
 from pcfix.adjust.straight import fixed_poses, intersected, straight_places
 from pcfix.errors import GeometryError, SettingError
@@ -87,8 +87,8 @@ def solve_with_colmap(
         if moved_m < CLOSE_M:
             state = intersected(only_points, state, loss)
         now = replace(now, state=state, lenses=lenses)
-        now = replace(now, cost=_cost(problem, now, loss))
-        row = LogRow(number, step + 1, now.cost, 0.0, *_counts(problem, now))
+        now = replace(now, cost=cost_at(problem, now, loss))
+        row = LogRow(number, step + 1, now.cost, 0.0, *counts_of(problem, now))
         log.append(row)
         if progress is not None:
             progress(row)
@@ -172,7 +172,8 @@ def _held_points(problem: Problem) -> BoolArray:
 
 def _has_priors(problem: Problem, held: BoolArray, fixed: BoolArray) -> bool:
     """Return whether GNSS positions make the datum, and check that something does."""
-    positions = int((gnss_weights(problem.block) > 0.0).all(axis=1).sum())
+    known = (gnss_weights(problem.block) > 0.0) & ~fixed[:, None]
+    positions = int(known.all(axis=1).sum())
     shown = np.unique(problem.block.owner[problem.seen.weight > 0.0])
     enough = int(held[shown].sum()) >= 3 or int(fixed.sum()) >= 2
     if problem.unknowns.free_network:
@@ -184,10 +185,10 @@ def _has_priors(problem: Problem, held: BoolArray, fixed: BoolArray) -> bool:
         return False
     if fixed.all():
         return False
-    if positions and positions < 3:
+    if (known.any(axis=1) & ~known.all(axis=1)).any() or 0 < positions < 3:
         raise SettingError(
-            f"COLMAP's engine needs three GNSS positions at least, or none: {positions} are there;"
-            " take the direct engine."
+            "COLMAP's engine needs GNSS positions of three images that move at least, or of none,"
+            f" each with x, y and z: {positions} are there; take the direct engine."
         )
     if not positions and not enough:
         raise SettingError(

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 MOST_STEPS = 100
 ANYWHERE_M = 1e6
-"""Standard deviation that stands for a coordinate without GNSS."""
+"""How far GNSS positions may be off when COLMAP first moves the model onto them: anything."""
 
 
 class Plan(NamedTuple):
@@ -226,16 +226,14 @@ def _config(colmap: Any, plan: Plan, model: Any) -> Any:
 
 
 def _priors(colmap: Any, problem: Problem, plan: Plan, model: Any) -> list[Any]:
-    """Return the GNSS positions with covariances as for image points of unit weight."""
+    """Return the GNSS positions of images that move, as for image points of unit weight."""
     weight = gnss_weights(problem.block)
-    there = np.where(weight > 0.0, problem.block.gnss_xyz - problem.origin, 0.0)
-    variance = np.where(weight > 0.0, 1.0 / np.where(weight > 0.0, weight, 1.0), ANYWHERE_M**2)
     priors = []
-    for i in np.flatnonzero((weight > 0.0).any(axis=1)).tolist():
+    for i in np.flatnonzero((weight > 0.0).all(axis=1) & ~plan.fixed).tolist():
         prior = colmap.PosePrior()
         prior.corr_data_id = model.image(i + 1).data_id
-        prior.position = there[i]
-        prior.position_covariance = np.diag(variance[i] / plan.sigma_px**2)
+        prior.position = problem.block.gnss_xyz[i] - problem.origin
+        prior.position_covariance = np.diag(1.0 / (weight[i] * plan.sigma_px**2))
         prior.coordinate_system = colmap.PosePriorCoordinateSystem.CARTESIAN
         priors.append(prior)
     return priors

@@ -94,5 +94,5 @@ def _point_steps(problem: Problem, state) -> FloatArray:  # type: ignore[no-unty
     k = len(problem.block.cameras)
     return point_steps(
         state, problem.seen, problem.surface, problem.columns, problem.priors,
-        Loss(), 0.0, problem.pivot, np.zeros((k, 6)), np.zeros(problem.columns.count),
+        Loss(), 0.0, problem.pivot, np.zeros((k, 6)), np.zeros(problem.columns.total),
     )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
     from pcfix.ports import Port
 
 LEAST_VIEWS = 2
+LEAST_SEEN = 4
+"""Points in an image: three have up to four poses."""
+
 LEAST_ANGLE_DEG = 2.0
 """Between the rays of a tie point: a point of less is hardly known, and tells hardly anything."""
 
@@ -227,3 +231,39 @@ def ties_of_cloud(xyz: FloatArray, views: Views, cameras: Cameras) -> TiePoints:
     tracks = Views(start, np.asarray(views.camera)[seen])
     rows = np.flatnonzero(counts >= LEAST_VIEWS)
     return taken(TiePoints(xyz, tracks, image[seen]), rows)
+
+
+def well_seen(block: Block) -> IntArray:
+    """Return rows of the images with observations enough to find their pose."""
+    counts = np.bincount(block.camera[np.isfinite(block.sigma_px)], minlength=len(block.cameras))
+    return np.flatnonzero(counts >= LEAST_SEEN)
+
+
+def restricted(block: Block, rows: IntArray) -> Block:
+    """Return a block with some of its images, in the given order."""
+    place = np.full(len(block.cameras), -1)
+    place[rows] = np.arange(len(rows))
+    kept = place[block.camera] >= 0
+    counts = np.bincount(block.owner[kept], minlength=len(block.xyz))
+    return replace(
+        block,
+        cameras=some_cameras(block.cameras, rows),
+        start=np.concatenate([[0], np.cumsum(counts)]),
+        camera=place[block.camera[kept]],
+        image_xy=block.image_xy[kept],
+        sigma_px=block.sigma_px[kept],
+        gnss_xyz=block.gnss_xyz[rows],
+        gnss_sigma_m=block.gnss_sigma_m[rows],
+    )
+
+
+def some_cameras(cameras: Cameras, rows: IntArray) -> Cameras:
+    """Return some of the cameras, in the given order, without what was read beside them."""
+    return replace(
+        cameras,
+        labels=tuple(cameras.labels[i] for i in rows),
+        centres=cameras.centres[rows],
+        rotations=None if cameras.rotations is None else cameras.rotations[rows],
+        lenses=None if cameras.lenses is None else tuple(cameras.lenses[i] for i in rows),
+        gnss=None,
+    )

@@ -49,12 +49,12 @@ class Trial(NamedTuple):
     found: Solution
     sigma_px: float
     misfit: float
-    count: int
+    observations: int
 
     @property
     def mean(self) -> float:
         """Misfit per observation that is free to differ."""
-        return self.misfit / max(self.count - 7, 1)
+        return self.misfit / max(self.observations - 7, 1)
 
 
 class Candidate(NamedTuple):

@@ -88,7 +88,7 @@ def pair_slots(seen: Seen, cameras: int) -> tuple[IntArray, IntArray]:
     _mark(share, seen.start, seen.camera)
     np.fill_diagonal(share, True)
     i, j = np.nonzero(np.triu(share))
-    slot = np.full((cameras, cameras), -1, np.int32)
+    slot = np.full((cameras, cameras), -1)
     slot[i, j] = slot[j, i] = np.arange(len(i))
     return slot, np.column_stack([i, j])
 
@@ -115,7 +115,7 @@ def normal_equations(
         About which a similarity turns and scales, block frame.
     """
     slot, pairs = slots
-    k, g = len(state.centres), columns.count
+    k, g = len(state.centres), columns.total
     sums = (
         np.zeros((PARTS, len(pairs), 6, 6)), np.zeros((PARTS, k, 6, g)), np.zeros((PARTS, g, g)),
         np.zeros((PARTS, k, 6)), np.zeros((PARTS, g)),
@@ -192,7 +192,7 @@ def _residuals(state: State, seen: Seen, surface: Surface, found: FloatArray) ->
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _linearise(
+def linearise(
     state: State, seen: Seen, surface: Surface, columns: Columns, kind: int, scale: float,
     pivot: FloatArray, p: int, o: int, light: FloatArray, plane: FloatArray, ahead: FloatArray,
     own: FloatArray, shared: FloatArray, r: FloatArray,
@@ -256,7 +256,7 @@ def _similarity_gradients(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _point_block(
+def point_block(
     v: FloatArray, rhs: FloatArray, priors: PointPriors, xyz: FloatArray, p: int, damping: float
 ) -> bool:
     """Add prior and damping to V and its right side, and invert V in place."""
@@ -279,6 +279,15 @@ def _point_block(
     return True
 
 
+@njit(cache=True, error_model="numpy", nogil=True)
+def most_seen(start: IntArray, first: int, last: int) -> int:
+    """Return the largest number of observations of one of the points."""
+    most = 1
+    for p in range(first, last):
+        most = max(most, start[p + 1] - start[p])
+    return most
+
+
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _sum_up(
     state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors, kind: int,
@@ -287,91 +296,117 @@ def _sum_up(
     shared_right: FloatArray, diagonal: FloatArray, shared_diagonal: FloatArray,
 ) -> None:  # fmt: skip
     for part in prange(PARTS):
-        m, g = len(state.xyz), columns.count
-        most = 1
-        for p in range(part * m // PARTS, (part + 1) * m // PARTS):
-            most = max(most, seen.start[p + 1] - seen.start[p])
+        m, g = len(state.xyz), columns.total
+        first, last = part * m // PARTS, (part + 1) * m // PARTS
+        most = most_seen(seen.start, first, last)
         light, plane, ahead = np.empty((3, 12)), np.empty(4), np.empty(3)
-        own, shared, r = np.empty((2, WIDTH)), np.zeros((2, g)), np.empty(2)
+        own, shared = np.empty((most, 2, WIDTH)), np.zeros((most, 2, g))
+        r, who = np.empty((most, 2)), np.empty(most, np.int64)
         v, rhs, w_g = np.empty((3, 3)), np.empty(3), np.empty((g, 3))
-        w, y, who = np.empty((most, 6, 3)), np.empty((6, 3)), np.empty(most, np.int64)
-        for p in range(part * m // PARTS, (part + 1) * m // PARTS):
-            v[:], rhs[:], w_g[:], count = 0.0, 0.0, 0.0, 0
+        w = np.empty((most, 6, 3))
+        for p in range(first, last):
+            v[:], rhs[:], count = 0.0, 0.0, 0
             for o in range(seen.start[p], seen.start[p + 1]):
-                if not _linearise(
+                if linearise(
                     state, seen, surface, columns, kind, scale, pivot, p, o,
-                    light, plane, ahead, own, shared, r,
+                    light, plane, ahead, own[count], shared[count], r[count],
                 ):  # fmt: skip
-                    continue
-                c = seen.camera[o]
-                who[count] = c
-                u = blocks[part, slot[c, c]]
-                for i in range(6):
-                    for j in range(6):
-                        u[i, j] += own[0, i] * own[0, j] + own[1, i] * own[1, j]
-                    for j in range(g):
-                        border[part, c, i, j] += own[0, i] * shared[0, j] + own[1, i] * shared[1, j]
-                    diagonal[part, c, i] += own[0, i] * own[0, i] + own[1, i] * own[1, i]
-                    poses[part, c, i] += own[0, i] * r[0] + own[1, i] * r[1]
-                    for j in range(3):
-                        w[count, i, j] = (
-                            own[0, i] * own[0, POINT + j] + own[1, i] * own[1, POINT + j]
-                        )
-                for i in range(g):
-                    for j in range(g):
-                        corner[part, i, j] += (
-                            shared[0, i] * shared[0, j] + shared[1, i] * shared[1, j]
-                        )
-                    shared_diagonal[part, i] += shared[0, i] ** 2 + shared[1, i] ** 2
-                    shared_right[part, i] += shared[0, i] * r[0] + shared[1, i] * r[1]
-                    for j in range(3):
-                        w_g[i, j] += (
-                            shared[0, i] * own[0, POINT + j] + shared[1, i] * own[1, POINT + j]
-                        )
-                for i in range(3):
-                    for j in range(3):
-                        v[i, j] += (
-                            own[0, POINT + i] * own[0, POINT + j]
-                            + own[1, POINT + i] * own[1, POINT + j]
-                        )
-                    rhs[i] += own[0, POINT + i] * r[0] + own[1, POINT + i] * r[1]
-                count += 1
-            if count == 0 or not _point_block(v, rhs, priors, state.xyz[p], p, damping):
+                    who[count] = seen.camera[o]
+                    _add_point(v, rhs, own[count], r[count])
+                    count += 1
+            # a point that its rays do not fix says nothing of the cameras either
+            if count == 0 or not point_block(v, rhs, priors, state.xyz[p], p, damping):
                 continue
+            w_g[:] = 0.0
             for a in range(count):
                 c = who[a]
+                _add_pose(
+                    blocks[part, slot[c, c]], border[part, c], poses[part, c], diagonal[part, c],
+                    w[a], own[a], shared[a], r[a],
+                )  # fmt: skip
+                _add_shared(
+                    corner[part], shared_right[part], shared_diagonal[part], w_g,
+                    own[a], shared[a], r[a],
+                )  # fmt: skip
+            _eliminate(
+                blocks[part], border[part], corner[part], poses[part], shared_right[part],
+                slot, who[:count], w, w_g, v, rhs,
+            )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _add_point(v: FloatArray, rhs: FloatArray, own: FloatArray, r: FloatArray) -> None:
+    """Add B'B and B'r."""
+    for i in range(3):
+        for j in range(3):
+            v[i, j] += own[0, POINT + i] * own[0, POINT + j] + own[1, POINT + i] * own[1, POINT + j]
+        rhs[i] += own[0, POINT + i] * r[0] + own[1, POINT + i] * r[1]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _add_pose(
+    u: FloatArray, border: FloatArray, right: FloatArray, diagonal: FloatArray, w: FloatArray,
+    own: FloatArray, shared: FloatArray, r: FloatArray,
+) -> None:  # fmt: skip
+    """Add J'J, J'G and J'r, and set W = J'B."""
+    for i in range(6):
+        for j in range(6):
+            u[i, j] += own[0, i] * own[0, j] + own[1, i] * own[1, j]
+        for j in range(shared.shape[1]):
+            border[i, j] += own[0, i] * shared[0, j] + own[1, i] * shared[1, j]
+        for j in range(3):
+            w[i, j] = own[0, i] * own[0, POINT + j] + own[1, i] * own[1, POINT + j]
+        diagonal[i] += own[0, i] * own[0, i] + own[1, i] * own[1, i]
+        right[i] += own[0, i] * r[0] + own[1, i] * r[1]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _add_shared(
+    corner: FloatArray, right: FloatArray, diagonal: FloatArray, w_g: FloatArray,
+    own: FloatArray, shared: FloatArray, r: FloatArray,
+) -> None:  # fmt: skip
+    """Add G'G, G'r and G'B."""
+    for i in range(shared.shape[1]):
+        for j in range(shared.shape[1]):
+            corner[i, j] += shared[0, i] * shared[0, j] + shared[1, i] * shared[1, j]
+        for j in range(3):
+            w_g[i, j] += shared[0, i] * own[0, POINT + j] + shared[1, i] * own[1, POINT + j]
+        diagonal[i] += shared[0, i] ** 2 + shared[1, i] ** 2
+        right[i] += shared[0, i] * r[0] + shared[1, i] * r[1]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _eliminate(
+    blocks: FloatArray, border: FloatArray, corner: FloatArray, poses: FloatArray,
+    shared_right: FloatArray, slot: IntArray, who: IntArray, w: FloatArray, w_g: FloatArray,
+    v: FloatArray, rhs: FloatArray,
+) -> None:  # fmt: skip
+    """Take a point out of the equations, with V inverted."""
+    g, y = len(w_g), np.empty((6, 3))
+    for a in range(who.size):
+        c = who[a]
+        for i in range(6):
+            for j in range(3):
+                y[i, j] = w[a, i, 0] * v[0, j] + w[a, i, 1] * v[1, j] + w[a, i, 2] * v[2, j]
+            poses[c, i] -= y[i, 0] * rhs[0] + y[i, 1] * rhs[1] + y[i, 2] * rhs[2]
+            for j in range(g):
+                border[c, i, j] -= y[i, 0] * w_g[j, 0] + y[i, 1] * w_g[j, 1] + y[i, 2] * w_g[j, 2]
+        for b in range(who.size):
+            # each pair once, the smaller camera first; one that sees the point twice, all ways
+            if who[b] >= c:
+                s = blocks[slot[c, who[b]]]
                 for i in range(6):
-                    for j in range(3):
-                        y[i, j] = w[a, i, 0] * v[0, j] + w[a, i, 1] * v[1, j] + w[a, i, 2] * v[2, j]
-                    poses[part, c, i] -= y[i, 0] * rhs[0] + y[i, 1] * rhs[1] + y[i, 2] * rhs[2]
-                    for j in range(g):
-                        border[part, c, i, j] -= (
-                            y[i, 0] * w_g[j, 0] + y[i, 1] * w_g[j, 1] + y[i, 2] * w_g[j, 2]
+                    for j in range(6):
+                        s[i, j] -= (
+                            y[i, 0] * w[b, j, 0] + y[i, 1] * w[b, j, 1] + y[i, 2] * w[b, j, 2]
                         )
-                for b in range(count):
-                    if who[b] < c or (who[b] == c and b < a):
-                        continue
-                    s = blocks[part, slot[c, who[b]]]
-                    for i in range(6):
-                        for j in range(6):
-                            s[i, j] -= (
-                                y[i, 0] * w[b, j, 0] + y[i, 1] * w[b, j, 1] + y[i, 2] * w[b, j, 2]
-                            )
-                    if who[b] == c and b > a:
-                        for i in range(6):
-                            for j in range(6):
-                                s[j, i] -= (
-                                    y[i, 0] * w[b, j, 0]
-                                    + y[i, 1] * w[b, j, 1]
-                                    + y[i, 2] * w[b, j, 2]
-                                )
-            for i in range(g):
-                y0 = w_g[i, 0] * v[0, 0] + w_g[i, 1] * v[1, 0] + w_g[i, 2] * v[2, 0]
-                y1 = w_g[i, 0] * v[0, 1] + w_g[i, 1] * v[1, 1] + w_g[i, 2] * v[2, 1]
-                y2 = w_g[i, 0] * v[0, 2] + w_g[i, 1] * v[1, 2] + w_g[i, 2] * v[2, 2]
-                shared_right[part, i] -= y0 * rhs[0] + y1 * rhs[1] + y2 * rhs[2]
-                for j in range(g):
-                    corner[part, i, j] -= y0 * w_g[j, 0] + y1 * w_g[j, 1] + y2 * w_g[j, 2]
+    for i in range(g):
+        y0 = w_g[i, 0] * v[0, 0] + w_g[i, 1] * v[1, 0] + w_g[i, 2] * v[2, 0]
+        y1 = w_g[i, 0] * v[0, 1] + w_g[i, 1] * v[1, 1] + w_g[i, 2] * v[2, 1]
+        y2 = w_g[i, 0] * v[0, 2] + w_g[i, 1] * v[1, 2] + w_g[i, 2] * v[2, 2]
+        shared_right[i] -= y0 * rhs[0] + y1 * rhs[1] + y2 * rhs[2]
+        for j in range(g):
+            corner[i, j] -= y0 * w_g[j, 0] + y1 * w_g[j, 1] + y2 * w_g[j, 2]
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
@@ -381,30 +416,25 @@ def _point_steps(
     steps: FloatArray,
 ) -> None:  # fmt: skip
     for part in prange(PARTS):
-        m, g = len(state.xyz), columns.count
+        m, g = len(state.xyz), columns.total
         light, plane, ahead = np.empty((3, 12)), np.empty(4), np.empty(3)
         own, shared, r = np.empty((2, WIDTH)), np.zeros((2, g)), np.empty(2)
         v, rhs = np.empty((3, 3)), np.empty(3)
         for p in range(part * m // PARTS, (part + 1) * m // PARTS):
             v[:], rhs[:], count = 0.0, 0.0, 0
             for o in range(seen.start[p], seen.start[p + 1]):
-                if not _linearise(
+                if not linearise(
                     state, seen, surface, columns, kind, scale, pivot, p, o,
                     light, plane, ahead, own, shared, r,
                 ):  # fmt: skip
                     continue
-                c = seen.camera[o]
                 for row in range(2):
-                    left = r[row]
                     for i in range(6):
-                        left -= own[row, i] * poses[c, i]
+                        r[row] -= own[row, i] * poses[seen.camera[o], i]
                     for i in range(g):
-                        left -= shared[row, i] * moved[i]
-                    for i in range(3):
-                        rhs[i] += own[row, POINT + i] * left
-                        for j in range(3):
-                            v[i, j] += own[row, POINT + i] * own[row, POINT + j]
+                        r[row] -= shared[row, i] * moved[i]
+                _add_point(v, rhs, own, r)
                 count += 1
-            if count and _point_block(v, rhs, priors, state.xyz[p], p, damping):
+            if count and point_block(v, rhs, priors, state.xyz[p], p, damping):
                 for i in range(3):
                     steps[p, i] = v[i, 0] * rhs[0] + v[i, 1] * rhs[1] + v[i, 2] * rhs[2]

@@ -153,7 +153,7 @@ def precision_of(problem: Problem, solution: Solution, sigma0: float = 1.0) -> P
             f"The covariances of the points were left out: {size:,} unknowns of poses, lens and"
             f" water are more than {DENSE_UP_TO:,}.",
         )
-    g = problem.columns.count
+    g = problem.columns.total
     correlation = _correlations(of_asked)
     sigma = np.sqrt(np.diag(of_asked)[:g]) * sigma0
     rows = zip(problem.names, solution.shared.tolist(), sigma.tolist(), strict=True)
@@ -172,7 +172,7 @@ def _left_out(equations: Undamped) -> tuple[str, ...]:
 
 def _asked(problem: Problem, solution: Solution) -> FloatArray:
     """Return what shared unknowns and block motions are of all unknowns, shape (u, g + 3)."""
-    k, g = len(solution.state.centres), problem.columns.count
+    k, g = len(solution.state.centres), problem.columns.total
     rows = np.zeros((6 * k + g, g + 3))
     rows[6 * k :, :g] = np.eye(g)
     away = solution.state.centres - solution.state.centres.mean(axis=0)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from scipy.sparse import csc_array
 
     from pcfix.adjust.normal import Sums
     from pcfix.model import BoolArray, FloatArray, IntArray
@@ -24,7 +26,7 @@ class Reduced(NamedTuple):
     active : rows, of poses and then of what is shared, that move.
     """
 
-    matrix: FloatArray
+    matrix: FloatArray | csc_array
     right: FloatArray
     active: IntArray
 
@@ -67,15 +69,15 @@ def assemble(
             matrix[np.diag_indices(size)] += extra
         matrix[np.diag_indices(size)] += damping * (diagonal + own)
         return Reduced(matrix[np.ix_(active, active)], right[active], active)
-    matrix = _sparse(sums, pairs, k, g)
     from scipy import sparse
 
-    matrix = matrix + (sparse.csc_array(extra) if extra.ndim == 2 else sparse.diags_array(extra))
-    matrix = matrix + sparse.diags_array(damping * (diagonal + own))
-    return Reduced(matrix.tocsc()[active][:, active], right[active], active)
+    total = _sparse(sums, pairs, k, g)
+    total += sparse.csc_array(extra) if extra.ndim == 2 else sparse.diags_array(extra)
+    total += sparse.diags_array(damping * (diagonal + own))
+    return Reduced(total.tocsc()[active][:, active], right[active], active)
 
 
-def _sparse(sums: Sums, pairs: IntArray, k: int, g: int) -> FloatArray:
+def _sparse(sums: Sums, pairs: IntArray, k: int, g: int) -> Any:
     from scipy import sparse
 
     i, j = pairs[:, 0], pairs[:, 1]
@@ -92,32 +94,42 @@ def _sparse(sums: Sums, pairs: IntArray, k: int, g: int) -> FloatArray:
     if g == 0:
         return body.tocsc()
     border = sparse.csc_array(sums.border.reshape(6 * k, g))
-    return sparse.block_array([[body, border], [border.T, sparse.csc_array(sums.corner)]]).tocsc()
+    parts: Any = [[body, border], [border.T, sparse.csc_array(sums.corner)]]
+    return sparse.block_array(parts).tocsc()
 
 
 def solver(reduced: Reduced) -> Callable[[FloatArray], FloatArray] | None:
     """Return a function that solves for a right side; None where the matrix is not definite."""
-    size = reduced.matrix.shape[0]
-    if size == 0:
+    if reduced.matrix.shape[0] == 0:
         return lambda right: right
-    if isinstance(reduced.matrix, np.ndarray):
-        from scipy.linalg import LinAlgError, cho_factor, cho_solve
-
-        scale = _scale(reduced.matrix.diagonal())
-        if scale is None:
-            return None
-        try:
-            factor = cho_factor(reduced.matrix * scale * scale[:, None], lower=True)
-        except LinAlgError:
-            return None
-        return lambda right: (cho_solve(factor, (right.T * scale).T).T * scale).T
-    from scipy.sparse import diags_array
-    from scipy.sparse.linalg import splu
-
     scale = _scale(reduced.matrix.diagonal())
     if scale is None:
         return None
-    scaled = diags_array(scale) @ reduced.matrix @ diags_array(scale)
+    solve = (
+        _dense(reduced.matrix * scale * scale[:, None])
+        if isinstance(reduced.matrix, np.ndarray)
+        else _factored(reduced.matrix, scale)
+    )
+    if solve is None:
+        return None
+    return lambda right: (solve((right.T * scale).T).T * scale).T
+
+
+def _dense(scaled: FloatArray) -> Callable[[FloatArray], FloatArray] | None:
+    from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+    try:
+        factor = cho_factor(scaled, lower=True)
+    except LinAlgError:
+        return None
+    return lambda right: np.asarray(cho_solve(factor, right))
+
+
+def _factored(matrix: csc_array, scale: FloatArray) -> Callable[[FloatArray], FloatArray] | None:
+    from scipy.sparse import diags_array
+    from scipy.sparse.linalg import splu
+
+    scaled = diags_array(scale) @ matrix @ diags_array(scale)
     try:
         lu = splu(
             scaled.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
@@ -125,7 +137,7 @@ def solver(reduced: Reduced) -> Callable[[FloatArray], FloatArray] | None:
         )  # fmt: skip
     except RuntimeError:
         return None
-    return lambda right: (lu.solve((right.T * scale).T).T * scale).T
+    return lambda right: np.asarray(lu.solve(right))
 
 
 def _scale(diagonal: FloatArray) -> FloatArray | None:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from pcfix.adjust.block import Block, Unknowns, usable_codes
+from pcfix.adjust.block import Block, Robust, Unknowns, usable_codes
 from pcfix.adjust.gather import LEAST_VIEWS
 from pcfix.adjust.normal import residuals
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.result import Adjusted, ControlRow, Source
 from pcfix.adjust.solve import (
+    CLOSE,
     LogRow,
     Problem,
     Solution,
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
 
     Progress = Callable[[LogRow], None]
 
+Engine = Literal["direct", "colmap"]
+
 ROUGHLY = 1e-4
 """Gain of a step, relative, below which the first, robust rounds end."""
 
@@ -43,6 +46,7 @@ OUTLIER_SIGMAS = 4.0
 SCALE_SIGMAS = 2.0
 MAD_TO_SIGMA = 1.4826
 OUTLIER_ROUNDS = 3
+LAST_ROUND = 2 + OUTLIER_ROUNDS
 WEAK_PX = 2.0
 """Standard error of the image at the corner of the frame above which a lens parameter is left as
 it was; the focal length always moves."""
@@ -60,11 +64,30 @@ class Rounds:
         Whether to look for them.
     drop_weak : bool
         Whether lens parameters that the block does not determine are left as they were.
+    engine : {"direct", "colmap"}
+        `pcfix.adjust.solve` or `pcfix.adjust.colmap_engine`.
     """
 
     sigma_px: float | None = None
     outliers: bool = True
     drop_weak: bool = True
+    engine: Engine = "direct"
+
+    def solve(
+        self,
+        problem: Problem,
+        now: Solution,
+        robust: Robust,
+        number: int,
+        progress: Progress | None,
+        close: float = CLOSE,
+    ) -> Solution:
+        """Return the solution of one round by the engine."""
+        if self.engine == "direct":
+            return solve(problem, now, robust, SCALE_SIGMAS, number, progress, close)
+        from pcfix.adjust.colmap_engine import solve_with_colmap
+
+        return solve_with_colmap(problem, now, robust, SCALE_SIGMAS, number, progress)
 
 
 def adjust_ties(
@@ -93,19 +116,19 @@ def adjust_ties(
     notes: list[str] = []
     problem, now = prepare(block, unknowns)
     if rounds.outliers or rounds.sigma_px is None:
-        now = solve(problem, now, "huber", SCALE_SIGMAS, 1, progress, ROUGHLY)
+        now = rounds.solve(problem, now, "huber", 1, progress, ROUGHLY)
     if rounds.sigma_px is None:
         problem = with_sigma(problem, noise_px(problem, now))
     if rounds.outliers:
         for number in range(OUTLIER_ROUNDS):
-            robust = "cauchy" if number == 0 else "squares"
-            now = solve(problem, now, robust, SCALE_SIGMAS, 2 + number, progress, ROUGHLY)
+            robust: Robust = "cauchy" if number == 0 else "squares"
+            now = rounds.solve(problem, now, robust, 2 + number, progress, ROUGHLY)
             problem, dropped = without_outliers(problem, now)
             if rounds.sigma_px is None:
                 problem = with_sigma(problem, noise_px(problem, now))
             if number and not dropped:
                 break
-    now = solve(problem, now, "squares", 1.0, 9, progress)
+    now = rounds.solve(problem, now, "squares", LAST_ROUND, progress)
     precision = precision_of(problem, now, sigma0_of(problem, now))
     if rounds.drop_weak:
         weak = weak_lens_parameters(problem, precision)
@@ -119,9 +142,9 @@ def adjust_ties(
             problem, start = prepare(block, fewer)
             problem.seen = problem.seen._replace(weight=weight)
             start = replace(start, state=start.state._replace(xyz=now.state.xyz), log=now.log)
-            now = solve(problem, start, "squares", 1.0, 10, progress)
+            now = rounds.solve(problem, start, "squares", LAST_ROUND + 1, progress)
             precision = precision_of(problem, now, sigma0_of(problem, now))
-    return adjusted_of(problem, now, precision, notes, "tie points", "direct")
+    return adjusted_of(problem, now, precision, notes, "tie points", rounds.engine)
 
 
 def check_datum(block: Block, unknowns: Unknowns) -> None:

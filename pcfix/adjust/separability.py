@@ -15,6 +15,8 @@ from pcfix.adjust.solve import similarity_gradients
 from pcfix.adjust.undamped import undamped
 
 if TYPE_CHECKING:
+    from scipy.sparse import csc_array
+
     from pcfix.adjust.block import Unknowns
     from pcfix.adjust.precision import Precision
     from pcfix.adjust.solve import Problem, Solution
@@ -169,7 +171,7 @@ def weakest(problem: Problem, solution: Solution) -> str:
     return "; ".join(parts) + "."
 
 
-def _smallest(matrix: FloatArray, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _smallest(matrix: FloatArray | csc_array, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the smallest eight eigenvalues and their vectors of the scaled matrix."""
     count, size = 8, len(scale)
     if isinstance(matrix, np.ndarray):

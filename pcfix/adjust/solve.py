@@ -46,6 +46,9 @@ MOST_STEPS = 60
 CLOSE = 1e-12
 """Of the cost, relative: two steps in a row that gain less end the last round."""
 
+EXACT = 1e-10
+"""Squared residual, in variances, below which an observation is met exactly."""
+
 NETWORK_SIGMA_M = 1e-4
 """How tightly the mean of the projection centres is held in a free network."""
 
@@ -157,7 +160,7 @@ def prepare(block: Block, unknowns: Unknowns) -> tuple[Problem, Solution]:
         _moves(block, unknowns, columns),
         state.centres.mean(axis=0),
     )  # fmt: skip
-    start = Solution(state, cameras.lenses, np.zeros(columns.count), np.inf, [])
+    start = Solution(state, cameras.lenses, np.zeros(columns.total), np.inf, [])
     return problem, start
 
 
@@ -207,7 +210,7 @@ def _moves(block: Block, unknowns: Unknowns, columns: Columns) -> BoolArray:
     poses = np.full((k, 6), unknowns.poses == "free")
     fixed = set(unknowns.fixed_images)
     poses[[label in fixed for label in block.cameras.labels]] = False
-    return np.concatenate([poses.ravel(), np.ones(columns.count, bool)])
+    return np.concatenate([poses.ravel(), np.ones(columns.total, bool)])
 
 
 class _Extra(NamedTuple):
@@ -227,7 +230,7 @@ def gnss_weights(block: Block) -> FloatArray:
 def priors_at(problem: Problem, found: Solution) -> _Extra:
     """Return what the priors of poses, lens and water say at a state."""
     block, columns, unknowns = problem.block, problem.columns, problem.unknowns
-    k, g = len(block.cameras), columns.count
+    k, g = len(block.cameras), columns.total
     diagonal, right = np.zeros(6 * k + g), np.zeros(6 * k + g)
     weight = gnss_weights(block)
     off = np.where(weight > 0.0, block.gnss_xyz - problem.origin, 0.0) - found.state.centres
@@ -288,10 +291,15 @@ def _with_network(problem: Problem, found: Solution, extra: _Extra) -> _Extra:
 def _undetermined(problem: Problem) -> list[int]:
     """Return which of shift, turn and scale nothing in the images tells.
 
-    A water surface that is fixed tells height and tilt of the block by itself.
+    A water surface whose level or tilt does not move freely tells the height or tilt of the block.
     """
-    fixed_water = problem.surface.there and problem.columns.water[0] < 0
-    return [0, 1, 5, 6] if fixed_water else list(range(7))
+    if not (problem.surface.there and problem.block.wet.any()):
+        return list(range(7))
+    level, tilt = problem.unknowns.level_sigma_m, problem.unknowns.tilt_sigma
+    rows = [0, 1, 5, 6]
+    rows += [2] if np.isinf(level) else []
+    rows += [3, 4] if np.isinf(tilt) else []
+    return sorted(rows)
 
 
 def _shared_sigma(problem: Problem) -> FloatArray:
@@ -302,7 +310,7 @@ def _shared_sigma(problem: Problem) -> FloatArray:
     given = {CODES[name]: value for name, value in unknowns.lens_sigma.items()}
     lens = [given.get(int(code), np.inf) for code in problem.columns.code]
     water = [sigma for sigma in unknowns.water_sigma if sigma]
-    rest = problem.columns.count - len(lens) - len(water)
+    rest = problem.columns.total - len(lens) - len(water)
     return np.array([*lens, *water, *([np.inf] * rest)], np.float64)
 
 
@@ -333,10 +341,11 @@ def solve(
         If the normal equations stay singular, or the cost is not finite.
     """
     loss = Loss(LOSSES[robust], scale)
-    now = replace(start, cost=_cost(problem, start, loss))
+    now = replace(start, cost=cost_at(problem, start, loss))
     if not np.isfinite(now.cost):
         raise GeometryError("the adjustment has no finite start: check the poses and the water.")
     damping, up, calm = FIRST_DAMPING, 2.0, 0
+    least_cost = EXACT * max(int((problem.seen.weight > 0.0).sum()), 1)
     log = list(start.log)
     for step in range(MOST_STEPS):
         sums, extra = _equations(problem, now, loss, damping)
@@ -352,10 +361,11 @@ def solve(
                     )
                 return replace(now, log=log)
             sums, extra = _equations(problem, now, loss, damping)
-        gain = (now.cost - trial.cost) / max(now.cost, 1e-300)
+        # exact data end at a cost of nothing, of which there is no share
+        gain = (now.cost - trial.cost) / max(now.cost, least_cost)
         now, up = trial, 2.0
         damping = max(damping / 10.0, LEAST_DAMPING)
-        row = LogRow(number, step + 1, now.cost, damping, *_counts(problem, now))
+        row = LogRow(number, step + 1, now.cost, damping, *counts_of(problem, now))
         log.append(row)
         if progress is not None:
             progress(row)
@@ -391,11 +401,11 @@ def _trial(
         now.state, problem.seen, problem.surface, problem.columns, problem.priors,
         loss, damping, problem.pivot, poses, shared,
     )  # fmt: skip
-    moved = _moved(problem, now, poses, shared, points)
-    return None if moved is None else replace(moved, cost=_cost(problem, moved, loss))
+    moved = moved_by(problem, now, poses, shared, points)
+    return None if moved is None else replace(moved, cost=cost_at(problem, moved, loss))
 
 
-def _moved(
+def moved_by(
     problem: Problem, now: Solution, poses: FloatArray, shared: FloatArray, points: FloatArray
 ) -> Solution | None:
     """Return a solution with steps added; None where a number leaves its range."""
@@ -456,14 +466,15 @@ def weighted_squares(problem: Problem, found: Solution) -> FloatArray:
     return (r[counts] ** 2).sum(axis=1) * problem.seen.weight[counts] ** 2
 
 
-def _cost(problem: Problem, found: Solution, loss: Loss) -> float:
+def cost_at(problem: Problem, found: Solution, loss: Loss) -> float:
+    """Return what a solution costs: images, surveyed points and all priors."""
     images = cost_of(weighted_squares(problem, found), loss)
     priors = problem.priors
     points = float((priors.weight * (priors.xyz - found.state.xyz) ** 2).sum())
     return images + points + priors_at(problem, found).cost
 
 
-def _counts(problem: Problem, found: Solution) -> tuple[int, float]:
+def counts_of(problem: Problem, found: Solution) -> tuple[int, float]:
     """Return how many observations count, and the root mean square of their residuals."""
     counts = problem.seen.weight > 0.0
     r = residuals(found.state, problem.seen, problem.surface)[counts]

@@ -86,14 +86,14 @@ class Columns(NamedTuple):
     code : shape (lens[-1],), which parameter each one is.
     water : shape (4,), -1 where fixed.
     similarity : the first of seven, -1 where the poses move on their own.
-    count : how many there are.
+    total : how many there are.
     """
 
     lens: IntArray
     code: IntArray
     water: IntArray
     similarity: int
-    count: int
+    total: int
 
 
 def places_of(code: int) -> tuple[int, ...]:

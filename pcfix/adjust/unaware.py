@@ -29,9 +29,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from pcfix.adjust.normal import PARTS, _linearise, _point_block
+from pcfix.adjust.normal import PARTS, linearise, most_seen, point_block
 from pcfix.adjust.observe import POINT, WATER, WIDTH, image_and_all_gradients, lens_gradients
-from pcfix.adjust.solve import LogRow, Problem, Solution, _counts, _moved, priors_at
+from pcfix.adjust.solve import LogRow, Problem, Solution, counts_of, moved_by, priors_at
 from pcfix.errors import GeometryError
 from pcfix.refract.threads import one_caller
 
@@ -67,7 +67,7 @@ def straight_columns(problem: Problem, start: Solution, apparent_xyz: FloatArray
         The points that the old adjustment saw, block frame.
     """
     seen, columns = problem.seen, problem.columns
-    o, g = len(seen.camera), columns.count
+    o, g = len(seen.camera), columns.total
     found = Tests(np.zeros((o, 2, 6)), np.zeros((o, 2, g)), np.zeros((o, 2, 3)))
     dry = seen._replace(wet=np.zeros(len(seen.wet), np.bool_))
     state = start.state._replace(xyz=np.ascontiguousarray(apparent_xyz))
@@ -102,7 +102,7 @@ def solve_unaware(
     now, log, before = start, list(start.log), np.inf
     for step in range(MAX_STEPS):
         poses, shared, points = _newton(problem, now, tests, is_tested)
-        moved = _moved(problem, now, poses, shared, points)
+        moved = moved_by(problem, now, poses, shared, points)
         size = float(np.abs(points).max(initial=0.0)) if np.isfinite(points).all() else np.inf
         if moved is None or not size < LARGE_STEP_M:
             raise GeometryError(
@@ -110,7 +110,7 @@ def solve_unaware(
                 " tie points, GNSS positions of more images, or control points."
             )
         now = moved
-        row = LogRow(1, step + 1, _squares(problem, now), 0.0, *_counts(problem, now))
+        row = LogRow(1, step + 1, _squares(problem, now), 0.0, *counts_of(problem, now))
         log.append(row)
         if progress is not None:
             progress(row)
@@ -133,7 +133,7 @@ def _squares(problem: Problem, now: Solution) -> float:
 def _newton(
     problem: Problem, now: Solution, tests: Tests, is_tested: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    k, g = len(now.state.centres), problem.columns.count
+    k, g = len(now.state.centres), problem.columns.total
     size = 6 * k + g
     parts = PARTS if size <= 3000 else 2
     matrix, right = np.zeros((parts, size, size)), np.zeros((parts, size))
@@ -218,12 +218,12 @@ def _gather(
     Columns of `right` and `left`: pose, point, shared. The block V and its right side are B_l'B
     and B_l'r.
     """
-    g = columns.count
+    g = columns.total
     light, plane, ahead = np.empty((3, 12)), np.empty(4), np.empty(3)
     own, common = np.empty((2, WIDTH)), np.zeros((2, g))
     v[:], rhs[:], count = 0.0, 0.0, 0
     for o in range(seen.start[p], seen.start[p + 1]):
-        if not _linearise(
+        if not linearise(
             state, seen, surface, columns, 0, 1.0, pivot, p, o,
             light, plane, ahead, own, common, r[count],
         ):  # fmt: skip
@@ -248,15 +248,7 @@ def _gather(
         return 0
     if tested:
         return count if _inverted(v) else 0
-    return count if _point_block(v, rhs, priors, state.xyz[p], p, 0.0) else 0
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _most(start: IntArray, first: int, last: int) -> int:
-    most = 1
-    for p in range(first, last):
-        most = max(most, start[p + 1] - start[p])
-    return most
+    return count if point_block(v, rhs, priors, state.xyz[p], p, 0.0) else 0
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
@@ -267,9 +259,9 @@ def _sum_tested(
 ) -> None:  # fmt: skip
     parts = len(matrix)
     for part in prange(parts):
-        m, g, k = len(state.xyz), columns.count, len(state.centres)
+        m, g, k = len(state.xyz), columns.total, len(state.centres)
         first, last = part * m // parts, (part + 1) * m // parts
-        most = _most(seen.start, first, last)
+        most = most_seen(seen.start, first, last)
         right, left = np.empty((most, 2, WATER + g)), np.empty((most, 2, WATER + g))
         r, who = np.empty((most, 2)), np.empty(most, np.int64)
         v, rhs = np.empty((3, 3)), np.empty(3)
@@ -333,9 +325,9 @@ def _tested_points(
     is_tested: BoolArray, poses: FloatArray, moved: FloatArray, steps: FloatArray,
 ) -> None:  # fmt: skip
     for part in prange(PARTS):
-        m, g = len(state.xyz), columns.count
+        m, g = len(state.xyz), columns.total
         first, last = part * m // PARTS, (part + 1) * m // PARTS
-        most = _most(seen.start, first, last)
+        most = most_seen(seen.start, first, last)
         right, left = np.empty((most, 2, WATER + g)), np.empty((most, 2, WATER + g))
         r, who = np.empty((most, 2)), np.empty(most, np.int64)
         v, rhs = np.empty((3, 3)), np.empty(3)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from pcfix.adjust.normal import PARTS, SQUARES, Loss, _linearise, _point_block, normal_equations
+from pcfix.adjust.normal import PARTS, SQUARES, Loss, linearise, normal_equations, point_block
 from pcfix.adjust.observe import POINT, WIDTH
 from pcfix.adjust.reduced import Reduced, assemble
 from pcfix.adjust.solve import priors_at
@@ -99,12 +99,12 @@ def _find_fixed(
 ) -> None:  # fmt: skip
     """Find the points whose normal matrix V, priors included, is not singular."""
     light, plane, ahead = np.empty((3, 12)), np.empty(4), np.empty(3)
-    own, shared, r = np.empty((2, WIDTH)), np.zeros((2, columns.count)), np.empty(2)
+    own, shared, r = np.empty((2, WIDTH)), np.zeros((2, columns.total)), np.empty(2)
     v = np.empty((3, 3))
     for p in range(len(state.xyz)):
         v[:] = 0.0
         for o in range(seen.start[p], seen.start[p + 1]):
-            if _linearise(
+            if linearise(
                 state, seen, surface, columns, SQUARES, 1.0, pivot, p, o,
                 light, plane, ahead, own, shared, r,
             ):  # fmt: skip
@@ -128,7 +128,7 @@ def _point_covariances(
     pivot: FloatArray, is_fixed: BoolArray, place: IntArray, inverse: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     for part in prange(PARTS):
-        m, g, poses = len(state.xyz), columns.count, 6 * len(state.centres)
+        m, g, poses = len(state.xyz), columns.total, 6 * len(state.centres)
         most = 0
         for p in range(part * m // PARTS, (part + 1) * m // PARTS):
             most = max(most, seen.start[p + 1] - seen.start[p])
@@ -143,7 +143,7 @@ def _point_covariances(
             for i in range(g):
                 at[i] = place[poses + i]
             for o in range(seen.start[p], seen.start[p + 1]):
-                if not _linearise(
+                if not linearise(
                     state, seen, surface, columns, SQUARES, 1.0, pivot, p, o,
                     light, plane, ahead, own, shared, r,
                 ):  # fmt: skip
@@ -159,7 +159,7 @@ def _point_covariances(
                 for i in range(6):
                     at[size + i] = place[6 * seen.camera[o] + i]
                 size += 6
-            _point_block(v, nothing, priors, state.xyz[p], p, 0.0)
+            point_block(v, nothing, priors, state.xyz[p], p, 0.0)
             _add_up(v, w[:size], at[:size], inverse, out[p])
 
 

@@ -240,7 +240,9 @@ def adjust(
         )  # fmt: skip
     if not quiet:
         typer.echo(adjustment_text(found, before_of(found)))
-        step = next_step(found, str(model), str(out), cloud and str(cloud), words.cameras_offset)
+        step = next_step(
+            found, str(model), str(out), None if cloud is None else str(cloud), words.cameras_offset
+        )
         typer.echo(f"Next: {step}")
 
 

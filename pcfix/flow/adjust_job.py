@@ -14,11 +14,14 @@ from pcfix.adjust.gather import (
     Datum,
     block_of,
     no_datum,
+    restricted,
+    some_cameras,
     ties_of_cloud,
     usable_ties,
+    well_seen,
 )
 from pcfix.adjust.mend import Candidate, mend
-from pcfix.adjust.rounds import Rounds, adjust_ties, default_lens
+from pcfix.adjust.rounds import Engine, Rounds, adjust_ties, default_lens
 from pcfix.adjust.separability import strong_correlations, undetermined
 from pcfix.adjust.state import CODES
 from pcfix.errors import GeometryError, InputError, SettingError
@@ -37,16 +40,16 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from os import PathLike
 
+    from pcfix.adjust.block import Block
     from pcfix.adjust.result import Adjusted
     from pcfix.adjust.solve import LogRow
     from pcfix.flow.inputs import Inputs
     from pcfix.flow.surfaces import CloudView
-    from pcfix.model import BoolArray, Cameras, FloatArray, TiePoints
+    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, TiePoints
 
     AnyPath = str | PathLike[str]
 
 Ties = Literal["auto", "measured", "cloud"]
-Engine = Literal["direct", "colmap"]
 WATER_UNKNOWNS = ("level", "tilt", "index")
 CLOUD_POINTS = 6000
 """Points of the cloud that stand for tie points."""
@@ -292,40 +295,62 @@ class AdjustJob:
         if lens is None:
             lens = () if self.calibrated is not None else default_lens(self.start.lenses or ())
         unknowns = how.unknowns(lens)
-        self._check_sides(block.xyz[: len(ties.xyz)], unknowns)
-        rounds = Rounds(how.sigma_px, how.outliers, drop_weak=how.lens_unknowns is None)
-        if how.engine == "colmap":
-            from pcfix.adjust.colmap_rounds import adjust_with_colmap
-
-            return adjust_with_colmap(block, unknowns, rounds, progress)
+        self._check_wet(block.xyz[: len(ties.xyz)])
+        block = restricted(block, self._kept(block))
+        rounds = Rounds(how.sigma_px, how.outliers, how.lens_unknowns is None, how.engine)
         found = adjust_ties(block, unknowns, rounds, progress)
+        self._check_dry(found)
         if found.precision is None:
             return found
         more = [*undetermined(found.precision, unknowns), *strong_correlations(found.precision)]
         return replace(found, notes=[*found.notes, *more])
 
-    def _check_sides(self, xyz: FloatArray, unknowns: Unknowns) -> None:
-        """Check that there is something to adjust with water, and that it can be told."""
+    def _check_wet(self, xyz: FloatArray) -> None:
+        """Check that there is water over some points."""
         if self.water is None:
             return
-        wet = surface_above(self.water, xyz).height_m > xyz[:, 2]
-        below, above = int(wet.sum()), int((~wet).sum())
+        below = int((surface_above(self.water, xyz).height_m > xyz[:, 2]).sum())
         if below < SMALL_WATER:
             raise GeometryError(
-                f"only {below} of {len(xyz):,} tie points lie below the water, so there is no"
+                f"only {below} of {len(xyz):,} points lie below the water, so there is no"
                 " refraction to adjust: check the water level against the model's heights, or use"
                 " an ordinary bundle adjustment."
             )
-        if above < SMALL_WATER and any(unknowns.water_sigma):
+
+    def _check_dry(self, found: Adjusted) -> None:
+        """Check that land tells what of the water moved; an absorbed block may have sunk it."""
+        if self.water is None:
+            return
+        seen = np.zeros(len(found.xyz), np.bool_)
+        seen[found.block.owner[found.used]] = True
+        above = int((seen & ~found.is_wet).sum())
+        if above >= SMALL_WATER:
+            return
+        said = f"only {above} of {int(seen.sum()):,} points lie above the water"
+        if any(found.unknowns.water_sigma):
             raise GeometryError(
-                f"only {above} of {len(xyz):,} tie points lie above the water: level, tilt and"
-                " index cannot be told from the height of the block then; leave the water fixed."
+                f"{said}: level, tilt and index cannot be told from the height of the block then;"
+                " leave the water fixed."
             )
-        if above < SMALL_WATER:
+        self.notes.append(
+            f"{said}: nothing but GNSS and control points ties the heights of the bed."
+        )
+
+    def _kept(self, block: Block) -> IntArray:
+        """Return rows of the images that can be adjusted, and say which cannot."""
+        kept = well_seen(block)
+        if len(kept) < 2:
+            raise GeometryError(
+                f"{self.name}: {len(kept)} of {len(block.cameras)} images have observations enough"
+                " for a pose; two at least are needed."
+            )
+        if len(kept) < len(block.cameras):
+            lost = sorted(set(range(len(block.cameras))) - set(kept.tolist()))
             self.notes.append(
-                f"only {above} of {len(xyz):,} tie points lie above the water: nothing but GNSS and"
-                " control points ties the heights."
+                f"{len(lost)} of {len(block.cameras)} images have too few observations for a pose"
+                f" and are left out; the first is {block.cameras.labels[lost[0]]}."
             )
+        return kept
 
     def _by_cloud(self, progress: Callable[[LogRow], None] | None) -> Adjusted:
 
@@ -347,13 +372,17 @@ class AdjustJob:
             apparent = ties.xyz
             if self.control is not None:
                 apparent = np.vstack([apparent, self.control.xyz])
-            candidates.append(Candidate(name, block, self.old, apparent))
+            kept = well_seen(block) if len(guesses) > 1 else self._kept(block)
+            if len(kept) < 2:
+                continue
+            old = some_cameras(self.old, kept)
+            candidates.append(Candidate(name, restricted(block, kept), old, apparent))
         if not candidates:
             raise GeometryError(
                 f"{self.name}: the images do not see the cloud; check the poses with 'pcfix cameras"
                 " --cloud'."
             )
-        self._check_sides(candidates[0].block.xyz, self.how.unknowns(()))
+        self._check_wet(candidates[0].block.xyz)
         if self.how.lens_unknowns is not None:
             sets: tuple[tuple[str, ...], ...] = (self.how.lens_unknowns,)
         elif self.calibrated is not None:
@@ -362,7 +391,9 @@ class AdjustJob:
             sets = tuple(
                 dict.fromkeys([("f",), ("f", "cx", "cy"), default_lens(self.old.lenses or ())])
             )
-        return mend(candidates, self.how.unknowns(sets[0]), sets, progress)
+        found = mend(candidates, self.how.unknowns(sets[0]), sets, progress)
+        self._check_dry(found)
+        return found
 
     def _sample(self) -> tuple[FloatArray, Views | None]:
         """Return points evenly drawn from the cloud, and their lists where there is one."""

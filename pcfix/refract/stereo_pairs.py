@@ -162,7 +162,6 @@ def _inverted(bundle: Bundle, pairs: Views | None, used: BoolArray) -> FloatArra
     made_xyz, made = bundle.made_with or (bundle.xyz, cameras)
     row, table = lens_table(made.lenses or ())
     rotations = np.ascontiguousarray(made.rotations, np.float64)
-    both = images_of(bundle.made_with, cameras)
     listed = None if pairs is None else (pairs.start, np.asarray(pairs.camera, np.int64))
     result = np.zeros((len(bundle.xyz), _WIDTH))
     with one_caller():
@@ -173,7 +172,11 @@ def _inverted(bundle: Bundle, pairs: Views | None, used: BoolArray) -> FloatArra
             bundle.normals(),
             np.ascontiguousarray(cameras.centres),
             np.ascontiguousarray(bundle.level_offset_m, np.float64),
-            _Images(rotations, row, table, both, bundle.settings.refractive_index),
+            rotations,
+            row,
+            table,
+            images_of(bundle.made_with, cameras),
+            bundle.settings.refractive_index,
             np.asarray(bundle.views.start, np.int64),
             np.asarray(bundle.views.camera, np.int64),
             listed,
@@ -187,12 +190,14 @@ def _inverted(bundle: Bundle, pairs: Views | None, used: BoolArray) -> FloatArra
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _invert(
     xyz: FloatArray, made_xyz: FloatArray, height: FloatArray, normals: FloatArray,
-    centres: FloatArray, offset: FloatArray, images: _Images, start: IntArray, camera: IntArray,
+    centres: FloatArray, offset: FloatArray, rotations: FloatArray, row: IntArray,
+    lenses: FloatArray, both: Images, n: float, start: IntArray, camera: IntArray,
     listed: tuple[IntArray, IntArray] | None, matched: IntArray, used: BoolArray,
     result: FloatArray,
 ) -> None:  # fmt: skip
     """Correct every point on its own; a block of them shares the memory for rays and pairs."""
     for block in prange((len(xyz) + _BLOCK - 1) // _BLOCK):
+        images = _Images(rotations, row, lenses, both, n)
         first, last = block * _BLOCK, min((block + 1) * _BLOCK, len(xyz))
         most, most_pairs = 0, 0
         for i in range(first, last):

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pcfix.adjust.block import moved_lens
-from pcfix.adjust.normal import _linearise
+from pcfix.adjust.normal import linearise
 from pcfix.adjust.observe import WATER, image, image_and_all_gradients, lens_gradients
 from pcfix.adjust.state import CODES, Seen, State, Surface, columns_of
 from pcfix.label.raster import build_field
@@ -181,7 +181,7 @@ def test_columns_of_a_similarity():
     )  # fmt: skip
     columns = columns_of([()], (False,) * 4, True)
     own, shared = np.empty((2, 13)), np.zeros((2, 7))
-    assert _linearise(
+    assert linearise(
         state, seen, no_surface(), columns, 0, 1.0, pivot, 0, 0,
         np.empty((3, 12)), np.empty(4), np.empty(3), own, shared, np.empty(2),
     )  # fmt: skip
