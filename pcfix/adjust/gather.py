@@ -53,6 +53,7 @@ def block_of(
     control: GroundControl | None = None,
     wet: BoolArray | None = None,
     port: Port | None = None,
+    level_sigma_m: float = 0.0,
 ) -> Block:
     """Return the block of tie points and surveyed points.
 
@@ -70,6 +71,8 @@ def block_of(
         In the frame of the cameras. Points to check with get no weight.
     wet : array of bool, shape (m,), optional
         Which tie points may be under water; all by default.
+    level_sigma_m : float
+        Standard deviation of the water level; infinite where it is to be found.
 
     Raises
     ------
@@ -97,7 +100,7 @@ def block_of(
     names: tuple[str, ...] = ()
     is_check = np.zeros(0, np.bool_)
     if control is not None:
-        _check_under_water(control, water)
+        _check_under_water(control, water, level_sigma_m)
         names, is_check = control.names, control.is_check
         parts.append(_control_part(control))
     allowed = np.ones(m, np.bool_) if wet is None else wet
@@ -139,11 +142,14 @@ def _control_part(
     return control.xyz, start, control.camera[order], control.image_xy[order], sigma
 
 
-def _check_under_water(control: GroundControl, water: WaterSurface | None) -> None:
+def _check_under_water(
+    control: GroundControl, water: WaterSurface | None, level_sigma_m: float
+) -> None:
     if water is None:
         return
     level = surface_above(water, control.xyz).height_m
-    deep = (control.xyz[:, 2] < level - 3.0 * control.sigma_m[:, 2]) & ~control.under_water
+    least = level - 3.0 * np.hypot(control.sigma_m[:, 2], level_sigma_m)
+    deep = (control.xyz[:, 2] < least) & ~control.under_water
     if deep.any():
         i = int(np.argmax(deep))
         raise GeometryError(
@@ -179,8 +185,8 @@ def usable_ties(
     """
     counts = np.diff(ties.views.start)
     good = np.isfinite(ties.xyz).all(axis=1) & (counts >= LEAST_VIEWS)
-    good &= _ray_angle_deg(ties, cameras) >= LEAST_ANGLE_DEG
     rows = np.flatnonzero(good)
+    rows = rows[_ray_angle_deg(taken(ties, rows), cameras) >= LEAST_ANGLE_DEG]
     if len(rows) > most:
         rows = np.sort(np.random.default_rng(seed).choice(rows, most, replace=False))
     return taken(ties, rows)

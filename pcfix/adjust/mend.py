@@ -122,7 +122,10 @@ def mend(
         if gain > chi2.isf(SURE, extra * len(chosen.problem.groups)):
             chosen = more
     notes.append(_said(chosen, candidates, lens_sets))
-    return adjusted_of(chosen.problem, chosen.found, None, notes, "cloud", "unaware")
+    found = adjusted_of(chosen.problem, chosen.found, None, notes, "cloud", "unaware")
+    # the points of the cloud say nothing of noise: GNSS and control points are all there is
+    free = max(chosen.observations - 7, 1)
+    return replace(found, sigma0=float(np.sqrt(chosen.mean)), redundancy=free)
 
 
 def _said(

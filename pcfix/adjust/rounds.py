@@ -147,8 +147,15 @@ def adjust_ties(
     return adjusted_of(problem, now, precision, notes, "tie points", rounds.engine)
 
 
-def check_datum(block: Block, unknowns: Unknowns) -> None:
+def check_datum(block: Block, unknowns: Unknowns, reason: str = "") -> None:
     """Check that something says where the block is.
+
+    Parameters
+    ----------
+    block : Block
+    unknowns : Unknowns
+    reason : str
+        Why GNSS positions that there are do not count.
 
     Raises
     ------
@@ -167,7 +174,7 @@ def check_datum(block: Block, unknowns: Unknowns) -> None:
         f" {gnss} GNSS positions, {control} control points in two images or more and {fixed} fixed"
         " images; shift in plan, turn and scale stay undetermined, and with them the heights."
         " Give --gnss or --gcps with three points at least, or --datum free to keep mean place,"
-        " direction and scale of the old projection centres."
+        " direction and scale of the old projection centres." + (f" {reason}" if reason else "")
     )
 
 

@@ -43,11 +43,13 @@ if TYPE_CHECKING:
 LOSSES = {"squares": SQUARES, "huber": HUBER, "cauchy": CAUCHY}
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e8
 MOST_STEPS = 60
-CLOSE = 1e-12
+CLOSE = 1e-10
 """Of the cost, relative: two steps in a row that gain less end the last round."""
 
 EXACT = 1e-10
 """Squared residual, in variances, below which an observation is met exactly."""
+
+ROUNDING = 1e-12
 
 NETWORK_SIGMA_M = 1e-4
 """How tightly the mean of the projection centres is held in a free network."""
@@ -293,7 +295,8 @@ def _undetermined(problem: Problem) -> list[int]:
 
     A water surface whose level or tilt does not move freely tells the height or tilt of the block.
     """
-    if not (problem.surface.there and problem.block.wet.any()):
+    bends = problem.block.refractive_index != 1.0 or problem.unknowns.index_sigma > 0.0
+    if not (problem.surface.there and bends and problem.block.wet.any()):
         return list(range(7))
     level, tilt = problem.unknowns.level_sigma_m, problem.unknowns.tilt_sigma
     rows = [0, 1, 5, 6]
@@ -353,6 +356,8 @@ def solve(
             trial = _trial(problem, now, loss, damping, sums, extra)
             if trial is not None and trial.cost <= now.cost:
                 break
+            if trial is not None and trial.cost - now.cost < ROUNDING * max(now.cost, least_cost):
+                return replace(now, log=log)  # the cost is known no better than this
             damping, up = damping * up, 2.0 * up
             if damping > MOST_DAMPING:
                 if trial is None and step == 0:

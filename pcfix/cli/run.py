@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,6 +18,15 @@ from pcfix.cli.words import (
     progress_bar,
 )
 from pcfix.settings import ErrorBudget
+
+
+class Adjusting(str, Enum):  # noqa: UP042 - typer shows the values of a str Enum
+    """Whether the cameras are adjusted first."""
+
+    auto = "auto"
+    yes = "yes"
+    no = "no"
+
 
 Input = Annotated[
     Path | None, typer.Argument(metavar="INPUT", help="LAS or LAZ cloud.", show_default=False)
@@ -35,6 +45,26 @@ Reference = Annotated[
 Resolution = Annotated[
     float | None, typer.Option(help="Of the rasters, m.", show_default="4 points a cell")
 ]
+Adjust = Annotated[
+    Adjusting,
+    typer.Option(
+        help="First adjust the cameras with the light bent at the water, as 'pcfix adjust'; auto:"
+        " where they have absorbed the refraction, and GNSS or --gcps say where they are."
+    ),
+]
+Gcps = Annotated[
+    Path | None, typer.Option(help="For --adjust: control points, as of 'pcfix adjust'.")
+]
+Gnss = Annotated[
+    Path | None,
+    typer.Option(
+        help="For --adjust: GNSS positions of the images, as of 'pcfix adjust'.",
+        show_default="what the cameras have",
+    ),
+]
+LensFile = Annotated[
+    Path | None, typer.Option(help="For --adjust: calibrated lens, as of 'pcfix adjust'.")
+]
 Config = Annotated[Path | None, typer.Option(help="run.json of an earlier run, to repeat it.")]
 
 
@@ -48,17 +78,22 @@ def run(
     reference: Reference = None,
     resolution: Resolution = None,
     m3c2: WithM3c2 = False,
+    adjust: Adjust = Adjusting.auto,
+    gcps: Gcps = None,
+    gnss: Gnss = None,
+    lens: LensFile = None,
     config: Config = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     jobs: Jobs = None,
 ) -> None:
-    """Correct, clean, grid, compare and report; resumes where it stopped.
+    """Adjust, correct, clean, grid, compare and report; resumes where it stopped.
 
     With --config give only the folder: pcfix run OUT_DIR --config run.json.
     """
     from pcfix.flow.run import Request, request_of, run_all
 
+    survey = {"gcps": gcps, "gnss": gnss, "lens": lens}
     if config is not None:
         folder = out_dir or input
         if folder is None or cameras is not None or water is not None:
@@ -76,6 +111,8 @@ def run(
             **{name: _plain(value) for name, value in words.keywords().items()},
             resolution_m=resolution,
             m3c2=m3c2,
+            adjust=adjust.value,
+            **{name: _plain(path) for name, path in survey.items()},
         )
 
     def say(text: str) -> None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pcfix.errors import PcfixWarning
 from pcfix.flow.adjust_files import checked_folder, write_adjustment
 from pcfix.flow.adjust_job import AdjustJob, AdjustSettings, Survey
 from pcfix.flow.inputs import Inputs
@@ -109,8 +107,6 @@ def adjust_cameras(
     view = None if cloud is None else view_of(check_input(cloud))
     job = AdjustJob(inputs, how, view, Survey(gcps, gnss, lens, gcps_crs, gnss_crs))
     found = job.adjusted(progress)
-    for note in found.notes:
-        warnings.warn(note, PcfixWarning, stacklevel=2)
     if target is not None:
         write_adjustment(target, found, str(model), overwrite=overwrite)
     return found

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 
 from pcfix.adjust.block import Unknowns
+from pcfix.adjust.control_fit import check_control, check_marks
 from pcfix.adjust.gather import (
     FIRST_SIGMA_PX,
     Datum,
@@ -21,13 +22,14 @@ from pcfix.adjust.gather import (
     well_seen,
 )
 from pcfix.adjust.mend import Candidate, mend
-from pcfix.adjust.rounds import Engine, Rounds, adjust_ties, default_lens
+from pcfix.adjust.rounds import Engine, Rounds, adjust_ties, check_datum, default_lens
 from pcfix.adjust.separability import strong_correlations, undetermined
 from pcfix.adjust.state import CODES
 from pcfix.errors import GeometryError, InputError, SettingError
 from pcfix.flow.carrying import in_frame
 from pcfix.flow.inputs import mask_of
 from pcfix.io.cameras.table.sensor import read_sensor
+from pcfix.io.earth import is_topocentric
 from pcfix.io.files import check_input
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
@@ -177,17 +179,21 @@ class AdjustJob:
         """
         self.inputs, self.how, self.view = inputs, how, view
         self.name = str(inputs.cameras) if isinstance(inputs.cameras, str | Path) else "cameras"
-        crs = None if view is None else view.crs
-        self.old, self.list = inputs.block(crs)
+        read = inputs.read()
+        self.crs = crs = _own_crs(read) if view is None else view.crs
+        self.old, self.list = inputs.block(crs, read)
         if self.old.rotations is None or self.old.lenses is None:
             raise InputError(
                 f"{self.name}: an adjustment needs angles and a lens of every image; give the"
                 " project or model of the software, or --sensor."
             )
         self.water = None if inputs.water is None else inputs.surface(view).surface
+        self._check_images()
         self.n = index_of(how.refractive_index)[0]
         self.notes: list[str] = []
+        self.no_gnss = ""
         self.gnss = self._datum(survey.gnss, survey.gnss_crs)
+        self.control_name = "gcps" if isinstance(survey.gcps, GroundControl) else str(survey.gcps)
         self.control = self._control(survey.gcps, survey.gcps_crs)
         self.calibrated = None if survey.lens is None else read_sensor(check_input(survey.lens))
         self.start = self._start()
@@ -198,13 +204,36 @@ class AdjustJob:
                 low, high = view.low, view.high
             self.mask = mask_of(inputs.water_mask, crs or self.old.crs, low[:2], high[:2])
 
+    def _check_images(self) -> None:
+        """Check that the images named are there, and that the cameras are above the water."""
+        missing = [name for name in self.how.fixed_images if name not in self.old.labels]
+        if missing:
+            raise SettingError(
+                f"fixed image {missing[0]} is not in the model, which has {len(self.old)} images,"
+                f" the first {self.old.labels[0]}."
+            )
+        if self.water is None:
+            return
+        level = surface_above(self.water, self.old.centres).height_m
+        wet = np.flatnonzero(level > self.old.centres[:, 2])
+        if len(wet):
+            i = int(wet[0])
+            raise GeometryError(
+                f"{self.name}: {len(wet)} of {len(self.old)} cameras are under the water, the"
+                f" first {self.old.labels[i]} at {self.old.centres[i, 2]:.2f} m; check the water"
+                " level, its CRS and that of the cameras; for images taken under water give --port."
+            )
+
     def _control(
         self, gcps: AnyPath | GroundControl | None, crs: str | None
     ) -> GroundControl | None:
-
-        if gcps is None or isinstance(gcps, GroundControl):
-            return gcps
-        return read_ground_control(gcps, self.old, crs=crs)
+        if gcps is None:
+            return None
+        if not isinstance(gcps, GroundControl):
+            gcps = read_ground_control(gcps, self.old, crs=crs)
+        if self.water is not None:
+            check_marks(gcps, self.old, self.control_name)
+        return gcps
 
     def _datum(self, path: AnyPath | None, crs: str | None) -> Datum:
         """Return GNSS positions in the block's frame, with standard deviations."""
@@ -220,6 +249,7 @@ class AdjustJob:
             self.notes.append(f"{error} The GNSS positions are left out.")
             return no_datum(len(cameras))
         if found.reason:
+            self.no_gnss = found.reason
             self.notes.append(found.reason)
         known = np.isfinite(found.xyz)
         if not known.any():
@@ -274,12 +304,18 @@ class AdjustJob:
             )
         else:
             found = self._by_cloud(progress)
+        if self.control is not None:
+            check_control(found, self.control_name)
         return replace(found, notes=[*self.notes, *found.notes])
 
     def _tie_points(self) -> TiePoints | None:
 
-        found = self.inputs.tie_points(None if self.view is None else self.view.crs)
+        found = self.inputs.tie_points(self.crs)
         return None if found is None else usable_ties(found, self.old)
+
+    @property
+    def _level_sigma_m(self) -> float:
+        return self.how.unknowns(()).level_sigma_m
 
     def _allowed(self, xyz: FloatArray) -> BoolArray | None:
         return None if self.mask is None else self.mask.inside(xyz[:, 0], xyz[:, 1])
@@ -289,12 +325,13 @@ class AdjustJob:
         how = self.how
         block = block_of(
             self.start, ties, how.sigma_px or FIRST_SIGMA_PX, self.water, self.n, self.gnss,
-            self.control, self._allowed(ties.xyz), self.inputs.port,
+            self.control, self._allowed(ties.xyz), self.inputs.port, self._level_sigma_m,
         )  # fmt: skip
         lens = how.lens_unknowns
         if lens is None:
             lens = () if self.calibrated is not None else default_lens(self.start.lenses or ())
         unknowns = how.unknowns(lens)
+        check_datum(block, unknowns, self.no_gnss)
         self._check_wet(block.xyz[: len(ties.xyz)])
         block = restricted(block, self._kept(block))
         rounds = Rounds(how.sigma_px, how.outliers, how.lens_unknowns is None, how.engine)
@@ -367,8 +404,9 @@ class AdjustJob:
                 continue
             block = block_of(
                 self.start, ties, FIRST_SIGMA_PX, self.water, self.n, self.gnss, self.control,
-                self._allowed(ties.xyz), self.inputs.port,
+                self._allowed(ties.xyz), self.inputs.port, self._level_sigma_m,
             )  # fmt: skip
+            check_datum(block, self.how.unknowns(()), self.no_gnss)
             apparent = ties.xyz
             if self.control is not None:
                 apparent = np.vstack([apparent, self.control.xyz])
@@ -427,6 +465,12 @@ _EXPORTS = (
     " (.psx, .psz) or its BlocksExchange export with tie points, Pix4D's project with its"
     " pmatrix and tie points, or Bundler's .out have them."
 )
+
+
+def _own_crs(cameras: Cameras) -> str | None:
+    """Return the CRS in which a model without a cloud is adjusted: its own, where it is one."""
+    own = cameras.crs
+    return None if own is None or is_topocentric(own) else own
 
 
 def _check_datum_offset(off: FloatArray, sigma: FloatArray, name: str) -> None:

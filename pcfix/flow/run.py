@@ -1,4 +1,4 @@
-"""The whole way in one call: correct, clean, grid, compare, report."""
+"""The whole way in one call: adjust, correct, clean, grid, compare, report."""
 
 from __future__ import annotations
 
@@ -17,6 +17,15 @@ from pcfix.flow.files import correct_file
 from pcfix.flow.inputs import Inputs, file_of
 from pcfix.flow.old_cameras import read_blocks
 from pcfix.flow.report import write_report
+from pcfix.flow.run_adjust import (
+    FOLDER,
+    adjust_first,
+    check_survey,
+    figures_of,
+    is_worth_saying,
+    outputs_of,
+    with_adjusted,
+)
 from pcfix.flow.steps import Record, read_record
 from pcfix.flow.surfaces import view_of
 from pcfix.io.clouds import own_water
@@ -27,12 +36,18 @@ from pcfix.io.rasters import open_raster
 from pcfix.model import Summary
 from pcfix.refract.index import index_of
 from pcfix.report.evaluation import evaluation, in_a_sentence
+from pcfix.report.run_adjustment import (
+    adjustment_sentence,
+    adjustment_table,
+    reason_sentence,
+)
 from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, ErrorBudget, LabelSettings, Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from pcfix.flow.comparison import Comparison
+    from pcfix.flow.run_adjust import AdjustWhen
     from pcfix.flow.surfaces import WaterModel
     from pcfix.io.cameras.formats import Angles
     from pcfix.report.page import Picture, Table
@@ -70,6 +85,12 @@ class Request:
     respect_classes, refractive_index, max_angle_deg, max_cameras, method, camera_set, matcher,
     views_are, occlusion, depth_factor, check_depths, least_r2
         See `pcfix.correct_file`; files by their paths.
+    adjust : {"auto", "yes", "no"}
+        Whether the cameras are adjusted first, with the light bent at the water. auto: where they
+        have absorbed the refraction (see `pcfix.adjust.diagnosis`), and GNSS positions or control
+        points say where the block is.
+    gcps, gnss, lens : str or None
+        See `pcfix.adjust_cameras`.
     errors : dict or None
         The values of an `pcfix.ErrorBudget`.
     reference : str or None
@@ -109,6 +130,10 @@ class Request:
     depth_factor: float | None = None
     check_depths: str | None = None
     least_r2: float = 0.5
+    adjust: AdjustWhen = "auto"
+    gcps: str | None = None
+    gnss: str | None = None
+    lens: str | None = None
     errors: dict[str, float | None] | None = None
     resolution_m: float | None = None
     m3c2: bool = False
@@ -117,6 +142,7 @@ class Request:
         """Check the values."""
         self.settings()
         self.label()
+        check_survey(self)
         if self.resolution_m is not None and not 0.0 < self.resolution_m < math.inf:
             raise SettingError(f"resolution {self.resolution_m:g} is not positive; give metres.")
         if self.m3c2 and self.reference is None:
@@ -151,6 +177,7 @@ class Request:
         mask = None if self.water_mask is None else str(file_of(self.water_mask))
         names = [self.input, self.cameras, self.sensor, self.views, mask, self.reference]
         names += [self.tide, self.image_times, self.check_depths, self.adjusted_from]
+        names += [self.gcps, self.gnss, self.lens]
         found = [path for name in names if name is not None for path in files_in(name)]
         return [*found, Path(self.water)] if Path(self.water).is_file() else found
 
@@ -158,7 +185,8 @@ class Request:
 def request_of(record: Path) -> Request:
     """Return what an earlier run was asked for, from its ``run.json``."""
     try:
-        return Request(**read_record(record)["request"])
+        # runs before there were adjustments did without
+        return Request(**{"adjust": "no", **read_record(record)["request"]})
     except TypeError as error:
         raise InputError(f"{record}: is not the record of a run ({error}).") from error
 
@@ -239,7 +267,15 @@ def run_all(
         say(f"{name:<9} {'done before' if was_done else 'done'}: {outputs[0]}")
         return result
 
+    first, was_done = record.step(
+        "adjust", outputs_of(out_dir), lambda: adjust_first(request, out_dir, jobs)
+    )
+    _say_adjusted(first, out_dir, was_done, say)
+    request = with_adjusted(request, out_dir, first)
     corrected = step("correct", [files.corrected], lambda: _correct(request, files, jobs, progress))
+    if not first["is_said"] and is_worth_saying(first, corrected["warnings"]):
+        first = {**first, "is_said": True}
+        _say_adjusted(first, out_dir, was_done, say)
     step("clean", [files.cleaned], lambda: _clean(request, files, jobs))
     step("dsm", [files.dsm, files.dsm_bed, files.hillshade], lambda: _grid(request, files))
     compared = None
@@ -247,8 +283,20 @@ def run_all(
         compared = step(
             "compare", [files.compare / "compare.json"], lambda: _compare(request, files)
         )
-    step("report", [files.report], lambda: _report(request, files, inputs, corrected, compared))
+    done = {"adjust": first, "correct": corrected, "compare": compared}
+    step("report", [files.report], lambda: _report(request, files, inputs, done))
     return files.report
+
+
+def _say_adjusted(
+    first: dict[str, Any], out_dir: Path, was_done: bool, say: Callable[[str], None]
+) -> None:
+    """Say what came of the adjustment; nothing where there was no question of one."""
+    if first["adjusted"]:
+        say(f"{'adjust':<9} {'done before' if was_done else 'done'}: {outputs_of(out_dir)[0]}")
+        say(f"{'':<9} {adjustment_sentence(figures_of(out_dir))}")
+    elif first["is_said"]:
+        say(f"{'adjust':<9} not done: {first['why']}")
 
 
 def _correct(
@@ -344,15 +392,16 @@ def _report(
     request: Request,
     files: Files,
     inputs: list[Path],
-    corrected: dict[str, Any],
-    compared: dict[str, Any] | None,
+    done: dict[str, Any],
 ) -> str:
-    more: tuple[list[Picture], list[Table]] = [], []
-    verdict = ""
+    pictures: list[Picture] = []
+    tables: list[Table] = []
+    first, compared = done["adjust"], done["compare"]
+    verdict = reason_sentence(first["adjusted"], first["why"]) if first["is_said"] else ""
     if compared is not None:
         dod = preview(files.compare / DOD) if _rasters(request) else None
-        more = evaluation(compared["figures"], compared["sections"], dod)
-        verdict = in_a_sentence(compared["figures"])
+        pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
+        verdict += in_a_sentence(compared["figures"])
     inputs_again = Inputs(**{**request.inputs(), "views": None})
     with warnings.catch_warnings():  # they were shown when the cloud was corrected
         warnings.simplefilter("ignore", PcfixWarning)
@@ -363,12 +412,19 @@ def _report(
     page = write_report(
         files.corrected,
         files.folder,
-        summary=Summary(**corrected),
+        summary=Summary(**done["correct"]),
         cameras=cameras,
         water=water or inputs_again.surface(view).surface,
         inputs=inputs,
-        more=more,
+        more=(pictures, [*_adjusted_table(first, files.folder), *tables]),
         verdict=verdict,
         overwrite=True,
     )
     return str(page)
+
+
+def _adjusted_table(first: dict[str, Any], folder: Path) -> list[Table]:
+    """Return what the adjustment changed, where there was one."""
+    if not first["adjusted"]:
+        return []
+    return [adjustment_table(figures_of(folder), f"{FOLDER}/report.html")]

@@ -102,8 +102,6 @@ class Sight(NamedTuple):
         Height of the water of each image over the point, along the normal, metres.
     normal : array, shape (3,)
         Of the water, upward.
-    images : Images
-    matcher : Matcher
     n : float
         Refractive index.
     """
@@ -112,21 +110,19 @@ class Sight(NamedTuple):
     made: FloatArray
     above: FloatArray
     normal: FloatArray
-    images: Images
-    matcher: Matcher
     n: float
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def sight_of(
     point: FloatArray, made_point: FloatArray, centres: FloatArray, height: float,
-    normal: FloatArray, offset: FloatArray, images: Images, matcher: Matcher, n: float,
+    normal: FloatArray, offset: FloatArray, images: Images, n: float,
 ) -> Sight:  # fmt: skip
     """Return what the images have of a point, shape (3,), with the water above it."""
     up = centres - point
     made = images.centres - made_point if len(images.centres) else up
     above = normal[2] * (height - point[2] + offset)
-    return Sight(up, made, above, normal, images, matcher, n)
+    return Sight(up, made, above, normal, n)
 
 
 def arrays_of(bundle: Bundle) -> tuple[Any, ...]:
@@ -180,18 +176,16 @@ def _invert(
         place = np.full(len(centres), ABSENT)
         found = np.empty(len(centres), np.int64)
         for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(xyz))):
-            sight = sight_of(
-                xyz[i], made_xyz[i], centres, height[i], normals[i], offset, images, matcher, n
-            )
+            sight = sight_of(xyz[i], made_xyz[i], centres, height[i], normals[i], offset, images, n)
             listed = camera[start[i] : start[i + 1]]
             given = weight[start[i] : start[i + 1]] if weight.size else weight
             maps = found[: _with_neighbours(found, place, listed, sight.made, matcher)]
-            bed, t, slope = lines(maps, sight)
+            bed, t, slope = lines(maps, sight, images, matcher)
             counts, step = np.zeros(maps.size), 0.0
             for _ in range(_ROUNDS):
                 _share(counts, place, listed, given, sight.made, t + slope * step, matcher)
                 step = balance(t, slope, counts)
-            settle_bed(result[i], maps, counts, t, slope, bed, sight)
+            settle_bed(result[i], maps, counts, t, slope, bed, sight, images, matcher)
             place[maps] = ABSENT
             for c in listed:
                 for a in matcher.averaged[c]:
@@ -258,7 +252,9 @@ def averages(own: int, a: int, now: FloatArray, place: IntArray) -> bool:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def lines(maps: IntArray, sight: Sight) -> tuple[float, FloatArray, FloatArray]:
+def lines(
+    maps: IntArray, sight: Sight, images: Images, matcher: Matcher
+) -> tuple[float, FloatArray, FloatArray]:
     """Return how the depth of each map changes with the height of the bed, nearly in a line.
 
     Returns
@@ -272,11 +268,11 @@ def lines(maps: IntArray, sight: Sight) -> tuple[float, FloatArray, FloatArray]:
     deep = -sight.above.mean() / sight.normal[2] * (sight.n - 1.0)
     bed, rise = 1.1 * deep, min(0.1 * deep, -LEAST_RISE_M)
     t, slope = np.empty(maps.size), np.empty(maps.size)
-    out, work = np.empty(5), np.empty((sight.matcher.matched.shape[1], 3))
+    out, work = np.empty(5), np.empty((matcher.matched.shape[1], 3))
     for q in range(maps.size):
-        _look(out, maps[q], bed, sight, work)
+        _look(out, maps[q], bed, sight, images, matcher, work)
         t[q] = out[0]
-        _look(out, maps[q], bed + rise, sight, work)
+        _look(out, maps[q], bed + rise, sight, images, matcher, work)
         slope[q] = (out[0] - t[q]) / rise
         usual = 1.0 / (sight.n * sight.made[maps[q], 2])
         if slope[q] == slope[q] and not 0.5 < -slope[q] / usual < 2.0:
@@ -297,7 +293,7 @@ def balance(t: FloatArray, slope: FloatArray, weight: FloatArray) -> float:
 @njit(cache=True, error_model="numpy", nogil=True)
 def settle_bed(
     row: FloatArray, maps: IntArray, weight: FloatArray, t: FloatArray, slope: FloatArray,
-    bed: float, sight: Sight,
+    bed: float, sight: Sight, images: Images, matcher: Matcher,
 ) -> None:  # fmt: skip
     """Find the height of the bed at which the fused depths give the apparent point, and write it.
 
@@ -305,14 +301,14 @@ def settle_bed(
     """
     row[OUTCOME] = _NO_CAMERA if maps.size == 0 else _ONE_CAMERA
     step = balance(t, slope, weight)
-    looks, work = np.empty((maps.size, 5)), np.empty((sight.matcher.matched.shape[1], 3))
+    looks, work = np.empty((maps.size, 5)), np.empty((matcher.matched.shape[1], 3))
     for _ in range(MAX_LOOKS):
         if not np.isfinite(step):
             return
         bed += step
         for q in range(maps.size):
             if weight[q] > 0.0:
-                _look(looks[q], maps[q], bed, sight, work)
+                _look(looks[q], maps[q], bed, sight, images, matcher, work)
             else:
                 looks[q, 0] = 0.0
         step = balance(looks[:, 0], slope, weight)
@@ -333,14 +329,17 @@ def settle_bed(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _look(out: FloatArray, c: int, bed: float, sight: Sight, work: FloatArray) -> None:
+def _look(
+    out: FloatArray, c: int, bed: float, sight: Sight, images: Images, matcher: Matcher,
+    work: FloatArray,
+) -> None:  # fmt: skip
     """Say where the depth map of image c has a bed at a height relative to the apparent point.
 
     Writes how far beyond P, relative to the distance from the camera, the place on the bed, and how
     that moves with the height.
     """
     normal = sight.normal
-    ax, ay, az, ex, ey, ez, above = _ray(c, sight)
+    ax, ay, az, ex, ey, ez, above = _ray(c, sight, images)
     length2 = ex * ex + ey * ey + ez * ez
     across = normal[0] * ex + normal[1] * ey + normal[2] * ez
     wet = sight.above[c] > 0.0
@@ -351,44 +350,46 @@ def _look(out: FloatArray, c: int, bed: float, sight: Sight, work: FloatArray) -
     s = (bed - az) / dz
     out[1], out[2] = ax + s * dx, ay + s * dy
     out[3], out[4] = dx / dz, dy / dz
-    made = sight.made[c]
-    length = np.sqrt(made[0] * made[0] + made[1] * made[1] + made[2] * made[2])
+    mx, my, mz = sight.made[c, 0], sight.made[c, 1], sight.made[c, 2]
+    length = np.sqrt(mx * mx + my * my + mz * mz)
     t = _depth(
-        c, out[1], out[2], bed, -made[0] / length, -made[1] / length, -made[2] / length, sight, work
-    )
+        c, out[1], out[2], bed, -mx / length, -my / length, -mz / length, sight, images, matcher,
+        work,
+    )  # fmt: skip
     out[0] = t / length
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _ray(c: int, sight: Sight) -> tuple[float, float, float, float, float, float, float]:
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def _ray(
+    c: int, sight: Sight, images: Images
+) -> tuple[float, float, float, float, float, float, float]:
     """Return the ray on which image c shows the point.
 
     Where it passes the point, relative to it, the way from there to the projection centre, and how
     high the water is over there.
     """
-    up = sight.up[c]
-    if len(sight.images.centres) == 0:
-        return 0.0, 0.0, 0.0, up[0], up[1], up[2], sight.above[c]
-    made, normal = sight.made[c], sight.normal
-    dx, dy, dz = as_now(sight.images, c, -made[0], -made[1], -made[2])
-    along = (up[0] * dx + up[1] * dy + up[2] * dz) / (dx * dx + dy * dy + dz * dz)
+    up, made, normal = sight.up, sight.made, sight.normal
+    if len(images.centres) == 0:
+        return 0.0, 0.0, 0.0, up[c, 0], up[c, 1], up[c, 2], sight.above[c]
+    dx, dy, dz = as_now(images, c, -made[c, 0], -made[c, 1], -made[c, 2])
+    along = (up[c, 0] * dx + up[c, 1] * dy + up[c, 2] * dz) / (dx * dx + dy * dy + dz * dz)
     ex, ey, ez = along * dx, along * dy, along * dz
-    ax, ay, az = up[0] - ex, up[1] - ey, up[2] - ez
+    ax, ay, az = up[c, 0] - ex, up[c, 1] - ey, up[c, 2] - ez
     above = sight.above[c] - (normal[0] * ax + normal[1] * ay + normal[2] * az)
     return ax, ay, az, ex, ey, ez, above
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 def _depth(
     c: int, qx: float, qy: float, qz: float, ux: float, uy: float, uz: float, sight: Sight,
-    work: FloatArray,
+    images: Images, matcher: Matcher, work: FloatArray,
 ) -> float:  # fmt: skip
     """Return how far beyond P, m along its ray u, the depth map of image c has the bed at Q.
 
     NaN where none of the images that it was matched with sees Q. The light goes as it does; where
     it seems to come from, and P and u, are as the matcher had them.
     """
-    count, matcher = 0, sight.matcher
+    count = 0
     nx, ny, nz = sight.normal[0], sight.normal[1], sight.normal[2]
     for j in matcher.matched[c]:
         if j < 0:
@@ -397,7 +398,7 @@ def _depth(
         k, _, _, _, sx, sy, sz = light_path(
             qx, qy, qz, ex, ey, ez, nx, ny, nz, sight.above[j], sight.n
         )
-        ax, ay, az = as_made(sight.images, j, k * sx - nx, k * sy - ny, k * sz - nz)
+        ax, ay, az = as_made(images, j, k * sx - nx, k * sy - ny, k * sz - nz)
         if not (k == k and holds(matcher.inner, j, -ax, -ay, -az)):
             continue
         size = 1.0 / np.sqrt(ax * ax + ay * ay + az * az)

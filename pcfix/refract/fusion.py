@@ -97,10 +97,8 @@ def _likely(
         place = np.full(len(centres), -1)
         for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(xyz))):
             maps = camera[start[i] : start[i + 1]]
-            sight = sight_of(
-                xyz[i], made_xyz[i], centres, height[i], normals[i], offset, images, matcher, n
-            )
-            bed, t, slope = lines(maps, sight)
+            sight = sight_of(xyz[i], made_xyz[i], centres, height[i], normals[i], offset, images, n)
+            bed, t, slope = lines(maps, sight, images, matcher)
             weight = np.empty(maps.size)
             _set(place, maps)
             for seed in range(maps.size):
@@ -123,10 +121,8 @@ def _invert(
         place = np.full(len(centres), -1)
         for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(xyz))):
             maps = camera[start[i] : start[i + 1]]
-            sight = sight_of(
-                xyz[i], made_xyz[i], centres, height[i], normals[i], offset, images, matcher, n
-            )
-            bed, t, slope = lines(maps, sight)
+            sight = sight_of(xyz[i], made_xyz[i], centres, height[i], normals[i], offset, images, n)
+            bed, t, slope = lines(maps, sight, images, matcher)
             weight = np.zeros(maps.size)
             _set(place, maps)
             seed, result[i, AMBIGUITY] = _best_seed(
@@ -135,7 +131,7 @@ def _invert(
             if seed >= 0:
                 _group(weight, seed, maps, place, t, slope, sight.made, matcher)
             place[maps] = -1
-            settle_bed(result[i], maps, weight, t, slope, bed, sight)
+            settle_bed(result[i], maps, weight, t, slope, bed, sight, images, matcher)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -102,7 +102,7 @@ def _are_equal(made: Cameras, now: Cameras) -> bool:
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 def as_made(images: Images, c: int, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Return where the matcher had what camera c sees in a direction, both in the world frame.
 

@@ -12,9 +12,10 @@ from pcfix.io.views import ViewMatch, read_views
 from pcfix.label.surface import surface_above
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.refract.bed import WIDTH_M, Bed, bed_of
-from pcfix.refract.depth_maps import _best_pairs, _depth
+from pcfix.refract.depth_maps import _best_pairs, _depth, sight_of
 from pcfix.refract.frames import frames_of
 from pcfix.refract.learned import Learned
+from pcfix.refract.made_with import images_of
 from pcfix.refract.matcher import Matcher
 from pcfix.refract.methods import correct
 from pcfix.settings import Settings
@@ -107,10 +108,9 @@ def test_a_depth_is_that_of_a_slow_twin(c):
     costs = costs_of(p, u, q, CAMERAS, partners, planes, N_WATER, "angles")
     normal = np.array([-plane[1], -plane[2], 1.0]) / np.sqrt(1 + plane[1] ** 2 + plane[2] ** 2)
     height = plane[0] + plane[1] * p[0] + plane[2] * p[1]
-    found = _depth(
-        c, *(q - p), *u, CAMERAS.centres - p, normal[2] * (height - p[2] + offset), normal,
-        matcher(), N_WATER, np.empty((5, 3)),
-    )  # fmt: skip
+    images = images_of(None, CAMERAS)
+    sight = sight_of(p, p, CAMERAS.centres, height, normal, offset, images, N_WATER)
+    found = _depth(c, *(q - p), *u, sight, images, matcher(), np.empty((5, 3)))
     # 0.3 to 1 m; scipy's least values are flat within 1e-6 m
     assert found == pytest.approx(slow_depth(costs, TOLERANCE), abs=5e-6)
 

@@ -68,7 +68,11 @@ def clear_of_the_waterline(scene: TieScene, by_m: float) -> TieScene:
     """
     water = scene.water
     level = water.a + scene.truth[:, :2] @ [water.b, water.c]
-    rows = np.flatnonzero(np.abs(scene.truth[:, 2] - level) > by_m)
+    return some_ties(scene, np.flatnonzero(np.abs(scene.truth[:, 2] - level) > by_m))
+
+
+def some_ties(scene: TieScene, rows) -> TieScene:
+    """Return a scene with some of its tie points, in the given order."""
     views, start = scene.views.take(rows), scene.views.start
     seen = np.concatenate([np.arange(start[row], start[row + 1]) for row in rows])
     ties = TiePoints(scene.truth[rows], views, scene.ties.image_xy[seen])

@@ -1,0 +1,267 @@
+"""The first step of a run: poses that have absorbed the refraction are adjusted before all else."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+
+import numpy as np
+
+from pcfix.adjust.diagnosis import MOST_STATED_M
+from pcfix.errors import PcfixError, PcfixWarning, SettingError
+from pcfix.flow.adjust import adjust_cameras
+from pcfix.flow.adjust_files import SUMMARY
+from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, ties_of
+from pcfix.flow.inputs import Inputs
+from pcfix.flow.surfaces import view_of
+from pcfix.flow.survey_signs import Evidence
+from pcfix.io.files import check_input, read_json
+from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
+from pcfix.io.ground_control import read_ground_control
+from pcfix.model import WaterDimension
+from pcfix.refract.index import index_of
+from pcfix.refract.threads import threads
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from pcfix.adjust.diagnosis import Diagnosis
+    from pcfix.flow.run import Request
+    from pcfix.flow.surfaces import CloudView
+    from pcfix.model import Cameras, WaterSurface
+
+AdjustWhen = Literal["auto", "yes", "no"]
+FOLDER = "adjusted"
+MODELS = ("colmap", "opensfm/reconstruction.json", "cameras.csv")
+"""What an adjustment leaves, in the order in which a run takes it."""
+
+LEAST_POSITIONS = 3
+"""Of the GNSS, that say where a block is, how it is turned, and its scale."""
+
+BENT = "have absorbed the refraction"
+"""In the warning of `pcfix.adjust.diagnosis.Diagnosis.sentence`."""
+
+
+class Decision(NamedTuple):
+    """Whether a run adjusts, why, and whether that is worth a line."""
+
+    adjust: bool
+    why: str
+    is_said: bool = True
+
+
+def outputs_of(folder: Path) -> list[Path]:
+    """Return what an adjustment may leave in the folder of a run, its report first."""
+    at = folder / FOLDER
+    names = ("cameras.bin", "images.bin", "points3D.bin", "georeference.json")
+    more = [*(f"colmap/{name}" for name in names), "opensfm/reconstruction.json", "cameras.csv"]
+    return [at / "report.html", at / SUMMARY, *(at / name for name in more)]
+
+
+def check_survey(request: Request) -> None:
+    """Refuse words that do not go with each other.
+
+    Raises
+    ------
+    SettingError
+        If nothing will be adjusted by the survey, or what is asked for cannot be adjusted.
+    """
+    if request.adjust not in get_args(AdjustWhen):
+        words = ", ".join(get_args(AdjustWhen))
+        raise SettingError(f"adjust '{request.adjust}' must be among {words}.")
+    if request.adjust == "no" and _survey(request):
+        raise SettingError(
+            f"{_survey(request)[0]} is of use to an adjustment only; leave it out, or let --adjust"
+            " be auto or yes."
+        )
+    if request.adjust == "yes" and (why := _unfit(request)):
+        raise SettingError(f"adjust yes: {why}; leave one of the two out.")
+
+
+def _survey(request: Request) -> list[str]:
+    """Return the names of the files that were given for an adjustment alone."""
+    return [name for name in ("gcps", "gnss", "lens") if getattr(request, name) is not None]
+
+
+def _unfit(request: Request) -> str:
+    """Return why an adjustment does not go with the other words; empty where it does."""
+    if request.adjusted_from is not None:
+        return "with adjusted-from the cameras are adjusted already"
+    if request.tide is not None:
+        return "a tide gives each image its own water level, and an adjustment takes one"
+    return ""
+
+
+def adjust_first(request: Request, folder: Path, jobs: int | None = None) -> dict[str, Any]:
+    """Adjust the cameras of a run into its folder where that is asked for, or called for.
+
+    Parameters
+    ----------
+    request : Request
+    folder : Path
+        Of the run.
+    jobs : int, optional
+        Threads.
+
+    Returns
+    -------
+    dict
+        `adjusted`, a bool; `model`, what of the folder of the adjustment has the cameras; `why`;
+        `is_said`, whether that is worth a line.
+
+    Raises
+    ------
+    PcfixError
+        If an adjustment was asked for, or files were given for it, and it cannot be done. Else
+        the run goes on with the cameras as they are.
+    """
+    decision, model = Decision(False, "", is_said=False), None
+    try:
+        decision = _decide(request)
+        if decision.adjust:
+            model = _adjust(request, folder / FOLDER, jobs)
+    except PcfixError as error:
+        if request.adjust == "yes" or _survey(request):
+            raise
+        # what cannot be read stops the correction, with the same sentence
+        decision = Decision(False, str(error), is_said=decision.adjust)
+    return {
+        "adjusted": decision.adjust, "model": model, "why": decision.why,
+        "is_said": decision.is_said,
+    }  # fmt: skip
+
+
+def is_worth_saying(step: dict[str, Any], warnings_of_correction: Sequence[str]) -> bool:
+    """Whether it matters that a run did not adjust: if asked, or if the poses turn out to be bent.
+
+    Parameters
+    ----------
+    step : dict
+        Of `adjust_first`.
+    warnings_of_correction : sequence of str
+    """
+    bent = any(BENT in warning for warning in warnings_of_correction)
+    return step["is_said"] or bool(step["why"] and bent)
+
+
+def _decide(request: Request) -> Decision:
+    """Return whether to adjust: on request, or where the poses are bent and there is a datum."""
+    if request.adjust == "yes":
+        return Decision(True, "that was asked for")
+    given = bool(_survey(request))
+    if request.adjust == "no":
+        return Decision(False, "", is_said=False)
+    if unfit := _unfit(request):
+        return Decision(False, unfit, is_said=given)
+    inputs, view = Inputs(**request.inputs()), view_of(check_input(request.input))
+    with warnings.catch_warnings():  # the correction shows them
+        warnings.simplefilter("ignore", PcfixWarning)
+        cameras = inputs.block(view.crs)[0]
+        if request.gnss is not None:
+            cameras = read_gnss(request.gnss, cameras)
+        if request.gnss is None and request.gcps is None and not _has_datum(cameras, request):
+            return Decision(False, _NO_DATUM, is_said=given)
+        water = inputs.surface(view).surface
+        if isinstance(water, WaterDimension):
+            return Decision(False, f"{water} is known at the points of the cloud alone")
+        return _verdict(_diagnosed(request, inputs, cameras, water, view))
+
+
+_NO_DATUM = (
+    "nothing says where the block is: no --gcps, no --gnss, and no positions of the GNSS to"
+    f" {MOST_STATED_M:g} m in the camera file"
+)
+
+
+def _has_datum(cameras: Cameras, request: Request) -> bool:
+    """Whether the camera file has positions of the GNSS good enough to hold a block."""
+    if cameras.gnss is None:
+        return False
+    found = gnss_in_frame_of(cameras, request.cameras)
+    known = np.isfinite(found.xyz).all(axis=1)
+    if known.sum() < LEAST_POSITIONS:
+        return False
+    off = (cameras.centres - found.xyz)[known]
+    spread = 1.4826 * np.median(np.abs(off - np.median(off, axis=0)))
+    stated = found.sigma_m[known]
+    return bool(np.median(np.where(np.isfinite(stated), stated, spread)) <= MOST_STATED_M)
+
+
+def _diagnosed(
+    request: Request, inputs: Inputs, cameras: Cameras, water: WaterSurface, view: CloudView
+) -> Diagnosis:
+    """Look for signs of absorbed refraction.
+
+    What the result is compared with is none of them: the cloud must not depend on it.
+    """
+    lens = request.lens
+    evidence = Evidence(
+        cameras, request.cameras, water, index_of(request.refractive_index)[0], view=view,
+        control=None if request.gcps is None else read_ground_control(request.gcps, cameras),
+        calibrated=given_focal_lengths(request.cameras) if lens is None else focal_length_of(lens),
+        in_passing=not _survey(request),
+    )  # fmt: skip
+    if evidence.has_rays:
+        evidence = replace(evidence, ties=ties_of(inputs, view.crs))
+    return diagnose(evidence)
+
+
+def _verdict(found: Diagnosis) -> Decision:
+    sign = found.decided_by
+    if sign is None:
+        return Decision(
+            False,
+            "nothing tells whether the poses have absorbed the refraction; --adjust yes does it"
+            " all the same",
+        )
+    if not sign.speaks:
+        shown = sign.plainly if sign.name == "tie points" else sign.words
+        return Decision(False, f"the poses have not absorbed the refraction: {shown}")
+    return Decision(True, f"the poses had absorbed the refraction: {sign.plainly or sign.words}")
+
+
+def _adjust(request: Request, target: Path, jobs: int | None) -> str:
+    """Adjust, and return which of `MODELS` has the cameras."""
+    _check_apart(target, request.files())
+    shared = (
+        "water", "gcps", "gnss", "lens", "sensor", "angles", "cameras_crs", "cameras_offset_m",
+        "views", "views_are", "water_mask", "water_model", "water_crs", "refractive_index",
+    )  # fmt: skip
+    with threads(jobs):
+        adjust_cameras(
+            request.cameras,
+            target,
+            cloud=request.input,
+            overwrite=True,
+            **{name: getattr(request, name) for name in shared},
+        )
+    return next(name for name in MODELS if (target / name).exists())
+
+
+def _check_apart(target: Path, inputs: Sequence[Path]) -> None:
+    """Refuse to replace a folder that inputs lie in."""
+    at = target.resolve()
+    for path in inputs:
+        if at in path.resolve().parents:
+            raise SettingError(
+                f"{path}: lies in {target}, which the adjustment replaces; give another OUT_DIR."
+            )
+
+
+def with_adjusted(request: Request, folder: Path, step: dict[str, Any]) -> Request:
+    """Return the request for the steps that follow: with the adjusted cameras where there are."""
+    if not step["adjusted"]:
+        return request
+    return replace(
+        request,
+        cameras=str(folder / FOLDER / step["model"]),
+        adjusted_from=request.cameras,
+        adjust="no", gcps=None, gnss=None, lens=None,
+    )  # fmt: skip
+
+
+def figures_of(folder: Path) -> dict[str, Any]:
+    """Return what the adjustment of a run came to, as of `pcfix.report.adjustment`."""
+    return dict(read_json(folder / FOLDER / SUMMARY))

@@ -1,0 +1,158 @@
+"""What an adjustment did that knew of no water is undone from its points alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from pcfix.adjust.block import Unknowns
+from pcfix.adjust.gather import Datum, block_of, no_datum, ties_of_cloud
+from pcfix.adjust.mend import Candidate, mend
+from pcfix.adjust.rounds import adjust_ties
+from pcfix.adjust.solve import prepare, solve, solved_cameras
+from pcfix.errors import GeometryError
+from pcfix.refract.threads import threads
+from pcfix.simulate.tie_points import simulate_tie_points
+from pcfix.simulate.tracing import piercing_points, project
+from tests.utils.unaware_blocks import unaware
+
+FOCAL = (("f",),)
+SMALL = {"area_m": (50, 40), "greatest_depth_m": 5, "position_noise_m": 0.5,
+         "attitude_noise_deg": 0.3}  # fmt: skip
+
+HOME_M = 1e-6
+"""Exact data: Newton's steps end below 1e-7 m."""
+
+AT_REST = 1e-7
+"""Of |J||r|: differences of the simulator's projection are good to about 1e-9 of it."""
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """So small a block spends more on waking a second thread than it does."""
+    with threads(1):
+        yield
+
+
+@cache
+def block(points=150, exact=True, **settings):
+    return unaware(simulate_tie_points(points, **(SMALL | settings)), exact=exact)
+
+
+def candidate(made, *, gnss=True, control=None, exact=True):
+    """Return the apparent points as the only thing that is known of the images."""
+    scene, old = made.scene, made.cameras
+    ties = ties_of_cloud(made.ties.xyz, made.ties.views, old)
+    datum = no_datum(len(old))
+    if gnss:
+        place = scene.true_cameras.centres if exact else scene.cameras.gnss.xyz
+        datum = Datum(place, scene.cameras.gnss.sigma_m)
+    whole = block_of(old, ties, 1.0, scene.water, scene.refractive_index, datum, control)
+    apparent = ties.xyz if control is None else np.vstack([ties.xyz, control.xyz])
+    return Candidate("all", whole, old, apparent)
+
+
+def centre_error_m(made, cameras):
+    return np.abs(cameras.centres - made.scene.true_cameras.centres).max()
+
+
+def test_the_old_adjustment_is_at_rest():
+    """Its residuals pull at nothing, as the simulator's straight rays see it; nor are they zero."""
+    pull, size = block(40).normal_vector()
+    assert np.abs(pull / size).max() < AT_REST
+    assert size.min() > 0.0
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"tilt_percent": 2.0}, {"obliques_deg": 30, "oblique_directions": 2}],
+    ids=["nadir", "tilted water", "obliques"],
+)
+def test_poses_come_home_from_the_points_alone(settings):
+    made = block(**settings)
+    assert centre_error_m(made, made.cameras) > 0.1
+    found = mend([candidate(made)], Unknowns(), FOCAL)
+    assert centre_error_m(made, found.cameras) < HOME_M
+    # px; a micrometre of 50 m is that of 3648 px in the focal length
+    assert abs(found.cameras.lenses[0].focal - made.scene.true_cameras.lenses[0].focal) < 1e-4
+    assert np.abs(found.xyz - made.scene.truth).max() < 10 * HOME_M  # seen from 50 m apart
+    assert found.source == "cloud"
+
+
+def test_control_points_are_datum_enough():
+    made = block()
+    control = replace(
+        made.scene.control, xyz=made.scene.control_truth, image_xy=made.scene.control_exact_xy
+    )
+    found = mend([candidate(made, gnss=False, control=control)], Unknowns(), FOCAL)
+    assert centre_error_m(made, found.cameras) < 10 * HOME_M  # four points hold six strips
+    assert {row.role for row in found.control} == {"control", "check"}
+    for row in found.control:
+        assert max(abs(row.dx_m), abs(row.dy_m), abs(row.dz_m)) < 10 * HOME_M
+        assert row.rms_px < 1e-3
+
+
+@pytest.mark.parametrize("sigma_px", [0.03, 0.3, 1.0])
+def test_least_squares_on_the_projected_points_do_not(sigma_px):
+    """Their residuals are those of the old adjustment taken away, which pulls back to it."""
+    made = block()
+    one = candidate(made).block
+    one = replace(one, sigma_px=np.full(len(one.camera), sigma_px))
+    problem, start = prepare(one, Unknowns(lens=("f",)))
+    found = solved_cameras(problem, solve(problem, start))
+    # exact GNSS positions hold the centres, so that the focal length takes it
+    assert abs(found.lenses[0].focal - made.scene.true_cameras.lenses[0].focal) > 10.0  # px
+    assert centre_error_m(made, found) > 1e4 * HOME_M
+
+
+def test_residuals_are_orthogonal_to_the_old_columns():
+    """Those of light through the water, by the simulator, at what was found."""
+    made = block(40)
+    scene = made.scene
+    found = mend([candidate(made)], Unknowns(), FOCAL)
+    owner = np.repeat(np.arange(len(scene.truth)), np.diff(scene.views.start))
+    camera, new, old = scene.views.camera, found.cameras, made.cameras
+    surface = piercing_points(
+        found.xyz[owner], new.centres[camera], scene.water.a, scene.refractive_index
+    )
+    wet, _ = project(surface, new, camera, new.lenses[0])
+    straight, _ = project(made.ties.xyz[owner], old, camera, old.lenses[0])
+    pull, size = made.normal_vector(wet - straight)
+    assert np.abs(pull / size).max() < AT_REST
+    assert np.abs(wet - straight).max() > 0.5  # px: what straight rays could not fit
+
+
+def test_noise_in_the_images_goes_where_it_goes_with_tie_points():
+    """As the old columns are nearly those of light through the water, so are the estimates."""
+    made = block(400, exact=False)
+    scene = made.scene
+    mended = mend([candidate(made, exact=False)], Unknowns(), FOCAL)
+    whole = block_of(
+        scene.cameras, scene.ties, scene.noise.image_px, scene.water, scene.refractive_index,
+        Datum(scene.cameras.gnss.xyz, scene.cameras.gnss.sigma_m),
+    )  # fmt: skip
+    aware = adjust_ties(whole, Unknowns(lens=("f",)))
+    sigma_m = aware.precision.centre_sigma_m
+    away = np.abs(mended.cameras.centres - scene.true_cameras.centres)
+    apart = np.abs(mended.cameras.centres - aware.cameras.centres)
+    # 1.4 and 0.6 of the standard errors of tie points, which are 16 mm
+    assert np.sqrt(np.mean((away / sigma_m) ** 2)) < 2.0
+    assert np.sqrt(np.mean((apart / sigma_m) ** 2)) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("unknowns", "words"),
+    [
+        (Unknowns(free_network=True), "give --gnss or --gcps"),
+        (Unknowns(poses="similarity"), "give --gnss or --gcps"),
+        (Unknowns(level_sigma_m=np.inf), "from measured tie points only"),
+        (Unknowns(), "nothing says where the block is"),
+    ],
+)
+def test_what_points_alone_cannot_tell_is_refused(unknowns, words):
+    one = candidate(block(40), gnss=unknowns.poses == "similarity" or bool(unknowns.level_sigma_m))
+    with pytest.raises(GeometryError, match=words):
+        mend([one], unknowns, FOCAL)

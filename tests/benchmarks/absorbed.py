@@ -1,0 +1,117 @@
+"""A block that has absorbed the refraction, mended and corrected, against the truth.
+
+    python tests/benchmarks/absorbed.py [FOLDER --truth TIF --cameras MODEL] [--every N]
+
+Default: ``rendered_a_free`` of PCFIX_SHARED. The folder has sparse/, cloud.las, dense.vis,
+gnss.csv, gcps.csv and offset.txt; water level 0.37 m, n 1.34. Bias / RMSE of Z in GSD (5 cm), bed
+below and land above the water by 10 cm in the truth; errors of the projection centres in metres
+against the true model, in the frame of the map.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+import warnings
+from pathlib import Path
+
+import laspy
+import numpy as np
+import rasterio
+
+import pcfix
+
+LEVEL, GSD, MARGIN = 0.37, 0.05, 0.1
+WAYS = {
+    "tie points, GNSS": {"ties": "measured"},
+    "tie points, GNSS, GCPs": {"ties": "measured", "gcps": True},
+    "cloud alone, GNSS": {"ties": "cloud"},
+    "cloud alone, GNSS, GCPs": {"ties": "cloud", "gcps": True},
+}
+CORRECTIONS = {
+    "all in frame": {},
+    "view list, snell": {"views": True, "views_are": "tracks"},
+    "view list, consistent": {"views": True, "method": "consistent"},
+    "no list, consistent": {"method": "consistent"},
+    "all in frame, consistent": {"method": "consistent", "camera_set": "all"},
+}
+
+
+def truth_of(path: Path):
+    """Return a function of plan positions: bilinear heights of the true surface."""
+    from scipy.interpolate import RegularGridInterpolator
+
+    with rasterio.open(path) as source:
+        heights, to_map = source.read(1).astype(float), source.transform
+    x = to_map.c + to_map.a * (np.arange(heights.shape[1]) + 0.5)
+    y = to_map.f + to_map.e * (np.arange(heights.shape[0]) + 0.5)
+    grid = RegularGridInterpolator((y[::-1], x), heights[::-1], bounds_error=False)
+    return lambda xy: grid(xy[:, ::-1])
+
+
+def errors(path: Path, truth, every: int) -> str:
+    """Return bias and RMSE of Z on bed and land."""
+    cloud = laspy.read(path)
+    xyz = np.column_stack([cloud.x, cloud.y, cloud.z])[::every]
+    true = truth(xyz[:, :2])
+    off = (xyz[:, 2] - true) / GSD
+    parts = []
+    for name, mine in (("bed", true < LEVEL - MARGIN), ("land", true > LEVEL + MARGIN)):
+        z = off[mine & np.isfinite(off)]
+        parts.append(f"{name} {z.mean():+6.2f} / {np.sqrt((z**2).mean()):5.2f}")
+    return "   ".join(parts)
+
+
+def main() -> None:
+    """Mend in each way, correct in each way, and print a line for each."""
+    shared = Path(os.environ.get("PCFIX_SHARED", "../shared")) / "data"
+    words = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    words.add_argument("folder", nargs="?", type=Path, default=shared / "rendered_a_free")
+    words.add_argument("--truth", type=Path, default=shared / "rendered_a" / "truth_dsm.tif")
+    words.add_argument("--cameras", type=Path, default=shared / "rendered_a" / "colmap")
+    words.add_argument("--every", type=int, default=1, help="compare every so many-th point")
+    given = words.parse_args()
+    warnings.simplefilter("ignore", pcfix.PcfixWarning)
+    folder, truth = given.folder, truth_of(given.truth)
+    offset = tuple(np.loadtxt(folder / "offset.txt").tolist())
+    true = pcfix.read_cameras(given.cameras)
+    where = dict(zip(true.labels, true.centres + offset, strict=True))
+    print(f"apparent                      {errors(folder / 'cloud.las', truth, given.every)}")
+    with tempfile.TemporaryDirectory() as scratch:
+        for name, way in WAYS.items():
+            mend_and_correct(name, dict(way), folder, Path(scratch), offset, where, truth, given)
+
+
+def mend_and_correct(name, way, folder, scratch, offset, where, truth, given) -> None:
+    """Print what one way comes to."""
+    out = scratch / name.replace(" ", "_").replace(",", "")
+    gcps = folder / "gcps.csv" if way.pop("gcps", False) else None
+    started = time.perf_counter()
+    found = pcfix.adjust_cameras(
+        folder / "sparse", out, water=LEVEL, cloud=folder / "cloud.las", gcps=gcps,
+        gnss=folder / "gnss.csv", cameras_offset_m=offset, views=folder / "dense.vis", **way,
+    )  # fmt: skip
+    seconds = time.perf_counter() - started
+    off = found.cameras.centres - np.array([where[label] for label in found.cameras.labels])
+    lens = found.cameras.lenses[0]
+    print(
+        f"{name}: focal length {lens.focal:.2f} px, principal point {lens.principal_x:.2f}"
+        f" {lens.principal_y:.2f}, centres {np.sqrt((off**2).sum(axis=1).mean()):.4f} m rms,"
+        f" {seconds:.0f} s"
+    )
+    for label, how in CORRECTIONS.items():
+        options = dict(how)
+        if options.pop("views", False):
+            options["views"] = folder / "dense.vis"
+        target = out / "corrected.las"
+        pcfix.correct_file(
+            folder / "cloud.las", target, cameras=out / "colmap", water=LEVEL,
+            adjusted_from=folder / "sparse", cameras_offset_m=offset, overwrite=True, **options,
+        )  # fmt: skip
+        print(f"   {label:26s} {errors(target, truth, given.every)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,326 @@
+"""A block that swallowed the water, mended from files and through every door."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+
+import laspy
+import numpy as np
+import pytest
+
+import pcfix
+from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
+from pcfix.flow.adjust import adjust_cameras, next_step
+from pcfix.refract.threads import threads
+from tests.utils.adjust_files import IMAGE_PX, write_block, write_gnss
+
+FOCAL_PX = 3648.0
+
+pytestmark = pytest.mark.filterwarnings("default::pcfix.errors.PcfixWarning")
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """So small a block spends more on waking a second thread than it does."""
+    with threads(1):
+        yield
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    return write_block(tmp_path_factory.mktemp("block"))
+
+
+@pytest.fixture(scope="module")
+def written(files):
+    """An adjustment by tie points and control, in a folder."""
+    out = files.folder / "adjusted"
+    found = adjust(files, out=out, gcps=files.folder / "gcps.csv", cloud=files.folder / "cloud.las")
+    return out, found
+
+
+def adjust(files, model="model", out=None, *, gnss="gnss.csv", **more):
+    more.setdefault("water", files.water)
+    positions = None if gnss is None else files.folder / gnss
+    return adjust_cameras(files.folder / model, out, gnss=positions, **more)
+
+
+def centre_rms_m(files, cameras):
+    off = cameras.centres - files.scene.true_cameras.centres
+    return float(np.sqrt((off * off).mean()))
+
+
+def heights_rms_m(files, cloud):
+    """Return the errors of the cloud's heights, bed and land."""
+    z, truth = np.array(laspy.read(cloud).z), files.truth[:, 2]
+    wet = truth < files.water
+    return [float(np.sqrt(np.mean((z - truth)[rows] ** 2))) for rows in (wet, ~wet)]
+
+
+def home(files, new, **more):
+    out = files.folder / "home.las"
+    pcfix.correct_file(
+        files.folder / "cloud.las", out, cameras=new, adjusted_from=files.folder / "model",
+        water=files.water, overwrite=True, **more,
+    )  # fmt: skip
+    return heights_rms_m(files, out)
+
+
+def test_the_block_has_swallowed_the_water(files):
+    """Land lies metres off, and the correction alone makes nothing better."""
+    with pytest.warns(PcfixWarning, match="have absorbed the refraction.*pcfix adjust"):
+        pcfix.correct_file(
+            files.folder / "cloud.las", files.folder / "alone.las", water=files.water,
+            cameras=files.folder / "model",
+        )  # fmt: skip
+    bed, land = heights_rms_m(files, files.folder / "alone.las")
+    assert min(bed, land) > 1.0
+    assert centre_rms_m(files, files.made.cameras) > 0.1
+
+
+def test_tie_points_and_control_bring_the_cloud_home(files, written):
+    out, found = written
+    assert found.source == "tie points"
+    # m: 3 cm of GNSS positions over 15 images, and what tie points leave of it
+    assert centre_rms_m(files, found.cameras) < 0.02
+    assert found.sigma0 == pytest.approx(1.0, abs=0.1)
+    assert found.rms_px(found.is_wet) == pytest.approx(IMAGE_PX, rel=0.1)
+    # m: half a GSD of 19 mm is 0.3 px and base over height
+    bed, land = home(files, out / "colmap")
+    assert bed < 0.02
+    assert land < 0.015
+
+
+def test_gnss_alone_leaves_the_height_of_the_focal_length(files):
+    found = adjust(files)
+    assert centre_rms_m(files, found.cameras) < 0.02
+    # px; 3 cm / sqrt(15) of 80 m is 0.4, and height and focal length are one on even ground
+    assert abs(found.cameras.lenses[0].focal - FOCAL_PX) < 15.0
+    off = found.xyz[: len(files.scene.truth)] - files.scene.truth
+    assert np.sqrt((off**2).mean()) < 0.1
+
+
+def test_a_calibration_is_held(files):
+    found = adjust(files, lens=files.folder / "lens.csv")
+    assert found.cameras.lenses[0].focal == pytest.approx(FOCAL_PX, rel=1e-12)
+    assert found.unknowns.lens == ()
+    off = found.xyz[: len(files.scene.truth)] - files.scene.truth
+    sigma_m = found.precision.point_sigma_m[: len(off)]
+    assert np.sqrt((off**2).mean()) < 2.0 * np.sqrt((sigma_m**2).mean())
+
+
+def test_the_cloud_stands_in_for_tie_points(files):
+    found = adjust(
+        files, "bare", cloud=files.folder / "cloud.las", gcps=files.folder / "gcps.csv",
+        lens_unknowns=("f",),
+    )  # fmt: skip
+    assert found.source == "cloud"
+    # m: 1200 points stand for the 400 of the old adjustment, which held noise of their own
+    assert centre_rms_m(files, found.cameras) < 0.04
+    assert any(note.startswith("without tie points") for note in found.notes)
+    bed, land = home(files, found.cameras)
+    assert bed < 0.03
+    assert land < 0.02
+
+
+def test_a_similarity_moves_all_poses_alike(files):
+    found = adjust(files, poses="similarity", lens=files.folder / "lens.csv")
+    before, after = files.made.cameras, found.cameras
+    turn = after.rotations[0].T @ before.rotations[0]
+    np.testing.assert_allclose(after.rotations @ turn, before.rotations, atol=1e-9)
+    lengths = [np.linalg.norm(c.centres - c.centres.mean(axis=0), axis=1) for c in (before, after)]
+    assert np.ptp(lengths[1] / lengths[0]) < 1e-8  # 10 m known to 1e-8 m and better
+
+
+def test_fixed_images_stay(files):
+    labels = files.made.cameras.labels[:3]
+    found = adjust(files, fixed_images=labels)
+    # the model is written with 1e-9 m at coordinates of millions
+    np.testing.assert_allclose(found.cameras.centres[:3], files.made.cameras.centres[:3], atol=1e-8)
+    np.testing.assert_allclose(found.cameras.rotations[:3], files.made.cameras.rotations[:3])
+    assert np.abs(found.cameras.centres - files.made.cameras.centres)[3:].max() > 0.01
+
+
+def test_a_free_network_keeps_place_and_scale(files):
+    found = adjust(files, gnss=None, free_network=True, lens=files.folder / "lens.csv")
+    moved = found.cameras.centres - files.made.cameras.centres
+    assert np.abs(moved[:, :2].mean(axis=0)).max() < 1e-4  # m: how tightly it is held
+    # the water tells heights: turned and shifted onto the truth, only noise is left
+    from tests.utils.unaware_blocks import similarity
+
+    scale, turn, shift = similarity(found.cameras.centres, files.scene.true_cameras.centres)
+    off = scale * found.cameras.centres @ turn.T + shift - files.scene.true_cameras.centres
+    sigma_m = found.precision.centre_sigma_m
+    assert np.sqrt((off**2).mean()) < 2.0 * np.sqrt((sigma_m**2).mean())
+    assert not np.isfinite(found.gnss_residual_m).any()
+
+
+def test_level_and_index_are_found_or_doubted(files):
+    found = adjust(
+        files, water=files.water + 0.25, refractive_index=1.33, free=("level", "index"),
+        gcps=files.folder / "gcps.csv", lens=files.folder / "lens.csv",
+    )  # fmt: skip
+    sigma = {row.name: row.sigma for row in found.precision.shared}
+    level, n = found.water.a, found.refractive_index
+    assert abs(level - files.water) < 3.0 * sigma["level"]
+    assert abs(n - files.scene.refractive_index) < 3.0 * sigma["index"]
+    for name, limit, words in (("level", 0.02, "water level"), ("index", 0.005, "refractive")):
+        doubted = any(words in note and "undetermined" in note for note in found.notes)
+        assert doubted == (sigma[name] > limit)
+
+
+def test_a_level_alone_is_found_within_two_centimetres(files):
+    found = adjust(
+        files, water=files.water + 0.25, free=("level",), gcps=files.folder / "gcps.csv",
+        lens=files.folder / "lens.csv",
+    )  # fmt: skip
+    assert abs(found.water.a - files.water) < 0.02
+
+
+def test_what_is_written_is_what_was_found(files, written):
+    out, found = written
+    names = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
+    assert {"colmap/images.bin", "opensfm/reconstruction.json", "cameras.csv", "sensor.csv",
+            "adjustment.json", "report.html"} <= names  # fmt: skip
+    for name in ("colmap", "opensfm/reconstruction.json", "cameras.csv"):
+        read = pcfix.read_cameras(out / name)
+        order = [read.labels.index(label) for label in found.cameras.labels]
+        # the table has 0.1 mm and nine digits of a quaternion
+        turns = [c @ c[0].T for c in (read.rotations[order], found.cameras.rotations)]
+        # east and north turn by 1e-5 over the 50 m of the block
+        close = 2e-5 if name == "opensfm/reconstruction.json" else 1e-7
+        np.testing.assert_allclose(*turns, atol=close)
+        assert read.lenses[0].focal == pytest.approx(found.cameras.lenses[0].focal, abs=1e-4)
+        off = read.centres[order] - found.cameras.centres
+        if name == "opensfm/reconstruction.json":  # its frame is topocentric
+            off = off - off.mean(axis=0)
+            assert np.abs(off).max() < 60.0
+        else:
+            assert np.abs(off).max() < 1e-3
+    page = (out / "report.html").read_text("utf-8")
+    assert "<html" in page
+    assert "Refractive bundle adjustment" in page
+
+
+def test_the_summary_tells_it_in_plain_values(files, written):
+    out, found = written
+    told = json.loads((out / "adjustment.json").read_text("utf-8"))
+    assert told["model"] == str(files.folder / "model")
+    assert told["source"] == "tie points"
+    assert told["images"] == len(found.cameras)
+    assert told["sigma0"] == pytest.approx(found.sigma0)
+    for where, rows in (("land", ~found.is_wet), ("water", found.is_wet)):
+        assert told["residuals"][where]["rms_px"] == pytest.approx(found.rms_px(rows), rel=1e-3)
+        assert told["residuals"][where]["rms_before_px"] > 2.0 * IMAGE_PX
+    assert told["gnss"]["images"] == len(found.cameras)
+    assert {row["name"] for row in told["control"]["points"]} == {
+        row.name for row in found.control if row.role == "control"
+    }
+    assert told["check"]["points"]
+    assert told["unknowns"]["lens"] == list(found.unknowns.lens)
+
+
+def test_the_next_step_does_what_it_says(files, written):
+    out, found = written
+    words = next_step(found, str(files.folder / "model"), str(out), str(files.folder / "cloud.las"))
+    target = files.folder / "next.las"
+    arguments = words.replace("OUTPUT", str(target)).split()[1:]
+    subprocess.run([sys.executable, "-m", "pcfix", *arguments, "-q"], check=True)
+    assert max(heights_rms_m(files, target)) < 0.02
+
+
+def test_program_and_function_agree(files, written, tmp_path):
+    out, _ = written
+    folder = files.folder
+    words = [
+        "adjust", folder / "model", tmp_path / "cli", "--water", repr(files.water),
+        "--gnss", folder / "gnss.csv", "--gcps", folder / "gcps.csv",
+        "--cloud", folder / "cloud.las", "--jobs", "1",
+    ]  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-m", "pcfix", *map(str, words)], check=True, capture_output=True,
+        text=True,
+    )  # fmt: skip
+    for name in ("colmap/images.bin", "colmap/points3D.bin", "cameras.csv", "adjustment.json"):
+        assert (tmp_path / "cli" / name).read_bytes() == (out / name).read_bytes(), name
+    assert "Next: pcfix correct" in done.stdout
+    assert "sigma0" in done.stdout
+
+
+def test_a_folder_is_replaced_only_if_asked_and_if_it_is_ours(files, tmp_path):
+    quick = {"poses": "similarity", "lens_unknowns": (), "outliers": False}
+    out = tmp_path / "out"
+    adjust(files, out=out, **quick)
+    before = (out / "adjustment.json").read_bytes()
+    with pytest.raises(SettingError, match="add --overwrite"):
+        adjust(files, out=out, **quick)
+    assert (out / "adjustment.json").read_bytes() == before
+    adjust(files, out=out, overwrite=True, **quick)
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "mine.txt").write_text("keep")
+    with pytest.raises(SettingError, match="holds other files"):
+        adjust(files, out=other, overwrite=True, **quick)
+    with pytest.raises(SettingError, match="is a file"):
+        adjust(files, out=other / "mine.txt", **quick)
+    with pytest.raises(SettingError, match="does not exist"):
+        adjust(files, out=tmp_path / "no" / "folder", **quick)
+    with pytest.raises(SettingError, match="the same"):
+        adjust(files, out=files.folder / "model", overwrite=True, **quick)
+    assert (other / "mine.txt").read_text() == "keep"
+
+
+def test_nothing_is_left_behind_when_writing_fails(files, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pcfix.flow.adjust_files.write_opensfm", full)
+    with pytest.raises(InputError, match="No space left"):
+        adjust(files, out=tmp_path / "out", poses="similarity", lens_unknowns=(), outliers=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_is_kept_when_the_next_adjustment_fails(files, written, tmp_path):
+    shutil.copytree(written[0], tmp_path / "out")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(PcfixError):
+        adjust(files, out=tmp_path / "out", gnss=None, overwrite=True)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_heights_above_another_datum_are_noticed(files):
+    """The geoid stands some 30 m and more above the ellipsoid over much of the world."""
+    positions = files.scene.cameras.gnss
+    write_gnss(
+        files.folder / "ellipsoid.csv", files.scene.cameras.labels, positions.xyz + np.array([0, 0, 30.0]),
+        positions.sigma_m,
+    )  # fmt: skip
+    with pytest.raises(GeometryError, match=r"30\.\d\d m .*another datum"):
+        adjust(files, gnss="ellipsoid.csv")
+
+
+def test_gnss_positions_in_another_crs_are_taken_over(files):
+    """Longitude and latitude of the same places give the same adjustment."""
+    from pyproj import Transformer
+
+    positions = files.scene.cameras.gnss
+    way = Transformer.from_crs(32633, 4326, always_xy=True)
+    x, y = way.transform(*positions.xyz.T[:2])
+    rows = [
+        f"{label},{lon:.12f},{lat:.12f},{z:.6f},0.03,0.03,0.03"
+        for label, lon, lat, z in zip(
+            files.scene.cameras.labels, x, y, positions.xyz[:, 2], strict=True
+        )
+    ]
+    path = files.folder / "degrees.csv"
+    path.write_text("\n".join(["image,longitude,latitude,height,sx,sy,sz", *rows]) + "\n")
+    fast = {"lens": files.folder / "lens.csv", "outliers": False}
+    one = adjust(files, **fast)
+    two = adjust(files, gnss="degrees.csv", gnss_crs="EPSG:4326", **fast)
+    known = np.isfinite(two.gnss_residual_m)
+    assert known[:, :2].all()
+    # m: the table of metres has four digits
+    np.testing.assert_allclose(two.cameras.centres[:, :2], one.cameras.centres[:, :2], atol=0.01)

@@ -1,0 +1,102 @@
+"""A block that swallowed the water, as the files that its user has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import laspy
+import numpy as np
+from pyproj import CRS
+
+from pcfix.io.cameras.colmap.writing import write_colmap
+from pcfix.simulate.tie_points import simulate_tie_points
+from tests.utils.unaware_blocks import apparent_cloud, parted, unaware
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pcfix.model import FloatArray
+    from pcfix.simulate.tie_points import TieScene
+    from tests.utils.unaware_blocks import Unaware
+
+EPSG = "EPSG:32633"
+IMAGE_PX = 0.3
+TIES = 400
+
+
+@dataclass(frozen=True, eq=False)
+class Files:
+    """What stands in a folder, and what is true.
+
+    model/, bare/ : COLMAP, with tie points and without.
+    cloud.las, gnss.csv, gcps.csv, lens.csv
+    truth : array, shape (n, 3), of the points of the cloud, row by row.
+    """
+
+    folder: Path
+    made: Unaware
+    truth: FloatArray
+
+    @property
+    def scene(self) -> TieScene:
+        return self.made.scene
+
+    @property
+    def water(self) -> float:
+        return self.scene.water.a
+
+
+def write_block(folder: Path, points: int = 1600, **settings: object) -> Files:
+    """Simulate a block, adjust it unaware of the water, and write what its user has."""
+    given = {
+        "area_m": (50, 40), "greatest_depth_m": 5, "image_noise_px": IMAGE_PX,
+        "position_noise_m": 0.3, "attitude_noise_deg": 0.2,
+    } | settings  # fmt: skip
+    scene, others = parted(simulate_tie_points(points, **given), TIES)
+    made = unaware(scene)
+    write_colmap(folder / "model", made.cameras, made.ties, crs=EPSG)
+    write_colmap(folder / "bare", made.cameras, crs=EPSG)
+    write_las(folder / "cloud.las", apparent_cloud(made, others))
+    positions = scene.cameras.gnss
+    write_gnss(folder / "gnss.csv", scene.cameras.labels, positions.xyz, positions.sigma_m)
+    write_gcps(folder / "gcps.csv", scene)
+    lens = scene.true_cameras.lenses[0]
+    (folder / "lens.csv").write_text(
+        f"focal_px,width_px,height_px,cx,cy\n{lens.focal!r},{lens.width:g},{lens.height:g},"
+        f"{lens.principal_x!r},{lens.principal_y!r}\n"
+    )
+    return Files(folder, made, others.truth)
+
+
+def write_las(path: Path, xyz: FloatArray) -> None:
+    header = laspy.LasHeader(point_format=3, version="1.4")
+    header.scales, header.offsets = np.full(3, 0.001), np.floor(xyz.min(axis=0))
+    header.add_crs(CRS(EPSG))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = xyz.T
+    las.write(path)
+
+
+def write_gnss(path: Path, labels: tuple[str, ...], xyz: FloatArray, sigma: FloatArray) -> None:
+    rows = [
+        ",".join([label, *(f"{value:.4f}" for value in (*place, *spread))])
+        for label, place, spread in zip(labels, xyz, sigma, strict=True)
+    ]
+    path.write_text("\n".join(["image,x,y,z,sx,sy,sz", *rows]) + "\n")
+
+
+def write_gcps(
+    path: Path, scene: TieScene, *, wet: bool = True, names: tuple[str, ...] | None = None
+) -> None:
+    """Write surveyed points; without the column under_water, or with other names, as asked."""
+    control = scene.control
+    names = control.names if names is None else names
+    rows = [f"# CRS: {EPSG}", "name,x,y,z,image,u,v,role" + (",under_water" if wet else "")]
+    for point, camera, (u, v) in zip(control.point, control.camera, control.image_xy, strict=True):
+        x, y, z = control.xyz[point]
+        role = "check" if control.is_check[point] else "control"
+        tail = f",{'yes' if control.under_water[point] else 'no'}" if wet else ""
+        label = scene.cameras.labels[camera]
+        rows.append(f"{names[point]},{x:.4f},{y:.4f},{z:.4f},{label},{u:.3f},{v:.3f},{role}{tail}")
+    path.write_text("\n".join(rows) + "\n")

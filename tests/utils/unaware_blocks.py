@@ -1,0 +1,91 @@
+"""Blocks over water that were adjusted by software which knew of no water, and what came of it.
+
+Images are made by `pcfix.simulate`. The unaware adjustment is an ordinary one, of straight rays,
+with a free focal length and no datum but its start, laid onto the GNSS positions by a similarity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.optimize._numdiff import approx_derivative
+
+from pcfix.adjust.block import Unknowns
+from pcfix.adjust.solve import prepare, solve, solved_cameras
+from pcfix.model import TiePoints, WaterPlane
+from pcfix.simulate.tracing import triangulate
+from tests.utils.adjust_twin import Twin
+from tests.utils.tie_blocks import block_of, some_ties
+
+if TYPE_CHECKING:
+    from pcfix.model import Cameras, FloatArray
+    from pcfix.simulate.tie_points import TieScene
+
+FAR_BELOW = WaterPlane(-1e3)
+"""Water that no point reaches."""
+
+
+@dataclass(frozen=True, eq=False)
+class Unaware:
+    """A scene, and the cameras and apparent points of an adjustment that knew of no water."""
+
+    scene: TieScene
+    cameras: Cameras
+    ties: TiePoints
+
+    def normal_vector(self, residual_px: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+        """Return J'r and |J||r| at the old solution: of poses, focal length and points.
+
+        J is that of straight rays, by differences of the simulator's projection; r is the old
+        adjustment's own unless others, shape (o, 2), are given.
+        """
+        block = replace(
+            block_of(self.scene, gnss=False, water=FAR_BELOW, cameras=self.cameras, sigma_px=1.0),
+            xyz=self.ties.xyz, image_xy=self.ties.image_xy,
+        )  # fmt: skip
+        twin = Twin(block, ("f",))
+        r = twin.residuals(twin.start()) if residual_px is None else residual_px.ravel()
+        jacobian = approx_derivative(twin.residuals, twin.start(), method="3-point")
+        return jacobian.T @ r, np.linalg.norm(jacobian, axis=0) * np.linalg.norm(r)
+
+
+def unaware(scene: TieScene, *, exact: bool = False) -> Unaware:
+    """Adjust a scene with straight rays."""
+    block = block_of(scene, exact=exact, gnss=False)
+    dry = replace(block, water=None, wet=np.zeros(len(block.xyz), bool))
+    problem, start = prepare(dry, Unknowns(lens=("f",), free_network=True))
+    found = solve(problem, start)
+    cameras, xyz = solved_cameras(problem, found), found.state.xyz + problem.origin
+    target = scene.true_cameras.centres if exact else scene.cameras.gnss.xyz
+    scale, turn, shift = similarity(cameras.centres, target)
+    cameras = replace(
+        cameras, centres=scale * cameras.centres @ turn.T + shift,
+        rotations=cameras.rotations @ turn.T, gnss=None,
+    )  # fmt: skip
+    image = scene.exact_xy if exact else scene.ties.image_xy
+    return Unaware(scene, cameras, TiePoints(scale * xyz @ turn.T + shift, scene.views, image))
+
+
+def similarity(start: FloatArray, target: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    """Return scale, turn and shift that take points nearest to others (Umeyama 1991)."""
+    a, b = start - start.mean(axis=0), target - target.mean(axis=0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    turn = (u * sign) @ vt
+    scale = float((s * sign).sum() / (a * a).sum())
+    return scale, turn, target.mean(axis=0) - scale * turn @ start.mean(axis=0)
+
+
+def parted(scene: TieScene, ties: int) -> tuple[TieScene, TieScene]:
+    """Return a scene with the first tie points, and one with the others."""
+    return some_ties(scene, np.arange(ties)), some_ties(scene, np.arange(ties, len(scene.truth)))
+
+
+def apparent_cloud(made: Unaware, others: TieScene) -> FloatArray:
+    """Return where the unaware cameras see points, by straight rays."""
+    old, views = made.cameras, others.views
+    return triangulate(
+        others.ties.image_xy, old, views.camera, views.start, old.lenses[0], others.truth
+    )
