@@ -295,7 +295,8 @@ def test_heights_above_another_datum_are_noticed(files):
     """The geoid stands some 30 m and more above the ellipsoid over much of the world."""
     positions = files.scene.cameras.gnss
     write_gnss(
-        files.folder / "ellipsoid.csv", files.scene.cameras.labels, positions.xyz + np.array([0, 0, 30.0]),
+        files.folder / "ellipsoid.csv", files.scene.cameras.labels,
+        positions.xyz + np.array([0, 0, 30.0]),
         positions.sigma_m,
     )  # fmt: skip
     with pytest.raises(GeometryError, match=r"30\.\d\d m .*another datum"):
