@@ -161,7 +161,7 @@ def test_control_points_above_another_datum(refuse, folder, files):
     control = files.scene.control
     high = replace(control, xyz=control.xyz + np.array([0.0, 0.0, 30.0]))
     write_gcps(folder / "gcps.csv", replace(files.scene, control=high))
-    has(refuse(more=["--gcps=gcps.csv"]), "control point", "does not fit")
+    has(refuse(more=["--gcps=gcps.csv"]), "control points", "height datum", "--gcps-crs")
 
 
 def test_marks_in_images_that_are_not_in_the_model(refuse, folder):
@@ -210,7 +210,7 @@ def test_start_poses_from_which_nothing_can_be_found(refuse, folder, files, mode
     )  # fmt: skip
     shutil.rmtree(folder / "model")
     write_colmap(folder / "model", wild, made.ties, crs=EPSG)
-    has(refuse(), "pose")
+    has(refuse(), "does not converge", "poses")
 
 
 def test_water_unknowns_from_the_cloud_alone(refuse):

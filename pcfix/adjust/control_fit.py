@@ -25,11 +25,23 @@ _REMEDY = (
 )
 
 
-def check_marks(control: GroundControl, cameras: Cameras, name: str) -> None:
+def check_marks(
+    control: GroundControl, cameras: Cameras, name: str, *, is_placed: bool = False
+) -> None:
     """Refuse control points whose marks are somewhere else altogether, before any adjustment.
 
     Each point is intersected from the cameras as they came, with straight rays. All may lie off
-    alike, as the block may; one that lies elsewhere than the others was mixed up.
+    alike, as the block may where nothing else places it; one that lies elsewhere than the others
+    was mixed up.
+
+    Parameters
+    ----------
+    control : GroundControl
+    cameras : Cameras
+    name : str
+        Of the file.
+    is_placed : bool
+        Whether GNSS positions say already where the block is.
 
     Raises
     ------
@@ -47,6 +59,14 @@ def check_marks(control: GroundControl, cameras: Cameras, name: str) -> None:
     off = found.xyz - control.xyz
     apart = np.linalg.norm(off - np.median(off[met], axis=0), axis=1)
     height = float(np.median(cameras.centres[:, 2]) - np.median(control.xyz[:, 2]))
+    middle = np.median(off[met], axis=0)
+    if is_placed and np.abs(middle).max() > ELSEWHERE * height > 0.0:
+        x, y, z = (-middle).tolist()
+        raise GeometryError(
+            f"{name}: the control points lie {x:.1f}, {y:.1f}, {z:.1f} m (x, y, z; the median) from"
+            " where their marks meet, but the GNSS positions say that the block lies right: one of"
+            " the two is in another CRS or height datum; name it with --gcps-crs or --gnss-crs."
+        )
     worst = int(np.argmax(np.where(met, apart, 0.0)))
     if not apart[worst] > ELSEWHERE * height > 0.0:
         return

@@ -11,7 +11,7 @@ from pcfix.adjust.block import Block
 from pcfix.errors import GeometryError, SettingError
 from pcfix.label.surface import surface_above
 from pcfix.model import TiePoints, Views, WaterDimension
-from pcfix.refract.lens import project
+from pcfix.refract.lens import project, unproject
 
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, Cameras, FloatArray, GroundControl, IntArray, WaterSurface
@@ -23,6 +23,9 @@ LEAST_SEEN = 4
 
 LEAST_ANGLE_DEG = 2.0
 """Between the rays of a tie point: a point of less is hardly known, and tells hardly anything."""
+
+LEAST_DETERMINANT = 1e-5
+"""Of the normal matrix of unit rays: two at a third of a degree."""
 
 TIE_POINTS = 150_000
 """At most; more tell nothing new, as their number beats down the noise of single images only."""
@@ -190,6 +193,34 @@ def usable_ties(
     if len(rows) > most:
         rows = np.sort(np.random.default_rng(seed).choice(rows, most, replace=False))
     return taken(ties, rows)
+
+
+def with_places(ties: TiePoints, cameras: Cameras) -> TiePoints:
+    """Return tie points, those without a place in space put where their straight rays meet best.
+
+    Least squares of the distances from the rays, which is near enough to start from.
+    """
+    lost = np.flatnonzero(~np.isfinite(ties.xyz).all(axis=1) & (np.diff(ties.views.start) >= 2))
+    if len(lost) == 0 or cameras.lenses is None or cameras.rotations is None:
+        return ties
+    some = taken(ties, lost)
+    owner = np.repeat(np.arange(len(lost)), np.diff(some.views.start))
+    ray = np.full((len(owner), 3), np.nan)
+    for c in np.unique(some.views.camera):
+        mine = some.views.camera == c
+        ray[mine] = unproject(cameras.lenses[c], some.image_xy[mine]) @ cameras.rotations[c]
+    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+    middle = cameras.centres.mean(axis=0)
+    centre = cameras.centres[some.views.camera] - middle
+    normal, right = np.zeros((len(lost), 3, 3)), np.zeros((len(lost), 3))
+    np.add.at(normal, owner, across)
+    np.add.at(right, owner, np.einsum("oij,oj->oi", across, centre))
+    finite = np.flatnonzero(np.isfinite(normal).all(axis=(1, 2)))
+    known = finite[np.linalg.det(normal[finite]) > LEAST_DETERMINANT]
+    xyz = ties.xyz.copy()
+    meet = np.linalg.solve(normal[known], right[known][:, :, None])[:, :, 0]
+    xyz[lost[known]] = meet + middle
+    return replace(ties, xyz=xyz)
 
 
 def taken(ties: TiePoints, rows: IntArray) -> TiePoints:

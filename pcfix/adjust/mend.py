@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 SIGMAS_PX = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 3.0, 5.0, 10.0)
 """How far the points of the cloud may be from images of tie points: tried in this order."""
 
+POOR_PX = 5.0
+"""Of `SIGMAS_PX`, from where the result deserves a warning."""
+
 FITS = 1.15
 """Mean square of GNSS and control residuals, in variances, up to which they fit."""
 
@@ -122,6 +125,13 @@ def mend(
         if gain > chi2.isf(SURE, extra * len(chosen.problem.groups)):
             chosen = more
     notes.append(_said(chosen, candidates, lens_sets))
+    if chosen.sigma_px >= POOR_PX:
+        notes.append(
+            f"the points of the cloud fit GNSS and control points only if they count as"
+            f" {chosen.sigma_px:g} px: they stand poorly for the old tie points, and bed and focal"
+            " length may be off by more than all figures here say; give tie points, control points"
+            " or a calibrated lens."
+        )
     found = adjusted_of(chosen.problem, chosen.found, None, notes, "cloud", "unaware")
     # the points of the cloud say nothing of noise: GNSS and control points are all there is
     free = max(chosen.observations - 7, 1)

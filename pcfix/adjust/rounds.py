@@ -44,6 +44,9 @@ OUTLIER_SIGMAS = 4.0
 """Residuals longer than this many standard deviations are left out: three good ones in 10,000."""
 
 SCALE_SIGMAS = 2.0
+LEAST_SHARE = 0.5
+"""Of the observations that fit, else nothing was found."""
+
 MAD_TO_SIGMA = 1.4826
 OUTLIER_ROUNDS = 3
 LAST_ROUND = 2 + OUTLIER_ROUNDS
@@ -115,6 +118,7 @@ def adjust_ties(
     check_datum(block, unknowns)
     notes: list[str] = []
     problem, now = prepare(block, unknowns)
+    _check_sight(problem, now)
     if rounds.outliers or rounds.sigma_px is None:
         now = rounds.solve(problem, now, "huber", 1, progress, ROUGHLY)
     if rounds.sigma_px is None:
@@ -124,6 +128,7 @@ def adjust_ties(
             robust: Robust = "cauchy" if number == 0 else "squares"
             now = rounds.solve(problem, now, robust, 2 + number, progress, ROUGHLY)
             problem, dropped = without_outliers(problem, now)
+            _check_share(problem)
             if rounds.sigma_px is None:
                 problem = with_sigma(problem, noise_px(problem, now))
             if number and not dropped:
@@ -228,6 +233,32 @@ def without_outliers(problem: Problem, now: Solution) -> tuple[Problem, int]:
     weight[ties & (left[problem.block.owner] < LEAST_VIEWS)] = 0.0
     dropped = int(((seen.weight > 0.0) & (weight == 0.0)).sum())
     return replace(problem, seen=seen._replace(weight=weight)), dropped
+
+
+def _check_sight(problem: Problem, start: Solution) -> None:
+    """Refuse a start from which most tie points are not in front of their cameras."""
+    counts = np.isfinite(problem.block.sigma_px) & _of_ties(problem)
+    r = residuals(start.state, problem.seen, problem.surface)[counts]
+    ahead = int(np.isfinite(r).all(axis=1).sum())
+    if ahead < LEAST_SHARE * len(r):
+        raise GeometryError(
+            f"the adjustment does not converge: at the start, only {ahead:,} of {len(r):,}"
+            " observations are of points in front of their cameras; check that the poses and the"
+            " tie points are of one model, and the axes of the camera file."
+        )
+
+
+def _check_share(problem: Problem) -> None:
+    """Refuse a block of which more is left out than fits: it has come to rest at a wrong place."""
+    counts = np.isfinite(problem.block.sigma_px) & _of_ties(problem)
+    used = counts & (problem.seen.weight > 0.0)
+    if used.sum() >= LEAST_SHARE * counts.sum():
+        return
+    raise GeometryError(
+        f"the adjustment does not converge: only {int(used.sum()):,} of {int(counts.sum()):,}"
+        " observations of tie points fit any poses near the given ones; check that the tie points"
+        " and the poses are of one model, and the water level, or align the images anew."
+    )
 
 
 def sigma0_of(problem: Problem, now: Solution) -> float:

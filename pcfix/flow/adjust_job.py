@@ -20,6 +20,7 @@ from pcfix.adjust.gather import (
     ties_of_cloud,
     usable_ties,
     well_seen,
+    with_places,
 )
 from pcfix.adjust.mend import Candidate, mend
 from pcfix.adjust.rounds import Engine, Rounds, adjust_ties, check_datum, default_lens
@@ -232,7 +233,8 @@ class AdjustJob:
         if not isinstance(gcps, GroundControl):
             gcps = read_ground_control(gcps, self.old, crs=crs)
         if self.water is not None:
-            check_marks(gcps, self.old, self.control_name)
+            is_placed = bool(np.isfinite(self.gnss.xyz).any())
+            check_marks(gcps, self.old, self.control_name, is_placed=is_placed)
         return gcps
 
     def _datum(self, path: AnyPath | None, crs: str | None) -> Datum:
@@ -310,8 +312,8 @@ class AdjustJob:
 
     def _tie_points(self) -> TiePoints | None:
 
-        found = self.inputs.tie_points(self.crs)
-        return None if found is None else usable_ties(found, self.old)
+        found = self.inputs.tie_points(self.crs, placed=False)
+        return None if found is None else usable_ties(with_places(found, self.old), self.old)
 
     @property
     def _level_sigma_m(self) -> float:

@@ -185,8 +185,11 @@ class Inputs:
         """Return a view list as what the user says that it is."""
         return views if self.views_are == "auto" else replace(views, kind=self.views_are)
 
-    def tie_points(self, cloud_crs: str | CRS | None) -> TiePoints | None:
-        """Return the tie points of the camera file in the cloud's CRS, where it has any."""
+    def tie_points(self, cloud_crs: str | CRS | None, *, placed: bool = True) -> TiePoints | None:
+        """Return the tie points of the camera file in the cloud's CRS, where it has any.
+
+        Some formats have their image places only; with `placed` these count as none.
+        """
         if isinstance(self.cameras, Cameras):
             return None
         read = self.read()
@@ -194,13 +197,16 @@ class Inputs:
             ties = read_tie_points(self.cameras, read)
         except InputError:
             return None
-        if not np.isfinite(ties.xyz).all(axis=1).any():
+        known = np.isfinite(ties.xyz).all(axis=1)
+        if placed and not known.any():
             return None
         way = georeference(
             read, cloud_crs, cameras_crs=self.cameras_crs, offset_m=self.cameras_offset_m,
             name=str(self.cameras),
         )  # fmt: skip
-        return replace(ties, xyz=np.ascontiguousarray(way.points(ties.xyz)))
+        xyz = np.full((len(ties.xyz), 3), np.nan)
+        xyz[known] = way.points(ties.xyz[known])
+        return replace(ties, xyz=xyz)
 
 
 def mask_of(

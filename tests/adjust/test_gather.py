@@ -18,6 +18,7 @@ from pcfix.adjust.gather import (
     true_start,
     usable_ties,
     well_seen,
+    with_places,
 )
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import TiePoints, Views, WaterDimension, WaterPlane
@@ -177,3 +178,16 @@ def test_no_datum_is_no_position():
     none = no_datum(3)
     assert np.isnan(none.xyz).all()
     assert np.isinf(none.sigma_m).all()
+
+
+def test_points_without_a_place_get_one_where_their_rays_meet():
+    """As of Pix4D, whose files have image places only; straight, so the apparent points."""
+    made = scene()
+    lost = TiePoints(np.full_like(made.ties.xyz, np.nan), made.ties.views, made.ties.image_xy)
+    placed = with_places(lost, made.cameras)
+    dry = made.truth[:, 2] > made.water.a + 0.3
+    # m: image places have half a pixel of noise, at 80 m two centimetres in plan and more in height
+    np.testing.assert_allclose(placed.xyz[dry], made.truth[dry], atol=0.5)
+    wet = made.truth[:, 2] < made.water.a - 1.0
+    assert (placed.xyz[wet, 2] > made.truth[wet, 2]).mean() > 0.9
+    assert placed.views is lost.views
