@@ -46,6 +46,21 @@ def no_datum(k: int) -> Datum:
     return Datum(np.full((k, 3), np.nan), np.full((k, 3), np.inf))
 
 
+def check_surface(water: WaterSurface | None) -> None:
+    """Check that the water is known everywhere, as tie points have no dimensions.
+
+    Raises
+    ------
+    SettingError
+        If it is a dimension of the cloud.
+    """
+    if isinstance(water, WaterDimension):
+        raise SettingError(
+            f"water {water} is known at the points of the cloud only; an adjustment needs the water"
+            " as a level, plane, raster, mesh or shoreline."
+        )
+
+
 def block_of(
     cameras: Cameras,
     ties: TiePoints,
@@ -84,11 +99,7 @@ def block_of(
     GeometryError
         If a control point lies under water and the survey does not say so.
     """
-    if isinstance(water, WaterDimension):
-        raise SettingError(
-            f"water {water} is known at the points of the cloud only; an adjustment needs the water"
-            " as a level, plane, raster, mesh or shoreline."
-        )
+    check_surface(water)
     m = len(ties.xyz)
     xyz = true_start(ties.xyz, water, refractive_index, wet)
     parts = [

@@ -14,6 +14,7 @@ from pcfix.adjust.gather import (
     FIRST_SIGMA_PX,
     Datum,
     block_of,
+    check_surface,
     no_datum,
     restricted,
     some_cameras,
@@ -189,6 +190,7 @@ class AdjustJob:
                 " project or model of the software, or --sensor."
             )
         self.water = None if inputs.water is None else inputs.surface(view).surface
+        check_surface(self.water)
         self._check_images()
         self.n = index_of(how.refractive_index)[0]
         self.notes: list[str] = []
