@@ -313,7 +313,6 @@ class AdjustJob:
         return replace(found, notes=[*self.notes, *found.notes])
 
     def _tie_points(self) -> TiePoints | None:
-
         found = self.inputs.tie_points(self.crs, placed=False)
         return None if found is None else usable_ties(with_places(found, self.old), self.old)
 
@@ -325,7 +324,6 @@ class AdjustJob:
         return None if self.mask is None else self.mask.inside(xyz[:, 0], xyz[:, 1])
 
     def _by_ties(self, ties: TiePoints, progress: Callable[[LogRow], None] | None) -> Adjusted:
-
         how = self.how
         block = block_of(
             self.start, ties, how.sigma_px or FIRST_SIGMA_PX, self.water, self.n, self.gnss,
@@ -394,7 +392,6 @@ class AdjustJob:
         return kept
 
     def _by_cloud(self, progress: Callable[[LogRow], None] | None) -> Adjusted:
-
         if self.how.engine == "colmap":
             raise SettingError("the engine colmap needs measured tie points; use --engine direct.")
         xyz, listed = self._sample()
