@@ -116,40 +116,53 @@ def adjust_ties(
     """
     rounds = rounds or Rounds()
     check_datum(block, unknowns)
-    notes: list[str] = []
     problem, now = prepare(block, unknowns)
     _check_sight(problem, now)
-    if rounds.outliers or rounds.sigma_px is None:
-        now = rounds.solve(problem, now, "huber", 1, progress, ROUGHLY)
-    if rounds.sigma_px is None:
-        problem = with_sigma(problem, noise_px(problem, now))
-    if rounds.outliers:
-        for number in range(OUTLIER_ROUNDS):
-            robust: Robust = "cauchy" if number == 0 else "squares"
-            now = rounds.solve(problem, now, robust, 2 + number, progress, ROUGHLY)
-            problem, dropped = without_outliers(problem, now)
-            _check_share(problem)
-            if rounds.sigma_px is None:
-                problem = with_sigma(problem, noise_px(problem, now))
-            if number and not dropped:
-                break
+    problem, now = _cleaned(problem, now, rounds, progress)
     now = rounds.solve(problem, now, "squares", LAST_ROUND, progress)
     precision = precision_of(problem, now, sigma0_of(problem, now))
-    if rounds.drop_weak:
-        weak = weak_lens_parameters(problem, precision)
-        if weak:
-            notes.append(
-                f"the block does not determine {', '.join(weak)} of the lens; left as they were."
-            )
-            kept = tuple(name for name in unknowns.lens if name not in weak)
-            fewer = replace(unknowns, lens=kept)
-            weight = problem.seen.weight
-            problem, start = prepare(block, fewer)
-            problem.seen = problem.seen._replace(weight=weight)
-            start = replace(start, state=start.state._replace(xyz=now.state.xyz), log=now.log)
-            now = rounds.solve(problem, start, "squares", LAST_ROUND + 1, progress)
-            precision = precision_of(problem, now, sigma0_of(problem, now))
+    weak = weak_lens_parameters(problem, precision) if rounds.drop_weak else []
+    notes = []
+    if weak:
+        notes.append(
+            f"the block does not determine {', '.join(weak)} of the lens; left as they were."
+        )
+        problem, start = _with_less_lens(problem, now, weak)
+        now = rounds.solve(problem, start, "squares", LAST_ROUND + 1, progress)
+        precision = precision_of(problem, now, sigma0_of(problem, now))
     return adjusted_of(problem, now, precision, notes, "tie points", rounds.engine)
+
+
+def _cleaned(
+    problem: Problem, now: Solution, rounds: Rounds, progress: Progress | None
+) -> tuple[Problem, Solution]:
+    """Return the problem with the noise of its tie points estimated and outliers left out."""
+    estimate = rounds.sigma_px is None
+    if rounds.outliers or estimate:
+        now = rounds.solve(problem, now, "huber", 1, progress, ROUGHLY)
+    if estimate:
+        problem = with_sigma(problem, noise_px(problem, now))
+    if not rounds.outliers:
+        return problem, now
+    for number in range(OUTLIER_ROUNDS):
+        robust: Robust = "cauchy" if number == 0 else "squares"
+        now = rounds.solve(problem, now, robust, 2 + number, progress, ROUGHLY)
+        problem, dropped = without_outliers(problem, now)
+        _check_share(problem)
+        if estimate:
+            problem = with_sigma(problem, noise_px(problem, now))
+        if number and not dropped:
+            break
+    return problem, now
+
+
+def _with_less_lens(problem: Problem, now: Solution, weak: list[str]) -> tuple[Problem, Solution]:
+    """Return the problem with some lens parameters as they came, and where to start from."""
+    unknowns = problem.unknowns
+    kept = tuple(name for name in unknowns.lens if name not in weak)
+    fewer, start = prepare(problem.block, replace(unknowns, lens=kept))
+    fewer.seen = fewer.seen._replace(weight=problem.seen.weight)
+    return fewer, replace(start, state=start.state._replace(xyz=now.state.xyz), log=now.log)
 
 
 def check_datum(block: Block, unknowns: Unknowns, reason: str = "") -> None:
