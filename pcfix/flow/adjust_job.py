@@ -463,8 +463,8 @@ class AdjustJob:
 
 _EXPORTS = (
     "COLMAP's model with points3D, OpenSfM's reconstruction with tracks.csv, a Metashape project"
-    " (.psx, .psz) or its BlocksExchange export with tie points, Pix4D's project with its"
-    " pmatrix and tie points, or Bundler's .out have them."
+    " (.psx, .psz) or its BlocksExchange export with tie points, Pix4D's params folder with"
+    " its tp_ file, or Bundler's .out have them."
 )
 
 
