@@ -9,6 +9,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from pcfix.version import __version__
+
 if TYPE_CHECKING:
     from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
     from pcfix.flow.clean import clean_file
@@ -31,11 +33,10 @@ if TYPE_CHECKING:
         WaterPlane,
         WaterSurface,
     )
-    from pcfix.refract.index import refractive_index
-    from pcfix.settings import ErrorBudget, Settings
+    from pcfix.options import ErrorBudget, Settings
     from pcfix.simulate import simulate_scene
+    from pcfix.water.index import refractive_index
 
-__version__ = "0.1.0"
 
 _HOME = {
     "clean_file": "pcfix.flow.clean",
@@ -47,18 +48,18 @@ _HOME = {
     "restore_file": "pcfix.flow.restore",
     "label_file": "pcfix.flow.label",
     "label_points": "pcfix.flow.label",
-    "ErrorBudget": "pcfix.settings",
-    "LabelSettings": "pcfix.settings",
+    "ErrorBudget": "pcfix.options",
+    "LabelSettings": "pcfix.options",
     "WaterRaster": "pcfix.model",
     "read_cameras": "pcfix.io.cameras",
-    "refractive_index": "pcfix.refract.index",
+    "refractive_index": "pcfix.water.index",
     "read_water": "pcfix.io.water",
     "simulate_scene": "pcfix.simulate",
     "Cameras": "pcfix.model",
     "Correction": "pcfix.model",
     "Lens": "pcfix.model",
     "Outcome": "pcfix.model",
-    "Settings": "pcfix.settings",
+    "Settings": "pcfix.options",
     "Summary": "pcfix.model",
     "Views": "pcfix.model",
     "WaterDimension": "pcfix.model",
@@ -92,6 +93,7 @@ __all__ = [
     "WaterPlane",
     "WaterRaster",
     "WaterSurface",
+    "__version__",
     "adjust_cameras",
     "clean_file",
     "compare_clouds",
@@ -116,4 +118,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return [*__all__, "__version__"]
+    return __all__

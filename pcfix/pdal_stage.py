@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from pcfix.flow.job import Points
     from pcfix.flow.surfaces import CloudView
     from pcfix.model import FloatArray, Summary, WaterSurface
-    from pcfix.settings import ErrorBudget, LabelSettings, Settings
+    from pcfix.options import ErrorBudget, LabelSettings, Settings
 
     Stage: TypeAlias = Callable[[Dimensions, Dimensions], bool]
 
@@ -170,7 +170,7 @@ def _run(
 def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
     from pcfix.flow.job import Job
     from pcfix.io.las.columns import columns_for
-    from pcfix.refract.threads import threads
+    from pcfix.threads import threads
 
     started = time.perf_counter()
     options = _options(namespace, _CORRECT_OPTIONS, needed=("cameras", "water"))
@@ -245,7 +245,7 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
 
 def _label_settings(options: dict[str, Any]) -> LabelSettings:
     from pcfix.flow.inputs import classes_of
-    from pcfix.settings import LabelSettings
+    from pcfix.options import LabelSettings
 
     given = options.get("respect_classes")
     return LabelSettings(
@@ -296,8 +296,8 @@ def _converted(name: str, value: Any, types: tuple[type, ...]) -> Any:
 
 
 def _settings(options: dict[str, Any]) -> Settings:
-    from pcfix.refract.index import index_of, index_words
-    from pcfix.settings import Settings
+    from pcfix.options import Settings
+    from pcfix.water.index import index_of, index_words
 
     if options.get("uncorrected") == "drop":
         raise SettingError(
@@ -332,7 +332,7 @@ _SIGMAS = {
 
 
 def _errors(options: dict[str, Any]) -> ErrorBudget:
-    from pcfix.settings import ErrorBudget
+    from pcfix.options import ErrorBudget
 
     given = {name: options[word] for word, name in _SIGMAS.items() if word in options}
     return ErrorBudget(**given)

@@ -11,7 +11,7 @@ from pcfix.adjust.state import CODES
 
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens, WaterSurface
-    from pcfix.ports import Port
+    from pcfix.port.shapes import Port
 
 Poses = Literal["free", "fixed", "similarity"]
 Robust = Literal["squares", "huber", "cauchy"]

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from pcfix.refract.image_jacobian import image_and_gradients
-from pcfix.refract.lens import image_of, lens_table
-from pcfix.refract.threads import one_caller
+from pcfix.lens.derivatives import image_and_gradients
+from pcfix.lens.imaging import image_of, lens_table
+from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Views

@@ -17,7 +17,7 @@ from pcfix.adjust.colmap_lens import lens_of, with_values
 from pcfix.adjust.normal import CAUCHY, HUBER
 from pcfix.adjust.solve import gnss_weights
 from pcfix.errors import GeometryError, SettingError
-from pcfix.refract.lens import lens_table
+from pcfix.lens.imaging import lens_table
 
 if TYPE_CHECKING:
     from pcfix.adjust.colmap_lens import Flags

@@ -9,13 +9,13 @@ import numpy as np
 
 from pcfix.adjust.block import Block
 from pcfix.errors import GeometryError, SettingError
-from pcfix.label.surface import surface_above
+from pcfix.lens.imaging import project, unproject
 from pcfix.model import TiePoints, Views, WaterDimension
-from pcfix.refract.lens import project, unproject
+from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, Cameras, FloatArray, GroundControl, IntArray, WaterSurface
-    from pcfix.ports import Port
+    from pcfix.port.shapes import Port
 
 LEAST_VIEWS = 2
 LEAST_SEEN = 4

@@ -12,11 +12,11 @@ from pcfix.adjust.fixed_poses import intersect_fixed, plain_block
 from pcfix.adjust.solve import prepare, solved_cameras
 from pcfix.adjust.unaware import solve_unaware, straight_columns
 from pcfix.errors import GeometryError
-from pcfix.label.surface import SurfaceAbove, is_submerged, surface_above
+from pcfix.lens.imaging import project
 from pcfix.model import WaterPlane
+from pcfix.options import Settings
 from pcfix.refract.choice import chosen_views
-from pcfix.refract.lens import project
-from pcfix.settings import Settings
+from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
 if TYPE_CHECKING:
     from pcfix.adjust.block import Block

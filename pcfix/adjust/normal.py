@@ -29,7 +29,7 @@ from pcfix.adjust.observe import (
     image_and_all_gradients,
     lens_gradients,
 )
-from pcfix.refract.threads import one_caller
+from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     from pcfix.adjust.state import Columns, Seen, State, Surface

@@ -15,12 +15,12 @@ import numpy as np
 from numba import njit
 
 from pcfix.adjust.state import B1, B2, CX, CY, FOCAL, K1, P1
-from pcfix.refract import places
+from pcfix.lens import places
+from pcfix.lens.brown import distorted, jacobian, undistorted
+from pcfix.lens.derivatives import image_and_gradients
+from pcfix.lens.imaging import image_of, in_plane
+from pcfix.port.light import through_port
 from pcfix.refract.backward import light_path, plane_at, settle
-from pcfix.refract.brown import distorted, jacobian, undistorted
-from pcfix.refract.image_jacobian import image_and_gradients
-from pcfix.refract.lens import image_of, in_plane
-from pcfix.refract.port import through_port
 from pcfix.refract.tracing.derivatives import light_and_gradients
 
 if TYPE_CHECKING:

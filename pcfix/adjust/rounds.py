@@ -25,7 +25,7 @@ from pcfix.adjust.solve import (
 )
 from pcfix.adjust.state import CODES, K1
 from pcfix.errors import GeometryError
-from pcfix.label.surface import surface_above
+from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -29,11 +29,11 @@ from pcfix.adjust.normal import (
 from pcfix.adjust.reduced import assemble, solver
 from pcfix.adjust.state import WATER_NAMES, Columns, Seen, State, Surface, columns_of
 from pcfix.errors import GeometryError
-from pcfix.label.raster import build_field
-from pcfix.label.tin import build_tin
+from pcfix.lens.imaging import lens_table
 from pcfix.model import Lens, WaterMesh, WaterPlane, WaterRaster
-from pcfix.refract.lens import lens_table
-from pcfix.refract.port import coefficients as port_coefficients
+from pcfix.port.light import coefficients as port_coefficients
+from pcfix.water.raster import build_field
+from pcfix.water.tin import build_tin
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pcfix.refract import places
+from pcfix.lens import places
 
 if TYPE_CHECKING:
-    from pcfix.label.raster import Field
-    from pcfix.label.tin import Tin
     from pcfix.model import BoolArray, FloatArray, IntArray
+    from pcfix.water.raster import Field
+    from pcfix.water.tin import Tin
 
 
 class State(NamedTuple):
     """What is estimated.
 
     centres : shape (k, 3); rotations : shape (k, 3, 3), world to camera.
-    lenses : shape (l, ...), coefficients of `pcfix.refract.lens.lens_table`.
+    lenses : shape (l, ...), coefficients of `pcfix.lens.imaging.lens_table`.
     xyz : shape (m, 3), true points.
     water : shape (4,), a, b, c and the refractive index.
     """

@@ -33,7 +33,7 @@ from pcfix.adjust.normal import PARTS, linearise, most_seen, point_block
 from pcfix.adjust.observe import POINT, WATER, WIDTH, image_and_all_gradients, lens_gradients
 from pcfix.adjust.solve import LogRow, Problem, Solution, counts_of, moved_by, priors_at
 from pcfix.errors import GeometryError
-from pcfix.refract.threads import one_caller
+from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     from collections.abc import Callable

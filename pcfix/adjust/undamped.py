@@ -16,7 +16,7 @@ from pcfix.adjust.normal import PARTS, SQUARES, Loss, linearise, normal_equation
 from pcfix.adjust.observe import POINT, WIDTH
 from pcfix.adjust.reduced import Reduced, assemble
 from pcfix.adjust.solve import priors_at
-from pcfix.refract.threads import one_caller
+from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     from pcfix.adjust.normal import PointPriors

@@ -20,7 +20,7 @@ from pcfix.cli.words import (
     ViewKinds,
     WaterUnlessPort,
 )
-from pcfix.settings import DEFAULT_REFRACTIVE_INDEX
+from pcfix.options import DEFAULT_REFRACTIVE_INDEX
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -177,7 +177,7 @@ class AdjustWords(WaterFitWords, CameraWords):
 
     def keywords(self) -> dict[str, Any]:
         """Return them as `pcfix.adjust_cameras` takes them."""
-        from pcfix.refract.index import index_words
+        from pcfix.water.index import index_words
 
         lens = None if self.lens_unknowns is None else _words(self.lens_unknowns)
         return {
@@ -226,9 +226,9 @@ def adjust(
 ) -> None:
     """Adjust poses, lens and points with the light bent at the water."""
     from pcfix.flow.adjust import adjust_cameras, next_step
-    from pcfix.ports import port_of
-    from pcfix.refract.threads import threads
+    from pcfix.port.shapes import port_of
     from pcfix.report.adjustment import adjustment_text, before_of
+    from pcfix.threads import threads
 
     if (water is None) == (port is None):
         raise typer.BadParameter("give --water, or --port for images taken under water")

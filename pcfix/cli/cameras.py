@@ -9,7 +9,7 @@ import typer
 
 from pcfix.cli.groups import CameraWords, takes
 from pcfix.cli.words import Overwrite, SummaryOption  # noqa: TC001 - typer reads them
-from pcfix.settings import DEFAULT_REFRACTIVE_INDEX
+from pcfix.options import DEFAULT_REFRACTIVE_INDEX
 
 CamerasPath = Annotated[
     Path,

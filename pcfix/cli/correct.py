@@ -82,7 +82,7 @@ def pipeline(
 
     from pcfix.flow.inputs import inputs_of
     from pcfix.flow.pipeline import pipeline_for
-    from pcfix.refract.index import index_of
+    from pcfix.water.index import index_of
 
     keywords = {"cameras": cameras, "water": water, **words.keywords()}
     settings = pcfix.Settings(

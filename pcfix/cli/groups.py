@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 import typer
 
 from pcfix.cli.words import AngleWords, CameraSets, Matchers, Methods, OnOff, ViewKinds, WaterModels
-from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, LEVEL_M, ErrorBudget, LabelSettings
+from pcfix.options import DEFAULT_REFRACTIVE_INDEX, LEVEL_M, ErrorBudget, LabelSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -305,7 +305,7 @@ class CorrectionWords(LabelWords, CameraWords):
 
     def refractive_index(self) -> float | str:
         """Return what `pcfix.correct_file` takes for it."""
-        from pcfix.refract.index import index_words
+        from pcfix.water.index import index_words
 
         return index_words(self.index, self.salinity, self.temperature, self.wavelength)
 

@@ -17,7 +17,7 @@ from pcfix.cli.words import (
     WithM3c2,
     progress_bar,
 )
-from pcfix.settings import ErrorBudget
+from pcfix.options import ErrorBudget
 
 
 class Adjusting(str, Enum):  # noqa: UP042 - typer shows the values of a str Enum

@@ -13,7 +13,7 @@ import pcfix
 from pcfix.cli.groups import takes
 from pcfix.cli.refraction_effect import EffectWords, check_unused, refraction_effect
 from pcfix.cli.words import Overwrite, Quiet, progress_bar
-from pcfix.settings import DEFAULT_REFRACTIVE_INDEX
+from pcfix.options import DEFAULT_REFRACTIVE_INDEX
 
 
 class Block(str, Enum):  # noqa: UP042
@@ -218,7 +218,7 @@ def demo(
     quiet: Quiet = False,
 ) -> None:
     """Simulate, correct, and show how far the cloud is from the truth."""
-    from pcfix.simulate.demo import run_demo
+    from pcfix.flow.demo import run_demo
 
     with progress_bar("Simulating and correcting", quiet) as progress:
         table = run_demo(out_dir, points=points, overwrite=overwrite, progress=progress)

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from pcfix.flow.surfaces import WaterModel
     from pcfix.io.cameras.formats import Angles
     from pcfix.model import Cameras, GroundControl, WaterSurface
-    from pcfix.ports import Port
-    from pcfix.settings import ViewsAre
+    from pcfix.options import ViewsAre
+    from pcfix.port.shapes import Port
 
     AnyPath = str | PathLike[str]
 

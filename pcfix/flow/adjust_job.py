@@ -36,9 +36,9 @@ from pcfix.io.files import check_input
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.io.views import ViewMatch
-from pcfix.label.surface import surface_above
 from pcfix.model import GroundControl, Views
-from pcfix.refract.index import index_of
+from pcfix.water.index import index_of
+from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
     from collections.abc import Callable

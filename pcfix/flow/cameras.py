@@ -16,10 +16,10 @@ from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.files import check_input, check_output, write_bytes
 from pcfix.io.las.crs import metric_crs
 from pcfix.io.las.source import LasSource, coordinates
-from pcfix.label.surface import surface_above
+from pcfix.lens.visibility import cameras_in_sight
 from pcfix.model import WaterDimension
-from pcfix.refract.visibility import cameras_in_sight
-from pcfix.settings import DEFAULT_REFRACTIVE_INDEX
+from pcfix.options import DEFAULT_REFRACTIVE_INDEX
+from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
     from os import PathLike

@@ -16,11 +16,11 @@ import numpy as np
 
 from pcfix.adjust.carry import carry
 from pcfix.errors import GeometryError, PcfixWarning
-from pcfix.label.surface import SurfaceAbove, is_submerged
 from pcfix.model import Outcome, Views, WaterPlane
+from pcfix.options import Settings
 from pcfix.refract.choice import chosen_views, spatial_order
 from pcfix.refract.made_with import MadeWith
-from pcfix.settings import Settings
+from pcfix.water.surface import SurfaceAbove, is_submerged
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

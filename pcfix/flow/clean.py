@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-import pcfix
 from pcfix.clean.flags import flag_weak
 from pcfix.clean.settings import CleanSettings, CleanSummary, Reason
 from pcfix.errors import InputError
@@ -24,9 +23,10 @@ from pcfix.io.las.provenance import cleaning_vlr
 from pcfix.io.las.sink import LasSink, check_suffix
 from pcfix.io.las.source import LasSource, coordinates
 from pcfix.io.scratch import scratch_arrays
-from pcfix.label.surface import is_submerged, surface_above
-from pcfix.model import WaterDimension
-from pcfix.refract.threads import threads
+from pcfix.model import HIGH_NOISE, LOW_NOISE, WaterDimension
+from pcfix.threads import threads
+from pcfix.version import __version__
+from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 
     AnyPath = str | PathLike[str]
 
-NOISE, HIGH_NOISE = 7, 18
 """ASPRS classes of low and high noise (LAS 1.4 R15, table 17)."""
 _PASSES = 4
 
@@ -112,7 +111,7 @@ def clean_file(
             steps = _Steps(len(las), progress)
             found = _find(las, surface, settings, _Means(empty, tile_m, jobs, steps))
         content: dict[str, Any] = {
-            "pcfix": pcfix.__version__,
+            "pcfix": __version__,
             "settings": asdict(settings),
             "water": None if surface is None else str(surface),
             "reasons": _counts(found.reasons),
@@ -223,7 +222,7 @@ def _read(
         xyz = coordinates(points)
         classes = np.asarray(points["classification"])
         withheld = np.asarray(points["withheld"]).astype(np.bool_)
-        good = ~(withheld | (classes == NOISE) | (classes == HIGH_NOISE))
+        good = ~(withheld | (classes == LOW_NOISE) | (classes == HIGH_NOISE))
         rays = las.dimension(points, "RayCount") if "RayCount" in names else None
         if rays is not None:
             optional = [
@@ -315,7 +314,7 @@ def _write(
                 if drop:
                     new = new[~noise]
                 else:
-                    new.array["classification"][noise] = NOISE
+                    new.array["classification"][noise] = LOW_NOISE
                     new["withheld"][:] = np.asarray(new["withheld"]) | noise
                 sink.write(new)
                 steps.add(len(noise))

@@ -11,8 +11,8 @@ from pcfix.clean.settings import LEAST_NEIGHBOURS, CleanSettings
 from pcfix.clean.tiles import in_memory
 from pcfix.errors import InputError, SettingError
 from pcfix.flow.points import as_surface, checked_points
-from pcfix.label.surface import is_submerged, surface_above
-from pcfix.refract.threads import threads
+from pcfix.threads import threads
+from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:
     from collections.abc import Callable

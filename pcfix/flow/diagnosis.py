@@ -27,8 +27,8 @@ from pcfix.flow.survey_signs import (
     signs_of_control,
     signs_of_reference,
 )
-from pcfix.label.surface import is_submerged, surface_above
 from pcfix.model import Cameras
+from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:
     from pcfix.adjust.likely_error import Mended

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-import pcfix
 from pcfix.flow.sorted_points import BLOCK_CELLS, SortedPoints, inside
 from pcfix.grid.cells import cell_numbers, cell_uncertainty
 from pcfix.grid.delaunay import triangulated
@@ -38,6 +37,7 @@ from pcfix.io.rasters import (
     read_heights,
     write_part,
 )
+from pcfix.version import __version__
 
 if TYPE_CHECKING:
     import os
@@ -205,7 +205,7 @@ class _Run:
             self.sorted = SortedPoints(source, self.settings, folder, self.report_reading)
         self.near, self.lattice = self.sorted.near, self.sorted.lattice
         plain = folder / "dsm.tif" if cog else draft
-        tags = {"PCFIX": json.dumps({"pcfix": pcfix.__version__, **asdict(self.settings)})}
+        tags = {"PCFIX": json.dumps({"pcfix": __version__, **asdict(self.settings)})}
         bands = WITH_SIGMA if self.sorted.has_sigma else BANDS
         with new_raster(plain, self.lattice, self.crs, bands, tags=tags) as dsm:
             if self.settings.fill_m is None or self.settings.method == "tin":
@@ -314,7 +314,7 @@ class _Run:
             input=str(self.source),
             output=str(target),
             hillshade=None if shade is None else str(shade),
-            pcfix=pcfix.__version__,
+            pcfix=__version__,
             crs=None if self.crs is None else self.crs.name,
             width=lattice.width,
             height=lattice.height,

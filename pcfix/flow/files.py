@@ -15,7 +15,6 @@ from pcfix.flow.points import CHUNK_POINTS
 from pcfix.flow.surfaces import view_of
 from pcfix.io.files import check_input, check_output, write_text
 from pcfix.io.las.columns import (
-    BATHYMETRIC_POINT,
     TooNarrowError,
     changed_rows,
     columns_for,
@@ -26,11 +25,15 @@ from pcfix.io.las.formats import OutOfRangeError, shifted
 from pcfix.io.las.headers import corrected_header, corrected_identity, output_evlrs
 from pcfix.io.las.sink import LasSink, check_suffix
 from pcfix.io.las.source import LasSource, centring_steps, coordinates
-from pcfix.model import Cameras, Correction, Summary, WaterDimension, WaterSurface
-from pcfix.ports import port_of
-from pcfix.refract.index import index_of
-from pcfix.refract.threads import threads
-from pcfix.settings import (
+from pcfix.model import (
+    BATHYMETRIC_POINT,
+    Cameras,
+    Correction,
+    Summary,
+    WaterDimension,
+    WaterSurface,
+)
+from pcfix.options import (
     DEFAULT_REFRACTIVE_INDEX,
     Dimensions,
     ErrorBudget,
@@ -38,6 +41,9 @@ from pcfix.settings import (
     Settings,
     Uncorrected,
 )
+from pcfix.port.shapes import port_of
+from pcfix.threads import threads
+from pcfix.water.index import index_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -52,8 +58,8 @@ if TYPE_CHECKING:
     from pcfix.io.cameras.formats import Angles
     from pcfix.io.las.columns import Column
     from pcfix.model import FloatArray
-    from pcfix.ports import Port
-    from pcfix.settings import CameraSet, MatcherKind, Method, Occlusion, ViewsAre
+    from pcfix.options import CameraSet, MatcherKind, Method, Occlusion, ViewsAre
+    from pcfix.port.shapes import Port
 
     AnyPath = str | PathLike[str]
 
@@ -111,8 +117,8 @@ def correct_file(
         See `pcfix.read_water`; besides, shoreline points in a vector file, or ``auto``.
     port : Port or str
         Instead of the water, for a cloud that was taken under water: the port of the cameras'
-        housing, as ``flat:distance=0.02,thickness=0.008``; see `pcfix.ports.port_of`. All points
-        count as under water. As no surface is known, ``WaterDepth`` is 0.001 m, the least.
+        housing, as ``flat:distance=0.02,thickness=0.008``; see `pcfix.port.shapes.port_of`. All
+        points count as under water. As no surface is known, ``WaterDepth`` is 0.001 m, the least.
     sensor, angles
         See `pcfix.read_cameras`.
     cameras_crs : str, optional

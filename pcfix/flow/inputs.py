@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from pcfix.io.views import ViewList
     from pcfix.label.mask import WaterMask
     from pcfix.model import FloatArray, TiePoints, WaterSurface
-    from pcfix.ports import Port
-    from pcfix.settings import ViewsAre
+    from pcfix.options import ViewsAre
+    from pcfix.port.shapes import Port
 
     AnyPath = str | PathLike[str]
 

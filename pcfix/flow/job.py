@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-import pcfix
 from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.flow.carrying import Carrying
 from pcfix.flow.diagnosis import diagnose_in_passing
@@ -25,11 +24,12 @@ from pcfix.flow.view_kinds import kind_of_views
 from pcfix.flow.water_checks import WaterMeeting, check_tilt
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.label.labelling import Labelling, Part
-from pcfix.label.surface import is_submerged, surface_above
 from pcfix.model import Correction, Outcome, Summary, WaterDimension, WaterPlane
+from pcfix.options import LabelSettings, Settings
 from pcfix.refract.learned import Learned
 from pcfix.report.tally import Tally
-from pcfix.settings import LabelSettings, Settings
+from pcfix.version import __version__
+from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -225,7 +225,7 @@ class Job:
     def provenance(self) -> dict[str, Any]:
         """Return what a file shall say of its correction."""
         return {
-            "pcfix": pcfix.__version__,
+            "pcfix": __version__,
             "settings": asdict(self.settings),
             "water": str(self.water),
             "water_plane": list(astuple(self.water))
@@ -342,7 +342,7 @@ class Job:
         return Summary(
             input=input,
             output=output,
-            pcfix=pcfix.__version__,
+            pcfix=__version__,
             points=tally.points,
             submerged=tally.submerged,
             corrected=tally.corrected,

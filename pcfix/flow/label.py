@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import pcfix
 from pcfix.errors import SettingError
 from pcfix.flow.files import file_points, water_heights
 from pcfix.flow.inputs import file_of, mask_of
@@ -25,10 +24,11 @@ from pcfix.io.las.provenance import labelling_vlr
 from pcfix.io.las.sink import LasSink, check_suffix
 from pcfix.io.las.source import LasSource, coordinates
 from pcfix.label.labelling import Labelling, Part, sets_class
-from pcfix.label.surface import surface_above
 from pcfix.model import WaterPlane
-from pcfix.refract.threads import threads
-from pcfix.settings import LabelSettings
+from pcfix.options import LabelSettings
+from pcfix.threads import threads
+from pcfix.version import __version__
+from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -227,7 +227,7 @@ def label_file(
     result = LabelSummary(
         input=str(path),
         output=str(target),
-        pcfix=pcfix.__version__,
+        pcfix=__version__,
         **vars(counts),
         water=str(surface),
         settings=asdict(settings),
@@ -299,7 +299,7 @@ def _labelled_header(
     """Return the header of a labelled file, with a record of what was done."""
     mask = labelling.mask
     content = {
-        "pcfix": pcfix.__version__,
+        "pcfix": __version__,
         "settings": asdict(labelling.settings),
         "water": str(water),
         "water_plane": list(astuple(water)) if isinstance(water, WaterPlane) else None,

@@ -9,17 +9,17 @@ import numpy as np
 
 from pcfix.errors import SettingError
 from pcfix.flow.occlusion import (
-    NOISE_CLASSES,
     OccluderBuilder,
     occluder_of,
     wants_occlusion,
 )
 from pcfix.label.labelling import Part
-from pcfix.label.surface import SurfaceAbove, is_submerged, surface_above
+from pcfix.model import NOISE_CLASSES
 from pcfix.refract.learned import Learned
 from pcfix.refract.made_with import MadeWith
 from pcfix.refract.matcher import matcher_of, matcher_of_ties, places_for
 from pcfix.refract.methods import learn_bed
+from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from pcfix.flow.job import Points
     from pcfix.flow.surfaces import CloudView
     from pcfix.model import Cameras, FloatArray, TiePoints, ViewKind, Views, WaterSurface
+    from pcfix.options import Settings
     from pcfix.refract.occlusion import Occluder
     from pcfix.refract.regression import DepthRegression
-    from pcfix.settings import Settings
 
 
 class Learning:

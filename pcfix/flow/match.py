@@ -79,7 +79,7 @@ def _water_at(
 ) -> FloatArray | None:
     """Return the surface's own height, or that above the nearest point that knows it."""
     if water is not None:
-        from pcfix.label.surface import surface_above  # with its compiler, not quick to load
+        from pcfix.water.surface import surface_above  # with its compiler, not quick to load
 
         return surface_above(water, np.column_stack([xy, xy[:, 0]])).height_m
     if len(water_points) == 0:

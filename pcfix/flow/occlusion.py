@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pcfix.model import NOISE_CLASSES
 from pcfix.refract.top_surface import TopSurface
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcfix.model import Cameras, FloatArray
+    from pcfix.options import Settings
     from pcfix.refract.occlusion import Occluder
-    from pcfix.settings import Settings
 
-NOISE_CLASSES = (7, 18)
 """ASPRS classes of low and high noise, which hide nothing."""
 OBLIQUE_DEG = 15.0
 """An image whose axis is farther off the nadir is an oblique. The axes of stabilised nadir blocks

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from pcfix.flow.inputs import Inputs
     from pcfix.io.las.columns import Column
-    from pcfix.settings import LabelSettings, Settings
+    from pcfix.options import LabelSettings, Settings
 
 WAVEFORM_FORMATS = (9, 10)
 

@@ -11,7 +11,6 @@ from pcfix.flow.carrying import Carrying
 from pcfix.flow.learning import learn_of_points
 from pcfix.flow.old_cameras import paired
 from pcfix.io.water import read_water
-from pcfix.label.surface import SurfaceAbove, is_submerged, surface_above
 from pcfix.model import (
     Cameras,
     Correction,
@@ -22,9 +21,10 @@ from pcfix.model import (
     WaterRaster,
     WaterSurface,
 )
+from pcfix.options import DEFAULT_REFRACTIVE_INDEX, ErrorBudget, Settings
 from pcfix.refract.made_with import MadeWith
 from pcfix.refract.methods import correct, shift_of_land
-from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, ErrorBudget, Settings
+from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcfix.model import BoolArray, FloatArray
+    from pcfix.options import CameraSet, MatcherKind, Method, Occlusion
     from pcfix.refract.learned import Learned
     from pcfix.refract.regression import DepthRegression
-    from pcfix.settings import CameraSet, MatcherKind, Method, Occlusion
 
     Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
 

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import pcfix
 from pcfix.errors import GeometryError, SettingError
 from pcfix.flow.inputs import mask_of
 from pcfix.flow.job import PLAIN, Job
 from pcfix.label.labelling import Labelling
-from pcfix.label.surface import SurfaceAbove
 from pcfix.model import Correction, Outcome, WaterPlane
-from pcfix.refract.port_intersection import correct_through_port
+from pcfix.port.intersection import correct_through_port
 from pcfix.report.tally import Tally
+from pcfix.version import __version__
+from pcfix.water.surface import SurfaceAbove
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from pcfix.flow.job import Points
     from pcfix.flow.surfaces import CloudView
     from pcfix.model import FloatArray, Summary
-    from pcfix.ports import Port
-    from pcfix.settings import LabelSettings, Settings
+    from pcfix.options import LabelSettings, Settings
+    from pcfix.port.shapes import Port
 
 
 class PortJob(Job):
@@ -121,7 +121,7 @@ class PortJob(Job):
     def provenance(self) -> dict[str, Any]:
         """Return what a file shall say of its correction."""
         return {
-            "pcfix": pcfix.__version__,
+            "pcfix": __version__,
             "settings": asdict(self.settings),
             "port": asdict(self.port),
             "cameras": len(self.cameras),

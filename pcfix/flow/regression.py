@@ -9,10 +9,10 @@ import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
 from pcfix.io.check_depths import read_check_depths
-from pcfix.io.clouds import NOISE
-from pcfix.label.surface import SurfaceAbove
+from pcfix.model import NOISE_CLASSES
 from pcfix.refract.apparent_depths import LEAST_NEIGHBOURS, REACH, ApparentDepths
 from pcfix.refract.regression import LEAST_COUNT, DepthRegression, fit_depths
+from pcfix.water.surface import SurfaceAbove
 
 if TYPE_CHECKING:
     import os
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pcfix.io.check_depths import CheckDepths
     from pcfix.label.labelling import Part
     from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.settings import Settings
+    from pcfix.options import Settings
 
 
 def learn_regression(
@@ -70,7 +70,7 @@ def learn_regression(
     checks = read_check_depths(path)
     around = ApparentDepths(checks.xy)
     for part in parts:
-        rows = np.flatnonzero(~np.isin(part.classes, NOISE))
+        rows = np.flatnonzero(~np.isin(part.classes, NOISE_CLASSES))
         surface = SurfaceAbove(part.surface.height_m[rows], part.surface.slope[rows])
         around.add(part.xyz[rows], surface)
     radius = REACH * around.spacing_m if radius_m is None else radius_m

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import pcfix
 from pcfix.errors import InputError
 from pcfix.flow.points import CHUNK_POINTS
 from pcfix.io.files import sha256, write_bytes, write_text
@@ -21,6 +20,7 @@ from pcfix.report.maps import MapsBuilder
 from pcfix.report.page import Layer, Picture, Report, Table, render
 from pcfix.report.text import errors_of, share
 from pcfix.report.tvu import ORDERS, tvu_sentence
+from pcfix.version import __version__
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -262,6 +262,6 @@ def _files(paths: Iterable[Path]) -> Table:
 
 
 def _versions() -> Table:
-    rows: list[list[Any]] = [["pcfix", pcfix.__version__], ["Python", platform.python_version()]]
+    rows: list[list[Any]] = [["pcfix", __version__], ["Python", platform.python_version()]]
     rows += [[name, version(name)] for name in ("numpy", "scipy", "numba", "laspy", "lazrs")]
     return Table("Software", ["name", "version"], rows)

@@ -15,7 +15,7 @@ from pcfix.io.las.headers import output_evlrs, restored_header
 from pcfix.io.las.provenance import read_settings
 from pcfix.io.las.sink import LasSink, check_suffix
 from pcfix.io.las.source import LasSource
-from pcfix.refract.threads import threads
+from pcfix.threads import threads
 
 if TYPE_CHECKING:
     import os
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import laspy
     import numpy.typing as npt
 
-    from pcfix.settings import Dimensions
+    from pcfix.options import Dimensions
 
     AnyPath = str | os.PathLike[str]
 

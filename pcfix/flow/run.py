@@ -34,14 +34,14 @@ from pcfix.io.files import files_in
 from pcfix.io.las.source import LasSource
 from pcfix.io.rasters import open_raster
 from pcfix.model import Summary
-from pcfix.refract.index import index_of
+from pcfix.options import DEFAULT_REFRACTIVE_INDEX, ErrorBudget, LabelSettings, Settings
 from pcfix.report.evaluation import evaluation, in_a_sentence
 from pcfix.report.run_adjustment import (
     adjustment_sentence,
     adjustment_table,
     reason_sentence,
 )
-from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, ErrorBudget, LabelSettings, Settings
+from pcfix.water.index import index_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -50,8 +50,8 @@ if TYPE_CHECKING:
     from pcfix.flow.run_adjust import AdjustWhen
     from pcfix.flow.surfaces import WaterModel
     from pcfix.io.cameras.formats import Angles
+    from pcfix.options import CameraSet, MatcherKind, Method, Occlusion, ViewsAre
     from pcfix.report.page import Picture, Table
-    from pcfix.settings import CameraSet, MatcherKind, Method, Occlusion, ViewsAre
 
 RECORD = "run.json"
 SECTIONS = 3

@@ -20,8 +20,8 @@ from pcfix.io.files import check_input, read_json
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.model import WaterDimension
-from pcfix.refract.index import index_of
-from pcfix.refract.threads import threads
+from pcfix.threads import threads
+from pcfix.water.index import index_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -12,8 +12,8 @@ from pcfix.flow.points import CHUNK_POINTS
 from pcfix.grid.lattice import Window, cells_of, fits, lattice_over, refuse_size
 from pcfix.grid.spacing import Occupancy
 from pcfix.io.bins import Bins
-from pcfix.io.las.columns import BATHYMETRIC_POINT
 from pcfix.io.las.source import LasSource, coordinates
+from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     Progress = Callable[[int, int], None]
 
-NOISE = (7, 18)
 """ASPRS classes of low and high noise."""
 BLOCK_CELLS = 1024
 """Longest side of a window; a power of two."""
@@ -141,7 +140,7 @@ def inside(cell: IntArray, window: Window) -> BoolArray:
 
 def _wanted(points: laspy.ScaleAwarePointRecord, surface: SurfaceChoice) -> BoolArray:
     classes = np.asarray(points["classification"])
-    wanted = classes == BATHYMETRIC_POINT if surface == "bed" else ~np.isin(classes, NOISE)
+    wanted = classes == BATHYMETRIC_POINT if surface == "bed" else ~np.isin(classes, NOISE_CLASSES)
     return np.asarray(wanted & ~np.asarray(points["withheld"]).astype(bool))
 
 

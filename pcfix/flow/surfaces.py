@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     import numpy.typing as npt
     from pyproj import CRS
 
-    from pcfix.label.auto import WaterProposal
-    from pcfix.label.fit import WaterFit
-    from pcfix.label.river import RiverFit
     from pcfix.model import FloatArray, WaterSurface
+    from pcfix.water.auto import WaterProposal
+    from pcfix.water.fit import WaterFit
+    from pcfix.water.river import RiverFit
 
     AnyPath = str | PathLike[str]
     Evidence: TypeAlias = WaterFit | RiverFit | WaterProposal
@@ -100,8 +100,8 @@ class WaterWords:
         See `pcfix.read_water`; besides, a vector file of shoreline points or lines, to which a
         surface is fitted, or ``auto``: the surface is sought in the cloud.
     model : {"auto", "level", "plane", "along", "river"}
-        What is fitted to shoreline points; see `pcfix.label.fit.fit_water` and
-        `pcfix.label.river.fit_river`.
+        What is fitted to shoreline points; see `pcfix.water.fit.fit_water` and
+        `pcfix.water.river.fit_river`.
     crs : str or None
         Of shoreline points, instead of what their file says.
     """
@@ -183,7 +183,7 @@ def _bounds(low: FloatArray, high: FloatArray) -> tuple[float, float, float, flo
 
 
 def _sought(view: CloudView | None) -> FoundSurface:
-    from pcfix.label.auto import find_water
+    from pcfix.water.auto import find_water
 
     if view is None:
         raise SettingError("water 'auto' is found in a cloud; give the cloud too.")
@@ -213,8 +213,8 @@ def _thinned(seen: Seen, every: int) -> Seen:
 def _fitted(words: WaterWords, path: AnyPath, view: CloudView | None) -> FoundSurface:
     """Return the surface fitted to shoreline points."""
     from pcfix.io.shorelines import read_shoreline
-    from pcfix.label.fit import fit_water
-    from pcfix.label.river import fit_river
+    from pcfix.water.fit import fit_water
+    from pcfix.water.river import fit_river
 
     shore = read_shoreline(path, None if view is None else view.crs, crs=words.crs)
     xyz, notes = shore.xyz, list(shore.notes)
@@ -236,7 +236,7 @@ def _with_heights(
     xyz: FloatArray, name: str, view: CloudView | None, notes: list[str]
 ) -> FloatArray:
     """Give the points without a height that of the cloud about them."""
-    from pcfix.label.cloud_heights import heights_from_cloud, is_near
+    from pcfix.water.cloud_heights import heights_from_cloud, is_near
 
     if view is None:
         raise InputError(f"{name}: has points without a height; give the cloud too.")

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.adjust.diagnosis import Sign, bed_sign, control_sign, focal_sign, land_sign
-from pcfix.label.surface import surface_above
 from pcfix.model import WaterDimension
+from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
     from pcfix.flow.surfaces import CloudView
@@ -131,7 +131,7 @@ def signs_of_control(evidence: Evidence, control: GroundControl) -> list[Sign]:
 
 
 def _control_sign(evidence: Evidence, control: GroundControl, rows: IntArray, gsd_m: float) -> Sign:
-    from pcfix.refract.lens import project
+    from pcfix.lens.imaging import project
 
     cameras, camera = evidence.cameras, control.camera[rows]
     away = control.xyz[control.point[rows]] - cameras.centres[camera]
@@ -144,7 +144,7 @@ def _control_sign(evidence: Evidence, control: GroundControl, rows: IntArray, gs
 
 def cloud_heights(view: CloudView, xyz: FloatArray, gsd_m: float) -> FloatArray:
     """Return the heights of a cloud about single places, shape (p,); NaN where it has none."""
-    from pcfix.label.cloud_heights import heights_from_cloud, is_near
+    from pcfix.water.cloud_heights import heights_from_cloud, is_near
 
     radius = float(np.clip(10.0 * gsd_m, 0.2, 2.0))
     xy = np.ascontiguousarray(xyz[:, :2])

@@ -17,11 +17,11 @@ from pcfix.refract.methods import correct
 if TYPE_CHECKING:
     from typing import Literal
 
-    from pcfix.label.surface import SurfaceAbove
     from pcfix.model import Cameras, FloatArray, IntArray, WaterSurface
+    from pcfix.options import Settings
     from pcfix.refract.learned import Learned
     from pcfix.refract.made_with import MadeWith
-    from pcfix.settings import Settings
+    from pcfix.water.surface import SurfaceAbove
 
 PATCHES, PATCH_POINTS = 300, 12
 CLEARLY = 0.95

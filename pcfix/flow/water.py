@@ -10,10 +10,10 @@ import numpy as np
 
 from pcfix.flow.surfaces import CloudView, FoundSurface, WaterWords, find_surface, view_of
 from pcfix.io.files import check_input, check_output, write_bytes
-from pcfix.label.fit import WaterFit
-from pcfix.label.river import RiverFit
-from pcfix.label.surface import surface_above
 from pcfix.model import WaterDimension
+from pcfix.water.fit import WaterFit
+from pcfix.water.river import RiverFit
+from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
     from os import PathLike

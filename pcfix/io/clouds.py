@@ -9,10 +9,18 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.io.las.columns import BATHYMETRIC_POINT, SHIFTS
+from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.provenance import is_ours
 from pcfix.io.las.source import LasSource, coordinates, las_errors
-from pcfix.model import BoolArray, FloatArray, WaterDimension, WaterPlane, WaterSurface
+from pcfix.model import (
+    BATHYMETRIC_POINT,
+    NOISE_CLASSES,
+    BoolArray,
+    FloatArray,
+    WaterDimension,
+    WaterPlane,
+    WaterSurface,
+)
 
 if TYPE_CHECKING:
     import os
@@ -21,8 +29,7 @@ if TYPE_CHECKING:
     import laspy
     from pyproj import CRS
 
-NOISE = (7, 18)
-"""ASPRS classes low noise and high noise."""
+
 CHUNK_POINTS = 2_000_000
 
 
@@ -75,7 +82,7 @@ class SurveyCloud:
 def read_cloud(
     path: str | os.PathLike[str],
     water: WaterSurface | None = None,
-    skip_classes: Sequence[int] = NOISE,
+    skip_classes: Sequence[int] = NOISE_CLASSES,
 ) -> SurveyCloud:
     """Read the points that count of a LAS or LAZ cloud that fits in memory.
 
@@ -151,7 +158,7 @@ def _part(
         depth = np.asarray(points["WaterDepth"], np.float64)
         above = np.where(depth > 0.0, xyz[:, 2] + depth, np.nan)
     elif water is not None:
-        from pcfix.label.surface import surface_above  # with its compiler, not quick to load
+        from pcfix.water.surface import surface_above  # with its compiler, not quick to load
 
         above = surface_above(water, xyz, heights).height_m
     else:

@@ -51,8 +51,8 @@ def check_mesh(mesh: WaterMesh, path: Path) -> None:
     InputError
         If much of it lies above another part, as a closed body or two surfaces do.
     """
-    from pcfix.label.sheets import in_two_sheets
-    from pcfix.label.tin import build_tin
+    from pcfix.water.sheets import in_two_sheets
+    from pcfix.water.tin import build_tin
 
     tin = build_tin(mesh)
     double, area_m2 = in_two_sheets(tin)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcfix.io.las.columns import Column
+from pcfix.model import BATHYMETRIC_POINT
     from pcfix.model import Correction, FloatArray, Summary
 
 Dimensions: TypeAlias = "dict[str, npt.NDArray[Any]]"

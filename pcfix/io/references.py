@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
-from pcfix.io.clouds import NOISE, read_cloud
+from pcfix.io.clouds import read_cloud
 from pcfix.io.crs import is_same, parts
 from pcfix.io.files import check_input
 from pcfix.io.tables import read_table
-from pcfix.model import FloatArray  # noqa: TC001 - dataclass fields
+from pcfix.model import (
+    NOISE_CLASSES,
+    FloatArray,
+)
 
 if TYPE_CHECKING:
     import os
@@ -67,7 +70,7 @@ def read_reference(path: str | os.PathLike[str]) -> Reference:
     source = check_input(path)
     suffix = source.suffix.lower()
     if suffix in (".las", ".laz"):
-        cloud = read_cloud(source, skip_classes=NOISE + WATER_CLASSES)
+        cloud = read_cloud(source, skip_classes=NOISE_CLASSES + WATER_CLASSES)
         return Reference(cloud.name, cloud.xyz, cloud.crs, cloud.left_out)
     if suffix in (".csv", ".txt"):
         table = read_table(source, ("x", "y", "z"))

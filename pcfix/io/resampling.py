@@ -113,7 +113,7 @@ def _extent(part: Part, to_cloud: Points, name: str) -> tuple[float, Bounds]:
 
 def _heights_at(part: Part, places: FloatArray, to_cloud: Points) -> FloatArray:
     """Return heights in the cloud's system at places in the raster's CRS; NaN where unknown."""
-    from pcfix.label.raster import Field, heights_above
+    from pcfix.water.raster import Field, heights_above
 
     column, row = place_of(~part.transform, places[:, 0], places[:, 1])
     cells = Field(np.ascontiguousarray(part.heights), 0.5, -0.5, 1.0, 1.0)

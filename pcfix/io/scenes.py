@@ -11,10 +11,10 @@ import laspy
 import numpy as np
 from pyproj import CRS
 
-import pcfix
 from pcfix.io.files import check_output, write_bytes, write_text
-from pcfix.io.las.columns import BATHYMETRIC_POINT
 from pcfix.io.las.sink import LasSink
+from pcfix.model import BATHYMETRIC_POINT
+from pcfix.version import __version__
 
 if TYPE_CHECKING:
     import os
@@ -150,7 +150,7 @@ def _facts(scene: Scene, files: dict[str, str]) -> str:
     plane = scene.water
     tilted = f"plane:{plane.a!r},{plane.b!r},{plane.c!r}"
     facts = {
-        "made_by": f"pcfix {pcfix.__version__}",
+        "made_by": f"pcfix {__version__}",
         "crs": f"EPSG:{scene.epsg}",
         "water": f"{plane.a!r}" if plane.b == plane.c == 0.0 else tilted,
         "water_level_m": scene.water_level_m,
@@ -221,7 +221,7 @@ def _write_cloud(
     header.scales = np.full(3, step_m)
     header.offsets = np.floor(xyz.min(axis=0))
     header.add_crs(CRS.from_epsg(epsg))
-    header.generating_software = f"pcfix {pcfix.__version__}"
+    header.generating_software = f"pcfix {__version__}"
     points = laspy.ScaleAwarePointRecord.zeros(len(xyz), header=header)
     for axis, name in enumerate("XYZ"):
         points.array[name] = np.rint((xyz[:, axis] - header.offsets[axis]) / step_m)

@@ -1,7 +1,7 @@
 """Rasters of the water's height, in the cloud's CRS.
 
 A north-up raster in the cloud's own CRS is taken cell by cell. Any other is sampled on a grid in
-the cloud's CRS, with the same rule between its cells as `pcfix.label.raster` has, so that a gap
+the cloud's CRS, with the same rule between its cells as `pcfix.water.raster` has, so that a gap
 stays a gap; GDAL would fill half a cell of it. Positions go through the transformations that
 cameras go through, which refuse what PROJ can only guess.
 """

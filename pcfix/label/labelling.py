@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.io.las.columns import BATHYMETRIC_POINT
 from pcfix.label.connected import Grid
 from pcfix.label.left_out import LeftOut
-from pcfix.label.surface import is_submerged
+from pcfix.model import BATHYMETRIC_POINT, UNCLASSIFIED, WATER_SURFACE
+from pcfix.water.surface import is_submerged
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -26,13 +26,12 @@ if TYPE_CHECKING:
 
     from pcfix.label.connected import Surroundings
     from pcfix.label.mask import WaterMask
-    from pcfix.label.surface import SurfaceAbove
     from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.settings import LabelSettings
+    from pcfix.options import LabelSettings
+    from pcfix.water.surface import SurfaceAbove
 
     Classes = npt.NDArray[np.uint8]
 
-UNCLASSIFIED, WATER_SURFACE = 1, 41
 """ASPRS classes (LAS 1.4 R15, table 17, and its topo-bathy lidar domain profile)."""
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pcfix.label.connected import Lattice, Pools, Surroundings
     from pcfix.label.mask import WaterMask
     from pcfix.model import BoolArray, FloatArray
-    from pcfix.settings import LabelSettings
+    from pcfix.options import LabelSettings
 
 
 class LeftOut:

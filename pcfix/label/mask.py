@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from pcfix.io.vectors import load
-
 if TYPE_CHECKING:
     import numpy.typing as npt
 
@@ -72,16 +70,19 @@ class WaterMask:
 
     def inside(self, x: FloatArray, y: FloatArray) -> BoolArray:
         """Return which of n plan positions, metres, world frame, are inside."""
+        import shapely
+
         states = np.empty(x.size, np.uint8)
         _look_up(self._cells, np.asarray(self.bounds), x, y, states)
         asked = np.flatnonzero(states == CROSSED)
-        states[asked] = load("shapely").intersects_xy(self.area, x[asked], y[asked])
+        states[asked] = shapely.intersects_xy(self.area, x[asked], y[asked])
         return states.astype(np.bool_)
 
 
 def _cells_over(area: Any, corner: FloatArray, side_m: float) -> _Cells:
     """Return the states of the cells of a square, halving only those that the border crosses."""
-    shapely = load("shapely")
+    import shapely
+
     shapely.prepare(area)
     west, south = corner.tolist()
     side_m = max(side_m, 1e-3)
@@ -99,7 +100,8 @@ def _cells_over(area: Any, corner: FloatArray, side_m: float) -> _Cells:
 
 
 def _states_of(area: Any, boxes: npt.NDArray[Any]) -> States:
-    shapely = load("shapely")
+    import shapely
+
     state = np.where(shapely.covers(area, boxes), INSIDE, CROSSED).astype(np.uint8)
     rest: IntArray = np.flatnonzero(state == CROSSED)
     state[rest[~shapely.intersects(area, boxes[rest])]] = OUTSIDE

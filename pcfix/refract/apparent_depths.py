@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.label.surface import is_submerged
+from pcfix.water.surface import is_submerged
 
 if TYPE_CHECKING:
-    from pcfix.label.surface import SurfaceAbove
     from pcfix.model import BoolArray, FloatArray
+    from pcfix.water.surface import SurfaceAbove
 
 NEIGHBOURS, LEAST_NEIGHBOURS = 16, 3
 MOST_PLACES = 1000

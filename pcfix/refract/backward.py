@@ -35,13 +35,13 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numba import njit
 
-from pcfix.label.raster import height_at
-from pcfix.label.tin import locate
+from pcfix.water.raster import height_at
+from pcfix.water.tin import locate
 
 if TYPE_CHECKING:
-    from pcfix.label.raster import Field
-    from pcfix.label.tin import Tin
     from pcfix.model import FloatArray
+    from pcfix.water.raster import Field
+    from pcfix.water.tin import Tin
 
 Path: TypeAlias = tuple[float, float, float, float, float, float, float]
 """k, S, H, D and s."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from pcfix.refract.threads import one_caller
+from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     from pcfix.model import FloatArray, IntArray

@@ -12,11 +12,11 @@ from pcfix.refract.result import Intersection
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from pcfix.label.surface import SurfaceAbove
     from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Views, WaterSurface
+    from pcfix.options import Settings
     from pcfix.refract.learned import Learned
     from pcfix.refract.made_with import MadeWith
-    from pcfix.settings import Settings
+    from pcfix.water.surface import SurfaceAbove
 
 
 class Bundle(NamedTuple):

@@ -10,10 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit, prange
 
-from pcfix.label.raster import build_field
-from pcfix.label.tin import build_tin, locate
-from pcfix.model import Views, WaterMesh, WaterRaster
-from pcfix.refract.frames import (
+from pcfix.lens.frames import (
     NOT_DISTORTED,
     NOTHING,
     frames_of,
@@ -22,16 +19,19 @@ from pcfix.refract.frames import (
     may_hold,
     no_frames,
 )
+from pcfix.model import Views, WaterMesh, WaterRaster
 from pcfix.refract.piercing import pierce_mesh, pierce_raster
-from pcfix.refract.threads import one_caller
+from pcfix.threads import one_caller
+from pcfix.water.raster import build_field
+from pcfix.water.tin import build_tin, locate
 
 if TYPE_CHECKING:
-    from pcfix.label.raster import Field
-    from pcfix.label.surface import SurfaceAbove
-    from pcfix.label.tin import Tin
+    from pcfix.lens.frames import Frames
     from pcfix.model import Cameras, FloatArray, IntArray, WaterSurface
-    from pcfix.refract.frames import Frames
-    from pcfix.settings import Settings
+    from pcfix.options import Settings
+    from pcfix.water.raster import Field
+    from pcfix.water.surface import SurfaceAbove
+    from pcfix.water.tin import Tin
 
 TILE = 128
 """Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""

@@ -32,22 +32,22 @@ import numpy as np
 from numba import njit, prange
 
 from pcfix.errors import PcfixWarning, SettingError
-from pcfix.label.raster import build_field
-from pcfix.label.tin import build_tin, locate
+from pcfix.lens.derivatives import image_and_gradients
+from pcfix.lens.imaging import image_of, lens_table
 from pcfix.model import Outcome, WaterMesh, WaterRaster
 from pcfix.refract.backward import light_path, settle, slope_of_path
-from pcfix.refract.image_jacobian import image_and_gradients
-from pcfix.refract.lens import image_of, lens_table
 from pcfix.refract.piercing import pierce_mesh, pierce_raster
 from pcfix.refract.rays import line_terms, nearest_point, refracted
 from pcfix.refract.result import Intersection
-from pcfix.refract.threads import one_caller
+from pcfix.threads import one_caller
+from pcfix.water.raster import build_field
+from pcfix.water.tin import build_tin, locate
 
 if TYPE_CHECKING:
-    from pcfix.label.raster import Field
-    from pcfix.label.tin import Tin
     from pcfix.model import Cameras, FloatArray, IntArray
     from pcfix.refract.bundles import Bundle
+    from pcfix.water.raster import Field
+    from pcfix.water.tin import Tin
 
 MAX_STEPS = 30
 CLOSE_M = 1e-7

@@ -29,18 +29,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numba import njit, prange
 
+from pcfix.lens.frames import holds
 from pcfix.model import Outcome
 from pcfix.refract.backward import light_path
-from pcfix.refract.frames import holds
 from pcfix.refract.made_with import Images, as_made, as_now, images_of
 from pcfix.refract.matcher import Matcher
 from pcfix.refract.rays import refracted
-from pcfix.refract.threads import one_caller
+from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
+    from pcfix.lens.frames import Frames
     from pcfix.model import FloatArray, IntArray
     from pcfix.refract.bundles import Bundle
-    from pcfix.refract.frames import Frames
     from pcfix.refract.result import Intersection
 
 MAX_LOOKS = 5

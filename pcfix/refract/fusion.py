@@ -32,12 +32,12 @@ from pcfix.refract.depth_maps import (
     sight_of,
 )
 from pcfix.refract.matcher import Matcher
-from pcfix.refract.threads import one_caller
+from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
+    from pcfix.lens.frames import Frames
     from pcfix.model import FloatArray, IntArray
     from pcfix.refract.bundles import Bundle
-    from pcfix.refract.frames import Frames
     from pcfix.refract.made_with import Images
     from pcfix.refract.result import Intersection
 

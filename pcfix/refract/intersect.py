@@ -18,19 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit, prange
 
-from pcfix.label.raster import build_field
-from pcfix.label.tin import build_tin, locate
-from pcfix.model import Outcome, WaterMesh, WaterRaster
-from pcfix.refract.choice import (
-    ANY_NUMBER,
-    TILE,
-    choose,
-    gather,
-    least_cosine2,
-    near_cameras,
-    spatial_order,
-)
-from pcfix.refract.frames import (
+from pcfix.lens.frames import (
     ALL,
     NOT_DISTORTED,
     NOTHING,
@@ -43,15 +31,25 @@ from pcfix.refract.frames import (
     no_frames,
     pyramid,
 )
+from pcfix.model import Outcome, WaterMesh, WaterRaster
+from pcfix.refract.choice import (
+    ANY_NUMBER,
+    TILE,
+    choose,
+    gather,
+    least_cosine2,
+    near_cameras,
+    spatial_order,
+)
 from pcfix.refract.piercing import pierce_mesh, pierce_raster
 from pcfix.refract.rays import line_terms, nearest_point, refracted
 from pcfix.refract.result import Intersection
-from pcfix.refract.threads import one_caller
+from pcfix.threads import one_caller
+from pcfix.water.raster import build_field
+from pcfix.water.tin import build_tin, locate
 
 if TYPE_CHECKING:
-    from pcfix.label.raster import Field
-    from pcfix.label.surface import SurfaceAbove
-    from pcfix.label.tin import Tin
+    from pcfix.lens.frames import Frames, Pyramid
     from pcfix.model import (
         BoolArray,
         Cameras,
@@ -60,8 +58,10 @@ if TYPE_CHECKING:
         Views,
         WaterSurface,
     )
-    from pcfix.refract.frames import Frames, Pyramid
-    from pcfix.settings import Settings
+    from pcfix.options import Settings
+    from pcfix.water.raster import Field
+    from pcfix.water.surface import SurfaceAbove
+    from pcfix.water.tin import Tin
 
 _NO_CAMERA, _ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
 _PARALLEL, _CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)

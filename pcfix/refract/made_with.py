@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit
 
-from pcfix.refract.lens import direction_of, image_of, lens_table
+from pcfix.lens.imaging import direction_of, image_of, lens_table
 
 if TYPE_CHECKING:
     from pcfix.model import Cameras, FloatArray, IntArray
@@ -51,7 +51,7 @@ class Images(NamedTuple):
     row, row_now : array, shape (k,)
         The lens of each image in the tables.
     lenses, lenses_now : array, shape (l, ...)
-        See `pcfix.refract.lens.lens_table`.
+        See `pcfix.lens.imaging.lens_table`.
     """
 
     centres: FloatArray

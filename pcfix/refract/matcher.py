@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit, prange
 
+from pcfix.lens.frames import frames_of
+from pcfix.lens.imaging import project
 from pcfix.model import Views
-from pcfix.refract.frames import frames_of
-from pcfix.refract.lens import project
-from pcfix.refract.threads import one_caller
+from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
+    from pcfix.lens.frames import Frames
     from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
-    from pcfix.refract.frames import Frames
 
 MATCHED, AVERAGED, NEIGHBOURS = 5, 8, 12
 BEST_ANGLE_DEG, NARROW_DEG, WIDE_DEG = 12.0, 4.56, 8.4

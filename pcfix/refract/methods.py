@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.label.surface import SurfaceAbove
 from pcfix.model import WaterPlane
 from pcfix.refract.bed import Bed, bed_of
 from pcfix.refract.bundles import Bundle
@@ -26,14 +25,15 @@ from pcfix.refract.occlusion import in_sight
 from pcfix.refract.result import Intersection
 from pcfix.refract.stereo_pairs import cameras_of_pairs, invert_pairs
 from pcfix.refract.uncertainty import with_uncertainty
+from pcfix.water.surface import SurfaceAbove
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterSurface
+    from pcfix.options import Settings
     from pcfix.refract.made_with import MadeWith
     from pcfix.refract.occlusion import Occluder
-    from pcfix.settings import Settings
 
 POINTS_AT_ONCE = 100_000
 """Bounds the memory of the lists of cameras: some 50 MB at 40 rays a point."""

@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit
 
-from pcfix.label.raster import height_at
-from pcfix.label.tin import locate
+from pcfix.water.raster import height_at
+from pcfix.water.tin import locate
 
 if TYPE_CHECKING:
-    from pcfix.label.raster import Field
-    from pcfix.label.tin import Tin
+    from pcfix.water.raster import Field
+    from pcfix.water.tin import Tin
 
 MAX_STEPS = 16
 MAX_HALVINGS = 64

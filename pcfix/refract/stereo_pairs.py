@@ -32,16 +32,16 @@ import numpy as np
 from numba import njit, prange
 
 from pcfix.errors import PcfixWarning
+from pcfix.lens.derivatives import image_and_gradients
+from pcfix.lens.imaging import lens_table
+from pcfix.lens.places import KIND
+from pcfix.lens.projections import CODES
 from pcfix.model import Outcome, Views
 from pcfix.refract.backward import light_path
 from pcfix.refract.consistent import check_consistent
-from pcfix.refract.image_jacobian import image_and_gradients
-from pcfix.refract.lens import lens_table
 from pcfix.refract.made_with import Images, as_made, images_of
-from pcfix.refract.places import KIND
-from pcfix.refract.projections import CODES
 from pcfix.refract.rays import MIN_DETERMINANT, line_terms, nearest_point, refracted
-from pcfix.refract.threads import one_caller
+from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, FloatArray, IntArray

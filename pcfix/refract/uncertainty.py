@@ -25,10 +25,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 from numba import njit, prange
 
-from pcfix.model import Outcome, WaterPlane
-from pcfix.refract import sensitivity as s
-from pcfix.refract.choice import TILE, chosen_views, gather, least_cosine2, spatial_order
-from pcfix.refract.frames import (
+from pcfix.lens.frames import (
     ALL,
     NOT_DISTORTED,
     NOTHING,
@@ -40,16 +37,19 @@ from pcfix.refract.frames import (
     may_hold,
     pyramid,
 )
-from pcfix.refract.threads import one_caller
-from pcfix.settings import LEVEL_M
+from pcfix.model import Outcome, WaterPlane
+from pcfix.options import LEVEL_M
+from pcfix.refract import sensitivity as s
+from pcfix.refract.choice import TILE, chosen_views, gather, least_cosine2, spatial_order
+from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
-    from pcfix.label.surface import SurfaceAbove
+    from pcfix.lens.frames import Frames, Pyramid
     from pcfix.model import Cameras, FloatArray, IntArray, Lens, Views
-    from pcfix.refract.frames import Frames, Pyramid
+    from pcfix.options import Settings
     from pcfix.refract.learned import Learned
     from pcfix.refract.result import Intersection
-    from pcfix.settings import Settings
+    from pcfix.water.surface import SurfaceAbove
 
 NOMINAL_FOCAL_PX = 3700.0
 """Of cameras without a lens: a survey drone's of 20 megapixels, 0.27 mrad a pixel."""

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.adjust.block import sensor_groups
-from pcfix.label.surface import surface_above
 from pcfix.report.adjustment_values import carried_by, nice_step, rms
 from pcfix.report.figures import AFTER, BEFORE, WATER, new_figure
 from pcfix.report.page import Picture
+from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,8 +8,8 @@ import numpy as np
 
 from pcfix.adjust.block import sensor_groups, usable_codes
 from pcfix.adjust.state import CODES, K1, P1, WATER_NAMES
-from pcfix.label.surface import surface_above
 from pcfix.model import WaterPlane
+from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.flow.flume_methods import METHODS
 from pcfix.report.figures import AFTER, BEFORE, REFERENCE, WATER, new_figure
-from pcfix.simulate.flume_methods import METHODS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from pcfix.simulate.flume_methods import DepthBins
+    from pcfix.flow.flume_methods import DepthBins
     from pcfix.simulate.shan import Iteration
 
 _COLOURS = {

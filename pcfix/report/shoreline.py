@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from pcfix.label.auto import WaterProposal
     from pcfix.model import FloatArray
+    from pcfix.water.auto import WaterProposal
 
 WITNESSES = ("brightness", "noise")
 """Cues that do not fix the level are drawn thinly."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from pcfix.options import DEFAULT_REFRACTIVE_INDEX
 from pcfix.report.tvu import budget_words, tvu_sentence
-from pcfix.settings import DEFAULT_REFRACTIVE_INDEX
 
 if TYPE_CHECKING:
     from pcfix.model import Summary

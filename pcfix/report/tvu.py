@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.settings import LEVEL_M
+from pcfix.options import LEVEL_M
 
 if TYPE_CHECKING:
     from pcfix.model import FloatArray
@@ -114,7 +114,7 @@ def budget_words(errors: dict[str, Any], level_from_fit: float | None = None) ->
     Parameters
     ----------
     errors : dict
-        `pcfix.settings.ErrorBudget` as plain values.
+        `pcfix.options.ErrorBudget` as plain values.
     level_from_fit : float, optional
         Standard error of the level that a fit gave, where the user stated none.
     """

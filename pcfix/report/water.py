@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.label.auto import WaterProposal
-from pcfix.label.fit import WaterFit
-from pcfix.label.river import RiverFit
 from pcfix.report.figures import AFTER, BEFORE, WATER, new_figure
 from pcfix.report.shoreline import shoreline_figure
+from pcfix.water.auto import WaterProposal
+from pcfix.water.fit import WaterFit
+from pcfix.water.river import RiverFit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

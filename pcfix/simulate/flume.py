@@ -15,7 +15,7 @@ import numpy as np
 from pcfix.errors import SettingError
 from pcfix.io.cameras.table import rotations_from_yaw_pitch_roll
 from pcfix.model import Cameras, Lens, Views
-from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, Settings
+from pcfix.options import DEFAULT_REFRACTIVE_INDEX, Settings
 from pcfix.simulate.tracing import piercing_points, project, triangulate
 
 if TYPE_CHECKING:

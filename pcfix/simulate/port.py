@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.model import Cameras, Lens, Views
-from pcfix.ports import DomePort, FlatPort
-from pcfix.settings import DEFAULT_REFRACTIVE_INDEX
+from pcfix.options import DEFAULT_REFRACTIVE_INDEX
+from pcfix.port.shapes import DomePort, FlatPort
 from pcfix.simulate.tracing import triangulate
 
 if TYPE_CHECKING:
     from pcfix.model import FloatArray
-    from pcfix.ports import Port
+    from pcfix.port.shapes import Port
 
 _NEWTON_STEPS = 60
 _CONVERGED_M = 1e-13

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, Settings
+from pcfix.options import DEFAULT_REFRACTIVE_INDEX, Settings
 
 if TYPE_CHECKING:
     from pcfix.model import FloatArray

@@ -10,7 +10,7 @@ import numpy as np
 
 from pcfix.errors import SettingError
 from pcfix.model import WaterPlane
-from pcfix.settings import DEFAULT_REFRACTIVE_INDEX, Settings
+from pcfix.options import DEFAULT_REFRACTIVE_INDEX, Settings
 from pcfix.simulate.block import (
     FLYING_HEIGHT_M,
     FOCAL_MM,

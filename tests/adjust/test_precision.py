@@ -13,8 +13,8 @@ from pcfix.adjust.block import Unknowns
 from pcfix.adjust.precision import precision_of, strong_correlations, undetermined
 from pcfix.adjust.solve import prepare, solve
 from pcfix.errors import GeometryError
-from pcfix.refract.threads import threads
 from pcfix.simulate.tie_points import simulate_tie_points
+from pcfix.threads import threads
 from tests.utils.adjust_twin import Twin
 from tests.utils.tie_blocks import block_of, clear_of_the_waterline
 

@@ -37,7 +37,7 @@ import pcfix
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from pcfix.flow.regression import learn_regression
 from pcfix.label.labelling import Part
-from pcfix.label.surface import surface_above
+from pcfix.water.surface import surface_above
 from tests.benchmarks.accuracy_scenes import NAMES, Case, make
 from tests.benchmarks.accuracy_sensitivity import COLUMNS as SENSITIVITY_COLUMNS
 from tests.benchmarks.accuracy_sensitivity import sensitivity

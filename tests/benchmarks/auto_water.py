@@ -17,9 +17,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from pcfix.errors import GeometryError
-from pcfix.label.auto import find_water
 from pcfix.simulate.block import fly, lens, reach_m
 from pcfix.simulate.tracing import piercing_points, project, triangulate
+from pcfix.water.auto import find_water
 
 N = 1.34
 HEIGHT_M = 80.0

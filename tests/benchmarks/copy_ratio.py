@@ -103,8 +103,8 @@ def kernel(cloud, cameras, sensor):
 
     import pcfix
     from pcfix.io.las.source import read_xyz
-    from pcfix.label.surface import SurfaceAbove
     from pcfix.refract.intersect import intersect
+    from pcfix.water.surface import SurfaceAbove
 
     xyz = read_xyz(cloud)
     xyz = xyz[xyz[:, 2] < 0.37][:1_000_000]

@@ -14,7 +14,7 @@ import pytest
 import pcfix
 from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.adjust import adjust_cameras, next_step
-from pcfix.refract.threads import threads
+from pcfix.threads import threads
 from tests.utils.adjust_files import IMAGE_PX, write_block, write_gnss
 
 FOCAL_PX = 3648.0

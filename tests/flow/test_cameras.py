@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import pcfix
 from pcfix.cli import app
 from pcfix.flow.cameras import check_cameras
-from pcfix.refract.lens import project
+from pcfix.lens.imaging import project
 from pcfix.report.cameras import cameras_text
 from tests.utils.shared import ROOT, needs
 

@@ -13,7 +13,7 @@ from pcfix.cli import app
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.label import label_file, label_points
 from pcfix.flow.run import Request, request_of
-from pcfix.settings import LabelSettings
+from pcfix.options import LabelSettings
 from tests.pdal_stage.test_arrays import arrays_of, metadata_of, run
 from tests.utils.clouds import (
     EAST_M,

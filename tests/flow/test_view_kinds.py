@@ -8,12 +8,12 @@ import pytest
 import pcfix
 from pcfix.flow.view_kinds import PATCHES, kind_of_views
 from pcfix.io.views import ViewMatch, read_views
-from pcfix.label.surface import surface_above
 from pcfix.model import Views, WaterPlane
+from pcfix.options import Settings
 from pcfix.refract.learned import Learned
 from pcfix.refract.matcher import matcher_of
-from pcfix.settings import Settings
 from pcfix.simulate.scene import simulate_scene
+from pcfix.water.surface import surface_above
 from tests.utils.shared import needs
 
 RENDERED, rendered = needs("rendered_a")

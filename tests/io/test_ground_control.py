@@ -8,8 +8,8 @@ from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import read_cameras
 from pcfix.io.cameras.georeference import bring_to
 from pcfix.io.ground_control import read_ground_control
+from pcfix.lens.imaging import project
 from pcfix.model import Cameras, Lens
-from pcfix.refract.lens import project
 from tests.utils.reprojection import check_file
 from tests.utils.shared import needs
 

@@ -10,7 +10,7 @@ from rasterio.transform import Affine, from_origin
 import pcfix
 from pcfix.io.scenes import write_scene
 from pcfix.io.water_rasters import MARGIN_M
-from pcfix.label.surface import surface_above
+from pcfix.water.surface import surface_above
 from tests.utils.shared import needs
 
 RIVER, river = needs("river")

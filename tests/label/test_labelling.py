@@ -8,8 +8,8 @@ import pytest
 from pcfix.errors import GeometryError, SettingError
 from pcfix.label.labelling import Labelling, Part
 from pcfix.label.mask import WaterMask
-from pcfix.label.surface import SurfaceAbove
-from pcfix.settings import LabelSettings
+from pcfix.options import LabelSettings
+from pcfix.water.surface import SurfaceAbove
 
 EAST, NORTH, WATER_M = 456_000.0, 5_432_000.0, 12.4
 

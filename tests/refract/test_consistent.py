@@ -13,14 +13,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pcfix.errors import PcfixWarning, SettingError
-from pcfix.label.surface import surface_above
+from pcfix.lens.derivatives import image_and_gradients
+from pcfix.lens.imaging import coefficients
 from pcfix.model import Cameras, Lens, Outcome, Views, WaterMesh, WaterPlane, WaterRaster
+from pcfix.options import Settings
 from pcfix.refract.consistent import check_consistent
-from pcfix.refract.image_jacobian import image_and_gradients
-from pcfix.refract.lens import coefficients
 from pcfix.refract.methods import correct
-from pcfix.settings import Settings
 from pcfix.simulate.tracing import triangulate
+from pcfix.water.surface import surface_above
 from tests.utils.consistent_twin import (
     found_by_full_triangulation,
     image_in,

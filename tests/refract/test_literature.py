@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 
 import pcfix
 from pcfix.errors import SettingError
-from pcfix.label.surface import surface_above
 from pcfix.model import Outcome, Views, WaterPlane
+from pcfix.options import Settings
 from pcfix.refract.bundles import Bundle
 from pcfix.refract.learned import Learned
 from pcfix.refract.literature.pairs import BASE_TO_HEIGHT, in_pairs
 from pcfix.refract.methods import correct
 from pcfix.refract.regression import DepthRegression
-from pcfix.settings import Settings
+from pcfix.water.surface import surface_above
 from tests.utils.twins import bend, correct_slowly, light_path, stacked_intersection
 
 UTM = np.array([512_345.678, 4_987_654.321, 0.0])

@@ -10,15 +10,15 @@ from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 from pcfix.errors import PcfixWarning, SettingError
-from pcfix.label.surface import surface_above
 from pcfix.model import Cameras, Lens, Outcome, Views, WaterPlane
+from pcfix.options import Settings
 from pcfix.refract.bundles import Bundle
 from pcfix.refract.learned import Learned
 from pcfix.refract.matcher import matcher_of
 from pcfix.refract.methods import correct
 from pcfix.refract.stereo_pairs import cameras_of_pairs, invert_pairs
-from pcfix.settings import Settings
 from pcfix.simulate.scene import simulate_scene
+from pcfix.water.surface import surface_above
 from tests.utils.consistent_twin import seen_through_water, triangulated_straight
 
 N_WATER = 1.34

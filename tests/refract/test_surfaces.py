@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
 import pcfix
-from pcfix.label.surface import surface_above
 from pcfix.model import WaterRaster
 from pcfix.simulate.block import fly, gsd_m, lens
 from pcfix.simulate.tracing import piercing_points, project, triangulate
+from pcfix.water.surface import surface_above
 from tests.utils.twins import correct_under
 
 UTM = np.array([512_345.0, 4_987_654.0, 0.0])

@@ -15,8 +15,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pcfix.label.surface import SurfaceAbove, surface_above
 from pcfix.model import Lens, Outcome, Views, WaterPlane
+from pcfix.options import LEVEL_M, ErrorBudget, Settings
 from pcfix.refract.intersect import intersect
 from pcfix.refract.methods import correct
 from pcfix.refract.regression import DepthRegression
@@ -25,7 +25,7 @@ from pcfix.refract.uncertainty import (
     covariances,
     focal_px,
 )
-from pcfix.settings import LEVEL_M, ErrorBudget, Settings
+from pcfix.water.surface import SurfaceAbove, surface_above
 from tests.utils.normalised import INDEX, apparent, block, views_of
 
 NONE = ErrorBudget(image_px=0.0, level_m=0.0, index=0.0)

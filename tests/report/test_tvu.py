@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import pcfix
+from pcfix.options import ErrorBudget
 from pcfix.report.figures import png_of, tvu_figure
 from pcfix.report.text import summary_text
 from pcfix.report.tvu import (
@@ -21,7 +22,6 @@ from pcfix.report.tvu import (
     strictest_order,
     tvu_sentence,
 )
-from pcfix.settings import ErrorBudget
 
 # Edition 6, table 1: the largest TVU at the surface and at 40 m, m, by hand
 BY_HAND = {

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from pcfix.ports import DomePort, FlatPort
+from pcfix.port.shapes import DomePort, FlatPort
 from pcfix.simulate.port import fermat_directions, simulate_port
 
 

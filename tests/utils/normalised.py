@@ -13,7 +13,7 @@ from pcfix.simulate.tracing import piercing_points, project, triangulate
 
 if TYPE_CHECKING:
     from pcfix.model import FloatArray
-    from pcfix.settings import ErrorBudget
+    from pcfix.options import ErrorBudget
 
 LENS = Lens(3600.0, 5400.0, 3600.0, 2700.0, 1800.0)
 HEIGHT_M = 60.0

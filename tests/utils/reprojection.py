@@ -6,7 +6,7 @@ from pathlib import PurePath
 import numpy as np
 from pyproj import CRS, Transformer
 
-from pcfix.refract.lens import project
+from pcfix.lens.imaging import project
 
 
 def check_file(sample):

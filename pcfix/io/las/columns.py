@@ -19,11 +19,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcfix.model import BoolArray, Correction, FloatArray
-    from pcfix.settings import Dimensions
-
-
-BATHYMETRIC_POINT = 40
-"""ASPRS class of a point on the bed (LAS 1.4, topo-bathy lidar domain profile)."""
+    from pcfix.options import Dimensions
 
 
 class TooNarrowError(Exception):

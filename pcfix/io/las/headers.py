@@ -10,13 +10,13 @@ import numpy as np
 from laspy.vlrs.known import ExtraBytesStruct, WktCoordinateSystemVlr
 from laspy.vlrs.vlr import VLR
 
-import pcfix
 from pcfix.errors import InputError
 from pcfix.io.las.columns import Column, column_scale
 from pcfix.io.las.formats import upgraded
 from pcfix.io.las.provenance import is_ours, settings_vlr
 from pcfix.io.las.records import Record, RecordList
 from pcfix.io.las.source import las_errors
+from pcfix.version import __version__
 
 if TYPE_CHECKING:
     from pcfix.io.las.source import LasSource
@@ -121,7 +121,7 @@ def _upgraded(source: LasSource, params: list[laspy.ExtraBytesParams]) -> _Upgra
 
 def corrected_identity(source: LasSource) -> bytes:
     """Return the identity of a corrected or cleaned file: made by pcfix, else as it was."""
-    name = f"pcfix {pcfix.__version__}".encode().ljust(32, b"\0")
+    name = f"pcfix {__version__}".encode().ljust(32, b"\0")
     return source.identity[: _SOFTWARE.start] + name + source.identity[_SOFTWARE.stop :]
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.refract.lens import project
+from pcfix.lens.imaging import project
 
 if TYPE_CHECKING:
     import numpy.typing as npt

@@ -25,7 +25,7 @@ import numpy as np
 from numba import njit, prange
 
 from pcfix.model import Views
-from pcfix.refract.threads import one_caller
+from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     from pcfix.model import FloatArray, IntArray

@@ -10,7 +10,7 @@ from numba import njit, prange
 from pcfix.model import Outcome
 from pcfix.refract.literature.level import depth_ratio, rays_of
 from pcfix.refract.rays import MIN_DETERMINANT
-from pcfix.refract.threads import one_caller
+from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, FloatArray, IntArray

@@ -4,8 +4,8 @@ The object point is the local origin. A ray is named by its aim: the place where
 level of the water above the point. It pierces the surface at A, bends there, and comes down to the
 height of the point at the place (mx, my): its miss.
 
-The surface is a plane, the bilinear raster of `pcfix.label.raster` or the facets of
-`pcfix.label.tin`. Where there is none, and where it faces away from the camera, all is NaN. Water
+The surface is a plane, the bilinear raster of `pcfix.water.raster` or the facets of
+`pcfix.water.tin`. Where there is none, and where it faces away from the camera, all is NaN. Water
 that hides water behind it is not looked for: the ray is taken to cross the surface once.
 """
 
@@ -20,9 +20,9 @@ from pcfix.refract.backward import plane_at
 from pcfix.refract.rays import refracted
 
 if TYPE_CHECKING:
-    from pcfix.label.raster import Field
-    from pcfix.label.tin import Tin
     from pcfix.model import FloatArray
+    from pcfix.water.raster import Field
+    from pcfix.water.tin import Tin
 
 Found: TypeAlias = tuple[float, float, int, bool]
 """Plan place (x, y) where a tracer ended, its number of steps, and whether it hit the point."""

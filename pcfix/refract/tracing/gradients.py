@@ -15,7 +15,6 @@ import numpy as np
 from numba import njit, prange
 
 from pcfix.errors import SettingError
-from pcfix.refract.threads import one_caller
 from pcfix.refract.tracing.derivatives import (
     BY_CENTRE,
     BY_INDEX,
@@ -26,6 +25,7 @@ from pcfix.refract.tracing.derivatives import (
     DIRECTION,
     light_and_gradients,
 )
+from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     import numpy.typing as npt

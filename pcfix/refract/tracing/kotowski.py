@@ -26,8 +26,8 @@ from numba import njit
 from pcfix.refract.tracing.forward import CLOSE_M, SHORT, height_of
 
 if TYPE_CHECKING:
-    from pcfix.label.raster import Field
     from pcfix.refract.tracing.forward import Found, Water
+    from pcfix.water.raster import Field
 
 MAX_STEPS = 40
 HALVINGS = 24

@@ -19,22 +19,22 @@ import numpy as np
 from numba import njit, prange
 
 from pcfix.errors import SettingError
-from pcfix.label.raster import build_field
-from pcfix.label.tin import build_tin
 from pcfix.model import WaterMesh, WaterPlane, WaterRaster
-from pcfix.refract.threads import one_caller
 from pcfix.refract.tracing.afrt import afrt
 from pcfix.refract.tracing.forward import Water, height_of, miss_through
 from pcfix.refract.tracing.kotowski import kotowski
 from pcfix.refract.tracing.mdfrt import mdfrt
 from pcfix.refract.tracing.scattershot import narrowed, scattershot
+from pcfix.threads import one_caller
+from pcfix.water.raster import build_field
+from pcfix.water.tin import build_tin
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from pcfix.label.raster import Field
-    from pcfix.label.tin import Tin
     from pcfix.model import BoolArray, FloatArray, IntArray
+    from pcfix.water.raster import Field
+    from pcfix.water.tin import Tin
 
 Surface: TypeAlias = WaterPlane | WaterRaster | WaterMesh
 

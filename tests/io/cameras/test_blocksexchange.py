@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import pcfix
 from pcfix.io.cameras import blocksexchange
 from pcfix.io.cameras.formats import Source
-from pcfix.refract.lens import project
+from pcfix.lens.imaging import project
 from tests.utils.reprojection import check_file, residuals_px, row_of
 from tests.utils.shared import needs
 

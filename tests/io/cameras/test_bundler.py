@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from pcfix import InputError
 from pcfix.io.cameras import bundler
 from pcfix.io.cameras.formats import Source
-from pcfix.refract.lens import project
+from pcfix.lens.imaging import project
 from tests.utils.reprojection import check_file
 from tests.utils.shared import needs
 

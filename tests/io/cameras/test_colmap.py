@@ -12,7 +12,7 @@ from pcfix import InputError
 from pcfix.io.cameras import colmap
 from pcfix.io.cameras.colmap.models import MODELS, Camera, lens
 from pcfix.io.cameras.formats import Source
-from pcfix.refract.lens import project
+from pcfix.lens.imaging import project
 from tests.utils.reprojection import check_file, residuals_px, row_of
 from tests.utils.shared import needs
 

@@ -10,8 +10,8 @@ from pcfix.errors import InputError, SettingError
 from pcfix.io.cameras import read_cameras, read_tie_points
 from pcfix.io.cameras.colmap.writing import colmap_camera, write_colmap
 from pcfix.io.cameras.georeference import bring_to
+from pcfix.lens.imaging import project
 from pcfix.model import Lens, TiePoints, Views
-from pcfix.refract.lens import project
 from tests.utils.blocks import PLAIN, small_block, some_ties
 from tests.utils.shared import needs
 

@@ -12,8 +12,8 @@ from pcfix.errors import InputError
 from pcfix.io.cameras import metashape
 from pcfix.io.cameras.formats import Source, SparseModel
 from pcfix.io.cameras.metashape import read_calibration
+from pcfix.lens.imaging import project
 from pcfix.model import Lens
-from pcfix.refract.lens import project
 from tests.utils.reprojection import check_file, residuals_px, row_of
 from tests.utils.shared import needs
 

@@ -12,7 +12,7 @@ import pytest
 from pcfix.errors import InputError
 from pcfix.io.cameras import micmac
 from pcfix.io.cameras.formats import Source
-from pcfix.refract.lens import project, unproject
+from pcfix.lens.imaging import project, unproject
 from tests.utils.reprojection import check_file, residuals_px
 from tests.utils.shared import needs
 

@@ -11,8 +11,8 @@ from pcfix.errors import InputError, SettingError
 from pcfix.io.cameras import read_cameras, read_tie_points
 from pcfix.io.cameras.georeference import bring_to, georeference
 from pcfix.io.cameras.opensfm.writing import opensfm_camera, write_opensfm
+from pcfix.lens.imaging import project
 from pcfix.model import Lens, TiePoints, Views
-from pcfix.refract.lens import project
 from tests.utils.blocks import PLAIN, small_block, some_ties
 from tests.utils.shared import needs
 

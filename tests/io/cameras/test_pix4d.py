@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import pcfix
 from pcfix.io.cameras import pix4d
 from pcfix.io.cameras.formats import Source
-from pcfix.refract.lens import project, unproject
+from pcfix.lens.imaging import project, unproject
 from tests.utils.reprojection import check_file, residuals_px, row_of
 from tests.utils.shared import needs
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 import pcfix
 from pcfix.io.cameras import realitycapture
 from pcfix.io.cameras.formats import Source
-from pcfix.refract.lens import project
+from pcfix.lens.imaging import project
 from tests.utils.shared import needs
 
 SAMPLE, sample = needs("cameras", "realitycapture", "xmp_one_image")

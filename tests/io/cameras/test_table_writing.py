@@ -9,8 +9,8 @@ from pyproj import CRS
 from pcfix.errors import InputError, SettingError
 from pcfix.io.cameras import read_cameras
 from pcfix.io.cameras.table.writing import write_table
+from pcfix.lens.imaging import project
 from pcfix.model import Lens
-from pcfix.refract.lens import project
 from tests.utils.blocks import PLAIN, small_block
 
 FRAME = (1600.0, 1200.0, 810.0, 590.0)

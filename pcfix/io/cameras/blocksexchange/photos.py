@@ -11,8 +11,8 @@ from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.blocksexchange.document import ReferenceSystems
 from pcfix.io.cameras.blocksexchange.groups import Photogroup
-from pcfix.io.cameras.rotations import from_omega_phi_kappa, from_photogrammetric
 from pcfix.io.cameras.xml import number
+from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
 from pcfix.model import Cameras, GnssPositions
 
 if TYPE_CHECKING:

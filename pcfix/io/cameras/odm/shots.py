@@ -13,7 +13,7 @@ from pcfix.io.cameras.odm.crs import crs_of_place
 from pcfix.io.cameras.opensfm.lenses import is_panorama, lens
 from pcfix.io.cameras.opensfm.reconstruction import left_out
 from pcfix.io.cameras.opensfm.values import load, mapping, number, rows, vector
-from pcfix.io.cameras.rotations import from_rotation_vectors
+from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, GnssPositions, Lens
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.io.cameras.opensfm.lenses import is_panorama, lens
 from pcfix.io.cameras.opensfm.values import load, mapping, number, rows, vector
-from pcfix.io.cameras.rotations import from_rotation_vectors
+from pcfix.lens.rotations import from_rotation_vectors
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -9,7 +9,7 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras.pix4d.files import read_text
-from pcfix.io.cameras.rotations import from_omega_phi_kappa
+from pcfix.lens.rotations import from_omega_phi_kappa
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -42,7 +42,6 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.rotations import from_yaw_pitch_roll as rotations_from_yaw_pitch_roll
 from pcfix.io.cameras.table.attitude import read_rotations
 from pcfix.io.cameras.table.headers import axes, headers, is_header
 from pcfix.io.cameras.table.positions import (
@@ -55,6 +54,7 @@ from pcfix.io.cameras.table.positions import (
     read_gnss,
 )
 from pcfix.io.cameras.table.sensor import read_lenses, read_sensor
+from pcfix.lens.rotations import from_yaw_pitch_roll as rotations_from_yaw_pitch_roll
 from pcfix.model import Cameras, GnssPositions
 
 if TYPE_CHECKING:

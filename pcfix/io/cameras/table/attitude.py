@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.io.cameras import checks, rotations
+from pcfix.io.cameras import checks
+from pcfix.lens import rotations
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

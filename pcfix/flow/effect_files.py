@@ -1,0 +1,151 @@
+"""Work out the effect of refraction and the tables of papers, and write them into a folder.
+
+What ``pcfix simulate --refraction-effect`` runs.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pcfix.flow.flume_methods import DepthBins, depth_bins
+from pcfix.io.files import check_output, write_bytes
+from pcfix.options import DEFAULT_REFRACTIVE_INDEX
+from pcfix.report.figures import png_of
+from pcfix.report.papers import (
+    depth_bins_figure,
+    depth_bins_rows,
+    depth_bins_text,
+    shan_rows,
+    shan_text,
+)
+from pcfix.report.refraction_effect import (
+    csv_text,
+    depth_figure,
+    effect_rows,
+    effect_text,
+    error_map_figure,
+)
+from pcfix.simulate.flume import simulate_flume
+from pcfix.simulate.refraction_effect import (
+    APPARENT_DEPTHS_M,
+    FLYING_HEIGHTS_M,
+    OVERLAP,
+    AerialCamera,
+    Effect,
+    StereoPair,
+    effects,
+)
+from pcfix.simulate.shan import Iteration, shan_iterations
+from pcfix.version import __version__
+
+if TYPE_CHECKING:
+    import os
+
+PUBLISHED = (
+    "published (Skarlatos & Agrafiotis 2018) for the SwingletCAM from 100 m, 80 %, 15 m: centre"
+    " -5.15 m, corner -8.23 m"
+)
+
+
+def write_refraction_effect(
+    out_dir: str | os.PathLike[str],
+    *,
+    camera: AerialCamera | None = None,
+    overlap: float = OVERLAP,
+    flying_heights_m: tuple[float, ...] | None = None,
+    apparent_depths_m: tuple[float, ...] = APPARENT_DEPTHS_M,
+    refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
+    seed: int = 1,
+    overwrite: bool = False,
+) -> str:
+    """Write tables, settings and pictures, and return a short text about them.
+
+    Parameters
+    ----------
+    camera : AerialCamera, optional
+        Default: the two cameras of Skarlatos & Agrafiotis (2018).
+    overlap : float
+        Share of the image's short side, 0 to 1.
+    flying_heights_m : tuple of float, optional
+        Above the water. Default: those of `FLYING_HEIGHTS_M`, and 50, 100 and 200 m for a camera
+        of one's own.
+    apparent_depths_m : tuple of float
+    refractive_index : float
+    seed : int
+        Of the flume's random numbers.
+
+    Raises
+    ------
+    SettingError
+        If an argument is outside its rule, or a file exists and `overwrite` is not set; then
+        none is written.
+    """
+    heights = {
+        one: flying_heights_m or FLYING_HEIGHTS_M.get(one, (50.0, 100.0, 200.0))
+        for one in ([camera] if camera else FLYING_HEIGHTS_M)
+    }
+    found = effects(heights, apparent_depths_m, overlap=overlap, refractive_index=refractive_index)
+    shan = _shan_tables(found)
+    bins = depth_bins(simulate_flume(refractive_index=refractive_index, seed=seed))
+    files = _pictures(found, bins) | {
+        "refraction_effect.csv": csv_text(effect_rows(found)).encode(),
+        "shan_iterations.csv": _shan_csv(shan).encode(),
+        "flume_depth_bins.csv": csv_text(depth_bins_rows(bins)).encode(),
+        "refraction_effect.json": _settings(
+            cameras=[asdict(one) | {"flying_heights_m": h} for one, h in heights.items()],
+            overlap=overlap,
+            apparent_depths_m=apparent_depths_m,
+            refractive_index=refractive_index,
+            seed=seed,
+        ),
+    }
+    _write(Path(out_dir), files, overwrite)
+    pair, table = list(shan.items())[len(next(iter(heights.values()))) // 2]
+    title = f"{_name(pair)}, bed {max(apparent_depths_m):g} m deep"
+    parts = [effect_text(found), shan_text(table, title), depth_bins_text(bins)]
+    if camera is None:
+        parts[0] += f"\n{PUBLISHED}"
+    return "\n\n".join([*parts, f"{out_dir}: {', '.join(sorted(files))}"])
+
+
+def _shan_tables(found: list[Effect]) -> dict[StereoPair, list[Iteration]]:
+    """Return the iterations of each pair over a bed as deep as the deepest apparent one."""
+    deepest = max(one.apparent_depth_m for one in found)
+    pairs = dict.fromkeys(one.pair for one in found)
+    return {pair: shan_iterations(pair, deepest, found[0].refractive_index) for pair in pairs}
+
+
+def _shan_csv(shan: dict[StereoPair, list[Iteration]]) -> str:
+    rows = []
+    for pair, table in shan.items():
+        rows += shan_rows(table, camera=pair.camera.name, flying_height_m=pair.flying_height_m)
+    return csv_text(rows)
+
+
+def _name(pair: StereoPair) -> str:
+    return f"{pair.camera.name} from {pair.flying_height_m:g} m"
+
+
+def _pictures(found: list[Effect], bins: DepthBins) -> dict[str, bytes]:
+    deepest = max(one.apparent_depth_m for one in found)
+    figures = {"refraction_effect_depth.png": depth_figure(found)}
+    for camera in dict.fromkeys(one.pair.camera for one in found):
+        own = [f for f in found if f.pair.camera == camera and f.apparent_depth_m == deepest]
+        figures[f"refraction_effect_{camera.name.lower()}.png"] = error_map_figure(own)
+    figures["flume_depth_bins.png"] = depth_bins_figure(bins)
+    return {name: png_of(figure) for name, figure in figures.items()}
+
+
+def _settings(**facts: object) -> bytes:
+    return (json.dumps({"made_by": f"pcfix {__version__}"} | facts, indent=2) + "\n").encode()
+
+
+def _write(folder: Path, files: dict[str, bytes], overwrite: bool) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in files:
+        check_output(folder / name, overwrite=overwrite)
+    for name, data in files.items():
+        write_bytes(folder / name, data, overwrite=overwrite)

@@ -1,0 +1,1 @@
+"""The camera: its lens both ways, its frame, its attitude."""

@@ -1,0 +1,220 @@
+"""Brown's distortion formula, its derivatives, where it stops being one to one, its inverse.
+
+The kernels take the flat coefficients of `pcfix.lens.imaging.coefficients`; the formula is in
+`pcfix.model.Lens`. Places are relative to the centre of distortion. The formula is used inside
+the largest disc in which the symmetric part of its Jacobian is positive definite: on a disc
+that is enough for no two places to have one image. Without tangential terms it is the disc up
+to the fold, where d r' / d r = 0.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numba import njit
+from numpy.polynomial import Polynomial
+
+from pcfix.lens.places import (
+    DENOMINATORS,
+    DISC,
+    IN_TURN,
+    RADIALS,
+    TAIL,
+    TANGENTIAL,
+    THIN_PRISM,
+)
+from pcfix.lens.projections import first_root
+
+if TYPE_CHECKING:
+    from pcfix.model import FloatArray, Lens
+
+Jacobian: TypeAlias = tuple[float, float, float, float]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def _radial(c: FloatArray, r2: float) -> tuple[float, float]:
+    """Return r' / r and its derivative by r^2."""
+    k, d = int(c[RADIALS]), int(c[DENOMINATORS])
+    above, slope = 0.0, 0.0
+    for i in range(TAIL + k - 1, TAIL - 1, -1):
+        slope = slope * r2 + above
+        above = above * r2 + c[i]
+    slope = slope * r2 + above
+    above = 1.0 + above * r2
+    if d == 0:
+        return above, slope
+    below, below_slope = 0.0, 0.0
+    for i in range(TAIL + k + d - 1, TAIL + k - 1, -1):
+        below_slope = below_slope * r2 + below
+        below = below * r2 + c[i]
+    below_slope = below_slope * r2 + below
+    below = 1.0 + below * r2
+    g = above / below
+    return g, (slope - g * below_slope) / below
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def _sideways(c: FloatArray, x: float, y: float) -> tuple[float, float]:
+    """Return the tangential and thin prism terms."""
+    p1, p2, p3, p4 = c[TANGENTIAL], c[TANGENTIAL + 1], c[TANGENTIAL + 2], c[TANGENTIAL + 3]
+    s1, s2, s3, s4 = c[THIN_PRISM], c[THIN_PRISM + 1], c[THIN_PRISM + 2], c[THIN_PRISM + 3]
+    r2 = x * x + y * y
+    more = 1.0 + (p3 + p4 * r2) * r2
+    tx = (p1 * (r2 + 2.0 * x * x) + 2.0 * p2 * x * y) * more
+    ty = (p2 * (r2 + 2.0 * y * y) + 2.0 * p1 * x * y) * more
+    return tx + (s1 + s2 * r2) * r2, ty + (s3 + s4 * r2) * r2
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def distorted(c: FloatArray, x: float, y: float) -> tuple[float, float]:
+    """Return Brown's formula at a place; NaN outside the disc where it is one to one."""
+    r2 = x * x + y * y
+    if not r2 <= c[DISC] * c[DISC]:
+        return np.nan, np.nan
+    g, _ = _radial(c, r2)
+    fx, fy = g * x, g * y
+    if c[IN_TURN] != 0.0:
+        tx, ty = _sideways(c, fx, fy)
+    else:
+        tx, ty = _sideways(c, x, y)
+    return fx + tx, fy + ty
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _sideways_jacobian(c: FloatArray, x: float, y: float) -> Jacobian:
+    p1, p2, p3, p4 = c[TANGENTIAL], c[TANGENTIAL + 1], c[TANGENTIAL + 2], c[TANGENTIAL + 3]
+    s1, s2, s3, s4 = c[THIN_PRISM], c[THIN_PRISM + 1], c[THIN_PRISM + 2], c[THIN_PRISM + 3]
+    r2 = x * x + y * y
+    tx = p1 * (r2 + 2.0 * x * x) + 2.0 * p2 * x * y
+    ty = p2 * (r2 + 2.0 * y * y) + 2.0 * p1 * x * y
+    more, slope = 1.0 + (p3 + p4 * r2) * r2, 2.0 * (p3 + 2.0 * p4 * r2)
+    across = 2.0 * (p1 * y + p2 * x) * more
+    sx, sy = 2.0 * (s1 + 2.0 * s2 * r2), 2.0 * (s3 + 2.0 * s4 * r2)
+    return (
+        (6.0 * p1 * x + 2.0 * p2 * y) * more + (tx * slope + sx) * x,
+        across + (tx * slope + sx) * y,
+        across + (ty * slope + sy) * x,
+        (6.0 * p2 * y + 2.0 * p1 * x) * more + (ty * slope + sy) * y,
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def jacobian(c: FloatArray, x: float, y: float) -> Jacobian:
+    """Return d x'/d x, d x'/d y, d y'/d x, d y'/d y of `distorted`."""
+    g, slope = _radial(c, x * x + y * y)
+    twice = 2.0 * slope
+    xx, xy, yy = g + twice * x * x, twice * x * y, g + twice * y * y
+    if c[IN_TURN] == 0.0:
+        a, b, d, e = _sideways_jacobian(c, x, y)
+        return xx + a, xy + b, xy + d, yy + e
+    a, b, d, e = _sideways_jacobian(c, g * x, g * y)
+    a, e = a + 1.0, e + 1.0
+    return a * xx + b * xy, a * xy + b * yy, d * xx + e * xy, d * xy + e * yy
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _start(c: FloatArray, rho: float) -> float:
+    """Return the radius that the radial terms alone bring to `rho`, or one near the fold."""
+    low, high = 0.0, min(c[DISC], 1e6)
+    r = min(rho, 0.9 * high)
+    for _ in range(100):
+        g, slope = _radial(c, r * r)
+        miss = r * g - rho
+        if miss < 0.0:
+            low = r
+        else:
+            high = r
+        then = r - miss / (g + 2.0 * r * r * slope)
+        if not low <= then <= high:
+            then = 0.5 * (low + high)
+        if abs(then - r) <= 1e-9 * r:
+            break
+        r = then
+    return r
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def undistorted(c: FloatArray, u: float, v: float) -> tuple[float, float]:
+    """Return the place in the disc that `distorted` brings to (u, v), NaN where there is none.
+
+    Newton's method from the solution without tangential terms, each step halved until it stays
+    in the disc and comes nearer.
+    """
+    rho = np.sqrt(u * u + v * v)
+    if rho == 0.0 or not rho < np.inf:
+        return u * 1.0, v * 1.0
+    scale = _start(c, rho) / rho
+    x, y = scale * u, scale * v
+    fx, fy = distorted(c, x, y)
+    fx, fy = fx - u, fy - v
+    for _ in range(60):
+        if fx * fx + fy * fy <= (2e-16 * (1.0 + rho)) ** 2:
+            break
+        a, b, d, e = jacobian(c, x, y)
+        det = a * e - b * d
+        dx, dy = (e * fx - b * fy) / det, (a * fy - d * fx) / det
+        nearer = False
+        for _ in range(40):
+            gx, gy = distorted(c, x - dx, y - dy)
+            gx, gy = gx - u, gy - v
+            if gx * gx + gy * gy < fx * fx + fy * fy:
+                nearer = True
+                break
+            dx, dy = 0.5 * dx, 0.5 * dy
+        if not nearer:
+            break
+        x, y, fx, fy = x - dx, y - dy, gx, gy
+    if fx * fx + fy * fy <= (1e-12 * (1.0 + rho)) ** 2:
+        return x, y
+    return np.nan, np.nan
+
+
+def largest_disc(lens: Lens, c: FloatArray) -> float:
+    """Return the radius of the disc where Brown's formula is one to one; may be infinite."""
+    fold = _radial_fold(lens)
+    if any(lens.tangential) or any(lens.thin_prism):
+        return float(_first_bend(c, fold))
+    return fold
+
+
+def _radial_fold(lens: Lens) -> float:
+    """Return the smallest r with d r' / d r = 0, or at which r' is infinite."""
+    above, below = Polynomial((1.0, *lens.radial)), Polynomial((1.0, *lens.denominator))
+    twice_q = Polynomial((0.0, 2.0))
+    slope = (above + twice_q * above.deriv()) * below - twice_q * above * below.deriv()
+    return float(np.sqrt(min(first_root(slope), first_root(below))))
+
+
+_DIRECTIONS, _RADII_PER_DECADE = 72, 40
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _bends(c: FloatArray, r: float) -> bool:
+    """Whether the symmetric part of the Jacobian is anywhere not positive definite on a circle."""
+    for i in range(_DIRECTIONS):
+        turn = 2.0 * np.pi * i / _DIRECTIONS
+        a, b, d, e = jacobian(c, r * np.cos(turn), r * np.sin(turn))
+        if not (a + e > 0.0 and a * e > 0.25 * (b + d) * (b + d)):
+            return True
+    return False
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _first_bend(c: FloatArray, fold: float) -> float:
+    """Return the smallest radius that bends, found on a fine series and then halved to it."""
+    low = 0.0
+    for step in range(-3 * _RADII_PER_DECADE, 6 * _RADII_PER_DECADE):
+        high = min(10.0 ** (step / _RADII_PER_DECADE), fold)
+        if _bends(c, high):
+            for _ in range(50):
+                middle = 0.5 * (low + high)
+                if _bends(c, middle):
+                    high = middle
+                else:
+                    low = middle
+            return low
+        if high == fold:
+            return fold
+        low = high
+    return fold

@@ -1,0 +1,267 @@
+"""Which cameras have a point in their frame, and which can have one of a whole tile.
+
+The frame of a central projection without distortion is a pyramid with its tip in the
+projection centre. Four planes bound it; a point is in the frame when it is on the inner side of
+all four.
+
+A distorted frame has curved sides, and the point has to be projected. Most tiles are spared
+that: those outside of a pyramid around the frame (of a cone, where the frame is too wide), and
+those whose middle falls so far from the border of the image that no ray of the tile can cross
+it. How far that is says the `scale` of the lens: no turn of a ray by an angle moves its image by
+more than `scale` times that angle, in the frame and within a `margin` around it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+import numpy as np
+from numba import njit
+
+from pcfix.lens.frame_shapes import frame_shape
+from pcfix.lens.imaging import image_of, lens_table
+from pcfix.lens.places import (
+    B2,
+    B3,
+    CENTRE_X,
+    CENTRE_Y,
+    DISC,
+    FOCAL_X,
+    FOCAL_Y,
+    HEIGHT,
+    PLAIN,
+    PRINCIPAL_X,
+    PRINCIPAL_Y,
+    TAIL,
+    TANGENTIAL,
+    WIDTH,
+)
+
+if TYPE_CHECKING:
+    from pcfix.model import Cameras, FloatArray, IntArray
+
+Plane: TypeAlias = tuple[float, float, float]
+Pyramid: TypeAlias = tuple[Plane, Plane, Plane, Plane]
+
+NOT_DISTORTED = -1
+NOTHING, SOME, ALL = 0, 1, 2
+
+
+class Frames(NamedTuple):
+    """The frames of k cameras; directions are in the world frame.
+
+    Attributes
+    ----------
+    planes : array, shape (k, 4, 3)
+        Inward normals of the pyramid that is the frame, or is around it. Zeros hold everything.
+    row : array, shape (k,)
+        The lens of each camera in `lenses`, or `NOT_DISTORTED`: then the pyramid is the frame.
+    cone : array, shape (k, 4)
+        An axis, and the angle (rad) from it that nothing of the frame exceeds.
+    reach : array, shape (k, 2)
+        Scale (unit of the lens per rad) and margin (unit of the lens) of the lens.
+    lenses : array, shape (l, ...)
+        Coefficients, one row per lens.
+    rotations : array, shape (k, 3, 3)
+        World to camera.
+    """
+
+    planes: FloatArray
+    row: IntArray
+    cone: FloatArray
+    reach: FloatArray
+    lenses: FloatArray
+    rotations: FloatArray
+
+
+def no_frames(k: int) -> Frames:
+    """Return frames of k cameras that hold every point."""
+    return Frames(
+        planes=np.zeros((k, 4, 3)),
+        row=np.full(k, NOT_DISTORTED),
+        cone=np.zeros((k, 4)),
+        reach=np.zeros((k, 2)),
+        lenses=np.zeros((1, 1)),
+        rotations=np.zeros((k, 3, 3)),
+    )
+
+
+def frames_of(cameras: Cameras) -> Frames:
+    """Return the frames of cameras.
+
+    Without lenses a frame is everything in front of the camera, without angles everything.
+    """
+    if cameras.rotations is None:
+        return no_frames(len(cameras))
+    rotations = np.ascontiguousarray(cameras.rotations, np.float64)
+    if cameras.lenses is None:
+        front = np.repeat(rotations[:, 2:3], 4, axis=1)
+        return no_frames(len(cameras))._replace(planes=front)
+    row, lenses = lens_table(cameras.lenses)
+    shapes = [frame_shape(lens) for lens in dict.fromkeys(cameras.lenses)]
+    widest = np.array([shape.widest for shape in shapes])
+    return Frames(
+        planes=np.ascontiguousarray(np.array([s.planes for s in shapes])[row] @ rotations),
+        row=np.where(np.array([s.distorted for s in shapes])[row], row, NOT_DISTORTED),
+        cone=np.column_stack([rotations[:, 2], widest[row]]),
+        reach=np.array([s.reach for s in shapes])[row],
+        lenses=lenses,
+        rotations=rotations,
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def pyramid(g: FloatArray) -> Pyramid:
+    """Return the planes of one camera, shape (4, 3), as twelve numbers.
+
+    As numbers they stay in registers; as an array they would be read again for every point.
+    """
+    return (
+        (g[0, 0], g[0, 1], g[0, 2]),
+        (g[1, 0], g[1, 1], g[1, 2]),
+        (g[2, 0], g[2, 1], g[2, 2]),
+        (g[3, 0], g[3, 1], g[3, 2]),
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def in_frame(g: Pyramid, ex: float, ey: float, ez: float) -> bool:
+    """Whether the point at C - e is on the inner side of all four planes."""
+    return (
+        (g[0][0] * ex + g[0][1] * ey + g[0][2] * ez <= 0.0)
+        & (g[1][0] * ex + g[1][1] * ey + g[1][2] * ez <= 0.0)
+        & (g[2][0] * ex + g[2][1] * ey + g[2][2] * ez <= 0.0)
+        & (g[3][0] * ex + g[3][1] * ey + g[3][2] * ez <= 0.0)
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def _image(lens: FloatArray, r: FloatArray, ex: float, ey: float, ez: float) -> tuple[float, float]:
+    """Return where a lens with rotation r images the point at C - e."""
+    return image_of(
+        lens,
+        -(r[0, 0] * ex + r[0, 1] * ey + r[0, 2] * ez),
+        -(r[1, 0] * ex + r[1, 1] * ey + r[1, 2] * ez),
+        -(r[2, 0] * ex + r[2, 1] * ey + r[2, 2] * ez),
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def _images(lens: FloatArray, r: FloatArray, ex: float, ey: float, ez: float) -> bool:
+    """Whether that place is in the frame."""
+    u, v = _image(lens, r, ex, ey, ez)
+    return (u >= 0.0) & (u <= lens[WIDTH]) & (v >= 0.0) & (v <= lens[HEIGHT])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def holds(frames: Frames, c: int, ex: float, ey: float, ez: float) -> bool:
+    """Whether the frame of camera c holds the point at C - e, distortion included."""
+    if not in_frame(pyramid(frames.planes[c]), ex, ey, ez):
+        return False
+    row = frames.row[c]
+    return row == NOT_DISTORTED or _images(frames.lenses[row], frames.rotations[c], ex, ey, ez)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def mark(
+    marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray,
+    centre: FloatArray, frames: Frames, c: int,
+) -> int:  # fmt: skip
+    """Set to 1 the marks of points in the distorted frame of camera c, to 0 those of others.
+
+    Returns how many are in it. It does to many points what `holds` does to one.
+    """
+    lens = frames.lenses[frames.row[c]]
+    if lens[PLAIN] != 0.0:
+        return _mark_plain(marks, x, y, z, centre, frames.rotations[c], lens)
+    around = pyramid(frames.planes[c])
+    return _mark_any(marks, x, y, z, centre, around, frames.rotations[c], lens)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _mark_any(
+    marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, centre: FloatArray,
+    around: Pyramid, r: FloatArray, lens: FloatArray,
+) -> int:  # fmt: skip
+    """Take any lens, point by point."""
+    count = 0
+    for j in range(marks.size):
+        ex, ey, ez = centre[0] - x[j], centre[1] - y[j], centre[2] - z[j]
+        inside = in_frame(around, ex, ey, ez) and _images(lens, r, ex, ey, ez)
+        marks[j] = 1.0 if inside else 0.0
+        count += 1 if inside else 0
+    return count
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _mark_plain(
+    marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, centre: FloatArray,
+    r: FloatArray, c: FloatArray,
+) -> int:  # fmt: skip
+    """Take the common lens: `image_of` written out without branches, for several points at once."""
+    cx, cy, cz = centre[0], centre[1], centre[2]
+    xx, xy, xz, yx, yy, yz = r[0, 0], r[0, 1], r[0, 2], r[1, 0], r[1, 1], r[1, 2]
+    zx, zy, zz = r[2, 0], r[2, 1], r[2, 2]
+    k1, k2, k3, k4 = c[TAIL], c[TAIL + 1], c[TAIL + 2], c[TAIL + 3]
+    p1, p2, px, py = c[TANGENTIAL], c[TANGENTIAL + 1], c[CENTRE_X], c[CENTRE_Y]
+    disc2 = c[DISC] * c[DISC]
+    fx, b2, b3, fy = c[FOCAL_X], c[B2], c[B3], c[FOCAL_Y]
+    u0, v0, width, height = c[PRINCIPAL_X], c[PRINCIPAL_Y], c[WIDTH], c[HEIGHT]
+    count = 0
+    for j in range(marks.size):
+        ex, ey, ez = cx - x[j], cy - y[j], cz - z[j]
+        front = -(zx * ex + zy * ey + zz * ez)
+        a = -(xx * ex + xy * ey + xz * ez) / front - px
+        b = -(yx * ex + yy * ey + yz * ez) / front - py
+        r2 = a * a + b * b
+        g = 1.0 + (((k4 * r2 + k3) * r2 + k2) * r2 + k1) * r2
+        da = g * a + (p1 * (r2 + 2.0 * a * a) + 2.0 * p2 * a * b) + px
+        db = g * b + (p2 * (r2 + 2.0 * b * b) + 2.0 * p1 * a * b) + py
+        u = u0 + fx * da + b2 * db
+        v = v0 + fy * db + b3 * da
+        inside = (u >= 0.0) & (u <= width) & (v >= 0.0) & (v <= height)
+        inside &= (front > 0.0) & (r2 <= disc2)
+        marks[j] = 1.0 if inside else 0.0
+        count += 1 if inside else 0
+    return count
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def may_hold(g: FloatArray, centre: FloatArray, low: FloatArray, high: FloatArray) -> bool:
+    """Whether a pyramid can hold any point of an upright box; never wrongly False."""
+    for p in range(4):
+        reach = 0.0
+        for axis in range(3):
+            corner = high[axis] if g[p, axis] > 0.0 else low[axis]
+            reach += g[p, axis] * (corner - centre[axis])
+        if reach < 0.0:
+            return False
+    return True
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def judge(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: FloatArray) -> int:
+    """Return whether the distorted frame of camera c holds all or nothing of an upright box.
+
+    `ALL`, `NOTHING` or `SOME`; never wrongly one of the first two. The box is taken as the ball
+    around it, seen from the camera under the angle `turn` about its middle.
+    """
+    ex = centre[0] - 0.5 * (low[0] + high[0])
+    ey = centre[1] - 0.5 * (low[1] + high[1])
+    ez = centre[2] - 0.5 * (low[2] + high[2])
+    far2 = ex * ex + ey * ey + ez * ez
+    size2 = (high[0] - low[0]) ** 2 + (high[1] - low[1]) ** 2 + (high[2] - low[2]) ** 2
+    if not 0.25 * size2 < far2:
+        return SOME
+    turn = np.arcsin(np.sqrt(0.25 * size2 / far2)) + 1e-6
+    axis, widest = frames.cone[c, :3], frames.cone[c, 3]
+    along = -(axis[0] * ex + axis[1] * ey + axis[2] * ez) / np.sqrt(far2)
+    if np.arccos(max(-1.0, min(1.0, along))) > widest + turn:
+        return NOTHING
+    lens, r = frames.lenses[frames.row[c]], frames.rotations[c]
+    u, v = _image(lens, r, ex, ey, ez)
+    within = min(min(u, lens[WIDTH] - u), min(v, lens[HEIGHT] - v))
+    move, margin = turn * frames.reach[c, 0], frames.reach[c, 1]
+    if within > move:
+        return ALL
+    return SOME if within >= -move or move >= margin else NOTHING

@@ -1,0 +1,434 @@
+"""Forward intersection through a housing port, for a cloud that was taken under water.
+
+Picture a camera in a housing, and a place in its image. The lens tells in which direction the
+camera looks there; the port bends that ray at its faces; behind the outer face it goes on straight
+through the water. Rays of several images meet at the true point. Mulsow calls the port a
+bundle-invariant interface: it goes along with each camera. There is no water surface between
+camera and point, all points are under water, and where up is does not matter.
+
+A dense cloud has no image places, but its points stand for them: software that knows nothing of
+the port put the point P where straight lines from the projection centres met best. So the line
+from a centre C to P has the direction of the image place, but for the residual of that adjustment.
+Through a flat port that residual is large, a hundred pixels and more where many images of a
+camera calibrated in air see a point: the straight rays hardly meet. The method `consistent`
+(`pcfix.port.inversion`) takes it into account, `snell` does not.
+
+Which images made P matters as much. Without a list, those are sought whose frames hold the image
+of the true point that they lead to. There may be several such sets; then the point may be wrong.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit, prange
+
+from pcfix.errors import SettingError
+from pcfix.lens.frames import frames_of, holds, no_frames
+from pcfix.model import Outcome, Views
+from pcfix.port.light import coefficients, cosine_at_port, ray_through, through_port
+from pcfix.refract.choice import ANY_NUMBER, TILE, near_cameras, spatial_order
+from pcfix.refract.methods import POINTS_AT_ONCE, joined
+from pcfix.refract.rays import line_terms, nearest_point
+from pcfix.refract.result import Intersection
+from pcfix.threads import one_caller
+
+if TYPE_CHECKING:
+    from pcfix.lens.frames import Frames
+    from pcfix.model import Cameras, FloatArray, IntArray
+    from pcfix.options import Settings
+    from pcfix.port.faces import Vector
+    from pcfix.port.shapes import Port
+
+_NO_CAMERA, _ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
+_PARALLEL, _CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
+
+# Columns of the result after the shift.
+_MISS, _SIGMA_Z, _COSINE, _OUTCOME = 3, 4, 5, 6
+
+
+def correct_through_port(
+    xyz: FloatArray,
+    cameras: Cameras,
+    port: Port,
+    settings: Settings,
+    views: Views | None = None,
+) -> Intersection:
+    """Return where the points of a cloud are that straight rays made under water, and how well.
+
+    The parameters, errors and result are those of `intersect_through_port`; besides, `sigma_z_m`
+    and `covariance_m2` are filled, of `pcfix.port.inversion.port_covariances`.
+    """
+    from pcfix.port.inversion import port_covariances
+
+    parts, order = [], spatial_order(xyz)
+    for first in range(0, max(len(xyz), 1), POINTS_AT_ONCE):
+        rows = order[first : first + POINTS_AT_ONCE]
+        mine = None if views is None else views.take(rows)
+        found, chosen = intersect_through_port(xyz[rows], cameras, port, settings, mine)
+        covariance = port_covariances(xyz[rows] + found.shift_m, chosen, cameras, port, settings)
+        covariance[found.outcome != Outcome.CORRECTED] = 0.0
+        sigma_z = np.sqrt(covariance[:, 5])
+        parts.append(found._replace(covariance_m2=covariance, sigma_z_m=sigma_z))
+    return joined(parts, order, len(cameras))
+
+
+def intersect_through_port(
+    xyz: FloatArray,
+    cameras: Cameras,
+    port: Port,
+    settings: Settings,
+    views: Views | None = None,
+) -> tuple[Intersection, Views]:
+    """Return where the points of a cloud are that straight rays made under water.
+
+    Parameters
+    ----------
+    xyz : array, shape (m, 3)
+        Points where straight rays put them, metres, world frame; all of them under water.
+    cameras : Cameras
+        Poses that are right, world frame, and lenses; a lens that has taken on what the port does
+        belongs to `pcfix adjust` first.
+    port : Port
+        The same before each camera.
+    settings : Settings
+        Refractive index of the water; the largest angle is that in air at the inner face, and of
+        more than the most cameras those with the smallest are taken. With the method consistent
+        the residuals of the straight rays count, with any other they are taken for zero.
+    views : Views, optional
+        The cameras of each point. Without it, every camera whose frame holds it: with the method
+        consistent the image of the true point must be in the frame, with others the apparent one.
+
+    Returns
+    -------
+    found : Intersection
+        One row per input point, in the same order. The miss is that of the rays through the
+        apparent point, the incidence that in air at the inner face.
+    chosen : Views
+        The cameras that were used.
+
+    Raises
+    ------
+    SettingError
+        If the cameras have no angles, or the method consistent finds no lenses.
+
+    Notes
+    -----
+    Snell's law at each face (Skarlatos & Agrafiotis 2018, eq 10), then the point nearest to all
+    rays (eq 11).
+    """
+    chosen = port_views(xyz, cameras, port, settings, views)
+    found = _intersect_chosen(xyz, chosen, cameras, port, settings)
+    if views is not None or settings.method != "consistent":
+        return found, chosen
+    for _ in range(ROUNDS):
+        seen = port_views(xyz, cameras, port, settings, shift_m=found.shift_m)
+        rows = _other_rows(chosen, seen)
+        if not rows.size:
+            break
+        part = _intersect_chosen(xyz[rows], seen.take(rows), cameras, port, settings)
+        found, chosen = _with_rows(found, part, rows), seen
+    return found, chosen
+
+
+ROUNDS = 6
+"""A point at the border of an image may go in and out; it stays as it is after so many rounds."""
+
+
+def _intersect_chosen(
+    xyz: FloatArray, chosen: Views, cameras: Cameras, port: Port, settings: Settings
+) -> Intersection:
+    """Intersect the rays through apparent points, shape (m, 3), with their cameras known."""
+    owner = np.repeat(np.arange(len(xyz)), np.diff(chosen.start))
+    ray = xyz[owner] - cameras.centres[chosen.camera]
+    looking = np.einsum("oij,oj->oi", _rotations(cameras)[chosen.camera], ray)
+    found = intersect_rays(xyz, looking, chosen, cameras, port, settings)
+    if settings.method != "consistent":
+        return found
+    from pcfix.port.inversion import consistent_through_port
+
+    return consistent_through_port(xyz, chosen, cameras, port, settings, found)
+
+
+def _other_rows(one: Views, other: Views) -> IntArray:
+    """Return the points that have other cameras in one list than in the other."""
+    same = np.diff(one.start) == np.diff(other.start)
+    rows = np.flatnonzero(same)
+    a, b = one.take(rows), other.take(rows)
+    owner = np.repeat(rows, np.diff(a.start))
+    same[owner[a.camera != b.camera]] = False
+    return np.flatnonzero(~same)
+
+
+def _with_rows(found: Intersection, part: Intersection, rows: IntArray) -> Intersection:
+    """Return the result with some rows replaced."""
+    values = found._asdict()
+    for name in ("shift_m", "outcome", "ray_count", "ray_miss_m", "sigma_z_m", "incidence_deg"):
+        values[name] = values[name].copy()
+        values[name][rows] = getattr(part, name)
+    values["camera_used"] = found.camera_used | part.camera_used
+    values["pairs_tested"] = found.pairs_tested + part.pairs_tested
+    return Intersection(**values)
+
+
+def intersect_rays(
+    near: FloatArray,
+    directions: FloatArray,
+    views: Views,
+    cameras: Cameras,
+    port: Port,
+    settings: Settings,
+) -> Intersection:
+    """Intersect rays behind the port: forward intersection from places in the images.
+
+    Parameters
+    ----------
+    near : array, shape (m, 3)
+        A place near each point, metres, world frame, as its apparent one; shifts are from there.
+    directions : array, shape (o, 3)
+        Where each camera looks, one row per entry of ``views.camera``: camera frame, any length,
+        as `pcfix.lens.imaging.unproject` has them of places in the image.
+    views : Views
+        The cameras of each point.
+    cameras, port, settings
+        As of `intersect_through_port`.
+
+    Returns
+    -------
+    Intersection
+        One row per point. A ray that does not meet the port does not count.
+    """
+    result = np.zeros((len(near), 7))
+    with one_caller():
+        _intersect(
+            np.ascontiguousarray(near, np.float64),
+            np.ascontiguousarray(directions, np.float64),
+            np.ascontiguousarray(views.start, np.int64),
+            np.ascontiguousarray(views.camera, np.int64),
+            np.ascontiguousarray(cameras.centres),
+            np.ascontiguousarray(_rotations(cameras)),
+            coefficients(port),
+            settings.refractive_index,
+            result,
+        )
+    outcome = result[:, _OUTCOME].astype(np.uint8)
+    moved = outcome == Outcome.CORRECTED
+    counts = np.diff(views.start)
+    used = np.zeros(len(cameras), np.bool_)
+    used[views.camera[np.repeat(moved, counts)]] = True
+    angle = np.degrees(np.arccos(np.clip(result[:, _COSINE], 0.0, 1.0)))
+    return Intersection(
+        shift_m=result[:, :3],
+        outcome=outcome,
+        ray_count=np.where(moved, counts, 0).astype(np.int32),
+        ray_miss_m=result[:, _MISS],
+        sigma_z_m=result[:, _SIGMA_Z],
+        incidence_deg=np.where(moved, angle, 0.0),
+        camera_used=used,
+        pairs_tested=len(views.camera),
+    )
+
+
+def port_views(
+    xyz: FloatArray,
+    cameras: Cameras,
+    port: Port,
+    settings: Settings,
+    views: Views | None = None,
+    shift_m: FloatArray | None = None,
+) -> Views:
+    """Return the cameras whose rays each point gets, as a list.
+
+    Parameters
+    ----------
+    xyz, cameras, port, settings, views
+        As of `intersect_through_port`.
+    shift_m : array, shape (m, 3), optional
+        To the true points; without `views`, their images through the port must be in the frame
+        instead of those of the apparent points along straight lines.
+
+    Returns
+    -------
+    Views
+        In the order of the cameras, or of `views`.
+    """
+    limit = settings.max_angle_deg
+    order = spatial_order(xyz)
+    count = np.zeros(len(xyz) + 1, np.int64)
+    common = (
+        order,
+        (len(xyz) + TILE - 1) // TILE,
+        np.ascontiguousarray(xyz),
+        np.ascontiguousarray(cameras.centres),
+        np.ascontiguousarray(_rotations(cameras)),
+        frames_of(cameras) if views is None else no_frames(len(cameras)),
+        None if views is None else (views.start, views.camera),
+        coefficients(port),
+        0.0 if limit is None else float(np.cos(np.radians(limit))),
+        settings.max_cameras or ANY_NUMBER,
+        None if shift_m is None else np.ascontiguousarray(shift_m),
+        settings.refractive_index,
+    )
+    with one_caller():
+        _choose(*common, count, np.zeros(0, np.int64), False)
+        start = np.cumsum(count)
+        chosen = np.empty(start[-1], np.int64)
+        _choose(*common, start, chosen, True)
+    return Views(start, chosen)
+
+
+def _rotations(cameras: Cameras) -> FloatArray:
+    if cameras.rotations is None:
+        raise SettingError(
+            "port: it is fixed to the camera, and these cameras have no angles; give a camera file"
+            " that has them."
+        )
+    return np.asarray(cameras.rotations, np.float64)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _choose(
+    order: IntArray, tiles: int, xyz: FloatArray, centres: FloatArray, rotations: FloatArray,
+    frames: Frames, views: tuple[IntArray, IntArray] | None, port: FloatArray,
+    least_cosine: float, most: int, shift: FloatArray | None, n: float,
+    start: IntArray, chosen: IntArray, fill: bool,
+) -> None:  # fmt: skip
+    """Count the cameras of point i into ``start[i + 1]``, or fill them in from ``start[i]``."""
+    for t in prange(tiles):
+        rows = order[t * TILE : (t + 1) * TILE]
+        near = rows[:0]
+        if views is None:
+            low, high = _box(xyz, rows, shift)
+            near = near_cameras(frames, centres, low, high)
+        for i in rows:
+            candidates = near
+            if views is not None:
+                candidates = views[1][views[0][i] : views[0][i + 1]].astype(np.int64)
+            place = xyz[i]
+            if shift is not None:
+                place = xyz[i] + shift[i]
+            kept = _usable(
+                candidates, place, centres, rotations, frames, port, least_cosine, most,
+                shift is not None, n,
+            )  # fmt: skip
+            if fill:
+                chosen[start[i] : start[i] + kept.size] = kept
+            else:
+                start[i + 1] = kept.size
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _box(
+    xyz: FloatArray, rows: IntArray, shift: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return the corners of an upright box around points; with shifts, a wide one around both.
+
+    A straight line to the true point leaves the frame where the bent light may still be in it, by
+    no more than it was moved.
+    """
+    low, high, wide = xyz[rows[0]].copy(), xyz[rows[0]].copy(), 0.0
+    for i in rows:
+        for axis in range(3):
+            moved = 0.0 if shift is None else shift[i, axis]
+            low[axis] = min(low[axis], xyz[i, axis] + min(moved, 0.0))
+            high[axis] = max(high[axis], xyz[i, axis] + max(moved, 0.0))
+            wide = max(wide, abs(moved))
+    return low - wide, high + wide
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _usable(
+    candidates: IntArray, point: FloatArray, centres: FloatArray, rotations: FloatArray,
+    frames: Frames, port: FloatArray, least_cosine: float, most: int, through: bool, n: float,
+) -> IntArray:  # fmt: skip
+    """Return the cameras that give a ray, in their order: at most so many, the steepest.
+
+    The point is seen along a straight line, or through the port.
+    """
+    kept, cosine = np.empty(candidates.size, np.int64), np.empty(candidates.size)
+    out = np.empty((3, 5))
+    k = 0
+    for c in candidates:
+        r = rotations[c]
+        x, y, z = point[0] - centres[c, 0], point[1] - centres[c, 1], point[2] - centres[c, 2]
+        wx, wy, wz = in_camera(r, x, y, z)
+        if through:
+            through_port(port, n, wx, wy, wz, out)
+            wx, wy, wz = out[0, 0], out[1, 0], out[2, 0]
+            x, y, z = in_world(r, wx, wy, wz)
+        steep = cosine_at_port(port, wx, wy, wz)
+        if steep > 0.0 and steep >= least_cosine and holds(frames, c, -x, -y, -z):
+            kept[k], cosine[k] = c, steep
+            k += 1
+    if k <= most:
+        return kept[:k]
+    ranked = np.argsort(-cosine[:k], kind="mergesort")[:most]
+    ranked.sort()
+    return kept[ranked]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def in_camera(r: FloatArray, x: float, y: float, z: float) -> Vector:
+    """Return a vector of the world in the frame of a camera."""
+    return (
+        r[0, 0] * x + r[0, 1] * y + r[0, 2] * z,
+        r[1, 0] * x + r[1, 1] * y + r[1, 2] * z,
+        r[2, 0] * x + r[2, 1] * y + r[2, 2] * z,
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def in_world(r: FloatArray, x: float, y: float, z: float) -> Vector:
+    """Return a vector of the frame of a camera in the world."""
+    return (
+        r[0, 0] * x + r[1, 0] * y + r[2, 0] * z,
+        r[0, 1] * x + r[1, 1] * y + r[2, 1] * z,
+        r[0, 2] * x + r[1, 2] * y + r[2, 2] * z,
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _intersect(
+    near: FloatArray, directions: FloatArray, start: IntArray, camera: IntArray,
+    centres: FloatArray, rotations: FloatArray, port: FloatArray, n: float, result: FloatArray,
+) -> None:  # fmt: skip
+    """Intersect the rays of each point, with the place near it as the origin."""
+    for i in prange(len(near)):
+        row, sums = result[i], np.zeros(9)
+        least, k = 1.0, 0
+        for o in range(start[i], start[i + 1]):
+            r, centre = rotations[camera[o]], centres[camera[o]]
+            dx, dy, dz = directions[o, 0], directions[o, 1], directions[o, 2]
+            ax, ay, az, tx, ty, tz = ray_through(port, n, dx, dy, dz)
+            if np.isnan(ax + tx):
+                continue
+            ax, ay, az = in_world(r, ax, ay, az)
+            tx, ty, tz = in_world(r, tx, ty, tz)
+            ax, ay, az = (
+                ax + (centre[0] - near[i, 0]),
+                ay + (centre[1] - near[i, 1]),
+                az + (centre[2] - near[i, 2]),
+            )
+            terms = line_terms(ax, ay, az, tx, ty, tz, 1.0)
+            for j in range(9):
+                sums[j] += terms[j]
+            least = min(least, cosine_at_port(port, dx, dy, dz))
+            k += 1
+        _solve(row, sums, k, least)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _solve(row: FloatArray, s: FloatArray, k: int, cosine: float) -> None:
+    """Solve one point and write its row; a point without a solution keeps a shift of zero."""
+    if k < 2:
+        row[_OUTCOME] = _ONE_CAMERA if k == 1 else _NO_CAMERA
+        return
+    solved, qx, qy, qz, miss, sigma_z = nearest_point(
+        float(k), s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8]
+    )
+    if not solved:
+        row[_OUTCOME] = _PARALLEL
+        return
+    row[0], row[1], row[2] = qx, qy, qz
+    row[_MISS], row[_SIGMA_Z], row[_COSINE], row[_OUTCOME] = miss, sigma_z, cosine, _CORRECTED

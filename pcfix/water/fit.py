@@ -1,0 +1,351 @@
+"""The water surface, fitted to points on the shoreline of which some are wrong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+
+import numpy as np
+
+from pcfix.errors import GeometryError, SettingError
+from pcfix.model import BoolArray, FloatArray, WaterPlane
+from pcfix.water.robust import robust_regression
+
+if TYPE_CHECKING:
+    from pcfix.model import IntArray
+    from pcfix.water.robust import Regression
+
+Model = Literal["auto", "level", "plane", "along"]
+MAX_TILT_PERCENT = 5.0
+SIGNIFICANCE = 0.05
+"""A tilt that chance alone gives more often than this is none."""
+LINE_RATIO = 0.1
+"""Points with less spread across than this part of their spread along are on one line."""
+LONG_RATIO = 1.0 / 3.0
+"""Points with less are along a river or a coast, where water lies level across."""
+WIDE_SCATTER_M = 0.1
+_SAME_PLACE_M = 1e-3
+_FEWEST_FOR_PLANE = 3
+_ON_LINE = 0.01
+_NO_SCATTER_M = 1e-6
+_MOSTLY = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class WaterFit:
+    """A level or a plane, and how well the points fix it.
+
+    Attributes
+    ----------
+    model : {"level", "plane", "along"}
+        ``along``: tilted in the direction in which the points lie, level across it.
+    surface : WaterPlane
+    centre_xy : array, shape (2,)
+        The middle of the points, metres, world frame.
+    level_m : float
+        The height of the surface there.
+    tilt : array, shape (2,)
+        dz/dx and dz/dy.
+    covariance : array, shape (3, 3)
+        Of `level_m` and `tilt`; zero for what the model does not have, NaN where no point is to
+        spare. It knows nothing of errors that all points share, as of a wrong datum.
+    sigma_m : float
+        Standard deviation of one accepted point; NaN where none is to spare.
+    residual_m : array, shape (n,)
+        Point minus surface; NaN of points without a height.
+    accepted : array of bool, shape (n,)
+        The others have no weight.
+    weight : array, shape (n,)
+        0 to 1.
+    notes : tuple of str
+        Why this model, and what to beware of.
+    """
+
+    model: Model
+    surface: WaterPlane
+    centre_xy: FloatArray
+    level_m: float
+    tilt: FloatArray
+    covariance: FloatArray
+    sigma_m: float
+    residual_m: FloatArray
+    accepted: BoolArray
+    weight: FloatArray
+    notes: tuple[str, ...] = ()
+
+    @property
+    def sigma_level_m(self) -> float:
+        """Standard error of the level in the middle of the points."""
+        return math.sqrt(self.covariance[0, 0])
+
+    @property
+    def sigma_tilt(self) -> FloatArray:
+        """Standard errors of dz/dx and dz/dy, shape (2,)."""
+        return np.sqrt(np.diag(self.covariance)[1:])
+
+    @property
+    def tilt_percent(self) -> float:
+        """The steepest slope."""
+        return 100.0 * math.hypot(*self.tilt)
+
+    @property
+    def sigma_tilt_percent(self) -> float:
+        """Standard error of the slope in its own direction."""
+        steepest = math.hypot(*self.tilt)
+        if steepest == 0.0:
+            return 100.0 * float(np.hypot(*self.sigma_tilt))
+        along = self.tilt / steepest
+        return 100.0 * math.sqrt(float(along @ self.covariance[1:, 1:] @ along))
+
+    @property
+    def downhill_deg(self) -> float:
+        """Direction in which the surface falls, clockwise from the y axis; NaN of a level."""
+        if not self.tilt.any():
+            return math.nan
+        return math.degrees(math.atan2(-self.tilt[0], -self.tilt[1])) % 360.0
+
+    def height_at(self, xy: FloatArray) -> FloatArray:
+        """Return the height (m) of the surface at places (m, 2)."""
+        return np.asarray(self.level_m + (xy - self.centre_xy) @ self.tilt)
+
+    def sigma_at(self, xy: FloatArray) -> FloatArray:
+        """Return the standard error (m) of that height."""
+        row = np.column_stack([np.ones(len(xy)), xy - self.centre_xy])
+        return np.sqrt(np.einsum("ij,jk,ik->i", row, self.covariance, row))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures as plain values."""
+        return {
+            "model": self.model,
+            "level_m": self.level_m,
+            "sigma_level_m": self.sigma_level_m,
+            "at_xy": self.centre_xy.tolist(),
+            "tilt_percent": self.tilt_percent,
+            "sigma_tilt_percent": self.sigma_tilt_percent,
+            "downhill_deg": self.downhill_deg,
+            "sigma_point_m": self.sigma_m,
+            "points": len(self.accepted),
+            "accepted": int(self.accepted.sum()),
+            "without_height": int(np.isnan(self.residual_m).sum()),
+            "notes": list(self.notes),
+        }
+
+
+class _Plan(NamedTuple):
+    """Where the points lie: centre, axes along and across (rows), spread (rms) along each, m."""
+
+    centre: FloatArray
+    axes: FloatArray
+    spread_m: FloatArray
+
+    def columns(self, xy: FloatArray, model: Model) -> FloatArray:
+        """Return the design matrix of a model."""
+        p = _UNKNOWNS[model]
+        place = (xy - self.centre) @ self.axes[: p - 1].T / self.spread_m[: p - 1]
+        return np.column_stack([np.ones(len(xy)), place])
+
+    def to_world(self, model: Model) -> FloatArray:
+        """Return the matrix from the unknowns of a model to level and tilt, shape (3, p)."""
+        p = _UNKNOWNS[model]
+        matrix = np.zeros((3, p))
+        matrix[0, 0] = 1.0
+        matrix[1:, 1:] = (self.axes[: p - 1] / self.spread_m[: p - 1, None]).T
+        return matrix
+
+
+_UNKNOWNS: dict[Model, int] = {"level": 1, "along": 2, "plane": 3}
+
+
+def fit_water(
+    xyz: FloatArray, *, model: Model = "auto", max_tilt_percent: float = MAX_TILT_PERCENT
+) -> WaterFit:
+    """Fit the water surface to shoreline points, nearly half of which may be wrong.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 3)
+        Metres, world frame; rows that are not finite are left out.
+    model : {"auto", "level", "plane", "along"}
+        ``along`` is tilted in the direction in which the points lie and level across it. ``auto``
+        takes a tilt only where it is significant, and only along the points where these are
+        nearly on one line, or lie along a river and show no tilt across it.
+    max_tilt_percent : float, default 5.0
+        A steeper surface is refused.
+
+    Returns
+    -------
+    WaterFit
+        One row per input point; the order of the points does not matter.
+
+    Raises
+    ------
+    SettingError
+        If the model is unknown, or the shape of `xyz` is another.
+    GeometryError
+        If there are too few points for the model, they lie on one line, or the surface is steeper
+        than `max_tilt_percent`.
+    """
+    if model not in get_args(Model):
+        raise SettingError(f"model '{model}' is not one of {', '.join(get_args(Model))}.")
+    points = np.asarray(xyz, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise SettingError(f"shoreline points must have the shape (n, 3), not {points.shape}.")
+    known = np.flatnonzero(np.isfinite(points).all(axis=1))
+    if len(known) == 0:
+        raise GeometryError(f"None of {len(points)} shoreline points has a height.")
+    known = known[np.lexsort(points[known].T)]
+    used = points[known]
+    chosen, found, notes = _choose(used, _plan(used[:, :2]), model)
+    fit = _spread_over(chosen, found, notes, points, known)
+    if not fit.tilt_percent <= max_tilt_percent:
+        raise GeometryError(
+            f"The shoreline points tilt by {fit.tilt_percent:.1f} %, more than"
+            f" {max_tilt_percent:g} % (standard error {fit.sigma_tilt_percent:.1f} %); check their"
+            " heights and units, or allow it, or fit a level."
+        )
+    return fit
+
+
+class _Found(NamedTuple):
+    """A regression and the plan it was made in."""
+
+    plan: _Plan
+    fit: Regression
+
+
+def _plan(xy: FloatArray) -> _Plan:
+    """Return the principal axes of places, along first."""
+    centre = xy.mean(axis=0)
+    variance, vectors = np.linalg.eigh(np.cov((xy - centre).T, bias=True).reshape(2, 2))
+    return _Plan(centre, vectors.T[::-1], np.sqrt(np.maximum(variance[::-1], 0.0)))
+
+
+def _choose(xyz: FloatArray, plan: _Plan, model: Model) -> tuple[Model, _Found, tuple[str, ...]]:
+    """Return the model, its fit, and why."""
+    if model != "auto":
+        _check_enough(len(xyz), plan, model)
+        return model, _regression(xyz, plan, model), ()
+    if len(xyz) <= _FEWEST_FOR_PLANE or plan.spread_m[0] < _SAME_PLACE_M:
+        note = f"{len(xyz)} points, too few or too close together to show a tilt: a level."
+        return "level", _regression(xyz, plan, "level"), (note,)
+    along, across = plan.spread_m
+    tilted: Model = "along" if across < LINE_RATIO * along else "plane"
+    found = _regression(xyz, plan, tilted)
+    chance = _chance_of_tilt(found.fit)
+    if not chance < SIGNIFICANCE:
+        note = f"The tilt of the points is not significant (chance gives it in {chance:.0%})."
+        return "level", _regression(xyz, plan, "level"), (f"{note[:-1]}: a level.",)
+    significant = f"The tilt of the points is significant (chance gives it in {chance:.2g})."
+    if tilted == "along":
+        return tilted, found, (significant, _on_a_line(plan))
+    if across < LONG_RATIO * along and _is_level_across(found.fit):
+        note = "No tilt across the direction in which the points lie: level across it."
+        return "along", _regression(xyz, plan, "along"), (significant, note)
+    return tilted, found, (significant,)
+
+
+def _on_a_line(plan: _Plan) -> str:
+    along, across = plan.spread_m
+    return (
+        f"The points are nearly on one line (rms {across:.1f} m across, {along:.1f} m along), which"
+        " cannot fix a tilt across it: level across it."
+    )
+
+
+def _check_enough(n: int, plan: _Plan, model: Model) -> None:
+    """Refuse a model that the points cannot fix.
+
+    Raises
+    ------
+    GeometryError
+    """
+    if n < _UNKNOWNS[model]:
+        raise GeometryError(
+            f"A water surface of the kind '{model}' needs at least {_UNKNOWNS[model]} shoreline"
+            f" points with heights, and there are {n}; fit a level."
+        )
+    along, across = plan.spread_m
+    if model != "level" and along < _SAME_PLACE_M:
+        raise GeometryError(f"The {n} shoreline points are at one place; fit a level.")
+    if model == "plane" and across < _ON_LINE * along:
+        raise GeometryError(
+            f"The {n} shoreline points are on one line (rms {across:.2g} m across, {along:.4g} m"
+            " along), which does not fix a plane; fit a level, or a tilt along them."
+        )
+
+
+def _regression(xyz: FloatArray, plan: _Plan, model: Model) -> _Found:
+    found = robust_regression(plan.columns(xyz[:, :2], model), xyz[:, 2])
+    if found is None:
+        raise GeometryError(
+            f"The {len(xyz)} shoreline points do not fix a surface of the kind '{model}': too many"
+            " are on one line; fit a level."
+        )
+    return _Found(plan, found)
+
+
+def _chance_of_tilt(fit: Regression) -> float:
+    """Return how often points of a level would show such a tilt (Wald's test, F distribution)."""
+    from scipy.stats import f
+
+    tilt, spare = fit.beta[1:], int((fit.weight > 0.0).sum()) - len(fit.beta)
+    if spare <= 0:
+        return 1.0
+    if fit.sigma_m < _NO_SCATTER_M:
+        return float(np.abs(tilt).max() < _NO_SCATTER_M)
+    value = float(tilt @ np.linalg.solve(fit.covariance[1:, 1:], tilt)) / len(tilt)
+    return float(f.sf(value, len(tilt), spare))
+
+
+def _is_level_across(fit: Regression) -> bool:
+    return bool(abs(fit.beta[2]) < 2.0 * math.sqrt(fit.covariance[2, 2]))
+
+
+def _spread_over(
+    model: Model, found: _Found, notes: tuple[str, ...], points: FloatArray, known: IntArray
+) -> WaterFit:
+    """Return the fit with one row per input point, about the middle of the accepted ones."""
+    plan, fit = found
+    accepted = fit.weight > 0.0
+    centre = points[known[accepted], :2].mean(axis=0)
+    to_world = plan.to_world(model)
+    moved = np.eye(3)
+    moved[0, 1:] = centre - plan.centre
+    level, *tilt = moved @ to_world @ fit.beta
+    transform = moved @ to_world
+    surface = WaterPlane(float(level - centre @ tilt), float(tilt[0]), float(tilt[1]))
+    rows = {}
+    for name, values, empty in (("residual_m", fit.residual_m, np.nan), ("weight", fit.weight, 0)):
+        rows[name] = np.full(len(points), empty, np.float64)
+        rows[name][known] = values
+    return WaterFit(
+        model=model,
+        surface=surface,
+        centre_xy=centre,
+        level_m=float(level),
+        tilt=np.array(tilt),
+        covariance=transform @ fit.covariance @ transform.T,
+        sigma_m=fit.sigma_m,
+        accepted=rows["weight"] > 0.0,
+        notes=(*notes, *_doubts(fit, len(points) - len(known))),
+        **rows,
+    )
+
+
+def _doubts(fit: Regression, without_height: int) -> tuple[str, ...]:
+    """Return what a user should look at."""
+    n, kept = len(fit.weight), int((fit.weight > 0.0).sum())
+    notes = []
+    if without_height:
+        notes.append(f"{without_height} points have no height and are left out.")
+    if kept <= len(fit.beta):
+        notes.append("No point is to spare, so nothing tells how good the surface is.")
+    if kept < _MOSTLY * n:
+        notes.append(f"Only {kept} of {n} points agree with the surface; look at the others.")
+    if fit.sigma_m > WIDE_SCATTER_M:
+        notes.append(
+            f"The points scatter by {fit.sigma_m:.2f} m: they may not be of one surface, or not"
+            " on the edge of the water."
+        )
+    return tuple(notes)

@@ -1,0 +1,154 @@
+"""The refractive index of natural waters, relative to air."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from pcfix.errors import SettingError
+from pcfix.options import DEFAULT_REFRACTIVE_INDEX
+
+SALINITY_PSU, TEMPERATURE_C, WAVELENGTH_UM = (0.0, 40.0), (0.0, 30.0), (0.4, 0.7)
+"""Where the formula was fitted (its salinities end at 35; natural seas go a little beyond)."""
+
+GREEN_UM = 0.53
+"""Where cameras see most through water: the peak of their green pixels."""
+
+
+class Water(NamedTuple):
+    """What decides the refractive index."""
+
+    salinity_psu: float
+    temperature_c: float = 15.0
+    wavelength_um: float = GREEN_UM
+
+
+WATERS = {"fresh": Water(0.0), "sea": Water(35.0)}
+"""Waters by name."""
+
+
+def refractive_index(
+    salinity: float = 35.0, temperature_c: float = 15.0, wavelength_um: float = GREEN_UM
+) -> float:
+    """Return the refractive index of water relative to air.
+
+    Parameters
+    ----------
+    salinity : float
+        PSU (grams of salt in a kilogram, nearly), 0 to 40.
+    temperature_c : float
+        Degrees Celsius, 0 to 30.
+    wavelength_um : float
+        Of the light, micrometres, 0.4 to 0.7.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    SettingError
+        If a value is outside its range.
+
+    Notes
+    -----
+    Skarlatos & Agrafiotis 2018, eq 13, which is the fit of Quan & Fry 1995 (*Applied Optics* 34,
+    3477, eq 3) to the measurements of Austin & Halikas 1976. The wavelength enters in nanometres;
+    the term in T^2 alone and the one in 1 / lambda^2 are negative. Without dispersion in mind a
+    camera's green, 0.53 um, is a fair choice; blue and red differ by 0.004.
+
+    Examples
+    --------
+    >>> import pcfix
+    >>> round(pcfix.refractive_index(salinity=0.0, temperature_c=20.0, wavelength_um=0.5893), 4)
+    1.333
+    """
+    for name, value, (low, high), unit in (
+        ("salinity", salinity, SALINITY_PSU, "PSU"),
+        ("temperature", temperature_c, TEMPERATURE_C, "degrees Celsius"),
+        ("wavelength", wavelength_um, WAVELENGTH_UM, "micrometres"),
+    ):
+        if not (math.isfinite(value) and low <= value <= high):
+            raise SettingError(
+                f"{name} {value:g} is outside {low:g} to {high:g}: give it in {unit}."
+            )
+    s, t, nm = float(salinity), float(temperature_c), 1000.0 * wavelength_um
+    return (
+        1.31405
+        + (1.779e-4 - 1.05e-6 * t + 1.6e-8 * t * t) * s
+        - 2.02e-6 * t * t
+        + (15.868 + 0.01155 * s - 0.00423 * t) / nm
+        - 4382.0 / nm**2
+        + 1.1455e6 / nm**3
+    )
+
+
+def index_words(
+    index: float | str | None,
+    salinity: float | None,
+    temperature_c: float | None,
+    wavelength_um: float | None,
+) -> float | str:
+    """Return what `index_of` takes, of an index or what decides it.
+
+    Raises
+    ------
+    SettingError
+        If both are given.
+    """
+    if salinity is None and temperature_c is None and wavelength_um is None:
+        return DEFAULT_REFRACTIVE_INDEX if index is None else _plain(index)
+    if index is not None:
+        raise SettingError(
+            "index and salinity, temperature or wavelength say the same twice; give one of them."
+        )
+    given = Water(35.0 if salinity is None else salinity)
+    temperature = given.temperature_c if temperature_c is None else temperature_c
+    wavelength = given.wavelength_um if wavelength_um is None else wavelength_um
+    return f"{given.salinity_psu!r},{temperature!r},{wavelength!r}"
+
+
+def _plain(index: float | str) -> float | str:
+    """Return a number as one, and a word as it is."""
+    try:
+        return float(index)
+    except ValueError:
+        return index
+
+
+def index_of(given: float | str) -> tuple[float, str]:
+    """Return the refractive index that a number or a word means, and what water that is.
+
+    Parameters
+    ----------
+    given : float or str
+        A number; ``fresh`` or ``sea``; or ``S,T`` or ``S,T,W``: salinity in PSU, temperature in
+        degrees Celsius and wavelength in micrometres.
+
+    Returns
+    -------
+    index : float
+    water : str
+        In words; empty where only a number was given.
+
+    Raises
+    ------
+    SettingError
+        If it is none of these, or a value is outside its range.
+    """
+    words = str(given).strip().lower()
+    water = WATERS.get(words)
+    try:
+        if water is None and "," in words:
+            water = Water(*(float(word) for word in words.split(",")))
+        if water is None:
+            return float(words), ""
+    except (ValueError, TypeError):
+        raise SettingError(
+            f"index '{given}' is neither a number nor {' nor '.join(WATERS)}, nor salinity,"
+            " temperature and wavelength as 35,15,0.53."
+        ) from None
+    name = f"{words}: " if words in WATERS else ""
+    return refractive_index(*water), (
+        f"{name}{water.salinity_psu:g} PSU, {water.temperature_c:g} C, {water.wavelength_um:g} um"
+    )

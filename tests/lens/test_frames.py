@@ -1,0 +1,270 @@
+"""Frames of distorted lenses: the slow twin point by point, tiles, and lenses without one."""
+
+import subprocess
+import sys
+
+import numba
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import pcfix
+from pcfix.lens.frames import ALL, NOT_DISTORTED, NOTHING, frames_of, holds, judge, may_hold
+from pcfix.lens.imaging import project
+from pcfix.refract.intersect import TILE
+from tests.refract.test_kernels import interpreted_environment, same
+from tests.utils.twins import image_slowly
+
+N = 5 * TILE + 17
+SIZE = (4000.0, 3000.0, 2010.0, 1490.0)
+LENSES = {
+    "barrel": pcfix.Lens(3000.0, *SIZE, radial=(-0.28, 0.12, -0.02)),
+    "pincushion": pcfix.Lens(3000.0, *SIZE, radial=(0.25, 0.3)),
+    "everything": pcfix.Lens(
+        3000.0, *SIZE, b1=9.0, b2=-5.0, b3=2.0, radial=(-0.1, 0.02, -0.003, 0.001, 0.0002),
+        denominator=(0.02,), tangential=(2e-3, -1e-3, 0.1), thin_prism=(1e-3, 0.0, -2e-3),
+        distortion_centre=(0.02, -0.03),
+    ),
+    "plain": pcfix.Lens(
+        3000.0, *SIZE, b1=9.0, b2=-5.0, b3=2.0, radial=(-0.1, 0.02, -0.003, 0.001),
+        tangential=(2e-3, -1e-3), distortion_centre=(0.02, -0.03),
+    ),
+    "inverse": pcfix.Lens(3000.0, *SIZE, radial=(0.15,), inverse=True),
+    "fisheye": pcfix.Lens(2200.0, *SIZE, projection="equidistant", radial=(-0.02, 0.003)),
+    "wide fisheye": pcfix.Lens(
+        2000.0, *SIZE, projection="polynomial", shape=(0.0, 1.0, 0.01, -0.05)
+    ),
+    "round fisheye": pcfix.Lens(1100.0, *SIZE, projection="equisolid"),
+    "folding": pcfix.Lens(3000.0, *SIZE, radial=(-0.9,)),
+}  # fmt: skip
+
+
+def block(lens, k=25, seed=7):
+    """Return cameras over 100 m by 100 m; each sees part of the points, the wide ones tilted."""
+    wide = lens.projection in ("polynomial", "equisolid")
+    rng = np.random.default_rng(seed)
+    centres = np.column_stack([rng.uniform(0, 100, (k, 2)), rng.uniform(55, 65, k)])
+    turns = rng.normal(0, [90, 60, 60] if wide else [90, 12, 12], (k, 3))
+    tilt = Rotation.from_euler("zyx", turns, degrees=True)
+    rotations = np.diag([1.0, -1.0, -1.0]) @ tilt.as_matrix().transpose(0, 2, 1)
+    return pcfix.Cameras(tuple(map(str, range(k))), centres, rotations, (lens,) * k)
+
+
+@pytest.fixture(scope="module")
+def points():
+    rng = np.random.default_rng(8)
+    return np.column_stack([rng.uniform(-60, 160, (N, 2)), -rng.uniform(0.1, 8, N)])
+
+
+def seen_slowly(lens, direction):
+    """Whether a direction is in the frame, by the slow twin."""
+    if lens.projection == "perspective" and (direction[2] <= 0.0 or is_folded(lens, direction)):
+        return False
+    u, v = image_slowly(lens, direction)
+    return 0.0 <= u <= lens.width and 0.0 <= v <= lens.height
+
+
+def is_folded(lens, direction):
+    """Whether r' comes to a maximum on the way out to a direction, in small steps."""
+    if lens.inverse:
+        return False
+    r = np.linspace(0.0, np.hypot(*direction[:2]) / direction[2], 3000)
+    slope = sum((2 * i + 1) * k * r ** (2 * i) for i, k in enumerate((1.0, *lens.radial)))
+    return bool((slope <= 0.0).any())
+
+
+def views_slowly(points, cameras):
+    lens = cameras.lenses[0]
+    rows = [
+        [
+            c
+            for c in range(len(cameras))
+            if seen_slowly(lens, cameras.rotations[c] @ (point - cameras.centres[c]))
+        ]
+        for point in points
+    ]
+    start = np.concatenate([[0], np.cumsum([len(r) for r in rows])])
+    return pcfix.Views(start, np.array([c for r in rows for c in r], np.int64))
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_slow_twin_agrees_point_by_point(name, points):
+    cameras = block(LENSES[name])
+    some = points if name != "inverse" else points[: 2 * TILE]  # its twin is very slow
+    views = views_slowly(some, cameras)
+    result = pcfix.correct_points(some, cameras, 0.0)
+    seen = np.diff(views.start)
+    assert 0 <= seen.min() < seen.max() <= len(cameras)  # the scene tests something
+    assert np.array_equal(result.ray_count, np.where(seen >= 2, seen, 0))
+    same(result, pcfix.correct_points(some, cameras, 0.0, views=views))
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_nothing_depends_on_tiles_order_or_threads(name, points):
+    cameras = block(LENSES[name])
+    whole = pcfix.correct_points(points, cameras, 0.0)
+    same(whole, pcfix.correct_points(points, cameras, 0.0, max_cameras=len(cameras)))
+    shuffled = np.random.default_rng(1).permutation(N)
+    assert np.array_equal(
+        whole.xyz[shuffled], pcfix.correct_points(points[shuffled], cameras, 0.0).xyz
+    )
+    for i in range(0, N, 97):
+        alone = pcfix.correct_points(points[i : i + 1], cameras, 0.0)
+        assert np.array_equal(alone.xyz[0], whole.xyz[i])
+    numba.set_num_threads(1)
+    one_thread = pcfix.correct_points(points, cameras, 0.0)
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    same(whole, one_thread)
+
+
+def boxes(rng, count=400):
+    """Return upright boxes of all sizes below and above the block."""
+    middle = rng.uniform((-100, -100, -20), (200, 200, 150), (count, 3))
+    half = 10 ** rng.uniform(-2, 1.5, (count, 1)) * rng.uniform(0.05, 1, (count, 3))
+    return middle - half, middle + half
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_tiles_are_never_judged_wrongly(name):
+    rng = np.random.default_rng(5)
+    cameras = block(LENSES[name], k=8, seed=3)
+    frames = frames_of(cameras)
+    judged = {ALL: 0, NOTHING: 0}
+    for low, high in zip(*boxes(rng), strict=True):
+        inside = rng.uniform(low, high, (40, 3))
+        inside[:8] = np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, low, high)
+        for c, centre in enumerate(cameras.centres):
+            e = centre - inside
+            held = [holds(frames, c, *row) for row in e]
+            if not may_hold(frames.planes[c], centre, low, high):
+                assert not any(held)
+                continue
+            verdict = judge(frames, c, centre, low, high)
+            if verdict == ALL:
+                assert all(held)
+            if verdict == NOTHING:
+                assert not any(held)
+            if verdict in judged:
+                judged[verdict] += 1
+    # where the fold is in the image no tile is taken as a whole, but for the cone
+    assert judged[NOTHING] > 0 or name == "round fisheye"
+    assert judged[ALL] > 0 or name in ("folding", "round fisheye")
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_pyramid_and_cone_are_around_the_frame(name):
+    lens = LENSES[name]
+    frames = frames_of(pcfix.Cameras(("a",), np.zeros((1, 3)), np.eye(3)[None], (lens,)))
+    directions = np.random.default_rng(2).normal(size=(200_000, 3))
+    u, v = project(lens, directions).T
+    held = directions[(u >= 0) & (u <= lens.width) & (v >= 0) & (v <= lens.height)]
+    assert len(held) > 1000
+    assert (held @ frames.planes[0].T >= 0).all()
+    angle = np.arccos(held[:, 2] / np.linalg.norm(held, axis=1))
+    assert angle.max() <= frames.cone[0, 3] <= np.pi + 0.1
+    if lens.projection == "perspective" and name != "folding":
+        assert frames.cone[0, 3] < 1.02 * angle.max() + 0.01  # and not far around
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_scale_bounds_how_far_the_image_moves(name):
+    lens = LENSES[name]
+    frames = frames_of(pcfix.Cameras(("a",), np.zeros((1, 3)), np.eye(3)[None], (lens,)))
+    scale, margin = frames.reach[0]
+    rng = np.random.default_rng(3)
+    one = rng.normal(size=(200_000, 3))
+    one /= np.linalg.norm(one, axis=1)[:, None]
+    other = one + 1e-3 * rng.normal(size=one.shape)
+    other /= np.linalg.norm(other, axis=1)[:, None]
+    images = [project(lens, d) for d in (one, other)]
+    near = np.logical_and(*(
+        ((image >= -margin) & (image <= np.add((4000, 3000), margin))).all(axis=1)
+        for image in images
+    ))  # fmt: skip
+    angle = 2 * np.arcsin(np.linalg.norm(one - other, axis=1) / 2)
+    moved = np.linalg.norm(images[0] - images[1], axis=1)
+    assert near.sum() > 1000
+    assert (moved[near] <= scale * angle[near]).all()
+
+
+def test_paths_of_straight_and_distorted_lenses_agree_to_the_bit(points):
+    """A distortion of next to nothing takes the other path to the same result."""
+    straight = pcfix.Lens(3000.0, *SIZE, b1=4.0, b2=1.0, b3=-2.0)
+    bent = pcfix.Lens(3000.0, *SIZE, b1=4.0, b2=1.0, b3=-2.0, radial=(1e-300,))
+    general = pcfix.Lens(3000.0, *SIZE, b1=4.0, b2=1.0, b3=-2.0, denominator=(1e-300,))
+    rows = [frames_of(block(lens)).row[0] for lens in (straight, bent, general)]
+    assert rows == [NOT_DISTORTED, 0, 0]
+    one = pcfix.correct_points(points, block(straight), 0.0)
+    assert one.ray_count.max() > 4
+    same(one, pcfix.correct_points(points, block(bent), 0.0))
+    same(one, pcfix.correct_points(points, block(general), 0.0))
+
+
+def test_lenses_may_differ_from_image_to_image(points):
+    """Coefficients of unequal number share one table."""
+    names = ["barrel", "everything", "fisheye", "wide fisheye"]
+    mixed = block(LENSES["barrel"], k=8)
+    lenses = (*(LENSES[name] for name in names), pcfix.Lens(3000.0, *SIZE)) * 2
+    mixed = pcfix.Cameras(mixed.labels, mixed.centres, mixed.rotations, lenses[:8])
+    frames = frames_of(mixed)
+    assert frames.row.tolist() == [0, 1, 2, 3, NOT_DISTORTED, 0, 1, 2]
+    alone = [
+        pcfix.Cameras(("a",), mixed.centres[c : c + 1], mixed.rotations[c : c + 1], (lenses[c],))
+        for c in range(8)
+    ]
+    for c, camera in enumerate(alone):
+        by_itself = frames_of(camera)
+        for point in points[:100]:
+            e = mixed.centres[c] - point
+            assert holds(frames, c, *e) == holds(by_itself, 0, *e)
+
+
+@pytest.mark.parametrize("radial", [(), (1e-300,)])
+@pytest.mark.parametrize(("x", "inside"), [(32.0, True), (32.0 + 1e-9, False), (-32.0, True)])
+def test_a_point_on_the_border_is_inside(radial, x, inside):
+    lens = pcfix.Lens(1024.0, 1024.0, 512.0, 512.0, 256.0, radial=radial)
+    looking_down = np.diag([1.0, -1.0, -1.0])
+    cameras = pcfix.Cameras(("a",), np.array([[0.0, 0, 60]]), looking_down[None], (lens,))
+    result = pcfix.correct_points([[x, 0.0, -4.0]], cameras, 0.0)  # X / Z = 0.5: u = 1024
+    expected = pcfix.Outcome.ONE_CAMERA if inside else pcfix.Outcome.NO_CAMERA
+    assert result.outcome.tolist() == [expected]
+
+
+def test_without_a_lens_a_frame_is_everything_in_front():
+    east = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # looks along x, horizontally
+    cameras = pcfix.Cameras(("a", "b"), np.array([[0.0, -9, 20], [0, 9, 20]]), np.stack([east] * 2))
+    result = pcfix.correct_points([[30.0, 0, -2], [-30.0, 0, -2]], cameras, 0.0)
+    assert result.ray_count.tolist() == [2, 0]
+    assert result.outcome.tolist() == [pcfix.Outcome.CORRECTED, pcfix.Outcome.NO_CAMERA]
+    far = pcfix.correct_points([[3000.0, 0, -2]], cameras, 0.0)  # flatter than 80 degrees
+    assert far.outcome.tolist() == [pcfix.Outcome.NO_CAMERA]
+
+
+def test_views_ignore_frames():
+    cameras = block(LENSES["barrel"], k=2)
+    away = np.array([[3000.0, 2500.0, -2.0]])
+    assert pcfix.correct_points(away, cameras, 0.0).outcome[0] == pcfix.Outcome.NO_CAMERA
+    views = pcfix.Views(np.array([0, 2]), np.array([0, 1]))
+    assert pcfix.correct_points(away, cameras, 0.0, views=views).ray_count[0] == 2
+
+
+def test_compiled_and_interpreted_agree(tmp_path, points):
+    names = ["everything", "plain", "fisheye"]
+    script = f"""
+import numpy as np, pcfix
+from tests.lens.test_frames import LENSES, block
+xyz = np.load({str(tmp_path / "xyz.npy")!r})
+found = {{n: pcfix.correct_points(xyz, block(LENSES[n], k=6), 0.0).xyz for n in {names}}}
+np.savez({str(tmp_path / "out.npz")!r}, **found)
+"""
+    some = points[np.abs(points[:, :2] - 50).max(axis=1) < 50][:40]
+    np.save(tmp_path / "xyz.npy", some)
+    subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", script], check=True, env=interpreted_environment()
+    )
+    slow = np.load(tmp_path / "out.npz")
+    for name in names:
+        fast = pcfix.correct_points(some, block(LENSES[name], k=6), 0.0)
+        assert fast.corrected.any()
+        # the compiler may round a product and a sum at once: allow the last bits
+        assert slow[name] == pytest.approx(fast.xyz, abs=1e-11)

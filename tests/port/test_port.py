@@ -1,0 +1,200 @@
+"""Light through a housing port, against closed forms, Fermat's principle and differences."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pcfix.errors import SettingError
+from pcfix.port.light import coefficients, cosine_at_port, ray_through, through_port
+from pcfix.port.shapes import DomePort, FlatPort, port_of
+from pcfix.simulate.port import fermat_directions
+
+N_WATER = 1.34
+PORTS = {
+    "thin": FlatPort(0.02),
+    "thick": FlatPort(0.02, 0.008, 1.49),
+    "leaning": FlatPort(0.1, 0.03, 1.52, (0.1, -0.05, 1.0)),
+    "dome behind": DomePort(0.05, 0.004, 1.49, (0.003, -0.002, -0.01)),
+    "dome before": DomePort(0.05, 0.004, 1.49, (0.0, 0.001, 0.02)),
+    "thin dome": DomePort(0.08, 0.0, 1.49, (0.02, 0.0, 0.01)),
+}
+
+
+def points(seed=0, count=300):
+    """Points up to 45 degrees off the axis, 0.3 to 10 m away; some on the axis, or next to it."""
+    rng = np.random.default_rng(seed)
+    away = rng.uniform(-1.0, 1.0, (count, 2))
+    away[:3], away[3:6] = 0.0, 1e-8
+    xyz = np.column_stack([away, np.ones(count)])
+    return xyz * 10.0 ** rng.uniform(math.log10(0.3), 1.0, (count, 1))
+
+
+def seen(port, xyz, n=N_WATER):
+    """Return w with its derivatives, shape (m, 3, 5)."""
+    out = np.empty((len(xyz), 3, 5))
+    for i, (x, y, z) in enumerate(xyz):
+        through_port(coefficients(port), n, x, y, z, out[i])
+    return out
+
+
+def unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+ROUNDING = 1e-12  # rad: of sines and roots of numbers near one, a few times over
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 0.001, 10.0, 35.0, 60.0, 80.0])
+@pytest.mark.parametrize("thickness", [0.0, 0.008])
+def test_flat_port_has_a_closed_form_forwards(angle_deg, thickness):
+    # by hand: tangents of the angles in air, glass and water times the layers
+    sine = math.sin(math.radians(angle_deg))
+    tangents = [math.tan(math.asin(sine / index)) for index in (1.0, 1.49, N_WATER)]
+    x = sum(t * d for t, d in zip(tangents, (0.02, thickness, 3.0), strict=True))
+    w = seen(FlatPort(0.02, thickness), [(x, 0.0, 3.02 + thickness)])[0, :, 0]
+    assert math.atan2(w[0], w[2]) == pytest.approx(math.radians(angle_deg), abs=ROUNDING)
+    assert w[1] == 0.0
+
+
+@pytest.mark.parametrize("name", PORTS)
+def test_fermat_agrees(name):
+    # the shortest path is found to 1e-13 m on a window 0.02 to 0.1 m away: 5e-12 rad
+    xyz = points()
+    w = unit(seen(PORTS[name], xyz)[:, :, 0])
+    assert np.abs(w - fermat_directions(xyz, PORTS[name], N_WATER)).max() < 1e-11
+
+
+@pytest.mark.parametrize("port", [FlatPort(0.02, 0.008, 1.0), DomePort(0.05, 0.004, 1.0)])
+def test_indices_of_one_are_a_pinhole(port):
+    xyz = points()
+    assert np.abs(unit(seen(port, xyz, 1.0)[:, :, 0]) - unit(xyz)).max() < ROUNDING
+
+
+def test_dome_about_the_projection_centre_does_nothing():
+    xyz = points()
+    out = seen(DomePort(0.05, 0.004, 1.49), xyz)
+    assert np.abs(unit(out[:, :, 0]) - unit(xyz)).max() < ROUNDING
+    assert np.abs(out[:, :, 4]).max() < ROUNDING
+
+
+def test_straight_ahead_nothing_bends():
+    for port in (FlatPort(0.02, 0.008), DomePort(0.05, 0.004, 1.49, (0.0, 0.0, -0.02))):
+        w = seen(port, [(0.0, 0.0, 2.0)])[0, :, 0]
+        assert unit(w).tolist() == [0.0, 0.0, 1.0]
+
+
+def test_flat_port_magnifies_by_n_near_the_axis():
+    # the paraxial limit of a port at the projection centre: the next term is t^2 (n^2 - 1) / 2
+    w = seen(FlatPort(0.0), [(1e-5, 0.0, 1.0)])[0, :, 0]
+    assert w[0] / w[2] == pytest.approx(1e-5 * N_WATER, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", PORTS)
+def test_out_and_back_in(name):
+    port, xyz = PORTS[name], points(1)
+    for point, w in zip(xyz, seen(port, xyz)[:, :, 0], strict=True):
+        ray = np.array(ray_through(coefficients(port), N_WATER, *w))
+        start, direction = ray[:3], ray[3:]
+        assert np.linalg.norm(direction) == pytest.approx(1.0, abs=ROUNDING)
+        # metres; the angle is known to 1e-13 and the point is up to 17 m away
+        assert np.linalg.norm(np.cross(point - start, direction)) < 1e-10
+        assert (point - start) @ direction > 0.0
+
+
+@pytest.mark.parametrize("name", PORTS)
+def test_derivatives_are_those_of_differences(name):
+    port, xyz, n = PORTS[name], points(2, 100), N_WATER
+    distance = np.linalg.norm(xyz, axis=1)[:, None]
+    out = seen(port, xyz)
+    size = np.linalg.norm(out[:, :, 0], axis=1)[:, None]
+    for axis in range(3):
+        step = np.zeros((len(xyz), 3))
+        step[:, axis] = 1e-5 * distance[:, 0]
+        change = seen(port, xyz + step)[:, :, 0] - seen(port, xyz - step)[:, :, 0]
+        numeric = change / (2.0 * step[:, axis : axis + 1])
+        # relative to |w| over the distance; the third derivative leaves (1e-5)^2 times some tens
+        assert np.abs((numeric - out[:, :, 1 + axis]) * distance / size).max() < 1e-6
+    change = seen(port, xyz, n + 1e-6)[:, :, 0] - seen(port, xyz, n - 1e-6)[:, :, 0]
+    assert np.abs((change / 2e-6 - out[:, :, 4]) / size).max() < 1e-6
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.floats(0.01, 0.3), st.floats(0.0, 0.05), st.floats(1.0, 1.9), st.floats(1.0, 1.5),
+    st.tuples(*[st.floats(-0.57, 0.57)] * 3), st.tuples(*[st.floats(-1.0, 1.0)] * 3),
+    st.floats(1e-3, 20.0),
+)  # fmt: skip
+def test_any_dome_comes_home(radius, thickness, glass, n, off, towards, beyond):
+    port = DomePort(radius, thickness, glass, tuple(radius * part for part in off))
+    direction = np.array(towards)
+    if np.linalg.norm(direction) < 1e-3:
+        direction = np.array([0.0, 0.0, 1.0])
+    point = port.centre_m + unit(direction) * (radius + thickness + beyond)
+    w = seen(port, [point], n)[0, :, 0]
+    ray = np.array(ray_through(coefficients(port), n, *w))
+    miss = np.cross(point - ray[:3], ray[3:])
+    assert np.linalg.norm(miss) < 1e-10  # metres, as above
+
+
+@pytest.mark.parametrize("port", [FlatPort(0.02, 0.008), DomePort(0.05, 0.004)])
+def test_no_light_from_inside_the_housing(port):
+    assert np.isnan(seen(port, [(0.0, 0.001, 0.025)])).all()
+
+
+def test_no_ray_backwards_through_a_flat_port():
+    assert np.isnan(ray_through(coefficients(FlatPort(0.02)), N_WATER, 0.1, 0.0, -1.0)).all()
+
+
+def test_angle_of_incidence_at_the_inner_face():
+    flat = coefficients(FlatPort(0.02, 0.008))
+    assert cosine_at_port(flat, 1.0, 0.0, 1.0) == pytest.approx(math.cos(math.pi / 4), abs=ROUNDING)
+    # 0.03 m before the centre of a dome of 0.05 m, looking across: the sine is 0.03 / 0.05
+    dome = coefficients(DomePort(0.05, 0.004, 1.49, (0.0, 0.0, 0.03)))
+    assert cosine_at_port(dome, 1.0, 0.0, 0.0) == pytest.approx(0.8, abs=ROUNDING)
+
+
+def test_words_of_a_port():
+    assert port_of("flat:distance=0.02") == FlatPort(0.02)
+    assert port_of("FLAT: distance=0.02, thickness=0.008, glass=1.52") == FlatPort(
+        0.02, 0.008, 1.52
+    )
+    leaning = port_of("flat:distance=0.02,nx=0.6")
+    assert leaning.normal == pytest.approx((0.6, 0.0, 0.8), abs=ROUNDING)
+    dome = DomePort(0.05, 0.004, 1.49, (0.0, 0.001, -0.01))
+    assert port_of("dome:radius=0.05,thickness=0.004,y=0.001,z=-0.01") == dome
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "kind '' is not flat or dome"),
+        ("round:radius=1", "kind 'round' is not flat or dome"),
+        ("flat", "distance is missing"),
+        ("flat:thickness=0.01", "distance is missing"),
+        ("dome:z=0.01", "radius is missing"),
+        ("flat:distance", "distance needs a number, not ''"),
+        ("flat:distance=two", "distance needs a number, not 'two'"),
+        ("flat:distance=nan", "distance needs a number, not 'nan'"),
+        ("flat:distance=0.02,,", "'' is not a word of a flat port"),
+        ("flat:distance=0.02,radius=1", "'radius' is not a word of a flat port"),
+        ("flat:distance=0.02,distance=0.03", "distance is given twice"),
+        ("flat:distance=-0.02", "distance -0.02 must not be negative"),
+        ("flat:distance=0.02,thickness=-1", "thickness -1 must not be negative"),
+        ("flat:distance=0.02,glass=0.9", "glass 0.9 is less than 1"),
+        ("flat:distance=0.02,nx=0.8,ny=0.8", "nx and ny are parts of a unit vector"),
+        ("dome:radius=0", "radius 0 must be positive"),
+        ("dome:radius=0.05,z=0.06", "beyond its radius"),
+    ],
+)
+def test_mistakes_in_words_are_named(text, words):
+    with pytest.raises(SettingError) as raised:
+        port_of(text)
+    assert words in str(raised.value)
+
+
+def test_a_normal_that_points_back_is_refused():
+    with pytest.raises(SettingError, match="must point forward"):
+        FlatPort(0.02, normal=(0.0, 0.0, -1.0))

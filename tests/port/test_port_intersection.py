@@ -1,0 +1,242 @@
+"""Clouds taken under water come home, on scenes whose light was traced by Fermat's principle."""
+
+import dataclasses
+
+import numba
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pcfix import Cameras, Settings
+from pcfix.errors import SettingError
+from pcfix.lens.imaging import unproject
+from pcfix.model import Outcome
+from pcfix.options import ErrorBudget
+from pcfix.port.intersection import (
+    correct_through_port,
+    intersect_rays,
+    intersect_through_port,
+    port_views,
+)
+from pcfix.port.inversion import port_covariances
+from pcfix.port.shapes import DomePort, FlatPort
+from pcfix.simulate.port import simulate_port
+
+FLAT = FlatPort(0.02, 0.008, 1.49, (0.02, -0.01, 1.0))
+DOME = DomePort(0.05, 0.004, 1.49, (0.001, -0.002, -0.01))
+CONSISTENT = Settings(method="consistent")
+NOISE_PX = 0.5
+
+
+@pytest.fixture(scope="module", params=[FLAT, DOME], ids=["flat", "dome"])
+def scene(request):
+    return simulate_port(request.param, points=1500)
+
+
+@pytest.fixture(scope="module", params=[FLAT, DOME], ids=["flat", "dome"])
+def noisy(request):
+    return simulate_port(request.param, points=1500, noise_px=NOISE_PX, seed=1)
+
+
+def rms(errors):
+    return np.sqrt((errors**2).mean(axis=0))
+
+
+def errors_of(scene, found):
+    assert (found.outcome == Outcome.CORRECTED).all()
+    return scene.apparent + found.shift_m - scene.truth
+
+
+def from_images(scene):
+    looking = unproject(scene.cameras.lenses[0], scene.image_xy)
+    return intersect_rays(
+        scene.apparent, looking, scene.views, scene.cameras, scene.port, Settings()
+    )
+
+
+def test_image_places_come_home(scene):
+    # the images are right to 1e-8 px (see test_port), 1e-11 m at 3 m; at UTM coordinates 1e-9 m
+    found = from_images(scene)
+    assert np.abs(errors_of(scene, found)).max() < 5e-9
+    assert found.ray_miss_m.max() < 1e-7  # square root of a difference
+    assert found.ray_count.tolist() == np.diff(scene.views.start).tolist()
+    assert found.camera_used.all()
+
+
+def test_apparent_points_come_home(scene):
+    # Newton's method stops at 1e-7 m, beyond which a further step would go; UTM as above
+    before = rms(scene.apparent - scene.truth)
+    assert before[2] > 0.1
+    found, chosen = intersect_through_port(
+        scene.apparent, scene.cameras, scene.port, CONSISTENT, scene.views
+    )
+    assert np.abs(errors_of(scene, found)).max() < 5e-9
+    assert chosen.camera.tolist() == scene.views.camera.tolist()
+
+
+def test_without_residuals_some_of_the_bias_stays(scene):
+    # what `snell` leaves: a third of a metre becomes some centimetres, not nothing
+    found, _ = intersect_through_port(
+        scene.apparent, scene.cameras, scene.port, Settings(), scene.views
+    )
+    before, after = rms(scene.apparent - scene.truth)[2], rms(errors_of(scene, found))[2]
+    assert 0.01 < after < 0.5 * before
+
+
+def test_noise_comes_through_as_the_covariance_says(noisy):
+    # three thousand normalised squares have a mean of 1 within 4 sigma = 0.15 (correlations aside)
+    budget = ErrorBudget(image_px=NOISE_PX, index=0.0)
+    settings = Settings(method="consistent", errors=budget)
+    found = correct_through_port(noisy.apparent, noisy.cameras, noisy.port, settings, noisy.views)
+    errors = errors_of(noisy, found)
+    c = found.covariance_m2
+    full = np.stack([c[:, [0, 1, 2]], c[:, [1, 3, 4]], c[:, [2, 4, 5]]], axis=1)
+    squares = np.einsum("mi,mij,mj->m", errors, np.linalg.inv(full), errors)
+    assert squares.mean() / 3.0 == pytest.approx(1.0, abs=0.1)
+    assert found.sigma_z_m == pytest.approx(np.sqrt(c[:, 5]))
+    # forward intersection of the image places is as good, up to its weights
+    assert rms(errors_of(noisy, from_images(noisy)))[2] == pytest.approx(rms(errors)[2], rel=0.1)
+
+
+def test_covariance_of_the_index_is_its_derivative():
+    # image places are fixed, so that they are intersected with another index
+    scene = simulate_port(FLAT, points=300, seed=2)
+    step = 1e-3
+    looking = unproject(scene.cameras.lenses[0], scene.image_xy)
+    two = [
+        intersect_rays(
+            scene.truth, looking, scene.views, scene.cameras, scene.port, Settings(1.34 + change)
+        ).shift_m
+        for change in (-step, step)
+    ]
+    by_n = (two[1] - two[0]) / (2.0 * step)
+    budget = ErrorBudget(image_px=0.0, index=1.0)
+    cov = port_covariances(
+        scene.truth, scene.views, scene.cameras, scene.port, Settings(errors=budget)
+    )
+    # the intersection weighs rays in space, the covariance residuals in the images: the rays of
+    # another index miss each other, and the two differ by some percent
+    assert np.median(np.abs(np.sqrt(cov[:, 5]) / np.abs(by_n[:, 2]) - 1.0)) < 0.1
+
+
+def test_covariance_of_poses_is_that_of_moved_images():
+    # one camera errs at a time: its centre by 0.1 mm, its attitude by 0.1 mrad, in turn
+    scene = simulate_port(FLAT, points=25, seed=3)
+    for budget, change in (
+        (ErrorBudget(image_px=0.0, index=0.0, centre_m=1e-4), shifted),
+        (ErrorBudget(image_px=0.0, index=0.0, attitude_deg=np.degrees(1e-4)), turned),
+    ):
+        settings = dataclasses.replace(CONSISTENT, errors=budget)
+        total = np.zeros(len(scene.truth))
+        for camera in range(len(scene.cameras)):
+            for axis in range(3):
+                other = adjusted_again(scene, change(scene.cameras, camera, axis, 1e-4))
+                total += (other - scene.truth)[:, 2] ** 2
+        cov = port_covariances(scene.truth, scene.views, scene.cameras, scene.port, settings)
+        # first order: the steps are 1e-4, second order a few thousandths of the result
+        assert np.sqrt(cov[:, 5]) == pytest.approx(np.sqrt(total), rel=0.01)
+
+
+def shifted(cameras, camera, axis, step):
+    centres = cameras.centres.copy()
+    centres[camera, axis] += step
+    return dataclasses.replace(cameras, centres=centres)
+
+
+def turned(cameras, camera, axis, step):
+    turn = np.zeros(3)
+    turn[axis] = step
+    rotations = cameras.rotations.copy()
+    rotations[camera] = Rotation.from_rotvec(turn).as_matrix() @ rotations[camera]
+    return dataclasses.replace(cameras, rotations=rotations)
+
+
+def adjusted_again(scene, cameras):
+    """Adjust the fixed image places through the port with other cameras, by numeric derivatives."""
+    from pcfix.simulate.port import fermat_directions
+
+    owner = np.repeat(np.arange(len(scene.truth)), np.diff(scene.views.start))
+    c, lens = scene.views.camera, scene.cameras.lenses[0]
+
+    def images(xyz):
+        local = np.einsum("oij,oj->oi", cameras.rotations[c], xyz[owner] - cameras.centres[c])
+        w = fermat_directions(local, scene.port, scene.refractive_index)
+        uv = lens.focal * w[:, :2] / w[:, 2:]
+        return uv + np.array([lens.principal_x, lens.principal_y])
+
+    xyz = scene.truth.copy()
+    for _ in range(2):
+        residual = scene.image_xy - images(xyz)
+        jacobian = np.stack(
+            [(images(xyz + 1e-4 * e) - images(xyz - 1e-4 * e)) / 2e-4 for e in np.eye(3)], axis=2
+        )
+        for i, (first, last) in enumerate(
+            zip(scene.views.start, scene.views.start[1:], strict=False)
+        ):
+            a = jacobian[first:last].reshape(-1, 3)
+            xyz[i] += np.linalg.lstsq(a, residual[first:last].ravel(), rcond=None)[0]
+    return xyz
+
+
+def test_the_images_of_true_points_tell_their_cameras(scene):
+    seen = port_views(
+        scene.apparent, scene.cameras, scene.port, CONSISTENT,
+        shift_m=scene.truth - scene.apparent,
+    )  # fmt: skip
+    assert seen.start.tolist() == scene.views.start.tolist()
+    assert seen.camera.tolist() == scene.views.camera.tolist()
+
+
+def test_without_a_list_most_points_come_home(scene):
+    # several sets of cameras can explain a point, and those at the border of an image are many in
+    # a block of twelve images: more than half the points must be right
+    found, _ = intersect_through_port(scene.apparent, scene.cameras, scene.port, CONSISTENT)
+    assert np.median(np.abs(errors_of(scene, found)[:, 2])) < 5e-9
+
+
+def test_limits_of_angle_and_number(scene):
+    def run(**limits):
+        return intersect_through_port(
+            scene.apparent, scene.cameras, scene.port,
+            dataclasses.replace(CONSISTENT, **limits), scene.views,
+        )  # fmt: skip
+
+    three, chosen = run(max_cameras=3)
+    assert np.diff(chosen.start).max() == 3
+    limit = 0.3 * run()[0].incidence_deg.max()
+    narrow, _ = run(max_angle_deg=limit)
+    assert narrow.incidence_deg.max() <= limit < three.incidence_deg.max()
+    few = narrow.outcome != Outcome.CORRECTED
+    assert few.any()
+    assert not narrow.shift_m[few].any()
+
+
+def test_bits_do_not_depend_on_threads_or_neighbours(noisy):
+    def run(rows):
+        found = correct_through_port(
+            noisy.apparent[rows], noisy.cameras, noisy.port, CONSISTENT, noisy.views.take(rows)
+        )
+        return found.shift_m, found.covariance_m2
+
+    rows = np.arange(len(noisy.apparent))
+    many = run(rows)
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        one = run(rows[::-3])
+    finally:
+        numba.set_num_threads(before)
+    for a, b in zip(many, one, strict=True):
+        assert a[::-3].tobytes() == b.tobytes()
+
+
+def test_cameras_need_angles_and_the_method_lenses():
+    bare = Cameras(("a", "b"), np.array([[0.0, 0, 0], [1.0, 0, 0]]))
+    xyz = np.array([[0.0, 0, -2]])
+    with pytest.raises(SettingError, match="have no angles"):
+        intersect_through_port(xyz, bare, FLAT, Settings())
+    turned = dataclasses.replace(bare, rotations=np.array([np.diag([1.0, -1.0, -1.0])] * 2))
+    found, _ = intersect_through_port(xyz, turned, FLAT, Settings())
+    assert found.outcome.tolist() == [Outcome.CORRECTED]
+    with pytest.raises(SettingError, match="no lenses"):
+        intersect_through_port(xyz, turned, FLAT, CONSISTENT)

@@ -1,0 +1,181 @@
+"""The water surface from the cloud alone: against made-up shores, real clouds, and nothing."""
+
+import laspy
+import numpy as np
+import pytest
+
+from pcfix.errors import GeometryError, SettingError
+from pcfix.report.shoreline import shoreline_figure
+from pcfix.water.auto import find_water
+from pcfix.water.auto.moments import Break, gain_of, gather, tile_moments
+from tests.utils.shared import needs
+
+RENDERED, needs_rendered = needs("rendered_a", "cloud.las")
+RIVER, needs_river = needs("river", "points.las")
+
+LEVEL_M = 12.0
+EAST_M, NORTH_M = 400_000.0, 5_000_000.0
+LIFT = 1.36
+
+
+def shore(n=30_000, *, slope=0.06, tilt=0.0, noise_m=0.01, bumps_m=0.04, seed=0):
+    """Return apparent points and colours of a bumpy shore; the bed is lifted, red fades."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0.0, 60.0, n), rng.uniform(0.0, 80.0, n)
+    true = slope * (25.0 - x + 2.0 * np.sin(y / 6.0)) + bumps_m * np.sin(x / 2.0) * np.cos(y / 3.0)
+    apparent = np.where(true < 0.0, true / LIFT, true) + rng.normal(0.0, noise_m, n)
+    ground = rng.uniform(0.7, 1.3, n)[:, None] * [120.0, 110.0, 90.0]
+    fading = np.exp(np.minimum(true, 0.0)[:, None] * [0.45, 0.12, 0.10])
+    xyz = np.column_stack([x + EAST_M, y + NORTH_M, apparent + LEVEL_M + tilt * y])
+    return xyz, ground * fading
+
+
+def test_level_of_a_shore_with_colours():
+    xyz, rgb = shore()
+    found = find_water(xyz, rgb=rgb)
+    assert found.surface.b == found.surface.c == 0.0
+    assert abs(found.level_m - LEVEL_M) < 0.05  # m: the aim of a few centimetres
+    assert abs(found.level_m - LEVEL_M) < 3.0 * found.sigma_level_m
+    assert any("red fades" in reason for reason in found.reasons)
+    assert 0.0 < found.confidence <= 1.0
+
+
+def test_refraction_alone_is_seen_by_its_size():
+    found = find_water(shore(noise_m=0.005, slope=0.12, bumps_m=0.02)[0])
+    assert abs(found.level_m - LEVEL_M) < 0.05
+    # a bend of the shore within a tile rounds the break off
+    assert found.evidence["slope amplitude"] == pytest.approx(LIFT - 1.0, abs=0.12)
+
+
+def test_tilt_of_a_river():
+    xyz, rgb = shore(tilt=0.004)
+    found = find_water(xyz, rgb=rgb)
+    along = found.shoreline[:, 1] - NORTH_M
+    error = found.level_m + (found.shoreline[:, :2] - found.centre_xy) @ found.tilt
+    assert found.tilt[1] == pytest.approx(0.004, abs=4.0 * found.sigma_tilt)
+    assert np.abs(error - LEVEL_M - 0.004 * along).max() < 0.08  # m, at the ends too
+
+
+def test_floating_points_fix_the_level():
+    xyz, _ = shore(bumps_m=0.01, seed=1)
+    rng = np.random.default_rng(2)
+    deep = np.flatnonzero(xyz[:, 2] < LEVEL_M - 0.5)
+    afloat = rng.choice(deep, 250, replace=False)
+    xyz[afloat, 2] = LEVEL_M + rng.normal(0.0, 0.02, 250)
+    found = find_water(xyz)
+    assert found.level_m == pytest.approx(LEVEL_M, abs=0.03)  # m, the thickness of the layer
+    assert any("float" in reason for reason in found.reasons)
+
+
+def test_same_cloud_gives_same_bits_and_shifts_along():
+    xyz, rgb = shore()
+    first, again = find_water(xyz, rgb=rgb), find_water(xyz, rgb=rgb)
+    raised = find_water(xyz + np.array([0.0, 0.0, 100.0]), rgb=rgb)
+    assert first.surface == again.surface and first.sigma_level_m == again.sigma_level_m
+    assert raised.level_m == pytest.approx(first.level_m + 100.0, abs=1e-6)
+
+
+def test_water_classes_decide():
+    xyz, _ = shore(5_000)
+    water = xyz[:400] * [1, 1, 0] + [0.0, 0.0, LEVEL_M + 1.0]
+    water[:, 2] += np.random.default_rng(0).normal(0.0, 0.02, len(water))
+    classes = np.r_[np.full(len(xyz), 2), np.full(len(water), 9)]
+    found = find_water(np.vstack([xyz, water]), classes=classes)
+    assert found.level_m == pytest.approx(LEVEL_M + 1.0, abs=0.005)  # m: 5 standard errors
+    assert "classified as water" in found.reasons[0]
+
+
+def test_noise_classes_and_points_above_the_cameras_are_left_out():
+    xyz, rgb = shore()
+    bad = np.array([[EAST_M, NORTH_M, 900.0], [EAST_M, NORTH_M, -900.0]])
+    classes = np.r_[np.full(len(xyz), 1), 1, 7]
+    colours = np.vstack([rgb, rgb[:2]])
+    centres = np.array([[EAST_M, NORTH_M, 100.0]])
+    clean = find_water(xyz, rgb=rgb)
+    found = find_water(np.vstack([xyz, bad]), rgb=colours, classes=classes, centres=centres)
+    assert found.surface == clean.surface
+
+
+@pytest.mark.parametrize("offset_m", [+5.0, -12.0])
+def test_land_alone_and_bed_alone_are_refused(offset_m):
+    rng = np.random.default_rng(3)
+    x, y = rng.uniform(0.0, 60.0, (2, 20_000))
+    z = 0.05 * x + 0.1 * np.sin(x / 4.0) * np.cos(y / 5.0) + rng.normal(0.0, 0.02, len(x))
+    rgb = rng.uniform(0.8, 1.2, len(x))[:, None] * [120.0, 110.0, 90.0]
+    if offset_m < 0.0:
+        rgb = rgb * np.exp((z - 4.0)[:, None] * [0.45, 0.12, 0.10])
+    xyz = np.column_stack([x + EAST_M, y + NORTH_M, z + offset_m])
+    with pytest.raises(GeometryError, match="No water surface was found"):
+        find_water(xyz, rgb=rgb)
+
+
+def test_a_bank_without_other_evidence_is_refused():
+    xyz, _ = shore(noise_m=0.005, slope=0.12, bumps_m=0.01)
+    above_m = xyz[:, 2] - LEVEL_M
+    xyz[:, 2] = LEVEL_M + np.where(above_m < 0.0, above_m / 4.0, above_m)
+    with pytest.raises(GeometryError, match="a bank or a terrace"):
+        find_water(xyz)
+
+
+def test_flat_ground_and_few_points_are_refused():
+    rng = np.random.default_rng(4)
+    flat = np.column_stack([rng.uniform(0.0, 60.0, (5_000, 2)), rng.normal(0.0, 0.02, 5_000)])
+    with pytest.raises(GeometryError, match="m of relief"):
+        find_water(flat)
+    with pytest.raises(GeometryError, match="1999 points are too few, 2000 are needed"):
+        find_water(flat[:1_999])
+
+
+def test_arrays_that_do_not_belong_together_are_refused():
+    with pytest.raises(SettingError, match=r"xyz must have the shape \(n, 3\), not \(4, 2\)"):
+        find_water(np.zeros((4, 2)))
+    with pytest.raises(SettingError, match=r"rgb must have the shape \(4, 3\), not \(3, 3\)"):
+        find_water(np.zeros((4, 3)), rgb=np.zeros((3, 3)))
+    with pytest.raises(SettingError, match=r"classes must have the shape \(4,\), not \(5,\)"):
+        find_water(np.zeros((4, 3)), classes=np.zeros(5))
+
+
+def test_amplitude_of_a_break_is_that_of_least_squares():
+    rng = np.random.default_rng(5)
+    heights = np.array([0.0, 0.1])
+    what = Break(np.inf, 1e6, 1.0)
+    parts = []
+    everything = []
+    for tile in range(3):
+        at = rng.uniform(-1.0, 1.0, 200)
+        y = tile + 0.1 * at + 0.5 * np.maximum(-at, 0.0) + rng.normal(0.0, 0.05, 200)
+        parts.append(tile_moments(np.ones((200, 1)), y, at, heights, what, with_trend=True))
+        everything.append((tile, at, y))
+    gain = gain_of(gather(parts, [np.zeros(2)] * 3, heights, what))
+    design = np.vstack(
+        [np.column_stack([np.eye(3)[np.full(200, t)], at, np.maximum(-at, 0)])
+         for t, at, _ in everything]
+    )  # fmt: skip
+    y = np.concatenate([y for _, _, y in everything])
+    expected = np.linalg.lstsq(design, y, rcond=None)[0][-1]
+    assert gain.amplitude[0] == pytest.approx(expected, abs=0.01)  # tiles differ in weight a little
+    assert gain.gain[0] > gain.gain[1]
+
+
+def test_the_picture_is_drawn(tmp_path):
+    xyz, rgb = shore(tilt=0.004)
+    figure = shoreline_figure(find_water(xyz, rgb=rgb))
+    figure.savefig(tmp_path / "shoreline.png")
+    assert (tmp_path / "shoreline.png").stat().st_size > 20_000
+    assert "Water" in figure.get_suptitle()
+
+
+@needs_rendered
+def test_a_real_dense_cloud():
+    cloud = laspy.read(RENDERED)
+    found = find_water(cloud.xyz, rgb=np.column_stack([cloud.red, cloud.green, cloud.blue]))
+    assert found.surface.b == found.surface.c == 0.0
+    assert found.level_m == pytest.approx(0.37, abs=0.05)  # m: 1 GSD
+
+
+@needs_river
+def test_a_river_without_land_is_refused():
+    cloud = laspy.read(RIVER)
+    rgb = np.column_stack([cloud.red, cloud.green, cloud.blue])
+    with pytest.raises(GeometryError, match="too weak"):
+        find_water(cloud.xyz, rgb=rgb)

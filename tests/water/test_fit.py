@@ -1,0 +1,395 @@
+"""The water surface from shoreline points: planes, levels, rivers, and points without heights."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import chi2
+
+from pcfix.errors import GeometryError, SettingError
+from pcfix.model import WaterPlane
+from pcfix.water.cloud_heights import heights_from_cloud, is_near
+from pcfix.water.fit import fit_water
+from pcfix.water.flow_axis import flow_axis
+from pcfix.water.river import fit_river
+from pcfix.water.surface import surface_above
+
+UTM = np.array([512_345.0, 4_987_654.0])
+
+
+def reach(seed, *, noise_m=0.025, n=30, share=0.2, length_m=200.0, width_m=25.0, tilt=0.003):
+    """Return points on two banks, the corners of the river, their heights, and who is good."""
+    rng = np.random.default_rng(seed)
+    turn = rng.uniform(0.0, 2.0 * np.pi)
+    axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    along = rng.uniform(-length_m / 2, length_m / 2, n)
+    across = np.where(np.arange(n) % 2, 0.5, -0.5) * width_m + rng.normal(0.0, 1.0, n)
+    z = 100.0 - tilt * along + rng.normal(0.0, noise_m, n)
+    wrong = rng.permutation(n)[: round(share * n)]
+    z[wrong] += rng.choice([-1.0, 1.0], len(wrong)) * rng.uniform(0.3, 2.0, len(wrong))
+    corners = np.array([[i * length_m / 2, j * width_m / 2] for i in (-1, 1) for j in (-1, 1)])
+    good = np.ones(n, bool)
+    good[wrong] = False
+    points = np.column_stack([UTM + np.column_stack([along, across]) @ axes, z])
+    return points, UTM + corners @ axes, 100.0 - tilt * corners[:, 0], good
+
+
+def least_squares(points, places):
+    """Return the heights at places of the plane of least squares."""
+    middle = points[:, :2].mean(axis=0)
+    design = np.column_stack([np.ones(len(points)), points[:, :2] - middle])
+    beta = np.linalg.lstsq(design, points[:, 2], rcond=None)[0]
+    return np.column_stack([np.ones(len(places)), places - middle]) @ beta
+
+
+@pytest.mark.parametrize("noise_m", [0.02, 0.03])
+def test_outliers_cost_nothing_against_least_squares_that_knows_them(noise_m):
+    error, known, masks = [], [], 0
+    for seed in range(60):
+        points, corners, true, good = reach(seed, noise_m=noise_m)
+        fit = fit_water(points)
+        masks += bool((fit.accepted == good).all())
+        error.append(np.abs(fit.height_at(corners) - true).max())
+        known.append(np.abs(least_squares(points[good], corners) - true).max())
+    assert masks >= 59  # 0.3 m is ten sigma and more
+    assert np.mean(error) < 1.05 * np.mean(known)
+    within = np.mean(np.array(error) < 0.02)
+    assert within >= np.mean(np.array(known) < 0.02) - 0.05
+    assert within > (0.8 if noise_m == 0.02 else 0.5)  # what 24 good points of such noise can give
+
+
+def test_plane_holds_two_centimetres_where_the_noise_allows_it():
+    """With 1 cm noise the corners have a standard error of 5 mm: 2 cm is four of them."""
+    for seed in range(25):
+        points, corners, true, _ = reach(seed, noise_m=0.01)
+        for model in ("auto", "plane"):
+            assert np.abs(fit_water(points, model=model).height_at(corners) - true).max() < 0.02
+
+
+def test_standard_errors_are_what_the_errors_are():
+    scores, levels = [], []
+    for seed in range(100):
+        points, corners, true, _ = reach(seed, n=40)
+        fit = fit_water(points, model="plane")
+        scores.append((fit.height_at(corners) - true) / fit.sigma_at(corners))
+        levels.append(fit.sigma_level_m)
+    # Student's t of about 29 degrees of freedom has the variance 1.07
+    assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1.04, abs=0.12)
+    assert np.mean(levels) == pytest.approx(0.025 / math.sqrt(32), rel=0.1)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.4])
+def test_up_to_two_fifths_may_be_wrong(share):
+    for seed in range(20):
+        points, corners, true, _ = reach(seed, share=share, n=40)
+        assert np.abs(fit_water(points).height_at(corners) - true).max() < 0.07  # 4 sigma
+
+
+def test_many_points_use_a_sample_only_to_start():
+    points, corners, true, good = reach(3, n=20_000, share=0.3)
+    fit = fit_water(points, model="plane")
+    assert (fit.accepted == good).mean() > 0.999
+    assert np.abs(fit.height_at(corners) - true).max() < 0.002  # 5 sigma
+    assert fit.sigma_m == pytest.approx(0.025, rel=0.02)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.permutations(range(20)))
+def test_the_order_of_points_does_not_matter(order):
+    points = reach(7, n=20)[0]
+    one, other = fit_water(points), fit_water(points[order])
+    assert one.surface == other.surface
+    assert np.array_equal(one.residual_m[order], other.residual_m)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(-0.04, 0.04), st.floats(-0.04, 0.04), st.floats(-50, 3000))
+def test_exact_points_give_their_plane(b, c, a):
+    rng = np.random.default_rng(1)
+    xy = rng.uniform(0, 100, (12, 2))
+    z = a + b * xy[:, 0] + c * xy[:, 1]
+    fit = fit_water(np.column_stack([xy + UTM, z]), model="plane", max_tilt_percent=6)
+    assert fit.height_at(xy + UTM) == pytest.approx(z, abs=1e-8)
+    assert fit.tilt == pytest.approx([b, c], abs=1e-9)
+    assert fit.sigma_m < 1e-8
+
+
+def test_surface_is_the_fit():
+    points, corners, _, _ = reach(2)
+    fit = fit_water(points)
+    seen = surface_above(fit.surface, np.column_stack([corners, np.zeros(4)])).height_m
+    assert seen == pytest.approx(fit.height_at(corners), abs=1e-8)
+
+
+def test_tilt_in_words():
+    xy = np.array([[x, y] for x in range(0, 100, 10) for y in range(0, 100, 10)], float)
+    fit = fit_water(np.column_stack([xy, 5.0 - 0.01 * xy[:, 0]]), model="plane")
+    assert fit.tilt_percent == pytest.approx(1.0)
+    assert fit.downhill_deg == pytest.approx(90.0)
+    assert fit.as_dict()["accepted"] == 100
+    assert math.isnan(fit_water(np.column_stack([xy, xy[:, 0] * 0]), model="level").downhill_deg)
+
+
+def test_auto_takes_a_level_for_level_water():
+    models = [fit_water(reach(seed, tilt=0.0)[0]).model for seed in range(60)]
+    # chance gives a tilt in 5 % of them: more than 9 of 60 in one case of 200
+    assert models.count("level") >= 51
+
+
+def test_auto_tilts_points_of_one_bank_along_it_alone():
+    points = reach(4, width_m=0.0, n=40)[0]
+    fit = fit_water(points)
+    assert fit.model == "along"
+    assert any("nearly on one line" in note for note in fit.notes)
+    assert fit.tilt_percent == pytest.approx(0.3, abs=0.05)
+
+
+def test_auto_takes_a_plane_where_the_tilt_is_across():
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(0, 100, (40, 2))
+    z = 0.01 * xy[:, 1] + rng.normal(0, 0.02, 40)
+    assert fit_water(np.column_stack([xy, z])).model == "plane"
+
+
+@pytest.mark.parametrize("xy", [np.zeros((5, 2)), np.zeros((2, 2)), np.eye(3)[:, :2]])
+def test_auto_takes_a_level_where_there_is_no_room_for_a_tilt(xy):
+    fit = fit_water(np.column_stack([xy, np.full(len(xy), 1.5)]))
+    assert fit.model == "level"
+    assert fit.surface.a == pytest.approx(1.5, abs=1e-12)
+    assert fit.surface.b == fit.surface.c == 0.0
+
+
+def test_one_point_is_a_level_without_a_standard_error():
+    fit = fit_water(np.array([[1.0, 2.0, 3.0]]))
+    assert fit.surface == WaterPlane(3.0)
+    assert math.isnan(fit.sigma_level_m)
+    assert any("No point is to spare" in note for note in fit.notes)
+
+
+def test_three_points_are_a_plane_without_a_standard_error():
+    points = np.array([[0.0, 0, 1.0], [100, 0, 1.5], [0, 100, 1.2]])
+    fit = fit_water(points, model="plane")
+    assert fit.residual_m == pytest.approx(np.zeros(3), abs=1e-12)
+    assert np.isnan(fit.sigma_at(points[:, :2])).all()
+
+
+def test_heights_rounded_to_centimetres_are_not_outliers():
+    z = np.array([0.37] * 9 + [0.38] * 4 + [0.36] * 2)
+    xy = np.random.default_rng(0).uniform(0, 50, (15, 2))
+    assert fit_water(np.column_stack([xy, z])).accepted.all()
+
+
+def test_points_without_heights_are_left_out():
+    points = reach(5)[0]
+    points[[3, 8], 2] = np.nan
+    fit = fit_water(points)
+    assert np.isnan(fit.residual_m[[3, 8]]).all()
+    assert not fit.accepted[[3, 8]].any()
+    assert fit.as_dict()["without_height"] == 2
+
+
+def test_what_to_look_at_is_said():
+    rng = np.random.default_rng(2)
+    xy = rng.uniform(0, 100, (40, 2))
+    scattered = fit_water(np.column_stack([xy, rng.uniform(0, 3, 40)]), model="level")
+    assert any("scatter by" in note for note in scattered.notes)
+    step = np.column_stack([xy, np.where(np.arange(40) < 22, 0.0, 1.0) + rng.normal(0, 0.01, 40)])
+    assert any("Only 22 of 40" in note for note in fit_water(step, model="level").notes)
+
+
+@pytest.mark.parametrize(
+    ("points", "model", "message"),
+    [
+        (np.zeros((2, 3)), "plane", "needs at least 3 shoreline points with heights, and there"),
+        (np.zeros((1, 3)), "along", "needs at least 2 shoreline points"),
+        (np.zeros((5, 3)), "plane", "The 5 shoreline points are at one place; fit a level"),
+        (np.outer(np.arange(6), [10, 5, 0]), "plane", "The 6 shoreline points are on one line"),
+        (np.full((4, 3), np.nan), "auto", "None of 4 shoreline points has a height"),
+        (np.empty((0, 3)), "auto", "None of 0 shoreline points has a height"),
+        (
+            np.array([[x, y, 0.08 * x] for x in range(9) for y in range(9)], float),
+            "auto",
+            r"tilt by 8.0 %, more than 5 % .* or allow it, or fit a level",
+        ),
+    ],
+)
+def test_points_that_fix_no_surface(points, model, message):
+    with pytest.raises(GeometryError, match=message):
+        fit_water(np.asarray(points, float), model=model)
+
+
+def test_a_steep_surface_may_be_allowed():
+    points = np.array([[x, y, 0.08 * x] for x in range(9) for y in range(9)], float)
+    assert fit_water(points, max_tilt_percent=10).tilt_percent == pytest.approx(8.0)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: fit_water(np.zeros((4, 3)), model="curve"), "model 'curve' is not one of auto"),
+        (lambda: fit_water(np.zeros((4, 2))), r"must have the shape \(n, 3\), not \(4, 2\)"),
+        (lambda: heights_from_cloud(np.zeros((1, 2)), np.zeros((1, 3)), 0), "must be positive"),
+    ],
+)
+def test_settings_outside_their_rule(call, message):
+    with pytest.raises(SettingError, match=message):
+        call()
+
+
+WEIR_M = 300.5
+
+
+def winding(seed, n, *, noise_m=0.025, share=0.15, length_m=500.0, width_m=20.0):
+    """Return shoreline points of a winding river, places on it and their heights and stations.
+
+    Pools fall 0.1 %, three riffles of 20 m fall 1.5 %, and a weir of 0.3 m is 1 m long.
+    """
+    rng = np.random.default_rng(seed)
+    step = 0.15
+    s = np.arange(-50.0, length_m + 50.0, step)
+    angle = 0.9 * np.sin(2.0 * np.pi * s / 320.0) + rng.uniform(0.0, 6.0)
+    axis = np.cumsum(np.column_stack([np.cos(angle), np.sin(angle)]) * step, axis=0) + UTM
+    normal = np.column_stack([-np.sin(angle), np.cos(angle)])
+
+    def place(station, away):
+        i = np.searchsorted(s, station)
+        return axis[i] + away[:, None] * normal[i]
+
+    def height(station):
+        z = 100.0 - 0.001 * station - 0.3 * np.clip(station - WEIR_M + 0.5, 0, 1)
+        return z - sum(0.014 * np.clip(station - start, 0, 20) for start in (100, 200, 425))
+
+    at = rng.uniform(0.0, length_m, n)
+    away = np.where(rng.random(n) < 0.5, 0.5, -0.5) * width_m + rng.normal(0.0, 0.7, n)
+    z = height(at) + rng.normal(0.0, noise_m, n)
+    wrong = rng.permutation(n)[: round(share * n)]
+    z[wrong] += rng.choice([-1, 1], len(wrong)) * rng.uniform(0.3, 2.0, len(wrong))
+    asked = rng.uniform(0.0, length_m, 2000)
+    places = place(asked, rng.uniform(-0.5, 0.5, 2000) * width_m)
+    line = place(np.arange(0.0, length_m, 5.0), np.zeros(100))
+    return np.column_stack([place(at, away), z]), places, height(asked), asked, line
+
+
+def bounds_of(places, margin=10.0):
+    return (*(places.min(axis=0) - margin), *(places.max(axis=0) + margin))
+
+
+@pytest.mark.parametrize(("n", "rms_m", "worst_m"), [(80, 0.05, 0.30), (300, 0.02, 0.15)])
+def test_a_winding_river_with_riffles_and_a_weir(n, rms_m, worst_m):
+    """More than 10 m from the weir; the worst is at the ends of riffles, between points."""
+    for seed in range(6):
+        points, places, true, asked, _ = winding(seed, n)
+        fit = fit_river(points, bounds_of(places))
+        error = (fit.height_at(places) - true)[np.abs(asked - WEIR_M) > 10.0]
+        assert np.sqrt(np.mean(error**2)) < rms_m
+        assert np.abs(error).max() < worst_m
+        assert fit.sigma_m == pytest.approx(0.025, abs=0.012)
+        assert fit.axis.width_m == pytest.approx(20.0, rel=0.2)
+        assert fit.profile.falls
+        assert (np.diff(fit.profile.height_m) < 1e-3).all()
+
+
+def test_the_step_of_a_weir_is_found():
+    points, places, true, asked, _ = winding(1, 400)
+    fit = fit_river(points, bounds_of(places))
+    for low, high in ((280, 290), (312, 322)):
+        near = (asked > low) & (asked < high)
+        assert np.mean((fit.height_at(places) - true)[near]) == pytest.approx(0.0, abs=0.03)
+
+
+def test_the_mesh_of_a_river_is_its_profile():
+    points, places, _, asked, _ = winding(2, 200)
+    fit = fit_river(points, bounds_of(places))
+    seen = surface_above(fit.surface, np.column_stack([places, np.zeros(len(places))])).height_m
+    assert np.isfinite(seen).all()
+    calm = np.abs(asked - WEIR_M) > 20.0
+    assert np.abs(seen - fit.height_at(places))[calm].max() < 0.02  # a cell beside a riffle's end
+
+
+def test_a_given_line_along_the_river_in_either_direction():
+    points, places, true, asked, line = winding(3, 200)
+    one = fit_river(points, bounds_of(places), centreline=line)
+    other = fit_river(points, bounds_of(places), centreline=line[::-1])
+    assert one.height_at(places) == pytest.approx(other.height_at(places), abs=0.02)
+    error = (one.height_at(places) - true)[np.abs(asked - WEIR_M) > 10.0]
+    assert np.sqrt(np.mean(error**2)) < 0.02
+
+
+def test_beyond_the_ends_the_surface_stays_as_it_is_there():
+    points, places, _, _, line = winding(4, 200)
+    fit = fit_river(points, bounds_of(places, 200.0))
+    beyond = line[:1] + 20.0 * (line[:1] - line[1:2])
+    ends = fit.profile.height_m[[0, -1]]
+    assert fit.height_at(beyond)[0] in ends
+    assert any("Beyond the outermost points" in note for note in fit.notes)
+    assert fit.as_dict()["drop_m"] == pytest.approx(ends[0] - ends[1])
+
+
+def test_the_axis_of_one_straight_bank():
+    xy = np.column_stack([np.linspace(0.0, 300.0, 40), np.zeros(40)]) + UTM
+    axis = flow_axis(xy)
+    station, away = axis.locate(xy)
+    assert away == pytest.approx(np.zeros(40), abs=1e-6)
+    assert np.abs(np.diff(station)) == pytest.approx(np.full(39, 300.0 / 39), abs=1e-6)
+
+
+def test_water_that_rises_in_the_middle_is_not_held_to_fall():
+    rng = np.random.default_rng(0)
+    x = rng.uniform(0, 300, 120)
+    z = 1.0 + 0.5 * np.sin(x / 300 * 2 * np.pi) + rng.normal(0, 0.01, 120)
+    points = np.column_stack([x, rng.choice([0.0, 15.0], 120), z])
+    fit = fit_river(points, (0.0, 0.0, 300.0, 15.0))
+    assert not fit.profile.falls
+    assert any("do not fall all along" in note for note in fit.notes)
+
+
+@pytest.mark.parametrize(
+    ("points", "bounds", "line", "message"),
+    [
+        (np.zeros((9, 3)), (0, 0, 1, 1), None, "needs at least 10 shoreline points with heights"),
+        (np.zeros((12, 3)), (0, 0, 1, 1), None, "at different places"),
+        (winding(0, 20)[0], (0, 0, 0, 1), None, "hold no area"),
+        (winding(0, 20)[0], (0, 0, 1, 1), np.zeros((3, 2)), "has no length"),
+    ],
+)
+def test_what_fixes_no_river(points, bounds, line, message):
+    with pytest.raises(GeometryError, match=message):
+        fit_river(points, bounds, centreline=line)
+
+
+def test_heights_on_an_even_bank_are_those_of_its_edge():
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(0, 50, (40_000, 2))
+    z = 3.0 + 0.1 * (xy[:, 0] - 25.0) + rng.normal(0, 0.02, len(xy))
+    cloud = np.column_stack([xy, z])
+    shore = np.column_stack([np.full(30, 25.0), np.linspace(5, 45, 30)])
+    found = heights_from_cloud(shore, cloud, 1.0)
+    # median of 25 points of 0.02 m and a slope of 0.1 over 0.7 m: 0.007 m
+    assert found.height_m == pytest.approx(np.full(30, 3.0), abs=0.03)
+    near = is_near(shore, cloud, 1.0)
+    assert np.array_equal(heights_from_cloud(shore, cloud[near], 1.0).height_m, found.height_m)
+    distance = np.hypot(*(xy[:, None] - shore[None]).transpose(2, 0, 1)).min(axis=1)
+    assert np.array_equal(near, distance <= 1.0)
+
+
+def test_places_without_cloud_have_no_height():
+    cloud = np.array([[0.0, 0, 1], [0.1, 0, 1], [0, 0.1, 2], [9, 9, 4]])
+    found = heights_from_cloud(np.array([[0.0, 0], [9, 9], [50, 50]]), cloud, 0.5)
+    assert found.height_m[0] == 1.0
+    assert np.isnan(found.height_m[1:]).all()
+    assert found.used.tolist() == [3, 1, 0]
+    assert found.missing == 2
+    assert heights_from_cloud(np.array([[70.0, 70]]), cloud, 0.5).missing == 1
+
+
+def test_chance_of_a_tilt_is_wald_s():
+    """Twice the F statistic of many points is chi squared with two degrees of freedom."""
+    rng = np.random.default_rng(3)
+    xy = rng.uniform(0, 100, (4000, 2))
+    z = 2e-5 * xy[:, 0] + rng.normal(0, 0.02, 4000)
+    fit = fit_water(np.column_stack([xy, z]), model="plane")
+    wald = float(fit.tilt @ np.linalg.solve(fit.covariance[1:, 1:], fit.tilt))
+    chosen = fit_water(np.column_stack([xy, z])).model
+    assert (chosen == "level") == (chi2.sf(wald, 2) > 0.05)

@@ -1,0 +1,93 @@
+"""The refractive index against measurements that its formula was not fitted to."""
+
+import pytest
+
+import pcfix
+from pcfix.water.index import index_of, refractive_index
+
+
+def iapws_1997(temperature_c, wavelength_um, density_kg_m3):
+    """Return n of pure water relative to vacuum (release R9-97 of the IAPWS)."""
+    t, rho = (temperature_c + 273.15) / 273.15, density_kg_m3 / 1000.0
+    w2 = (wavelength_um / 0.589) ** 2
+    a = (0.244257733, 9.74634476e-3, -3.73234996e-3, 2.68678472e-4, 1.58920570e-3,
+         2.45934259e-3, 0.900704920, -1.66626219e-2)  # fmt: skip
+    uv2, ir2 = 0.2292020**2, 5.432937**2
+    right = a[0] + a[1] * rho + a[2] * t + a[3] * w2 * t + a[4] / w2
+    right += a[5] / (w2 - uv2) + a[6] / (w2 - ir2) + a[7] * rho * rho
+    right *= rho
+    return ((1.0 + 2.0 * right) / (1.0 - right)) ** 0.5
+
+
+AIR = 1.000274
+"""Index of air at 15 degrees and sea level; it varies by 2e-5 with the weather."""
+
+
+@pytest.mark.parametrize("wavelength_um", [0.42, 0.5, 0.5893, 0.68])
+@pytest.mark.parametrize(
+    ("temperature_c", "density"), [(0.0, 999.84), (10.0, 999.70), (20.0, 998.21), (30.0, 995.65)]
+)
+def test_pure_water_is_that_of_the_iapws(temperature_c, density, wavelength_um):
+    vacuum = iapws_1997(temperature_c, wavelength_um, density)
+    found = refractive_index(0.0, temperature_c, wavelength_um)
+    # the fit's own scatter is 1.5e-5; IAPWS and the weather of the air add as much. 1e-4 would
+    # move a bed 15 m deep by 1 mm
+    assert found == pytest.approx(vacuum / AIR, abs=1e-4)
+
+
+def test_the_reference_of_this_test_gives_the_values_of_its_release():
+    # R9-97, table of check values: 0 degrees Celsius, 0.1 MPa, 0.589 um and 100 degrees
+    assert iapws_1997(0.0, 0.5893, 999.843) == pytest.approx(1.33434, abs=2e-5)
+
+
+@pytest.mark.parametrize("temperature_c", [2.0, 15.0, 28.0])
+@pytest.mark.parametrize("wavelength_nm", [450.0, 532.0, 600.0])
+@pytest.mark.parametrize(
+    ("salinity", "a", "b", "c", "d", "e"),
+    [
+        (35.0, -1.50156e-6, 1.07085e-7, -4.27594e-5, -1.60476e-4, 1.39807),
+        (0.0, -1.97812e-6, 1.03223e-7, -8.58125e-6, -1.54834e-4, 1.38919),
+    ],
+)
+def test_sea_and_fresh_water_of_parrish_2020(salinity, a, b, c, d, e, wavelength_nm, temperature_c):
+    # a surface through the tables of Mobley 2010, with an RMSE of 2e-4 of its own: three times
+    # that is allowed, 9 mm in 15 m of water
+    published = a * temperature_c**2 + b * wavelength_nm**2 + c * temperature_c
+    published += d * wavelength_nm + e
+    found = refractive_index(salinity, temperature_c, wavelength_nm / 1000.0)
+    assert found == pytest.approx(published, abs=6e-4)
+
+
+def test_index_falls_with_temperature_and_wavelength_and_grows_with_salt():
+    assert refractive_index(35, 10, 0.5) > refractive_index(35, 25, 0.5)
+    assert refractive_index(35, 10, 0.45) > refractive_index(35, 10, 0.65)
+    assert refractive_index(35, 10, 0.5) > refractive_index(10, 10, 0.5)
+
+
+def test_waters_by_name():
+    assert index_of("fresh")[0] == pytest.approx(1.335, abs=0.001)
+    assert index_of(" Sea ")[0] == pytest.approx(1.342, abs=0.001)
+    assert index_of("1.337") == (1.337, "")
+    assert index_of(1.337) == (1.337, "")
+    assert index_of("sea") == (index_of("35,15,0.53")[0], "sea: 35 PSU, 15 C, 0.53 um")
+    assert index_of("20,4")[0] == refractive_index(20.0, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"salinity": -1.0}, "salinity -1 is outside 0 to 40"),
+        ({"temperature_c": 293.0}, "temperature 293 .* degrees Celsius"),
+        ({"wavelength_um": 550.0}, "wavelength 550 .* micrometres"),
+        ({"salinity": float("nan")}, "salinity nan"),
+    ],
+)
+def test_values_outside_the_fit_are_refused(words, message):
+    with pytest.raises(pcfix.SettingError, match=message):
+        refractive_index(**words)
+
+
+@pytest.mark.parametrize("words", ["brackish", "", "35,warm", "1,2,3,4", "35;15"])
+def test_words_that_are_no_water_are_refused(words):
+    with pytest.raises(pcfix.SettingError, match="neither a number nor fresh nor sea"):
+        index_of(words)

@@ -1,0 +1,114 @@
+"""Water meshes: the height above a point, and rays that bend at the right facet."""
+
+import numpy as np
+import pytest
+from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import Delaunay
+
+import pcfix
+from pcfix.water.surface import surface_above
+from tests.utils.twins import bend, stacked_intersection
+
+UTM = np.array([512_000.0, 4_987_000.0, 100.0])
+
+
+def random_mesh(seed=3, n=60, relief=0.2):
+    rng = np.random.default_rng(seed)
+    plan = np.vstack([rng.uniform(0, 50, (n, 2)), [[0, 0], [0, 50], [50, 0], [50, 50]]])
+    vertices = np.column_stack([plan, rng.normal(0, relief, len(plan))]) + UTM
+    return vertices, Delaunay(plan).simplices.astype(np.int64)
+
+
+def test_height_equals_linear_interpolation():
+    vertices, triangles = random_mesh()
+    mesh = pcfix.WaterMesh(vertices, triangles)
+    plan = np.random.default_rng(0).uniform(-5, 55, (5000, 2)) + UTM[:2]
+    heights = surface_above(mesh, np.column_stack([plan, np.zeros(5000)])).height_m
+    local = LinearNDInterpolator(Delaunay(vertices[:, :2] - UTM[:2]), vertices[:, 2])
+    expected = local(plan - UTM[:2])
+    assert np.array_equal(np.isnan(heights), np.isnan(expected))
+    inside = ~np.isnan(heights)
+    assert heights[inside] == pytest.approx(expected[inside], abs=1e-9)
+
+
+def test_flat_mesh_equals_plane():
+    b, c = 0.01, -0.02
+    plan = np.array([[0, 0], [60, 0], [60, 60], [0, 60], [25, 31]], float)
+    vertices = np.column_stack([plan, 1.0 + b * plan[:, 0] + c * plan[:, 1]])
+    mesh = pcfix.WaterMesh(vertices, Delaunay(plan).simplices.astype(np.int64))
+    rng = np.random.default_rng(5)
+    points = np.column_stack([rng.uniform(5, 55, (300, 2)), rng.uniform(-8, -2, 300)])
+    centres = np.column_stack([rng.uniform(0, 60, (5, 2)), np.full(5, 70.0)])
+    cameras = pcfix.Cameras(tuple("abcde"), centres)
+    one = pcfix.correct_points(points, cameras, mesh)
+    other = pcfix.correct_points(points, cameras, pcfix.WaterPlane(1.0, b, c))
+    assert one.corrected.all()
+    assert one.xyz == pytest.approx(other.xyz, abs=1e-9)
+
+
+def test_slow_search_over_all_facets_agrees():
+    vertices, triangles = random_mesh(relief=0.5)
+    mesh = pcfix.WaterMesh(vertices, triangles)
+    rng = np.random.default_rng(8)
+    points = np.column_stack([rng.uniform(10, 40, (40, 2)), rng.uniform(-9, -3, 40)]) + UTM
+    centres = np.column_stack([rng.uniform(0, 50, (4, 2)), rng.uniform(55, 65, 4)]) + UTM
+    result = pcfix.correct_points(points, pcfix.Cameras(tuple("abcd"), centres), mesh)
+    assert result.corrected.all()
+    for point, found in zip(points, result.xyz, strict=True):
+        hits = [first_hit(vertices[triangles], centre, point) for centre in centres]
+        anchors = [at - point for at, _ in hits]
+        down = [(point - c) / np.linalg.norm(point - c) for c in centres]
+        bent = [bend(d, normal, 1.34) for d, (_, normal) in zip(down, hits, strict=True)]
+        expected = point + stacked_intersection(anchors, bent)
+        assert found == pytest.approx(expected, abs=1e-8)
+
+
+def first_hit(corners, centre, point):
+    """Return where the line meets the mesh, and the normal, by trying every triangle."""
+    ray = point - centre
+    for triangle in corners:
+        normal = np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
+        normal = normal / np.linalg.norm(normal) * np.sign(normal[2])
+        at = centre + ray * ((triangle[0] - centre) @ normal) / (ray @ normal)
+        sides = [
+            np.cross(triangle[(i + 1) % 3] - triangle[i], at - triangle[i]) @ normal
+            for i in range(3)
+        ]
+        if min(sides) >= -1e-12 or max(sides) <= 1e-12:
+            return at, normal
+    raise AssertionError("the line misses the mesh")
+
+
+def test_vertical_and_degenerate_facets_are_ignored():
+    vertices = np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 5], [5, 5, 1]], float)
+    triangles = np.array([[0, 1, 3], [0, 0, 1], [0, 1, 2]])
+    mesh = pcfix.WaterMesh(vertices, triangles)
+    heights = surface_above(mesh, np.array([[1.0, 1, 0], [9, 9, 0]])).height_m
+    assert heights[0] == 0.0
+    assert np.isnan(heights[1])
+    with pytest.raises(pcfix.GeometryError, match="no facet"):
+        surface_above(pcfix.WaterMesh(vertices, triangles[:2]), np.zeros((1, 3)))
+
+
+@pytest.mark.parametrize("limit_deg", [12.0, 18.0, 25.0])
+def test_limit_holds_at_the_facet_that_the_ray_pierces(limit_deg):
+    vertices, triangles = random_mesh(relief=0.5)
+    mesh = pcfix.WaterMesh(vertices, triangles)
+    rng = np.random.default_rng(9)
+    points = np.column_stack([rng.uniform(10, 40, (30, 2)), rng.uniform(-9, -3, 30)]) + UTM
+    centres = np.column_stack([rng.uniform(0, 50, (12, 2)), rng.uniform(55, 65, 12)]) + UTM
+    cameras = pcfix.Cameras(tuple("abcdefghijkl"), centres)
+    result = pcfix.correct_points(points, cameras, mesh, max_angle_deg=limit_deg)
+    for i, point in enumerate(points):
+        angles = np.array([local_incidence_deg(vertices[triangles], c, point) for c in centres])
+        assert result.ray_count[i] in (0, np.sum(angles <= limit_deg))
+        if result.corrected[i]:
+            assert result.incidence_deg[i] == pytest.approx(
+                angles[angles <= limit_deg].max(), abs=1e-6
+            )
+
+
+def local_incidence_deg(facets, centre, point):
+    _, normal = first_hit(facets, centre, point)
+    up = (centre - point) / np.linalg.norm(centre - point)
+    return np.degrees(np.arccos(min(1.0, float(normal @ up))))
