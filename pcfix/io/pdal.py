@@ -13,19 +13,18 @@ import numpy as np
 
 from pcfix.errors import SettingError
 from pcfix.io.las.columns import (
-    BATHYMETRIC_POINT,
     changed_rows,
     column_scale,
     in_steps,
     rows_of,
     shift_steps,
 )
+from pcfix.model import BATHYMETRIC_POINT
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcfix.io.las.columns import Column
-from pcfix.model import BATHYMETRIC_POINT
     from pcfix.model import Correction, FloatArray, Summary
 
 Dimensions: TypeAlias = "dict[str, npt.NDArray[Any]]"
