@@ -206,10 +206,9 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     from pcfix.flow.inputs import mask_of
     from pcfix.flow.job import parts_of
     from pcfix.flow.label import Counts
-    from pcfix.flow.points import check_submerged
     from pcfix.flow.surfaces import WaterWords, find_surface
-    from pcfix.flow.water_checks import check_tilt
     from pcfix.label.labelling import Labelling
+    from pcfix.water.checks import check_submerged, check_tilt
 
     options = _options(namespace, _LABEL_OPTIONS, needed=("water",))
     metadata = namespace.get("metadata")
@@ -359,7 +358,7 @@ def _slices(n: int) -> Iterator[slice]:
 
 def _chunks(ins: Dimensions, water: WaterSurface, flags: Flags) -> Iterator[tuple[slice, Points]]:
     """Yield the rows of each chunk, and its coordinates, heights of the water and classes."""
-    from pcfix.flow.points import checked_points
+    from pcfix.water.checks import checked_points
 
     for rows in _slices(len(ins["X"])):
         xyz = checked_points(np.column_stack([ins[axis][rows] for axis in "XYZ"]))

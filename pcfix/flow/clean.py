@@ -14,7 +14,7 @@ from pcfix.clean.flags import flag_weak
 from pcfix.clean.settings import CleanSettings, CleanSummary, Reason
 from pcfix.errors import InputError
 from pcfix.flow.clean_points import check_tile, flag_neighbours
-from pcfix.flow.points import CHUNK_POINTS, check_submerged
+from pcfix.flow.points import CHUNK_POINTS
 from pcfix.flow.surfaces import WaterWords, find_surface, view_of
 from pcfix.io.files import check_input, check_output, write_text
 from pcfix.io.las.formats import convert
@@ -26,6 +26,7 @@ from pcfix.io.scratch import scratch_arrays
 from pcfix.model import HIGH_NOISE, LOW_NOISE, WaterDimension
 from pcfix.threads import threads
 from pcfix.version import __version__
+from pcfix.water.checks import check_submerged
 from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from pcfix.clean.flags import flag_off_bed, flag_sparse, flag_weak
 from pcfix.clean.settings import LEAST_NEIGHBOURS, CleanSettings
 from pcfix.clean.tiles import in_memory
 from pcfix.errors import InputError, SettingError
-from pcfix.flow.points import as_surface, checked_points
 from pcfix.threads import threads
+from pcfix.water.checks import as_surface, checked_points
 from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:

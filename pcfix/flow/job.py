@@ -15,13 +15,8 @@ from pcfix.flow.diagnosis import diagnose_in_passing
 from pcfix.flow.inputs import mask_of
 from pcfix.flow.learning import Learning
 from pcfix.flow.old_cameras import old_tie_points, read_blocks
-from pcfix.flow.points import (
-    check_above_water,
-    correct_checked,
-    refuse_under_water,
-)
+from pcfix.flow.points import correct_checked
 from pcfix.flow.view_kinds import kind_of_views
-from pcfix.flow.water_checks import WaterMeeting, check_tilt
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.label.labelling import Labelling, Part
 from pcfix.model import Correction, Outcome, Summary, WaterDimension, WaterPlane
@@ -29,6 +24,7 @@ from pcfix.options import LabelSettings, Settings
 from pcfix.refract.learned import Learned
 from pcfix.report.tally import Tally
 from pcfix.version import __version__
+from pcfix.water.checks import WaterMeeting, check_above_water, check_tilt, refuse_under_water
 from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:

@@ -14,9 +14,8 @@ from pcfix.errors import SettingError
 from pcfix.flow.files import file_points, water_heights
 from pcfix.flow.inputs import file_of, mask_of
 from pcfix.flow.job import parts_of
-from pcfix.flow.points import CHUNK_POINTS, as_surface, check_submerged, checked_points
+from pcfix.flow.points import CHUNK_POINTS
 from pcfix.flow.surfaces import WaterWords, find_surface, view_of
-from pcfix.flow.water_checks import check_tilt
 from pcfix.io.files import check_input, check_output, write_text
 from pcfix.io.las.formats import convert
 from pcfix.io.las.headers import corrected_identity, noted_header, output_evlrs
@@ -28,6 +27,7 @@ from pcfix.model import WaterPlane
 from pcfix.options import LabelSettings
 from pcfix.threads import threads
 from pcfix.version import __version__
+from pcfix.water.checks import as_surface, check_submerged, check_tilt, checked_points
 from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""The calculation over arrays, and the checks that cloud, water and cameras fit together."""
+"""The calculation over arrays."""
 
 from __future__ import annotations
 
@@ -6,24 +6,15 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from pcfix.errors import GeometryError, SettingError
+from pcfix.errors import SettingError
 from pcfix.flow.carrying import Carrying
 from pcfix.flow.learning import learn_of_points
 from pcfix.flow.old_cameras import paired
-from pcfix.io.water import read_water
-from pcfix.model import (
-    Cameras,
-    Correction,
-    Views,
-    WaterDimension,
-    WaterMesh,
-    WaterPlane,
-    WaterRaster,
-    WaterSurface,
-)
+from pcfix.model import Cameras, Correction, Views, WaterSurface
 from pcfix.options import DEFAULT_REFRACTIVE_INDEX, ErrorBudget, Settings
 from pcfix.refract.made_with import MadeWith
 from pcfix.refract.methods import correct, shift_of_land
+from pcfix.water.checks import as_surface, check_above_water, checked_points
 from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
 if TYPE_CHECKING:
@@ -192,44 +183,6 @@ def _only(may_be_submerged: npt.ArrayLike, n: int) -> Label:
     return lambda xyz, surface: is_submerged(xyz[:, 2], surface) & allowed
 
 
-def checked_points(xyz: npt.ArrayLike) -> FloatArray:
-    """Return finite points, C-contiguous, shape (n, 3).
-
-    Raises
-    ------
-    SettingError
-        If the shape is another, or a coordinate is not finite.
-    """
-    points = np.ascontiguousarray(xyz, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise SettingError(f"xyz must have the shape (n, 3), not {points.shape}.")
-    finite = np.isfinite(points)
-    if not finite.all():
-        row = int(np.argmin(finite.all(axis=1)))
-        raise SettingError(f"xyz row {row} is not finite: {points[row].tolist()}; remove it.")
-    return points
-
-
-def as_surface(
-    water: WaterSurface | float | npt.ArrayLike, n: int
-) -> tuple[WaterSurface, FloatArray | None]:
-    """Return the water surface, and its height above each of n points where it is given so.
-
-    Raises
-    ------
-    SettingError
-        If there is not one height per point.
-    """
-    if isinstance(water, WaterSurface):
-        return water, None
-    heights = np.asarray(water, dtype=np.float64)
-    if heights.ndim == 0:
-        return read_water(float(heights)), None
-    if heights.shape != (n,):
-        raise SettingError(f"water must be one height or {n}, not of shape {heights.shape}.")
-    return WaterDimension("given heights"), heights
-
-
 def _check_views(views: Views, n: int, k: int) -> None:
     if len(views.start) != n + 1 or views.start[0] != 0 or views.start[-1] != len(views.camera):
         raise SettingError(f"views must have {n + 1} starts, from 0 to the number of entries.")
@@ -306,57 +259,3 @@ def _land_shift(
     mine = None if views is None else views.take(rows)
     shift[rows] = shift_of_land(xyz[rows], cameras, settings, mine, learned, made_with.take(rows))
     return shift
-
-
-def check_above_water(
-    cameras: Cameras, water: WaterSurface, level_offset_m: FloatArray | None = None
-) -> None:
-    """Refuse cameras that stand under the water, each under its own where that moves.
-
-    Raises
-    ------
-    GeometryError
-        With the first of them, and what is likely wrong.
-    """
-    match water:
-        case WaterPlane(a, b, c):
-            level = a + b * cameras.centres[:, 0] + c * cameras.centres[:, 1]
-        case WaterMesh(vertices):
-            from scipy.spatial import cKDTree
-
-            nearest = cKDTree(vertices[:, :2]).query(cameras.centres[:, :2])[1]
-            level = vertices[nearest, 2]
-        case WaterRaster():
-            height = surface_above(water, cameras.centres).height_m
-            level = np.where(np.isnan(height), np.nanmin(water.height_m), height)
-        case WaterDimension():
-            return  # known only once the points are; see `correct_file`
-    offset = 0.0 if level_offset_m is None else level_offset_m
-    refuse_under_water(cameras, level + offset, str(water))
-
-
-def refuse_under_water(cameras: Cameras, level: FloatArray | float, water: str) -> None:
-    """Refuse cameras below a level, metres: one for all, or one each, shape (k,)."""
-    below = np.flatnonzero(cameras.centres[:, 2] <= level)
-    if below.size:
-        first = below[0]
-        raise GeometryError(
-            f"{below.size} of {len(cameras)} cameras are under the water, the first"
-            f" {cameras.labels[first]} at z = {cameras.centres[first, 2]:.2f} m ({water}): check"
-            " the heights' datum, the order of the columns and the water surface."
-        )
-
-
-def check_submerged(count: int, name: str, water: WaterSurface, heights: str = "") -> None:
-    """Refuse a cloud of which no point lies below the water.
-
-    Raises
-    ------
-    GeometryError
-        With the cloud's name, the surface, and what `heights` says of the cloud's.
-    """
-    if count == 0:
-        raise GeometryError(
-            f"{name}: no point lies below the water ({water}){heights}; check the water's height,"
-            " and that it has the cloud's vertical datum."
-        )

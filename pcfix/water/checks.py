@@ -1,18 +1,21 @@
-"""Whether a water surface can be one, and whether it lies where the cloud is."""
+"""Whether points, cameras and a water surface can be ones, and how they lie to each other."""
 
 from __future__ import annotations
 
+import math
 import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.errors import GeometryError, PcfixWarning
-from pcfix.flow.points import check_submerged
-from pcfix.model import WaterDimension, WaterMesh, WaterPlane, WaterRaster
+from pcfix.errors import GeometryError, PcfixWarning, SettingError
+from pcfix.model import WaterDimension, WaterMesh, WaterPlane, WaterRaster, WaterSurface
+from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
-    from pcfix.model import Correction, FloatArray, WaterSurface
+    import numpy.typing as npt
+
+    from pcfix.model import Cameras, Correction, FloatArray
 
 MOST_TILT = 0.05
 """Rise per metre of a whole surface. Rapids reach 2 %; a weir is steeper, but only in part."""
@@ -21,6 +24,101 @@ DEEPEST_M = 100.0
 FOOT_M = 0.3048
 CLEARLY_OFF_M = 10.0
 _ENOUGH_HEIGHTS = 200_000
+
+
+def checked_points(xyz: npt.ArrayLike) -> FloatArray:
+    """Return finite points, C-contiguous, shape (n, 3).
+
+    Raises
+    ------
+    SettingError
+        If the shape is another, or a coordinate is not finite.
+    """
+    points = np.ascontiguousarray(xyz, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise SettingError(f"xyz must have the shape (n, 3), not {points.shape}.")
+    finite = np.isfinite(points)
+    if not finite.all():
+        row = int(np.argmin(finite.all(axis=1)))
+        raise SettingError(f"xyz row {row} is not finite: {points[row].tolist()}; remove it.")
+    return points
+
+
+def as_surface(
+    water: WaterSurface | float | npt.ArrayLike, n: int
+) -> tuple[WaterSurface, FloatArray | None]:
+    """Return the water surface, and its height above each of n points where it is given so.
+
+    Raises
+    ------
+    SettingError
+        If there is not one height per point.
+    """
+    if isinstance(water, WaterSurface):
+        return water, None
+    heights = np.asarray(water, dtype=np.float64)
+    if heights.ndim == 0:
+        level = float(heights)
+        if not math.isfinite(level):
+            raise SettingError(f"water '{level}': the numbers must be finite.")
+        return WaterPlane(level), None
+    if heights.shape != (n,):
+        raise SettingError(f"water must be one height or {n}, not of shape {heights.shape}.")
+    return WaterDimension("given heights"), heights
+
+
+def check_above_water(
+    cameras: Cameras, water: WaterSurface, level_offset_m: FloatArray | None = None
+) -> None:
+    """Refuse cameras that stand under the water, each under its own where that moves.
+
+    Raises
+    ------
+    GeometryError
+        With the first of them, and what is likely wrong.
+    """
+    match water:
+        case WaterPlane(a, b, c):
+            level = a + b * cameras.centres[:, 0] + c * cameras.centres[:, 1]
+        case WaterMesh(vertices):
+            from scipy.spatial import cKDTree
+
+            nearest = cKDTree(vertices[:, :2]).query(cameras.centres[:, :2])[1]
+            level = vertices[nearest, 2]
+        case WaterRaster():
+            height = surface_above(water, cameras.centres).height_m
+            level = np.where(np.isnan(height), np.nanmin(water.height_m), height)
+        case WaterDimension():
+            return  # known only once the points are; see `correct_file`
+    offset = 0.0 if level_offset_m is None else level_offset_m
+    refuse_under_water(cameras, level + offset, str(water))
+
+
+def refuse_under_water(cameras: Cameras, level: FloatArray | float, water: str) -> None:
+    """Refuse cameras below a level, metres: one for all, or one each, shape (k,)."""
+    below = np.flatnonzero(cameras.centres[:, 2] <= level)
+    if below.size:
+        first = below[0]
+        raise GeometryError(
+            f"{below.size} of {len(cameras)} cameras are under the water, the first"
+            f" {cameras.labels[first]} at z = {cameras.centres[first, 2]:.2f} m ({water}): check"
+            " the heights' datum, the order of the columns and the water surface."
+        )
+
+
+def check_submerged(count: int, name: str, water: WaterSurface, heights: str = "") -> None:
+    """Refuse a cloud of which no point lies below the water.
+
+    Raises
+    ------
+    GeometryError
+        With the cloud's name, the surface, and what `heights` says of the cloud's.
+    """
+    if count == 0:
+        raise GeometryError(
+            f"{name}: no point lies below the water ({water}){heights}; check the water's height,"
+            " and that it has the cloud's vertical datum."
+        )
 
 
 def check_tilt(water: WaterSurface) -> None:
@@ -51,8 +149,8 @@ def overall_tilt(water: WaterSurface) -> float:
             return _tilt_of(water.vertices[np.unique(water.triangles)])
         case WaterRaster():
             row, column = np.nonzero(np.isfinite(water.height_m))
-            some = slice(None, None, len(row) // _ENOUGH_HEIGHTS + 1)
-            row, column = row[some], column[some]
+            step = len(row) // _ENOUGH_HEIGHTS + 1
+            row, column = row[::step], column[::step]
             width, height = water.cell_m
             return _tilt_of(
                 np.column_stack([column * width, -row * height, water.height_m[row, column]])
