@@ -11,15 +11,10 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
-from pcfix.errors import InputError
 from pcfix.io.files import check_input
-from pcfix.io.views import colmap_vis, openmvs, tracks
-from pcfix.io.views.geometry import fitted
-from pcfix.io.views.lists import RawList, ViewList
-from pcfix.io.views.matching import ViewMatch
-from pcfix.io.views.orders import ImageOrder, image_orders
-from pcfix.io.views.report import ViewReport
-from pcfix.io.views.spacing import spacing_m
+from pcfix.io.views.lists import ImageOrder, RawList, ViewList, read_list, tracks_as_list
+from pcfix.io.views.matching import ViewMatch, ViewReport, spacing_m
+from pcfix.io.views.orders import fitted, image_orders
 
 if TYPE_CHECKING:
     import os
@@ -32,18 +27,10 @@ __all__ = ["ViewList", "ViewMatch", "ViewReport", "read_views", "track_views"]
 
 Transformation: TypeAlias = "Callable[[FloatArray], FloatArray]"
 
-_DENSE_SPACINGS = 0.05
-_TRACK_SPACINGS = 2.0
-"""On a real block the nearest track holds 77 % of a dense point's images at any distance up to
-this, so that a tie point speaks for its surroundings as a dense point does not."""
-
-_OTHERS = {
-    b"LASF": "a LAS file: the cloud, not the list of its images",
-    b"MVSI": "an OpenMVS scene: give the dense PLY file beside it",
-    b"PK\x03\x04": "a ZIP archive or a project",
-    b"SQLi": "a database",
-}
-"""What people give instead, by its first bytes."""
+_SPACINGS = {"depth-maps": 0.05, "tracks": 2.0}
+"""Default tolerance of a match by position. On a real block the nearest track holds 77 % of a dense
+point's images at any distance up to two spacings, so that a tie point speaks for its surroundings
+as a dense point does not."""
 
 
 def read_views(
@@ -78,11 +65,8 @@ def read_views(
         If the file is not a whole view list, names images that are not there, or its cameras
         do not see its points.
     """
-    raw = _moved(_read(check_input(path)), to_cloud)
-    views = _listed(raw, image_orders(raw, cameras, names), "depth-maps")
-    if raw.xyz is None:
-        return views
-    return fitted(views, cameras, raw.xyz, np.arange(len(views)))
+    raw = _moved(read_list(check_input(path)), to_cloud)
+    return _fitted(raw, image_orders(raw, cameras, names), "depth-maps", cameras)
 
 
 def track_views(
@@ -113,18 +97,9 @@ def track_views(
     InputError
         If no tie point has a position, or the cameras do not see them.
     """
-    raw = _moved(tracks.read(path, tie_points), to_cloud)
+    raw = _moved(tracks_as_list(path, tie_points), to_cloud)
     order = ImageOrder("the cameras of the tie points", np.arange(len(cameras), dtype=np.int32))
-    views = _listed(raw, (order,), "tracks")
-    return views if raw.xyz is None else fitted(views, cameras, raw.xyz, np.arange(len(views)))
-
-
-def _listed(
-    raw: RawList, orders: tuple[ImageOrder, ...], kind: Literal["tracks", "depth-maps"]
-) -> ViewList:
-    spacing = None if raw.xyz is None else spacing_m(raw.xyz)
-    spacings = _TRACK_SPACINGS if kind == "tracks" else _DENSE_SPACINGS
-    return ViewList(raw, orders, None, spacing, spacings, kind)
+    return _fitted(raw, (order,), "tracks", cameras)
 
 
 def _moved(raw: RawList, to_cloud: Transformation | None) -> RawList:
@@ -133,17 +108,14 @@ def _moved(raw: RawList, to_cloud: Transformation | None) -> RawList:
     return replace(raw, xyz=np.ascontiguousarray(to_cloud(raw.xyz), np.float64))
 
 
-def _read(path: Path) -> RawList:
-    with path.open("rb") as stream:
-        head = stream.read(4)
-    if head in _OTHERS:
-        raise InputError(
-            f"{path}: is {_OTHERS[head]}; a view list is the fused.ply.vis of COLMAP or the dense"
-            " PLY of OpenMVS."
-        )
-    if not head.startswith(b"ply"):
-        return colmap_vis.read(path)
-    beside = path.with_name(f"{path.name}.vis")
-    if not openmvs.has_lists(path) and beside.is_file():
-        return colmap_vis.read(beside)
-    return openmvs.read(path)
+def _fitted(
+    raw: RawList,
+    orders: tuple[ImageOrder, ...],
+    kind: Literal["tracks", "depth-maps"],
+    cameras: Cameras,
+) -> ViewList:
+    """Return a list whose cameras see its points, as far as it says where these are."""
+    if raw.xyz is None:
+        return ViewList(raw, orders, None, None, _SPACINGS[kind], kind)
+    views = ViewList(raw, orders, None, spacing_m(raw.xyz), _SPACINGS[kind], kind)
+    return fitted(views, cameras, raw.xyz, np.arange(len(views)))

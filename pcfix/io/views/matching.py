@@ -10,13 +10,13 @@ numbers must match, and the listed cameras must have the points in their frames,
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pcfix.errors import InputError, SettingError
-from pcfix.io.views.geometry import fitted
-from pcfix.io.views.report import ViewReport
+from pcfix.io.views.orders import entries, fitted
 from pcfix.model import Views
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from pcfix.io.views.lists import ViewList
     from pcfix.model import Cameras, FloatArray, IntArray
+
 
 _QUERIES = 250_000
 """Points looked up at a time, which bounds the memory."""
@@ -191,16 +192,169 @@ class ViewMatch:
 
     def _given(self, row: IntArray) -> Views:
         """Turn the images of the given rows into cameras, and leave out those without a pose."""
-        from pcfix.io.views.ragged import copy_posed, posed_starts
+        raw = self._views.raw
+        listed = np.flatnonzero(row >= 0)
+        point, entry = entries(raw.start, row[listed])
+        camera = self._views.orders[0].camera[raw.image[entry]].astype(np.int64)
+        posed = camera >= 0
+        counts = np.zeros(len(row), np.int64)
+        counts[listed] = np.bincount(point[posed], minlength=len(listed))
+        self.report.entries += int(posed.sum())
+        self.report.unposed_entries += int(len(posed) - posed.sum())
+        self.report.without_camera += int(np.count_nonzero(counts[listed] == 0))
+        start = np.concatenate([[0], np.cumsum(counts)])
+        weight = None if raw.weight is None else raw.weight[entry[posed]]
+        return Views(start, camera[posed], weight, self._views.kind)
 
-        raw, camera = self._views.raw, self._views.orders[0].camera
-        start, left_out = posed_starts(row, raw.start, raw.image, camera)
-        weight = np.zeros(0, np.float32) if raw.weight is None else raw.weight
-        given = np.empty(int(start[-1]), np.int64)
-        given_weight = np.empty(len(given) if weight.size else 0, np.float32)
-        copy_posed(row, raw.start, raw.image, camera, weight, given, given_weight)
-        self.report.entries += len(given)
-        self.report.unposed_entries += left_out
-        self.report.without_camera += int(np.count_nonzero((row >= 0) & (np.diff(start) == 0)))
-        known = None if raw.weight is None else given_weight
-        return Views(start, given, known, self._views.kind)
+
+_BINS = 1000
+_MANY = 0.1
+"""A share of points without a list that the user should hear of."""
+
+
+@dataclass
+class ViewReport:
+    """What was matched so far; it grows with every chunk.
+
+    Attributes
+    ----------
+    source : str
+        Kind and path of the list.
+    list_points : int
+    image_order : str
+        What the image numbers were found to mean.
+    share_seen : float or None
+        Share of listed cameras whose frame holds the point, the lowest of all chunks.
+    tolerance_m : float or None
+        Largest distance of a match by position.
+    by_row, by_position, unmatched : int
+        Points of the cloud.
+    without_camera : int
+        Matched points of whose images none has a pose.
+    entries, unposed_entries : int
+        Of the lists: cameras given out, and images without a pose that were dropped.
+    unposed : tuple of str
+        Images without a pose that a list may name.
+    weights : bool
+        Whether the list has weights.
+    notes : list of str
+    """
+
+    source: str
+    list_points: int
+    image_order: str = ""
+    share_seen: float | None = None
+    tolerance_m: float | None = None
+    by_row: int = 0
+    by_position: int = 0
+    unmatched: int = 0
+    without_camera: int = 0
+    entries: int = 0
+    unposed_entries: int = 0
+    unposed: tuple[str, ...] = ()
+    weights: bool = False
+    notes: list[str] = field(default_factory=list)
+    _histogram: IntArray = field(default_factory=lambda: np.zeros(_BINS + 1, np.int64), repr=False)
+
+    @property
+    def points(self) -> int:
+        """Points of the cloud so far."""
+        return self.by_row + self.by_position + self.unmatched
+
+    @property
+    def matched_share(self) -> float:
+        """Share of the points that have a list."""
+        return (self.by_row + self.by_position) / max(self.points, 1)
+
+    @property
+    def cameras_per_point(self) -> float:
+        """Mean over the points that have a list."""
+        return self.entries / max(self.by_row + self.by_position, 1)
+
+    def add_distances(self, distance_m: FloatArray) -> None:
+        """Count the distances of matches by position."""
+        step = (self.tolerance_m or 0.0) / _BINS
+        bins = np.ceil(distance_m / step) if step else np.zeros(len(distance_m))
+        self._histogram += np.bincount(bins.astype(np.int64).clip(0, _BINS), minlength=_BINS + 1)
+        self.by_position += len(distance_m)
+
+    def distance_m(self, share: float) -> float | None:
+        """Return the distance that this share of the matches by position do not exceed.
+
+        To a thousandth of the tolerance; None where no point was matched by position.
+        """
+        if not self.by_position or self.tolerance_m is None:
+            return None
+        enough = np.cumsum(self._histogram) >= share * self.by_position
+        return float(int(np.argmax(enough)) * self.tolerance_m / _BINS)
+
+    def check(self) -> None:
+        """Refuse a list that has nothing for the cloud.
+
+        Raises
+        ------
+        InputError
+            If no point got a camera.
+        """
+        if self.points and self.entries == 0:
+            raise InputError(
+                f"{self.source}: none of the cloud's {self.points:,} points is in the list"
+                f" ({self.list_points:,} points, {self._tolerance()}); the list is of another"
+                " cloud, or its coordinates need an offset (--cameras-offset)."
+            )
+
+    def warnings(self) -> list[str]:
+        """Return what the user should know of, as sentences."""
+        said = list(self.notes)
+        if self.unmatched > _MANY * self.points:
+            said.append(
+                f"{self.source}: {self.unmatched:,} of the cloud's {self.points:,} points are not"
+                f" in the list ({self._tolerance()})."
+            )
+        if self.share_seen is None and self.entries:
+            said.append(
+                f"{self.source}: the cameras have no frames, so nothing shows that the list counts"
+                f" its images in the order assumed ({self.image_order})."
+            )
+        if self.unposed_entries:
+            named = f", among them {', '.join(self.unposed[:3])}" if self.unposed else ""
+            said.append(
+                f"{self.source}: {self.unposed_entries:,} entries name images without a pose"
+                f"{named}; they are left out."
+            )
+        return said
+
+    def _tolerance(self) -> str:
+        return "by row" if self.tolerance_m is None else f"tolerance {self.tolerance_m:.3g} m"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        values = {k: v for k, v in vars(self).items() if not k.startswith("_") and k != "notes"}
+        return {
+            **values,
+            "unposed": list(self.unposed),
+            "cameras_per_point": self.cameras_per_point,
+            "distance_median_m": self.distance_m(0.5),
+            "distance_95_m": self.distance_m(0.95),
+        }
+
+
+_ENOUGH = 20_000
+
+
+def spacing_m(xyz: FloatArray) -> float | None:
+    """Return the median distance of a point from its nearest neighbour, metres.
+
+    From a box about the point in the middle of the file that holds some ten thousand points; None
+    for fewer than two points.
+    """
+    from scipy.spatial import cKDTree
+
+    if len(xyz) < 2:
+        return None
+    centre = xyz[len(xyz) // 2]
+    away = np.maximum(np.abs(xyz[:, 0] - centre[0]), np.abs(xyz[:, 1] - centre[1]))
+    near = min(_ENOUGH, len(xyz) - 1)
+    box = xyz[away <= np.partition(away, near)[near]]
+    distance = np.asarray(cKDTree(box).query(box[:_ENOUGH], k=2)[0])
+    return float(np.median(distance[:, 1]))
