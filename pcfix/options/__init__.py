@@ -1,0 +1,35 @@
+"""Every option of every command, said once; the doors and their documentation are made from it.
+
+`pcfix.options.declare` says how; the other files are the tables: what several commands share, a
+correction, what follows it, what goes before it, and made-up scenes.
+"""
+
+from pcfix.options.settings import (
+    DEFAULT_REFRACTIVE_INDEX,
+    LEVEL_M,
+    CameraSet,
+    Dimensions,
+    ErrorBudget,
+    LabelSettings,
+    MatcherKind,
+    Method,
+    Occlusion,
+    Settings,
+    Uncorrected,
+    ViewsAre,
+)
+
+__all__ = [
+    "DEFAULT_REFRACTIVE_INDEX",
+    "LEVEL_M",
+    "CameraSet",
+    "Dimensions",
+    "ErrorBudget",
+    "LabelSettings",
+    "MatcherKind",
+    "Method",
+    "Occlusion",
+    "Settings",
+    "Uncorrected",
+    "ViewsAre",
+]

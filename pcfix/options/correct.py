@@ -1,0 +1,192 @@
+"""The options of a correction and of a labelling."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from pcfix.errors import SettingError
+from pcfix.options.declare import OptionSet, at_least, not_negative, option, within
+from pcfix.options.shared import (
+    BUDGET,
+    METHOD,
+    OUTPUT,
+    WATER,
+    IndexOptions,
+    InputOptions,
+    JobOptions,
+    NeededOptions,
+    SubmergedOptions,
+    SummaryOption,
+    WaterOptions,
+)
+
+Uncorrected = Literal["withhold", "keep", "drop"]
+Dimensions = Literal["all", "minimal", "none"]
+Method = Literal[
+    "snell", "consistent", "shan", "butler", "murase", "dietrich", "factor", "regression"
+]
+CameraSet = Literal["auto", "mvs", "all"]
+Occlusion = Literal["auto", "on", "off"]
+MatcherKind = Literal["depth-maps", "pairs"]
+
+LEVEL_M = 0.02
+"""Standard deviation of a water level that nothing else is known of."""
+
+_SIGMA = not_negative("give a standard deviation")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodOptions(IndexOptions):
+    """Which rays count, and how the true point follows from the apparent one."""
+
+    panel = METHOD
+
+    method: Method = option("snell", "How the true point follows from the apparent one.")
+    camera_set: CameraSet = option(
+        "auto",
+        "Without --views: every camera whose frame holds the point, or a model of dense matching;"
+        " auto: the model with --method consistent, else all.",
+    )
+    matcher: MatcherKind = option(
+        "depth-maps",
+        "What that model makes a point of: fused depth maps (OpenMVS, COLMAP), or the median of"
+        " stereo pairs (MicMac, SURE).",
+    )
+    max_angle: float | None = option(
+        None,
+        "Use rays up to this incidence angle in air, from the surface normal.",
+        unit="deg",
+        rule=within(0.0, 90.0, "give degrees from the surface normal", above=True),
+        default_is="no limit; 80 without angles",
+        old=("max_angle_deg",),
+    )
+    max_cameras: int | None = option(
+        None,
+        "Use so many rays a point at most, the steepest.",
+        rule=at_least(2, "an intersection needs two rays"),
+        default_is="no limit",
+    )
+    occlusion: Occlusion = option(
+        "auto",
+        "Leave out cameras to which the cloud itself hides the point; auto: where there are"
+        " obliques.",
+    )
+    depth_factor: float | None = option(
+        None,
+        "With --method factor: true by apparent depth.",
+        rule=within(1.0, 3.0, "give true by apparent depth"),
+        default_is="the refractive index",
+    )
+    least_r2: float = option(
+        0.5, "With --method regression: a fit with a lower r2 is refused.", rule=within(0, 1, "")
+    )
+    index_from: str = ""
+    """Which water the index is of, where it was not given as a number; not an option."""
+
+    def check(self) -> None:
+        """Check what options say together."""
+        super().check()
+        if self.depth_factor is not None and self.method != "factor":
+            raise SettingError("depth-factor is of no use without --method factor; give both.")
+
+    @property
+    def models_matcher(self) -> bool:
+        """Whether a model of dense matching stands in for a list of views."""
+        automatic = self.camera_set == "auto" and self.method == "consistent"
+        return automatic or self.camera_set == "mvs"
+
+
+@dataclass(frozen=True, kw_only=True)
+class BudgetOptions(OptionSet):
+    """Standard deviations of what goes into a correction; see `pcfix.refract.uncertainty`."""
+
+    panel = BUDGET
+
+    sigma_image: float = option(
+        0.5, "Standard deviation of an image coordinate.", unit="px", rule=_SIGMA
+    )
+    sigma_level: float | None = option(
+        None,
+        "Of the water level.",
+        unit="m",
+        rule=_SIGMA,
+        default_is=f"what its fit says, else {LEVEL_M:g}",
+    )
+    sigma_tilt: float = option(
+        0.0, "Of the slope of the water surface, about each axis.", unit="deg", rule=_SIGMA
+    )
+    sigma_index: float = option(0.002, "Of the refractive index.", rule=_SIGMA)
+    sigma_waves: float = option(
+        0.0, "Of the slope of the waves, from ray to ray.", unit="deg", rule=_SIGMA
+    )
+    sigma_centre: float = option(0.0, "Of a projection centre, each axis.", unit="m", rule=_SIGMA)
+    sigma_attitude: float = option(
+        0.0, "Of the attitude of an image, about each axis.", unit="deg", rule=_SIGMA
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefractionOptions(BudgetOptions, MethodOptions):
+    """What the correction of points goes by; `pcfix.correct_points` takes these."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultOptions(OptionSet):
+    """What is written of a correction."""
+
+    panel = OUTPUT
+
+    uncorrected: Uncorrected = option(
+        "withhold", "Submerged points with fewer than two usable rays: flagged, kept or left out."
+    )
+    dimensions: Dimensions = option("all", "Extra dimensions; 'pcfix restore' needs all.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScienceOptions(RefractionOptions, ResultOptions):
+    """What the values of a corrected file depend on, beside its inputs; the file records it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrectOptions(JobOptions, SummaryOption, ScienceOptions, SubmergedOptions, InputOptions):
+    """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelRules(SubmergedOptions):
+    """Which points count as submerged, beyond lying below the surface; see `pcfix.label`."""
+
+    panel = WATER
+
+    band: float = option(
+        0.0,
+        "Points at most so far from the surface, above or below, become class 41.",
+        unit="m",
+        rule=not_negative("give metres from the water surface, or 0 for none"),
+        default_is="no class 41",
+        old=("band_m",),
+    )
+    dead_band: float = option(
+        0.0,
+        "Points at most so far from the surface take the label of their surroundings.",
+        unit="m",
+        rule=not_negative("give metres from the water surface, or 0 for none"),
+        default_is="none",
+        old=("dead_band_m",),
+    )
+    reset: bool = option(False, "Points that come as class 40 or 41 and are neither become 1.")
+
+    def check(self) -> None:
+        """Check what options say together."""
+        super().check()
+        if 0.0 < self.dead_band <= self.band:
+            raise SettingError(
+                f"dead-band {self.dead_band:g} does not reach beyond band {self.band:g}, in"
+                " which all points are class 41: give a wider dead band, or 0 for none."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelOptions(JobOptions, SummaryOption, LabelRules, WaterOptions, NeededOptions):
+    """The options of ``pcfix label``."""

@@ -1,0 +1,351 @@
+"""How an option is declared: one entry, from which every door and its documentation is made.
+
+An option is a field of a frozen dataclass, `option(default, help, ...)`; the classes are panels of
+the command line's help, and what a command takes is a class that inherits some of them. Names are
+the same everywhere: ``max_angle`` in Python and JSON is ``--max-angle`` on the command line.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import os
+import types
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from functools import cache
+from inspect import get_annotations
+from typing import (
+    Any,
+    ClassVar,
+    Literal,
+    NamedTuple,
+    TypeAlias,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+from pcfix.errors import PcfixWarning, SettingError
+
+File: TypeAlias = str | os.PathLike[str]
+Rule: TypeAlias = Callable[[str, Any], str | None]
+"""Takes an option's name and value; returns what is wrong as a sentence, or None."""
+
+Set = TypeVar("Set", bound="OptionSet")
+
+
+class Declared(NamedTuple):
+    """What is declared of an option beside its name, type and default.
+
+    Attributes
+    ----------
+    help : str
+        One sentence, for the help and the tables.
+    unit : str
+        Of the value, as it is written after a number: m, deg, px.
+    rule : Rule or None
+    default_is : str
+        The default in words, where it is not the value.
+    needed : bool
+        Whether the command line and PDAL ask for it.
+    parse : callable or None
+        From the text of the command line or of JSON to the value.
+    metavar : str
+        What stands for the value in the help.
+    old : tuple of str
+        Names that it had; they work, with a warning.
+    """
+
+    help: str
+    unit: str = ""
+    rule: Rule | None = None
+    default_is: str = ""
+    needed: bool = False
+    parse: Callable[[str, str], Any] | None = None
+    metavar: str = ""
+    old: tuple[str, ...] = ()
+
+
+def option(default: Any, help: str, **more: Any) -> Any:
+    """Declare an option; for the names of `more` see `Declared`."""
+    return field(default=default, metadata={"help": help, "declared": Declared(help, **more)})
+
+
+class Option(NamedTuple):
+    """An option of a class: its name, type, default and panel, and what is `Declared`."""
+
+    name: str
+    type: Any
+    default: Any
+    panel: str
+    declared: Declared
+
+    @property
+    def flag(self) -> str:
+        """Its name on the command line."""
+        return "--" + self.name.replace("_", "-")
+
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """The words that it may be; empty where it is free."""
+        return next((get_args(kind) for kind in self.kinds if get_origin(kind) is Literal), ())
+
+    @property
+    def kinds(self) -> tuple[Any, ...]:
+        """The types that it may have, without None."""
+        union = get_origin(self.type) in (Union, types.UnionType)
+        kinds = get_args(self.type) if union else (self.type,)
+        return tuple(kind for kind in kinds if kind is not type(None))
+
+    def checked(self, value: Any) -> Any:
+        """Return a value as its type.
+
+        Raises
+        ------
+        SettingError
+            If it is another type, not among the choices, or outside the rule.
+        """
+        if isinstance(value, str) and self.declared.parse is not None:
+            value = self.declared.parse(self.flag[2:], value)
+        if value is None and (self.default is None or type(None) in get_args(self.type)):
+            return None
+        if self.choices and value not in self.choices:
+            raise SettingError(
+                f"{self.flag[2:]} '{value}' is not one of {', '.join(self.choices)}."
+            )
+        value = _converted(self, value)
+        wrong = None if self.declared.rule is None else self.declared.rule(self.flag[2:], value)
+        if wrong is not None:
+            raise SettingError(wrong)
+        return value
+
+
+def _converted(one: Option, value: Any) -> Any:
+    """Return numbers as Python's, and sequences as tuples."""
+    kinds = one.kinds
+    if isinstance(value, list):
+        return tuple(value)
+    if bool in kinds or isinstance(value, str | tuple | os.PathLike):
+        if isinstance(value, str) and kinds in ((float,), (int,)):
+            raise SettingError(f"{one.flag[2:]} {value!r} must be a number.")
+        return value
+    if kinds == (int,):
+        if value != value or float(value) != math.floor(value):
+            raise SettingError(f"{one.flag[2:]} {value} must be a whole number.")
+        return int(value)
+    return float(value) if float in kinds and hasattr(value, "__float__") else value
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptionSet:
+    """The base of all classes of options: every value is checked against its rule."""
+
+    panel: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        for one in options_of(type(self)):
+            object.__setattr__(self, one.name, one.checked(getattr(self, one.name)))
+        self.check()
+
+    def check(self) -> None:
+        """Check what options say together."""
+
+    def part(self, kind: type[Set]) -> Set:
+        """Return those options that another class has too."""
+        return kind(
+            **{
+                one.name: getattr(self, one.name)
+                for one in options_of(kind)
+                if hasattr(self, one.name)
+            }
+        )
+
+    def plain(self) -> dict[str, Any]:
+        """Return what was given, other than the defaults, as JSON holds it."""
+        return {
+            one.name: _plain(getattr(self, one.name))
+            for one in options_of(type(self))
+            if getattr(self, one.name) != one.default
+        }
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all values, as JSON holds them."""
+        return {name: _plain(value) for name, value in asdict(self).items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return list(value) if isinstance(value, tuple) else value
+
+
+@cache
+def options_of(kind: type) -> tuple[Option, ...]:
+    """Return the options of a class, in the order of its help."""
+    hints = get_type_hints(kind)
+    panels = {
+        name: base.__dict__.get("panel", "")
+        for base in reversed(kind.__mro__)
+        for name in get_annotations(base)
+    }
+    return tuple(
+        Option(one.name, hints[one.name], one.default, panels[one.name], one.metadata["declared"])
+        for one in fields(kind)
+        if "declared" in one.metadata
+    )
+
+
+def taken(
+    kind: type[Set], given: Set | None, keywords: Mapping[str, Any], where: str, **defaults: Any
+) -> Set:
+    """Return the options that a Python function is called with.
+
+    Parameters
+    ----------
+    kind : type
+        The class of its options.
+    given : OptionSet or None
+        The argument ``options``.
+    keywords : mapping
+        The others, by name; names of old work with a warning.
+    where : str
+        Whose options they are, for messages.
+    **defaults
+        Other defaults than those of the class.
+
+    Raises
+    ------
+    SettingError
+        If a name is unknown, or options are given both ways.
+    """
+    if given is not None and keywords:
+        raise SettingError(
+            f"{where}: give options=... or {next(iter(keywords))}=..., not both;"
+            " dataclasses.replace changes single options."
+        )
+    if given is not None:
+        return given if isinstance(given, kind) else given.part(kind)
+    return kind(**{**defaults, **named(kind, keywords, where)})
+
+
+def named(kind: type, given: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return values under the names of today, and warn of older ones.
+
+    Raises
+    ------
+    SettingError
+        If a name is unknown; the message names the nearest known one.
+    """
+    known = {one.name for one in options_of(kind)}
+    renamed = {old: one.name for one in options_of(kind) for old in one.declared.old}
+    found: dict[str, Any] = {}
+    for name, value in _without_budget(given, known).items():
+        if name in known:
+            found[name] = value
+        elif name in renamed:
+            warnings.warn(
+                f"{where}: {name} is called {renamed[name]} now; the old name goes with the next"
+                " version.",
+                PcfixWarning,
+                stacklevel=4,
+            )
+            found[renamed[name]] = value
+        else:
+            raise SettingError(_unknown(name, known, where))
+    return found
+
+
+def _unknown(name: str, known: set[str], where: str) -> str:
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    mean = f"; did you mean {near[0]}?" if near else ";"
+    return f"{where}: there is no option '{name}'{mean} The options are {', '.join(sorted(known))}."
+
+
+def _without_budget(given: Mapping[str, Any], known: set[str]) -> dict[str, Any]:
+    """Return options with those of an old record's ``errors`` by their own names."""
+    if "errors" not in given or "sigma_image" not in known:
+        return dict(given)
+    rest = {name: value for name, value in given.items() if name != "errors"}
+    budget: dict[str, Any] = given["errors"] or {}
+    return {**rest, **{f"sigma_{name.rpartition('_')[0] or name}": budget[name] for name in budget}}
+
+
+def within(low: float, high: float, remedy: str, *, name: str = "", above: bool = False) -> Rule:
+    """Return the rule of a range, without its lower end where `above`."""
+
+    def rule(option: str, value: Any) -> str | None:
+        if isinstance(value, str):
+            return None
+        if (low < value if above else low <= value) and value <= high:
+            return None
+        ends = f"{low:.1f} to {high:.1f}" if name else f"{low:g} to {high:g}"
+        return f"{name or option} {value:g} is outside {ends}{remedy and ': ' + remedy}."
+
+    return rule
+
+
+def not_negative(remedy: str) -> Rule:
+    """Return the rule of what is finite and at least 0."""
+
+    def rule(option: str, value: Any) -> str | None:
+        if math.isfinite(value) and value >= 0.0:
+            return None
+        return f"{option} {value:g} must not be negative: {remedy}."
+
+    return rule
+
+
+def at_least(low: float, remedy: str) -> Rule:
+    """Return the rule of a lower end."""
+
+    def rule(option: str, value: Any) -> str | None:
+        return f"{option} {value:g} is less than {low:g}: {remedy}." if value < low else None
+
+    return rule
+
+
+def must_be(low: float, high: float, remedy: str, *, whole: bool = False) -> Rule:
+    """Return the rule of finite numbers from low to high; a low of zero is itself not allowed."""
+    least = "above 0" if low == 0.0 else f"at least {low:g}"
+    most = f" and at most {high:g}" if math.isfinite(high) else ""
+    words = f"{'a whole number ' if whole else ''}{least}{most}"
+
+    def rule(option: str, value: Any) -> str | None:
+        number = math.nan if isinstance(value, str) else float(value)
+        integer = not whole or number == math.floor(number)
+        above = number > low if low == 0.0 else number >= low
+        if math.isfinite(number) and integer and above and number <= high:
+            return None
+        return f"{option} {value} must be {words}: {remedy}."
+
+    return rule
+
+
+def positive(words: str) -> Rule:
+    """Return the rule of what is above zero and finite; `words` end the sentence."""
+
+    def rule(option: str, value: Any) -> str | None:
+        return None if 0.0 < value < math.inf else f"{option} {value:g} {words}"
+
+    return rule
+
+
+def one_or_more(kind: type, example: str) -> Callable[[str, str], tuple[Any, ...]]:
+    """Return the parser of words or numbers with commas between."""
+
+    def parse(option: str, text: str) -> tuple[Any, ...]:
+        try:
+            return tuple(kind(word.strip()) for word in text.split(",") if word.strip())
+        except ValueError:
+            raise SettingError(
+                f"{option} '{text}' must be {_KINDS[kind]} with commas between, as {example}."
+            ) from None
+
+    return parse
+
+
+_KINDS = {int: "whole numbers", float: "numbers", str: "words"}

@@ -1,0 +1,306 @@
+"""The options of what follows a correction: clean, dsm and compare."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from pcfix.errors import SettingError
+from pcfix.options.declare import File, OptionSet, at_least, must_be, option, positive
+from pcfix.options.shared import OUTPUT, JobOptions, OverwriteOption, SummaryOption
+
+LEAST_NEIGHBOURS, MOST_NEIGHBOURS = 6, 500
+MAX_HOLE_CELLS = 1000
+MIN_RESOLUTION_M = 1e-4
+LEAST_PLANE_POINTS, PLANE_POINTS = 6, 8
+"""Reference points of each plane of a comparison, unless told otherwise."""
+
+DsmMethod = Literal["mean", "median", "min", "max", "idw", "tin"]
+SurfaceChoice = Literal["all", "bed"]
+TESTS, RASTER, FIGURES = "Tests", "Raster", "Figures"
+
+METRES = "is not positive; give metres."
+
+
+@dataclass(frozen=True, kw_only=True)
+class CleanRules(OptionSet):
+    """Thresholds of the tests; None leaves a test out.
+
+    The fences are those of Tukey (Exploratory Data Analysis, 1977): three ranges are 4.7 standard
+    deviations of a normal distribution. Up to a quarter of the neighbours may be noise on one
+    side. On a slope, at a wall or on a rock that holds a quarter of the neighbours the range is
+    as large as the terrain is high, so that nothing is taken for noise there. The mean distance
+    to the neighbours finds, in a cloud of even spacing, also its edges and corners.
+    """
+
+    panel = TESTS
+
+    statistical: bool = option(True, "Test the mean distance to the nearest points in space.")
+    neighbours: int = option(
+        20,
+        "Nearest points of the statistical test, the point itself among them.",
+        rule=must_be(LEAST_NEIGHBOURS, MOST_NEIGHBOURS, "20 is usual", whole=True),
+    )
+    deviations: float | None = option(
+        4.0,
+        "Noise if the mean distance to the neighbours exceeds that of all points by so many"
+        " standard deviations.",
+        rule=must_be(0.0, math.inf, "4 finds gross outliers, 2 also the edges of sparse parts"),
+    )
+    radius: float | None = option(
+        None,
+        "Noise if fewer than --radius-neighbours others are nearer.",
+        unit="m",
+        rule=must_be(0.0, math.inf, "ten times the spacing of the points is usual"),
+        default_is="no such test",
+        old=("radius_m",),
+    )
+    radius_neighbours: int = option(
+        3, "See --radius.", rule=must_be(1, MOST_NEIGHBOURS, "3 is usual", whole=True)
+    )
+    weak: bool = option(True, "Test rays, ray miss and incidence of corrected points.")
+    min_rays: int | None = option(
+        3,
+        "Noise if corrected from fewer rays.",
+        rule=must_be(
+            2, math.inf, "an intersection needs two rays, and a third to check it", whole=True
+        ),
+    )
+    max_ray_miss: float | None = option(
+        0.5,
+        "Noise if the rays miss by more (RayMiss).",
+        unit="m",
+        rule=must_be(0.0, math.inf, "a few times the ground sampling distance or more"),
+        old=("max_ray_miss_m",),
+    )
+    max_incidence: float | None = option(
+        75.0,
+        "Noise if a ray had a larger incidence angle.",
+        unit="deg",
+        rule=must_be(0.0, 90.0, "degrees from the normal of the water surface"),
+        old=("max_incidence_deg",),
+    )
+    bed_neighbours: int = option(
+        32,
+        "Nearest submerged points in plan that show where the bed is.",
+        rule=must_be(LEAST_NEIGHBOURS, MOST_NEIGHBOURS, "32 is usual", whole=True),
+    )
+    fences: float = option(
+        3.0,
+        "Noise if beyond the middle half of their heights by so many times its range, and by more"
+        " than --below or --floating.",
+        rule=must_be(0.0, math.inf, "3 is usual"),
+    )
+    below: float | None = option(
+        0.3,
+        "Least height under the bed of noise.",
+        unit="m",
+        rule=must_be(0.0, math.inf, "metres, more than the noise of the bed"),
+        old=("below_m",),
+    )
+    floating: float | None = option(
+        0.5,
+        "Least height over the bed of noise.",
+        unit="m",
+        rule=must_be(0.0, math.inf, "metres, more than the height of plants and stones"),
+        old=("floating_m",),
+    )
+
+    def check(self) -> None:
+        """Leave out what is not asked for; something must be left."""
+        super().check()
+        if not self.statistical:
+            object.__setattr__(self, "deviations", None)
+        if not self.weak:
+            for name in ("min_rays", "max_ray_miss", "max_incidence"):
+                object.__setattr__(self, name, None)
+        limits = (self.min_rays, self.max_ray_miss, self.max_incidence)
+        object.__setattr__(self, "statistical", self.deviations is not None)
+        object.__setattr__(self, "weak", any(limit is not None for limit in limits))
+        if not (self.statistical or self.radius is not None or self.weak or self.below_or_floating):
+            raise SettingError("No test is left to run: leave at least one of them on.")
+
+    @property
+    def below_or_floating(self) -> bool:
+        """Whether any test against the bed runs."""
+        return self.below is not None or self.floating is not None
+
+    @property
+    def nearest(self) -> int:
+        """How many neighbours in space are needed, the point itself among them; 0 for none."""
+        statistical = self.neighbours if self.statistical else 0
+        return max(statistical, 0 if self.radius is None else self.radius_neighbours + 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CleanOptions(JobOptions, SummaryOption, CleanRules):
+    """The options of ``pcfix clean``."""
+
+    panel = OUTPUT
+
+    water: Any = option(
+        None,
+        "As of 'pcfix correct': what lies below it is tested against the bed.",
+        default_is="the points that pcfix corrected",
+        metavar="SPEC",
+    )
+    drop: bool = option(False, "Leave noise out; else class 7 and the withheld flag.")
+
+
+def _resolution(option: str, value: Any) -> str | None:
+    if math.isfinite(value) and value >= MIN_RESOLUTION_M:
+        return None
+    return (
+        f"The resolution is {value:g} m; it must be a positive number of metres, at least"
+        f" {MIN_RESOLUTION_M:g}."
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DsmRules(OptionSet):
+    """How a cloud becomes a raster."""
+
+    panel = RASTER
+
+    resolution: float = option(
+        None, "Side of a cell.", unit="m", needed=True, rule=_resolution, old=("resolution_m",)
+    )
+    method: DsmMethod = option("mean", "How a cell gets its height.")
+    surface: SurfaceChoice = option(
+        "all", "Land and bed without noise, or only the bed (class 40)."
+    )
+    fill: float | None = option(
+        None,
+        "Fill holes up to so many metres wide; they get count 0.",
+        unit="m",
+        old=("fill_m",),
+    )
+    azimuth: float = option(
+        315.0,
+        "Sun of the hillshade, clockwise from north.",
+        unit="deg",
+        old=("azimuth_deg",),
+    )
+    altitude: float = option(
+        45.0, "Sun of the hillshade, above the horizon.", unit="deg", old=("altitude_deg",)
+    )
+
+    def check(self) -> None:
+        """Check the values."""
+        super().check()
+        if not math.isfinite(self.azimuth):
+            raise SettingError(f"The azimuth is {self.azimuth:g}; it must be in degrees.")
+        if not 0.0 < self.altitude <= 90.0:
+            raise SettingError(
+                f"The altitude of the sun is {self.altitude:g} degrees; it must be above 0 and"
+                " at most 90."
+            )
+        fill, side = self.fill, self.resolution
+        if fill is not None and not (math.isfinite(fill) and fill > 0.0):
+            raise SettingError(f"The width of holes to fill is {fill:g} m; it must be positive.")
+        if fill is not None and fill > MAX_HOLE_CELLS * side:
+            raise SettingError(
+                f"Holes up to {fill:g} m are more than {MAX_HOLE_CELLS:,} cells of {side:g} m"
+                f" wide; fill up to {MAX_HOLE_CELLS * side:g} m, or take a coarser resolution."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DsmOptions(OverwriteOption, SummaryOption, DsmRules):
+    """The options of ``pcfix dsm``."""
+
+    panel = OUTPUT
+
+    hillshade: File | None = option(None, "Write a hillshade there (.tif).")
+    cog: bool = option(False, "Write cloud optimised GeoTIFF.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class M3c2Option(OptionSet):
+    """Whether M3C2 is wanted."""
+
+    panel = FIGURES
+
+    m3c2: bool = option(False, "Compare by M3C2 too, with py4dgeo: the extra m3c2.")
+
+
+def _not_negative_count(option: str, value: Any) -> str | None:
+    return f"{option} {value} is negative; give how many." if value < 0 else None
+
+
+def _bin_width(option: str, value: Any) -> str | None:
+    if math.isfinite(value) and value > 0.0:
+        return None
+    return f"bin width {value:g} is not positive; give metres, such as 1."
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareRules(M3c2Option):
+    """What is measured of two clouds."""
+
+    panel = FIGURES
+
+    submerged: bool = option(False, "Only points of class 40, or below --water.")
+    c2c_only: bool = option(False, "Distances to the nearest point, nothing signed.")
+    neighbours: int = option(
+        PLANE_POINTS,
+        "Reference points of each fitted plane.",
+        rule=at_least(
+            LEAST_PLANE_POINTS, "a plane through so few points follows their noise; 8 is usual"
+        ),
+    )
+    bin_width: float = option(
+        1.0, "Of the table by depth.", unit="m", rule=_bin_width, old=("bin_width_m",)
+    )
+    shore_bin_width: float = option(
+        10.0,
+        "Of the table by distance from shore.",
+        unit="m",
+        rule=_bin_width,
+        old=("shore_bin_width_m",),
+    )
+    max_gap: float | None = option(
+        None,
+        "How far outside the reference a point counts.",
+        unit="m",
+        rule=positive(METRES),
+        default_is="5 point spacings, at least 1",
+        old=("max_gap_m",),
+    )
+    sections: int = option(
+        0, "So many automatic cross-sections, down the slope.", rule=_not_negative_count
+    )
+    corridor: float = option(
+        1.0,
+        "Half-width of a cross-section.",
+        unit="m",
+        rule=positive(METRES),
+        old=("corridor_m",),
+    )
+
+    @property
+    def vertical(self) -> bool:
+        """Whether signed differences are wanted, and all that rests on them."""
+        return not self.c2c_only
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareOptions(OverwriteOption, SummaryOption, CompareRules):
+    """The options of ``pcfix compare``."""
+
+    panel = OUTPUT
+
+    out_dir: File | None = option(None, "Folder for compare.json, depth tables and sections (CSV).")
+    water: Any = option(
+        None,
+        "As of 'pcfix correct'.",
+        default_is="what the cloud says",
+        metavar="SPEC",
+    )
+    section: tuple[Any, ...] = option(
+        (),
+        "A cross-section x1,y1,x2,y2; may be repeated.",
+        metavar="X,Y,X,Y",
+        old=("section_lines",),
+    )
