@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from pcfix.adjust.normal import residuals
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.result import Adjusted, ControlRow, Source
 from pcfix.adjust.solve import (
-    CLOSE,
     LogRow,
     Problem,
     Solution,
@@ -35,15 +34,12 @@ if TYPE_CHECKING:
 
     Progress = Callable[[LogRow], None]
 
-Engine = Literal["direct", "colmap"]
-
 ROUGHLY = 1e-4
 """Gain of a step, relative, below which the first, robust rounds end."""
 
 OUTLIER_SIGMAS = 4.0
 """Residuals longer than this many standard deviations are left out: three good ones in 10,000."""
 
-SCALE_SIGMAS = 2.0
 LEAST_SHARE = 0.5
 """Of the observations that fit, else nothing was found."""
 
@@ -67,30 +63,11 @@ class Rounds:
         Whether to look for them.
     drop_weak : bool
         Whether lens parameters that the block does not determine are left as they were.
-    engine : {"direct", "colmap"}
-        `pcfix.adjust.solve` or `pcfix.adjust.colmap_engine`.
     """
 
     sigma_px: float | None = None
     outliers: bool = True
     drop_weak: bool = True
-    engine: Engine = "direct"
-
-    def solve(
-        self,
-        problem: Problem,
-        now: Solution,
-        robust: Robust,
-        number: int,
-        progress: Progress | None,
-        close: float = CLOSE,
-    ) -> Solution:
-        """Return the solution of one round by the engine."""
-        if self.engine == "direct":
-            return solve(problem, now, robust, SCALE_SIGMAS, number, progress, close)
-        from pcfix.adjust.colmap_engine import solve_with_colmap
-
-        return solve_with_colmap(problem, now, robust, SCALE_SIGMAS, number, progress)
 
 
 def adjust_ties(
@@ -119,7 +96,7 @@ def adjust_ties(
     problem, now = prepare(block, unknowns)
     _check_sight(problem, now)
     problem, now = _cleaned(problem, now, rounds, progress)
-    now = rounds.solve(problem, now, "squares", LAST_ROUND, progress)
+    now = solve(problem, now, "squares", number=LAST_ROUND, progress=progress)
     precision = precision_of(problem, now, sigma0_of(problem, now))
     weak = weak_lens_parameters(problem, precision) if rounds.drop_weak else []
     notes = []
@@ -128,9 +105,9 @@ def adjust_ties(
             f"the block does not determine {', '.join(weak)} of the lens; left as they were."
         )
         problem, start = _with_less_lens(problem, now, weak)
-        now = rounds.solve(problem, start, "squares", LAST_ROUND + 1, progress)
+        now = solve(problem, start, "squares", number=LAST_ROUND + 1, progress=progress)
         precision = precision_of(problem, now, sigma0_of(problem, now))
-    return adjusted_of(problem, now, precision, notes, "tie points", rounds.engine)
+    return adjusted_of(problem, now, precision, notes, "tie points", "direct")
 
 
 def _cleaned(
@@ -139,14 +116,14 @@ def _cleaned(
     """Return the problem with the noise of its tie points estimated and outliers left out."""
     estimate = rounds.sigma_px is None
     if rounds.outliers or estimate:
-        now = rounds.solve(problem, now, "huber", 1, progress, ROUGHLY)
+        now = solve(problem, now, "huber", number=1, progress=progress, close=ROUGHLY)
     if estimate:
         problem = with_sigma(problem, noise_px(problem, now))
     if not rounds.outliers:
         return problem, now
     for number in range(OUTLIER_ROUNDS):
         robust: Robust = "cauchy" if number == 0 else "squares"
-        now = rounds.solve(problem, now, robust, 2 + number, progress, ROUGHLY)
+        now = solve(problem, now, robust, number=2 + number, progress=progress, close=ROUGHLY)
         problem, dropped = without_outliers(problem, now)
         _check_share(problem)
         if estimate:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
@@ -20,6 +21,7 @@ from pcfix.cli.words import (
     ViewKinds,
     WaterUnlessPort,
 )
+from pcfix.errors import PcfixWarning, SettingError
 from pcfix.options import DEFAULT_REFRACTIVE_INDEX
 
 if TYPE_CHECKING:
@@ -49,13 +51,6 @@ class TiesWords(str, Enum):  # noqa: UP042
     auto = "auto"
     measured = "measured"
     cloud = "cloud"
-
-
-class Engines(str, Enum):  # noqa: UP042
-    """What solves."""
-
-    direct = "direct"
-    colmap = "colmap"
 
 
 Model = Annotated[
@@ -157,9 +152,7 @@ class AdjustWords(WaterFitWords, CameraWords):
     outliers: Annotated[
         bool, typer.Option("--outliers/--no-outliers", help="Look for outliers and leave them out.")
     ] = True
-    engine: Annotated[
-        Engines, typer.Option(help="colmap: pycolmap's adjustment in rounds, the extra adjust.")
-    ] = Engines.direct
+    engine: Annotated[str | None, typer.Option(hidden=True)] = None
     views: Annotated[
         Path | None, typer.Option(help="View list of --cloud, as of 'pcfix correct'.")
     ] = None
@@ -179,6 +172,7 @@ class AdjustWords(WaterFitWords, CameraWords):
         """Return them as `pcfix.adjust_cameras` takes them."""
         from pcfix.water.index import index_words
 
+        _check_engine(self.engine)
         lens = None if self.lens_unknowns is None else _words(self.lens_unknowns)
         return {
             **super().keywords(),
@@ -197,12 +191,27 @@ class AdjustWords(WaterFitWords, CameraWords):
             "gcps_crs": self.gcps_crs,
             "sigma_px": self.sigma_image,
             "outliers": self.outliers,
-            "engine": self.engine.value,
             "views": self.views,
             "views_are": self.views_are.value,
             "water_mask": self.water_mask,
             "refractive_index": index_words(self.index, None, None, None),
         }
+
+
+def _check_engine(engine: str | None) -> None:
+    """Warn of an option that says nothing any more, or refuse an engine that is gone."""
+    if engine is None:
+        return
+    if engine not in ("direct", "pcfix"):
+        raise SettingError(
+            f"engine '{engine}': pcfix 0.1.0 was the last version with COLMAP's engine; leave"
+            " --engine out, as there is one engine only."
+        )
+    warnings.warn(
+        "--engine is of no use any more, as there is one engine only; leave it out.",
+        PcfixWarning,
+        stacklevel=2,
+    )
 
 
 def _words(text: str | None) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ from pcfix.adjust.gather import (
     with_places,
 )
 from pcfix.adjust.mend import Candidate, mend
-from pcfix.adjust.rounds import Engine, Rounds, adjust_ties, check_datum, default_lens
+from pcfix.adjust.rounds import Rounds, adjust_ties, check_datum, default_lens
 from pcfix.adjust.separability import strong_correlations, undetermined
 from pcfix.adjust.state import CODES
 from pcfix.errors import GeometryError, InputError, SettingError
@@ -95,7 +95,6 @@ class AdjustSettings:
     sigma_px : float or None
         Of measured tie points; None: from their residuals.
     outliers : bool
-    engine : {"direct", "colmap"}
     """
 
     refractive_index: float | str = 1.34
@@ -111,7 +110,6 @@ class AdjustSettings:
     gnss_sigma_m: float | None = None
     sigma_px: float | None = None
     outliers: bool = True
-    engine: Engine = "direct"
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -336,7 +334,7 @@ class AdjustJob:
         check_datum(block, unknowns, self.no_gnss)
         self._check_wet(block.xyz[: len(ties.xyz)])
         block = restricted(block, self._kept(block))
-        rounds = Rounds(how.sigma_px, how.outliers, how.lens_unknowns is None, how.engine)
+        rounds = Rounds(how.sigma_px, how.outliers, how.lens_unknowns is None)
         found = adjust_ties(block, unknowns, rounds, progress)
         self._check_dry(found)
         if found.precision is None:
@@ -392,8 +390,6 @@ class AdjustJob:
         return kept
 
     def _by_cloud(self, progress: Callable[[LogRow], None] | None) -> Adjusted:
-        if self.how.engine == "colmap":
-            raise SettingError("the engine colmap needs measured tie points; use --engine direct.")
         xyz, listed = self._sample()
         candidates = []
         guesses = {"all images in frame": in_frame(xyz, self.old)}

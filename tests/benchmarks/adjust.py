@@ -1,4 +1,4 @@
-"""How long an adjustment takes, and where it ends, by both engines.
+"""How long an adjustment takes, and where it ends.
 
 Makes a block of nadir images in strips, four fifths of forward and three of side overlap, over
 land and a bed under water, with points in six to ten images, and adjusts it from poses that are
@@ -6,7 +6,7 @@ off. Each case is a process of its own, so that its peak memory is its own. With
 the rendered block whose poses were fitted to refracted tie points too.
 
     python tests/benchmarks/adjust.py [--images 300] [--points 25000 50000 100000]
-                                      [--engines direct colmap] [--loss squares] [--rendered]
+                                      [--loss squares] [--rendered]
 """
 
 import argparse
@@ -24,11 +24,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pcfix.adjust.block import Block, Unknowns
-from pcfix.adjust.colmap_engine import solve_with_colmap
 from pcfix.adjust.solve import prepare, solve, solved_cameras
 from pcfix.model import Cameras, Lens, WaterPlane
 
-ENGINES = {"direct": solve, "colmap": solve_with_colmap}
 LENS = Lens(1500.0, 1600, 1200, 800.0, 600.0)
 HEIGHT_M, N, NOISE_PX, GNSS_M = 60.0, 1.34, 0.5, 0.03
 MOST_VIEWS = 10
@@ -38,44 +36,42 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--images", type=int, default=300)
     parser.add_argument("--points", type=int, nargs="+", default=[25_000, 50_000, 100_000])
-    parser.add_argument("--engines", nargs="+", choices=ENGINES, default=list(ENGINES))
     parser.add_argument("--loss", choices=("squares", "huber", "cauchy"), default="squares")
     parser.add_argument("--rendered", action="store_true")
-    parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.one:
-        case, engine, loss = arguments.one
-        print(json.dumps(run(case, arguments.images, engine, loss)))
+        case, loss = arguments.one
+        print(json.dumps(run(case, arguments.images, loss)))
         return
-    print("case        engine    obs      wall s   cpu s  steps  us/obs  MB    centres m  df px")
+    print("case           obs      wall s   cpu s  steps  us/obs  MB    centres m  df px")
     cases = ["rendered"] if arguments.rendered else map(str, arguments.points)
     for case in cases:
-        for engine in arguments.engines:
-            show(case, engine, arguments)
+        show(case, arguments)
 
 
-def show(case, engine, arguments):
+def show(case, arguments):
     command = [sys.executable, __file__, "--images", str(arguments.images)]
-    command += ["--one", case, engine, arguments.loss]
+    command += ["--one", case, arguments.loss]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     r = json.loads(done.stdout.splitlines()[-1])
     print(
-        f"{case:<11} {engine:<8} {r['observations']:>8} {r['wall_s']:>8.1f} {r['cpu_s']:>7.1f}"
+        f"{case:<11} {r['observations']:>8} {r['wall_s']:>8.1f} {r['cpu_s']:>7.1f}"
         f" {r['steps']:>5} {1e6 * r['cpu_s'] / r['observations']:>7.1f} {r['peak_mb']:>6.0f}"
         f" {r['before_m']:>7.4f} -> {r['after_m']:.4f} {r['focal_px']:+.3f}",
         flush=True,
     )
 
 
-def run(case, images, engine, loss):
+def run(case, images, loss):
     """Return the figures of one adjustment in this process; kernels are compiled before."""
     make, unknowns = (rendered, ("f", "cx", "cy")) if case == "rendered" else (flown, ("f",))
     small, _, _ = flown(500, 12)
-    ENGINES[engine](*prepare(small, Unknowns(lens=unknowns)), loss)
+    solve(*prepare(small, Unknowns(lens=unknowns)), loss)
     block, centres, focal = make(*(() if case == "rendered" else (int(case), images)))
     started, cpu = time.perf_counter(), time.process_time()
     problem, start = prepare(block, Unknowns(lens=unknowns))
-    found = ENGINES[engine](problem, start, loss)
+    found = solve(problem, start, loss)
     cameras = solved_cameras(problem, found)
     return {
         "wall_s": time.perf_counter() - started,
