@@ -31,7 +31,7 @@ from pcfix.errors import GeometryError, InputError, SettingError
 from pcfix.flow.carrying import in_frame
 from pcfix.flow.inputs import mask_of
 from pcfix.io.cameras.table.sensor import read_sensor
-from pcfix.io.earth import is_topocentric
+from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control

@@ -14,8 +14,7 @@ from pcfix.flow.surfaces import view_of
 from pcfix.io.cameras.gnss import adjusted_minus_gnss
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.files import check_input, check_output, write_bytes
-from pcfix.io.las.crs import metric_crs
-from pcfix.io.las.source import LasSource, coordinates
+from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.lens.visibility import cameras_in_sight
 from pcfix.model import WaterDimension
 from pcfix.options import DEFAULT_REFRACTIVE_INDEX
@@ -196,7 +195,7 @@ def check_cameras(
         The calibration of the camera: one of Metashape's, or a table as of `sensor`. Default: the
         one that a file of Metashape says to have begun with.
     reference : path, optional
-        A survey of land or bed: see `pcfix.io.references.read_reference`.
+        A survey of land or bed: see `pcfix.io.clouds.read_reference`.
     refractive_index : float
         Of the water, relative to air.
     plot : path, optional
@@ -288,8 +287,8 @@ def _diagnosis(
     """Look for all signs that the poses have absorbed the refraction."""
     from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, ties_of
     from pcfix.flow.survey_signs import Evidence
+    from pcfix.io.clouds import check_same_crs, read_reference
     from pcfix.io.ground_control import read_ground_control
-    from pcfix.io.references import check_same_crs, read_reference
 
     path = str(inputs.cameras)
     survey = None if reference is None else read_reference(reference)

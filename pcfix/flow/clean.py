@@ -16,13 +16,17 @@ from pcfix.errors import InputError
 from pcfix.flow.clean_points import check_tile, flag_neighbours
 from pcfix.flow.points import CHUNK_POINTS
 from pcfix.flow.surfaces import WaterWords, find_surface, view_of
-from pcfix.io.files import check_input, check_output, write_text
-from pcfix.io.las.formats import convert
-from pcfix.io.las.headers import corrected_identity, noted_header, output_evlrs
-from pcfix.io.las.provenance import cleaning_vlr
-from pcfix.io.las.sink import LasSink, check_suffix
+from pcfix.io.files import check_input, check_output, scratch_arrays, write_text
+from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource, coordinates
-from pcfix.io.scratch import scratch_arrays
+from pcfix.io.las.writing import (
+    LasSink,
+    check_suffix,
+    cleaning_vlr,
+    corrected_identity,
+    noted_header,
+    output_evlrs,
+)
 from pcfix.model import HIGH_NOISE, LOW_NOISE, WaterDimension
 from pcfix.threads import threads
 from pcfix.version import __version__

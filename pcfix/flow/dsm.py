@@ -25,8 +25,7 @@ from pcfix.grid.inverse import inverse_distance
 from pcfix.grid.model import DsmSettings, DsmSummary, Method, SurfaceChoice
 from pcfix.grid.shade import NO_LIGHT, hillshade
 from pcfix.io.files import check_input, check_output, replaced_when_whole, write_text
-from pcfix.io.las.crs import metric_crs
-from pcfix.io.las.source import LasSource
+from pcfix.io.las.source import LasSource, metric_crs
 from pcfix.io.rasters import (
     add_overviews,
     check_cog,

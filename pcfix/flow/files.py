@@ -15,16 +15,22 @@ from pcfix.flow.points import CHUNK_POINTS
 from pcfix.flow.surfaces import view_of
 from pcfix.io.files import check_input, check_output, write_text
 from pcfix.io.las.columns import (
+    OutOfRangeError,
     TooNarrowError,
     changed_rows,
     columns_for,
     fill,
     shift_steps,
+    shifted,
 )
-from pcfix.io.las.formats import OutOfRangeError, shifted
-from pcfix.io.las.headers import corrected_header, corrected_identity, output_evlrs
-from pcfix.io.las.sink import LasSink, check_suffix
 from pcfix.io.las.source import LasSource, centring_steps, coordinates
+from pcfix.io.las.writing import (
+    LasSink,
+    check_suffix,
+    corrected_header,
+    corrected_identity,
+    output_evlrs,
+)
 from pcfix.model import (
     BATHYMETRIC_POINT,
     Cameras,
@@ -153,7 +159,7 @@ def correct_file(
     views_are : {"auto", "tracks", "depth-maps"}
         What the views are; see `pcfix.Views`. auto: what their kind of file says.
     check_depths : path, optional
-        With the method regression: measured depths; see `pcfix.io.check_depths`.
+        With the method regression: measured depths; see `pcfix.io.tables`.
     least_r2 : float
         A regression with a lower coefficient of determination is refused.
     uncorrected : {"withhold", "keep", "drop"}

@@ -52,14 +52,14 @@ class Inputs:
     views_are : {"auto", "tracks", "depth-maps"}
         What the list means; see `pcfix.model.Views`. auto: what its kind of file says.
     check_depths : path or None
-        See `pcfix.io.check_depths.read_check_depths`.
+        See `pcfix.io.tables.read_check_depths`.
     water_mask : path or None
-        See `pcfix.io.shorelines.read_water_polygons`.
+        See `pcfix.io.vectors.read_water_polygons`.
     tide : path or None
         See `pcfix.io.tides.read_tide`: each image gets its own level, the water shifted along the
         vertical; the water is that of the images' mean level.
     image_times : path or None
-        See `pcfix.io.image_times.read_image_times`. Default, with a tide: the camera file, of
+        See `pcfix.io.tides.read_image_times`. Default, with a tide: the camera file, of
         two the one that the cloud was made with.
     port : Port or None
         Of the housing of cameras under water, instead of `water`.
@@ -124,8 +124,7 @@ class Inputs:
             if self.image_times is not None:
                 raise SettingError("image-times is of no use without tide; give both, or neither.")
             return None
-        from pcfix.io.image_times import read_image_times
-        from pcfix.io.tides import level_offsets, read_tide
+        from pcfix.io.tides import level_offsets, read_image_times, read_tide
 
         own = self.cameras if self.adjusted_from is None else self.adjusted_from
         given = own if self.image_times is None else self.image_times
@@ -217,7 +216,7 @@ def mask_of(
     Parameters
     ----------
     path : path or None
-        See `pcfix.io.shorelines.read_water_polygons`.
+        See `pcfix.io.vectors.read_water_polygons`.
     cloud_crs : str, CRS or None
     low, high : array, shape (2,)
         South-west and north-east corner of the cloud, metres.
@@ -229,7 +228,7 @@ def mask_of(
     """
     if path is None:
         return None
-    from pcfix.io.shorelines import read_water_polygons
+    from pcfix.io.vectors import read_water_polygons
     from pcfix.label.mask import WaterMask
 
     polygons = read_water_polygons(path, cloud_crs)

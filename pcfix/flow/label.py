@@ -17,11 +17,16 @@ from pcfix.flow.job import parts_of
 from pcfix.flow.points import CHUNK_POINTS
 from pcfix.flow.surfaces import WaterWords, find_surface, view_of
 from pcfix.io.files import check_input, check_output, write_text
-from pcfix.io.las.formats import convert
-from pcfix.io.las.headers import corrected_identity, noted_header, output_evlrs
-from pcfix.io.las.provenance import labelling_vlr
-from pcfix.io.las.sink import LasSink, check_suffix
+from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource, coordinates
+from pcfix.io.las.writing import (
+    LasSink,
+    check_suffix,
+    corrected_identity,
+    labelling_vlr,
+    noted_header,
+    output_evlrs,
+)
 from pcfix.label.labelling import Labelling, Part, sets_class
 from pcfix.model import WaterPlane
 from pcfix.options import LabelSettings

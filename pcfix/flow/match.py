@@ -12,9 +12,8 @@ from pcfix.compare.neighbours import Neighbours, mean_spacing_m
 from pcfix.compare.overlap import near_in_plan
 from pcfix.errors import GeometryError, InputError
 from pcfix.flow.comparison import CompareSettings  # noqa: TC001 - dataclass fields
-from pcfix.io.clouds import SurveyCloud, read_cloud
+from pcfix.io.clouds import Reference, SurveyCloud, check_same_crs, read_cloud, read_reference
 from pcfix.io.files import check_input
-from pcfix.io.references import Reference, check_same_crs, read_reference
 from pcfix.model import BoolArray, FloatArray, WaterSurface  # noqa: TC001 - dataclass fields
 
 if TYPE_CHECKING:

@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 from pcfix.errors import InputError
 from pcfix.flow.files import job_for
-from pcfix.io.las.columns import columns_for
-from pcfix.io.las.formats import UPGRADE
-from pcfix.io.las.sink import check_suffix
+from pcfix.io.las.columns import UPGRADE, columns_for
 from pcfix.io.las.source import LasSource
+from pcfix.io.las.writing import check_suffix
 from pcfix.io.pdal import CLASS_FLAGS, OUTCOME, STAGE_SOURCE, add_dimension
 
 if TYPE_CHECKING:

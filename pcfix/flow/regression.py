@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
-from pcfix.io.check_depths import read_check_depths
+from pcfix.io.tables import read_check_depths
 from pcfix.model import NOISE_CLASSES
 from pcfix.refract.apparent_depths import LEAST_NEIGHBOURS, REACH, ApparentDepths
 from pcfix.refract.regression import LEAST_COUNT, DepthRegression, fit_depths
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import os
     from collections.abc import Iterable
 
-    from pcfix.io.check_depths import CheckDepths
+    from pcfix.io.tables import CheckDepths
     from pcfix.label.labelling import Part
     from pcfix.model import BoolArray, FloatArray, IntArray
     from pcfix.options import Settings
@@ -35,7 +35,7 @@ def learn_regression(
     Parameters
     ----------
     path : path
-        See `pcfix.io.check_depths.read_check_depths`.
+        See `pcfix.io.tables.read_check_depths`.
     parts : iterable of Part
         The whole cloud as it came, each point with the water above it; gone through once, in
         bounded memory. Points of noise (classes 7 and 18) do not count.

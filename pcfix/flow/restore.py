@@ -9,12 +9,9 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.flow.points import CHUNK_POINTS
 from pcfix.io.files import check_input, check_output
-from pcfix.io.las.columns import SHIFTS, columns_for, is_corrected, is_marked_uncorrected
-from pcfix.io.las.formats import shifted
-from pcfix.io.las.headers import output_evlrs, restored_header
-from pcfix.io.las.provenance import read_settings
-from pcfix.io.las.sink import LasSink, check_suffix
+from pcfix.io.las.columns import SHIFTS, columns_for, is_corrected, is_marked_uncorrected, shifted
 from pcfix.io.las.source import LasSource
+from pcfix.io.las.writing import LasSink, check_suffix, output_evlrs, read_settings, restored_header
 from pcfix.threads import threads
 
 if TYPE_CHECKING:

@@ -29,10 +29,9 @@ from pcfix.flow.run_adjust import (
 from pcfix.flow.steps import Record, read_record
 from pcfix.flow.surfaces import view_of
 from pcfix.io.clouds import own_water
-from pcfix.io.dod import preview, write_dod
 from pcfix.io.files import files_in
 from pcfix.io.las.source import LasSource
-from pcfix.io.rasters import open_raster
+from pcfix.io.rasters import open_raster, preview, write_dod
 from pcfix.model import Summary
 from pcfix.options import DEFAULT_REFRACTIVE_INDEX, ErrorBudget, LabelSettings, Settings
 from pcfix.report.evaluation import evaluation, in_a_sentence

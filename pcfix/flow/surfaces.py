@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
-from pcfix.io.las.crs import metric_crs
-from pcfix.io.las.source import LasSource, coordinates
+from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.water import read_water
 
 if TYPE_CHECKING:
@@ -212,7 +211,7 @@ def _thinned(seen: Seen, every: int) -> Seen:
 
 def _fitted(words: WaterWords, path: AnyPath, view: CloudView | None) -> FoundSurface:
     """Return the surface fitted to shoreline points."""
-    from pcfix.io.shorelines import read_shoreline
+    from pcfix.io.vectors import read_shoreline
     from pcfix.water.fit import fit_water
     from pcfix.water.river import fit_river
 

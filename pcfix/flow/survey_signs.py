@@ -13,7 +13,7 @@ from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
     from pcfix.flow.surfaces import CloudView
-    from pcfix.io.references import Reference
+    from pcfix.io.clouds import Reference
     from pcfix.model import (
         Cameras,
         FloatArray,

@@ -1,18 +1,30 @@
-"""Rules for every file that pcfix writes: whole or not at all, and never over another's work."""
+"""Rules for every file that pcfix writes, and files for what is larger than memory.
+
+What is written is whole or not at all, and never over another's work.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
+import tempfile
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from pcfix.errors import InputError, SettingError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
+
+    import numpy.typing as npt
+
+    from pcfix.clean.tiles import Empty
+    from pcfix.grid.lattice import Window
+    from pcfix.model import FloatArray, IntArray
 
 
 def check_input(path: str | os.PathLike[str]) -> Path:
@@ -119,3 +131,118 @@ def write_bytes(path: str | os.PathLike[str], data: bytes, *, overwrite: bool) -
 def write_text(path: str | os.PathLike[str], text: str, *, overwrite: bool) -> None:
     """Write a small text file under the same rules."""
     write_bytes(path, text.encode(), overwrite=overwrite)
+
+
+@contextmanager
+def scratch_arrays(target: Path) -> Iterator[Empty]:
+    """Give a maker of arrays in temporary files beside the target, gone when the block ends.
+
+    Raises
+    ------
+    InputError
+        If the disk cannot hold them.
+    """
+    try:
+        folder = tempfile.TemporaryDirectory(
+            prefix=f".{target.stem}.", suffix=".part", dir=target.parent, ignore_cleanup_errors=True
+        )
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written ({error.strerror or error}).") from error
+    made: list[Path] = []
+
+    def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+        made.append(Path(folder.name) / f"{len(made)}.bin")
+        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+        try:
+            _reserve(made[-1], size)
+        except OSError as error:
+            raise InputError(
+                f"{target}: {size / 1e9:,.1f} GB of temporary space beside it cannot be had"
+                f" ({error.strerror or error}); make room, or write to another disk."
+            ) from error
+        return np.memmap(made[-1], dtype=dtype, mode="r+", shape=shape)
+
+    with folder:
+        yield empty
+
+
+def _reserve(path: Path, size: int) -> None:
+    """Make a file of a size that the disk really has: a full disk kills whoever writes to a map."""
+    with path.open("wb") as stream:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(stream.fileno(), 0, size)
+        else:
+            stream.truncate(size)
+
+
+class Bins:
+    """Points sorted by place, as float64, in files of a folder that the caller makes and removes.
+
+    Parameters
+    ----------
+    folder : Path
+    side : int
+        Cells along a square.
+    corner : tuple of int
+        Column and row of a corner of the squares, counted from x = 0 and y = 0.
+    numbers : int
+        Of each point: its coordinates, and what else belongs to it.
+    """
+
+    def __init__(self, folder: Path, side: int, corner: Iterable[int], numbers: int = 3) -> None:
+        self._numbers = numbers
+        self._folder, self._side = folder, side
+        self._corner = np.array(list(corner), np.int64)
+        self._points: dict[tuple[int, int], int] = {}
+
+    def add(self, cell: IntArray, xyz: FloatArray) -> None:
+        """Store points; those of one cell keep their order.
+
+        Parameters
+        ----------
+        cell : array, shape (n, 2)
+            Columns and rows, counted from x = 0 and y = 0.
+        xyz : array, shape (n, numbers)
+            Metres, world frame.
+        """
+        square = (cell - self._corner) // self._side
+        order = np.lexsort((square[:, 0], square[:, 1]))
+        square, xyz = square[order], xyz[order]
+        first = np.flatnonzero((np.diff(square, axis=0, prepend=square[:1] - 1) != 0).any(axis=1))
+        for start, stop in zip(first, [*first[1:], len(xyz)], strict=True):
+            place = (int(square[start, 0]), int(square[start, 1]))
+            self._points[place] = self._points.get(place, 0) + int(stop - start)
+            with self._file(place).open("ab") as stream:
+                stream.write(xyz[start:stop].tobytes())
+
+    def read(self, cells: Window) -> FloatArray:
+        """Return the points of all squares that touch a window, counted as `add` counts cells.
+
+        Returns
+        -------
+        array, shape (n, numbers)
+            Metres, world frame; points of the squares outside the window are among them.
+        """
+        places, numbers = self._touched(cells), self._numbers
+        parts = [np.fromfile(self._file(place)).reshape(-1, numbers) for place in places]
+        return np.concatenate([np.empty((0, numbers)), *parts])
+
+    def count(self, cells: Window) -> int:
+        """Return how many points `read` would return."""
+        return sum(self._points[place] for place in self._touched(cells))
+
+    @property
+    def side(self) -> int:
+        """Cells along a square."""
+        return self._side
+
+    def _touched(self, cells: Window) -> list[tuple[int, int]]:
+        """Return the squares with points that touch a window."""
+        column, row = self._corner.tolist()
+        left, right = (cells.column - column) // self._side, (cells.column_stop - 1 - column)
+        top, bottom = (cells.row - row) // self._side, (cells.row_stop - 1 - row)
+        columns, rows = range(left, right // self._side + 1), range(top, bottom // self._side + 1)
+        return [(c, r) for r in rows for c in columns if (c, r) in self._points]
+
+    def _file(self, place: tuple[int, int]) -> Path:
+        return self._folder / f"{place[0]}_{place[1]}.points"

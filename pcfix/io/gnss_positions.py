@@ -16,8 +16,7 @@ from pcfix.io.cameras.gnss import adjusted_minus_gnss
 from pcfix.io.cameras.heights import is_tied
 from pcfix.io.cameras.odm.shots import read_images
 from pcfix.io.cameras.table.positions import gnss_positions, open_table
-from pcfix.io.crs import METRES, parse_crs
-from pcfix.io.earth import is_topocentric
+from pcfix.io.crs import METRES, is_topocentric, parse_crs
 from pcfix.io.files import check_input
 from pcfix.io.labels import is_named, match_labels
 from pcfix.model import Cameras, GnssPositions

@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
-from pcfix.io.control_markers import has_markers, read_markers
-from pcfix.io.control_marks import read_marks
-from pcfix.io.earth import is_topocentric
+from pcfix.io.control_marks import has_markers, read_markers, read_marks
+from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
 from pcfix.io.labels import is_named, match_labels
-from pcfix.io.placement import LOCAL, way_to_cloud
+from pcfix.io.transformations import LOCAL, way_to_cloud
 from pcfix.model import GroundControl
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import numpy as np
 from pyproj import CRS
 
 from pcfix.io.files import check_output, write_bytes, write_text
-from pcfix.io.las.sink import LasSink
+from pcfix.io.las.writing import LasSink
 from pcfix.model import BATHYMETRIC_POINT
 from pcfix.version import __version__
 

@@ -1,16 +1,27 @@
-"""Small tables of text with a header line: names and numbers, and errors that say where."""
+"""Text files: tables with a header line, geometries as WKT or points, check depths."""
 
 from __future__ import annotations
 
 import csv
 import math
-from typing import TYPE_CHECKING, NamedTuple
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from pcfix.errors import InputError
+from pcfix.io.files import check_input
 
 if TYPE_CHECKING:
+    import os
     from collections.abc import Iterator, Sequence
     from pathlib import Path
+    from types import ModuleType
+
+    import numpy.typing as npt
+
+    from pcfix.model import FloatArray
 
 
 class Table(NamedTuple):
@@ -150,3 +161,242 @@ def _split(
         raise InputError(
             f"{path}: line {first + reader.line_num - 1} is not CSV ({error})."
         ) from error
+
+
+TEXT_SUFFIXES = (".wkt", ".csv", ".txt")
+COLUMNS = {
+    "x": ("x", "easting", "east", "e", "x_m", "easting_m"),
+    "y": ("y", "northing", "north", "n", "y_m", "northing_m"),
+    "longitude": ("longitude", "lon", "long", "lng"),
+    "latitude": ("latitude", "lat"),
+    "z": (
+        *("z", "height", "h", "altitude", "alt", "elevation", "elev", "level"),
+        *("z_m", "height_m", "altitude_m", "elevation_m", "level_m"),
+    ),
+    "wkt": ("wkt", "geometry", "geom", "wkt_geom"),
+}
+"""What a column is, and its names; the first that is there counts."""
+_UNIT = re.compile(r"\s*[\[(]\s*(m|metres?|meters?|deg|degrees?|°)\s*[\])]$")
+_WKT = re.compile(
+    r"\s*(SRID\s*=\s*\d+\s*;)?\s*((MULTI)?(POINT|LINESTRING|POLYGON)|LINEARRING|GEOMETRYCOLLECTION)"
+    r"\s*(ZM|Z|M)?\s*(\(|EMPTY)",
+    re.IGNORECASE,
+)
+_SRID = re.compile(r"\s*SRID\s*=\s*(\d+)\s*;", re.IGNORECASE)
+_CRS = re.compile(r"#\s*crs\s*[:=]\s*(.+)$", re.IGNORECASE)
+
+
+def read_text(path: Path, shapely: ModuleType) -> tuple[npt.NDArray[Any], str | None]:
+    """Return the geometries of a text file, and the CRS that it names.
+
+    A comment ``# crs: EPSG:25830`` above the rest names it, or ``SRID=25830;`` before a WKT;
+    longitude and latitude are taken to be of WGS 84.
+
+    Raises
+    ------
+    InputError
+        If it is neither WKT nor a table of points, or damaged.
+    """
+    lines = read_lines(path)
+    said = [found.group(1).strip() for line in lines[:20] if (found := _CRS.match(line.strip()))]
+    kept = [(i, line) for i, line in enumerate(lines) if _counts(line)]
+    if not kept:
+        raise InputError(f"{path}: is empty.")
+    at, first = kept[0]
+    if _WKT.match(first):
+        numbered = [(i + 1, line) for i, line in kept]
+        geometries, srid = _from_wkt(path, numbered, shapely)
+    else:
+        geometries, srid = _from_table(path, lines, at, shapely)
+    return geometries, said[0] if said else srid
+
+
+def _counts(line: str) -> bool:
+    return bool(line.strip()) and not line.lstrip().startswith("#")
+
+
+def _from_wkt(
+    path: Path, lines: list[tuple[int, str]], shapely: ModuleType
+) -> tuple[npt.NDArray[Any], str | None]:
+    """Return the geometry of each numbered line, and the CRS that they name."""
+    geometries = np.empty(len(lines), dtype=object)
+    srids: set[str | None] = set()
+    for row, (line, text) in enumerate(lines):
+        named = _SRID.match(text)
+        srids.add(f"EPSG:{named.group(1)}" if named else None)
+        try:
+            geometries[row] = shapely.from_wkt(_SRID.sub("", text).strip())
+        except (shapely.errors.ShapelyError, ValueError) as error:
+            raise InputError(
+                f"{path}: line {line} is not WKT ({str(error).split(':', 1)[-1].strip()}); write"
+                " one whole geometry a line."
+            ) from error
+    if len(srids) > 1:
+        raise InputError(f"{path}: the lines name different SRIDs; write one CRS a file.")
+    return geometries, srids.pop()
+
+
+def _from_table(
+    path: Path, lines: list[str], at: int, shapely: ModuleType
+) -> tuple[npt.NDArray[Any], str | None]:
+    """Return the points, or the geometries, of a table whose header is ``lines[at]``."""
+    names, delimiter = split_header(lines[at])
+    header = [_UNIT.sub("", name) for name in names]
+    table = table_below(path, lines, header, delimiter, at=at, comments=True)
+    if (wkt := _column(header, "wkt")) is not None:
+        numbered = list(zip(table.line, table.column(wkt), strict=True))
+        return _from_wkt(path, numbered, shapely)
+    for x, y, crs in (("x", "y", None), ("longitude", "latitude", "EPSG:4326")):
+        plan = _column(header, x), _column(header, y)
+        if plan[0] is not None and plan[1] is not None:
+            return _points(table, plan[0], plan[1], shapely), crs
+    raise InputError(
+        f"{path}: line {at + 1} must name the columns x and y (or easting and northing, longitude"
+        f" and latitude), with z or height where there is one; it has: {', '.join(names)}."
+    )
+
+
+def _column(header: list[str], role: str) -> str | None:
+    return next((name for name in COLUMNS[role] if name in header), None)
+
+
+def _points(table: Table, x: str, y: str, shapely: ModuleType) -> npt.NDArray[Any]:
+    """Return the points of a table; where the height of one is empty it has none."""
+    plan = np.column_stack([table.numbers(x), table.numbers(y)])
+    name = _column(table.header, "z")
+    if name is None:
+        return np.asarray(shapely.points(plan))
+    z = _numbers_or_none(table, name)
+    points = np.asarray(shapely.points(np.column_stack([plan, z])))
+    return np.where(np.isfinite(z), points, shapely.force_2d(points))
+
+
+def _numbers_or_none(table: Table, name: str) -> FloatArray:
+    """Return a column as numbers, NaN for empty fields and NaN; other text is refused."""
+    texts = table.column(name)
+    values = np.array([number(text) for text in texts])
+    for row in np.flatnonzero(~np.isfinite(values)):
+        if texts[row].lower() not in ("", "nan", "na", "null", "none"):
+            raise InputError(
+                f"{table.path}: line {table.line[row]}, column {name}: '{texts[row]}' is not a"
+                " finite number."
+            )
+    return values
+
+
+SPELLINGS = {
+    "x": ("x", "easting", "east"),
+    "y": ("y", "northing", "north"),
+    "depth": ("depth", "true_depth", "water_depth", "measured_depth"),
+    "z": ("z", "height", "elevation", "elev", "altitude"),
+}
+_DEPTH_UNIT = re.compile(r"^(.*?)[ _]*[\[(]([^\])]*)[\])]$|^(.*)_(m|cm|mm|ft)$")
+_METRES = ("", "m", "metre", "metres", "meter", "meters")
+
+
+@dataclass(frozen=True, eq=False)
+class CheckDepths:
+    """Places with a known depth, or a known height of the bed; p of them.
+
+    Attributes
+    ----------
+    name : str
+        Of the file, for messages.
+    xy : array, shape (p, 2)
+        Metres, the cloud's CRS.
+    value_m : array, shape (p,)
+        Depth below the water, positive down; or world Z, see `are_heights`.
+    are_heights : bool
+    line : list of int
+        Of each place in the file.
+    """
+
+    name: str
+    xy: FloatArray
+    value_m: FloatArray
+    are_heights: bool
+    line: list[int]
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+    def where(self, row: int) -> str:
+        """Return file, line and place, for messages."""
+        return f"{self.name}: line {self.line[row]} ({self.xy[row, 0]:.2f}, {self.xy[row, 1]:.2f})"
+
+
+def read_check_depths(path: str | os.PathLike[str]) -> CheckDepths:
+    """Read check depths from a table with a header line.
+
+    Parameters
+    ----------
+    path : path
+        Columns in any order, separated by comma, semicolon, tab or space: ``x`` and ``y`` (or
+        easting and northing) in the cloud's CRS, and ``depth``, metres below the water surface
+        that the correction is given, positive down, or ``z``, the height of the bed in the
+        cloud's heights. Where both are there the depth counts. Other columns are passed over,
+        a standard error too: all check depths count alike.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, a column is missing, not in metres or there twice, a field is
+        not a finite number, or a depth is negative.
+    """
+    source = check_input(path)
+    table = read_table(source, ())
+    names, units = zip(*(_split_unit(name) for name in table.header), strict=True)
+    place = {role: _place(table, names, role) for role in SPELLINGS}
+    what = "z" if place["depth"] is None else "depth"
+    missing = [role for role in ("x", "y", what) if place[role] is None]
+    if missing:
+        raise InputError(
+            f"{source}: line 1 must name the columns x, y and depth (or z);"
+            f" {', '.join('depth or z' if m == 'z' else m for m in missing)} missing (it has:"
+            f" {', '.join(table.header)})."
+        )
+    values = []
+    for role in ("x", "y", what):
+        column = place[role] or 0
+        if units[column] not in _METRES:
+            raise InputError(
+                f"{source}: column {table.header[column]} is in '{units[column]}'; give metres."
+            )
+        values.append(np.array(table.numbers(table.header[column]), np.float64))
+    found = CheckDepths(
+        str(source), np.column_stack(values[:2]), values[2], what == "z", table.line
+    )
+    _refuse_negative(found)
+    return found
+
+
+def _split_unit(name: str) -> tuple[str, str]:
+    """Return the name of a column and its unit: depth_m, Depth (m), x [m]."""
+    match = _DEPTH_UNIT.match(name)
+    if not match:
+        return name.replace(" ", "_"), ""
+    name, unit = (match[1], match[2]) if match[3] is None else (match[3], match[4])
+    return name.strip().replace(" ", "_"), unit.strip()
+
+
+def _place(table: Table, names: tuple[str, ...], role: str) -> int | None:
+    """Return the number of a column; easting beside x is refused."""
+    there = [i for i, name in enumerate(names) if name in SPELLINGS[role]]
+    if len(there) > 1:
+        twice = ", ".join(table.header[i] for i in there)
+        raise InputError(
+            f"{table.path}: line 1: the columns {twice} may all be {role}; take out all but one."
+        )
+    return there[0] if there else None
+
+
+def _refuse_negative(found: CheckDepths) -> None:
+    negative = np.flatnonzero(found.value_m < 0.0)
+    if found.are_heights or not len(negative):
+        return
+    first = int(negative[0])
+    raise InputError(
+        f"{found.where(first)}: the depth {found.value_m[first]:g} is negative, as are"
+        f" {len(negative)} of {len(found)}; depths count positive down, and heights of the bed"
+        " belong in a column z."
+    )

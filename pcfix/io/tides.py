@@ -1,4 +1,4 @@
-"""A water level that moves: tide tables, and how high the water stood at each image.
+"""A water level that moves: tide tables, when each image was taken, how high the water stood then.
 
 Times with a zone (or Z) are moments; times without one are the readings of one clock that table
 and images share. The two cannot be compared, so both must be of one kind.
@@ -6,23 +6,193 @@ and images share. The two cannot be compared, so both must be of one kind.
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.io.files import check_input
-from pcfix.io.image_times import seconds_of
+from pcfix.io.files import check_input, read_json
 from pcfix.io.tables import read_table
 
 if TYPE_CHECKING:
     import os
     from collections.abc import Sequence
 
-    from pcfix.io.image_times import ImageTimes
     from pcfix.model import FloatArray
+
+
+IMAGES = (".jpg", ".jpeg", ".tif", ".tiff", ".png", ".webp", ".heic", ".dng")
+_EXIF_DATE = re.compile(r"^(\d{4}):(\d\d):(\d\d)\b")
+_DATE_TIME_ORIGINAL, _OFFSET_ORIGINAL, _SUBSECONDS, _EXIF = 0x9003, 0x9011, 0x9291, 0x8769
+
+
+@dataclass(frozen=True, eq=False)
+class ImageTimes:
+    """When k images were taken.
+
+    Attributes
+    ----------
+    time_s : array, shape (k,)
+        Seconds since 1970, UTC where `zoned`, else of a local clock.
+    zoned : bool
+    name : str
+        Where the times came from.
+    """
+
+    time_s: FloatArray
+    zoned: bool
+    name: str
+
+
+def read_image_times(path: str | os.PathLike[str], labels: Sequence[str]) -> ImageTimes:
+    """Find out when images were taken.
+
+    Parameters
+    ----------
+    path : path
+        A table with the columns ``label`` and ``time`` (ISO 8601); a folder with the images,
+        whose EXIF data has DateTimeOriginal, and OffsetTimeOriginal for the zone; ODM's
+        ``images.json`` or ``shots.geojson``, or OpenSfM's ``reconstruction.json``. These last
+        count as UTC; where the images' EXIF data states no zone they hold local time.
+    labels : sequence of str
+        Names of the k images; a folder or an extension may be missing on either side.
+
+    Raises
+    ------
+    InputError
+        If the time of an image is not there, or some have a zone and some not.
+    """
+    found = Path(path)
+    if found.is_dir():
+        return _from_exif(found, labels)
+    if check_input(found).suffix.lower() in (".json", ".geojson"):
+        return _from_json(found, labels)
+    table = read_table(found, ["label", "time"])
+    row = _rows(table.column("label"), labels, str(path))
+    words = table.column("time")
+    where = [f"line {table.line[r]}" for r in row]
+    return ImageTimes(*seconds_of(str(path), where, [words[r] for r in row]), str(path))
+
+
+def _from_exif(folder: Path, labels: Sequence[str]) -> ImageTimes:
+    files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in IMAGES)
+    if not files:
+        raise InputError(f"{folder}: holds no images; give the folder with those of the block.")
+    chosen = [files[row] for row in _rows([str(p) for p in files], labels, str(folder))]
+    where = [f"image {file.name}" for file in chosen]
+    return ImageTimes(*seconds_of(str(folder), where, [_exif_time(f) for f in chosen]), str(folder))
+
+
+def _exif_time(file: Path) -> str:
+    """Return DateTimeOriginal with fraction and zone, as far as they are there."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(file) as image:
+            tags = image.getexif().get_ifd(_EXIF)
+    except (UnidentifiedImageError, OSError) as error:
+        raise InputError(f"{file}: is not an image that can be read ({error}).") from error
+    text = str(tags.get(_DATE_TIME_ORIGINAL, "")).strip("\0 ")
+    if not text:
+        raise InputError(
+            f"{file}: its EXIF data has no DateTimeOriginal; give a CSV table label,time instead."
+        )
+    fraction = str(tags.get(_SUBSECONDS, "")).strip("\0 ")
+    zone = str(tags.get(_OFFSET_ORIGINAL, "")).strip("\0 ")
+    return text + (f".{fraction}" if fraction.isdecimal() else "") + zone
+
+
+def _from_json(path: Path, labels: Sequence[str]) -> ImageTimes:
+    try:
+        times = _json_times(read_json(path))
+    except (OSError, ValueError, TypeError, AttributeError, LookupError) as error:
+        raise InputError(f"{path}: is not a file of OpenDroneMap or OpenSfM ({error}).") from error
+    if not times:
+        raise InputError(f"{path}: has no times of images; give a CSV table label,time instead.")
+    names = list(times)
+    chosen = [names[row] for row in _rows(names, labels, str(path))]
+    for name in chosen:
+        if not times[name] > 0.0:
+            raise InputError(f"{path}: does not say when image {name} was taken.")
+    return ImageTimes(np.array([times[name] for name in chosen]), True, str(path))
+
+
+def _json_times(content: Any) -> dict[str, float]:
+    """Return seconds since 1970 by image name, of any of the three layouts."""
+    if isinstance(content, dict):  # shots.geojson
+        shots = [feature["properties"] for feature in content.get("features", ())]
+        return {shot["filename"]: float(shot.get("capture_time") or 0.0) for shot in shots}
+    if content and "shots" in content[0]:  # reconstruction.json
+        shots = [item for part in content for item in part["shots"].items()]
+        return {name: float(shot.get("capture_time") or 0.0) for name, shot in shots}
+    return {one["filename"]: float(one.get("utc_time") or 0.0) / 1000.0 for one in content}
+
+
+def _rows(names: Sequence[str], labels: Sequence[str], source: str) -> list[int]:
+    """Return for each label the row of its name: whole, without folder, without extension."""
+    rows = [-1] * len(labels)
+    for key in (str, _file_name, _stem):
+        once = {name for name, count in Counter(map(key, names)).items() if count == 1}
+        where = {key(name): row for row, name in enumerate(names) if key(name) in once}
+        rows = [
+            where.get(key(label), -1) if row < 0 else row
+            for row, label in zip(rows, labels, strict=True)
+        ]
+    missing = [label for label, row in zip(labels, rows, strict=True) if row < 0]
+    if missing:
+        raise InputError(
+            f"{source}: does not say when image {missing[0]} was taken ({len(missing)} of"
+            f" {len(labels)} images are missing, or not told apart by their names)."
+        )
+    return rows
+
+
+def _file_name(name: str) -> str:
+    return PurePosixPath(name.replace("\\", "/")).name
+
+
+def _stem(name: str) -> str:
+    return PurePosixPath(_file_name(name)).stem.lower()
+
+
+def seconds_of(source: str, where: Sequence[str], texts: Sequence[str]) -> tuple[FloatArray, bool]:
+    """Return seconds since 1970 of times as text, and whether they have zones: all, or none.
+
+    Raises
+    ------
+    InputError
+        If one is no time, or some have a zone and some not; `where` says which.
+    """
+    moments = [_moment(source, at, text) for at, text in zip(where, texts, strict=True)]
+    zoned = [moment.tzinfo is not None for moment in moments]
+    if any(zoned) != all(zoned):
+        odd = zoned.index(not zoned[0])
+        raise InputError(
+            f"{source}: {where[odd]}: '{texts[odd]}' has {'a' if zoned[odd] else 'no'} zone, others"
+            f" have {'none' if zoned[odd] else 'one'}; write all times alike."
+        )
+    utc = [m if m.tzinfo is not None else m.replace(tzinfo=UTC) for m in moments]
+    return np.array([moment.timestamp() for moment in utc]), zoned[0]
+
+
+def _moment(source: str, where: str, text: str) -> datetime:
+    iso = _EXIF_DATE.sub(r"\1-\2-\3", text.strip())
+    try:
+        moment = datetime.fromisoformat(iso)
+    except ValueError:
+        moment = None
+    if moment is None or len(iso) <= len("2026-05-01"):
+        raise InputError(
+            f"{source}: {where}: '{text}' is not a date with a time of day as ISO 8601 writes it"
+            " (2026-05-01T12:00:00Z)."
+        )
+    return moment
+
 
 LONG_GAP_S = 3600.0
 """Between rows. Half a tide lasts 6.2 h; with an amplitude A of 2 m the chord over one hour is up

@@ -281,7 +281,7 @@ def test_a_full_disk_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyP
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("pcfix.io.scratch._reserve", full)
+    monkeypatch.setattr("pcfix.io.files._reserve", full)
     with pytest.raises(InputError, match="temporary space beside it cannot be had"):
         clean_file(source, tmp_path / "out.las")
     assert [p.name for p in tmp_path.iterdir()] == ["in.las"]

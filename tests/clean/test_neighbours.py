@@ -8,7 +8,7 @@ import pytest
 from pcfix.clean import CleanSettings, Reason, clean_points, neighbours, tiles
 from pcfix.clean.neighbours import Neighbours, height_quartiles, mean_of_first
 from pcfix.clean.tiles import make_tiles
-from pcfix.io.meshes import load_open3d
+from pcfix.io.water import load_open3d
 from tests.clean.scenes import spoilt_scene
 
 K = 12

@@ -3,7 +3,7 @@
 import pytest
 
 from pcfix.errors import InputError
-from pcfix.io.check_depths import read_check_depths
+from pcfix.io.tables import read_check_depths
 
 ROWS = "500001.5,4600002.25,1.5\n500003,4600004,2\n"
 

@@ -6,8 +6,10 @@ from pyproj import CRS, Transformer
 
 from pcfix.errors import InputError
 from pcfix.io.crs import (
+    Topocentric,
     check_projected_metres,
     crs_text,
+    geographic_3d,
     heights_of,
     is_local,
     is_same,
@@ -17,7 +19,6 @@ from pcfix.io.crs import (
     parts,
     with_heights,
 )
-from pcfix.io.earth import Topocentric, geographic_3d
 from pcfix.io.transformations import HeightsError, transformation_in_plan, transformation_in_space
 
 ESRI = (

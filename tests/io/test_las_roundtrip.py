@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import struct
 from fractions import Fraction
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import laspy
 import numpy as np
@@ -13,7 +14,7 @@ from laspy.vlrs.vlrlist import VLRList
 
 import pcfix
 from pcfix import PcfixError
-from pcfix.io.las.formats import UPGRADE
+from pcfix.io.las.columns import UPGRADE, documented_columns
 from tests.utils.clouds import (
     CAMERA_HEIGHT_M,
     EAST_M,
@@ -35,9 +36,6 @@ from tests.utils.clouds import (
     write_cloud,
     xyz_of,
 )
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 BATHYMETRIC_POINT = 40
 ALL = ["ShiftX", "ShiftY", "ShiftZ", "WaterDepth", "RayMiss", "SigmaZ", "Incidence", "RayCount"]
@@ -648,3 +646,10 @@ def test_straight_below_a_lone_pair_the_incidence_is_that_of_the_geometry(tmp_pa
     angle = np.degrees(np.arctan2(np.hypot(away[..., 0], away[..., 1]), away[..., 2])).max(axis=1)
     found = added(trip.before, trip.after)["Incidence"][wet] * 0.1
     np.testing.assert_allclose(found, angle, atol=0.051)  # half a step of 0.1 degrees
+
+
+def test_the_documentation_has_the_table_of_dimensions() -> None:
+    """Made by `pcfix.io.las.columns.documented_columns`; paste it where this fails."""
+    root = Path(__file__).parents[2]
+    documents = [*root.glob("*.md"), *root.glob("pcfix/**/*.md")]
+    assert any(documented_columns() in document.read_text("utf-8") for document in documents)

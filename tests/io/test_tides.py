@@ -11,9 +11,8 @@ from PIL import Image
 
 import pcfix
 from pcfix.flow.inputs import Inputs
-from pcfix.io.image_times import ImageTimes, read_image_times
 from pcfix.io.scenes import write_scene
-from pcfix.io.tides import TideTable, level_offsets, read_tide
+from pcfix.io.tides import ImageTimes, TideTable, level_offsets, read_image_times, read_tide
 from tests.utils.shared import needs
 
 ODM, odm = needs("cameras/odm/testerarm_sub0")

@@ -8,9 +8,14 @@ import pytest
 from pyproj import Transformer
 
 from pcfix.errors import InputError, SettingError
-from pcfix.io.shorelines import read_shoreline, read_water_polygons
 from pcfix.io.transformations import HeightsError
-from pcfix.io.vectors import in_cloud_crs, is_vector_file, read_vectors
+from pcfix.io.vectors import (
+    in_cloud_crs,
+    is_vector_file,
+    read_shoreline,
+    read_vectors,
+    read_water_polygons,
+)
 
 shapely = pytest.importorskip("shapely")
 raw = pytest.importorskip("pyogrio.raw")

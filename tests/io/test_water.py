@@ -283,7 +283,7 @@ def test_rasters_that_are_no_surface(tmp_path):
 
 
 def test_too_many_cells_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("pcfix.io.resampling.MOST_CELLS", 100)
+    monkeypatch.setattr("pcfix.io.water_rasters.MOST_CELLS", 100)
     path = write(tmp_path / "w.tif", np.full((20, 20), 10.0))
     with pytest.raises(pcfix.InputError, match="400 cells are too many"):
         pcfix.read_water(path, UTM33)

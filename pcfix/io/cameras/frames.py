@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.io.crs import metres_up, parse_crs, plan_unit
-from pcfix.io.earth import (
+from pcfix.io.crs import (
     GEOCENTRIC_WGS84,
     GEOGRAPHIC_WGS84,
     Topocentric,
     geographic_3d,
     is_topocentric,
+    metres_up,
+    parse_crs,
+    plan_unit,
 )
 
 if TYPE_CHECKING:

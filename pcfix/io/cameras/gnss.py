@@ -11,8 +11,16 @@ from pcfix.errors import InputError
 from pcfix.io.cameras.frames import frame_of
 from pcfix.io.cameras.georeference import georeference
 from pcfix.io.cameras.heights import is_tied
-from pcfix.io.crs import METRES, crs_text, heights_of, parse_crs, parts, unbound, with_heights
-from pcfix.io.earth import is_topocentric
+from pcfix.io.crs import (
+    METRES,
+    crs_text,
+    heights_of,
+    is_topocentric,
+    parse_crs,
+    parts,
+    unbound,
+    with_heights,
+)
 from pcfix.io.transformations import HeightsError
 from pcfix.model import Cameras, FloatArray, GnssPositions
 

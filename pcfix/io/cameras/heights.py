@@ -14,6 +14,7 @@ from pcfix.io.crs import (
     is_local,
     is_same,
     is_same_vertical_datum,
+    is_topocentric,
     metres_up,
     parse_crs,
     parts,
@@ -21,7 +22,6 @@ from pcfix.io.crs import (
     shortened,
     with_heights,
 )
-from pcfix.io.earth import is_topocentric
 
 if TYPE_CHECKING:
     from pyproj import CRS

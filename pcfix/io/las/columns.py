@@ -1,25 +1,29 @@
-"""The extra dimensions that a correction leaves in the file: what, how wide, in which unit.
+"""What a point record holds: LAS point formats, and the extra dimensions of a correction.
 
-All are integers with a scale, so that LAZ packs them well. Each has a narrow type, which nearly
-every cloud fits, and a wide one; a cloud with a value outside the narrow range is written again
-with the wide types.
+The extra dimensions are integers with a scale, so that LAZ packs them well. Each has a narrow type,
+which nearly every cloud fits, and a wide one; a cloud with a value outside the narrow range is
+written again with the wide types. `COLUMNS` is all that is said of them: files, PDAL's stage and
+the documentation take name, type, unit and meaning from it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
+import laspy
 import numpy as np
 
 from pcfix.errors import InputError
 
 if TYPE_CHECKING:
-    import laspy
     import numpy.typing as npt
 
     from pcfix.model import BoolArray, Correction, FloatArray
     from pcfix.options import Dimensions
+
+Records: TypeAlias = Any
+"""A numpy array of point records, whose dtype has named fields."""
 
 
 class TooNarrowError(Exception):
@@ -28,33 +32,81 @@ class TooNarrowError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One extra dimension. Scale 0 means the file's own scale of that axis; 1 means a count."""
+    """One extra dimension.
+
+    Attributes
+    ----------
+    name : str
+    of : str
+        The attribute of `pcfix.Correction` that it holds; empty for the class before.
+    narrow, wide : str
+        Types.
+    scale : float
+        0 means the file's own scale of that axis; 1 means a count.
+    description : str
+        In the file, at most 31 letters.
+    meaning : str
+        In the documentation.
+    saturates : bool
+        The largest value means "or more".
+    least : int or None
+        In steps of the scale.
+    """
 
     name: str
+    of: str
     narrow: str
     wide: str
     scale: float
     description: str
+    meaning: str
     saturates: bool = False
+    least: int | None = None
 
     def dtype(self, *, wide: bool) -> np.dtype[Any]:
         """Return the numpy type."""
         return np.dtype(self.wide if wide else self.narrow)
 
 
+_SHIFT = ("shift_m", "int16", "int32", 0.0)
 COLUMNS = (
-    Column("ShiftX", "int16", "int32", 0.0, "true minus apparent X"),
-    Column("ShiftY", "int16", "int32", 0.0, "true minus apparent Y"),
-    Column("ShiftZ", "int16", "int32", 0.0, "true minus apparent Z"),
-    Column("WaterDepth", "uint16", "uint32", 0.001, "below the water surface, m"),
-    Column("RayMiss", "uint16", "uint32", 0.0001, "rms distance from the rays, m", True),
-    Column("SigmaZ", "uint16", "uint32", 0.0001, "formal standard error of Z, m", True),
-    Column("Incidence", "uint16", "uint16", 0.1, "largest angle in air, deg"),
-    Column("RayCount", "uint16", "uint16", 1.0, "rays intersected", True),
-    Column("SourceClass", "uint8", "uint8", 1.0, "class before the correction"),
+    *(
+        Column(f"Shift{axis}", *_SHIFT, f"true minus apparent {axis}", "true minus apparent")
+        for axis in "XYZ"
+    ),
+    Column(
+        *("WaterDepth", "depth_m", "uint16", "uint32", 0.001, "below the water surface, m"),
+        "below the surface along the vertical; apparent depth where not corrected",
+        least=1,  # a submerged point is never at zero depth
+    ),
+    Column(
+        *("RayMiss", "ray_miss_m", "uint16", "uint32", 0.0001, "rms distance from the rays, m"),
+        'rms distance of the point from its rays; the largest value means "or more"',
+        saturates=True,
+    ),
+    Column(
+        *("SigmaZ", "sigma_z_m", "uint16", "uint32", 0.0001, "formal standard error of Z, m"),
+        "standard error of Z by the law of propagation, from the `--sigma-...` options; it knows"
+        " nothing of mismatches and of wrong cameras",
+        saturates=True,
+    ),
+    Column(
+        *("Incidence", "incidence_deg", "uint16", "uint16", 0.1, "largest angle in air, deg"),
+        "largest incidence angle in air of a ray used",
+    ),
+    Column(
+        *("RayCount", "ray_count", "uint16", "uint16", 1.0, "rays intersected"),
+        "rays intersected; of dense clouds the depth maps that count",
+        saturates=True,
+    ),
+    Column(
+        *("SourceClass", "", "uint8", "uint8", 1.0, "class before the correction"),
+        "class before",
+    ),
 )
 SHIFTS = ("ShiftX", "ShiftY", "ShiftZ")
 MINIMAL = ("ShiftZ", "RayCount")
+_UNITS = {0.0: "file's scale", 0.001: "1 mm", 0.0001: "0.1 mm", 0.1: "0.1°", 1.0: ""}
 
 
 def columns_for(dimensions: Dimensions) -> tuple[Column, ...]:
@@ -63,6 +115,17 @@ def columns_for(dimensions: Dimensions) -> tuple[Column, ...]:
         return COLUMNS
     names = MINIMAL if dimensions == "minimal" else ()
     return tuple(column for column in COLUMNS if column.name in names)
+
+
+def documented_columns() -> str:
+    """Return the table of the documentation, as Markdown."""
+    lines = ["| extra dimension | type | unit | |", "|---|---|---|---|"]
+    for c in COLUMNS:
+        kind = c.narrow if c.narrow == c.wide else f"{c.narrow} ({c.wide})"
+        lines.append(
+            f"| `{c.name}` | {kind} | {_UNITS[c.scale]} | {c.meaning} |".replace("  ", " ")
+        )
+    return "\n".join(lines) + "\n"
 
 
 def column_scale(column: Column, scales: FloatArray) -> float:
@@ -95,23 +158,12 @@ def in_steps(
         Before the correction.
     rows : array of bool, shape (n,)
     """
-    values: dict[str, npt.NDArray[Any]] = {
-        "ShiftX": moved[:, 0],
-        "ShiftY": moved[:, 1],
-        "ShiftZ": moved[:, 2],
-        "WaterDepth": correction.depth_m,
-        "RayMiss": correction.ray_miss_m,
-        "SigmaZ": correction.sigma_z_m,
-        "Incidence": correction.incidence_deg,
-        "RayCount": correction.ray_count,
-        "SourceClass": classes,
-    }
-    value = values[column.name][rows]
-    if column.scale not in (0.0, 1.0):
+    if column.scale == 0.0:
+        return moved[rows, SHIFTS.index(column.name)]
+    value: npt.NDArray[Any] = (getattr(correction, column.of) if column.of else classes)[rows]
+    if column.scale != 1.0:
         value = np.rint(value / column.scale)
-    if column.name == "WaterDepth":
-        value = np.maximum(value, 1)  # a submerged point is never at zero depth
-    return value
+    return value if column.least is None else np.maximum(value, column.least)
 
 
 def fill(
@@ -132,8 +184,8 @@ def fill(
     for column in columns:
         target = points.array[column.name]
         limits = np.iinfo(target.dtype)
-        mine = rows_of(column, correction, rows)
-        value = in_steps(column, correction, moved, classes, mine)
+        filled = rows_of(column, correction, rows)
+        value = in_steps(column, correction, moved, classes, filled)
         if column.saturates:
             value = np.minimum(value, limits.max)
         if value.size and (value.min() < limits.min or value.max() > limits.max):
@@ -145,7 +197,7 @@ def fill(
                 " the cloud has points far below the water; remove them, or write it with a"
                 " coarser scale."
             )
-        target[mine] = value
+        target[filled] = value
 
 
 def rows_of(column: Column, correction: Correction, changed: BoolArray) -> BoolArray:
@@ -172,3 +224,104 @@ def is_corrected(points: laspy.ScaleAwarePointRecord) -> BoolArray:
 def is_marked_uncorrected(points: laspy.ScaleAwarePointRecord) -> BoolArray:
     """Return which rows of an output file pcfix should have moved and could not."""
     return np.asarray((points.array["RayCount"] == 0) & (points.array["WaterDepth"] > 0))
+
+
+UPGRADE = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10, 6: 6, 7: 7, 8: 8, 9: 9, 10: 10}
+"""The format that each one becomes (LAS 1.4 R15, table 6 and on)."""
+
+SCAN_ANGLE_STEP_DEG = 0.006
+"""Unit of the scan angle in formats 6 and up; whole degrees before."""
+
+_INT32 = np.iinfo(np.int32)
+
+_PACKED = (
+    "return_number",
+    "number_of_returns",
+    "scan_direction_flag",
+    "edge_of_flight_line",
+    "classification",
+    "synthetic",
+    "key_point",
+    "withheld",
+)
+
+
+class OutOfRangeError(Exception):
+    """A coordinate leaves the 32 bits that LAS has; move the offsets and write again."""
+
+
+def upgraded(point_format: laspy.PointFormat) -> laspy.PointFormat:
+    """Return the output's point format, with the input's extra dimensions."""
+    return _with_extra(UPGRADE[point_format.id], point_format)
+
+
+def _with_extra(format_id: int, like: laspy.PointFormat) -> laspy.PointFormat:
+    new = laspy.PointFormat(format_id)
+    new.dimensions.extend(like.extra_dimensions)
+    return new
+
+
+def convert(
+    points: laspy.ScaleAwarePointRecord, point_format: laspy.PointFormat
+) -> laspy.ScaleAwarePointRecord:
+    """Return the points in another format, which may have more or fewer extra dimensions.
+
+    Values that both formats have come over bit for bit; dimensions that are new are zero.
+    """
+    array: Records = np.zeros(len(points), point_format.dtype())
+    new = laspy.ScaleAwarePointRecord(array, point_format, points.scales, points.offsets)
+    if points.point_format.id == point_format.id and _one_begins_the_other(points.array, array):
+        size = min(points.array.itemsize, array.itemsize)
+        _bytes(array)[:, :size] = _bytes(points.array)[:, :size]
+        return new
+    for name in points.array.dtype.names:
+        if name in array.dtype.names and name != "bit_fields":
+            array[name] = points.array[name]
+    if points.point_format.id == point_format.id:
+        array["bit_fields"] = points.array["bit_fields"]
+        return new
+    for name in _PACKED:
+        new[name][:] = np.asarray(points[name])
+    _convert_scan_angle(points.array, array)
+    return new
+
+
+def _one_begins_the_other(one: Records, other: Records) -> bool:
+    layouts = [
+        [(name, *array.dtype.fields[name][:2]) for name in array.dtype.names]
+        for array in (one, other)
+    ]
+    return all(a == b for a, b in zip(*layouts, strict=False))
+
+
+def _bytes(array: Records) -> Records:
+    return np.ascontiguousarray(array).view(np.uint8).reshape(len(array), array.itemsize)
+
+
+def _convert_scan_angle(old: Records, new: Records) -> None:
+    if "scan_angle" in new.dtype.names and "scan_angle_rank" in old.dtype.names:
+        new["scan_angle"] = np.rint(old["scan_angle_rank"] / SCAN_ANGLE_STEP_DEG)
+    elif "scan_angle_rank" in new.dtype.names and "scan_angle" in old.dtype.names:
+        new["scan_angle_rank"] = np.rint(old["scan_angle"] * SCAN_ANGLE_STEP_DEG)
+
+
+def shifted(
+    points: laspy.ScaleAwarePointRecord,
+    header: laspy.LasHeader,
+    steps: npt.NDArray[np.int64],
+) -> laspy.ScaleAwarePointRecord:
+    """Return points in the header's format, moved by whole steps of its scale, shape (n, 3).
+
+    Raises
+    ------
+    OutOfRangeError
+        If a coordinate does not fit 32 bits.
+    """
+    new = convert(points, header.point_format)
+    for axis, name in enumerate("XYZ"):
+        moved = points.array[name].astype(np.int64) + steps[:, axis]
+        if moved.size and (moved.min() < _INT32.min or moved.max() > _INT32.max):
+            raise OutOfRangeError(name)
+        new.array[name] = moved
+    new.offsets = header.offsets
+    return new

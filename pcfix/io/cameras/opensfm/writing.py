@@ -25,12 +25,14 @@ from pcfix.io.cameras.georeference import georeference
 from pcfix.io.cameras.heights import is_tied
 from pcfix.io.cameras.opensfm.lenses import lens as lens_of
 from pcfix.io.cameras.same_lens import is_same_lens
-from pcfix.io.crs import heights_of, parse_crs, shortened
-from pcfix.io.earth import (
+from pcfix.io.crs import (
     GEOCENTRIC_WGS84,
     GEOGRAPHIC_WGS84,
     Topocentric,
+    heights_of,
     is_topocentric,
+    parse_crs,
+    shortened,
 )
 from pcfix.io.files import check_output, write_text
 from pcfix.io.transformations import transformation_in_plan, transformation_in_space

@@ -19,7 +19,7 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.io.cameras.same_lens import is_same_lens
 from pcfix.io.cameras.table.sensor import FILM_MM
-from pcfix.io.earth import is_topocentric
+from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_output, write_text
 from pcfix.model import Lens
 

@@ -1,26 +1,42 @@
-"""The header of a corrected or cleaned file from that of its input, and the way back."""
+"""Write a LAS or LAZ file: its header from that of its input and the way back, its points.
+
+A VLR says what pcfix did, and what the file was before. Points go chunk by chunk into a file beside
+the target, which is renamed when it is whole.
+"""
 
 from __future__ import annotations
 
+import json
+from contextlib import ExitStack, contextmanager
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import laspy
+import lazrs
 import numpy as np
 from laspy.vlrs.known import ExtraBytesStruct, WktCoordinateSystemVlr
 from laspy.vlrs.vlr import VLR
 
-from pcfix.errors import InputError
-from pcfix.io.las.columns import Column, column_scale
-from pcfix.io.las.formats import upgraded
-from pcfix.io.las.provenance import is_ours, settings_vlr
-from pcfix.io.las.records import Record, RecordList
-from pcfix.io.las.source import las_errors
+from pcfix.errors import InputError, SettingError
+from pcfix.io.files import replaced_when_whole
+from pcfix.io.las.columns import Column, column_scale, upgraded
+from pcfix.io.las.source import (
+    IDENTITY_PLACE,
+    Record,
+    RecordList,
+    append_evlrs,
+    backend,
+    las_errors,
+)
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+    from pathlib import Path
+
     from pcfix.io.las.source import LasSource
     from pcfix.model import FloatArray
+
 
 EXTRA_BYTES = ("LASF_Spec", 4)
 _SOFTWARE = slice(32, 64)
@@ -250,3 +266,150 @@ def _wkt_for(header: laspy.LasHeader, source: LasSource) -> VLR | None:
         return None
     wkt = WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL"))
     return VLR("LASF_Projection", 2112, "OGC COORDINATE SYSTEM WKT", wkt.record_data_bytes())
+
+
+USER_ID = "pcfix"
+SETTINGS_RECORD = 1
+DESCRIPTION = "pcfix settings (JSON)"
+CLEANING_RECORD = 2
+CLEANING_DESCRIPTION = "pcfix cleaning (JSON)"
+LABELLING_RECORD = 3
+LABELLING_DESCRIPTION = "pcfix labelling (JSON)"
+BEFORE = (
+    "version",
+    "point_format",
+    "identity",
+    "global_encoding",
+    "offsets",
+    "steps",
+    "added_wkt",
+    "undescribed",
+)
+"""What the VLR says of the file before the correction."""
+
+
+def is_ours(vlr: VLR) -> bool:
+    """Whether a VLR is the one of `settings_vlr`."""
+    return bool(vlr.user_id == USER_ID and vlr.record_id == SETTINGS_RECORD)
+
+
+def settings_vlr(content: dict[str, Any]) -> VLR:
+    """Return the VLR that holds the content as JSON."""
+    return _json_vlr(SETTINGS_RECORD, DESCRIPTION, content)
+
+
+def cleaning_vlr(content: dict[str, Any]) -> VLR:
+    """Return the VLR that says how a file was cleaned, as JSON; one for each cleaning."""
+    return _json_vlr(CLEANING_RECORD, CLEANING_DESCRIPTION, content)
+
+
+def labelling_vlr(content: dict[str, Any]) -> VLR:
+    """Return the VLR that says how a file was labelled, as JSON; one for each labelling."""
+    return _json_vlr(LABELLING_RECORD, LABELLING_DESCRIPTION, content)
+
+
+def _json_vlr(record: int, description: str, content: dict[str, Any]) -> VLR:
+    text = json.dumps(content, ensure_ascii=True, separators=(",", ":"))
+    return VLR(USER_ID, record, description, text.encode())
+
+
+def read_settings(vlrs: Iterable[VLR], path: Path) -> dict[str, Any]:
+    """Return the content of the VLR.
+
+    Raises
+    ------
+    InputError
+        If there is none, or it is damaged.
+    """
+    ours = next((vlr for vlr in vlrs if is_ours(vlr)), None)
+    if ours is None:
+        raise InputError(f"{path}: was not corrected by pcfix; there is nothing to undo.")
+    try:
+        content: dict[str, Any] = json.loads(ours.record_data)
+        _ = content["settings"]["dimensions"], [content["before"][key] for key in BEFORE]
+    except (ValueError, TypeError, KeyError) as error:
+        raise InputError(
+            f"{path}: pcfix's own VLR is damaged ({error}); use the original cloud."
+        ) from error
+    return content
+
+
+def check_suffix(path: Path) -> bool:
+    """Return whether a name asks for LAZ rather than LAS.
+
+    Raises
+    ------
+    SettingError
+        If it asks for neither.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in (".las", ".laz"):
+        raise SettingError(f"{path}: give an output name that ends in .las or .laz.")
+    return suffix == ".laz"
+
+
+class LasSink:
+    """An output file that is being written. Use it as a context manager.
+
+    Parameters
+    ----------
+    path : Path
+        Its suffix decides between LAS and LAZ.
+    header : laspy.LasHeader
+    evlrs : list of Record
+        To stand behind the points.
+    identity : bytes
+        To stand in the header as it is; see `LasSource.identity`.
+    jobs : int, optional
+        Threads.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        header: laspy.LasHeader,
+        evlrs: list[Record] | None = None,
+        identity: bytes = b"",
+        jobs: int | None = None,
+    ) -> None:
+        self.header = header
+        self._path, self._evlrs, self._identity, self._jobs = path, evlrs or [], identity, jobs
+        self._stack = ExitStack()
+
+    def __enter__(self) -> LasSink:
+        laz = check_suffix(self._path)
+        with ExitStack() as stack:
+            draft = stack.enter_context(replaced_when_whole(self._path))
+            stack.enter_context(_write_errors(self._path))
+            self._stream = stack.enter_context(draft.open("w+b"))
+            self._writer = laspy.LasWriter(
+                self._stream,
+                self.header,
+                do_compress=laz,
+                laz_backend=backend(self._jobs),
+                closefd=False,
+            )
+            self._stack = stack.pop_all()
+        return self
+
+    def write(self, points: laspy.ScaleAwarePointRecord) -> None:
+        """Append points, in the header's format and scale."""
+        with _write_errors(self._path):
+            self._writer.write_points(points)
+
+    def __exit__(self, kind: Any, value: Any, traceback: Any) -> None:
+        with self._stack:
+            if kind is not None:
+                raise value
+            self._writer.close()
+            append_evlrs(self._stream, self._evlrs, self.header.version.minor)
+            self._stream.seek(IDENTITY_PLACE)
+            self._stream.write(self._identity)
+
+
+@contextmanager
+def _write_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (laspy.LaspyException, lazrs.LazrsError, OSError) as error:
+        raise InputError(f"{path}: cannot be written ({error}).") from error
