@@ -159,11 +159,11 @@ def in_steps(
     rows : array of bool, shape (n,)
     """
     if column.scale == 0.0:
-        return moved[rows, SHIFTS.index(column.name)]
-    value: npt.NDArray[Any] = (getattr(correction, column.of) if column.of else classes)[rows]
+        return np.asarray(moved[rows, SHIFTS.index(column.name)])
+    value = (getattr(correction, column.of) if column.of else classes)[rows]
     if column.scale != 1.0:
         value = np.rint(value / column.scale)
-    return value if column.least is None else np.maximum(value, column.least)
+    return value if column.least is None else np.asarray(np.maximum(value, column.least))
 
 
 def fill(
