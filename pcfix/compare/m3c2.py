@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.compare.neighbours import Neighbours
+from pcfix.compare.nearest import Neighbours
 from pcfix.compare.statistics import Statistics, statistics_of
 from pcfix.errors import GeometryError, SettingError
 

@@ -7,14 +7,14 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pcfix.compare.figures import Comparison, bins_table, figures_of
 from pcfix.compare.m3c2 import load_py4dgeo
+from pcfix.compare.match import CompareSettings, match
 from pcfix.compare.sections import parse_line
 from pcfix.compare.vertical import DEFAULT_NEIGHBOURS
 from pcfix.errors import SettingError
-from pcfix.flow.comparison import CompareSettings, Comparison, bins_table
-from pcfix.flow.evaluate import figures_of
-from pcfix.flow.match import match
-from pcfix.io.files import check_output, write_text
+from pcfix.io.clouds import check_same_crs, read_cloud, read_reference
+from pcfix.io.files import check_input, check_output, write_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -96,7 +96,15 @@ def compare_clouds(
     _check_outputs(out_dir, summary, [cloud, reference], overwrite=overwrite)
     if m3c2:
         load_py4dgeo()
-    result = figures_of(match(cloud, reference, water, settings), lines, started)
+    given = None
+    if water is not None:
+        from pcfix.flow.surfaces import WaterWords, find_surface, view_of  # not quick to load
+
+        given = find_surface(WaterWords(water), view_of(check_input(cloud))).surface
+    target, whole = read_reference(reference), read_cloud(cloud, given)
+    check_same_crs(whole.name, whole.crs, target.name, target.crs)
+    matched = match(whole, target, settings, given=given is not None)
+    result = figures_of(matched, lines, started)
     _write(result, out_dir, summary, overwrite=overwrite)
     return result
 

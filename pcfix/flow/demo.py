@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pcfix.compare.truth import errors_against_truth
+from pcfix.compare.statistics import errors_against_truth
 from pcfix.flow.points import correct_points
 from pcfix.flow.run import Request, run_all
 from pcfix.io.las.source import read_xyz

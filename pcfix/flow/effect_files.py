@@ -35,10 +35,11 @@ from pcfix.simulate.refraction_effect import (
     OVERLAP,
     AerialCamera,
     Effect,
+    Iteration,
     StereoPair,
     effects,
+    shan_iterations,
 )
-from pcfix.simulate.shan import Iteration, shan_iterations
 from pcfix.version import __version__
 
 if TYPE_CHECKING:

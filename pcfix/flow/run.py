@@ -45,7 +45,7 @@ from pcfix.water.index import index_of
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from pcfix.flow.comparison import Comparison
+    from pcfix.compare.figures import Comparison
     from pcfix.flow.run_adjust import AdjustWhen
     from pcfix.flow.surfaces import WaterModel
     from pcfix.io.cameras.formats import Angles

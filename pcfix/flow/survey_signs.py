@@ -12,8 +12,8 @@ from pcfix.model import WaterDimension
 from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
+    from pcfix.compare.match import Reference
     from pcfix.flow.surfaces import CloudView
-    from pcfix.io.clouds import Reference
     from pcfix.model import (
         Cameras,
         FloatArray,

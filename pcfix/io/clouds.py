@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import warnings
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from pcfix.compare.match import Reference, SurveyCloud
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.crs import is_same, parts
 from pcfix.io.files import check_input
@@ -36,52 +36,6 @@ if TYPE_CHECKING:
 
 
 CHUNK_POINTS = 2_000_000
-
-
-@dataclass(frozen=True, eq=False)
-class SurveyCloud:
-    """Points that count; n of them.
-
-    Attributes
-    ----------
-    name : str
-        For messages.
-    xyz : array, shape (n, 3)
-        Metres, world frame.
-    crs : CRS or None
-    left_out : int
-        Points withheld, or of a class that does not count.
-    shift_m : array, shape (n, 3), or None
-        True minus apparent, of a cloud that pcfix corrected.
-    bathymetric : array of bool, shape (n,)
-        Class 40.
-    water_m : array, shape (n,)
-        Height of the water surface above each point; NaN where the cloud does not say.
-    water : WaterSurface or None
-        The surface itself, where it is known away from the points too.
-    """
-
-    name: str
-    xyz: FloatArray
-    crs: CRS | None
-    left_out: int
-    shift_m: FloatArray | None
-    bathymetric: BoolArray
-    water_m: FloatArray
-    water: WaterSurface | None = None
-
-    def __len__(self) -> int:
-        return len(self.xyz)
-
-    def take(self, rows: BoolArray) -> SurveyCloud:
-        """Return the cloud with these rows alone."""
-        return replace(
-            self,
-            xyz=self.xyz[rows],
-            shift_m=None if self.shift_m is None else self.shift_m[rows],
-            bathymetric=self.bathymetric[rows],
-            water_m=self.water_m[rows],
-        )
 
 
 def read_cloud(
@@ -199,30 +153,6 @@ def _crs(source: LasSource) -> CRS | None:
 WATER_CLASSES = (9, 41, 42, 45)
 """ASPRS classes of water and of its surface and column: not the bed."""
 KINDS = "a cloud (.las, .laz), check points (.csv, .txt) or a grid (.tif, .tiff)"
-
-
-@dataclass(frozen=True, eq=False)
-class Reference:
-    """Heights that are taken as true.
-
-    Attributes
-    ----------
-    name : str
-        For messages.
-    xyz : array, shape (m, 3)
-        Metres, world frame.
-    crs : CRS or None
-    left_out : int
-        Points withheld, of noise, or of water; cells without data.
-    sparse : bool
-        Whether these are single check points, not a sampled surface.
-    """
-
-    name: str
-    xyz: FloatArray
-    crs: CRS | None
-    left_out: int = 0
-    sparse: bool = False
 
 
 def read_reference(path: str | os.PathLike[str]) -> Reference:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 from pcfix.report.text import share
 
 if TYPE_CHECKING:
-    from pcfix.compare.depth import Bin, Line
-    from pcfix.compare.statistics import Statistics
-    from pcfix.flow.comparison import Comparison, M3c2Pair
+    from pcfix.compare.figures import AfterBefore, Comparison
+    from pcfix.compare.m3c2 import M3c2
+    from pcfix.compare.statistics import Bin, Line, Statistics
 
 HEAD = f"{'m':<20}{'mean':>9}{'sd':>9}{'rmse':>9}{'nmad':>9}{'median':>9}{'5 %':>9}{'95 %':>9}"
 
@@ -99,7 +99,7 @@ def _bins(title: str, bins: tuple[Bin, ...]) -> list[str]:
     return lines
 
 
-def _m3c2(pair: M3c2Pair) -> list[str]:
+def _m3c2(pair: AfterBefore[M3c2]) -> list[str]:
     m = pair.after
     return [
         f"M3C2: {m.statistics.count:,} of {m.core_points:,} core points, normals"

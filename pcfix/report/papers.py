@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from pcfix.flow.flume_methods import DepthBins
-    from pcfix.simulate.shan import Iteration
+    from pcfix.simulate.refraction_effect import Iteration
 
 _COLOURS = {
     "uncorrected": REFERENCE, "I": BEFORE, "II": WATER, "III": "#8a8a8a", "pcfix": AFTER,

@@ -26,7 +26,7 @@ distance says; so of two pairs with nearly the same squares either may be taken.
 Departures from the program: costs are squares of distances, not correlations of patches, which are
 squares to first order; rays are not rounded to pixels; all confidences are alike, as in the
 program they nearly are in the end; the map that a neighbour has near a place is a plane, parallel
-to the bed; and the local water plane of each image (see `pcfix.simulate.water`) is that at the
+to the bed; and the local water plane of each image (see `pcfix.simulate.tracing`) is that at the
 point for which the picture was begun.
 """
 
@@ -37,13 +37,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pcfix.model import Views
+from pcfix.simulate.sight import intersect, starts_of
 from pcfix.simulate.tracing import bed_points, piercing_points_of_planes, project
-from pcfix.simulate.tracks import straight
 
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens
-    from pcfix.simulate.neighbours import Partners
-    from pcfix.simulate.sight import Rig, Sight
+    from pcfix.simulate.sight import Partners, Rig, Sight
 
 AVERAGED_WITHIN = 0.012
 AGREE = 0.01
@@ -128,7 +127,7 @@ def fuse_depth_maps(
     """
     matching = _matching(bed, sight, rig, partners, rng)
     luck = rng.uniform(0.0, 1.0, len(sight.point))
-    place = straight(bed[0], sight, rig, sight.ideal)
+    place = intersect(bed[0], sight, rig, sight.ideal)
     maps = depth_maps(matching, place)
     seed, group = _groups(matching, maps, luck)
     made = np.flatnonzero(seed >= 0)
@@ -141,9 +140,8 @@ def fuse_depth_maps(
     point, weight = sight.point[rows], 1.0 / maps.averaged[rows] ** 2
     xyz = maps.points(rows, maps.averaged[rows])
     fused, true = (_means(v, weight, point, bed[0]) for v in (xyz, maps.shown[rows]))
-    count = np.bincount(point, minlength=len(fused))
-    start = np.concatenate([[0], np.cumsum(count)])
-    return DepthCloud(fused, true, Views(start, sight.camera[rows], weight.astype(np.float32)))
+    views = Views(starts_of(point, len(fused)), sight.camera[rows], weight.astype(np.float32))
+    return DepthCloud(fused, true, views)
 
 
 def _matching(

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.io.cameras.table import rotations_from_yaw_pitch_roll
+from pcfix.lens.rotations import from_yaw_pitch_roll
 from pcfix.model import Cameras, Lens, Views
 from pcfix.options import DEFAULT_REFRACTIVE_INDEX, Settings
+from pcfix.simulate.sight import starts_of
 from pcfix.simulate.tracing import piercing_points, project, triangulate
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def simulate_flume(
     inside = ((pixels >= 0.0) & (pixels < [LENS.width, LENS.height])).all(axis=1)
     point, camera, pixels = point[inside], camera[inside], pixels[inside]
     pixels = pixels + rng.normal(0.0, image_noise_px, pixels.shape)
-    start = np.concatenate([[0], np.cumsum(np.bincount(point, minlength=points))])
+    start = starts_of(point, points)
     return Flume(
         apparent_xyz=triangulate(pixels, cameras, camera, start, LENS, bed),
         true_xyz=bed,
@@ -118,6 +119,6 @@ def _cameras(rng: np.random.Generator) -> Cameras:
     return Cameras(
         labels=tuple(f"F{i + 1:02d}" for i in range(len(x))),
         centres=centres,
-        rotations=rotations_from_yaw_pitch_roll(*tilt.T),
+        rotations=from_yaw_pitch_roll(*tilt.T),
         lenses=(LENS,) * len(x),
     )

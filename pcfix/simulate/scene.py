@@ -10,13 +10,20 @@ import numpy as np
 from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterPlane
 from pcfix.simulate.block import Block, fly_block, misplaced
 from pcfix.simulate.depth_maps import fuse_depth_maps
-from pcfix.simulate.neighbours import SAMPLE, TIES, Partners, neighbour_table, openmvs_partners
-from pcfix.simulate.pairs import match_pairs
 from pcfix.simulate.settings import BlockKind, SceneSettings
-from pcfix.simulate.sight import Rig, see
+from pcfix.simulate.sight import (
+    SAMPLE,
+    TIES,
+    Partners,
+    Rig,
+    intersect,
+    match_pairs,
+    neighbour_table,
+    openmvs_partners,
+    see,
+)
 from pcfix.simulate.terrain import Terrain
-from pcfix.simulate.tracks import intersect_tracks, straight
-from pcfix.simulate.water import Water, Waves
+from pcfix.simulate.tracing import Water, Waves
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -186,18 +193,15 @@ def simulate_scene(
     2
     """
     chosen = SceneSettings(points=points, **settings)
-    streams, extent, flight = Streams.of(chosen.seed), _extent(chosen), chosen.flight
-    plane = chosen.water_plane(extent)
-    terrain = Terrain.random(chosen.bed, extent, plane, chosen.depth_m, streams.main)
-    flown = fly_block(extent, chosen.water_level_m, flight, streams.main)
-    given = misplaced(flown, chosen.position_noise_m, chosen.attitude_noise_deg, streams.poses)
-    rig = _rig(chosen, flown, given, plane, extent, streams)
-    truth = _on(terrain, points, streams.main)
-    partners = _partners(chosen, truth, terrain, rig)
-    parts = _parts(chosen, truth, terrain, rig, partners, streams, progress)
-    lidar = _on(terrain, round(extent[0] * extent[1] * chosen.lidar_per_m2), streams.main)
-    lidar[:, 2] += streams.main.normal(0.0, chosen.lidar_noise_m, len(lidar))
-    cameras = _moved(given.cameras)
+    site = lay_out(chosen)
+    terrain, flown, given, rng = site.terrain, site.flown, site.given, site.streams.main
+    truth = points_on(terrain, points, rng)
+    partners = _partners(chosen, truth, site)
+    parts = _parts(truth, site, partners, progress)
+    area_m2 = terrain.length_m * terrain.width_m
+    lidar = points_on(terrain, round(area_m2 * chosen.lidar_per_m2), rng)
+    lidar[:, 2] += rng.normal(0.0, chosen.lidar_noise_m, len(lidar))
+    cameras = cameras_in_world(given.cameras)
     return Scene(
         apparent_xyz=np.vstack([part.xyz for part in parts]) + ORIGIN_M,
         true_xyz=np.vstack([part.true_xyz for part in parts]) + ORIGIN_M,
@@ -207,16 +211,50 @@ def simulate_scene(
         lidar_xyz=lidar + ORIGIN_M,
         water_level_m=chosen.water_level_m,
         refractive_index=chosen.refractive_index,
-        gsd_m=flight.gsd_m,
-        sensor_mm=flight.sensor,
+        gsd_m=chosen.flight.gsd_m,
+        sensor_mm=chosen.flight.sensor,
         epsg=EPSG,
         settings=chosen.as_dict(),
-        water=_in_world(plane),
-        true_cameras=cameras if given is flown else _moved(flown.cameras),
+        water=plane_in_world(terrain.water),
+        true_cameras=cameras if given is flown else cameras_in_world(flown.cameras),
         true_yaw_pitch_roll_deg=flown.yaw_pitch_roll_deg,
         neighbours=partners.matched if isinstance(partners, Partners) else partners,
         **_joined_pairs(parts),
     )
+
+
+class Site(NamedTuple):
+    """What stands before a point is seen: ground, block, what images are made with, randomness."""
+
+    terrain: Terrain
+    flown: Block
+    given: Block
+    rig: Rig
+    streams: Streams
+
+
+def lay_out(chosen: SceneSettings) -> Site:
+    """Return ground and block of a scene, in local coordinates."""
+    streams, extent = Streams.of(chosen.seed), _extent(chosen)
+    plane = chosen.water_plane(extent)
+    terrain = Terrain.random(chosen.bed, extent, plane, chosen.depth_m, streams.main)
+    flown = fly_block(extent, chosen.water_level_m, chosen.flight, streams.main)
+    given = misplaced(flown, chosen.position_noise_m, chosen.attitude_noise_deg, streams.poses)
+    waves = None
+    if chosen.wave_slope_deg > 0.0:
+        count = len(flown.cameras)
+        waves = Waves.random(count, chosen.wave_slope_deg, chosen.wave_length_m, streams.waves)
+    fall_m = chosen.water_tilt * float(np.hypot(*extent)) / 2.0
+    rig = Rig(
+        true=flown.cameras,
+        given=given.cameras,
+        optics=chosen.optics,
+        water=Water(plane, chosen.refractive_index, waves),
+        lowest_m=chosen.water_level_m - chosen.depth_m - fall_m,
+        image_noise_px=chosen.image_noise_px,
+        detection=chosen.detection,
+    )
+    return Site(terrain, flown, given, rig, streams)
 
 
 def _extent(chosen: SceneSettings) -> tuple[float, float]:
@@ -230,93 +268,59 @@ def _extent(chosen: SceneSettings) -> tuple[float, float]:
     return reach, max(chosen.cameras * base * spacing / side - 1.5 * spacing, spacing / 2.0)
 
 
-def _rig(
-    chosen: SceneSettings,
-    flown: Block,
-    given: Block,
-    plane: WaterPlane,
-    extent_m: tuple[float, float],
-    streams: Streams,
-) -> Rig:
-    waves = None
-    if chosen.wave_slope_deg > 0.0:
-        count = len(flown.cameras)
-        waves = Waves.random(count, chosen.wave_slope_deg, chosen.wave_length_m, streams.waves)
-    return Rig(
-        true=flown.cameras,
-        given=given.cameras,
-        optics=chosen.optics,
-        water=Water(plane, chosen.refractive_index, waves),
-        lowest_m=chosen.water_level_m
-        - chosen.depth_m
-        - chosen.water_tilt * float(np.hypot(*extent_m)) / 2.0,
-        image_noise_px=chosen.image_noise_px,
-        detection=chosen.detection,
-    )
-
-
-def _on(terrain: Terrain, count: int, rng: np.random.Generator) -> FloatArray:
+def points_on(terrain: Terrain, count: int, rng: np.random.Generator) -> FloatArray:
     """Return random points of the surface, west to east in narrow bands, as matchers write."""
     plan = rng.uniform(0.0, 1.0, (count, 2)) * [terrain.length_m, terrain.width_m]
     plan = plan[np.lexsort((plan[:, 0], np.floor(plan[:, 1])))]
     return np.column_stack([plan, terrain.height(*plan.T)])
 
 
-def _partners(
-    chosen: SceneSettings, truth: FloatArray, terrain: Terrain, rig: Rig
-) -> Partners | IntArray | None:
+def _partners(chosen: SceneSettings, truth: FloatArray, site: Site) -> Partners | IntArray | None:
     """Return what the kind of cloud needs of which images are matched with which."""
     if chosen.cloud == "tracks":
         return None
-    rng, sure = np.random.default_rng(0), replace(rig, detection=1.0)
+    rig, rng = site.rig, np.random.default_rng(0)
+    sure = replace(rig, detection=1.0)
     if chosen.cloud == "pairs":
         sample = truth[:: max(1, len(truth) // SAMPLE)][:SAMPLE]
         every = see(sample, sure, rng)
         return neighbour_table(sample, every, rig.true.centres, chosen.matched_with)
-    sample = _on(terrain, max(TIES, 10 * len(rig.true)), rng)
+    sample = points_on(site.terrain, max(TIES, 10 * len(rig.true)), rng)
     every = see(sample, sure, rng)
-    ties = straight(sample, every, rig, every.ideal)
+    ties = intersect(sample, every, rig, every.ideal)
     return openmvs_partners(ties, every, rig.given, rig.optics, chosen.matched_with, rng)
 
 
 def _parts(
-    chosen: SceneSettings,
     truth: FloatArray,
-    terrain: Terrain,
-    rig: Rig,
+    site: Site,
     partners: Partners | IntArray | None,
-    streams: Streams,
     progress: Callable[[int, int], None] | None,
 ) -> list[Part]:
     """Return the cloud in parts that fit into the memory."""
     pairs = _TRACK_PAIRS_AT_ONCE if partners is None else _DENSE_PAIRS_AT_ONCE
-    at_once = max(1, pairs // len(rig.true))
+    at_once = max(1, pairs // len(site.rig.true))
     parts: list[Part] = []
     for first in range(0, len(truth), at_once):
         part = truth[first : first + at_once]
-        parts.append(_observe(part, terrain, rig, partners, streams))
+        parts.append(_observe(part, site, partners))
         if progress is not None:
             progress(first + len(part), len(truth))
     return parts
 
 
-def _observe(
-    truth: FloatArray,
-    terrain: Terrain,
-    rig: Rig,
-    partners: Partners | IntArray | None,
-    streams: Streams,
-) -> Part:
+def _observe(truth: FloatArray, site: Site, partners: Partners | IntArray | None) -> Part:
     """Return the cloud that is made of the images of some points."""
+    rig, streams = site.rig, site.streams
     sight = see(truth, rig, streams.detection)
     if partners is None:
-        xyz = intersect_tracks(truth, sight, rig, streams.main)
-        return Part(xyz, truth, Views(sight.start, sight.camera))
+        pixels = rig.observed(sight.ideal, streams.main)
+        return Part(intersect(truth, sight, rig, pixels), truth, Views(sight.start, sight.camera))
     if isinstance(partners, Partners):
-        bed = truth, terrain.normals(*truth[:, :2].T)
+        bed = truth, site.terrain.normals(*truth[:, :2].T)
         return Part(*fuse_depth_maps(bed, sight, rig, partners, streams.matching))
-    made = match_pairs(truth, sight, rig, partners, streams.matching)
-    return Part(made.xyz, truth, made.views, made.start, made.pairs)
+    found = match_pairs(truth, sight, rig, partners, streams.matching)
+    return Part(found.xyz, truth, found.views, found.start, found.pairs)
 
 
 def _joined_views(parts: list[Part]) -> Views:
@@ -341,11 +345,12 @@ def _joined_pairs(parts: list[Part]) -> dict[str, IntArray]:
     }
 
 
-def _moved(cameras: Cameras) -> Cameras:
+def cameras_in_world(cameras: Cameras) -> Cameras:
     """Return cameras in the world's coordinates."""
     return replace(cameras, centres=cameras.centres + ORIGIN_M)
 
 
-def _in_world(plane: WaterPlane) -> WaterPlane:
+def plane_in_world(plane: WaterPlane) -> WaterPlane:
+    """Return a plane in the world's coordinates."""
     a = plane.a - plane.b * ORIGIN_M[0] - plane.c * ORIGIN_M[1]
     return WaterPlane(float(a), plane.b, plane.c)

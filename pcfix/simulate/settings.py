@@ -20,9 +20,10 @@ from pcfix.simulate.block import (
     SENSOR_PX,
     SIDE_OVERLAP,
     Flight,
+    Optics,
+    make_optics,
 )
-from pcfix.simulate.optics import Optics, make_optics
-from pcfix.simulate.terrain import BEDS, DEFAULT_DEPTH_M, BedKind
+from pcfix.simulate.terrain import BEDS, BedKind
 
 BlockKind = Literal["nadir", "oblique"]
 CloudKind = Literal["tracks", "pairs", "depth-maps"]
@@ -99,7 +100,7 @@ class SceneSettings:
         cloud is intersected with the given ones.
     wave_slope_deg : float
         Standard deviation of the slope of the water along either axis; see
-        `pcfix.simulate.water`.
+        `pcfix.simulate.tracing`.
     wave_length_m : float
     tilt_percent : float, optional
         How steeply the mean water plane falls. Default: 0, of a river 0.3.
@@ -111,8 +112,7 @@ class SceneSettings:
         Default: shore 12, flat 3, slope and steps 6, river 2.5.
     cloud : {"tracks", "pairs", "depth-maps"}
         How the cloud is made of the images: every image that shows a point at once, the median
-        of stereo pairs, or the weighted mean of depth maps. See `pcfix.simulate.tracks`,
-        `pcfix.simulate.pairs` and `pcfix.simulate.depth_maps`.
+        of stereo pairs (see `pcfix.simulate.sight`), or the weighted mean of depth maps.
     detection : float
         Probability that an image that shows a point takes part in it; three at least do.
     neighbours : int, optional
@@ -158,20 +158,17 @@ class SceneSettings:
         for name in ("area_m", "sensor_mm", "sensor_px", "distortion"):
             object.__setattr__(self, name, tuple(getattr(self, name)))  # JSON has lists
         Settings(refractive_index=self.refractive_index)
-        self._check_words()
+        choices = {"block": get_args(BlockKind), "bed": BEDS, "cloud": _NEIGHBOURS}
+        for name, allowed in choices.items():
+            if getattr(self, name) not in allowed:
+                raise SettingError(
+                    f"{name} '{getattr(self, name)}' is not one of {', '.join(allowed)}."
+                )
         for name, rule in _RULES.items():
             _check_range(getattr(self, name), *rule)
         self._check_counts()
         self._check_shapes()
         self._check_together()
-
-    def _check_words(self) -> None:
-        words = {"block": get_args(BlockKind), "bed": BEDS, "cloud": get_args(CloudKind)}
-        for name, allowed in words.items():
-            if getattr(self, name) not in allowed:
-                raise SettingError(
-                    f"{name} '{getattr(self, name)}' is not one of {', '.join(allowed)}."
-                )
 
     def _check_counts(self) -> None:
         if self.points < 1:
@@ -231,7 +228,8 @@ class SceneSettings:
     @property
     def depth_m(self) -> float:
         """The greatest depth, as given or the default of the bed."""
-        return DEFAULT_DEPTH_M[self.bed] if self.greatest_depth_m is None else self.greatest_depth_m
+        usual = BEDS[self.bed].default_depth_m
+        return usual if self.greatest_depth_m is None else self.greatest_depth_m
 
     @property
     def water_tilt(self) -> float:

@@ -1,21 +1,34 @@
-"""Which images show which points, and where: what every kind of cloud is made from."""
+"""Which images show which points and are matched with one another; clouds of tracks and pairs.
+
+A point of a cloud of *tracks* is made of all images that show it at once. One of *pairs* is what
+semi-global matching and fusion by the median make: each image is matched with its neighbours, every
+pair that shows a point measures it in both images anew, two straight rays give a place (least
+residuals in the images), and the point is the median of these places in x, y and z one by one.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from pcfix.model import Views
 from pcfix.simulate.block import reach_m
-from pcfix.simulate.tracing import project
+from pcfix.simulate.tracing import project, triangulate
 
 if TYPE_CHECKING:
     from pcfix.model import Cameras, FloatArray, IntArray
-    from pcfix.simulate.optics import Optics
-    from pcfix.simulate.water import Water
+    from pcfix.simulate.block import Optics
+    from pcfix.simulate.tracing import Water
+
 
 LEAST_VIEWS = 3
+
+
+def starts_of(point: IntArray, count: int) -> IntArray:
+    """Return where the rows of each of `count` points begin, and the end, where rows are sorted."""
+    return np.concatenate([[0], np.cumsum(np.bincount(point, minlength=count))])
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +114,7 @@ def see(truth: FloatArray, rig: Rig, rng: np.random.Generator) -> Sight:
     taken = _detected(point, rig.detection, rng)
     taken &= np.bincount(point, minlength=len(truth))[point] >= LEAST_VIEWS
     point, camera, ideal = point[taken], camera[taken], ideal[taken]
-    start = np.concatenate([[0], np.cumsum(np.bincount(point, minlength=len(truth)))])
-    return Sight(start, point, camera, ideal)
+    return Sight(starts_of(point, len(truth)), point, camera, ideal)
 
 
 def _detected(point: IntArray, probability: float, rng: np.random.Generator) -> np.ndarray:
@@ -115,3 +127,274 @@ def _detected(point: IntArray, probability: float, rng: np.random.Generator) -> 
     rank = np.empty(len(point), np.int64)
     rank[order] = np.arange(len(point)) - first
     return np.asarray((luck < probability) | (rank < LEAST_VIEWS))
+
+
+def intersect(truth: FloatArray, sight: Sight, rig: Rig, pixels: FloatArray) -> FloatArray:
+    """Return where straight rays through ideal pixels, (m, 2), meet with least residuals, (n, 3).
+
+    A point without pairs stays where it is.
+    """
+    made, apparent = sight.made, truth.copy()
+    if made.any():
+        starts = np.concatenate([sight.start[:-1][made], sight.start[-1:]])
+        apparent[made] = triangulate(
+            pixels, rig.given, sight.camera, starts, rig.optics.lens, truth[made]
+        )
+    return apparent
+
+
+SAMPLE = 1000
+"""Points that overlap and angles are judged by."""
+
+OPTIMAL_DEG, SPREAD_BELOW_DEG, SPREAD_ABOVE_DEG = 10.0, 4.0, 10.0
+
+TIES = 4000
+"""Tie points that OpenMVS's choice is made by; ten for each image where that is more."""
+
+FOUND_AGAIN_DEG = 45.0
+BEST_DEG, BELOW_DEG, ABOVE_DEG, LEAST_WEIGHT = 12.0, 0.38 * 12.0, 0.70 * 12.0, 0.1
+FARTHER = 1.6
+CELLS = 16
+LEAST_COMMON, LEAST_AREA, LEAST_LEFT = 3, 0.05, 9
+SCALES, ANGLES_DEG = (0.2, 3.2), (3.0, 65.0)
+MOST, AVERAGED = 12, 8
+LEAST_SCORE = 0.03
+
+
+class Partners(NamedTuple):
+    """What OpenMVS would use of the other images, for each of k; best first, -1 for none.
+
+    Attributes
+    ----------
+    matched : array, shape (k, c)
+        Those that the depth map is matched with.
+    averaged : array, shape (k, 8)
+        Those whose depth maps are averaged into it.
+    fused : array, shape (k, 12)
+        Those whose depth maps may be fused with it.
+    known : array, shape (k,)
+        How many images have tie points in common with it; the fusion begins with the most.
+    """
+
+    matched: IntArray
+    averaged: IntArray
+    fused: IntArray
+    known: IntArray
+
+
+def neighbour_table(truth: FloatArray, sight: Sight, centres: FloatArray, count: int) -> IntArray:
+    """Return the best neighbours of each image, shape (k, count), best first, -1 for none.
+
+    An image scores for every point that both show, the more the nearer the angle between their
+    rays is to 10 degrees (a bell, wider above): the manner of OpenMVS's choice, not its formula.
+
+    Parameters
+    ----------
+    truth : array, shape (n, 3)
+    sight : Sight
+        Of these points.
+    centres : array, shape (k, 3)
+    count : int
+    """
+    k = len(centres)
+    score = np.zeros((k, k))
+    for i in range(len(truth)):
+        seen = sight.camera[sight.start[i] : sight.start[i + 1]]
+        ray = centres[seen] - truth[i]
+        ray /= np.linalg.norm(ray, axis=1)[:, None]
+        angle = np.degrees(np.arccos(np.clip(ray @ ray.T, -1.0, 1.0)))
+        spread = np.where(angle < OPTIMAL_DEG, SPREAD_BELOW_DEG, SPREAD_ABOVE_DEG)
+        score[np.ix_(seen, seen)] += np.exp(-0.5 * ((angle - OPTIMAL_DEG) / spread) ** 2)
+    np.fill_diagonal(score, 0.0)
+    best = np.argsort(-score, axis=1, kind="stable")[:, :count]
+    table = np.full((k, count), -1)
+    table[:, : best.shape[1]] = np.where(np.take_along_axis(score, best, axis=1) > 0.0, best, -1)
+    return table
+
+
+def openmvs_partners(
+    ties: FloatArray,
+    sight: Sight,
+    cameras: Cameras,
+    optics: Optics,
+    count: int,
+    rng: np.random.Generator,
+) -> Partners:
+    """Return the partners that OpenMVS 2.3 would choose (`Scene::SelectNeighborViews`).
+
+    Each tie point is a feature of one image, found again in others with a probability that falls
+    with the angle to it, so that nadir and oblique images have few in common. Left out is the
+    weight of the region of interest, and the least score, as it counts tie points.
+
+    Parameters
+    ----------
+    ties : array, shape (p, 3)
+        Tie points where the software has them.
+    sight : Sight
+        Of the same points: the images that show them.
+    cameras : Cameras
+    optics : Optics
+    count : int
+        Partners that a depth map is matched with.
+    rng : Generator
+        Of which features are found again.
+    """
+    if cameras.rotations is None:
+        raise ValueError("partners need cameras with angles")
+    k = len(cameras)
+    cell = _cells(sight, optics, k)
+    cell[_lost(ties, sight, cameras.centres, rng)] = -1
+    depth = np.einsum("ki,kpi->kp", cameras.rotations[:, 2], ties - cameras.centres[:, None])
+    table, known = np.full((k, max(MOST, count)), -1), np.zeros(k, int)
+    matched = np.full((k, count), -1)
+    for i in range(k):
+        mine = np.flatnonzero(cell[i] >= 0)
+        common = cell[:, mine] >= 0
+        common[i] = False
+        angle = _angles_deg(cameras.centres, i, ties[mine])
+        scale = depth[:, mine] / depth[i, mine]
+        area = _shares_of_cells(common, cell[i, mine])
+        score = (common * _weights(angle, scale)).sum(axis=1) * np.maximum(area, 0.01)
+        order = np.argsort(-score, kind="stable")
+        order = order[common.sum(axis=1)[order] >= LEAST_COMMON]
+        good = (area >= LEAST_AREA) & _within(common, scale, SCALES)
+        good &= _within(common, angle, ANGLES_DEG)
+        kept = _filtered(order, good)[: table.shape[1]]
+        table[i, : len(kept)], known[i] = kept, len(order)
+        strong = kept[:count][score[kept[:count]] >= LEAST_SCORE * score[kept[:1]]]
+        matched[i, : len(strong)] = strong
+    return Partners(matched, table[:, :AVERAGED], table[:, :MOST], known)
+
+
+def _cells(sight: Sight, optics: Optics, k: int) -> IntArray:
+    """Return in which cell of each image each point lies, shape (k, p), -1 where it is not."""
+    lens = optics.lens
+    cell = np.full((k, len(sight.start) - 1), -1)
+    share = optics.to_image(sight.ideal) / [lens.width, lens.height]
+    column, row = np.clip((CELLS * share).astype(int), 0, CELLS - 1).T
+    cell[sight.camera, sight.point] = row * CELLS + column
+    return cell
+
+
+def _lost(
+    ties: FloatArray, sight: Sight, centres: FloatArray, rng: np.random.Generator
+) -> tuple[IntArray, IntArray]:
+    """Return cameras and points where a feature is not found again."""
+    count = np.diff(sight.start)
+    luck = rng.uniform(0.0, 1.0, len(ties))
+    home = sight.start[:-1] + (luck * count).astype(int)
+    first = np.minimum(home, max(0, len(sight.camera) - 1))[sight.point]
+    ray = centres[sight.camera] - ties[sight.point]
+    ray /= np.linalg.norm(ray, axis=1)[:, None]
+    cosine = np.einsum("mi,mi->m", ray, ray[first])
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    gone = rng.uniform(0.0, 1.0, len(ray)) > np.exp(-((angle / FOUND_AGAIN_DEG) ** 2))
+    return sight.camera[gone], sight.point[gone]
+
+
+def _angles_deg(centres: FloatArray, i: int, places: FloatArray) -> FloatArray:
+    """Return the angles at places between the rays to image i and to every other, (k, m)."""
+    rays = centres[:, None] - places
+    rays /= np.linalg.norm(rays, axis=2)[:, :, None]
+    cosine = np.einsum("kmi,mi->km", rays, rays[i])
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def _weights(angle_deg: FloatArray, scale: FloatArray) -> FloatArray:
+    spread = np.where(angle_deg < BEST_DEG, BELOW_DEG, ABOVE_DEG)
+    bell = np.exp(-0.5 * ((angle_deg - BEST_DEG) / spread) ** 2)
+    coarse = np.where(scale > FARTHER, (FARTHER / scale) ** 2, np.minimum(scale, 1.0) ** 2)
+    return np.asarray(np.maximum(bell, LEAST_WEIGHT) * coarse)
+
+
+def _shares_of_cells(common: np.ndarray, cell: IntArray) -> FloatArray:
+    """Return what share of the reference's cells holds points in common with each image, (k,)."""
+    holds = np.zeros((len(cell), CELLS * CELLS))
+    holds[np.arange(len(cell)), cell] = 1.0
+    return np.asarray((common.astype(float) @ holds > 0.0).sum(axis=1) / CELLS**2)
+
+
+def _within(common: np.ndarray, values: FloatArray, limits: tuple[float, float]) -> np.ndarray:
+    mean = (common * values).sum(axis=1) / np.maximum(common.sum(axis=1), 1)
+    return np.asarray((mean >= limits[0]) & (mean <= limits[1]))
+
+
+def _filtered(order: IntArray, good: np.ndarray) -> IntArray:
+    """Drop bad candidates from the worst up, while more than nine remain."""
+    kept = list(order)
+    for candidate in order[::-1]:
+        if len(kept) <= LEAST_LEFT:
+            break
+        if not good[candidate]:
+            kept.remove(candidate)
+    return np.array(kept, int)
+
+
+class PairCloud(NamedTuple):
+    """Points, shape (n, 3), their cameras, and their pairs.
+
+    Point i has the pairs ``pairs[start[i]:start[i + 1]]``, shape (p, 2), the lower camera first.
+    """
+
+    xyz: FloatArray
+    views: Views
+    start: IntArray
+    pairs: IntArray
+
+
+def match_pairs(
+    truth: FloatArray, sight: Sight, rig: Rig, table: IntArray, rng: np.random.Generator
+) -> PairCloud:
+    """Return the medians of the pairs of each point.
+
+    A point without a pair stays where it is and has no cameras.
+
+    Parameters
+    ----------
+    truth : array, shape (n, 3)
+    sight : Sight
+    rig : Rig
+    table : array, shape (k, c)
+        Neighbours of each camera, -1 for none.
+    rng : Generator
+        Of the noise, two image points for each pair.
+    """
+    one, other = pair_rows(sight, table)
+    point = sight.point[one]
+    both = np.column_stack([one, other]).ravel()
+    places = triangulate(
+        rig.observed(sight.ideal[both], rng),
+        rig.given,
+        sight.camera[both],
+        np.arange(0, len(both) + 1, 2),
+        rig.optics.lens,
+        truth[point],
+    )
+    start = starts_of(point, len(truth))
+    xyz, made = truth.copy(), np.diff(start) > 0
+    for axis in range(3):
+        xyz[made, axis] = _medians(places[:, axis], point, start)[made]
+    used = np.zeros(len(sight.point), bool)
+    used[both] = True
+    views = Views(starts_of(sight.point[used], len(truth)), sight.camera[used])
+    return PairCloud(xyz, views, start, np.column_stack([sight.camera[one], sight.camera[other]]))
+
+
+def pair_rows(sight: Sight, table: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the rows of `sight` that are pairs, each once, sorted by point, then camera."""
+    k, rows = len(table), sight.rows(len(table))
+    match = np.zeros((k, k + 1), bool)
+    match[np.arange(k)[:, None], table] = True  # the column k, or -1, is for "none"
+    match = match[:, :k]
+    first, second = np.nonzero(np.triu(match | match.T, 1))
+    both = (rows[:, first] >= 0) & (rows[:, second] >= 0)
+    point, pair = np.nonzero(both)
+    return rows[point, first[pair]], rows[point, second[pair]]
+
+
+def _medians(values: FloatArray, point: IntArray, start: IntArray) -> FloatArray:
+    """Return the median of each point's values, shape (n,); any number where it has none."""
+    ordered = np.concatenate([values[np.lexsort((values, point))], [0.0]])
+    count = np.diff(start)
+    low, high = start[:-1] + (count - 1) // 2, start[:-1] + count // 2
+    return np.asarray((ordered[low] + ordered[high]) / 2.0)

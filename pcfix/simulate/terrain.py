@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import expit
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from pcfix.model import FloatArray, WaterPlane
 
 BedKind = Literal["shore", "flat", "slope", "steps", "river"]
-BEDS: tuple[BedKind, ...] = get_args(BedKind)
 
 LAND_HEIGHT_M = 3.0
 GREATEST_DEPTH_M = 12.0
-DEFAULT_DEPTH_M = {"shore": GREATEST_DEPTH_M, "flat": 3.0, "slope": 6.0, "steps": 6.0, "river": 2.5}
 STEPS = 6
 _ROCKS_PER_M2 = 1.0 / 150.0
 _BANK = 0.3  # of a river's depth
@@ -29,18 +29,10 @@ _WALL = 10.0  # a slope steeper than this is the wall of a step, beside which th
 class Terrain:
     """A surface z(x, y) over a rectangle from the origin.
 
-    =======  ===================================================================================
-    shore    land at x = 0, then beach and bed with swells, rocks and a ledge to the deep water
-             at x = length
-    flat     one depth everywhere
-    slope    an even slope from the waterline at x = 0 to the greatest depth at x = length
-    steps    `STEPS` level steps of equal length and height from x = 0 to x = length, a flume
-    river    a winding channel along x with pools, and banks above the water
-    =======  ===================================================================================
-
     Attributes
     ----------
-    kind : {"shore", "flat", "slope", "steps", "river"}
+    kind : BedKind
+        See `BEDS`.
     length_m, width_m : float
         Extent in x and y.
     water : WaterPlane
@@ -78,7 +70,7 @@ class Terrain:
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return z at plan positions, metres; never deeper than `greatest_depth_m`."""
-        above = np.maximum(self._above_water(x, y), -self.greatest_depth_m)
+        above = np.maximum(BEDS[self.kind].above_water(self, x, y), -self.greatest_depth_m)
         return np.asarray(self.water.a + self.water.b * x + self.water.c * y + above)
 
     def normals(self, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -91,41 +83,54 @@ class Terrain:
         up = np.column_stack([-slopes[0], -slopes[1], np.ones(len(x))])
         return np.asarray(up / np.linalg.norm(up, axis=1)[:, None])
 
-    def _above_water(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        share, deepest = x / self.length_m, self.greatest_depth_m
-        if self.kind == "shore":
-            return self._shore(x, y)
-        if self.kind == "river":
-            return self._river(x, y)
-        if self.kind == "slope":
-            return np.asarray(-deepest * share)
-        if self.kind == "steps":
-            step = np.clip(np.floor(STEPS * share) + 1.0, 1.0, STEPS)
-            return np.asarray(-deepest * step / STEPS)
-        return np.full(len(x), -deepest)
 
-    def _shore(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        size = min(1.0, self.greatest_depth_m / GREATEST_DEPTH_M)  # shallow shores are smoother
-        land, share = LAND_HEIGHT_M * size, np.maximum(x / self.length_m, 0.0)
-        slope = land - (land + self.greatest_depth_m) * share**1.2
-        swell = 0.4 * np.sin(x / 7.0) * np.cos(y / 9.0) + 0.15 * np.sin(x / 2.3 + y / 3.1)
-        ledge = -0.6 * expit((x - 0.6 * self.length_m - 0.1 * y) / 0.3)
-        z = slope + size * swell + size * ledge
-        if len(self.rocks):
-            for start in range(0, len(x), 50_000):
-                part = slice(start, start + 50_000)
-                z[part] += size * self._rocks(x[part], y[part])
-        return np.asarray(z)
+def _shore(ground: Terrain, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return land at x = 0, then beach and bed with swells, rocks and a ledge to deep water."""
+    size = min(1.0, ground.greatest_depth_m / GREATEST_DEPTH_M)  # shallow shores are smoother
+    land, share = LAND_HEIGHT_M * size, np.maximum(x / ground.length_m, 0.0)
+    slope = land - (land + ground.greatest_depth_m) * share**1.2
+    swell = 0.4 * np.sin(x / 7.0) * np.cos(y / 9.0) + 0.15 * np.sin(x / 2.3 + y / 3.1)
+    ledge = -0.6 * expit((x - 0.6 * ground.length_m - 0.1 * y) / 0.3)
+    z = slope + size * swell + size * ledge
+    if len(ground.rocks):
+        tree = cKDTree(ground.rocks[:, :2])
+        for start in range(0, len(x), 50_000):
+            part = slice(start, start + 50_000)
+            distance, rock = tree.query(np.column_stack([x[part], y[part]]), k=1)
+            height, radius = ground.rocks[rock, 2:].T
+            z[part] += size * np.asarray(height * np.exp(-((distance / radius) ** 2)))
+    return np.asarray(z)
 
-    def _rocks(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        near = cKDTree(self.rocks[:, :2]).query(np.column_stack([x, y]), k=1)
-        distance, (height, radius) = near[0], self.rocks[near[1], 2:].T
-        return np.asarray(height * np.exp(-((distance / radius) ** 2)))
 
-    def _river(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        turn = 2.0 * np.pi * x / self.length_m
-        middle = self.width_m * (0.5 + 0.1 * np.sin(turn))
-        across = (y - middle) / (0.35 * self.width_m)
-        pools = 0.8 + 0.2 * np.sin(3.0 * turn)
-        deepest = self.greatest_depth_m
-        return np.asarray(np.minimum(-deepest * pools * (1.0 - across**2), _BANK * deepest))
+def _steps(ground: Terrain, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return `STEPS` level steps of equal length and height along x, as in a flume."""
+    step = np.clip(np.floor(STEPS * (x / ground.length_m)) + 1.0, 1.0, STEPS)
+    return np.asarray(-ground.greatest_depth_m * step / STEPS)
+
+
+def _river(ground: Terrain, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return a winding channel along x with pools, and banks above the water."""
+    turn = 2.0 * np.pi * x / ground.length_m
+    middle = ground.width_m * (0.5 + 0.1 * np.sin(turn))
+    across = (y - middle) / (0.35 * ground.width_m)
+    pools = 0.8 + 0.2 * np.sin(3.0 * turn)
+    deepest = ground.greatest_depth_m
+    return np.asarray(np.minimum(-deepest * pools * (1.0 - across**2), _BANK * deepest))
+
+
+class Bed(NamedTuple):
+    """A kind of bed: its usual greatest depth, and its height above the water at n places."""
+
+    default_depth_m: float
+    above_water: Callable[[Terrain, FloatArray, FloatArray], FloatArray]
+
+
+BEDS: dict[BedKind, Bed] = {
+    "shore": Bed(GREATEST_DEPTH_M, _shore),
+    "flat": Bed(3.0, lambda ground, x, y: np.full(len(x), -ground.greatest_depth_m)),
+    "slope": Bed(6.0, lambda ground, x, y: -ground.greatest_depth_m * (x / ground.length_m)),
+    "steps": Bed(6.0, _steps),
+    "river": Bed(2.5, _river),
+}
+"""Flat: one depth everywhere; slope: an even one from the waterline at x = 0 to the greatest depth
+at x = length; the others as their functions say. A kind more is an entry here and in `BedKind`."""

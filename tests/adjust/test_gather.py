@@ -22,8 +22,8 @@ from pcfix.adjust.gather import (
 )
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import TiePoints, Views, WaterDimension, WaterPlane
-from pcfix.simulate.tie_points import simulate_tie_points
 from pcfix.simulate.tracing import project
+from tests.utils.tie_points import simulate_tie_points
 
 
 @cache

@@ -13,10 +13,10 @@ from pcfix.adjust.block import Unknowns
 from pcfix.adjust.precision import precision_of, strong_correlations, undetermined
 from pcfix.adjust.solve import prepare, solve
 from pcfix.errors import GeometryError
-from pcfix.simulate.tie_points import simulate_tie_points
 from pcfix.threads import threads
 from tests.utils.adjust_twin import Twin
 from tests.utils.tie_blocks import block_of, clear_of_the_waterline
+from tests.utils.tie_points import simulate_tie_points
 
 FREE = np.inf
 

@@ -13,9 +13,9 @@ from pcfix.adjust.gather import Datum, block_of, no_datum
 from pcfix.adjust.rounds import Rounds, adjust_ties, check_datum, default_lens, noise_px
 from pcfix.adjust.solve import prepare, solve
 from pcfix.errors import GeometryError
-from pcfix.simulate.tie_points import simulate_tie_points
 from pcfix.threads import threads
 from tests.utils.tie_blocks import block_of as simple_block
+from tests.utils.tie_points import simulate_tie_points
 
 FOCAL = Unknowns(lens=("f",))
 

@@ -14,10 +14,10 @@ from pcfix.adjust.block import Unknowns
 from pcfix.adjust.precision import precision_of, undetermined
 from pcfix.adjust.solve import prepare, solve, solved_cameras, water_of
 from pcfix.model import WaterPlane
-from pcfix.simulate.tie_points import simulate_tie_points
 from pcfix.threads import threads
 from tests.utils.adjust_twin import Twin
 from tests.utils.tie_blocks import block_of
+from tests.utils.tie_points import simulate_tie_points
 
 FREE = np.inf
 

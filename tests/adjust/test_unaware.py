@@ -14,9 +14,9 @@ from pcfix.adjust.mend import Candidate, mend
 from pcfix.adjust.rounds import adjust_ties
 from pcfix.adjust.solve import prepare, solve, solved_cameras
 from pcfix.errors import GeometryError
-from pcfix.simulate.tie_points import simulate_tie_points
 from pcfix.simulate.tracing import piercing_points, project
 from pcfix.threads import threads
+from tests.utils.tie_points import simulate_tie_points
 from tests.utils.unaware_blocks import unaware
 
 FOCAL = (("f",),)

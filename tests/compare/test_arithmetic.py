@@ -5,12 +5,16 @@ import math
 import numpy as np
 import pytest
 
-from pcfix.compare.c2c import cloud_to_cloud
-from pcfix.compare.depth import binned, distance_from_shore, fit_line
-from pcfix.compare.neighbours import Neighbours, strip_order
-from pcfix.compare.overlap import near_in_plan
+from pcfix.compare.match import near_in_plan
+from pcfix.compare.nearest import Neighbours, cloud_to_cloud, strip_order
 from pcfix.compare.sections import lines_downslope, parse_line, section_along
-from pcfix.compare.statistics import distribution_of, statistics_of
+from pcfix.compare.statistics import (
+    binned,
+    distance_from_shore,
+    distribution_of,
+    fit_line,
+    statistics_of,
+)
 from pcfix.compare.vertical import heights_at
 from pcfix.errors import GeometryError, SettingError
 

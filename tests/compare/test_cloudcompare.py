@@ -8,7 +8,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from pcfix.compare.c2c import cloud_to_cloud
+from pcfix.compare.nearest import cloud_to_cloud
 from pcfix.compare.statistics import statistics_of
 
 PROGRAM = shutil.which("CloudCompare")

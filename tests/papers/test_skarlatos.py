@@ -8,8 +8,13 @@ import pytest
 
 import pcfix
 from pcfix.report.papers import shan_rows, shan_text
-from pcfix.simulate.refraction_effect import SWINGLETCAM, ULTRACAM, StereoPair, effect
-from pcfix.simulate.shan import shan_iterations
+from pcfix.simulate.refraction_effect import (
+    SWINGLETCAM,
+    ULTRACAM,
+    StereoPair,
+    effect,
+    shan_iterations,
+)
 
 PAIR = StereoPair(SWINGLETCAM, 100.0)
 

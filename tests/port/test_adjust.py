@@ -14,9 +14,9 @@ from pcfix.flow.adjust import adjust_cameras
 from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.model import TiePoints
 from pcfix.port.shapes import DomePort, FlatPort
-from pcfix.simulate.port import simulate_port
 from pcfix.threads import threads
 from tests.utils.adjust_files import EPSG, write_gnss
+from tests.utils.port_scenes import simulate_port
 
 pytestmark = pytest.mark.filterwarnings("default::pcfix.errors.PcfixWarning")
 

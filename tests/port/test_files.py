@@ -13,7 +13,7 @@ from pcfix.errors import GeometryError, SettingError
 from pcfix.port.intersection import correct_through_port
 from pcfix.port.shapes import FlatPort
 from pcfix.report.text import summary_text
-from pcfix.simulate.port import simulate_port
+from tests.utils.port_scenes import simulate_port
 
 SPEC = "flat:distance=0.02,thickness=0.008"
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pcfix.errors import SettingError
 from pcfix.port.light import coefficients, cosine_at_port, ray_through, through_port
 from pcfix.port.shapes import DomePort, FlatPort, port_of
-from pcfix.simulate.port import fermat_directions
+from tests.utils.port_scenes import fermat_directions
 
 N_WATER = 1.34
 PORTS = {

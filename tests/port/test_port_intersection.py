@@ -20,7 +20,7 @@ from pcfix.port.intersection import (
 )
 from pcfix.port.inversion import port_covariances
 from pcfix.port.shapes import DomePort, FlatPort
-from pcfix.simulate.port import simulate_port
+from tests.utils.port_scenes import simulate_port
 
 FLAT = FlatPort(0.02, 0.008, 1.49, (0.02, -0.01, 1.0))
 DOME = DomePort(0.05, 0.004, 1.49, (0.001, -0.002, -0.01))
@@ -153,7 +153,7 @@ def turned(cameras, camera, axis, step):
 
 def adjusted_again(scene, cameras):
     """Adjust the fixed image places through the port with other cameras, by numeric derivatives."""
-    from pcfix.simulate.port import fermat_directions
+    from tests.utils.port_scenes import fermat_directions
 
     owner = np.repeat(np.arange(len(scene.truth)), np.diff(scene.views.start))
     c, lens = scene.views.camera, scene.cameras.lenses[0]

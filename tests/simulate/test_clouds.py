@@ -9,8 +9,8 @@ import pytest
 from scipy.optimize import brentq, least_squares, minimize_scalar
 
 import pcfix
-from pcfix.simulate.neighbours import openmvs_partners
 from pcfix.simulate.scene import ORIGIN_M
+from pcfix.simulate.sight import openmvs_partners
 from tests.utils.twins import bend, light_path
 
 KINDS = ("tracks", "pairs", "depth-maps")

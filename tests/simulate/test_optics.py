@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.simulate.optics import make_optics
+from pcfix.simulate.block import make_optics
 from tests.utils.twins import image_slowly
 
 CAMERA = (8.8, (13.2, 8.8), (5472, 3648))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pcfix.port.shapes import DomePort, FlatPort
-from pcfix.simulate.port import fermat_directions, simulate_port
+from tests.utils.port_scenes import fermat_directions, simulate_port
 
 
 def test_flat_port_obeys_snell():

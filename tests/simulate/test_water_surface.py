@@ -4,8 +4,13 @@ import numpy as np
 import pytest
 
 from pcfix.model import WaterPlane
-from pcfix.simulate.tracing import bed_points, piercing_points, piercing_points_of_planes
-from pcfix.simulate.water import Water, Waves
+from pcfix.simulate.tracing import (
+    Water,
+    Waves,
+    bed_points,
+    piercing_points,
+    piercing_points_of_planes,
+)
 from tests.utils.twins import bend, light_path
 
 N = 1.34

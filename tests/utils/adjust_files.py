@@ -10,14 +10,14 @@ import numpy as np
 from pyproj import CRS
 
 from pcfix.io.cameras.colmap.writing import write_colmap
-from pcfix.simulate.tie_points import simulate_tie_points
+from tests.utils.tie_points import simulate_tie_points
 from tests.utils.unaware_blocks import apparent_cloud, parted, unaware
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from pcfix.model import FloatArray
-    from pcfix.simulate.tie_points import TieScene
+    from tests.utils.tie_points import TieScene
     from tests.utils.unaware_blocks import Unaware
 
 EPSG = "EPSG:32633"

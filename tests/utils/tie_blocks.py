@@ -11,7 +11,7 @@ from pcfix.adjust.block import Block
 from pcfix.model import TiePoints
 
 if TYPE_CHECKING:
-    from pcfix.simulate.tie_points import TieScene
+    from tests.utils.tie_points import TieScene
 
 
 def block_of(

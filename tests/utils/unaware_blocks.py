@@ -21,7 +21,7 @@ from tests.utils.tie_blocks import block_of, some_ties
 
 if TYPE_CHECKING:
     from pcfix.model import Cameras, FloatArray
-    from pcfix.simulate.tie_points import TieScene
+    from tests.utils.tie_points import TieScene
 
 FAR_BELOW = WaterPlane(-1e3)
 """Water that no point reaches."""

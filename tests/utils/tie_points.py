@@ -1,6 +1,6 @@
 """A block of images as it goes into a bundle adjustment: tie points, GNSS and control, with truth.
 
-The light is traced by `pcfix.simulate.tracing`, the lens is that of `pcfix.simulate.optics`:
+The light is traced by `pcfix.simulate.tracing`, the lens is that of `pcfix.simulate.block`:
 nothing here is shared with the adjustment. Everything measured is there twice, exact and with
 noise, and `TieScene.measured` draws the noise anew.
 """
@@ -13,11 +13,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.model import Cameras, GnssPositions, GroundControl, TiePoints, Views
-from pcfix.simulate.block import Block, fly_block, misplaced
-from pcfix.simulate.scene import ORIGIN_M, Streams, _extent, _in_world, _moved, _on, _rig
+from pcfix.simulate.block import Block
+from pcfix.simulate.scene import (
+    ORIGIN_M,
+    Streams,
+    cameras_in_world,
+    lay_out,
+    plane_in_world,
+    points_on,
+)
 from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.sight import see
-from pcfix.simulate.terrain import Terrain
 
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, FloatArray, WaterPlane
@@ -142,30 +148,26 @@ def simulate_tie_points(
         If an argument is outside its rule.
     """
     chosen = SceneSettings(points=points, **settings)
-    streams, extent = Streams.of(chosen.seed), _extent(chosen)
-    plane = chosen.water_plane(extent)
-    terrain = Terrain.random(chosen.bed, extent, plane, chosen.depth_m, streams.main)
-    flown = fly_block(extent, chosen.water_level_m, chosen.flight, streams.main)
-    given = misplaced(flown, chosen.position_noise_m, chosen.attitude_noise_deg, streams.poses)
-    rig = _rig(chosen, flown, given, plane, extent, streams)
-    truth, ties = _seen(_on(terrain, points, streams.main), rig, streams)
+    terrain, flown, given, rig, streams = lay_out(chosen)
+    plane = terrain.water
+    truth, ties = _seen(points_on(terrain, points, streams.main), rig, streams)
     enough = np.bincount(ties.camera, minlength=len(rig.true)) >= _LEAST_TIES
     if not enough.all():
         flown, given = _only(flown, enough), _only(given, enough)
         rig = replace(rig, true=flown.cameras, given=given.cameras)
         truth, ties = _seen(truth, rig, streams)
-    places = _on(terrain, _CANDIDATES, streams.main)
+    places = points_on(terrain, _CANDIDATES, streams.main)
     places = places[_spread(places, _above(places, plane), control, checks)]
     surveyed, marks = _seen(places, rig, streams)
     made = TieScene(
-        true_cameras=_moved(flown.cameras), cameras=_moved(given.cameras),
+        true_cameras=cameras_in_world(flown.cameras), cameras=cameras_in_world(given.cameras),
         truth=truth + ORIGIN_M, views=Views(ties.start, ties.camera),
         exact_xy=rig.optics.to_image(ties.ideal),
         ties=TiePoints(truth, Views(ties.start, ties.camera), ties.ideal),
         is_wet=_above(truth, plane) < 0.0,
         control=_control(surveyed, marks, _above(surveyed, plane) < 0.0, control, chosen),
         control_truth=surveyed + ORIGIN_M, control_exact_xy=rig.optics.to_image(marks.ideal),
-        water=_in_world(plane), refractive_index=chosen.refractive_index,
+        water=plane_in_world(plane), refractive_index=chosen.refractive_index,
         noise=TieNoise(chosen.image_noise_px, gnss_noise_m, survey_noise_m),
         settings=chosen.as_dict(),
     )  # fmt: skip

@@ -1,28 +1,156 @@
-"""The figures of a comparison, from the points that were matched."""
+"""What a comparison says of the points that were matched, in figures."""
 
 from __future__ import annotations
 
+import math
 import time
-from typing import TYPE_CHECKING
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 import numpy as np
 
-from pcfix.compare.c2c import cloud_to_cloud
-from pcfix.compare.depth import Bin, binned, distance_from_shore, fit_line
-from pcfix.compare.m3c2 import m3c2_distances
-from pcfix.compare.pairs import pairs_at_cloud, pairs_at_reference
-from pcfix.compare.sections import lines_downslope, section_along
-from pcfix.compare.statistics import distribution_of
+from pcfix.compare.m3c2 import (
+    M3c2,
+    m3c2_distances,
+)
+from pcfix.compare.nearest import cloud_to_cloud
+from pcfix.compare.sections import (
+    Section,
+    lines_downslope,
+    section_along,
+)
+from pcfix.compare.statistics import (
+    Bin,
+    Distribution,
+    Line,
+    binned,
+    distance_from_shore,
+    distribution_of,
+    fit_line,
+)
+from pcfix.compare.vertical import (
+    pairs_at_cloud,
+    pairs_at_reference,
+)
 from pcfix.errors import GeometryError
-from pcfix.flow.comparison import Comparison, Counts, DepthFits, Distances, M3c2Pair
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
-    from pcfix.compare.pairs import Pairs
+    from pcfix.compare.match import CompareSettings, Match
     from pcfix.compare.sections import Section, SectionLine
-    from pcfix.flow.match import Match
+    from pcfix.compare.vertical import Pairs
     from pcfix.model import FloatArray
+
+
+Figure = TypeVar("Figure")
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """Points of the cloud, of the reference, and those that were compared."""
+
+    cloud: int
+    cloud_left_out: int
+    reference: int
+    reference_left_out: int
+    outside_overlap: int
+    not_submerged: int
+    compared: int
+    by_nearest: int
+
+
+@dataclass(frozen=True, slots=True)
+class AfterBefore(Generic[Figure]):
+    """A figure after the correction and, where the cloud says where its points were, before."""
+
+    after: Figure
+    before: Figure | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """A cloud against a reference; all errors are cloud minus reference, metres.
+
+    Attributes
+    ----------
+    cloud, reference : str
+    measured_at : {"cloud", "reference"}
+        Whether each point of the cloud was compared, or each check point.
+    counts : Counts
+    c2c : AfterBefore of Distribution
+        To the nearest point, without sign.
+    vertical : AfterBefore of Distribution, or None
+        Signed, along the vertical.
+    depth : AfterBefore of Line, or None
+        Depth against reference depth; None where the water surface is not known.
+    depth_bins, shore_bins : tuple of Bin
+        Submerged places by reference depth, and by distance in plan from the nearest dry point.
+    m3c2 : AfterBefore of M3c2, or None
+    sections : tuple of Section
+    settings : CompareSettings
+    notes : tuple of str
+        What was left out, and why.
+    seconds : float
+    """
+
+    cloud: str
+    reference: str
+    measured_at: Literal["cloud", "reference"]
+    counts: Counts
+    c2c: AfterBefore[Distribution]
+    vertical: AfterBefore[Distribution] | None
+    depth: AfterBefore[Line | None] | None
+    depth_bins: tuple[Bin, ...]
+    shore_bins: tuple[Bin, ...]
+    m3c2: AfterBefore[M3c2] | None
+    sections: tuple[Section, ...]
+    settings: CompareSettings
+    notes: tuple[str, ...]
+    seconds: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON; a section by its line, its heights are CSV."""
+        names = [name for name in self.__slots__ if name != "sections"]
+        plain = {name: _plain(getattr(self, name)) for name in names}
+        plain["sections"] = [
+            {**asdict(s.line), "half_width_m": s.half_width_m, "stations": len(s.distance_m)}
+            for s in self.sections
+        ]
+        return plain
+
+
+def _plain(value: Any) -> Any:
+    if hasattr(value, "__dataclass_fields__"):
+        return _plain(asdict(value))
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def bins_table(bins: Iterable[Bin]) -> str:
+    """Return bins as CSV text; the columns of `before` are empty where it is not known."""
+    figures = ("count", "mean_m", "sd_m", "rmse_m", "nmad_m")
+    names = [n.replace("mean_m", "bias_m") for n in figures]
+    head = [
+        f"{n}_{when}" if n == "count" else f"{n[:-2]}_{when}_m"
+        for when in ("after", "before")
+        for n in names
+    ]
+    lines = [",".join(["from_m", "to_m", *head])]
+    for one in bins:
+        fields = [f"{one.from_m:g}", f"{one.to_m:g}"]
+        for statistics in (one.after, one.before):
+            for name in figures:
+                value = "" if statistics is None else getattr(statistics, name)
+                fields.append(f"{value:.4f}" if isinstance(value, float) else str(value))
+        lines.append(",".join(fields))
+    return "\n".join(lines) + "\n"
+
 
 MIN_REACH_M, REACH_FACTOR = 1.0, 1.5
 """M3C2 looks along the normal beyond nearly all differences: 1.5 times their 99th percentile."""
@@ -45,26 +173,30 @@ def figures_of(match: Match, lines: Sequence[SectionLine], started: float) -> Co
         If there are too few points for planes, or M3C2 finds nothing.
     """
     notes, apparent = _notes(match), match.apparent
-    after = before = None
+    after = before = vertical = None
     if match.settings.vertical:
         _check_enough(match)
         after = _pairs(match, match.cloud.xyz)
         before = None if apparent is None else _pairs(match, apparent)
+        vertical = AfterBefore(
+            distribution_of(after.error_m),
+            None if before is None else distribution_of(before.error_m),
+        )
     fits, depth_bins, shore_bins = _by_depth(match, after, before, notes)
     return Comparison(
         cloud=match.whole.name,
         reference=match.reference.name,
         measured_at="reference" if match.reference.sparse else "cloud",
         counts=_counts(match, after),
-        c2c=Distances(
+        c2c=AfterBefore(
             distribution_of(_c2c(match, match.cloud.xyz)),
             None if apparent is None else distribution_of(_c2c(match, apparent)),
         ),
-        vertical=_vertical(after, before),
+        vertical=vertical,
         depth=fits,
         depth_bins=depth_bins,
         shore_bins=shore_bins,
-        m3c2=_m3c2(match, after, before),
+        m3c2=_m3c2(match, before or after),
         sections=_sections(match, lines),
         settings=match.settings,
         notes=tuple(notes),
@@ -97,18 +229,9 @@ def _c2c(match: Match, xyz: FloatArray) -> FloatArray:
     return cloud_to_cloud(xyz, match.reference.xyz)
 
 
-def _vertical(after: Pairs | None, before: Pairs | None) -> Distances | None:
-    if after is None:
-        return None
-    return Distances(
-        distribution_of(after.error_m),
-        None if before is None else distribution_of(before.error_m),
-    )
-
-
 def _by_depth(
     match: Match, after: Pairs | None, before: Pairs | None, notes: list[str]
-) -> tuple[DepthFits | None, tuple[Bin, ...], tuple[Bin, ...]]:
+) -> tuple[AfterBefore[Line | None] | None, tuple[Bin, ...], tuple[Bin, ...]]:
     """Return the fits and tables of the submerged places, as far as the water is known."""
     surface = None if after is None else match.water_at(after.xy)
     if after is None or surface is None:
@@ -126,7 +249,7 @@ def _by_depth(
         over = match.water_at(before.xy)
         depth_before = ((surface if over is None else over) - before.reference_m)[wet]
         error_before = before.error_m[wet]
-    fits = DepthFits(
+    fits = AfterBefore(
         fit_line(depth, depth - error),
         None
         if depth_before is None or error_before is None
@@ -140,14 +263,13 @@ def _by_depth(
     return fits, bins, binned(shore, error, error_before, match.settings.shore_bin_width_m)
 
 
-def _m3c2(match: Match, after: Pairs | None, before: Pairs | None) -> M3c2Pair | None:
+def _m3c2(match: Match, pairs: Pairs | None) -> AfterBefore[M3c2] | None:
     if not match.settings.m3c2:
         return None
-    pairs = before or after
     far = _c2c(match, match.cloud.xyz) if pairs is None else np.abs(pairs.error_m)
     reach = max(MIN_REACH_M, REACH_FACTOR * float(np.percentile(far, 99)))
     target, apparent = match.reference.xyz, match.apparent
-    return M3c2Pair(
+    return AfterBefore(
         m3c2_distances(match.cloud.xyz, target, reach),
         None if apparent is None else m3c2_distances(apparent, target, reach),
     )

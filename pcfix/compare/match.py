@@ -1,0 +1,321 @@
+"""Which points of a cloud are compared with which of a reference."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pcfix.compare.nearest import Neighbours, mean_spacing_m
+from pcfix.compare.statistics import check_width
+from pcfix.compare.vertical import DEFAULT_NEIGHBOURS, check_neighbours
+from pcfix.errors import GeometryError, InputError, SettingError
+from pcfix.model import BoolArray, FloatArray, WaterSurface  # noqa: TC001 - dataclass fields
+
+if TYPE_CHECKING:
+    from pcfix.model import IntArray
+
+
+GAP_SPACINGS, MIN_GAP_M = 5.0, 1.0
+"""How far outside the other cloud a point still counts, unless the user says so."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompareSettings:
+    """What the user of a comparison may choose.
+
+    Attributes
+    ----------
+    submerged : bool
+        Compare only points under water.
+    vertical : bool
+        Whether signed differences are wanted, and all that rests on them.
+    m3c2 : bool
+        Whether M3C2 is wanted.
+    neighbours : int
+        Points of each fitted plane, at least 6.
+    bin_width_m, shore_bin_width_m : float
+        Of the tables by depth and by distance from the shore.
+    max_gap_m : float or None
+        How far in plan from the nearest point of the other cloud a point still counts; None: 5
+        mean spacings of that cloud, at least 1 m.
+    sections : int
+        Automatic cross-sections.
+    corridor_m : float
+        Half-width of a cross-section.
+    """
+
+    submerged: bool = False
+    vertical: bool = True
+    m3c2: bool = False
+    neighbours: int = DEFAULT_NEIGHBOURS
+    bin_width_m: float = 1.0
+    shore_bin_width_m: float = 10.0
+    max_gap_m: float | None = None
+    sections: int = 0
+    corridor_m: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check every value against its rule."""
+        check_neighbours(self.neighbours)
+        check_width(self.bin_width_m)
+        check_width(self.shore_bin_width_m)
+        for name, value in (("max-gap", self.max_gap_m), ("corridor", self.corridor_m)):
+            if value is not None and not (math.isfinite(value) and value > 0.0):
+                raise SettingError(f"{name} {value:g} is not positive; give metres.")
+        if self.sections < 0:
+            raise SettingError(f"sections {self.sections} is negative; give how many.")
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyCloud:
+    """Points that count; n of them.
+
+    Attributes
+    ----------
+    name : str
+        For messages.
+    xyz : array, shape (n, 3)
+        Metres, world frame.
+    crs : pyproj.CRS or None
+    left_out : int
+        Points withheld, or of a class that does not count.
+    shift_m : array, shape (n, 3), or None
+        True minus apparent, of a cloud that pcfix corrected.
+    bathymetric : array of bool, shape (n,)
+        Class 40.
+    water_m : array, shape (n,)
+        Height of the water surface above each point; NaN where the cloud does not say.
+    water : WaterSurface or None
+        The surface itself, where it is known away from the points too.
+    """
+
+    name: str
+    xyz: FloatArray
+    crs: Any
+    left_out: int
+    shift_m: FloatArray | None
+    bathymetric: BoolArray
+    water_m: FloatArray
+    water: WaterSurface | None = None
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    def take(self, rows: BoolArray) -> SurveyCloud:
+        """Return the cloud with these rows alone."""
+        return replace(
+            self,
+            xyz=self.xyz[rows],
+            shift_m=None if self.shift_m is None else self.shift_m[rows],
+            bathymetric=self.bathymetric[rows],
+            water_m=self.water_m[rows],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Heights that are taken as true.
+
+    Attributes
+    ----------
+    name : str
+        For messages.
+    xyz : array, shape (m, 3)
+        Metres, world frame.
+    crs : pyproj.CRS or None
+    left_out : int
+        Points withheld, of noise, or of water; cells without data.
+    sparse : bool
+        Whether these are single check points, not a sampled surface.
+    """
+
+    name: str
+    xyz: FloatArray
+    crs: Any
+    left_out: int = 0
+    sparse: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """A cloud and a reference, of each the points that are compared.
+
+    Attributes
+    ----------
+    whole : SurveyCloud
+        All points that are neither withheld nor noise.
+    cloud : SurveyCloud
+        Those of them to compare; n points.
+    wet : array of bool, shape (n,)
+        Which of these are under water.
+    dry_xy : array, shape (d, 2)
+        Where the whole cloud is above the water, metres.
+    reference : Reference
+    places : array, shape (p, 3)
+        Points of the reference that the cloud reaches, metres.
+    outside, not_submerged : int
+        Points that were not chosen.
+    settings : CompareSettings
+    """
+
+    whole: SurveyCloud
+    cloud: SurveyCloud
+    wet: BoolArray
+    dry_xy: FloatArray
+    reference: Reference
+    places: FloatArray
+    outside: int
+    not_submerged: int
+    settings: CompareSettings
+
+    @cached_property
+    def apparent(self) -> FloatArray | None:
+        """Where the points were before the correction, shape (n, 3), metres."""
+        return None if self.cloud.shift_m is None else self.cloud.xyz - self.cloud.shift_m
+
+    @cached_property
+    def water_points(self) -> FloatArray:
+        """The water surface above the points that know it, shape (w, 3), metres."""
+        known = np.isfinite(self.whole.water_m)
+        return np.column_stack([self.whole.xyz[known, :2], self.whole.water_m[known]])
+
+    def water_at(self, xy: FloatArray) -> FloatArray | None:
+        """Return the height of the water at places (n, 2); None where unknown.
+
+        It is the surface's own, or that above the nearest point that knows it.
+        """
+        if self.whole.water is not None:
+            from pcfix.water.surface import surface_above  # with its compiler, not quick to load
+
+            return surface_above(self.whole.water, np.column_stack([xy, xy[:, 0]])).height_m
+        if len(self.water_points) == 0:
+            return None
+        _, row = Neighbours(self.water_points[:, :2]).nearest(xy)
+        return np.asarray(self.water_points[row, 2])
+
+
+def match(
+    whole: SurveyCloud, target: Reference, settings: CompareSettings, *, given: bool
+) -> Match:
+    """Choose the points to compare.
+
+    Parameters
+    ----------
+    whole, target
+    settings : CompareSettings
+    given : bool
+        Whether the user gave the water surface; else what the cloud says counts, its classes too.
+
+    Raises
+    ------
+    PcfixError
+        If nothing is under water where that was asked for, or the two do not overlap.
+    """
+    below = whole.xyz[:, 2] < whole.water_m
+    wet = below if given else whole.bathymetric | below
+    chosen = wet if settings.submerged else np.ones(len(whole), np.bool_)
+    if not chosen.any():
+        raise InputError(
+            f"{whole.name}: no point is of class 40 or below the water; give the surface with"
+            " --water, or compare without --submerged."
+        )
+    not_submerged = int(len(whole) - chosen.sum())
+    if target.sparse:
+        held = near_in_plan(target.xyz[:, :2], whole.xyz[chosen, :2], _gap(whole.xyz, settings))
+        near, places = chosen, target.xyz[held]
+        outside = int((~held).sum())
+    else:
+        near = chosen & near_in_plan(
+            whole.xyz[:, :2], target.xyz[:, :2], _gap(target.xyz, settings)
+        )
+        places, outside = target.xyz, int(chosen.sum() - near.sum())
+    if not (near.any() and len(places)):
+        raise GeometryError(
+            f"{whole.name} and {target.name} do not overlap in plan: the points to compare lie in"
+            f" {_bounds(whole.xyz[chosen])}, the reference in {_bounds(target.xyz)}; check the"
+            " CRS of both."
+        )
+    found = Match(
+        whole, whole.take(near), wet[near], whole.xyz[~wet, :2], target, places, outside,
+        not_submerged, settings,
+    )  # fmt: skip
+    return _only_wet_places(found) if target.sparse and settings.submerged else found
+
+
+def _only_wet_places(found: Match) -> Match:
+    """Leave out check points above the water, where the water is known."""
+    surface = found.water_at(found.places[:, :2])
+    if surface is None:
+        return found
+    wet = found.places[:, 2] < surface
+    if not wet.any():
+        raise GeometryError(
+            f"{found.reference.name}: no check point is under water; compare without --submerged."
+        )
+    return replace(
+        found,
+        places=found.places[wet],
+        not_submerged=found.not_submerged + int((~wet).sum()),
+    )
+
+
+def _gap(xyz: FloatArray, settings: CompareSettings) -> float:
+    return settings.max_gap_m or max(GAP_SPACINGS * mean_spacing_m(xyz[:, :2]), MIN_GAP_M)
+
+
+def _bounds(xyz: FloatArray) -> str:
+    (x0, y0), (x1, y1) = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
+    return f"x {x0:.1f} to {x1:.1f}, y {y0:.1f} to {y1:.1f}"
+
+
+MAX_TABLE = 50_000_000
+"""Squares up to which each has a place of its own in memory."""
+
+
+def near_in_plan(xy: FloatArray, other_xy: FloatArray, limit_m: float) -> BoolArray:
+    """Return which points have a point of the other cloud about them in plan.
+
+    The plan is cut into squares of side `limit_m`; a point counts when its own square or one of
+    the eight around it holds a point of the other cloud. So all within the limit count, and none
+    beyond 2.83 times the limit.
+
+    Parameters
+    ----------
+    xy : array, shape (n, 2)
+        Metres, world frame.
+    other_xy : array, shape (m, 2)
+        The same frame.
+    limit_m : float
+
+    Returns
+    -------
+    array of bool, shape (n,)
+    """
+    low = np.array([other_xy[:, 0].min(), other_xy[:, 1].min()]) - 2.0 * limit_m
+    columns = int(np.ptp(other_xy[:, 0]) / limit_m) + 6
+    rows = int(np.ptp(other_xy[:, 1]) / limit_m) + 6
+    near = np.zeros(len(xy), np.bool_)
+    high = low + np.array([columns, rows]) * limit_m
+    x, y = xy[:, 0], xy[:, 1]
+    inside = np.flatnonzero((x >= low[0]) & (x < high[0]) & (y >= low[1]) & (y < high[1]))
+    steps = np.array([-1, 0, 1])
+    around = (steps[:, np.newaxis] * columns + steps).ravel()
+    asked, held = (_codes(p, low, limit_m, columns) for p in (xy[inside], other_xy))
+    if columns * rows > MAX_TABLE:
+        near[inside] = np.isin(asked, (np.unique(held)[:, np.newaxis] + around).ravel())
+        return near
+    table = np.zeros(columns * rows, np.bool_)
+    table[held] = True
+    table[(np.flatnonzero(table)[:, np.newaxis] + around).ravel()] = True
+    near[inside] = table[asked]
+    return near
+
+
+def _codes(xy: FloatArray, low: FloatArray, side_m: float, columns: int) -> IntArray:
+    column = ((xy[:, 0] - low[0]) / side_m).astype(np.int64)
+    row = ((xy[:, 1] - low[1]) / side_m).astype(np.int64)
+    return np.asarray(row * columns + column)
