@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -14,7 +13,7 @@ from pcfix.io.crs import is_same, parts
 from pcfix.io.files import check_input
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, las_errors
-from pcfix.io.las.writing import is_ours
+from pcfix.io.las.writing import own_settings
 from pcfix.io.tables import read_table
 from pcfix.model import (
     BATHYMETRIC_POINT,
@@ -127,9 +126,9 @@ def _part(
 
 def own_water(source: LasSource) -> WaterSurface | None:
     """Return the plane of the water surface that the cloud's own VLR names, if any."""
-    ours = next((vlr for vlr in source.vlrs if is_ours(vlr)), None)
     try:
-        plane = None if ours is None else json.loads(ours.record_data)["water_plane"]
+        ours = own_settings(source.vlrs)
+        plane = None if ours is None else ours["water_plane"]
         return None if plane is None else WaterPlane(*map(float, plane))
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(

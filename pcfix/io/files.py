@@ -28,13 +28,7 @@ if TYPE_CHECKING:
 
 
 def check_input(path: str | os.PathLike[str]) -> Path:
-    """Return the path of a file that exists.
-
-    Raises
-    ------
-    InputError
-        If there is no such file.
-    """
+    """Return the path of a file; one that does not exist is an `InputError`."""
     found = Path(path)
     if not found.is_file():
         raise InputError(f"{found}: there is no such file.")
@@ -61,7 +55,8 @@ def check_output(
     """
     target = Path(path)
     for source in inputs:
-        if _is_same(target, Path(source)):
+        both = target.exists() and Path(source).exists()
+        if target.samefile(source) if both else target.resolve() == Path(source).resolve():
             raise SettingError(
                 f"{target}: output and {source} are the same file; give the output another name."
             )
@@ -72,12 +67,6 @@ def check_output(
     if not target.parent.is_dir():
         raise SettingError(f"{target}: the folder {target.parent} does not exist; make it first.")
     return target
-
-
-def _is_same(one: Path, other: Path) -> bool:
-    if one.exists() and other.exists():
-        return one.samefile(other)
-    return one.resolve() == other.resolve()
 
 
 @contextmanager
@@ -111,13 +100,7 @@ def file_state(path: Path) -> dict[str, Any]:
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a JSON file.
-
-    Raises
-    ------
-    OSError, ValueError
-        If it cannot be read, or is no JSON.
-    """
+    """Return the content of a JSON file; OSError or ValueError where it is none."""
     return json.loads(path.read_text("utf-8"))
 
 
@@ -148,45 +131,34 @@ def scratch_arrays(target: Path) -> Iterator[Empty]:
         )
     except OSError as error:
         raise InputError(f"{target}: cannot be written ({error.strerror or error}).") from error
-    made: list[Path] = []
+    files: list[Path] = []
 
     def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-        made.append(Path(folder.name) / f"{len(made)}.bin")
+        files.append(Path(folder.name) / f"{len(files)}.bin")
         size = int(np.prod(shape)) * np.dtype(dtype).itemsize
         try:
-            _reserve(made[-1], size)
+            with files[-1].open("wb") as stream:  # a full disk kills whoever writes to a map
+                if hasattr(os, "posix_fallocate"):
+                    os.posix_fallocate(stream.fileno(), 0, size)
+                else:
+                    stream.truncate(size)
         except OSError as error:
             raise InputError(
                 f"{target}: {size / 1e9:,.1f} GB of temporary space beside it cannot be had"
                 f" ({error.strerror or error}); make room, or write to another disk."
             ) from error
-        return np.memmap(made[-1], dtype=dtype, mode="r+", shape=shape)
+        return np.memmap(files[-1], dtype=dtype, mode="r+", shape=shape)
 
     with folder:
         yield empty
 
 
-def _reserve(path: Path, size: int) -> None:
-    """Make a file of a size that the disk really has: a full disk kills whoever writes to a map."""
-    with path.open("wb") as stream:
-        if hasattr(os, "posix_fallocate"):
-            os.posix_fallocate(stream.fileno(), 0, size)
-        else:
-            stream.truncate(size)
-
-
 class Bins:
     """Points sorted by place, as float64, in files of a folder that the caller makes and removes.
 
-    Parameters
-    ----------
-    folder : Path
-    side : int
-        Cells along a square.
-    corner : tuple of int
-        Column and row of a corner of the squares, counted from x = 0 and y = 0.
-    numbers : int
-        Of each point: its coordinates, and what else belongs to it.
+    There is a file for each square of `side` cells; `corner` is column and row of a corner of the
+    squares, counted from x = 0 and y = 0. Each point has so many `numbers`: its coordinates, and
+    what else belongs to it.
     """
 
     def __init__(self, folder: Path, side: int, corner: Iterable[int], numbers: int = 3) -> None:
@@ -196,14 +168,9 @@ class Bins:
         self._points: dict[tuple[int, int], int] = {}
 
     def add(self, cell: IntArray, xyz: FloatArray) -> None:
-        """Store points; those of one cell keep their order.
+        """Store points, shape (n, numbers), by columns and rows of their cells, shape (n, 2).
 
-        Parameters
-        ----------
-        cell : array, shape (n, 2)
-            Columns and rows, counted from x = 0 and y = 0.
-        xyz : array, shape (n, numbers)
-            Metres, world frame.
+        Those of one cell keep their order.
         """
         square = (cell - self._corner) // self._side
         order = np.lexsort((square[:, 0], square[:, 1]))
@@ -216,12 +183,9 @@ class Bins:
                 stream.write(xyz[start:stop].tobytes())
 
     def read(self, cells: Window) -> FloatArray:
-        """Return the points of all squares that touch a window, counted as `add` counts cells.
+        """Return the points, shape (n, numbers), of all squares that touch a window.
 
-        Returns
-        -------
-        array, shape (n, numbers)
-            Metres, world frame; points of the squares outside the window are among them.
+        Points of the squares outside the window are among them.
         """
         places, numbers = self._touched(cells), self._numbers
         parts = [np.fromfile(self._file(place)).reshape(-1, numbers) for place in places]

@@ -33,17 +33,10 @@ _SUFFIXES = (".tif", ".tiff")
 
 
 class Raster(NamedTuple):
-    """A raster in memory.
+    """A raster in memory: `array` (bands, rows, columns) as stored, the first row at the top.
 
-    Attributes
-    ----------
-    array : array, shape (bands, rows, columns)
-        As stored; the first row is at the top.
-    transform : Affine
-        From (column, row) of a cell's corner to x and y in the raster's CRS.
-    crs : rasterio CRS or None
-    nodata : float or None
-        Value of cells that have none.
+    `transform` goes from (column, row) of a cell's corner to x and y in the raster's CRS; `nodata`
+    is the value of cells that have none.
     """
 
     array: npt.NDArray[Any]
@@ -53,13 +46,7 @@ class Raster(NamedTuple):
 
 
 def read_raster(path: AnyPath) -> Raster:
-    """Return a whole raster of any format that GDAL reads.
-
-    Raises
-    ------
-    InputError
-        If there is no such file, or it is none.
-    """
+    """Return a whole raster of any format that GDAL reads; see `open_raster`."""
     with open_raster(path) as source:
         return Raster(source.read(), source.transform, source.crs, source.nodata)
 
@@ -107,13 +94,7 @@ def _slices(window: Window) -> tuple[tuple[int, int], tuple[int, int]]:
 def check_tif(
     path: AnyPath, *, overwrite: bool, inputs: Iterable[str | os.PathLike[str]] = ()
 ) -> Path:
-    """Return the path of a GeoTIFF that may be written; see `pcfix.io.files.check_output`.
-
-    Raises
-    ------
-    SettingError
-        Also if the name does not end in ``.tif`` or ``.tiff``.
-    """
+    """Return the path of a GeoTIFF that may be written, by its suffix and `check_output`."""
     target = check_output(path, overwrite=overwrite, inputs=inputs)
     if target.suffix.lower() not in _SUFFIXES:
         raise SettingError(f"{target}: a raster is written as GeoTIFF; end the name in .tif.")
@@ -121,12 +102,7 @@ def check_tif(
 
 
 def check_cog() -> None:
-    """Refuse to promise a cloud optimised GeoTIFF where GDAL cannot write one.
-
-    Raises
-    ------
-    SettingError
-    """
+    """Refuse to promise a cloud optimised GeoTIFF where GDAL cannot write one."""
     import rasterio
 
     with rasterio.Env() as environment:
@@ -151,22 +127,8 @@ def new_raster(
 ) -> Iterator[DatasetWriter]:
     """Open a new tiled, compressed GeoTIFF for `write_part`.
 
-    Parameters
-    ----------
-    path : Path
-    lattice : Lattice
-    crs : pyproj CRS or None
-    bands : mapping
-        Description and unit of each band.
-    dtype, nodata
-        Of all bands.
-    tags : mapping, optional
-        Metadata of the file.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
+    `bands` maps the description of each band to its unit; `dtype` and `nodata` are those of all
+    bands, `tags` the metadata of the file.
     """
     import rasterio
     from rasterio.transform import from_origin
@@ -205,35 +167,19 @@ def add_overviews(path: Path) -> None:
 
     with rasterio.open(path) as raster:
         dtype, longest = raster.dtypes[0], max(raster.width, raster.height)
-    factors = _factors(longest)
-    if factors:
-        with rasterio.Env(**_overview_compression(dtype)), rasterio.open(path, "r+") as raster:
-            raster.build_overviews(factors, Resampling.average)
-
-
-def _predictor(dtype: str) -> int:
-    return 3 if dtype.startswith("float") else 2
-
-
-def _compression(dtype: str) -> dict[str, Any]:
-    return {"compress": "deflate", "predictor": _predictor(dtype), "bigtiff": "IF_SAFER"}
-
-
-def _overview_compression(dtype: str) -> dict[str, Any]:
-    return {
-        "COMPRESS_OVERVIEW": "DEFLATE",
-        "PREDICTOR_OVERVIEW": str(_predictor(dtype)),
-        "BIGTIFF_OVERVIEW": "IF_SAFER",
-        "GDAL_TIFF_OVR_BLOCKSIZE": str(TILE),
-    }
-
-
-def _factors(longest: int) -> list[int]:
-    """Return by how much each overview is smaller."""
     factors: list[int] = []
     while longest > TILE * 2 ** len(factors):
         factors.append(2 ** (len(factors) + 1))
-    return factors
+    if factors:
+        settings = {f"{k}_OVERVIEW".upper(): str(v).upper() for k, v in _compression(dtype).items()}
+        settings["GDAL_TIFF_OVR_BLOCKSIZE"] = str(TILE)
+        with rasterio.Env(**settings), rasterio.open(path, "r+") as raster:
+            raster.build_overviews(factors, Resampling.average)
+
+
+def _compression(dtype: str) -> dict[str, Any]:
+    predictor = 3 if dtype.startswith("float") else 2
+    return {"compress": "deflate", "predictor": predictor, "bigtiff": "IF_SAFER"}
 
 
 def copy_as_cog(source: Path, target: Path) -> None:

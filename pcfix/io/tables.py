@@ -17,11 +17,42 @@ if TYPE_CHECKING:
     import os
     from collections.abc import Iterator, Sequence
     from pathlib import Path
-    from types import ModuleType
 
     import numpy.typing as npt
 
     from pcfix.model import FloatArray
+
+
+TEXT_SUFFIXES = (".wkt", ".csv", ".txt")
+COLUMNS = {
+    "x": ("x", "easting", "east", "e", "x_m", "easting_m"),
+    "y": ("y", "northing", "north", "n", "y_m", "northing_m"),
+    "longitude": ("longitude", "lon", "long", "lng"),
+    "latitude": ("latitude", "lat"),
+    "z": (
+        *("z", "height", "h", "altitude", "alt", "elevation", "elev", "level"),
+        *("z_m", "height_m", "altitude_m", "elevation_m", "level_m"),
+    ),
+    "wkt": ("wkt", "geometry", "geom", "wkt_geom"),
+}
+"""What a column is, and its names; the first that is there counts."""
+_UNIT = re.compile(r"\s*[\[(]\s*(m|metres?|meters?|deg|degrees?|°)\s*[\])]$")
+_WKT = re.compile(
+    r"\s*(SRID\s*=\s*\d+\s*;)?\s*((MULTI)?(POINT|LINESTRING|POLYGON)|LINEARRING|GEOMETRYCOLLECTION)"
+    r"\s*(ZM|Z|M)?\s*(\(|EMPTY)",
+    re.IGNORECASE,
+)
+_SRID = re.compile(r"\s*SRID\s*=\s*(\d+)\s*;", re.IGNORECASE)
+_CRS = re.compile(r"#\s*crs\s*[:=]\s*(.+)$", re.IGNORECASE)
+
+DEPTH_SPELLINGS = {
+    "x": ("x", "easting", "east"),
+    "y": ("y", "northing", "north"),
+    "depth": ("depth", "true_depth", "water_depth", "measured_depth"),
+    "z": ("z", "height", "elevation", "elev", "altitude"),
+}
+_DEPTH_UNIT = re.compile(r"^(.*?)[ _]*[\[(]([^\])]*)[\])]$|^(.*)_(m|cm|mm|ft)$")
+_METRES = ("", "m", "metre", "metres", "meter", "meters")
 
 
 class Table(NamedTuple):
@@ -92,23 +123,17 @@ def read_table(path: Path, required: Sequence[str]) -> Table:
     Raises
     ------
     InputError
-        If a required column is missing, a row has another number of fields than the header, or
-        there are no rows.
+        If a required column is missing; see `table_below`.
     """
     lines = read_lines(path)
     header, delimiter = split_header(lines[0] if lines else "")
-    require(path, 1, header, required)
-    return table_below(path, lines, header, delimiter)
-
-
-def require(path: Path, line: int, header: Sequence[str], required: Sequence[str]) -> None:
-    """Refuse a header that lacks a column."""
     missing = [name for name in required if name not in header]
     if missing:
         raise InputError(
-            f"{path}: line {line} must name the columns {', '.join(required)};"
+            f"{path}: line 1 must name the columns {', '.join(required)};"
             f" {', '.join(missing)} missing (it has: {', '.join(header)})."
         )
+    return table_below(path, lines, header, delimiter)
 
 
 def table_below(
@@ -163,30 +188,7 @@ def _split(
         ) from error
 
 
-TEXT_SUFFIXES = (".wkt", ".csv", ".txt")
-COLUMNS = {
-    "x": ("x", "easting", "east", "e", "x_m", "easting_m"),
-    "y": ("y", "northing", "north", "n", "y_m", "northing_m"),
-    "longitude": ("longitude", "lon", "long", "lng"),
-    "latitude": ("latitude", "lat"),
-    "z": (
-        *("z", "height", "h", "altitude", "alt", "elevation", "elev", "level"),
-        *("z_m", "height_m", "altitude_m", "elevation_m", "level_m"),
-    ),
-    "wkt": ("wkt", "geometry", "geom", "wkt_geom"),
-}
-"""What a column is, and its names; the first that is there counts."""
-_UNIT = re.compile(r"\s*[\[(]\s*(m|metres?|meters?|deg|degrees?|°)\s*[\])]$")
-_WKT = re.compile(
-    r"\s*(SRID\s*=\s*\d+\s*;)?\s*((MULTI)?(POINT|LINESTRING|POLYGON)|LINEARRING|GEOMETRYCOLLECTION)"
-    r"\s*(ZM|Z|M)?\s*(\(|EMPTY)",
-    re.IGNORECASE,
-)
-_SRID = re.compile(r"\s*SRID\s*=\s*(\d+)\s*;", re.IGNORECASE)
-_CRS = re.compile(r"#\s*crs\s*[:=]\s*(.+)$", re.IGNORECASE)
-
-
-def read_text(path: Path, shapely: ModuleType) -> tuple[npt.NDArray[Any], str | None]:
+def read_text(path: Path) -> tuple[npt.NDArray[Any], str | None]:
     """Return the geometries of a text file, and the CRS that it names.
 
     A comment ``# crs: EPSG:25830`` above the rest names it, or ``SRID=25830;`` before a WKT;
@@ -198,27 +200,25 @@ def read_text(path: Path, shapely: ModuleType) -> tuple[npt.NDArray[Any], str | 
         If it is neither WKT nor a table of points, or damaged.
     """
     lines = read_lines(path)
-    said = [found.group(1).strip() for line in lines[:20] if (found := _CRS.match(line.strip()))]
-    kept = [(i, line) for i, line in enumerate(lines) if _counts(line)]
+    stated = [found.group(1).strip() for line in lines[:20] if (found := _CRS.match(line.strip()))]
+    kept = [
+        (i, line)
+        for i, line in enumerate(lines, start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
     if not kept:
         raise InputError(f"{path}: is empty.")
-    at, first = kept[0]
-    if _WKT.match(first):
-        numbered = [(i + 1, line) for i, line in kept]
-        geometries, srid = _from_wkt(path, numbered, shapely)
+    if _WKT.match(kept[0][1]):
+        geometries, srid = _from_wkt(path, kept)
     else:
-        geometries, srid = _from_table(path, lines, at, shapely)
-    return geometries, said[0] if said else srid
+        geometries, srid = _from_table(path, lines, kept[0][0] - 1)
+    return geometries, stated[0] if stated else srid
 
 
-def _counts(line: str) -> bool:
-    return bool(line.strip()) and not line.lstrip().startswith("#")
-
-
-def _from_wkt(
-    path: Path, lines: list[tuple[int, str]], shapely: ModuleType
-) -> tuple[npt.NDArray[Any], str | None]:
+def _from_wkt(path: Path, lines: list[tuple[int, str]]) -> tuple[npt.NDArray[Any], str | None]:
     """Return the geometry of each numbered line, and the CRS that they name."""
+    import shapely
+
     geometries = np.empty(len(lines), dtype=object)
     srids: set[str | None] = set()
     for row, (line, text) in enumerate(lines):
@@ -236,20 +236,18 @@ def _from_wkt(
     return geometries, srids.pop()
 
 
-def _from_table(
-    path: Path, lines: list[str], at: int, shapely: ModuleType
-) -> tuple[npt.NDArray[Any], str | None]:
+def _from_table(path: Path, lines: list[str], at: int) -> tuple[npt.NDArray[Any], str | None]:
     """Return the points, or the geometries, of a table whose header is ``lines[at]``."""
     names, delimiter = split_header(lines[at])
     header = [_UNIT.sub("", name) for name in names]
     table = table_below(path, lines, header, delimiter, at=at, comments=True)
     if (wkt := _column(header, "wkt")) is not None:
         numbered = list(zip(table.line, table.column(wkt), strict=True))
-        return _from_wkt(path, numbered, shapely)
+        return _from_wkt(path, numbered)
     for x, y, crs in (("x", "y", None), ("longitude", "latitude", "EPSG:4326")):
         plan = _column(header, x), _column(header, y)
         if plan[0] is not None and plan[1] is not None:
-            return _points(table, plan[0], plan[1], shapely), crs
+            return _points(table, plan[0], plan[1]), crs
     raise InputError(
         f"{path}: line {at + 1} must name the columns x and y (or easting and northing, longitude"
         f" and latitude), with z or height where there is one; it has: {', '.join(names)}."
@@ -260,8 +258,10 @@ def _column(header: list[str], role: str) -> str | None:
     return next((name for name in COLUMNS[role] if name in header), None)
 
 
-def _points(table: Table, x: str, y: str, shapely: ModuleType) -> npt.NDArray[Any]:
+def _points(table: Table, x: str, y: str) -> npt.NDArray[Any]:
     """Return the points of a table; where the height of one is empty it has none."""
+    import shapely
+
     plan = np.column_stack([table.numbers(x), table.numbers(y)])
     name = _column(table.header, "z")
     if name is None:
@@ -282,16 +282,6 @@ def _numbers_or_none(table: Table, name: str) -> FloatArray:
                 " finite number."
             )
     return values
-
-
-SPELLINGS = {
-    "x": ("x", "easting", "east"),
-    "y": ("y", "northing", "north"),
-    "depth": ("depth", "true_depth", "water_depth", "measured_depth"),
-    "z": ("z", "height", "elevation", "elev", "altitude"),
-}
-_DEPTH_UNIT = re.compile(r"^(.*?)[ _]*[\[(]([^\])]*)[\])]$|^(.*)_(m|cm|mm|ft)$")
-_METRES = ("", "m", "metre", "metres", "meter", "meters")
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,7 +336,7 @@ def read_check_depths(path: str | os.PathLike[str]) -> CheckDepths:
     source = check_input(path)
     table = read_table(source, ())
     names, units = zip(*(_split_unit(name) for name in table.header), strict=True)
-    place = {role: _place(table, names, role) for role in SPELLINGS}
+    place = {role: _place(table, names, role) for role in DEPTH_SPELLINGS}
     what = "z" if place["depth"] is None else "depth"
     missing = [role for role in ("x", "y", what) if place[role] is None]
     if missing:
@@ -366,7 +356,14 @@ def read_check_depths(path: str | os.PathLike[str]) -> CheckDepths:
     found = CheckDepths(
         str(source), np.column_stack(values[:2]), values[2], what == "z", table.line
     )
-    _refuse_negative(found)
+    negative = np.flatnonzero(found.value_m < 0.0)
+    if len(negative) and not found.are_heights:
+        first = int(negative[0])
+        raise InputError(
+            f"{found.where(first)}: the depth {found.value_m[first]:g} is negative, as are"
+            f" {len(negative)} of {len(found)}; depths count positive down, and heights of the bed"
+            " belong in a column z."
+        )
     return found
 
 
@@ -381,22 +378,10 @@ def _split_unit(name: str) -> tuple[str, str]:
 
 def _place(table: Table, names: tuple[str, ...], role: str) -> int | None:
     """Return the number of a column; easting beside x is refused."""
-    there = [i for i, name in enumerate(names) if name in SPELLINGS[role]]
+    there = [i for i, name in enumerate(names) if name in DEPTH_SPELLINGS[role]]
     if len(there) > 1:
         twice = ", ".join(table.header[i] for i in there)
         raise InputError(
             f"{table.path}: line 1: the columns {twice} may all be {role}; take out all but one."
         )
     return there[0] if there else None
-
-
-def _refuse_negative(found: CheckDepths) -> None:
-    negative = np.flatnonzero(found.value_m < 0.0)
-    if found.are_heights or not len(negative):
-        return
-    first = int(negative[0])
-    raise InputError(
-        f"{found.where(first)}: the depth {found.value_m[first]:g} is negative, as are"
-        f" {len(negative)} of {len(found)}; depths count positive down, and heights of the bed"
-        " belong in a column z."
-    )

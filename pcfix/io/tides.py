@@ -7,16 +7,15 @@ and images share. The two cannot be compared, so both must be of one kind.
 from __future__ import annotations
 
 import re
-from collections import Counter
-from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.files import check_input, read_json
+from pcfix.io.labels import match_labels
 from pcfix.io.tables import read_table
 
 if TYPE_CHECKING:
@@ -31,17 +30,11 @@ _EXIF_DATE = re.compile(r"^(\d{4}):(\d\d):(\d\d)\b")
 _DATE_TIME_ORIGINAL, _OFFSET_ORIGINAL, _SUBSECONDS, _EXIF = 0x9003, 0x9011, 0x9291, 0x8769
 
 
-@dataclass(frozen=True, eq=False)
-class ImageTimes:
+class ImageTimes(NamedTuple):
     """When k images were taken.
 
-    Attributes
-    ----------
-    time_s : array, shape (k,)
-        Seconds since 1970, UTC where `zoned`, else of a local clock.
-    zoned : bool
-    name : str
-        Where the times came from.
+    Seconds since 1970, shape (k,), UTC where `zoned`, else of a local clock; `name` says where the
+    times came from.
     """
 
     time_s: FloatArray
@@ -74,9 +67,8 @@ def read_image_times(path: str | os.PathLike[str], labels: Sequence[str]) -> Ima
         return _from_json(found, labels)
     table = read_table(found, ["label", "time"])
     row = _rows(table.column("label"), labels, str(path))
-    words = table.column("time")
-    where = [f"line {table.line[r]}" for r in row]
-    return ImageTimes(*seconds_of(str(path), where, [words[r] for r in row]), str(path))
+    texts, where = table.column("time"), [f"line {table.line[r]}" for r in row]
+    return ImageTimes(*_seconds(str(path), where, [texts[r] for r in row]), str(path))
 
 
 def _from_exif(folder: Path, labels: Sequence[str]) -> ImageTimes:
@@ -85,7 +77,7 @@ def _from_exif(folder: Path, labels: Sequence[str]) -> ImageTimes:
         raise InputError(f"{folder}: holds no images; give the folder with those of the block.")
     chosen = [files[row] for row in _rows([str(p) for p in files], labels, str(folder))]
     where = [f"image {file.name}" for file in chosen]
-    return ImageTimes(*seconds_of(str(folder), where, [_exif_time(f) for f in chosen]), str(folder))
+    return ImageTimes(*_seconds(str(folder), where, [_exif_time(f) for f in chosen]), str(folder))
 
 
 def _exif_time(file: Path) -> str:
@@ -134,15 +126,8 @@ def _json_times(content: Any) -> dict[str, float]:
 
 
 def _rows(names: Sequence[str], labels: Sequence[str], source: str) -> list[int]:
-    """Return for each label the row of its name: whole, without folder, without extension."""
-    rows = [-1] * len(labels)
-    for key in (str, _file_name, _stem):
-        once = {name for name, count in Counter(map(key, names)).items() if count == 1}
-        where = {key(name): row for row, name in enumerate(names) if key(name) in once}
-        rows = [
-            where.get(key(label), -1) if row < 0 else row
-            for row, label in zip(rows, labels, strict=True)
-        ]
+    """Return for each label the row of its name."""
+    rows: list[int] = match_labels(labels, names).row.tolist()
     missing = [label for label, row in zip(labels, rows, strict=True) if row < 0]
     if missing:
         raise InputError(
@@ -152,22 +137,8 @@ def _rows(names: Sequence[str], labels: Sequence[str], source: str) -> list[int]
     return rows
 
 
-def _file_name(name: str) -> str:
-    return PurePosixPath(name.replace("\\", "/")).name
-
-
-def _stem(name: str) -> str:
-    return PurePosixPath(_file_name(name)).stem.lower()
-
-
-def seconds_of(source: str, where: Sequence[str], texts: Sequence[str]) -> tuple[FloatArray, bool]:
-    """Return seconds since 1970 of times as text, and whether they have zones: all, or none.
-
-    Raises
-    ------
-    InputError
-        If one is no time, or some have a zone and some not; `where` says which.
-    """
+def _seconds(source: str, where: Sequence[str], texts: Sequence[str]) -> tuple[FloatArray, bool]:
+    """Return seconds since 1970 of times as text, and whether they have zones: all, or none."""
     moments = [_moment(source, at, text) for at, text in zip(where, texts, strict=True)]
     zoned = [moment.tzinfo is not None for moment in moments]
     if any(zoned) != all(zoned):
@@ -199,18 +170,10 @@ LONG_GAP_S = 3600.0
 to A (2 pi 1 h / 12.4 h)^2 / 8 = 6 cm off, that over two hours 26 cm."""
 
 
-@dataclass(frozen=True, eq=False)
-class TideTable:
-    """Water levels over time.
+class TideTable(NamedTuple):
+    """Water levels, shape (m,), over increasing times as in `ImageTimes`.
 
-    Attributes
-    ----------
-    time_s : array, shape (m,)
-        Increasing; seconds since 1970, UTC where `zoned`, else of a local clock.
-    level_m : array, shape (m,)
-        Above any datum, as only differences count.
-    zoned : bool
-    name : str
+    Levels are above any datum, as only differences count.
     """
 
     time_s: FloatArray
@@ -230,7 +193,7 @@ def read_tide(path: str | os.PathLike[str]) -> TideTable:
     table = read_table(check_input(path), ["time", "level_m"])
     level = table.numbers("level_m")
     where = [f"line {line}" for line in table.line]
-    seconds, zoned = seconds_of(str(path), where, table.column("time"))
+    seconds, zoned = _seconds(str(path), where, table.column("time"))
     late = np.flatnonzero(np.diff(seconds) <= 0.0)
     if late.size:
         raise InputError(

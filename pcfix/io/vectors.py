@@ -5,11 +5,11 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import shapely
 
 from pcfix.errors import InputError, SettingError
 from pcfix.io.crs import parse_crs
@@ -20,7 +20,6 @@ from pcfix.io.transformations import way_to_cloud
 if TYPE_CHECKING:
     import os
     from collections.abc import Callable
-    from types import ModuleType
 
     import numpy.typing as npt
     from pyproj import CRS
@@ -64,7 +63,6 @@ class Vectors:
     @cached_property
     def coordinates(self) -> FloatArray:
         """All vertices, shape (n, 3); z is NaN where a geometry has none."""
-        shapely = load("shapely")
         return np.asarray(shapely.get_coordinates(self.geometries, include_z=True), np.float64)
 
     @property
@@ -75,8 +73,7 @@ class Vectors:
 
 def is_vector_file(path: str | os.PathLike[str]) -> bool:
     """Whether the name of a file, with or without a layer, is one that `read_vectors` reads."""
-    suffix = Path(_split_layer(path)[0]).suffix.lower()
-    return suffix in (*GDAL_SUFFIXES, *TEXT_SUFFIXES)
+    return Path(_split_layer(path)[0]).suffix.lower() in (*GDAL_SUFFIXES, *TEXT_SUFFIXES)
 
 
 def read_vectors(
@@ -112,31 +109,13 @@ def read_vectors(
     source = check_input(file)
     suffix = source.suffix.lower()
     if suffix in TEXT_SUFFIXES:
-        shapely = load("shapely")
-        geometries, found = read_text(source, shapely)
+        geometries, found = read_text(source)
         name = str(source)
     elif suffix in GDAL_SUFFIXES:
         geometries, found, name = _read_gdal(source, layer or named)
     else:
         raise InputError(f"{source}: is not a vector file that pcfix reads; give {KINDS}.")
-    vectors = Vectors(geometries, crs or found, name)
-    return _checked(_without_gaps(vectors))
-
-
-def load(module: str) -> ModuleType:
-    """Import shapely or pyogrio.
-
-    Raises
-    ------
-    SettingError
-        If it is not installed; the message names the extra.
-    """
-    try:
-        return import_module(module)
-    except ImportError as error:
-        raise SettingError(
-            f"Vector files need {module}, which is not installed; run: pip install 'pcfix[vector]'."
-        ) from error
+    return _checked(_without_gaps(Vectors(geometries, crs or found, name)))
 
 
 def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool) -> Vectors:
@@ -165,7 +144,7 @@ def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool
         return vectors
     geometries = vectors.geometries
     if not heights:
-        geometries = load("shapely").segmentize(geometries, _longest_edge(vectors.crs))
+        geometries = shapely.segmentize(geometries, _longest_edge(vectors.crs))
     moved = replace(vectors, geometries=_moved(geometries, forward))
     if not np.isfinite(moved.coordinates[:, :2]).all():
         raise InputError(
@@ -176,7 +155,6 @@ def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool
 
 def _moved(geometries: npt.NDArray[Any], forward: Callable[[FloatArray], FloatArray]) -> Any:
     """Return geometries with all vertices moved; those without heights stay so."""
-    shapely = load("shapely")
 
     def move(xyz: FloatArray) -> FloatArray:
         there = forward(np.nan_to_num(xyz))
@@ -201,12 +179,17 @@ def _split_layer(path: str | os.PathLike[str]) -> tuple[str, str | None]:
 
 def _read_gdal(path: Path, layer: str | None) -> tuple[npt.NDArray[Any], str | None, str]:
     """Return geometries (None where one is missing), CRS and name."""
-    shapely, pyogrio = load("shapely"), load("pyogrio")
+    try:
+        import pyogrio
+    except ImportError as error:
+        raise SettingError(
+            "Vector files need pyogrio, which is not installed; run: pip install 'pcfix[vector]'."
+        ) from error
     try:
         layer = _layer(path, pyogrio.list_layers(path), layer)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # M values, which are not needed, are left out
-            meta, _, wkb, _ = load("pyogrio.raw").read(path, layer=layer, columns=[])
+            meta, _, wkb, _ = pyogrio.raw.read(path, layer=layer, columns=[])
         geometries = shapely.from_wkb(wkb)
     except (RuntimeError, ValueError, shapely.errors.ShapelyError) as error:
         first = str(error).split(";")[0].strip().rstrip(".")
@@ -236,7 +219,6 @@ def _layer(path: Path, layers: npt.NDArray[Any], wanted: str | None) -> str:
 
 def _without_gaps(vectors: Vectors) -> Vectors:
     """Return the geometries that are there and finite, and say how many were not."""
-    shapely = load("shapely")
     gone = shapely.is_missing(vectors.geometries) | shapely.is_empty(vectors.geometries)
     xy, at = shapely.get_coordinates(vectors.geometries, return_index=True)
     gone[at[~np.isfinite(xy).all(axis=1)]] = True
@@ -248,12 +230,7 @@ def _without_gaps(vectors: Vectors) -> Vectors:
 
 
 def _checked(vectors: Vectors) -> Vectors:
-    """Refuse a CRS that is unknown, and degrees that are none.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a CRS that is unknown, and degrees that are none."""
     if vectors.crs is None or vectors.crs.strip().lower() == "local":
         return vectors
     crs = parse_crs(vectors.crs, vectors.name)
@@ -276,17 +253,10 @@ MOST_POINTS = 1_000_000
 FEW = 3
 
 
-@dataclass(frozen=True, eq=False)
-class Shoreline:
-    """Points on the edge of the water.
+class Shoreline(NamedTuple):
+    """Points on the edge of the water, shape (n, 3): metres, the cloud's CRS, z NaN where unknown.
 
-    Attributes
-    ----------
-    xyz : array, shape (n, 3)
-        Metres, the cloud's CRS; z is NaN where the file has no height.
-    name : str
-        For messages.
-    notes : tuple of str
+    `name` is the file's, for messages; `notes` are for the summary.
     """
 
     xyz: FloatArray
@@ -294,16 +264,10 @@ class Shoreline:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class WaterPolygons:
-    """Where there is water.
+class WaterPolygons(NamedTuple):
+    """Where there is water: `area` is a valid shapely (Multi)Polygon in the cloud's CRS.
 
-    Attributes
-    ----------
-    area : shapely MultiPolygon or Polygon
-        Valid, its holes are dry; the cloud's CRS.
-    name : str
-    notes : tuple of str
+    Its holes are dry.
     """
 
     area: Any
@@ -342,34 +306,29 @@ def read_shoreline(
     if not spacing_m > 0.0:
         raise SettingError(f"spacing {spacing_m:g} m must be positive.")
     vectors = in_cloud_crs(read_vectors(path, layer=layer, crs=crs), cloud_crs, heights=True)
-    shapely = load("shapely")
-    lines, points = _lines_and_points(vectors.geometries, shapely)
+    lines, points = _lines_and_points(vectors.geometries)
     level = shapely.has_z(lines)
-    check_count(vectors.name, float(shapely.length(lines[~level]).sum()) / spacing_m)
-    parts = [points, lines[level], shapely.segmentize(lines[~level], spacing_m)]
-    xyz = np.vstack([_vertices(part, shapely) for part in parts])
-    z, notes = _known_heights(xyz[:, 2], vectors.name)
-    return Shoreline(np.column_stack([xyz[:, :2], z]), vectors.name, (*vectors.notes, *notes))
-
-
-def check_count(name: str, count: float) -> None:
-    """Refuse a line that would give more points than anything needs.
-
-    Raises
-    ------
-    InputError
-    """
+    count = float(shapely.length(lines[~level]).sum()) / spacing_m
     if count > MOST_POINTS:
         raise InputError(
-            f"{name}: would give {count:.3g} points; check its CRS and unit, or thin it out."
+            f"{vectors.name}: would give {count:.3g} points; check its CRS and unit, or thin it"
+            " out."
         )
+    parts = [points, lines[level], shapely.segmentize(lines[~level], spacing_m)]
+    xyz = np.vstack([_vertices(part) for part in parts])
+    known = xyz[np.isfinite(xyz[:, 2]), 2]
+    if len(known) < FEW or known.any():
+        return Shoreline(xyz, vectors.name, vectors.notes)
+    xyz[:, 2] = np.nan  # all exactly zero, as of a flat drawing
+    note = (
+        f"{vectors.name}: all {len(known)} heights are exactly 0; taken as points without heights."
+    )
+    return Shoreline(xyz, vectors.name, (*vectors.notes, note))
 
 
-def _lines_and_points(
-    geometries: npt.NDArray[Any], shapely: Any
-) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+def _lines_and_points(geometries: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
     """Return the lines and rings, and the points, that geometries consist of."""
-    parts = _simple(geometries, shapely)
+    parts = _simple(geometries)
     kind = shapely.get_type_id(parts)
     kinds = shapely.GeometryType
     rings = shapely.get_rings(parts[kind == kinds.POLYGON])
@@ -377,28 +336,19 @@ def _lines_and_points(
     return np.concatenate([lines, rings]), parts[kind == kinds.POINT]
 
 
-def _simple(geometries: npt.NDArray[Any], shapely: Any) -> npt.NDArray[Any]:
+def _simple(geometries: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return the parts of multi-part geometries and collections, however deep."""
     while (shapely.get_type_id(geometries) > shapely.GeometryType.POLYGON).any():
         geometries = shapely.get_parts(geometries)
     return geometries
 
 
-def _vertices(geometries: npt.NDArray[Any], shapely: Any) -> FloatArray:
+def _vertices(geometries: npt.NDArray[Any]) -> FloatArray:
     """Return vertices (n, 3); of a closed line the last is the first and does not count twice."""
     xyz, at = shapely.get_coordinates(geometries, include_z=True, return_index=True)
     last = np.flatnonzero(np.diff(at, append=-1) != 0)
     again = last[shapely.is_closed(geometries)[at[last]]] if len(last) else last
     return np.asarray(np.delete(xyz, again, axis=0), np.float64)
-
-
-def _known_heights(z: FloatArray, name: str) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return heights; where all are exactly zero, as of a flat drawing, they are none."""
-    known = z[np.isfinite(z)]
-    if len(known) >= FEW and not known.any():
-        note = f"{name}: all {len(known)} heights are exactly 0; taken as points without heights."
-        return np.full_like(z, np.nan), (note,)
-    return z, ()
 
 
 def read_water_polygons(
@@ -422,14 +372,13 @@ def read_water_polygons(
         If there is no polygon with an area, or they cannot be read or brought to the cloud's CRS.
     """
     vectors = in_cloud_crs(read_vectors(path, layer=layer, crs=crs), cloud_crs, heights=False)
-    shapely = load("shapely")
-    parts = shapely.force_2d(_simple(vectors.geometries, shapely))
+    parts = shapely.force_2d(_simple(vectors.geometries))
     is_polygon = shapely.get_type_id(parts) == shapely.GeometryType.POLYGON
     if not is_polygon.any():
         raise InputError(
             f"{vectors.name}: holds no polygon ({vectors.kinds}); a mask needs polygons of water."
         )
-    polygons, notes = _valid(parts[is_polygon], vectors.name, shapely)
+    polygons, notes = _valid(parts[is_polygon], vectors.name)
     if not is_polygon.all():
         other = int((~is_polygon).sum())
         notes += (f"{vectors.name}: {other} points or lines beside the polygons are left out.",)
@@ -439,9 +388,7 @@ def read_water_polygons(
     return WaterPolygons(area, vectors.name, (*vectors.notes, *notes))
 
 
-def _valid(
-    polygons: npt.NDArray[Any], name: str, shapely: Any
-) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
+def _valid(polygons: npt.NDArray[Any], name: str) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
     """Return polygons with those repaired that cross themselves: holes stay holes."""
     crossed = ~shapely.is_valid(polygons)
     if not crossed.any():

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from contextlib import ExitStack, contextmanager
 from copy import deepcopy
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import laspy
@@ -39,8 +40,13 @@ if TYPE_CHECKING:
 
 
 EXTRA_BYTES = ("LASF_Spec", 4)
-_SOFTWARE = slice(32, 64)
-"""Where a file's identity names the generating software."""
+USER_ID = "pcfix"
+_SETTINGS = (1, "pcfix settings (JSON)")
+BEFORE = (
+    *("version", "point_format", "identity", "global_encoding"),
+    *("offsets", "steps", "added_wkt", "undescribed"),
+)
+"""What the VLR says of the file before the correction."""
 
 
 def corrected_header(
@@ -85,7 +91,7 @@ def corrected_header(
         "added_wkt": new.added_wkt,
         "undescribed": new.undescribed,
     }
-    vlrs = [*new.vlrs, settings_vlr({**content, "before": before})]
+    vlrs = [*new.vlrs, _note(_SETTINGS, {**content, "before": before})]
     _set_records(new.header, vlrs, new.described + records)
     return new.header
 
@@ -93,11 +99,7 @@ def corrected_header(
 def noted_header(source: LasSource, note: VLR) -> laspy.LasHeader:
     """Return the header of a file with other classes or flags: LAS 1.4, its records, and a note.
 
-    Parameters
-    ----------
-    source : LasSource
-    note : VLR
-        What was done; notes of earlier times stay before it.
+    Notes of earlier times stay before it.
     """
     new = _upgraded(source, [])
     _set_records(new.header, [*new.vlrs, note], new.described)
@@ -138,20 +140,13 @@ def _upgraded(source: LasSource, params: list[laspy.ExtraBytesParams]) -> _Upgra
 def corrected_identity(source: LasSource) -> bytes:
     """Return the identity of a corrected or cleaned file: made by pcfix, else as it was."""
     name = f"pcfix {__version__}".encode().ljust(32, b"\0")
-    return source.identity[: _SOFTWARE.start] + name + source.identity[_SOFTWARE.stop :]
+    return source.identity[:32] + name + source.identity[64:]  # the generating software
 
 
 def restored_header(source: LasSource, before: dict[str, Any], drop: set[str]) -> laspy.LasHeader:
-    """Return the header that a file had before it was corrected.
+    """Return the header that a corrected file had before, by `before` of its own VLR.
 
-    Parameters
-    ----------
-    source : LasSource
-        The corrected file.
-    before : dict
-        From its provenance VLR.
-    drop : set of str
-        The extra dimensions that pcfix added.
+    The extra dimensions that pcfix added go: `drop`.
     """
     header = _copied(source.header)
     extra = list(source.header.point_format.extra_dimensions)
@@ -268,69 +263,53 @@ def _wkt_for(header: laspy.LasHeader, source: LasSource) -> VLR | None:
     return VLR("LASF_Projection", 2112, "OGC COORDINATE SYSTEM WKT", wkt.record_data_bytes())
 
 
-USER_ID = "pcfix"
-SETTINGS_RECORD = 1
-DESCRIPTION = "pcfix settings (JSON)"
-CLEANING_RECORD = 2
-CLEANING_DESCRIPTION = "pcfix cleaning (JSON)"
-LABELLING_RECORD = 3
-LABELLING_DESCRIPTION = "pcfix labelling (JSON)"
-BEFORE = (
-    "version",
-    "point_format",
-    "identity",
-    "global_encoding",
-    "offsets",
-    "steps",
-    "added_wkt",
-    "undescribed",
-)
-"""What the VLR says of the file before the correction."""
-
-
 def is_ours(vlr: VLR) -> bool:
-    """Whether a VLR is the one of `settings_vlr`."""
-    return bool(vlr.user_id == USER_ID and vlr.record_id == SETTINGS_RECORD)
+    """Whether a VLR is the one that says how a file was corrected."""
+    return bool(vlr.user_id == USER_ID and vlr.record_id == _SETTINGS[0])
 
 
-def settings_vlr(content: dict[str, Any]) -> VLR:
-    """Return the VLR that holds the content as JSON."""
-    return _json_vlr(SETTINGS_RECORD, DESCRIPTION, content)
-
-
-def cleaning_vlr(content: dict[str, Any]) -> VLR:
-    """Return the VLR that says how a file was cleaned, as JSON; one for each cleaning."""
-    return _json_vlr(CLEANING_RECORD, CLEANING_DESCRIPTION, content)
-
-
-def labelling_vlr(content: dict[str, Any]) -> VLR:
-    """Return the VLR that says how a file was labelled, as JSON; one for each labelling."""
-    return _json_vlr(LABELLING_RECORD, LABELLING_DESCRIPTION, content)
-
-
-def _json_vlr(record: int, description: str, content: dict[str, Any]) -> VLR:
+def _note(record: tuple[int, str], content: dict[str, Any]) -> VLR:
+    number, description = record
     text = json.dumps(content, ensure_ascii=True, separators=(",", ":"))
-    return VLR(USER_ID, record, description, text.encode())
+    return VLR(USER_ID, number, description, text.encode())
+
+
+cleaning_vlr = partial(_note, (2, "pcfix cleaning (JSON)"))
+"""The VLR that says how a file was cleaned; one for each cleaning."""
+labelling_vlr = partial(_note, (3, "pcfix labelling (JSON)"))
+"""The VLR that says how a file was labelled; one for each labelling."""
+
+
+def own_settings(vlrs: Iterable[VLR]) -> Any:
+    """Return what the VLR of a correction says, None where there is none.
+
+    Raises
+    ------
+    ValueError
+        If it is no JSON.
+    """
+    ours = next((vlr for vlr in vlrs if is_ours(vlr)), None)
+    return None if ours is None else json.loads(ours.record_data)
 
 
 def read_settings(vlrs: Iterable[VLR], path: Path) -> dict[str, Any]:
-    """Return the content of the VLR.
+    """Return what the VLR of a correction says.
 
     Raises
     ------
     InputError
         If there is none, or it is damaged.
     """
-    ours = next((vlr for vlr in vlrs if is_ours(vlr)), None)
-    if ours is None:
-        raise InputError(f"{path}: was not corrected by pcfix; there is nothing to undo.")
     try:
-        content: dict[str, Any] = json.loads(ours.record_data)
-        _ = content["settings"]["dimensions"], [content["before"][key] for key in BEFORE]
+        content: dict[str, Any] | None = own_settings(vlrs)
+        if content is not None:
+            _ = content["settings"]["dimensions"], [content["before"][key] for key in BEFORE]
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(
             f"{path}: pcfix's own VLR is damaged ({error}); use the original cloud."
         ) from error
+    if content is None:
+        raise InputError(f"{path}: was not corrected by pcfix; there is nothing to undo.")
     return content
 
 
