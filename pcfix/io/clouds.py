@@ -15,15 +15,7 @@ from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, las_errors
 from pcfix.io.las.writing import own_settings
 from pcfix.io.tables import read_table
-from pcfix.model import (
-    BATHYMETRIC_POINT,
-    NOISE_CLASSES,
-    BoolArray,
-    FloatArray,
-    WaterDimension,
-    WaterPlane,
-    WaterSurface,
-)
+from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, WaterDimension, WaterPlane
 
 if TYPE_CHECKING:
     import os
@@ -33,6 +25,7 @@ if TYPE_CHECKING:
     import laspy
     from pyproj import CRS
 
+    from pcfix.model import BoolArray, FloatArray, WaterSurface
 
 CHUNK_POINTS = 2_000_000
 
@@ -157,11 +150,8 @@ KINDS = "a cloud (.las, .laz), check points (.csv, .txt) or a grid (.tif, .tiff)
 def read_reference(path: str | os.PathLike[str]) -> Reference:
     """Read a reference; the end of its name says what it is.
 
-    Parameters
-    ----------
-    path : path
-        ``.las``, ``.laz``: all points but those withheld and those of noise or water; ``.csv``,
-        ``.txt``: columns x, y, z; ``.tif``, ``.tiff``: the centres of all cells with data.
+    ``.las``, ``.laz``: all points but those withheld and those of noise or water; ``.csv``,
+    ``.txt``: columns x, y, z; ``.tif``, ``.tiff``: the centres of all cells with data.
 
     Raises
     ------

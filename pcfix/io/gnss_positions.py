@@ -39,14 +39,10 @@ _NAMED = 5
 
 
 class GnssInFrame(NamedTuple):
-    """Positions of the GNSS in the frame of cameras.
+    """Positions of the GNSS in the frame of k cameras, shape (k, 3), and standard deviations.
 
-    xyz : array, shape (k, 3)
-        NaN where a camera has no position, or its z cannot be compared.
-    sigma_m : array, shape (k, 3)
-        Along x, y, z; NaN where `xyz` is or none is stated.
-    reason : str
-        Why z, or all, is missing; empty where nothing is.
+    `xyz` is NaN where a camera has no position, or its z cannot be compared; `sigma_m`, along x, y,
+    z, is NaN there and where none is stated. `reason` says why z, or all, is missing.
     """
 
     xyz: FloatArray
@@ -89,15 +85,19 @@ def read_gnss(path: str | os.PathLike[str], cameras: Cameras, *, crs: str | None
     if crs is not None and crs.strip().lower() != "local":
         parse_crs(crs, str(source))
     if source.name == "images.json":
-        found, unknown = _from_images_json(source, cameras)
+        nothing = np.full((len(cameras), 3), np.nan)
+        stated, names = read_images(source, cameras.labels)
+        found = GnssPositions(nothing, nothing, None) if stated is None else stated
+        unknown = [name for name in names if not is_named(name, cameras.labels)]
     else:
         labels, listed = _listed(source)
         found, unknown = _by_camera(source, cameras, labels, listed)
     known = np.isfinite(found.xyz).all(axis=1)
     if not known.any():
+        first = f"{cameras.labels[0]}{f', in the file {unknown[0]}' if unknown else ''}"
         raise InputError(
             f"{source}: no position is of an image of the block, which has {len(cameras)} (the"
-            f" first is {cameras.labels[0]}{_first(unknown)}); give the positions of this block."
+            f" first is {first}); give the positions of this block."
         )
     if crs is not None:
         found = replace(found, crs=crs)
@@ -106,14 +106,6 @@ def read_gnss(path: str | os.PathLike[str], cameras: Cameras, *, crs: str | None
     for note in notes:
         warnings.warn(note, PcfixWarning, stacklevel=2)
     return replace(cameras, gnss=found, notes=(*cameras.notes, *notes))
-
-
-def _from_images_json(path: Path, cameras: Cameras) -> tuple[GnssPositions, list[str]]:
-    found, names = read_images(path, cameras.labels)
-    if found is None:
-        nothing = np.full((len(cameras), 3), np.nan)
-        found = GnssPositions(nothing, nothing, None)
-    return found, [name for name in names if not is_named(name, cameras.labels)]
 
 
 def _listed(path: Path) -> tuple[list[str], GnssPositions]:
@@ -146,7 +138,13 @@ def _by_camera(
     path: Path, cameras: Cameras, names: list[str], listed: GnssPositions
 ) -> tuple[GnssPositions, list[str]]:
     """Return the positions by camera, and the names of images that are none of the cameras."""
-    _check_sigmas(path, names, listed.sigma_m)
+    bad = (listed.sigma_m <= 0.0).any(axis=1)
+    if bad.any():
+        i = int(np.argmax(bad))
+        raise InputError(
+            f"{path}: image {names[i]}: the standard deviation {np.nanmin(listed.sigma_m[i]):g} m"
+            " must be positive; leave it empty where it is not known."
+        )
     row_of = _first_rows(path, names, listed)
     labels = list(row_of)
     matched = match_labels(labels, cameras.labels)
@@ -175,16 +173,6 @@ def _check_near(path: Path, cameras: Cameras) -> None:
         )
 
 
-def _check_sigmas(path: Path, labels: list[str], sigma_m: FloatArray) -> None:
-    bad = (sigma_m <= 0.0).any(axis=1)
-    if bad.any():
-        i = int(np.argmax(bad))
-        raise InputError(
-            f"{path}: image {labels[i]}: the standard deviation {np.nanmin(sigma_m[i]):g} m must be"
-            " positive; leave it empty where it is not known."
-        )
-
-
 def _first_rows(path: Path, labels: list[str], listed: GnssPositions) -> dict[str, int]:
     """Return the row of each label; two rows of one must say the same."""
     row_of: dict[str, int] = {}
@@ -196,10 +184,6 @@ def _first_rows(path: Path, labels: list[str], listed: GnssPositions) -> dict[st
                 " in the name where several are called alike."
             )
     return row_of
-
-
-def _first(names: list[str]) -> str:
-    return f", in the file {names[0]}" if names else ""
 
 
 def _notes(path: Path, cameras: Cameras, known: int, unknown: list[str]) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcfix.io.control_marks import Marks
-    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray
+    from pcfix.model import Cameras, FloatArray, IntArray
 
 SIGMA_M, SIGMA_PX = 0.01, 0.5
 """Where the file states none."""
@@ -38,8 +38,6 @@ def read_ground_control(
     cameras: Cameras,
     *,
     crs: str | None = None,
-    sigma_m: float = SIGMA_M,
-    sigma_px: float = SIGMA_PX,
 ) -> GroundControl:
     """Read surveyed points and where the images show them.
 
@@ -53,14 +51,13 @@ def read_ground_control(
         In the cloud's CRS, with lenses in pixels.
     crs : str, optional
         Of the points, instead of what the file says; ``local`` takes the numbers as they are.
-    sigma_m, sigma_px : float
-        Standard deviations of points (m) and marks (px) for which the file states none.
 
     Returns
     -------
     GroundControl
         In the CRS of the cameras. Stated standard deviations along x and y are taken over
-        unturned, whatever the angle between the axes of the two CRS.
+        unturned, whatever the angle between the axes of the two CRS; where none is stated, they
+        are `SIGMA_M` and `SIGMA_PX`.
 
     Warns
     -----
@@ -85,19 +82,22 @@ def read_ground_control(
     first = first[used]
     xyz, way_notes = _to_cameras(marks, cameras, crs, first)
     _check_near(marks, cameras, xyz, first)
-    notes += (*_unseen(marks, name, used), *way_notes)
+    unseen = [one for i, one in enumerate(name) if i not in used]
+    if unseen:
+        notes += (f"{marks.path}: no image with a pose shows {_few(unseen)}; left out.",)
+    notes += way_notes
     for note in notes:
         warnings.warn(note, PcfixWarning, stacklevel=2)
     return GroundControl(
         names=tuple(name[i] for i in used),
         xyz=xyz,
-        sigma_m=np.where(np.isnan(marks.sigma_m[first]), sigma_m, marks.sigma_m[first]),
+        sigma_m=np.where(np.isnan(marks.sigma_m[first]), SIGMA_M, marks.sigma_m[first]),
         is_check=marks.is_check[first],
         under_water=marks.under_water[first],
         point=np.searchsorted(used, point[kept]),
         camera=camera[kept],
         image_xy=marks.uv[kept],
-        sigma_px=np.where(np.isnan(marks.sigma_px[kept]), sigma_px, marks.sigma_px[kept]),
+        sigma_px=np.where(np.isnan(marks.sigma_px[kept]), SIGMA_PX, marks.sigma_px[kept]),
         crs=cameras.crs,
     )
 
@@ -126,7 +126,7 @@ def _cameras_of(marks: Marks, cameras: Cameras) -> tuple[IntArray, IntArray, tup
         return camera, kept, ()
     note = (
         f"{marks.path}: {len(camera) - len(kept)} of {len(camera)} measurements are in images"
-        f" without a pose ({_some(unposed)}) and are left out."
+        f" without a pose ({_few(unposed)}) and are left out."
     )
     return camera, kept, (note,)
 
@@ -145,13 +145,13 @@ def _refuse_unknown(
         )
     count = sum(image in names for image in marks.image)
     raise InputError(
-        f"{marks.at(row)}: measured in images that are not in the model: {_some(names)}, {count} of"
+        f"{marks.at(row)}: measured in images that are not in the model: {_few(names)}, {count} of"
         f" {len(marks.image)} measurements ({many}); give the points of this block, or take those"
         " rows out."
     )
 
 
-def _some(names: list[str]) -> str:
+def _few(names: list[str]) -> str:
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return ", ".join(names[:_NAMED]) + more
 
@@ -165,7 +165,8 @@ def _check_agreement(marks: Marks, first: IntArray, point: IntArray) -> None:
         ("roles", marks.is_check[:, None]),
         ("words on water", marks.under_water[:, None]),
     ):
-        other = ~_equal(values, values[same]).all(axis=1)
+        both_nan = (values != values) & (values[same] != values[same])
+        other = ~((values == values[same]) | both_nan).all(axis=1)
         if other.any():
             row = int(np.argmax(other))
             raise InputError(
@@ -173,10 +174,6 @@ def _check_agreement(marks: Marks, first: IntArray, point: IntArray) -> None:
                 f" {marks.where[same[row]]} ({_shown(values[row])} and"
                 f" {_shown(values[same[row]])}); give two points two names."
             )
-
-
-def _equal(one: npt.NDArray[np.generic], other: npt.NDArray[np.generic]) -> BoolArray:
-    return np.asarray((one == other) | ((one != one) & (other != other)))
 
 
 def _shown(values: npt.NDArray[np.generic]) -> str:
@@ -270,11 +267,3 @@ def _check_near(marks: Marks, cameras: Cameras, xyz: FloatArray, rows: IntArray)
             f"{marks.at(int(rows[i]))}: the point lies {apart_m[i] / 1e3:,.0f} km from the block;"
             f" {hint}."
         )
-
-
-def _unseen(marks: Marks, names: list[str], used: IntArray) -> tuple[str, ...]:
-    """Return a note on points that are left without a mark."""
-    unseen = [name for i, name in enumerate(names) if i not in used]
-    if not unseen:
-        return ()
-    return (f"{marks.path}: no image with a pose shows {_some(unseen)}; left out.",)

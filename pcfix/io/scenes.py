@@ -11,7 +11,7 @@ import laspy
 import numpy as np
 from pyproj import CRS
 
-from pcfix.io.files import check_output, write_bytes, write_text
+from pcfix.io.files import check_output, write_bytes
 from pcfix.io.las.writing import LasSink
 from pcfix.model import BATHYMETRIC_POINT
 from pcfix.version import __version__
@@ -33,31 +33,28 @@ FILES = {
 }
 """Files that every scene has."""
 
-VIEWS = {
+OTHERS = {
     "fused.ply.vis": "the cameras of each point of the cloud, row by row, in COLMAP's layout",
     "dense.ply": "the cloud with the cameras of each point and their weights, in OpenMVS's layout",
+    "true_cameras.csv": "the poses that the images were made with",
+    "neighbours.csv": "label of each image and of those it was matched with, best first",
+    "pairs.npz": "start and pairs: point i has the stereo pairs start[i] to start[i + 1]",
 }
-"""The view list; of depth maps the latter."""
-
-TRUE_CAMERAS = {"true_cameras.csv": "the poses that the images were made with"}
-NEIGHBOURS = {"neighbours.csv": "label of each image and of those it was matched with, best first"}
-PAIRS = {"pairs.npz": "start and pairs: point i has the stereo pairs start[i] to start[i + 1]"}
+"""Files that some scenes have; the view list is one of the first two, of depth maps the second."""
 
 _FINE_GSD_M = 0.005  # clouds of finer images get steps of 0.1 mm
 
 
 def files_of(scene: Scene) -> dict[str, str]:
     """Return the names of a scene's files and what is in them."""
-    files = dict(FILES)
-    name = "fused.ply.vis" if scene.views.weight is None else "dense.ply"
-    files[name] = VIEWS[name]
-    if scene.true_cameras is not scene.cameras:
-        files |= TRUE_CAMERAS
-    if scene.neighbours is not None:
-        files |= NEIGHBOURS
-    if scene.pairs is not None:
-        files |= PAIRS
-    return files
+    there = {
+        "fused.ply.vis": scene.views.weight is None,
+        "dense.ply": scene.views.weight is not None,
+        "true_cameras.csv": scene.true_cameras is not scene.cameras,
+        "neighbours.csv": scene.neighbours is not None,
+        "pairs.npz": scene.pairs is not None,
+    }
+    return FILES | {name: text for name, text in OTHERS.items() if there[name]}
 
 
 def write_scene(scene: Scene, out_dir: str | os.PathLike[str], *, overwrite: bool) -> None:
@@ -73,25 +70,27 @@ def write_scene(scene: Scene, out_dir: str | os.PathLike[str], *, overwrite: boo
     for name in files:
         check_output(folder / name, overwrite=overwrite)
     _write_clouds(scene, folder)
-    texts = {"sensor.csv": _sensor_csv(scene)}
-    texts["cameras.csv"] = _cameras_csv(scene.cameras, scene.yaw_pitch_roll_deg)
+    contents = {
+        "sensor.csv": _sensor_csv(scene).encode(),
+        "cameras.csv": _cameras_csv(scene.cameras, scene.yaw_pitch_roll_deg),
+        "scene.json": _facts(scene, files).encode(),
+    }
     if "true_cameras.csv" in files:
-        texts["true_cameras.csv"] = _cameras_csv(scene.true_cameras, scene.true_yaw_pitch_roll_deg)
+        true = _cameras_csv(scene.true_cameras, scene.true_yaw_pitch_roll_deg)
+        contents["true_cameras.csv"] = true
     if scene.neighbours is not None:
-        texts["neighbours.csv"] = _neighbours_csv(scene.cameras.labels, scene.neighbours)
-    texts["scene.json"] = _facts(scene, files)
-    for name, text in texts.items():
-        write_text(folder / name, text, overwrite=overwrite)
+        labels = scene.cameras.labels
+        contents["neighbours.csv"] = _neighbours_csv(labels, scene.neighbours).encode()
     if scene.views.weight is None:
-        lists = colmap_vis(scene.views)
-        write_bytes(folder / "fused.ply.vis", lists, overwrite=overwrite)
+        contents["fused.ply.vis"] = colmap_vis(scene.views)
     else:
-        cloud = openmvs_ply(scene.apparent_xyz, scene.views)
-        write_bytes(folder / "dense.ply", cloud, overwrite=overwrite)
+        contents["dense.ply"] = openmvs_ply(scene.apparent_xyz, scene.views)
     if scene.pairs is not None and scene.pairs_start is not None:
         arrays = io.BytesIO()
         np.savez_compressed(arrays, start=scene.pairs_start, pairs=scene.pairs)
-        write_bytes(folder / "pairs.npz", arrays.getvalue(), overwrite=overwrite)
+        contents["pairs.npz"] = arrays.getvalue()
+    for name, content in contents.items():
+        write_bytes(folder / name, content, overwrite=overwrite)
 
 
 def colmap_vis(views: Views) -> bytes:
@@ -192,14 +191,14 @@ def _write_clouds(scene: Scene, folder: Path) -> None:
     _write_cloud(folder / "lidar.laz", scene.lidar_xyz, place, classes=classes)
 
 
-def _cameras_csv(cameras: Cameras, yaw_pitch_roll_deg: FloatArray) -> str:
+def _cameras_csv(cameras: Cameras, yaw_pitch_roll_deg: FloatArray) -> bytes:
     lines = ["label,x,y,z,yaw,pitch,roll"]
     for label, centre, angles in zip(
         cameras.labels, cameras.centres, yaw_pitch_roll_deg, strict=True
     ):
         numbers = [f"{v:.4f}" for v in centre] + [f"{v:.6f}" for v in angles]
         lines.append(",".join([label, *numbers]))
-    return "\n".join(lines) + "\n"
+    return ("\n".join(lines) + "\n").encode()
 
 
 def _colours(scene: Scene) -> FloatArray:

@@ -8,7 +8,6 @@ names the grid, or a note. Heights are shifted only where both sides say what th
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -49,34 +48,54 @@ class HeightsError(InputError):
     """Heights of two systems that cannot be brought together."""
 
 
-@dataclass(frozen=True, eq=False)
-class Transformation:
+class Transformation(NamedTuple):
     """From one CRS to another.
 
-    Attributes
-    ----------
-    forward : callable
-        From points (n, 3) to points (n, 3), x east or longitude first; not finite where a point
-        has no place in the other CRS.
-    notes : tuple of str
-        What a user should know of it.
+    forward : from points (n, 3) to points (n, 3), x east or longitude first; not finite where a
+    point has no place in the other CRS.
+    notes : what a user should know of it.
     """
 
     forward: Points
     notes: tuple[str, ...] = ()
 
 
+def transformation(
+    source: CRS, target: CRS, at: FloatArray, name: str, *, heights: bool, instead: str
+) -> Transformation:
+    """Return the transformation in plan, or of `heights` too: refused with the way out `instead`.
+
+    See `transformation_in_plan`.
+    """
+    if not heights:
+        return transformation_in_plan(source, target, at, name)
+    try:
+        return transformation_in_space(source, target, at, name)
+    except HeightsError as error:
+        raise HeightsError(f"{error}; {instead}.") from None
+
+
+def heights_agree(source: CRS, target: CRS) -> bool:
+    """Whether heights go over as they are: one datum, or one side does not say which."""
+    kinds = heights_of(source), heights_of(target)
+    if "unstated" in kinds:
+        return True
+    (plan, vertical), (other_plan, other) = parts(source), parts(target)
+    if vertical is not None and other is not None:
+        return is_same_vertical_datum(vertical, other)
+    return kinds[0] == kinds[1] and is_same(plan, other_plan)
+
+
+def is_same_numbers(source: CRS, target: CRS, *, heights: bool = True) -> bool:
+    """Whether points have the same numbers in both, given that the heights agree."""
+    same = is_same(parts(source)[0], parts(target)[0])
+    return same and not (heights and metres_up(source) != metres_up(target))
+
+
 def transformation_in_plan(source: CRS, target: CRS, at: FloatArray, name: str) -> Transformation:
     """Return the horizontal transformation; heights change their unit and nothing else.
 
-    Parameters
-    ----------
-    source, target : CRS
-        Not geocentric.
-    at : array, shape (n, 3)
-        Where it is needed, in `source`.
-    name : str
-        What is transformed, for messages.
+    It is needed `at` places of `source`, shape (n, 3); neither CRS is geocentric.
 
     Raises
     ------
@@ -215,14 +234,9 @@ LOCAL = "local"
 
 
 class Way(NamedTuple):
-    """The way from one CRS into another.
+    """A `Transformation`, or none where the numbers stay as they are."""
 
-    forward : from points (n, 3) to points (n, 3), not finite where one has no place there; None
-    where the numbers stay as they are.
-    notes : what a user should know of it.
-    """
-
-    forward: Callable[[FloatArray], FloatArray] | None
+    forward: Points | None
     notes: tuple[str, ...] = ()
 
 
@@ -258,7 +272,8 @@ def way_to_cloud(
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
     if crs is None:
         tied = cloud is not None and not is_local(cloud)
-        return Way(None, (_names_none(name, cloud),) if cloud is not None and tied else ())
+        note = "" if cloud is None else f"; taken to be in the cloud's ({cloud.name})."
+        return Way(None, (f"{name}: names no CRS{note}",) if tied else ())
     if crs.strip().lower() == LOCAL:
         return Way(None)
     source = parse_crs(crs, name)
@@ -267,11 +282,16 @@ def way_to_cloud(
     if is_local(cloud) and is_local(source):
         return Way(None)
     _check_kinds(source, cloud, name)
-    return _between(source, cloud, at, name, heights=heights)
-
-
-def _names_none(name: str, cloud: CRS) -> str:
-    return f"{name}: names no CRS; taken to be in the cloud's ({cloud.name})."
+    agree = not heights or heights_agree(source, cloud)
+    notes = _height_notes(source, cloud, name) if heights and agree else ()
+    if agree and is_same_numbers(source, cloud, heights=heights):
+        return Way(None, notes)
+    instead = (
+        "or, if the heights of the file are known to agree with the cloud's, give the file's CRS as"
+        f" {shortened(crs_text(parts(source)[0]))}, the horizontal CRS alone"
+    )
+    step = transformation(source, cloud, at, name, heights=not agree, instead=instead)
+    return Way(step.forward, (*step.notes, *notes))
 
 
 def _without_cloud_crs(source: CRS, name: str) -> Way:
@@ -299,56 +319,16 @@ def _check_kinds(source: CRS, cloud: CRS, name: str) -> None:
         raise InputError(f"{name}: {source.name} is neither a map projection nor in degrees.")
 
 
-def _between(source: CRS, cloud: CRS, at: FloatArray, name: str, *, heights: bool) -> Way:
-    """Return the transformation between two CRS that are tied to the earth."""
-    if heights and not _heights_agree(source, cloud):
-        step = _in_space(source, cloud, at, name)
-        return Way(step.forward, step.notes)
-    notes = _height_notes(source, cloud, name) if heights else ()
-    if _is_same_numbers(source, cloud, heights=heights):
-        return Way(None, notes)
-    step = transformation_in_plan(source, cloud, at, name)
-    return Way(step.forward, (*step.notes, *notes))
-
-
-def _is_same_numbers(source: CRS, cloud: CRS, *, heights: bool) -> bool:
-    same = is_same(parts(source)[0], parts(cloud)[0])
-    return same and not (heights and metres_up(source) != metres_up(cloud))
-
-
-def _heights_agree(source: CRS, cloud: CRS) -> bool:
-    """Whether heights go over as they are: one datum, or one side does not say which."""
-    kinds = heights_of(source), heights_of(cloud)
-    if "unstated" in kinds:
-        return True
-    verticals = parts(source)[1], parts(cloud)[1]
-    if verticals[0] is not None and verticals[1] is not None:
-        return is_same_vertical_datum(verticals[0], verticals[1])
-    return kinds[0] == kinds[1] and is_same(parts(source)[0], parts(cloud)[0])
-
-
 def _height_notes(source: CRS, cloud: CRS, name: str) -> tuple[str, ...]:
     """Return what is taken for granted about heights."""
-    mine, theirs = heights_of(source), heights_of(cloud)
-    if mine == "unstated" and theirs != "unstated":
+    own, theirs = heights_of(source), heights_of(cloud)
+    if own == "unstated" and theirs != "unstated":
         return (
             f"{name}: does not say what its heights are; taken to be the cloud's ({cloud.name}).",
         )
-    if mine == "ellipsoidal" and theirs == "unstated":
+    if own == "ellipsoidal" and theirs == "unstated":
         return (
             f"{name}: has ellipsoidal heights ({source.name}), and the cloud's CRS ({cloud.name})"
             " does not say what its own are; taken to be the same.",
         )
     return ()
-
-
-def _in_space(source: CRS, cloud: CRS, at: FloatArray, name: str) -> Transformation:
-    """Return the transformation of plan and heights, or refuse with the way out."""
-    try:
-        return transformation_in_space(source, cloud, at, name)
-    except HeightsError as error:
-        plan = shortened(crs_text(parts(source)[0]))
-        raise HeightsError(
-            f"{error}; or, if the heights of the file are known to agree with the cloud's, give"
-            f" the file's CRS as {plan}, the horizontal CRS alone."
-        ) from None

@@ -40,6 +40,11 @@ _NO_RASTERS = (".csv", ".txt", ".json", ".geojson", ".gpkg", ".shp", ".wkt", ".l
 """GDAL would try some of these as rasters all the same."""
 
 
+MOST_OVERLAP = 0.01
+"""Of the plan area: what folds at the rim of a triangulated shore come to."""
+LEAST_FACET_M2 = 1e-6
+
+
 def read_water(
     spec: float | str | os.PathLike[str],
     cloud_crs: str | CRS | None = None,
@@ -102,17 +107,12 @@ def read_water(
     try:
         return WaterPlane(*_finite([text], text))
     except SettingError:
-        if not (Path(text).is_file() or _is_named_like_a_file(text)):
-            raise
+        if not (Path(text).is_file() or Path(text).suffix[1:2].isalpha()):
+            raise  # no number ends as file names do
         check_input(text)
     if Path(text).suffix.lower() in _NO_RASTERS:
         raise InputError(f"{text}: is not a water surface that pcfix reads; give {KINDS}.")
     return read_water_raster(text, cloud_crs, bounds)
-
-
-def _is_named_like_a_file(text: str) -> bool:
-    """Whether a word ends as file names do, with a suffix that no number has."""
-    return Path(text).suffix[1:2].isalpha()
 
 
 def _finite(values: list[str] | list[float], text: str) -> list[float]:
@@ -138,19 +138,8 @@ def _mesh(path: Path) -> WaterMesh:
     return mesh
 
 
-MOST_OVERLAP = 0.01
-"""Of the plan area: what folds at the rim of a triangulated shore come to."""
-LEAST_FACET_M2 = 1e-6
-
-
 def read_mesh(path: Path) -> tuple[FloatArray, IntArray]:
-    """Return vertices, shape (v, 3), and triangles, shape (t, 3), of an OBJ or PLY file.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    """
+    """Return vertices, shape (v, 3), and triangles, shape (t, 3), of an OBJ or PLY file."""
     return _read_obj(path) if path.suffix.lower() == ".obj" else _read_ply(path)
 
 
@@ -159,11 +148,6 @@ def check_mesh(mesh: WaterMesh, path: Path) -> None:
 
     Which way a facet faces does not matter, nor do holes, edges of three facets, or facets that
     overlap at one height: all are well defined as heights. Vertical facets have none.
-
-    Raises
-    ------
-    InputError
-        If much of it lies above another part, as a closed body or two surfaces do.
     """
     from pcfix.water.sheets import in_two_sheets
     from pcfix.water.tin import build_tin

@@ -42,7 +42,9 @@ _UNITS_M = {
     "cm": 0.01, "mm": 0.001, "ft": 0.3048, "foot": 0.3048, "feet": 0.3048,
     "us-ft": 1200.0 / 3937.0, "ftus": 1200.0 / 3937.0, "us survey foot": 1200.0 / 3937.0,
 }  # fmt: skip
+MOST_CELLS = 50_000_000
 _EDGE_POINTS = 33
+_AT_ONCE = 1_000_000
 
 
 def read_water_raster(
@@ -78,7 +80,10 @@ def read_water_raster(
     PcfixWarning
         Of what was taken for granted.
     """
-    bounds = _about(bounds)
+    if bounds is not None:
+        west, south, east, north = bounds
+        about = west - MARGIN_M, south - MARGIN_M, east + MARGIN_M, north + MARGIN_M
+        bounds = about if np.isfinite(bounds).all() else None
     with open_raster(path) as source:
         name = str(path)
         _check_band(source, name)
@@ -86,26 +91,16 @@ def read_water_raster(
         part = _read(source, name, None if bounds is None else from_cloud(_edge(bounds)))
         known = np.isfinite(part.heights)
         if not known.any():
-            raise InputError(f"{name}: holds no height{_there(bounds)}; check its nodata value.")
+            there = "" if bounds is None else " near the cloud"
+            raise InputError(f"{name}: holds no height{there}; check its nodata value.")
         notes += (*_unstated_nodata(source, part.heights, name), *_unstated_feet(source, name))
         title = source.name.replace("\\", "/").rpartition("/")[2]
     for note in notes:
         warnings.warn(note, PcfixWarning, stacklevel=3)
-    if to_cloud is None and _is_north_up(part.transform):
-        return _as_it_is(part, title)
+    t = part.transform
+    if to_cloud is None and t.b == t.d == 0.0 and t.a > 0.0 > t.e:  # north-up: as it is
+        return WaterRaster(part.heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), title)
     return sampled(part, to_cloud or (lambda xyz: xyz), from_cloud, bounds, (name, title))
-
-
-def _about(bounds: Bounds | None) -> Bounds | None:
-    """Return the cloud's bounds with their margin, None where they are not known."""
-    if bounds is None or not np.isfinite(bounds).all():
-        return None
-    west, south, east, north = bounds
-    return west - MARGIN_M, south - MARGIN_M, east + MARGIN_M, north + MARGIN_M
-
-
-def _there(bounds: Bounds | None) -> str:
-    return "" if bounds is None else " near the cloud"
 
 
 def _check_band(source: DatasetReader, name: str) -> None:
@@ -217,20 +212,6 @@ def _unstated_nodata(source: DatasetReader, heights: FloatArray, name: str) -> t
     )
 
 
-def _is_north_up(transform: Affine) -> bool:
-    t = transform
-    return bool(t.b == t.d == 0.0 and t.a > 0.0 > t.e)
-
-
-def _as_it_is(part: Part, title: str) -> WaterRaster:
-    t = part.transform
-    return WaterRaster(part.heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), title)
-
-
-MOST_CELLS = 50_000_000
-_AT_ONCE = 1_000_000
-
-
 class Part(NamedTuple):
     """Part of a raster: heights, and the transform from (column, row) of it to its CRS."""
 
@@ -245,12 +226,7 @@ def place_of(transform: Affine, column: Any, row: Any) -> tuple[Any, Any]:
 
 
 def check_size(cells: int, name: str) -> None:
-    """Refuse more cells than memory should hold.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse more cells than memory should hold."""
     if cells > MOST_CELLS:
         raise InputError(
             f"{name}: {cells:,} cells are too many ({MOST_CELLS:,} at most); water is smooth, so"
@@ -267,21 +243,8 @@ def sampled(
 ) -> WaterRaster:
     """Sample on a grid in the cloud's CRS with square cells as fine as the raster's finest.
 
-    Parameters
-    ----------
-    part : Part
-        In metres, in its own CRS.
-    to_cloud, from_cloud : callable
-        From points (n, 3) to points (n, 3); the way back is of the plan alone.
-    bounds : tuple of 4 float, or None
-        West, south, east and north end of what is wanted, in the cloud's CRS.
-    names : tuple of 2 str
-        Of the raster, for messages and as its title.
-
-    Raises
-    ------
-    InputError
-        If it holds no height there, is too large, or reaches where the cloud's CRS does not.
+    The way back `from_cloud` is of the plan alone; `bounds` are of what is wanted, in the cloud's
+    CRS; `names` are the raster's for messages and as its title.
     """
     cell, (west, south, east, north) = _extent(part, to_cloud, names[0])
     if bounds is not None:
@@ -293,10 +256,10 @@ def sampled(
     heights = np.empty((max(rows, 2), max(columns, 2)))
     x = left + (np.arange(heights.shape[1]) + 0.5) * cell
     for first in range(0, len(heights), max(1, _AT_ONCE // len(x))):
-        some = heights[first : first + max(1, _AT_ONCE // len(x))]
-        y = top - (first + np.arange(len(some)) + 0.5) * cell
-        plan = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x)), np.zeros(some.size)])
-        some[:] = _heights_at(part, from_cloud(plan), to_cloud).reshape(some.shape)
+        strip = heights[first : first + max(1, _AT_ONCE // len(x))]
+        y = top - (first + np.arange(len(strip)) + 0.5) * cell
+        plan = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x)), np.zeros(strip.size)])
+        strip[:] = _heights_at(part, from_cloud(plan), to_cloud).reshape(strip.shape)
     if not np.isfinite(heights).any():
         raise InputError(f"{names[0]}: holds no height near the cloud; check its CRS.")
     return WaterRaster(heights, float(left), float(top), (float(cell), float(cell)), names[1])

@@ -168,10 +168,10 @@ def test_what_a_table_may_say_beside(tmp_path):
         "G10;500010;4000010;2.5;a;100;200;0.02;0.03;0.05;0.3;0.4;check point;yes",
         "G9;500030;4000020;-1.75;b;100;200;;;;;;Control;0",
     ]
-    found = read(tmp_path, *rows, head=head, sigma_m=0.04, sigma_px=0.7)
+    found = read(tmp_path, *rows, head=head)
     assert found.names == ("G10", "G9")  # the order of the file
-    assert found.sigma_m.tolist() == [[0.02, 0.03, 0.05], [0.04] * 3]
-    assert found.sigma_px == pytest.approx([np.sqrt((0.09 + 0.16) / 2.0), 0.7])
+    assert found.sigma_m.tolist() == [[0.02, 0.03, 0.05], [0.01] * 3]  # where none is stated
+    assert found.sigma_px == pytest.approx([np.sqrt((0.09 + 0.16) / 2.0), 0.5])
     assert found.is_check.tolist() == [True, False]
     assert found.under_water.tolist() == [True, False]
 

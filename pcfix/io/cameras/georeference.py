@@ -23,10 +23,9 @@ from pcfix.errors import InputError
 from pcfix.io.cameras.frames import Frame, frame_of
 from pcfix.io.cameras.heights import (
     Statement,
+    agree,
     completed,
     height_notes,
-    heights_agree,
-    is_same_numbers,
     is_tied,
     statement,
     without_grid,
@@ -39,12 +38,7 @@ from pcfix.io.crs import (
     plan_unit,
     shortened,
 )
-from pcfix.io.transformations import (
-    HeightsError,
-    Transformation,
-    transformation_in_plan,
-    transformation_in_space,
-)
+from pcfix.io.transformations import Transformation, is_same_numbers, transformation
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -264,18 +258,10 @@ def _into(
     frame.check(at, cameras.labels, name)
     target = completed(cloud, frame, said)
     crs, notes = crs_text(target), height_notes(frame, target, said, name)
-    if not heights_agree(frame, target, said):
-        step = _in_space(frame, target, frame.enter(at), name)
-    elif frame.direct and is_same_numbers(frame.crs, target):
+    heights, instead = not agree(frame, target, said), without_grid(frame, target)
+    if frame.direct and not heights and is_same_numbers(frame.crs, target):
         return Georeference(frame, None, offset, crs, notes, name)
-    else:
-        step = transformation_in_plan(frame.crs, target, frame.enter(at), name)
+    step = transformation(
+        frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
+    )
     return Georeference(frame, step, offset, crs, (*step.notes, *notes), name)
-
-
-def _in_space(frame: Frame, target: CRS, at: FloatArray, name: str) -> Transformation:
-    """Return the transformation of plan and heights, or refuse with every way out."""
-    try:
-        return transformation_in_space(frame.crs, target, at, name)
-    except HeightsError as error:
-        raise HeightsError(f"{error}; {without_grid(frame, target)}.") from None

@@ -12,16 +12,14 @@ from pcfix.io.crs import (
     crs_text,
     heights_of,
     is_local,
-    is_same,
-    is_same_vertical_datum,
     is_topocentric,
-    metres_up,
     parse_crs,
     parts,
     plan_unit,
     shortened,
     with_heights,
 )
+from pcfix.io.transformations import heights_agree
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -102,21 +100,9 @@ def completed(cloud: CRS, frame: Frame, said: Statement) -> CRS:
     return cloud if vertical is None else with_heights(cloud, vertical)
 
 
-def is_same_numbers(source: CRS, target: CRS) -> bool:
-    """Whether points have the same numbers in both, given that the heights agree."""
-    same = is_same(parts(source)[0], parts(target)[0])
-    return same and metres_up(source) == metres_up(target)
-
-
-def heights_agree(frame: Frame, target: CRS, said: Statement) -> bool:
-    """Whether heights go over as they are: one datum, or one side does not say which."""
-    mine, cloud = heights_of(frame.crs), heights_of(target)
-    if "unstated" in (mine, cloud) or (said.trusted and not frame.direct):
-        return True
-    one, other = parts(frame.crs)[1], parts(target)[1]
-    if one is not None and other is not None:
-        return is_same_vertical_datum(one, other)
-    return mine == cloud and is_same(parts(frame.crs)[0], parts(target)[0])
+def agree(frame: Frame, target: CRS, said: Statement) -> bool:
+    """Whether heights go over as they are: the user says so, or the CRSs do."""
+    return (said.trusted and not frame.direct) or heights_agree(frame.crs, target)
 
 
 def height_notes(frame: Frame, target: CRS, said: Statement, name: str) -> tuple[str, ...]:

@@ -89,15 +89,16 @@ class ViewMatch:
             notes=list(raw.notes),
             weights=raw.weight is not None,
         )
-        self._same_m = _ROUNDING * (step_m / 2 + raw.resolution_m)
         if raw.xyz is None:
             self._check_count(points)
         else:
-            self._set_tolerances(views.spacing_m or 0.0, tolerance_m)
+            rounding_m = _ROUNDING * (step_m / 2 + raw.resolution_m)
+            self._set_tolerances(views.spacing_m or 0.0, tolerance_m, rounding_m)
         self._note_order()
 
-    def _set_tolerances(self, spacing_m: float, tolerance_m: float | None) -> None:
-        rounding_m = self._same_m
+    def _set_tolerances(
+        self, spacing_m: float, tolerance_m: float | None, rounding_m: float
+    ) -> None:
         own = max(rounding_m, self._views.default_spacings * spacing_m)
         self.report.tolerance_m = own if tolerance_m is None else tolerance_m
         self._same_m = min(max(rounding_m, _SAME * spacing_m), self.report.tolerance_m)
@@ -146,20 +147,17 @@ class ViewMatch:
         """
         if self._views.raw.xyz is None:
             row = np.arange(first_row, first_row + len(xyz))
-            self._check_row(row)
+            if row.size and not 0 <= row[0] <= row[-1] < len(self._views):
+                raise InputError(
+                    f"{self._views.raw.path}: has no row {row[-1]:,}, it has"
+                    f" {len(self._views):,}; the cloud has changed since its points were counted."
+                )
             self._views = fitted(self._views, self._cameras, xyz, row)
             self._note_order()
             self.report.by_row += len(row)
         else:
             row = self._rows(xyz, first_row, self._views.raw.xyz)
         return self._given(row)
-
-    def _check_row(self, row: IntArray) -> None:
-        if row.size and not 0 <= row[0] <= row[-1] < len(self._views):
-            raise InputError(
-                f"{self._views.raw.path}: has no row {row[-1]:,}, it has {len(self._views):,}; the"
-                " cloud has changed since its points were counted."
-            )
 
     def _rows(self, xyz: FloatArray, first_row: int, listed: FloatArray) -> IntArray:
         """Return the list's row of each point, -1 where it has none."""
