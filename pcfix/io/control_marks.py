@@ -43,6 +43,7 @@ from pcfix.io.cameras.xml import number as xml_number
 from pcfix.io.cameras.xml import numbers
 from pcfix.io.crs import is_local, parse_crs
 from pcfix.io.tables import number, read_lines
+from pcfix.io.transformations import LOCAL
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -85,28 +86,16 @@ _LEAST_ODM = 6
 class Marks:
     """Marks of points in images, n of them, with what the file says of the point in each row.
 
-    Attributes
-    ----------
-    path : Path
-    point, image : list of str
-    xyz, sigma_m : array, shape (n, 3)
-        In `crs`; metres. NaN where no standard deviation is stated.
-    uv : array, shape (n, 2)
-    sigma_px : array, shape (n,)
-        NaN where none is stated.
-    is_check, under_water : array of bool, shape (n,)
-    where : list of str
-        The place of each row in the file.
-    crs : str or None
+    Standard deviations are NaN where none is stated; `where` is the place of each row in the file.
     """
 
     path: Path
     point: list[str]
     image: list[str]
-    xyz: FloatArray
-    sigma_m: FloatArray
-    uv: FloatArray
-    sigma_px: FloatArray
+    xyz: FloatArray  # (n, 3), in `crs`
+    sigma_m: FloatArray  # (n, 3)
+    uv: FloatArray  # (n, 2)
+    sigma_px: FloatArray  # (n,)
     is_check: BoolArray
     under_water: BoolArray
     where: list[str]
@@ -118,13 +107,15 @@ class Marks:
 
 
 def read_marks(path: Path) -> Marks:
-    """Read a table of marks or OpenDroneMap's ``gcp_list.txt``.
+    """Read a table of marks, OpenDroneMap's ``gcp_list.txt``, or markers of Metashape.
 
     Raises
     ------
     InputError
-        If it is neither, or a field is not what it should be.
+        If it is none of these, or a field is not what it should be.
     """
+    if documents.recognises(Source(path)):
+        return _from_metashape(path)
     lines = read_lines(path)
     rows = _odm_rows(path, lines)
     if rows is None and not any(is_header(header.names) for header in headers(lines)):
@@ -145,10 +136,19 @@ def _from_table(path: Path) -> Marks:
         )
     sigma = columns.where_there(("sigma_x", "sigma_y", "sigma_z"))
     sigma_uv = columns.where_there(("sigma_u", "sigma_v"))
-    _refuse_not_positive(columns, "standard deviation", np.column_stack([sigma, sigma_uv]))
+    every = np.column_stack([sigma, sigma_uv])
+    for i in np.flatnonzero((every <= 0.0).any(axis=1))[:1]:
+        value = every[i][every[i] <= 0.0][0]
+        raise InputError(
+            f"{columns.where(int(i))}: the standard deviation {value:g} must be positive."
+        )
+    names = _texts(columns, "point")
+    if "" in names:
+        line = columns.table.line[names.index("")]
+        raise InputError(f"{path}: line {line}: the point has no name.")
     return Marks(
         path=path,
-        point=_names(columns),
+        point=names,
         image=columns.labels,
         xyz=centres(columns, needed=True),
         sigma_m=sigma,
@@ -203,14 +203,6 @@ def _texts(columns: Columns, role: str) -> list[str]:
     return [row[columns.place[role]] for row in columns.table.rows]
 
 
-def _names(columns: Columns) -> list[str]:
-    names = _texts(columns, "point")
-    if "" in names:
-        line = columns.table.line[names.index("")]
-        raise InputError(f"{columns.path}: line {line}: the point has no name.")
-    return names
-
-
 def _flags(
     columns: Columns, role: str, true: tuple[str, ...], false: tuple[str, ...], words: str
 ) -> BoolArray:
@@ -224,14 +216,6 @@ def _flags(
                 f"{columns.where(i)}, column {columns.name(role)}: '{text}' is neither {words}."
             )
     return np.array([text in true for text in found])
-
-
-def _refuse_not_positive(columns: Columns, what: str, values: FloatArray) -> None:
-    bad = (values <= 0.0).any(axis=1)
-    if bad.any():
-        i = int(np.argmax(bad))
-        value = values[i][values[i] <= 0.0][0]
-        raise InputError(f"{columns.where(i)}: the {what} {value:g} must be positive.")
 
 
 def _odm_rows(path: Path, lines: list[str]) -> list[tuple[int, list[str]]] | None:
@@ -260,10 +244,11 @@ def _from_odm(path: Path, rows: list[tuple[int, list[str]]]) -> Marks:
         raise InputError(
             f"{path}: line {rows[i][0]}: {what} '{rows[i][1][k]}' is not a finite number."
         )
-    by_place = {place: f"GCP {i + 1}" for i, place in enumerate(dict.fromkeys(_places(values)))}
+    places = [tuple(row) for row in values[:, :3].tolist()]
+    by_place = {place: f"GCP {i + 1}" for i, place in enumerate(dict.fromkeys(places))}
     names = [
         fields[_LEAST_ODM] if len(fields) > _LEAST_ODM else by_place[place]
-        for (_, fields), place in zip(rows, _places(values), strict=True)
+        for (_, fields), place in zip(rows, places, strict=True)
     ]
     no = np.zeros(len(rows), bool)
     return Marks(
@@ -281,26 +266,8 @@ def _from_odm(path: Path, rows: list[tuple[int, list[str]]]) -> Marks:
     )
 
 
-def _places(values: FloatArray) -> list[tuple[float, ...]]:
-    return [tuple(row) for row in values[:, :3].tolist()]
-
-
-LOCAL = "local"
-
-
-def has_markers(path: Path) -> bool:
-    """Whether a file is a document or project of Metashape."""
-    return documents.recognises(Source(path))
-
-
-def read_markers(path: Path) -> Marks:
-    """Read the markers that have a surveyed place and were measured.
-
-    Raises
-    ------
-    InputError
-        If there are none, or a number cannot be right.
-    """
+def _from_metashape(path: Path) -> Marks:
+    """Read the markers that have a surveyed place and were measured."""
     chunk = documents.open_chunk(path)
     surveyed = {
         marker.get("id") or "": marker

@@ -18,8 +18,6 @@ import numpy as np
 from pcfix.errors import InputError
 
 if TYPE_CHECKING:
-    from typing import Any
-
     from pyproj import CRS
 
     from pcfix.model import FloatArray
@@ -33,16 +31,11 @@ METRES = ("metre", "meter")
 def parse_crs(given: str | CRS, name: str) -> CRS:
     """Return the CRS that a text names, as EPSG code, WKT of any flavour, PROJ string or name.
 
-    Parameters
-    ----------
-    given : str or CRS
-    name : str
-        Whose it is, for the message.
-
     Raises
     ------
     InputError
-        If PROJ does not know it, or it says where nothing lies (a vertical CRS alone).
+        If PROJ does not know it, or it says where nothing lies (a vertical CRS alone); the message
+        has the `name` of the file or option that gave it.
     """
     from pyproj import CRS
     from pyproj.exceptions import CRSError
@@ -115,13 +108,9 @@ def _differ_in_projection(one: CRS, other: CRS) -> bool:
 
 def is_same_vertical_datum(one: CRS, other: CRS) -> bool:
     """Whether two vertical CRS count from one datum, in whatever unit."""
-    names = [_datum_name(crs) for crs in (one, other)]
+    datums = [crs if crs.datum is None else crs.datum for crs in (one, other)]
+    names = ["".join(c for c in datum.name.lower() if c.isalnum()) for datum in datums]
     return is_same(one, other) or (names[0] == names[1] and names[0] not in ("", "unknown"))
-
-
-def _datum_name(vertical: CRS) -> str:
-    name = vertical.datum.name if vertical.datum is not None else vertical.name
-    return "".join(c for c in name.lower() if c.isalnum())
 
 
 def unbound(crs: CRS) -> CRS:
@@ -175,20 +164,11 @@ def check_projected_metres(crs: CRS, name: str) -> None:
 def with_heights(plan: CRS, vertical: CRS) -> CRS:
     """Return a horizontal CRS with the datum of a vertical one, heights in metres."""
     from pyproj import CRS
-    from pyproj.crs import CompoundCRS
+    from pyproj.crs import CompoundCRS, VerticalCRS
 
-    if vertical.axis_info[0].unit_name not in METRES:
-        vertical = _in_metres(vertical)
+    if vertical.axis_info[0].unit_name not in METRES and vertical.datum is not None:
+        vertical = VerticalCRS(f"{vertical.datum.name} height", vertical.datum)
     return CRS(CompoundCRS(f"{plan.name} + {vertical.name}", [plan, vertical]))
-
-
-def _in_metres(vertical: CRS) -> CRS:
-    """Return the vertical CRS of the same datum with heights in metres."""
-    from pyproj.crs import VerticalCRS
-
-    if vertical.datum is None:
-        return vertical
-    return VerticalCRS(f"{vertical.datum.name} height", vertical.datum)
 
 
 def crs_text(crs: CRS) -> str:
@@ -221,26 +201,16 @@ GEOCENTRIC_WGS84, GEOGRAPHIC_WGS84 = "EPSG:4978", "EPSG:4979"
 def geographic_3d(crs: CRS) -> CRS:
     """Return longitude, latitude and ellipsoidal height on the datum of a geocentric CRS."""
     from pyproj import CRS
+    from pyproj.crs import BoundCRS, GeographicCRS
+    from pyproj.crs.coordinate_system import Ellipsoidal3DCS
+    from pyproj.crs.enums import Ellipsoidal3DCSAxis
 
-    found = CRS.from_json_dict(_geographic(crs.to_json_dict()))
+    if crs.is_bound and crs.source_crs is not None:
+        return BoundCRS(geographic_3d(crs.source_crs), crs.target_crs, crs.coordinate_operation)
+    axes = Ellipsoidal3DCS(Ellipsoidal3DCSAxis.LATITUDE_LONGITUDE_HEIGHT)
+    found = GeographicCRS(crs.name, crs.datum, axes)
     code = found.to_epsg(min_confidence=100)
     return found if code is None else CRS.from_epsg(code)
-
-
-def _geographic(geocentric: dict[str, Any]) -> dict[str, Any]:
-    """Return PROJJSON with the axes of a geographic CRS instead of a geocentric one's."""
-    if "source_crs" in geocentric:
-        return {**geocentric, "source_crs": _geographic(geocentric["source_crs"])}
-    kept = {k: v for k, v in geocentric.items() if k in ("$schema", "name")}
-    kept |= {k: v for k, v in geocentric.items() if k in ("datum", "datum_ensemble")}
-    axes = (
-        ("Geodetic latitude", "Lat", "north", "degree"),
-        ("Geodetic longitude", "Lon", "east", "degree"),
-        ("Ellipsoidal height", "h", "up", "metre"),
-    )
-    words = ("name", "abbreviation", "direction", "unit")
-    system = {"subtype": "ellipsoidal", "axis": [dict(zip(words, a, strict=True)) for a in axes]}
-    return {**kept, "type": "GeographicCRS", "coordinate_system": system}
 
 
 def is_topocentric(text: str) -> bool:
@@ -266,7 +236,7 @@ class Topocentric:
             If these are not two or three numbers, or no place on the earth.
         """
         try:
-            numbers = [float(word) for word in text.partition(":")[2].split(",")]
+            numbers = [float(part) for part in text.partition(":")[2].split(",")]
         except ValueError:
             numbers = []
         if len(numbers) == 2:

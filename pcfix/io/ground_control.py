@@ -1,6 +1,6 @@
 """Surveyed points and their marks in images, for cameras that are already in the cloud's CRS.
 
-The forms of file are in `control_marks` and `control_markers`.
+The forms of file are in `control_marks`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
-from pcfix.io.control_marks import has_markers, read_markers, read_marks
+from pcfix.io.control_marks import read_marks
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
 from pcfix.io.labels import is_named, match_labels
@@ -44,9 +44,9 @@ def read_ground_control(
     Parameters
     ----------
     path : path
-        A table with the columns name, x, y, z, image, u, v or OpenDroneMap's ``gcp_list.txt``,
-        see `pcfix.io.control_marks`; or Metashape's markers (XML, .psx, .psz), see
-        `control_markers`. An image may be named with or without folder and extension.
+        A table with the columns name, x, y, z, image, u, v, OpenDroneMap's ``gcp_list.txt``, or
+        Metashape's markers (XML, .psx, .psz); see `pcfix.io.control_marks`. An image may be named
+        with or without folder and extension.
     cameras : Cameras
         In the cloud's CRS, with lenses in pixels.
     crs : str, optional
@@ -72,7 +72,7 @@ def read_ground_control(
         image or in one that is not in the model, or the CRS cannot be brought together.
     """
     source = check_input(path)
-    marks = read_markers(source) if has_markers(source) else read_marks(source)
+    marks = read_marks(source)
     camera, kept, notes = _cameras_of(marks, cameras)
     name, first, point = _points(marks)
     _check_agreement(marks, first, point)

@@ -251,23 +251,15 @@ def way_to_cloud(
         The file's; None where it names none, ``local`` to take its numbers as they are.
     cloud_crs : str, CRS or None
         Projected, in metres; None where the cloud names none.
-    at : array, shape (n, 3)
-        Where it is needed, in the file's CRS, x east or longitude first.
-    name : str
-        The file, for messages.
+    at, name
+        Where it is needed, see `transformation_in_plan`; the file, for messages.
     heights : bool
         Whether z counts. Where it does not, it is not looked at.
-
-    Returns
-    -------
-    Way
 
     Raises
     ------
     InputError
-        If the two cannot be brought together.
-    HeightsError
-        If their heights cannot, as where a vertical grid is not installed.
+        If the two cannot be brought together; `HeightsError` if only their heights cannot.
     """
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
     if crs is None:

@@ -36,20 +36,18 @@ LONGEST_EDGE_M = 500.0
 _METRES_PER_DEGREE = 111_000.0
 
 
+SPACING_M = 1.0
+"""Along lines without heights, which take them from the cloud."""
+MOST_POINTS = 1_000_000
+FEW = 3
+
+
 @dataclass(frozen=True, eq=False)
 class Vectors:
-    """The geometries of one layer.
+    """The n shapely geometries of one layer, none missing or empty; x is east or longitude.
 
-    Attributes
-    ----------
-    geometries : array of shapely geometries, shape (n,)
-        None missing or empty; x is east or longitude.
-    crs : str or None
-        What pyproj understands; None where the file names none.
-    name : str
-        The file and its layer, for messages.
-    notes : tuple of str
-        What was done on reading, for the summary.
+    `crs` is what pyproj understands, None where the file names none; `name` is that of the file and
+    its layer; `notes` say what was done on reading.
     """
 
     geometries: npt.NDArray[Any]
@@ -76,9 +74,7 @@ def is_vector_file(path: str | os.PathLike[str]) -> bool:
     return Path(_split_layer(path)[0]).suffix.lower() in (*GDAL_SUFFIXES, *TEXT_SUFFIXES)
 
 
-def read_vectors(
-    path: str | os.PathLike[str], *, layer: str | None = None, crs: str | None = None
-) -> Vectors:
+def read_vectors(path: str | os.PathLike[str], *, crs: str | None = None) -> Vectors:
     """Read one layer of a vector file.
 
     Parameters
@@ -86,9 +82,8 @@ def read_vectors(
     path : path
         ``.gpkg``, ``.shp``, ``.geojson``, ``.json``; ``.wkt`` with one geometry a line; ``.csv``
         or ``.txt`` with the columns x, y and perhaps z, or easting, northing, height, or
-        longitude, latitude, height, or wkt. A layer may follow: ``river.gpkg|layername=shore``.
-    layer : str, optional
-        Its name. Default: the only one.
+        longitude, latitude, height, or wkt. A layer may follow, if there are several:
+        ``river.gpkg|layername=shore``.
     crs : str, optional
         What the file's CRS is, over what it says itself. ``local``: the cloud's, whatever it says.
 
@@ -105,29 +100,21 @@ def read_vectors(
     SettingError
         If the extra ``vector`` is not installed.
     """
-    file, named = _split_layer(path)
+    file, layer = _split_layer(path)
     source = check_input(file)
     suffix = source.suffix.lower()
     if suffix in TEXT_SUFFIXES:
         geometries, found = read_text(source)
         name = str(source)
     elif suffix in GDAL_SUFFIXES:
-        geometries, found, name = _read_gdal(source, layer or named)
+        geometries, found, name = _read_gdal(source, layer)
     else:
         raise InputError(f"{source}: is not a vector file that pcfix reads; give {KINDS}.")
     return _checked(_without_gaps(Vectors(geometries, crs or found, name)))
 
 
 def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool) -> Vectors:
-    """Return geometries in the cloud's CRS.
-
-    Parameters
-    ----------
-    vectors : Vectors
-    cloud_crs : str, CRS or None
-        Projected, in metres; None where the cloud names none.
-    heights : bool
-        Whether z counts; without it z is left as it is.
+    """Return geometries in the cloud's CRS; see `way_to_cloud`. Without `heights` z stays.
 
     Raises
     ------
@@ -144,7 +131,9 @@ def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool
         return vectors
     geometries = vectors.geometries
     if not heights:
-        geometries = shapely.segmentize(geometries, _longest_edge(vectors.crs))
+        degrees = vectors.crs is not None and parse_crs(vectors.crs, "the file").is_geographic
+        longest = LONGEST_EDGE_M / (_METRES_PER_DEGREE if degrees else 1.0)
+        geometries = shapely.segmentize(geometries, longest)
     moved = replace(vectors, geometries=_moved(geometries, forward))
     if not np.isfinite(moved.coordinates[:, :2]).all():
         raise InputError(
@@ -163,12 +152,6 @@ def _moved(geometries: npt.NDArray[Any], forward: Callable[[FloatArray], FloatAr
 
     moved = shapely.transform(geometries, move, include_z=True)
     return np.where(shapely.has_z(geometries), moved, shapely.force_2d(moved))
-
-
-def _longest_edge(crs: str | None) -> float:
-    """Return `LONGEST_EDGE_M` in the unit of a CRS; its feet and degrees need no more digits."""
-    degrees = crs is not None and parse_crs(crs, "the file").is_geographic
-    return LONGEST_EDGE_M / (_METRES_PER_DEGREE if degrees else 1.0)
 
 
 def _split_layer(path: str | os.PathLike[str]) -> tuple[str, str | None]:
@@ -247,12 +230,6 @@ def _checked(vectors: Vectors) -> Vectors:
     return vectors
 
 
-SPACING_M = 1.0
-"""Along lines without heights, which take them from the cloud."""
-MOST_POINTS = 1_000_000
-FEW = 3
-
-
 class Shoreline(NamedTuple):
     """Points on the edge of the water, shape (n, 3): metres, the cloud's CRS, z NaN where unknown.
 
@@ -279,7 +256,6 @@ def read_shoreline(
     path: str | os.PathLike[str],
     cloud_crs: str | CRS | None = None,
     *,
-    layer: str | None = None,
     crs: str | None = None,
     spacing_m: float = SPACING_M,
 ) -> Shoreline:
@@ -291,21 +267,19 @@ def read_shoreline(
 
     Parameters
     ----------
-    path, layer, crs
+    path, crs
         See `read_vectors`.
     cloud_crs : str, CRS or None
     spacing_m : float, default 1.0
 
     Raises
     ------
-    InputError
-        See `read_vectors` and `in_cloud_crs`.
-    SettingError
-        If `spacing_m` is not positive.
+    InputError, SettingError
+        See `read_vectors` and `in_cloud_crs`; or if `spacing_m` is not positive.
     """
     if not spacing_m > 0.0:
         raise SettingError(f"spacing {spacing_m:g} m must be positive.")
-    vectors = in_cloud_crs(read_vectors(path, layer=layer, crs=crs), cloud_crs, heights=True)
+    vectors = in_cloud_crs(read_vectors(path, crs=crs), cloud_crs, heights=True)
     lines, points = _lines_and_points(vectors.geometries)
     level = shapely.has_z(lines)
     count = float(shapely.length(lines[~level]).sum()) / spacing_m
@@ -355,14 +329,13 @@ def read_water_polygons(
     path: str | os.PathLike[str],
     cloud_crs: str | CRS | None = None,
     *,
-    layer: str | None = None,
     crs: str | None = None,
 ) -> WaterPolygons:
     """Read the polygons inside which points may be submerged, as one area.
 
     Parameters
     ----------
-    path, layer, crs
+    path, crs
         See `read_vectors`.
     cloud_crs : str, CRS or None
 
@@ -371,7 +344,7 @@ def read_water_polygons(
     InputError
         If there is no polygon with an area, or they cannot be read or brought to the cloud's CRS.
     """
-    vectors = in_cloud_crs(read_vectors(path, layer=layer, crs=crs), cloud_crs, heights=False)
+    vectors = in_cloud_crs(read_vectors(path, crs=crs), cloud_crs, heights=False)
     parts = shapely.force_2d(_simple(vectors.geometries))
     is_polygon = shapely.get_type_id(parts) == shapely.GeometryType.POLYGON
     if not is_polygon.any():

@@ -107,8 +107,8 @@ def test_a_layer_is_named_where_there_are_several(tmp_path):
     with pytest.raises(InputError, match=r"has 2 layers \(shore, gauge\); name one, as in"):
         read_vectors(path)
     with pytest.raises(InputError, match="has no layer bank with geometries; it has shore, gauge"):
-        read_vectors(path, layer="bank")
-    for found in (read_vectors(f"{path}|layername=gauge"), read_vectors(path, layer="gauge")):
+        read_vectors(f"{path}|layername=bank")
+    for found in (read_vectors(f"{path}|layername=gauge"), read_vectors(f"{path}|gauge")):
         assert len(found) == 1
         assert found.name == f"{path}, layer gauge"
 

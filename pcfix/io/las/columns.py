@@ -26,6 +26,24 @@ Records: TypeAlias = Any
 """A numpy array of point records, whose dtype has named fields."""
 
 
+UPGRADE = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10, 6: 6, 7: 7, 8: 8, 9: 9, 10: 10}
+"""The format that each one becomes (LAS 1.4 R15, table 6 and on)."""
+
+SCAN_ANGLE_STEP_DEG = 0.006
+"""Unit of the scan angle in formats 6 and up; whole degrees before."""
+
+_INT32 = np.iinfo(np.int32)
+
+_PACKED = (
+    *("return_number", "number_of_returns", "scan_direction_flag", "edge_of_flight_line"),
+    *("classification", "synthetic", "key_point", "withheld"),
+)
+
+
+class OutOfRangeError(Exception):
+    """A coordinate leaves the 32 bits that LAS has; move the offsets and write again."""
+
+
 class TooNarrowError(Exception):
     """A value does not fit the narrow types; write the file again with the wide ones."""
 
@@ -147,16 +165,7 @@ def in_steps(
 ) -> npt.NDArray[Any]:
     """Return a column's values of the given rows, whole numbers of its scale.
 
-    Parameters
-    ----------
-    column : Column
-    correction : Correction
-        Of n points.
-    moved : array, shape (n, 3)
-        See `shift_steps`.
-    classes : array, shape (n,)
-        Before the correction.
-    rows : array of bool, shape (n,)
+    `moved` is from `shift_steps`, shape (n, 3); `classes`, shape (n,), are those before.
     """
     if column.scale == 0.0:
         return np.asarray(moved[rows, SHIFTS.index(column.name)])
@@ -226,38 +235,10 @@ def is_marked_uncorrected(points: laspy.ScaleAwarePointRecord) -> BoolArray:
     return np.asarray((points.array["RayCount"] == 0) & (points.array["WaterDepth"] > 0))
 
 
-UPGRADE = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10, 6: 6, 7: 7, 8: 8, 9: 9, 10: 10}
-"""The format that each one becomes (LAS 1.4 R15, table 6 and on)."""
-
-SCAN_ANGLE_STEP_DEG = 0.006
-"""Unit of the scan angle in formats 6 and up; whole degrees before."""
-
-_INT32 = np.iinfo(np.int32)
-
-_PACKED = (
-    "return_number",
-    "number_of_returns",
-    "scan_direction_flag",
-    "edge_of_flight_line",
-    "classification",
-    "synthetic",
-    "key_point",
-    "withheld",
-)
-
-
-class OutOfRangeError(Exception):
-    """A coordinate leaves the 32 bits that LAS has; move the offsets and write again."""
-
-
 def upgraded(point_format: laspy.PointFormat) -> laspy.PointFormat:
     """Return the output's point format, with the input's extra dimensions."""
-    return _with_extra(UPGRADE[point_format.id], point_format)
-
-
-def _with_extra(format_id: int, like: laspy.PointFormat) -> laspy.PointFormat:
-    new = laspy.PointFormat(format_id)
-    new.dimensions.extend(like.extra_dimensions)
+    new = laspy.PointFormat(UPGRADE[point_format.id])
+    new.dimensions.extend(point_format.extra_dimensions)
     return new
 
 
@@ -282,7 +263,11 @@ def convert(
         return new
     for name in _PACKED:
         new[name][:] = np.asarray(points[name])
-    _convert_scan_angle(points.array, array)
+    old = points.array
+    if "scan_angle" in array.dtype.names and "scan_angle_rank" in old.dtype.names:
+        array["scan_angle"] = np.rint(old["scan_angle_rank"] / SCAN_ANGLE_STEP_DEG)
+    elif "scan_angle_rank" in array.dtype.names and "scan_angle" in old.dtype.names:
+        array["scan_angle_rank"] = np.rint(old["scan_angle"] * SCAN_ANGLE_STEP_DEG)
     return new
 
 
@@ -296,13 +281,6 @@ def _one_begins_the_other(one: Records, other: Records) -> bool:
 
 def _bytes(array: Records) -> Records:
     return np.ascontiguousarray(array).view(np.uint8).reshape(len(array), array.itemsize)
-
-
-def _convert_scan_angle(old: Records, new: Records) -> None:
-    if "scan_angle" in new.dtype.names and "scan_angle_rank" in old.dtype.names:
-        new["scan_angle"] = np.rint(old["scan_angle_rank"] / SCAN_ANGLE_STEP_DEG)
-    elif "scan_angle_rank" in new.dtype.names and "scan_angle" in old.dtype.names:
-        new["scan_angle_rank"] = np.rint(old["scan_angle"] * SCAN_ANGLE_STEP_DEG)
 
 
 def shifted(

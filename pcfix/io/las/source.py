@@ -19,6 +19,7 @@ from laspy.vlrs.vlr import VLR
 from laspy.vlrs.vlrlist import VLRList
 
 from pcfix.errors import InputError
+from pcfix.io.crs import METRES
 from pcfix.io.files import check_input
 
 if TYPE_CHECKING:
@@ -35,6 +36,13 @@ WAVEFORM_PACKETS = ("LASF_Spec", 65535)
 _VLR, _EVLR = "<2x16sHH32s", "<2x16sHQ32s"
 _INTERNAL_WAVEFORMS = 2
 """Bit of the global encoding (LAS 1.4 R15, table 4)."""
+IDENTITY_PLACE, _IDENTITY_SIZE = 26, 68
+"""Where the header names system, software and date (LAS 1.4 R15, table 3)."""
+_DAMAGED = (
+    *(laspy.LaspyException, lazrs.LazrsError, struct.error),
+    *(ValueError, IndexError, OverflowError, OSError),
+)
+"""What the LAS libraries raise."""
 
 
 class Record(VLR):  # type: ignore[misc]  # laspy is untyped
@@ -74,14 +82,9 @@ class RecordList(VLRList):  # type: ignore[misc]
 
 
 def read_records(stream: BinaryIO) -> tuple[list[Record], list[Record]]:
-    """Return the VLRs and the EVLRs of a LAS or LAZ file.
+    """Return the VLRs and the EVLRs of a LAS or LAZ file, see `las_errors` for what it raises.
 
     The waveform packets inside a LAS 1.3 file count as an EVLR.
-
-    Raises
-    ------
-    ValueError, struct.error
-        If the file does not hold what its header says.
     """
     head = stream.read(375)
     if head[:4] != b"LASF":
@@ -130,24 +133,12 @@ def append_evlrs(stream: BinaryIO, records: list[Record], minor_version: int) ->
         start += stream.write(record.to_bytes())
 
 
-IDENTITY_PLACE, _IDENTITY_SIZE = 26, 68
-"""Where the header names system, software and date (LAS 1.4 R15, table 3)."""
-
-
 @contextmanager
 def las_errors(path: Path) -> Iterator[None]:
     """Turn whatever the LAS libraries raise into one sentence about the file."""
     try:
         yield
-    except (
-        laspy.LaspyException,
-        lazrs.LazrsError,
-        struct.error,
-        ValueError,
-        IndexError,
-        OverflowError,
-        OSError,
-    ) as error:
+    except _DAMAGED as error:
         reason = str(error).strip().rstrip(".") or type(error).__name__
         raise InputError(
             f"{path}: is damaged, or is not LAS or LAZ ({reason}); export or copy it again."
@@ -155,29 +146,15 @@ def las_errors(path: Path) -> Iterator[None]:
 
 
 class LasSource:
-    """An open LAS or LAZ file.
+    """An open LAS or LAZ file; use it as a context manager.
 
-    Use it as a context manager.
-
-    Attributes
-    ----------
-    path : Path
-    header : laspy.LasHeader
-    vlrs, evlrs : list of Record
-        See `read_records`.
-    identity : bytes
-        System identifier, generating software and date, as they are in the file: other
-        software writes there what laspy would not.
+    It has `path`, laspy's `header`, `vlrs` and `evlrs` from `read_records`, and `identity`: system
+    identifier, generating software and date as they are in the file, where other software writes
+    what laspy would not.
     """
 
     def __init__(self, path: str | os.PathLike[str], jobs: int | None = None) -> None:
-        """Open and check the header.
-
-        Raises
-        ------
-        InputError
-            If the file is missing, damaged or empty, or its scales or offsets are unusable.
-        """
+        """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable."""
         self.path = check_input(path)
         with las_errors(self.path):
             with self.path.open("rb") as stream:
@@ -278,9 +255,6 @@ def read_xyz(path: str | os.PathLike[str]) -> FloatArray:
         return np.vstack([coordinates(points) for points in source.chunks(10_000_000)])
 
 
-_METRES = ("metre", "meter")
-
-
 def metric_crs(source: LasSource) -> CRS | None:
     """Return the coordinate system of a cloud in metres, or None if it states none.
 
@@ -301,7 +275,7 @@ def metric_crs(source: LasSource) -> CRS | None:
     if crs is None:
         return None
     units = {axis.unit_name for axis in crs.axis_info[:2]}
-    if not units.issubset(_METRES):
+    if not units.issubset(METRES):
         raise InputError(
             f"{source.path}: its coordinate system {crs.name} is in {' and '.join(sorted(units))};"
             " reproject the cloud to one in metres first."
