@@ -19,13 +19,15 @@ as_root() {
     if [ "$(id -u)" = 0 ]; then "$@"; elif command -v sudo >/dev/null; then sudo "$@"; else return 1; fi
 }
 
-system_packages() {
+# One installation at a time talks to apt, as it does not wait for itself.
+system_packages() (
+    if command -v flock >/dev/null; then flock 9; fi
     if command -v apt-get >/dev/null && as_root apt-get update -qq &&
         as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >/dev/null; then
-        return
+        exit
     fi
     echo "install.sh: please install: $*" >&2
-}
+) 9<samples/install.sh
 
 if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
     echo "install.sh: pcfix needs Python 3.11 or newer, this is $("$python" --version)" >&2

@@ -101,9 +101,12 @@ unpack_debian_11() (
 
 build_from_debian_11() {
     echo "no PDAL of 2.5 or newer here: unpacking PDAL 2.2 of Debian 11"
-    as_root apt-get update -qq
-    as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends \
-        "${packages_of_debian_12[@]}" "$@" >/dev/null
+    ( # beside samples/install.sh, which waits too
+        flock 9
+        as_root apt-get update -qq
+        as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends \
+            "${packages_of_debian_12[@]}" "$@" >/dev/null
+    ) 9<samples/install.sh
     unpack_debian_11
     constrain_numpy
     install_pcfix test

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 
 import laspy
 import numpy as np
@@ -16,6 +14,7 @@ from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, Se
 from pcfix.flow.adjust import adjust_cameras, next_step
 from pcfix.threads import threads
 from tests.utils.adjust_files import IMAGE_PX, write_block, write_gnss
+from tests.utils.program import run_pcfix
 
 FOCAL_PX = 3648.0
 
@@ -228,7 +227,8 @@ def test_the_next_step_does_what_it_says(files, written):
     words = next_step(found, str(files.folder / "model"), str(out), str(files.folder / "cloud.las"))
     target = files.folder / "next.las"
     arguments = words.replace("OUTPUT", str(target)).split()[1:]
-    subprocess.run([sys.executable, "-m", "pcfix", *arguments, "-q"], check=True)
+    done = run_pcfix(*arguments, "-q")
+    assert done.returncode == 0, done.stderr
     assert max(heights_rms_m(files, target)) < 0.02
 
 
@@ -240,10 +240,8 @@ def test_program_and_function_agree(files, written, tmp_path):
         "--gnss", folder / "gnss.csv", "--gcps", folder / "gcps.csv",
         "--cloud", folder / "cloud.las", "--jobs", "1",
     ]  # fmt: skip
-    done = subprocess.run(
-        [sys.executable, "-m", "pcfix", *map(str, words)], check=True, capture_output=True,
-        text=True,
-    )  # fmt: skip
+    done = run_pcfix(*words)
+    assert done.returncode == 0, done.stderr
     for name in ("colmap/images.bin", "colmap/points3D.bin", "cameras.csv", "adjustment.json"):
         assert (tmp_path / "cli" / name).read_bytes() == (out / name).read_bytes(), name
     assert "Next: pcfix correct" in done.stdout

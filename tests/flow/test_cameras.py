@@ -8,13 +8,12 @@ import laspy
 import numpy as np
 import pytest
 from pyproj import Transformer
-from typer.testing import CliRunner
 
 import pcfix
-from pcfix.cli import app
 from pcfix.flow.cameras import check_cameras
 from pcfix.lens.imaging import project
 from pcfix.report.cameras import cameras_text
+from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
 
 SCENE = ROOT / "samples" / "scene"
@@ -38,10 +37,9 @@ def table(path, change=lambda xyz: xyz, crs=None):
 
 
 def words(*arguments):
-    result = CliRunner().invoke(app, list(map(str, arguments)))
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result.output
+    done = run_pcfix(*arguments)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def test_a_block_that_fits_is_said_to_fit(tmp_path):
@@ -135,13 +133,12 @@ def test_cameras_shifted_to_the_origin_take_an_offset(tmp_path, plain):
 
 @pytest.mark.parametrize("text", ["1,2", "a,b,c", "1,2,inf", ""])
 def test_an_offset_is_three_numbers(tmp_path, text):
-    result = CliRunner().invoke(
-        app,
-        ["correct", str(CLOUD), str(tmp_path / "o.las"), "--cameras", str(CAMERAS), "--water",
-         "0.37", "--cameras-offset", text],
+    done = run_pcfix(
+        "correct", CLOUD, tmp_path / "o.las", "--cameras", CAMERAS, "--water", "0.37",
+        "--cameras-offset", text,
     )  # fmt: skip
-    assert isinstance(result.exception, pcfix.SettingError)
-    assert "three numbers X,Y,Z" in str(result.exception)
+    assert done.returncode == 1
+    assert "three numbers X,Y,Z" in done.stderr
 
 
 def in_frame(xyz, cameras):

@@ -1,8 +1,6 @@
 """A cloud of old cameras, corrected with adjusted ones, through every door."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import laspy
@@ -29,6 +27,7 @@ from tests.utils.clouds import (
     read_raw,
     write_cloud,
 )
+from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
 
 FREE, free = needs("rendered_a_free")
@@ -154,11 +153,8 @@ def test_the_doors_agree(cloud, old, tmp_path):
     }
     _, before, after = correct(cloud, **paths)
     words = [f"--{key.replace('_', '-')}={value}" for key, value in paths.items()]
-    program = [sys.executable, "-m", "pcfix"]
-    subprocess.run(
-        [*program, "correct", cloud, tmp_path / "cli.las", "--water", str(WATER_M), "-q", *words],
-        check=True,
-    )
+    done = run_pcfix("correct", cloud, tmp_path / "cli.las", "--water", WATER_M, "-q", *words)
+    assert done.returncode == 0, done.stderr
     assert (tmp_path / "cli.las").read_bytes() == (tmp_path / "out.las").read_bytes()
     outs, _ = run("correct", arrays_of(before), metadata_of(before.header), water=WATER_M, **paths)
     for axis in "XYZ":
@@ -172,10 +168,7 @@ def test_the_doors_agree(cloud, old, tmp_path):
         adjusted_from=pcfix.read_cameras(paths["adjusted_from"]),
     )  # fmt: skip
     assert np.array_equal(np.rint(result.shift_m / SCALES), shift_of(after))
-    done = subprocess.run(
-        [*program, "pipeline", cloud, "o.las", "--water", str(WATER_M), *words],
-        check=True, capture_output=True,
-    )  # fmt: skip
+    done = run_pcfix("pipeline", cloud, "o.las", "--water", WATER_M, *words)
     stage = json.loads(done.stdout)["pipeline"][1]
     assert stage["pdalargs"]["adjusted_from"] == paths["adjusted_from"]
 
@@ -302,11 +295,11 @@ def test_an_offset_is_for_the_file_that_does_not_say_where_it_lies(tmp_path, old
 
 def test_a_run_keeps_it(tmp_path):
     scene = ROOT / "samples" / "scene"
-    words = ["--cameras", scene / "cameras.csv", "--adjusted-from", scene / "cameras.csv"]
-    program = [sys.executable, "-m", "pcfix", "run", "-q"]
-    subprocess.run(
-        [*program, scene / "cloud.laz", tmp_path / "a", "--water", "0.37", *words], check=True
-    )
+    done = run_pcfix(
+        "run", "-q", scene / "cloud.laz", tmp_path / "a", "--water", "0.37",
+        "--cameras", scene / "cameras.csv", "--adjusted-from", scene / "cameras.csv",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
     record = tmp_path / "a" / "run.json"
     request = request_of(record)
     assert isinstance(request, Request)

@@ -4,15 +4,14 @@ import json
 import warnings
 
 import pytest
-from typer.testing import CliRunner
 
 import pcfix
-from pcfix.cli import app
 from pcfix.errors import PcfixWarning, SettingError
 from pcfix.flow.cameras import check_cameras
 from pcfix.flow.diagnosis import command_of
 from pcfix.flow.inputs import Inputs
 from pcfix.report.cameras import cameras_text
+from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
 
 SCENE = ROOT / "samples" / "scene"
@@ -116,8 +115,7 @@ def test_a_calibration_tells(tmp_path):
 def test_evidence_needs_cloud_and_water():
     with pytest.raises(SettingError, match="give cloud and water too"):
         check_cameras(SCENE / "cameras.csv", gcps="gcps.csv")
-    result = CliRunner().invoke(app, ["cameras", str(SCENE / "cameras.csv"), "--lens", "a.csv"])
-    assert result.exit_code == 1
+    assert run_pcfix("cameras", SCENE / "cameras.csv", "--lens", "a.csv").returncode == 1
 
 
 def test_the_command_names_what_was_given():
@@ -131,9 +129,10 @@ def test_the_command_names_what_was_given():
 
 @bent
 def test_the_command_line_says_so():
-    words = ["cameras", str(BENT / "cameras.xml"), "--cloud", str(BENT / "cloud.las")]
-    words += ["--water", "0.37", "--gnss", str(BENT / "gnss.csv")]
-    result = CliRunner().invoke(app, words)
-    assert result.exit_code == 0
-    assert "GNSS           absorbed:" in result.stdout
-    assert "pcfix adjust" in result.stdout
+    done = run_pcfix(
+        "cameras", BENT / "cameras.xml", "--cloud", BENT / "cloud.las", "--water", "0.37",
+        "--gnss", BENT / "gnss.csv",
+    )  # fmt: skip
+    assert done.returncode == 0
+    assert "GNSS           absorbed:" in done.stdout
+    assert "pcfix adjust" in done.stdout

@@ -13,6 +13,7 @@ import pytest
 
 import pcfix
 from pcfix.io.scenes import write_scene
+from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
 
 RIVER, river = needs("river")
@@ -26,16 +27,16 @@ def scene(tmp_path_factory):
     return folder
 
 
-def run(*words, **more):
+def in_a_process(*words):
     return subprocess.run(
         [sys.executable, "-m", "pcfix", *map(str, words)],
-        capture_output=True, text=True, check=False, **more,
+        capture_output=True, text=True, check=False,
     )  # fmt: skip
 
 
 def test_command_line_and_python_give_the_same_file(scene, tmp_path):
     words = ("--cameras", scene / "cameras.csv", "--water", "0.37", "--max-angle", "45")
-    done = run("correct", scene / "cloud.laz", tmp_path / "a.las", *words, "--jobs", "1")
+    done = in_a_process("correct", scene / "cloud.laz", tmp_path / "a.las", *words, "--jobs=1")
     assert done.returncode == 0, done.stderr
     pcfix.correct_file(
         scene / "cloud.laz",
@@ -66,7 +67,7 @@ def test_arrays_and_files_give_the_same_coordinates(scene, tmp_path):
 
 def test_piped_output_is_the_summary_and_nothing_else(scene, tmp_path):
     words = ("--cameras", scene / "cameras.csv", "--water", "0.37")
-    done = run(
+    done = in_a_process(
         "correct", scene / "cloud.laz", tmp_path / "out.laz", *words,
         "--summary", tmp_path / "run.json",
     )  # fmt: skip
@@ -119,7 +120,7 @@ def test_bar_on_a_terminal(scene, tmp_path):
 
 
 def test_demo_prints_errors_before_and_after(tmp_path):
-    done = run("demo", tmp_path / "demo", "--points", "1500")
+    done = run_pcfix("demo", tmp_path / "demo", "--points", "1500")
     assert done.returncode == 0, done.stderr
     rows = {}
     for line in done.stdout.splitlines():
@@ -131,7 +132,7 @@ def test_demo_prints_errors_before_and_after(tmp_path):
     assert (consistent < snell).all()
     assert (snell < 0.2 * factor).all()
     assert (factor < before).all()
-    again = run("demo", tmp_path / "demo", "--points", "1500")
+    again = run_pcfix("demo", tmp_path / "demo", "--points", "1500")
     assert again.returncode == 1
     assert "exists; add --overwrite" in again.stderr
 
@@ -139,7 +140,7 @@ def test_demo_prints_errors_before_and_after(tmp_path):
 @river
 def test_river_in_one_command(tmp_path):
     out = tmp_path / "river.las"
-    done = run(
+    done = run_pcfix(
         "correct", RIVER / "points.las", out, "--cameras", RIVER / "cameras.csv",
         "--water", "dim:w_surf", "--index", "1.337", "--max-angle", "35",
     )  # fmt: skip

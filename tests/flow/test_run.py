@@ -6,8 +6,6 @@ import importlib.util
 import json
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import laspy
@@ -17,6 +15,7 @@ import rasterio
 
 import pcfix
 from pcfix.flow.run import Request, request_of, run_all
+from tests.utils.program import run_pcfix
 
 SCENE = Path(__file__).parents[2] / "samples" / "scene"
 WORDS = [
@@ -30,8 +29,7 @@ RESULTS = [
 
 
 def run(folder, *words):
-    command = [sys.executable, "-m", "pcfix", "run", *words]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    return run_pcfix("run", *words, folder=folder)
 
 
 @pytest.fixture(scope="module")

@@ -15,10 +15,8 @@ import laspy
 import numpy as np
 import pyproj
 import pytest
-from typer.testing import CliRunner
 
 from pcfix.adjust.fixed_poses import intersect_fixed, plain_block
-from pcfix.cli import app
 from pcfix.errors import GeometryError, PcfixWarning, SettingError
 from pcfix.flow.files import correct_file
 from pcfix.flow.inputs import Inputs
@@ -27,6 +25,7 @@ from pcfix.flow.run_adjust import adjust_first
 from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.model import TiePoints, Views
 from tests.utils.bent_blocks import GNSS_M, LEVEL_M, TrueBlock
+from tests.utils.program import run_pcfix
 
 ORIGIN_M = (319900.0, 3842700.0, 0.0)
 GSD_M = 0.05
@@ -158,8 +157,8 @@ def test_a_record_repeats_the_adjustment(finished, tmp_path, monkeypatch):
     seen = []
     monkeypatch.setattr("pcfix.flow.run.run_all", lambda request, *_, **__: seen.append(request))
     words = ["run", str(tmp_path / "again"), "--config", str(folder / "run.json")]
-    done = CliRunner().invoke(app, words)
-    assert done.exit_code == 0, done.output
+    done = run_pcfix(*words)
+    assert done.returncode == 0, done.stderr
     assert seen == [request_of(folder / "run.json")]
     assert (seen[0].adjust, seen[0].gnss[-8:]) == ("yes", "gnss.csv")
 
@@ -278,6 +277,5 @@ def test_records_from_before_adjustments_do_without(finished, tmp_path):
 def test_command_line_passes_its_words(scene, tmp_path):
     words = ["run", f"{scene.folder}/bent.las", str(tmp_path / "out"), "--water", "0"]
     words += ["--cameras", f"{scene.folder}/bent", "--adjust", "no", "--gnss", scene.gnss]
-    done = CliRunner().invoke(app, words)
-    assert "gnss is of use to an adjustment only" in str(done.exception)
-    assert CliRunner().invoke(app, [*words, "--adjust", "maybe"]).exit_code == 2
+    assert "gnss is of use to an adjustment only" in run_pcfix(*words).stderr
+    assert run_pcfix(*words, "--adjust", "maybe").returncode == 2

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 import rasterio
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 import pcfix
-from pcfix.cli import app
 from pcfix.flow.surfaces import WaterWords
 from pcfix.flow.water import check_water
+from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT
 
 SCENE = ROOT / "samples" / "scene"
@@ -123,10 +122,9 @@ def test_raster_and_mesh_of_a_plane_are_the_plane(river, tmp_path):
 
 
 def invoke(*arguments):
-    result = CliRunner().invoke(app, list(map(str, arguments)))
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result.output
+    done = run_pcfix(*arguments)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def test_every_door_takes_shoreline_points(tmp_path):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pcfix.label.mask import WaterMask
@@ -42,7 +42,6 @@ def lake(rng, corners=60):
     return area, [shapely.get_coordinates(r)[:-1] for r in shapely.get_rings(parts)]
 
 
-@settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10**6))
 def test_as_the_slow_rule(seed):
     rng = np.random.default_rng(seed)

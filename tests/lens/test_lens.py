@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import root
 
@@ -62,7 +62,6 @@ def one(lens, *place):
     return unproject(lens, np.array([place]))[0]
 
 
-@settings(max_examples=250, deadline=None)
 @given(lens=lenses())
 def test_image_to_direction_and_back(lens):
     image = image_grid()
@@ -73,7 +72,6 @@ def test_image_to_direction_and_back(lens):
     assert np.abs(project(lens, directions)[there] - image[there]).max() <= RELATIVE * lens.focal
 
 
-@settings(max_examples=200, deadline=None)
 @given(lens=lenses(), seed=st.integers(0, 2**32 - 1))
 def test_direction_to_image_and_back_is_the_same_branch(lens, seed):
     directions = np.random.default_rng(seed).normal(size=(300, 3))
@@ -87,7 +85,6 @@ def test_direction_to_image_and_back_is_the_same_branch(lens, seed):
     assert np.median(np.linalg.norm(back - directions[near], axis=1)) < 1e-9 or not near.any()
 
 
-@settings(max_examples=200, deadline=None)
 @given(lens=lenses())
 def test_slow_twin_agrees(lens):
     directions = unproject(lens, image_grid(5))
@@ -97,7 +94,6 @@ def test_slow_twin_agrees(lens):
         assert (u, v) == pytest.approx(image_slowly(lens, direction), abs=1e-7 * lens.focal)
 
 
-@settings(max_examples=200, deadline=None)
 @given(lens=lenses(), x=st.floats(-0.6, 0.6), y=st.floats(-0.6, 0.6))
 def test_jacobian_is_the_derivative(lens, x, y):
     c, h = coefficients(lens), 1e-6

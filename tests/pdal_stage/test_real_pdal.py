@@ -13,6 +13,7 @@ import pcfix
 from pcfix.io.las.columns import COLUMNS
 from pcfix.io.pdal import CLASS_FLAGS, STAGE_SOURCE, add_dimension
 from tests.utils.clouds import WATER_M, block, cameras_csv, framed_block, random_cloud, write_cloud
+from tests.utils.program import run_pcfix
 from tests.utils.real_pdal import ROOT, needs_pdal, pdal, python
 from tests.utils.shared import needs
 
@@ -40,8 +41,7 @@ def run_pipeline(door: str, job: dict[str, Any] | list[Any], folder: Path) -> An
 
 def pipeline_of(folder: Path, *words: object) -> dict[str, Any]:
     """Return what ``pcfix pipeline`` prints."""
-    program = "import sys; from pcfix.cli import main; sys.argv[0] = 'pcfix'; main()"
-    done = python(program, "pipeline", *words, folder=folder)
+    done = run_pcfix("pipeline", *words, folder=folder)
     assert (done.returncode, done.stderr) == (0, "")
     job: dict[str, Any] = json.loads(done.stdout)
     return job
@@ -356,6 +356,7 @@ MISTAKES = {
 
 SURVIVE = """
 import json, os, signal, sys, pdal
+from tests.utils.program import run_pcfix
 job = open(sys.argv[1]).read()
 before = sys.stdout, os.getcwd(), signal.getsignal(signal.SIGINT), sys.getdlopenflags()
 for attempt in range(30):
@@ -436,7 +437,6 @@ def test_pipeline_command_refuses_what_correct_refuses(tmp_path: Path) -> None:
     write_cloud(tmp_path / "cloud.las", 7, plain=True, count=300)
     write_cloud(tmp_path / "waves.las", 10, plain=True, count=300)
     cameras_csv(tmp_path / "cameras.csv", block())
-    program = "import sys; from pcfix.cli import main; sys.argv[0] = 'pcfix'; main()"
     good = ["--cameras", "cameras.csv", "--water", "5"]
     for words, sentence in [
         (["cloud.las", "out.las", *good, "--index", "1.6"], "outside 1.0 to 1.5"),
@@ -447,7 +447,7 @@ def test_pipeline_command_refuses_what_correct_refuses(tmp_path: Path) -> None:
         (["cloud.las", "out.las", *good, "--water", "500"], "under the water"),
         (["waves.las", "out.las", *good], "has waveforms"),
     ]:
-        done = python(program, "pipeline", *words, folder=tmp_path)
+        done = run_pcfix("pipeline", *words, folder=tmp_path)
         assert (done.returncode, done.stdout) == (1, "")
         assert len(done.stderr.splitlines()) == 1
         assert sentence in done.stderr

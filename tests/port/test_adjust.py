@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +15,7 @@ from pcfix.port.shapes import DomePort, FlatPort
 from pcfix.threads import threads
 from tests.utils.adjust_files import EPSG, write_gnss
 from tests.utils.port_scenes import simulate_port
+from tests.utils.program import run_pcfix
 
 pytestmark = pytest.mark.filterwarnings("default::pcfix.errors.PcfixWarning")
 
@@ -66,7 +65,8 @@ def test_the_program_writes_it(tmp_path):
         "adjust", "model", "out", "--port", "flat:distance=0.02,thickness=0.008",
         "--gnss", "gnss.csv", "--lens-unknowns", "none", "-q",
     ]  # fmt: skip
-    subprocess.run([sys.executable, "-m", "pcfix", *words], cwd=tmp_path, check=True)
+    done = run_pcfix(*words, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
     read = pcfix.read_cameras(tmp_path / "out" / "colmap")
     off = read.centres - made.cameras.centres
     assert np.sqrt((off**2).mean()) < 0.02  # m: what they were off before

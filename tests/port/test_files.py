@@ -1,8 +1,6 @@
 """A file of points taken under water, through the doors."""
 
 import json
-import subprocess
-import sys
 
 import laspy
 import numpy as np
@@ -14,6 +12,7 @@ from pcfix.port.intersection import correct_through_port
 from pcfix.port.shapes import FlatPort
 from pcfix.report.text import summary_text
 from tests.utils.port_scenes import simulate_port
+from tests.utils.program import run_pcfix
 
 SPEC = "flat:distance=0.02,thickness=0.008"
 
@@ -105,11 +104,9 @@ def test_cameras_elsewhere_are_refused(scene, cloud, tmp_path):
 
 def test_command_line(cloud, tmp_path):
     def run(*words):
-        return subprocess.run(
-            [sys.executable, "-m", "pcfix", "correct", str(cloud), str(tmp_path / "out.las"),
-             "--cameras", str(tmp_path / "none.csv"), *words],
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
+        return run_pcfix(
+            "correct", cloud, tmp_path / "out.las", "--cameras", tmp_path / "none.csv", *words
+        )
 
     neither = run()
     assert neither.returncode == 2

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pcfix.errors import SettingError
@@ -121,7 +121,6 @@ def test_derivatives_are_those_of_differences(name):
     assert np.abs((change / 2e-6 - out[:, :, 4]) / size).max() < 1e-6
 
 
-@settings(max_examples=200, deadline=None)
 @given(
     st.floats(0.01, 0.3), st.floats(0.0, 0.05), st.floats(1.0, 1.9), st.floats(1.0, 1.5),
     st.tuples(*[st.floats(-0.57, 0.57)] * 3), st.tuples(*[st.floats(-1.0, 1.0)] * 3),

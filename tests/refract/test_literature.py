@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import pcfix
@@ -92,7 +92,6 @@ def test_exactly_overhead_the_depth_is_n_times_or_stays_open():
         assert (found.shift_m == 0.0).all()
 
 
-@settings(max_examples=20, deadline=None)
 @given(
     depth=st.floats(0.05, 20),
     aside=st.floats(-40, 40),
@@ -314,7 +313,6 @@ def test_a_tilted_surface_counts_as_level_above_each_point(method):
         assert found.shift_m[i] == pytest.approx(alone.shift_m[0], abs=NANOMETRE)
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     method=st.sampled_from(ALL),
     depth=st.sampled_from([1e-12, 1e-6, 0.01, 1.0, 30.0]),

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import pcfix
@@ -78,7 +78,6 @@ def test_two_rays_equal_equation_11_as_a_system_of_six_by_five():
     assert result.ray_count[0] == 2
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     x=st.floats(-40, 40),
     y=st.floats(-40, 40),
@@ -103,7 +102,6 @@ def test_out_through_the_surface_and_back_comes_home(x, y, depth, slope, n):
     assert result.xyz[0] == pytest.approx(point, abs=1e-7)
 
 
-@settings(max_examples=50, deadline=None)
 @given(
     depth=st.floats(0.01, 30),
     n=st.floats(1.0, 1.5),

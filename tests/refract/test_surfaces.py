@@ -5,7 +5,7 @@ import math
 import numba
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
@@ -159,7 +159,6 @@ def test_a_curved_surface_converges_to_its_formula(cell, within_m):
     assert np.sqrt(np.mean(np.square(apart))) < within_m
 
 
-@settings(max_examples=30, deadline=None)
 @given(
     slope=st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05)),
     cell=st.tuples(st.floats(0.3, 9.0), st.floats(0.3, 9.0)),

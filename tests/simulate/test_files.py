@@ -5,13 +5,12 @@ import json
 import laspy
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import pcfix
-from pcfix.cli import app
 from pcfix.io.scenes import colmap_vis, files_of, openmvs_ply, write_scene
 from pcfix.io.views import read_views
 from pcfix.model import Views
+from tests.utils.program import run_pcfix
 
 KINDS = ("tracks", "pairs", "depth-maps")
 
@@ -118,8 +117,8 @@ def test_a_flume_keeps_a_tenth_of_a_millimetre(tmp_path):
 def test_the_command_says_what_python_says(tmp_path):
     words = "--points 150 --obliques-deg 35 --area-m 60 40 --bed river --cloud pairs"
     words += " --wave-slope-deg 1.5 --distortion -0.03 0 0 0 0 --lidar-per-m2 0.5 --quiet"
-    done = CliRunner().invoke(app, ["simulate", str(tmp_path), *words.split()])
-    assert done.exit_code == 0, done.output
+    done = run_pcfix("simulate", tmp_path, *words.split())
+    assert done.returncode == 0, done.stderr
     facts = json.loads((tmp_path / "scene.json").read_text())
     scene = pcfix.simulate_scene(
         150,

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
@@ -95,7 +95,6 @@ def test_many_points_use_a_sample_only_to_start():
     assert fit.sigma_m == pytest.approx(0.025, rel=0.02)
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.permutations(range(20)))
 def test_the_order_of_points_does_not_matter(order):
     points = reach(7, n=20)[0]
@@ -104,7 +103,6 @@ def test_the_order_of_points_does_not_matter(order):
     assert np.array_equal(one.residual_m[order], other.residual_m)
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.floats(-0.04, 0.04), st.floats(-0.04, 0.04), st.floats(-50, 3000))
 def test_exact_points_give_their_plane(b, c, a):
     rng = np.random.default_rng(1)
