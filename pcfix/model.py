@@ -30,6 +30,13 @@ Projection = Literal[
 ]
 
 
+NOMINAL_FOCAL_PX = 3700.0
+"""Of cameras without a lens: a survey drone's of 20 megapixels, 0.27 mrad a pixel."""
+NOMINAL_WIDTH_PX = 5472.0
+"""Of lenses in millimetres whose pixel size is not known: the same camera's longer side, 13.2 mm of
+pixels of 2.4 um."""
+
+
 @dataclass(frozen=True, slots=True)
 class Lens:
     """An interior orientation: how a direction in the camera frame becomes a place in the image.
@@ -110,6 +117,22 @@ class Lens:
     pixel_size_mm: float | None = None
     sensor: str = ""
     unit: Literal["px", "mm"] = "px"
+
+    @property
+    def pixel_size(self) -> float:
+        """The length of a pixel in the unit of the lens, nominal where nothing tells it."""
+        if self.unit == "px":
+            return 1.0
+        return self.pixel_size_mm or max(self.width, self.height) / NOMINAL_WIDTH_PX
+
+    @property
+    def focal_px(self) -> float:
+        """The focal length in pixels, nominal where nothing tells how large they are."""
+        if self.unit == "px":
+            return self.focal
+        if self.pixel_size_mm is not None:
+            return self.focal / self.pixel_size_mm
+        return self.focal / max(self.width, self.height) * NOMINAL_WIDTH_PX
 
 
 @dataclass(frozen=True, eq=False)

@@ -141,7 +141,7 @@ def command_of(inputs: Inputs, cloud: str, **more: AnyPath | None) -> str:
 
 def given_focal_lengths(path: AnyPath) -> dict[str, float]:
     """Return focal length by width of the calibrations that a camera file was given."""
-    from pcfix.io.cameras.metashape.calibrated import given_lenses
+    from pcfix.io.cameras.metashape.sensors import given_lenses
 
     found = given_lenses(Path(path))
     return {name: lens.focal / lens.width for name, lens in found.items()}

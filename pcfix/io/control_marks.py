@@ -33,12 +33,10 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras.formats import Source
-from pcfix.io.cameras.metashape import documents
-from pcfix.io.cameras.metashape.positions import SPREADS
-from pcfix.io.cameras.odm.crs import named_crs
-from pcfix.io.cameras.table.columns import read_columns
-from pcfix.io.cameras.table.headers import headers, is_header
-from pcfix.io.cameras.table.positions import centres, crs
+from pcfix.io.cameras.metashape import SPREADS, documents
+from pcfix.io.cameras.odm.project import named_crs
+from pcfix.io.cameras.table import centres, crs
+from pcfix.io.cameras.table.columns import headers, is_header, read_columns
 from pcfix.io.cameras.xml import number as xml_number
 from pcfix.io.cameras.xml import numbers
 from pcfix.io.crs import is_local, parse_crs

@@ -14,11 +14,11 @@ from pcfix.io.cameras import read_cameras, table
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.gnss import adjusted_minus_gnss
 from pcfix.io.cameras.heights import is_tied
-from pcfix.io.cameras.odm.shots import read_images
-from pcfix.io.cameras.table.positions import gnss_positions, open_table
+from pcfix.io.cameras.odm.project import read_images
+from pcfix.io.cameras.table import gnss_positions, open_table
 from pcfix.io.crs import METRES, is_topocentric, parse_crs
 from pcfix.io.files import check_input
-from pcfix.io.labels import is_named, match_labels
+from pcfix.io.labels import match_labels, unnamed
 from pcfix.model import Cameras, GnssPositions
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def read_gnss(path: str | os.PathLike[str], cameras: Cameras, *, crs: str | None
         nothing = np.full((len(cameras), 3), np.nan)
         stated, names = read_images(source, cameras.labels)
         found = GnssPositions(nothing, nothing, None) if stated is None else stated
-        unknown = [name for name in names if not is_named(name, cameras.labels)]
+        unknown = list(unnamed(names, cameras.labels))
     else:
         labels, listed = _listed(source)
         found, unknown = _by_camera(source, cameras, labels, listed)
@@ -190,7 +190,7 @@ def _notes(path: Path, cameras: Cameras, known: int, unknown: list[str]) -> tupl
     notes = []
     if known < len(cameras):
         notes.append(f"{path}: {known} of {len(cameras)} images have a position by GNSS.")
-    others = [name for name in unknown if not is_named(name, cameras.unposed)]
+    others = unnamed(unknown, cameras.unposed)
     if others:
         more = ", ..." if len(others) > _NAMED else ""
         notes.append(

@@ -14,7 +14,7 @@ from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.control_marks import read_marks
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
-from pcfix.io.labels import is_named, match_labels
+from pcfix.io.labels import match_labels, unnamed
 from pcfix.io.transformations import LOCAL, way_to_cloud
 from pcfix.model import GroundControl
 
@@ -117,8 +117,9 @@ def _cameras_of(marks: Marks, cameras: Cameras) -> tuple[IntArray, IntArray, tup
     of_name = dict(zip(names, matched.row.tolist(), strict=True))
     camera = np.array([of_name[name] for name in marks.image])
     lost = [name for name in names if of_name[name] < 0]
-    unposed = [n for n in lost if n not in matched.ambiguous and is_named(n, cameras.unposed)]
-    _refuse_unknown(marks, cameras, [n for n in lost if n not in unposed], matched.ambiguous)
+    unknown = {*matched.ambiguous, *unnamed(lost, cameras.unposed)}
+    unposed = [name for name in lost if name not in unknown]
+    _refuse_unknown(marks, cameras, [n for n in lost if n in unknown], matched.ambiguous)
     kept = np.flatnonzero(camera >= 0)
     if not len(kept):
         raise InputError(f"{marks.path}: all its images are without a pose; align them first.")

@@ -27,14 +27,17 @@ class Matched(NamedTuple):
     ambiguous: tuple[str, ...]
 
 
-def match_labels(names: Sequence[str], labels: Sequence[str]) -> Matched:
+def match_labels(
+    names: Sequence[str], labels: Sequence[str], *, one_to_one: bool = True
+) -> Matched:
     """Find each name among labels: whole, without its folder, without its extension.
 
     Parameters
     ----------
     names : sequence of str, length n
-        All different.
     labels : sequence of str
+    one_to_one : bool
+        Whether a label is meant by one name at most; else names may share a label.
 
     Returns
     -------
@@ -44,18 +47,20 @@ def match_labels(names: Sequence[str], labels: Sequence[str]) -> Matched:
     unclear: set[int] = set()
     for key in KEYS:
         here, there = _rows_by(key, names), _rows_by(key, labels)
-        for word, mine in here.items():
+        for word, rows in here.items():
             found = there.get(word, [])
-            if len(mine) == 1 == len(found) and row[mine[0]] < 0:
-                row[mine[0]] = found[0]
+            left = [i for i in rows if row[i] < 0]
+            if len(found) == 1 and (len(rows) == 1 or not one_to_one):
+                row[left] = found[0]
             elif found:
-                unclear.update(mine)
+                unclear.update(rows)
     return Matched(row, tuple(names[i] for i in sorted(unclear) if row[i] < 0))
 
 
-def is_named(name: str, labels: Iterable[str]) -> bool:
-    """Whether one of the labels can be what a name means."""
-    return _stem(name) in {_stem(label) for label in labels}
+def unnamed(names: Iterable[str], labels: Iterable[str]) -> tuple[str, ...]:
+    """Return the names, each once, that none of the labels can mean."""
+    stems = {_stem(label) for label in labels}
+    return tuple(name for name in dict.fromkeys(names) if _stem(name) not in stems)
 
 
 def _rows_by(key: Callable[[str], str], names: Sequence[str]) -> dict[str, list[int]]:

@@ -127,7 +127,7 @@ def _json_times(content: Any) -> dict[str, float]:
 
 def _rows(names: Sequence[str], labels: Sequence[str], source: str) -> list[int]:
     """Return for each label the row of its name."""
-    rows: list[int] = match_labels(labels, names).row.tolist()
+    rows: list[int] = match_labels(labels, names, one_to_one=False).row.tolist()
     missing = [label for label, row in zip(labels, rows, strict=True) if row < 0]
     if missing:
         raise InputError(

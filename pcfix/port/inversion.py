@@ -31,11 +31,10 @@ from numba import njit, prange
 from pcfix.errors import PcfixWarning
 from pcfix.lens.derivatives import image_and_gradients
 from pcfix.lens.imaging import lens_table
-from pcfix.model import Lens, Outcome
+from pcfix.model import NOMINAL_FOCAL_PX, NOMINAL_WIDTH_PX, Lens, Outcome
 from pcfix.port.intersection import in_camera
 from pcfix.port.light import coefficients, through_port
 from pcfix.refract.consistent import check_consistent
-from pcfix.refract.uncertainty import NOMINAL_FOCAL_PX, NOMINAL_WIDTH_PX
 from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
@@ -165,10 +164,7 @@ def _block(cameras: Cameras) -> tuple[FloatArray, FloatArray, IntArray, FloatArr
 
 def _pixels(cameras: Cameras) -> FloatArray:
     """Return how long a pixel is in the unit of each camera's lens, shape (k,)."""
-    return np.array([
-        1.0 if lens.unit == "px" else lens.pixel_size_mm or lens.width / NOMINAL_WIDTH_PX
-        for lens in _lenses(cameras)
-    ])  # fmt: skip
+    return np.array([lens.pixel_size for lens in _lenses(cameras)])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -18,7 +18,7 @@ from numba import njit, prange
 
 from pcfix.lens.frames import frames_of
 from pcfix.lens.imaging import project
-from pcfix.model import Views
+from pcfix.model import NOMINAL_FOCAL_PX, Views
 from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ def without_border(cameras: Cameras) -> Cameras:
 
 
 def _narrower(lens: Lens) -> Lens:
-    border = BORDER_PX * (1.0 if lens.unit == "px" else lens.width / PIXELS_ACROSS)
+    border = BORDER_PX * lens.pixel_size
     return replace(
         lens,
         width=lens.width - 2.0 * border,
@@ -254,17 +254,8 @@ def steepest_and_partners(
     return Views(start, np.asarray(views.camera)[kept])
 
 
-PIXELS_ACROSS = 4000.0
-"""Of an image whose lens is in millimetres."""
-
-
 def focal_px(cameras: Cameras) -> FloatArray:
     """Return the focal length of each image in pixels, shape (k,)."""
     if cameras.lenses is None:
-        return np.full(len(cameras), PIXELS_ACROSS)
-    return np.array(
-        [
-            lens.focal if lens.unit == "px" else lens.focal / lens.width * PIXELS_ACROSS
-            for lens in cameras.lenses
-        ]
-    )
+        return np.full(len(cameras), NOMINAL_FOCAL_PX)
+    return np.array([lens.focal_px for lens in cameras.lenses])

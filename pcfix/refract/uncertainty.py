@@ -37,7 +37,7 @@ from pcfix.lens.frames import (
     may_hold,
     pyramid,
 )
-from pcfix.model import Outcome, WaterPlane
+from pcfix.model import NOMINAL_FOCAL_PX, Outcome, WaterPlane
 from pcfix.options import LEVEL_M
 from pcfix.refract import sensitivity as s
 from pcfix.refract.choice import TILE, chosen_views, gather, least_cosine2, spatial_order
@@ -45,17 +45,11 @@ from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     from pcfix.lens.frames import Frames, Pyramid
-    from pcfix.model import Cameras, FloatArray, IntArray, Lens, Views
+    from pcfix.model import Cameras, FloatArray, IntArray, Views
     from pcfix.options import Settings
     from pcfix.refract.learned import Learned
     from pcfix.refract.result import Intersection
     from pcfix.water.surface import SurfaceAbove
-
-NOMINAL_FOCAL_PX = 3700.0
-"""Of cameras without a lens: a survey drone's of 20 megapixels, 0.27 mrad a pixel."""
-NOMINAL_WIDTH_PX = 5472.0
-"""Of lenses in millimetres whose pixel size is not known: the same camera's longer side."""
-
 
 Three: TypeAlias = tuple[float, float, float]
 Four: TypeAlias = tuple[float, float, float, float]
@@ -227,16 +221,7 @@ def _focal_lengths(cameras: Cameras) -> tuple[FloatArray, FloatArray]:
         return axes, np.full(len(cameras), NOMINAL_FOCAL_PX)
     flat = np.array([lens.projection == "perspective" for lens in cameras.lenses])
     axes[flat] = cameras.rotations[flat, 2]
-    return axes, np.array([focal_px(lens) for lens in cameras.lenses])
-
-
-def focal_px(lens: Lens) -> float:
-    """Return the focal length in pixels; of a lens in millimetres without a pixel size, nearly."""
-    if lens.unit == "px":
-        return lens.focal
-    if lens.pixel_size_mm is not None:
-        return lens.focal / lens.pixel_size_mm
-    return lens.focal / max(lens.width, lens.height) * NOMINAL_WIDTH_PX
+    return axes, np.array([lens.focal_px for lens in cameras.lenses])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

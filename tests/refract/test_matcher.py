@@ -67,7 +67,7 @@ def test_few_images_leave_the_rest_of_the_table_empty():
 def test_a_lens_in_millimetres_has_the_same_border():
     cameras, _ = block(np.random.default_rng(4))
     lens = cameras.lenses[0]
-    mm = 13.2 / 4000  # a pixel, where an image is taken as 4000 wide
+    mm = 13.2 / 5472  # a pixel of the nominal camera
     values = {
         name: getattr(lens, name) * 13.2 / lens.width
         for name in ("focal", "width", "height", "principal_x", "principal_y")

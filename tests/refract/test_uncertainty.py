@@ -15,16 +15,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pcfix.model import Lens, Outcome, Views, WaterPlane
+from pcfix.model import NOMINAL_WIDTH_PX, Lens, Outcome, Views, WaterPlane
 from pcfix.options import LEVEL_M, ErrorBudget, Settings
 from pcfix.refract.intersect import intersect
 from pcfix.refract.methods import correct
 from pcfix.refract.regression import DepthRegression
-from pcfix.refract.uncertainty import (
-    NOMINAL_WIDTH_PX,
-    covariances,
-    focal_px,
-)
+from pcfix.refract.uncertainty import covariances
 from pcfix.water.surface import SurfaceAbove, surface_above
 from tests.utils.normalised import INDEX, apparent, block, views_of
 
@@ -279,8 +275,9 @@ def test_it_is_skipped_where_nobody_reads_it():
 
 def test_focal_lengths_in_pixels():
     lens = Lens(8.8, 13.2, 8.8, 6.6, 4.4, unit="mm")
-    assert focal_px(replace(lens, pixel_size_mm=0.0024)) == pytest.approx(8.8 / 0.0024)
-    assert focal_px(lens) == pytest.approx(8.8 / 13.2 * NOMINAL_WIDTH_PX)
+    assert replace(lens, pixel_size_mm=0.0024).focal_px == pytest.approx(8.8 / 0.0024)
+    assert lens.focal_px == pytest.approx(8.8 / 13.2 * NOMINAL_WIDTH_PX)
+    assert lens.focal_px == pytest.approx(lens.focal / lens.pixel_size)
 
 
 @pytest.mark.parametrize("method", ["shan", "factor", "murase"])

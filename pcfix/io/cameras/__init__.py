@@ -1,8 +1,8 @@
 """Camera poses, whatever wrote them: one module per format behind one `read_cameras`.
 
-A format module has ``SOFTWARE``, ``recognises(source)``, ``read(source)`` and, where the format has
-tie points, ``tie_points(source, cameras)``; see `formats.CameraFormat`. To add a format, write its
-module and name it in `FORMATS`; nothing else changes.
+A format module has ``recognises(source)``, ``read(source)`` and, where the format has tie points,
+``tie_points(source, cameras)``; see `formats.Reader`. To add a format, write its module and an
+entry of `FORMATS`, from which its line in README.md of this folder follows.
 """
 
 from __future__ import annotations
@@ -26,19 +26,47 @@ from pcfix.io.cameras import (
     table,
     unsupported,
 )
-from pcfix.io.cameras.formats import Angles, Source, SparseModel
+from pcfix.io.cameras.formats import Angles, CameraFormat, Source, SparseReader
 from pcfix.io.files import check_input
 
 if TYPE_CHECKING:
     import os
 
-    from pcfix.io.cameras.formats import CameraFormat
     from pcfix.model import Cameras, TiePoints
 
-FORMATS: tuple[CameraFormat, ...] = (
-    metashape, pix4d, odm, opensfm, colmap, micmac, bundler, nvm, blocksexchange, realitycapture,
-    table, unsupported,
-)  # fmt: skip
+FORMATS = (
+    CameraFormat(
+        "Agisoft Metashape, PhotoScan",
+        "cameras or markers XML, `.psx`, `.psz`; omega-phi-kappa text or reference table with"
+        " `--sensor calibration.xml`",
+        metashape,
+    ),
+    CameraFormat("Pix4D", "the `params` folder, the project folder or one of its tables", pix4d),
+    CameraFormat("OpenDroneMap", "the project folder, `reconstruction.json`, `shots.geojson`", odm),
+    CameraFormat("OpenSfM", "`reconstruction.json` or its folder", opensfm),
+    CameraFormat("COLMAP", "the model folder or workspace, text or binary", colmap),
+    CameraFormat("MicMac", "the `Ori-...` folder", micmac),
+    CameraFormat(
+        "Bundler, MVE",
+        "`bundle.out`, `synth_0.out`, with the images or their list beside it",
+        bundler,
+    ),
+    CameraFormat("VisualSFM", "`.nvm`, with the images beside it", nvm),
+    CameraFormat(
+        "ContextCapture, iTwin Capture, DJI Terra",
+        "BlocksExchange XML, plain or zipped",
+        blocksexchange,
+    ),
+    CameraFormat("RealityCapture (XMP)", "the folder of XMP files", realitycapture),
+    CameraFormat(
+        "CSV table",
+        "a table with a header: `label,x,y,z` and, if known, `omega,phi,kappa`, `yaw,pitch,roll`,"
+        " `qw,qx,qy,qz` (world to camera) or `r11..r33`; RealityCapture's internal and external"
+        " parameters, Metashape's and ODM's lists among them",
+        table,
+    ),
+    CameraFormat("a format that pcfix does not read", "", unsupported),
+)
 """In the order in which they are asked: ODM knows more of an OpenSfM file than OpenSfM, and a plain
 table says least of all."""
 
@@ -97,7 +125,7 @@ def read_cameras(
     (40, 3)
     """
     source, form = _recognised(path, sensor, angles)
-    cameras = form.read(source)
+    cameras = form.reader.read(source)
     for note in cameras.notes:
         warnings.warn(note, PcfixWarning, stacklevel=2)
     return cameras
@@ -123,9 +151,9 @@ def read_tie_points(path: str | os.PathLike[str], cameras: Cameras) -> TiePoints
         If the format has no tie points, or the file has none.
     """
     source, form = _recognised(path, None, None)
-    if not isinstance(form, SparseModel):
-        raise InputError(f"{source.path}: the format ({form.SOFTWARE}) has no tie points.")
-    return form.tie_points(source, cameras)
+    if not isinstance(form.reader, SparseReader):
+        raise InputError(f"{source.path}: the format ({form.software}) has no tie points.")
+    return form.reader.tie_points(source, cameras)
 
 
 def _recognised(
@@ -138,7 +166,7 @@ def _recognised(
         angles,
     )
     for form in FORMATS:
-        if form.recognises(source):
+        if form.reader.recognises(source):
             return source, form
     raise InputError(
         f"{where}: is not a camera file that pcfix knows; give a CSV table with the columns"

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
     from pcfix.io.cameras.formats import Source
 
-SOFTWARE = "Bundler"
 _BUNDLER, _MVE = re.compile(r"#\s*Bundle file v(\d+\.\d+)"), re.compile(r"drews 1\.0")
 _VERSION = "0.3"
 _CAMERA_NUMBERS = 15

@@ -1,10 +1,10 @@
-"""What every module of a camera format gets and gives."""
+"""What every module of a camera format gets and gives, and its entry in the table of formats."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, runtime_checkable
 
 from pcfix.io.files import check_input
 
@@ -54,10 +54,12 @@ class Source:
         return frozenset(p.name for p in self.path.iterdir()) if self.path.is_dir() else frozenset()
 
 
-class CameraFormat(Protocol):
-    """A module of this folder."""
+class Reader(Protocol):
+    """A module of this folder.
 
-    SOFTWARE: str
+    What is wrong with a file is an `InputError` with the file, the image or the line, the value,
+    and what to do; no reader raises another error.
+    """
 
     def recognises(self, source: Source) -> bool:
         """Whether the content is of this format; cheap, and never an error."""
@@ -69,9 +71,24 @@ class CameraFormat(Protocol):
 
 
 @runtime_checkable
-class SparseModel(CameraFormat, Protocol):
-    """A format that has tie points too."""
+class SparseReader(Reader, Protocol):
+    """One whose format has tie points too."""
 
     def tie_points(self, source: Source, cameras: Cameras) -> TiePoints:
         """Read points and observations; `cameras` is what `read` gave for the same source."""
         ...
+
+
+class CameraFormat(NamedTuple):
+    """An entry of the table of formats.
+
+    software : str
+        Whose it is, for messages and the documentation.
+    give : str
+        What to give ``--cameras``, for the documentation; empty where it says nothing.
+    reader : Reader
+    """
+
+    software: str
+    give: str
+    reader: Reader

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 
     from pcfix.io.cameras.formats import Source
 
-SOFTWARE = "VisualSFM"
 _HEAD = re.compile(r"NVM_V3(_R9T)?\b(.*)")
 _FIXED = re.compile(r"\s*FixedK\s+(.*)")
 _QUATERNION_NUMBERS, _MATRIX_NUMBERS = 10, 15
@@ -85,7 +84,7 @@ def read(source: Source) -> Cameras:
         lenses=lenses,
         notes=(*notes, *more),
         unposed=tuple(dict.fromkeys(name for name in everything if name not in taken)),
-        source=SOFTWARE,
+        source="VisualSFM",
     )
 
 

@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     from pcfix.io.cameras.formats import Source
     from pcfix.model import FloatArray
 
-SOFTWARE = "RealityCapture (XMP)"
 NAMESPACE = "http://www.capturingreality.com/ns/xcr/"
 DESCRIPTION = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"
 HEAD_BYTES = 65536

@@ -17,8 +17,6 @@ from pcfix.io.tables import number
 if TYPE_CHECKING:
     from pcfix.io.cameras.formats import Source
 
-SOFTWARE = "a format that pcfix does not read"
-
 ANY_CAMERAS = "give the file or folder with the camera poses"
 OMEGA_PHI_KAPPA = (
     "write a table with the header label,x,y,z,omega,phi,kappa and give its lens by --sensor"
@@ -126,7 +124,9 @@ def read(source: Source) -> NoReturn:
         Always; with the name of the format and what to give instead.
     """
     found = _refusal(source)
-    what, remedy = (found.what, found.remedy) if found else (SOFTWARE, ANY_CAMERAS)
+    what, remedy = (
+        (found.what, found.remedy) if found else ("a format that pcfix does not read", ANY_CAMERAS)
+    )
     raise InputError(f"{source.path}: is {what}, which pcfix does not read as cameras; {remedy}.")
 
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.io.cameras.colmap import binary, text
+from pcfix.io.cameras.colmap.files import read_images
 from pcfix.io.labels import match_labels
 from pcfix.io.views.lists import ImageOrder
 from pcfix.lens.imaging import project
@@ -112,12 +112,12 @@ def _model_orders(folder: Path) -> list[tuple[str, list[str]]]:
 
 
 def _orders(model: Path) -> list[tuple[str, list[str]]]:
-    if (model / "images.bin").is_file():
-        images = binary.read_images(model / "images.bin", points=False)
-    elif (model / "images.txt").is_file():
-        images = text.read_images(model / "images.txt", points=False)
-    else:
+    path = model / "images.bin"
+    if not path.is_file():
+        path = model / "images.txt"
+    if not path.is_file():
         return []
+    images = read_images(path, points=False)
     name = {image.identifier: image.name for image in images}
     by_frame = [name[i] for ids in _frames(model) for i in ids if i in name]
     orders = [

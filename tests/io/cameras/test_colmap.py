@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from pcfix import InputError
 from pcfix.io.cameras import colmap
-from pcfix.io.cameras.colmap.models import MODELS, Camera, lens
+from pcfix.io.cameras.colmap.files import MODELS, Camera, lens
 from pcfix.io.cameras.formats import Source
 from pcfix.lens.imaging import project
 from tests.utils.reprojection import check_file, residuals_px, row_of

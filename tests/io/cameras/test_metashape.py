@@ -823,7 +823,7 @@ def test_cameras_of_another_file_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("points0.ply", b"solid", r"point_cloud.zip: points0.ply: is not a binary PLY"),
+        ("points0.ply", b"solid", r"point_cloud.zip: points0.ply: is not a PLY file"),
         ("points0.ply", ply(MARK, []), "points0.ply: has no property z"),
         ("p1.ply", ply(MARK, [(1, 2, 3, 4)])[:-1], "says 1 vertices but is cut off after 0"),
         (
@@ -831,13 +831,13 @@ def test_cameras_of_another_file_are_refused(tmp_path):
             ply(MARK, []).replace(b"vertex 0", b"vertex 9" + b"9" * 30),
             "is cut off after 0",
         ),
-        ("p1.ply", ply(MARK, []).replace(b"vertex 0", b"vertex -1"), "is not understood"),
+        ("p1.ply", ply(MARK, []).replace(b"vertex 0", b"vertex -1"), "header is damaged"),
         (
             "p1.ply",
             ply(MARK, []).replace(b"float size", b"list uchar int size"),
-            "is not understood",
+            "is not a binary PLY of vertices",
         ),
-        ("p1.ply", ply(MARK, []).replace(b"size", b"x"), "or a property twice"),
+        ("p1.ply", ply(MARK, []).replace(b"size", b"x"), "not a binary PLY of vertices"),
         ("p1.ply", ply((*MARK[:3], ("float", "id")), []), "id of p1.ply is not a whole number"),
         ("p1.ply", None, "point_cloud.zip: has no p1.ply"),
     ],

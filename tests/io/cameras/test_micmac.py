@@ -1,9 +1,6 @@
 """MicMac's orientation folders."""
 
-import itertools
-import math
 import shutil
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -83,71 +80,26 @@ def test_sample_is_reproduced_exactly():
 
 
 @li3ds
-def test_sample_with_a_polynomial_keeps_to_what_its_note_says():
-    misses, cameras = verified("Orientation-1.xml")
-    assert "Calib-1.xml" in cameras.notes[0]
-    told = float(cameras.notes[0].split("up to ")[1].split()[0])
-    assert 0.5 < misses.max() < told < 2.0
+@pytest.mark.parametrize(
+    ("name", "calibration", "model"),
+    [
+        ("Orientation-1.xml", "Calib-1.xml", "ModRad after eModelePolyDeg4"),
+        ("", "Calib-1.xml", "ModRad after eModelePolyDeg4"),
+        ("TestOri-2.xml", "TestOri-2.xml", "eModelePolyDeg2"),
+    ],
+)
+def test_samples_with_other_formulas_are_refused(name, calibration, model):
+    with pytest.raises(InputError, match="mm3d ConvertCalib") as error:
+        micmac.read(Source(LI3DS / name))
+    assert f"{calibration}: the calibration has the distortion {model}," in str(error.value)
 
 
 @li3ds
-def test_polynomial_of_the_sample_comes_before_its_radial_model():
-    root = ElementTree.parse(LI3DS / "Orientation-1.xml").getroot()
-    seen = np.array([[float(v) for v in e.text.split()] for e in root.iter("Im")])
-    points = np.array([[float(v) for v in e.text.split()] for e in root.iter("Ter")])
-    cameras = micmac.read(Source(LI3DS / "Orientation-1.xml"))
-    path = LI3DS / "Calib-1.xml"
-    inner = ElementTree.parse(path).getroot().find("CalibrationInternConique")
-    calibration = micmac.calibration.parse(path, inner)
-    rays = (points - cameras.centres[0]) @ cameras.rotations[0].T
-    ideal = calibration.focal * rays[:, :2] / rays[:, 2:] + calibration.principal
-    assert calibration.move(ideal) == pytest.approx(seen, abs=1e-6)
-
-
-@li3ds
-def test_folder_of_the_sample():
-    cameras = micmac.read(Source(LI3DS))
-    assert cameras.labels == ("00", "1")
-    for i, truth in enumerate(check_file(LI3DS)["projection_centres"]):
-        assert cameras.centres[i] == pytest.approx([truth[k] for k in "XYZ"], abs=1e-6)
-        assert cameras.rotations[i][2] == pytest.approx(truth["view_dir"], abs=1e-6)
-        assert -cameras.rotations[i][1] == pytest.approx(truth["up_dir_minus_cam_y"], abs=1e-6)
-    assert cameras.crs is None
-
-
-@li3ds
-def test_fisheye_of_the_sample_is_replaced_within_what_its_note_says(tmp_path):
+def test_fisheye_of_the_sample_is_refused(tmp_path):
     name = "AutoCal_Foc-15000_Cam-Caml023_20161205a.xml"
     shutil.copy(LI3DS / name, tmp_path)
-    cameras = read(tmp_path, orientation(f"<FileInterne>Ori-Calib/{name}</FileInterne>"))
-    told = float(cameras.notes[0].split("up to ")[1].split()[0])
-    root = ElementTree.parse(tmp_path / name).getroot()
-    params = [float(e.text) for e in root.iter("Params")]
-    state = float(root.find(".//Etats").text)
-    focal, (px, py) = float(root.find(".//F").text), map(float, root.find(".//PP").text.split())
-    misses = []
-    for degrees, turn in itertools.product((1, 10, 25, 40, 50), range(0, 360, 15)):
-        tangent = math.tan(math.radians(degrees))
-        ray = np.array([tangent * math.cos(turn), tangent * math.sin(turn), 1.0])
-        expected = fisheye_place(ray, focal, (px, py), params, state)
-        if 0 < expected[0] < 2560 and 0 < expected[1] < 1920:
-            misses.append(math.dist(project(cameras.lenses[0], ray[None])[0], expected))
-    assert len(misses) > 80
-    assert max(misses) < told + 0.05 < 2.0
-
-
-def fisheye_place(ray, focal, principal, params, state):
-    """Linear fisheye of the sample: radial terms, one pair of decentring, two affine ones."""
-    x = (focal * ray[0] / ray[2] + principal[0] - params[0]) / state
-    y = (focal * ray[1] / ray[2] + principal[1] - params[1]) / state
-    r = math.hypot(x, y)
-    x, y = x * math.atan(r) / r, y * math.atan(r) / r
-    r2 = x * x + y * y
-    bent = 1.0 + sum(k * r2 ** (i + 1) for i, k in enumerate(params[2:12]))
-    p, q, l1, l2 = *params[12:14], *params[22:24]
-    out_x = x * bent + p * (r2 + 2 * x * x) + q * 2 * x * y + l1 * x + l2 * y
-    out_y = y * bent + q * (r2 + 2 * y * y) + p * 2 * x * y + l2 * x
-    return params[0] + state * out_x, params[1] + state * out_y
+    with pytest.raises(InputError, match=r"Caml023.*eModele_FishEye_10_5_5.*ConvertCalib"):
+        read(tmp_path, orientation(f"<FileInterne>Ori-Calib/{name}</FileInterne>"))
 
 
 def test_matrix_is_camera_to_world(tmp_path):
@@ -226,122 +178,30 @@ def test_unified_names_of_the_radial_and_standard_models(tmp_path, name):
     assert project(cameras.lenses[0], ray[None])[0] == pytest.approx(expected, abs=1e-8)
 
 
-def second_degree(x, y, p):
-    return (
-        (1 + p[0]) * x + p[1] * y - 2 * p[2] * x * x + p[3] * x * y + p[4] * y * y,
-        (1 - p[0]) * y + p[1] * x + p[2] * x * y - 2 * p[3] * y * y + p[5] * x * x,
-    )
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("eModelePolyDeg2", "eModeleRadFour7x2", "eModeleEbner", "eModeleDCBrown", "eModeleNew"),
+        *("eModele_FishEye_10_5_5", "eModele_EquiSolid_FishEye_10_5_5"),
+    ],
+)
+def test_unified_models_that_no_lens_holds_are_refused(tmp_path, name):
+    with pytest.raises(InputError, match=f"the distortion {name}, which .*mm3d ConvertCalib"):
+        read(tmp_path, embedded(unified(name, [1e-4] * 6, [F, *PP])))
 
 
-def degree_three(x, y, p, _):
-    out_x, out_y = second_degree(x, y, p)
-    cubic = [x**3, x * x * y, x * y * y, y**3]
-    return (
-        out_x + sum(c * t for c, t in zip(p[6:10], cubic, strict=True)),
-        out_y + sum(c * t for c, t in zip(p[10:14], cubic, strict=True)),
-    )
-
-
-def radial_four(x, y, p, _):
-    out_x, out_y = second_degree(x, y, p)
-    dx, dy = x - p[6], y - p[7]
-    r2 = dx * dx + dy * dy
-    bent = p[8] * r2 + p[9] * r2**2 + p[10] * r2**3
-    return out_x + dx * bent, out_y + dy * bent
-
-
-SMALL = [1e-4, -2e-4, 1e-5, 2e-5, 3e-4, -2e-4]
+def test_no_distortion_by_its_unified_name(tmp_path):
+    lens = read(tmp_path, embedded(unified("eModelePolyDeg0", [], []), RADIAL)).lenses[0]
+    assert lens == read(tmp_path, embedded(RADIAL)).lenses[0]
 
 
 @pytest.mark.parametrize(
-    ("name", "params", "formula"),
-    [
-        ("eModelePolyDeg2", SMALL, lambda x, y, p, _: second_degree(x, y, p)),
-        (
-            "eModelePolyDeg3",
-            [*SMALL, 0.02, 1e-5, 0.02, 2e-5, 1e-5, 0.02, -1e-5, 0.02],
-            degree_three,
-        ),
-        ("eModeleRadFour7x2", [*SMALL, 1e-5, -2e-5, 0.05, -0.02, 0.01], radial_four),
-    ],
+    ("affinity", "convention"),
+    [("<b1>2e-2</b1><b2>0</b2>", "eConvApero_DistM2C"), ("<b1>1e-5</b1>", "eConvApero_DistC2M")],
 )
-def test_unified_models_are_met_by_the_nearest_lens(tmp_path, name, params, formula):
-    cameras = read(tmp_path, embedded(unified(name, params, [F, *PP])))
-    assert cameras.notes == ()
-    for ray in RAYS:
-        x, y = formula(ray[0], ray[1], params, F)
-        expected = (PP[0] + F * x, PP[1] + F * y)
-        assert project(cameras.lenses[0], ray[None])[0] == pytest.approx(expected, abs=0.5)
-
-
-def moved(model, place):
-    element = ElementTree.fromstring(f"<I>{interior(model)}</I>")
-    return micmac.calibration.parse(Path("file.xml"), element).move(np.array([place], dtype=float))[
-        0
-    ]
-
-
-def test_ebner(tmp_path):
-    p = [1e-4, 2e-4, 1e-8, 2e-8, 3e-8, 4e-8, 1e-11, 2e-11, 3e-11, 4e-11, 1e-15, 2e-15]
-    x, y, b = 2500.0, 800.0, 1000.0
-    x2, y2 = x * x - b * b * 2 / 3, y * y - b * b * 2 / 3
-    out_x = (1 + p[0]) * x + p[1] * y - 2 * p[2] * x2 + p[3] * x * y + p[4] * y2
-    out_x += p[6] * x * y2 + p[8] * y * x2 + p[10] * x2 * y2
-    out_y = (1 - p[0]) * y + p[1] * x + p[2] * x * y - 2 * p[3] * y2 + p[5] * x2
-    out_y += p[7] * y * x2 + p[9] * x * y2 + p[11] * x2 * y2
-    assert moved(unified("eModeleEbner", p, [b]), (x, y)) == pytest.approx((out_x, out_y))
-
-
-def test_brown_of_fourteen_terms(tmp_path):
-    p = [1e-4, 2e-4, 1e-8, 2e-8, 3e-12, 4e-12, 1e-15, 2e-8, 3e-8, 4e-12, 1e-12, 2e-15, 1e-12, 1e-9]
-    x, y = 2500.0, 800.0
-    both = p[12] * x * x * y * y / F + p[13] * (x * x + y * y)
-    out_x = (1 + p[0]) * x + p[1] * y + p[2] * x * y + p[3] * y * y + p[4] * x * x * y
-    out_x += p[5] * x * y * y + p[6] * x * x * y * y + x * both
-    out_y = y + p[7] * x * y + p[8] * x * x + p[9] * x * x * y + p[10] * x * y * y
-    out_y += p[11] * x * x * y * y + y * both
-    assert moved(unified("eModeleDCBrown", p, [F]), (x, y)) == pytest.approx((out_x, out_y))
-
-
-@pytest.mark.parametrize(
-    ("name", "radius"),
-    [
-        ("eModele_FishEye_10_5_5", lambda t: t),
-        ("eModele_EquiSolid_FishEye_10_5_5", lambda t: 2 * math.sin(t / 2)),
-        ("eModele_Stereographik_FishEye_10_5_5", lambda t: 2 * math.tan(t / 2)),
-    ],
-)
-@pytest.mark.parametrize("state", [900.0, 1000.0])
-def test_fisheyes(tmp_path, name, radius, state):
-    text = embedded(unified(name, [*PP, 0.01, -0.005], [state])).replace(f"<F>{F}", "<F>1000")
-    lens = read(tmp_path, text).lenses[0]
-    for degrees in (0.5, 20, 40, 55):
-        inside = math.atan(1000.0 / state * math.tan(math.radians(degrees)))
-        r = radius(inside)
-        r = state * r * (1 + 0.01 * r * r - 0.005 * r**4)
-        ray = [0.8 * math.sin(math.radians(degrees)), 0.6 * math.sin(math.radians(degrees))]
-        place = project(lens, np.array([[*ray, math.cos(math.radians(degrees))]]))[0]
-        assert place == pytest.approx([PP[0] + 0.8 * r, PP[1] + 0.6 * r], abs=0.1)
-
-
-def test_polynomial_degrees_of_the_fisheye():
-    """Terms above the second degree skip what radial and decentring terms span already."""
-    params = [0.0] * 50
-    params[24:31] = [1, 2, 3, 4, 5, 6, 7]  # y of x^3; x, y of x^2 y; x y^2; y^3
-    params[31:39] = [11, 12, 13, 14, 15, 16, 17, 18]
-    params[39:50] = [21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31]
-    x, y = 0.03, -0.02
-    r = math.hypot(x, y)
-    place = (np.array([x, y]) * math.tan(r) / r)[None]
-    found = micmac.distortion.fisheye(place, params, [1.0], "linear")[0]
-    more_x = 2 * x * x * y + 4 * x * y * y + 6 * y**3
-    more_y = 1 * x**3 + 3 * x * x * y + 5 * x * y * y + 7 * y**3
-    more_x += 12 * x**3 * y + 14 * x * x * y * y + 16 * x * y**3 + 18 * y**4
-    more_y += 11 * x**4 + 13 * x**3 * y + 15 * x * x * y * y + 17 * x * y**3
-    more_x += 22 * x**4 * y + 24 * x**3 * y**2 + 26 * x**2 * y**3 + 28 * x * y**4 + 30 * y**5
-    more_y += 21 * x**5 + 23 * x**4 * y + 25 * x**3 * y**2 + 27 * x**2 * y**3 + 29 * x * y**4
-    more_y += 31 * y**5
-    assert found == pytest.approx([x + more_x, y + more_y])
+def test_an_affinity_that_a_lens_does_not_hold_is_refused(tmp_path, affinity, convention):
+    with pytest.raises(InputError, match=r"ModPhgrStd with an affinity .*ConvertCalib"):
+        read(tmp_path, embedded(STANDARD.format(affinity), convention=convention))
 
 
 def test_scaled_image(tmp_path):
@@ -421,15 +281,9 @@ MATRIX = POSE[POSE.index("<ParamRotation>") :]
         (embedded().replace(f"<F>{F}", "<F>0"), "focal length F is 0"),
         (embedded().replace("<SzIm>4000", "<SzIm>0"), "frame 0 x 3000 must be positive"),
         (embedded().replace("<SzIm>4000 3000</SzIm>", ""), "SzIm: has 0 numbers"),
-        (embedded(RADIAL, RADIAL, convention="eConvApero_DistC2M"), "several distortions"),
-        (embedded("<ModGridDef/>"), "the distortion model ModGridDef is not read"),
-        (embedded(unified("eModeleNew", [], [])), "'eModeleNew' is none that pcfix knows"),
-        (embedded(unified("eModelePolyDeg2", [1e-3] * 8, [F, *PP])), "has 8 Params instead of 6"),
-        (embedded(unified("eModelePolyDeg2", [1e-3] * 6, [F])), "needs 3 Etats"),
-        (
-            embedded(unified("eModelePolyDeg2", [9e9] * 6, [F, *PP])),
-            "nearly nothing into the frame",
-        ),
+        (embedded(RADIAL, RADIAL), "ModRad after ModRad, which pcfix does not model"),
+        (embedded("<ModGridDef/>"), "the distortion ModGridDef, which .*mm3d ConvertCalib"),
+        (embedded(unified("eModele_DRad_PPaEqPPs", [1e-9] * 10, [])), "10 Params instead of 9"),
         (embedded(RADIAL.replace("2e-8", "1e308")), "not finite"),
         (
             embedded()

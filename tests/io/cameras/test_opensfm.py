@@ -295,7 +295,7 @@ def test_tracks_of_every_version(tmp_path, header, tail):
 
 
 def test_tracks_longer_than_a_block(tmp_path, monkeypatch):
-    monkeypatch.setattr(opensfm.tracks, "CHUNK_BYTES", 7)
+    monkeypatch.setattr(opensfm, "CHUNK_BYTES", 7)
     lines = [f"a.jpg\t{i}\t0\t{i / 100}\t0\t1\t2\t3" for i in range(20)]
     (tmp_path / "tracks.csv").write_text("\n".join(lines))
     points = {str(i): {"coordinates": [i, 0, 0]} for i in range(20)}

@@ -8,7 +8,7 @@ from pyproj import CRS
 
 from pcfix.errors import InputError, SettingError
 from pcfix.io.cameras import read_cameras
-from pcfix.io.cameras.table.writing import write_table
+from pcfix.io.cameras.table.sensor import write_table
 from pcfix.lens.imaging import project
 from pcfix.model import Lens
 from tests.utils.blocks import PLAIN, small_block

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import zipfile
 import zlib
+from pathlib import PureWindowsPath
 from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.xml import read_xml
+from pcfix.io.cameras.tracks import tie_points
+from pcfix.io.cameras.xml import number, read_xml
+from pcfix.model import Lens
 
 if TYPE_CHECKING:
     from pathlib import Path
     from xml.etree.ElementTree import Element
 
     from pcfix.io.cameras.formats import Source
+    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, TiePoints
+
 
 COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
 TIE_POINTS = re.compile(rb"<TiePoints>(.*?)</TiePoints>", re.DOTALL)
@@ -125,3 +133,283 @@ class ReferenceSystems:
 
 def _text(element: Element, name: str) -> str:
     return (element.findtext(name) or "").strip()
+
+
+FIRST_PIXEL = 0.5
+"""The centre of the first pixel, seen from its corner."""
+DIRECTIONS = {"Right": (1, 0), "Left": (-1, 0), "Down": (0, 1), "Up": (0, -1)}
+ORIENTATIONS = {
+    f"X{x}Y{y}": np.array([(*DIRECTIONS[x], 0.0), (*DIRECTIONS[y], 0.0)])
+    for x in DIRECTIONS
+    for y in DIRECTIONS
+    if (x in ("Right", "Left")) != (y in ("Right", "Left"))
+}
+
+
+class Photogroup:
+    """What the photos of a group share; its numbers are read with messages that name the group."""
+
+    def __init__(self, path: Path, element: Element) -> None:
+        self.path = path
+        self.element = element
+        self.name = (element.findtext("Name") or "without a name").strip()
+
+    def number(self, name: str) -> float | None:
+        """Return the number of an element, or None where the group has no such element."""
+        text = self.element.findtext(name)
+        if text is None or not text.strip():
+            return None
+        return number(self.path, f"photogroup {self.name}, {name}", text)
+
+    def numbers(self, parent: str, names: tuple[str, ...]) -> list[float]:
+        """Return numbers below an element, 0 for those that are not there."""
+        return [self.number(f"{parent}/{name}") or 0.0 for name in names]
+
+    def axes(self) -> FloatArray:
+        """Return the matrix from camera axes to x right, y down, z forward."""
+        name = (self.element.findtext("CameraOrientation") or "XRightYDown").strip()
+        if name not in ORIENTATIONS:
+            raise InputError(
+                f"{self.path}: photogroup {self.name}: the camera orientation '{name}' is not one"
+                f" of {', '.join(ORIENTATIONS)}."
+            )
+        x, y = ORIENTATIONS[name]
+        return np.column_stack([x, y, np.cross(x, y)])
+
+    def pixel_size_mm(self) -> float | None:
+        """Return the size of a pixel where the group tells it."""
+        pixel, sensor = self.number("PixelSize"), self.number("SensorSize")
+        if pixel is not None:
+            return pixel if pixel > 0.0 else None
+        largest = max(self.size())
+        return sensor / largest if sensor is not None and sensor > 0.0 < largest else None
+
+    def size(self) -> list[float]:
+        """Return width and height in pixels, 0 where they are not there."""
+        return self.numbers("ImageDimensions", ("Width", "Height"))
+
+    def lens(self) -> Lens | None:
+        """Return the lens, or None where the group lacks frame or focal length.
+
+        Raises
+        ------
+        InputError
+            If it is of a kind that is not known.
+        """
+        kind = (self.element.findtext("CameraModelType") or "Perspective").strip()
+        if kind not in ("Perspective", "Fisheye"):
+            raise InputError(
+                f"{self.path}: photogroup {self.name}: the camera model {kind} is not supported;"
+                " export Perspective or Fisheye photos."
+            )
+        self._refuse_other_distortions()
+        has_matrix = kind == "Fisheye" and self.element.find("FisheyeFocalMatrix") is not None
+        focal = self._focal_px()
+        if not min(self.size()) > 0.0 or (focal is None and not has_matrix):
+            return None
+        lens = self._perspective(focal or 0.0) if kind == "Perspective" else self._fisheye(focal)
+        return checks.lens(self.path, f"of photogroup {self.name}", lens)
+
+    def _refuse_other_distortions(self) -> None:
+        for child in self.element:
+            tag = str(child.tag)
+            if "Distortion" in tag and tag not in ("Distortion", "FisheyeDistortion"):
+                raise InputError(
+                    f"{self.path}: photogroup {self.name}: the distortion {tag} is not supported;"
+                    " export BlocksExchange 3.2 or older, or undistorted photos."
+                )
+
+    def _focal_px(self) -> float | None:
+        focal_px, focal_mm = self.number("FocalLengthPixels"), self.number("FocalLength")
+        pixel = self.pixel_size_mm()
+        if focal_px is None and focal_mm is not None and pixel is not None:
+            return focal_mm / pixel
+        return focal_px
+
+    def principal_point(self) -> tuple[float, float]:
+        """Return the principal point in pixels from the corner; the centre where none is given."""
+        x, y = self.number("PrincipalPoint/x"), self.number("PrincipalPoint/y")
+        if x is not None and y is not None:
+            return x + FIRST_PIXEL, y + FIRST_PIXEL
+        pixel = self.pixel_size_mm()
+        offset = np.zeros(2)
+        if pixel is not None:
+            mm = np.array(self.numbers("PrincipalPoint", ("xmm", "ymm")))
+            offset = self.axes()[:2, :2] @ mm / pixel
+        u, v = np.array(self.size()) / 2.0 + offset
+        return float(u), float(v)
+
+    def _perspective(self, focal: float) -> Lens:
+        aspect = self.number("AspectRatio")
+        down = focal if aspect is None else focal * aspect
+        width, height = self.size()
+        u, v = self.principal_point()
+        return Lens(
+            focal=down,
+            width=width,
+            height=height,
+            principal_x=u,
+            principal_y=v,
+            b1=focal - down,
+            b2=self.number("Skew") or 0.0,
+            radial=tuple(self.numbers("Distortion", ("K1", "K2", "K3"))),
+            tangential=tuple(self.numbers("Distortion", ("P1", "P2"))),
+            pixel_size_mm=self.pixel_size_mm(),
+            sensor=self.name,
+        )
+
+    def _fisheye(self, focal: float | None) -> Lens:
+        m00, m01, m10, m11 = self.numbers("FisheyeFocalMatrix", ("M_00", "M_01", "M_10", "M_11"))
+        if self.element.find("FisheyeFocalMatrix") is None and focal is not None:
+            m00 = m11 = math.pi / 2.0 * focal
+        shape = [0.0, 1.0, 0.0, 0.0, 0.0]
+        if self.element.find("FisheyeDistortion") is not None:
+            shape = self.numbers("FisheyeDistortion", ("P0", "P1", "P2", "P3", "P4"))
+        width, height = self.size()
+        u, v = self.principal_point()
+        return Lens(
+            focal=m11,
+            width=width,
+            height=height,
+            principal_x=u,
+            principal_y=v,
+            b1=m00 - m11,
+            b2=m01,
+            b3=m10,
+            projection="polynomial",
+            shape=tuple(shape),
+            pixel_size_mm=self.pixel_size_mm(),
+            sensor=self.name,
+        )
+
+
+class Rows(NamedTuple):
+    """For the tie points: row and group of each photo by block and id, and ids of the SRS."""
+
+    of: dict[tuple[int, str], int]
+    groups: dict[tuple[int, str], Photogroup]
+    srs: str
+    srs_of_blocks: list[str]
+
+
+BEGINS = ("TiePoint", "Position", "Measurement")
+NAMES = (*BEGINS, "x", "y", "z", "xmm", "ymm", "PhotoId", "SRSId")
+CODES = {name: code for code, name in enumerate(NAMES)}
+TOKEN = re.compile(f"<({'|'.join(NAMES)})>\\s*([^<]*)")
+EXTERNAL = re.compile(rb"<Path>\s*([^<]*?)\s*</Path>")
+
+
+class Tokens:
+    """The tags of a text that count, with the number of the point and measurement each is in."""
+
+    def __init__(self, path: Path, text: str) -> None:
+        self.path = path
+        found = TOKEN.findall(text)
+        self.texts = [word for _, word in found]
+        self.code = np.array([CODES[name] for name, _ in found], dtype=np.int8)
+        self.point = np.cumsum(self.code == CODES["TiePoint"]) - 1
+        self.measurement = np.cumsum(self.code == CODES["Measurement"]) - 1
+        begun = np.where(self.code < len(BEGINS), np.arange(len(self.code)), 0)
+        self.inside = self.code[np.maximum.accumulate(begun)] if len(begun) else self.code
+
+    def rows(self, name: str, within: str) -> IntArray:
+        """Return the rows of a tag inside the latest element of a name."""
+        return np.flatnonzero((self.code == CODES[name]) & (self.inside == CODES[within]))
+
+    def numbers(self, names: tuple[str, ...], within: str) -> FloatArray:
+        """Return one row per point (within Position) or measurement; NaN where there is none."""
+        number = self.point if within == "Position" else self.measurement
+        values = np.full((int(number[-1]) + 1 if len(number) else 0, len(names)), np.nan)
+        for column, name in enumerate(names):
+            rows = self.rows(name, within)
+            try:
+                values[number[rows], column] = np.array([self.texts[row] for row in rows], float)
+            except ValueError as error:
+                raise InputError(
+                    f"{self.path}: {name} of a tie point: {error}; the file is damaged, export it"
+                    " again."
+                ) from error
+        return values
+
+    def owned(self, name: str, number: IntArray, count: int) -> list[str]:
+        """Return the text of a tag in each point or measurement, empty where there is none."""
+        texts = [""] * count
+        for row in np.flatnonzero((self.code == CODES[name]) & (number >= 0)):
+            texts[number[row]] = self.texts[row].strip()
+        return texts
+
+
+def read_ties(path: Path, texts: list[TieText], cameras: Cameras, rows: Rows) -> TiePoints:
+    """Read all tie points that a posed photo saw."""
+    xyz, point, camera, uv = [np.empty((0, 3))], [], [], [np.empty((0, 2))]
+    for block, text in texts:
+        where, inside = _inside(path, text)
+        tokens = Tokens(where, inside)
+        positions = _positions(tokens, rows.srs_of_blocks[block], rows.srs)
+        if len(positions):
+            point.append(len(np.concatenate(xyz)) + _point_of_measurement(tokens))
+            xyz.append(positions)
+            ids = tokens.owned("PhotoId", tokens.measurement, len(point[-1]))
+            camera.append(np.array([rows.of.get((block, name), -1) for name in ids], np.int64))
+            uv.append(_places(tokens, camera[-1], [rows.groups.get((block, n)) for n in ids], ids))
+    cameras_of_all = np.concatenate([np.empty(0, np.int64), *camera])
+    if not (cameras_of_all >= 0).any():
+        raise InputError(f"{path}: has no tie points that one of its {len(cameras)} photos saw.")
+    points = np.concatenate(point)
+    seen, points[cameras_of_all >= 0] = np.unique(points[cameras_of_all >= 0], return_inverse=True)
+    return tie_points(np.concatenate(xyz)[seen], points, cameras_of_all, np.concatenate(uv))
+
+
+def _inside(path: Path, text: bytes) -> tuple[Path, str]:
+    """Return the text itself, or that of the file beside the document that it names."""
+    other = EXTERNAL.search(text)
+    if other is None:
+        return path, text.decode(errors="replace")
+    plain = other[1].decode(errors="replace").replace("\\", "/")
+    for place in (path.parent / plain, path.parent / PureWindowsPath(plain).name):
+        if place.is_file():
+            data = read_bytes(place)
+            if not data.rstrip().endswith((b"</TiePoint>", b"</TiePoints>")):
+                raise InputError(f"{place}: is cut off; export it again.")
+            return place, data.decode(errors="replace")
+    raise InputError(f"{path}: its tie points are in {plain}, which is not beside it.")
+
+
+def _point_of_measurement(tokens: Tokens) -> IntArray:
+    return np.asarray(tokens.point[tokens.code == CODES["Measurement"]])
+
+
+def _positions(tokens: Tokens, srs_of_block: str, srs: str) -> FloatArray:
+    """Return the points, NaN without a position or with one in another reference system."""
+    xyz = tokens.numbers(("x", "y", "z"), "Position")
+    before = (tokens.code == CODES["SRSId"]) & (tokens.point < 0)
+    default = next((tokens.texts[row].strip() for row in np.flatnonzero(before)), srs_of_block)
+    own = tokens.owned("SRSId", tokens.point, len(xyz))
+    other = np.array([(name or default) != srs for name in own], dtype=bool)
+    xyz[other] = np.nan
+    return xyz
+
+
+def _places(
+    tokens: Tokens, camera: IntArray, groups: list[Photogroup | None], ids: list[str]
+) -> FloatArray:
+    """Return u, v in pixels from the corner, of places in pixels or in mm."""
+    uv = tokens.numbers(("x", "y"), "Measurement") + FIRST_PIXEL
+    missing: BoolArray = ~np.isfinite(uv).all(axis=1) & (camera >= 0)
+    if missing.any():
+        mm = tokens.numbers(("xmm", "ymm"), "Measurement")
+        for row in np.flatnonzero(missing):
+            uv[row] = _from_mm(mm[row], groups[row])
+            if not np.isfinite(uv[row]).all():
+                raise InputError(
+                    f"{tokens.path}: photo {ids[row]}: a measurement of a tie point has no x and"
+                    " y, or is in mm and the photogroup has no pixel size."
+                )
+    return uv
+
+
+def _from_mm(mm: FloatArray, group: Photogroup | None) -> FloatArray:
+    pixel = None if group is None else group.pixel_size_mm()
+    if group is None or pixel is None:
+        return np.full(2, np.nan)
+    return np.asarray(group.principal_point() + group.axes()[:2, :2] @ mm / pixel)

@@ -18,30 +18,29 @@ has, -1 for none; ``points3D`` lists the same as tracks.
 
 from __future__ import annotations
 
+import json
 import re
-from contextlib import suppress
-from typing import TYPE_CHECKING, NamedTuple
+import sqlite3
+from contextlib import closing, suppress
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.colmap import binary, text
-from pcfix.io.cameras.colmap.models import lens
-from pcfix.io.cameras.colmap.place import read_place
-from pcfix.io.cameras.colmap.priors import read_priors
-from pcfix.model import Cameras, Lens, TiePoints
+from pcfix.io.cameras.colmap.files import lens, read_cameras, read_images, read_points
+from pcfix.io.files import read_json
+from pcfix.model import Cameras, GnssPositions, Lens, TiePoints
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
-    from types import ModuleType
 
-    from pcfix.io.cameras.colmap.models import Camera
-    from pcfix.io.cameras.colmap.parts import Image
+    from pcfix.io.cameras.colmap.files import Camera, Image
     from pcfix.io.cameras.formats import Source
-    from pcfix.model import IntArray
+    from pcfix.model import FloatArray, IntArray
 
-SOFTWARE = "COLMAP"
+
 _PART = re.compile(r"(cameras|images|points3D|rigs|frames)\.(bin|txt)")
 _CAMERA_LINE = re.compile(r"^\s*\d+\s+[A-Z][A-Z_0-9]+(\s+\S+){2}", re.MULTILINE)
 
@@ -52,11 +51,6 @@ class Model(NamedTuple):
     folder: Path
     suffix: str
     others: int = 0
-
-    @property
-    def form(self) -> ModuleType:
-        """The module that reads it."""
-        return binary if self.suffix == "bin" else text
 
     def part(self, name: str) -> Path:
         """Return the path of one of its files."""
@@ -73,8 +67,8 @@ def recognises(source: Source) -> bool:
 def read(source: Source) -> Cameras:
     """Read the poses of registered images and their lenses."""
     model = _model(source)
-    cameras = model.form.read_cameras(model.part("cameras"))
-    images: list[Image] = model.form.read_images(model.part("images"), points=False)
+    cameras = read_cameras(model.part("cameras"))
+    images: list[Image] = read_images(model.part("images"), points=False)
     posed = [image for image in images if image.posed]
     path = model.part("images")
     if not posed:
@@ -96,7 +90,7 @@ def read(source: Source) -> Cameras:
         notes=(*_others(model), *notes),
         gnss=gnss,
         unposed=tuple(image.name for image in images if not image.posed),
-        source=SOFTWARE,
+        source="COLMAP",
     )
 
 
@@ -106,8 +100,8 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     path = model.part("points3D")
     if not path.is_file():
         raise InputError(f"{path}: there is no such file, so there are no tie points.")
-    points = model.form.read_points(path)
-    images = [i for i in model.form.read_images(model.part("images"), points=True) if i.posed]
+    points = read_points(path)
+    images = [i for i in read_images(model.part("images"), points=True) if i.posed]
     if not len(points.identifiers) or not any(len(image.points) for image in images):
         raise InputError(f"{path}: the model has no points that its images saw; no tie points.")
     seen = np.concatenate([image.points for image in images])
@@ -187,3 +181,122 @@ def _in_folder(folder: Path, suffix: str) -> Model | None:
             if not _CAMERA_LINE.search(stream.read(4096)):
                 return None
     return model
+
+
+FILE = "georeference.json"
+WRITER = "pcfix"
+
+
+class Place(NamedTuple):
+    """What is added to the positions of a model, shape (3,), metres, and the CRS they then have."""
+
+    offset_m: FloatArray
+    crs: str | None
+
+
+def read_place(folder: Path) -> Place | None:
+    """Return what the file beside a model says; None where there is none by pcfix.
+
+    Raises
+    ------
+    InputError
+        If it is damaged.
+    """
+    path = folder / FILE
+    if not path.is_file():
+        return None
+    try:
+        found = read_json(path)
+        if not isinstance(found, dict) or found.get("written_by") != WRITER:
+            return None
+        offset = np.array(found["offset_m"], np.float64)
+        crs = found["crs"]
+    except (OSError, ValueError, TypeError, LookupError) as error:
+        raise InputError(f"{path}: is damaged ({error}); write the model again.") from error
+    if offset.shape != (3,) or not np.isfinite(offset).all() or not isinstance(crs, str | None):
+        raise InputError(
+            f"{path}: needs offset_m, three numbers, and crs, a text or null; write the model"
+            " again."
+        )
+    return Place(offset, _checked(path, crs))
+
+
+def _checked(path: Path, crs: str | None) -> str | None:
+    return crs if crs is None or crs.upper().startswith("ENU:") else checks.crs(path, crs)
+
+
+def place_text(offset_m: FloatArray, crs: str | None) -> str:
+    """Return the content of the file."""
+    place = {"crs": crs, "offset_m": [float(value) for value in offset_m], "written_by": WRITER}
+    return json.dumps(place, indent=2) + "\n"
+
+
+_DATABASE = "database.db"
+_FOLDERS_ABOVE = 3
+_WGS84 = 0
+_WGS84_CRS = "EPSG:4979"
+
+_Row: TypeAlias = tuple[str, bytes, bytes | None, int]
+
+
+def read_priors(model: Path, labels: Sequence[str]) -> tuple[GnssPositions | None, tuple[str, ...]]:
+    """Return the priors of images by their names, from the database beside or above a model.
+
+    Parameters
+    ----------
+    model : Path
+        The folder of the model.
+    labels : sequence of str, length k
+
+    Returns
+    -------
+    GnssPositions or None
+        None where there is no database, or no prior of these images in it.
+    tuple of str
+        What to tell the user: that a database cannot be read.
+    """
+    places = (model, *model.resolve().parents[:_FOLDERS_ABOVE])
+    path = next((p / _DATABASE for p in places if (p / _DATABASE).is_file()), None)
+    if path is None:
+        return None, ()
+    try:
+        rows = _rows(path)
+    except sqlite3.Error as error:
+        return None, (f"{path}: the pose priors cannot be read ({error}); they are left out.",)
+    row_of = {label: i for i, label in enumerate(labels)}
+    found = [(row_of[row[0]], row) for row in rows if row[0] in row_of]
+    if len({row[-1] for _, row in found}) > 1:
+        return None, (f"{path}: the pose priors are in several systems; they are left out.",)
+    return _positions(found, len(labels)), ()
+
+
+def _rows(path: Path) -> list[_Row]:
+    """Return name, position, covariance and coordinate system; nothing is written or locked."""
+    whole = not path.with_name(path.name + "-wal").exists()
+    uri = path.resolve().as_uri() + ("?immutable=1" if whole else "?mode=ro")
+    with closing(sqlite3.connect(uri, uri=True, timeout=1.0)) as database:
+        columns = {row[1] for row in database.execute("PRAGMA table_info(pose_priors)")}
+        if not columns:
+            return []
+        image = "corr_data_id" if "corr_data_id" in columns else "image_id"
+        camera = "corr_sensor_type = 0" if "corr_sensor_type" in columns else "1"
+        return database.execute(
+            "SELECT images.name, position, position_covariance, coordinate_system"
+            f" FROM pose_priors JOIN images ON images.image_id = pose_priors.{image}"
+            f" WHERE {camera} AND typeof(position) = 'blob' AND length(position) = 24"
+            " AND typeof(images.name) = 'text'"
+        ).fetchall()
+
+
+def _positions(found: Sequence[tuple[int, _Row]], count: int) -> GnssPositions | None:
+    xyz, sigma = np.full((2, count, 3), np.nan)
+    for row, (_, position, covariance, _) in found:
+        xyz[row] = np.frombuffer(position, "<f8")
+        if isinstance(covariance, bytes) and len(covariance) == 9 * 8:
+            variances = np.frombuffer(covariance, "<f8").reshape(3, 3).diagonal()
+            sigma[row] = np.sqrt(np.where(variances >= 0.0, variances, np.nan))
+    xyz[~np.isfinite(xyz).all(axis=1)] = np.nan
+    if np.isnan(xyz).all():
+        return None
+    wgs84 = found[0][1][-1] == _WGS84
+    return GnssPositions(xyz[:, [1, 0, 2]] if wgs84 else xyz, sigma, _WGS84_CRS if wgs84 else None)

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError, SettingError
-from pcfix.io.cameras.colmap.models import BY_NAME, MODELS, Camera, lens
-from pcfix.io.cameras.colmap.place import FILE, place_text
+from pcfix.io.cameras.colmap import FILE, place_text
+from pcfix.io.cameras.colmap.files import BY_NAME, MODELS, Camera, lens
 from pcfix.io.cameras.same_lens import is_same_lens
 from pcfix.io.files import check_output, write_bytes
 

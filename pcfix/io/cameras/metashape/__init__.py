@@ -21,21 +21,31 @@ References: "Agisoft Metashape User Manual, Professional Edition", appendix "Cam
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
-from pcfix.io.cameras.metashape import documents, ties
+import numpy as np
+
+from pcfix.errors import InputError
+from pcfix.io.cameras.metashape import documents
 from pcfix.io.cameras.metashape.block import read_block
-from pcfix.io.cameras.metashape.calibration import read_calibration
-from pcfix.io.cameras.metashape.positions import gnss_positions
-from pcfix.model import Cameras
+from pcfix.io.cameras.metashape.documents import opened
+from pcfix.io.cameras.metashape.sensors import read_calibration
+from pcfix.io.cameras.xml import number, numbers
+from pcfix.io.crs import is_local, parse_crs
+from pcfix.io.ply import parse_header
+from pcfix.model import Cameras, GnssPositions, TiePoints, Views
 
 if TYPE_CHECKING:
+    from pathlib import Path
+    from xml.etree.ElementTree import Element
+
     from pcfix.io.cameras.formats import Source
-    from pcfix.model import TiePoints
+    from pcfix.io.cameras.metashape.block import Block, Image
+    from pcfix.io.cameras.metashape.documents import Archive, Chunk, Document
+    from pcfix.model import FloatArray, IntArray
 
-__all__ = ["SOFTWARE", "read", "read_calibration", "recognises", "tie_points"]
 
-SOFTWARE = "Agisoft Metashape"
+__all__ = ["read", "read_calibration", "recognises", "tie_points"]
 
 
 def recognises(source: Source) -> bool:
@@ -99,4 +109,263 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
         If there is nothing that two images saw, or a document is damaged.
     """
     chunk = documents.open_chunk(source.path)
-    return ties.read(chunk, read_block(chunk), len(cameras))
+    return read_ties(chunk, read_block(chunk), len(cameras))
+
+
+Spreads: TypeAlias = tuple[tuple[str, tuple[int, ...]], ...]
+"""Names of statements and the axes that they speak of."""
+
+SPREADS: Spreads = (
+    *(("sxyz", (0, 1, 2)), ("sxy", (0, 1))),
+    *(("sx", (0,)), ("sy", (1,)), ("sz", (2,))),
+)
+DEFAULTS: Spreads = (
+    ("accuracy_cameras", (0, 1, 2)),
+    ("accuracy_cameras_xy", (0, 1)),
+    ("accuracy_cameras_z", (2,)),
+)
+LOCAL = "LOCAL"
+
+
+def gnss_positions(chunk: Chunk, block: Block) -> tuple[GnssPositions | None, tuple[str, ...]]:
+    """Return the reference positions of the images of a block, and notes on them.
+
+    Positions that the user unticked are no measurement and left out, unless all are, as is usual
+    when control points alone hold the block.
+    """
+    path = chunk.path
+    given = [image.element.find("reference") for image in block.images]
+    ticked = [None if r is None or r.get("enabled") == "false" else r for r in given]
+    used = given if all(reference is None for reference in ticked) else ticked
+    xyz = np.array([_xyz(path, i, r) for i, r in zip(block.images, used, strict=True)])
+    if not np.isfinite(xyz[:, :2]).all(axis=1).any():
+        return None, ()
+    start = _defaults(path, chunk.element)
+    rows = [_sigma(path, i, r, start) for i, r in zip(block.images, used, strict=True)]
+    sigma = np.where(np.isfinite(xyz), np.array(rows), np.nan)
+    crs, notes = _crs(path, chunk.element, xyz)
+    return GnssPositions(xyz, sigma, crs), (*notes, *_antenna_notes(path, block))
+
+
+def _xyz(path: Path, image: Image, reference: Element | None) -> list[float]:
+    if reference is None:
+        return [np.nan] * 3
+    where = f"image {image.label}, reference"
+    words = (reference.get(axis) for axis in "xyz")
+    return [np.nan if word is None else number(path, where, word) for word in words]
+
+
+def _sigma(path: Path, image: Image, reference: Element | None, start: FloatArray) -> FloatArray:
+    """Return the stated standard deviations, from the widest statement to the narrowest."""
+    stated = {} if reference is None else reference.attrib
+    sigma = _stated(path, f"image {image.label}, reference", stated, SPREADS, start)
+    return np.where(sigma > 0.0, sigma, np.nan)
+
+
+def _defaults(path: Path, chunk: Element) -> FloatArray:
+    """Return what the settings of the chunk state for every camera."""
+    settings = {
+        (entry.get("name") or "").replace("/", "_"): entry.get("value") or ""
+        for entry in chunk.iterfind("settings/property")
+    }
+    return _stated(path, "settings of the chunk", settings, DEFAULTS, np.full(3, np.nan))
+
+
+def _stated(
+    path: Path, where: str, given: dict[str, str], spreads: Spreads, start: FloatArray
+) -> FloatArray:
+    """Return `start` with what is given: one number for its axes, or one for each."""
+    sigma = start.copy()
+    for name, axes in spreads:
+        if text := given.get(name):
+            count = 1 if len(text.split()) == 1 else len(axes)
+            sigma[list(axes)] = numbers(path, f"{where}, {name}", text, count)
+    return sigma
+
+
+def _crs(path: Path, chunk: Element, xyz: FloatArray) -> tuple[str, tuple[str, ...]]:
+    """Return the CRS of the positions; that of the cameras may differ from that of the chunk."""
+    own = (chunk.findtext("camera_reference") or "").strip()
+    text = own or (chunk.findtext("reference") or "").strip() or LOCAL
+    if text.upper() == LOCAL or is_local(crs := parse_crs(text, str(path))):
+        return "local", ()
+    if not own and not crs.is_geographic and _are_degrees(xyz):
+        return "EPSG:4979", (
+            f"{path}: the reference positions of the cameras are degrees, although the CRS of the"
+            " chunk is in metres; taken as WGS 84.",
+        )
+    return text, ()
+
+
+def _are_degrees(xyz: FloatArray) -> bool:
+    return bool(np.nanmax(np.abs(xyz[:, 0])) <= 180.0 and np.nanmax(np.abs(xyz[:, 1])) <= 90.0)
+
+
+def _antenna_notes(path: Path, block: Block) -> tuple[str, ...]:
+    found = {id(image.sensor): image.sensor for image in block.images}
+    return tuple(
+        f"{path}: sensor {sensor.get('label')}: its GNSS antenna has an offset from the camera; the"
+        " GNSS positions are those of the antenna."
+        for sensor in found.values()
+        if sensor is not None and _has_antenna_offset(path, sensor)
+    )
+
+
+def _has_antenna_offset(path: Path, sensor: Element) -> bool:
+    antenna = sensor.find("antenna")
+    if antenna is None:
+        return False
+    reference = antenna.find("reference")
+    words = (antenna.findtext("location") or "").split()
+    if reference is not None:
+        words += [reference.get(axis) or "0" for axis in "xyz"]
+        words += (reference.get("location") or "").split()
+    return any(number(path, "GNSS antenna", word) != 0.0 for word in words)
+
+
+POINTS = ("x", "y", "z", "id")
+PROJECTIONS = ("x", "y", "id")
+
+
+class Seen(NamedTuple):
+    """Points, and observations of them, camera by camera: row of both, u and v."""
+
+    xyz: FloatArray
+    point: IntArray
+    camera: IntArray
+    uv: FloatArray
+
+
+NOTHING = Seen(np.empty((0, 3)), np.empty(0, int), np.empty(0, int), np.empty((0, 2)))
+
+
+def read_ties(chunk: Chunk, block: Block, count: int) -> TiePoints:
+    """Read what the first frame of a chunk has; see `pcfix.io.cameras.metashape.tie_points`."""
+    if len(block.images) != count:
+        raise InputError(
+            f"{chunk.path}: has {len(block.images)} aligned images, but the cameras are {count};"
+            " read the cameras from the same file."
+        )
+    frames = chunk.element.find("frames/frame")
+    seen = NOTHING
+    if frames is not None:
+        frame = chunk.document.follow(frames)
+        seen = _joined(_tie_points(frame, block), _markers(frame, block))
+    if not len(seen.point):
+        raise InputError(
+            f"{chunk.path}: has neither tie points nor markers that were measured in aligned"
+            " images; give the project (.psx with its .files folder), or export the markers."
+        )
+    order = np.argsort(seen.point, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(seen.point, minlength=len(seen.xyz)))])
+    return TiePoints(seen.xyz, Views(start, seen.camera[order]), seen.uv[order])
+
+
+def _joined(one: Seen, other: Seen) -> Seen:
+    return Seen(
+        np.vstack([one.xyz, other.xyz]),
+        np.concatenate([one.point, other.point + len(one.xyz)]),
+        np.concatenate([one.camera, other.camera]),
+        np.vstack([one.uv, other.uv]),
+    )
+
+
+def _tie_points(frame: Document, block: Block) -> Seen:
+    """Return the points of every component that has a place; their archive may be left out."""
+    for element in (*frame.root.iterfind("point_cloud"), *frame.root.iterfind("tie_points")):
+        if not frame.leads_to_a_file(element):
+            continue
+        document = frame.follow(element)
+        if document.root.find("projections") is not None:
+            with opened(document.path) as archive:
+                return _from_archive(archive, document.root, block)
+    return NOTHING
+
+
+def _from_archive(archive: Archive, root: Element, block: Block) -> Seen:
+    files = {p.get("camera_id") or "": p.get("path") or "" for p in root.iterfind("projections")}
+    seen = NOTHING
+    for points in root.iterfind("points"):
+        component = points.get("component_id")
+        rows = [
+            i
+            for i, image in enumerate(block.images)
+            if image.id in files
+            and (component == image.component or None in (component, image.component))
+        ]
+        if rows:
+            seen = _joined(seen, _component(archive, points.get("path") or "", rows, files, block))
+    return seen
+
+
+def _component(
+    archive: Archive, points: str, rows: list[int], files: dict[str, str], block: Block
+) -> Seen:
+    """Return the points of one component and where the images in `rows` saw them."""
+    vertices = _vertices(archive, points, POINTS)
+    xyz = block.places[rows[0]].points(
+        np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
+    )
+    order = np.argsort(vertices["id"], kind="stable")
+    ids = vertices["id"][order].astype(np.int64)
+    point, camera, uv = [], [], []
+    for row in rows:
+        marks = _vertices(archive, files[block.images[row].id], PROJECTIONS)
+        found = np.minimum(np.searchsorted(ids, marks["id"].astype(np.int64)), max(len(ids) - 1, 0))
+        known = (ids[found] == marks["id"]) if len(ids) else np.zeros(len(marks), bool)
+        point.append(order[found[known]])
+        camera.append(np.full(int(known.sum()), row))
+        uv.append(np.column_stack([marks["x"], marks["y"]])[known].astype(np.float64))
+    return Seen(xyz, np.concatenate(point), np.concatenate(camera), np.concatenate(uv))
+
+
+def _vertices(archive: Archive, name: str, needed: tuple[str, ...]) -> np.ndarray:
+    """Return the vertices of a binary PLY in an archive, with the properties that are needed."""
+    where, data = f"{archive.path}: {name}", archive.read(name)
+    header = parse_header(where, data)
+    kinds = [(p.name, header.order + p.item) for p in header.properties if not p.length]
+    if not header.order or header.skipped or len({*kinds}) < len(header.properties):
+        raise InputError(f"{where}: is not a binary PLY of vertices; save the project again.")
+    missing = [field for field in needed if field not in dict(kinds)]
+    if missing:
+        raise InputError(f"{where}: has no property {', '.join(missing)}; save the project again.")
+    kind = np.dtype(kinds)
+    whole = (len(data) - header.end) // kind.itemsize
+    if header.vertices > whole:
+        raise InputError(
+            f"{where}: says {header.vertices} vertices but is cut off after {whole}; save the"
+            " project again."
+        )
+    vertices = np.frombuffer(data, kind, header.vertices, header.end)
+    if vertices["id"].dtype.kind not in "iu":
+        raise InputError(f"{archive.path}: the id of {name} is not a whole number.")
+    return vertices
+
+
+def _markers(frame: Document, block: Block) -> Seen:
+    """Return the markers that were measured; they have no position."""
+    row_of = {image.id: i for i, image in enumerate(block.images)}
+    point, camera, uv = [], [], []
+    count = 0
+    for marker in frame.root.iterfind("markers//marker"):
+        marks = [
+            m
+            for m in marker.iterfind("location")
+            if _is_measured(m) and m.get("camera_id") in row_of
+        ]
+        for mark in marks:
+            where = f"marker {marker.get('marker_id')}, camera {mark.get('camera_id')}"
+            point.append(count)
+            camera.append(row_of[mark.get("camera_id") or ""])
+            uv.append([number(frame.path, where, mark.get(axis)) for axis in "xy"])
+        count += bool(marks)
+    return Seen(
+        np.full((count, 3), np.nan),
+        np.array(point, dtype=np.int64),
+        np.array(camera, dtype=np.int64),
+        np.array(uv, dtype=np.float64).reshape(-1, 2),
+    )
+
+
+def _is_measured(location: Element) -> bool:
+    return location.get("pinned") != "false" and location.get("valid") != "false"

@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.io.cameras.odm.crs import named_crs
+from pcfix.io.cameras import checks
+from pcfix.io.cameras.opensfm import left_out
+from pcfix.io.cameras.opensfm.lenses import is_panorama, lens
+from pcfix.io.cameras.opensfm.values import load, mapping, number, rows, vector
+from pcfix.lens.rotations import from_rotation_vectors
+from pcfix.model import Cameras, GnssPositions, Lens
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from pcfix.model import FloatArray
+
 
 SHOTS = "shots.geojson"
 RECONSTRUCTION = "reconstruction.json"
@@ -107,3 +119,244 @@ def _link(path: Path) -> str | None:
     text = path.read_bytes().decode("utf-8", errors="replace").strip()
     is_path = "/" in text and text.rsplit(".", 1)[-1] == path.suffix[1:]
     return text if is_path and not set(text) & set('{}[]"\n\0') else None
+
+
+WHOLE_M = 2e-3
+"""Newer ODM puts the origin at whole metres; reference_lla is rounded a little."""
+
+_UTM = re.compile(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
+
+
+def named_crs(path: Path) -> str:
+    """Return the CRS in the first line of a file: a PROJ string, EPSG:n or WGS84 UTM 16N.
+
+    Raises
+    ------
+    InputError
+        If it names none.
+    """
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    text = path.read_bytes()[:4096].decode("utf-8-sig", errors="replace").strip()
+    line = text.splitlines()[0].strip() if text else ""
+    utm = _UTM.match(line)
+    crs = _utm_code(int(utm[1]), utm[2].upper() == "N") if utm else line
+    try:
+        CRS.from_user_input(crs)
+    except CRSError as error:
+        raise InputError(f"{path}: '{line[:80]}' names no CRS; put its EPSG code there.") from error
+    return crs
+
+
+def whole_metres(lat: float, lon: float, crs: str | None) -> tuple[str, float, float] | None:
+    """Return CRS, easting and northing where a reference is at whole metres of both.
+
+    The CRS is the one named, or else UTM, the zone of the reference or one beside it.
+    """
+    for candidate in [crs] if crs else _zones(lat, lon):
+        east, north = _projected(candidate, lon, lat)
+        if np.hypot(east - np.round(east), north - np.round(north)) < WHOLE_M:
+            return candidate, float(np.round(east)), float(np.round(north))
+    return None
+
+
+def crs_of_place(
+    lon: float, lat: float, east: float, north: float, candidates: list[str] | None = None
+) -> str | None:
+    """Return the CRS (by default a UTM zone) in which a place has these coordinates, to a metre."""
+    for candidate in candidates or _zones(lat, lon):
+        if np.hypot(*(_projected(candidate, lon, lat) - np.array([east, north]))) < 1.0:
+            return candidate
+    return None
+
+
+def from_topocentric(
+    xyz: FloatArray, reference: tuple[float, float, float], crs: str
+) -> FloatArray:
+    """Return topocentric points in a projected CRS, heights on the ellipsoid, shape (n, 3)."""
+    from pyproj import Transformer
+
+    lat, lon, height = reference
+    local = Transformer.from_pipeline(
+        f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lat_0={lat!r} +lon_0={lon!r}"
+        f" +h_0={height!r} +step +inv +proj=cart +ellps=WGS84"
+    )
+    geographic = np.column_stack(local.transform(xyz[:, 0], xyz[:, 1], xyz[:, 2]))
+    return np.column_stack([_projected(crs, *geographic[:, :2].T).T, geographic[:, 2]])
+
+
+def _zones(lat: float, lon: float) -> list[str]:
+    zone = int((lon + 180.0) // 6.0) if np.isfinite(lon) else 0
+    return [_utm_code((zone + step) % 60 + 1, lat >= 0.0) for step in (0, -1, 1)]
+
+
+def _utm_code(zone: int, north: bool) -> str:
+    return f"EPSG:{(32600 if north else 32700) + zone}"
+
+
+def _projected(crs: str, lon: float | FloatArray, lat: float | FloatArray) -> FloatArray:
+    from pyproj import Transformer
+
+    return np.array(Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon, lat))
+
+
+SAME_FOCAL = 1e-6
+
+
+def read_shots(project: Project, path: Path) -> Cameras:
+    """Read the cameras of shots.geojson, in the projected CRS.
+
+    Raises
+    ------
+    InputError
+        If an entry is not what it should be.
+    """
+    shots = _shots(path)
+    labels = tuple(shots)
+    turns = [vector(path, f"image {k}, rotation", s.get("rotation"), 3) for k, s in shots.items()]
+    lenses, notes = _lenses(project, path, shots)
+    gnss, listed = read_images(project.find("images.json"), labels)
+    return Cameras(
+        labels=labels,
+        centres=np.array(list(positions(path).values())),
+        rotations=from_rotation_vectors(np.array(turns)),
+        lenses=lenses,
+        crs=project.crs() or _crs_of_geometry(path, shots),
+        notes=notes,
+        gnss=gnss,
+        unposed=left_out(labels, listed),
+        source="OpenDroneMap",
+    )
+
+
+def positions(path: Path) -> dict[str, FloatArray]:
+    """Return the projection centre of every image of shots.geojson, metres."""
+    shots = _shots(path)
+    xyz = rows(path, "translation", [shot.get("translation") for shot in shots.values()], 3)
+    return dict(zip(shots, xyz, strict=True))
+
+
+def read_images(
+    path: Path | None, labels: tuple[str, ...]
+) -> tuple[GnssPositions | None, list[str]]:
+    """Return the GNSS positions of images.json per label, and the names of all its images.
+
+    Longitude, latitude, and the altitude as the image states it.
+    """
+    if path is None:
+        return None, []
+    entries = load(path)
+    if not isinstance(entries, list):
+        raise InputError(f"{path}: is not a list of images as OpenDroneMap writes it.")
+    images = [mapping(path, f"entry {i + 1}", entry) for i, entry in enumerate(entries)]
+    names = [str(image.get("filename")) for image in images]
+    by_name = dict(zip(names, images, strict=True))
+    xyz, sigma = np.full((2, len(labels), 3), np.nan)
+    for i, label in enumerate(labels):
+        image = by_name.get(label) or by_name.get(PurePath(label).stem)
+        if image is not None and image.get("latitude") is not None:
+            xyz[i], sigma[i] = _position(path, label, image)
+    if not np.isfinite(xyz).any():
+        return None, names
+    return GnssPositions(xyz, sigma, "EPSG:4326"), names
+
+
+def _position(path: Path, label: str, image: dict[str, Any]) -> tuple[list[float], list[float]]:
+    keys = ("longitude", "latitude", "altitude", "gps_xy_stddev", "gps_z_stddev")
+    values = [
+        np.nan if image.get(key) is None else number(path, f"image {label}, {key}", image[key])
+        for key in keys
+    ]
+    return values[:3], [values[3], values[3], values[4]]
+
+
+def _shots(path: Path) -> dict[str, dict[str, Any]]:
+    """Return the properties of every feature by file name, with its `geometry`."""
+    features = mapping(path, "the file", load(path)).get("features")
+    if not isinstance(features, list) or not features:
+        raise InputError(f"{path}: has no features, so no cameras.")
+    shots: dict[str, dict[str, Any]] = {}
+    for i, value in enumerate(features):
+        feature = mapping(path, f"feature {i + 1}", value)
+        shot = mapping(path, f"feature {i + 1}, properties", feature.get("properties"))
+        name = shot.get("filename")
+        if not isinstance(name, str):
+            raise InputError(f"{path}: feature {i + 1} has no filename.")
+        if name in shots:
+            raise InputError(
+                f"{path}: feature {i + 1} repeats the filename {name}; give every image a name of"
+                " its own, as OpenDroneMap needs."
+            )
+        shots[name] = {**shot, "geometry": feature.get("geometry")}
+    return shots
+
+
+def _lenses(
+    project: Project, path: Path, shots: dict[str, dict[str, Any]]
+) -> tuple[tuple[Lens, ...], tuple[str, ...]]:
+    """Return the lens of each shot, and a note where cameras.json does not have it."""
+    known = _known_lenses(project.find("cameras.json"))
+    plain = 0
+    lenses = []
+    for label, shot in shots.items():
+        size = [shot.get(key) for key in ("width", "height", "focal")]
+        width, height, focal = vector(
+            path, f"image {label}, width, height, focal", size, 3
+        ).tolist()
+        match = _match(known, str(shot.get("camera")), width, height, focal)
+        plain += match is None
+        lenses.append(match or _plain(path, label, width, height, focal))
+    if not plain:
+        return tuple(lenses), ()
+    note = (
+        f"{path}: cameras.json has no camera of the size and focal length of {plain} images; their"
+        " lens is taken as free of distortion."
+    )
+    return tuple(lenses), (note,)
+
+
+def _known_lenses(path: Path | None) -> dict[str, Lens]:
+    """Return the lenses of cameras.json, none where there is no such file."""
+    if path is None:
+        return {}
+    entries = mapping(path, "the file", load(path))
+    cameras = {name: mapping(path, f"camera {name}", entry) for name, entry in entries.items()}
+    return {name: lens(path, name, c) for name, c in cameras.items() if not is_panorama(c)}
+
+
+def _match(
+    known: dict[str, Lens], name: str, width: float, height: float, focal: float
+) -> Lens | None:
+    """Return the lens of the camera a shot names, or else of the only one that is alike."""
+    if name in known:
+        return known[name]
+    fits = [
+        found
+        for found in known.values()
+        if (found.width, found.height) == (width, height)
+        and abs((found.focal + found.b1) / max(width, height) - focal) < SAME_FOCAL
+    ]
+    return fits[0] if len(fits) == 1 else None
+
+
+def _plain(path: Path, label: str, width: float, height: float, focal: float) -> Lens:
+    scale = max(width, height)
+    return checks.lens(
+        path, f"of image {label}", Lens(focal * scale, width, height, width / 2.0, height / 2.0)
+    )
+
+
+def _crs_of_geometry(path: Path, shots: dict[str, dict[str, Any]]) -> str:
+    """Return the UTM zone that takes a shot's longitude and latitude to its translation.
+
+    A project without GNSS has made-up coordinates, which fit no zone.
+    """
+    label, shot = next(iter(shots.items()))
+    geometry = mapping(path, f"image {label}, geometry", shot["geometry"] or {})
+    place = geometry.get("coordinates")
+    if place is None:
+        return "local"
+    lon, lat, _ = vector(path, f"image {label}, coordinates", place, 3)
+    east, north, _ = vector(path, f"image {label}, translation", shot.get("translation"), 3)
+    return crs_of_place(lon, lat, east, north) or "local"

@@ -21,19 +21,46 @@ References: Pix4D, "What does the Output Params Folder contain?" (support.pix4d.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections import defaultdict
+from typing import TYPE_CHECKING, NamedTuple
 
-from pcfix.io.cameras.pix4d.block import read_block
-from pcfix.io.cameras.pix4d.files import first_line, holds_tables, is_project
-from pcfix.io.cameras.pix4d.observations import read_observations
+import numpy as np
+
+from pcfix.errors import InputError
+from pcfix.io.cameras import checks
+from pcfix.io.cameras.pix4d.files import (
+    EXTERNAL,
+    GEOGRAPHIC,
+    PARAMETERS,
+    find,
+    first_line,
+    holds_tables,
+    is_project,
+    read_observations,
+    read_project,
+    read_text,
+)
+from pcfix.io.cameras.pix4d.tables import (
+    lens_of_calibration,
+    lenses_of_images,
+    read_calibrations,
+    read_external,
+    read_offsets,
+    read_parameters,
+)
+from pcfix.model import Cameras
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pcfix.io.cameras.formats import Source
-    from pcfix.model import Cameras, TiePoints
+    from pcfix.io.cameras.pix4d.files import Files
+    from pcfix.io.cameras.pix4d.tables import Calibration, Image
+    from pcfix.model import FloatArray, Lens, TiePoints
 
-__all__ = ["SOFTWARE", "read", "recognises", "tie_points"]
 
-SOFTWARE = "Pix4D"
+__all__ = ["read", "recognises", "tie_points"]
+
 HEADERS = (
     ["filename", "imagewidth", "imageheight"],
     ["imagename", "x", "y", "z", "omega", "phi", "kappa"],
@@ -56,3 +83,164 @@ def read(source: Source) -> Cameras:
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the image measurements; only control points have coordinates."""
     return read_observations(source, cameras)
+
+
+AGREE_M = 0.01
+AGREE_DEG = 0.001
+
+
+class Poses(NamedTuple):
+    """The posed images: labels, centres, rotations, and their rows in the camera parameters."""
+
+    labels: list[str]
+    centres: FloatArray
+    rotations: FloatArray
+    rows: list[int]
+    unposed: list[str]
+    notes: tuple[str, ...]
+
+
+def read_block(source: Source) -> Cameras:
+    """Read poses and lenses; see the docstring of the package."""
+    files = find(source)
+    if files is None or (files.parameters is None and files.external is None):
+        raise InputError(
+            f"{source.path}: has no {PARAMETERS} or {EXTERNAL} beside it; give the params folder"
+            f" of the project ({GEOGRAPHIC} alone does not suffice)."
+        )
+    calibrations = [] if files.calibration is None else read_calibrations(files.calibration)
+    if files.parameters is None:
+        poses, lenses = _external_only(files, calibrations)
+    else:
+        images = read_parameters(files.parameters)
+        poses = _poses(files, images)
+        used = [images[row] for row in poses.rows]
+        lenses = lenses_of_images(files.parameters, used, calibrations)
+    labels, posed = tuple(poses.labels), set(poses.labels)
+    gnss, others = (None, ()) if files.project is None else read_project(files.project, labels)
+    return Cameras(
+        labels=labels,
+        centres=poses.centres,
+        rotations=poses.rotations,
+        lenses=lenses,
+        crs=_crs(files.wkt),
+        notes=(*poses.notes, *checks.repeated(source.path, labels)),
+        gnss=gnss,
+        unposed=tuple(dict.fromkeys(n for n in (*poses.unposed, *others) if n not in posed)),
+        source="Pix4D",
+    )
+
+
+def _crs(path: Path | None) -> str | None:
+    text = "" if path is None else read_text(path).strip()
+    return checks.crs(path, text) if path is not None and text else None
+
+
+def _external_only(
+    files: Files, calibrations: list[Calibration]
+) -> tuple[Poses, tuple[Lens, ...] | None]:
+    """Return the poses of the absolute table, with a lens where all images must share it."""
+    if files.external is None:
+        raise InputError("There is no table of exterior orientation.")
+    labels, centres, rotations = read_external(files.external)
+    lens = None
+    if files.calibration is not None and len(calibrations) == 1:
+        lens = lens_of_calibration(files.calibration, calibrations[0])
+    note = (
+        f"{files.external}: there is no {PARAMETERS} beside it that tells the lens of each image;"
+        " frames are taken as boundless."
+    )
+    poses = Poses(labels, centres, rotations, [], [], () if lens else (note,))
+    return poses, None if lens is None else (lens,) * len(labels)
+
+
+def _poses(files: Files, images: list[Image]) -> Poses:
+    if files.parameters is None:
+        raise InputError("There are no camera parameters.")
+    labels = [image.label for image in images]
+    rotations = np.array(
+        [
+            checks.rotation(files.parameters, i.label, i.fields["rotation"].reshape(3, 3))
+            for i in images
+        ]
+    )
+    centres, notes = _absolute(files, images)
+    if files.external is None:
+        return _those_known(labels, centres, rotations, notes)
+    names, there, turned = read_external(files.external)
+    row_of = _matched(labels, rotations, names, turned)
+    both = [i for i, row in enumerate(row_of) if row is not None]
+    rows = [row for row in row_of if row is not None]
+    notes = _compared(files.external, centres[both], rotations[both], there[rows], turned[rows])
+    if notes:
+        centres = np.full_like(centres, np.nan)
+    centres[both], rotations[both] = there[rows], turned[rows]
+    poses = _those_known(labels, centres, rotations, notes)
+    there_only = sorted(set(names) - set(labels))
+    return poses._replace(unposed=poses.unposed + there_only)
+
+
+def _those_known(
+    labels: list[str], centres: FloatArray, rotations: FloatArray, notes: tuple[str, ...]
+) -> Poses:
+    known = np.isfinite(centres).all(axis=1)
+    rows = np.flatnonzero(known).tolist()
+    unposed = [labels[i] for i in np.flatnonzero(~known)]
+    return Poses([labels[i] for i in rows], centres[known], rotations[known], rows, unposed, notes)
+
+
+def _absolute(files: Files, images: list[Image]) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return the centres with the offset added; NaN where several offsets name no such image."""
+    local = np.array([image.fields["centre"] for image in images])
+    if files.offset is None and files.external is not None:
+        return np.full_like(local, np.nan), ()
+    if files.offset is None:
+        note = (
+            f"{files.parameters}: its positions are relative to an offset and there is no"
+            " offset.xyz beside it; add the offset to the cameras yourself."
+        )
+        return local, (note,)
+    offsets = read_offsets(files.offset)
+    if len({values.tobytes() for _, values in offsets}) == 1:
+        return local + offsets[0][1], ()
+    added = np.full_like(local, np.nan)
+    for i, image in enumerate(images):
+        fitting = [values for label, values in offsets if label and image.label.startswith(label)]
+        if fitting:
+            added[i] = local[i] + fitting[0]
+    return added, ()
+
+
+def _matched(
+    labels: list[str], rotations: FloatArray, names: list[str], turned: FloatArray
+) -> list[int | None]:
+    """Return the row of each label among the names; of equal names the one turned most alike."""
+    rows: dict[str, list[int]] = defaultdict(list)
+    for row, name in enumerate(names):
+        rows[name].append(row)
+    matched: list[int | None] = []
+    for label, rotation in zip(labels, rotations, strict=True):
+        left = rows[label]
+        unlike = np.linalg.norm(turned[left] - rotation, axis=(1, 2))
+        matched.append(left.pop(int(np.argmin(unlike))) if left else None)
+    return matched
+
+
+def _compared(
+    path: Path, local: FloatArray, rotations: FloatArray, centres: FloatArray, turned: FloatArray
+) -> tuple[str, ...]:
+    """Return what to tell when the two tables disagree; the first may lack its offset."""
+    if len(centres) == 0:
+        raise InputError(f"{path}: names none of the images of {PARAMETERS} beside it.")
+    distances = np.linalg.norm(local - centres, axis=1)
+    apart = float(distances[np.isfinite(distances)].max(initial=0.0))
+    sines = np.linalg.norm(rotations - turned, axis=(1, 2)) / np.sqrt(8.0)
+    turn = float(np.degrees(2.0 * np.arcsin(np.clip(sines, 0.0, 1.0))).max())
+    if apart <= AGREE_M and turn <= AGREE_DEG:
+        return ()
+    note = (
+        f"{path}: its poses differ by up to {apart:.2f} m and {turn:.3f} degrees from those of"
+        f" {PARAMETERS} with offset.xyz; the absolute ones are used, and images that only the"
+        " other table has are left out."
+    )
+    return (note,)

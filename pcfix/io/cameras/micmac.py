@@ -7,12 +7,17 @@ looked for beside the orientation first. `OrIntImaM2C` is an affine map from the
 to those of a scaled image. Where MicMac's pixels begin, at the corner or the centre of the first,
 its formats do not say; they are taken as they are. The files name no CRS.
 
-Distortion that Brown's model does not hold is replaced by the nearest lens, and the largest
-difference is told where it is more than half a pixel.
+An ideal position F (x, y) / z + PP, in pixels, goes through the distortion of the calibration to
+the observed one (eConvApero_DistM2C), or from the observed to the ideal one (eConvApero_DistC2M).
+Read are the formulas that `pcfix.model.Lens` holds exactly, d being the distance from the centre of
+distortion: none; radial, d (k1 d^2 + k2 d^4 + ...); and Fraser's with decentring P1 (2 x^2 + d^2) +
+2 P2 x y beside it. The affinity b1 x + b2 y of Fraser's is of the ideal place, that of a lens of
+the distorted one: it is read where that makes no difference, up to `AFFINITY_PX`. mm3d ConvertCalib
+turns any other formula into one of these.
 
 References: M. Pierrot-Deseilligny and others, "MicMac, Apero, Pastis and other beverages in a
-nutshell", https://github.com/micmacIGN/Documentation; include/XML_GEN/ParamChantierPhotogram.xml
-of https://github.com/micmacIGN/micmac for the elements.
+nutshell", https://github.com/micmacIGN/Documentation, "Distortion models" and ConvertCalib;
+include/XML_GEN/ParamChantierPhotogram.xml of https://github.com/micmacIGN/micmac for the elements.
 """
 
 from __future__ import annotations
@@ -25,9 +30,7 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.micmac.calibration import Calibration, parse
-from pcfix.io.cameras.micmac.fit import nearest
-from pcfix.io.cameras.xml import numbers, read_xml
+from pcfix.io.cameras.xml import number, numbers, read_xml
 from pcfix.model import Cameras, Lens
 
 if TYPE_CHECKING:
@@ -37,11 +40,13 @@ if TYPE_CHECKING:
     from pcfix.io.cameras.formats import Source
     from pcfix.model import FloatArray
 
-SOFTWARE = "MicMac"
 PREFIX, SUFFIX = "Orientation-", ".xml"
-TOLD_PX = 0.5
+UNIFIED = ("eModele_DRad_PPaEqPPs", "eModele_Fraser_PPaEqPPs")
+"""Of `ModUnif`: radial and Fraser's about the principal point; five k, P1, P2, b1, b2."""
+AFFINITY_PX = 0.1
+"""Largest distance in the frame that a lens with Fraser's affinity may be off."""
 
-_CONVENTIONS = ("", "eConvApero_DistM2C", "eConvApero_DistC2M")
+_IS_INVERSE = {"": False, "eConvApero_DistM2C": False, "eConvApero_DistC2M": True}
 
 
 def recognises(source: Source) -> bool:
@@ -56,15 +61,14 @@ def read(source: Source) -> Cameras:
     paths = [source.path]
     if source.path.is_dir():
         paths = sorted(p for p in source.path.glob(f"{PREFIX}*{SUFFIX}") if p.is_file())
-    known: dict[Path, tuple[Lens, str]] = {}
+    known: dict[Path, Lens] = {}
     poses = [_orientation(path, known) for path in paths]
     return Cameras(
         labels=tuple(_image(path) for path in paths),
         centres=np.array([centre for centre, _, _ in poses]),
         rotations=np.array([rotation for _, rotation, _ in poses]),
         lenses=tuple(lens for _, _, lens in poses),
-        notes=tuple(note for _, note in known.values() if note),
-        source=SOFTWARE,
+        source="MicMac",
     )
 
 
@@ -72,9 +76,7 @@ def _image(path: Path) -> str:
     return path.name.removesuffix(SUFFIX).removeprefix(PREFIX)
 
 
-def _orientation(
-    path: Path, known: dict[Path, tuple[Lens, str]]
-) -> tuple[FloatArray, FloatArray, Lens]:
+def _orientation(path: Path, known: dict[Path, Lens]) -> tuple[FloatArray, FloatArray, Lens]:
     """Return centre, rotation world to camera, and lens."""
     root = read_xml(path)
     conic = _first(path, root, "OrientationConique")
@@ -91,7 +93,7 @@ def _exterior(path: Path, outer: Element) -> tuple[FloatArray, FloatArray]:
     image = f"image {_image(path)}"
     convention = outer.findtext("KnownConv", "").strip()
     matrix = outer.find("ParamRotation/CodageMatr")
-    if convention not in _CONVENTIONS or matrix is None:
+    if convention not in _IS_INVERSE or matrix is None:
         raise InputError(
             f"{path}: {image}: its rotation is not a matrix in MicMac's own convention"
             f" ({convention or 'no CodageMatr'}); write the orientations anew with OriConvert."
@@ -101,29 +103,15 @@ def _exterior(path: Path, outer: Element) -> tuple[FloatArray, FloatArray]:
     return centre, checks.rotation(path, _image(path), np.array(rows)).T
 
 
-def _lens(path: Path, conic: Element, known: dict[Path, tuple[Lens, str]]) -> Lens:
+def _lens(path: Path, conic: Element, known: dict[Path, Lens]) -> Lens:
     """Return the lens inside the file, or that of the file it names."""
     inner = conic.find("Interne")
     where = path if inner is not None else _calibration_file(path, conic)
     if where not in known:
         if inner is None:
             inner = _first(where, read_xml(where), "CalibrationInternConique")
-        known[where] = _calibrated(parse(where, inner))
-    return known[where][0]
-
-
-def _calibrated(calibration: Calibration) -> tuple[Lens, str]:
-    """Return the lens, and what to tell of it where it is not the calibration itself."""
-    if calibration.exact:
-        return calibration.brown(), ""
-    lens, miss = nearest(calibration)
-    if miss < TOLD_PX:
-        return lens, ""
-    return lens, (
-        f"{calibration.path}: the distortion has terms that pcfix does not model; the lens used"
-        f" instead is up to {miss:.1f} pixels off in the frame, enough to choose cameras by but not"
-        " to adjust with."
-    )
+        known[where] = _calibration(where, inner)
+    return known[where]
 
 
 def _calibration_file(path: Path, conic: Element) -> Path:
@@ -137,6 +125,85 @@ def _calibration_file(path: Path, conic: Element) -> Path:
         f"{path}: image {_image(path)}: its calibration '{name}' is neither beside it nor in"
         f" {project}; copy it beside the orientation."
     )
+
+
+def _calibration(path: Path, element: Element) -> Lens:
+    """Return the lens of an `Interne` or `CalibrationInternConique`."""
+    convention = element.findtext("KnownConv", "").strip()
+    if convention not in _IS_INVERSE:
+        raise InputError(
+            f"{path}: the calibration is in the convention {convention}; pcfix reads those of"
+            " MicMac's own results (eConvApero_DistM2C, eConvApero_DistC2M)."
+        )
+    focal = number(path, "F", element.findtext("F"))
+    if focal <= 0.0:
+        raise InputError(f"{path}: the focal length F is {focal:g}; calibrate again.")
+    x, y = numbers(path, "PP", element.findtext("PP"), 2).tolist()
+    width, height = numbers(path, "SzIm", element.findtext("SzIm"), 2).tolist()
+    models = [model for entry in element.iter("CalibDistortion") for model in entry]
+    models = [model for model in models if not _is_none(model)]
+    if len(models) > 1:
+        raise _not_held(path, " after ".join(_name(model) for model in models))
+    (cx, cy), radial, rest = (x, y), np.empty(0), np.empty(0)
+    for model in models:
+        (cx, cy), radial, rest = _distortion(path, model, (x, y))
+    b1, b2 = rest[2:].tolist() or (0.0, 0.0)
+    if b1 or b2:
+        corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
+        d = np.hypot(*(corners - [cx, cy]).T).max()
+        away = abs(d * sum(k * d ** (2 * i + 2) for i, k in enumerate(radial.tolist())))
+        if _IS_INVERSE[convention] or not np.hypot(b1, b2) * away <= AFFINITY_PX:
+            raise _not_held(path, f"{_name(models[0])} with an affinity (b1, b2)")
+    with np.errstate(over="ignore", invalid="ignore"):
+        radial = radial * np.float64(focal) ** (2 * np.arange(len(radial)) + 2)
+    lens = Lens(
+        *(focal, width, height, x + b1 * (x - cx) + b2 * (y - cy), y, b1 * focal, b2 * focal),
+        radial=tuple(radial.tolist()),
+        tangential=tuple((rest[:2] * focal).tolist()),
+        distortion_centre=((cx - x) / focal, (cy - y) / focal),
+        inverse=_IS_INVERSE[convention],
+        sensor=path.stem,
+    )
+    return checks.lens(path, path.stem, lens)
+
+
+def _name(model: Element) -> str:
+    return model.findtext("TypeModele", "").strip() or str(model.tag)
+
+
+def _is_none(model: Element) -> bool:
+    return _name(model) in ("ModNoDist", "eModelePolyDeg0")
+
+
+def _not_held(path: Path, name: str) -> InputError:
+    return InputError(
+        f"{path}: the calibration has the distortion {name}, which pcfix does not model; convert it"
+        " to a radial or Fraser's one (mm3d ConvertCalib)."
+    )
+
+
+def _distortion(
+    path: Path, model: Element, principal: tuple[float, float]
+) -> tuple[tuple[float, float], FloatArray, FloatArray]:
+    """Return the centre (pixels), k1, k2, ... and P1, P2, b1, b2 of a distortion."""
+    name = _name(model)
+    if name in UNIFIED:
+        given = [number(path, "Params", e.text) for e in model.findall("Params")]
+        if any(given[9:]):
+            raise InputError(f"{path}: {name} has {len(given)} Params instead of 9.")
+        values = np.array([*given[:9], *(0.0,) * (9 - len(given))])
+        centre, radial, rest = principal, values[:5], values[5:]
+    elif name in ("ModRad", "ModPhgrStd"):
+        part = model.find("RadialePart")
+        part = model if part is None else part
+        x, y = numbers(path, "CDist", part.findtext("CDist"), 2).tolist()
+        terms = [number(path, "CoeffDist", e.text) for e in part.findall("CoeffDist")]
+        tags = () if name == "ModRad" else ("P1", "P2", "b1", "b2")
+        rest = np.array([number(path, tag, model.findtext(tag, "0")) for tag in tags])
+        centre, radial = (x, y), np.array(terms)
+    else:
+        raise _not_held(path, name)
+    return centre, radial, rest
 
 
 def _scanned(path: Path, element: Element | None, lens: Lens) -> Lens:

@@ -1,0 +1,377 @@
+"""COLMAP's camera models: their numbers, names, parameters, and the lens that each one is.
+
+The parameters are those of COLMAP's own list, in its order (https://colmap.github.io/cameras.html
+and, for models that are not there yet, ``src/colmap/sensor/models`` of COLMAP 4). The image's
+origin is the upper left corner of the upper left pixel, as in `pcfix.model.Lens`, so principal
+points are taken as they are. p1 and p2 are in OpenCV's order, except in the model of Project
+Aria's cameras (RAD_TAN_THIN_PRISM_FISHEYE), where they are in Brown's, and where the tangential
+and prism terms are of the radially distorted place.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from pcfix.errors import InputError
+from pcfix.io.cameras import checks
+from pcfix.model import Lens, Projection
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from pcfix.model import FloatArray, IntArray
+
+
+_SMALLEST_OMEGA = 1e-6
+"""Below, in radians, the FOV model is a perspective one to double precision."""
+
+
+class Model(NamedTuple):
+    """A camera model; `parameters` are the names in the order of the file."""
+
+    name: str
+    parameters: tuple[str, ...]
+    projection: Projection | None
+
+
+def _model(name: str, parameters: str, projection: Projection | None = "perspective") -> Model:
+    return Model(name, tuple(parameters.split()), projection)
+
+
+MODELS = (
+    _model("SIMPLE_PINHOLE", "f cx cy"),
+    _model("PINHOLE", "fx fy cx cy"),
+    _model("SIMPLE_RADIAL", "f cx cy k1"),
+    _model("RADIAL", "f cx cy k1 k2"),
+    _model("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
+    _model("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4", "equidistant"),
+    _model("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3"),
+    _model("FOV", "fx fy cx cy omega", "fov"),
+    _model("SIMPLE_RADIAL_FISHEYE", "f cx cy k1", "equidistant"),
+    _model("RADIAL_FISHEYE", "f cx cy k1 k2", "equidistant"),
+    _model("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s3", "equidistant"),
+    _model(
+        "RAD_TAN_THIN_PRISM_FISHEYE",
+        "fx fy cx cy k1 k2 k3 k4 k5 k6 p2 p1 s1 s2 s3 s4",
+        "equidistant",
+    ),
+    _model("SIMPLE_DIVISION", "f cx cy k", "division"),
+    _model("DIVISION", "fx fy cx cy k", "division"),
+    _model("SIMPLE_FISHEYE", "f cx cy", "equidistant"),
+    _model("FISHEYE", "fx fy cx cy", "equidistant"),
+    _model("EUCM", "fx fy cx cy alpha beta", "eucm"),
+    _model("EQUIRECTANGULAR", "w h", None),
+)
+"""In the order of their numbers in binary files, from 0."""
+
+BY_NAME = {model.name: model for model in MODELS}
+
+
+class Camera(NamedTuple):
+    """A row of the camera list."""
+
+    model: Model
+    width: float
+    height: float
+    values: tuple[float, ...]
+
+
+def lens(path: Path, identifier: int, camera: Camera) -> Lens:
+    """Return the lens of a camera.
+
+    Raises
+    ------
+    InputError
+        If the model is one that `Lens` cannot express, or a number is none of a camera.
+    """
+    model = camera.model
+    if model.projection is None:
+        raise InputError(
+            f"{path}: camera {identifier}: pcfix has no lens for the model {model.name}; give the"
+            " undistorted model (colmap image_undistorter)."
+        )
+    given = dict(zip(model.parameters, camera.values, strict=True))
+    focal_x, focal = given.get("fx", given.get("f", 0.0)), given.get("fy", given.get("f", 0.0))
+    projection, shape = _projection(model.projection, given)
+    made = Lens(
+        *(focal, camera.width, camera.height, given["cx"], given["cy"]),
+        b1=focal_x - focal,
+        projection=projection,
+        shape=shape,
+        radial=_some(given, "k1", "k2", "k3", "k4", "k5", "k6"),
+        denominator=_some(given, "d1", "d2", "d3"),
+        tangential=_some(given, "p2", "p1"),
+        thin_prism=_some(given, "s1", "s2", "s3", "s4"),
+        in_turn=model.name == "RAD_TAN_THIN_PRISM_FISHEYE",
+        sensor=f"{identifier} {model.name}",
+    )
+    checks.lens(path, str(identifier), made)
+    if not focal_x > 0.0:
+        raise InputError(
+            f"{path}: camera {identifier}: focal length fx {focal_x:g} must be positive; export the"
+            " model again."
+        )
+    return made
+
+
+def _some(given: dict[str, float], *names: str) -> tuple[float, ...]:
+    """Return the values up to the last name that the model has, 0 for those between."""
+    there = [i for i, name in enumerate(names) if name in given]
+    return tuple(given.get(name, 0.0) for name in names[: there[-1] + 1]) if there else ()
+
+
+def _projection(
+    projection: Projection, given: dict[str, float]
+) -> tuple[Projection, tuple[float, ...]]:
+    match projection:
+        case "division":
+            return projection, (given["k"],)
+        case "eucm":
+            return projection, (given["alpha"], given["beta"])
+        case "fov" if abs(given["omega"]) < _SMALLEST_OMEGA:
+            return "perspective", ()
+        case "fov":
+            return projection, (given["omega"],)
+        case _:
+            return projection, ()
+
+
+class Image(NamedTuple):
+    """A row of the image list.
+
+    `pose` is qw, qx, qy, qz, tx, ty, tz. `xy` (o, 2) and `points` (o,) are the image points that
+    have a point in space, and the identifiers of those; empty where they were not asked for.
+    """
+
+    identifier: int
+    pose: tuple[float, ...]
+    camera: int
+    name: str
+    xy: FloatArray
+    points: IntArray
+
+    @property
+    def posed(self) -> bool:
+        """Whether it has a pose at all; COLMAP itself writes no others."""
+        return bool(np.isfinite(self.pose).all())
+
+
+class Points(NamedTuple):
+    """Identifiers and places of the points in space."""
+
+    identifiers: IntArray
+    xyz: FloatArray
+
+
+NO_XY: FloatArray = np.empty((0, 2))
+NO_POINTS: IntArray = np.empty(0, np.int64)
+
+
+def cut_off(path: Path) -> InputError:
+    """Return the error for a file that ends too early."""
+    return InputError(f"{path}: is cut off or damaged; export the model again.")
+
+
+_COUNT = struct.Struct("<Q")
+_CAMERA = struct.Struct("<IiQQ")
+_IMAGE = struct.Struct("<I7dI")
+_OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+_POINT_BYTES, _POINT_TO_COUNT, _POINT_TO_COLOUR = 51, 43, 32
+_VIEW_BYTES = 8
+
+
+def _binary_cameras(path: Path) -> dict[int, Camera]:
+    data = _bytes_of(path)
+    cameras: dict[int, Camera] = {}
+    at = _COUNT.size
+    for _ in range(_count(path, data, 0, _CAMERA.size)):
+        if at + _CAMERA.size > len(data):
+            raise cut_off(path)
+        identifier, number, width, height = _CAMERA.unpack_from(data, at)
+        if not 0 <= number < len(MODELS):
+            raise InputError(
+                f"{path}: camera {identifier} has the model number {number}, which pcfix does not"
+                " know; give the undistorted model (colmap image_undistorter)."
+            )
+        values = struct.Struct(f"<{len(MODELS[number].parameters)}d")
+        at += _CAMERA.size
+        if at + values.size > len(data):
+            raise cut_off(path)
+        camera = Camera(MODELS[number], float(width), float(height), values.unpack_from(data, at))
+        cameras[identifier] = camera
+        at += values.size
+    return cameras
+
+
+def _binary_images(path: Path, *, points: bool) -> list[Image]:
+    data = _bytes_of(path)
+    images = []
+    at = _COUNT.size
+    for _ in range(_count(path, data, 0, _IMAGE.size + 1 + _COUNT.size)):
+        if at + _IMAGE.size > len(data):
+            raise cut_off(path)
+        identifier, *pose, camera = _IMAGE.unpack_from(data, at)
+        end = data.find(b"\0", at + _IMAGE.size)
+        name = data[at + _IMAGE.size : end].decode("utf-8", "replace")
+        observations = _count(path, data, end + 1, _OBSERVATION.itemsize) if end > 0 else -1
+        if observations < 0:
+            raise cut_off(path)
+        xy, seen = NO_XY, NO_POINTS
+        if points and observations:
+            rows = np.frombuffer(data, _OBSERVATION, observations, end + 1 + _COUNT.size)
+            rows = rows[rows["point"] >= 0]
+            xy, seen = rows["xy"].astype(np.float64), rows["point"].astype(np.int64)
+        images.append(Image(identifier, tuple(pose), camera, name, xy, seen))
+        at = end + 1 + _COUNT.size + observations * _OBSERVATION.itemsize
+    return images
+
+
+def _binary_points(path: Path) -> Points:
+    data = _bytes_of(path)
+    count = _count(path, data, 0, _POINT_BYTES)
+    starts = np.empty(count, np.int64)
+    at = _COUNT.size
+    for i in range(count):
+        if at + _POINT_BYTES > len(data):
+            raise cut_off(path)
+        starts[i] = at
+        at += _POINT_BYTES + _VIEW_BYTES * _COUNT.unpack_from(data, at + _POINT_TO_COUNT)[0]
+    if at > len(data):
+        raise cut_off(path)
+    if not count:
+        return Points(NO_POINTS, np.empty((0, 3)))
+    every_byte = np.frombuffer(data, np.uint8)
+    rows = np.lib.stride_tricks.sliding_window_view(every_byte, _POINT_TO_COLOUR)[starts]
+    place = np.ascontiguousarray(rows[:, _COUNT.size :]).view("<f8")
+    return Points(np.ascontiguousarray(rows[:, : _COUNT.size]).view("<i8")[:, 0], place)
+
+
+def _bytes_of(path: Path) -> bytes | mmap.mmap:
+    """Return the content without reading it; unmapped when nothing refers to it any more."""
+    with path.open("rb") as stream:
+        if path.stat().st_size == 0:
+            return b""
+        return mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+
+
+def _count(path: Path, data: bytes | mmap.mmap, at: int, least_bytes: int) -> int:
+    """Return the count of a list whose rows have at least so many bytes, if they can be there."""
+    if at + _COUNT.size > len(data):
+        raise cut_off(path)
+    (count,) = _COUNT.unpack_from(data, at)
+    if count * least_bytes > len(data) - at - _COUNT.size:
+        raise cut_off(path)
+    return int(count)
+
+
+_CAMERA_WORDS = 4
+_IMAGE_WORDS = 10
+_POINT_WORDS = 4
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield number and text of every line, blank ones too, without comments."""
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        for number, line in enumerate(stream, start=1):
+            if not line.lstrip().startswith("#"):
+                yield number, line.strip()
+
+
+def _wrong(path: Path, number: int, rule: str) -> InputError:
+    return InputError(f"{path}: line {number} {rule}; export the model again.")
+
+
+def _text_cameras(path: Path) -> dict[int, Camera]:
+    cameras: dict[int, Camera] = {}
+    for number, line in _lines(path):
+        words = line.split()
+        if not words:
+            continue
+        if len(words) < _CAMERA_WORDS:
+            raise _wrong(path, number, "must give a camera: number, model, width, height, ...")
+        model = BY_NAME.get(words[1])
+        if model is None:
+            raise InputError(
+                f"{path}: line {number}: camera {words[0]} has the model {words[1][:40]}, which"
+                " pcfix does not know; give the undistorted model (colmap image_undistorter)."
+            )
+        if len(words) != _CAMERA_WORDS + len(model.parameters):
+            rule = f"must end with the {len(model.parameters)} parameters of {model.name}"
+            raise _wrong(path, number, rule)
+        try:
+            width, height, *values = (float(word) for word in words[2:])
+            cameras[int(words[0])] = Camera(model, width, height, tuple(values))
+        except ValueError as error:
+            raise _wrong(path, number, "has a word that must be a number") from error
+    return cameras
+
+
+def _text_images(path: Path, *, points: bool) -> list[Image]:
+    images = []
+    lines = _lines(path)
+    for number, line in lines:
+        if not line:
+            continue
+        words = line.split(None, _IMAGE_WORDS - 1)
+        if len(words) < _IMAGE_WORDS:
+            raise _wrong(path, number, "must give an image: number, QW, QX, ... TZ, camera, name")
+        try:
+            identifier, camera = int(words[0]), int(words[8])
+            pose = tuple(float(word) for word in words[1:8])
+        except ValueError as error:
+            raise _wrong(path, number, "has a word that must be a number") from error
+        xy, seen = _image_points(path, *next(lines, (number + 1, "")), points=points)
+        images.append(Image(identifier, pose, camera, words[9], xy, seen))
+    return images
+
+
+def _image_points(
+    path: Path, number: int, line: str, *, points: bool
+) -> tuple[FloatArray, IntArray]:
+    """Read a second line: x, y and identifier of each image point, -1 for none."""
+    if not line:
+        return NO_XY, NO_POINTS
+    try:
+        int(line.rsplit(None, 1)[-1])  # a line of the next image ends with a name
+        values = np.array(line.split(), float).reshape(-1, 3) if points else np.empty((0, 3))
+    except ValueError as error:
+        rule = "must give the image points (x, y, number of the point) of the image above, or none"
+        raise _wrong(path, number, rule) from error
+    values = values[values[:, 2] >= 0]
+    return values[:, :2], values[:, 2].astype(np.int64)
+
+
+def _text_points(path: Path) -> Points:
+    rows = []
+    for number, line in _lines(path):
+        words = line.split(None, _POINT_WORDS)[:_POINT_WORDS]
+        if not words:
+            continue
+        try:
+            identifier, x, y, z = words
+            rows.append((int(identifier), float(x), float(y), float(z)))
+        except ValueError as error:
+            raise _wrong(path, number, "must give a point: number, X, Y, Z, ...") from error
+    values = np.array(rows, float).reshape(-1, 4)
+    return Points(values[:, 0].astype(np.int64), values[:, 1:])
+
+
+def read_cameras(path: Path) -> dict[int, Camera]:
+    """Read ``cameras``, binary or text: identifier, model, width, height, parameters."""
+    return _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path)
+
+
+def read_images(path: Path, *, points: bool) -> list[Image]:
+    """Read ``images``; the image points only where they are asked for."""
+    form = _binary_images if path.suffix == ".bin" else _text_images
+    return form(path, points=points)
+
+
+def read_points(path: Path) -> Points:
+    """Read identifiers and places of ``points3D``; the tracks are in the images too."""
+    return _binary_points(path) if path.suffix == ".bin" else _text_points(path)
