@@ -270,7 +270,7 @@ def _from_metashape(path: Path) -> Marks:
     surveyed = {
         marker.get("id") or "": marker
         for marker in chunk.element.iterfind("markers//marker")
-        if _has_place(marker)
+        if all(_reference(marker).get(axis) for axis in "xyz")
     }
     marks = [mark for mark in _locations(chunk) if mark[0] in surveyed]
     if not marks:
@@ -280,7 +280,8 @@ def _from_metashape(path: Path) -> Marks:
         )
     of = [surveyed[marker] for marker, _, _ in marks]
     references = [_reference(marker) for marker in of]
-    image = _images(chunk)
+    cameras = chunk.element.iterfind("cameras//camera")
+    image = {camera.get("id"): _label(camera) for camera in cameras}
     default = _setting(chunk, "accuracy_markers")
     return Marks(
         path=path,
@@ -297,11 +298,6 @@ def _from_metashape(path: Path) -> Marks:
     )
 
 
-def _has_place(marker: Element) -> bool:
-    reference = marker.find("reference")
-    return reference is not None and all(reference.get(axis) for axis in "xyz")
-
-
 def _reference(marker: Element) -> Element:
     found = marker.find("reference")
     return marker if found is None else found
@@ -309,16 +305,6 @@ def _reference(marker: Element) -> Element:
 
 def _label(marker: Element) -> str:
     return marker.get("label") or f"number {marker.get('id')}"
-
-
-def _images(chunk: Chunk) -> dict[str, str]:
-    """Return the labels of images by their numbers in the document."""
-    cameras = chunk.element.iterfind("cameras//camera")
-    return {
-        number_: camera.get("label") or f"number {number_}"
-        for camera in cameras
-        if (number_ := camera.get("id")) is not None
-    }
 
 
 def _locations(chunk: Chunk) -> list[tuple[str, str, tuple[float, float]]]:

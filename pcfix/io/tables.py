@@ -286,26 +286,13 @@ def _numbers_or_none(table: Table, name: str) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class CheckDepths:
-    """Places with a known depth, or a known height of the bed; p of them.
+    """Places with a known depth, or a known height of the bed; p of them."""
 
-    Attributes
-    ----------
-    name : str
-        Of the file, for messages.
-    xy : array, shape (p, 2)
-        Metres, the cloud's CRS.
-    value_m : array, shape (p,)
-        Depth below the water, positive down; or world Z, see `are_heights`.
-    are_heights : bool
-    line : list of int
-        Of each place in the file.
-    """
-
-    name: str
-    xy: FloatArray
-    value_m: FloatArray
+    name: str  # of the file, for messages
+    xy: FloatArray  # (p, 2), metres, the cloud's CRS
+    value_m: FloatArray  # (p,), depth below the water, positive down; or world Z, `are_heights`
     are_heights: bool
-    line: list[int]
+    line: list[int]  # of each place in the file
 
     def __len__(self) -> int:
         return len(self.line)

@@ -45,31 +45,15 @@ _OTHERS = {
 
 @dataclass(frozen=True, eq=False)
 class RawList:
-    """The lists of n points as a file has them.
-
-    Attributes
-    ----------
-    path : Path
-    what : str
-        The kind of file.
-    start : array of int64, shape (n + 1,)
-    image : array of int32, shape (start[-1],)
-        What the file counts its images by.
-    weight : array of float32, shape (start[-1],), or None
-    xyz : array, shape (n, 3), or None
-        Positions, frame of the file.
-    resolution_m : float
-        How far from where it was a position can be, from the type of its numbers.
-    notes : tuple of str
-    """
+    """The lists of n points as a file has them."""
 
     path: Path
-    what: str
-    start: IntArray
-    image: npt.NDArray[np.int32]
-    weight: npt.NDArray[np.float32] | None = None
-    xyz: FloatArray | None = None
-    resolution_m: float = 0.0
+    what: str  # the kind of file
+    start: IntArray  # (n + 1,)
+    image: npt.NDArray[np.int32]  # (start[-1],), what the file counts its images by
+    weight: npt.NDArray[np.float32] | None = None  # (start[-1],)
+    xyz: FloatArray | None = None  # (n, 3), frame of the file
+    resolution_m: float = 0.0  # how far off a position can be, from the type of its numbers
     notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -78,21 +62,11 @@ class RawList:
 
 @dataclass(frozen=True, eq=False)
 class ImageOrder:
-    """One meaning of the image numbers.
+    """One meaning of the image numbers."""
 
-    Attributes
-    ----------
-    what : str
-        Where it is from.
-    camera : array of int32, shape (images,)
-        The row of `Cameras` of each image, -1 where it has none.
-    unposed : tuple of str
-        Images without a row.
-    """
-
-    what: str
-    camera: npt.NDArray[np.int32]
-    unposed: tuple[str, ...] = ()
+    what: str  # where it is from
+    camera: npt.NDArray[np.int32]  # (images,), rows of `Cameras`, -1 where there is none
+    unposed: tuple[str, ...] = ()  # images without a row
 
 
 @dataclass(frozen=True, eq=False)

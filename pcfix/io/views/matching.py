@@ -33,15 +33,14 @@ _SAME = 0.05
 """A fraction of the spacing within which two positions are those of one point."""
 
 _ROUNDING = 1.01 * np.sqrt(3.0)
+_BINS = 1000
+_MANY = 0.1
+"""A share of points without a list that the user should hear of."""
+_ENOUGH = 20_000
 
 
 class ViewMatch:
-    """A view list and a cloud whose chunks come in order.
-
-    Attributes
-    ----------
-    report : ViewReport
-    """
+    """A view list and a cloud whose chunks come in order; `report` says how they went together."""
 
     def __init__(
         self,
@@ -89,11 +88,16 @@ class ViewMatch:
             notes=list(raw.notes),
             weights=raw.weight is not None,
         )
-        if raw.xyz is None:
-            self._check_count(points)
-        else:
+        if raw.xyz is not None:
             rounding_m = _ROUNDING * (step_m / 2 + raw.resolution_m)
             self._set_tolerances(views.spacing_m or 0.0, tolerance_m, rounding_m)
+        elif points != len(views):
+            raise InputError(
+                f"{raw.path}: has the lists of {len(views):,} points, the cloud has"
+                f" {'an unknown number' if points is None else f'{points:,}'}, and without"
+                " positions they cannot be told apart; put the PLY file that was written with the"
+                " list beside it, or give the cloud as it was when the list was written."
+            )
         self._note_order()
 
     def _set_tolerances(
@@ -109,15 +113,6 @@ class ViewMatch:
                 " neighbour's list; use files with more decimals, as the software wrote them."
             )
 
-    def _check_count(self, points: int | None) -> None:
-        if points != len(self._views):
-            raise InputError(
-                f"{self._views.raw.path}: has the lists of {len(self._views):,} points, the cloud"
-                f" has {'an unknown number' if points is None else f'{points:,}'}, and without"
-                " positions they cannot be told apart; put the PLY file that was written with the"
-                " list beside it, or give the cloud as it was when the list was written."
-            )
-
     def _note_order(self) -> None:
         order = self._views.orders[0]
         shares = (self.report.share_seen, self._views.share_seen)
@@ -128,22 +123,8 @@ class ViewMatch:
     def for_chunk(self, xyz: FloatArray, first_row: int) -> Views:
         """Return the cameras of a chunk's points; a point without a match has none.
 
-        Parameters
-        ----------
-        xyz : array, shape (n, 3)
-            Apparent points, frame of the cameras.
-        first_row : int
-            The cloud's row of the first of them.
-
-        Returns
-        -------
-        Views
-            Of n points, with weights where the list has them.
-
-        Raises
-        ------
-        InputError
-            If the list goes by row alone and its cameras do not see the points.
+        The points, shape (n, 3), are apparent ones in the frame of the cameras, from the cloud's
+        `first_row` on. A list that goes by row alone is refused if its cameras do not see them.
         """
         if self._views.raw.xyz is None:
             row = np.arange(first_row, first_row + len(xyz))
@@ -169,8 +150,8 @@ class ViewMatch:
         self.report.by_row += int(np.count_nonzero(near))
         rest = np.flatnonzero(row < 0)
         for at in range(0, len(rest), _QUERIES):
-            some = rest[at : at + _QUERIES]
-            row[some] = self._nearest(xyz[some], listed)
+            part = rest[at : at + _QUERIES]
+            row[part] = self._nearest(xyz[part], listed)
         return row
 
     def _nearest(self, xyz: FloatArray, listed: FloatArray) -> IntArray:
@@ -205,51 +186,22 @@ class ViewMatch:
         return Views(start, camera[posed], weight, self._views.kind)
 
 
-_BINS = 1000
-_MANY = 0.1
-"""A share of points without a list that the user should hear of."""
-
-
 @dataclass
 class ViewReport:
-    """What was matched so far; it grows with every chunk.
+    """What was matched so far; it grows with every chunk."""
 
-    Attributes
-    ----------
-    source : str
-        Kind and path of the list.
-    list_points : int
-    image_order : str
-        What the image numbers were found to mean.
-    share_seen : float or None
-        Share of listed cameras whose frame holds the point, the lowest of all chunks.
-    tolerance_m : float or None
-        Largest distance of a match by position.
-    by_row, by_position, unmatched : int
-        Points of the cloud.
-    without_camera : int
-        Matched points of whose images none has a pose.
-    entries, unposed_entries : int
-        Of the lists: cameras given out, and images without a pose that were dropped.
-    unposed : tuple of str
-        Images without a pose that a list may name.
-    weights : bool
-        Whether the list has weights.
-    notes : list of str
-    """
-
-    source: str
+    source: str  # kind and path of the list
     list_points: int
-    image_order: str = ""
-    share_seen: float | None = None
-    tolerance_m: float | None = None
-    by_row: int = 0
+    image_order: str = ""  # what the image numbers were found to mean
+    share_seen: float | None = None  # see `ViewList`, the lowest of all chunks
+    tolerance_m: float | None = None  # largest distance of a match by position
+    by_row: int = 0  # points of the cloud, as the next two
     by_position: int = 0
     unmatched: int = 0
-    without_camera: int = 0
-    entries: int = 0
-    unposed_entries: int = 0
-    unposed: tuple[str, ...] = ()
+    without_camera: int = 0  # matched points of whose images none has a pose
+    entries: int = 0  # of the lists: cameras given out
+    unposed_entries: int = 0  # images without a pose that were dropped
+    unposed: tuple[str, ...] = ()  # images without a pose that a list may name
     weights: bool = False
     notes: list[str] = field(default_factory=list)
     _histogram: IntArray = field(default_factory=lambda: np.zeros(_BINS + 1, np.int64), repr=False)
@@ -287,13 +239,7 @@ class ViewReport:
         return float(int(np.argmax(enough)) * self.tolerance_m / _BINS)
 
     def check(self) -> None:
-        """Refuse a list that has nothing for the cloud.
-
-        Raises
-        ------
-        InputError
-            If no point got a camera.
-        """
+        """Refuse a list that gave no point of the cloud a camera."""
         if self.points and self.entries == 0:
             raise InputError(
                 f"{self.source}: none of the cloud's {self.points:,} points is in the list"
@@ -303,24 +249,24 @@ class ViewReport:
 
     def warnings(self) -> list[str]:
         """Return what the user should know of, as sentences."""
-        said = list(self.notes)
+        sentences = list(self.notes)
         if self.unmatched > _MANY * self.points:
-            said.append(
+            sentences.append(
                 f"{self.source}: {self.unmatched:,} of the cloud's {self.points:,} points are not"
                 f" in the list ({self._tolerance()})."
             )
         if self.share_seen is None and self.entries:
-            said.append(
+            sentences.append(
                 f"{self.source}: the cameras have no frames, so nothing shows that the list counts"
                 f" its images in the order assumed ({self.image_order})."
             )
         if self.unposed_entries:
             named = f", among them {', '.join(self.unposed[:3])}" if self.unposed else ""
-            said.append(
+            sentences.append(
                 f"{self.source}: {self.unposed_entries:,} entries name images without a pose"
                 f"{named}; they are left out."
             )
-        return said
+        return sentences
 
     def _tolerance(self) -> str:
         return "by row" if self.tolerance_m is None else f"tolerance {self.tolerance_m:.3g} m"
@@ -335,9 +281,6 @@ class ViewReport:
             "distance_median_m": self.distance_m(0.5),
             "distance_95_m": self.distance_m(0.95),
         }
-
-
-_ENOUGH = 20_000
 
 
 def spacing_m(xyz: FloatArray) -> float | None:

@@ -173,19 +173,8 @@ def _text_frames(content: str) -> dict[int, list[tuple[int, int]]]:
 def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -> ViewList:
     """Return the list with the one order of images with which its cameras see the points.
 
-    Parameters
-    ----------
-    views : ViewList
-    cameras : Cameras
-    xyz : array, shape (m, 3)
-        Apparent points, frame of the cameras.
-    rows : array of int64, shape (m,)
-        Their rows of the list.
-
-    Raises
-    ------
-    InputError
-        If they do not with any.
+    The apparent points, shape (m, 3), are in the frame of the cameras; `rows`, shape (m,), are
+    theirs of the list. One that fits with no order is an `InputError`.
     """
     if cameras.rotations is None or cameras.lenses is None:
         return replace(views, orders=views.orders[:1])
@@ -221,14 +210,8 @@ def entries(start: IntArray, rows: IntArray) -> tuple[IntArray, IntArray]:
 def share_seen(cameras: Cameras, camera: npt.NDArray[np.int32], xyz: FloatArray) -> float | None:
     """Return the share of cameras whose frame holds their point, None without any.
 
-    Parameters
-    ----------
-    cameras : Cameras
-        With rotations and lenses.
-    camera : array of int, shape (m,)
-        Rows of `cameras`; negative ones do not count.
-    xyz : array, shape (m, 3)
-        The point of each, world frame.
+    `camera`, shape (m,), has rows of cameras with rotations and lenses, of which negative ones do
+    not count; `xyz`, shape (m, 3), the point of each.
     """
     order = np.argsort(camera, kind="stable")
     ends = np.searchsorted(camera[order], np.arange(len(cameras) + 1))
