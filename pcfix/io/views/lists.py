@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.io.ply import Vertices, copy_field, list_starts, read_header
+from pcfix.io.ply import read_header
+from pcfix.io.views.vertices import Vertices, copy_field, list_starts
 
 if TYPE_CHECKING:
     from pathlib import Path
