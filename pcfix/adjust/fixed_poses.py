@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.block import Block, Unknowns
-from pcfix.adjust.normal import Loss, point_steps, residuals
-from pcfix.adjust.solve import prepare
+from pcfix.adjust.block import Block, Loss, Unknowns
+from pcfix.adjust.normal import point_steps, residuals
+from pcfix.adjust.problem import prepare
 
 if TYPE_CHECKING:
-    from pcfix.adjust.solve import Problem
     from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, WaterSurface
 
 STEPS = 10
@@ -78,9 +77,10 @@ def intersect_fixed(block: Block) -> Intersected:
     A point that takes more than `STEPS` steps of Gauss and Newton has failed.
     """
     problem, now = prepare(block, Unknowns(poses="fixed", lens=()))
+    poses, shared = np.zeros((len(block.cameras), 6)), np.zeros(problem.columns.total)
     state, step = now.state, np.full((len(block.xyz), 3), np.inf)
     for _ in range(STEPS):
-        step = _point_steps(problem, state)
+        step = point_steps(state, problem.given, Loss(), 0.0, poses, shared)
         state = state._replace(xyz=state.xyz + step)
         if np.nanmax(np.abs(step), initial=0.0) < CLOSE_M:
             break
@@ -88,11 +88,3 @@ def intersect_fixed(block: Block) -> Intersected:
     settled = (np.abs(step) < CLOSE_M).all(axis=1)
     r[~settled[block.owner]] = np.nan
     return Intersected(state.xyz + problem.origin, r, np.asarray(block.start))
-
-
-def _point_steps(problem: Problem, state) -> FloatArray:  # type: ignore[no-untyped-def]
-    k = len(problem.block.cameras)
-    return point_steps(
-        state, problem.seen, problem.surface, problem.columns, problem.priors,
-        Loss(), 0.0, problem.pivot, np.zeros((k, 6)), np.zeros(problem.columns.total),
-    )  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 
 from pcfix.adjust.block import Unknowns
 from pcfix.adjust.fixed_poses import intersect_fixed, plain_block
-from pcfix.adjust.solve import prepare, solved_cameras
+from pcfix.adjust.problem import prepare, solved_cameras
 from pcfix.adjust.unaware import solve_unaware, straight_columns
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import project

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from pcfix.adjust.normal import residuals
+from pcfix.adjust.problem import Problem, Solution, gnss_weights, prepare
 from pcfix.adjust.rounds import adjusted_of, check_datum
-from pcfix.adjust.solve import Problem, Solution, gnss_weights, prepare
 from pcfix.adjust.unaware import solve_unaware, straight_columns
 from pcfix.errors import GeometryError
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from pcfix.adjust.block import Block, Unknowns
+    from pcfix.adjust.problem import LogRow
     from pcfix.adjust.result import Adjusted
-    from pcfix.adjust.solve import LogRow
     from pcfix.model import Cameras, FloatArray
 
     Progress = Callable[[LogRow], None]

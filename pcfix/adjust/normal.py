@@ -21,39 +21,26 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit, prange
 
+from pcfix.adjust.block import CAUCHY, HUBER
 from pcfix.adjust.observe import (
     POINT,
     WATER,
     WIDTH,
+    Scratch,
     image,
     image_and_all_gradients,
     lens_gradients,
+    scratch,
 )
 from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
-    from pcfix.adjust.state import Columns, Seen, State, Surface
+    from pcfix.adjust.block import Given, Loss, PointPriors, Seen, State, Surface
     from pcfix.model import FloatArray, IntArray
 
 PARTS = 8
 LOST = 1e6
 """What an observation costs whose point got out of sight, in its weighted square."""
-
-SQUARES, HUBER, CAUCHY = range(3)
-
-
-class Loss(NamedTuple):
-    """How residuals count: the kind, and where it begins to bend, in standard deviations."""
-
-    kind: int = SQUARES
-    scale: float = 1.0
-
-
-class PointPriors(NamedTuple):
-    """Surveyed points: where, and the inverse variances along x, y, z; zero for the others."""
-
-    xyz: FloatArray
-    weight: FloatArray
 
 
 class Sums(NamedTuple):
@@ -102,44 +89,39 @@ def _mark(share: FloatArray, start: IntArray, camera: IntArray) -> None:
 
 
 def normal_equations(
-    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
-    loss: Loss, damping: float, slots: tuple[IntArray, IntArray], pivot: FloatArray,
-) -> Sums:  # fmt: skip
+    state: State, given: Given, loss: Loss, damping: float, slots: tuple[IntArray, IntArray]
+) -> Sums:
     """Return the reduced normal equations at a state.
 
     Parameters
     ----------
+    state : State
+    given : Given
+    loss : Loss
     damping : float
         Levenberg-Marquardt's factor on the diagonal of V; that of the poses is added later.
-    pivot : array, shape (3,)
-        About which a similarity turns and scales, block frame.
+    slots : tuple
+        Of `pair_slots`.
     """
     slot, pairs = slots
-    k, g = len(state.centres), columns.total
-    sums = (
+    k, g = len(state.centres), given.columns.total
+    sums = Sums(
         np.zeros((PARTS, len(pairs), 6, 6)), np.zeros((PARTS, k, 6, g)), np.zeros((PARTS, g, g)),
         np.zeros((PARTS, k, 6)), np.zeros((PARTS, g)),
         np.zeros((PARTS, k, 6)), np.zeros((PARTS, g)),
     )  # fmt: skip
     with one_caller():
-        _sum_up(
-            state, seen, surface, columns, priors, loss.kind, loss.scale, damping, slot, pivot,
-            *sums,
-        )  # fmt: skip
+        _sum_up(state, given, loss, damping, slot, sums)
     return Sums(*(part.sum(axis=0) for part in sums))
 
 
 def point_steps(
-    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
-    loss: Loss, damping: float, pivot: FloatArray, poses: FloatArray, shared: FloatArray,
-) -> FloatArray:  # fmt: skip
+    state: State, given: Given, loss: Loss, damping: float, poses: FloatArray, shared: FloatArray
+) -> FloatArray:
     """Return how the points move, given how the poses and what they share do, shape (m, 3)."""
     steps = np.zeros((len(state.xyz), 3))
     with one_caller():
-        _point_steps(
-            state, seen, surface, columns, priors, loss.kind, loss.scale, damping, pivot,
-            poses, shared, steps,
-        )  # fmt: skip
+        _point_steps(state, given, loss, damping, poses, shared, steps)
     return steps
 
 
@@ -167,63 +149,57 @@ def cost_of(squares: FloatArray, loss: Loss) -> float:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _influence(square: float, kind: int, scale: float) -> float:
+def _influence(square: float, loss: Loss) -> float:
     """Return the derivative of the loss by the square: the weight of the observation."""
-    if kind == HUBER:
-        return 1.0 if square <= scale * scale else scale / np.sqrt(square)
-    if kind == CAUCHY:
-        return 1.0 / (1.0 + square / (scale * scale))
+    if loss.kind == HUBER:
+        return 1.0 if square <= loss.scale * loss.scale else loss.scale / np.sqrt(square)
+    if loss.kind == CAUCHY:
+        return 1.0 / (1.0 + square / (loss.scale * loss.scale))
     return 1.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _residuals(state: State, seen: Seen, surface: Surface, found: FloatArray) -> None:
     for part in prange(PARTS):
-        m = len(state.xyz)
-        light, plane = np.empty((3, 12)), np.empty(4)
+        m, room = len(state.xyz), scratch()
         for p in range(part * m // PARTS, (part + 1) * m // PARTS):
             for o in range(seen.start[p], seen.start[p + 1]):
-                c = seen.camera[o]
-                u, v = image(
-                    state.xyz[p], seen.wet[p], state.centres[c], state.rotations[c],
-                    state.lenses[seen.lens_row[c]], state.water, surface, light, plane,
-                )  # fmt: skip
+                u, v = image(state, seen, surface, p, seen.camera[o], room)
                 found[o, 0], found[o, 1] = seen.image_xy[o, 0] - u, seen.image_xy[o, 1] - v
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def linearise(
-    state: State, seen: Seen, surface: Surface, columns: Columns, kind: int, scale: float,
-    pivot: FloatArray, p: int, o: int, light: FloatArray, plane: FloatArray, ahead: FloatArray,
+    state: State, given: Given, loss: Loss, p: int, o: int, room: Scratch,
     own: FloatArray, shared: FloatArray, r: FloatArray,
 ) -> bool:  # fmt: skip
-    """Fill in the weighted residual and Jacobians of one observation; whether it counts."""
+    """Fill in the weighted residual and Jacobians of one observation; whether it counts.
+
+    `own`, shape (2, 13), by pose, point and water; `shared`, shape (2, g); `r`, shape (2,).
+    """
+    seen, columns = given.seen, given.columns
     c = seen.camera[o]
     if seen.weight[o] == 0.0:
         return False
-    u, v = image_and_all_gradients(
-        state.xyz[p], seen.wet[p], state.centres[c], state.rotations[c],
-        state.lenses[seen.lens_row[c]], state.water, surface, light, plane, ahead, own,
-    )  # fmt: skip
+    u, v = image_and_all_gradients(state, seen, given.surface, p, c, room, own)
     r[0], r[1] = seen.image_xy[o, 0] - u, seen.image_xy[o, 1] - v
     w = seen.weight[o]
     square = w * w * (r[0] * r[0] + r[1] * r[1])
     if not square < np.inf:
         return False
-    w *= np.sqrt(_influence(square, kind, scale))
+    w *= np.sqrt(_influence(square, loss))
     group = seen.group[c]
     first, last = columns.lens[group], columns.lens[group + 1]
     shared[:] = 0.0
     if last > first:
-        lens_gradients(
-            state.lenses[seen.lens_row[c]], ahead, columns.code[first:last], shared[:, first:last]
-        )
+        lens, codes = state.lenses[seen.lens_row[c]], columns.code[first:last]
+        lens_gradients(lens, room.ahead, codes, shared[:, first:last])
     for i in range(4):
         if columns.water[i] >= 0:
             shared[0, columns.water[i]] = own[0, WATER + i]
             shared[1, columns.water[i]] = own[1, WATER + i]
     if columns.similarity >= 0:
-        _similarity_gradients(state, c, own, pivot, shared, columns.similarity)
+        _similarity_gradients(state, c, own, given.pivot, shared, columns.similarity)
     r *= w
     own *= w
     shared *= w
@@ -290,48 +266,38 @@ def most_seen(start: IntArray, first: int, last: int) -> int:
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _sum_up(
-    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors, kind: int,
-    scale: float, damping: float, slot: IntArray, pivot: FloatArray,
-    blocks: FloatArray, border: FloatArray, corner: FloatArray, poses: FloatArray,
-    shared_right: FloatArray, diagonal: FloatArray, shared_diagonal: FloatArray,
-) -> None:  # fmt: skip
+    state: State, given: Given, loss: Loss, damping: float, slot: IntArray, sums: Sums
+) -> None:
+    """Add up the equations of the points, each part of them in its row of the sums."""
+    blocks, border, corner, poses, shared_right, diagonal, shared_diagonal = sums
     for part in prange(PARTS):
-        m, g = len(state.xyz), columns.total
+        m, g = len(state.xyz), given.columns.total
         first, last = part * m // PARTS, (part + 1) * m // PARTS
-        most = most_seen(seen.start, first, last)
-        light, plane, ahead = np.empty((3, 12)), np.empty(4), np.empty(3)
+        start, most = given.seen.start, most_seen(given.seen.start, first, last)
+        of_part = Sums(
+            blocks[part], border[part], corner[part], poses[part], shared_right[part],
+            diagonal[part], shared_diagonal[part],
+        )  # fmt: skip
+        room = scratch()
         own, shared = np.empty((most, 2, WIDTH)), np.zeros((most, 2, g))
         r, who = np.empty((most, 2)), np.empty(most, np.int64)
         v, rhs, w_g = np.empty((3, 3)), np.empty(3), np.empty((g, 3))
         w = np.empty((most, 6, 3))
         for p in range(first, last):
             v[:], rhs[:], count = 0.0, 0.0, 0
-            for o in range(seen.start[p], seen.start[p + 1]):
-                if linearise(
-                    state, seen, surface, columns, kind, scale, pivot, p, o,
-                    light, plane, ahead, own[count], shared[count], r[count],
-                ):  # fmt: skip
-                    who[count] = seen.camera[o]
+            for o in range(start[p], start[p + 1]):
+                if linearise(state, given, loss, p, o, room, own[count], shared[count], r[count]):
+                    who[count] = given.seen.camera[o]
                     _add_point(v, rhs, own[count], r[count])
                     count += 1
             # a point that its rays do not fix says nothing of the cameras either
-            if count == 0 or not point_block(v, rhs, priors, state.xyz[p], p, damping):
+            if count == 0 or not point_block(v, rhs, given.priors, state.xyz[p], p, damping):
                 continue
             w_g[:] = 0.0
             for a in range(count):
-                c = who[a]
-                _add_pose(
-                    blocks[part, slot[c, c]], border[part, c], poses[part, c], diagonal[part, c],
-                    w[a], own[a], shared[a], r[a],
-                )  # fmt: skip
-                _add_shared(
-                    corner[part], shared_right[part], shared_diagonal[part], w_g,
-                    own[a], shared[a], r[a],
-                )  # fmt: skip
-            _eliminate(
-                blocks[part], border[part], corner[part], poses[part], shared_right[part],
-                slot, who[:count], w, w_g, v, rhs,
-            )  # fmt: skip
+                _add_pose(of_part, who[a], slot, w[a], own[a], shared[a], r[a])
+                _add_shared(of_part, w_g, own[a], shared[a], r[a])
+            _eliminate(of_part, slot, who[:count], w, w_g, v, rhs)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -345,10 +311,12 @@ def _add_point(v: FloatArray, rhs: FloatArray, own: FloatArray, r: FloatArray) -
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _add_pose(
-    u: FloatArray, border: FloatArray, right: FloatArray, diagonal: FloatArray, w: FloatArray,
+    sums: Sums, c: int, slot: IntArray, w: FloatArray,
     own: FloatArray, shared: FloatArray, r: FloatArray,
 ) -> None:  # fmt: skip
-    """Add J'J, J'G and J'r, and set W = J'B."""
+    """Add J'J, J'G and J'r of camera c, and set W = J'B."""
+    u, border = sums.blocks[slot[c, c]], sums.border[c]
+    right, diagonal = sums.poses[c], sums.diagonal[c]
     for i in range(6):
         for j in range(6):
             u[i, j] += own[0, i] * own[0, j] + own[1, i] * own[1, j]
@@ -362,10 +330,10 @@ def _add_pose(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _add_shared(
-    corner: FloatArray, right: FloatArray, diagonal: FloatArray, w_g: FloatArray,
-    own: FloatArray, shared: FloatArray, r: FloatArray,
-) -> None:  # fmt: skip
+    sums: Sums, w_g: FloatArray, own: FloatArray, shared: FloatArray, r: FloatArray
+) -> None:
     """Add G'G, G'r and G'B."""
+    corner, right, diagonal = sums.corner, sums.shared, sums.shared_diagonal
     for i in range(shared.shape[1]):
         for j in range(shared.shape[1]):
             corner[i, j] += shared[0, i] * shared[0, j] + shared[1, i] * shared[1, j]
@@ -377,11 +345,12 @@ def _add_shared(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _eliminate(
-    blocks: FloatArray, border: FloatArray, corner: FloatArray, poses: FloatArray,
-    shared_right: FloatArray, slot: IntArray, who: IntArray, w: FloatArray, w_g: FloatArray,
+    sums: Sums, slot: IntArray, who: IntArray, w: FloatArray, w_g: FloatArray,
     v: FloatArray, rhs: FloatArray,
 ) -> None:  # fmt: skip
     """Take a point out of the equations, with V inverted."""
+    blocks, border, corner, poses = sums.blocks, sums.border, sums.corner, sums.poses
+    shared_right = sums.shared
     g, y = len(w_g), np.empty((6, 3))
     for a in range(who.size):
         c = who[a]
@@ -411,22 +380,18 @@ def _eliminate(
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _point_steps(
-    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors, kind: int,
-    scale: float, damping: float, pivot: FloatArray, poses: FloatArray, moved: FloatArray,
-    steps: FloatArray,
+    state: State, given: Given, loss: Loss, damping: float,
+    poses: FloatArray, moved: FloatArray, steps: FloatArray,
 ) -> None:  # fmt: skip
     for part in prange(PARTS):
-        m, g = len(state.xyz), columns.total
-        light, plane, ahead = np.empty((3, 12)), np.empty(4), np.empty(3)
+        m, g, seen = len(state.xyz), given.columns.total, given.seen
+        room = scratch()
         own, shared, r = np.empty((2, WIDTH)), np.zeros((2, g)), np.empty(2)
         v, rhs = np.empty((3, 3)), np.empty(3)
         for p in range(part * m // PARTS, (part + 1) * m // PARTS):
             v[:], rhs[:], count = 0.0, 0.0, 0
             for o in range(seen.start[p], seen.start[p + 1]):
-                if not linearise(
-                    state, seen, surface, columns, kind, scale, pivot, p, o,
-                    light, plane, ahead, own, shared, r,
-                ):  # fmt: skip
+                if not linearise(state, given, loss, p, o, room, own, shared, r):
                     continue
                 for row in range(2):
                     for i in range(6):
@@ -435,6 +400,6 @@ def _point_steps(
                         r[row] -= shared[row, i] * moved[i]
                 _add_point(v, rhs, own, r)
                 count += 1
-            if count and point_block(v, rhs, priors, state.xyz[p], p, damping):
+            if count and point_block(v, rhs, given.priors, state.xyz[p], p, damping):
                 for i in range(3):
                     steps[p, i] = v[i, 0] * rhs[0] + v[i, 1] * rhs[1] + v[i, 2] * rhs[2]

@@ -9,12 +9,12 @@ is (x x g) by omega.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numba import njit
 
-from pcfix.adjust.state import B1, B2, CX, CY, FOCAL, K1, P1
+from pcfix.adjust.block import B1, B2, CX, CY, FOCAL, K1, P1
 from pcfix.lens import places
 from pcfix.lens.brown import distorted, jacobian, undistorted
 from pcfix.lens.derivatives import image_and_gradients
@@ -24,11 +24,30 @@ from pcfix.refract.backward import light_path, plane_at, settle
 from pcfix.refract.tracing.derivatives import light_and_gradients
 
 if TYPE_CHECKING:
-    from pcfix.adjust.state import Surface
+    from pcfix.adjust.block import Seen, State, Surface
     from pcfix.model import FloatArray
 
 POSE, POINT, WATER, WIDTH = 0, 6, 9, 13
 """Columns of the gradients: omega and C, Q, and a, b, c, n."""
+
+
+class Scratch(NamedTuple):
+    """Room for one observation, made once a thread.
+
+    light, plane : shapes (3, 12) and (4,), the light with its derivatives and where it is bent.
+    ahead : shape (3,), filled with the direction that the lens images, camera frame.
+    """
+
+    light: FloatArray
+    plane: FloatArray
+    ahead: FloatArray
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def scratch() -> Scratch:
+    """Return new room."""
+    return Scratch(np.empty((3, 12)), np.empty(4), np.empty(3))
+
 
 _CENTRE_X, _CENTRE_Y, _INVERSE = places.CENTRE_X, places.CENTRE_Y, places.INVERSE
 _FOCAL_X, _FOCAL_Y, _B2, _B3 = places.FOCAL_X, places.FOCAL_Y, places.B2, places.B3
@@ -64,12 +83,13 @@ def water_plane(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def image(
-    q: FloatArray, wet: bool, centre: FloatArray, r: FloatArray, lens: FloatArray,
-    water: FloatArray, surface: Surface, light: FloatArray, plane: FloatArray,
-) -> tuple[float, float]:  # fmt: skip
-    """Return where a camera images a point; NaN where it does not."""
+    state: State, seen: Seen, surface: Surface, p: int, c: int, room: Scratch
+) -> tuple[float, float]:
+    """Return where camera c images point p; NaN where it does not."""
+    q, centre, r, water = state.xyz[p], state.centres[c], state.rotations[c], state.water
+    light, plane = room.light, room.plane
     dx, dy, dz = q[0] - centre[0], q[1] - centre[1], q[2] - centre[2]
-    refracted = surface.port.size == 0 and wet and surface.there
+    refracted = surface.port.size == 0 and seen.wet[p] and surface.there
     if refracted:
         refracted = water_plane(plane, water, surface, q, centre)
     if refracted:
@@ -84,27 +104,20 @@ def image(
     if surface.port.size:
         through_port(surface.port, water[3], x, y, z, light)
         x, y, z = light[0, 0], light[1, 0], light[2, 0]
-    return image_of(lens, x, y, z)
+    return image_of(state.lenses[seen.lens_row[c]], x, y, z)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def image_and_all_gradients(
-    q: FloatArray, wet: bool, centre: FloatArray, r: FloatArray, lens: FloatArray,
-    water: FloatArray, surface: Surface, light: FloatArray, plane: FloatArray,
-    ahead: FloatArray, out: FloatArray,
-) -> tuple[float, float]:  # fmt: skip
-    """Return where a camera images a point, and fill in how that moves.
+    state: State, seen: Seen, surface: Surface, p: int, c: int, room: Scratch, out: FloatArray
+) -> tuple[float, float]:
+    """Return where camera c images point p, and fill in how that moves.
 
-    Parameters
-    ----------
-    light : array, shape (3, 12)
-        Scratch; `plane`, shape (4,), too.
-    ahead : array, shape (3,)
-        Filled with the direction that the lens images, camera frame.
-    out : array, shape (2, 13)
-        Filled with the derivatives of u and v: by omega, C, Q, and a, b, c, n.
+    `out`, shape (2, 13), has the derivatives of u and v: by omega, C, Q, and a, b, c, n.
     """
-    refracted = surface.port.size == 0 and wet and surface.there
+    q, centre, r, water = state.xyz[p], state.centres[c], state.rotations[c], state.water
+    light, plane, ahead = room.light, room.plane, room.ahead
+    refracted = surface.port.size == 0 and seen.wet[p] and surface.there
     if refracted:
         refracted = water_plane(plane, water, surface, q, centre)
     if refracted:
@@ -125,7 +138,7 @@ def image_and_all_gradients(
         through_port(surface.port, water[3], x, y, z, bent)
         ahead[:] = bent[:, 0]
         by_n_port[:] = bent[:, 4]
-    u, v, g = image_and_gradients(lens, ahead[0], ahead[1], ahead[2])
+    u, v, g = image_and_gradients(state.lenses[seen.lens_row[c]], ahead[0], ahead[1], ahead[2])
     for row in range(2):
         gx, gy, gz = g[3 * row], g[3 * row + 1], g[3 * row + 2]
         along_n = 0.0
@@ -171,7 +184,7 @@ def lens_gradients(c: FloatArray, ahead: FloatArray, codes: FloatArray, out: Flo
     ahead : array, shape (3,)
         The direction, camera frame.
     codes : array of int, shape (p,)
-        See `pcfix.adjust.state`.
+        See `pcfix.adjust.block`.
     out : array, shape (2, p)
 
     Notes

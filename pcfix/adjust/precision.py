@@ -8,31 +8,22 @@ priors; in a free network that of the start values.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.reduced import solver
-from pcfix.adjust.separability import strong_correlations, undetermined, weakest
-from pcfix.adjust.solve import similarity_gradients
-from pcfix.adjust.undamped import Undamped, point_covariances, undamped
+from pcfix.adjust.equations import Undamped, point_covariances, solver, undamped
+from pcfix.adjust.problem import similarity_gradients
+from pcfix.adjust.solve import BED, LIMITS, MOTIONS, weakest, words_of
 from pcfix.errors import GeometryError
 
 if TYPE_CHECKING:
-    from pcfix.adjust.reduced import Reduced
-    from pcfix.adjust.solve import Problem, Solution
+    from pcfix.adjust.block import Unknowns
+    from pcfix.adjust.equations import Reduced
+    from pcfix.adjust.problem import Problem, Solution
     from pcfix.model import FloatArray
-
-__all__ = [
-    "BLOCK_MOTIONS",
-    "Precision",
-    "SharedUnknown",
-    "precision_of",
-    "strong_correlations",
-    "undetermined",
-    "weakest",
-]
 
 DENSE_UP_TO = 12_000
 """Unknowns up to which the whole inverse is computed (1.2 GB)."""
@@ -289,3 +280,80 @@ def _correlations(covariance: FloatArray) -> FloatArray:
     known = sigma > 0.0
     scale = np.where(known, 1.0 / np.where(known, sigma, 1.0), 0.0)
     return np.asarray(covariance * scale * scale[:, None])
+
+
+STRONG = 0.95
+
+
+NO_NEWS = 0.9
+"""Share of a given standard deviation above which the images told nothing beyond it."""
+
+
+def strong_correlations(precision: Precision, limit: float = STRONG) -> list[str]:
+    """Return a sentence for each two unknowns that are hardly told apart, the strongest first.
+
+    Pairs of k1, k2, ... are left out: they always are, and it harms nothing.
+    """
+    names = [row.name for row in precision.shared]
+    found: list[tuple[float, str]] = []
+    for i, name in enumerate(names):
+        for j in range(i):
+            r = float(precision.correlation[i, j])
+            if abs(r) > limit and not (_is_radial(name) and _is_radial(names[j])):
+                found.append((r, _pair(names[j], name, r)))
+        for words, r in zip(BLOCK_MOTIONS, precision.block_correlation[i].tolist(), strict=True):
+            # where poses move together, their shift is a shared unknown of its own
+            if abs(r) > limit and not _moves_block(name):
+                found.append((r, _with_block(name, words, r)))
+    return [words for _, words in sorted(found, key=lambda row: -abs(row[0]))]
+
+
+def _is_radial(name: str) -> bool:
+    return name[0] == "k" and name[1:2].isdigit()
+
+
+def _moves_block(name: str) -> bool:
+    return name in MOTIONS or name == "scale"
+
+
+def _pair(a: str, b: str, r: float) -> str:
+    first, second = words_of(a), words_of(b)
+    if a in BED and b in BED:
+        return f"{first} and {second} move the bed alike: r = {r:.3f}; fix one of them."
+    if a in BED or b in BED:
+        return (
+            f"{first} and {second} are hardly told apart: r = {r:.3f}; fix one of them, or give"
+            " control points at several heights."
+        )
+    return f"{first} and {second} do the same to the images: r = {r:.3f}; fix one of them."
+
+
+def _with_block(name: str, motion: str, r: float) -> str:
+    first = words_of(name)
+    if name in BED:
+        remedy = "fix it, or give control points on land or better GNSS positions"
+    else:
+        remedy = "fix it, or give control points at several heights or obliques"
+    return f"{first} and {motion} are hardly told apart: r = {r:.3f}; {remedy}."
+
+
+def undetermined(precision: Precision, unknowns: Unknowns) -> list[str]:
+    """Return a sentence for each unknown whose standard error is too large to be of use."""
+    sigma = dict(zip(("level", "tilt_x", "tilt_y", "index"), unknowns.water_sigma, strict=True))
+    given = sigma | unknowns.lens_sigma
+    notes = []
+    for row in precision.shared:
+        limit, unit, _ = LIMITS.get(row.name, (math.inf, "", ""))
+        prior = given.get(row.name.partition(" of ")[0], math.inf)
+        space = f" {unit}" if unit else ""
+        if row.sigma > limit:
+            notes.append(
+                f"{words_of(row.name)} is undetermined: its standard error of"
+                f" {row.sigma:.2g}{space} exceeds {limit:g}{space}; fix it to a measured value."
+            )
+        elif prior < math.inf and row.sigma > NO_NEWS * prior:
+            notes.append(
+                f"{words_of(row.name)} is what was given: the images tell no more than its standard"
+                f" deviation of {prior:g}{space}."
+            )
+    return notes

@@ -10,7 +10,7 @@ import numpy as np
 if TYPE_CHECKING:
     from pcfix.adjust.block import Block, Unknowns
     from pcfix.adjust.precision import Precision
-    from pcfix.adjust.solve import LogRow
+    from pcfix.adjust.problem import LogRow
     from pcfix.model import BoolArray, Cameras, FloatArray, WaterSurface
 
 Source = Literal["tie points", "cloud"]

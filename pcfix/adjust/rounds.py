@@ -7,22 +7,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.adjust.block import Block, Robust, Unknowns, usable_codes
+from pcfix.adjust.block import CODES, K1, Block, Robust, Unknowns, usable_codes
 from pcfix.adjust.gather import LEAST_VIEWS
 from pcfix.adjust.normal import residuals
 from pcfix.adjust.precision import precision_of
-from pcfix.adjust.result import Adjusted, ControlRow, Source
-from pcfix.adjust.solve import (
+from pcfix.adjust.problem import (
     LogRow,
     Problem,
     Solution,
     gnss_weights,
     prepare,
-    solve,
     solved_cameras,
     water_of,
 )
-from pcfix.adjust.state import CODES, K1
+from pcfix.adjust.result import Adjusted, ControlRow, Source
+from pcfix.adjust.solve import solve
 from pcfix.errors import GeometryError
 from pcfix.water.surface import surface_above
 

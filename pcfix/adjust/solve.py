@@ -1,44 +1,40 @@
-"""The adjustment itself: Levenberg and Marquardt's steps, outliers, rounds.
+"""The adjustment itself: Levenberg and Marquardt's steps, and what a block does not determine.
 
-The datum and all other prior knowledge enter as observations of the unknowns: GNSS positions,
-surveyed points, standard deviations of lens, water and index.
+Water level, its tilt, the refractive index and the lens all move the bed, and over some blocks
+alike (Mulsow 2024): then they cannot all be free.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import Block, Robust, Unknowns, moved_lens, sensor_groups, usable_codes
-from pcfix.adjust.normal import (
-    CAUCHY,
-    HUBER,
-    SQUARES,
-    Loss,
-    PointPriors,
-    Sums,
-    cost_of,
-    normal_equations,
-    pair_slots,
-    point_steps,
-    residuals,
+from pcfix.adjust.block import CAUCHY, HUBER, SQUARES, Loss, Robust, State, moved_lens
+from pcfix.adjust.equations import assemble, solver, undamped
+from pcfix.adjust.normal import Sums, normal_equations, point_steps
+from pcfix.adjust.problem import (
+    LogRow,
+    Priors,
+    Problem,
+    Solution,
+    cost_at,
+    counts_of,
+    priors_at,
+    similarity_gradients,
 )
-from pcfix.adjust.reduced import assemble, solver
-from pcfix.adjust.state import WATER_NAMES, Columns, Seen, State, Surface, columns_of
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import lens_table
-from pcfix.model import Lens, WaterMesh, WaterPlane, WaterRaster
-from pcfix.port.light import coefficients as port_coefficients
-from pcfix.water.raster import build_field
-from pcfix.water.tin import build_tin
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, WaterSurface
+    from scipy.sparse import csc_array
+
+    from pcfix.model import FloatArray, IntArray, Lens
+
 
 LOSSES = {"squares": SQUARES, "huber": HUBER, "cauchy": CAUCHY}
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e8
@@ -50,271 +46,6 @@ EXACT = 1e-10
 """Squared residual, in variances, below which an observation is met exactly."""
 
 ROUNDING = 1e-12
-
-NETWORK_SIGMA_M = 1e-4
-"""How tightly the mean of the projection centres is held in a free network."""
-
-
-class LogRow(NamedTuple):
-    """One step: which round, what it came to, and the damping."""
-
-    round: int
-    step: int
-    cost: float
-    damping: float
-    observations: int
-    rms_px: float
-
-
-@dataclass(eq=False)
-class Problem:
-    """A block with everything that stays as it is while it is solved."""
-
-    block: Block
-    unknowns: Unknowns
-    origin: FloatArray
-    seen: Seen
-    surface: Surface
-    columns: Columns
-    groups: list[list[int]]
-    codes: list[tuple[int, ...]]
-    slots: tuple[IntArray, IntArray]
-    priors: PointPriors
-    moves: BoolArray
-    pivot: FloatArray
-
-    @property
-    def names(self) -> list[str]:
-        """What each of the shared unknowns is."""
-        from pcfix.adjust.state import CODES
-
-        by_code = {code: name for name, code in CODES.items()}
-        names = [
-            f"{by_code[code]}" if len(self.groups) == 1 else f"{by_code[code]} of sensor {i + 1}"
-            for i, mine in enumerate(self.codes)
-            for code in mine
-        ]
-        names += [name for name, at in zip(WATER_NAMES, self.columns.water, strict=True) if at >= 0]
-        if self.columns.similarity >= 0:
-            names += ["shift x", "shift y", "shift z", "turn x", "turn y", "turn z", "scale"]
-        return names
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Where a problem came to rest.
-
-    Attributes
-    ----------
-    state : State
-        Relative to `Problem.origin`.
-    lenses : tuple of Lens, length k
-    shared : array, shape (g,)
-        What was added to the shared unknowns.
-    cost : float
-        Sum of weighted squares, priors included.
-    log : list of LogRow
-    """
-
-    state: State
-    lenses: tuple[Lens, ...]
-    shared: FloatArray
-    cost: float
-    log: list[LogRow]
-
-
-def prepare(block: Block, unknowns: Unknowns) -> tuple[Problem, Solution]:
-    """Return a problem and its start.
-
-    Raises
-    ------
-    GeometryError
-        If cameras lack angles or lenses, or the water's tilt is to move over a mesh or raster.
-    """
-    cameras = block.cameras
-    if cameras.rotations is None or cameras.lenses is None:
-        raise GeometryError("an adjustment needs cameras with angles and lenses.")
-    origin = np.round(cameras.centres.mean(axis=0))
-    group, groups = sensor_groups(cameras.lenses)
-    codes = [usable_codes(cameras.lenses[mine[0]], unknowns.lens) for mine in groups]
-    plane = isinstance(block.water, WaterPlane) or block.water is None
-    if unknowns.tilt_sigma and not plane:
-        raise GeometryError("the tilt of the water can be free for a level or plane only.")
-    free = tuple(bool(sigma) for sigma in unknowns.water_sigma)
-    columns = columns_of(codes, free, unknowns.poses == "similarity")  # type: ignore[arg-type]
-    row, table = lens_table(cameras.lenses)
-    seen = Seen(
-        np.ascontiguousarray(block.start, np.int64),
-        np.ascontiguousarray(block.camera, np.int64),
-        np.ascontiguousarray(block.image_xy, np.float64),
-        1.0 / np.asarray(block.sigma_px, np.float64),
-        np.ascontiguousarray(block.wet, np.bool_),
-        row.astype(np.int64),
-        group,
-    )
-    state = State(
-        cameras.centres - origin, np.ascontiguousarray(cameras.rotations, np.float64), table,
-        block.xyz - origin, _water_numbers(block, origin),
-    )  # fmt: skip
-    problem = Problem(
-        block, unknowns, origin, seen, _surface(block, origin), columns, groups, codes,
-        pair_slots(seen, len(cameras)), _point_priors(block, origin),
-        _moves(block, unknowns, columns),
-        state.centres.mean(axis=0),
-    )  # fmt: skip
-    start = Solution(state, cameras.lenses, np.zeros(columns.total), np.inf, [])
-    return problem, start
-
-
-def _water_numbers(block: Block, origin: FloatArray) -> FloatArray:
-    n = block.refractive_index
-    match block.water:
-        case WaterPlane(a, b, c):
-            return np.array([a + (b * origin[0] + c * origin[1]) - origin[2], b, c, n])
-        case _:
-            return np.array([0.0, 0.0, 0.0, n])
-
-
-def water_of(problem: Problem, state: State) -> WaterSurface | None:
-    """Return the water surface as it was found, world frame."""
-    water, origin = problem.block.water, problem.origin
-    level, b, c = (float(value) for value in state.water[:3])
-    match water:
-        case WaterPlane():
-            return WaterPlane(level + origin[2] - (b * origin[0] + c * origin[1]), b, c)
-        case WaterRaster() if level:
-            return replace(water, height_m=water.height_m + level)
-        case WaterMesh() if level:
-            return replace(water, vertices=water.vertices + np.array([0.0, 0.0, level]))
-        case _:
-            return water
-
-
-def _surface(block: Block, origin: FloatArray) -> Surface:
-    water = block.water
-    return Surface(
-        water is not None,
-        build_tin(water) if isinstance(water, WaterMesh) else None,
-        build_field(water) if isinstance(water, WaterRaster) else None,
-        origin,
-        np.zeros(0) if block.port is None else port_coefficients(block.port),
-    )
-
-
-def _point_priors(block: Block, origin: FloatArray) -> PointPriors:
-    known = np.isfinite(block.surveyed_sigma_m) & np.isfinite(block.surveyed_xyz)
-    weight = np.where(known, 1.0 / np.where(known, block.surveyed_sigma_m, 1.0) ** 2, 0.0)
-    return PointPriors(np.where(known, block.surveyed_xyz - origin, 0.0), weight)
-
-
-def _moves(block: Block, unknowns: Unknowns, columns: Columns) -> BoolArray:
-    k = len(block.cameras)
-    poses = np.full((k, 6), unknowns.poses == "free")
-    fixed = set(unknowns.fixed_images)
-    poses[[label in fixed for label in block.cameras.labels]] = False
-    return np.concatenate([poses.ravel(), np.ones(columns.total, bool)])
-
-
-class _Extra(NamedTuple):
-    """What priors add: cost, to the matrix or its diagonal, and to the right side."""
-
-    cost: float
-    matrix: FloatArray
-    right: FloatArray
-
-
-def gnss_weights(block: Block) -> FloatArray:
-    """Return inverse variances of the GNSS positions, shape (k, 3); zero where there is none."""
-    known = np.isfinite(block.gnss_xyz) & np.isfinite(block.gnss_sigma_m)
-    return np.where(known, 1.0 / np.where(known, block.gnss_sigma_m, 1.0) ** 2, 0.0)
-
-
-def priors_at(problem: Problem, found: Solution) -> _Extra:
-    """Return what the priors of poses, lens and water say at a state."""
-    block, columns, unknowns = problem.block, problem.columns, problem.unknowns
-    k, g = len(block.cameras), columns.total
-    diagonal, right = np.zeros(6 * k + g), np.zeros(6 * k + g)
-    weight = gnss_weights(block)
-    off = np.where(weight > 0.0, block.gnss_xyz - problem.origin, 0.0) - found.state.centres
-    off = np.where(weight > 0.0, off, 0.0)
-    cost = float((weight * off * off).sum())
-    sigma = _shared_sigma(problem)
-    held = np.isfinite(sigma)
-    tight = np.where(held, 1.0 / np.where(held, sigma, 1.0) ** 2, 0.0)
-    cost += float((tight * found.shared**2).sum())
-    diagonal[6 * k :] = tight
-    right[6 * k :] = -tight * found.shared
-    poses = np.column_stack([np.zeros((k, 3)), weight])
-    if columns.similarity < 0:
-        diagonal[: 6 * k] = poses.ravel()
-        right[: 6 * k] = np.column_stack([np.zeros((k, 3)), weight * off]).ravel()
-        if unknowns.free_network:
-            return _with_network(problem, found, _Extra(cost, diagonal, right))
-        return _Extra(cost, diagonal, right)
-    matrix = np.diag(diagonal)
-    by = similarity_gradients(found.state.centres - problem.pivot)
-    at = 6 * k + columns.similarity
-    matrix[at:, at:] += np.einsum("kia,ki,kib->ab", by, weight, by)
-    right[at:] += np.einsum("kia,ki->a", by, weight * off)
-    return _Extra(cost, matrix, right)
-
-
-def similarity_gradients(d: FloatArray) -> FloatArray:
-    """Return how places move with a shift, a turn and a scale about the pivot, shape (k, 3, 7)."""
-    by = np.zeros((len(d), 3, 7))
-    by[:, [0, 1, 2], [0, 1, 2]] = 1.0
-    x, y, z = d.T
-    by[:, 0, 4], by[:, 0, 5] = z, -y
-    by[:, 1, 3], by[:, 1, 5] = -z, x
-    by[:, 2, 3], by[:, 2, 4] = y, -x
-    by[:, :, 6] = d
-    return by
-
-
-def _with_network(problem: Problem, found: Solution, extra: _Extra) -> _Extra:
-    """Hold mean place, direction and scale of the projection centres."""
-    start = problem.block.cameras.centres - problem.origin
-    k = len(start)
-    d = start - start.mean(axis=0)
-    by = similarity_gradients(d) / np.array([1.0] * 3 + [np.sqrt((d * d).sum() / k)] * 4)
-    rows = np.zeros((7, len(extra.right)))
-    rows[:, : 6 * k].reshape(7, k, 6)[:, :, 3:] = by.transpose(2, 0, 1) / k
-    rows = rows[_undetermined(problem)]
-    off = rows[:, : 6 * k].reshape(len(rows), k, 6)[:, :, 3:]
-    miss = np.einsum("akj,kj->a", off, found.state.centres - start)
-    weight = 1.0 / NETWORK_SIGMA_M**2
-    return _Extra(
-        extra.cost + weight * float((miss * miss).sum()),
-        np.diag(extra.matrix) + weight * rows.T @ rows,
-        extra.right - weight * rows.T @ miss,
-    )
-
-
-def _undetermined(problem: Problem) -> list[int]:
-    """Return which of shift, turn and scale nothing in the images tells.
-
-    A water surface whose level or tilt does not move freely tells the height or tilt of the block.
-    """
-    bends = problem.block.refractive_index != 1.0 or problem.unknowns.index_sigma > 0.0
-    if not (problem.surface.there and bends and problem.block.wet.any()):
-        return list(range(7))
-    level, tilt = problem.unknowns.level_sigma_m, problem.unknowns.tilt_sigma
-    rows = [0, 1, 5, 6]
-    rows += [2] if np.isinf(level) else []
-    rows += [3, 4] if np.isinf(tilt) else []
-    return sorted(rows)
-
-
-def _shared_sigma(problem: Problem) -> FloatArray:
-    """Return the standard deviations of the shared unknowns about their start."""
-    from pcfix.adjust.state import CODES
-
-    unknowns = problem.unknowns
-    given = {CODES[name]: value for name, value in unknowns.lens_sigma.items()}
-    lens = [given.get(int(code), np.inf) for code in problem.columns.code]
-    water = [sigma for sigma in unknowns.water_sigma if sigma]
-    rest = problem.columns.total - len(lens) - len(water)
-    return np.array([*lens, *water, *([np.inf] * rest)], np.float64)
 
 
 def solve(
@@ -362,7 +93,7 @@ def solve(
             if damping > MOST_DAMPING:
                 if trial is None and step == 0:
                     raise GeometryError(
-                        "the normal equations are singular: " + what_is_singular(problem, now)
+                        "the normal equations are singular: " + weakest(problem, now)
                     )
                 return replace(now, log=log)
             sums, extra = _equations(problem, now, loss, damping)
@@ -380,16 +111,13 @@ def solve(
     return replace(now, log=log)
 
 
-def _equations(problem: Problem, now: Solution, loss: Loss, damping: float) -> tuple[Sums, _Extra]:
-    sums = normal_equations(
-        now.state, problem.seen, problem.surface, problem.columns, problem.priors,
-        loss, damping, problem.slots, problem.pivot,
-    )  # fmt: skip
+def _equations(problem: Problem, now: Solution, loss: Loss, damping: float) -> tuple[Sums, Priors]:
+    sums = normal_equations(now.state, problem.given, loss, damping, problem.slots)
     return sums, priors_at(problem, now)
 
 
 def _trial(
-    problem: Problem, now: Solution, loss: Loss, damping: float, sums: Sums, extra: _Extra
+    problem: Problem, now: Solution, loss: Loss, damping: float, sums: Sums, extra: Priors
 ) -> Solution | None:
     """Return the state one step on; None where the equations are singular."""
     reduced = assemble(sums, problem.slots[1], damping, extra.matrix, extra.right, problem.moves)
@@ -402,10 +130,7 @@ def _trial(
         return None
     k = len(now.state.centres)
     poses, shared = step[: 6 * k].reshape(k, 6), step[6 * k :]
-    points = point_steps(
-        now.state, problem.seen, problem.surface, problem.columns, problem.priors,
-        loss, damping, problem.pivot, poses, shared,
-    )  # fmt: skip
+    points = point_steps(now.state, problem.given, loss, damping, poses, shared)
     moved = moved_by(problem, now, poses, shared, points)
     return None if moved is None else replace(moved, cost=cost_at(problem, moved, loss))
 
@@ -464,41 +189,192 @@ def _moved_lenses(
     return tuple(made)
 
 
-def weighted_squares(problem: Problem, found: Solution) -> FloatArray:
-    """Return the weighted square of each observation that counts; NaN where out of sight."""
-    r = residuals(found.state, problem.seen, problem.surface)
-    counts = problem.seen.weight > 0.0
-    return (r[counts] ** 2).sum(axis=1) * problem.seen.weight[counts] ** 2
+WEAK = 1e-11
+"""Eigenvalues of the matrix with unit diagonal, below which a motion costs nothing."""
 
 
-def cost_at(problem: Problem, found: Solution, loss: Loss) -> float:
-    """Return what a solution costs: images, surveyed points and all priors."""
-    images = cost_of(weighted_squares(problem, found), loss)
-    priors = problem.priors
-    points = float((priors.weight * (priors.xyz - found.state.xyz) ** 2).sum())
-    return images + points + priors_at(problem, found).cost
+LIMITS = {
+    "level": (0.02, "m", "the water level"),
+    "tilt_x": (0.0005, "m/m", "the tilt of the water along x"),
+    "tilt_y": (0.0005, "m/m", "the tilt of the water along y"),
+    "index": (0.005, "", "the refractive index"),
+    "scale": (0.001, "", "the scale of the block"),
+}
+"""Standard errors beyond which an unknown counts as undetermined, its unit and its name."""
 
 
-def counts_of(problem: Problem, found: Solution) -> tuple[int, float]:
-    """Return how many observations count, and the root mean square of their residuals."""
-    counts = problem.seen.weight > 0.0
-    r = residuals(found.state, problem.seen, problem.surface)[counts]
-    n = int(counts.sum())
-    return n, float(np.sqrt(np.nansum(r * r) / max(2 * n, 1)))
+_WORDS = {name: words for name, (_, _, words) in LIMITS.items()} | {
+    "f": "the focal length", "cx": "the principal point's x", "cy": "the principal point's y",
+    "b1": "the affinity b1", "b2": "the skew b2",
+}  # fmt: skip
 
 
-def what_is_singular(problem: Problem, found: Solution) -> str:
-    """Say in words which unknowns the block does not determine."""
-    from pcfix.adjust.precision import weakest
-
-    return weakest(problem, found)
+MOTIONS = {"shift x", "shift y", "shift z", "turn x", "turn y", "turn z"}
 
 
-def solved_cameras(problem: Problem, found: Solution) -> Cameras:
-    """Return the cameras of a solution, world frame."""
-    return replace(
-        problem.block.cameras,
-        centres=found.state.centres + problem.origin,
-        rotations=found.state.rotations,
-        lenses=found.lenses,
+BED = {"level", "index", "tilt_x", "tilt_y"}
+
+
+def words_of(name: str) -> str:
+    """Return what a surveyor calls a shared unknown."""
+    base, _, sensor = name.partition(" of sensor ")
+    words = _WORDS.get(base, base)
+    if base in MOTIONS:
+        words = (
+            f"the block's {base.replace('shift ', 'shift along ').replace('turn ', 'turn about ')}"
+        )
+    elif base[0] in "kp" and base[1:].isdigit():
+        words = f"the distortion {base}"
+    return f"{words} of sensor {sensor}" if sensor else words
+
+
+class _Motion(NamedTuple):
+    """A motion of everything together that images alone cannot see."""
+
+    words: str
+    pose: FloatArray
+    shared: dict[str, float]
+
+
+def weakest(problem: Problem, solution: Solution) -> str:
+    """Say which unknowns the normal equations leave free at a solution.
+
+    The eigenvectors of the smallest eigenvalues of the reduced matrix with unit diagonal are
+    compared with motions of the whole block; what remains is named by the unknowns in it.
+    """
+    equations = undamped(problem, solution)
+    reduced = equations.reduced
+    diagonal = reduced.matrix.diagonal()
+    silent = reduced.active[~(diagonal > 0.0)]
+    if len(silent):
+        return _not_observed(problem, silent)
+    scale = 1.0 / np.sqrt(diagonal)
+    values, vectors = _smallest(reduced.matrix, scale)
+    weak = values < max(WEAK, 10.0 * float(values[0]))
+    free = vectors[:, weak]
+    found, left = [], free
+    for motion in _motions(problem, solution):
+        v = _vector(problem, motion)[reduced.active] / scale
+        length = float(np.linalg.norm(v))
+        if length > 0.0 and float(np.linalg.norm(free.T @ v)) > 0.99 * length:
+            found.append(motion.words)
+            v = left @ (left.T @ v)
+            left = _without(left, v)
+    parts = [_datum(found)] if found else []
+    parts += [_named(problem, left[:, i], reduced.active) for i in range(left.shape[1])]
+    return "; ".join(parts) + "."
+
+
+def _smallest(matrix: FloatArray | csc_array, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the smallest eight eigenvalues and their vectors of the scaled matrix."""
+    count, size = 8, len(scale)
+    if isinstance(matrix, np.ndarray):
+        from scipy.linalg import eigh
+
+        last = min(count, size) - 1
+        return eigh(matrix * scale * scale[:, None], subset_by_index=[0, last])
+    from scipy import sparse
+    from scipy.sparse.linalg import eigsh
+
+    scaled = sparse.diags_array(scale) @ matrix @ sparse.diags_array(scale)
+    start = np.random.default_rng(0).normal(size=size)
+    values, vectors = eigsh(scaled.tocsc(), k=count, sigma=-1e-9, which="LM", v0=start)
+    order = np.argsort(values)
+    return values[order], vectors[:, order]
+
+
+def _without(basis: FloatArray, v: FloatArray) -> FloatArray:
+    """Return a basis of what is at right angles to v, which lies in the given one."""
+    length = float(np.linalg.norm(v))
+    if length < 0.1:
+        return basis
+    rest = basis - np.outer(v, v @ basis) / length**2
+    u, s, _ = np.linalg.svd(rest, full_matrices=False)
+    return np.asarray(u[:, s > 0.5])
+
+
+def _motions(problem: Problem, solution: Solution) -> list[_Motion]:
+    """Return shift, turn and scale of everything, the water with it where it is free.
+
+    Turned and scaled about the place of the water at the block's origin, whose level stays. The
+    normal of z = a + b x + c y turns with the rest, and with it the slopes.
+    """
+    state = solution.state
+    k = len(state.centres)
+    a, b, c, _ = state.water
+    about = np.array([0.0, 0.0, a]) if problem.surface.there else problem.pivot
+    by = np.zeros((k, 6, 7))
+    by[:, :3, 3:6] = -state.rotations
+    by[:, 3:] = similarity_gradients(state.centres - about)
+    water: tuple[tuple[str, dict[str, float]], ...] = (
+        ("along x", {"level": -b}), ("along y", {"level": -c}), ("in height", {"level": 1.0}),
+        ("about x", {"tilt_x": b * c, "tilt_y": 1.0 + c * c}),
+        ("about y", {"tilt_x": -1.0 - b * b, "tilt_y": -b * c}),
+        ("about the vertical", {"tilt_x": -c, "tilt_y": b}), ("", {}),
+    )  # fmt: skip
+    kinds = ("shift",) * 3 + ("turn",) * 3 + ("scale",)
+    return [
+        _Motion(f"{kind} {way}".strip(), by[:, :, i], shared)
+        for i, (kind, (way, shared)) in enumerate(zip(kinds, water, strict=True))
+    ]
+
+
+def _vector(problem: Problem, motion: _Motion) -> FloatArray:
+    """Return a motion as a step of all unknowns."""
+    k, names = len(problem.block.cameras), problem.names
+    step = np.concatenate([motion.pose.ravel(), np.zeros(len(names))])
+    for name, by in motion.shared.items():
+        if name in names:
+            step[6 * k + names.index(name)] = by
+    step[: 6 * k][~problem.moves[: 6 * k]] = 0.0
+    return step
+
+
+def _datum(found: list[str]) -> str:
+    return (
+        f"nothing holds the {_listed(found)} of the block (no datum): give GNSS positions, three"
+        " control points, or fix images, or ask for a free network"
     )
+
+
+def _named(problem: Problem, v: FloatArray, active: IntArray) -> str:
+    """Return the unknowns that one free motion moves most."""
+    full = np.zeros(len(problem.moves))
+    full[active] = v
+    k = len(problem.block.cameras)
+    shared, poses = full[6 * k :], np.linalg.norm(full[: 6 * k].reshape(k, 6), axis=1)
+    largest = float(np.abs(v).max())
+    most = [words_of(problem.names[i]) for i in np.flatnonzero(np.abs(shared) > 0.1 * largest)]
+    if poses.max(initial=0.0) > 0.1 * largest:
+        moved = np.flatnonzero(poses > 0.3 * poses.max())
+        labels = [problem.block.cameras.labels[i] for i in moved[:3]]
+        few = f"the pose of {_listed(labels)}" if len(moved) <= 3 else "the poses"
+        most.append(few)
+    if len(most) == 1:
+        return f"nothing in the block determines {most[0]}: fix it"
+    return f"the block cannot tell {_listed(most)} apart: fix one of them"
+
+
+def _not_observed(problem: Problem, rows: IntArray) -> str:
+    """Return what has no observation at all."""
+    k = len(problem.block.cameras)
+    images = sorted({int(row) // 6 for row in rows if row < 6 * k})
+    names = [problem.names[int(row) - 6 * k] for row in rows if row >= 6 * k]
+    parts = []
+    if images:
+        labels = [problem.block.cameras.labels[i] for i in images[:3]]
+        more = f" and {len(images) - 3} more" if len(images) > 3 else ""
+        parts.append(
+            f"{', '.join(labels)}{more}: no tie point that two images fix: leave the image out or"
+            " fix its pose"
+        )
+    if names:
+        wet = " (no point lies under water)" if set(names) & BED else ""
+        parts.append(
+            f"no observation depends on {_listed([words_of(name) for name in names])}{wet}: fix it"
+        )
+    return "; ".join(parts) + "."
+
+
+def _listed(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

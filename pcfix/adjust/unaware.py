@@ -29,22 +29,41 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit, prange
 
+from pcfix.adjust.block import Loss
 from pcfix.adjust.normal import PARTS, linearise, most_seen, point_block
-from pcfix.adjust.observe import POINT, WATER, WIDTH, image_and_all_gradients, lens_gradients
-from pcfix.adjust.solve import LogRow, Problem, Solution, counts_of, moved_by, priors_at
+from pcfix.adjust.observe import (
+    POINT,
+    WATER,
+    WIDTH,
+    image_and_all_gradients,
+    lens_gradients,
+    scratch,
+)
+from pcfix.adjust.problem import LogRow, Problem, Solution, counts_of, priors_at
+from pcfix.adjust.solve import moved_by
 from pcfix.errors import GeometryError
 from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from pcfix.adjust.normal import PointPriors
-    from pcfix.adjust.state import Columns, Seen, State, Surface
+    from pcfix.adjust.block import Given, State
     from pcfix.model import BoolArray, FloatArray, IntArray
 
 MAX_STEPS = 25
 CLOSE_M = 1e-7
 LARGE_STEP_M = 1e4
+
+
+class _Rows(NamedTuple):
+    """The observations of one point: columns of both sides, residuals, cameras, V and its side."""
+
+    right: FloatArray
+    left: FloatArray
+    r: FloatArray
+    who: IntArray
+    v: FloatArray
+    rhs: FloatArray
 
 
 class Tests(NamedTuple):
@@ -69,10 +88,10 @@ def straight_columns(problem: Problem, start: Solution, apparent_xyz: FloatArray
     seen, columns = problem.seen, problem.columns
     o, g = len(seen.camera), columns.total
     found = Tests(np.zeros((o, 2, 6)), np.zeros((o, 2, g)), np.zeros((o, 2, 3)))
-    dry = seen._replace(wet=np.zeros(len(seen.wet), np.bool_))
+    dry = problem.given._replace(seen=seen._replace(wet=np.zeros(len(seen.wet), np.bool_)))
     state = start.state._replace(xyz=np.ascontiguousarray(apparent_xyz))
     with one_caller():
-        _columns(state, dry, problem.surface, columns, *found)
+        _columns(state, dry, found)
     return found
 
 
@@ -88,7 +107,7 @@ def solve_unaware(
     Parameters
     ----------
     problem, start : Problem, Solution
-        Of `pcfix.adjust.solve.prepare`; observations of the cloud are where the old cameras image
+        Of `pcfix.adjust.problem.prepare`; observations of the cloud are where the old cameras image
         the apparent points.
     tests : Tests
     is_tested : array of bool, shape (m,)
@@ -137,10 +156,7 @@ def _newton(
     size = 6 * k + g
     parts = PARTS if size <= 3000 else 2
     matrix, right = np.zeros((parts, size, size)), np.zeros((parts, size))
-    common = (
-        now.state, problem.seen, problem.surface, problem.columns, problem.priors,
-        problem.pivot, *tests, is_tested,
-    )  # fmt: skip
+    common = now.state, problem.given, Loss(), tests, is_tested
     with one_caller():
         _sum_tested(*common, matrix, right)
     total, side = matrix.sum(axis=0), right.sum(axis=0)
@@ -169,26 +185,23 @@ def _newton(
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def _columns(
-    state: State, seen: Seen, surface: Surface, columns: Columns,
-    pose: FloatArray, shared: FloatArray, point: FloatArray,
-) -> None:  # fmt: skip
+def _columns(state: State, given: Given, found: Tests) -> None:
+    pose, shared, point = found
     for part in prange(PARTS):
-        m = len(state.xyz)
-        light, plane, ahead, own = np.empty((3, 12)), np.empty(4), np.empty(3), np.empty((2, WIDTH))
+        m, seen, columns = len(state.xyz), given.seen, given.columns
+        room, own = scratch(), np.empty((2, WIDTH))
         for p in range(part * m // PARTS, (part + 1) * m // PARTS):
             for o in range(seen.start[p], seen.start[p + 1]):
                 c = seen.camera[o]
                 lens = state.lenses[seen.lens_row[c]]
-                image_and_all_gradients(
-                    state.xyz[p], False, state.centres[c], state.rotations[c], lens,
-                    state.water, surface, light, plane, ahead, own,
-                )  # fmt: skip
+                image_and_all_gradients(state, seen, given.surface, p, c, room, own)
                 pose[o] = own[:, :POINT]
                 point[o] = own[:, POINT:WATER]
                 first, last = columns.lens[seen.group[c]], columns.lens[seen.group[c] + 1]
                 if last > first:
-                    lens_gradients(lens, ahead, columns.code[first:last], shared[o][:, first:last])
+                    lens_gradients(
+                        lens, room.ahead, columns.code[first:last], shared[o][:, first:last]
+                    )
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -207,34 +220,36 @@ def _inverted(v: FloatArray) -> bool:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def _rows(most: int, g: int) -> _Rows:
+    """Return room for so many observations."""
+    right, left = np.empty((most, 2, WATER + g)), np.empty((most, 2, WATER + g))
+    r, who = np.empty((most, 2)), np.empty(most, np.int64)
+    return _Rows(right, left, r, who, np.empty((3, 3)), np.empty(3))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def _gather(
-    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
-    pivot: FloatArray, pose: FloatArray, shared: FloatArray, point: FloatArray, tested: bool,
-    p: int, right: FloatArray, left: FloatArray, r: FloatArray, who: IntArray,
-    v: FloatArray, rhs: FloatArray,
-) -> int:  # fmt: skip
+    state: State, given: Given, loss: Loss, tests: Tests, tested: bool, p: int, rows: _Rows
+) -> int:
     """Fill in the columns of a point's observations and V, inverted; how many count.
 
     Columns of `right` and `left`: pose, point, shared. The block V and its right side are B_l'B
     and B_l'r.
     """
-    g = columns.total
-    light, plane, ahead = np.empty((3, 12)), np.empty(4), np.empty(3)
-    own, common = np.empty((2, WIDTH)), np.zeros((2, g))
+    right, left, r, who, v, rhs = rows
+    seen, room = given.seen, scratch()
+    own, common = np.empty((2, WIDTH)), np.zeros((2, given.columns.total))
     v[:], rhs[:], count = 0.0, 0.0, 0
     for o in range(seen.start[p], seen.start[p + 1]):
-        if not linearise(
-            state, seen, surface, columns, 0, 1.0, pivot, p, o,
-            light, plane, ahead, own, common, r[count],
-        ):  # fmt: skip
+        if not linearise(state, given, loss, p, o, room, own, common, r[count]):
             continue
         right[count, :, :WATER] = own[:, :WATER]
         right[count, :, WATER:] = common
         if tested:
             w = seen.weight[o]
-            left[count, :, :POINT] = w * pose[o]
-            left[count, :, POINT:WATER] = w * point[o]
-            left[count, :, WATER:] = w * shared[o]
+            left[count, :, :POINT] = w * tests.pose[o]
+            left[count, :, POINT:WATER] = w * tests.point[o]
+            left[count, :, WATER:] = w * tests.shared[o]
         else:
             left[count] = right[count]
         for i in range(3):
@@ -248,31 +263,26 @@ def _gather(
         return 0
     if tested:
         return count if _inverted(v) else 0
-    return count if point_block(v, rhs, priors, state.xyz[p], p, 0.0) else 0
+    return count if point_block(v, rhs, given.priors, state.xyz[p], p, 0.0) else 0
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _sum_tested(
-    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
-    pivot: FloatArray, pose: FloatArray, shared: FloatArray, point: FloatArray,
-    is_tested: BoolArray, matrix: FloatArray, side: FloatArray,
+    state: State, given: Given, loss: Loss, tests: Tests, is_tested: BoolArray,
+    matrix: FloatArray, side: FloatArray,
 ) -> None:  # fmt: skip
     parts = len(matrix)
     for part in prange(parts):
-        m, g, k = len(state.xyz), columns.total, len(state.centres)
+        m, g, k = len(state.xyz), given.columns.total, len(state.centres)
         first, last = part * m // parts, (part + 1) * m // parts
-        most = most_seen(seen.start, first, last)
-        right, left = np.empty((most, 2, WATER + g)), np.empty((most, 2, WATER + g))
-        r, who = np.empty((most, 2)), np.empty(most, np.int64)
-        v, rhs = np.empty((3, 3)), np.empty(3)
+        most = most_seen(given.seen.start, first, last)
+        rows = _rows(most, g)
+        right, left, r, who, v, rhs = rows
         size = 6 * most + g
         column = np.empty(size, np.int64)
         w_right, w_left = np.empty((3, size)), np.empty((size, 3))
         for p in range(first, last):
-            count = _gather(
-                state, seen, surface, columns, priors, pivot, pose, shared, point, is_tested[p],
-                p, right, left, r, who, v, rhs,
-            )  # fmt: skip
+            count = _gather(state, given, loss, tests, is_tested[p], p, rows)
             if count == 0:
                 continue
             used = 6 * count + g
@@ -320,22 +330,16 @@ def _add_direct(
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _tested_points(
-    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
-    pivot: FloatArray, pose: FloatArray, shared: FloatArray, point: FloatArray,
-    is_tested: BoolArray, poses: FloatArray, moved: FloatArray, steps: FloatArray,
+    state: State, given: Given, loss: Loss, tests: Tests, is_tested: BoolArray,
+    poses: FloatArray, moved: FloatArray, steps: FloatArray,
 ) -> None:  # fmt: skip
     for part in prange(PARTS):
-        m, g = len(state.xyz), columns.total
+        m, g = len(state.xyz), given.columns.total
         first, last = part * m // PARTS, (part + 1) * m // PARTS
-        most = most_seen(seen.start, first, last)
-        right, left = np.empty((most, 2, WATER + g)), np.empty((most, 2, WATER + g))
-        r, who = np.empty((most, 2)), np.empty(most, np.int64)
-        v, rhs = np.empty((3, 3)), np.empty(3)
+        rows = _rows(most_seen(given.seen.start, first, last), g)
+        right, left, _, who, v, rhs = rows
         for p in range(first, last):
-            count = _gather(
-                state, seen, surface, columns, priors, pivot, pose, shared, point, is_tested[p],
-                p, right, left, r, who, v, rhs,
-            )  # fmt: skip
+            count = _gather(state, given, loss, tests, is_tested[p], p, rows)
             for o in range(count):
                 for a in range(2):
                     change = 0.0

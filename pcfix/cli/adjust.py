@@ -27,7 +27,7 @@ from pcfix.options import DEFAULT_REFRACTIVE_INDEX
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from pcfix.adjust.solve import LogRow
+    from pcfix.adjust.problem import LogRow
 
 
 class Poses(str, Enum):  # noqa: UP042

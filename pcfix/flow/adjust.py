@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from os import PathLike
 
+    from pcfix.adjust.problem import LogRow
     from pcfix.adjust.result import Adjusted
-    from pcfix.adjust.solve import LogRow
     from pcfix.flow.surfaces import WaterModel
     from pcfix.io.cameras.formats import Angles
     from pcfix.model import Cameras, GroundControl, WaterSurface

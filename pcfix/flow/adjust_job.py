@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.block import Unknowns
+from pcfix.adjust.block import CODES, Unknowns
 from pcfix.adjust.control_fit import check_control, check_marks
 from pcfix.adjust.gather import (
     FIRST_SIGMA_PX,
@@ -24,9 +24,8 @@ from pcfix.adjust.gather import (
     with_places,
 )
 from pcfix.adjust.mend import Candidate, mend
+from pcfix.adjust.precision import strong_correlations, undetermined
 from pcfix.adjust.rounds import Rounds, adjust_ties, check_datum, default_lens
-from pcfix.adjust.separability import strong_correlations, undetermined
-from pcfix.adjust.state import CODES
 from pcfix.errors import GeometryError, InputError, SettingError
 from pcfix.flow.carrying import in_frame
 from pcfix.flow.inputs import mask_of
@@ -45,8 +44,8 @@ if TYPE_CHECKING:
     from os import PathLike
 
     from pcfix.adjust.block import Block
+    from pcfix.adjust.problem import LogRow
     from pcfix.adjust.result import Adjusted
-    from pcfix.adjust.solve import LogRow
     from pcfix.flow.inputs import Inputs
     from pcfix.flow.surfaces import CloudView
     from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, TiePoints

@@ -253,7 +253,7 @@ class _Gnss(NamedTuple):
 
     def sign(self, cameras: Cameras, mended: Mended) -> Sign:
         """Look for the pattern that the water would make."""
-        from pcfix.adjust.solve import similarity_gradients
+        from pcfix.adjust.problem import similarity_gradients
 
         centres = cameras.centres[mended.row]
         return gnss_sign(
@@ -264,7 +264,7 @@ class _Gnss(NamedTuple):
 
 
 def _gnss(evidence: Evidence) -> _Gnss:
-    from pcfix.adjust.solve import similarity_gradients
+    from pcfix.adjust.problem import similarity_gradients
     from pcfix.io.gnss_positions import gnss_in_frame_of
 
     cameras = evidence.cameras

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.block import sensor_groups, usable_codes
-from pcfix.adjust.state import CODES, K1, P1, WATER_NAMES
+from pcfix.adjust.block import CODES, K1, P1, WATER_NAMES, sensor_groups, usable_codes
 from pcfix.model import WaterPlane
 from pcfix.water.surface import surface_above
 
@@ -47,7 +46,7 @@ def before_of(adjusted: Adjusted) -> Before:
     from pcfix.adjust.block import Unknowns
     from pcfix.adjust.fixed_poses import intersect_fixed
     from pcfix.adjust.normal import residuals
-    from pcfix.adjust.solve import prepare
+    from pcfix.adjust.problem import prepare
 
     block = adjusted.block
     free = replace(
@@ -382,7 +381,7 @@ def _turned_deg(a: Adjusted) -> FloatArray:
 
 
 def _precision(p: Precision, unknowns: Unknowns) -> Plain:
-    from pcfix.adjust.separability import strong_correlations, undetermined
+    from pcfix.adjust.precision import strong_correlations, undetermined
 
     centre, angle = p.centre_sigma_m, p.angle_sigma_deg
     moves = (centre > 0.0).any(axis=1) | (angle > 0.0).any(axis=1)

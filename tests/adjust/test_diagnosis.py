@@ -18,7 +18,7 @@ from pcfix.adjust.diagnosis import (
 )
 from pcfix.adjust.fixed_poses import intersect_fixed
 from pcfix.adjust.likely_error import deeper, mended
-from pcfix.adjust.solve import similarity_gradients
+from pcfix.adjust.problem import similarity_gradients
 from pcfix.model import WaterPlane
 from tests.utils.bent_blocks import GNSS_M, LEVEL_M, N, TrueBlock
 

@@ -6,10 +6,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import moved_lens
+from pcfix.adjust.block import (
+    CODES,
+    Given,
+    Loss,
+    PointPriors,
+    Seen,
+    State,
+    Surface,
+    columns_of,
+    moved_lens,
+)
 from pcfix.adjust.normal import linearise
-from pcfix.adjust.observe import WATER, image, image_and_all_gradients, lens_gradients
-from pcfix.adjust.state import CODES, Seen, State, Surface, columns_of
+from pcfix.adjust.observe import WATER, image, image_and_all_gradients, lens_gradients, scratch
 from pcfix.lens.imaging import coefficients, lens_table
 from pcfix.model import Lens, WaterRaster
 from pcfix.water.raster import build_field
@@ -57,22 +66,24 @@ def pose(seed: int):
     return rng.uniform(-5.0, 5.0, 3), DOWN @ turn.as_matrix()
 
 
-def at(q, centre, rotation, lens, water, surface):
-    return np.array(
-        image(
-            q, True, centre, rotation, lens, np.asarray(water, float), surface,
-            np.empty((3, 12)), np.empty(4),
-        )
+def one(q, centre, rotation, lens, water):
+    """Return the state and the observation of one point, under water where it lies below it."""
+    state = State(centre[None], rotation[None], lens[None], q[None], np.asarray(water, float))
+    return state, Seen(
+        np.array([0, 1]), np.array([0]), np.zeros((1, 2)), np.ones(1), np.array([True]),
+        np.zeros(1, np.int64), np.zeros(1, np.int64),
     )  # fmt: skip
+
+
+def at(q, centre, rotation, lens, water, surface):
+    return np.array(image(*one(q, centre, rotation, lens, water), surface, 0, 0, scratch()))
 
 
 def gradients(q, centre, rotation, lens, water, surface):
-    ahead, out = np.empty(3), np.empty((2, 13))
-    uv = image_and_all_gradients(
-        q, True, centre, rotation, lens, np.asarray(water, float), surface,
-        np.empty((3, 12)), np.empty(4), ahead, out,
-    )  # fmt: skip
-    return np.array(uv), out, ahead
+    room, out = scratch(), np.empty((2, 13))
+    seen = one(q, centre, rotation, lens, water)
+    uv = image_and_all_gradients(*seen, surface, 0, 0, room, out)
+    return np.array(uv), out, room.ahead
 
 
 def differences(q, centre, rotation, lens, water, surface):
@@ -173,18 +184,12 @@ def test_columns_of_a_similarity():
     centre, rotation = pose(9)
     lens, water, q = coefficients(BROWN), np.array(WATERS["tilted"]), np.array([6.0, 5.0, -65.0])
     pivot = np.array([3.0, -14.0, 2.0])
-    table = lens_table((BROWN,))[1]
-    state = State(centre[None], rotation[None], table, q[None], water)
-    seen = Seen(
-        np.array([0, 1]), np.array([0]), np.zeros((1, 2)), np.ones(1), np.array([True]),
-        np.zeros(1, np.int64), np.zeros(1, np.int64),
-    )  # fmt: skip
+    state, seen = one(q, centre, rotation, lens_table((BROWN,))[1][0], water)
+    nothing = PointPriors(np.zeros((1, 3)), np.zeros((1, 3)))
     columns = columns_of([()], (False,) * 4, True)
     own, shared = np.empty((2, 13)), np.zeros((2, 7))
-    assert linearise(
-        state, seen, no_surface(), columns, 0, 1.0, pivot, 0, 0,
-        np.empty((3, 12)), np.empty(4), np.empty(3), own, shared, np.empty(2),
-    )  # fmt: skip
+    given = Given(seen, no_surface(), columns, nothing, pivot)
+    assert linearise(state, given, Loss(), 0, 0, scratch(), own, shared, np.empty(2))
     assert not own[:, :6].any()  # the poses do not move on their own
     wanted = []
     for i in range(7):

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from pcfix.adjust.block import Unknowns
 from pcfix.adjust.precision import precision_of, strong_correlations, undetermined
-from pcfix.adjust.solve import prepare, solve
+from pcfix.adjust.problem import prepare
+from pcfix.adjust.solve import solve
 from pcfix.errors import GeometryError
 from pcfix.threads import threads
 from tests.utils.adjust_twin import Twin

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from pcfix.adjust.block import Block, Unknowns
 from pcfix.adjust.normal import residuals
-from pcfix.adjust.solve import prepare, solve
+from pcfix.adjust.problem import prepare
+from pcfix.adjust.solve import solve
 from pcfix.model import Cameras, Lens, WaterPlane
 
 pycolmap = pytest.importorskip("pycolmap")

@@ -10,8 +10,9 @@ import pytest
 
 from pcfix.adjust.block import Unknowns
 from pcfix.adjust.gather import Datum, block_of, no_datum
+from pcfix.adjust.problem import prepare
 from pcfix.adjust.rounds import Rounds, adjust_ties, check_datum, default_lens, noise_px
-from pcfix.adjust.solve import prepare, solve
+from pcfix.adjust.solve import solve
 from pcfix.errors import GeometryError
 from pcfix.threads import threads
 from tests.utils.tie_blocks import block_of as simple_block

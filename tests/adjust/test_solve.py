@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from pcfix.adjust.block import Unknowns
 from pcfix.adjust.precision import precision_of, undetermined
-from pcfix.adjust.solve import prepare, solve, solved_cameras, water_of
+from pcfix.adjust.problem import prepare, solved_cameras, water_of
+from pcfix.adjust.solve import solve
 from pcfix.model import WaterPlane
 from pcfix.threads import threads
 from tests.utils.adjust_twin import Twin

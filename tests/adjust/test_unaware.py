@@ -11,8 +11,9 @@ import pytest
 from pcfix.adjust.block import Unknowns
 from pcfix.adjust.gather import Datum, block_of, no_datum, ties_of_cloud
 from pcfix.adjust.mend import Candidate, mend
+from pcfix.adjust.problem import prepare, solved_cameras
 from pcfix.adjust.rounds import adjust_ties
-from pcfix.adjust.solve import prepare, solve, solved_cameras
+from pcfix.adjust.solve import solve
 from pcfix.errors import GeometryError
 from pcfix.simulate.tracing import piercing_points, project
 from pcfix.threads import threads

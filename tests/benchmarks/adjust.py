@@ -24,7 +24,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pcfix.adjust.block import Block, Unknowns
-from pcfix.adjust.solve import prepare, solve, solved_cameras
+from pcfix.adjust.problem import prepare, solved_cameras
+from pcfix.adjust.solve import solve
 from pcfix.model import Cameras, Lens, WaterPlane
 
 LENS = Lens(1500.0, 1600, 1200, 800.0, 600.0)

@@ -12,8 +12,8 @@ import pytest
 
 from pcfix.adjust.block import Block, Unknowns
 from pcfix.adjust.precision import Precision, SharedUnknown
+from pcfix.adjust.problem import LogRow
 from pcfix.adjust.result import Adjusted, ControlRow
-from pcfix.adjust.solve import LogRow
 from pcfix.model import Cameras, Lens, WaterPlane, WaterRaster
 from pcfix.report.adjustment import (
     Before,

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from pcfix.adjust.block import Unknowns
 from pcfix.adjust.fixed_poses import plain_block
-from pcfix.adjust.solve import prepare, solve, solved_cameras
+from pcfix.adjust.problem import prepare, solved_cameras
+from pcfix.adjust.solve import solve
 from pcfix.model import Cameras, GnssPositions, Lens
 from pcfix.simulate.tracing import piercing_points
 

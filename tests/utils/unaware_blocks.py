@@ -13,7 +13,8 @@ import numpy as np
 from scipy.optimize._numdiff import approx_derivative
 
 from pcfix.adjust.block import Unknowns
-from pcfix.adjust.solve import prepare, solve, solved_cameras
+from pcfix.adjust.problem import prepare, solved_cameras
+from pcfix.adjust.solve import solve
 from pcfix.model import TiePoints, WaterPlane
 from pcfix.simulate.tracing import triangulate
 from tests.utils.adjust_twin import Twin

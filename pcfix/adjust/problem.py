@@ -1,0 +1,338 @@
+"""A block as a problem to solve: what is measured, what moves, what is known beforehand.
+
+The datum and all other prior knowledge enter as observations of the unknowns: GNSS positions,
+surveyed points, standard deviations of lens, water and index.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from pcfix.adjust.block import (
+    CODES,
+    WATER_NAMES,
+    Block,
+    Columns,
+    Given,
+    Loss,
+    PointPriors,
+    Seen,
+    State,
+    Surface,
+    Unknowns,
+    columns_of,
+    sensor_groups,
+    usable_codes,
+)
+from pcfix.adjust.normal import cost_of, pair_slots, residuals
+from pcfix.errors import GeometryError
+from pcfix.lens.imaging import lens_table
+from pcfix.model import Lens, WaterMesh, WaterPlane, WaterRaster
+from pcfix.port.light import coefficients as port_coefficients
+from pcfix.water.raster import build_field
+from pcfix.water.tin import build_tin
+
+if TYPE_CHECKING:
+    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, WaterSurface
+
+NETWORK_SIGMA_M = 1e-4
+"""How tightly the mean of the projection centres is held in a free network."""
+
+
+class LogRow(NamedTuple):
+    """One step: which round, what it came to, and the damping."""
+
+    round: int
+    step: int
+    cost: float
+    damping: float
+    observations: int
+    rms_px: float
+
+
+@dataclass(eq=False)
+class Problem:
+    """A block with everything that stays as it is while it is solved."""
+
+    block: Block
+    unknowns: Unknowns
+    origin: FloatArray
+    seen: Seen
+    surface: Surface
+    columns: Columns
+    groups: list[list[int]]
+    codes: list[tuple[int, ...]]
+    slots: tuple[IntArray, IntArray]
+    priors: PointPriors
+    moves: BoolArray
+    pivot: FloatArray
+
+    @property
+    def given(self) -> Given:
+        """What the kernels take of it."""
+        return Given(self.seen, self.surface, self.columns, self.priors, self.pivot)
+
+    @property
+    def names(self) -> list[str]:
+        """What each of the shared unknowns is."""
+        by_code = {code: name for name, code in CODES.items()}
+        names = [
+            f"{by_code[code]}" if len(self.groups) == 1 else f"{by_code[code]} of sensor {i + 1}"
+            for i, mine in enumerate(self.codes)
+            for code in mine
+        ]
+        names += [name for name, at in zip(WATER_NAMES, self.columns.water, strict=True) if at >= 0]
+        if self.columns.similarity >= 0:
+            names += ["shift x", "shift y", "shift z", "turn x", "turn y", "turn z", "scale"]
+        return names
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Where a problem came to rest.
+
+    Attributes
+    ----------
+    state : State
+        Relative to `Problem.origin`.
+    lenses : tuple of Lens, length k
+    shared : array, shape (g,)
+        What was added to the shared unknowns.
+    cost : float
+        Sum of weighted squares, priors included.
+    log : list of LogRow
+    """
+
+    state: State
+    lenses: tuple[Lens, ...]
+    shared: FloatArray
+    cost: float
+    log: list[LogRow]
+
+
+def prepare(block: Block, unknowns: Unknowns) -> tuple[Problem, Solution]:
+    """Return a problem and its start.
+
+    Raises
+    ------
+    GeometryError
+        If cameras lack angles or lenses, or the water's tilt is to move over a mesh or raster.
+    """
+    cameras = block.cameras
+    if cameras.rotations is None or cameras.lenses is None:
+        raise GeometryError("an adjustment needs cameras with angles and lenses.")
+    origin = np.round(cameras.centres.mean(axis=0))
+    group, groups = sensor_groups(cameras.lenses)
+    codes = [usable_codes(cameras.lenses[mine[0]], unknowns.lens) for mine in groups]
+    plane = isinstance(block.water, WaterPlane) or block.water is None
+    if unknowns.tilt_sigma and not plane:
+        raise GeometryError("the tilt of the water can be free for a level or plane only.")
+    free = tuple(bool(sigma) for sigma in unknowns.water_sigma)
+    columns = columns_of(codes, free, unknowns.poses == "similarity")  # type: ignore[arg-type]
+    row, table = lens_table(cameras.lenses)
+    seen = Seen(
+        np.ascontiguousarray(block.start, np.int64),
+        np.ascontiguousarray(block.camera, np.int64),
+        np.ascontiguousarray(block.image_xy, np.float64),
+        1.0 / np.asarray(block.sigma_px, np.float64),
+        np.ascontiguousarray(block.wet, np.bool_),
+        row.astype(np.int64),
+        group,
+    )
+    state = State(
+        cameras.centres - origin, np.ascontiguousarray(cameras.rotations, np.float64), table,
+        block.xyz - origin, _water_numbers(block, origin),
+    )  # fmt: skip
+    problem = Problem(
+        block, unknowns, origin, seen, _surface(block, origin), columns, groups, codes,
+        pair_slots(seen, len(cameras)), _point_priors(block, origin),
+        _moves(block, unknowns, columns),
+        state.centres.mean(axis=0),
+    )  # fmt: skip
+    start = Solution(state, cameras.lenses, np.zeros(columns.total), np.inf, [])
+    return problem, start
+
+
+def _water_numbers(block: Block, origin: FloatArray) -> FloatArray:
+    n = block.refractive_index
+    match block.water:
+        case WaterPlane(a, b, c):
+            return np.array([a + (b * origin[0] + c * origin[1]) - origin[2], b, c, n])
+        case _:
+            return np.array([0.0, 0.0, 0.0, n])
+
+
+def water_of(problem: Problem, state: State) -> WaterSurface | None:
+    """Return the water surface as it was found, world frame."""
+    water, origin = problem.block.water, problem.origin
+    level, b, c = (float(value) for value in state.water[:3])
+    match water:
+        case WaterPlane():
+            return WaterPlane(level + origin[2] - (b * origin[0] + c * origin[1]), b, c)
+        case WaterRaster() if level:
+            return replace(water, height_m=water.height_m + level)
+        case WaterMesh() if level:
+            return replace(water, vertices=water.vertices + np.array([0.0, 0.0, level]))
+        case _:
+            return water
+
+
+def _surface(block: Block, origin: FloatArray) -> Surface:
+    water = block.water
+    return Surface(
+        water is not None,
+        build_tin(water) if isinstance(water, WaterMesh) else None,
+        build_field(water) if isinstance(water, WaterRaster) else None,
+        origin,
+        np.zeros(0) if block.port is None else port_coefficients(block.port),
+    )
+
+
+def _point_priors(block: Block, origin: FloatArray) -> PointPriors:
+    known = np.isfinite(block.surveyed_sigma_m) & np.isfinite(block.surveyed_xyz)
+    weight = np.where(known, 1.0 / np.where(known, block.surveyed_sigma_m, 1.0) ** 2, 0.0)
+    return PointPriors(np.where(known, block.surveyed_xyz - origin, 0.0), weight)
+
+
+def _moves(block: Block, unknowns: Unknowns, columns: Columns) -> BoolArray:
+    k = len(block.cameras)
+    poses = np.full((k, 6), unknowns.poses == "free")
+    fixed = set(unknowns.fixed_images)
+    poses[[label in fixed for label in block.cameras.labels]] = False
+    return np.concatenate([poses.ravel(), np.ones(columns.total, bool)])
+
+
+class Priors(NamedTuple):
+    """What priors add: cost, to the matrix or its diagonal, and to the right side."""
+
+    cost: float
+    matrix: FloatArray
+    right: FloatArray
+
+
+def gnss_weights(block: Block) -> FloatArray:
+    """Return inverse variances of the GNSS positions, shape (k, 3); zero where there is none."""
+    known = np.isfinite(block.gnss_xyz) & np.isfinite(block.gnss_sigma_m)
+    return np.where(known, 1.0 / np.where(known, block.gnss_sigma_m, 1.0) ** 2, 0.0)
+
+
+def priors_at(problem: Problem, found: Solution) -> Priors:
+    """Return what the priors of poses, lens and water say at a state."""
+    block, columns, unknowns = problem.block, problem.columns, problem.unknowns
+    k, g = len(block.cameras), columns.total
+    diagonal, right = np.zeros(6 * k + g), np.zeros(6 * k + g)
+    weight = gnss_weights(block)
+    off = np.where(weight > 0.0, block.gnss_xyz - problem.origin, 0.0) - found.state.centres
+    off = np.where(weight > 0.0, off, 0.0)
+    cost = float((weight * off * off).sum())
+    sigma = _shared_sigma(problem)
+    held = np.isfinite(sigma)
+    tight = np.where(held, 1.0 / np.where(held, sigma, 1.0) ** 2, 0.0)
+    cost += float((tight * found.shared**2).sum())
+    diagonal[6 * k :] = tight
+    right[6 * k :] = -tight * found.shared
+    poses = np.column_stack([np.zeros((k, 3)), weight])
+    if columns.similarity < 0:
+        diagonal[: 6 * k] = poses.ravel()
+        right[: 6 * k] = np.column_stack([np.zeros((k, 3)), weight * off]).ravel()
+        if unknowns.free_network:
+            return _with_network(problem, found, Priors(cost, diagonal, right))
+        return Priors(cost, diagonal, right)
+    matrix = np.diag(diagonal)
+    by = similarity_gradients(found.state.centres - problem.pivot)
+    at = 6 * k + columns.similarity
+    matrix[at:, at:] += np.einsum("kia,ki,kib->ab", by, weight, by)
+    right[at:] += np.einsum("kia,ki->a", by, weight * off)
+    return Priors(cost, matrix, right)
+
+
+def similarity_gradients(d: FloatArray) -> FloatArray:
+    """Return how places move with a shift, a turn and a scale about the pivot, shape (k, 3, 7)."""
+    by = np.zeros((len(d), 3, 7))
+    by[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    x, y, z = d.T
+    by[:, 0, 4], by[:, 0, 5] = z, -y
+    by[:, 1, 3], by[:, 1, 5] = -z, x
+    by[:, 2, 3], by[:, 2, 4] = y, -x
+    by[:, :, 6] = d
+    return by
+
+
+def _with_network(problem: Problem, found: Solution, extra: Priors) -> Priors:
+    """Hold mean place, direction and scale of the projection centres."""
+    start = problem.block.cameras.centres - problem.origin
+    k = len(start)
+    d = start - start.mean(axis=0)
+    by = similarity_gradients(d) / np.array([1.0] * 3 + [np.sqrt((d * d).sum() / k)] * 4)
+    rows = np.zeros((7, len(extra.right)))
+    rows[:, : 6 * k].reshape(7, k, 6)[:, :, 3:] = by.transpose(2, 0, 1) / k
+    rows = rows[_undetermined(problem)]
+    off = rows[:, : 6 * k].reshape(len(rows), k, 6)[:, :, 3:]
+    miss = np.einsum("akj,kj->a", off, found.state.centres - start)
+    weight = 1.0 / NETWORK_SIGMA_M**2
+    return Priors(
+        extra.cost + weight * float((miss * miss).sum()),
+        np.diag(extra.matrix) + weight * rows.T @ rows,
+        extra.right - weight * rows.T @ miss,
+    )
+
+
+def _undetermined(problem: Problem) -> list[int]:
+    """Return which of shift, turn and scale nothing in the images tells.
+
+    A water surface whose level or tilt does not move freely tells the height or tilt of the block.
+    """
+    bends = problem.block.refractive_index != 1.0 or problem.unknowns.index_sigma > 0.0
+    if not (problem.surface.there and bends and problem.block.wet.any()):
+        return list(range(7))
+    level, tilt = problem.unknowns.level_sigma_m, problem.unknowns.tilt_sigma
+    rows = [0, 1, 5, 6]
+    rows += [2] if np.isinf(level) else []
+    rows += [3, 4] if np.isinf(tilt) else []
+    return sorted(rows)
+
+
+def _shared_sigma(problem: Problem) -> FloatArray:
+    """Return the standard deviations of the shared unknowns about their start."""
+    unknowns = problem.unknowns
+    given = {CODES[name]: value for name, value in unknowns.lens_sigma.items()}
+    lens = [given.get(int(code), np.inf) for code in problem.columns.code]
+    water = [sigma for sigma in unknowns.water_sigma if sigma]
+    rest = problem.columns.total - len(lens) - len(water)
+    return np.array([*lens, *water, *([np.inf] * rest)], np.float64)
+
+
+def weighted_squares(problem: Problem, found: Solution) -> FloatArray:
+    """Return the weighted square of each observation that counts; NaN where out of sight."""
+    r = residuals(found.state, problem.seen, problem.surface)
+    counts = problem.seen.weight > 0.0
+    return (r[counts] ** 2).sum(axis=1) * problem.seen.weight[counts] ** 2
+
+
+def cost_at(problem: Problem, found: Solution, loss: Loss) -> float:
+    """Return what a solution costs: images, surveyed points and all priors."""
+    images = cost_of(weighted_squares(problem, found), loss)
+    priors = problem.priors
+    points = float((priors.weight * (priors.xyz - found.state.xyz) ** 2).sum())
+    return images + points + priors_at(problem, found).cost
+
+
+def counts_of(problem: Problem, found: Solution) -> tuple[int, float]:
+    """Return how many observations count, and the root mean square of their residuals."""
+    counts = problem.seen.weight > 0.0
+    r = residuals(found.state, problem.seen, problem.surface)[counts]
+    n = int(counts.sum())
+    return n, float(np.sqrt(np.nansum(r * r) / max(2 * n, 1)))
+
+
+def solved_cameras(problem: Problem, found: Solution) -> Cameras:
+    """Return the cameras of a solution, world frame."""
+    return replace(
+        problem.block.cameras,
+        centres=found.state.centres + problem.origin,
+        rotations=found.state.rotations,
+        lenses=found.lenses,
+    )
