@@ -7,22 +7,36 @@ P is where the same places in the images meet now: P' with
 
 straight rays, as ordinary software intersects them, land and bed alike. The cloud is then what the
 same software would have made with the adjusted cameras, and any method of correction goes on from
-there with them.
+there with them. What is submerged is decided afterwards, as an adjustment that knew of no water
+sinks or lifts whole beaches.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+import warnings
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numba import njit, prange
 
+from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.lens.derivatives import image_and_gradients
 from pcfix.lens.imaging import image_of, lens_table
+from pcfix.model import Cameras, Outcome, Views, WaterPlane
+from pcfix.options import Settings
+from pcfix.refract.choice import chosen_views, spatial_order
+from pcfix.refract.made_with import MadeWith
 from pcfix.threads import one_caller
+from pcfix.water.surface import SurfaceAbove, is_submerged
 
 if TYPE_CHECKING:
-    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Views
+    from collections.abc import Callable, Iterator
+    from typing import TypeAlias
+
+    from pcfix.model import BoolArray, Correction, FloatArray, IntArray, Lens, TiePoints
+
+    Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
 
 MAX_STEPS = 12
 CLOSE_M = 1e-6
@@ -65,25 +79,33 @@ def carry(xyz: FloatArray, views: Views, old: Cameras, new: Cameras) -> Carried:
     """
     shift = np.zeros((len(xyz), 3))
     moved = np.zeros(len(xyz), np.bool_)
-    old_row, old_lenses = lens_table(old.lenses or ())
-    new_row, new_lenses = lens_table(new.lenses or ())
     with one_caller():
         _carry(
             np.ascontiguousarray(xyz), np.asarray(views.start, np.int64),
-            np.asarray(views.camera, np.int64),
-            np.ascontiguousarray(old.centres), np.ascontiguousarray(old.rotations, np.float64),
-            old_row, old_lenses,
-            np.ascontiguousarray(new.centres), np.ascontiguousarray(new.rotations, np.float64),
-            new_row, new_lenses, shift, moved,
+            np.asarray(views.camera, np.int64), _side_of(old), _side_of(new), shift, moved,
         )  # fmt: skip
     return Carried(shift, moved)
 
 
+class _Side(NamedTuple):
+    """Cameras for the kernels: poses, each one's row of the lens table, and the table."""
+
+    centres: FloatArray
+    rotations: FloatArray
+    row: IntArray
+    lenses: FloatArray
+
+
+def _side_of(cameras: Cameras) -> _Side:
+    return _Side(
+        np.ascontiguousarray(cameras.centres), np.ascontiguousarray(cameras.rotations, np.float64),
+        *lens_table(cameras.lenses or ()),
+    )  # fmt: skip
+
+
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _carry(
-    xyz: FloatArray, start: IntArray, camera: IntArray,
-    old_centres: FloatArray, old_rotations: FloatArray, old_row: IntArray, old_lenses: FloatArray,
-    new_centres: FloatArray, new_rotations: FloatArray, new_row: IntArray, new_lenses: FloatArray,
+    xyz: FloatArray, start: IntArray, camera: IntArray, old: _Side, new: _Side,
     shift: FloatArray, moved: BoolArray,
 ) -> None:  # fmt: skip
     for block in prange((len(xyz) + _BLOCK - 1) // _BLOCK):
@@ -97,17 +119,14 @@ def _carry(
             for j in range(start[i], start[i + 1]):
                 c = camera[j]
                 u, v = _image(
-                    xyz[i, 0] - old_centres[c, 0], xyz[i, 1] - old_centres[c, 1],
-                    xyz[i, 2] - old_centres[c, 2], old_rotations[c], old_lenses[old_row[c]],
+                    xyz[i, 0] - old.centres[c, 0], xyz[i, 1] - old.centres[c, 1],
+                    xyz[i, 2] - old.centres[c, 2], old.rotations[c], old.lenses[old.row[c]],
                 )  # fmt: skip
                 if u == u and v == v:
                     image[count, 0], image[count, 1], who[count] = u, v, c
                     count += 1
             if count >= 2:
-                moved[i] = _meet(
-                    shift[i], xyz[i], image[:count], who[:count], new_centres, new_rotations,
-                    new_row, new_lenses,
-                )  # fmt: skip
+                moved[i] = _meet(shift[i], xyz[i], image[:count], who[:count], new)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -121,21 +140,18 @@ def _image(dx: float, dy: float, dz: float, r: FloatArray, lens: FloatArray) -> 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _meet(
-    shift: FloatArray, xyz: FloatArray, image: FloatArray, who: IntArray, centres: FloatArray,
-    rotations: FloatArray, row: IntArray, lenses: FloatArray,
-) -> bool:  # fmt: skip
+def _meet(shift: FloatArray, xyz: FloatArray, image: FloatArray, who: IntArray, new: _Side) -> bool:
     """Find the shift after which the cameras image the point nearest to the places; whether so."""
     x, y, z = 0.0, 0.0, 0.0
     for _ in range(MAX_STEPS):
         m00, m01, m02, m11, m12, m22, b0, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for j in range(who.size):
-            c, r = who[j], rotations[who[j]]
-            dx = xyz[0] + x - centres[c, 0]
-            dy = xyz[1] + y - centres[c, 1]
-            dz = xyz[2] + z - centres[c, 2]
+            c, r = who[j], new.rotations[who[j]]
+            dx = xyz[0] + x - new.centres[c, 0]
+            dy = xyz[1] + y - new.centres[c, 1]
+            dz = xyz[2] + z - new.centres[c, 2]
             u, v, g = image_and_gradients(
-                lenses[row[c]],
+                new.lenses[new.row[c]],
                 r[0, 0] * dx + r[0, 1] * dy + r[0, 2] * dz,
                 r[1, 0] * dx + r[1, 1] * dy + r[1, 2] * dz,
                 r[2, 0] * dx + r[2, 1] * dy + r[2, 2] * dz,
@@ -162,3 +178,300 @@ def _meet(
             shift[0], shift[1], shift[2] = x, y, z
             return True
     return False
+
+
+SAME_SHAPE = 0.002
+"""Of the ratio of an image's sides. Undistorted images differ by more from those that they were
+made of, unless they have the very same size; sides in millimetres are rounded by less."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Old and adjusted cameras of the same k images, row by row.
+
+    Attributes
+    ----------
+    old, new : Cameras
+        In the cloud's CRS, with angles and lenses; the lenses of an image in one unit.
+    row : array, shape (o,)
+        The row here of each of the old cameras as they were read, -1 where it was not adjusted.
+    left_out : tuple of str
+        Images of the old model that were not adjusted.
+    """
+
+    old: Cameras
+    new: Cameras
+    row: IntArray
+    left_out: tuple[str, ...]
+
+    def renumbered(self, views: Views) -> Views:
+        """Return views of the old cameras as they were read as views of the rows here."""
+        return renumbered(views, self.row)[0]
+
+
+def pair_of(old: Cameras, new: Cameras, place: IntArray) -> Pair:
+    """Return the pair of two models, given the row in the old one of each new image.
+
+    Raises
+    ------
+    GeometryError
+        If the images have not the same shape.
+    """
+    row = np.full(len(old), -1)
+    row[place] = np.arange(len(new))
+    left_out = tuple(label for label, at in zip(old.labels, row, strict=True) if at < 0)
+    lenses: list[Lens] = []
+    for i, lens in zip(place, new.lenses or (), strict=True):
+        lenses.append(_in_unit_of(lens, (old.lenses or ())[i], old.labels[i]))
+    taken = replace(
+        old,
+        labels=tuple(old.labels[i] for i in place),
+        centres=old.centres[place],
+        rotations=None if old.rotations is None else old.rotations[place],
+        lenses=tuple(lenses),
+        gnss=None,
+    )
+    return Pair(taken, new, row, left_out)
+
+
+def _in_unit_of(new: Lens, old: Lens, label: str) -> Lens:
+    """Return an old lens in the unit of the new one, whose image has the same shape."""
+    factor = new.width / old.width
+    if not abs(factor * old.height / new.height - 1.0) <= SAME_SHAPE:
+        raise GeometryError(
+            f"adjusted-from: image {label} has {old.width:g} x {old.height:g} {old.unit} there, but"
+            f" {new.width:g} x {new.height:g} {new.unit} in the cameras; these are not the same"
+            " images (one of them undistorted?); give the model that the cameras were adjusted"
+            " from."
+        )
+    if factor == 1.0:
+        return old
+    lengths = ("focal", "width", "height", "principal_x", "principal_y", "b1", "b2", "b3")
+    scaled = {name: factor * getattr(old, name) for name in lengths}
+    return replace(old, unit=new.unit, **scaled)
+
+
+def renumbered(views: Views, row: IntArray) -> tuple[Views, IntArray]:
+    """Return views of other numbers, without entries of negative ones, and which entries stayed."""
+    camera = row[np.asarray(views.camera)]
+    stays = camera >= 0
+    if views.kind == "pairs":
+        stays = np.repeat(stays[::2] & stays[1::2], 2)
+    entry = np.flatnonzero(stays)
+    start = np.concatenate([[0], np.cumsum(stays)])[views.start]
+    weight = None if views.weight is None else views.weight[entry]
+    return Views(start, camera[entry], weight, views.kind), entry
+
+
+POINTS_AT_ONCE = 100_000
+"""Whose cameras are listed at a time, which bounds the memory."""
+
+MOST_APART = 0.1
+"""Of the flying height, between two centres of one image. What refraction does to a block, datum
+and scale included, is a few hundredths."""
+
+REASON = "fewer than two old cameras image them"
+
+
+class Step(NamedTuple):
+    """Points on the way: n of them.
+
+    old_xyz : where they were, shape (n, 3), metres; xyz : where they are with the new cameras;
+    carried : which could be taken there; views : theirs, of the new cameras, where there are any.
+    """
+
+    old_xyz: FloatArray
+    xyz: FloatArray
+    carried: BoolArray
+    views: Views | None
+
+    def rule(self, label: Label | None) -> Label:
+        """Return the rule that says what is submerged, by which no point is that stayed behind."""
+        below = _below if label is None else label
+        return lambda xyz, surface: below(xyz, surface) & self.carried
+
+    def whole(self, correction: Correction) -> Correction:
+        """Return the correction of `xyz` as one of the points as they were.
+
+        A point that is submerged and got no rays stays where it was, and so does one that
+        was not carried.
+        """
+        outcome = np.where(self.carried, correction.outcome, np.uint8(Outcome.NOT_CARRIED))
+        found = replace(correction, outcome=outcome)
+        stays = found.uncorrected
+        shift = np.where(stays[:, None], 0.0, self.xyz - self.old_xyz + correction.shift_m)
+        return replace(found, apparent_xyz=self.old_xyz, shift_m=shift)
+
+
+def _below(xyz: FloatArray, surface: SurfaceAbove) -> BoolArray:
+    return is_submerged(xyz[:, 2], surface)
+
+
+def in_frame(xyz: FloatArray, cameras: Cameras) -> Views:
+    """Return the cameras whose frame holds each point, above the water or below."""
+    xyz = np.ascontiguousarray(xyz)
+    at_themselves = SurfaceAbove(xyz[:, 2].copy(), np.zeros((len(xyz), 2)))
+    return chosen_views(xyz, at_themselves, WaterPlane(0.0), cameras, Settings())
+
+
+class Carrying:
+    """The two models of a block, and what became of the points so far.
+
+    Parameters
+    ----------
+    pair : Pair
+    """
+
+    def __init__(self, pair: Pair) -> None:
+        self.pair = pair
+        self._is_checked = False
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the points so far."""
+        self._points = self._not_carried = self._land = 0
+        self._sum_m, self._most_m = np.zeros(4), 0.0
+
+    def step(self, xyz: FloatArray, listed: Views | None) -> Step:
+        """Take points over.
+
+        Parameters
+        ----------
+        xyz : array, shape (n, 3)
+            Metres, world frame.
+        listed : Views or None
+            Of the old cameras, as they were read.
+
+        Raises
+        ------
+        GeometryError
+            If the two models do not lie in one place.
+        """
+        self._check(xyz)
+        views = None if listed is None else self.pair.renumbered(listed)
+        shift = np.zeros((len(xyz), 3))
+        carried = np.zeros(len(xyz), np.bool_)
+        if views is not None:
+            # whatever the list means to the correction, these images saw the point
+            shift, carried = carry(xyz, replace(views, kind="tracks"), self.pair.old, self.pair.new)
+        for rows in _batches(xyz, np.flatnonzero(~carried)):
+            shift[rows], carried[rows] = self._by_all(xyz[rows])
+        return Step(xyz, xyz + shift, carried, views)
+
+    def _by_all(self, xyz: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Take points over by every old camera whose frame holds them."""
+        return carry(xyz, in_frame(xyz, self.pair.old), self.pair.old, self.pair.new)
+
+    def made_with(self, xyz: FloatArray) -> MadeWith:
+        """Return what made points, as they were."""
+        return MadeWith(xyz, self.pair.old)
+
+    def of_new_ties(self, ties: TiePoints) -> TiePoints:
+        """Return tie points of the adjusted block, taken back to the old cameras."""
+        known = np.flatnonzero(np.isfinite(ties.xyz).all(axis=1))
+        xyz = ties.xyz.copy()
+        some = ties.views.take(known)
+        xyz[known] += carry(xyz[known], some, self.pair.new, self.pair.old).shift_m
+        return replace(ties, xyz=xyz)
+
+    def _check(self, xyz: FloatArray) -> None:
+        """Refuse models that are apart, by the first points to come, and warn of single images."""
+        if self._is_checked or not len(xyz):
+            return
+        self._is_checked = True
+        old, new = self.pair.old, self.pair.new
+        height = float(np.median(old.centres[:, 2]) - np.median(xyz[:, 2]))
+        apart = np.linalg.norm(new.centres - old.centres, axis=1)
+        middle, most = float(np.median(apart)), MOST_APART * height
+        if height <= 0.0 or apart.max() <= most:
+            return
+        if middle > most:
+            raise GeometryError(
+                f"adjusted-from: its cameras stand {_metres(middle)} from where the adjusted ones"
+                f" do (the middle of {len(apart)} images), more than a tenth of their height of"
+                f" {_metres(height)} over the cloud, so the two are not of one block in one CRS;"
+                " check both files, --cameras-crs and --cameras-offset (they count for the file"
+                " that does not say where it lies)."
+            )
+        worst = int(np.argmax(apart))
+        warnings.warn(
+            f"adjusted-from: {int((apart > most).sum())} of {len(apart)} images were moved by more"
+            f" than a tenth of their height over the cloud, {old.labels[worst]} by"
+            f" {_metres(apart[worst])}; look at their poses.",
+            PcfixWarning,
+            stacklevel=3,
+        )
+
+    def add(self, step: Step, correction: Correction) -> None:
+        """Count a chunk: the step, and what `Step.whole` made of its correction."""
+        followed = step.carried & ~correction.uncorrected
+        shift = (step.xyz - step.old_xyz)[followed]
+        length2 = (shift**2).sum(axis=1)
+        self._points += len(shift)
+        self._land += int((correction.outcome[followed] == Outcome.LAND).sum())
+        self._not_carried += int((~step.carried).sum())
+        self._sum_m += [*shift.sum(axis=0), length2.sum()]
+        self._most_m = max(self._most_m, float(np.sqrt(length2.max(initial=0.0))))
+
+    @property
+    def not_carried(self) -> int:
+        """Points so far that could not be taken over."""
+        return self._not_carried
+
+    def check(self, name: str) -> None:
+        """Refuse a cloud that the old cameras do not see.
+
+        Raises
+        ------
+        GeometryError
+            If no point was carried.
+        """
+        if self._points == 0 and self._not_carried:
+            raise GeometryError(
+                f"{name}: no point could be taken from the old cameras to the new ones:"
+                f" {REASON}; check that adjusted-from is the model that the cloud was made with,"
+                " in its CRS."
+            )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures in plain values, metres."""
+        apart = np.linalg.norm(self.pair.new.centres - self.pair.old.centres, axis=1)
+        mean = self._sum_m / max(self._points, 1)
+        return {
+            "points": self._points,
+            "land": self._land,
+            "not_carried": self._not_carried,
+            "not_carried_reason": REASON,
+            "shift_m": {
+                "mean_x": _rounded(mean[0]),
+                "mean_y": _rounded(mean[1]),
+                "mean_z": _rounded(mean[2]),
+                "rms": _rounded(np.sqrt(mean[3])),
+                "max": _rounded(self._most_m),
+            },
+            "cameras": len(apart),
+            "cameras_left_out": list(self.pair.left_out),
+            "centres_m": {
+                "rms": _rounded(np.sqrt((apart**2).mean())),
+                "max": _rounded(apart.max()),
+            },
+        }
+
+    def provenance(self) -> dict[str, Any]:
+        """Return what a file shall say of it."""
+        return {"adjusted_from": {"cameras": len(self.pair.row), "source": self.pair.old.source}}
+
+
+def _batches(xyz: FloatArray, rows: IntArray) -> Iterator[IntArray]:
+    """Yield rows of points, neighbours together."""
+    order = rows[spatial_order(np.ascontiguousarray(xyz[rows]))]
+    for first in range(0, len(order), POINTS_AT_ONCE):
+        yield order[first : first + POINTS_AT_ONCE]
+
+
+def _metres(value: float) -> str:
+    return f"{value:,.2f} m" if value < 100.0 else f"{value:,.0f} m"
+
+
+def _rounded(value: float) -> float:
+    return round(float(value), 4)

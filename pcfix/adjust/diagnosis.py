@@ -8,7 +8,7 @@ of what they can tell:
 tie points : intersected with refraction, points under water fit their images worse than with
     straight rays. With true poses it is the other way round.
 GNSS : the centres are off in the very pattern in which this water would have bent this block
-    (`pcfix.adjust.likely_error`).
+    (`pcfix.adjust.mend`).
 bed : depths of the cloud are nearly the true ones before any correction, where refraction leaves
     1/n of them or less.
 land, control points, focal length : they are off. They can be so for other reasons, and show
@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from pcfix.adjust.fixed_poses import Intersected
-    from pcfix.adjust.likely_error import Mended
+    from pcfix.adjust.intersect import Intersected
+    from pcfix.adjust.mend import Mended
     from pcfix.model import BoolArray, FloatArray, IntArray
 
 LEAST_POINTS = 30

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -14,7 +14,17 @@ from pcfix.model import TiePoints, Views, WaterDimension
 from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
-    from pcfix.model import BoolArray, Cameras, FloatArray, GroundControl, IntArray, WaterSurface
+    from collections.abc import Callable
+
+    from pcfix.model import (
+        BoolArray,
+        Cameras,
+        FloatArray,
+        GroundControl,
+        IntArray,
+        Lens,
+        WaterSurface,
+    )
     from pcfix.port.shapes import Port
 
 LEAST_VIEWS = 2
@@ -41,9 +51,65 @@ class Datum(NamedTuple):
     sigma_m: FloatArray
 
 
+LEAST_GNSS_SIGMA_M = 0.02
+FAR_OFF_M, FAR_OFF_SIGMAS = 1.0, 10.0
+"""Mean distance of GNSS positions from the projection centres that no adjustment leaves, where it
+is also so many standard deviations: another datum."""
+
+
 def no_datum(k: int) -> Datum:
     """Return the datum of a block without GNSS."""
     return Datum(np.full((k, 3), np.nan), np.full((k, 3), np.inf))
+
+
+def datum_of(
+    centres: FloatArray, found: Datum, name: str, sigma_m: float | None
+) -> tuple[Datum, list[str]]:
+    """Return GNSS positions with standard deviations, and what a user should know of them.
+
+    Parameters
+    ----------
+    centres : array, shape (k, 3)
+        Projection centres, metres.
+    found : Datum
+        As they were read: both are NaN where unknown.
+    name : str
+        Of their file, for messages.
+    sigma_m : float or None
+        Of those whose file states none; None: as they lie about the projection centres.
+
+    Raises
+    ------
+    GeometryError
+        If they lie off as a whole: another datum or CRS.
+    """
+    known = np.isfinite(found.xyz)
+    if not known.any():
+        return no_datum(len(centres)), []
+    sigma = np.where(known, found.sigma_m, np.inf)
+    silent = known & ~np.isfinite(found.sigma_m)
+    off = np.where(known, centres - found.xyz, np.nan)
+    notes = []
+    if silent.any() and sigma_m is None:
+        rest = off - np.nanmedian(off, axis=0)
+        sigma_m = max(1.4826 * float(np.nanmedian(np.abs(rest))), LEAST_GNSS_SIGMA_M)
+        notes.append(
+            f"the GNSS positions come without standard deviations; {sigma_m:.2f} m is taken, as"
+            " they lie about the projection centres; --gnss-sigma says it yourself."
+        )
+    if silent.any():
+        sigma[silent] = sigma_m
+    mean = np.nan_to_num(np.nanmean(off, axis=0))
+    typical = float(np.median(sigma[np.isfinite(sigma)]))
+    if np.abs(mean).max() > max(FAR_OFF_M, FAR_OFF_SIGMAS * typical):
+        x, y, z = (-mean).tolist()
+        raise GeometryError(
+            f"{name}: the GNSS positions lie {x:.2f}, {y:.2f}, {z:.2f} m (x, y, z) from the"
+            " projection centres on average, which is another datum or CRS (heights above the"
+            " ellipsoid?): name it with --gnss-crs, bring them into one, or align the model to them"
+            " first."
+        )
+    return Datum(found.xyz, sigma), notes
 
 
 def check_surface(water: WaterSurface | None) -> None:
@@ -61,36 +127,61 @@ def check_surface(water: WaterSurface | None) -> None:
         )
 
 
-def block_of(
-    cameras: Cameras,
-    ties: TiePoints,
-    sigma_px: float,
-    water: WaterSurface | None,
-    refractive_index: float,
-    gnss: Datum,
-    control: GroundControl | None = None,
-    wet: BoolArray | None = None,
-    port: Port | None = None,
-    level_sigma_m: float = 0.0,
-) -> Block:
+@dataclass(frozen=True, eq=False)
+class Material:
+    """What a block is made of beside its observations; in one frame, metres, Z up.
+
+    Attributes
+    ----------
+    name : str
+        Of the model, for messages.
+    old : Cameras
+        As they came, with angles and lenses.
+    water, refractive_index, port
+        See `pcfix.adjust.block.Block`.
+    gnss : Datum
+    control : GroundControl or None
+        Points to check with get no weight.
+    calibrated : Lens or None
+        Instead of the lenses of the cameras.
+    inside : callable or None
+        Whether places, x and y, may be under water; everywhere by default.
+    level_sigma_m : float
+        Standard deviation of the water level; infinite where it is to be found.
+    no_gnss : str
+        Why GNSS positions that there are do not count.
+    """
+
+    name: str
+    old: Cameras
+    water: WaterSurface | None
+    refractive_index: float
+    gnss: Datum
+    control: GroundControl | None = None
+    port: Port | None = None
+    calibrated: Lens | None = None
+    inside: Callable[[FloatArray, FloatArray], BoolArray] | None = None
+    level_sigma_m: float = 0.0
+    no_gnss: str = ""
+
+    @property
+    def start(self) -> Cameras:
+        """The cameras from which the adjustment starts."""
+        if self.calibrated is None:
+            return self.old
+        return replace(self.old, lenses=(self.calibrated,) * len(self.old))
+
+
+def block_of(material: Material, ties: TiePoints, sigma_px: float) -> Block:
     """Return the block of tie points and surveyed points.
 
     Parameters
     ----------
-    cameras : Cameras
+    material : Material
     ties : TiePoints
         Apparent points, in the frame of the cameras.
     sigma_px : float
         Of their image places.
-    water, refractive_index, port
-        See `pcfix.adjust.block.Block`.
-    gnss : Datum
-    control : GroundControl, optional
-        In the frame of the cameras. Points to check with get no weight.
-    wet : array of bool, shape (m,), optional
-        Which tie points may be under water; all by default.
-    level_sigma_m : float
-        Standard deviation of the water level; infinite where it is to be found.
 
     Raises
     ------
@@ -99,22 +190,17 @@ def block_of(
     GeometryError
         If a control point lies under water and the survey does not say so.
     """
+    water, control = material.water, material.control
     check_surface(water)
-    m = len(ties.xyz)
-    xyz = true_start(ties.xyz, water, refractive_index, wet)
-    parts = [
-        (
-            xyz,
-            ties.views.start,
-            ties.views.camera,
-            ties.image_xy,
-            np.full(len(ties.views.camera), sigma_px),
-        )
-    ]
+    m, inside = len(ties.xyz), material.inside
+    wet = None if inside is None else inside(ties.xyz[:, 0], ties.xyz[:, 1])
+    sigma = np.full(len(ties.views.camera), sigma_px)
+    xyz = true_start(ties.xyz, water, material.refractive_index, wet)
+    parts = [(xyz, ties.views.start, ties.views.camera, ties.image_xy, sigma)]
     names: tuple[str, ...] = ()
     is_check = np.zeros(0, np.bool_)
     if control is not None:
-        _check_under_water(control, water, level_sigma_m)
+        _check_under_water(control, water, material.level_sigma_m)
         names, is_check = control.names, control.is_check
         parts.append(_control_part(control))
     allowed = np.ones(m, np.bool_) if wet is None else wet
@@ -126,20 +212,20 @@ def block_of(
         allowed = np.concatenate([allowed, control.under_water])
     starts = [parts[0][1]] + [part[1][1:] + parts[0][1][-1] for part in parts[1:]]
     return Block(
-        cameras=cameras,
+        cameras=material.start,
         xyz=np.vstack([part[0] for part in parts]),
         start=np.concatenate(starts),
         camera=np.concatenate([part[2] for part in parts]),
         image_xy=np.vstack([part[3] for part in parts]),
         sigma_px=np.concatenate([part[4] for part in parts]),
         water=water,
-        refractive_index=refractive_index,
+        refractive_index=material.refractive_index,
         wet=allowed,
         surveyed_xyz=surveyed_xyz,
         surveyed_sigma_m=surveyed_sigma,
-        gnss_xyz=gnss.xyz,
-        gnss_sigma_m=gnss.sigma_m,
-        port=port,
+        gnss_xyz=material.gnss.xyz,
+        gnss_sigma_m=material.gnss.sigma_m,
+        port=material.port,
         control_names=names,
         is_check=is_check,
     )

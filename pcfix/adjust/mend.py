@@ -1,6 +1,7 @@
-"""Poses mended from the cloud alone: which images made it, what may move, how much it counts.
+"""Poses mended from the cloud alone, and what it is likely to cost where they are not.
 
-See `pcfix.adjust.unaware` for the equations. What the points of the cloud say is not noise but how
+See `pcfix.adjust.unaware` for the equations. `mend` decides which images made the cloud, what may
+move, and how much it counts. What the points of the cloud say is not noise but how
 well they stand for the tie points of the old adjustment. GNSS positions and control points tell it:
 the points count as much as lets these fit within their standard deviations, and of several choices
 the one under which they fit best is taken.
@@ -14,21 +15,32 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
+from pcfix.adjust.block import Unknowns
+from pcfix.adjust.gather import some_cameras
+from pcfix.adjust.intersect import intersect_fixed, plain_block
 from pcfix.adjust.normal import residuals
-from pcfix.adjust.problem import Problem, Solution, gnss_weights, prepare
-from pcfix.adjust.rounds import adjusted_of, check_datum
+from pcfix.adjust.problem import Problem, Solution, gnss_weights, prepare, solved_cameras
+from pcfix.adjust.result import adjusted_of
+from pcfix.adjust.rounds import check_datum
 from pcfix.adjust.unaware import solve_unaware, straight_columns
 from pcfix.errors import GeometryError
+from pcfix.lens.imaging import project
+from pcfix.model import WaterPlane
+from pcfix.options import Settings
+from pcfix.refract.choice import chosen_views
+from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from pcfix.adjust.block import Block, Unknowns
+    from pcfix.adjust.block import Block
     from pcfix.adjust.problem import LogRow
     from pcfix.adjust.result import Adjusted
     from pcfix.model import Cameras, FloatArray
 
     Progress = Callable[[LogRow], None]
+    from pcfix.model import BoolArray, IntArray, Lens, WaterSurface
+
 
 SIGMAS_PX = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 3.0, 5.0, 10.0)
 """How far the points of the cloud may be from images of tie points: tried in this order."""
@@ -124,7 +136,7 @@ def mend(
         gain = (chosen.misfit - more.misfit) / max(chosen.mean, 1.0)
         if gain > chi2.isf(SURE, extra * len(chosen.problem.groups)):
             chosen = more
-    notes.append(_said(chosen, candidates, lens_sets))
+    notes.append(_what_counts(chosen, candidates, lens_sets))
     if chosen.sigma_px >= POOR_PX:
         notes.append(
             f"the points of the cloud fit GNSS and control points only if they count as"
@@ -138,7 +150,7 @@ def mend(
     return replace(found, sigma0=float(np.sqrt(chosen.mean)), redundancy=free)
 
 
-def _said(
+def _what_counts(
     chosen: Trial, candidates: list[Candidate], lens_sets: tuple[tuple[str, ...], ...]
 ) -> str:
     free = chosen.problem.unknowns.lens
@@ -191,3 +203,137 @@ def _trial(one: Candidate, unknowns: Unknowns, sigma_px: float, progress: Progre
     count = _observed(block) + 2 * int(marks.sum()) + int(surveyed.sum())
     count -= 3 * int(surveyed.any(axis=1).sum())
     return Trial(one.name, block, problem, found, sigma_px, found.cost + in_images, count)
+
+
+_LEVEL = WaterPlane(0.0)  # any: straight rays
+SIGMA_PX = 0.25
+"""Of a place in the image; small, so that the centres only decide where the block lies."""
+OWN_SIGMA_M = 1.0
+"""Of a projection centre, which holds the block as a whole where it is."""
+LEAST_VIEWS, LEAST_POINTS, LEAST_IMAGES = 3, 10, 5
+
+
+class Mended(NamedTuple):
+    """What the poses would be if they had absorbed the refraction, and what that changes.
+
+    cameras : Cameras
+        Those of the images that enough points lie in.
+    row : shape (k,), of each of them among all.
+    land_m, bed_m : shape (m,) and (w,)
+        By how much land and bed lie too low now, the bed after its correction with the poses as
+        they are.
+    """
+
+    cameras: Cameras
+    row: IntArray
+    land_m: FloatArray
+    bed_m: FloatArray
+
+
+def images_of(
+    xyz: FloatArray, cameras: Cameras, least: int = 2
+) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
+    """Return which points lie in frames, and where straight rays image them.
+
+    Parameters
+    ----------
+    xyz : array, shape (m, 3)
+        Metres, world frame.
+    cameras : Cameras
+        With angles and lenses.
+    least : int
+        Frames that must hold a point.
+
+    Returns
+    -------
+    rows, start, camera, image_xy
+        Of the points; the other three as of `pcfix.adjust.block.Block`.
+    """
+    rotations = np.asarray(cameras.rotations)
+    above = SurfaceAbove(xyz[:, 2].copy(), np.zeros((len(xyz), 2)))
+    views = chosen_views(xyz, above, _LEVEL, cameras, Settings())
+    rows = np.flatnonzero(np.diff(views.start) >= least)
+    views = views.take(rows)
+    owner = np.repeat(rows, np.diff(views.start))
+    local = xyz[owner] - cameras.centres[views.camera]
+    local = np.einsum("oij,oj->oi", rotations[views.camera], local)
+    image_xy = np.empty((len(owner), 2))
+    by_lens: dict[Lens, list[int]] = {}
+    for row, lens in enumerate(cameras.lenses or ()):
+        by_lens.setdefault(lens, []).append(row)
+    for lens, mine in by_lens.items():
+        of_lens = np.isin(views.camera, mine)
+        image_xy[of_lens] = project(lens, local[of_lens])
+    return rows, views.start, views.camera, image_xy
+
+
+def mended(
+    xyz: FloatArray, cameras: Cameras, water: WaterSurface, refractive_index: float
+) -> Mended:
+    """Return the poses as an adjustment that knows of the water would have them.
+
+    The block stays as a whole where its cameras are.
+
+    Parameters
+    ----------
+    xyz : array, shape (m, 3)
+        Points of the apparent cloud, or tie points, spread over it; a thousand or two.
+    cameras : Cameras
+        With angles and lenses.
+    water : WaterPlane, WaterMesh or WaterRaster
+    refractive_index : float
+
+    Raises
+    ------
+    GeometryError
+        If the cloud does not determine the poses.
+    """
+    row = _well_covered(xyz, cameras)
+    cameras = some_cameras(cameras, row)
+    block, apparent = _block_of(xyz, cameras, water, refractive_index)
+    problem, begin = prepare(block, Unknowns(lens=("f",)))
+    tests = straight_columns(problem, begin, apparent - problem.origin)
+    found = solve_unaware(problem, begin, tests, np.ones(len(apparent), np.bool_))
+    higher = found.state.xyz[:, 2] + problem.origin[2] - intersect_fixed(block).xyz[:, 2]
+    known, wet = np.isfinite(higher), block.wet
+    return Mended(solved_cameras(problem, found), row, higher[~wet & known], higher[wet & known])
+
+
+def _well_covered(xyz: FloatArray, cameras: Cameras) -> IntArray:
+    """Return the rows of the cameras that image enough points.
+
+    Raises
+    ------
+    GeometryError
+        If they are fewer than three.
+    """
+    _, _, camera, _ = images_of(xyz, cameras, LEAST_VIEWS)
+    row = np.flatnonzero(np.bincount(camera, minlength=len(cameras)) >= LEAST_POINTS)
+    if len(row) < LEAST_IMAGES:
+        raise GeometryError(f"only {len(row)} images hold {LEAST_POINTS} points of the cloud.")
+    return row
+
+
+def _block_of(
+    xyz: FloatArray, cameras: Cameras, water: WaterSurface, refractive_index: float
+) -> tuple[Block, FloatArray]:
+    """Return the block that the points and their straight images make, and the points in it."""
+    rows, start, camera, image_xy = images_of(xyz, cameras, LEAST_VIEWS)
+    apparent = xyz[rows]
+    above = surface_above(water, apparent)
+    wet = is_submerged(apparent[:, 2], above)
+    if not wet.any():
+        raise GeometryError("no point of the cloud under water lies in three images.")
+    true = deeper(apparent, above.height_m, wet, refractive_index)
+    own = cameras.centres, np.full((len(cameras), 3), OWN_SIGMA_M)
+    block = plain_block(cameras, true, start, camera, image_xy, water, refractive_index, wet, own)
+    return replace(block, sigma_px=np.full(len(camera), SIGMA_PX)), apparent
+
+
+def deeper(
+    apparent: FloatArray, level_m: FloatArray, wet: BoolArray, refractive_index: float
+) -> FloatArray:
+    """Return about where apparent points are: straight down the depth grows by the index."""
+    true = apparent.copy()
+    true[wet, 2] = level_m[wet] - refractive_index * (level_m - apparent[:, 2])[wet]
+    return true

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from pcfix.adjust.gather import LEAST_VIEWS
+from pcfix.adjust.normal import residuals
+from pcfix.adjust.problem import gnss_weights, prepare, solved_cameras, water_of
+from pcfix.adjust.solve import solve
+from pcfix.water.surface import surface_above
+
 if TYPE_CHECKING:
     from pcfix.adjust.block import Block, Unknowns
     from pcfix.adjust.precision import Precision
-    from pcfix.adjust.problem import LogRow
+    from pcfix.adjust.problem import LogRow, Problem, Solution
     from pcfix.model import BoolArray, Cameras, FloatArray, WaterSurface
 
 Source = Literal["tie points", "cloud"]
@@ -102,3 +108,95 @@ class Adjusted:
         focal = np.array([lens.focal for lens in self.cameras.lenses or ()])[camera]
         metres = self.residual_px[rows] * (np.linalg.norm(away, axis=1) / focal)[:, None]
         return float(np.sqrt(np.nanmean(metres * metres)))
+
+
+def sigma0_of(problem: Problem, now: Solution) -> float:
+    """Return the a-posteriori standard deviation of unit weight."""
+    return float(np.sqrt(now.cost / max(redundancy_of(problem), 1)))
+
+
+def redundancy_of(problem: Problem) -> int:
+    """Return the number of observations, those of the unknowns included, minus unknowns."""
+    block, seen = problem.block, problem.seen
+    used = seen.weight > 0.0
+    points = len(np.unique(block.owner[used]))
+    priors = int((gnss_weights(block) > 0.0).sum() + (problem.priors.weight > 0.0).sum())
+    sigma = [*problem.unknowns.lens_sigma.values(), *problem.unknowns.water_sigma]
+    priors += sum(0.0 < value < np.inf for value in sigma)
+    datum = 7 if problem.unknowns.free_network else 0
+    return int(2 * used.sum() + priors + datum - 3 * points - problem.moves.sum())
+
+
+def adjusted_of(
+    problem: Problem, now: Solution, precision: Precision | None, notes: list[str],
+    source: Source, engine: str,
+) -> Adjusted:  # fmt: skip
+    """Return what a solution says, with check points intersected."""
+    block = problem.block
+    state = now.state
+    xyz = state.xyz + problem.origin
+    xyz = with_checks(problem, now, xyz)
+    shown = state._replace(xyz=xyz - problem.origin)
+    r = residuals(shown, problem.seen, problem.surface)
+    water = water_of(problem, state)
+    level = np.full(len(xyz), -np.inf) if water is None else surface_above(water, xyz).height_m
+    cameras = solved_cameras(problem, now)
+    off = cameras.centres - block.gnss_xyz
+    return Adjusted(
+        block=block,
+        unknowns=problem.unknowns,
+        cameras=cameras,
+        water=water,
+        refractive_index=float(state.water[3]),
+        xyz=xyz,
+        residual_px=r,
+        used=problem.seen.weight > 0.0,
+        is_wet=np.asarray((xyz[:, 2] < level) & block.wet),
+        sigma0=sigma0_of(problem, now),
+        redundancy=redundancy_of(problem),
+        rounds=now.log,
+        source=source,
+        engine=engine,
+        precision=precision,
+        gnss_residual_m=np.where(gnss_weights(block) > 0.0, off, np.nan),
+        control=_control_rows(block, xyz, r),
+        notes=notes,
+    )
+
+
+def with_checks(problem: Problem, now: Solution, xyz: FloatArray) -> FloatArray:
+    """Return the points, those to check with intersected from the adjusted cameras."""
+    block = problem.block
+    first = len(block.xyz) - len(block.control_names)
+    rows = first + np.flatnonzero(block.is_check)
+    rows = rows[np.diff(block.start)[rows] >= LEAST_VIEWS]
+    if len(rows) == 0:
+        return xyz
+    fixed = replace(problem.unknowns, poses="fixed", lens=(), level_sigma_m=0.0, tilt_sigma=0.0,
+                    index_sigma=0.0, free_network=False)  # fmt: skip
+    only = np.isin(block.owner, rows)
+    whole = replace(block, cameras=solved_cameras(problem, now), xyz=xyz,
+                    water=water_of(problem, now.state), refractive_index=float(now.state.water[3]),
+                    sigma_px=np.where(only, 1.0, np.inf))  # fmt: skip
+    part, start = prepare(whole, fixed)
+    found = solve(part, start)
+    moved = xyz.copy()
+    moved[rows] = found.state.xyz[rows] + part.origin
+    return moved
+
+
+def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlRow]:
+    first = len(block.xyz) - len(block.control_names)
+    rows = []
+    for i, name in enumerate(block.control_names):
+        p = first + i
+        mine = r[block.start[p] : block.start[p + 1]]
+        mine = mine[np.isfinite(mine).all(axis=1)]
+        check = bool(block.is_check[i])
+        known = block.surveyed_xyz[p]
+        if check and len(mine) < LEAST_VIEWS:
+            continue
+        dx, dy, dz = (xyz[p] - known).tolist()
+        rms = float(np.sqrt((mine * mine).mean())) if len(mine) else float("nan")
+        rows.append(ControlRow(name, "check" if check else "control", dx, dy, dz, rms, len(mine)))
+    return rows

@@ -17,19 +17,17 @@ from pcfix.adjust.problem import (
     Solution,
     gnss_weights,
     prepare,
-    solved_cameras,
-    water_of,
 )
-from pcfix.adjust.result import Adjusted, ControlRow, Source
+from pcfix.adjust.result import adjusted_of, sigma0_of
 from pcfix.adjust.solve import solve
 from pcfix.errors import GeometryError
-from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from pcfix.adjust.precision import Precision
-    from pcfix.model import BoolArray, FloatArray, Lens
+    from pcfix.adjust.result import Adjusted
+    from pcfix.model import BoolArray, Lens
 
     Progress = Callable[[LogRow], None]
 
@@ -250,23 +248,6 @@ def _check_share(problem: Problem) -> None:
     )
 
 
-def sigma0_of(problem: Problem, now: Solution) -> float:
-    """Return the a-posteriori standard deviation of unit weight."""
-    return float(np.sqrt(now.cost / max(redundancy_of(problem), 1)))
-
-
-def redundancy_of(problem: Problem) -> int:
-    """Return the number of observations, those of the unknowns included, minus unknowns."""
-    block, seen = problem.block, problem.seen
-    used = seen.weight > 0.0
-    points = len(np.unique(block.owner[used]))
-    priors = int((gnss_weights(block) > 0.0).sum() + (problem.priors.weight > 0.0).sum())
-    sigma = [*problem.unknowns.lens_sigma.values(), *problem.unknowns.water_sigma]
-    priors += sum(0.0 < value < np.inf for value in sigma)
-    datum = 7 if problem.unknowns.free_network else 0
-    return int(2 * used.sum() + priors + datum - 3 * points - problem.moves.sum())
-
-
 def weak_lens_parameters(problem: Problem, precision: Precision) -> list[str]:
     """Return which lens parameters, the focal length apart, the block hardly determines."""
     weak = []
@@ -310,78 +291,3 @@ def default_lens(lenses: tuple[Lens, ...]) -> tuple[str, ...]:
         if any(code in usable_codes(one, (name,)) for one in lenses)
     }
     return tuple(name for name in names if name in known)
-
-
-def adjusted_of(
-    problem: Problem, now: Solution, precision: Precision | None, notes: list[str],
-    source: Source, engine: str,
-) -> Adjusted:  # fmt: skip
-    """Return what a solution says, with check points intersected."""
-    block = problem.block
-    state = now.state
-    xyz = state.xyz + problem.origin
-    xyz = with_checks(problem, now, xyz)
-    shown = state._replace(xyz=xyz - problem.origin)
-    r = residuals(shown, problem.seen, problem.surface)
-    water = water_of(problem, state)
-    level = np.full(len(xyz), -np.inf) if water is None else surface_above(water, xyz).height_m
-    cameras = solved_cameras(problem, now)
-    off = cameras.centres - block.gnss_xyz
-    return Adjusted(
-        block=block,
-        unknowns=problem.unknowns,
-        cameras=cameras,
-        water=water,
-        refractive_index=float(state.water[3]),
-        xyz=xyz,
-        residual_px=r,
-        used=problem.seen.weight > 0.0,
-        is_wet=np.asarray((xyz[:, 2] < level) & block.wet),
-        sigma0=sigma0_of(problem, now),
-        redundancy=redundancy_of(problem),
-        rounds=now.log,
-        source=source,
-        engine=engine,
-        precision=precision,
-        gnss_residual_m=np.where(gnss_weights(block) > 0.0, off, np.nan),
-        control=_control_rows(block, xyz, r),
-        notes=notes,
-    )
-
-
-def with_checks(problem: Problem, now: Solution, xyz: FloatArray) -> FloatArray:
-    """Return the points, those to check with intersected from the adjusted cameras."""
-    block = problem.block
-    first = len(block.xyz) - len(block.control_names)
-    rows = first + np.flatnonzero(block.is_check)
-    rows = rows[np.diff(block.start)[rows] >= LEAST_VIEWS]
-    if len(rows) == 0:
-        return xyz
-    fixed = replace(problem.unknowns, poses="fixed", lens=(), level_sigma_m=0.0, tilt_sigma=0.0,
-                    index_sigma=0.0, free_network=False)  # fmt: skip
-    only = np.isin(block.owner, rows)
-    whole = replace(block, cameras=solved_cameras(problem, now), xyz=xyz,
-                    water=water_of(problem, now.state), refractive_index=float(now.state.water[3]),
-                    sigma_px=np.where(only, 1.0, np.inf))  # fmt: skip
-    part, start = prepare(whole, fixed)
-    found = solve(part, start)
-    moved = xyz.copy()
-    moved[rows] = found.state.xyz[rows] + part.origin
-    return moved
-
-
-def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlRow]:
-    first = len(block.xyz) - len(block.control_names)
-    rows = []
-    for i, name in enumerate(block.control_names):
-        p = first + i
-        mine = r[block.start[p] : block.start[p + 1]]
-        mine = mine[np.isfinite(mine).all(axis=1)]
-        check = bool(block.is_check[i])
-        known = block.surveyed_xyz[p]
-        if check and len(mine) < LEAST_VIEWS:
-            continue
-        dx, dy, dz = (xyz[p] - known).tolist()
-        rms = float(np.sqrt((mine * mine).mean())) if len(mine) else float("nan")
-        rows.append(ControlRow(name, "check" if check else "control", dx, dy, dz, rms, len(mine)))
-    return rows

@@ -1,16 +1,29 @@
-"""Refractive bundle adjustment from files: one call for all doors."""
+"""Refractive bundle adjustment from files into a folder: one call for all doors."""
 
 from __future__ import annotations
 
+import json
+import shutil
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pcfix.flow.adjust_files import checked_folder, write_adjustment
-from pcfix.flow.adjust_job import AdjustJob, AdjustSettings, Survey
+import numpy as np
+
+from pcfix.adjust.gather import LEAST_VIEWS
+from pcfix.adjust.gather import taken as taken_ties
+from pcfix.adjust.ways import unknowns_of
+from pcfix.errors import InputError, SettingError
+from pcfix.flow.adjust_job import Survey, adjusted, read_job
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.surfaces import view_of
+from pcfix.io.cameras.colmap.writing import write_colmap
+from pcfix.io.cameras.opensfm.writing import write_opensfm
+from pcfix.io.cameras.table.sensor import write_table
 from pcfix.io.files import check_input
-from pcfix.model import WaterPlane
+from pcfix.model import TiePoints, Views, WaterPlane
+from pcfix.options.declare import taken
+from pcfix.options.survey import AdjustRules
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,6 +38,8 @@ if TYPE_CHECKING:
     from pcfix.port.shapes import Port
 
     AnyPath = str | PathLike[str]
+
+SUMMARY = "adjustment.json"
 
 
 def adjust_cameras(
@@ -50,7 +65,7 @@ def adjust_cameras(
     port: Port | None = None,
     overwrite: bool = False,
     progress: Callable[[LogRow], None] | None = None,
-    **settings: Any,
+    **options: Any,
 ) -> Adjusted:
     """Adjust the poses of a block with the water in the light's way; ``pcfix adjust``.
 
@@ -71,7 +86,7 @@ def adjust_cameras(
         See `pcfix.io.gnss_positions.read_gnss`. Default: what the model has beside it.
     lens : path, optional
         A calibration, see `pcfix.io.cameras.table.sensor.read_sensor`; it is held fixed unless
-        `settings` say otherwise.
+        `lens_unknowns` say otherwise.
     gcps_crs, gnss_crs : str, optional
         Of these, instead of what they say.
     views : path, optional
@@ -84,8 +99,8 @@ def adjust_cameras(
         Replace a folder that an earlier adjustment wrote.
     progress : callable, optional
         Called with the `LogRow` of each step.
-    **settings
-        The attributes of `AdjustSettings`.
+    **options
+        Those of `pcfix.options.survey.AdjustRules`.
 
     Returns
     -------
@@ -97,18 +112,29 @@ def adjust_cameras(
         If an input cannot be read or does not fit, the block has no datum, or the unknowns cannot
         be told apart. Nothing is written then.
     """
-    how = AdjustSettings(**settings)
+    rules = taken(AdjustRules, None, options, "adjust_cameras")
     inputs = Inputs(
         model, water, sensor=sensor, angles=angles, cameras_crs=cameras_crs,
         cameras_offset_m=cameras_offset_m, views=views, water_mask=water_mask,
         water_model=water_model, water_crs=water_crs, views_are=views_are, port=port,
     )  # fmt: skip
-    target = None if out_dir is None else checked_folder(Path(out_dir), overwrite, inputs.paths())
+    survey = Survey(gcps, gnss, lens, gcps_crs, gnss_crs)
+    target = None if out_dir is None else Path(out_dir)
+    return adjust_into(target, inputs, survey, rules, cloud, overwrite=overwrite, progress=progress)
+
+
+def adjust_into(
+    folder: Path | None, inputs: Inputs, survey: Survey, rules: AdjustRules,
+    cloud: AnyPath | None = None, *, overwrite: bool = False,
+    progress: Callable[[LogRow], None] | None = None,
+) -> Adjusted:  # fmt: skip
+    """Adjust cameras with what was read of the options; see `adjust_cameras`."""
+    unknowns_of(rules, ())
+    target = None if folder is None else checked_folder(folder, overwrite, inputs.paths())
     view = None if cloud is None else view_of(check_input(cloud))
-    job = AdjustJob(inputs, how, view, Survey(gcps, gnss, lens, gcps_crs, gnss_crs))
-    found = job.adjusted(progress)
+    found = adjusted(read_job(inputs, rules, view, survey), progress)
     if target is not None:
-        write_adjustment(target, found, str(model), overwrite=overwrite)
+        write_adjustment(target, found, str(inputs.cameras))
     return found
 
 
@@ -125,3 +151,91 @@ def next_step(
         f" --adjusted-from {model} --water {level}"
         + ("" if offset is None else f" --cameras-offset {offset}")
     )
+
+
+def checked_folder(folder: Path, overwrite: bool, inputs: list[Any]) -> Path:
+    """Return a folder that may be written.
+
+    Raises
+    ------
+    SettingError
+        If it exists and is not an earlier adjustment that may be replaced.
+    """
+    if any(folder.exists() and Path(one).exists() and folder.samefile(one) for one in inputs):
+        raise SettingError(f"{folder}: output and model are the same; give another folder.")
+    if folder.exists() and not folder.is_dir():
+        raise SettingError(f"{folder}: is a file; give a folder.")
+    if folder.is_dir() and any(folder.iterdir()):
+        if not overwrite:
+            raise SettingError(f"{folder}: the output exists; add --overwrite to replace it.")
+        if not (folder / SUMMARY).is_file():
+            raise SettingError(
+                f"{folder}: holds other files than an adjustment's; give an empty or new folder."
+            )
+    if not folder.resolve().parent.is_dir():
+        raise SettingError(f"{folder}: the folder {folder.parent} does not exist; make it first.")
+    return folder
+
+
+def write_adjustment(folder: Path, found: Adjusted, model: str) -> None:
+    """Write an adjusted block: model, camera files, summary, report; all or nothing."""
+    from pcfix.report.adjustment import adjustment_dict, adjustment_page, before_of
+
+    before = before_of(found)
+    parent = folder.resolve().parent
+    draft = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=parent))
+    try:
+        _write_models(draft, found)
+        summary = {"model": model, **adjustment_dict(found, before)}
+        text = json.dumps(summary, indent=2, allow_nan=False)
+        (draft / SUMMARY).write_text(text + "\n", "utf-8")
+        (draft / "report.html").write_text(adjustment_page(found, before), "utf-8")
+        draft.chmod(0o755)
+        if folder.exists():
+            shutil.rmtree(folder)
+        draft.replace(folder)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror or error}).") from error
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def _write_models(folder: Path, found: Adjusted) -> None:
+    """Write the model in each form that holds its lenses exactly."""
+    ties = adjusted_ties(found)
+    (folder / "opensfm").mkdir()
+    writers: dict[str, Callable[[], object]] = {
+        "colmap": lambda: write_colmap(
+            folder / "colmap", found.cameras, ties, crs=found.cameras.crs
+        ),
+        "opensfm": lambda: write_opensfm(
+            folder / "opensfm" / "reconstruction.json", found.cameras, ties
+        ),
+        "cameras.csv": lambda: write_table(folder, found.cameras),
+    }
+    failed = []
+    for name, write in writers.items():
+        try:
+            write()
+        except InputError as error:
+            failed.append(str(error).replace(f"{folder}/", ""))
+            if name != "cameras.csv":  # a table is a convenience for blocks of one plain lens
+                found.notes.append(f"{name} is not written: {failed[-1]}")
+    if not any((folder / "opensfm").iterdir()):
+        (folder / "opensfm").rmdir()
+    if len(failed) == len(writers):
+        raise InputError("no form of camera file holds these lenses: " + " ".join(failed))
+
+
+def adjusted_ties(found: Adjusted) -> TiePoints | None:
+    """Return the adjusted tie points without outliers; None where points of the cloud stood in."""
+    if found.source == "cloud":
+        return None
+    block = found.block
+    m = len(block.xyz) - len(block.control_names)
+    owner = block.owner
+    kept = found.used & (owner < m)
+    counts = np.bincount(owner[kept], minlength=m)[:m]
+    start = np.concatenate([[0], np.cumsum(counts)])
+    ties = TiePoints(found.xyz[:m], Views(start, block.camera[kept]), block.image_xy[kept])
+    return taken_ties(ties, np.flatnonzero(counts >= LEAST_VIEWS))

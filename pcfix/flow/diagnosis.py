@@ -31,7 +31,7 @@ from pcfix.model import Cameras
 from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:
-    from pcfix.adjust.likely_error import Mended
+    from pcfix.adjust.mend import Mended
     from pcfix.flow.inputs import Inputs
     from pcfix.flow.surfaces import CloudView
     from pcfix.model import FloatArray, TiePoints, WaterSurface
@@ -193,8 +193,8 @@ class _Ties(NamedTuple):
 
 def _some_ties(evidence: Evidence, ties: TiePoints) -> _Ties | None:
     """Intersect some tie points straight and refracted."""
-    from pcfix.adjust.fixed_poses import intersect_fixed, plain_block
-    from pcfix.adjust.likely_error import deeper
+    from pcfix.adjust.intersect import intersect_fixed, plain_block
+    from pcfix.adjust.mend import deeper
 
     seen_by = np.diff(ties.views.start)
     rows = np.flatnonzero((seen_by >= LEAST_TIE_VIEWS) & np.isfinite(ties.xyz).all(axis=1))
@@ -290,7 +290,7 @@ def _mended(evidence: Evidence, apparent: FloatArray | None) -> Mended:
     GeometryError
         If the block is too large, or its points do not determine them.
     """
-    from pcfix.adjust.likely_error import mended
+    from pcfix.adjust.mend import mended
 
     count, most = len(evidence.cameras), QUICK_IMAGES if evidence.in_passing else MOST_IMAGES
     if count > most:

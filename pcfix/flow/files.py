@@ -135,7 +135,7 @@ def correct_file(
     adjusted_from : Cameras or path, optional
         The cameras that the cloud was made with, where `cameras` are the same images adjusted
         since: all points, land too, are first taken from those to these; see
-        `pcfix.flow.carrying`. `views` are theirs then. `cameras_crs` and `cameras_offset_m` count
+        `pcfix.adjust.carry`. `views` are theirs then. `cameras_crs` and `cameras_offset_m` count
         for whichever of the two files does not say where it lies; see
         `pcfix.flow.old_cameras.told_apart`.
     views : path, optional

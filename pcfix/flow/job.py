@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from pcfix.adjust.carry import Carrying
 from pcfix.errors import GeometryError, PcfixWarning
-from pcfix.flow.carrying import Carrying
 from pcfix.flow.diagnosis import diagnose_in_passing
 from pcfix.flow.inputs import mask_of
 from pcfix.flow.learning import Learning
@@ -231,7 +231,7 @@ class Job:
             "cameras_source": self.cameras.source,
             "views": None if self._list is None else str(self._list.raw.path),
             **self._labelling_words(),
-            **({} if self.carrying is None else self.carrying.words()),
+            **({} if self.carrying is None else self.carrying.provenance()),
         }
 
     def _water_words(self) -> str:

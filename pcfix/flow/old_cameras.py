@@ -2,51 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from pcfix.adjust.carry import Pair, pair_of, renumbered
 from pcfix.errors import GeometryError, SettingError
 from pcfix.io.labels import match_labels
-from pcfix.model import Cameras, Views
+from pcfix.model import Cameras
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
     from pcfix.flow.inputs import Inputs
     from pcfix.io.views import ViewList
-    from pcfix.model import FloatArray, IntArray, Lens, TiePoints
+    from pcfix.model import FloatArray, IntArray, TiePoints
 
 LOCAL = "local"
-SAME_SHAPE = 0.002
-"""Of the ratio of an image's sides. Undistorted images differ by more from those that they were
-made of, unless they have the very same size; sides in millimetres are rounded by less."""
-
-
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """Old and adjusted cameras of the same k images, row by row.
-
-    Attributes
-    ----------
-    old, new : Cameras
-        In the cloud's CRS, with angles and lenses; the lenses of an image in one unit.
-    row : array, shape (o,)
-        The row here of each of the old cameras as they were read, -1 where it was not adjusted.
-    left_out : tuple of str
-        Images of the old model that were not adjusted.
-    """
-
-    old: Cameras
-    new: Cameras
-    row: IntArray
-    left_out: tuple[str, ...]
-
-    def renumbered(self, views: Views) -> Views:
-        """Return views of the old cameras as they were read as views of the rows here."""
-        return _renumbered(views, self.row)[0]
 
 
 def paired(old: Cameras, new: Cameras) -> Pair:
@@ -71,11 +45,7 @@ def paired(old: Cameras, new: Cameras) -> Pair:
                 f"{which}: has no {'angles' if cameras.rotations is None else 'lens'}, without"
                 " which a point has no place in the image; give the model itself, or --sensor."
             )
-    place = _rows(old.labels, new.labels)
-    row = np.full(len(old), -1)
-    row[place] = np.arange(len(new))
-    left_out = tuple(label for label, at in zip(old.labels, row, strict=True) if at < 0)
-    return Pair(_taken(old, place, new), new, row, left_out)
+    return pair_of(old, new, _rows(old.labels, new.labels))
 
 
 def _rows(old: tuple[str, ...], new: tuple[str, ...]) -> IntArray:
@@ -102,50 +72,6 @@ def _rows(old: tuple[str, ...], new: tuple[str, ...]) -> IntArray:
             " model that these cameras were adjusted from."
         )
     return row
-
-
-def _taken(old: Cameras, place: IntArray, new: Cameras) -> Cameras:
-    """Return some rows of the old cameras, each lens in the unit of the new one."""
-    lenses: list[Lens] = []
-    for i, lens in zip(place, new.lenses or (), strict=True):
-        lenses.append(_in_unit_of(lens, (old.lenses or ())[i], old.labels[i]))
-    return replace(
-        old,
-        labels=tuple(old.labels[i] for i in place),
-        centres=old.centres[place],
-        rotations=None if old.rotations is None else old.rotations[place],
-        lenses=tuple(lenses),
-        gnss=None,
-    )
-
-
-def _in_unit_of(new: Lens, old: Lens, label: str) -> Lens:
-    """Return an old lens in the unit of the new one, whose image has the same shape."""
-    factor = new.width / old.width
-    if not abs(factor * old.height / new.height - 1.0) <= SAME_SHAPE:
-        raise GeometryError(
-            f"adjusted-from: image {label} has {old.width:g} x {old.height:g} {old.unit} there, but"
-            f" {new.width:g} x {new.height:g} {new.unit} in the cameras; these are not the same"
-            " images (one of them undistorted?); give the model that the cameras were adjusted"
-            " from."
-        )
-    if factor == 1.0:
-        return old
-    lengths = ("focal", "width", "height", "principal_x", "principal_y", "b1", "b2", "b3")
-    scaled = {name: factor * getattr(old, name) for name in lengths}
-    return replace(old, unit=new.unit, **scaled)
-
-
-def _renumbered(views: Views, row: IntArray) -> tuple[Views, IntArray]:
-    """Return views of other numbers, without entries of negative ones, and which entries stayed."""
-    camera = row[np.asarray(views.camera)]
-    stays = camera >= 0
-    if views.kind == "pairs":
-        stays = np.repeat(stays[::2] & stays[1::2], 2)
-    entry = np.flatnonzero(stays)
-    start = np.concatenate([[0], np.cumsum(stays)])[views.start]
-    weight = None if views.weight is None else views.weight[entry]
-    return Views(start, camera[entry], weight, views.kind), entry
 
 
 class Blocks(NamedTuple):
@@ -256,5 +182,5 @@ def old_tie_points(
     ties = old.tie_points(cloud_crs)
     if ties is None:
         return new.tie_points(cloud_crs), False
-    views, entry = _renumbered(ties.views, pair.row)
+    views, entry = renumbered(ties.views, pair.row)
     return replace(ties, views=views, image_xy=ties.image_xy[entry]), True

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from pcfix.adjust.carry import Carrying
 from pcfix.errors import SettingError
-from pcfix.flow.carrying import Carrying
 from pcfix.flow.learning import learn_of_points
 from pcfix.flow.old_cameras import paired
 from pcfix.model import Cameras, Correction, Views, WaterSurface
@@ -102,7 +102,7 @@ def correct_points(
     adjusted_from : Cameras, optional
         Those that the points were made with, in the same frame, where `cameras` are the same
         images (matched by their labels) adjusted since. All points, land too, are first taken
-        from those to these; see `pcfix.flow.carrying`.
+        from those to these; see `pcfix.adjust.carry`.
 
     Returns
     -------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,12 +19,11 @@ from pcfix.flow.old_cameras import read_blocks
 from pcfix.flow.report import write_report
 from pcfix.flow.run_adjust import (
     FOLDER,
+    AdjustStep,
     adjust_first,
-    check_survey,
     figures_of,
     is_worth_saying,
     outputs_of,
-    with_adjusted,
 )
 from pcfix.flow.steps import Record, read_record
 from pcfix.flow.surfaces import view_of
@@ -46,10 +45,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from pcfix.compare.figures import Comparison
-    from pcfix.flow.run_adjust import AdjustWhen
     from pcfix.flow.surfaces import WaterModel
     from pcfix.io.cameras.formats import Angles
     from pcfix.options import CameraSet, MatcherKind, Method, Occlusion, ViewsAre
+    from pcfix.options.survey import AdjustWhen
     from pcfix.report.page import Picture, Table
 
 RECORD = "run.json"
@@ -141,7 +140,7 @@ class Request:
         """Check the values."""
         self.settings()
         self.label()
-        check_survey(self)
+        self.adjust_step()
         if self.resolution_m is not None and not 0.0 < self.resolution_m < math.inf:
             raise SettingError(f"resolution {self.resolution_m:g} is not positive; give metres.")
         if self.m3c2 and self.reference is None:
@@ -162,6 +161,24 @@ class Request:
         """Return what `pcfix.flow.inputs.Inputs` takes; a run is about a water surface, no port."""
         names = [field.name for field in fields(Inputs) if field.name != "port"]
         return {name: getattr(self, name) for name in names}
+
+    def adjust_step(self) -> AdjustStep:
+        """Return what the first step is asked for."""
+        return AdjustStep(
+            self.input, Inputs(**self.inputs()), self.refractive_index, self.adjust,
+            self.gcps, self.gnss, self.lens,
+        )  # fmt: skip
+
+    def with_adjusted(self, folder: Path, step: dict[str, Any]) -> Request:
+        """Return the request of the steps that follow: with the adjusted cameras where they are."""
+        if not step["adjusted"]:
+            return self
+        return replace(
+            self,
+            cameras=str(folder / FOLDER / step["model"]),
+            adjusted_from=self.cameras,
+            adjust="no", gcps=None, gnss=None, lens=None,
+        )  # fmt: skip
 
     def label(self) -> LabelSettings:
         """Return the rules by which points are left out."""
@@ -267,10 +284,12 @@ def run_all(
         return result
 
     first, was_done = record.step(
-        "adjust", outputs_of(out_dir), lambda: adjust_first(request, out_dir, jobs)
+        "adjust",
+        outputs_of(out_dir),
+        lambda: adjust_first(request.adjust_step(), out_dir, inputs, jobs),
     )
     _say_adjusted(first, out_dir, was_done, say)
-    request = with_adjusted(request, out_dir, first)
+    request = request.with_adjusted(out_dir, first)
     corrected = step("correct", [files.corrected], lambda: _correct(request, files, jobs, progress))
     if not first["is_said"] and is_worth_saying(first, corrected["warnings"]):
         first = {**first, "is_said": True}

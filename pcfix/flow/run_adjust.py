@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 import numpy as np
 
 from pcfix.adjust.diagnosis import MOST_STATED_M
 from pcfix.errors import PcfixError, PcfixWarning, SettingError
-from pcfix.flow.adjust import adjust_cameras
-from pcfix.flow.adjust_files import SUMMARY
+from pcfix.flow.adjust import SUMMARY, adjust_into
+from pcfix.flow.adjust_job import Survey
 from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, ties_of
-from pcfix.flow.inputs import Inputs
 from pcfix.flow.surfaces import view_of
 from pcfix.flow.survey_signs import Evidence
 from pcfix.io.files import check_input, read_json
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.model import WaterDimension
+from pcfix.options.survey import AdjustRules, AdjustWhen
 from pcfix.threads import threads
 from pcfix.water.index import index_of
 
@@ -28,11 +28,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pcfix.adjust.diagnosis import Diagnosis
-    from pcfix.flow.run import Request
+    from pcfix.flow.inputs import Inputs
     from pcfix.flow.surfaces import CloudView
     from pcfix.model import Cameras, WaterSurface
 
-AdjustWhen = Literal["auto", "yes", "no"]
 FOLDER = "adjusted"
 MODELS = ("colmap", "opensfm/reconstruction.json", "cameras.csv")
 """What an adjustment leaves, in the order in which a run takes it."""
@@ -60,48 +59,62 @@ def outputs_of(folder: Path) -> list[Path]:
     return [at / "report.html", at / SUMMARY, *(at / name for name in more)]
 
 
-def check_survey(request: Request) -> None:
-    """Refuse words that do not go with each other.
+@dataclass(frozen=True)
+class AdjustStep:
+    """What a run is asked of its first step.
 
-    Raises
-    ------
-    SettingError
-        If nothing will be adjusted by the survey, or what is asked for cannot be adjusted.
+    cloud, inputs, index : of the run. when : {"auto", "yes", "no"}. gcps, gnss, lens : files that
+    are of use to an adjustment only, See `pcfix.adjust_cameras`.
     """
-    if request.adjust not in get_args(AdjustWhen):
-        words = ", ".join(get_args(AdjustWhen))
-        raise SettingError(f"adjust '{request.adjust}' must be among {words}.")
-    if request.adjust == "no" and _survey(request):
-        raise SettingError(
-            f"{_survey(request)[0]} is of use to an adjustment only; leave it out, or let --adjust"
-            " be auto or yes."
-        )
-    if request.adjust == "yes" and (why := _unfit(request)):
-        raise SettingError(f"adjust yes: {why}; leave one of the two out.")
+
+    cloud: str
+    inputs: Inputs
+    index: float | str
+    when: AdjustWhen = "auto"
+    gcps: str | None = None
+    gnss: str | None = None
+    lens: str | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what does not go with each other."""
+        if self.when not in get_args(AdjustWhen):
+            names = ", ".join(get_args(AdjustWhen))
+            raise SettingError(f"adjust '{self.when}' must be among {names}.")
+        if self.when == "no" and self.survey:
+            raise SettingError(
+                f"{self.survey[0]} is of use to an adjustment only; leave it out, or let --adjust"
+                " be auto or yes."
+            )
+        if self.when == "yes" and self.unfit:
+            raise SettingError(f"adjust yes: {self.unfit}; leave one of the two out.")
+
+    @property
+    def survey(self) -> list[str]:
+        """The names of the files that were given for an adjustment alone."""
+        return [name for name in ("gcps", "gnss", "lens") if getattr(self, name) is not None]
+
+    @property
+    def unfit(self) -> str:
+        """Why an adjustment does not go with the other options; empty where it does."""
+        if self.inputs.adjusted_from is not None:
+            return "with adjusted-from the cameras are adjusted already"
+        if self.inputs.tide is not None:
+            return "a tide gives each image its own water level, and an adjustment takes one"
+        return ""
 
 
-def _survey(request: Request) -> list[str]:
-    """Return the names of the files that were given for an adjustment alone."""
-    return [name for name in ("gcps", "gnss", "lens") if getattr(request, name) is not None]
-
-
-def _unfit(request: Request) -> str:
-    """Return why an adjustment does not go with the other words; empty where it does."""
-    if request.adjusted_from is not None:
-        return "with adjusted-from the cameras are adjusted already"
-    if request.tide is not None:
-        return "a tide gives each image its own water level, and an adjustment takes one"
-    return ""
-
-
-def adjust_first(request: Request, folder: Path, jobs: int | None = None) -> dict[str, Any]:
+def adjust_first(
+    step: AdjustStep, folder: Path, files: list[Path], jobs: int | None = None
+) -> dict[str, Any]:
     """Adjust the cameras of a run into its folder where that is asked for, or called for.
 
     Parameters
     ----------
-    request : Request
+    step : AdjustStep
     folder : Path
         Of the run.
+    files : list of Path
+        Inputs of the run, which the adjustment must not replace.
     jobs : int, optional
         Threads.
 
@@ -119,11 +132,11 @@ def adjust_first(request: Request, folder: Path, jobs: int | None = None) -> dic
     """
     decision, model = Decision(False, "", is_said=False), None
     try:
-        decision = _decide(request)
+        decision = _decide(step)
         if decision.adjust:
-            model = _adjust(request, folder / FOLDER, jobs)
+            model = _adjust(step, folder / FOLDER, files, jobs)
     except PcfixError as error:
-        if request.adjust == "yes" or _survey(request):
+        if step.when == "yes" or step.survey:
             raise
         # what cannot be read stops the correction, with the same sentence
         decision = Decision(False, str(error), is_said=decision.adjust)
@@ -146,27 +159,27 @@ def is_worth_saying(step: dict[str, Any], warnings_of_correction: Sequence[str])
     return step["is_said"] or bool(step["why"] and bent)
 
 
-def _decide(request: Request) -> Decision:
+def _decide(step: AdjustStep) -> Decision:
     """Return whether to adjust: on request, or where the poses are bent and there is a datum."""
-    if request.adjust == "yes":
+    if step.when == "yes":
         return Decision(True, "that was asked for")
-    given = bool(_survey(request))
-    if request.adjust == "no":
+    given = bool(step.survey)
+    if step.when == "no":
         return Decision(False, "", is_said=False)
-    if unfit := _unfit(request):
-        return Decision(False, unfit, is_said=given)
-    inputs, view = Inputs(**request.inputs()), view_of(check_input(request.input))
+    if step.unfit:
+        return Decision(False, step.unfit, is_said=given)
+    inputs, view = step.inputs, view_of(check_input(step.cloud))
     with warnings.catch_warnings():  # the correction shows them
         warnings.simplefilter("ignore", PcfixWarning)
         cameras = inputs.block(view.crs)[0]
-        if request.gnss is not None:
-            cameras = read_gnss(request.gnss, cameras)
-        if request.gnss is None and request.gcps is None and not _has_datum(cameras, request):
+        if step.gnss is not None:
+            cameras = read_gnss(step.gnss, cameras)
+        if step.gnss is None and step.gcps is None and not _has_datum(cameras, str(inputs.cameras)):
             return Decision(False, _NO_DATUM, is_said=given)
         water = inputs.surface(view).surface
         if isinstance(water, WaterDimension):
             return Decision(False, f"{water} is known at the points of the cloud alone")
-        return _verdict(_diagnosed(request, inputs, cameras, water, view))
+        return _verdict(_diagnosed(step, cameras, water, view))
 
 
 _NO_DATUM = (
@@ -175,11 +188,11 @@ _NO_DATUM = (
 )
 
 
-def _has_datum(cameras: Cameras, request: Request) -> bool:
+def _has_datum(cameras: Cameras, name: str) -> bool:
     """Whether the camera file has positions of the GNSS good enough to hold a block."""
     if cameras.gnss is None:
         return False
-    found = gnss_in_frame_of(cameras, request.cameras)
+    found = gnss_in_frame_of(cameras, name)
     known = np.isfinite(found.xyz).all(axis=1)
     if known.sum() < LEAST_POSITIONS:
         return False
@@ -190,21 +203,21 @@ def _has_datum(cameras: Cameras, request: Request) -> bool:
 
 
 def _diagnosed(
-    request: Request, inputs: Inputs, cameras: Cameras, water: WaterSurface, view: CloudView
+    step: AdjustStep, cameras: Cameras, water: WaterSurface, view: CloudView
 ) -> Diagnosis:
     """Look for signs of absorbed refraction.
 
     What the result is compared with is none of them: the cloud must not depend on it.
     """
-    lens = request.lens
+    lens, model = step.lens, str(step.inputs.cameras)
     evidence = Evidence(
-        cameras, request.cameras, water, index_of(request.refractive_index)[0], view=view,
-        control=None if request.gcps is None else read_ground_control(request.gcps, cameras),
-        calibrated=given_focal_lengths(request.cameras) if lens is None else focal_length_of(lens),
-        in_passing=not _survey(request),
+        cameras, model, water, index_of(step.index)[0], view=view,
+        control=None if step.gcps is None else read_ground_control(step.gcps, cameras),
+        calibrated=given_focal_lengths(model) if lens is None else focal_length_of(lens),
+        in_passing=not step.survey,
     )  # fmt: skip
     if evidence.has_rays:
-        evidence = replace(evidence, ties=ties_of(inputs, view.crs))
+        evidence = replace(evidence, ties=ties_of(step.inputs, view.crs))
     return diagnose(evidence)
 
 
@@ -222,20 +235,13 @@ def _verdict(found: Diagnosis) -> Decision:
     return Decision(True, f"the poses had absorbed the refraction: {sign.plainly or sign.words}")
 
 
-def _adjust(request: Request, target: Path, jobs: int | None) -> str:
+def _adjust(step: AdjustStep, target: Path, files: list[Path], jobs: int | None) -> str:
     """Adjust, and return which of `MODELS` has the cameras."""
-    _check_apart(target, request.files())
-    shared = (
-        "water", "gcps", "gnss", "lens", "sensor", "angles", "cameras_crs", "cameras_offset_m",
-        "views", "views_are", "water_mask", "water_model", "water_crs", "refractive_index",
-    )  # fmt: skip
+    _check_apart(target, files)
+    survey = Survey(step.gcps, step.gnss, step.lens)
     with threads(jobs):
-        adjust_cameras(
-            request.cameras,
-            target,
-            cloud=request.input,
-            overwrite=True,
-            **{name: getattr(request, name) for name in shared},
+        adjust_into(
+            target, step.inputs, survey, AdjustRules(index=step.index), step.cloud, overwrite=True
         )
     return next(name for name in MODELS if (target / name).exists())
 
@@ -248,18 +254,6 @@ def _check_apart(target: Path, inputs: Sequence[Path]) -> None:
             raise SettingError(
                 f"{path}: lies in {target}, which the adjustment replaces; give another OUT_DIR."
             )
-
-
-def with_adjusted(request: Request, folder: Path, step: dict[str, Any]) -> Request:
-    """Return the request for the steps that follow: with the adjusted cameras where there are."""
-    if not step["adjusted"]:
-        return request
-    return replace(
-        request,
-        cameras=str(folder / FOLDER / step["model"]),
-        adjusted_from=request.cameras,
-        adjust="no", gcps=None, gnss=None, lens=None,
-    )  # fmt: skip
 
 
 def figures_of(folder: Path) -> dict[str, Any]:

@@ -44,7 +44,7 @@ def before_of(adjusted: Adjusted) -> Before:
     from dataclasses import replace
 
     from pcfix.adjust.block import Unknowns
-    from pcfix.adjust.fixed_poses import intersect_fixed
+    from pcfix.adjust.intersect import intersect_fixed
     from pcfix.adjust.normal import residuals
     from pcfix.adjust.problem import prepare
 

@@ -16,8 +16,8 @@ from pcfix.adjust.diagnosis import (
     land_sign,
     tie_point_sign,
 )
-from pcfix.adjust.fixed_poses import intersect_fixed
-from pcfix.adjust.likely_error import deeper, mended
+from pcfix.adjust.intersect import intersect_fixed
+from pcfix.adjust.mend import deeper, mended
 from pcfix.adjust.problem import similarity_gradients
 from pcfix.model import WaterPlane
 from tests.utils.bent_blocks import GNSS_M, LEVEL_M, N, TrueBlock

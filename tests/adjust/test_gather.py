@@ -10,6 +10,7 @@ import pytest
 
 from pcfix.adjust.gather import (
     Datum,
+    Material,
     block_of,
     no_datum,
     restricted,
@@ -34,11 +35,11 @@ def scene():
 def gathered(**changes):
     made = scene()
     given = {
-        "cameras": made.cameras, "ties": made.ties, "sigma_px": 0.7, "water": made.water,
+        "name": "model", "old": made.cameras, "water": made.water,
         "refractive_index": made.refractive_index,
         "gnss": Datum(made.cameras.gnss.xyz, made.cameras.gnss.sigma_m), "control": made.control,
     }  # fmt: skip
-    return block_of(**(given | changes))
+    return block_of(Material(**(given | changes)), made.ties, 0.7)
 
 
 def observations(block):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pcfix.adjust.block import Unknowns
-from pcfix.adjust.gather import Datum, block_of, no_datum
+from pcfix.adjust.gather import Datum, Material, block_of, no_datum
 from pcfix.adjust.problem import prepare
 from pcfix.adjust.rounds import Rounds, adjust_ties, check_datum, default_lens, noise_px
 from pcfix.adjust.solve import solve
@@ -41,9 +41,10 @@ def block(made, ties=None, gnss=True, control=None):
     if gnss:
         datum = Datum(made.cameras.gnss.xyz, made.cameras.gnss.sigma_m)
     ties = made.ties if ties is None else ties
-    return block_of(
-        made.cameras, ties, 1.0, made.water, made.refractive_index, datum, control
+    material = Material(
+        "model", made.cameras, made.water, made.refractive_index, datum, control
     )  # fmt: skip
+    return block_of(material, ties, 1.0)
 
 
 def with_gross_errors(made, share=0.05):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pcfix.adjust.block import Unknowns
-from pcfix.adjust.gather import Datum, block_of, no_datum, ties_of_cloud
+from pcfix.adjust.gather import Datum, Material, block_of, no_datum, ties_of_cloud
 from pcfix.adjust.mend import Candidate, mend
 from pcfix.adjust.problem import prepare, solved_cameras
 from pcfix.adjust.rounds import adjust_ties
@@ -51,7 +51,8 @@ def candidate(made, *, gnss=True, control=None, exact=True):
     if gnss:
         place = scene.true_cameras.centres if exact else scene.cameras.gnss.xyz
         datum = Datum(place, scene.cameras.gnss.sigma_m)
-    whole = block_of(old, ties, 1.0, scene.water, scene.refractive_index, datum, control)
+    material = Material("model", old, scene.water, scene.refractive_index, datum, control)
+    whole = block_of(material, ties, 1.0)
     apparent = ties.xyz if control is None else np.vstack([ties.xyz, control.xyz])
     return Candidate("all", whole, old, apparent)
 

@@ -144,7 +144,7 @@ def test_fixed_images_stay(files):
 
 
 def test_a_free_network_keeps_place_and_scale(files):
-    found = adjust(files, gnss=None, free_network=True, lens=files.folder / "lens.csv")
+    found = adjust(files, gnss=None, datum="free", lens=files.folder / "lens.csv")
     moved = found.cameras.centres - files.made.cameras.centres
     assert np.abs(moved[:, :2].mean(axis=0)).max() < 1e-4  # m: how tightly it is held
     # the water tells heights: turned and shifted onto the truth, only noise is left
@@ -275,7 +275,7 @@ def test_nothing_is_left_behind_when_writing_fails(files, tmp_path, monkeypatch)
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("pcfix.flow.adjust_files.write_opensfm", full)
+    monkeypatch.setattr("pcfix.flow.adjust.write_opensfm", full)
     with pytest.raises(InputError, match="No space left"):
         adjust(files, out=tmp_path / "out", poses="similarity", lens_unknowns=(), outliers=False)
     assert list(tmp_path.iterdir()) == []

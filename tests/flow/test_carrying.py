@@ -177,7 +177,7 @@ def test_chunks_leave_no_trace(cloud, old, tmp_path, monkeypatch):
     correct(cloud, cameras=adjusted(old), adjusted_from=old)
     whole = (tmp_path / "out.las").read_bytes()
     monkeypatch.setattr("pcfix.flow.files.CHUNK_POINTS", 333)
-    monkeypatch.setattr("pcfix.flow.carrying.POINTS_AT_ONCE", 100)
+    monkeypatch.setattr("pcfix.adjust.carry.POINTS_AT_ONCE", 100)
     correct(cloud, cameras=adjusted(old), adjusted_from=old, jobs=1)
     assert (tmp_path / "out.las").read_bytes() == whole
 

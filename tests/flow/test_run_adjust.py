@@ -16,7 +16,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from pcfix.adjust.fixed_poses import intersect_fixed, plain_block
+from pcfix.adjust.intersect import intersect_fixed, plain_block
 from pcfix.errors import GeometryError, PcfixWarning, SettingError
 from pcfix.flow.files import correct_file
 from pcfix.flow.inputs import Inputs
@@ -26,6 +26,11 @@ from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.model import TiePoints, Views
 from tests.utils.bent_blocks import GNSS_M, LEVEL_M, TrueBlock
 from tests.utils.program import run_pcfix
+
+
+def first_step(request, folder):
+    return adjust_first(request.adjust_step(), folder, request.files())
+
 
 ORIGIN_M = (319900.0, 3842700.0, 0.0)
 GSD_M = 0.05
@@ -165,7 +170,7 @@ def test_a_record_repeats_the_adjustment(finished, tmp_path, monkeypatch):
 
 def test_auto_adjusts_bent_poses_with_a_datum(scene, tmp_path, monkeypatch):
     monkeypatch.setattr("pcfix.flow.run_adjust._adjust", lambda *_: "colmap")
-    step = adjust_first(scene.request(gnss=scene.gnss), tmp_path)
+    step = first_step(scene.request(gnss=scene.gnss), tmp_path)
     assert step["adjusted"]
     assert "absorbed the refraction: tie points under water" in step["why"]
 
@@ -189,11 +194,11 @@ def test_auto_without_a_datum_says_what_is_missing(scene, tmp_path):
 
 
 def test_auto_leaves_true_poses_alone(scene, tmp_path):
-    step = adjust_first(scene.request("true", gnss=scene.gnss), tmp_path)
+    step = first_step(scene.request("true", gnss=scene.gnss), tmp_path)
     assert not step["adjusted"]
     assert step["is_said"]
     assert step["why"].startswith("the poses have not absorbed the refraction: tie points")
-    step = adjust_first(scene.request("true"), tmp_path)
+    step = first_step(scene.request("true"), tmp_path)
     assert (step["adjusted"], step["is_said"]) == (False, False)
     assert list(tmp_path.iterdir()) == []
 
@@ -215,7 +220,7 @@ def test_positions_in_the_camera_file_are_a_datum_if_they_are_good(
 
     monkeypatch.setattr(Inputs, "block", with_gnss)
     monkeypatch.setattr("pcfix.flow.run_adjust._adjust", lambda *_: "colmap")
-    assert adjust_first(scene.request(), tmp_path)["adjusted"] is is_datum
+    assert first_step(scene.request(), tmp_path)["adjusted"] is is_datum
 
 
 def test_a_water_dimension_is_not_adjusted(scene, tmp_path):
@@ -226,11 +231,11 @@ def test_a_water_dimension_is_not_adjusted(scene, tmp_path):
     request = replace(
         scene.request(gnss=scene.gnss), input=str(tmp_path / "cloud.las"), water="dim:w_surf"
     )
-    step = adjust_first(request, tmp_path)
+    step = first_step(request, tmp_path)
     assert not step["adjusted"]
     assert "w_surf" in step["why"]
     with pytest.raises(SettingError, match="known at the points of the cloud only"):
-        adjust_first(replace(request, adjust="yes"), tmp_path)
+        first_step(replace(request, adjust="yes"), tmp_path)
 
 
 def test_yes_without_a_datum_stops(scene, tmp_path):

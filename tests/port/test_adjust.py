@@ -44,7 +44,7 @@ def test_poses_and_bed_come_home(tmp_path, port):
     with threads(1):
         found = adjust_cameras(
             tmp_path / "model", water=None, port=port, gnss=tmp_path / "gnss.csv",
-            refractive_index=made.refractive_index, lens_unknowns=(),
+            index=made.refractive_index, lens_unknowns=(),
         )  # fmt: skip
     assert found.sigma0 == pytest.approx(1.0, abs=0.1)
     off = found.cameras.centres - made.cameras.centres

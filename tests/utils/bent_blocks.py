@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pcfix.adjust.block import Unknowns
-from pcfix.adjust.fixed_poses import plain_block
+from pcfix.adjust.intersect import plain_block
 from pcfix.adjust.problem import prepare, solved_cameras
 from pcfix.adjust.solve import solve
 from pcfix.model import Cameras, GnssPositions, Lens

@@ -13,6 +13,7 @@ from pcfix.adjust.problem import prepare
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, WaterSurface
 
+
 STEPS = 10
 CLOSE_M = 1e-4
 

@@ -1,0 +1,354 @@
+"""A block adjusted by its tie points, or by the cloud, and what must hold of it for that."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pcfix.adjust.block import CODES, Unknowns
+from pcfix.adjust.gather import (
+    FIRST_SIGMA_PX,
+    Material,
+    block_of,
+    restricted,
+    some_cameras,
+    ties_of_cloud,
+    well_seen,
+)
+from pcfix.adjust.intersect import intersect_fixed, plain_block
+from pcfix.adjust.mend import Candidate, mend
+from pcfix.adjust.precision import strong_correlations, undetermined
+from pcfix.adjust.rounds import Rounds, adjust_ties, check_datum, default_lens
+from pcfix.errors import GeometryError, SettingError
+from pcfix.water.surface import surface_above
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pcfix.adjust.block import Block
+    from pcfix.adjust.problem import LogRow
+    from pcfix.adjust.result import Adjusted
+    from pcfix.model import (
+        BoolArray,
+        Cameras,
+        FloatArray,
+        GroundControl,
+        IntArray,
+        TiePoints,
+        Views,
+        WaterSurface,
+    )
+    from pcfix.options.survey import AdjustRules
+
+    Progress = Callable[[LogRow], None]
+
+LEAST_TIES = 100
+SMALL_WATER = 10
+"""Tie points on one side of the surface, at least, so that both sides count as observed."""
+
+GROSS_SIGMAS, GROSS_PX = 20.0, 10.0
+"""A control point that is off by more than both was not measured badly but mixed up."""
+
+
+ELSEWHERE = 0.1
+"""Of the flying height: no block is bent so far that a control point is off by as much."""
+
+
+_REMEDY = (
+    "Check its name, its coordinates and its marks; names that are swapped look like this. A point"
+    " with the role check does not count."
+)
+
+
+def unknowns_of(rules: AdjustRules, lens: tuple[str, ...]) -> Unknowns:
+    """Return what moves, with these lens parameters.
+
+    Raises
+    ------
+    SettingError
+        If one of those that the user names is none.
+    """
+    for name in rules.lens_unknowns or ():
+        if name not in CODES:
+            raise SettingError(
+                f"lens parameter '{name}' must be among {', '.join(CODES)}, or none."
+            )
+    tilt = None if rules.sigma_tilt is None else float(np.tan(np.radians(rules.sigma_tilt)))
+    sigma = {"level": rules.sigma_level, "tilt": tilt, "index": rules.sigma_index}
+    water = {
+        name: (np.inf if value is None else value) if name in rules.free or value else 0.0
+        for name, value in sigma.items()
+    }
+    return Unknowns(
+        poses=rules.poses,
+        fixed_images=rules.fixed_images,
+        lens=lens,
+        level_sigma_m=water["level"],
+        tilt_sigma=water["tilt"],
+        index_sigma=water["index"],
+        free_network=rules.datum == "free",
+    )
+
+
+def by_ties(
+    material: Material, ties: TiePoints, rules: AdjustRules, progress: Progress | None = None
+) -> Adjusted:
+    """Adjust a block by measured tie points.
+
+    Raises
+    ------
+    GeometryError
+        If it cannot be adjusted: no datum, no water over it, images without points.
+    """
+    block = block_of(material, ties, rules.sigma_image or FIRST_SIGMA_PX)
+    lens = rules.lens_unknowns
+    if lens is None:
+        calibrated = material.calibrated is not None
+        lens = () if calibrated else default_lens(material.old.lenses or ())
+    unknowns = unknowns_of(rules, lens)
+    check_datum(block, unknowns, material.no_gnss)
+    _check_wet(material.water, block.xyz[: len(ties.xyz)])
+    kept, left_out = _kept(material.name, block)
+    rounds = Rounds(rules.sigma_image, rules.outliers, rules.lens_unknowns is None)
+    found = adjust_ties(restricted(block, kept), unknowns, rounds, progress)
+    notes = [*left_out, *_check_dry(material.water, found), *found.notes]
+    if found.precision is not None:
+        notes += undetermined(found.precision, unknowns)
+        notes += strong_correlations(found.precision)
+    return replace(found, notes=notes)
+
+
+def by_cloud(
+    material: Material, xyz: FloatArray, guesses: dict[str, Views], rules: AdjustRules,
+    progress: Progress | None = None,
+) -> Adjusted:  # fmt: skip
+    """Adjust a block by points of the cloud that it made.
+
+    Parameters
+    ----------
+    material : Material
+    xyz : array, shape (m, 3)
+        Points of the apparent cloud.
+    guesses : dict of str to Views
+        Which images made them, under the name of each guess.
+    rules : AdjustRules
+    progress : callable, optional
+
+    Raises
+    ------
+    GeometryError
+        If the images do not see the cloud, or as of `by_ties`.
+    """
+    candidates: list[Candidate] = []
+    notes: list[str] = []
+    for name, views in guesses.items():
+        ties = ties_of_cloud(xyz, views, material.old)
+        if len(ties.xyz) < LEAST_TIES:
+            continue
+        block = block_of(material, ties, FIRST_SIGMA_PX)
+        check_datum(block, unknowns_of(rules, ()), material.no_gnss)
+        apparent = ties.xyz
+        if material.control is not None:
+            apparent = np.vstack([apparent, material.control.xyz])
+        if len(guesses) > 1:
+            kept = well_seen(block)
+        else:
+            kept, notes = _kept(material.name, block)
+        if len(kept) < 2:
+            continue
+        old = some_cameras(material.old, kept)
+        candidates.append(Candidate(name, restricted(block, kept), old, apparent))
+    if not candidates:
+        raise GeometryError(
+            f"{material.name}: the images do not see the cloud; check the poses with 'pcfix cameras"
+            " --cloud'."
+        )
+    _check_wet(material.water, candidates[0].block.xyz)
+    if rules.lens_unknowns is not None:
+        sets: tuple[tuple[str, ...], ...] = (rules.lens_unknowns,)
+    elif material.calibrated is not None:
+        sets = ((),)
+    else:
+        default = default_lens(material.old.lenses or ())
+        sets = tuple(dict.fromkeys([("f",), ("f", "cx", "cy"), default]))
+    found = mend(candidates, unknowns_of(rules, sets[0]), sets, progress)
+    return replace(found, notes=[*notes, *_check_dry(material.water, found), *found.notes])
+
+
+def _check_wet(water: WaterSurface | None, xyz: FloatArray) -> None:
+    """Check that there is water over some points."""
+    if water is None:
+        return
+    below = int((surface_above(water, xyz).height_m > xyz[:, 2]).sum())
+    if below < SMALL_WATER:
+        raise GeometryError(
+            f"only {below} of {len(xyz):,} points lie below the water, so there is no"
+            " refraction to adjust: check the water level against the model's heights, or use"
+            " an ordinary bundle adjustment."
+        )
+
+
+def _check_dry(water: WaterSurface | None, found: Adjusted) -> list[str]:
+    """Check that land tells what of the water moved; an absorbed block may have sunk it."""
+    if water is None:
+        return []
+    seen = np.zeros(len(found.xyz), np.bool_)
+    seen[found.block.owner[found.used]] = True
+    above = int((seen & ~found.is_wet).sum())
+    if above >= SMALL_WATER:
+        return []
+    few = f"only {above} of {int(seen.sum()):,} points lie above the water"
+    if any(found.unknowns.water_sigma):
+        raise GeometryError(
+            f"{few}: level, tilt and index cannot be told from the height of the block then;"
+            " leave the water fixed."
+        )
+    return [f"{few}: nothing but GNSS and control points ties the heights of the bed."]
+
+
+def _kept(name: str, block: Block) -> tuple[IntArray, list[str]]:
+    """Return rows of the images that can be adjusted, and a note on those that cannot."""
+    kept = well_seen(block)
+    if len(kept) < 2:
+        raise GeometryError(
+            f"{name}: {len(kept)} of {len(block.cameras)} images have observations enough"
+            " for a pose; two at least are needed."
+        )
+    lost = sorted(set(range(len(block.cameras))) - set(kept.tolist()))
+    if not lost:
+        return kept, []
+    return kept, [
+        f"{len(lost)} of {len(block.cameras)} images have too few observations for a pose"
+        f" and are left out; the first is {block.cameras.labels[lost[0]]}."
+    ]
+
+
+def check_images(
+    name: str, old: Cameras, water: WaterSurface | None, fixed_images: tuple[str, ...]
+) -> None:
+    """Check that the images named are there, and that the cameras are above the water."""
+    missing = [label for label in fixed_images if label not in old.labels]
+    if missing:
+        raise SettingError(
+            f"fixed image {missing[0]} is not in the model, which has {len(old)} images,"
+            f" the first {old.labels[0]}."
+        )
+    if water is None:
+        return
+    level = surface_above(water, old.centres).height_m
+    wet = np.flatnonzero(level > old.centres[:, 2])
+    if len(wet):
+        i = int(wet[0])
+        raise GeometryError(
+            f"{name}: {len(wet)} of {len(old)} cameras are under the water, the"
+            f" first {old.labels[i]} at {old.centres[i, 2]:.2f} m; check the water"
+            " level, its CRS and that of the cameras; for images taken under water give --port."
+        )
+
+
+def check_marks(
+    control: GroundControl, cameras: Cameras, name: str, *, is_placed: bool = False
+) -> None:
+    """Refuse control points whose marks are somewhere else altogether, before any adjustment.
+
+    Each point is intersected from the cameras as they came, with straight rays. All may lie off
+    alike, as the block may where nothing else places it; one that lies elsewhere than the others
+    was mixed up.
+
+    Parameters
+    ----------
+    control : GroundControl
+    cameras : Cameras
+    name : str
+        Of the file.
+    is_placed : bool
+        Whether GNSS positions say already where the block is.
+
+    Raises
+    ------
+    GeometryError
+        Naming the point that is farthest off.
+    """
+    order = np.argsort(control.point, kind="stable")
+    start = np.searchsorted(control.point[order], np.arange(len(control.names) + 1))
+    camera, marks = control.camera[order], control.image_xy[order]
+    wet = np.zeros(len(control.names), np.bool_)
+    found = intersect_fixed(plain_block(cameras, control.xyz, start, camera, marks, None, 1.0, wet))
+    met = np.isfinite(found.squares) & (np.diff(start) >= 2) & ~control.is_check
+    if met.sum() < 3:
+        return
+    off = found.xyz - control.xyz
+    apart = np.linalg.norm(off - np.median(off[met], axis=0), axis=1)
+    height = float(np.median(cameras.centres[:, 2]) - np.median(control.xyz[:, 2]))
+    middle = np.median(off[met], axis=0)
+    if is_placed and np.abs(middle).max() > ELSEWHERE * height > 0.0:
+        x, y, z = (-middle).tolist()
+        raise GeometryError(
+            f"{name}: the control points lie {x:.1f}, {y:.1f}, {z:.1f} m (x, y, z; the median) from"
+            " where their marks meet, but the GNSS positions say that the block lies right: one of"
+            " the two is in another CRS or height datum; name it with --gcps-crs or --gnss-crs."
+        )
+    worst = int(np.argmax(np.where(met, apart, 0.0)))
+    if not apart[worst] > ELSEWHERE * height > 0.0:
+        return
+    raise GeometryError(
+        f"{name}: control point {control.names[worst]} does not fit: its marks meet"
+        f" {apart[worst]:.1f} m from its coordinates, the other points taken as right. {_REMEDY}"
+    )
+
+
+def check_control(found: Adjusted, name: str) -> None:
+    """Refuse control points that are off by far more than they were measured to.
+
+    The adjustment shares a gross error out between the place of the point and its marks, so that
+    both count: the place as it shows in the images.
+
+    Raises
+    ------
+    GeometryError
+        Naming the point that is farthest off.
+    """
+    block = found.block
+    first = len(block.xyz) - len(block.control_names)
+    rows = np.flatnonzero(block.is_surveyed[first:])
+    if len(rows) == 0:
+        return
+    px, sigmas = (
+        np.array(v) for v in zip(*(_off(found, first + int(i)) for i in rows), strict=True)
+    )
+    gross = (px > GROSS_PX) & (sigmas > GROSS_SIGMAS)
+    if not gross.any():
+        return
+    worst = int(np.argmax(np.where(gross, px, 0.0)))
+    others = int(gross.sum()) - 1
+    more = f" ({others} more are off as well)" if others else ""
+    raise GeometryError(
+        f"{name}: control point {block.control_names[rows[worst]]} does not fit: it is off by"
+        f" {px[worst]:.0f} px, {sigmas[worst]:.0f} standard deviations{more}. {_REMEDY}"
+    )
+
+
+def _off(found: Adjusted, point: int) -> tuple[float, float]:
+    """Return by how much a control point is off in the images, and in standard deviations."""
+    block = found.block
+    mine = slice(block.start[point], block.start[point + 1])
+    sigma_px = block.sigma_px[mine]
+    seen = np.isfinite(found.residual_px[mine]).all(axis=1) & np.isfinite(sigma_px)
+    if not seen.any():
+        return 0.0, 0.0
+    marks = np.linalg.norm(found.residual_px[mine][seen], axis=1)
+    moved = found.xyz[point] - block.surveyed_xyz[point]
+    known = np.isfinite(block.surveyed_sigma_m[point])
+    place = np.where(known, moved, 0.0)
+    px = float(marks.max() + np.linalg.norm(place) * _px_per_metre(found, point, mine, seen))
+    of_place = np.abs(place[known] / block.surveyed_sigma_m[point][known]).max(initial=0.0)
+    return px, float(max((marks / sigma_px[seen]).max(), of_place))
+
+
+def _px_per_metre(found: Adjusted, point: int, mine: slice, seen: BoolArray) -> float:
+    camera = found.block.camera[mine][seen]
+    away = np.linalg.norm(found.cameras.centres[camera] - found.xyz[point], axis=1)
+    focal = np.array([lens.focal for lens in found.cameras.lenses or ()])[camera]
+    return float(np.median(focal / away))
