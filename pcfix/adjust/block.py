@@ -88,6 +88,7 @@ class Columns(NamedTuple):
     water : shape (4,), -1 where fixed.
     similarity : the first of seven, -1 where the poses move on their own.
     total : how many there are.
+    pivot : shape (3,), about which a similarity turns and scales.
     """
 
     lens: IntArray
@@ -95,6 +96,7 @@ class Columns(NamedTuple):
     water: IntArray
     similarity: int
     total: int
+    pivot: FloatArray
 
 
 class Loss(NamedTuple):
@@ -116,20 +118,19 @@ class PointPriors(NamedTuple):
 
 
 class Given(NamedTuple):
-    """What stays as it is while a block is adjusted.
-
-    pivot : shape (3,), about which a similarity turns and scales.
-    """
+    """What stays as it is while a block is adjusted."""
 
     seen: Seen
     surface: Surface
     columns: Columns
     priors: PointPriors
-    pivot: FloatArray
 
 
 def columns_of(
-    codes: list[tuple[int, ...]], water: tuple[bool, bool, bool, bool], similarity: bool
+    codes: list[tuple[int, ...]],
+    water: list[bool],
+    similarity: bool,
+    pivot: FloatArray,
 ) -> Columns:
     """Return the columns of the free parameters of each group, the water's and a similarity's."""
     lens = np.concatenate([[0], np.cumsum([len(mine) for mine in codes])]).astype(np.int64)
@@ -138,7 +139,7 @@ def columns_of(
     place[free] = lens[-1] + np.arange(len(free))
     first = int(lens[-1]) + len(free)
     flat = np.array([code for mine in codes for code in mine], np.int64)
-    return Columns(lens, flat, place, first if similarity else -1, first + 7 * similarity)
+    return Columns(lens, flat, place, first if similarity else -1, first + 7 * similarity, pivot)
 
 
 Poses = Literal["free", "fixed", "similarity"]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from pcfix.adjust.block import Loss
+from pcfix.adjust.block import SQUARES, Given, Loss
 from pcfix.adjust.normal import PARTS, linearise, most_seen, normal_equations, point_block
 from pcfix.adjust.observe import POINT, WIDTH, scratch
 from pcfix.adjust.problem import priors_at
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from scipy.sparse import csc_array
 
-    from pcfix.adjust.block import Given, State
+    from pcfix.adjust.block import Columns, PointPriors, Seen, State, Surface
     from pcfix.adjust.normal import Sums
     from pcfix.adjust.problem import Problem, Solution
     from pcfix.model import BoolArray, FloatArray, IntArray
@@ -187,7 +187,7 @@ def undamped(problem: Problem, found: Solution) -> Undamped:
     """Return the reduced normal equations at a solution."""
     is_fixed = np.zeros(len(found.state.xyz), np.bool_)
     with one_caller():
-        _find_fixed(found.state, problem.given, Loss(), is_fixed)
+        _find_fixed(found.state, problem.given, is_fixed)
     counts = np.repeat(is_fixed, np.diff(problem.seen.start))
     weight = np.where(counts, problem.seen.weight, 0.0)
     problem = replace(problem, seen=problem.seen._replace(weight=weight))
@@ -218,14 +218,12 @@ def point_covariances(equations: Undamped, found: Solution, inverse: FloatArray)
     place[equations.reduced.active] = np.arange(len(equations.reduced.active))
     out = np.full((len(found.state.xyz), 6), np.nan)
     with one_caller():
-        _point_covariances(
-            found.state, problem.given, Loss(), equations.is_fixed, place, inverse, out
-        )
+        _point_covariances(found.state, *problem.given, equations.is_fixed, place, inverse, out)
     return out
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _find_fixed(state: State, given: Given, loss: Loss, is_fixed: BoolArray) -> None:
+def _find_fixed(state: State, given: Given, is_fixed: BoolArray) -> None:
     """Find the points whose normal matrix V, priors included, is not singular."""
     room, seen = scratch(), given.seen
     own, shared, r = np.empty((2, WIDTH)), np.zeros((2, given.columns.total)), np.empty(2)
@@ -233,7 +231,7 @@ def _find_fixed(state: State, given: Given, loss: Loss, is_fixed: BoolArray) -> 
     for p in range(len(state.xyz)):
         v[:] = 0.0
         for o in range(seen.start[p], seen.start[p + 1]):
-            if linearise(state, given, loss, p, o, room, own, shared, r):
+            if linearise(state, given, Loss(SQUARES, 1.0), p, o, room, own, shared, r):
                 b = own[:, POINT : POINT + 3]
                 for i in range(3):
                     for j in range(3):
@@ -250,12 +248,13 @@ def _find_fixed(state: State, given: Given, loss: Loss, is_fixed: BoolArray) -> 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _point_covariances(
-    state: State, given: Given, loss: Loss, is_fixed: BoolArray, place: IntArray,
-    inverse: FloatArray, out: FloatArray,
+    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
+    is_fixed: BoolArray, place: IntArray, inverse: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     for part in prange(PARTS):
-        m, g, poses = len(state.xyz), given.columns.total, 6 * len(state.centres)
-        room, seen = scratch(), given.seen
+        given = Given(seen, surface, columns, priors)  # a loop takes flat tuples only
+        m, g, poses = len(state.xyz), columns.total, 6 * len(state.centres)
+        room = scratch()
         most = most_seen(seen.start, part * m // PARTS, (part + 1) * m // PARTS)
         own, shared, r = np.empty((2, WIDTH)), np.zeros((2, g)), np.empty(2)
         v, nothing = np.empty((3, 3)), np.zeros(3)
@@ -267,7 +266,7 @@ def _point_covariances(
             for i in range(g):
                 at[i] = place[poses + i]
             for o in range(seen.start[p], seen.start[p + 1]):
-                if not linearise(state, given, loss, p, o, room, own, shared, r):
+                if not linearise(state, given, Loss(SQUARES, 1.0), p, o, room, own, shared, r):
                     continue
                 for j in range(3):
                     b0, b1 = own[0, POINT + j], own[1, POINT + j]
@@ -280,7 +279,7 @@ def _point_covariances(
                 for i in range(6):
                     at[size + i] = place[6 * seen.camera[o] + i]
                 size += 6
-            point_block(v, nothing, given.priors, state.xyz[p], p, 0.0)
+            point_block(v, nothing, priors, state.xyz[p], p, 0.0)
             _add_up(v, w[:size], at[:size], inverse, out[p])
 
 

@@ -78,10 +78,10 @@ def intersect_fixed(block: Block) -> Intersected:
     A point that takes more than `STEPS` steps of Gauss and Newton has failed.
     """
     problem, now = prepare(block, Unknowns(poses="fixed", lens=()))
-    poses, shared = np.zeros((len(block.cameras), 6)), np.zeros(problem.columns.total)
+    nothing = np.zeros(len(problem.moves))
     state, step = now.state, np.full((len(block.xyz), 3), np.inf)
     for _ in range(STEPS):
-        step = point_steps(state, problem.given, Loss(), 0.0, poses, shared)
+        step = point_steps(state, problem.given, Loss(), 0.0, nothing)
         state = state._replace(xyz=state.xyz + step)
         if np.nanmax(np.abs(step), initial=0.0) < CLOSE_M:
             break

@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from pcfix.adjust.block import Unknowns
 from pcfix.adjust.gather import some_cameras
@@ -134,7 +134,7 @@ def mend(
             continue
         extra = len(names) - len(chosen.problem.unknowns.lens)
         gain = (chosen.misfit - more.misfit) / max(chosen.mean, 1.0)
-        if gain > chi2.isf(SURE, extra * len(chosen.problem.groups)):
+        if gain > chdtri(extra * len(chosen.problem.groups), SURE):
             chosen = more
     notes.append(_what_counts(chosen, candidates, lens_sets))
     if chosen.sigma_px >= POOR_PX:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from pcfix.adjust.block import CAUCHY, HUBER
+from pcfix.adjust.block import CAUCHY, HUBER, Given
 from pcfix.adjust.observe import (
     POINT,
     WATER,
@@ -35,7 +35,7 @@ from pcfix.adjust.observe import (
 from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
-    from pcfix.adjust.block import Given, Loss, PointPriors, Seen, State, Surface
+    from pcfix.adjust.block import Columns, Loss, PointPriors, Seen, State, Surface
     from pcfix.model import FloatArray, IntArray
 
 PARTS = 8
@@ -111,17 +111,17 @@ def normal_equations(
         np.zeros((PARTS, k, 6)), np.zeros((PARTS, g)),
     )  # fmt: skip
     with one_caller():
-        _sum_up(state, given, loss, damping, slot, sums)
+        _sum_up(state, *given, loss, damping, slot, sums)
     return Sums(*(part.sum(axis=0) for part in sums))
 
 
 def point_steps(
-    state: State, given: Given, loss: Loss, damping: float, poses: FloatArray, shared: FloatArray
+    state: State, given: Given, loss: Loss, damping: float, moved: FloatArray
 ) -> FloatArray:
-    """Return how the points move, given how the poses and what they share do, shape (m, 3)."""
+    """Return the steps of the points, shape (m, 3), given those of all the rest, (6 k + g,)."""
     steps = np.zeros((len(state.xyz), 3))
     with one_caller():
-        _point_steps(state, given, loss, damping, poses, shared, steps)
+        _point_steps(state, *given, loss, damping, moved, steps)
     return steps
 
 
@@ -199,7 +199,7 @@ def linearise(
             shared[0, columns.water[i]] = own[0, WATER + i]
             shared[1, columns.water[i]] = own[1, WATER + i]
     if columns.similarity >= 0:
-        _similarity_gradients(state, c, own, given.pivot, shared, columns.similarity)
+        _similarity_gradients(state, c, own, columns.pivot, shared, columns.similarity)
     r *= w
     own *= w
     shared *= w
@@ -266,14 +266,16 @@ def most_seen(start: IntArray, first: int, last: int) -> int:
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _sum_up(
-    state: State, given: Given, loss: Loss, damping: float, slot: IntArray, sums: Sums
-) -> None:
+    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
+    loss: Loss, damping: float, slot: IntArray, sums: Sums,
+) -> None:  # fmt: skip
     """Add up the equations of the points, each part of them in its row of the sums."""
     blocks, border, corner, poses, shared_right, diagonal, shared_diagonal = sums
     for part in prange(PARTS):
-        m, g = len(state.xyz), given.columns.total
+        given = Given(seen, surface, columns, priors)  # a loop takes flat tuples only
+        m, g = len(state.xyz), columns.total
         first, last = part * m // PARTS, (part + 1) * m // PARTS
-        start, most = given.seen.start, most_seen(given.seen.start, first, last)
+        start, most = seen.start, most_seen(seen.start, first, last)
         of_part = Sums(
             blocks[part], border[part], corner[part], poses[part], shared_right[part],
             diagonal[part], shared_diagonal[part],
@@ -287,11 +289,11 @@ def _sum_up(
             v[:], rhs[:], count = 0.0, 0.0, 0
             for o in range(start[p], start[p + 1]):
                 if linearise(state, given, loss, p, o, room, own[count], shared[count], r[count]):
-                    who[count] = given.seen.camera[o]
+                    who[count] = seen.camera[o]
                     _add_point(v, rhs, own[count], r[count])
                     count += 1
             # a point that its rays do not fix says nothing of the cameras either
-            if count == 0 or not point_block(v, rhs, given.priors, state.xyz[p], p, damping):
+            if count == 0 or not point_block(v, rhs, priors, state.xyz[p], p, damping):
                 continue
             w_g[:] = 0.0
             for a in range(count):
@@ -380,11 +382,12 @@ def _eliminate(
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _point_steps(
-    state: State, given: Given, loss: Loss, damping: float,
-    poses: FloatArray, moved: FloatArray, steps: FloatArray,
+    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
+    loss: Loss, damping: float, moved: FloatArray, steps: FloatArray,
 ) -> None:  # fmt: skip
     for part in prange(PARTS):
-        m, g, seen = len(state.xyz), given.columns.total, given.seen
+        given = Given(seen, surface, columns, priors)  # a loop takes flat tuples only
+        m, g, first = len(state.xyz), columns.total, 6 * len(state.centres)
         room = scratch()
         own, shared, r = np.empty((2, WIDTH)), np.zeros((2, g)), np.empty(2)
         v, rhs = np.empty((3, 3)), np.empty(3)
@@ -395,11 +398,11 @@ def _point_steps(
                     continue
                 for row in range(2):
                     for i in range(6):
-                        r[row] -= own[row, i] * poses[seen.camera[o], i]
+                        r[row] -= own[row, i] * moved[6 * seen.camera[o] + i]
                     for i in range(g):
-                        r[row] -= shared[row, i] * moved[i]
+                        r[row] -= shared[row, i] * moved[first + i]
                 _add_point(v, rhs, own, r)
                 count += 1
-            if count and point_block(v, rhs, given.priors, state.xyz[p], p, damping):
+            if count and point_block(v, rhs, priors, state.xyz[p], p, damping):
                 for i in range(3):
                     steps[p, i] = v[i, 0] * rhs[0] + v[i, 1] * rhs[1] + v[i, 2] * rhs[2]

@@ -68,12 +68,16 @@ class Problem:
     slots: tuple[IntArray, IntArray]
     priors: PointPriors
     moves: BoolArray
-    pivot: FloatArray
+
+    @property
+    def pivot(self) -> FloatArray:
+        """About which a similarity turns and scales, block frame, shape (3,)."""
+        return self.columns.pivot
 
     @property
     def given(self) -> Given:
         """What the kernels take of it."""
-        return Given(self.seen, self.surface, self.columns, self.priors, self.pivot)
+        return Given(self.seen, self.surface, self.columns, self.priors)
 
     @property
     def names(self) -> list[str]:
@@ -130,8 +134,9 @@ def prepare(block: Block, unknowns: Unknowns) -> tuple[Problem, Solution]:
     plane = isinstance(block.water, WaterPlane) or block.water is None
     if unknowns.tilt_sigma and not plane:
         raise GeometryError("the tilt of the water can be free for a level or plane only.")
-    free = tuple(bool(sigma) for sigma in unknowns.water_sigma)
-    columns = columns_of(codes, free, unknowns.poses == "similarity")  # type: ignore[arg-type]
+    free = [bool(sigma) for sigma in unknowns.water_sigma]
+    centres = cameras.centres - origin
+    columns = columns_of(codes, free, unknowns.poses == "similarity", centres.mean(axis=0))
     row, table = lens_table(cameras.lenses)
     seen = Seen(
         np.ascontiguousarray(block.start, np.int64),
@@ -143,14 +148,13 @@ def prepare(block: Block, unknowns: Unknowns) -> tuple[Problem, Solution]:
         group,
     )
     state = State(
-        cameras.centres - origin, np.ascontiguousarray(cameras.rotations, np.float64), table,
+        centres, np.ascontiguousarray(cameras.rotations, np.float64), table,
         block.xyz - origin, _water_numbers(block, origin),
     )  # fmt: skip
     problem = Problem(
         block, unknowns, origin, seen, _surface(block, origin), columns, groups, codes,
         pair_slots(seen, len(cameras)), _point_priors(block, origin),
         _moves(block, unknowns, columns),
-        state.centres.mean(axis=0),
     )  # fmt: skip
     start = Solution(state, cameras.lenses, np.zeros(columns.total), np.inf, [])
     return problem, start

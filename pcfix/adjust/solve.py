@@ -128,18 +128,17 @@ def _trial(
     step[reduced.active] = solve_for(reduced.right)
     if not np.isfinite(step).all():
         return None
-    k = len(now.state.centres)
-    poses, shared = step[: 6 * k].reshape(k, 6), step[6 * k :]
-    points = point_steps(now.state, problem.given, loss, damping, poses, shared)
-    moved = moved_by(problem, now, poses, shared, points)
+    points = point_steps(now.state, problem.given, loss, damping, step)
+    moved = moved_by(problem, now, step, points)
     return None if moved is None else replace(moved, cost=cost_at(problem, moved, loss))
 
 
 def moved_by(
-    problem: Problem, now: Solution, poses: FloatArray, shared: FloatArray, points: FloatArray
+    problem: Problem, now: Solution, step: FloatArray, points: FloatArray
 ) -> Solution | None:
     """Return a solution with steps added; None where a number leaves its range."""
-    state, columns = now.state, problem.columns
+    state, columns, k = now.state, problem.columns, len(now.state.centres)
+    poses, shared = step[: 6 * k].reshape(k, 6), step[6 * k :]
     centres = state.centres + poses[:, 3:]
     rotations = Rotation.from_rotvec(poses[:, :3]).as_matrix() @ state.rotations
     if columns.similarity >= 0:

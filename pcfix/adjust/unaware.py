@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from pcfix.adjust.block import Loss
+from pcfix.adjust.block import SQUARES, Given, Loss
 from pcfix.adjust.normal import PARTS, linearise, most_seen, point_block
 from pcfix.adjust.observe import (
     POINT,
@@ -47,7 +47,7 @@ from pcfix.threads import one_caller
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from pcfix.adjust.block import Given, State
+    from pcfix.adjust.block import Columns, PointPriors, Seen, State, Surface
     from pcfix.model import BoolArray, FloatArray, IntArray
 
 MAX_STEPS = 25
@@ -91,7 +91,7 @@ def straight_columns(problem: Problem, start: Solution, apparent_xyz: FloatArray
     dry = problem.given._replace(seen=seen._replace(wet=np.zeros(len(seen.wet), np.bool_)))
     state = start.state._replace(xyz=np.ascontiguousarray(apparent_xyz))
     with one_caller():
-        _columns(state, dry, found)
+        _columns(state, *dry, found)
     return found
 
 
@@ -119,9 +119,9 @@ def solve_unaware(
         If the equations are singular or Newton's steps do not shrink.
     """
     now, log, before = start, list(start.log), np.inf
-    for step in range(MAX_STEPS):
-        poses, shared, points = _newton(problem, now, tests, is_tested)
-        moved = moved_by(problem, now, poses, shared, points)
+    for number in range(MAX_STEPS):
+        step, points = _newton(problem, now, tests, is_tested)
+        moved = moved_by(problem, now, step, points)
         size = float(np.abs(points).max(initial=0.0)) if np.isfinite(points).all() else np.inf
         if moved is None or not size < LARGE_STEP_M:
             raise GeometryError(
@@ -129,7 +129,7 @@ def solve_unaware(
                 " tie points, GNSS positions of more images, or control points."
             )
         now = moved
-        row = LogRow(1, step + 1, _squares(problem, now), 0.0, *counts_of(problem, now))
+        row = LogRow(1, number + 1, _squares(problem, now), 0.0, *counts_of(problem, now))
         log.append(row)
         if progress is not None:
             progress(row)
@@ -151,12 +151,13 @@ def _squares(problem: Problem, now: Solution) -> float:
 
 def _newton(
     problem: Problem, now: Solution, tests: Tests, is_tested: BoolArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray]:
+    """Return the step of all that are not points, shape (6 k + g,), and that of the points."""
     k, g = len(now.state.centres), problem.columns.total
     size = 6 * k + g
     parts = PARTS if size <= 3000 else 2
     matrix, right = np.zeros((parts, size, size)), np.zeros((parts, size))
-    common = now.state, problem.given, Loss(), tests, is_tested
+    common = now.state, *problem.given, tests, is_tested
     with one_caller():
         _sum_tested(*common, matrix, right)
     total, side = matrix.sum(axis=0), right.sum(axis=0)
@@ -177,24 +178,25 @@ def _newton(
             "the poses cannot be mended from the cloud: the equations are singular; GNSS positions"
             " of three images or more, or three control points, are needed."
         ) from None
-    poses, shared = step[: 6 * k].reshape(k, 6), step[6 * k :]
     points = np.zeros((len(now.state.xyz), 3))
     with one_caller():
-        _tested_points(*common, poses, shared, points)
-    return poses, shared, points
+        _tested_points(*common, step, points)
+    return step, points
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def _columns(state: State, given: Given, found: Tests) -> None:
+def _columns(
+    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors, found: Tests
+) -> None:
     pose, shared, point = found
     for part in prange(PARTS):
-        m, seen, columns = len(state.xyz), given.seen, given.columns
+        m = len(state.xyz)
         room, own = scratch(), np.empty((2, WIDTH))
         for p in range(part * m // PARTS, (part + 1) * m // PARTS):
             for o in range(seen.start[p], seen.start[p + 1]):
                 c = seen.camera[o]
                 lens = state.lenses[seen.lens_row[c]]
-                image_and_all_gradients(state, seen, given.surface, p, c, room, own)
+                image_and_all_gradients(state, seen, surface, p, c, room, own)
                 pose[o] = own[:, :POINT]
                 point[o] = own[:, POINT:WATER]
                 first, last = columns.lens[seen.group[c]], columns.lens[seen.group[c] + 1]
@@ -228,9 +230,7 @@ def _rows(most: int, g: int) -> _Rows:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _gather(
-    state: State, given: Given, loss: Loss, tests: Tests, tested: bool, p: int, rows: _Rows
-) -> int:
+def _gather(state: State, given: Given, tests: Tests, tested: bool, p: int, rows: _Rows) -> int:
     """Fill in the columns of a point's observations and V, inverted; how many count.
 
     Columns of `right` and `left`: pose, point, shared. The block V and its right side are B_l'B
@@ -241,7 +241,7 @@ def _gather(
     own, common = np.empty((2, WIDTH)), np.zeros((2, given.columns.total))
     v[:], rhs[:], count = 0.0, 0.0, 0
     for o in range(seen.start[p], seen.start[p + 1]):
-        if not linearise(state, given, loss, p, o, room, own, common, r[count]):
+        if not linearise(state, given, Loss(SQUARES, 1.0), p, o, room, own, common, r[count]):
             continue
         right[count, :, :WATER] = own[:, :WATER]
         right[count, :, WATER:] = common
@@ -268,21 +268,22 @@ def _gather(
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _sum_tested(
-    state: State, given: Given, loss: Loss, tests: Tests, is_tested: BoolArray,
-    matrix: FloatArray, side: FloatArray,
+    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
+    tests: Tests, is_tested: BoolArray, matrix: FloatArray, side: FloatArray,
 ) -> None:  # fmt: skip
     parts = len(matrix)
     for part in prange(parts):
-        m, g, k = len(state.xyz), given.columns.total, len(state.centres)
+        given = Given(seen, surface, columns, priors)  # a loop takes flat tuples only
+        m, g, k = len(state.xyz), columns.total, len(state.centres)
         first, last = part * m // parts, (part + 1) * m // parts
-        most = most_seen(given.seen.start, first, last)
+        most = most_seen(seen.start, first, last)
         rows = _rows(most, g)
         right, left, r, who, v, rhs = rows
         size = 6 * most + g
         column = np.empty(size, np.int64)
         w_right, w_left = np.empty((3, size)), np.empty((size, 3))
         for p in range(first, last):
-            count = _gather(state, given, loss, tests, is_tested[p], p, rows)
+            count = _gather(state, given, tests, is_tested[p], p, rows)
             if count == 0:
                 continue
             used = 6 * count + g
@@ -330,23 +331,24 @@ def _add_direct(
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _tested_points(
-    state: State, given: Given, loss: Loss, tests: Tests, is_tested: BoolArray,
-    poses: FloatArray, moved: FloatArray, steps: FloatArray,
+    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
+    tests: Tests, is_tested: BoolArray, moved: FloatArray, steps: FloatArray,
 ) -> None:  # fmt: skip
     for part in prange(PARTS):
-        m, g = len(state.xyz), given.columns.total
+        given = Given(seen, surface, columns, priors)  # a loop takes flat tuples only
+        m, g, k = len(state.xyz), columns.total, len(state.centres)
         first, last = part * m // PARTS, (part + 1) * m // PARTS
-        rows = _rows(most_seen(given.seen.start, first, last), g)
+        rows = _rows(most_seen(seen.start, first, last), g)
         right, left, _, who, v, rhs = rows
         for p in range(first, last):
-            count = _gather(state, given, loss, tests, is_tested[p], p, rows)
+            count = _gather(state, given, tests, is_tested[p], p, rows)
             for o in range(count):
                 for a in range(2):
                     change = 0.0
                     for i in range(6):
-                        change += right[o, a, i] * poses[who[o], i]
+                        change += right[o, a, i] * moved[6 * who[o] + i]
                     for i in range(g):
-                        change += right[o, a, WATER + i] * moved[i]
+                        change += right[o, a, WATER + i] * moved[6 * k + i]
                     for i in range(3):
                         rhs[i] -= left[o, a, POINT + i] * change
             if count:

@@ -285,8 +285,8 @@ def _diagnosis(
     reference: AnyPath | None,
 ) -> Diagnosis:  # fmt: skip
     """Look for all signs that the poses have absorbed the refraction."""
+    from pcfix.adjust.evidence import Evidence
     from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, ties_of
-    from pcfix.flow.survey_signs import Evidence
     from pcfix.io.clouds import check_same_crs, read_reference
     from pcfix.io.ground_control import read_ground_control
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 import numpy as np
 
 from pcfix.adjust.diagnosis import MOST_STATED_M
+from pcfix.adjust.evidence import Evidence
 from pcfix.errors import PcfixError, PcfixWarning, SettingError
 from pcfix.flow.adjust import SUMMARY, adjust_into
 from pcfix.flow.adjust_job import Survey
 from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, ties_of
 from pcfix.flow.surfaces import view_of
-from pcfix.flow.survey_signs import Evidence
 from pcfix.io.files import check_input, read_json
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control

@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.report import adjustment_text as words
-from pcfix.report.adjustment_figures import pictures_of
-from pcfix.report.adjustment_tables import adjustment_tables, what_was_free
-from pcfix.report.adjustment_values import (
+from pcfix.adjust.values import (
     Before,
     adjustment_dict,
     before_of,
     carried_by,
     depth_of,
 )
+from pcfix.report import adjustment_text as words
+from pcfix.report.adjustment_figures import pictures_of
+from pcfix.report.adjustment_tables import adjustment_tables, what_was_free
 from pcfix.report.maps import MapsBuilder
 from pcfix.report.page import Layer, Picture, Report, Table, render
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.adjust.block import sensor_groups
-from pcfix.report.adjustment_values import carried_by, nice_step, rms
+from pcfix.adjust.values import carried_by, nice_step, rms
 from pcfix.report.figures import AFTER, BEFORE, WATER, new_figure
 from pcfix.report.page import Picture
 from pcfix.water.surface import surface_above
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from pcfix.adjust.result import Adjusted
+    from pcfix.adjust.values import Before
     from pcfix.model import BoolArray, FloatArray
-    from pcfix.report.adjustment_values import Before
 
 Plain = dict[str, Any]
 

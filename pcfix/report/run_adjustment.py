@@ -40,7 +40,7 @@ def adjustment_table(d: Plain, page: str) -> Table:
     Parameters
     ----------
     d : dict
-        Of `pcfix.report.adjustment_values.adjustment_dict`.
+        Of `pcfix.adjust.values.adjustment_dict`.
     page : str
         Address of its report, relative to that of the run.
     """

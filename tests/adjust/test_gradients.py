@@ -186,9 +186,9 @@ def test_columns_of_a_similarity():
     pivot = np.array([3.0, -14.0, 2.0])
     state, seen = one(q, centre, rotation, lens_table((BROWN,))[1][0], water)
     nothing = PointPriors(np.zeros((1, 3)), np.zeros((1, 3)))
-    columns = columns_of([()], (False,) * 4, True)
+    columns = columns_of([()], [False] * 4, True, pivot)
     own, shared = np.empty((2, 13)), np.zeros((2, 7))
-    given = Given(seen, no_surface(), columns, nothing, pivot)
+    given = Given(seen, no_surface(), columns, nothing)
     assert linearise(state, given, Loss(), 0, 0, scratch(), own, shared, np.empty(2))
     assert not own[:, :6].any()  # the poses do not move on their own
     wanted = []

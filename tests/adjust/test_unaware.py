@@ -132,10 +132,9 @@ def test_noise_in_the_images_goes_where_it_goes_with_tie_points():
     made = block(400, exact=False)
     scene = made.scene
     mended = mend([candidate(made, exact=False)], Unknowns(), FOCAL)
-    whole = block_of(
-        scene.cameras, scene.ties, scene.noise.image_px, scene.water, scene.refractive_index,
-        Datum(scene.cameras.gnss.xyz, scene.cameras.gnss.sigma_m),
-    )  # fmt: skip
+    datum = Datum(scene.cameras.gnss.xyz, scene.cameras.gnss.sigma_m)
+    material = Material("model", scene.cameras, scene.water, scene.refractive_index, datum)
+    whole = block_of(material, scene.ties, scene.noise.image_px)
     aware = adjust_ties(whole, Unknowns(lens=("f",)))
     sigma_m = aware.precision.centre_sigma_m
     away = np.abs(mended.cameras.centres - scene.true_cameras.centres)

@@ -1,0 +1,399 @@
+"""What signs of absorbed refraction are looked for in: tie points, GNSS, surveys and the cloud.
+
+The signs themselves are in `pcfix.adjust.diagnosis`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+
+from pcfix.adjust.diagnosis import (
+    Diagnosis,
+    Sign,
+    bed_sign,
+    control_sign,
+    diagnosis_of,
+    focal_sign,
+    gnss_is_suspicious,
+    gnss_sign,
+    land_sign,
+    tie_point_sign,
+)
+from pcfix.adjust.intersect import intersect_fixed, plain_block
+from pcfix.adjust.mend import deeper, mended
+from pcfix.adjust.problem import similarity_gradients
+from pcfix.errors import GeometryError
+from pcfix.lens.imaging import project
+from pcfix.model import WaterDimension
+from pcfix.water.cloud_heights import heights_from_cloud, is_near
+from pcfix.water.surface import is_submerged, surface_above
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from pcfix.adjust.gather import Datum
+    from pcfix.adjust.mend import Mended
+    from pcfix.model import Cameras, FloatArray, GroundControl, IntArray, TiePoints, WaterSurface
+
+TIE_POINTS, LEAST_TIE_VIEWS = 3000, 3
+CLOUD_POINTS, POINTS_PER_IMAGE = 1500, 10
+LEAST_COORDINATES = 24
+"""Of GNSS positions, that a statement takes."""
+MOST_IMAGES, QUICK_IMAGES = 600, 200
+"""Of which the pattern of absorbed refraction is computed, and in passing, where nobody asked; the
+cost grows with their cube."""
+LAND_M = 0.3
+"""Above the water: what counts as land."""
+
+
+NEAREST = 3
+"""Points of a reference that give its height beside a point of the cloud."""
+
+
+SAMPLE_POINTS = 50_000
+
+
+class Cloud(Protocol):
+    """A cloud that is read chunk by chunk; each has `xyz`, shape (n, 3)."""
+
+    @property
+    def points(self) -> int:
+        """How many there are."""
+
+    @property
+    def chunks(self) -> Callable[[], Iterator[Any]]:
+        """Reads them from the start."""
+
+
+class Reference(Protocol):
+    """A survey of land and bed: single points, or so many that they make a surface."""
+
+    @property
+    def xyz(self) -> FloatArray:
+        """Shape (m, 3), in the cloud's CRS."""
+
+    @property
+    def sparse(self) -> bool:
+        """Whether they are single points."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What is at hand.
+
+    Attributes
+    ----------
+    cameras : Cameras
+        In the cloud's CRS, with the GNSS positions to compare with.
+    name : str
+        Of their file, for messages.
+    water : WaterSurface
+    refractive_index : float
+    ties : TiePoints or None
+    view : Cloud or None
+        Of the cloud, for points that stand for tie points, and heights about surveyed places.
+    control : GroundControl or None
+    calibrated : dict
+        Focal length by width of the image, by the name of the sensor; "" is any.
+    reference : Reference or None
+    gnss : Datum or None
+        Positions of the GNSS in the frame of the cameras, NaN where there is none.
+    in_passing : bool
+        Whether nobody asked, so that it must not take long.
+    """
+
+    cameras: Cameras
+    name: str
+    water: WaterSurface
+    refractive_index: float
+    ties: TiePoints | None = None
+    view: Cloud | None = None
+    control: GroundControl | None = None
+    calibrated: dict[str, float] | None = None
+    reference: Reference | None = None
+    gnss: Datum | None = None
+    in_passing: bool = False
+
+    @property
+    def has_rays(self) -> bool:
+        """Whether straight and refracted rays can be computed."""
+        cameras = self.cameras
+        if cameras.rotations is None or cameras.lenses is None:
+            return False
+        pixels = all(lens.unit == "px" for lens in cameras.lenses)
+        return pixels and not isinstance(self.water, WaterDimension)
+
+
+def diagnosed(evidence: Evidence) -> Diagnosis:
+    """Look for every sign that the evidence allows.
+
+    Raises
+    ------
+    PcfixError
+        If the cloud cannot be read.
+    """
+    signs: list[Sign] = []
+    if evidence.has_rays:
+        signs += _signs_of_rays(evidence)
+    if evidence.calibrated and (found := focal_of(evidence)) is not None:
+        signs.append(found)
+    if evidence.control is not None:
+        signs += signs_of_control(evidence, evidence.control)
+    if evidence.reference is not None:
+        signs += signs_of_reference(evidence, evidence.reference)
+    return diagnosis_of(signs)
+
+
+def _signs_of_rays(evidence: Evidence) -> list[Sign]:
+    """Look at tie points, and at the GNSS."""
+    signs: list[Sign] = []
+    apparent: FloatArray | None = None
+    ties = None if evidence.ties is None else _some_ties(evidence, evidence.ties)
+    if ties is not None:
+        signs.append(ties.sign)
+        apparent = ties.apparent
+    off = _gnss(evidence)
+    bent = ties is not None and bool(ties.sign.speaks)
+    asked = off.known and not evidence.in_passing
+    if not (bent or off.suspicious or asked):
+        return signs + ([off.calm] if off.calm is not None else [])
+    try:
+        mended = _mended(evidence, apparent)
+    except GeometryError as error:
+        return [*signs, *off.unsure(str(error))]
+    if ties is not None and bent:
+        signs = [ties.with_size(mended)]
+    if off.known:
+        signs.append(off.sign(evidence.cameras, mended))
+    return signs
+
+
+class _Ties(NamedTuple):
+    """The sign of tie points, what made it, and where straight rays put them."""
+
+    sign: Sign
+    made_of: tuple[Any, Any, FloatArray]
+    apparent: FloatArray
+
+    def with_size(self, mended: Mended) -> Sign:
+        """Return the sign with the size of the error."""
+        return tie_point_sign(*self.made_of, mended)
+
+
+def _some_ties(evidence: Evidence, ties: TiePoints) -> _Ties | None:
+    """Intersect some tie points straight and refracted."""
+    seen_by = np.diff(ties.views.start)
+    rows = np.flatnonzero((seen_by >= LEAST_TIE_VIEWS) & np.isfinite(ties.xyz).all(axis=1))
+    if not len(rows):
+        return None
+    rows = rows[:: max(1, len(rows) // TIE_POINTS)]
+    views = ties.views.take(rows)
+    first = np.repeat(ties.views.start[rows] - views.start[:-1], np.diff(views.start))
+    image_xy = ties.image_xy[first + np.arange(len(views.camera))]
+    dry = np.zeros(len(rows), np.bool_)
+    n = evidence.refractive_index
+    block = plain_block(
+        evidence.cameras, ties.xyz[rows], views.start, views.camera, image_xy, None, n, dry
+    )
+    straight = intersect_fixed(block)
+    above = surface_above(evidence.water, straight.xyz)
+    depth = above.height_m - straight.xyz[:, 2]
+    wet = is_submerged(straight.xyz[:, 2], above)
+    begin = deeper(straight.xyz, above.height_m, wet, n)
+    refracted = intersect_fixed(replace(block, xyz=begin, wet=wet, water=evidence.water))
+    fits = np.isfinite(straight.squares)
+    return _Ties(
+        tie_point_sign(straight, refracted, depth), (straight, refracted, depth),
+        straight.xyz[fits],
+    )  # fmt: skip
+
+
+class _Gnss(NamedTuple):
+    """Adjusted minus GNSS, its stated standard deviation, and whether that is worth a look."""
+
+    off_m: FloatArray
+    sigma_m: FloatArray
+    suspicious: bool
+
+    @property
+    def known(self) -> bool:
+        """Whether there are positions enough."""
+        return int(np.isfinite(self.off_m).sum()) >= LEAST_COORDINATES
+
+    @property
+    def calm(self) -> Sign | None:
+        """Say that nothing is to be seen, where there are positions."""
+        if not self.known:
+            return None
+        rms = float(np.sqrt(np.nanmean(self.off_m**2)))
+        words = f"centres minus GNSS are {rms:.3f} m rms, without a pattern"
+        return Sign("GNSS", words, {"rms_m": rms}, None)
+
+    def unsure(self, why: str) -> list[Sign]:
+        """Say that a pattern could not be compared with that of the water."""
+        if not self.known:
+            return []
+        rms = float(np.sqrt(np.nanmean(self.off_m**2)))
+        words = f"centres minus GNSS are {rms:.3f} m rms; what made their pattern is open ({why})"
+        return [Sign("GNSS", words, {"rms_m": rms}, None)]
+
+    def sign(self, cameras: Cameras, mended: Mended) -> Sign:
+        """Look for the pattern that the water would make."""
+        centres = cameras.centres[mended.row]
+        return gnss_sign(
+            self.off_m[mended.row], self.sigma_m[mended.row],
+            similarity_gradients(centres - centres.mean(axis=0)), mended,
+            centres - mended.cameras.centres,
+        )  # fmt: skip
+
+
+def _gnss(evidence: Evidence) -> _Gnss:
+    cameras, found = evidence.cameras, evidence.gnss
+    if found is None:
+        nothing = np.full((len(cameras), 3), np.nan)
+        return _Gnss(nothing, nothing, suspicious=False)
+    off = cameras.centres - found.xyz
+    by = similarity_gradients(cameras.centres - cameras.centres.mean(axis=0))
+    suspicious = gnss_is_suspicious(cameras.centres, off, found.sigma_m, by)
+    return _Gnss(off, found.sigma_m, suspicious)
+
+
+def _mended(evidence: Evidence, apparent: FloatArray | None) -> Mended:
+    """Return the poses as an adjustment with water would have them.
+
+    Raises
+    ------
+    GeometryError
+        If the block is too large, or its points do not determine them.
+    """
+    count, most = len(evidence.cameras), QUICK_IMAGES if evidence.in_passing else MOST_IMAGES
+    if count > most:
+        raise GeometryError(f"{count} images are more than {most}")
+    wanted = max(CLOUD_POINTS, POINTS_PER_IMAGE * count)
+    if apparent is None:
+        if evidence.view is None:
+            raise GeometryError("there is no cloud")
+        apparent = sample_of(evidence.view, wanted)
+    some = apparent[:: max(1, len(apparent) // wanted)]
+    return mended(some, evidence.cameras, evidence.water, evidence.refractive_index)
+
+
+def sample_of(view: Cloud, wanted: int) -> FloatArray:
+    """Return about so many points of a cloud, evenly spread over it, shape (m, 3)."""
+    every = max(1, view.points // wanted)
+    return np.vstack([np.zeros((0, 3)), *(seen.xyz[::every] for seen in view.chunks())])
+
+
+def focal_of(evidence: Evidence) -> Sign | None:
+    """Compare each sensor with its calibration."""
+    known = evidence.calibrated or {}
+    lenses = evidence.cameras.lenses or ()
+    by_sensor: dict[str, list[float]] = {}
+    for lens in lenses:
+        by_sensor.setdefault(lens.sensor, []).append(lens.focal / lens.width)
+    pairs = [
+        (float(np.mean(focal)), known.get(name, known.get("", np.nan)))
+        for name, focal in by_sensor.items()
+    ]
+    pairs = [pair for pair in pairs if np.isfinite(pair[1])]
+    if not pairs:
+        return None
+    centres = evidence.cameras.centres
+    level = surface_above(evidence.water, centres).height_m if has_height(evidence) else np.nan
+    height = float(np.nanmedian(centres[:, 2] - level)) if np.isfinite(level).any() else 0.0
+    focal, calibrated = np.array(pairs).T
+    return focal_sign(focal, calibrated, height)
+
+
+def has_height(evidence: Evidence) -> bool:
+    """Whether the water has a height anywhere, not only where the cloud has points."""
+    return not isinstance(evidence.water, WaterDimension)
+
+
+def _gsd_m(evidence: Evidence) -> float:
+    """Return the size of a pixel at the water, roughly; zero where it cannot be known."""
+    lenses, centres = evidence.cameras.lenses, evidence.cameras.centres
+    if lenses is None or not has_height(evidence):
+        return 0.0
+    level = surface_above(evidence.water, centres).height_m
+    above = centres[:, 2] - np.where(np.isfinite(level), level, np.nanmean(level))
+    focal = np.array([lens.focal if lens.unit == "px" else np.inf for lens in lenses])
+    return float(np.mean(above / focal))
+
+
+def signs_of_control(evidence: Evidence, control: GroundControl) -> list[Sign]:
+    """Compare control points on land with the cloud and in the images."""
+    level = surface_above(evidence.water, control.xyz).height_m
+    land = ~control.under_water & ~(control.xyz[:, 2] < level)
+    gsd, signs = _gsd_m(evidence), []
+    if evidence.view is not None:
+        higher = cloud_heights(evidence.view, control.xyz[land], gsd) - control.xyz[land, 2]
+        signs.append(land_sign(higher, gsd, "the control points"))
+    if evidence.cameras.rotations is not None and evidence.cameras.lenses is not None:
+        rows = np.flatnonzero(land[control.point])
+        signs.append(_control_sign(evidence, control, rows, gsd))
+    return signs
+
+
+def _control_sign(evidence: Evidence, control: GroundControl, rows: IntArray, gsd_m: float) -> Sign:
+    cameras, camera = evidence.cameras, control.camera[rows]
+    away = control.xyz[control.point[rows]] - cameras.centres[camera]
+    local = np.einsum("oij,oj->oi", np.asarray(cameras.rotations)[camera], away)
+    lenses = cameras.lenses or ()
+    at = [project(lenses[c], one[None])[0] for c, one in zip(camera, local, strict=True)]
+    off = control.image_xy[rows] - np.array(at).reshape(-1, 2)
+    return control_sign(off, control.sigma_px[rows], gsd_m)
+
+
+def cloud_heights(view: Cloud, xyz: FloatArray, gsd_m: float) -> FloatArray:
+    """Return the heights of a cloud about single places, shape (p,); NaN where it has none."""
+    radius = float(np.clip(10.0 * gsd_m, 0.2, 2.0))
+    xy = np.ascontiguousarray(xyz[:, :2])
+    if not len(xy):
+        return np.zeros(0)
+    near = [seen.xyz[is_near(xy, seen.xyz, radius)] for seen in view.chunks()]
+    return heights_from_cloud(xy, np.vstack([np.zeros((0, 3)), *near]), radius).height_m
+
+
+def signs_of_reference(evidence: Evidence, reference: Reference) -> list[Sign]:
+    """Compare land and bed of the cloud with a survey of both."""
+    if evidence.view is None or not has_height(evidence):
+        return []
+    gsd = _gsd_m(evidence)
+    if reference.sparse:
+        surveyed = reference.xyz
+        cloud_z = cloud_heights(evidence.view, surveyed, gsd)
+    else:
+        cloud, surveyed = _beside(evidence.view, reference.xyz)
+        cloud_z = cloud[:, 2]
+    if not len(surveyed):
+        return []
+    level = surface_above(evidence.water, surveyed).height_m
+    land, bed = surveyed[:, 2] > level + LAND_M, surveyed[:, 2] < level
+    signs = []
+    if land.any():
+        higher = cloud_z[land] - surveyed[land, 2]
+        signs.append(land_sign(higher, gsd, "the reference"))
+    if bed.any():
+        apparent, true = level - cloud_z, level - surveyed[:, 2]
+        signs.append(bed_sign(apparent[bed], true[bed], evidence.refractive_index))
+    return signs
+
+
+def _beside(view: Cloud, reference: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return points of a cloud and the reference at their places."""
+    from scipy.spatial import cKDTree
+
+    cloud = sample_of(view, SAMPLE_POINTS)
+    if len(reference) < NEAREST or not len(cloud):
+        return cloud[:0], reference[:0]
+    size = np.ptp(reference[:, :2], axis=0)
+    spacing = float(np.sqrt(max(size.prod(), 1e-9) / len(reference)))
+    found = cKDTree(reference[:, :2]).query(cloud[:, :2], k=NEAREST)
+    distance, row = np.asarray(found[0]), np.asarray(found[1])
+    near = distance[:, -1] < 3.0 * spacing
+    z = reference[row[near], 2].mean(axis=1)
+    return cloud[near], np.column_stack([cloud[near, :2], z])
