@@ -49,12 +49,8 @@ _BLOCK = 256
 class Carried(NamedTuple):
     """Where points went.
 
-    Attributes
-    ----------
-    shift_m : array, shape (n, 3)
-        Zero where the point stayed.
-    moved : array of bool, shape (n,)
-        Whether two cameras or more imaged the point, before and after.
+    shift_m : shape (n, 3), zero where the point stayed.
+    moved : shape (n,), whether two cameras or more imaged the point, before and after.
     """
 
     shift_m: FloatArray
@@ -315,12 +311,7 @@ def in_frame(xyz: FloatArray, cameras: Cameras) -> Views:
 
 
 class Carrying:
-    """The two models of a block, and what became of the points so far.
-
-    Parameters
-    ----------
-    pair : Pair
-    """
+    """The two models of a block, and what became of the points so far."""
 
     def __init__(self, pair: Pair) -> None:
         self.pair = pair
@@ -355,12 +346,9 @@ class Carrying:
             # whatever the list means to the correction, these images saw the point
             shift, carried = carry(xyz, replace(views, kind="tracks"), self.pair.old, self.pair.new)
         for rows in _batches(xyz, np.flatnonzero(~carried)):
-            shift[rows], carried[rows] = self._by_all(xyz[rows])
+            every = in_frame(xyz[rows], self.pair.old)
+            shift[rows], carried[rows] = carry(xyz[rows], every, self.pair.old, self.pair.new)
         return Step(xyz, xyz + shift, carried, views)
-
-    def _by_all(self, xyz: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Take points over by every old camera whose frame holds them."""
-        return carry(xyz, in_frame(xyz, self.pair.old), self.pair.old, self.pair.new)
 
     def made_with(self, xyz: FloatArray) -> MadeWith:
         """Return what made points, as they were."""

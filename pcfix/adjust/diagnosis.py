@@ -382,14 +382,7 @@ def land_sign(higher_m: FloatArray, gsd_m: float, against: str, name: str = "lan
 
 
 def bed_sign(apparent_m: FloatArray, true_m: FloatArray, refractive_index: float) -> Sign:
-    """Compare depths of the cloud with measured ones.
-
-    Parameters
-    ----------
-    apparent_m, true_m : array, shape (m,)
-        Depths below the water, metres, positive down.
-    refractive_index : float
-    """
+    """Compare depths of the cloud with measured ones, both below the water, shape (m,), metres."""
     deep = np.isfinite(apparent_m) & (true_m > 2.0 * LEAST_DEPTH_M) & (apparent_m > 0.0)
     if deep.sum() < 3:
         return Sign("bed", f"only {deep.sum()} measured depths", {}, None)
@@ -416,15 +409,7 @@ def bed_sign(apparent_m: FloatArray, true_m: FloatArray, refractive_index: float
 
 
 def control_sign(residual_px: FloatArray, sigma_px: FloatArray, gsd_m: float) -> Sign:
-    """Look at surveyed points on land in the images.
-
-    Parameters
-    ----------
-    residual_px : array, shape (o, 2)
-        Measured minus computed.
-    sigma_px : array, shape (o,)
-    gsd_m : float
-    """
+    """Look at marks of points on land in the images: measured minus computed, shape (o, 2)."""
     seen = np.isfinite(residual_px).all(axis=1)
     if seen.sum() < 3:
         return Sign("control points", "fewer than three marks in images", {}, None)
@@ -441,15 +426,7 @@ def control_sign(residual_px: FloatArray, sigma_px: FloatArray, gsd_m: float) ->
 
 
 def focal_sign(focal: FloatArray, calibrated: FloatArray, height_m: float) -> Sign:
-    """Compare focal lengths with calibrated ones.
-
-    Parameters
-    ----------
-    focal, calibrated : array, shape (s,)
-        Of the sensors, each in its own unit.
-    height_m : float
-        Of the block over the ground.
-    """
+    """Compare focal lengths of the sensors, shape (s,), each in its unit, with calibrated ones."""
     off = focal / calibrated - 1.0
     worst = float(off[np.argmax(np.abs(off))])
     error = abs(worst) * height_m
