@@ -15,8 +15,7 @@ from pcfix.lens import places
 
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.water.raster import Field
-    from pcfix.water.tin import Tin
+    from pcfix.water.surface import Field, Tin
 
 
 class State(NamedTuple):

@@ -144,7 +144,7 @@ def _control_sign(evidence: Evidence, control: GroundControl, rows: IntArray, gs
 
 def cloud_heights(view: CloudView, xyz: FloatArray, gsd_m: float) -> FloatArray:
     """Return the heights of a cloud about single places, shape (p,); NaN where it has none."""
-    from pcfix.water.cloud_heights import heights_from_cloud, is_near
+    from pcfix.water.fit import heights_from_cloud, is_near
 
     radius = float(np.clip(10.0 * gsd_m, 0.2, 2.0))
     xy = np.ascontiguousarray(xyz[:, :2])

@@ -45,8 +45,7 @@ from pcfix.refract.piercing import pierce_mesh, pierce_raster
 from pcfix.refract.rays import line_terms, nearest_point, refracted
 from pcfix.refract.result import Intersection
 from pcfix.threads import one_caller
-from pcfix.water.raster import build_field
-from pcfix.water.tin import build_tin, locate
+from pcfix.water.surface import build_field, build_tin, locate
 
 if TYPE_CHECKING:
     from pcfix.lens.frames import Frames, Pyramid
@@ -59,9 +58,7 @@ if TYPE_CHECKING:
         WaterSurface,
     )
     from pcfix.options import Settings
-    from pcfix.water.raster import Field
-    from pcfix.water.surface import SurfaceAbove
-    from pcfix.water.tin import Tin
+    from pcfix.water.surface import Field, SurfaceAbove, Tin
 
 _NO_CAMERA, _ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
 _PARALLEL, _CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)

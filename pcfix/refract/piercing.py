@@ -17,12 +17,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit
 
-from pcfix.water.raster import height_at
-from pcfix.water.tin import locate
+from pcfix.water.surface import height_at, locate
 
 if TYPE_CHECKING:
-    from pcfix.water.raster import Field
-    from pcfix.water.tin import Tin
+    from pcfix.water.surface import Field, Tin
 
 MAX_STEPS = 16
 MAX_HALVINGS = 64

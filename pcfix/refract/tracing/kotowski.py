@@ -27,7 +27,7 @@ from pcfix.refract.tracing.forward import CLOSE_M, SHORT, height_of
 
 if TYPE_CHECKING:
     from pcfix.refract.tracing.forward import Found, Water
-    from pcfix.water.raster import Field
+    from pcfix.water.surface import Field
 
 MAX_STEPS = 40
 HALVINGS = 24

@@ -1,29 +1,27 @@
-"""The water surface from the cloud alone."""
+"""The water surface from the cloud alone: `find_water`."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import NOISE_CLASSES, WaterPlane
-from pcfix.water.auto import search
-from pcfix.water.auto.layer import layer_gain, points_above
-from pcfix.water.auto.moments import gain_of
-from pcfix.water.auto.proposal import EvidenceCurves, WaterProposal
-from pcfix.water.auto.samples import sample_cloud
-from pcfix.water.auto.surveyed import WATER_CLASSES, from_classes
-from pcfix.water.auto.verdict import INSTEAD, LAYER, judge
+from pcfix.water import search
+from pcfix.water.fit import fit_water
+from pcfix.water.samples import gain_of, layer_gain, points_above, sample_cloud
+from pcfix.water.search import INSTEAD, LAYER, judge
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcfix.model import FloatArray, IntArray
-    from pcfix.water.auto.layer import Floating
-    from pcfix.water.auto.samples import Samples
-    from pcfix.water.auto.search import Looked, Peak
+    from pcfix.water.samples import Floating, Samples
+    from pcfix.water.search import Looked, Peak
+
 
 _Column: TypeAlias = "npt.NDArray[Any] | None"
 
@@ -232,3 +230,113 @@ def _varied(values: _Column, kept: IntArray) -> _Column:
     """Return the values of the points that are kept, None where all are the same."""
     chosen = _of(values, kept)
     return chosen if chosen is not None and (chosen != chosen[:1]).any() else None
+
+
+@dataclass(frozen=True, eq=False)
+class EvidenceCurves:
+    """What each cue gains (logarithm of a ratio of likelihoods) from water at each height.
+
+    Attributes
+    ----------
+    height_m : array, shape (h,)
+        World heights; of a tilted surface, those above `WaterProposal.centre_xy`.
+    gain : dict of array, shape (h,)
+        By the name of the cue.
+    """
+
+    height_m: FloatArray
+    gain: dict[str, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class WaterProposal:
+    """A water surface that a cloud suggests.
+
+    Attributes
+    ----------
+    surface : WaterPlane
+    sigma_level_m : float
+        Standard error of its height at `centre_xy`, from drawing tiles of the cloud anew. It knows
+        nothing of what deceives all of the shore alike, such as a bank that stops at the water.
+    centre_xy : array, shape (2,)
+        The middle of the shoreline, metres, world frame.
+    level_m : float
+        The height of the surface there.
+    tilt : array, shape (2,)
+        dz/dx and dz/dy.
+    sigma_tilt : float
+        Standard error of the tilt along the shore, dz per metre; NaN where it was not looked for.
+    confidence : float
+        0 to 1: how far the evidence is above what is refused.
+    evidence : dict of str to float
+        The figures, by name.
+    reasons : tuple of str
+        The same in sentences.
+    shoreline : array, shape (m, 3)
+        Places where the ground passes the surface, metres, world frame.
+    curves : EvidenceCurves
+    ground : array, shape (c, 3)
+        The cloud thinned to cells, metres, world frame.
+    """
+
+    surface: WaterPlane
+    sigma_level_m: float
+    centre_xy: FloatArray
+    level_m: float
+    tilt: FloatArray
+    sigma_tilt: float
+    confidence: float
+    evidence: dict[str, float]
+    reasons: tuple[str, ...]
+    shoreline: FloatArray
+    curves: EvidenceCurves
+    ground: FloatArray
+
+
+WATER_CLASSES = (9, 41)
+"""ASPRS: water, and water surface of the topo-bathy profile."""
+MOST_POINTS = 2_000
+
+
+def from_classes(water: FloatArray, samples: Samples) -> WaterProposal:
+    """Fit the points of the water classes.
+
+    Parameters
+    ----------
+    water : array, shape (w, 3)
+        Metres, world frame.
+    samples : Samples
+        Of the whole cloud.
+
+    Raises
+    ------
+    GeometryError
+        If they do not make a level or a plane.
+    """
+    thinned = water[:: math.ceil(len(water) / MOST_POINTS)]
+    fit = fit_water(thinned)
+    accepted = thinned[fit.accepted]
+    figures = {
+        "classified points": float(len(water)),
+        "sigma of a point": fit.sigma_m,
+        "share accepted": float(fit.accepted.mean()),
+    }
+    counts, edges = np.histogram(thinned[:, 2], 60)
+    said = (
+        f"{len(water):,} points are classified as water and scatter by {fit.sigma_m:.3f} m",
+        *fit.notes,
+    )
+    return WaterProposal(
+        surface=fit.surface,
+        sigma_level_m=fit.sigma_level_m,
+        centre_xy=fit.centre_xy,
+        level_m=fit.level_m,
+        tilt=fit.tilt,
+        sigma_tilt=fit.sigma_tilt_percent / 100.0,
+        confidence=float(fit.accepted.mean()),
+        evidence=figures,
+        reasons=said,
+        shoreline=accepted,
+        curves=EvidenceCurves((edges[1:] + edges[:-1]) / 2.0, {"classified points": counts + 0.0}),
+        ground=samples.xyz + samples.origin,
+    )
