@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from pcfix.lens.derivatives import image_and_gradients
-from pcfix.lens.imaging import image_of, lens_table
+from pcfix.lens.imaging import image_and_gradients, image_of, lens_table
 from pcfix.threads import one_caller
 
 if TYPE_CHECKING:

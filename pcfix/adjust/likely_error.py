@@ -15,14 +15,13 @@ from pcfix.errors import GeometryError
 from pcfix.lens.imaging import project
 from pcfix.model import WaterPlane
 from pcfix.options import Settings
-from pcfix.refract.choice import chosen_views
+from pcfix.refract.choice import views_in_frame
 from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
 if TYPE_CHECKING:
     from pcfix.adjust.block import Block
     from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens, WaterSurface
 
-_LEVEL = WaterPlane(0.0)  # any: straight rays
 SIGMA_PX = 0.25
 """Of a place in the image; small, so that the centres only decide where the block lies."""
 OWN_SIGMA_M = 1.0
@@ -67,8 +66,7 @@ def images_of(
         Of the points; the other three as of `pcfix.adjust.block.Block`.
     """
     rotations = np.asarray(cameras.rotations)
-    above = SurfaceAbove(xyz[:, 2].copy(), np.zeros((len(xyz), 2)))
-    views = chosen_views(xyz, above, _LEVEL, cameras, Settings())
+    views = views_in_frame(xyz, cameras)
     rows = np.flatnonzero(np.diff(views.start) >= least)
     views = views.take(rows)
     owner = np.repeat(rows, np.diff(views.start))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pcfix.lens import places
+from pcfix.lens import formulas as places
 
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, FloatArray, IntArray

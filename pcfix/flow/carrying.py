@@ -18,8 +18,8 @@ from pcfix.adjust.carry import carry
 from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options import Settings
-from pcfix.refract.choice import chosen_views, spatial_order
-from pcfix.refract.made_with import MadeWith
+from pcfix.refract.batch import MadeWith
+from pcfix.refract.choice import spatial_order, views_in_frame
 from pcfix.water.surface import SurfaceAbove, is_submerged
 
 if TYPE_CHECKING:
@@ -75,13 +75,6 @@ def _below(xyz: FloatArray, surface: SurfaceAbove) -> BoolArray:
     return is_submerged(xyz[:, 2], surface)
 
 
-def in_frame(xyz: FloatArray, cameras: Cameras) -> Views:
-    """Return the cameras whose frame holds each point, above the water or below."""
-    xyz = np.ascontiguousarray(xyz)
-    at_themselves = SurfaceAbove(xyz[:, 2].copy(), np.zeros((len(xyz), 2)))
-    return chosen_views(xyz, at_themselves, WaterPlane(0.0), cameras, Settings())
-
-
 class Carrying:
     """The two models of a block, and what became of the points so far.
 
@@ -128,7 +121,7 @@ class Carrying:
 
     def _by_all(self, xyz: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Take points over by every old camera whose frame holds them."""
-        return carry(xyz, in_frame(xyz, self.pair.old), self.pair.old, self.pair.new)
+        return carry(xyz, views_in_frame(xyz, self.pair.old), self.pair.old, self.pair.new)
 
     def made_with(self, xyz: FloatArray) -> MadeWith:
         """Return what made points, as they came."""

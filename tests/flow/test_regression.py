@@ -11,10 +11,15 @@ from pcfix.flow.regression import learn_regression
 from pcfix.label.labelling import Part
 from pcfix.model import Outcome, WaterPlane
 from pcfix.options import Settings
-from pcfix.refract.apparent_depths import LEAST_NEIGHBOURS, NEIGHBOURS, ApparentDepths
-from pcfix.refract.learned import Learned
+from pcfix.refract.batch import Learned
 from pcfix.refract.methods import correct
-from pcfix.refract.regression import DepthRegression, fit_depths
+from pcfix.refract.regression import (
+    LEAST_NEIGHBOURS,
+    NEIGHBOURS,
+    ApparentDepths,
+    DepthRegression,
+    fit_depths,
+)
 from pcfix.water.surface import surface_above
 
 ORIGIN = np.array([500_000.0, 4_600_000.0])

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.flow.view_kinds import PATCHES, kind_of_views
 from pcfix.io.views import ViewMatch, read_views
 from pcfix.model import Views, WaterPlane
 from pcfix.options import Settings
-from pcfix.refract.learned import Learned
+from pcfix.refract.batch import Learned
+from pcfix.refract.learning import PATCHES, kind_of_views
 from pcfix.refract.matcher import matcher_of
 from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above

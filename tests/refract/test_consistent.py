@@ -13,8 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pcfix.errors import PcfixWarning, SettingError
-from pcfix.lens.derivatives import image_and_gradients
-from pcfix.lens.imaging import coefficients
+from pcfix.lens.imaging import coefficients, image_and_gradients
 from pcfix.model import Cameras, Lens, Outcome, Views, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options import Settings
 from pcfix.refract.consistent import check_consistent

@@ -12,11 +12,9 @@ from pcfix.io.views import ViewMatch, read_views
 from pcfix.lens.frames import frames_of
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options import Settings
-from pcfix.refract.bed import WIDTH_M, Bed, bed_of
+from pcfix.refract.batch import Learned, images_of
 from pcfix.refract.depth_maps import _best_pairs, _depth, sight_of
-from pcfix.refract.learned import Learned
-from pcfix.refract.made_with import images_of
-from pcfix.refract.matcher import Matcher
+from pcfix.refract.matcher import WIDTH_M, Bed, Matcher, bed_of
 from pcfix.refract.methods import correct
 from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above

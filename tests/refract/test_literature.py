@@ -12,9 +12,8 @@ import pcfix
 from pcfix.errors import SettingError
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options import Settings
-from pcfix.refract.bundles import Bundle
-from pcfix.refract.learned import Learned
-from pcfix.refract.literature.pairs import BASE_TO_HEIGHT, in_pairs
+from pcfix.refract.batch import Bundle, Learned
+from pcfix.refract.literature import BASE_TO_HEIGHT, in_pairs
 from pcfix.refract.methods import correct
 from pcfix.refract.regression import DepthRegression
 from pcfix.water.surface import surface_above

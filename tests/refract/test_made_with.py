@@ -9,10 +9,8 @@ from scipy.spatial.transform import Rotation
 from pcfix.lens.frames import frames_of
 from pcfix.model import Cameras, Outcome, Views, WaterPlane
 from pcfix.options import Settings
-from pcfix.refract.bed import Bed
-from pcfix.refract.learned import Learned
-from pcfix.refract.made_with import MadeWith, as_made, as_now, images_of
-from pcfix.refract.matcher import Matcher
+from pcfix.refract.batch import Learned, MadeWith, as_made, as_now, images_of
+from pcfix.refract.matcher import Bed, Matcher
 from pcfix.refract.methods import correct, shift_of_land
 from pcfix.water.surface import surface_above
 from tests.utils.depth_map_twin import LENS, fused_slowly, looking

@@ -7,12 +7,12 @@ import pytest
 
 import pcfix
 from pcfix import Cameras, Lens, Settings
-from pcfix.flow.occlusion import occluder_of
 from pcfix.io.views import ViewMatch, read_views
 from pcfix.model import Views, WaterPlane
-from pcfix.refract.learned import Learned
+from pcfix.refract.batch import Learned
 from pcfix.refract.methods import correct
 from pcfix.refract.occlusion import hidden, in_sight
+from pcfix.refract.top_surface import occluder_of
 from pcfix.simulate.tracing import piercing_points, project, triangulate
 from pcfix.water.surface import SurfaceAbove
 from tests.utils.shared import needs

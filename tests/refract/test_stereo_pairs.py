@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from pcfix.errors import PcfixWarning, SettingError
 from pcfix.model import Cameras, Lens, Outcome, Views, WaterPlane
 from pcfix.options import Settings
-from pcfix.refract.bundles import Bundle
-from pcfix.refract.learned import Learned
+from pcfix.refract.batch import Bundle, Learned
 from pcfix.refract.matcher import matcher_of
 from pcfix.refract.methods import correct
 from pcfix.refract.stereo_pairs import cameras_of_pairs, invert_pairs

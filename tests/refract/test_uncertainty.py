@@ -290,7 +290,7 @@ def test_other_methods_get_the_same_budget(method):
 
 
 def test_a_regression_has_the_error_of_its_predictions():
-    from pcfix.refract.learned import Learned
+    from pcfix.refract.batch import Learned
 
     bed, cameras, _ = scene(0.0, points=5)
     line = DepthRegression(0.0, 1.4, 0.01, 0.01, 0.99, 0.08, 0.11, 20, 1.0, 9.0)

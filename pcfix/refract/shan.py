@@ -8,26 +8,25 @@ import numpy as np
 from numba import njit, prange
 
 from pcfix.model import Outcome
-from pcfix.refract.literature.level import depth_ratio, rays_of
+from pcfix.refract.literature import depth_ratio, rays_of
 from pcfix.refract.rays import MIN_DETERMINANT
 from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.refract.bundles import Bundle
-    from pcfix.refract.result import Intersection
+    from pcfix.refract.batch import Batch, Intersection
 
 TOLERANCE = 1e-9
 """Of tan a between two iterations; the depth then changes by less than 1e-9 of itself."""
 MOST_ITERATIONS = 50
 
 
-def shan(bundle: Bundle) -> Intersection:
+def shan(batch: Batch) -> Intersection:
     """Intersect with the collinearity equations of the s-model; X, Y and Z move.
 
     Parameters
     ----------
-    bundle : Bundle
+    batch : Batch
 
     Returns
     -------
@@ -64,12 +63,12 @@ def shan(bundle: Bundle) -> Intersection:
     or in one vertical plane with the point. With the image ray given, s is given, so the
     iteration only takes in that rays pass each other; a few turns do.
     """
-    found = np.zeros((len(bundle.xyz), 4))
-    failed = np.zeros(len(bundle.xyz), np.bool_)
+    found = np.zeros((len(batch.xyz), 4))
+    failed = np.zeros(len(batch.xyz), np.bool_)
     with one_caller():
-        _solve_all(*rays_of(bundle), bundle.settings.refractive_index, found, failed)
-    outcome = np.where(failed, np.uint8(Outcome.PARALLEL_RAYS), bundle.outcome())
-    return bundle.result(found[:, :3], outcome=outcome, ray_miss_m=found[:, 3])
+        _solve_all(*rays_of(batch), batch.survey.settings.refractive_index, found, failed)
+    outcome = np.where(failed, np.uint8(Outcome.PARALLEL_RAYS), batch.outcome())
+    return batch.result(found[:, :3], outcome=outcome, ray_miss_m=found[:, 3])
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
