@@ -13,10 +13,8 @@ from pcfix.adjust.solve import prepare, solved_cameras
 from pcfix.adjust.unaware import solve_unaware, straight_columns
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import project
-from pcfix.model import WaterPlane
-from pcfix.options import Settings
 from pcfix.refract.choice import views_in_frame
-from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
+from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:
     from pcfix.adjust.block import Block

@@ -28,7 +28,6 @@ from pcfix.adjust.rounds import Rounds, adjust_ties, check_datum, default_lens
 from pcfix.adjust.separability import strong_correlations, undetermined
 from pcfix.adjust.state import CODES
 from pcfix.errors import GeometryError, InputError, SettingError
-from pcfix.flow.carrying import in_frame
 from pcfix.flow.inputs import mask_of
 from pcfix.io.cameras.table.sensor import read_sensor
 from pcfix.io.crs import is_topocentric
@@ -37,6 +36,7 @@ from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.io.views import ViewMatch
 from pcfix.model import GroundControl, Views
+from pcfix.refract.choice import views_in_frame
 from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
 
@@ -392,7 +392,7 @@ class AdjustJob:
     def _by_cloud(self, progress: Callable[[LogRow], None] | None) -> Adjusted:
         xyz, listed = self._sample()
         candidates = []
-        guesses = {"all images in frame": in_frame(xyz, self.old)}
+        guesses = {"all images in frame": views_in_frame(xyz, self.old)}
         if listed is not None:
             guesses["the images of the view list"] = listed
         for name, views in guesses.items():

@@ -16,8 +16,7 @@ import numpy as np
 
 from pcfix.adjust.carry import carry
 from pcfix.errors import GeometryError, PcfixWarning
-from pcfix.model import Outcome, Views, WaterPlane
-from pcfix.options import Settings
+from pcfix.model import Outcome, Views
 from pcfix.refract.batch import MadeWith
 from pcfix.refract.choice import spatial_order, views_in_frame
 from pcfix.water.surface import SurfaceAbove, is_submerged
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
     from typing import TypeAlias
 
     from pcfix.flow.old_cameras import Pair
-    from pcfix.model import BoolArray, Cameras, Correction, FloatArray, IntArray, TiePoints
+    from pcfix.model import BoolArray, Correction, FloatArray, IntArray, TiePoints
 
     Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from pcfix.flow.points import Label
     from pcfix.flow.surfaces import CloudView
     from pcfix.io.views import ViewMatch
-    from pcfix.model import FloatArray, TiePoints, ViewKind, Views, WaterSurface
+    from pcfix.model import FloatArray, TiePoints, ViewKind, WaterSurface
     from pcfix.refract.batch import MadeWith
 
     Points: TypeAlias = tuple[FloatArray, FloatArray | None, npt.NDArray[np.uint8]]

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from pcfix.model import BoolArray, FloatArray
     from pcfix.options import CameraSet, MatcherKind, Method, Occlusion
-    from pcfix.refract.batch import Learned
     from pcfix.refract.regression import DepthRegression
 
     Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]

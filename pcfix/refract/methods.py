@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from pcfix.model import FloatArray, IntArray, Views
-    from pcfix.refract.batch import MadeWith, Survey
+    from pcfix.refract.batch import Survey
 
     Method: TypeAlias = Callable[[Batch], Intersection]
 

@@ -21,6 +21,7 @@ from pcfix.refract.regression import (
     fit_depths,
 )
 from pcfix.water.surface import surface_above
+from tests.utils.batches import batch_of
 
 ORIGIN = np.array([500_000.0, 4_600_000.0])
 LEVEL = WaterPlane(12.0)
@@ -270,7 +271,9 @@ def test_it_is_applied(tmp_path):
     assert isinstance(found, DepthRegression)
     above = surface_above(LEVEL, xyz)
     cameras = pcfix.Cameras(("a",), np.array([[*ORIGIN, 100.0]]))
-    result = correct(xyz, above, LEVEL, cameras, SETTINGS, learned=Learned(regression=found))
+    result = correct(
+        batch_of(xyz, above, LEVEL, cameras, SETTINGS, learned=Learned(regression=found))
+    )
     assert (result.outcome == Outcome.CORRECTED).all()
     depth = 12.0 - xyz[:, 2]
     expected = found.intercept_m + found.slope * depth

@@ -20,6 +20,7 @@ from pcfix.refract.consistent import check_consistent
 from pcfix.refract.methods import correct
 from pcfix.simulate.tracing import triangulate
 from pcfix.water.surface import surface_above
+from tests.utils.batches import batch_of
 from tests.utils.consistent_twin import (
     found_by_full_triangulation,
     image_in,
@@ -102,7 +103,7 @@ def views_of(lists):
 def run(points, cameras, water, views, *, method="consistent", n=N_WATER, offset=None):
     settings = Settings(method=method, refractive_index=n)
     above = surface_above(water, points)
-    return correct(points, above, water, cameras, settings, views, offset)
+    return correct(batch_of(points, above, water, cameras, settings, views, offset))
 
 
 def bed(count, seed=3, spread=20.0):
