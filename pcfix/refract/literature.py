@@ -226,7 +226,7 @@ def regression(batch: Batch) -> Intersection:
     -------
     Intersection
         Every point is corrected, as no ray is needed; see
-        `pcfix.refract.literature.without_rays`.
+        `without_rays`.
 
     Raises
     ------
