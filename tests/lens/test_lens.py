@@ -1,6 +1,7 @@
 """Lenses: there and back, beside the slow twin, and what lies beyond the fold."""
 
 import math
+
 import numpy as np
 import pytest
 from hypothesis import given
