@@ -24,17 +24,14 @@ from pcfix.options import Settings
 from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.rays import pierce_mesh, pierce_raster
 from pcfix.threads import one_caller
-from pcfix.water.raster import build_field
-from pcfix.water.surface import SurfaceAbove
-from pcfix.water.tin import build_tin, locate
+from pcfix.water.surface import SurfaceAbove, build_field, build_tin, locate
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcfix.lens.frames import Frames
     from pcfix.model import Cameras, FloatArray, IntArray, WaterSurface
-    from pcfix.water.raster import Field
-    from pcfix.water.tin import Tin
+    from pcfix.water.surface import Field, Tin
 
 TILE = 128
 """Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""

@@ -46,14 +46,12 @@ from pcfix.refract.rays import (
     slope_of_path,
 )
 from pcfix.threads import one_caller
-from pcfix.water.raster import build_field
-from pcfix.water.tin import build_tin, locate
+from pcfix.water.surface import build_field, build_tin, locate
 
 if TYPE_CHECKING:
     from pcfix.model import Cameras, FloatArray, IntArray
     from pcfix.refract.batch import Batch
-    from pcfix.water.raster import Field
-    from pcfix.water.tin import Tin
+    from pcfix.water.surface import Field, Tin
 
 MAX_STEPS = 30
 CLOSE_M = 1e-7

@@ -43,7 +43,7 @@ from pcfix.refract.uncertainty import (
     with_errors,
 )
 from pcfix.threads import one_caller
-from pcfix.water.tin import locate
+from pcfix.water.surface import locate
 
 if TYPE_CHECKING:
     from pcfix.lens.frames import Frames
@@ -51,8 +51,7 @@ if TYPE_CHECKING:
     from pcfix.refract.batch import Batch
     from pcfix.refract.choice import Points, Rig, Rule
     from pcfix.refract.sensitivity import Budget
-    from pcfix.water.raster import Field
-    from pcfix.water.tin import Tin
+    from pcfix.water.surface import Field, Tin
 
 _NO_CAMERA, _ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
 _PARALLEL, _CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)

@@ -20,13 +20,11 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numba import njit
 
-from pcfix.water.raster import height_at
-from pcfix.water.tin import locate
+from pcfix.water.surface import height_at, locate
 
 if TYPE_CHECKING:
     from pcfix.model import FloatArray
-    from pcfix.water.raster import Field
-    from pcfix.water.tin import Tin
+    from pcfix.water.surface import Field, Tin
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

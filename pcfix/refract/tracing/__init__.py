@@ -31,15 +31,13 @@ from pcfix.refract.tracing.tracers import (
     scattershot,
 )
 from pcfix.threads import one_caller
-from pcfix.water.raster import build_field
-from pcfix.water.tin import build_tin
+from pcfix.water.surface import build_field, build_tin
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.water.raster import Field
-    from pcfix.water.tin import Tin
+    from pcfix.water.surface import Field, Tin
 
 Surface: TypeAlias = WaterPlane | WaterRaster | WaterMesh
 

@@ -4,8 +4,8 @@ The object point is the local origin. A ray is named by its aim: the place where
 level of the water above the point. It pierces the surface at A, bends there, and comes down to the
 height of the point at the place (mx, my): its miss.
 
-The surface is a plane, the bilinear raster of `pcfix.water.raster` or the facets of
-`pcfix.water.tin`. Where there is none, and where it faces away from the camera, all is NaN. Water
+The surface is a plane, the bilinear raster or the facets of
+`pcfix.water.surface`. Where there is none, and where it faces away from the camera, all is NaN. Water
 that hides water behind it is not looked for: the ray is taken to cross the surface once.
 """
 
@@ -20,8 +20,7 @@ from pcfix.refract.rays import plane_at, refracted
 
 if TYPE_CHECKING:
     from pcfix.model import FloatArray
-    from pcfix.water.raster import Field
-    from pcfix.water.tin import Tin
+    from pcfix.water.surface import Field, Tin
 
 
 Found: TypeAlias = tuple[float, float, int, bool]
