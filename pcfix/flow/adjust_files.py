@@ -13,7 +13,7 @@ import numpy as np
 from pcfix.adjust.gather import LEAST_VIEWS, taken
 from pcfix.errors import InputError, SettingError
 from pcfix.io.cameras.colmap.writing import write_colmap
-from pcfix.io.cameras.opensfm.writing import write_opensfm
+from pcfix.io.cameras.opensfm.models import write_opensfm
 from pcfix.io.cameras.table.sensor import write_table
 from pcfix.model import TiePoints, Views
 

@@ -1,9 +1,10 @@
-"""Values out of JSON that may be anything; each message names file and place."""
+"""Values out of XML and JSON that may be anything; each message names file and place."""
 
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
+from xml.etree.ElementTree import ParseError
 
 import numpy as np
 
@@ -12,18 +13,58 @@ from pcfix.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Collection
     from pathlib import Path
+    from xml.etree.ElementTree import Element
 
     from pcfix.model import FloatArray
 
 
-def load(path: Path) -> Any:
-    """Return what a JSON file holds.
+def read_xml(path: Path, stream: IO[bytes] | None = None) -> Element:
+    """Return the root of a document.
 
-    Raises
-    ------
-    InputError
-        If it cannot be read, or is cut off or no JSON at all.
+    Parameters
+    ----------
+    path : Path
+        The file; only for messages when `stream` is given.
+    stream : binary file, optional
+        Read this instead, for documents inside an archive.
     """
+    from defusedxml.common import DefusedXmlException
+    from defusedxml.ElementTree import parse
+
+    try:
+        root: Element = parse(stream if stream is not None else path, forbid_dtd=False).getroot()
+    except DefusedXmlException as error:
+        raise InputError(
+            f"{path}: the XML declares entities, which no camera file needs; it is not read."
+        ) from error
+    except (ParseError, LookupError, ValueError) as error:
+        raise InputError(
+            f"{path}: the XML is damaged or cut off ({error}); export it again."
+        ) from error
+    return root
+
+
+def number(path: Path, where: str, text: str | None) -> float:
+    """Return the number in a text; `where` is the image and element, for the message."""
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise InputError(f"{path}: {where}: '{(text or '').strip()}' is not a number.")
+    return value
+
+
+def numbers(path: Path, where: str, text: str | None, count: int) -> FloatArray:
+    """Return `count` numbers separated by white space or commas."""
+    words: list[Any] = (text or "").replace(",", " ").split()
+    if len(words) != count:
+        raise InputError(f"{path}: {where}: has {len(words)} numbers instead of {count}.")
+    return np.array([number(path, where, word) for word in words])
+
+
+def load_json(path: Path) -> Any:
+    """Return what a JSON file holds."""
     try:
         return json.loads(path.read_bytes())
     except OSError as error:
@@ -41,7 +82,7 @@ def mapping(path: Path, where: str, value: Any) -> dict[str, Any]:
     return value
 
 
-def number(path: Path, where: str, value: Any) -> float:
+def json_number(path: Path, where: str, value: Any) -> float:
     """Return a finite number."""
     return float(vector(path, where, [value], 1)[0])
 
