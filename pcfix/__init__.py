@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
+    from pcfix.clean.points import clean_points
     from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
     from pcfix.flow.clean import clean_file
     from pcfix.flow.compare import compare_clouds
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
 _HOME = {
     "clean_file": "pcfix.flow.clean",
+    "clean_points": "pcfix.clean.points",
     "compare_clouds": "pcfix.flow.compare",
     "grid_dsm": "pcfix.flow.dsm",
     "adjust_cameras": "pcfix.flow.adjust",
@@ -96,6 +98,7 @@ __all__ = [
     "__version__",
     "adjust_cameras",
     "clean_file",
+    "clean_points",
     "compare_clouds",
     "correct_file",
     "correct_points",

@@ -16,8 +16,7 @@ import numpy as np
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens, WaterSurface
     from pcfix.port.shapes import Port
-    from pcfix.water.raster import Field
-    from pcfix.water.tin import Tin
+    from pcfix.water.surface import Field, Tin
 
 
 class State(NamedTuple):

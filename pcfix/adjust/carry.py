@@ -21,12 +21,10 @@ import numpy as np
 from numba import njit, prange
 
 from pcfix.errors import GeometryError, PcfixWarning
-from pcfix.lens.derivatives import image_and_gradients
-from pcfix.lens.imaging import image_of, lens_table
-from pcfix.model import Cameras, Outcome, Views, WaterPlane
-from pcfix.options import Settings
-from pcfix.refract.choice import chosen_views, spatial_order
-from pcfix.refract.made_with import MadeWith
+from pcfix.lens.imaging import image_and_gradients, image_of, lens_table
+from pcfix.model import Cameras, Outcome, Views
+from pcfix.refract.batch import MadeWith
+from pcfix.refract.choice import spatial_order, views_in_frame
 from pcfix.threads import one_caller
 from pcfix.water.surface import SurfaceAbove, is_submerged
 
@@ -303,13 +301,6 @@ def _below(xyz: FloatArray, surface: SurfaceAbove) -> BoolArray:
     return is_submerged(xyz[:, 2], surface)
 
 
-def in_frame(xyz: FloatArray, cameras: Cameras) -> Views:
-    """Return the cameras whose frame holds each point, above the water or below."""
-    xyz = np.ascontiguousarray(xyz)
-    at_themselves = SurfaceAbove(xyz[:, 2].copy(), np.zeros((len(xyz), 2)))
-    return chosen_views(xyz, at_themselves, WaterPlane(0.0), cameras, Settings())
-
-
 class Carrying:
     """The two models of a block, and what became of the points so far."""
 
@@ -346,7 +337,7 @@ class Carrying:
             # whatever the list means to the correction, these images saw the point
             shift, carried = carry(xyz, replace(views, kind="tracks"), self.pair.old, self.pair.new)
         for rows in _batches(xyz, np.flatnonzero(~carried)):
-            every = in_frame(xyz[rows], self.pair.old)
+            every = views_in_frame(xyz[rows], self.pair.old)
             shift[rows], carried[rows] = carry(xyz[rows], every, self.pair.old, self.pair.new)
         return Step(xyz, xyz + shift, carried, views)
 
@@ -400,11 +391,6 @@ class Carrying:
         self._not_carried += int((~step.carried).sum())
         self._sum_m += [*shift.sum(axis=0), length2.sum()]
         self._most_m = max(self._most_m, float(np.sqrt(length2.max(initial=0.0))))
-
-    @property
-    def not_carried(self) -> int:
-        """Points so far that could not be taken over."""
-        return self._not_carried
 
     def check(self, name: str) -> None:
         """Refuse a cloud that the old cameras do not see.

@@ -28,7 +28,7 @@ from pcfix.adjust.problem import similarity_gradients
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import project
 from pcfix.model import WaterDimension
-from pcfix.water.cloud_heights import heights_from_cloud, is_near
+from pcfix.water.fit import heights_from_cloud, is_near
 from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:

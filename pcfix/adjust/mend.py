@@ -25,10 +25,8 @@ from pcfix.adjust.rounds import check_datum
 from pcfix.adjust.unaware import solve_unaware, straight_columns
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import project
-from pcfix.model import WaterPlane
-from pcfix.options import Settings
-from pcfix.refract.choice import chosen_views
-from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
+from pcfix.refract.choice import views_in_frame
+from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -205,7 +203,6 @@ def _trial(one: Candidate, unknowns: Unknowns, sigma_px: float, progress: Progre
     return Trial(one.name, block, problem, found, sigma_px, found.cost + in_images, count)
 
 
-_LEVEL = WaterPlane(0.0)  # any: straight rays
 SIGMA_PX = 0.25
 """Of a place in the image; small, so that the centres only decide where the block lies."""
 OWN_SIGMA_M = 1.0
@@ -250,8 +247,7 @@ def images_of(
         Of the points; the other three as of `pcfix.adjust.block.Block`.
     """
     rotations = np.asarray(cameras.rotations)
-    above = SurfaceAbove(xyz[:, 2].copy(), np.zeros((len(xyz), 2)))
-    views = chosen_views(xyz, above, _LEVEL, cameras, Settings())
+    views = views_in_frame(xyz, cameras)
     rows = np.flatnonzero(np.diff(views.start) >= least)
     views = views.take(rows)
     owner = np.repeat(rows, np.diff(views.start))

@@ -1,7 +1,7 @@
 r"""One observation: where the lens images a point through the water, and how that moves.
 
 The refractive collinearity (Mulsow 2024): object point, piercing point, image. The light's
-direction w at the projection centre comes from `pcfix.refract.tracing.derivatives` with its
+direction w at the projection centre comes from `pcfix.refract.tracing.gradients` with its
 derivatives; in the camera frame it is x = R w. The rotation moves as exp(omega) R with a small
 vector omega in the camera frame, for which d x = omega x x, so that a gradient g of the image by x
 is (x x g) by omega.
@@ -15,13 +15,12 @@ import numpy as np
 from numba import njit
 
 from pcfix.adjust.block import B1, B2, CX, CY, FOCAL, K1, P1
-from pcfix.lens import places
-from pcfix.lens.brown import distorted, jacobian, undistorted
-from pcfix.lens.derivatives import image_and_gradients
-from pcfix.lens.imaging import image_of, in_plane
+from pcfix.lens import formulas as places
+from pcfix.lens.formulas import distorted, jacobian, undistorted
+from pcfix.lens.imaging import image_and_gradients, image_of, in_plane
 from pcfix.port.light import through_port
-from pcfix.refract.backward import light_path, plane_at, settle
-from pcfix.refract.tracing.derivatives import light_and_gradients
+from pcfix.refract.rays import light_path, plane_at, settle
+from pcfix.refract.tracing.gradients import light_and_gradients
 
 if TYPE_CHECKING:
     from pcfix.adjust.block import Seen, State, Surface

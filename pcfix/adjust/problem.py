@@ -32,8 +32,7 @@ from pcfix.errors import GeometryError
 from pcfix.lens.imaging import lens_table
 from pcfix.model import Lens, WaterMesh, WaterPlane, WaterRaster
 from pcfix.port.light import coefficients as port_coefficients
-from pcfix.water.raster import build_field
-from pcfix.water.tin import build_tin
+from pcfix.water.surface import build_field, build_tin
 
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, WaterSurface

@@ -18,7 +18,7 @@ from pcfix.flow.adjust_job import Survey, adjusted, read_job
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.surfaces import view_of
 from pcfix.io.cameras.colmap.writing import write_colmap
-from pcfix.io.cameras.opensfm.writing import write_opensfm
+from pcfix.io.cameras.opensfm.models import write_opensfm
 from pcfix.io.cameras.table.sensor import write_table
 from pcfix.io.files import check_input
 from pcfix.model import TiePoints, Views, WaterPlane

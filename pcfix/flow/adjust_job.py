@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.carry import in_frame
 from pcfix.adjust.gather import (
     Datum,
     Material,
@@ -36,6 +35,7 @@ from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.io.views import ViewMatch
 from pcfix.model import GroundControl, Views
+from pcfix.refract.choice import views_in_frame
 from pcfix.water.index import index_of
 
 if TYPE_CHECKING:
@@ -199,7 +199,7 @@ def adjusted(job: Job, progress: Callable[[LogRow], None] | None = None) -> Adju
         )
     else:
         xyz, listed = _sample(job.view, job.views, material.old)
-        guesses = {"all images in frame": in_frame(xyz, material.old)}
+        guesses = {"all images in frame": views_in_frame(xyz, material.old)}
         if listed is not None:
             guesses["the images of the view list"] = listed
         found = by_cloud(material, xyz, guesses, rules, progress)

@@ -11,11 +11,11 @@ from pcfix.errors import InputError, SettingError
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.points import CHUNK_POINTS
 from pcfix.flow.surfaces import view_of
-from pcfix.io.cameras.gnss import adjusted_minus_gnss
+from pcfix.io.cameras.georeference import adjusted_minus_gnss
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.files import check_input, check_output, write_bytes
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
-from pcfix.lens.visibility import cameras_in_sight
+from pcfix.lens.frames import cameras_in_sight
 from pcfix.model import WaterDimension
 from pcfix.options import DEFAULT_REFRACTIVE_INDEX
 from pcfix.water.surface import surface_above

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.clean.flags import flag_weak
+from pcfix.clean.points import check_tile, flag_neighbours, flag_weak
 from pcfix.clean.settings import CleanSettings, CleanSummary, Reason
 from pcfix.errors import InputError
-from pcfix.flow.clean_points import check_tile, flag_neighbours
 from pcfix.flow.points import CHUNK_POINTS
 from pcfix.flow.surfaces import WaterWords, find_surface, view_of
 from pcfix.io.files import check_input, check_output, scratch_arrays, write_text
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
     import laspy
     import numpy.typing as npt
 
-    from pcfix.clean.tiles import Empty
+    from pcfix.clean.neighbours import Empty
     from pcfix.model import BoolArray, FloatArray, WaterSurface
 
     AnyPath = str | PathLike[str]

@@ -18,12 +18,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.flow.sorted_points import BLOCK_CELLS, SortedPoints, inside
-from pcfix.grid.cells import cell_numbers, cell_uncertainty
-from pcfix.grid.delaunay import triangulated
-from pcfix.grid.holes import fill_holes, margin_cells
-from pcfix.grid.inverse import inverse_distance
-from pcfix.grid.model import DsmSettings, DsmSummary, Method, SurfaceChoice
-from pcfix.grid.shade import NO_LIGHT, hillshade
+from pcfix.grid.heights import (
+    cell_numbers,
+    cell_uncertainty,
+    fill_holes,
+    inverse_distance,
+    margin_cells,
+    triangulated,
+)
+from pcfix.grid.model import NO_LIGHT, DsmSettings, DsmSummary, Method, SurfaceChoice, hillshade
 from pcfix.io.files import check_input, check_output, replaced_when_whole, write_text
 from pcfix.io.las.source import LasSource, metric_crs
 from pcfix.io.rasters import (
@@ -89,7 +92,7 @@ def grid_dsm(
 
     A cloud with the dimension ``SigmaZ``, as `pcfix.correct_file` writes it, gives a fourth band,
     uncertainty: the standard uncertainty of the height (m), the root mean square of the ``SigmaZ``
-    of the cell's corrected points; see `pcfix.grid.cells.cell_uncertainty`. Nodata without any.
+    of the cell's corrected points; see `pcfix.grid.heights.cell_uncertainty`. Nodata without any.
 
     Parameters
     ----------

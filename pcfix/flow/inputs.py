@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pcfix.flow.surfaces import CloudView, FoundSurface, WaterModel
     from pcfix.io.cameras.formats import Angles
     from pcfix.io.views import ViewList
-    from pcfix.label.mask import WaterMask
+    from pcfix.label.areas import WaterMask
     from pcfix.model import FloatArray, TiePoints, WaterSurface
     from pcfix.options import ViewsAre
     from pcfix.port.shapes import Port
@@ -229,7 +229,7 @@ def mask_of(
     if path is None:
         return None
     from pcfix.io.vectors import read_water_polygons
-    from pcfix.label.mask import WaterMask
+    from pcfix.label.areas import WaterMask
 
     polygons = read_water_polygons(path, cloud_crs)
     for note in polygons.notes:

@@ -16,12 +16,12 @@ from pcfix.flow.inputs import mask_of
 from pcfix.flow.learning import Learning
 from pcfix.flow.old_cameras import old_tie_points, read_blocks
 from pcfix.flow.points import correct_checked
-from pcfix.flow.view_kinds import kind_of_views
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.label.labelling import Labelling, Part
 from pcfix.model import Correction, Outcome, Summary, WaterDimension, WaterPlane
 from pcfix.options import LabelSettings, Settings
-from pcfix.refract.learned import Learned
+from pcfix.refract.batch import Batch, Survey
+from pcfix.refract.learning import kind_of_views
 from pcfix.report.tally import Tally
 from pcfix.version import __version__
 from pcfix.water.checks import WaterMeeting, check_above_water, check_tilt, refuse_under_water
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from pcfix.flow.points import Label
     from pcfix.flow.surfaces import CloudView
     from pcfix.io.views import ViewMatch
-    from pcfix.model import FloatArray, TiePoints, ViewKind, Views, WaterSurface
-    from pcfix.refract.made_with import MadeWith
+    from pcfix.model import FloatArray, TiePoints, ViewKind, WaterSurface
+    from pcfix.refract.batch import MadeWith
 
     Points: TypeAlias = tuple[FloatArray, FloatArray | None, npt.NDArray[np.uint8]]
     """Some points: coordinates (n, 3), water heights where those are a dimension, classes."""
@@ -93,10 +93,13 @@ class Job:
         self.labelling = Labelling(label, mask)
         kind = None if self._list is None else self._list.kind
         self._learning = Learning(
-            settings, inputs, self.cameras, self.water, view, kind, self.level_offset_m,
+            Survey(self.water, self.cameras, settings, self.level_offset_m),
+            inputs,
+            view,
+            kind,
             None if pair is None else self._old_ties,
-        )  # fmt: skip
-        self.learned = Learned()
+        )
+        self.survey = self._learning.survey
         self._inputs = inputs
         self._kind: ViewKind | None = None
         self._kind_notes: list[str] = []
@@ -127,7 +130,7 @@ class Job:
                 lambda: parts_of(around(), self.water), self._low, self._high
             )
         came = None if self.carrying is None else partial(self._came, chunks, self.carrying)
-        self.learned = self._learning.of_cloud(around, came)
+        self.survey = replace(self.survey, learned=self._learning.of_cloud(around, came))
 
     def _carried(
         self, chunks: Callable[[], Iterable[Points]], carrying: Carrying
@@ -173,11 +176,9 @@ class Job:
         if self.carrying is not None:
             step, made_with = self.carrying.step(xyz, views), self.carrying.made_with(xyz)
             xyz, views, label = step.xyz, step.views, step.rule(label)
-        views = self._of_kind(views, xyz, heights, made_with)
-        correction = correct_checked(
-            xyz, self.cameras, self.water, self.settings, heights, views, label,
-            self.level_offset_m, self.learned, self._level_sigma_m, made_with,
-        )  # fmt: skip
+        above = surface_above(self.water, xyz, heights)
+        batch = self._of_kind(Batch(xyz, above, self.survey, views, made_with))
+        correction = correct_checked(batch, label, self._level_sigma_m)
         if self.carrying is not None and step is not None:
             correction = step.whole(correction)
             self.carrying.add(step, correction)
@@ -185,28 +186,18 @@ class Job:
         self.meeting.add(xyz, correction)
         return correction
 
-    def _of_kind(
-        self,
-        views: Views | None,
-        xyz: FloatArray,
-        heights: FloatArray | None,
-        made_with: MadeWith | None,
-    ) -> Views | None:
-        """Return the views of a chunk as what they are; the first one tells what the list lists."""
-        if views is None:
-            return None
-        if self.learned.matcher is None or self._inputs.views_are != "auto":
-            return views
+    def _of_kind(self, batch: Batch) -> Batch:
+        """Return a chunk with its views as what they are; the first one tells what they list."""
+        if batch.views is None or self.survey.learned.matcher is None:
+            return batch
+        if self._inputs.views_are != "auto":
+            return batch
         if self._kind is None:
-            rows = np.flatnonzero(is_submerged(xyz[:, 2], surface_above(self.water, xyz, heights)))
-            above = surface_above(self.water, xyz[rows], None if heights is None else heights[rows])
-            found = kind_of_views(
-                xyz[rows], above, self.water, self.cameras, self.settings, views.take(rows),
-                self.learned, None if made_with is None else made_with.take(rows),
-            )  # fmt: skip
-            self._kind = views.kind if found is None else found.kind
+            rows = np.flatnonzero(is_submerged(batch.xyz[:, 2], batch.surface))
+            found = kind_of_views(batch.take(rows))
+            self._kind = batch.views.kind if found is None else found.kind
             self._kind_notes = [] if found is None else [str(found)]
-        return replace(views, kind=self._kind)
+        return replace(batch, views=replace(batch.views, kind=self._kind))
 
     def _level_sigma_m(self, xy: FloatArray) -> FloatArray | None:
         """Return the standard error of the water's height at places, where its fit says one."""

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcfix.flow.surfaces import WaterModel
+    from pcfix.label.areas import WaterMask
     from pcfix.label.labelling import Labels
-    from pcfix.label.mask import WaterMask
     from pcfix.model import FloatArray, WaterSurface
 
     AnyPath = str | PathLike[str]

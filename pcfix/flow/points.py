@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from pcfix.adjust.carry import Carrying
 from pcfix.errors import SettingError
-from pcfix.flow.learning import learn_of_points
 from pcfix.flow.old_cameras import paired
 from pcfix.model import Cameras, Correction, Views, WaterSurface
 from pcfix.options import DEFAULT_REFRACTIVE_INDEX, ErrorBudget, Settings
-from pcfix.refract.made_with import MadeWith
+from pcfix.refract.batch import Batch, MadeWith, Survey
+from pcfix.refract.learning import learn_of_points
 from pcfix.refract.methods import correct, shift_of_land
 from pcfix.water.checks import as_surface, check_above_water, checked_points
 from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
     from pcfix.model import BoolArray, FloatArray
     from pcfix.options import CameraSet, MatcherKind, Method, Occlusion
-    from pcfix.refract.learned import Learned
     from pcfix.refract.regression import DepthRegression
 
     Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
@@ -153,13 +153,10 @@ def correct_points(
         made_with = MadeWith(points, pair.old)
         points, views, label = step.xyz, step.views, step.rule(label)
     above = surface_above(surface, points, dimension)
-    learned = learn_of_points(
-        points, above, cameras, surface, settings, regression, views, offset, made_with
-    )
-    found = correct_checked(
-        points, cameras, surface, settings, dimension, views, label, offset, learned,
-        made_with=made_with,
-    )  # fmt: skip
+    batch = Batch(points, above, Survey(surface, cameras, settings, offset), views, made_with)
+    learned = learn_of_points(batch, regression)
+    batch = replace(batch, survey=replace(batch.survey, learned=learned))
+    found = correct_checked(batch, label)
     return found if step is None else step.whole(found)
 
 
@@ -193,30 +190,28 @@ def _check_views(views: Views, n: int, k: int) -> None:
 
 
 def correct_checked(
-    xyz: FloatArray,
-    cameras: Cameras,
-    water: WaterSurface,
-    settings: Settings,
-    dimension: FloatArray | None = None,
-    views: Views | None = None,
+    batch: Batch,
     label: Label | None = None,
-    level_offset_m: FloatArray | None = None,
-    learned: Learned | None = None,
     level_sigma_m: Callable[[FloatArray], FloatArray | None] | None = None,
-    made_with: MadeWith | None = None,
 ) -> Correction:
-    """Label, refract, and spread the result over all rows: what every door runs."""
-    surface = surface_above(water, xyz, dimension)
+    """Label, refract, and spread the result over all rows: what every door runs.
+
+    Parameters
+    ----------
+    batch : Batch
+        Of n points, land too.
+    label : callable, optional
+        Says which are submerged. Default: those below the surface.
+    level_sigma_m : callable, optional
+        Returns the standard deviation of the water's height at places, shape (m, 2).
+    """
+    xyz, surface = batch.xyz, batch.surface
     submerged = is_submerged(xyz[:, 2], surface) if label is None else label(xyz, surface)
     rows = np.flatnonzero(submerged)
-    above = SurfaceAbove(surface.height_m[rows], surface.slope[rows])
-    mine = None if views is None else views.take(rows)
-    sigma = None if level_sigma_m is None else level_sigma_m(xyz[rows, :2])
-    made = None if made_with is None else made_with.take(rows)
-    found = correct(
-        xyz[rows], above, water, cameras, settings, mine, level_offset_m, learned, sigma, made
-    )
-    land = _land_shift(xyz, submerged, cameras, settings, views, learned, made_with)
+    wet = batch.take(rows)
+    if level_sigma_m is not None:
+        wet = replace(wet, level_sigma_m=level_sigma_m(wet.xyz[:, :2]))
+    above, found = wet.surface, correct(wet)
     shift_x, shift_y, shift_z = found.shift_m.T
     rise = above.slope[:, 0] * shift_x + above.slope[:, 1] * shift_y
 
@@ -228,7 +223,7 @@ def correct_checked(
     known = np.isfinite(surface.height_m)
     return Correction(
         apparent_xyz=xyz,
-        shift_m=spread(found.shift_m) + land,
+        shift_m=spread(found.shift_m) + _land_shift(batch, submerged),
         outcome=spread(found.outcome),
         ray_count=spread(found.ray_count),
         ray_miss_m=spread(found.ray_miss_m),
@@ -242,20 +237,11 @@ def correct_checked(
     )
 
 
-def _land_shift(
-    xyz: FloatArray,
-    submerged: BoolArray,
-    cameras: Cameras,
-    settings: Settings,
-    views: Views | None,
-    learned: Learned | None,
-    made_with: MadeWith | None,
-) -> FloatArray | float:
+def _land_shift(batch: Batch, submerged: BoolArray) -> FloatArray | float:
     """Return the shift of points made with other cameras, shape (n, 3), zero where submerged."""
-    if made_with is None:
+    if batch.made_with is None:
         return 0.0
-    shift = np.zeros((len(xyz), 3))
+    shift = np.zeros((len(batch), 3))
     rows = np.flatnonzero(~submerged)
-    mine = None if views is None else views.take(rows)
-    shift[rows] = shift_of_land(xyz[rows], cameras, settings, mine, learned, made_with.take(rows))
+    shift[rows] = shift_of_land(batch.take(rows))
     return shift

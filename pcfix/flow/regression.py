@@ -10,8 +10,14 @@ import numpy as np
 from pcfix.errors import GeometryError, SettingError
 from pcfix.io.tables import read_check_depths
 from pcfix.model import NOISE_CLASSES
-from pcfix.refract.apparent_depths import LEAST_NEIGHBOURS, REACH, ApparentDepths
-from pcfix.refract.regression import LEAST_COUNT, DepthRegression, fit_depths
+from pcfix.refract.regression import (
+    LEAST_COUNT,
+    LEAST_NEIGHBOURS,
+    REACH,
+    ApparentDepths,
+    DepthRegression,
+    fit_depths,
+)
 from pcfix.water.surface import SurfaceAbove
 
 if TYPE_CHECKING:

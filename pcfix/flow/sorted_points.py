@@ -9,8 +9,7 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.flow.points import CHUNK_POINTS
-from pcfix.grid.lattice import Window, cells_of, fits, lattice_over, refuse_size
-from pcfix.grid.spacing import Occupancy
+from pcfix.grid.lattice import Occupancy, Window, cells_of, fits, lattice_over, refuse_size
 from pcfix.io.files import Bins
 from pcfix.io.las.source import LasSource, coordinates
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES

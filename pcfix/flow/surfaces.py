@@ -235,7 +235,7 @@ def _with_heights(
     xyz: FloatArray, name: str, view: CloudView | None, notes: list[str]
 ) -> FloatArray:
     """Give the points without a height that of the cloud about them."""
-    from pcfix.water.cloud_heights import heights_from_cloud, is_near
+    from pcfix.water.fit import heights_from_cloud, is_near
 
     if view is None:
         raise InputError(f"{name}: has points without a height; give the cloud too.")

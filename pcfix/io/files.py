@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from pcfix.clean.tiles import Empty
+    from pcfix.clean.neighbours import Empty
     from pcfix.grid.lattice import Window
     from pcfix.model import FloatArray, IntArray
 

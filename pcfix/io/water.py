@@ -149,8 +149,7 @@ def check_mesh(mesh: WaterMesh, path: Path) -> None:
     Which way a facet faces does not matter, nor do holes, edges of three facets, or facets that
     overlap at one height: all are well defined as heights. Vertical facets have none.
     """
-    from pcfix.water.sheets import in_two_sheets
-    from pcfix.water.tin import build_tin
+    from pcfix.water.surface import build_tin, in_two_sheets
 
     tin = build_tin(mesh)
     double, area_m2 = in_two_sheets(tin)

@@ -1,7 +1,7 @@
 """Rasters of the water's height, in the cloud's CRS.
 
 A north-up raster in the cloud's own CRS is taken cell by cell. Any other is sampled on a grid in
-the cloud's CRS, with the same rule between its cells as `pcfix.water.raster` has, so that a gap
+the cloud's CRS, with the same rule between its cells as `pcfix.water.surface` has, so that a gap
 stays a gap; GDAL would fill half a cell of it. Positions go through the transformations that
 cameras go through, which refuse what PROJ can only guess.
 """
@@ -283,7 +283,7 @@ def _extent(part: Part, to_cloud: Points, name: str) -> tuple[float, Bounds]:
 
 def _heights_at(part: Part, places: FloatArray, to_cloud: Points) -> FloatArray:
     """Return heights in the cloud's system at places in the raster's CRS; NaN where unknown."""
-    from pcfix.water.raster import Field, heights_above
+    from pcfix.water.surface import Field, heights_above
 
     column, row = place_of(~part.transform, places[:, 0], places[:, 1])
     cells = Field(np.ascontiguousarray(part.heights), 0.5, -0.5, 1.0, 1.0)

@@ -1,26 +1,18 @@
-"""Which cameras have a point in their frame, and which can have one of a whole tile.
+"""The frame of one lens in its camera frame: what lies around it, and how its image moves.
 
-The frame of a central projection without distortion is a pyramid with its tip in the
-projection centre. Four planes bound it; a point is in the frame when it is on the inner side of
-all four.
-
-A distorted frame has curved sides, and the point has to be projected. Most tiles are spared
-that: those outside of a pyramid around the frame (of a cone, where the frame is too wide), and
-those whose middle falls so far from the border of the image that no ray of the tile can cross
-it. How far that is says the `scale` of the lens: no turn of a ray by an angle moves its image by
-more than `scale` times that angle, in the frame and within a `margin` around it.
+The border of the image is sent out through the lens, densely; where all of it is there, what it
+encloses is the frame, as a lens is used only where it is one to one.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 
-from pcfix.lens.frame_shapes import frame_shape
-from pcfix.lens.imaging import image_of, lens_table
-from pcfix.lens.places import (
+from pcfix.lens.formulas import (
     B2,
     B3,
     CENTRE_X,
@@ -29,16 +21,140 @@ from pcfix.lens.places import (
     FOCAL_X,
     FOCAL_Y,
     HEIGHT,
+    LARGEST_ANGLE,
     PLAIN,
     PRINCIPAL_X,
     PRINCIPAL_Y,
     TAIL,
     TANGENTIAL,
     WIDTH,
+    angle,
 )
+from pcfix.lens.imaging import coefficients, image_of, lens_table, project, unproject
+from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
-    from pcfix.model import Cameras, FloatArray, IntArray
+    from pcfix.model import Cameras, FloatArray, IntArray, Lens
+
+
+class FrameShape(NamedTuple):
+    """The frame of one lens, camera frame; see `Frames`."""
+
+    planes: FloatArray
+    distorted: bool
+    widest: float
+    reach: tuple[float, float]
+
+
+@lru_cache(maxsize=8192)
+def frame_shape(lens: Lens) -> FrameShape:
+    """Return the frame of a lens."""
+    if _is_a_pyramid(lens):
+        return FrameShape(_frame_planes(lens), distorted=False, widest=np.pi, reach=(np.inf, 0.0))
+    border = unproject(lens, _border(lens))
+    return FrameShape(
+        _planes_around(border),
+        distorted=True,
+        widest=_widest_angle(lens, border),
+        reach=_reach(lens) if np.isfinite(border).all() else (np.inf, 0.0),
+    )
+
+
+def _is_a_pyramid(lens: Lens) -> bool:
+    """Whether straight lines stay straight."""
+    brown = (*lens.radial, *lens.denominator, *lens.tangential, *lens.thin_prism)
+    return lens.projection == "perspective" and not any(brown)
+
+
+def _frame_planes(lens: Lens) -> FloatArray:
+    """Return the inward normals of the frame of a lens without distortion, shape (4, 3)."""
+    width, height = lens.width - lens.principal_x, lens.height - lens.principal_y
+    return np.array([
+        (lens.focal + lens.b1, lens.b2, lens.principal_x),
+        (-(lens.focal + lens.b1), -lens.b2, width),
+        (lens.b3, lens.focal, lens.principal_y),
+        (-lens.b3, -lens.focal, height),
+    ])  # fmt: skip
+
+
+BORDER = 400
+"""Points along each side of a frame; between neighbours it is taken to be nearly straight."""
+
+STEEPEST = np.cos(np.radians(80.0))
+"""A pyramid with flatter sides would be too long to be of use."""
+
+
+def _border(lens: Lens) -> FloatArray:
+    """Return points around the image, the first one again at the end."""
+    w, h = lens.width, lens.height
+    corners = np.array([(0.0, 0.0), (w, 0.0), (w, h), (0.0, h), (0.0, 0.0)])
+    share = np.linspace(0.0, 1.0, BORDER, endpoint=False)[:, None]
+    sides = [(1.0 - share) * corners[i] + share * corners[i + 1] for i in range(4)]
+    return np.vstack([*sides, corners[:1]])
+
+
+def _widest_step(points: FloatArray) -> float:
+    """Return the largest distance between neighbours; a curve strays less from its points."""
+    return float(np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1).max()))
+
+
+def _planes_around(border: FloatArray) -> FloatArray:
+    """Return a pyramid around the directions of the border, shape (4, 3)."""
+    if not (border[:, 2] > STEEPEST).all():
+        return np.zeros((4, 3))
+    flat = border[:, :2] / border[:, 2:]
+    step = _widest_step(flat)
+    (left, top), (right, bottom) = flat.min(axis=0) - step, flat.max(axis=0) + step
+    return np.array([
+        (1.0, 0.0, -left), (-1.0, 0.0, right), (0.0, 1.0, -top), (0.0, -1.0, bottom),
+    ])  # fmt: skip
+
+
+def _widest_angle(lens: Lens, border: FloatArray) -> float:
+    """Return an angle from the axis that no direction in the frame exceeds, radians."""
+    if np.isfinite(border).all():
+        widest = float(np.arccos(np.clip(border[:, 2].min(), -1.0, 1.0)))
+        return widest + 2.0 * _widest_step(border)
+    c = coefficients(lens)
+    widest = float(angle(c, c[DISC] + np.hypot(*lens.distortion_centre)))
+    if lens.inverse or np.isnan(widest):
+        widest = float(c[LARGEST_ANGLE])
+    return widest + 1e-6
+
+
+MARGIN = 0.1
+"""Of the longer side of the image."""
+
+_GRID = 41
+_SAFETY = 1.1  # the scale is smooth, and known at a grid of places
+
+
+def _reach(lens: Lens) -> tuple[float, float]:
+    """Return scale and margin; the margin is zero where part of it is beyond the fold."""
+    margin = MARGIN * max(lens.width, lens.height)
+    scale = _largest_scale(lens, margin)
+    if np.isfinite(scale):
+        return _SAFETY * scale, margin
+    return _SAFETY * _largest_scale(lens, 0.0), 0.0
+
+
+def _largest_scale(lens: Lens, margin: float) -> float:
+    """Return the largest derivative of the image by an angle; infinite if a place has none."""
+    u = np.linspace(-margin, lens.width + margin, _GRID)
+    v = np.linspace(-margin, lens.height + margin, _GRID)
+    d = unproject(lens, np.column_stack([np.repeat(u, _GRID), np.tile(v, _GRID)]))
+    side = np.cross(d, np.where(np.abs(d[:, :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    turn = 1e-6
+    by_side, by_other = (
+        (project(lens, d + turn * t) - project(lens, d - turn * t)) / (2.0 * turn)
+        for t in (side, np.cross(d, side))
+    )
+    squares = (by_side**2 + by_other**2).sum(axis=1)
+    det = by_side[:, 0] * by_other[:, 1] - by_side[:, 1] * by_other[:, 0]
+    longest = np.sqrt(0.5 * (squares + np.sqrt(np.maximum(squares**2 - 4.0 * det**2, 0.0))))
+    return np.inf if np.isnan(longest).any() else float(longest.max())
+
 
 Plane: TypeAlias = tuple[float, float, float]
 Pyramid: TypeAlias = tuple[Plane, Plane, Plane, Plane]
@@ -163,6 +279,16 @@ def holds(frames: Frames, c: int, ex: float, ey: float, ez: float) -> bool:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def mark_pyramid(
+    marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, centre: FloatArray, g: Pyramid
+) -> None:
+    """Set to 1 the marks of points in a frame without distortion, to 0 those of others."""
+    cx, cy, cz = centre[0], centre[1], centre[2]
+    for j in range(marks.size):
+        marks[j] = 1.0 if in_frame(g, cx - x[j], cy - y[j], cz - z[j]) else 0.0
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def mark(
     marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray,
     centre: FloatArray, frames: Frames, c: int,
@@ -265,3 +391,61 @@ def judge(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: Flo
     if within > move:
         return ALL
     return SOME if within >= -move or move >= margin else NOTHING
+
+
+BORDER_POINTS = 8
+"""On each side of a footprint: enough to show the curve of a distorted frame."""
+
+
+def cameras_in_sight(xyz: FloatArray, cameras: Cameras) -> IntArray:
+    """Return how many cameras have each point in their frame; nothing hides a point.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 3)
+        Metres, world frame.
+    cameras : Cameras
+
+    Returns
+    -------
+    array of int, shape (n,)
+    """
+    with one_caller():
+        return _count(np.ascontiguousarray(xyz), cameras.centres, frames_of(cameras))
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _count(xyz: FloatArray, centres: FloatArray, frames: Frames) -> IntArray:
+    counts = np.zeros(len(xyz), np.int64)
+    for i in prange(len(xyz)):
+        for c in range(len(centres)):
+            ex, ey, ez = centres[c, 0] - xyz[i, 0], centres[c, 1] - xyz[i, 1], 0.0
+            ez = centres[c, 2] - xyz[i, 2]
+            counts[i] += holds(frames, c, ex, ey, ez)
+    return counts
+
+
+def footprint(cameras: Cameras, row: int, height_m: float) -> FloatArray:
+    """Return the border of a frame on a level, shape (p, 2); NaN where it looks past it.
+
+    Parameters
+    ----------
+    cameras : Cameras
+        With rotations and lenses.
+    row : int
+    height_m : float
+        Of the level, world frame.
+    """
+    if cameras.rotations is None or cameras.lenses is None:
+        return np.zeros((0, 2))
+    lens = cameras.lenses[row]
+    t = np.linspace(0.0, 1.0, BORDER_POINTS, endpoint=False)
+    zero, one = np.zeros_like(t), np.ones_like(t)
+    u = np.concatenate([t, one, 1.0 - t, zero])
+    v = np.concatenate([zero, t, one, 1.0 - t])
+    rays = unproject(lens, np.column_stack([u * lens.width, v * lens.height]))
+    rays = rays @ cameras.rotations[row]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = (height_m - cameras.centres[row, 2]) / rays[:, 2]
+    reach = np.where(reach > 0.0, reach, np.nan)
+    return np.asarray(cameras.centres[row, :2] + reach[:, None] * rays[:, :2])

@@ -28,17 +28,17 @@ from pcfix.errors import SettingError
 from pcfix.lens.frames import frames_of, holds, no_frames
 from pcfix.model import Outcome, Views
 from pcfix.port.light import coefficients, cosine_at_port, ray_through, through_port
+from pcfix.refract.batch import Intersection
 from pcfix.refract.choice import ANY_NUMBER, TILE, near_cameras, spatial_order
 from pcfix.refract.methods import POINTS_AT_ONCE, joined
 from pcfix.refract.rays import line_terms, nearest_point
-from pcfix.refract.result import Intersection
 from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     from pcfix.lens.frames import Frames
     from pcfix.model import Cameras, FloatArray, IntArray
     from pcfix.options import Settings
-    from pcfix.port.faces import Vector
+    from pcfix.port.light import Vector
     from pcfix.port.shapes import Port
 
 _NO_CAMERA, _ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
@@ -168,7 +168,6 @@ def _with_rows(found: Intersection, part: Intersection, rows: IntArray) -> Inter
         values[name] = values[name].copy()
         values[name][rows] = getattr(part, name)
     values["camera_used"] = found.camera_used | part.camera_used
-    values["pairs_tested"] = found.pairs_tested + part.pairs_tested
     return Intersection(**values)
 
 
@@ -226,7 +225,6 @@ def intersect_rays(
         sigma_z_m=result[:, _SIGMA_Z],
         incidence_deg=np.where(moved, angle, 0.0),
         camera_used=used,
-        pairs_tested=len(views.camera),
     )
 
 

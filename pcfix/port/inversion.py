@@ -29,8 +29,7 @@ import numpy as np
 from numba import njit, prange
 
 from pcfix.errors import PcfixWarning
-from pcfix.lens.derivatives import image_and_gradients
-from pcfix.lens.imaging import lens_table
+from pcfix.lens.imaging import image_and_gradients, lens_table
 from pcfix.model import NOMINAL_FOCAL_PX, NOMINAL_WIDTH_PX, Lens, Outcome
 from pcfix.port.intersection import in_camera
 from pcfix.port.light import coefficients, through_port
@@ -41,7 +40,7 @@ if TYPE_CHECKING:
     from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Views
     from pcfix.options import Settings
     from pcfix.port.shapes import Port
-    from pcfix.refract.result import Intersection
+    from pcfix.refract.batch import Intersection
 
 MAX_STEPS = 30
 CLOSE_M = 1e-7

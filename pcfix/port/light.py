@@ -1,35 +1,279 @@
-"""The light through the port of a housing: from a point to its image, and back out.
-
-Everything is in the camera frame, with the projection centre as the origin: metres, x right, y
-down, z forward. Two questions are answered for each kind of port:
-
-`through_port`: a point in the water is given. In which direction w does its light come to the
-projection centre? A lens images the point where it images w. With the derivatives by the point and
-by the refractive index of the water, which a bundle adjustment needs.
-
-`ray_through`: a direction is given that the lens looks to. Where does that ray leave the port, and
-how does it go on through the water?
-
-The two are solved apart, the first by an equation in one unknown, the second by Snell's law at one
-face after the other, so that each proves the other right.
-"""
+"""A ray at the face of a port, in vectors of three numbers."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numba import njit
 
-from pcfix.port.dome import cosine_at_dome, ray_through_dome, through_dome
-from pcfix.port.faces import dot, unit
-from pcfix.port.flat import ray_through_flat, through_flat
 from pcfix.port.shapes import DomePort, FlatPort
 
 if TYPE_CHECKING:
     from pcfix.model import FloatArray
-    from pcfix.port.faces import Ray
     from pcfix.port.shapes import Port
+
+
+Vector: TypeAlias = tuple[float, float, float]
+Ray: TypeAlias = tuple[float, float, float, float, float, float]
+"""A place and a unit direction."""
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def dot(a: Vector, b: Vector) -> float:
+    """Return a.b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def unit(a: Vector) -> Vector:
+    """Return a vector of length 1; NaN for one without length."""
+    scale = 1.0 / np.sqrt(dot(a, a)) if dot(a, a) > 0.0 else np.nan
+    return scale * a[0], scale * a[1], scale * a[2]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def bent(s: Vector, normal: Vector, r: float) -> Vector:
+    """Return the unit direction behind a face: Snell's law in vector form.
+
+    Skarlatos & Agrafiotis 2018, eq 10, with the normal along the light instead of against it:
+    t = r s + (sqrt(1 - r^2 (1 - c^2)) - r c) N, c = N.s. NaN where all light is reflected.
+
+    Parameters
+    ----------
+    s, normal : Vector
+        Unit direction of the light; unit normal of the face, to the side it goes to.
+    r : float
+        Refractive index before the face by that behind it.
+    """
+    c = dot(normal, s)
+    k = np.sqrt(1.0 - r * r * (1.0 - c * c)) - r * c
+    return r * s[0] + k * normal[0], r * s[1] + k * normal[1], r * s[2] + k * normal[2]
+
+
+FLAT_STEPS = 60
+FLAT_CLOSE = 1e-8
+"""Of a step, relative; as each step squares the error, the next would be below rounding."""
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def through_flat(
+    normal: Vector, distance: float, thickness: float, glass: float, n: float,
+    point: Vector, out: FloatArray,
+) -> None:  # fmt: skip
+    """Find the direction of a point behind a flat port, as `pcfix.port.light.through_port`.
+
+    Of G(k, D, s.s, n) = 0, implicitly, with grad D = N and grad s.s = 2 s.
+    """
+    along = normal[0] * point[0] + normal[1] * point[1] + normal[2] * point[2]
+    aside = (
+        point[0] - along * normal[0],
+        point[1] - along * normal[1],
+        point[2] - along * normal[2],
+    )
+    aside2 = aside[0] * aside[0] + aside[1] * aside[1] + aside[2] * aside[2]
+    depth = along - distance - thickness
+    k = _slope(distance, thickness, depth, aside2, glass, n)
+    g2, n2, t2 = glass * glass, n * n, k * k * aside2
+    cube_g, root_n = np.sqrt(g2 + (g2 - 1.0) * t2) ** 3, np.sqrt(n2 + (n2 - 1.0) * t2)
+    cube_n = root_n * root_n * root_n
+    below = 1.0 / (distance + thickness * g2 / cube_g + depth * n2 / cube_n)
+    by_depth = -below * k / root_n
+    by_aside = below * k * k * k * (thickness * (g2 - 1.0) / cube_g + depth * (n2 - 1.0) / cube_n)
+    by_n = below * k * depth * n * (1.0 + t2) / cube_n
+    for i in range(3):
+        out[i, 0], out[i, 4] = normal[i] + k * aside[i], by_n * aside[i]
+        for j in range(3):
+            gradient = by_depth * normal[j] + by_aside * aside[j]
+            across = (1.0 if i == j else 0.0) - normal[i] * normal[j]
+            out[i, 1 + j] = k * across + aside[i] * gradient
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _slope(
+    distance: float, thickness: float, depth: float, aside2: float, glass: float, n: float
+) -> float:
+    """Solve G for k; NaN for a point that is not in the water, or out of reach of all light."""
+    if not depth > 0.0:
+        return np.nan
+    g2, n2 = glass * glass, n * n
+    a_g, a_n = (g2 - 1.0) * aside2, (n2 - 1.0) * aside2
+    k = 1.0 / (distance + thickness / glass + depth / n)
+    for _ in range(FLAT_STEPS):
+        k2 = k * k
+        root_g, root_n = np.sqrt(g2 + a_g * k2), np.sqrt(n2 + a_n * k2)
+        miss = 1.0 - k * (distance + thickness / root_g + depth / root_n)
+        step = miss / (distance + thickness * g2 / root_g**3 + depth * n2 / root_n**3)
+        k += step
+        if abs(step) <= FLAT_CLOSE * k:
+            return k
+    return np.nan
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def ray_through_flat(
+    normal: Vector, distance: float, thickness: float, glass: float, n: float, direction: Vector
+) -> Ray:
+    """Return the ray behind a flat port, as `pcfix.port.light.ray_through`."""
+    s = unit(direction)
+    steep = dot(normal, s)
+    inside = bent(s, normal, 1.0 / glass)
+    if not steep > 0.0:
+        inside = (np.nan, np.nan, np.nan)
+    f, h = distance / steep, thickness / dot(normal, inside)
+    t = bent(inside, normal, glass / n)
+    return (
+        f * s[0] + h * inside[0], f * s[1] + h * inside[1], f * s[2] + h * inside[2],
+        t[0], t[1], t[2],
+    )  # fmt: skip
+
+
+DOME_STEPS = 100
+DOME_CLOSE = 1e-9
+"""Of a step of q, relative to 1 / a; as each step squares the error, the next would be below
+rounding."""
+SERIES_UP_TO = 0.01
+"""Beyond, the closed form of the derivative loses two digits at most."""
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def turn(y: float, u: float) -> tuple[float, float, float]:
+    """Return asin(y sqrt(u)) / sqrt(u), which is a series in u, and its derivatives by y and u."""
+    z = y * y * u
+    root = np.sqrt(1.0 - z)
+    if z < SERIES_UP_TO:
+        high = 35 / 1152 + z * (63 / 2816 + z * 231 / 13312)
+        s = 1.0 + z * (1 / 6 + z * (3 / 40 + z * (5 / 112 + z * high)))
+        high = 35 / 288 + z * (315 / 2816 + z * 693 / 6656)
+        by_z = 1 / 6 + z * (3 / 20 + z * (15 / 112 + z * high))
+    else:
+        s = np.arcsin(np.sqrt(z)) / np.sqrt(z)
+        by_z = 0.5 * (1.0 / root - s) / z
+    return y * s, 1.0 / root, y * y * y * by_z
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _miss(
+    q: float, v: float, u: float, far: float, a: float, b: float, glass: float, n: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return by how much the two sides differ at q, and its derivatives by q, v, u, R and n."""
+    cosine = np.sqrt(1.0 - q * q * u)
+    cosine_q, cosine_u = -q * u / cosine, -0.5 * q * q / cosine
+    length2 = a * a + v * v + u - 2.0 * a * (v * cosine + q * u)
+    scale = a / np.sqrt(length2)
+    lean = cosine - q * v
+    p = scale * lean  # by |o across|
+    half = a * p / length2
+    p_q = scale * (cosine_q - v) + half * (v * cosine_q + u)
+    p_u = scale * cosine_u + half * (v * cosine_u + q)
+    p_v = -scale * q + half * cosine
+    in_1, in_1p, in_1u = turn(p / (glass * a), u)
+    in_2, in_2p, in_2u = turn(p / (glass * b), u)
+    out_1, out_1p, out_1u = turn(p / (n * b), u)
+    out_2, out_2p, out_2u = turn(p / (n * far), u)
+    left, left_q, left_u = turn(q, u)
+    total = left - (in_1 - in_2) - (out_1 - out_2)
+    by_p = (in_1p / a - in_2p / b) / glass + (out_1p / b - out_2p / far) / n
+    by_u = left_u - (in_1u - in_2u) - (out_1u - out_2u)
+    by_far = -p * out_2p / (n * far * far)
+    by_n = p * (out_1p / b - out_2p / far) / (n * n)
+    return total, left_q - by_p * p_q, -by_p * p_v, by_u - by_p * p_u, by_far, by_n
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _place(v: float, u: float, far: float, a: float, b: float, glass: float, n: float) -> float:
+    """Solve for q: Newton's method, and halving where it would leave the bracket."""
+    # where the straight line from o to X meets the inner sphere
+    run2 = (far - v) ** 2 + u
+    part = v * v + u - v * far
+    t = (part + np.sqrt(part * part + run2 * (a * a - v * v - u))) / run2
+    low, high = 0.0, (1.0 - t) / a
+    q = high
+    for _ in range(DOME_STEPS):
+        miss, slope = _miss(q, v, u, far, a, b, glass, n)[:2]
+        if miss > 0.0:
+            high = q
+        else:
+            low = q
+        new = q - miss / slope
+        if not low <= new <= high:
+            new = 0.5 * (low + high)
+        step, q = new - q, new
+        if abs(step) * a <= DOME_CLOSE:
+            break
+    return q
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def through_dome(
+    centre: Vector, a: float, thickness: float, glass: float, n: float,
+    point: Vector, out: FloatArray,
+) -> None:  # fmt: skip
+    """Find the direction of a point behind a dome, as `pcfix.port.light.through_port`.
+
+    Implicitly, with grad R = e, grad v = (o - v e) / R and grad u = -2 v grad v.
+    """
+    b = a + thickness
+    x = point[0] - centre[0], point[1] - centre[1], point[2] - centre[2]
+    far = np.sqrt(dot(x, x))
+    if not far > b:
+        out[:] = np.nan
+        return
+    e = unit(x)
+    o = -centre[0], -centre[1], -centre[2]
+    v = dot(o, e)
+    across = o[0] - v * e[0], o[1] - v * e[1], o[2] - v * e[2]
+    u = dot(across, across)
+    q = _place(v, u, far, a, b, glass, n)
+    _, by_q, by_v, by_u, by_far, by_n = _miss(q, v, u, far, a, b, glass, n)
+    cosine = np.sqrt(1.0 - q * q * u)
+    lean = a * (cosine - q * v)
+    q_n = -by_n / by_q
+    lean_q = a * (-q * u / cosine - v)
+    for i in range(3):
+        out[i, 0] = lean * e[i] + (a * q - 1.0) * o[i]
+        out[i, 4] = (lean_q * e[i] + a * o[i]) * q_n
+    for j in range(3):
+        v_j = across[j] / far
+        u_j = -2.0 * v * v_j
+        q_j = -(by_v * v_j + by_u * u_j + by_far * e[j]) / by_q
+        lean_j = lean_q * q_j - a * q * (0.5 * q * u_j / cosine + v_j)
+        for i in range(3):
+            turned = (1.0 if i == j else 0.0) - e[i] * e[j]
+            out[i, 1 + j] = e[i] * lean_j + lean * turned / far + a * o[i] * q_j
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def ray_through_dome(
+    centre: Vector, a: float, thickness: float, glass: float, n: float, direction: Vector
+) -> Ray:
+    """Return the ray behind a dome, as `pcfix.port.light.ray_through`."""
+    o = -centre[0], -centre[1], -centre[2]
+    s = unit(direction)
+    inner = _meet(o, s, a)
+    inside = bent(s, unit(inner), 1.0 / glass)
+    outer = _meet(inner, inside, a + thickness)
+    t = bent(inside, unit(outer), glass / n)
+    return (
+        outer[0] + centre[0], outer[1] + centre[1], outer[2] + centre[2], t[0], t[1], t[2],
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _meet(start: Vector, s: Vector, radius: float) -> Vector:
+    """Return where a ray that starts inside a sphere about the origin, or on it, leaves it."""
+    along = dot(start, s)
+    f = -along + np.sqrt(along * along + max(radius * radius - dot(start, start), 0.0))
+    return start[0] + f * s[0], start[1] + f * s[1], start[2] + f * s[2]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def cosine_at_dome(centre: Vector, a: float, direction: Vector) -> float:
+    """Return the cosine of the angle at which a ray from the projection centre meets a dome."""
+    o = -centre[0], -centre[1], -centre[2]
+    s = unit(direction)
+    return dot(s, unit(_meet(o, s, a)))
+
 
 KIND, X, Y, Z, SIZE, THICK, GLASS = range(7)
 FLAT, DOME = 0.0, 1.0

@@ -5,7 +5,7 @@ Points are worked on in tiles of neighbours, so that a tile needs to look at few
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -19,19 +19,19 @@ from pcfix.lens.frames import (
     may_hold,
     no_frames,
 )
-from pcfix.model import Views, WaterMesh, WaterRaster
-from pcfix.refract.piercing import pierce_mesh, pierce_raster
+from pcfix.model import NOMINAL_FOCAL_PX, Views, WaterMesh, WaterPlane, WaterRaster
+from pcfix.options import Settings
+from pcfix.refract.batch import Batch, Survey
+from pcfix.refract.rays import pierce_mesh, pierce_raster
 from pcfix.threads import one_caller
-from pcfix.water.raster import build_field
-from pcfix.water.tin import build_tin, locate
+from pcfix.water.surface import SurfaceAbove, build_field, build_tin, locate
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from pcfix.lens.frames import Frames
     from pcfix.model import Cameras, FloatArray, IntArray, WaterSurface
-    from pcfix.options import Settings
-    from pcfix.water.raster import Field
-    from pcfix.water.surface import SurfaceAbove
-    from pcfix.water.tin import Tin
+    from pcfix.water.surface import Field, Tin
 
 TILE = 128
 """Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""
@@ -41,88 +41,184 @@ ANY_NUMBER = 2**31
 """A list may name a camera twice, so that there can be more entries than cameras."""
 
 
-def chosen_views(
-    xyz: FloatArray,
-    surface: SurfaceAbove,
-    water: WaterSurface,
-    cameras: Cameras,
-    settings: Settings,
-    views: Views | None = None,
-    level_offset_m: FloatArray | None = None,
-) -> Views:
+class Points(NamedTuple):
+    """Points and the water above them, for kernels; see `Batch`.
+
+    `order` brings neighbours together. Kernels that run in parallel take flat tuples of arrays
+    like this one; numba has no place for tuples within tuples there.
+    """
+
+    order: IntArray
+    xyz: FloatArray
+    height: FloatArray
+    slope: FloatArray
+
+
+class Rig(NamedTuple):
+    """The k cameras, for kernels.
+
+    Attributes
+    ----------
+    centres : array, shape (k, 3)
+        Projection centres, metres, world frame.
+    offset : array, shape (k,)
+        How much higher the water stood for each, metres.
+    axes : array, shape (k, 3)
+        Optical axes, world frame. Zeros stand for an image in which equal angles are equally long,
+        as in a fisheye's, nearly.
+    focal_px : array, shape (k,)
+    """
+
+    centres: FloatArray
+    offset: FloatArray
+    axes: FloatArray
+    focal_px: FloatArray
+
+
+class Rule(NamedTuple):
+    """Which rays count, and how they bend.
+
+    The square of the cosine of the largest incidence angle, the most rays of a point, 1 / n.
+    """
+
+    least_cosine2: float
+    most: int
+    bend: float
+
+
+def points_of(batch: Batch) -> Points:
+    """Return the points of a batch for kernels."""
+    return Points(
+        spatial_order(batch.xyz),
+        np.ascontiguousarray(batch.xyz),
+        np.ascontiguousarray(batch.surface.height_m),
+        np.ascontiguousarray(batch.surface.slope),
+    )
+
+
+def rig_of(survey: Survey) -> Rig:
+    """Return the cameras for kernels."""
+    cameras = survey.cameras
+    axes, focal = np.zeros((len(cameras), 3)), np.full(len(cameras), NOMINAL_FOCAL_PX)
+    if cameras.lenses is not None and cameras.rotations is not None:
+        flat = np.array([lens.projection == "perspective" for lens in cameras.lenses])
+        axes[flat] = cameras.rotations[flat, 2]
+        focal = np.array([lens.focal_px for lens in cameras.lenses])
+    return Rig(np.ascontiguousarray(cameras.centres), survey.offset_m, axes, focal)
+
+
+def rule_of(survey: Survey) -> Rule:
+    """Return the rule for kernels."""
+    settings = survey.settings
+    limit = settings.max_angle_deg
+    if limit is None and survey.cameras.lenses is None:
+        limit = MAX_ANGLE_WITHOUT_FRAMES_DEG
+    least = 0.0 if limit is None else float(np.cos(np.radians(limit)) ** 2)
+    return Rule(least, settings.max_cameras or ANY_NUMBER, 1.0 / settings.refractive_index)
+
+
+def shapes_of(water: WaterSurface) -> tuple[Tin | None, Field | None]:
+    """Return a mesh or raster for kernels; of another surface neither."""
+    return (
+        build_tin(water) if isinstance(water, WaterMesh) else None,
+        build_field(water) if isinstance(water, WaterRaster) else None,
+    )
+
+
+def chosen_views(batch: Batch) -> Views:
     """Return the cameras whose rays each point gets, as a list.
 
-    Parameters
-    ----------
-    xyz, surface, water, cameras, settings, views, level_offset_m
-        As of `pcfix.refract.intersect.intersect`.
+    Those of the list of the batch, or, without one, all in whose frame the point lies.
 
     Returns
     -------
     Views
-        In the order of the cameras, or of `views`; its weights are kept.
+        In the order of the cameras, or of the list; its weights are kept.
     """
-    order = spatial_order(xyz)
-    tiles = (len(xyz) + TILE - 1) // TILE
-    count = np.zeros(len(xyz) + 1, np.int64)
-    entries = None if views is None else (views.start, views.camera)
-    common = (
-        order,
-        np.ascontiguousarray(xyz),
-        np.ascontiguousarray(surface.height_m),
-        np.ascontiguousarray(surface.slope),
-        np.ascontiguousarray(cameras.centres),
-        np.zeros(len(cameras)) if level_offset_m is None else level_offset_m,
-        frames_of(cameras) if views is None else no_frames(len(cameras)),
-        least_cosine2(settings, cameras),
-        settings.max_cameras or ANY_NUMBER,
-        tiles,
-        build_tin(water) if isinstance(water, WaterMesh) else None,
-        build_field(water) if isinstance(water, WaterRaster) else None,
-        entries,
-    )
-    with one_caller():
-        _list_cameras(*common, count, np.zeros(0, np.int64), False)
-        start = np.cumsum(count)
-        place = np.empty(start[-1], np.int64)
-        _list_cameras(*common, start, place, True)
+    survey, views = batch.survey, batch.views
+    points, rig = points_of(batch), rig_of(survey)
+    frames = no_frames(len(survey.cameras))
     if views is None:
-        return Views(start, place)
-    weight = None if views.weight is None else views.weight[place]
-    return Views(start, np.asarray(views.camera)[place], weight, views.kind)
+        frames = frames_of(survey.cameras)
+    tiles = (len(batch) + TILE - 1) // TILE
+    first, count = np.zeros(tiles + 1, np.int64), np.zeros(len(batch) + 1, np.int64)
+    with one_caller():
+        if views is None:
+            _make_room(points, rig, frames, first)
+            begin, entries = np.empty(len(batch), np.int64), None
+            place = np.empty(np.cumsum(first, out=first)[-1], np.int32)
+        else:
+            begin, entries = np.array(views.start[:-1], np.int64), (views.start, views.camera)
+            place = np.empty(len(views.camera), np.int32)
+        _choose_all(
+            points, rig, frames, rule_of(survey), *shapes_of(survey.water), entries, first,
+            (begin, count, place),
+        )  # fmt: skip
+        start = np.cumsum(count)
+        chosen = _gathered(begin, start, place)
+    if views is None:
+        return Views(start, chosen)
+    weight = None if views.weight is None else views.weight[chosen]
+    return Views(start, np.asarray(views.camera)[chosen], weight, views.kind)
+
+
+def views_in_frame(xyz: FloatArray, cameras: Cameras) -> Views:
+    """Return the cameras whose frame holds each point, shape (m, 3), above the water or below."""
+    xyz = np.ascontiguousarray(xyz)
+    at_themselves = SurfaceAbove(xyz[:, 2].copy(), np.zeros((len(xyz), 2)))
+    return chosen_views(Batch(xyz, at_themselves, Survey(WaterPlane(0.0), cameras, Settings())))
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def _list_cameras(
-    order: IntArray, xyz: FloatArray, surface: FloatArray, slope: FloatArray,
-    centres: FloatArray, offset: FloatArray, frames: Frames, least_cosine2: float, most: int,
-    tiles: int, tin: Tin | None, field: Field | None, views: tuple[IntArray, IntArray] | None,
-    start: IntArray, place: IntArray, fill: bool,
-) -> None:  # fmt: skip
-    """Count the cameras of point i into ``start[i + 1]``, or fill their places from ``start[i]``.
+def _make_room(points: Points, rig: Rig, frames: Frames, first: IntArray) -> None:
+    """Set for each tile, one place on, how many entries it may get."""
+    for t in prange(first.size - 1):
+        rows = points.order[t * TILE : (t + 1) * TILE]
+        low, high = gather(np.empty(7 * TILE), rows, points)
+        first[t + 1] = rows.size * near_cameras(frames, rig.centres, low, high).size
 
-    A place is the number of a camera, or that of an entry of the views.
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _choose_all(
+    points: Points, rig: Rig, frames: Frames, rule: Rule, tin: Tin | None, field: Field | None,
+    views: tuple[IntArray, IntArray] | None, first: IntArray,
+    found: tuple[IntArray, IntArray, npt.NDArray[np.int32]],
+) -> None:  # fmt: skip
+    """Fill in where the entries of point i begin, how many they are (at i + 1), and the entries.
+
+    An entry is the number of a camera, or that of an entry of the views.
     """
-    for t in prange(tiles):
-        rows = order[t * TILE : (t + 1) * TILE]
+    begin, count, place = found
+    for t in prange(first.size - 1):
+        rows = points.order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
-        low, high = gather(tile, rows, xyz, surface, slope)
-        near = near_cameras(frames, centres, low, high)
+        low, high = gather(tile, rows, points)
+        near = near_cameras(frames, rig.centres, low, high)
+        free = first[t]
         for j in range(rows.size):
             i = rows[j]
             facet = -1 if tin is None else locate(tin, tile[j], tile[TILE + j])
-            candidates, first = near, 0
+            candidates = near
             if views is not None:
-                first = views[0][i]
-                candidates = views[1][first : views[0][i + 1]].astype(np.int64)
-            kept = choose(
-                candidates, tile, j, centres, offset, frames, least_cosine2, most, tin, field, facet
-            )
-            if not fill:
-                start[i + 1] = kept.size
-            for k in range(kept.size if fill else 0):
+                candidates = views[1][begin[i] : views[0][i + 1]].astype(np.int64)
+            else:
+                begin[i] = free
+            kept = choose(candidates, tile, j, rig, frames, rule, tin, field, facet)
+            for k in range(kept.size):
                 at = kept[k]
-                place[start[i] + k] = first + at if views is not None else candidates[at]
+                place[begin[i] + k] = begin[i] + at if views is not None else candidates[at]
+            count[i + 1] = kept.size
+            free += kept.size
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _gathered(begin: IntArray, start: IntArray, place: npt.NDArray[np.int32]) -> IntArray:
+    """Return the entries of all points one after the other."""
+    chosen = np.empty(start[-1], np.int64)
+    for i in prange(begin.size):
+        for k in range(start[i + 1] - start[i]):
+            chosen[start[i] + k] = place[begin[i] + k]
+    return chosen
 
 
 def spatial_order(xyz: FloatArray) -> IntArray:
@@ -166,29 +262,19 @@ MAX_ANGLE_WITHOUT_FRAMES_DEG = 80.0
 block in another CRS is told apart."""
 
 
-def least_cosine2(settings: Settings, cameras: Cameras) -> float:
-    """Return the square of the cosine of the largest incidence angle."""
-    limit = settings.max_angle_deg
-    if limit is None and cameras.lenses is None:
-        limit = MAX_ANGLE_WITHOUT_FRAMES_DEG
-    return 0.0 if limit is None else float(np.cos(np.radians(limit)) ** 2)
-
-
 @njit(cache=True, error_model="numpy", nogil=True)
-def gather(
-    tile: FloatArray, order: IntArray, xyz: FloatArray, surface: FloatArray, slope: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def gather(tile: FloatArray, rows: IntArray, points: Points) -> tuple[FloatArray, FloatArray]:
     """Bring a tile together: runs of x, y, z, surface height and unit normal; return its box."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for j in range(order.size):
-        i = order[j]
+    for j in range(rows.size):
+        i = rows[j]
         for axis in range(3):
-            value = xyz[i, axis]
+            value = points.xyz[i, axis]
             tile[axis * TILE + j] = value
             low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
-        b, c = slope[i, 0], slope[i, 1]
+        b, c = points.slope[i, 0], points.slope[i, 1]
         up = 1.0 / np.sqrt(1.0 + b * b + c * c)
-        tile[3 * TILE + j] = surface[i]
+        tile[3 * TILE + j] = points.height[i]
         tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j] = -b * up, -c * up, up
     return low, high
 
@@ -224,30 +310,30 @@ def near_cameras(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def choose(
-    candidates: IntArray, tile: FloatArray, j: int, centres: FloatArray, offset: FloatArray,
-    frames: Frames, least_cosine2: float, most: int,
+    candidates: IntArray, tile: FloatArray, j: int, rig: Rig, frames: Frames, rule: Rule,
     tin: Tin | None, field: Field | None, facet: int,
 ) -> IntArray:  # fmt: skip
     """Return which of the candidates give a ray to a point of the tile, in their order.
 
     On a mesh or raster the incidence angle is that where the ray pierces it.
     """
+    centres, least_cosine2, most = rig.centres, rule.least_cosine2, rule.most
     chosen = np.empty(candidates.size, np.int64)
     cosine2 = np.empty(candidates.size)
-    some_only = least_cosine2 > 0.0 or most < candidates.size
+    is_limited = least_cosine2 > 0.0 or most < candidates.size
     k = 0
     for at in range(candidates.size):
         c = candidates[at]
         px, py, pz = tile[j], tile[TILE + j], tile[2 * TILE + j]
         ex, ey, ez = centres[c, 0] - px, centres[c, 1] - py, centres[c, 2] - pz
         nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-        lowered = pz - offset[c]
+        lowered = pz - rig.offset[c]
         h = nz * (tile[3 * TILE + j] - lowered)
         height = nx * ex + ny * ey + nz * ez
         length2 = ex * ex + ey * ey + ez * ez
         if not (height > h and holds(frames, c, ex, ey, ez)):
             continue
-        if h > 0.0 and some_only and (tin is not None or field is not None):
+        if h > 0.0 and is_limited and (tin is not None or field is not None):
             if tin is not None:
                 _, nx, ny, nz = pierce_mesh(tin, px, py, lowered, ex, ey, ez, facet)
             if field is not None:

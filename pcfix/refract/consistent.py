@@ -6,7 +6,7 @@ with the least squared residuals in the images, over straight rays:
     F(Q) = argmin_P  sum_i \|x_i(Q) - pi_i(P)\|^2
 
 with pi_i the projection of camera i, distortion included, and x_i(Q) = pi_i(A_i) the image of the
-point where the light from Q to that camera leaves the water (`pcfix.refract.backward`). P is known
+point where the light from Q to that camera leaves the water (`pcfix.refract.rays`). P is known
 and Q is looked for, so that nothing need be triangulated: at the least the derivative is zero,
 
     g(Q) = sum_i J_i' (x_i(Q) - pi_i(P)) = 0,    J_i = d pi_i / d P
@@ -32,22 +32,26 @@ import numpy as np
 from numba import njit, prange
 
 from pcfix.errors import PcfixWarning, SettingError
-from pcfix.lens.derivatives import image_and_gradients
-from pcfix.lens.imaging import image_of, lens_table
+from pcfix.lens.imaging import image_and_gradients, image_of, lens_table
 from pcfix.model import Outcome, WaterMesh, WaterRaster
-from pcfix.refract.backward import light_path, settle, slope_of_path
-from pcfix.refract.piercing import pierce_mesh, pierce_raster
-from pcfix.refract.rays import line_terms, nearest_point, refracted
-from pcfix.refract.result import Intersection
+from pcfix.refract.batch import Intersection
+from pcfix.refract.rays import (
+    light_path,
+    line_terms,
+    nearest_point,
+    pierce_mesh,
+    pierce_raster,
+    refracted,
+    settle,
+    slope_of_path,
+)
 from pcfix.threads import one_caller
-from pcfix.water.raster import build_field
-from pcfix.water.tin import build_tin, locate
+from pcfix.water.surface import build_field, build_tin, locate
 
 if TYPE_CHECKING:
     from pcfix.model import Cameras, FloatArray, IntArray
-    from pcfix.refract.bundles import Bundle
-    from pcfix.water.raster import Field
-    from pcfix.water.tin import Tin
+    from pcfix.refract.batch import Batch
+    from pcfix.water.surface import Field, Tin
 
 MAX_STEPS = 30
 CLOSE_M = 1e-7
@@ -85,12 +89,12 @@ def check_consistent(cameras: Cameras) -> None:
         )
 
 
-def consistent(bundle: Bundle) -> Intersection:
+def consistent(batch: Batch) -> Intersection:
     """Correct points so that straight rays to the true ones' images meet in the apparent ones.
 
     Parameters
     ----------
-    bundle : Bundle
+    batch : Batch
         Its cameras need angles and lenses. Weights of its views are not used: software
         triangulates with all residuals alike.
 
@@ -113,8 +117,8 @@ def consistent(bundle: Bundle) -> Intersection:
         Of points for which no true point was found; they get the solution of `snell`. That
         happens under waves that focus the light.
     """
-    check_consistent(bundle.cameras)
-    result = _solved(bundle)
+    check_consistent(batch.survey.cameras)
+    result = _solved(batch)
     outcome = result[:, _OUTCOME].astype(np.uint8)
     moved = outcome == Outcome.CORRECTED
     lost = int((moved & (result[:, _FOUND] == 0.0)).sum())
@@ -129,33 +133,32 @@ def consistent(bundle: Bundle) -> Intersection:
     return Intersection(
         shift_m=result[:, :3],
         outcome=outcome,
-        ray_count=np.where(moved, bundle.counts, 0).astype(np.int32),
+        ray_count=np.where(moved, batch.counts, 0).astype(np.int32),
         ray_miss_m=result[:, _MISS],
         sigma_z_m=result[:, _SIGMA_Z],
         incidence_deg=np.where(moved, angle, 0.0),
-        camera_used=bundle.camera_used(moved),
-        pairs_tested=len(bundle.views.camera),
+        camera_used=batch.camera_used(moved),
     )
 
 
-def _solved(bundle: Bundle) -> FloatArray:
+def _solved(batch: Batch) -> FloatArray:
     """Return the rows of the kernel, one per point."""
-    cameras, water = bundle.cameras, bundle.water
+    cameras, water = batch.survey.cameras, batch.survey.water
     row, table = lens_table(cameras.lenses or ())
-    result = np.zeros((len(bundle.xyz), 8))
+    result = np.zeros((len(batch.xyz), 8))
     with one_caller():
         _correct(
-            np.ascontiguousarray(bundle.xyz),
-            np.ascontiguousarray(bundle.surface.height_m),
-            np.ascontiguousarray(bundle.surface.slope),
-            np.ascontiguousarray(bundle.views.start, np.int64),
-            np.ascontiguousarray(bundle.views.camera, np.int64),
+            np.ascontiguousarray(batch.xyz),
+            np.ascontiguousarray(batch.surface.height_m),
+            np.ascontiguousarray(batch.surface.slope),
+            np.ascontiguousarray(batch.rays.start, np.int64),
+            np.ascontiguousarray(batch.rays.camera, np.int64),
             np.ascontiguousarray(cameras.centres),
             np.ascontiguousarray(cameras.rotations, np.float64),
-            np.ascontiguousarray(bundle.level_offset_m, np.float64),
+            np.ascontiguousarray(batch.survey.offset_m, np.float64),
             row,
             table,
-            bundle.settings.refractive_index,
+            batch.survey.settings.refractive_index,
             build_tin(water) if isinstance(water, WaterMesh) else None,
             build_field(water) if isinstance(water, WaterRaster) else None,
             result,

@@ -31,17 +31,15 @@ from numba import njit, prange
 
 from pcfix.lens.frames import holds
 from pcfix.model import Outcome
-from pcfix.refract.backward import light_path
-from pcfix.refract.made_with import Images, as_made, as_now, images_of
+from pcfix.refract.batch import Images, as_made, as_now, images_of
 from pcfix.refract.matcher import Matcher
-from pcfix.refract.rays import refracted
+from pcfix.refract.rays import light_path, refracted
 from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     from pcfix.lens.frames import Frames
     from pcfix.model import FloatArray, IntArray
-    from pcfix.refract.bundles import Bundle
-    from pcfix.refract.result import Intersection
+    from pcfix.refract.batch import Batch, Intersection
 
 MAX_LOOKS = 5
 CLOSE_M = 0.002
@@ -60,14 +58,14 @@ COLUMNS = 7
 """Of what the kernels write: the shift, and these."""
 
 
-def invert_depth_maps(bundle: Bundle) -> Intersection:
+def invert_depth_maps(batch: Batch) -> Intersection:
     """Return the true points from which dense matching would have made the apparent ones.
 
     Parameters
     ----------
-    bundle : Bundle
+    batch : Batch
         Its views are the images whose depth maps were fused, with their weights;
-        `bundle.learned.matcher` says how they were matched.
+        `batch.survey.learned.matcher` says how they were matched.
 
     Returns
     -------
@@ -77,15 +75,15 @@ def invert_depth_maps(bundle: Bundle) -> Intersection:
     -----
     The surface above each point is taken as a plane.
     """
-    weights = bundle.views.weight
-    result = np.zeros((len(bundle.xyz), COLUMNS))
+    weights = batch.rays.weight
+    result = np.zeros((len(batch.xyz), COLUMNS))
     with one_caller():
         _invert(
-            *arrays_of(bundle),
+            *arrays_of(batch),
             np.zeros(0) if weights is None else weights.astype(np.float64),
             result,
         )
-    return intersection_of(bundle, result)
+    return intersection_of(batch, result)
 
 
 class Sight(NamedTuple):
@@ -125,33 +123,33 @@ def sight_of(
     return Sight(up, made, above, normal, n)
 
 
-def arrays_of(bundle: Bundle) -> tuple[Any, ...]:
-    """Return what the kernels take of a bundle."""
-    matcher = bundle.learned.matcher
+def arrays_of(batch: Batch) -> tuple[Any, ...]:
+    """Return what the kernels take of a batch."""
+    matcher = batch.survey.learned.matcher
     if matcher is None:
         raise ValueError("a model of the matcher is needed")
-    made_xyz = bundle.xyz if bundle.made_with is None else bundle.made_with.xyz
+    made_xyz = batch.xyz if batch.made_with is None else batch.made_with.xyz
     return (
-        np.ascontiguousarray(bundle.xyz),
+        np.ascontiguousarray(batch.xyz),
         np.ascontiguousarray(made_xyz),
-        np.ascontiguousarray(bundle.surface.height_m),
-        bundle.normals(),
-        np.ascontiguousarray(bundle.cameras.centres),
-        bundle.level_offset_m,
-        images_of(bundle.made_with, bundle.cameras),
+        np.ascontiguousarray(batch.surface.height_m),
+        batch.normals(),
+        np.ascontiguousarray(batch.survey.cameras.centres),
+        batch.survey.offset_m,
+        images_of(batch.made_with, batch.survey.cameras),
         *matcher,
-        bundle.views.start,
-        np.asarray(bundle.views.camera, np.int64),
-        bundle.settings.refractive_index,
+        batch.rays.start,
+        np.asarray(batch.rays.camera, np.int64),
+        batch.survey.settings.refractive_index,
     )
 
 
-def intersection_of(bundle: Bundle, result: FloatArray) -> Intersection:
+def intersection_of(batch: Batch, result: FloatArray) -> Intersection:
     """Return the rows that the kernels wrote as a result; its `sigma_z_m` is the ambiguity.
 
     The rays are those of the depth maps that count, averaged ones included.
     """
-    found = bundle.result(
+    found = batch.result(
         result[:, :3],
         outcome=result[:, OUTCOME].astype(np.uint8),
         ray_miss_m=result[:, _MISS],

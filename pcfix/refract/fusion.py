@@ -9,7 +9,7 @@ For each image that sees the point the model fuses what would agree with it as t
 at which height the bed would lie if that group had made the point: the likely beds. Neighbouring
 points are of different groups, and only the true bed is among the likely ones of all; so the
 height that most points around can have come from, the bed of the surroundings
-(`pcfix.refract.bed`), tells which group made each of them.
+(`pcfix.refract.matcher`), tells which group made each of them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit, prange
 
-from pcfix.refract.bed import WIDTH_M
 from pcfix.refract.depth_maps import (
     AMBIGUITY,
     COLUMNS,
@@ -31,15 +30,13 @@ from pcfix.refract.depth_maps import (
     settle_bed,
     sight_of,
 )
-from pcfix.refract.matcher import Matcher
+from pcfix.refract.matcher import WIDTH_M, Matcher
 from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     from pcfix.lens.frames import Frames
     from pcfix.model import FloatArray, IntArray
-    from pcfix.refract.bundles import Bundle
-    from pcfix.refract.made_with import Images
-    from pcfix.refract.result import Intersection
+    from pcfix.refract.batch import Batch, Images, Intersection
 
 AGREE = 0.01
 """Depths that differ by less, relative, are fused."""
@@ -49,28 +46,28 @@ CLOSE_M = 2e-3
 _BLOCK = 64
 
 
-def invert_fusion(bundle: Bundle) -> Intersection:
+def invert_fusion(batch: Batch) -> Intersection:
     """Return the true points from which fused depth maps would have made the apparent ones.
 
     Parameters
     ----------
-    bundle : Bundle
-        Its views are all images that see each point. `bundle.learned` has the matcher and, if
+    batch : Batch
+        Its views are all images that see each point. `batch.survey.learned` has the matcher and, if
         it was learned, the bed of the surroundings; without it the largest group made the point.
 
     Returns
     -------
     Intersection
     """
-    bed = bundle.learned.bed
-    around = np.full(len(bundle.xyz), np.nan) if bed is None else bed.height_at(bundle.xyz[:, :2])
-    result = np.zeros((len(bundle.xyz), COLUMNS))
+    bed = batch.survey.learned.bed
+    around = np.full(len(batch.xyz), np.nan) if bed is None else bed.height_at(batch.xyz[:, :2])
+    result = np.zeros((len(batch.xyz), COLUMNS))
     with one_caller():
-        _invert(*arrays_of(bundle), around, result)
-    return intersection_of(bundle, result)
+        _invert(*arrays_of(batch), around, result)
+    return intersection_of(batch, result)
 
 
-def likely_beds(bundle: Bundle) -> FloatArray:
+def likely_beds(batch: Batch) -> FloatArray:
     """Return the heights of the bed that different groups of images would have made points of.
 
     Returns
@@ -78,9 +75,9 @@ def likely_beds(bundle: Bundle) -> FloatArray:
     array of float32, shape (m, most views)
         Relative to each apparent point, metres; NaN where there is none.
     """
-    likely = np.full((len(bundle.xyz), max(1, bundle.counts.max(initial=0))), np.nan, np.float32)
+    likely = np.full((len(batch.xyz), max(1, batch.counts.max(initial=0))), np.nan, np.float32)
     with one_caller():
-        _likely(*arrays_of(bundle), likely)
+        _likely(*arrays_of(batch), likely)
     return likely
 
 

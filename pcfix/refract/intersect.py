@@ -24,113 +24,84 @@ from pcfix.lens.frames import (
     NOTHING,
     SOME,
     frames_of,
-    in_frame,
     judge,
     mark,
+    mark_pyramid,
     may_hold,
-    no_frames,
     pyramid,
 )
-from pcfix.model import Outcome, WaterMesh, WaterRaster
-from pcfix.refract.choice import (
-    ANY_NUMBER,
-    TILE,
-    choose,
-    gather,
-    least_cosine2,
-    near_cameras,
-    spatial_order,
+from pcfix.model import Outcome
+from pcfix.refract.batch import Intersection
+from pcfix.refract.choice import TILE, gather, points_of, rig_of, rule_of, shapes_of
+from pcfix.refract.rays import line_terms, nearest_point, pierce_mesh, pierce_raster, refracted
+from pcfix.refract.sensitivity import SUMS, TILE_RUNS, add_below
+from pcfix.refract.uncertainty import (
+    add_errors,
+    budget_of,
+    finish_tile,
+    level_sigma_of,
+    with_errors,
 )
-from pcfix.refract.piercing import pierce_mesh, pierce_raster
-from pcfix.refract.rays import line_terms, nearest_point, refracted
-from pcfix.refract.result import Intersection
 from pcfix.threads import one_caller
-from pcfix.water.raster import build_field
-from pcfix.water.tin import build_tin, locate
+from pcfix.water.surface import locate
 
 if TYPE_CHECKING:
-    from pcfix.lens.frames import Frames, Pyramid
-    from pcfix.model import (
-        BoolArray,
-        Cameras,
-        FloatArray,
-        IntArray,
-        Views,
-        WaterSurface,
-    )
-    from pcfix.options import Settings
-    from pcfix.water.raster import Field
-    from pcfix.water.surface import SurfaceAbove
-    from pcfix.water.tin import Tin
+    from pcfix.lens.frames import Frames
+    from pcfix.model import BoolArray, FloatArray, IntArray
+    from pcfix.refract.batch import Batch
+    from pcfix.refract.choice import Points, Rig, Rule
+    from pcfix.refract.sensitivity import Budget
+    from pcfix.water.surface import Field, Tin
 
 _NO_CAMERA, _ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
 _PARALLEL, _CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
 
 
-def intersect(
-    xyz: FloatArray,
-    surface: SurfaceAbove,
-    water: WaterSurface,
-    cameras: Cameras,
-    settings: Settings,
-    views: Views | None = None,
-    level_offset_m: FloatArray | None = None,
-) -> Intersection:
-    """Re-intersect the refracted rays of submerged points.
-
-    Parameters
-    ----------
-    xyz : array, shape (m, 3)
-        Apparent points below the surface, metres, world frame.
-    surface : SurfaceAbove
-        The water surface above each of them.
-    water : WaterSurface
-        Needed for its shape where it is a mesh or raster.
-    cameras : Cameras
-        Projection centres and frames, world frame.
-    settings : Settings
-        Refractive index, largest angle, most cameras.
-    views : Views, optional
-        The cameras of each point; without it, every camera whose frame holds the point.
-    level_offset_m : array, shape (k,), optional
-        How much higher than `surface` the water stood when each camera took its image.
+def intersect(batch: Batch) -> Intersection:
+    """Re-intersect the refracted rays of points with chosen cameras.
 
     Returns
     -------
     Intersection
-        One row per input point, in the same order.
+        `sigma_z_m` is that of the scatter of the rays.
 
     Notes
     -----
-    Skarlatos & Agrafiotis 2018, eqs 10 and 11, for any number of rays with equal weight. The
-    frame test is for the apparent point, as that is where the SfM software projected it.
+    Skarlatos & Agrafiotis 2018, eqs 10 and 11, for any number of rays with equal weight.
     """
-    order = spatial_order(xyz)
-    result = np.zeros((len(xyz), 8))
-    used = np.zeros(len(cameras), np.bool_)
-    tested = np.zeros((len(xyz) + TILE - 1) // TILE, np.int64)
-    common = (
-        order,
-        np.ascontiguousarray(xyz),
-        np.ascontiguousarray(surface.height_m),
-        np.ascontiguousarray(surface.slope),
-        np.ascontiguousarray(cameras.centres),
-        np.zeros(len(cameras)) if level_offset_m is None else level_offset_m,
-        frames_of(cameras) if views is None else no_frames(len(cameras)),
-        least_cosine2(settings, cameras),
-        1.0 / settings.refractive_index,
-        result,
-        used,
-        tested,
-    )
+    survey, views = batch.survey, batch.rays
+    result, used = np.zeros((len(batch), 8)), np.zeros(len(survey.cameras), np.bool_)
     with one_caller():
-        tin = build_tin(water) if isinstance(water, WaterMesh) else None
-        field = build_field(water) if isinstance(water, WaterRaster) else None
-        if views is None and settings.max_cameras is None and tin is None and field is None:
-            _all_in_frame(*common)
-        else:
-            rows = None if views is None else (views.start, views.camera)
-            _chosen(*common, tin, field, rows, settings.max_cameras or ANY_NUMBER)
+        _chosen(
+            points_of(batch), rig_of(survey), rule_of(survey), *shapes_of(survey.water),
+            (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)), result, used,
+        )  # fmt: skip
+    return _as_intersection(result, used)
+
+
+def intersect_in_frame(batch: Batch) -> Intersection:
+    """Re-intersect the refracted rays of every camera whose frame holds a point.
+
+    The surface is a plane above each point. The covariances are computed in the same pass, where
+    the settings ask for them, so that the frames are looked at once.
+
+    Notes
+    -----
+    The frame test is for the apparent point, as that is where the SfM software projected it.
+    """
+    survey = batch.survey
+    result, used = np.zeros((len(batch), 8)), np.zeros(len(survey.cameras), np.bool_)
+    covariance = np.zeros((len(batch) if survey.settings.dimensions == "all" else 0, 6))
+    with one_caller():
+        _all_in_frame(
+            points_of(batch), rig_of(survey), frames_of(survey.cameras), rule_of(survey),
+            budget_of(survey), level_sigma_of(batch), result, used, covariance,
+        )  # fmt: skip
+    found = _as_intersection(result, used)
+    return with_errors(found, covariance if len(covariance) == len(batch) else None, survey)
+
+
+def _as_intersection(result: FloatArray, used: BoolArray) -> Intersection:
     return Intersection(
         shift_m=result[:, :3],
         outcome=result[:, _OUTCOME].astype(np.uint8),
@@ -139,7 +110,6 @@ def intersect(
         sigma_z_m=result[:, _SIGMA_Z],
         incidence_deg=result[:, _INCIDENCE],
         camera_used=used,
-        pairs_tested=int(tested.sum()),
     )
 
 
@@ -148,50 +118,56 @@ _MISS, _SIGMA_Z, _INCIDENCE, _COUNT, _OUTCOME = 3, 4, 5, 6, 7
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _usable(
-    g: Pyramid | None, marked: float, ex: float, ey: float, ez: float, h: float, height: float,
-    length2: float, least_cosine2: float,
-) -> bool:  # fmt: skip
-    """Whether a camera above the water has the point in its frame, steeply enough.
-
-    The frame is a pyramid, or it was tested before and left a mark.
-    """
-    steep = (height > h) & (height * height >= least_cosine2 * length2)
-    if g is None:
-        return (marked > 0.0) & steep
-    return in_frame(g, ex, ey, ez) & steep
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _solve(
-    row: FloatArray, k: float, xx: float, xy: float, xz: float, yy: float, yz: float,
-    bx: float, by: float, bz: float, s: float, cosine2: float,
-) -> None:  # fmt: skip
+def _solve(row: FloatArray, k: float, sums: FloatArray) -> None:
     """Solve one point and write its row; a point without a solution keeps a shift of zero."""
     if k < 2.0:
         row[_OUTCOME] = _ONE_CAMERA if k == 1.0 else _NO_CAMERA
         return
-    solved, qx, qy, qz, miss, sigma_z = nearest_point(k, xx, xy, xz, yy, yz, bx, by, bz, s)
+    solved, qx, qy, qz, miss, sigma_z = nearest_point(
+        k, sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7], sums[8]
+    )
     if not solved:
         row[_OUTCOME] = _PARALLEL
         return
     row[0], row[1], row[2] = qx, qy, qz
     row[_MISS], row[_SIGMA_Z] = miss, sigma_z
-    row[_INCIDENCE] = np.degrees(np.arccos(np.sqrt(min(cosine2, 1.0))))
+    row[_INCIDENCE] = np.degrees(np.arccos(np.sqrt(min(sums[10], 1.0))))
     row[_COUNT], row[_OUTCOME] = k, _CORRECTED
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def _mark_camera(
+    marks: FloatArray, tile: FloatArray, frames: Frames, c: int, centre: FloatArray,
+    low: FloatArray, high: FloatArray,
+) -> bool:  # fmt: skip
+    """Mark the points of a tile that lie in the frame of camera c; return whether any may."""
+    x, y, z = (
+        tile[: marks.size],
+        tile[TILE : TILE + marks.size],
+        tile[2 * TILE : 2 * TILE + marks.size],
+    )
+    if frames.row[c] == NOT_DISTORTED:
+        mark_pyramid(marks, x, y, z, centre, pyramid(frames.planes[c]))
+        return True
+    held = judge(frames, c, centre, low, high)
+    if held == ALL:
+        marks[:] = 1.0
+    if held != SOME:
+        return bool(held != NOTHING)
+    return bool(mark(marks, x, y, z, centre, frames, c) > 0)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def _add_camera(
-    sums: FloatArray, tile: FloatArray, marks: FloatArray,
-    centre: FloatArray, offset: float, g: Pyramid | None, least_cosine2: float, r: float,
-) -> int:  # fmt: skip
+    sums: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule
+) -> int:
     """Add one camera's rays to the sums of a tile; return how many it gave.
 
     `sums` and `tile` hold runs of `TILE` numbers in one array each: with one base address and
     fixed distances the compiler sees that the runs cannot overlap, and vectorises.
     """
-    cx, cy, cz = centre[0], centre[1], centre[2]
+    cx, cy, cz, offset = rig.centres[c, 0], rig.centres[c, 1], rig.centres[c, 2], rig.offset[c]
+    least_cosine2, r = rule.least_cosine2, rule.bend
     rays = 0
     for j in range(marks.size):
         z = tile[2 * TILE + j]
@@ -200,8 +176,8 @@ def _add_camera(
         height = nx * ex + ny * ey + nz * ez
         h = nz * (tile[3 * TILE + j] - (z - offset))
         length2 = ex * ex + ey * ey + ez * ez
-        marked = marks[j]
-        use = _usable(g, marked, ex, ey, ez, h, height, length2, least_cosine2)
+        steep = (height > h) & (height * height >= least_cosine2 * length2)
+        use = (marks[j] > 0.0) & steep
         # one division for two; a ray that is not used adds zeros
         q = 1.0 / (length2 * height)
         f = h * length2 * q if use and h > 0.0 else 0.0
@@ -227,95 +203,74 @@ def _add_camera(
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _all_in_frame(
-    order: IntArray, xyz: FloatArray, surface: FloatArray, slope: FloatArray,
-    centres: FloatArray, offset: FloatArray, frames: Frames, least_cosine2: float, r: float,
-    result: FloatArray, used: BoolArray, tested: IntArray,
+    points: Points, rig: Rig, frames: Frames, rule: Rule, budget: Budget, level_sigma: FloatArray,
+    result: FloatArray, used: BoolArray, covariance: FloatArray,
 ) -> None:  # fmt: skip
     """Every camera whose frame holds the point; the surface above it is a plane."""
-    planes, row = frames.planes, frames.row
-    for t in prange(tested.size):
-        rows = order[t * TILE : (t + 1) * TILE]
-        tile, marks = np.empty(7 * TILE), np.empty(rows.size)
-        low, high = gather(tile, rows, xyz, surface, slope)
-        sums = np.zeros(11 * TILE)
+    centres = rig.centres
+    for t in prange((points.order.size + TILE - 1) // TILE):
+        rows = points.order[t * TILE : (t + 1) * TILE]
+        tile, sums = np.empty(TILE_RUNS * TILE), np.zeros(11 * TILE)
+        low, high = gather(tile, rows, points)
         sums[10 * TILE :] = 1.0
-        x, y, z = (
-            tile[: rows.size],
-            tile[TILE : TILE + rows.size],
-            tile[2 * TILE : 2 * TILE + rows.size],
-        )
+        near = np.empty(len(centres), np.int64)
+        count = 0
         for c in range(len(centres)):
-            if not may_hold(planes[c], centres[c], low, high):
+            if may_hold(frames.planes[c], centres[c], low, high):
+                near[count] = c
+                count += 1
+        marks = np.empty((count, rows.size))
+        seeing = 0
+        for k in range(count):
+            c = near[k]
+            if not _mark_camera(marks[seeing], tile, frames, c, centres[c], low, high):
                 continue
-            if row[c] == NOT_DISTORTED:
-                frame = pyramid(planes[c])
-                rays = _add_camera(
-                    sums, tile, marks, centres[c], offset[c], frame, least_cosine2, r
-                )
-            else:
-                held = judge(frames, c, centres[c], low, high)
-                if held == SOME and not mark(marks, x, y, z, centres[c], frames, c):
-                    held = NOTHING
-                if held == NOTHING:
-                    continue
-                if held == ALL:
-                    marks[:] = 1.0
-                rays = _add_camera(sums, tile, marks, centres[c], offset[c], None, least_cosine2, r)
-            tested[t] += rows.size
-            if rays:
+            if _add_camera(sums, tile, marks[seeing], rig, c, rule):
                 used[c] = True  # threads may write it at once: always the same value
+                near[seeing] = c
+                seeing += 1
         for j in range(rows.size):
-            _solve(
-                result[rows[j]], sums[9 * TILE + j], sums[j], sums[TILE + j],
-                sums[2 * TILE + j], sums[3 * TILE + j], sums[4 * TILE + j], sums[5 * TILE + j],
-                sums[6 * TILE + j], sums[7 * TILE + j], sums[8 * TILE + j], sums[10 * TILE + j],
-            )  # fmt: skip
+            _solve(result[rows[j]], sums[9 * TILE + j], sums[j::TILE])
+        if len(covariance):
+            add_below(tile, result, rows)
+            errors = np.zeros(SUMS * TILE)
+            for k in range(seeing):
+                add_errors(errors, tile, marks[k], rig, near[k], rule, budget)
+            finish_tile(covariance, rows, errors, tile, level_sigma, budget)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _chosen(
-    order: IntArray, xyz: FloatArray, surface: FloatArray, slope: FloatArray,
-    centres: FloatArray, offset: FloatArray, frames: Frames, least_cosine2: float, r: float,
-    result: FloatArray, used: BoolArray, tested: IntArray,
-    tin: Tin | None, field: Field | None, views: tuple[IntArray, IntArray] | None, most: int,
+    points: Points, rig: Rig, rule: Rule, tin: Tin | None, field: Field | None,
+    views: tuple[IntArray, IntArray], result: FloatArray, used: BoolArray,
 ) -> None:  # fmt: skip
-    """Chosen cameras per point, or rays that bend at a mesh or raster."""
-    for t in prange(tested.size):
-        rows = order[t * TILE : (t + 1) * TILE]
+    """Chosen cameras per point, and rays that may bend at a mesh or raster."""
+    start, camera = views
+    for t in prange((points.order.size + TILE - 1) // TILE):
+        rows = points.order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
-        low, high = gather(tile, rows, xyz, surface, slope)
-        near = near_cameras(frames, centres, low, high)
+        gather(tile, rows, points)
         for j in range(rows.size):
+            i = rows[j]
             facet = -1 if tin is None else locate(tin, tile[j], tile[TILE + j])
-            candidates = near
-            if views is not None:
-                candidates = views[1][views[0][rows[j]] : views[0][rows[j] + 1]]
-            kept = choose(
-                candidates, tile, j, centres, offset, frames, least_cosine2, most, tin, field, facet
-            )
-            tested[t] += candidates.size
-            row = result[rows[j]]
-            _intersect_one(
-                row, candidates[kept], tile, j, centres, offset, r, used, tin, field, facet
-            )
+            cameras = camera[start[i] : start[i + 1]]
+            _intersect_one(result[i], cameras, tile, j, rig, rule.bend, used, tin, field, facet)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _intersect_one(
-    row: FloatArray, cameras: IntArray, tile: FloatArray, j: int, centres: FloatArray,
-    offset: FloatArray, r: float, used: BoolArray,
-    tin: Tin | None, field: Field | None, facet: int,
+    row: FloatArray, cameras: IntArray, tile: FloatArray, j: int, rig: Rig, r: float,
+    used: BoolArray, tin: Tin | None, field: Field | None, facet: int,
 ) -> None:  # fmt: skip
     """Intersect the rays of one point with its own cameras."""
     px, py, pz = tile[j], tile[TILE + j], tile[2 * TILE + j]
     ux, uy, uz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-    sums = np.zeros(9)
-    least = 1.0
+    centres, sums, least = rig.centres, np.zeros(11), 1.0
     for c in cameras:
         used[c] = True
         ex, ey, ez = centres[c, 0] - px, centres[c, 1] - py, centres[c, 2] - pz
         length2 = ex * ex + ey * ey + ez * ez
-        lowered = pz - offset[c]
+        lowered = pz - rig.offset[c]
         h = uz * (tile[3 * TILE + j] - lowered)
         f, bend, nx, ny, nz = 0.0, 1.0, ux, uy, uz
         if h > 0.0:
@@ -334,7 +289,5 @@ def _intersect_one(
         for i in range(9):
             sums[i] += terms[i]
         least = min(least, height * height * inv)
-    _solve(
-        row, float(cameras.size), sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6],
-        sums[7], sums[8], least,
-    )  # fmt: skip
+    sums[10] = least
+    _solve(row, float(cameras.size), sums)

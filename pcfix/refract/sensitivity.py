@@ -43,7 +43,7 @@ The functions hold arithmetic only, see `pcfix.refract.rays`; all sums are in th
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit
@@ -53,12 +53,34 @@ from pcfix.refract.rays import refracted
 
 if TYPE_CHECKING:
     from pcfix.model import FloatArray, IntArray
+    from pcfix.refract.choice import Rig, Rule
 
 Six: TypeAlias = tuple[float, float, float, float, float, float]
 """A symmetric matrix: xx, xy, xz, yy, yz, zz."""
+Three: TypeAlias = tuple[float, float, float]
+Sight: TypeAlias = tuple[float, float, float, float, float, float]
+"""Projection centre, its level's offset, least squared cosine, 1 / n."""
 Seen: TypeAlias = tuple[
     float, float, float, float, float, float, float, float, float, float, float, float
 ]
+
+
+class Budget(NamedTuple):
+    """Standard deviations, angles in radians; the place about which the water tilts.
+
+    `in_images` says which residuals the correction makes least.
+    """
+
+    image_px: float
+    refractive_index: float
+    tilt: float
+    waves: float
+    centre_m: float
+    attitude: float
+    pivot_x: float
+    pivot_y: float
+    in_images: bool
+
 
 # Runs of `TILE` numbers in `tile`: those of `pcfix.refract.choice.gather`, then y - h.
 BELOW = 7
@@ -86,16 +108,25 @@ def add_below(tile: FloatArray, shift: FloatArray, rows: IntArray) -> None:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _seen(
-    tile: FloatArray, j: int, mark: float, centre: tuple[float, float, float], offset: float,
-    least_cosine2: float, r: float,
-) -> Seen:  # fmt: skip
+def _of_camera(rig: Rig, c: int, rule: Rule) -> tuple[Sight, Three, float]:
+    """Return a camera as plain numbers, which stay in registers, for the loops over points."""
+    sight = (
+        rig.centres[c, 0], rig.centres[c, 1], rig.centres[c, 2], rig.offset[c],
+        rule.least_cosine2, rule.bend,
+    )  # fmt: skip
+    axis = (rig.axes[c, 0], rig.axes[c, 1], rig.axes[c, 2])
+    return sight, axis, rig.focal_px[c] * rig.focal_px[c]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _seen(tile: FloatArray, j: int, mark: float, sight: Sight) -> Seen:
     """Return how often a ray counts; e, N, H, L^2, h, y and r where the light bends.
 
     A ray that is not used gets heights and lengths that do no harm.
     """
+    cx, cy, cz, offset, least_cosine2, r = sight
     z = tile[2 * TILE + j]
-    ex, ey, ez = centre[0] - tile[j], centre[1] - tile[TILE + j], centre[2] - z
+    ex, ey, ez = cx - tile[j], cy - tile[TILE + j], cz - z
     nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
     height = nx * ex + ny * ey + nz * ez
     h = nz * (tile[3 * TILE + j] - (z - offset))
@@ -214,17 +245,12 @@ def _in_space(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def add_in_space(
-    sums: FloatArray, tile: FloatArray, marks: FloatArray,
-    centre: FloatArray, axis: FloatArray, focal_px: float, offset: float,
-    least_cosine2: float, r: float,
-) -> None:  # fmt: skip
+    sums: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule
+) -> None:
     """Add one camera's rays to the sums of a tile's points, as often as their marks say."""
-    place, view = (centre[0], centre[1], centre[2]), (axis[0], axis[1], axis[2])
-    square = focal_px * focal_px
+    sight, view, square = _of_camera(rig, c, rule)
     for j in range(marks.size):
-        one, ex, ey, ez, nx, ny, nz, height, length2, h, y, bend = _seen(
-            tile, j, marks[j], place, offset, least_cosine2, r
-        )
+        one, ex, ey, ez, nx, ny, nz, height, length2, h, y, bend = _seen(tile, j, marks[j], sight)
         kappa, inv_h, inv2, lean, away, beta, by_n = _bent(height, length2, h, y, bend)
         tt, gx, gy, gz = _in_space(
             one, ex, ey, ez, nx, ny, nz, height, length2, bend, kappa, inv2
@@ -247,21 +273,16 @@ def add_in_space(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def add_in_images(
-    sums: FloatArray, tile: FloatArray, marks: FloatArray,
-    centre: FloatArray, axis: FloatArray, focal_px: float, offset: float,
-    least_cosine2: float, r: float,
-) -> None:  # fmt: skip
+    sums: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule
+) -> None:
     """Add one camera's rays to the sums of a tile's points, as often as their marks say.
 
     S T = W / (1 - m) + W N (u N + v e)', with c = 1 - m + beta rho^2, v = H beta / ((1 - m) c) and
     u = (r H / kappa) / c - 1 / (1 - m) - H v.
     """
-    place, view = (centre[0], centre[1], centre[2]), (axis[0], axis[1], axis[2])
-    square = focal_px * focal_px
+    sight, view, square = _of_camera(rig, c, rule)
     for j in range(marks.size):
-        one, ex, ey, ez, nx, ny, nz, height, length2, h, y, bend = _seen(
-            tile, j, marks[j], place, offset, least_cosine2, r
-        )
+        one, ex, ey, ez, nx, ny, nz, height, length2, h, y, bend = _seen(tile, j, marks[j], sight)
         _, inv_h, _, lean, away, beta, by_n = _bent(height, length2, h, y, bend)
         w = _weight(one, ex, ey, ez, length2, view, square)
         gx, gy, gz = _times(w, nx, ny, nz)
@@ -297,21 +318,17 @@ def _turned(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def add_tilt(
-    sums: FloatArray, tile: FloatArray, marks: FloatArray,
-    centre: FloatArray, axis: FloatArray, focal_px: float, offset: float,
-    least_cosine2: float, r: float, in_images: bool,
+    sums: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule,
+    in_images: bool,
 ) -> None:  # fmt: skip
     """Add how the slope of the water moves each of one camera's rays, M delta or S delta.
 
     S delta = (a W + (a beta - (1 - m) b) H / c W N d') / (1 - m) tau, c as above, with the a and b
     of `_turned`; d.tau = e.tau.
     """
-    place, view = (centre[0], centre[1], centre[2]), (axis[0], axis[1], axis[2])
-    square = focal_px * focal_px
+    sight, view, square = _of_camera(rig, c, rule)
     for j in range(marks.size):
-        one, ex, ey, ez, nx, ny, nz, height, length2, h, y, bend = _seen(
-            tile, j, marks[j], place, offset, least_cosine2, r
-        )
+        one, ex, ey, ez, nx, ny, nz, height, length2, h, y, bend = _seen(tile, j, marks[j], sight)
         kappa, inv_h, inv2, lean, away, beta, _ = _bent(height, length2, h, y, bend)
         turn, along = _turned(height, inv_h, h, y, bend, 1.0 / kappa, lean)
         if in_images:
@@ -332,10 +349,8 @@ def add_tilt(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def add_noise(
-    sums: FloatArray, tile: FloatArray, marks: FloatArray,
-    centre: FloatArray, axis: FloatArray, focal_px: float, offset: float,
-    least_cosine2: float, r: float,
-    image_px: float, centre_m: float, attitude: float, waves: float,
+    sums: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule,
+    budget: Budget,
 ) -> None:  # fmt: skip
     """Add the noise of one camera's rays to the normal equations of the straight rays.
 
@@ -345,12 +360,11 @@ def add_noise(
     -y (1 - r H / kappa) (tau + r^2 / kappa^2 d (d.tau)); D^-1 of that is what moves P, by c_t
     across d and c_r along.
     """
-    place, view = (centre[0], centre[1], centre[2]), (axis[0], axis[1], axis[2])
-    square = focal_px * focal_px
+    sight, view, square = _of_camera(rig, c, rule)
+    image_px, centre_m = budget.image_px, budget.centre_m
+    attitude, waves = budget.attitude, budget.waves
     for j in range(marks.size):
-        one, ex, ey, ez, nx, ny, nz, height, length2, h, y, bend = _seen(
-            tile, j, marks[j], place, offset, least_cosine2, r
-        )
+        one, ex, ey, ez, nx, ny, nz, height, length2, h, y, bend = _seen(tile, j, marks[j], sight)
         kappa, _, _, lean, away, beta, _ = _bent(height, length2, h, y, bend)
         w = _weight(one, ex, ey, ez, length2, view, square)
         gx, gy, gz = _times(w, nx, ny, nz)

@@ -7,7 +7,7 @@ these places. Under water every pair is off in its own way, more so the more obl
 The model, for an apparent point P and its pairs (a, b), all of which show one true point Q:
 
 1. The light from Q leaves the water towards the camera c, which sees it in the direction w_c
-   (`pcfix.refract.backward`).
+   (`pcfix.refract.rays`).
 2. The two straight rays of a pair give the place with the least squared residuals in the two
    images,
 
@@ -26,27 +26,24 @@ above, and is taken back to half of such a step wherever it does not come nearer
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numba import njit, prange
 
 from pcfix.errors import PcfixWarning
-from pcfix.lens.derivatives import image_and_gradients
-from pcfix.lens.imaging import lens_table
-from pcfix.lens.places import KIND
-from pcfix.lens.projections import CODES
+from pcfix.lens.formulas import CODES, KIND
+from pcfix.lens.imaging import image_and_gradients, lens_table
 from pcfix.model import Outcome, Views
-from pcfix.refract.backward import light_path
+from pcfix.refract.batch import Images, as_made, images_of
 from pcfix.refract.consistent import check_consistent
-from pcfix.refract.made_with import Images, as_made, images_of
-from pcfix.refract.rays import MIN_DETERMINANT, line_terms, nearest_point, refracted
+from pcfix.refract.rays import MIN_DETERMINANT, light_path, line_terms, nearest_point, refracted
 from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.refract.bundles import Bundle
-    from pcfix.refract.result import Intersection
+    from pcfix.refract.batch import Batch, Intersection
 
 MAX_STEPS = 40
 CLOSE_M = 1e-6
@@ -78,16 +75,16 @@ class _Images(NamedTuple):
     refractive_index: float
 
 
-def invert_pairs(bundle: Bundle, pairs: Views | None = None) -> Intersection:
+def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     """Return the true points from which the median of stereo pairs would be the apparent ones.
 
     Parameters
     ----------
-    bundle : Bundle
+    batch : Batch
         Its cameras need angles and lenses. Its views are pairs, or the cameras that may be in one.
     pairs : Views, optional
-        Of the kind pairs; one is left out where either camera is not among the bundle's views.
-        Without them the pairs are those of the images that `bundle.learned.matcher` matched, each
+        Of the kind pairs; one is left out where either camera is not among the batch's views.
+        Without them the pairs are those of the images that the matcher learned matched, each
         pair once.
 
     Returns
@@ -111,11 +108,11 @@ def invert_pairs(bundle: Bundle, pairs: Views | None = None) -> Intersection:
     -----
     The surface above each point is taken as a plane.
     """
-    check_consistent(bundle.cameras)
-    if bundle.views.kind == "pairs":
-        pairs, bundle = bundle.views, bundle._replace(views=cameras_of_pairs(bundle.views))
-    used = np.zeros(len(bundle.views.camera), np.bool_)
-    result = _inverted(bundle, pairs, used)
+    check_consistent(batch.survey.cameras)
+    if batch.rays.kind == "pairs":
+        pairs, batch = batch.rays, replace(batch, views=cameras_of_pairs(batch.rays))
+    used = np.zeros(len(batch.rays.camera), np.bool_)
+    result = _inverted(batch, pairs, used)
     outcome = result[:, _OUTCOME].astype(np.uint8)
     moved = outcome == Outcome.CORRECTED
     lost = int((moved & (result[:, _FOUND] == 0.0)).sum())
@@ -127,8 +124,8 @@ def invert_pairs(bundle: Bundle, pairs: Views | None = None) -> Intersection:
             stacklevel=2,
         )
     count = np.concatenate([[0], np.cumsum(used)])
-    in_pairs = Views(count[bundle.views.start], np.asarray(bundle.views.camera)[used])
-    return bundle._replace(views=in_pairs).result(
+    in_pairs = Views(count[batch.rays.start], np.asarray(batch.rays.camera)[used])
+    return replace(batch, views=in_pairs).result(
         result[:, :3], outcome=outcome, ray_miss_m=result[:, _MISS]
     )
 
@@ -154,31 +151,31 @@ def _distinct(start: IntArray, camera: IntArray, first: IntArray, distinct: IntA
         first[i + 1] = count
 
 
-def _inverted(bundle: Bundle, pairs: Views | None, used: BoolArray) -> FloatArray:
+def _inverted(batch: Batch, pairs: Views | None, used: BoolArray) -> FloatArray:
     """Return the rows of the kernel, one per point; mark the entries of the views in a pair."""
-    cameras, matcher = bundle.cameras, bundle.learned.matcher
+    cameras, matcher = batch.survey.cameras, batch.survey.learned.matcher
     if pairs is None and matcher is None:
         raise ValueError("pairs or a model of the matcher are needed")
-    made_xyz, made = bundle.made_with or (bundle.xyz, cameras)
+    made_xyz, made = batch.made_with or (batch.xyz, cameras)
     row, table = lens_table(made.lenses or ())
     rotations = np.ascontiguousarray(made.rotations, np.float64)
     listed = None if pairs is None else (pairs.start, np.asarray(pairs.camera, np.int64))
-    result = np.zeros((len(bundle.xyz), _WIDTH))
+    result = np.zeros((len(batch.xyz), _WIDTH))
     with one_caller():
         _invert(
-            np.ascontiguousarray(bundle.xyz),
+            np.ascontiguousarray(batch.xyz),
             np.ascontiguousarray(made_xyz),
-            np.ascontiguousarray(bundle.surface.height_m),
-            bundle.normals(),
+            np.ascontiguousarray(batch.surface.height_m),
+            batch.normals(),
             np.ascontiguousarray(cameras.centres),
-            np.ascontiguousarray(bundle.level_offset_m, np.float64),
+            np.ascontiguousarray(batch.survey.offset_m, np.float64),
             rotations,
             row,
             table,
-            images_of(bundle.made_with, cameras),
-            bundle.settings.refractive_index,
-            np.asarray(bundle.views.start, np.int64),
-            np.asarray(bundle.views.camera, np.int64),
+            images_of(batch.made_with, cameras),
+            batch.survey.settings.refractive_index,
+            np.asarray(batch.rays.start, np.int64),
+            np.asarray(batch.rays.camera, np.int64),
             listed,
             np.zeros((0, 0), np.int64) if matcher is None else matcher.matched,
             used,

@@ -20,36 +20,22 @@ of the rays differ, the more the two do.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numba import njit, prange
 
-from pcfix.lens.frames import (
-    ALL,
-    NOT_DISTORTED,
-    NOTHING,
-    SOME,
-    frames_of,
-    in_frame,
-    judge,
-    mark,
-    may_hold,
-    pyramid,
-)
-from pcfix.model import NOMINAL_FOCAL_PX, Outcome, WaterPlane
+from pcfix.model import Outcome
 from pcfix.options import LEVEL_M
 from pcfix.refract import sensitivity as s
-from pcfix.refract.choice import TILE, chosen_views, gather, least_cosine2, spatial_order
+from pcfix.refract.choice import TILE, gather, points_of, rig_of, rule_of
+from pcfix.refract.sensitivity import Budget
 from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
-    from pcfix.lens.frames import Frames, Pyramid
-    from pcfix.model import Cameras, FloatArray, IntArray, Views
-    from pcfix.options import Settings
-    from pcfix.refract.learned import Learned
-    from pcfix.refract.result import Intersection
-    from pcfix.water.surface import SurfaceAbove
+    from pcfix.model import FloatArray, IntArray
+    from pcfix.refract.batch import Batch, Intersection, Survey
+    from pcfix.refract.choice import Points, Rig, Rule
 
 Three: TypeAlias = tuple[float, float, float]
 Four: TypeAlias = tuple[float, float, float, float]
@@ -60,49 +46,16 @@ MIN_DETERMINANT = 1e-6
 """As of `pcfix.refract.rays.nearest_point`, of half the trace cubed: k^3 for k rays in space."""
 
 
-class _Budget(NamedTuple):
-    """Standard deviations, angles in radians; the place about which the water tilts.
-
-    `in_images` says which residuals the correction makes least, see `pcfix.refract.sensitivity`.
-    """
-
-    image_px: float
-    refractive_index: float
-    tilt: float
-    waves: float
-    centre_m: float
-    attitude: float
-    pivot_x: float
-    pivot_y: float
-    in_images: bool
-
-
-def covariances(
-    xyz: FloatArray,
-    shift_m: FloatArray,
-    surface: SurfaceAbove,
-    cameras: Cameras,
-    settings: Settings,
-    views: Views | None = None,
-    level_offset_m: FloatArray | None = None,
-    level_sigma_m: FloatArray | float | None = None,
-) -> FloatArray:
+def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
     """Return the covariance of each corrected point.
 
     Parameters
     ----------
-    xyz : array, shape (m, 3)
-        Apparent points below the surface, metres, world frame.
+    batch : Batch
+        With the cameras that gave rays; the standard deviations are ``settings.errors`` and, where
+        these do not have it, that of the level is `level_sigma_m`, else `LEVEL_M`.
     shift_m : array, shape (m, 3)
         True minus apparent, by whichever method.
-    surface : SurfaceAbove
-        The plane of the water surface above each of them.
-    cameras, settings, views, level_offset_m
-        As of `pcfix.refract.intersect.intersect`; the standard deviations are
-        ``settings.errors``.
-    level_sigma_m : array, shape (m,), or float, optional
-        Standard deviation of the height of the surface above each point, as its fit has it; not
-        used where ``settings.errors.level_m`` is given. NaN and None stand for `LEVEL_M`.
 
     Returns
     -------
@@ -121,62 +74,34 @@ def covariances(
     `snell`), and where `consistent` inverts a dense matcher (depth maps, stereo pairs, their
     models), which gets that of one adjustment of all its images.
     """
-    if not len(xyz):
-        return np.zeros((0, 6))
-    if settings.max_cameras is not None:
-        plane = WaterPlane(0.0)  # only what is not a plane is looked at
-        views = chosen_views(xyz, surface, plane, cameras, settings, views, level_offset_m)
-    result = np.zeros((len(xyz), 6))
-    points = (
-        spatial_order(xyz),
-        np.ascontiguousarray(xyz),
-        np.ascontiguousarray(shift_m),
-        np.ascontiguousarray(surface.height_m),
-        np.ascontiguousarray(surface.slope),
-        _level_sigma(level_sigma_m, settings, len(xyz)),
-        np.ascontiguousarray(cameras.centres),
-        *_focal_lengths(cameras),
-        np.zeros(len(cameras)) if level_offset_m is None else level_offset_m,
-    )
-    rest = (
-        least_cosine2(settings, cameras),
-        1.0 / settings.refractive_index,
-        _budget(settings, cameras),
-        result,
-    )
+    survey, views, result = batch.survey, batch.rays, np.zeros((len(batch), 6))
     with one_caller():
-        if views is None:
-            _all_in_frame(*points, frames_of(cameras), *rest)
-        else:
-            _of_lists(*points, views.start, views.camera, *rest)
+        _of_lists(
+            points_of(batch), np.ascontiguousarray(shift_m), rig_of(survey),
+            (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)),
+            rule_of(survey), budget_of(survey), level_sigma_of(batch), result,
+        )  # fmt: skip
     return result
 
 
-def with_uncertainty(
-    found: Intersection,
-    xyz: FloatArray,
-    surface: SurfaceAbove,
-    cameras: Cameras,
-    settings: Settings,
-    views: Views | None,
-    level_offset_m: FloatArray | None,
-    learned: Learned,
-    level_sigma_m: FloatArray | float | None,
-) -> Intersection:
-    """Return a result with its covariances and standard errors of Z, where they are asked for.
+def with_uncertainty(found: Intersection, batch: Batch) -> Intersection:
+    """Return a result with its covariances and standard errors of Z, where they are asked for."""
+    wanted = batch.survey.settings.dimensions == "all"
+    return with_errors(found, covariances(batch, found.shift_m) if wanted else None, batch.survey)
+
+
+def with_errors(found: Intersection, covariance: FloatArray | None, survey: Survey) -> Intersection:
+    """Return a result with covariances, which it may change, and what follows from them.
 
     The standard error of a regression is that with which it predicts check depths left out of it
     (of its residuals, where none can be): it holds whatever the poses and the water were.
     """
+    if covariance is None:
+        return found._replace(sigma_z_m=np.zeros(len(found.outcome)))
     moved = found.outcome == Outcome.CORRECTED
-    if settings.dimensions != "all":
-        return found._replace(sigma_z_m=np.zeros(len(xyz)))
-    covariance = covariances(
-        xyz, found.shift_m, surface, cameras, settings, views, level_offset_m, level_sigma_m
-    )
     covariance[~moved] = 0.0
-    line = learned.regression
-    if settings.method == "regression" and line is not None:
+    line = survey.learned.regression
+    if survey.settings.method == "regression" and line is not None:
         sigma = line.rmse_m if line.cv_rmse_m is None else line.cv_rmse_m
         covariance[:, [_XZ, _YZ]] = 0.0
         covariance[moved, _ZZ] = sigma**2
@@ -186,18 +111,20 @@ def with_uncertainty(
 _XZ, _YZ, _ZZ = 2, 4, 5
 
 
-def _level_sigma(given: FloatArray | float | None, settings: Settings, m: int) -> FloatArray:
-    stated = settings.errors.level_m
-    sigma = LEVEL_M if given is None else given
-    full = np.array(np.broadcast_to(sigma if stated is None else stated, m), np.float64)
+def level_sigma_of(batch: Batch) -> FloatArray:
+    """Return the standard deviation of the water above each point, metres, shape (m,)."""
+    stated, fitted = batch.survey.settings.errors.level_m, batch.level_sigma_m
+    known = stated if stated is not None else LEVEL_M if fitted is None else fitted
+    full = np.array(np.broadcast_to(known, len(batch)), np.float64)
     full[np.isnan(full)] = LEVEL_M
     return full
 
 
-def _budget(settings: Settings, cameras: Cameras) -> _Budget:
-    errors = settings.errors
-    x, y = cameras.centres[:, :2].mean(axis=0).tolist()
-    return _Budget(
+def budget_of(survey: Survey) -> Budget:
+    """Return the error budget for kernels."""
+    errors = survey.settings.errors
+    x, y = survey.cameras.centres[:, :2].mean(axis=0).tolist()
+    return Budget(
         image_px=errors.image_px,
         refractive_index=errors.index,
         tilt=math.radians(errors.tilt_deg),
@@ -206,109 +133,32 @@ def _budget(settings: Settings, cameras: Cameras) -> _Budget:
         attitude=math.radians(errors.attitude_deg),
         pivot_x=x,
         pivot_y=y,
-        in_images=settings.method == "consistent",
+        in_images=survey.settings.method == "consistent",
     )
-
-
-def _focal_lengths(cameras: Cameras) -> tuple[FloatArray, FloatArray]:
-    """Return optical axes, shape (k, 3), and focal lengths (px), shape (k,).
-
-    An axis of zeros stands for an image in which equal angles are equally long, as in a
-    fisheye's, nearly.
-    """
-    axes = np.zeros((len(cameras), 3))
-    if cameras.lenses is None or cameras.rotations is None:
-        return axes, np.full(len(cameras), NOMINAL_FOCAL_PX)
-    flat = np.array([lens.projection == "perspective" for lens in cameras.lenses])
-    axes[flat] = cameras.rotations[flat, 2]
-    return axes, np.array([lens.focal_px for lens in cameras.lenses])
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _mark_pyramid(
-    marks: FloatArray, tile: FloatArray, centre: FloatArray, g: Pyramid
-) -> None:  # fmt: skip
-    """Mark the points of a tile that lie in a frame without distortion."""
-    cx, cy, cz = centre[0], centre[1], centre[2]
-    for j in range(marks.size):
-        held = in_frame(g, cx - tile[j], cy - tile[TILE + j], cz - tile[2 * TILE + j])
-        marks[j] = 1.0 if held else 0.0
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _mark_camera(
-    marks: FloatArray, tile: FloatArray, frames: Frames, c: int, centre: FloatArray,
-    low: FloatArray, high: FloatArray,
-) -> bool:  # fmt: skip
-    """Mark the points of a tile that lie in the frame of camera c; return whether any may."""
-    if not may_hold(frames.planes[c], centre, low, high):
-        return False
-    if frames.row[c] == NOT_DISTORTED:
-        _mark_pyramid(marks, tile, centre, pyramid(frames.planes[c]))
-        return True
-    held = judge(frames, c, centre, low, high)
-    if held == ALL:
-        marks[:] = 1.0
-    if held != SOME:
-        return bool(held != NOTHING)
-    x, y, z = (
-        tile[: marks.size],
-        tile[TILE : TILE + marks.size],
-        tile[2 * TILE : 2 * TILE + marks.size],
-    )
-    return bool(mark(marks, x, y, z, centre, frames, c) > 0)
-
-
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def _all_in_frame(
-    order: IntArray, xyz: FloatArray, shift: FloatArray, surface: FloatArray, slope: FloatArray,
-    level_sigma: FloatArray, centres: FloatArray, axes: FloatArray, focal: FloatArray,
-    offset: FloatArray, frames: Frames, least_cosine2: float, r: float, budget: _Budget,
-    result: FloatArray,
-) -> None:  # fmt: skip
-    """Every camera whose frame holds the point; see `pcfix.refract.intersect`."""
-    for t in prange((len(order) + TILE - 1) // TILE):
-        rows = order[t * TILE : (t + 1) * TILE]
-        tile, sums = np.empty(s.TILE_RUNS * TILE), np.zeros(s.SUMS * TILE)
-        marks = np.empty(rows.size)
-        low, high = gather(tile, rows, xyz, surface, slope)
-        s.add_below(tile, shift, rows)
-        for c in range(len(centres)):
-            if _mark_camera(marks, tile, frames, c, centres[c], low, high):
-                _add(
-                    sums, tile, marks, centres[c], axes[c], focal[c], offset[c],
-                    least_cosine2, r, budget,
-                )  # fmt: skip
-        _finish_tile(result, rows, sums, tile, level_sigma, budget)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _of_lists(
-    order: IntArray, xyz: FloatArray, shift: FloatArray, surface: FloatArray, slope: FloatArray,
-    level_sigma: FloatArray, centres: FloatArray, axes: FloatArray, focal: FloatArray,
-    offset: FloatArray, start: IntArray, camera: IntArray, least_cosine2: float, r: float,
-    budget: _Budget, result: FloatArray,
+    points: Points, shift: FloatArray, rig: Rig, views: tuple[IntArray, IntArray], rule: Rule,
+    budget: Budget, level_sigma: FloatArray, result: FloatArray,
 ) -> None:  # fmt: skip
     """Take the cameras of lists; those of a tile come one after the other, as by their frames."""
-    for t in prange((len(order) + TILE - 1) // TILE):
-        rows = order[t * TILE : (t + 1) * TILE]
+    start, camera = views
+    for t in prange((points.order.size + TILE - 1) // TILE):
+        rows = points.order[t * TILE : (t + 1) * TILE]
         tile, sums = np.empty(s.TILE_RUNS * TILE), np.zeros(s.SUMS * TILE)
-        gather(tile, rows, xyz, surface, slope)
+        gather(tile, rows, points)
         s.add_below(tile, shift, rows)
-        named = _named(start, camera, rows, len(centres))
-        place = np.zeros(len(centres), np.int64)
+        named = _named(start, camera, rows, len(rig.centres))
+        place = np.zeros(len(rig.centres), np.int64)
         place[named] = np.arange(named.size)
         marks = np.zeros((named.size, rows.size))
         for j in range(rows.size):
             for at in range(start[rows[j]], start[rows[j] + 1]):
                 marks[place[camera[at]], j] += 1.0
         for at in range(named.size):
-            c = named[at]
-            _add(
-                sums, tile, marks[at], centres[c], axes[c], focal[c], offset[c],
-                least_cosine2, r, budget,
-            )  # fmt: skip
-        _finish_tile(result, rows, sums, tile, level_sigma, budget)
+            add_errors(sums, tile, marks[at], rig, named[at], rule, budget)
+        finish_tile(result, rows, sums, tile, level_sigma, budget)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -322,41 +172,35 @@ def _named(start: IntArray, camera: IntArray, rows: IntArray, k: int) -> IntArra
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _add(
-    sums: FloatArray, tile: FloatArray, marks: FloatArray,
-    centre: FloatArray, axis: FloatArray, focal: float, offset: float,
-    least_cosine2: float, r: float, budget: _Budget,
+def add_errors(
+    sums: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule,
+    budget: Budget,
 ) -> None:  # fmt: skip
     """Add one camera's rays to the points of a tile that have a mark."""
     if budget.in_images:
-        s.add_in_images(sums, tile, marks, centre, axis, focal, offset, least_cosine2, r)
+        s.add_in_images(sums, tile, marks, rig, c, rule)
     else:
-        s.add_in_space(sums, tile, marks, centre, axis, focal, offset, least_cosine2, r)
+        s.add_in_space(sums, tile, marks, rig, c, rule)
     if budget.tilt > 0.0:
-        s.add_tilt(
-            sums, tile, marks, centre, axis, focal, offset, least_cosine2, r, budget.in_images
-        )  # fmt: skip
+        s.add_tilt(sums, tile, marks, rig, c, rule, budget.in_images)
     if _per_image(budget):
-        s.add_noise(
-            sums, tile, marks, centre, axis, focal, offset, least_cosine2, r,
-            budget.image_px, budget.centre_m, budget.attitude, budget.waves,
-        )  # fmt: skip
+        s.add_noise(sums, tile, marks, rig, c, rule, budget)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _per_image(budget: _Budget) -> bool:
+def _per_image(budget: Budget) -> bool:
     """Whether rays differ by more than the noise of image coordinates."""
     return max(budget.waves, max(budget.centre_m, budget.attitude)) > 0.0
 
 
-# What follows `_finish_tile` is inlined: with calls left in it the loop over the points of a tile
+# What follows `finish_tile` is inlined: with calls left in it the loop over the points of a tile
 # is not vectorised, and takes five times as long.
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _finish_tile(
+def finish_tile(
     result: FloatArray, rows: IntArray, sums: FloatArray, tile: FloatArray,
-    level_sigma: FloatArray, budget: _Budget,
+    level_sigma: FloatArray, budget: Budget,
 ) -> None:  # fmt: skip
     """Turn the sums of a tile into covariances."""
     out, sigma = np.empty(6 * TILE), level_sigma[rows]
@@ -408,7 +252,7 @@ def _solved_in_space(sums: FloatArray, j: int) -> tuple[bool, Nine, Nine]:
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
 def _write(
     out: FloatArray, j: int, solved: bool, by_delta: Nine, by_noise: Nine, sums: FloatArray,
-    tile: FloatArray, level_sigma: float, budget: _Budget,
+    tile: FloatArray, level_sigma: float, budget: Budget,
 ) -> None:  # fmt: skip
     """Write the covariance of a point: of its noise, and of each common error a column squared."""
     b = by_noise
@@ -436,7 +280,7 @@ def _dot(x: Four, y: Four) -> float:
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
 def _columns(
-    by_delta: Nine, sums: FloatArray, tile: FloatArray, j: int, level_sigma: float, budget: _Budget
+    by_delta: Nine, sums: FloatArray, tile: FloatArray, j: int, level_sigma: float, budget: Budget
 ) -> tuple[Three, Three, Three, Three]:
     """Return how a point moves by one standard deviation of level, index and both tilts.
 

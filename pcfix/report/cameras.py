@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.lens.visibility import footprint
+from pcfix.lens.frames import footprint
 from pcfix.report.figures import AFTER, WATER, new_figure
 
 if TYPE_CHECKING:

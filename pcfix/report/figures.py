@@ -37,7 +37,7 @@ def png_of(figure: Figure, dpi: int = 130) -> bytes:
 
 def relief(height_m: FloatArray, cell_m: float) -> FloatArray:
     """Return the shade of a surface lit from the north-west, 45 degrees up, 0 to 1."""
-    from pcfix.grid.shade import NO_LIGHT, hillshade
+    from pcfix.grid.model import NO_LIGHT, hillshade
 
     light = hillshade(np.pad(height_m, 1, constant_values=np.nan), cell_m, 315.0, 45.0)
     return np.where(light == NO_LIGHT, np.nan, (light - 1.0) / 254.0)

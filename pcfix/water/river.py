@@ -1,19 +1,29 @@
-"""A water surface along a river: level across the flow, its height a profile along it."""
+"""A water surface along a river: level across the flow, its height a profile along it.
+
+The order of the points along the river is that of their shortest ways through a net from the two
+ends, as in Isomap (Tenenbaum et al. 2000, Science 290: 2319-2323). The axis is then a principal
+curve (Hastie & Stuetzle 1989, J. Am. Stat. Assoc. 84: 502-516): smoothed over about the width of
+the river, and the points projected onto it anew, until that changes nothing more.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pcfix.errors import GeometryError
 from pcfix.model import BoolArray, FloatArray, WaterMesh
-from pcfix.water.flow_axis import Axis, flow_axis, given_axis
-from pcfix.water.profile import Profile, fit_profile
+from pcfix.water.robust import Profile, fit_profile
 
 if TYPE_CHECKING:
-    from pcfix.model import IntArray
+    from scipy.sparse import csr_array
+    from scipy.spatial import cKDTree
+
+    from pcfix.model import FloatArray, IntArray
+
 
 FEWEST = 10
 MOST_CELLS = 200_000
@@ -188,3 +198,183 @@ def _grid_triangles(columns: int, rows: int) -> IntArray:
     one = np.column_stack([corner, corner + 1, corner + columns])
     other = np.column_stack([corner + 1, corner + columns + 1, corner + columns])
     return np.vstack([one, other]).astype(np.int64)
+
+
+FEWEST_ON_AXIS = 6
+NET_POINTS = 1500
+"""Points of the net; where there are more, those of a cell count as one."""
+REACH = 2.0
+"""Longest edge of the net, over the longest that is needed to hold it together."""
+_ROUNDS, _NODES = 10, 300
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """A line along a river.
+
+    Attributes
+    ----------
+    xy : array, shape (m, 2)
+        Its vertices, metres, world frame.
+    width_m : float
+        Twice the rms distance of the points from it; zero where it was given.
+    """
+
+    xy: FloatArray
+    width_m: float = 0.0
+
+    @cached_property
+    def station_m(self) -> FloatArray:
+        """Distance along the line to each vertex, shape (m,)."""
+        steps = np.hypot(*np.diff(self.xy, axis=0).T)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.xy)
+
+    def locate(self, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the distance along the line of places (n, 2), and their distance from it, m.
+
+        A place beyond an end is at that end.
+        """
+        nearest = np.asarray(self._tree.query(xy)[1], np.int64)
+        sides = [np.clip(nearest + k, 0, len(self.xy) - 2) for k in (-1, 0)]
+        (one, far_one), (other, far_other) = (self._on_segment(xy, side) for side in sides)
+        first = far_one <= far_other
+        return np.where(first, one, other), np.where(first, far_one, far_other)
+
+    def _on_segment(self, xy: FloatArray, i: IntArray) -> tuple[FloatArray, FloatArray]:
+        start, edge = self.xy[i], self.xy[i + 1] - self.xy[i]
+        length2 = np.maximum((edge**2).sum(axis=1), 1e-12)
+        share = np.clip(((xy - start) * edge).sum(axis=1) / length2, 0.0, 1.0)
+        away = np.hypot(*(xy - start - share[:, None] * edge).T)
+        return self.station_m[i] + share * np.sqrt(length2), away
+
+    def reversed(self) -> Axis:
+        """Return the line from its other end."""
+        return Axis(self.xy[::-1].copy(), self.width_m)
+
+
+def given_axis(xy: FloatArray) -> Axis:
+    """Return the axis along a line (m, 2) that a user gives.
+
+    Raises
+    ------
+    GeometryError
+        If it has no length.
+    """
+    xy = np.asarray(xy, np.float64)[:, :2]
+    kept = np.concatenate([[True], np.hypot(*np.diff(xy, axis=0).T) > 0.0])
+    if kept.sum() < 2:
+        raise GeometryError("The line along the river has no length; give two points or more.")
+    return Axis(xy[kept])
+
+
+def flow_axis(xy: FloatArray) -> Axis:
+    """Return the axis of a river from points (n, 2) on its banks, metres.
+
+    Raises
+    ------
+    GeometryError
+        If there are fewer than `FEWEST_ON_AXIS` points, or they are at one place.
+    """
+    if len(xy) < FEWEST_ON_AXIS or not np.ptp(xy, axis=0).any():
+        raise GeometryError(
+            f"The axis of a river needs at least {FEWEST_ON_AXIS} shoreline points at different"
+            f" places, and there are {len(xy)}; fit a plane, or give the line along the river."
+        )
+    origin = xy.mean(axis=0)
+    places = xy - origin
+    net = _thinned(places)
+    station, bandwidth = _stations(net)
+    nodes = _smoothed(net, station, bandwidth)
+    for _ in range(_ROUNDS):
+        station, away = Axis(nodes).locate(places)
+        width = 2.0 * float(np.sqrt(np.mean(away**2)))
+        bandwidth = max(width, _gap(station), 1e-3)
+        nodes = _smoothed(places, station, bandwidth)
+    _, away = Axis(nodes).locate(places)
+    return Axis(_extended(nodes, bandwidth) + origin, 2.0 * float(np.sqrt(np.mean(away**2))))
+
+
+def _thinned(xy: FloatArray) -> FloatArray:
+    """Return places, or the mean of those in each cell where they are many."""
+    if len(xy) <= NET_POINTS:
+        return np.unique(xy, axis=0)
+    cell_m = float(np.sqrt(np.prod(np.maximum(np.ptp(xy, axis=0), 1e-3)) / NET_POINTS))
+    _, cell = np.unique(np.floor(xy / cell_m), axis=0, return_inverse=True)
+    cell = cell.ravel()
+    count = np.bincount(cell)
+    return np.column_stack([np.bincount(cell, xy[:, k]) / count for k in (0, 1)])
+
+
+def _stations(xy: FloatArray) -> tuple[FloatArray, float]:
+    """Return how far along the river each place is, and how far to smooth, m."""
+    from scipy.sparse.csgraph import dijkstra
+
+    net, longest = _net(xy)
+    start = np.argmax(dijkstra(net, indices=np.array([0])), axis=1)
+    from_start = dijkstra(net, indices=start)[0]
+    end = int(np.argmax(from_start))
+    from_end = dijkstra(net, indices=np.array([end]))[0]
+    return (from_start + from_start[end] - from_end) / 2.0, REACH * longest
+
+
+def _net(xy: FloatArray) -> tuple[csr_array, float]:
+    """Return a net between neighbours, and the longest edge that holds it together."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import minimum_spanning_tree
+
+    edges = _edges(xy)
+    length = np.hypot(*(xy[edges[:, 0]] - xy[edges[:, 1]]).T)
+    n = len(xy)
+    longest = float(minimum_spanning_tree(csr_array((length, edges.T), shape=(n, n))).data.max())
+    kept = length <= REACH * longest
+    both = np.vstack([edges[kept], edges[kept][:, ::-1]])
+    return csr_array((np.tile(length[kept], 2), both.T), shape=(n, n)), longest
+
+
+def _edges(xy: FloatArray) -> IntArray:
+    """Return the edges of Delaunay's triangles, each once; along a line where there are none."""
+    from scipy.spatial import Delaunay, QhullError
+
+    try:
+        corners = Delaunay(xy).simplices
+    except QhullError:
+        direction = np.linalg.svd(xy - xy.mean(axis=0), full_matrices=False)[2][0]
+        order = np.argsort(xy @ direction, kind="stable")
+        return np.column_stack([order[:-1], order[1:]])
+    pairs = np.vstack([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    return np.unique(np.sort(pairs, axis=1), axis=0)
+
+
+def _smoothed(xy: FloatArray, station: FloatArray, bandwidth: float) -> FloatArray:
+    """Return a line through the local linear means of places along their stations."""
+    low, high = float(station.min()), float(station.max())
+    count = int(np.clip((high - low) / bandwidth * 4.0, 8, _NODES))
+    at = np.linspace(low, high, count)
+    from_node = station[None] - at[:, None]
+    weight = np.exp(-0.5 * (from_node / bandwidth) ** 2)
+    s0, s1, s2 = (np.sum(weight * from_node**k, axis=1) for k in range(3))
+    local = weight * (s2[:, None] - s1[:, None] * from_node)
+    size = s0 * s2 - s1**2
+    flat = size <= 1e-9 * s0**2 * bandwidth**2
+    local[flat], size[flat] = weight[flat], s0[flat]
+    return np.asarray(local @ xy / size[:, None])
+
+
+def _gap(station: FloatArray) -> float:
+    """Return a wide gap between stations: one in ten is wider."""
+    return float(np.quantile(np.diff(np.sort(station)), 0.9))
+
+
+def _extended(nodes: FloatArray, by_m: float) -> FloatArray:
+    """Return a line drawn on at both ends, so that the outermost points lie beside it."""
+    ends = []
+    for end, inner in ((nodes[0], nodes[1]), (nodes[-1], nodes[-2])):
+        outward = (end - inner) / max(float(np.hypot(*(end - inner))), 1e-9)
+        ends.append(end + 2.0 * by_m * outward)
+    return np.vstack([ends[0], nodes, ends[1]])

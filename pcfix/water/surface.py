@@ -1,20 +1,28 @@
-"""The water surface as the points see it: its height and its normal above each of them."""
+"""The water surface as the points see it: its height and its normal above each of them.
+
+A raster: between the centres of four cells it is bilinear, z = z00 + s dx + t dy + k s t with s and
+t from 0 to 1; its slope is the gradient of that. An unknown cell is NaN and makes the four patches
+around it unknown, by arithmetic alone. A mesh: the plan is covered by a grid of square cells, each
+of which lists the facets whose bounding box touches it. Coordinates inside are relative to the
+raster's upper left cell, or the mesh's lower left corner, so that nothing is lost at UTM northings
+of five million.
+"""
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numba import njit, prange
 
-from pcfix.errors import SettingError
+from pcfix.errors import GeometryError, SettingError
 from pcfix.model import WaterDimension, WaterMesh, WaterPlane, WaterRaster
-from pcfix.water.raster import build_field, heights_above
-from pcfix.water.tin import build_tin, facets_above
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from pcfix.model import BoolArray, FloatArray, WaterSurface
+    from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 
 
 class SurfaceAbove(NamedTuple):
@@ -83,3 +91,205 @@ def _mesh_above(mesh: WaterMesh, xyz: FloatArray) -> SurfaceAbove:
 def is_submerged(z: FloatArray, surface: SurfaceAbove) -> BoolArray:
     """Return which points lie below the water surface; unknown surface means no."""
     return np.asarray(z < surface.height_m)
+
+
+class Field(NamedTuple):
+    """The numbers of the lookup; see `build_field`.
+
+    heights : shape (rows, columns), metres, northern row first.
+    west_x, north_y : the centre of the upper left cell, world frame.
+    cell_x, cell_y : width and height of a cell, metres.
+    """
+
+    heights: FloatArray
+    west_x: float
+    north_y: float
+    cell_x: float
+    cell_y: float
+
+
+@lru_cache(maxsize=4)
+def build_field(raster: WaterRaster) -> Field:
+    """Return a raster as the kernels take it."""
+    width, height = (float(side) for side in raster.cell_m)
+    return Field(
+        np.ascontiguousarray(raster.height_m, np.float64),
+        float(raster.left_m) + width / 2.0,
+        float(raster.top_m) - height / 2.0,
+        width,
+        height,
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def height_at(field: Field, x: float, y: float) -> tuple[float, float, float]:
+    """Return height, dz/dx and dz/dy at a plan position (world frame); NaN where not known.
+
+    In the outer half of the cells at the edge the outermost patch goes on.
+    """
+    rows, columns = field.heights.shape
+    u, v = (x - field.west_x) / field.cell_x, (field.north_y - y) / field.cell_y
+    if not (-0.5 <= u <= columns - 0.5 and -0.5 <= v <= rows - 0.5):
+        return np.nan, 0.0, 0.0
+    column = min(max(int(np.floor(u)), 0), columns - 2)
+    row = min(max(int(np.floor(v)), 0), rows - 2)
+    s, t = u - column, v - row
+    z = field.heights[row, column]
+    east = field.heights[row, column + 1] - z
+    south = field.heights[row + 1, column] - z
+    twist = field.heights[row + 1, column + 1] - z - east - south
+    height = z + s * east + t * south + s * t * twist
+    return height, (east + t * twist) / field.cell_x, -(south + s * twist) / field.cell_y
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def heights_above(
+    field: Field, x: FloatArray, y: FloatArray
+) -> tuple[FloatArray, FloatArray]:  # pragma: no cover - compiled
+    """Return `height_at` for n positions: heights, shape (n,), and slopes, shape (n, 2)."""
+    height, slope = np.empty(x.size), np.empty((x.size, 2))
+    for i in prange(x.size):
+        height[i], slope[i, 0], slope[i, 1] = height_at(field, x[i], y[i])
+    return height, slope
+
+
+EDGE_TOLERANCE = 1e-9  # of a barycentric coordinate: a point on an edge belongs to both sides
+MIN_FACET_AREA_M2 = 1e-12  # in plan; below this a facet is vertical or a sliver, and has no height
+
+
+class Tin(NamedTuple):
+    """The arrays of the lookup; see `build_tin`."""
+
+    origin_x: float
+    origin_y: float
+    cell_m: float
+    columns: int
+    rows: int
+    cell_start: IntArray
+    cell_facet: IntArray
+    corners: FloatArray  # (t, 3, 2), relative to the origin
+    planes: FloatArray  # (t, 3): z = a + b x + c y, relative to the origin
+
+
+@lru_cache(maxsize=4)
+def build_tin(mesh: WaterMesh) -> Tin:
+    """Index the facets of a mesh by plan position.
+
+    Raises
+    ------
+    GeometryError
+        If no facet has an area in plan.
+    """
+    origin = mesh.vertices[:, :2].min(axis=0)
+    xyz = (mesh.vertices - np.append(origin, 0.0))[mesh.triangles]
+    edge1, edge2 = xyz[:, 1] - xyz[:, 0], xyz[:, 2] - xyz[:, 0]
+    normal = np.cross(edge1, edge2)
+    flat = np.abs(normal[:, 2]) > 2.0 * MIN_FACET_AREA_M2
+    if not flat.any():
+        raise GeometryError(f"The water surface {mesh.name} has no facet with an area in plan.")
+    xyz, normal = xyz[flat], normal[flat]
+    slope = -normal[:, :2] / normal[:, 2:]
+    a = xyz[:, 0, 2] - (slope * xyz[:, 0, :2]).sum(axis=1)
+    corners = np.ascontiguousarray(xyz[:, :, :2])
+    grid = _index_cells(corners)
+    return Tin(float(origin[0]), float(origin[1]), *grid, corners, np.column_stack([a, slope]))
+
+
+def _index_cells(corners: FloatArray) -> tuple[float, int, int, IntArray, IntArray]:
+    """Return cell size, columns, rows and the ragged table of facets per cell."""
+    extent = corners.reshape(-1, 2).max(axis=0)
+    cell = float(max(np.sqrt(extent.prod() / len(corners)), extent.max() / 4096, 1e-6))
+    columns, rows = (np.floor(extent / cell).astype(int) + 1).tolist()
+    low = np.floor(corners.min(axis=1) / cell).astype(np.int64)
+    high = np.floor(corners.max(axis=1) / cell).astype(np.int64)
+    width, height = (high - low + 1).T
+    facet = np.repeat(np.arange(len(corners)), width * height)
+    within = np.arange(len(facet)) - np.repeat(
+        np.cumsum(width * height) - width * height, width * height
+    )
+    column = low[facet, 0] + within % width[facet]
+    row = low[facet, 1] + within // width[facet]
+    code = row * columns + column
+    order = np.argsort(code, kind="stable")
+    start = np.searchsorted(code[order], np.arange(rows * columns + 1))
+    return cell, columns, rows, start.astype(np.int64), facet[order].astype(np.int64)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def locate(tin: Tin, x: float, y: float) -> int:
+    """Return the facet above the plan position (world frame), or -1 outside the mesh."""
+    u, v = x - tin.origin_x, y - tin.origin_y
+    column, row = int(np.floor(u / tin.cell_m)), int(np.floor(v / tin.cell_m))
+    if column < 0 or row < 0 or column >= tin.columns or row >= tin.rows:
+        return -1
+    cell = row * tin.columns + column
+    for k in range(tin.cell_start[cell], tin.cell_start[cell + 1]):
+        facet = tin.cell_facet[k]
+        if _inside(tin.corners[facet], u, v):
+            return int(facet)
+    return -1
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _inside(corners: FloatArray, u: float, v: float) -> bool:
+    """Whether a plan position lies in a triangle, edges included."""
+    ax, ay = corners[1, 0] - corners[0, 0], corners[1, 1] - corners[0, 1]
+    bx, by = corners[2, 0] - corners[0, 0], corners[2, 1] - corners[0, 1]
+    px, py = u - corners[0, 0], v - corners[0, 1]
+    area = ax * by - ay * bx
+    s = (px * by - py * bx) / area
+    t = (ax * py - ay * px) / area
+    return bool(s >= -EDGE_TOLERANCE and t >= -EDGE_TOLERANCE and s + t <= 1.0 + EDGE_TOLERANCE)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def facets_above(
+    tin: Tin, x: FloatArray, y: FloatArray
+) -> npt.NDArray[np.int64]:  # pragma: no cover - compiled
+    """Return `locate` for n positions."""
+    facet = np.empty(x.size, np.int64)
+    for i in prange(x.size):
+        facet[i] = locate(tin, x[i], y[i])
+    return facet
+
+
+APART_M = 0.01
+"""Facets that overlap are of no harm where their heights differ by less."""
+_EDGE = 1e-9  # of a barycentric coordinate: an edge belongs to both sides
+_AT_ONCE = 200_000
+
+
+def in_two_sheets(tin: Tin) -> tuple[BoolArray, FloatArray]:
+    """Return which facets have another above or below their centre, and all plan areas, m2."""
+    centres = tin.corners.mean(axis=1)
+    column, row = (centres // tin.cell_m).astype(np.int64).T
+    cell = row * tin.columns + column
+    double = np.zeros(len(centres), np.bool_)
+    for first in range(0, len(centres), _AT_ONCE):
+        facet = np.arange(first, min(first + _AT_ONCE, len(centres)))
+        double[facet] = _meet_others(tin, facet, centres[facet], cell[facet])
+    edge1, edge2 = tin.corners[:, 1] - tin.corners[:, 0], tin.corners[:, 2] - tin.corners[:, 0]
+    area_m2 = np.abs(edge1[:, 0] * edge2[:, 1] - edge1[:, 1] * edge2[:, 0]) / 2.0
+    return double, area_m2
+
+
+def _meet_others(tin: Tin, facet: IntArray, centres: FloatArray, cell: IntArray) -> BoolArray:
+    """Return which facets' centres lie in another facet of another height."""
+    counts = tin.cell_start[cell + 1] - tin.cell_start[cell]
+    mine = np.repeat(np.arange(len(facet)), counts)
+    within = np.arange(len(mine)) - np.repeat(np.cumsum(counts) - counts, counts)
+    other = tin.cell_facet[tin.cell_start[cell][mine] + within]
+    place = centres[mine]
+    planes = tin.planes[other] - tin.planes[facet[mine]]
+    apart_m = np.abs(planes[:, 0] + (planes[:, 1:] * place).sum(axis=1))
+    hit = (apart_m > APART_M) & _holds(tin.corners[other], place)
+    return np.bincount(mine[hit], minlength=len(facet)) > 0
+
+
+def _holds(corners: FloatArray, place: FloatArray) -> BoolArray:
+    """Whether each place lies in its triangle."""
+    (ax, ay), (bx, by) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
+    px, py = (place - corners[:, 0]).T
+    area = ax * by - ay * bx
+    s, t = (px * by - py * bx) / area, (ax * py - ay * px) / area
+    return np.asarray((s >= -_EDGE) & (t >= -_EDGE) & (s + t <= 1.0 + _EDGE))

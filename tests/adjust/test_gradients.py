@@ -21,7 +21,7 @@ from pcfix.adjust.normal import linearise
 from pcfix.adjust.observe import WATER, image, image_and_all_gradients, lens_gradients, scratch
 from pcfix.lens.imaging import coefficients, lens_table
 from pcfix.model import Lens, WaterRaster
-from pcfix.water.raster import build_field
+from pcfix.water.surface import build_field
 
 DOWN = np.diag([1.0, -1.0, -1.0])
 PLAIN = Lens(3600.0, 5472.0, 3648.0, 2730.0, 1830.0)

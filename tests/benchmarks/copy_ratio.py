@@ -103,25 +103,27 @@ def kernel(cloud, cameras, sensor):
 
     import pcfix
     from pcfix.io.las.source import read_xyz
-    from pcfix.refract.intersect import intersect
+    from pcfix.refract.batch import Batch, Survey
+    from pcfix.refract.intersect import intersect_in_frame
     from pcfix.water.surface import SurfaceAbove
 
     xyz = read_xyz(cloud)
     xyz = xyz[xyz[:, 2] < 0.37][:1_000_000]
     block, water = pcfix.read_cameras(cameras, sensor), pcfix.WaterPlane(0.37)
     surface = SurfaceAbove(np.full(len(xyz), 0.37), np.zeros((len(xyz), 2)))
+    survey = Survey(water, block, pcfix.Settings(dimensions="minimal"))
     best, found = np.inf, None
     for _ in range(15):
         started = time.perf_counter()
-        found = intersect(xyz, surface, water, block, pcfix.Settings())
+        found = intersect_in_frame(Batch(xyz, surface, survey))
         best = min(best, time.perf_counter() - started)
     rays = int(found.ray_count.sum())
     print(
-        f"kernel         {found.pairs_tested / best / 1e6:7.0f} M point-camera pairs/s computed,"
-        f" {rays / best / 1e6:.0f} M of them rays ({len(xyz):,} points, {len(block)} cameras,"
-        f" {found.pairs_tested / len(xyz):.0f} pairs and {rays / len(xyz):.0f} rays a point; least"
-        f" of 15 runs, ordering and scattering included);\n               all pairs of the block,"
-        f" most of them ruled out by tile: {len(xyz) * len(block) / best / 1e6:,.0f} M/s"
+        f"kernel         {rays / best / 1e6:7.0f} M rays/s ({len(xyz):,} points,"
+        f" {len(block)} cameras, {rays / len(xyz):.0f} rays a point; least of 15 runs, ordering"
+        f" and scattering included);"
+        f"\n               all pairs of the block, most of them ruled out by tile:"
+        f" {len(xyz) * len(block) / best / 1e6:,.0f} M/s"
     )
 
 

@@ -117,7 +117,7 @@ def in_memory(cloud):
     """Time the mask alone, the cells and the question to the polygons for every point."""
     import shapely
 
-    from pcfix.label.mask import WaterMask
+    from pcfix.label.areas import WaterMask
 
     las = laspy.read(cloud)
     x, y, area = np.array(las.x), np.array(las.y), lake()

@@ -17,7 +17,7 @@ import time
 import numpy as np
 
 from pcfix.model import WaterPlane, WaterRaster
-from pcfix.refract.tracing.paths import METHODS, trace
+from pcfix.refract.tracing import METHODS, trace
 
 INDEX = 1.34
 HEAD = "method        paths/s  steps  ray %  crease %  lost %  elsewhere %  95 % of these within, m"

@@ -13,10 +13,12 @@ import typer
 from typer.testing import CliRunner
 
 import pcfix
-from pcfix.clean import CleanSettings, clean_file, clean_points
+from pcfix.clean.points import clean_points
+from pcfix.clean.settings import CleanSettings
 from pcfix.cli.clean import clean
 from pcfix.errors import GeometryError, InputError, SettingError
 from pcfix.flow import clean as flow_clean
+from pcfix.flow.clean import clean_file
 from pcfix.io.las.source import read_xyz
 from tests.clean.scenes import spoilt_scene
 from tests.utils.clouds import (

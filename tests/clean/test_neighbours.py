@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pcfix.clean import CleanSettings, Reason, clean_points, neighbours, tiles
-from pcfix.clean.neighbours import Neighbours, height_quartiles, mean_of_first
-from pcfix.clean.tiles import make_tiles
+from pcfix.clean import neighbours
+from pcfix.clean.neighbours import Neighbours, height_quartiles, make_tiles, mean_of_first
+from pcfix.clean.points import clean_points
+from pcfix.clean.settings import CleanSettings, Reason
 from pcfix.io.water import load_open3d
 from tests.clean.scenes import spoilt_scene
 
@@ -85,7 +86,7 @@ def test_tiles_hold_every_used_point_once() -> None:
 def test_blocks_of_rows_do_not_change_the_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
     xyz, used = _clustered(), np.ones(900, bool)
     whole = make_tiles(xyz, used, 4.0)
-    monkeypatch.setattr(tiles, "BLOCK_ROWS", 77)
+    monkeypatch.setattr(neighbours, "BLOCK_ROWS", 77)
     cut = make_tiles(xyz, used, 4.0)
     assert np.array_equal(cut.row, whole.row)
     assert np.array_equal(cut.start, whole.start)

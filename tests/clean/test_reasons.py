@@ -7,9 +7,10 @@ import doctest
 import numpy as np
 import pytest
 
-from pcfix.clean import CleanSettings, Reason, clean_points
+from pcfix.clean import points as door
+from pcfix.clean.points import clean_points
+from pcfix.clean.settings import CleanSettings, Reason
 from pcfix.errors import InputError, SettingError
-from pcfix.flow import clean_points as door
 from pcfix.model import WaterPlane
 from tests.clean.scenes import spoilt_scene
 

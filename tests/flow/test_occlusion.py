@@ -5,7 +5,7 @@ import pytest
 
 import pcfix.refract.top_surface as top_surface
 from pcfix import Cameras, Settings
-from pcfix.flow.occlusion import OccluderBuilder, occluder_of, wants_occlusion
+from pcfix.refract.top_surface import OccluderBuilder, occluder_of, wants_occlusion
 
 UTM = np.array([512_345.678, 4_987_654.321, 0.0])
 NAMES = ("height", "margin", "block_top", "large_block_top")

@@ -11,11 +11,17 @@ from pcfix.flow.regression import learn_regression
 from pcfix.label.labelling import Part
 from pcfix.model import Outcome, WaterPlane
 from pcfix.options import Settings
-from pcfix.refract.apparent_depths import LEAST_NEIGHBOURS, NEIGHBOURS, ApparentDepths
-from pcfix.refract.learned import Learned
+from pcfix.refract.batch import Learned
 from pcfix.refract.methods import correct
-from pcfix.refract.regression import DepthRegression, fit_depths
+from pcfix.refract.regression import (
+    LEAST_NEIGHBOURS,
+    NEIGHBOURS,
+    ApparentDepths,
+    DepthRegression,
+    fit_depths,
+)
 from pcfix.water.surface import surface_above
+from tests.utils.batches import batch_of
 
 ORIGIN = np.array([500_000.0, 4_600_000.0])
 LEVEL = WaterPlane(12.0)
@@ -265,7 +271,9 @@ def test_it_is_applied(tmp_path):
     assert isinstance(found, DepthRegression)
     above = surface_above(LEVEL, xyz)
     cameras = pcfix.Cameras(("a",), np.array([[*ORIGIN, 100.0]]))
-    result = correct(xyz, above, LEVEL, cameras, SETTINGS, learned=Learned(regression=found))
+    result = correct(
+        batch_of(xyz, above, LEVEL, cameras, SETTINGS, learned=Learned(regression=found))
+    )
     assert (result.outcome == Outcome.CORRECTED).all()
     depth = 12.0 - xyz[:, 2]
     expected = found.intercept_m + found.slope * depth

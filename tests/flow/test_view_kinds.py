@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.flow.view_kinds import PATCHES, kind_of_views
 from pcfix.io.views import ViewMatch, read_views
 from pcfix.model import Views, WaterPlane
 from pcfix.options import Settings
-from pcfix.refract.learned import Learned
+from pcfix.refract.batch import Learned
+from pcfix.refract.learning import PATCHES, kind_of_views
 from pcfix.refract.matcher import matcher_of
 from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
+from tests.utils.batches import batch_of
 from tests.utils.shared import needs
 
 RENDERED, rendered = needs("rendered_a")
@@ -23,7 +24,7 @@ def kind_of(xyz, cameras, water, views, n=1.34):
     settings = Settings(method="consistent", refractive_index=n, dimensions="none")
     learned = Learned(matcher=matcher_of(cameras, xyz))
     above = surface_above(water, xyz)
-    return kind_of_views(xyz, above, water, cameras, settings, views, learned)
+    return kind_of_views(batch_of(xyz, above, water, cameras, settings, views, learned=learned))
 
 
 def under_water(cloud, points=1200, **settings):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pcfix.errors import GeometryError, SettingError
+from pcfix.label.areas import WaterMask
 from pcfix.label.labelling import Labelling, Part
-from pcfix.label.mask import WaterMask
 from pcfix.options import LabelSettings
 from pcfix.water.surface import SurfaceAbove
 

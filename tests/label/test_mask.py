@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pcfix.label.mask import WaterMask
+from pcfix.label.areas import WaterMask
 
 shapely = pytest.importorskip("shapely")
 

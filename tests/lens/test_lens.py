@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import root
 
 import pcfix
-from pcfix.lens.brown import distorted, jacobian
+from pcfix.lens.formulas import distorted, jacobian
 from pcfix.lens.imaging import coefficients, project, unproject
 from tests.utils.twins import brown_slowly, image_slowly
 

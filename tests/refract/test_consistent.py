@@ -13,14 +13,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pcfix.errors import PcfixWarning, SettingError
-from pcfix.lens.derivatives import image_and_gradients
-from pcfix.lens.imaging import coefficients
+from pcfix.lens.imaging import coefficients, image_and_gradients
 from pcfix.model import Cameras, Lens, Outcome, Views, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options import Settings
 from pcfix.refract.consistent import check_consistent
 from pcfix.refract.methods import correct
 from pcfix.simulate.tracing import triangulate
 from pcfix.water.surface import surface_above
+from tests.utils.batches import batch_of
 from tests.utils.consistent_twin import (
     found_by_full_triangulation,
     image_in,
@@ -103,7 +103,7 @@ def views_of(lists):
 def run(points, cameras, water, views, *, method="consistent", n=N_WATER, offset=None):
     settings = Settings(method=method, refractive_index=n)
     above = surface_above(water, points)
-    return correct(points, above, water, cameras, settings, views, offset)
+    return correct(batch_of(points, above, water, cameras, settings, views, offset))
 
 
 def bed(count, seed=3, spread=20.0):

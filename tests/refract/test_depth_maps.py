@@ -12,14 +12,13 @@ from pcfix.io.views import ViewMatch, read_views
 from pcfix.lens.frames import frames_of
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options import Settings
-from pcfix.refract.bed import WIDTH_M, Bed, bed_of
+from pcfix.refract.batch import Learned, images_of
 from pcfix.refract.depth_maps import _best_pairs, _depth, sight_of
-from pcfix.refract.learned import Learned
-from pcfix.refract.made_with import images_of
-from pcfix.refract.matcher import Matcher
+from pcfix.refract.matcher import WIDTH_M, Bed, Matcher, bed_of
 from pcfix.refract.methods import correct
 from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
+from tests.utils.batches import batch_of
 from tests.utils.depth_map_twin import (
     LENS,
     costs_of,
@@ -61,7 +60,7 @@ def matcher(cameras=CAMERAS, matched=MATCHED, averaged=None, fused=None, toleran
 def run(xyz, water, views, learned, *, cameras=CAMERAS, offset=None, n=N_WATER):
     settings = Settings(method="consistent", refractive_index=n, dimensions="none")
     above = surface_above(water, xyz)
-    return correct(xyz, above, water, cameras, settings, views, offset, learned)
+    return correct(batch_of(xyz, above, water, cameras, settings, views, offset, learned=learned))
 
 
 def listed(lists, weights=None):
@@ -305,7 +304,7 @@ def test_maps_are_found_where_no_list_tells_them(name, most, monkeypatch):
     assert abs(error.mean()) < 4.5
     for choices in ({"camera_set": "mvs"}, {"camera_set": "all"}):
         assert rms(error) < 0.6 * rms(errors_gsd(name, method="snell", **choices))
-    monkeypatch.setattr("pcfix.flow.learning.learn_bed", lambda *_: None)
+    monkeypatch.setattr("pcfix.refract.learning._learn_bed", lambda *_: None)
     alone = errors_gsd(name, method="consistent", camera_set="mvs")
     # 3.5 and 42 GSD: the images of a group see the bed at heights that are a metre apart
     assert rms(error) < {"nadir": 0.9, "half oblique": 0.4}[name] * rms(alone)

@@ -12,12 +12,12 @@ import pcfix
 from pcfix.errors import SettingError
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options import Settings
-from pcfix.refract.bundles import Bundle
-from pcfix.refract.learned import Learned
-from pcfix.refract.literature.pairs import BASE_TO_HEIGHT, in_pairs
+from pcfix.refract.batch import Learned
+from pcfix.refract.literature import BASE_TO_HEIGHT, in_pairs
 from pcfix.refract.methods import correct
 from pcfix.refract.regression import DepthRegression
 from pcfix.water.surface import surface_above
+from tests.utils.batches import batch_of
 from tests.utils.twins import bend, correct_slowly, light_path, stacked_intersection
 
 UTM = np.array([512_345.678, 4_987_654.321, 0.0])
@@ -41,7 +41,9 @@ def run(method, points, centres, n=1.34, *, water=LEVEL, views=None, offset=None
     learned = Learned(regression=line(more.pop("a", 0.0), more.pop("b", n)))
     chosen = Settings(n, method=method, max_angle_deg=90.0, **more)
     above = surface_above(water, xyz)
-    return correct(xyz, above, water, named(centres), chosen, views, offset, learned)
+    return correct(
+        batch_of(xyz, above, water, named(centres), chosen, views, offset, learned=learned)
+    )
 
 
 def block(k=6, seed=0, height=80.0, spread=50.0):
@@ -255,7 +257,7 @@ def test_pairs_keep_what_becomes_of_points_with_fewer_rays():
     xyz = bed(3)
     above = surface_above(LEVEL, xyz)
     cameras = named(block(3))
-    whole = Bundle(xyz, above, LEVEL, cameras, views, Settings(), np.zeros(3), Learned())
+    whole = batch_of(xyz, above, LEVEL, cameras, Settings(), views)
     paired = in_pairs(whole)
     assert paired.counts.tolist() == [0, 1, 2]
     expected = [Outcome.NO_CAMERA, Outcome.ONE_CAMERA, Outcome.CORRECTED]
@@ -287,7 +289,7 @@ def test_regression_is_refused_where_none_was_learned():
     xyz = bed(3)
     chosen = Settings(method="regression")
     with pytest.raises(SettingError, match="needs a regression"):
-        correct(xyz, surface_above(LEVEL, xyz), LEVEL, named(block()), chosen)
+        correct(batch_of(xyz, surface_above(LEVEL, xyz), LEVEL, named(block()), chosen))
 
 
 @pytest.mark.parametrize("method", BY_CAMERAS)

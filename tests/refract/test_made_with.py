@@ -9,12 +9,11 @@ from scipy.spatial.transform import Rotation
 from pcfix.lens.frames import frames_of
 from pcfix.model import Cameras, Outcome, Views, WaterPlane
 from pcfix.options import Settings
-from pcfix.refract.bed import Bed
-from pcfix.refract.learned import Learned
-from pcfix.refract.made_with import MadeWith, as_made, as_now, images_of
-from pcfix.refract.matcher import Matcher
+from pcfix.refract.batch import Learned, MadeWith, as_made, as_now, images_of
+from pcfix.refract.matcher import Bed, Matcher
 from pcfix.refract.methods import correct, shift_of_land
 from pcfix.water.surface import surface_above
+from tests.utils.batches import batch_of
 from tests.utils.depth_map_twin import LENS, fused_slowly, looking
 
 N_WATER, TOLERANCE = 1.34, 0.1
@@ -68,7 +67,9 @@ def run(xyz, views, learned, made_with, kind="depth-maps"):
         method="consistent", refractive_index=N_WATER, dimensions="none", matcher=kind
     )
     above = surface_above(WATER, xyz)
-    return correct(xyz, above, WATER, CAMERAS, settings, views, None, learned, made_with=made_with)
+    return correct(
+        batch_of(xyz, above, WATER, CAMERAS, settings, views, learned=learned, made_with=made_with)
+    )
 
 
 def listed(lists, kind="depth-maps"):
@@ -172,18 +173,17 @@ def test_land_comes_home(with_list):
     settings = Settings(method="consistent", refractive_index=N_WATER)
     alone = matcher(made)._replace(fused=np.full((8, 12), -1))
     views = listed([maps]) if with_list else None
-    shift = shift_of_land(
-        came[None], CAMERAS, settings, views, Learned(matcher=alone), MadeWith(came[None], made)
-    )
+    batch = batch_of(
+        came[None], surface_above(WATER, came[None]), WATER, CAMERAS, settings, views,
+        learned=Learned(matcher=alone), made_with=MadeWith(came[None], made),
+    )  # fmt: skip
+    shift = shift_of_land(batch)
     if with_list:
         assert came + shift[0] == pytest.approx(true, abs=0.01)
     else:  # each image alone may have made it
         assert np.isfinite(shift).all() and np.abs(shift).max() > 0.1
     tracks = replace(listed([MIXED]), kind="tracks")
-    none = shift_of_land(
-        came[None], CAMERAS, settings, tracks, Learned(matcher=alone), MadeWith(came[None], made)
-    )
-    assert not none.any()
+    assert not shift_of_land(replace(batch, views=tracks)).any()
 
 
 def test_directions_go_through_the_lenses_and_back():

@@ -7,14 +7,15 @@ import pytest
 
 import pcfix
 from pcfix import Cameras, Lens, Settings
-from pcfix.flow.occlusion import occluder_of
 from pcfix.io.views import ViewMatch, read_views
 from pcfix.model import Views, WaterPlane
-from pcfix.refract.learned import Learned
+from pcfix.refract.batch import Learned
 from pcfix.refract.methods import correct
 from pcfix.refract.occlusion import hidden, in_sight
+from pcfix.refract.top_surface import occluder_of
 from pcfix.simulate.tracing import piercing_points, project, triangulate
 from pcfix.water.surface import SurfaceAbove
+from tests.utils.batches import batch_of
 from tests.utils.shared import needs
 
 RENDERED, rendered = needs("rendered_a")
@@ -313,8 +314,10 @@ def test_cliff_spoils_the_bed_below_it_unless_its_shadow_is_known():
 
     def rms_m(views=None, occluder=None, **words):
         result = correct(
-            apparent, flat, water, cameras, Settings(**words), views, None,
-            Learned(occluder=occluder),
+            batch_of(
+                apparent, flat, water, cameras, Settings(**words), views,
+                learned=Learned(occluder=occluder),
+            )
         )  # fmt: skip
         return np.sqrt(((apparent + result.shift_m - true) ** 2).sum(axis=1).mean())
 

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 from pcfix.errors import PcfixWarning, SettingError
 from pcfix.model import Cameras, Lens, Outcome, Views, WaterPlane
 from pcfix.options import Settings
-from pcfix.refract.bundles import Bundle
-from pcfix.refract.learned import Learned
+from pcfix.refract.batch import Learned
 from pcfix.refract.matcher import matcher_of
 from pcfix.refract.methods import correct
 from pcfix.refract.stereo_pairs import cameras_of_pairs, invert_pairs
 from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
+from tests.utils.batches import batch_of
 from tests.utils.consistent_twin import seen_through_water, triangulated_straight
 
 N_WATER = 1.34
@@ -57,7 +57,9 @@ def corrected(scene, rows, views, *, method="consistent", learned=None, **choice
         refractive_index=scene.refractive_index, method=method, dimensions="none", **choices
     )
     above = surface_above(scene.water, xyz)
-    return correct(xyz, above, scene.water, scene.cameras, settings, views, None, learned)
+    return correct(
+        batch_of(xyz, above, scene.water, scene.cameras, settings, views, learned=learned)
+    )
 
 
 def errors_m(scene, rows, result):
@@ -114,14 +116,14 @@ def test_modelled_pairs_are_better_than_one_intersection(name):
 def test_a_matcher_with_the_true_partners_gives_the_known_pairs():
     scene = scene_of("obliques", 0.5)
     rows = under_water(scene)[:300]
-    xyz, count = scene.apparent_xyz[rows], len(scene.cameras)
+    xyz = scene.apparent_xyz[rows]
     matcher = matcher_of(scene.cameras, xyz)._replace(matched=scene.neighbours)
     settings = Settings(refractive_index=scene.refractive_index, method="consistent")
-    bundle = Bundle(
-        xyz, surface_above(scene.water, xyz), scene.water, scene.cameras, scene.views.take(rows),
-        settings, np.zeros(count), Learned(matcher=matcher),
+    batch = batch_of(
+        xyz, surface_above(scene.water, xyz), scene.water, scene.cameras, settings,
+        scene.views.take(rows), learned=Learned(matcher=matcher),
     )  # fmt: skip
-    modelled, known = invert_pairs(bundle), invert_pairs(bundle, pairs_in(scene, rows))
+    modelled, known = invert_pairs(batch), invert_pairs(batch, pairs_in(scene, rows))
     # the same pairs in another order, and cameras within a pair: two medians end 1e-6 m from P
     assert modelled.shift_m == pytest.approx(known.shift_m, abs=1e-5)
     assert (modelled.ray_count == known.ray_count).all()
@@ -154,7 +156,9 @@ def listed(lists):
 
 def run(points, cameras, water, pairs, *, n=N_WATER, offset=None, **choices):
     settings = Settings(method="consistent", refractive_index=n, dimensions="none", **choices)
-    return correct(points, surface_above(water, points), water, cameras, settings, pairs, offset)
+    return correct(
+        batch_of(points, surface_above(water, points), water, cameras, settings, pairs, offset)
+    )
 
 
 def median_slowly(q, cameras, pairs, planes, n, start):
@@ -252,7 +256,7 @@ def test_points_without_a_solution_keep_that_of_snell():
         result = run(points, cameras, water, listed([[[0, 1]]]))
     settings = Settings(method="snell", refractive_index=N_WATER)
     views = Views(np.array([0, 2]), np.array([0, 1]))
-    plain = correct(points, surface_above(water, points), water, cameras, settings, views)
+    plain = correct(batch_of(points, surface_above(water, points), water, cameras, settings, views))
     assert result.shift_m == pytest.approx(plain.shift_m, abs=1e-9)
 
 

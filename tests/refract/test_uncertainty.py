@@ -17,11 +17,12 @@ import pytest
 
 from pcfix.model import NOMINAL_WIDTH_PX, Lens, Outcome, Views, WaterPlane
 from pcfix.options import LEVEL_M, ErrorBudget, Settings
-from pcfix.refract.intersect import intersect
-from pcfix.refract.methods import correct
+from pcfix.refract import uncertainty
+from pcfix.refract.intersect import intersect_in_frame
+from pcfix.refract.methods import correct, with_rays
 from pcfix.refract.regression import DepthRegression
-from pcfix.refract.uncertainty import covariances
 from pcfix.water.surface import SurfaceAbove, surface_above
+from tests.utils.batches import batch_of
 from tests.utils.normalised import INDEX, apparent, block, views_of
 
 NONE = ErrorBudget(image_px=0.0, level_m=0.0, index=0.0)
@@ -54,7 +55,18 @@ def flat(points):
 
 def solved(xyz, cameras, settings, **changed):
     views = views_of(len(xyz), cameras)
-    return correct(xyz, flat(len(xyz)), LEVEL, cameras, replace(settings, **changed), views)
+    return correct(
+        batch_of(xyz, flat(len(xyz)), LEVEL, cameras, replace(settings, **changed), views)
+    )
+
+
+def intersect(*args):
+    return intersect_in_frame(batch_of(*args))
+
+
+def covariances(xyz, shift_m, above, cameras, settings, views=None, level_sigma_m=None):
+    batch = batch_of(xyz, above, LEVEL, cameras, settings, views, level_sigma_m=level_sigma_m)
+    return uncertainty.covariances(with_rays(batch), shift_m)
 
 
 DRAWS = 1000
@@ -114,7 +126,8 @@ def test_common_errors_are_the_derivatives_of_consistent(tilt_deg):
     def z_of(plane=LEVEL, index=INDEX):
         settings = Settings(method="consistent", refractive_index=index, dimensions="minimal")
         above = surface_above(plane, xyz)
-        return correct(xyz, above, plane, cameras, settings, views_of(len(xyz), cameras)).shift_m
+        views = views_of(len(xyz), cameras)
+        return correct(batch_of(xyz, above, plane, cameras, settings, views)).shift_m
 
     def slope(**changed):
         up, down = ({name: pair[i] for name, pair in changed.items()} for i in range(2))
@@ -212,7 +225,7 @@ def test_both_kernels_agree_to_the_bit(method):
     assert seen.sum() > 300
     for errors in (ErrorBudget(), SOURCES["all"]):
         settings = Settings(method=method, errors=errors)
-        every = covariances(bed, found.shift_m, flat(500), cameras, settings)
+        every = intersect(bed, flat(500), LEVEL, cameras, settings).covariance_m2
         views = views_of(500, cameras)
         listed = covariances(bed, found.shift_m, flat(500), cameras, settings, views)
         assert (every[seen] == listed[seen]).all()
@@ -250,7 +263,7 @@ def test_level_is_the_users_else_the_fits_else_a_default():
 
     one = sigma(None, 1.0)
     np.testing.assert_allclose(sigma(None), LEVEL_M * one)
-    np.testing.assert_allclose(sigma(0.3), 0.3 * one)
+    np.testing.assert_allclose(sigma(np.full(20, 0.3)), 0.3 * one)
     each = np.linspace(0.01, 0.2, 20)
     np.testing.assert_allclose(sigma(each), each * one)
     np.testing.assert_allclose(sigma(each, 0.05), 0.05 * one)
@@ -261,7 +274,7 @@ def test_level_is_the_users_else_the_fits_else_a_default():
 def test_points_without_a_solution_have_none():
     bed, cameras, _ = scene(0.0, points=3)
     bed[1] = [500.0, 500.0, -3.0]  # out of every frame
-    found = correct(bed, flat(3), LEVEL, cameras, Settings())
+    found = correct(batch_of(bed, flat(3), LEVEL, cameras, Settings()))
     assert (found.covariance_m2[1] == 0.0).all() and found.sigma_z_m[1] == 0.0
     assert (found.sigma_z_m[[0, 2]] > 0.0).all()
     assert covariances(bed[:0], bed[:0], flat(0), cameras, Settings()).shape == (0, 6)
@@ -269,7 +282,7 @@ def test_points_without_a_solution_have_none():
 
 def test_it_is_skipped_where_nobody_reads_it():
     bed, cameras, _ = scene(0.0, points=3)
-    found = correct(bed, flat(3), LEVEL, cameras, Settings(dimensions="minimal"))
+    found = correct(batch_of(bed, flat(3), LEVEL, cameras, Settings(dimensions="minimal")))
     assert found.covariance_m2 is None and (found.sigma_z_m == 0.0).all()
 
 
@@ -290,12 +303,14 @@ def test_other_methods_get_the_same_budget(method):
 
 
 def test_a_regression_has_the_error_of_its_predictions():
-    from pcfix.refract.learned import Learned
+    from pcfix.refract.batch import Learned
 
     bed, cameras, _ = scene(0.0, points=5)
     line = DepthRegression(0.0, 1.4, 0.01, 0.01, 0.99, 0.08, 0.11, 20, 1.0, 9.0)
     found = correct(
-        bed, flat(5), LEVEL, cameras, Settings(method="regression"),
-        views_of(5, cameras), learned=Learned(regression=line),
+        batch_of(
+            bed, flat(5), LEVEL, cameras, Settings(method="regression"),
+            views_of(5, cameras), learned=Learned(regression=line),
+        )
     )  # fmt: skip
     np.testing.assert_allclose(found.sigma_z_m, 0.11)

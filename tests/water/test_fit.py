@@ -10,10 +10,8 @@ from scipy.stats import chi2
 
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import WaterPlane
-from pcfix.water.cloud_heights import heights_from_cloud, is_near
-from pcfix.water.fit import fit_water
-from pcfix.water.flow_axis import flow_axis
-from pcfix.water.river import fit_river
+from pcfix.water.fit import fit_water, heights_from_cloud, is_near
+from pcfix.water.river import fit_river, flow_axis
 from pcfix.water.surface import surface_above
 
 UTM = np.array([512_345.0, 4_987_654.0])

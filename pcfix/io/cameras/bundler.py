@@ -13,7 +13,7 @@ MVE ("drews 1.0", https://github.com/simonfuhrmann/mve/wiki/MVE-File-Format) has
 in units of the longer side of the frame, and views (image, feature, nothing).
 
 Neither has names or sizes of the images. Names are in ``list.txt``, a line for each camera. Sizes
-are taken as `pcfix.io.cameras.sizes` says. The CRS is not told.
+are taken as `pcfix.io.cameras.tracks` says. The CRS is not told.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.io.cameras import checks, sizes, tracks
+from pcfix.io.cameras import checks, tracks
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ def _lenses(
     bounds = np.zeros((len(bundle.cameras), 2))
     if not bundle.mve:
         np.maximum.at(bounds, bundle.points.image, np.abs(bundle.points.rest[:, 1:]))
-    frames, notes = sizes.frames(bundle.path, labels, focal, 2.0 * bounds[bundle.posed])
+    frames, notes = tracks.frame_sizes(bundle.path, labels, focal, 2.0 * bounds[bundle.posed])
     if frames is None:
         return None, notes
     if bundle.mve:

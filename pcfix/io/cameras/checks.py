@@ -1,8 +1,9 @@
-"""Rules that the numbers of every camera file must keep; each message names file and image."""
+"""Rules that the numbers of every camera file must keep, and whether two lenses are one."""
 
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,18 +16,13 @@ if TYPE_CHECKING:
 
     from pcfix.model import FloatArray, Lens
 
+
 ROUNDING = 1e-3
 """Of a rotation's elements: files with four decimals pass, a mirrored or scaled one does not."""
 
 
 def rotation(path: Path, label: str, matrix: FloatArray) -> FloatArray:
-    """Return the proper rotation next to a 3x3 matrix that is one but for its rounding.
-
-    Raises
-    ------
-    InputError
-        If it is not orthonormal, or mirrors.
-    """
+    """Return the proper rotation next to a 3x3 matrix that is one but for its rounding."""
     if not (np.abs(matrix) < 2.0).all() or np.abs(matrix @ matrix.T - np.eye(3)).max() > ROUNDING:
         raise InputError(
             f"{path}: image {label}: the rotation matrix is not orthonormal; export it again."
@@ -54,13 +50,7 @@ def repeated(path: Path, labels: Sequence[str], dropped: int = 0) -> tuple[str, 
 
 
 def quaternion(path: Path, label: str, wxyz: FloatArray) -> FloatArray:
-    """Return the rotation matrix of a unit quaternion, the scalar first.
-
-    Raises
-    ------
-    InputError
-        If its length is not 1.
-    """
+    """Return the rotation matrix of a unit quaternion, the scalar first."""
     from scipy.spatial.transform import Rotation
 
     with np.errstate(over="ignore"):
@@ -74,13 +64,7 @@ def quaternion(path: Path, label: str, wxyz: FloatArray) -> FloatArray:
 
 
 def lens(path: Path, name: str, given: Lens) -> Lens:
-    """Return the lens when its numbers can be those of a camera.
-
-    Raises
-    ------
-    InputError
-        If focal length or frame are not positive, or a number is not finite.
-    """
+    """Return the lens when its numbers can be those of a camera."""
     numbers = (
         *(given.focal, given.width, given.height, given.principal_x, given.principal_y),
         *(given.b1, given.b2, given.b3, *given.shape, *given.radial, *given.denominator),
@@ -97,13 +81,7 @@ def lens(path: Path, name: str, given: Lens) -> Lens:
 
 
 def crs(path: Path, definition: str) -> str:
-    """Return what a file says of its CRS: ``local``, or a definition that PROJ understands.
-
-    Raises
-    ------
-    InputError
-        If PROJ does not understand it.
-    """
+    """Return what a file says of its CRS: ``local``, or a definition that PROJ understands."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
@@ -118,3 +96,58 @@ def crs(path: Path, definition: str) -> str:
             " with an EPSG code."
         ) from error
     return text
+
+
+TOLERANCE = 1e-12
+"""Of every number, relative to the focal length where it is a length."""
+
+
+def is_same_lens(one: Lens, other: Lens) -> bool:
+    """Whether two lenses take every direction to the same place, but for rounding.
+
+    Zeros at the end of a list of coefficients count for nothing, nor does what the lens is called.
+    """
+    first, second = _plain(one), _plain(other)
+    if (first.projection, first.unit) != (second.projection, second.unit):
+        return False
+    if (first.inverse, first.in_turn) != (second.inverse, second.in_turn):
+        return False
+    lengths = np.array([_lengths(lens) for lens in (first, second)])
+    if np.abs(lengths[0] - lengths[1]).max() > TOLERANCE * first.focal * 10.0:
+        return False
+    pairs = ((first.shape, second.shape), (first.distortion_centre, second.distortion_centre))
+    lists = ((_series(first)[i], _series(second)[i]) for i in range(4))
+    return all(_are_close(a, b) for a, b in (*pairs, *lists))
+
+
+def _plain(lens: Lens) -> Lens:
+    """Return the lens without switches that switch nothing."""
+    radial, denominator, tangential, prism = _series(lens)
+    bent = bool(radial or denominator or tangential or prism)
+    return replace(
+        lens,
+        inverse=lens.inverse and bent,
+        in_turn=lens.in_turn and bool(tangential or prism),
+        distortion_centre=lens.distortion_centre if bent else (0.0, 0.0),
+    )
+
+
+def _lengths(lens: Lens) -> tuple[float, ...]:
+    frame = (lens.focal, lens.width, lens.height, lens.principal_x, lens.principal_y)
+    return (*frame, lens.b1, lens.b2, lens.b3)
+
+
+def _series(lens: Lens) -> tuple[tuple[float, ...], ...]:
+    lists = (lens.radial, lens.denominator, lens.tangential, lens.thin_prism)
+    return tuple(_without_zeros(each) for each in lists)
+
+
+def _without_zeros(values: Sequence[float]) -> tuple[float, ...]:
+    last = max((i for i, value in enumerate(values) if value != 0.0), default=-1)
+    return tuple(values[: last + 1])
+
+
+def _are_close(one: Sequence[float], other: Sequence[float]) -> bool:
+    return len(one) == len(other) and bool(
+        np.allclose(np.array(one, float), np.array(other, float), rtol=TOLERANCE, atol=0.0)
+    )

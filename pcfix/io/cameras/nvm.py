@@ -18,7 +18,7 @@ shorter side of the frame by its own length instead of the longer one's. Such a 
 places none of which is negative and which are far from where the points project; the middle of its
 frame, and whether the shorter side is squeezed, then follow from the points themselves.
 
-Sizes of the images are taken as `pcfix.io.cameras.sizes` says. The CRS is not told.
+Sizes of the images are taken as `pcfix.io.cameras.tracks` says. The CRS is not told.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.io.cameras import checks, sizes, tracks
+from pcfix.io.cameras import checks, tracks
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 
 if TYPE_CHECKING:
@@ -197,7 +197,7 @@ def _pose(part: Part, row: int) -> tuple[FloatArray, FloatArray]:
 def _lenses(part: Part, labels: tuple[str, ...]) -> tuple[tuple[Lens, ...] | None, tuple[str, ...]]:
     rows = part.rows[part.posed]
     smallest = _placed(part)[1][part.posed]
-    frames, notes = sizes.frames(part.path, labels, rows[:, 0], smallest)
+    frames, notes = tracks.frame_sizes(part.path, labels, rows[:, 0], smallest)
     if frames is None:
         return None, notes
     lenses = []

@@ -116,13 +116,7 @@ def recognises(source: Source) -> bool:
 
 
 def read(source: Source) -> NoReturn:
-    """Refuse the file.
-
-    Raises
-    ------
-    InputError
-        Always; with the name of the format and what to give instead.
-    """
+    """Refuse the file."""
     found = _refusal(source)
     what, remedy = (
         (found.what, found.remedy) if found else ("a format that pcfix does not read", ANY_CAMERAS)

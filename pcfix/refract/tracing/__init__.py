@@ -1,1 +1,257 @@
-"""Refractive collinearity: from an object point through the water to the projection centre."""
+"""Where light from object points leaves the water towards the projection centres.
+
+This is the refractive collinearity of Mulsow's multimedia bundle: the image of a point is that of
+its piercing point. Four methods find it, `kotowski`, `afrt`, `mdfrt` and `scattershot`, each in a
+module of its own; they agree where all of them arrive.
+
+The first three look for a refracted ray that hits the point. On facets, and on the bilinear
+patches of a raster, there may be none: through a crease that is a trough light comes that obeys
+Fermat but no one facet's normal. Where they end without a ray, `trace` lets the grids of
+`scattershot` narrow from there to the path of the least optical length near by.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numba import njit, prange
+
+from pcfix.errors import SettingError
+from pcfix.model import WaterMesh, WaterPlane, WaterRaster
+from pcfix.refract.tracing.tracers import (
+    Water,
+    afrt,
+    height_of,
+    kotowski,
+    mdfrt,
+    miss_through,
+    narrowed,
+    scattershot,
+)
+from pcfix.threads import one_caller
+from pcfix.water.surface import build_field, build_tin
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from pcfix.model import BoolArray, FloatArray, IntArray
+    from pcfix.water.surface import Field, Tin
+
+Surface: TypeAlias = WaterPlane | WaterRaster | WaterMesh
+
+METHODS = ("kotowski", "afrt", "mdfrt", "scattershot")
+_KOTOWSKI, _AFRT, _MDFRT, _SCATTERSHOT = range(4)
+_LOST, _HIT, _CREASE = 0, 1, 2
+
+# Columns of the result.
+_SLOPE, _STEPS, _STATE, _WIDTH = 3, 5, 6, 7
+
+HIGHEST_AIM = 0.95
+"""Of the camera's height over the point: rays are aimed below the camera even where a tilted
+water stands higher above the point than the camera."""
+CREASE_M = 1e-7
+"""A path by which the ray misses the point by more goes through a crease."""
+NEAR = 0.25
+"""Of the depth: how far around the end of a method its path is narrowed down."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracing:
+    """Paths of n pairs of an object point and a projection centre.
+
+    Attributes
+    ----------
+    piercing_xyz : array, shape (n, 3)
+        Where the light leaves the water, metres, world frame. The point itself where the light
+        goes straight; NaN where no path was found.
+    direction : array, shape (n, 3)
+        Unit vectors from the projection centre to there, world frame.
+    slope : array, shape (n, 2)
+        dz/dx and dz/dy of the surface there. On a crease those of the plane that bends light as
+        the crease does.
+    iterations : array of int, shape (n,)
+        Steps of the method; shots, for grids.
+    converged : array of bool, shape (n,)
+        Whether a path was found.
+    on_crease : array of bool, shape (n,)
+        Whether it leaves through a crease: the shortest path near by, but no refracted ray.
+    """
+
+    piercing_xyz: FloatArray
+    direction: FloatArray
+    slope: FloatArray
+    iterations: IntArray
+    converged: BoolArray
+    on_crease: BoolArray
+
+
+def trace(
+    points: npt.ArrayLike,
+    centres: npt.ArrayLike,
+    surface: Surface,
+    refractive_index: float,
+    *,
+    method: str = "kotowski",
+    narrow: bool = True,
+) -> Tracing:
+    """Trace light backwards from projection centres to object points.
+
+    Parameters
+    ----------
+    points : array, shape (n, 3) or (3,)
+        True object points, metres, world frame. One that is above the water, or has none above
+        it, is seen straight.
+    centres : array, shape (n, 3) or (3,)
+        The projection centre that each is seen from, metres, world frame.
+    surface : WaterPlane, WaterRaster or WaterMesh
+    refractive_index : float
+        Of water against air.
+    method : str
+        One of `METHODS`.
+    narrow : bool
+        Where the method finds no ray, look for the shortest path near by.
+
+    Returns
+    -------
+    Tracing
+        Nothing is found for a camera that is not above the water, nor where the light would
+        leave the water beyond its edge. Positions are good to about 1e-9 m, on creases 1e-6 m.
+
+    Raises
+    ------
+    SettingError
+        If the shapes do not fit, the method or surface is unknown or the index is below one.
+    """
+    xyz, seen_from = _pairs(points, centres)
+    code, n = _checked(refractive_index, method)
+    plane, tin, field = _as_kernels_take(surface)
+    result = np.empty((len(xyz), _WIDTH))
+    with one_caller():
+        _trace(xyz, seen_from, plane, tin, field, n, code, narrow, result)
+    piercing = xyz + result[:, :_SLOPE]
+    way = (xyz - seen_from) + result[:, :_SLOPE]
+    return Tracing(
+        piercing_xyz=piercing,
+        direction=way / np.linalg.norm(way, axis=1)[:, None],
+        slope=result[:, _SLOPE:_STEPS].copy(),
+        iterations=result[:, _STEPS].astype(np.int64),
+        converged=result[:, _STATE] != _LOST,
+        on_crease=result[:, _STATE] == _CREASE,
+    )
+
+
+def _pairs(points: npt.ArrayLike, centres: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Return points and centres as two arrays of the same shape (n, 3)."""
+    xyz, seen_from = np.atleast_2d(points), np.atleast_2d(centres)
+    fit = xyz.ndim == seen_from.ndim == 2 and xyz.shape[1] == seen_from.shape[1] == 3
+    if not (fit and (len(xyz) == len(seen_from) or 1 in (len(xyz), len(seen_from)))):
+        raise SettingError(
+            f"points of shape {np.shape(points)} and centres of shape {np.shape(centres)} do not"
+            " make pairs: give both as (n, 3), or one of them as (3,)."
+        )
+    both = np.broadcast_arrays(xyz, seen_from)
+    return np.ascontiguousarray(both[0], float), np.ascontiguousarray(both[1], float)
+
+
+def _checked(refractive_index: float, method: str) -> tuple[int, float]:
+    """Return method and index as the kernel takes them."""
+    if method not in METHODS:
+        raise SettingError(f"method {method!r} is none of {', '.join(METHODS)}.")
+    n = float(refractive_index)
+    if not 1.0 <= n < np.inf:
+        raise SettingError(f"refractive index {n:g} is below 1: water's is about 1.34.")
+    return METHODS.index(method), n
+
+
+def _as_kernels_take(surface: Surface) -> tuple[FloatArray, Tin | None, Field | None]:
+    """Return plane, mesh and raster of a surface; what it is not is zero or None."""
+    plane = np.zeros(3)
+    if isinstance(surface, WaterPlane):
+        plane[:] = surface.a, surface.b, surface.c
+        return plane, None, None
+    if isinstance(surface, WaterMesh):
+        return plane, build_tin(surface), None
+    if isinstance(surface, WaterRaster):
+        return plane, None, build_field(surface)
+    raise SettingError(f"Light is traced through a plane, raster or mesh, not {surface}.")
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _trace(
+    points: FloatArray, centres: FloatArray, plane: FloatArray, tin: Tin | None,
+    field: Field | None, n: float, method: int, narrow: bool, result: FloatArray,
+) -> None:  # fmt: skip
+    """Trace every pair on its own, in coordinates about the object point."""
+    for i in prange(len(points)):
+        p = points[i]
+        local = np.empty(3)
+        local[0] = plane[0] + plane[1] * p[0] + plane[2] * p[1] - p[2]
+        local[1], local[2] = plane[1], plane[2]
+        water = Water(local, tin, field, p)
+        ex, ey, ez = centres[i, 0] - p[0], centres[i, 1] - p[1], centres[i, 2] - p[2]
+        _path(result[i], water, ex, ey, ez, n, method, narrow)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _path(
+    out: FloatArray, water: Water, ex: float, ey: float, ez: float, n: float, method: int,
+    narrow: bool,
+) -> None:  # fmt: skip
+    """Trace one pair and write its row."""
+    out[:] = np.nan
+    out[_STEPS], out[_STATE] = 0.0, _LOST
+    level, over = height_of(water, 0.0, 0.0)[0], height_of(water, ex, ey)[0]
+    if ez <= over or not abs(ex) + abs(ey) + abs(ez) < np.inf:
+        return
+    if not level > 0.0:
+        out[:_STEPS], out[_STATE] = 0.0, _HIT
+        return
+    if not ez > 0.0:
+        return
+    aim = min(level, HIGHEST_AIM * ez)
+    x, y, steps, found = _search(water, aim, ex, ey, ez, n, method)
+    if not found and narrow and method != _SCATTERSHOT:
+        if np.isnan(height_of(water, x, y)[0]):
+            x, y = aim / ez * ex, aim / ez * ey
+        x, y, more, found = narrowed(water, ex, ey, ez, x, y, NEAR * level, n)
+        steps += more
+    out[_STEPS] = steps
+    if found:
+        _write(out, water, ex, ey, ez, x, y, n)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _search(
+    water: Water, level: float, ex: float, ey: float, ez: float, n: float, method: int
+) -> tuple[float, float, int, bool]:
+    """Return what the method finds."""
+    if method == _KOTOWSKI:
+        return kotowski(water, level, ex, ey, ez, n)
+    if method == _AFRT:
+        return afrt(water, level, ex, ey, ez, n)
+    if method == _MDFRT:
+        return mdfrt(water, level, ex, ey, ez, n)
+    return scattershot(water, level, ex, ey, ez, n)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _write(
+    out: FloatArray, water: Water, ex: float, ey: float, ez: float, x: float, y: float, n: float
+) -> None:
+    """Fill in place and slope of the surface where the light leaves the water.
+
+    Of a crease, where no facet's plane bends the light so, Snell's law gives the normal: it is
+    parallel to u - n v, with the unit vectors u to A and v from there.
+    """
+    z, b, c = height_of(water, x, y)
+    out[0], out[1], out[2], out[_SLOPE], out[_SLOPE + 1] = x, y, z, b, c
+    out[_STATE] = _HIT
+    mx, my = miss_through(water, ex, ey, ez, x, y, n)
+    if mx * mx + my * my <= CREASE_M * CREASE_M:
+        return
+    ux, uy, uz = x - ex, y - ey, z - ez
+    air, wet = 1.0 / np.sqrt(ux * ux + uy * uy + uz * uz), n / np.sqrt(x * x + y * y + z * z)
+    gx, gy, gz = air * ux + wet * x, air * uy + wet * y, air * uz + wet * z
+    out[_SLOPE], out[_SLOPE + 1], out[_STATE] = -gx / gz, -gy / gz, _CREASE

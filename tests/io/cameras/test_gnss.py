@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 
-from pcfix.io.cameras.georeference import bring_to
-from pcfix.io.cameras.gnss import adjusted_minus_gnss
+from pcfix.io.cameras.georeference import adjusted_minus_gnss, bring_to
 from pcfix.model import Cameras, GnssPositions
 from tests.utils.reprojection import check_file
 from tests.utils.shared import needs

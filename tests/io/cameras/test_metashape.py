@@ -10,7 +10,7 @@ from pyproj import CRS, Transformer
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import metashape
-from pcfix.io.cameras.formats import Source, SparseModel
+from pcfix.io.cameras.formats import Source, SparseReader
 from pcfix.io.cameras.metashape import read_calibration
 from pcfix.lens.imaging import project
 from pcfix.model import Lens
@@ -312,7 +312,7 @@ def test_sample_calibrations():
 
 
 def test_is_a_format_with_tie_points():
-    assert isinstance(metashape, SparseModel)
+    assert isinstance(metashape, SparseReader)
 
 
 def test_scale_enters_the_centre_alone(tmp_path):

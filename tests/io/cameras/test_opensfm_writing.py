@@ -10,7 +10,7 @@ from pyproj import CRS, Transformer
 from pcfix.errors import InputError, SettingError
 from pcfix.io.cameras import read_cameras, read_tie_points
 from pcfix.io.cameras.georeference import bring_to, georeference
-from pcfix.io.cameras.opensfm.writing import opensfm_camera, write_opensfm
+from pcfix.io.cameras.opensfm.models import opensfm_camera, write_opensfm
 from pcfix.lens.imaging import project
 from pcfix.model import Lens, TiePoints, Views
 from tests.utils.blocks import PLAIN, small_block, some_ties

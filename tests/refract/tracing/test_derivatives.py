@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pcfix.refract.backward import light_path
-from pcfix.refract.tracing.derivatives import COLUMNS, light_and_gradients
+from pcfix.refract.rays import light_path
+from pcfix.refract.tracing.gradients import COLUMNS, light_and_gradients
 from tests.utils.tracing_twin import through_plane
 
 STEPS = np.array([3e-3] * 6 + [3e-3, 1e-4, 1e-4, 1e-3])

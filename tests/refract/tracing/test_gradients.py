@@ -5,8 +5,8 @@ import pytest
 
 from pcfix.errors import SettingError
 from pcfix.model import WaterMesh, WaterPlane, WaterRaster
+from pcfix.refract.tracing import METHODS, trace
 from pcfix.refract.tracing.gradients import gradients
-from pcfix.refract.tracing.paths import METHODS, trace
 
 INDEX = 1.34
 RELATIVE = 1e-6

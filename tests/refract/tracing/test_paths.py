@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 
 from pcfix.errors import SettingError
 from pcfix.model import WaterDimension, WaterMesh, WaterPlane, WaterRaster
-from pcfix.refract.tracing.paths import METHODS, trace
+from pcfix.refract.tracing import METHODS, trace
 from tests.utils.tracing_twin import direction, through_plane, through_surface
 from tests.utils.twins import bend
 

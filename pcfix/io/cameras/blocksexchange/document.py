@@ -1,4 +1,4 @@
-"""The document itself: plain or in a zip archive, and its spatial reference systems."""
+"""The document, plain or zipped: reference systems, photogroups with their lenses, tie points."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.tracks import tie_points
-from pcfix.io.cameras.xml import number, read_xml
+from pcfix.io.cameras.values import number, read_xml
 from pcfix.model import Lens
 
 if TYPE_CHECKING:
@@ -98,13 +98,7 @@ class ReferenceSystems:
         self._definitions = {_text(srs, "Id"): _text(srs, "Definition") for srs in root.iter("SRS")}
 
     def of(self, srs_id: str) -> str:
-        """Return the CRS of an id as `Cameras` has it; without an id the frame is local.
-
-        Raises
-        ------
-        InputError
-            If there is no such id, or its definition is not understood.
-        """
+        """Return the CRS of an id as `Cameras` has it; without an id the frame is local."""
         if not srs_id:
             return "local"
         if srs_id not in self._definitions:
@@ -189,13 +183,7 @@ class Photogroup:
         return self.numbers("ImageDimensions", ("Width", "Height"))
 
     def lens(self) -> Lens | None:
-        """Return the lens, or None where the group lacks frame or focal length.
-
-        Raises
-        ------
-        InputError
-            If it is of a kind that is not known.
-        """
+        """Return the lens, or None where the group lacks frame or focal length."""
         kind = (self.element.findtext("CameraModelType") or "Perspective").strip()
         if kind not in ("Perspective", "Fisheye"):
             raise InputError(

@@ -8,12 +8,18 @@ A pose is a unit quaternion, scalar first, and a translation, both world to came
 axes: ``x_cam = R x + t``, so the projection centre is ``-R' t``. Pixels start at the upper left
 corner of the upper left pixel. The world is that of the alignment, if there was one, often minus an
 offset; the files do not tell, so the CRS is None, unless ``georeference.json`` of pcfix lies beside
-them (``crs``, ``offset_m``, ``written_by``; see `place`): its offset is then added to centres and
-tie points, and its CRS is theirs. Lenses are in `models`, priors of the positions in `priors`;
-`writing` writes such models.
+them (``crs``, text or null, ``offset_m``, three numbers, ``written_by``): its offset is then added
+to centres and tie points, and its CRS is theirs. `files` has the lenses, `writing` writes models.
 
 Images keep the order of the file. An image point belongs to the point in space whose identifier it
 has, -1 for none; ``points3D`` lists the same as tracks.
+
+Where the GNSS said the cameras were is in ``database.db`` (SQLite). Table ``pose_priors`` has a row
+for an image (``image_id``; from COLMAP 4 on ``corr_data_id`` with the type of the sensor, 0 a
+camera), the position as three doubles, its covariance as nine, and the coordinate system: 0 is
+WGS84 with latitude, longitude, height, 1 is Cartesian, -1 not defined. The covariance is of metres
+east, north, up, or of the Cartesian axes (https://colmap.github.io/database.html and
+``src/colmap/geometry/pose_prior.h``).
 """
 
 from __future__ import annotations
@@ -195,13 +201,7 @@ class Place(NamedTuple):
 
 
 def read_place(folder: Path) -> Place | None:
-    """Return what the file beside a model says; None where there is none by pcfix.
-
-    Raises
-    ------
-    InputError
-        If it is damaged.
-    """
+    """Return what the file beside a model says; None where there is none by pcfix."""
     path = folder / FILE
     if not path.is_file():
         return None

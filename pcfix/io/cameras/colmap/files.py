@@ -1,4 +1,7 @@
-"""COLMAP's camera models: their numbers, names, parameters, and the lens that each one is.
+"""COLMAP's files, and its camera models with the lens that each one is.
+
+Binary files are little-endian, with counts before lists and names that end with a zero byte; text
+files have a line per camera and point, two per image, and ``#`` before comments.
 
 The parameters are those of COLMAP's own list, in its order (https://colmap.github.io/cameras.html
 and, for models that are not there yet, ``src/colmap/sensor/models`` of COLMAP 4). The image's
@@ -82,13 +85,7 @@ class Camera(NamedTuple):
 
 
 def lens(path: Path, identifier: int, camera: Camera) -> Lens:
-    """Return the lens of a camera.
-
-    Raises
-    ------
-    InputError
-        If the model is one that `Lens` cannot express, or a number is none of a camera.
-    """
+    """Return the lens of a camera."""
     model = camera.model
     if model.projection is None:
         raise InputError(

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError, SettingError
+from pcfix.io.cameras.checks import is_same_lens
 from pcfix.io.cameras.colmap import FILE, place_text
 from pcfix.io.cameras.colmap.files import BY_NAME, MODELS, Camera, lens
-from pcfix.io.cameras.same_lens import is_same_lens
 from pcfix.io.files import check_output, write_bytes
 
 if TYPE_CHECKING:
@@ -203,13 +203,7 @@ def _observations(
 
 
 def colmap_camera(path: Path, given: Lens) -> Camera:
-    """Return the simplest of COLMAP's cameras that is exactly this lens.
-
-    Raises
-    ------
-    InputError
-        If none is.
-    """
+    """Return the simplest of COLMAP's cameras that is exactly this lens."""
     whole = float(given.width).is_integer() and float(given.height).is_integer()
     if given.unit == "px" and whole:
         values = _values(given)

@@ -12,7 +12,13 @@ slave camera (``master_id``) has the pose T_master [R, t], with the rotation and
 sensor in the master's frame, t in the unit of the chunk. EXIF orientations turn only what is
 displayed: matrices and pixels are those of the image as stored.
 
-The formulas of a calibration stand in `calibration`, markers and tie points in `ties`.
+The tie points of a frame are PLY files in one archive: ``points`` has x, y, z in the frame of the
+component and the id of the track, ``projections`` of each camera have x and y in pixels from the
+corner of the image and the id of the track. A project of one file has them beside its document.
+Markers stand in the document of the frame, as ``location`` with x and y; only the pinned ones were
+measured, the others Metashape computed from the poses. Where the GNSS put the cameras is their
+``reference``, in the CRS of the cameras or of the chunk. The formulas of a calibration stand in
+`sensors`.
 
 References: "Agisoft Metashape User Manual, Professional Edition", appendix "Camera models";
 "Metashape Python Reference", Chunk.transform, Sensor.location, CoordinateSystem.geoccs;
@@ -30,7 +36,7 @@ from pcfix.io.cameras.metashape import documents
 from pcfix.io.cameras.metashape.block import read_block
 from pcfix.io.cameras.metashape.documents import opened
 from pcfix.io.cameras.metashape.sensors import read_calibration
-from pcfix.io.cameras.xml import number, numbers
+from pcfix.io.cameras.values import number, numbers
 from pcfix.io.crs import is_local, parse_crs
 from pcfix.io.ply import parse_header
 from pcfix.model import Cameras, GnssPositions, TiePoints, Views
@@ -65,11 +71,6 @@ def read(source: Source) -> Cameras:
     -------
     Cameras
         Geocentric with `project_crs` the CRS of the chunk, or in a ``local`` frame.
-
-    Raises
-    ------
-    InputError
-        If a document is missing or damaged, no image is aligned, or a number cannot be right.
     """
     chunk = documents.open_chunk(source.path)
     block = read_block(chunk)
@@ -102,11 +103,6 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     TiePoints
         First the tie points, then the markers; a marker has no position (NaN), as the file tells
         only where the survey put it. Projections that Metashape itself computed are left out.
-
-    Raises
-    ------
-    InputError
-        If there is nothing that two images saw, or a document is damaged.
     """
     chunk = documents.open_chunk(source.path)
     return read_ties(chunk, read_block(chunk), len(cameras))

@@ -1,4 +1,4 @@
-"""From the frame of a chunk to the world: components, scale, and the CRS of the result."""
+"""The aligned images of a chunk: poses, lenses, and the way from the chunk to the world."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import ROUNDING
 from pcfix.io.cameras.metashape import sensors
-from pcfix.io.cameras.xml import number, numbers
+from pcfix.io.cameras.values import number, numbers
 from pcfix.io.crs import METRES, crs_text, is_local, parse_crs, shortened, unbound
 
 if TYPE_CHECKING:
@@ -114,13 +114,7 @@ def _checked(path: Path, scale: float, rotation: FloatArray, translation: FloatA
 
 
 def world_of(path: Path, chunk: Element) -> tuple[World, tuple[str, ...]]:
-    """Return the world that the transforms of a chunk lead to, and notes on it.
-
-    Raises
-    ------
-    InputError
-        If the CRS is not one that PROJ knows.
-    """
+    """Return the world that the transforms of a chunk lead to, and notes on it."""
     text = (chunk.findtext("reference") or "").strip()
     if not text or text.upper() == "LOCAL":
         return World("local"), ()
@@ -194,11 +188,6 @@ def read_block(chunk: Chunk) -> Block:
 
     Left out are images that are not aligned, disabled (they took no part in the dense cloud), not
     of a central projection, or in a component without a place in the frame of the others.
-
-    Raises
-    ------
-    InputError
-        If none is left, an image has no sensor, or a number cannot be right.
     """
     path, element = chunk.path, chunk.element
     images = _images(element)

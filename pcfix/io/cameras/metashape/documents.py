@@ -1,4 +1,7 @@
-"""From what the user named to the one chunk that is read."""
+"""From what the user named to the one chunk that is read.
+
+The zip archives of a project are read without trusting what their directories say.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pcfix.errors import InputError
-from pcfix.io.cameras.xml import read_xml
+from pcfix.io.cameras.values import read_xml
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -91,13 +94,7 @@ def recognises(source: Source) -> bool:
 
 
 def open_chunk(path: Path) -> Chunk:
-    """Return the active chunk, or the first that has aligned images where that one has none.
-
-    Raises
-    ------
-    InputError
-        If a document is missing or damaged, or there is no chunk.
-    """
+    """Return the active chunk, or the first that has aligned images where that one has none."""
     top = _top(path)
     if top.root.tag == "chunk":
         return Chunk(path, top, _software(top.root, top.root), ())
@@ -206,13 +203,7 @@ class Archive:
         return name in self._names
 
     def read(self, name: str) -> bytes:
-        """Return the content of an entry.
-
-        Raises
-        ------
-        InputError
-            If it is not there, damaged, or absurdly large.
-        """
+        """Return the content of an entry."""
         if name not in self._names:
             raise InputError(
                 f"{self.path}: has no {name}; the project is incomplete, save it again."
@@ -233,13 +224,7 @@ class Archive:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Archive]:
-    """Open an archive.
-
-    Raises
-    ------
-    InputError
-        If it is missing or not a zip.
-    """
+    """Open an archive."""
     if not path.is_file():
         raise InputError(f"{path}: is missing; keep all files of the project together.")
     with _damage(path):

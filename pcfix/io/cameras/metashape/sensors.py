@@ -1,4 +1,4 @@
-"""Calibrations, as formulas of `pcfix.model.Lens`.
+"""The sensors of a chunk: their calibrations, and where the slaves of a rig sit.
 
 Convention. With (x, y) the direction, (X, Y) / Z for a frame camera, and r its length:
 
@@ -23,7 +23,7 @@ from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import documents
-from pcfix.io.cameras.xml import number, numbers, read_xml
+from pcfix.io.cameras.values import number, numbers, read_xml
 from pcfix.model import Lens
 
 if TYPE_CHECKING:
@@ -50,11 +50,6 @@ def read_calibration(path: Path) -> Lens:
     -------
     Lens
         In pixels.
-
-    Raises
-    ------
-    InputError
-        If it is not one, or of a projection without a lens (spherical, cylindrical, RPC).
     """
     root = read_xml(path)
     if root.tag != "calibration":
@@ -75,13 +70,7 @@ def read_calibration(path: Path) -> Lens:
 def lens_of_calibration(
     path: Path, sensor: str, kind: str, calibration: Element, size: tuple[float, float]
 ) -> Lens:
-    """Return the lens of a calibration of a known kind, for an image of the given size in pixels.
-
-    Raises
-    ------
-    InputError
-        If it has no focal length, or its numbers cannot be those of a lens.
-    """
+    """Return the lens of a calibration of a known kind, for an image of a size in pixels."""
     given = {
         entry.tag: number(path, f"sensor {sensor}, {entry.tag}", entry.text)
         for entry in calibration
@@ -157,13 +146,7 @@ def is_central(sensor: Element) -> bool:
 
 
 def lens_of(path: Path, sensor: Element, image: str) -> Lens:
-    """Return the adjusted calibration of a sensor, else the initial one, else its data sheet.
-
-    Raises
-    ------
-    InputError
-        If there is none; the message names `image`, the first that needs it.
-    """
+    """Return the adjusted calibration of a sensor, else the initial one, else its data sheet."""
     label = name_of(sensor)
     found = _calibration(sensor)
     if found is None:

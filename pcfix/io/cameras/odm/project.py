@@ -1,4 +1,4 @@
-"""The files of an OpenDroneMap project, wherever in it the user points."""
+"""The files of an OpenDroneMap project: its CRS, shots.geojson, cameras.json and images.json."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.opensfm import left_out
-from pcfix.io.cameras.opensfm.lenses import is_panorama, lens
-from pcfix.io.cameras.opensfm.values import load, mapping, number, rows, vector
+from pcfix.io.cameras.opensfm.models import is_panorama, lens
+from pcfix.io.cameras.values import json_number, load_json, mapping, rows, vector
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, GnssPositions, Lens
 
@@ -83,13 +83,7 @@ def locate(path: Path) -> Project:
 
 
 def whole_file(project: Project) -> Path:
-    """Return the file with the poses, followed where it is a link kept as text.
-
-    Raises
-    ------
-    InputError
-        If the link leads out of the project or to nothing.
-    """
+    """Return the file with the poses, followed where it is a link kept as text."""
     if project.poses is None:
         raise InputError(f"{project.root}: has neither opensfm/{RECONSTRUCTION} nor {SHOTS}.")
     found = _followed(project.poses, project.root)
@@ -128,13 +122,7 @@ _UTM = re.compile(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
 
 
 def named_crs(path: Path) -> str:
-    """Return the CRS in the first line of a file: a PROJ string, EPSG:n or WGS84 UTM 16N.
-
-    Raises
-    ------
-    InputError
-        If it names none.
-    """
+    """Return the CRS in the first line of a file: a PROJ string, EPSG:n or WGS84 UTM 16N."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
@@ -205,13 +193,7 @@ SAME_FOCAL = 1e-6
 
 
 def read_shots(project: Project, path: Path) -> Cameras:
-    """Read the cameras of shots.geojson, in the projected CRS.
-
-    Raises
-    ------
-    InputError
-        If an entry is not what it should be.
-    """
+    """Read the cameras of shots.geojson, in the projected CRS."""
     shots = _shots(path)
     labels = tuple(shots)
     turns = [vector(path, f"image {k}, rotation", s.get("rotation"), 3) for k, s in shots.items()]
@@ -246,7 +228,7 @@ def read_images(
     """
     if path is None:
         return None, []
-    entries = load(path)
+    entries = load_json(path)
     if not isinstance(entries, list):
         raise InputError(f"{path}: is not a list of images as OpenDroneMap writes it.")
     images = [mapping(path, f"entry {i + 1}", entry) for i, entry in enumerate(entries)]
@@ -265,7 +247,7 @@ def read_images(
 def _position(path: Path, label: str, image: dict[str, Any]) -> tuple[list[float], list[float]]:
     keys = ("longitude", "latitude", "altitude", "gps_xy_stddev", "gps_z_stddev")
     values = [
-        np.nan if image.get(key) is None else number(path, f"image {label}, {key}", image[key])
+        np.nan if image.get(key) is None else json_number(path, f"image {label}, {key}", image[key])
         for key in keys
     ]
     return values[:3], [values[3], values[3], values[4]]
@@ -273,7 +255,7 @@ def _position(path: Path, label: str, image: dict[str, Any]) -> tuple[list[float
 
 def _shots(path: Path) -> dict[str, dict[str, Any]]:
     """Return the properties of every feature by file name, with its `geometry`."""
-    features = mapping(path, "the file", load(path)).get("features")
+    features = mapping(path, "the file", load_json(path)).get("features")
     if not isinstance(features, list) or not features:
         raise InputError(f"{path}: has no features, so no cameras.")
     shots: dict[str, dict[str, Any]] = {}
@@ -320,7 +302,7 @@ def _known_lenses(path: Path | None) -> dict[str, Lens]:
     """Return the lenses of cameras.json, none where there is no such file."""
     if path is None:
         return {}
-    entries = mapping(path, "the file", load(path))
+    entries = mapping(path, "the file", load_json(path))
     cameras = {name: mapping(path, f"camera {name}", entry) for name, entry in entries.items()}
     return {name: lens(path, name, c) for name, c in cameras.items() if not is_panorama(c)}
 

@@ -9,6 +9,10 @@ Where a shot rides on a rig and has no pose of its own, it is that of the rig ca
 camera) after that of the rig instance (world to rig). Coordinates too large to be topocentric come
 from ``export_geocoords --reconstruction``; that file does not name its CRS.
 
+A line of tracks.csv is image, track, feature, x, y and more that differs between the versions (0
+without a header, 1 and 2 with one): scale, colour, segmentation. x and y are image coordinates
+divided by the larger side, the origin in the image centre.
+
 References: "Reconstruction file", "Coordinate Systems" and "Rig Models" in the manual,
 https://opensfm.org/docs.
 """
@@ -23,8 +27,8 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.io.cameras.opensfm.lenses import is_panorama, lens
-from pcfix.io.cameras.opensfm.values import load, mapping, number, rows, vector
+from pcfix.io.cameras.opensfm.models import is_panorama, lens
+from pcfix.io.cameras.values import json_number, load_json, mapping, rows, vector
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, GnssPositions, TiePoints, Views
 
@@ -131,14 +135,8 @@ class Reconstruction:
 
 
 def read_reconstruction(path: Path) -> Reconstruction:
-    """Read the reconstruction with the most images.
-
-    Raises
-    ------
-    InputError
-        If the file is no reconstruction, or an entry is not what it should be.
-    """
-    chosen, others, notes = _largest(path, load(path))
+    """Read the reconstruction with the most images."""
+    chosen, others, notes = _largest(path, load_json(path))
     cameras = mapping(path, "cameras", chosen.get("cameras"))
     shots, panoramas = _usable(path, chosen["shots"], cameras)
     if panoramas:
@@ -274,7 +272,7 @@ def _gnss(path: Path, shots: dict[str, dict[str, Any]]) -> tuple[FloatArray, Flo
             continue
         xyz[i] = vector(path, f"image {label}, gps_position", shot["gps_position"], 3)
         if dop is not None:
-            sigma[i] = number(path, f"image {label}, gps_dop", dop)
+            sigma[i] = json_number(path, f"image {label}, gps_dop", dop)
     return xyz, sigma
 
 
@@ -283,7 +281,7 @@ def _reference(path: Path, chosen: dict[str, Any]) -> tuple[float, float, float]
     entry = chosen.get("reference_lla")
     beside = path.with_name("reference_lla.json")
     if entry is None and beside.is_file() and beside.read_bytes()[:100].lstrip()[:1] == b"{":
-        path, entry = beside, load(beside)
+        path, entry = beside, load_json(beside)
     if entry is None:
         return None
     entry = mapping(path, "reference_lla", entry)

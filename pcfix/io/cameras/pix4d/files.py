@@ -1,4 +1,4 @@
-"""The files of one Pix4D project, whichever of them the user named."""
+"""The files of one Pix4D project, its positions by GNSS and its image measurements."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.tracks import tie_points as gathered
-from pcfix.io.cameras.xml import number, read_xml
+from pcfix.io.cameras.values import number, read_xml
 from pcfix.model import GnssPositions
 
 if TYPE_CHECKING:
@@ -77,13 +77,7 @@ def holds_tables(root: Path) -> bool:
 
 
 def find(source: Source) -> Files | None:
-    """Return the files of the project that a folder holds, or that a file belongs to.
-
-    Raises
-    ------
-    InputError
-        If a folder holds several projects.
-    """
+    """Return the files of the project that a folder holds, or that a file belongs to."""
     path = source.path
     if is_project(source):
         return _in_folders(path.with_suffix(""), path)

@@ -1,4 +1,4 @@
-"""The tables of exterior orientation, the offset, and the calibration file."""
+"""The tables of exterior orientation, the offset, the calibration file, and the lenses in them."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Plain tables of poses: a header line, then one image a row.
 
 Fields are separated by comma, semicolon, tab or spaces; the header may be a comment (#), and units
-may stand in it (x[m], omega[gon]). What its columns may be called is in `headers.SPELLINGS`:
+may stand in it (x[m], omega[gon]). What its columns may be called is in `columns.SPELLINGS`:
 
 - the image: label, name, image, filename, PhotoID, imageName, SourceFile, ...
 - its projection centre: x, y, z; easting, northing, height; or longitude, latitude, altitude in
@@ -175,11 +175,6 @@ def read_gnss(path: str | os.PathLike[str]) -> tuple[tuple[str, ...], GnssPositi
     labels : tuple of str, length k
     positions : GnssPositions
         k rows, NaN where an image has no position.
-
-    Raises
-    ------
-    InputError
-        If it is not such a table, or has no position at all.
     """
     columns = open_table(check_input(path))
     positions = gnss_positions(columns)

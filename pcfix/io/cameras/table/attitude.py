@@ -41,12 +41,6 @@ def read_rotations(columns: Columns, angles: Angles | None, suffix: str = "") ->
     Returns
     -------
     array, shape (k, 3, 3), or None
-
-    Raises
-    ------
-    InputError
-        If columns are missing, are of a convention that is not known or could be of two, or a
-        row does not hold a rotation.
     """
     opk, ypr = (tuple(a + suffix for a in kind) for kind in (OMEGA_PHI_KAPPA, YAW_PITCH_ROLL))
     for kind in (opk, ypr, QUATERNION, MATRIX):

@@ -1,4 +1,4 @@
-"""The header of a table of cameras, which names its columns in many ways."""
+"""The columns of a table of cameras by what they are, however its header names them."""
 
 from __future__ import annotations
 
@@ -261,13 +261,7 @@ class Columns:
 
 
 def read_columns(path: Path) -> Columns:
-    """Read a table with a header line, which may be a comment.
-
-    Raises
-    ------
-    InputError
-        If there is no header, two columns are the same thing, or a row has another length.
-    """
+    """Read a table with a header line, which may be a comment."""
     lines = read_lines(path)
     found = [header for header in headers(lines) if is_header(header.names)]
     if not found:

@@ -1,4 +1,12 @@
-"""The lens of the images of a table: from a table beside it, a calibration, or its own columns."""
+"""The lens of the images of a table, and a block written as a table with its sensor beside it.
+
+The lens is that of a table beside it, a calibration, or the table's own columns. Written are
+``cameras.csv``, with label, x, y, z, qw, qx, qy, qz: projection centre and rotation from the world
+to the camera (x right, y down, z forward), after a comment with the CRS where there is one; and
+``sensor.csv``, with the lens in pixels with OpenCV's names or, of an undistorted lens in mm, as
+focal, sensor_x, sensor_y. Where the images have several lenses of one frame, each row of
+``cameras.csv`` has its own (f, px, py, k1 ... k4, t1, t2) and ``sensor.csv`` says the frame alone.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +19,7 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.same_lens import is_same_lens
+from pcfix.io.cameras.checks import is_same_lens
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input, check_output, write_text
 from pcfix.io.tables import read_lines, read_table, split_header
@@ -44,11 +52,6 @@ def read_sensor(path: Path) -> Lens:
         sensor_x, sensor_y in mm; the principal point is then the centre. Or they are focal_px,
         width_px, height_px and, where known, OpenCV's cx, cy (pixels from the upper left corner
         of the image), k1 ... k6, p1, p2.
-
-    Raises
-    ------
-    InputError
-        If it is neither, or a number cannot be that of a camera.
     """
     if _is_xml(check_input(path)):
         from pcfix.io.cameras.metashape import read_calibration
@@ -68,13 +71,7 @@ def read_sensor(path: Path) -> Lens:
 
 
 def read_lenses(columns: Columns, sensor: Path | None) -> tuple[Lens, ...]:
-    """Return the lens of each row.
-
-    Raises
-    ------
-    InputError
-        If there is no sensor, neither given nor beside the table.
-    """
+    """Return the lens of each row."""
     own = columns.has("f", "px", "py")
     beside = columns.path.with_name("sensor.csv")
     if sensor is None and not beside.is_file():

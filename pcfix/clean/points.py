@@ -1,0 +1,342 @@
+"""The tests, each of which sets its bit of `Reason` in the rows that fail it.
+
+They are independent of each other: each looks at all used points, whatever another found.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pcfix.clean.neighbours import (
+    SLACK,
+    Empty,
+    Neighbours,
+    height_quartiles,
+    in_memory,
+    make_tiles,
+    mean_of_first,
+    used_rows,
+)
+from pcfix.clean.settings import LEAST_NEIGHBOURS, CleanSettings, Reason
+from pcfix.errors import InputError, SettingError
+from pcfix.threads import threads
+from pcfix.water.checks import as_surface, checked_points
+from pcfix.water.surface import is_submerged, surface_above
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy.typing as npt
+
+    from pcfix.model import BoolArray, FloatArray, IntArray
+
+    ReasonArray = npt.NDArray[np.uint8]
+    from pcfix.clean.neighbours import Empty
+    from pcfix.model import WaterSurface
+
+
+PIECE_ROWS = 65_536
+
+
+def flag_weak(
+    settings: CleanSettings,
+    reasons: ReasonArray,
+    ray_count: npt.NDArray[np.number],
+    ray_miss_m: FloatArray | None = None,
+    incidence_deg: FloatArray | None = None,
+) -> None:
+    """Flag weak intersections among the corrected points, those with a ray count above zero.
+
+    Parameters
+    ----------
+    settings : CleanSettings
+    reasons : array of uint8, shape (n,)
+        Gets `Reason.FEW_RAYS`, `RAY_MISS` and `INCIDENCE`.
+    ray_count : array, shape (n,)
+    ray_miss_m, incidence_deg : array, shape (n,), optional
+        See `pcfix.Correction`; without them their test is not run.
+    """
+    corrected = ray_count > 0
+    if settings.min_rays is not None:
+        _set(reasons, corrected & (ray_count < settings.min_rays), Reason.FEW_RAYS)
+    if settings.max_ray_miss_m is not None and ray_miss_m is not None:
+        _set(reasons, corrected & (ray_miss_m > settings.max_ray_miss_m), Reason.RAY_MISS)
+    if settings.max_incidence_deg is not None and incidence_deg is not None:
+        _set(reasons, corrected & (incidence_deg > settings.max_incidence_deg), Reason.INCIDENCE)
+
+
+def flag_sparse(
+    xyz: FloatArray,
+    used: BoolArray,
+    settings: CleanSettings,
+    reasons: ReasonArray,
+    *,
+    tile_m: float | None = None,
+    empty: Empty = in_memory,
+    jobs: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> dict[str, float]:
+    """Flag statistical and radius outliers.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 3)
+        Metres, world frame.
+    used : array of bool, shape (n,)
+        The points to test; more than ``settings.nearest`` of them.
+    settings : CleanSettings
+    reasons : array of uint8, shape (n,)
+        Gets `Reason.STATISTICAL` and `RADIUS`.
+    tile_m, empty, jobs
+        See `make_tiles` and `Neighbours`; without effect on the result.
+    progress : callable, optional
+        Called with the number of points after each piece.
+
+    Returns
+    -------
+    dict
+        Mean, sd and limit of the mean distances to the neighbours, metres; empty without the
+        statistical test.
+
+    Notes
+    -----
+    Both tests find what open3d's ``remove_statistical_outlier`` and ``remove_radius_outlier``
+    find, but for two kinds of clouds: where so many points coincide that the mean distance is
+    zero, and where it is the same for all points, open3d takes them for outliers and pcfix does
+    not.
+    """
+    tiles = make_tiles(xyz, used, tile_m, empty)
+    near = Neighbours(tiles, 3, jobs)
+    mean_m = np.zeros(len(xyz)) if settings.statistical else None
+    for piece in tiles.pieces(PIECE_ROWS):
+        rows = tiles.row[piece]
+        distance, _ = near.nearest(tiles.xyz[piece], settings.nearest)
+        if mean_m is not None:
+            mean_m[rows] = mean_of_first(distance, settings.neighbours)
+        if settings.radius_m is not None:
+            alone = distance[:, settings.radius_neighbours] * SLACK >= settings.radius_m
+            _set(reasons, rows[alone], Reason.RADIUS)
+        if progress is not None:
+            progress(len(rows))
+    return {} if mean_m is None else _flag_far(mean_m, used, settings, reasons)
+
+
+def _flag_far(
+    mean_m: FloatArray, used: BoolArray, settings: CleanSettings, reasons: ReasonArray
+) -> dict[str, float]:
+    """Flag the points whose mean distance is beyond the limit of all; sums go by file order."""
+    count = int(used.sum())
+    mean = math.fsum(float(mean_m[rows].sum()) for rows in used_rows(used)) / count
+    squares = math.fsum(float(((mean_m[rows] - mean) ** 2).sum()) for rows in used_rows(used))
+    sd = math.sqrt(squares / (count - 1))
+    limit = mean + (settings.deviations or 0.0) * sd
+    for rows in used_rows(used):
+        _set(reasons, rows[mean_m[rows] > limit * SLACK], Reason.STATISTICAL)
+    return {"mean": mean, "sd": sd, "limit": limit}
+
+
+def flag_off_bed(
+    xyz: FloatArray,
+    submerged: BoolArray,
+    settings: CleanSettings,
+    reasons: ReasonArray,
+    *,
+    tile_m: float | None = None,
+    empty: Empty = in_memory,
+    jobs: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> None:
+    """Flag submerged points below the bed and floating in the water.
+
+    The bed about a point is the middle half, by height, of the submerged points nearest to it in
+    plan; see `CleanSettings`.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 3)
+        Metres, world frame.
+    submerged : array of bool, shape (n,)
+        The points to test; at least ``settings.bed_neighbours`` of them.
+    settings : CleanSettings
+    reasons : array of uint8, shape (n,)
+        Gets `Reason.BELOW_BED` and `FLOATING`.
+    tile_m, empty, jobs, progress
+        See `flag_sparse`.
+    """
+    tiles = make_tiles(xyz, submerged, tile_m, empty)
+    near = Neighbours(tiles, 2, jobs)
+    for piece in tiles.pieces(PIECE_ROWS):
+        rows, points = tiles.row[piece], tiles.xyz[piece]
+        lower, upper = height_quartiles(near, points, settings.bed_neighbours).T
+        fence = settings.fences * (upper - lower)
+        z = points[:, 2]
+        if settings.below_m is not None:
+            below = lower - z > np.maximum(fence, settings.below_m)
+            _set(reasons, rows[below], Reason.BELOW_BED)
+        if settings.floating_m is not None:
+            above = z - upper > np.maximum(fence, settings.floating_m)
+            _set(reasons, rows[above], Reason.FLOATING)
+        if progress is not None:
+            progress(len(rows))
+
+
+def _set(reasons: ReasonArray, where: BoolArray | IntArray, reason: Reason) -> None:
+    """Set a bit in the rows of a mask, or with the given numbers."""
+    reasons[where] |= np.uint8(reason)
+
+
+def clean_points(
+    xyz: npt.ArrayLike,
+    *,
+    water: WaterSurface | float | npt.ArrayLike | None = None,
+    ray_count: npt.ArrayLike | None = None,
+    ray_miss_m: npt.ArrayLike | None = None,
+    incidence_deg: npt.ArrayLike | None = None,
+    used: npt.ArrayLike | None = None,
+    settings: CleanSettings | None = None,
+    tile_m: float | None = None,
+    jobs: int | None = None,
+) -> npt.NDArray[np.uint8]:
+    """Find the points that are noise, and say why.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 3)
+        Points, metres, world frame; corrected ones where the cloud was corrected.
+    water : WaterSurface, float, or array of shape (n,), optional
+        See `pcfix.correct_points`. Without it the points with rays are the submerged ones, and
+        without rays no point is tested against the bed.
+    ray_count : array, shape (n,), optional
+        Rays that were intersected, 0 for points that were not corrected. Without it no
+        intersection is weak.
+    ray_miss_m, incidence_deg : array, shape (n,), optional
+        Metres, degrees in air; see `pcfix.Correction`.
+    used : array of bool, shape (n,), optional
+        Points to test; the others are no one's neighbour. Default: all.
+    settings : CleanSettings, optional
+        The thresholds.
+    tile_m : float, optional
+        Side of the square tiles that are worked on; without effect on the result.
+    jobs : int, optional
+        Threads; default all cores.
+
+    Returns
+    -------
+    array of uint8, shape (n,)
+        Bits of `Reason`; 0 for a good point.
+
+    Raises
+    ------
+    SettingError
+        If an argument is outside its rule.
+    InputError
+        If there are fewer points than a neighbourhood has.
+
+    Examples
+    --------
+    A bed of 30 by 30 points, 2 m under the water, and one point 1 m above it:
+
+    >>> import numpy as np
+    >>> from pcfix.clean.points import clean_points
+    >>> from pcfix.clean.settings import CleanSettings, Reason
+    >>> x, y = (grid.ravel() / 4 for grid in np.mgrid[:30, :30])
+    >>> cloud = np.column_stack([x, y, -2 + 0.01 * np.sin(9 * x + 7 * y)])
+    >>> cloud[450, 2] += 1
+    >>> reasons = clean_points(cloud, water=0.0, settings=CleanSettings(deviations=None))
+    >>> [(int(row), Reason(int(reasons[row])).name) for row in np.flatnonzero(reasons)]
+    [(450, 'FLOATING')]
+    """
+    points = checked_points(xyz)
+    settings = settings or CleanSettings()
+    check_tile(tile_m)
+    n = len(points)
+    mask = np.ones(n, np.bool_) if used is None else _column("used", used, n).astype(np.bool_)
+    rays = None if ray_count is None else _column("ray_count", ray_count, n)
+    reasons = np.zeros(n, np.uint8)
+    if rays is not None:
+        miss = None if ray_miss_m is None else _column("ray_miss_m", ray_miss_m, n)
+        angle = None if incidence_deg is None else _column("incidence_deg", incidence_deg, n)
+        flag_weak(settings, reasons, rays, miss, angle)
+        reasons[~mask] = 0
+    submerged = mask & _submerged(points, water, rays)
+    with threads(jobs):
+        flag_neighbours("xyz", points, mask, submerged, settings, reasons, tile_m=tile_m, jobs=jobs)
+    return reasons
+
+
+def check_tile(tile_m: float | None) -> None:
+    """Refuse a side of the tiles that is none.
+
+    Raises
+    ------
+    SettingError
+    """
+    if tile_m is not None and not 0.0 < tile_m < np.inf:
+        raise SettingError(f"tile_m {tile_m:g} must be above 0: give metres, or None.")
+
+
+def _column(name: str, values: npt.ArrayLike, n: int) -> npt.NDArray[np.float64]:
+    column = np.asarray(values, dtype=np.float64)
+    if column.shape != (n,):
+        raise SettingError(
+            f"{name} must have one value per point, shape ({n},), not {column.shape}."
+        )
+    return column
+
+
+def _submerged(
+    points: FloatArray,
+    water: WaterSurface | float | npt.ArrayLike | None,
+    rays: FloatArray | None,
+) -> BoolArray:
+    if water is not None:
+        surface, heights = as_surface(water, len(points))
+        return is_submerged(points[:, 2], surface_above(surface, points, heights))
+    return np.zeros(len(points), np.bool_) if rays is None else rays > 0
+
+
+def flag_neighbours(
+    name: str,
+    xyz: FloatArray,
+    used: BoolArray,
+    submerged: BoolArray,
+    settings: CleanSettings,
+    reasons: npt.NDArray[np.uint8],
+    *,
+    tile_m: float | None = None,
+    empty: Empty = in_memory,
+    jobs: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> dict[str, float]:
+    """Run the tests that look at neighbours: see `flag_sparse` and `flag_off_bed`.
+
+    Raises
+    ------
+    InputError
+        If there are fewer used or submerged points than a neighbourhood has; no submerged ones
+        are allowed.
+    """
+    _check_enough(name, int(used.sum()), int(submerged.sum()), settings)
+    work: dict[str, Any] = {"tile_m": tile_m, "empty": empty, "jobs": jobs, "progress": progress}
+    distances = flag_sparse(xyz, used, settings, reasons, **work) if settings.nearest else {}
+    if settings.below_or_floating and submerged.any():
+        flag_off_bed(xyz, submerged, settings, reasons, **work)
+    return distances
+
+
+def _check_enough(name: str, used: int, submerged: int, settings: CleanSettings) -> None:
+    least = max(LEAST_NEIGHBOURS, settings.nearest)
+    if used < least + 1:
+        raise InputError(
+            f"{name}: has {used:,} points that are neither withheld nor noise already, too few"
+            f" for a neighbourhood of {least}; choose fewer neighbours, or do without cleaning."
+        )
+    if settings.below_or_floating and 0 < submerged < settings.bed_neighbours + 1:
+        raise InputError(
+            f"{name}: has {submerged:,} submerged points, too few for a neighbourhood of"
+            f" {settings.bed_neighbours} on the bed; choose fewer bed-neighbours, or leave out the"
+            " tests below and floating."
+        )

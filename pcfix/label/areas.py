@@ -1,0 +1,373 @@
+"""Areas in plan: the polygons of a mask, and the waters that hang together.
+
+For a mask, asked of millions of points at a time, the plan is cut into square cells, each wholly
+inside, wholly outside, or crossed by the border. Only for points in crossed cells the polygons
+themselves are asked. (`rasterize` of rasterio says of a cell whether its centre is inside: it
+cannot say that a border crosses it, and is not exact.)
+
+What lies around a point is said by a grid over the cloud, filled chunk by chunk. Cells have sides
+of a power of two, in metres, and count from the origin of the world frame, so that a point's cell
+does not depend on the order or the number of points that come before it. All sums are of whole
+numbers, for the same reason.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numba import njit, prange
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from pcfix.model import BoolArray, FloatArray, IntArray
+
+    States = npt.NDArray[np.uint8]
+    Flags = npt.NDArray[np.uint8]
+
+
+OUTSIDE, INSIDE, CROSSED = 0, 1, 2
+HALVINGS = 9
+"""So often the square around the area is halved: 512 by 512 cells."""
+_MARGIN = 1e-6  # of a cell: what is tested is a little larger, so that rounding cannot matter
+
+
+class _Cells(NamedTuple):
+    """The square around the area; ``states[row, column]`` counts from its south-west corner."""
+
+    west: float
+    south: float
+    cell_m: float
+    states: States
+
+
+class WaterMask:
+    """The polygons inside which points may be submerged.
+
+    A point on the border, of a hole too, is inside.
+
+    Parameters
+    ----------
+    area : shapely Polygon or MultiPolygon
+        Valid, in the cloud's CRS, metres.
+    name : str
+        For messages.
+    low, high : array, shape (2,), optional
+        South-west and north-east corner of where points will be. It makes the cells finer where
+        the area reaches far beyond, and has no effect on the result.
+    notes : tuple of str
+        What was done on reading it, for the summary.
+    """
+
+    def __init__(
+        self,
+        area: Any,
+        name: str = "mask",
+        low: FloatArray | None = None,
+        high: FloatArray | None = None,
+        notes: tuple[str, ...] = (),
+    ) -> None:
+        self.area, self.name, self.notes = area, name, notes
+        self.bounds: tuple[float, float, float, float] = area.bounds
+        corner, opposite = np.array(self.bounds[:2]), np.array(self.bounds[2:])
+        if low is not None and high is not None:
+            west_south, east_north = np.maximum(corner, low), np.minimum(opposite, high)
+            if (west_south < east_north).all():
+                corner, opposite = west_south, east_north
+        self._cells = _cells_over(area, corner, float((opposite - corner).max()))
+
+    def inside(self, x: FloatArray, y: FloatArray) -> BoolArray:
+        """Return which of n plan positions, metres, world frame, are inside."""
+        import shapely
+
+        states = np.empty(x.size, np.uint8)
+        _look_up(self._cells, np.asarray(self.bounds), x, y, states)
+        asked = np.flatnonzero(states == CROSSED)
+        states[asked] = shapely.intersects_xy(self.area, x[asked], y[asked])
+        return states.astype(np.bool_)
+
+
+def _cells_over(area: Any, corner: FloatArray, side_m: float) -> _Cells:
+    """Return the states of the cells of a square, halving only those that the border crosses."""
+    import shapely
+
+    shapely.prepare(area)
+    west, south = corner.tolist()
+    side_m = max(side_m, 1e-3)
+    far = np.spacing(np.abs([*area.bounds, west, south]).max() + side_m)
+    states = np.full((1, 1), CROSSED, np.uint8)
+    for halvings in range(1, HALVINGS + 1):
+        states = states.repeat(2, axis=0).repeat(2, axis=1)
+        row, column = np.nonzero(states == CROSSED)
+        cell = side_m / 2**halvings
+        margin = _MARGIN * cell + 4.0 * far
+        x, y = west + column * cell, south + row * cell
+        boxes = shapely.box(x - margin, y - margin, x + cell + margin, y + cell + margin)
+        states[row, column] = _states_of(area, boxes)
+    return _Cells(west, south, side_m / 2**HALVINGS, states)
+
+
+def _states_of(area: Any, boxes: npt.NDArray[Any]) -> States:
+    import shapely
+
+    state = np.where(shapely.covers(area, boxes), INSIDE, CROSSED).astype(np.uint8)
+    rest: IntArray = np.flatnonzero(state == CROSSED)
+    state[rest[~shapely.intersects(area, boxes[rest])]] = OUTSIDE
+    return state
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _look_up(
+    cells: _Cells, bounds: FloatArray, x: FloatArray, y: FloatArray, states: States
+) -> None:  # pragma: no cover - compiled
+    """Write the state of each position; those off the cells but within the bounds are unsure."""
+    rows, columns = cells.states.shape
+    for i in prange(x.size):
+        column = np.floor((x[i] - cells.west) / cells.cell_m)
+        row = np.floor((y[i] - cells.south) / cells.cell_m)
+        within = bounds[0] <= x[i] <= bounds[2] and bounds[1] <= y[i] <= bounds[3]
+        if not within:
+            states[i] = OUTSIDE
+        elif 0 <= column < columns and 0 <= row < rows:
+            states[i] = cells.states[int(row), int(column)]
+        else:
+            states[i] = CROSSED
+
+
+MOST_CELLS = 2**24
+"""Bounds the memory; where a cloud needs more, its cells are larger."""
+POINTS_A_CELL = 4.0
+"""Cells are as small as they can be with so many points, on average, where there is water."""
+FINEST_M = 2.0**-10
+SHARE_OF_LARGEST = 0.1
+"""Of the area of the largest water; a pool of at least so much of it stays in."""
+_VOTE = 1000
+
+PRESENT, BELOW, UNDECIDED = 1, 2, 4
+"""A cell has points at all; has points below the surface; has points within the dead band."""
+
+
+class Lattice(NamedTuple):
+    """Square cells; the first column and row count from the origin of the world frame."""
+
+    side_m: float
+    first_column: int
+    first_row: int
+    columns: int
+    rows: int
+
+
+def lattice_over(low: FloatArray, high: FloatArray) -> Lattice:
+    """Return the finest lattice with at most `MOST_CELLS` over a rectangle, shapes (2,), metres."""
+    side = FINEST_M
+    while True:
+        first, last = np.floor(low / side), np.floor(high / side)
+        columns, rows = last - first + 1.0
+        if columns * rows <= MOST_CELLS:
+            return Lattice(side, int(first[0]), int(first[1]), int(columns), int(rows))
+        side *= 2.0
+
+
+class Pools(NamedTuple):
+    """The waters of a grid: what hangs together is one.
+
+    number : shape (rows, columns), 0 where there is none, else a row of the others.
+    area_m2 : of the cells with submerged points.
+    stays : whether it counts as water.
+    """
+
+    number: npt.NDArray[np.int32]
+    area_m2: FloatArray
+    stays: BoolArray
+
+
+class Surroundings(NamedTuple):
+    """What a grid says of the points in its cells.
+
+    is_wet : shape (rows, columns), whether an undecided point in the cell is submerged.
+    joined : shape (rows, columns), whether the cell, or one beside it, is of a water that stays.
+    """
+
+    lattice: Lattice
+    is_wet: BoolArray
+    pools: Pools | None
+    joined: BoolArray | None
+
+    def cells(self, x: FloatArray, y: FloatArray) -> tuple[IntArray, IntArray]:
+        """Return row and column of n plan positions that the grid was made with."""
+        side = self.lattice.side_m
+        column = np.floor(x / side).astype(np.int64) - self.lattice.first_column
+        row = np.floor(y / side).astype(np.int64) - self.lattice.first_row
+        return row, column
+
+
+class Grid:
+    """Adds up points, chunk by chunk.
+
+    Parameters
+    ----------
+    low, high : array, shape (2,)
+        South-west and north-east corner of the cloud, metres; if they turn out to be wrong,
+        `lattice` tells, and the points must be added again.
+    dead_band_m : float
+        Points at most so far from the surface are undecided; 0 for none.
+
+    Attributes
+    ----------
+    lattice : Lattice
+    low, high : array, shape (2,)
+        Of the points so far.
+    """
+
+    def __init__(self, low: FloatArray, high: FloatArray, dead_band_m: float) -> None:
+        self.lattice = lattice_over(low, high)
+        self.low, self.high = np.full(2, np.inf), np.full(2, -np.inf)
+        self._dead_m, self._water_points = dead_band_m, 0
+        shape = self.lattice.rows, self.lattice.columns
+        self._flags: Flags = np.zeros(shape, np.uint8)
+        self._votes: IntArray = np.zeros(shape if dead_band_m else (1, 1), np.int64)
+
+    def add(self, x: FloatArray, y: FloatArray, height_m: FloatArray, counts: BoolArray) -> None:
+        """Add n points.
+
+        Parameters
+        ----------
+        x, y : array, shape (n,)
+            Metres, world frame.
+        height_m : array, shape (n,)
+            Above the water surface; NaN where that is not known.
+        counts : array of bool, shape (n,)
+            Whether a point may be submerged. The others only show that there is no gap.
+        """
+        if not x.size:
+            return
+        self.low = np.minimum(self.low, [x.min(), y.min()])
+        self.high = np.maximum(self.high, [x.max(), y.max()])
+        self._water_points += _add(
+            self.lattice, self._flags, self._votes, self._dead_m, x, y, height_m, counts
+        )
+
+    @property
+    def fits(self) -> bool:
+        """Whether the grid is the one that the points so far would have."""
+        mine, theirs = self.lattice, lattice_over(self.low, self.high)
+        across, up = theirs.first_column - mine.first_column, theirs.first_row - mine.first_row
+        return (
+            mine.side_m == theirs.side_m
+            and 0 <= across <= mine.columns - theirs.columns
+            and 0 <= up <= mine.rows - theirs.rows
+        )
+
+    def surroundings(self, *, connected: bool, least_pool_m2: float | None) -> Surroundings:
+        """Return what the points say together; the grid is used up."""
+        lattice, flags, votes = self.lattice, self._flags, self._votes
+        while _is_thin(flags, self._water_points):
+            lattice, flags, votes = _halved(lattice, flags, votes)
+        is_wet = _majority_below(votes) if self._dead_m else np.zeros((1, 1), np.bool_)
+        if not connected:
+            return Surroundings(lattice, is_wet, None, None)
+        water = (flags & BELOW) > 0
+        if self._dead_m:
+            water |= ((flags & UNDECIDED) > 0) & is_wet
+        pools = _pools(water, flags == 0, lattice.side_m**2, least_pool_m2)
+        return Surroundings(lattice, is_wet, pools, _grown(pools.stays[pools.number]))
+
+
+def _is_thin(flags: Flags, points: int) -> bool:
+    """Whether the cells with water have too few points on average."""
+    water = np.count_nonzero(flags & (BELOW | UNDECIDED))
+    return max(flags.shape) > 2 and bool(points < POINTS_A_CELL * water)
+
+
+def _halved(lattice: Lattice, flags: Flags, votes: IntArray) -> tuple[Lattice, Flags, IntArray]:
+    """Return the same in cells of twice the side."""
+    _, column, row, columns, rows = lattice
+    west, south = column % 2, row % 2  # the cells to add, for pairs that begin with an even one
+    pad = (south, (south + rows) % 2), (west, (west + columns) % 2)
+    quads = _quads(flags, pad)
+    new = Lattice(lattice.side_m * 2.0, column // 2, row // 2, quads[0].shape[1], quads[0].shape[0])
+    joined = quads[0] | quads[1] | quads[2] | quads[3]
+    if votes.size == flags.size:
+        a, b, c, d = _quads(votes, pad)
+        votes = a + b + c + d
+    return new, joined, votes
+
+
+def _quads(
+    cells: npt.NDArray[Any], pad: tuple[tuple[int, int], ...]
+) -> tuple[npt.NDArray[Any], ...]:
+    """Return the four cells of each two by two, after adding empty rows and columns."""
+    full = np.pad(cells, pad) if np.any(pad) else cells
+    return full[::2, ::2], full[::2, 1::2], full[1::2, ::2], full[1::2, 1::2]
+
+
+def _grown(cells: BoolArray) -> BoolArray:
+    """Return cells and those that touch them, corners included."""
+    from scipy.ndimage import binary_dilation
+
+    return np.asarray(binary_dilation(cells, np.ones((3, 3), np.bool_)))
+
+
+def _pools(
+    water: BoolArray, is_gap: BoolArray, cell_m2: float, least_pool_m2: float | None
+) -> Pools:
+    """Return what hangs together over sides, corners, and gaps of at most two cells."""
+    from scipy.ndimage import label
+
+    found, count = label(water | (_grown(water) & is_gap), np.ones((3, 3), np.int8))
+    number = np.where(water, found, 0).astype(np.int32)
+    cells = np.bincount(number[water], minlength=count + 1)
+    area = cells.astype(np.float64) * cell_m2
+    least = SHARE_OF_LARGEST * area.max() if least_pool_m2 is None else least_pool_m2
+    stays = (area >= least) | (area == area.max())
+    stays[0] = False
+    return Pools(number, area, stays)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _add(
+    lattice: Lattice,
+    flags: Flags,
+    votes: IntArray,
+    dead_m: float,
+    x: FloatArray,
+    y: FloatArray,
+    height_m: FloatArray,
+    counts: BoolArray,
+) -> int:  # pragma: no cover - compiled
+    """Mark the cells of points and add their votes; return how many are below or undecided."""
+    water = 0
+    for i in range(x.size):
+        column = np.floor(x[i] / lattice.side_m) - lattice.first_column
+        row = np.floor(y[i] / lattice.side_m) - lattice.first_row
+        if not (0 <= column < lattice.columns and 0 <= row < lattice.rows):
+            continue
+        c, r, height = int(column), int(row), height_m[i]
+        flags[r, c] |= PRESENT
+        if not counts[i] or np.isnan(height):
+            continue
+        if height < -dead_m:
+            flags[r, c] |= BELOW
+            water += 1
+        elif dead_m > 0.0 and height <= dead_m:
+            flags[r, c] |= UNDECIDED
+            water += 1
+        if dead_m > 0.0:
+            votes[r, c] += int(np.rint(_VOTE * min(max(height / dead_m, -1.0), 1.0)))
+    return water
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _majority_below(votes: IntArray) -> BoolArray:  # pragma: no cover - compiled
+    """Return where the votes of a cell and its eight neighbours lie below the surface together."""
+    rows, columns = votes.shape
+    below = np.empty((rows, columns), np.bool_)
+    for r in range(rows):
+        for c in range(columns):
+            total = 0
+            for i in range(max(r - 1, 0), min(r + 2, rows)):
+                for j in range(max(c - 1, 0), min(c + 2, columns)):
+                    total += votes[i, j]
+            below[r, c] = total < 0
+    return below

@@ -1,0 +1,387 @@
+"""Where each number of a lens stands in the flat array that the kernels take.
+
+The arrays of several lenses, padded with zeros, are the rows of one table. See
+`pcfix.lens.imaging.coefficients`, which fills it, and `pcfix.model.Lens` for the names.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeAlias, get_args
+
+import numpy as np
+from numba import njit
+from numpy.polynomial import Polynomial
+
+from pcfix.model import Projection
+
+if TYPE_CHECKING:
+    from pcfix.model import FloatArray, Lens
+
+
+KIND, LARGEST_ANGLE, LARGEST_RADIUS = range(3)
+"""The projection as a number, and how far it goes: radians, and in its plane."""
+
+TANGENTIAL, THIN_PRISM = 3, 7
+IN_TURN, INVERSE, CENTRE_X, CENTRE_Y, DISC = range(11, 16)
+"""`DISC` is the radius about the centre of distortion up to which Brown's formula is used."""
+
+FOCAL_X, B2, B3, FOCAL_Y, PRINCIPAL_X, PRINCIPAL_Y, WIDTH, HEIGHT = range(16, 24)
+
+PLAIN = 24
+"""Whether the lens is perspective with Brown's k1 to k4, p1 and p2 alone, the common one."""
+
+RADIALS, DENOMINATORS, SHAPES, SHAPE, TAIL = range(25, 30)
+"""How many there are of each; k1 is at `TAIL`, the others follow, the first shape at `SHAPE`."""
+
+LEAST_RADIALS, LEAST_SHAPES = 4, 2
+"""Zeros are added up to these, so that the first few can be read without asking."""
+
+
+CODES: dict[str, int] = {name: i for i, name in enumerate(get_args(Projection))}
+_PERSPECTIVE, _EQUIDISTANT, _EQUISOLID = (
+    CODES[name] for name in ("perspective", "equidistant", "equisolid")
+)
+_POLYNOMIAL, _FOV, _DUAL = (CODES[name] for name in ("polynomial", "fov", "dual"))
+_DIVISION, _EUCM = CODES["division"], CODES["eucm"]
+
+RIGHT_ANGLE = 0.5 * np.pi
+
+
+def largest_angle(lens: Lens) -> float:
+    """Return the angle up to which the projection goes outwards, radians."""
+    s0, s1 = (*lens.shape, 0.0, 0.0)[:2]
+    match lens.projection:
+        case "equidistant" | "equisolid":
+            return np.pi
+        case "polynomial":
+            return _end_of_polynomial(lens.shape)
+        case "dual" if s0 == 0.0:
+            return np.pi
+        case "dual" if s0 < 0.0:
+            return float(np.arctan(np.sqrt(-1.0 / s0)))
+        case "division" if s0 < 0.0:
+            return np.pi
+        case "division" if s0 > 0.0:
+            return float(np.arctan(0.5 / np.sqrt(s0)))
+        case "fov" if abs(s0) >= np.pi:
+            return 0.0
+        case "eucm" if s0 > 0.0:
+            w = s0 / (1.0 - s0) if s0 <= 0.5 else (1.0 - s0) / s0
+            return float(np.pi - np.arctan2(np.sqrt((1.0 - w * w) / s1), w))
+        case _:
+            return RIGHT_ANGLE
+
+
+def largest_radius(c: FloatArray) -> float:
+    """Return the distance from the centre of the largest angle; may be infinite."""
+    rho = float(radius(c, c[LARGEST_ANGLE]))
+    return rho if rho >= 0.0 else np.inf  # a tangent or a quotient beyond its pole by rounding
+
+
+def _end_of_polynomial(shape: tuple[float, ...]) -> float:
+    slope = Polynomial(shape or (0.0,)).deriv()
+    if slope(0.0) <= 0.0:
+        return 0.0
+    return RIGHT_ANGLE * min(2.0, first_root(slope))
+
+
+def first_root(polynomial: Polynomial) -> float:
+    """Return the smallest positive real root; infinite where there is none.
+
+    Found as the largest root of the polynomial in 1 / x, as the lowest coefficient is never
+    small while the highest may be next to nothing.
+    """
+    roots = np.asarray(Polynomial(polynomial.coef[::-1]).roots(), complex)
+    real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 1e-300)]
+    return 1.0 / float(real.max()) if real.size else np.inf
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def _shape(c: FloatArray, i: int) -> float:
+    return c[int(c[SHAPE]) + i]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def radius(c: FloatArray, theta: float) -> float:
+    """Return the distance from the centre of the plane of a direction at an angle."""
+    kind, s0, s1 = int(c[KIND]), _shape(c, 0), _shape(c, 1)
+    if kind == _EQUIDISTANT:
+        return theta
+    if kind == _EQUISOLID:
+        return 2.0 * np.sin(0.5 * theta)
+    if kind == _POLYNOMIAL:
+        return _polynomial(c, theta)[0]
+    if kind == _FOV and s0 != 0.0:
+        return np.arctan(2.0 * np.tan(0.5 * s0) * np.tan(theta)) / s0
+    if kind == _DUAL:
+        return _dual(s0, theta)[0]
+    sine, cosine = np.sin(theta), np.cos(theta)
+    if kind == _DIVISION:
+        root = np.sqrt(max(cosine * cosine - 4.0 * s0 * sine * sine, 0.0))
+        if cosine < 0.0:
+            return (cosine - root) / (2.0 * s0 * sine)
+        return 2.0 * sine / (cosine + root)
+    if kind == _EUCM:
+        d = np.sqrt(s1 * sine * sine + cosine * cosine)
+        return sine / (s0 * d + (1.0 - s0) * cosine)
+    return np.tan(theta)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def angle(c: FloatArray, rho: float) -> float:
+    """Return the angle from the axis of a place in the plane; undoes `radius`."""
+    if not rho <= c[LARGEST_RADIUS]:
+        return np.nan
+    kind, s0, s1 = int(c[KIND]), _shape(c, 0), _shape(c, 1)
+    if kind == _EQUIDISTANT:
+        return rho
+    if kind == _EQUISOLID:
+        return 2.0 * np.arcsin(0.5 * rho)
+    if kind in (_POLYNOMIAL, _DUAL):
+        return _search(c, rho)
+    if kind == _FOV and s0 != 0.0:
+        return np.arctan(np.tan(rho * s0) / (2.0 * np.tan(0.5 * s0)))
+    if kind == _DIVISION:
+        return np.arctan2(rho, 1.0 + s0 * rho * rho)
+    if kind == _EUCM:
+        q = s1 * rho * rho
+        root = np.sqrt(max(1.0 - (2.0 * s0 - 1.0) * q, 0.0))
+        up = (1.0 - s0 * s0 * q) / (s0 * root + 1.0 - s0)
+        return np.arctan2(rho, up)
+    return np.arctan(rho)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def _polynomial(c: FloatArray, theta: float) -> tuple[float, float]:
+    """Return Pix4D's polynomial and its slope."""
+    q = theta / RIGHT_ANGLE
+    value, slope = 0.0, 0.0
+    for i in range(int(c[SHAPES]) - 1, -1, -1):
+        slope = slope * q + value
+        value = value * q + _shape(c, i)
+    return value, slope / RIGHT_ANGLE
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def _dual(share: float, theta: float) -> tuple[float, float]:
+    """Return the mean of perspective and equidistant, and its slope."""
+    if share == 0.0:
+        return theta, 1.0
+    tangent = np.tan(theta)
+    return share * tangent + (1.0 - share) * theta, 1.0 + share * tangent * tangent
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _search(c: FloatArray, rho: float) -> float:
+    """Solve radius(theta) = rho by Newton's steps, halving the bracket where they leave it."""
+    low, high = 0.0, c[LARGEST_ANGLE]
+    if rho < radius(c, low):
+        return np.nan
+    theta = 0.5 * high
+    for _ in range(100):
+        if c[KIND] == _DUAL:
+            value, slope = _dual(_shape(c, 0), theta)
+        else:
+            value, slope = _polynomial(c, theta)
+        if value < rho:
+            low = theta
+        else:
+            high = theta
+        then = theta - (value - rho) / slope
+        if not low <= then <= high:
+            then = 0.5 * (low + high)
+        if abs(then - theta) <= 4e-16:
+            return then
+        theta = then
+    return theta
+
+
+Jacobian: TypeAlias = tuple[float, float, float, float]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def _radial(c: FloatArray, r2: float) -> tuple[float, float]:
+    """Return r' / r and its derivative by r^2."""
+    k, d = int(c[RADIALS]), int(c[DENOMINATORS])
+    above, slope = 0.0, 0.0
+    for i in range(TAIL + k - 1, TAIL - 1, -1):
+        slope = slope * r2 + above
+        above = above * r2 + c[i]
+    slope = slope * r2 + above
+    above = 1.0 + above * r2
+    if d == 0:
+        return above, slope
+    below, below_slope = 0.0, 0.0
+    for i in range(TAIL + k + d - 1, TAIL + k - 1, -1):
+        below_slope = below_slope * r2 + below
+        below = below * r2 + c[i]
+    below_slope = below_slope * r2 + below
+    below = 1.0 + below * r2
+    g = above / below
+    return g, (slope - g * below_slope) / below
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def _sideways(c: FloatArray, x: float, y: float) -> tuple[float, float]:
+    """Return the tangential and thin prism terms."""
+    p1, p2, p3, p4 = c[TANGENTIAL], c[TANGENTIAL + 1], c[TANGENTIAL + 2], c[TANGENTIAL + 3]
+    s1, s2, s3, s4 = c[THIN_PRISM], c[THIN_PRISM + 1], c[THIN_PRISM + 2], c[THIN_PRISM + 3]
+    r2 = x * x + y * y
+    more = 1.0 + (p3 + p4 * r2) * r2
+    tx = (p1 * (r2 + 2.0 * x * x) + 2.0 * p2 * x * y) * more
+    ty = (p2 * (r2 + 2.0 * y * y) + 2.0 * p1 * x * y) * more
+    return tx + (s1 + s2 * r2) * r2, ty + (s3 + s4 * r2) * r2
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def distorted(c: FloatArray, x: float, y: float) -> tuple[float, float]:
+    """Return Brown's formula at a place; NaN outside the disc where it is one to one."""
+    r2 = x * x + y * y
+    if not r2 <= c[DISC] * c[DISC]:
+        return np.nan, np.nan
+    g, _ = _radial(c, r2)
+    fx, fy = g * x, g * y
+    if c[IN_TURN] != 0.0:
+        tx, ty = _sideways(c, fx, fy)
+    else:
+        tx, ty = _sideways(c, x, y)
+    return fx + tx, fy + ty
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _sideways_jacobian(c: FloatArray, x: float, y: float) -> Jacobian:
+    p1, p2, p3, p4 = c[TANGENTIAL], c[TANGENTIAL + 1], c[TANGENTIAL + 2], c[TANGENTIAL + 3]
+    s1, s2, s3, s4 = c[THIN_PRISM], c[THIN_PRISM + 1], c[THIN_PRISM + 2], c[THIN_PRISM + 3]
+    r2 = x * x + y * y
+    tx = p1 * (r2 + 2.0 * x * x) + 2.0 * p2 * x * y
+    ty = p2 * (r2 + 2.0 * y * y) + 2.0 * p1 * x * y
+    more, slope = 1.0 + (p3 + p4 * r2) * r2, 2.0 * (p3 + 2.0 * p4 * r2)
+    across = 2.0 * (p1 * y + p2 * x) * more
+    sx, sy = 2.0 * (s1 + 2.0 * s2 * r2), 2.0 * (s3 + 2.0 * s4 * r2)
+    return (
+        (6.0 * p1 * x + 2.0 * p2 * y) * more + (tx * slope + sx) * x,
+        across + (tx * slope + sx) * y,
+        across + (ty * slope + sy) * x,
+        (6.0 * p2 * y + 2.0 * p1 * x) * more + (ty * slope + sy) * y,
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def jacobian(c: FloatArray, x: float, y: float) -> Jacobian:
+    """Return d x'/d x, d x'/d y, d y'/d x, d y'/d y of `distorted`."""
+    g, slope = _radial(c, x * x + y * y)
+    twice = 2.0 * slope
+    xx, xy, yy = g + twice * x * x, twice * x * y, g + twice * y * y
+    if c[IN_TURN] == 0.0:
+        a, b, d, e = _sideways_jacobian(c, x, y)
+        return xx + a, xy + b, xy + d, yy + e
+    a, b, d, e = _sideways_jacobian(c, g * x, g * y)
+    a, e = a + 1.0, e + 1.0
+    return a * xx + b * xy, a * xy + b * yy, d * xx + e * xy, d * xy + e * yy
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _start(c: FloatArray, rho: float) -> float:
+    """Return the radius that the radial terms alone bring to `rho`, or one near the fold."""
+    low, high = 0.0, min(c[DISC], 1e6)
+    r = min(rho, 0.9 * high)
+    for _ in range(100):
+        g, slope = _radial(c, r * r)
+        miss = r * g - rho
+        if miss < 0.0:
+            low = r
+        else:
+            high = r
+        then = r - miss / (g + 2.0 * r * r * slope)
+        if not low <= then <= high:
+            then = 0.5 * (low + high)
+        if abs(then - r) <= 1e-9 * r:
+            break
+        r = then
+    return r
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def undistorted(c: FloatArray, u: float, v: float) -> tuple[float, float]:
+    """Return the place in the disc that `distorted` brings to (u, v), NaN where there is none.
+
+    Newton's method from the solution without tangential terms, each step halved until it stays
+    in the disc and comes nearer.
+    """
+    rho = np.sqrt(u * u + v * v)
+    if rho == 0.0 or not rho < np.inf:
+        return u * 1.0, v * 1.0
+    scale = _start(c, rho) / rho
+    x, y = scale * u, scale * v
+    fx, fy = distorted(c, x, y)
+    fx, fy = fx - u, fy - v
+    for _ in range(60):
+        if fx * fx + fy * fy <= (2e-16 * (1.0 + rho)) ** 2:
+            break
+        a, b, d, e = jacobian(c, x, y)
+        det = a * e - b * d
+        dx, dy = (e * fx - b * fy) / det, (a * fy - d * fx) / det
+        nearer = False
+        for _ in range(40):
+            gx, gy = distorted(c, x - dx, y - dy)
+            gx, gy = gx - u, gy - v
+            if gx * gx + gy * gy < fx * fx + fy * fy:
+                nearer = True
+                break
+            dx, dy = 0.5 * dx, 0.5 * dy
+        if not nearer:
+            break
+        x, y, fx, fy = x - dx, y - dy, gx, gy
+    if fx * fx + fy * fy <= (1e-12 * (1.0 + rho)) ** 2:
+        return x, y
+    return np.nan, np.nan
+
+
+def largest_disc(lens: Lens, c: FloatArray) -> float:
+    """Return the radius of the disc where Brown's formula is one to one; may be infinite."""
+    fold = _radial_fold(lens)
+    if any(lens.tangential) or any(lens.thin_prism):
+        return float(_first_bend(c, fold))
+    return fold
+
+
+def _radial_fold(lens: Lens) -> float:
+    """Return the smallest r with d r' / d r = 0, or at which r' is infinite."""
+    above, below = Polynomial((1.0, *lens.radial)), Polynomial((1.0, *lens.denominator))
+    twice_q = Polynomial((0.0, 2.0))
+    slope = (above + twice_q * above.deriv()) * below - twice_q * above * below.deriv()
+    return float(np.sqrt(min(first_root(slope), first_root(below))))
+
+
+_DIRECTIONS, _RADII_PER_DECADE = 72, 40
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _bends(c: FloatArray, r: float) -> bool:
+    """Whether the symmetric part of the Jacobian is anywhere not positive definite on a circle."""
+    for i in range(_DIRECTIONS):
+        turn = 2.0 * np.pi * i / _DIRECTIONS
+        a, b, d, e = jacobian(c, r * np.cos(turn), r * np.sin(turn))
+        if not (a + e > 0.0 and a * e > 0.25 * (b + d) * (b + d)):
+            return True
+    return False
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _first_bend(c: FloatArray, fold: float) -> float:
+    """Return the smallest radius that bends, found on a fine series and then halved to it."""
+    low = 0.0
+    for step in range(-3 * _RADII_PER_DECADE, 6 * _RADII_PER_DECADE):
+        high = min(10.0 ** (step / _RADII_PER_DECADE), fold)
+        if _bends(c, high):
+            for _ in range(50):
+                middle = 0.5 * (low + high)
+                if _bends(c, middle):
+                    high = middle
+                else:
+                    low = middle
+            return low
+        if high == fold:
+            return fold
+        low = high
+    return fold

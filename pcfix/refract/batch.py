@@ -1,0 +1,354 @@
+"""What goes into a correction and what comes out: one batch of points, one result.
+
+`Survey` is what all points have in common, `Batch` adds what each of them has of its own. The door
+of the room, `pcfix.refract.methods.correct`, takes a batch whole; so does each method, with the
+cameras chosen.
+
+A dense matcher compared images in the geometry of its own cameras, right or wrong; the light went
+in that of the true ones. What both have in common is the place in the image: a direction in the
+one geometry is a direction in the other, through the lens of either (`MadeWith`, `Images`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from pcfix.lens.imaging import direction_of, image_of, lens_table
+from pcfix.model import Outcome
+from pcfix.water.surface import SurfaceAbove
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Views, WaterSurface
+    from pcfix.options import Settings
+    from pcfix.refract.matcher import Bed, Matcher
+    from pcfix.refract.occlusion import Occluder
+    from pcfix.refract.regression import DepthRegression
+
+
+class Learned(NamedTuple):
+    """What methods may need beyond the points themselves; None where it was not learned.
+
+    Attributes
+    ----------
+    regression : DepthRegression or None
+        From check depths, for the method of that name.
+    occluder : Occluder or None
+        The cloud's own surface, which hides points from cameras.
+    matcher : Matcher or None
+        Which images were matched with which.
+    bed : Bed or None
+        What fused points of one place have in common.
+    """
+
+    regression: DepthRegression | None = None
+    occluder: Occluder | None = None
+    matcher: Matcher | None = None
+    bed: Bed | None = None
+
+
+class MadeWith(NamedTuple):
+    """What made m points, where that are other cameras than those they are corrected with.
+
+    Attributes
+    ----------
+    xyz : array, shape (m, 3)
+        Apparent points as the software had them, metres, world frame.
+    cameras : Cameras
+        Those it had, in the order of the adjusted ones, with angles and lenses.
+    """
+
+    xyz: FloatArray
+    cameras: Cameras
+
+    def take(self, rows: IntArray) -> MadeWith:
+        """Return what made some of the points."""
+        return MadeWith(self.xyz[rows], self.cameras)
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What all points of a cloud are corrected with.
+
+    Attributes
+    ----------
+    water : WaterSurface
+        Needed for its shape where it is a mesh or raster.
+    cameras : Cameras
+        Projection centres and frames, world frame.
+    settings : Settings
+    level_offset_m : array, shape (k,), or None
+        How much higher the water stood when each camera took its image. None: nowhere.
+    learned : Learned
+    """
+
+    water: WaterSurface
+    cameras: Cameras
+    settings: Settings
+    level_offset_m: FloatArray | None = None
+    learned: Learned = field(default_factory=Learned)
+
+    @property
+    def offset_m(self) -> FloatArray:
+        """`level_offset_m`, with zeros where the water did not move."""
+        if self.level_offset_m is None:
+            return np.zeros(len(self.cameras))
+        return np.ascontiguousarray(self.level_offset_m, np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Submerged points, the water above them and the cameras that see them.
+
+    Attributes
+    ----------
+    xyz : array, shape (m, 3)
+        Apparent points, metres, world frame.
+    surface : SurfaceAbove
+        The water above each of them.
+    survey : Survey
+    views : Views or None
+        The cameras of each point: those of a list, to choose from; or, once they are chosen, those
+        that give it a ray. None where no list says it.
+    made_with : MadeWith or None
+        The points as they came and the cameras they came from, where `xyz` are the same points
+        carried to others (`pcfix.adjust.carry`). What undoes dense matching goes by it; the matcher
+        learned is one of those cameras then.
+    level_sigma_m : array, shape (m,), or None
+        Standard deviation of the height of the surface above each point, as its fit has it.
+    """
+
+    xyz: FloatArray
+    surface: SurfaceAbove
+    survey: Survey
+    views: Views | None = None
+    made_with: MadeWith | None = None
+    level_sigma_m: FloatArray | None = None
+
+    def take(self, rows: IntArray) -> Batch:
+        """Return some of the points, in the order of `rows`."""
+        sigma = self.level_sigma_m
+        return replace(
+            self,
+            xyz=self.xyz[rows],
+            surface=SurfaceAbove(self.surface.height_m[rows], self.surface.slope[rows]),
+            views=None if self.views is None else self.views.take(rows),
+            made_with=None if self.made_with is None else self.made_with.take(rows),
+            level_sigma_m=None if sigma is None else sigma[rows],
+        )
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    @property
+    def rays(self) -> Views:
+        """The cameras that were chosen for each point."""
+        if self.views is None:
+            raise ValueError("the cameras of the batch are not chosen yet")
+        return self.views
+
+    @property
+    def counts(self) -> IntArray:
+        """Rays of each point, shape (m,)."""
+        return np.diff(self.rays.start)
+
+    @property
+    def owner(self) -> IntArray:
+        """The point of each ray, shape (rays,)."""
+        return np.repeat(np.arange(len(self.xyz)), self.counts)
+
+    def normals(self) -> FloatArray:
+        """Return the unit normal of the surface above each point, upward, shape (m, 3)."""
+        slope = self.surface.slope
+        up = 1.0 / np.sqrt(1.0 + (slope**2).sum(axis=1))
+        return np.column_stack([-slope * up[:, None], up])
+
+    def outcome(self) -> npt.NDArray[np.uint8]:
+        """Return what becomes of points with so many rays, shape (m,)."""
+        counts = self.counts
+        few = np.where(counts == 1, Outcome.ONE_CAMERA, Outcome.NO_CAMERA)
+        return np.where(counts >= 2, Outcome.CORRECTED, few).astype(np.uint8)
+
+    def incidence_deg(self) -> FloatArray:
+        """Return the largest incidence angle in air of each point's rays, shape (m,)."""
+        owner = self.owner
+        to_camera = self.survey.cameras.centres[self.rays.camera] - self.xyz[owner]
+        across = np.einsum("ij,ij->i", self.normals()[owner], to_camera)
+        cosine = across / np.linalg.norm(to_camera, axis=1)
+        least = np.ones(len(self.xyz))
+        np.minimum.at(least, owner, cosine)
+        return np.degrees(np.arccos(np.clip(least, 0.0, 1.0)))
+
+    def camera_used(self, moved: BoolArray) -> BoolArray:
+        """Return which cameras give a ray to a point that is moved, shape (k,)."""
+        used = np.zeros(len(self.survey.cameras), np.bool_)
+        used[self.rays.camera[moved[self.owner]]] = True
+        return used
+
+    def result(
+        self,
+        shift_m: FloatArray,
+        *,
+        outcome: npt.NDArray[np.uint8] | None = None,
+        ray_miss_m: FloatArray | None = None,
+    ) -> Intersection:
+        """Return the result of a method that gives shifts, shape (m, 3).
+
+        Points that are not moved get a shift of zero, and zeros beside it.
+        """
+        outcome = self.outcome() if outcome is None else outcome
+        moved = outcome == Outcome.CORRECTED
+        zero = np.zeros(len(self.xyz))
+        return Intersection(
+            shift_m=np.where(moved[:, None], shift_m, 0.0),
+            outcome=outcome,
+            ray_count=np.where(moved, self.counts, 0).astype(np.int32),
+            ray_miss_m=zero if ray_miss_m is None else np.where(moved, ray_miss_m, 0.0),
+            sigma_z_m=zero,
+            incidence_deg=np.where(moved, self.incidence_deg(), 0.0),
+            camera_used=self.camera_used(moved),
+        )
+
+
+def stacked(batches: list[Batch]) -> Batch:
+    """Return batches of one survey, without views, as one; at least one of them."""
+    made = [batch.made_with for batch in batches if batch.made_with is not None]
+    return replace(
+        batches[0],
+        xyz=np.vstack([batch.xyz for batch in batches]),
+        surface=SurfaceAbove(
+            np.concatenate([batch.surface.height_m for batch in batches]),
+            np.vstack([batch.surface.slope for batch in batches]),
+        ),
+        made_with=MadeWith(np.vstack([one.xyz for one in made]), made[0].cameras) if made else None,
+    )
+
+
+class Intersection(NamedTuple):
+    """The result for m submerged points; see `pcfix.Correction` for the meaning of each.
+
+    The methods themselves leave `sigma_z_m` and `covariance_m2` open, but for some that know a
+    scatter; `pcfix.refract.methods.correct` fills both.
+    """
+
+    shift_m: FloatArray
+    outcome: npt.NDArray[np.uint8]
+    ray_count: npt.NDArray[np.int32]
+    ray_miss_m: FloatArray
+    sigma_z_m: FloatArray
+    incidence_deg: FloatArray
+    camera_used: BoolArray
+    covariance_m2: FloatArray | None = None
+
+
+class Images(NamedTuple):
+    """The k images in the cameras that made the points and in those of now, for kernels.
+
+    Without rows where they are the same: then no light goes through a lens, and nothing is rounded.
+
+    Attributes
+    ----------
+    centres : array, shape (k, 3)
+        Of those that made the points, metres, world frame.
+    rotations, rotations_now : array, shape (k, 3, 3)
+        World to camera.
+    row, row_now : array, shape (k,)
+        The lens of each image in the tables.
+    lenses, lenses_now : array, shape (l, ...)
+        See `pcfix.lens.imaging.lens_table`.
+    """
+
+    centres: FloatArray
+    rotations: FloatArray
+    row: IntArray
+    lenses: FloatArray
+    rotations_now: FloatArray
+    row_now: IntArray
+    lenses_now: FloatArray
+
+
+def images_of(made_with: MadeWith | None, now: Cameras) -> Images:
+    """Return the images for kernels.
+
+    Raises
+    ------
+    ValueError
+        If there are two sets of cameras, and one has no angles or no lenses, or they are not of
+        the same number.
+    """
+    if made_with is None or _are_equal(made_with.cameras, now):
+        none, no_row = np.zeros((0, 3, 3)), np.zeros(0, np.int64)
+        return Images(np.zeros((0, 3)), none, no_row, np.zeros((0, 1)), none, no_row, none[:, 0])
+    made = made_with.cameras
+    if made.lenses is None or now.lenses is None or len(made) != len(now):
+        raise ValueError("the same images are needed twice, with angles and lenses")
+    row, lenses = lens_table(made.lenses)
+    row_now, lenses_now = lens_table(now.lenses)
+    return Images(
+        np.ascontiguousarray(made.centres, np.float64),
+        np.ascontiguousarray(made.rotations, np.float64),
+        row,
+        lenses,
+        np.ascontiguousarray(now.rotations, np.float64),
+        row_now,
+        lenses_now,
+    )
+
+
+def _are_equal(made: Cameras, now: Cameras) -> bool:
+    """Whether two sets of cameras show the same everywhere."""
+    return made is now or (
+        np.array_equal(made.centres, now.centres)
+        and made.lenses == now.lenses
+        and made.rotations is not None
+        and now.rotations is not None
+        and np.array_equal(made.rotations, now.rotations)
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def as_made(images: Images, c: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return where the matcher had what camera c sees in a direction, both in the world frame.
+
+    NaN where there is no image; of any length.
+    """
+    if len(images.centres) == 0:
+        return x, y, z
+    return _through(
+        images.rotations_now[c], images.lenses_now[images.row_now[c]],
+        images.rotations[c], images.lenses[images.row[c]], x, y, z,
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def as_now(images: Images, c: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return in which direction camera c sees what the matcher had in a direction."""
+    return _through(
+        images.rotations[c], images.lenses[images.row[c]],
+        images.rotations_now[c], images.lenses_now[images.row_now[c]], x, y, z,
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _through(
+    r: FloatArray, lens: FloatArray, to_r: FloatArray, to_lens: FloatArray,
+    x: float, y: float, z: float,
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return the direction of the same place in the image for another pose and lens."""
+    u, v = image_of(
+        lens,
+        r[0, 0] * x + r[0, 1] * y + r[0, 2] * z,
+        r[1, 0] * x + r[1, 1] * y + r[1, 2] * z,
+        r[2, 0] * x + r[2, 1] * y + r[2, 2] * z,
+    )
+    x, y, z = direction_of(to_lens, u, v)
+    return (
+        to_r[0, 0] * x + to_r[1, 0] * y + to_r[2, 0] * z,
+        to_r[0, 1] * x + to_r[1, 1] * y + to_r[2, 1] * z,
+        to_r[0, 2] * x + to_r[1, 2] * y + to_r[2, 2] * z,
+    )

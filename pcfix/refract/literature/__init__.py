@@ -1,1 +1,0 @@
-"""Methods of the literature, for comparison; each a function that takes a `Bundle`."""

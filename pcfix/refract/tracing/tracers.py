@@ -1,0 +1,390 @@
+"""From the camera forwards: a ray through any water surface, and by how much it misses the point.
+
+The object point is the local origin. A ray is named by its aim: the place where it would cross the
+level of the water above the point. It pierces the surface at A, bends there, and comes down to the
+height of the point at the place (mx, my): its miss.
+
+The surface is a plane, the bilinear raster or the facets of
+`pcfix.water.surface`. Where there is none, and where it faces away from the camera, all is NaN. Water
+that hides water behind it is not looked for: the ray is taken to cross the surface once.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+import numpy as np
+from numba import njit
+
+from pcfix.refract.rays import plane_at, refracted
+
+if TYPE_CHECKING:
+    from pcfix.model import FloatArray
+    from pcfix.water.surface import Field, Tin
+
+
+Found: TypeAlias = tuple[float, float, int, bool]
+"""Plan place (x, y) where a tracer ended, its number of steps, and whether it hit the point."""
+
+CLOSE_M = 1e-9
+"""A miss that is none: no finer than UTM northings allow in doubles (1e-9 m)."""
+
+SHORT = 0.1
+"""Of the depth: a step of a search that is taken though it seems to lead away, as one may from
+one patch of a broken surface to the next."""
+
+PIERCING_STEPS = 64
+
+
+class Water(NamedTuple):
+    """A surface as the kernels take it; see `height_of`.
+
+    Each kind has kernels of its own: one for all, with the fields it has no use for left empty,
+    compiles in a third of the time and then is four times slower on planes.
+
+    plane : array, shape (3,), a, b, c of z = a + b x + c y about the point; used if the others
+        are None.
+    tin, field : the mesh or the raster.
+    origin : array, shape (3,), the object point, world frame, metres.
+    """
+
+    plane: FloatArray
+    tin: Tin | None
+    field: Field | None
+    origin: FloatArray
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def height_of(water: Water, x: float, y: float) -> tuple[float, float, float]:
+    """Return height over the point, dz/dx and dz/dy of the water at a plan place; NaN if none."""
+    return _height_of(water.plane, water.tin, water.field, water.origin, x, y)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _height_of(
+    plane: FloatArray, tin: Tin | None, field: Field | None, origin: FloatArray, x: float, y: float
+) -> tuple[float, float, float]:
+    """Do it; numba drops the branch of what is None only where it is an argument of its own."""
+    if tin is None and field is None:
+        return plane[0] + plane[1] * x + plane[2] * y, plane[1], plane[2]
+    return plane_at(tin, field, x, y, origin)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def pierce(
+    water: Water, ex: float, ey: float, ez: float, dx: float, dy: float, dz: float
+) -> tuple[float, float]:
+    """Return the plan place where the ray from e along d pierces the surface.
+
+    Newton's method on the tangent plane, from e + d on, inside the bracket in which the ray
+    crosses the water. (`pcfix.refract.rays` starts below the surface, at a known point; here
+    that point may lie beyond the edge of the water though the ray crosses it well within.)
+    """
+    low, high, f = 0.0, np.inf, 1.0
+    for _ in range(PIERCING_STEPS):
+        x, y = ex + f * dx, ey + f * dy
+        z, b, c = height_of(water, x, y)
+        gap = z - (ez + f * dz)
+        if not abs(gap) > 0.1 * CLOSE_M:
+            break
+        if gap > 0.0:
+            high = f
+        else:
+            low = f
+        f += gap / (dz - b * dx - c * dy)
+        if not low < f < high:
+            f = 2.0 * low if high == np.inf else 0.5 * (low + high)
+    return (x, y) if abs(gap) <= CLOSE_M else (np.nan, np.nan)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def miss_through(
+    water: Water, ex: float, ey: float, ez: float, x: float, y: float, n: float
+) -> tuple[float, float]:
+    """Return the miss of the ray that pierces the surface at the plan place x, y."""
+    z, b, c = height_of(water, x, y)
+    nz = 1.0 / np.sqrt(1.0 + b * b + c * c)
+    nx, ny = -b * nz, -c * nz
+    ux, uy, uz = ex - x, ey - y, ez - z
+    facing = nx * ux + ny * uy + nz * uz
+    if not facing > 0.0:
+        return np.nan, np.nan
+    tx, ty, tz = refracted(ux, uy, uz, ux * ux + uy * uy + uz * uz, nx, ny, nz, facing, 1.0 / n)
+    if not tz < 0.0:
+        return np.nan, np.nan
+    return x - tx * z / tz, y - ty * z / tz
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def shoot(
+    water: Water, level: float, ex: float, ey: float, ez: float, x: float, y: float, n: float
+) -> tuple[float, float, float, float]:
+    """Return piercing place (x, y) and miss (x, y) of the ray aimed at x, y on a level."""
+    ax, ay = pierce(water, ex, ey, ez, x - ex, y - ey, level - ez)
+    mx, my = miss_through(water, ex, ey, ez, ax, ay, n)
+    return ax, ay, mx, my
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def travel(water: Water, ex: float, ey: float, ez: float, x: float, y: float, n: float) -> float:
+    """Return optical length (m) of the path through a plan place; infinite where there is none."""
+    z, b, c = height_of(water, x, y)
+    ux, uy, uz = ex - x, ey - y, ez - z
+    if not uz - b * ux - c * uy > 0.0:
+        return np.inf
+    air, wet = np.sqrt(ux * ux + uy * uy + uz * uz), np.sqrt(x * x + y * y + z * z)
+    return float(air + n * wet)
+
+
+KOTOWSKI_STEPS = 40
+HALVINGS = 24
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def kotowski(water: Water, level: float, ex: float, ey: float, ez: float, n: float) -> Found:
+    """Return where light from the origin leaves the water towards e, (x, y, steps, found).
+
+    A step that makes g grow is halved until it is short; from one patch of a broken surface to the
+    next g may grow on the right way. So is one beyond the edge of the water.
+    """
+    f = level / ez
+    x, y = f * ex, f * ey
+    gx, gy, hxx, hxy, hyy = _snell_at(water, ex, ey, ez, x, y, n)
+    if np.isnan(gx):
+        x, y = 0.0, 0.0
+        gx, gy, hxx, hxy, hyy = _snell_at(water, ex, ey, ez, x, y, n)
+    for step in range(1, KOTOWSKI_STEPS + 1):
+        det = hxx * hyy - hxy * hxy
+        dx, dy = (hxy * gy - hyy * gx) / det, (hxy * gx - hxx * gy) / det
+        before, size, share = gx * gx + gy * gy, np.sqrt(dx * dx + dy * dy), 1.0
+        for _ in range(HALVINGS):
+            gx, gy, hxx, hxy, hyy = _snell_at(water, ex, ey, ez, x + share * dx, y + share * dy, n)
+            if gx * gx + gy * gy < before or (share * size < SHORT * level and not np.isnan(gx)):
+                break
+            share *= 0.5
+        if np.isnan(gx):
+            return x, y, step, False
+        x, y = x + share * dx, y + share * dy
+        if size <= CLOSE_M:
+            return x, y, step, True
+    return x, y, KOTOWSKI_STEPS, False
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _snell_at(
+    water: Water, ex: float, ey: float, ez: float, x: float, y: float, n: float
+) -> tuple[float, float, float, float, float]:
+    r"""Return g at a plan place, and its derivatives by x and y: xx, xy and yy.
+
+    The unit vectors turn with A by (I - u u') / \|A - C\| and -(I - v v') / \|A\|.
+    """
+    z, b, c = height_of(water, x, y)
+    twist = _twist_at(water.field, water.origin[0] + x, water.origin[1] + y)
+    ux, uy, uz = x - ex, y - ey, z - ez
+    air, wet = 1.0 / np.sqrt(ux * ux + uy * uy + uz * uz), 1.0 / np.sqrt(x * x + y * y + z * z)
+    ux, uy, uz, vx, vy, vz = air * ux, air * uy, air * uz, -wet * x, -wet * y, -wet * z
+    along_ux, along_uy = ux + b * uz, uy + c * uz
+    along_vx, along_vy = vx + b * vz, vy + c * vz
+    up = uz - n * vz
+    both = air + n * wet
+    return (
+        along_ux - n * along_vx,
+        along_uy - n * along_vy,
+        both * (1.0 + b * b) - air * along_ux * along_ux - n * wet * along_vx * along_vx,
+        both * b * c - air * along_ux * along_uy - n * wet * along_vx * along_vy + up * twist,
+        both * (1.0 + c * c) - air * along_uy * along_uy - n * wet * along_vy * along_vy,
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _twist_at(field: Field | None, x: float, y: float) -> float:
+    """Return the second derivative z_xy of a raster's patch at a place (world frame), 1 / m."""
+    if field is not None:
+        rows, columns = field.heights.shape
+        u, v = (x - field.west_x) / field.cell_x, (field.north_y - y) / field.cell_y
+        if not (-0.5 <= u <= columns - 0.5 and -0.5 <= v <= rows - 0.5):
+            return 0.0
+        column = min(max(int(np.floor(u)), 0), columns - 2)
+        row = min(max(int(np.floor(v)), 0), rows - 2)
+        z = field.heights
+        twist = z[row + 1, column + 1] - z[row, column + 1] - z[row + 1, column] + z[row, column]
+        return -float(twist) / (field.cell_x * field.cell_y)
+    return 0.0
+
+
+AFRT_STEPS = 60
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def afrt(water: Water, level: float, ex: float, ey: float, ez: float, n: float) -> Found:
+    """Return where light from the origin leaves the water towards e, (x, y, steps, found).
+
+    After a step s = -B m the good Broyden update of the inverse B is
+    B + t (s'B) / (s'(s - t)), with t = -B m of the new miss. A step is at most the depth or,
+    where that is more, what the straight line goes sideways in the water.
+    """
+    f = level / ez
+    px, py, sx, sy = 0.0, 0.0, 0.0, 0.0
+    bxx, bxy, byx, byy = 1.0, 0.0, 0.0, 1.0
+    x, y = f * ex, f * ey
+    longest = max(level, np.sqrt(x * x + y * y))
+    for step in range(1, AFRT_STEPS + 1):
+        ax, ay, mx, my = shoot(water, level, ex, ey, ez, px + f * (ex - px), py + f * (ey - py), n)
+        if np.isnan(mx):
+            return x, y, step, False
+        x, y = ax, ay
+        if mx * mx + my * my <= CLOSE_M * CLOSE_M:
+            return x, y, step, True
+        tx, ty = -bxx * mx - bxy * my, -byx * mx - byy * my
+        if step > 1:
+            share = 1.0 / (sx * (sx - tx) + sy * (sy - ty))
+            along_x, along_y = sx * bxx + sy * byx, sx * bxy + sy * byy
+            bxx, bxy = bxx + share * tx * along_x, bxy + share * tx * along_y
+            byx, byy = byx + share * ty * along_x, byy + share * ty * along_y
+            tx, ty = -bxx * mx - bxy * my, -byx * mx - byy * my
+        size = np.sqrt(tx * tx + ty * ty)
+        if not size < np.inf:
+            return x, y, step, False
+        if size > longest:
+            tx, ty = tx * longest / size, ty * longest / size
+        px, py, sx, sy = px + tx, py + ty, tx, ty
+    return x, y, AFRT_STEPS, False
+
+
+MDFRT_STEPS = 30
+NARROW_M = 1e-6
+"""The least distance of the aims: below, rounding would outdo what is left out."""
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def mdfrt(water: Water, level: float, ex: float, ey: float, ez: float, n: float) -> Found:
+    """Return where light from the origin leaves the water towards e, (x, y, steps, found).
+
+    A step that makes the miss grow is halved until it is short; so is one beyond the edge of the
+    water.
+    """
+    f = level / ez
+    x, y = f * ex, f * ey
+    ax, ay, mx, my = shoot(water, level, ex, ey, ez, x, y, n)
+    if np.isnan(mx):
+        x, y = 0.0, 0.0
+        ax, ay, mx, my = shoot(water, level, ex, ey, ez, x, y, n)
+    for step in range(1, MDFRT_STEPS + 1):
+        before = mx * mx + my * my
+        if not before > CLOSE_M * CLOSE_M:
+            return ax, ay, step, not np.isnan(mx)
+        apart = min(max(0.01 * np.sqrt(before), NARROW_M), 0.05 * level)
+        _, _, xx, yx = shoot(water, level, ex, ey, ez, x + apart, y, n)
+        _, _, xy, yy = shoot(water, level, ex, ey, ez, x, y + apart, n)
+        xx, yx, xy, yy = xx - mx, yx - my, xy - mx, yy - my
+        det = (xx * yy - xy * yx) / apart
+        dx, dy = (xy * my - yy * mx) / det, (yx * mx - xx * my) / det
+        size, share = np.sqrt(dx * dx + dy * dy), 1.0
+        if not size < np.inf:
+            return ax, ay, step, False
+        for _ in range(HALVINGS):
+            there = shoot(water, level, ex, ey, ez, x + share * dx, y + share * dy, n)
+            less = there[2] * there[2] + there[3] * there[3] < before
+            if less or (share * size < SHORT * level and not np.isnan(there[2])):
+                break
+            share *= 0.5
+        if np.isnan(there[2]):
+            return ax, ay, step, False
+        x, y = x + share * dx, y + share * dy
+        ax, ay, mx, my = there
+    return ax, ay, MDFRT_STEPS, mx * mx + my * my <= CLOSE_M * CLOSE_M
+
+
+KNOTS = 21
+"""Of the first shot, each way."""
+SHOTS = 200
+BLUNT_M = 1e-7
+"""Half the grid at which lengths no longer tell the rays apart."""
+NEIGHBOUR_M = 1e-4
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def scattershot(water: Water, level: float, ex: float, ey: float, ez: float, n: float) -> Found:
+    """Return where light from the origin leaves the water towards e, (x, y, shots, found).
+
+    On calm water that is between the plan place of the point and the straight line; the first
+    shot covers these and as much as the point is deep all around.
+    """
+    f = level / ez
+    middle_x, middle_y = 0.5 * f * ex, 0.5 * f * ey
+    half = level + max(abs(middle_x), abs(middle_y))
+    best, x, y = np.inf, middle_x, middle_y
+    apart = 2.0 * half / (KNOTS - 1)
+    for i in range(KNOTS):
+        for j in range(KNOTS):
+            knot_x, knot_y = middle_x - half + i * apart, middle_y - half + j * apart
+            length = travel(water, ex, ey, ez, knot_x, knot_y, n)
+            if length < best:
+                best, x, y = length, knot_x, knot_y
+    x, y, shots, found = narrowed(water, ex, ey, ez, x, y, 2.0 * apart, n)
+    return x, y, shots + 1, found
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def narrowed(
+    water: Water, ex: float, ey: float, ez: float, x: float, y: float, half: float, n: float
+) -> Found:
+    """Return the nearest place of least optical length, from a place and half a grid's size on.
+
+    Found is a path that hits the point, or one through a crease, known to about 1e-6 m along it:
+    the shortest one although the rays beside it miss.
+    """
+    x, y, first, _ = _draw_together(water, ex, ey, ez, x, y, half, BLUNT_M, n, False)
+    px, py, second, miss = _draw_together(
+        water, ex, ey, ez, x, y, NEIGHBOUR_M, 0.1 * CLOSE_M, n, True
+    )
+    if miss <= CLOSE_M:
+        return px, py, first + second, True
+    return x, y, first + second, _inside(water, x, y)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _draw_together(
+    water: Water, ex: float, ey: float, ez: float, x: float, y: float, half: float, end: float,
+    n: float, by_miss: bool,
+) -> tuple[float, float, int, float]:  # fmt: skip
+    """Halve a grid of 5 x 5 about its best knot until it is small enough.
+
+    While the best knot is on the rim the grid moves and keeps its size.
+    """
+    best, shots = _badness(water, ex, ey, ez, x, y, n, by_miss), 0
+    while shots < SHOTS and half > end and not (by_miss and best <= CLOSE_M):
+        shots += 1
+        best_i, best_j = 0, 0
+        for i in range(-2, 3):
+            for j in range(-2, 3):
+                bad = _badness(
+                    water, ex, ey, ez, x + 0.5 * half * i, y + 0.5 * half * j, n, by_miss
+                )
+                if bad < best:
+                    best, best_i, best_j = bad, i, j
+        x, y = x + 0.5 * half * best_i, y + 0.5 * half * best_j
+        if max(abs(best_i), abs(best_j)) < 2:
+            half *= 0.5
+    return x, y, shots, best
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _badness(
+    water: Water, ex: float, ey: float, ez: float, x: float, y: float, n: float, by_miss: bool
+) -> float:
+    """Return the miss of a ray or the optical length of a path, metres; infinite without any."""
+    if by_miss:
+        mx, my = miss_through(water, ex, ey, ez, x, y, n)
+        return np.inf if np.isnan(mx) else float(np.sqrt(mx * mx + my * my))
+    return travel(water, ex, ey, ez, x, y, n)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _inside(water: Water, x: float, y: float) -> bool:
+    """Whether there is water on all sides: at an edge the shortest path means nothing."""
+    for i in (-1.0, 1.0):
+        for j in (-1.0, 1.0):
+            if np.isnan(height_of(water, x + i * NEIGHBOUR_M, y + j * NEIGHBOUR_M)[0]):
+                return False
+    return True

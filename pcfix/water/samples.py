@@ -1,0 +1,387 @@
+"""A cloud in which the water is sought: its ground in cells, what floats, and sums over tiles.
+
+Sums: a broken line against the unbroken one, tile by tile, for every height where it may break.
+y = (smooth within each tile) + trend * height + amplitude * f(depth), where
+f(d) = D (1 - exp(-d / D)) below the height in question and 0 above it; trend and amplitude are the
+same in all tiles. Where the amplitude is free, the trend must be the weaker of the two: what fades
+under water is steady on land. Each tile gives its sums of squares and products once; to add tiles,
+at their own heights under a tilted surface, or to draw them anew, costs little then.
+
+What floats is well above the ground around it and lies at one height, thinly: waves, foam and
+glints that images agree on by chance give points on the surface itself. Leaves and wires are above
+the ground too, but at all heights.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.spatial import cKDTree
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from pcfix.model import BoolArray, FloatArray, IntArray
+
+
+MOST_CELLS = 100_000
+POINTS_PER_CELL = 4.0
+NEIGHBOURS = 8
+_TRIES = 4
+
+
+class Samples(NamedTuple):
+    """One row a cell that holds points; m of them.
+
+    xyz : shape (m, 3), mean x and y, median z, metres from `origin`.
+    smooth_m : shape (m,), the height at x, y of a plane through the cells around, without its own.
+    rough_m : shape (m,), rms distance of the cells around from that plane.
+    colour : shape (m, 3), mean of the natural logarithms of red, green and blue; or None.
+    intensity : shape (m,), mean logarithm; or None.
+    cell_m : side of a cell.
+    origin : shape (3,), world.
+    of_point : shape (n,), the row of each point's cell.
+    """
+
+    xyz: FloatArray
+    smooth_m: FloatArray
+    rough_m: FloatArray
+    colour: FloatArray | None
+    intensity: FloatArray | None
+    cell_m: float
+    origin: FloatArray
+    of_point: IntArray
+
+
+def sample_cloud(
+    xyz: FloatArray, rgb: npt.ArrayLike | None = None, intensity: npt.ArrayLike | None = None
+) -> Samples:
+    """Thin a cloud to cells.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 3)
+        Metres, world frame.
+    rgb : array, shape (n, 3), optional
+        In any unit from zero up.
+    intensity : array, shape (n,), optional
+    """
+    origin = xyz.min(axis=0)
+    local = xyz - origin
+    cell_m = _cell_m(local)
+    of_point, count = _cells(local, cell_m)
+    mean = [np.bincount(of_point, local[:, i]) / count for i in (0, 1)]
+    ground = np.column_stack([*mean, _medians(of_point, count, local[:, 2])])
+    smooth, rough = _planes_around(ground)
+    colour = None if rgb is None else _log_means(np.asarray(rgb), of_point, count)
+    bright = None if intensity is None else np.asarray(intensity).reshape(-1, 1)
+    light = None if bright is None else _log_means(bright, of_point, count)[:, 0]
+    return Samples(ground, smooth, rough, colour, light, cell_m, origin, of_point)
+
+
+def _cell_m(local: FloatArray) -> float:
+    """Return a side that leaves about `POINTS_PER_CELL` in a cell, and `MOST_CELLS` at most."""
+    wanted = min(len(local) / POINTS_PER_CELL, MOST_CELLS)
+    side = float(np.sqrt(max(np.prod(np.ptp(local[:, :2], axis=0)), 1e-6) / wanted))
+    for _ in range(_TRIES):  # the box of a cloud is seldom full
+        held = len(np.unique(_keys(local, side)))
+        side *= np.sqrt(held / wanted)
+    return side
+
+
+def _keys(local: FloatArray, side_m: float) -> IntArray:
+    cell: IntArray = (local[:, :2] / side_m).astype(np.int64)
+    return np.asarray(cell[:, 1] * (cell[:, 0].max() + 1) + cell[:, 0])
+
+
+def _cells(local: FloatArray, cell_m: float) -> tuple[IntArray, IntArray]:
+    _, of_point, count = np.unique(_keys(local, cell_m), return_inverse=True, return_counts=True)
+    return of_point.reshape(-1), count
+
+
+def _medians(group: IntArray, count: IntArray, values: FloatArray) -> FloatArray:
+    """Return the median of each group."""
+    ordered = values[np.lexsort((values, group))]
+    first = np.cumsum(count) - count
+    return (ordered[first + (count - 1) // 2] + ordered[first + count // 2]) / 2.0
+
+
+def _log_means(values: npt.NDArray[np.generic], group: IntArray, count: IntArray) -> FloatArray:
+    """Return mean logarithms a group; a small part of white keeps black finite."""
+    light = values.astype(np.float64)
+    logs = np.log(light + 0.004 * max(float(np.percentile(light, 99.0)), 1e-9))
+    return np.column_stack([np.bincount(group, column) / count for column in logs.T])
+
+
+def _planes_around(ground: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return height at each place, and rms residual, of the plane through the places around."""
+    k = min(NEIGHBOURS, len(ground) - 1)
+    _, near = cKDTree(ground[:, :2]).query(ground[:, :2], k=k + 1)
+    around = ground[np.asarray(near)[:, 1:]] - ground[:, None]
+    design = np.concatenate([np.ones((*around.shape[:2], 1)), around[..., :2]], axis=2)
+    normal = np.einsum("mki,mkj->mij", design, design)
+    scale = np.trace(normal, axis1=1, axis2=2)[:, None, None]
+    right = np.einsum("mki,mk->mi", design, around[..., 2])
+    plane = np.linalg.solve(normal + 1e-9 * scale * np.eye(3), right[..., None])[..., 0]
+    residual = around[..., 2] - np.einsum("mki,mi->mk", design, plane)
+    spare = max(k - 3, 1)
+    return ground[:, 2] + plane[:, 0], np.sqrt((residual**2).sum(axis=1) / spare)
+
+
+LEAST_SIDE = 8.0
+"""Cells (weights added) that a tile must have above a height, and below, to say anything."""
+_TINY = 1e-12
+_STEADY_M = 0.3
+
+
+class Break(NamedTuple):
+    """The break that is looked for.
+
+    scale_m : D, infinite for a straight line below.
+    window_m : observations weigh less towards this far above and below.
+    sign : +1 or -1, what the amplitude must be.
+    amplitude : where physics gives it; else it is free.
+    most : a free amplitude larger than this is not likely, one twice as large is something else.
+    """
+
+    scale_m: float
+    window_m: float
+    sign: float
+    amplitude: float | None = None
+    most: float = np.inf
+
+
+class Moments(NamedTuple):
+    """Sums of t tiles at h heights.
+
+    sums : shape (t, h, 6), of yy, yx, yf, xx, xf, ff after the smooth part is taken out of the
+        y, x (height) and f; each tile in units of its own residual variance.
+    number : shape (t, h), how many observations that is.
+    xy : shape (t, 2), the middle of each tile.
+    heights_m : shape (h,), evenly spaced.
+    what : Break
+    """
+
+    sums: FloatArray
+    number: FloatArray
+    xy: FloatArray
+    heights_m: FloatArray
+    what: Break
+
+    def shifted(self, tilt: FloatArray) -> Moments:
+        """Return the sums at the heights `heights_m` + tilt . xy of each tile."""
+        step = self.heights_m[1] - self.heights_m[0]
+        offset = np.rint(self.xy @ tilt / step).astype(np.int64)
+        column = np.arange(len(self.heights_m)) + offset[:, None]
+        inside = (column >= 0) & (column < len(self.heights_m))
+        rows = np.arange(len(self.sums))[:, None]
+        column = np.clip(column, 0, len(self.heights_m) - 1)
+        sums = self.sums[rows, column] * inside[..., None]
+        return self._replace(sums=sums, number=self.number[rows, column] * inside)
+
+
+class Gain(NamedTuple):
+    """What the break explains, h heights.
+
+    gain : shape (h,), logarithm of the ratio of likelihoods with and without it, scaled down to
+        what the differences between tiles allow.
+    amplitude, sigma : shape (h,), and its standard error from those differences.
+    """
+
+    gain: FloatArray
+    amplitude: FloatArray
+    sigma: FloatArray
+
+
+def gain_of(moments: Moments, times: FloatArray | None = None) -> Gain:
+    """Add up the tiles, each as many times as `times` says."""
+    sums = moments.sums if times is None else moments.sums * times[:, None, None]
+    count = moments.number if times is None else moments.number * times[:, None]
+    yy, yx, yf, xx, xf, ff = np.moveaxis(sums.sum(axis=0), -1, 0)
+    slope, share = yx / (xx + _TINY), xf / (xx + _TINY)
+    sse = np.maximum(yy - slope * yx, 0.0) + _TINY
+    cross, own = yf - share * yx, np.maximum(ff - share * xf, _TINY)
+    amplitude = cross / own
+    what = moments.what
+    if what.amplitude is None:
+        steady = np.clip(2.0 - 2.0 * np.abs(slope / (amplitude + _TINY) - share), 0.0, 1.0)
+        likely = np.clip(2.0 - np.abs(amplitude) / what.most, 0.0, 1.0)
+        saved = np.maximum(what.sign * cross, 0.0) ** 2 / own * steady * likely
+    else:
+        saved = 2.0 * what.amplitude * cross - what.amplitude**2 * own
+    left = np.maximum(sse - saved, 1e-3 * sse)
+    n = count.sum(axis=0)
+    variance = np.maximum(sse - cross**2 / own, 1e-3 * sse) / np.maximum(n, 1.0)
+    trend = slope - amplitude * share
+    scores = (
+        sums[..., 2] - trend * sums[..., 4] - amplitude * sums[..., 5]
+        - share * (sums[..., 1] - trend * sums[..., 3] - amplitude * sums[..., 4])
+    )  # fmt: skip
+    scatter = (scores**2 if times is None else scores**2 / np.maximum(times, 1.0)[:, None]).sum(0)
+    held = np.maximum(variance * own, scatter)
+    sigma = np.sqrt(held) / own
+    temper = variance * own / (held + _TINY)
+    width = max(1, round(_STEADY_M / (moments.heights_m[1] - moments.heights_m[0])))
+    gain = 0.5 * n * np.log(sse / left) * uniform_filter1d(temper, width)
+    return Gain(np.where(own > 1e3 * _TINY, gain, 0.0), amplitude, sigma)
+
+
+def tile_moments(
+    smooth: FloatArray, y: FloatArray, at_m: FloatArray, heights_m: FloatArray, what: Break,
+    *, with_trend: bool,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Return the sums of one tile, shapes (h, 6) and (h,).
+
+    Parameters
+    ----------
+    smooth : array, shape (n, p)
+        Columns of the smooth part.
+    y, at_m : array, shape (n,)
+        The observations and the heights that they belong to.
+    heights_m : array, shape (h,)
+    what : Break
+    with_trend : bool
+        Whether y may change with height in the same way above and below.
+    """
+    depth = heights_m[:, None] - at_m
+    weight = np.maximum(1.0 - (depth / what.window_m) ** 2, 0.0) ** 2
+    total = weight.sum(axis=1)
+    below = (weight * (depth > 0.0)).sum(axis=1)
+    enough = np.minimum(below, total - below) >= LEAST_SIDE
+    sums, count = np.zeros((len(heights_m), 6)), np.zeros(len(heights_m))
+    if enough.any():
+        x = (at_m - at_m.mean()) * float(with_trend)
+        sums[enough] = _sums(smooth, y, x, depth[enough], weight[enough], what.scale_m)
+        squares = (weight[enough] ** 2).sum(axis=1)
+        count[enough] = np.maximum(total[enough] ** 2 / squares - smooth.shape[1], 1.0)
+    return sums, count
+
+
+def _sums(
+    smooth: FloatArray, y: FloatArray, x: FloatArray, depth: FloatArray, weight: FloatArray,
+    scale_m: float,
+) -> FloatArray:  # fmt: skip
+    below = np.maximum(depth, 0.0)
+    f = below if np.isinf(scale_m) else -scale_m * np.expm1(-below / scale_m)
+    p = smooth.shape[1]
+    fixed = np.column_stack([smooth, y, x])
+    products = (fixed[:, :, None] * fixed[:, None, :]).reshape(len(y), -1)
+    whole = np.zeros((len(depth), p + 3, p + 3))
+    whole[:, :-1, :-1] = (weight @ products).reshape(-1, p + 2, p + 2)
+    whole[:, -1, :-1] = whole[:, :-1, -1] = (weight * f) @ fixed
+    whole[:, -1, -1] = (weight * f * f).sum(axis=1)
+    normal, right = whole[:, :p, :p], whole[:, :p, p:]
+    ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(p)
+    rest = whole[:, p:, p:] - np.swapaxes(right, 1, 2) @ np.linalg.solve(normal + ridge, right)
+    return np.asarray(rest[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])
+
+
+def square_tiles(xy: FloatArray, side_m: float, least: int) -> list[IntArray]:
+    """Return the rows of each square tile that holds at least so many; `xy` from zero up."""
+    column, row = (xy / side_m).astype(np.int64).T
+    _, tile = np.unique(row * (column.max() + 1) + column, return_inverse=True)
+    tile = tile.reshape(-1)
+    order = np.argsort(tile, kind="stable")
+    parts = np.split(order, np.cumsum(np.bincount(tile))[:-1])
+    return [part for part in parts if len(part) >= least]
+
+
+def gather(
+    parts: list[tuple[FloatArray, FloatArray]], xy: list[FloatArray], heights_m: FloatArray,
+    what: Break,
+) -> Moments | None:  # fmt: skip
+    """Put tiles together, each in units of its residual variance; None where none says anything."""
+    said = [i for i, (_, count) in enumerate(parts) if count.any()]
+    if not said:
+        return None
+    sums = np.array([parts[i][0] for i in said])
+    count = np.array([parts[i][1] for i in said])
+    variance = sums[..., 0].sum(axis=1) / count.sum(axis=1)
+    least = 0.3 * float(np.median(variance)) + _TINY
+    sums /= np.maximum(variance, least)[:, None, None]
+    return Moments(sums, count, np.array([xy[i] for i in said]), heights_m, what)
+
+
+LEAST_ABOVE_M, TIMES_NOISE = 0.25, 10.0
+"""Less, and the tail of the noise follows the ground and piles up where that is flat."""
+HALF_LAYER_M, HALF_AROUND_M = 0.05, 0.6
+MOST_GAIN = 100.0
+"""Many points are not independent: what they gain tends to this."""
+TILE_CELLS = 12.0
+
+
+class Floating(NamedTuple):
+    """Points above the ground; p of them.
+
+    xyz : shape (p, 3), metres from the origin of the samples.
+    tile : shape (p,), number of the square that each is in.
+    """
+
+    xyz: FloatArray
+    tile: IntArray
+
+
+def points_above(samples: Samples, xyz: FloatArray, among: BoolArray | None = None) -> Floating:
+    """Return the points of the cloud, shape (n, 3), that are well above the ground.
+
+    `among`, shape (n,): which points to look at.
+    """
+    above_m = (xyz[:, 2] - samples.origin[2]) - samples.smooth_m[samples.of_point]
+    least = np.maximum(LEAST_ABOVE_M, TIMES_NOISE * samples.rough_m)
+    chosen = above_m > least[samples.of_point]
+    local = xyz[chosen if among is None else chosen & among] - samples.origin
+    column, row = (local[:, :2] / (TILE_CELLS * samples.cell_m)).astype(np.int64).T
+    return Floating(local, row * (column.max(initial=0) + 1) + column)
+
+
+def layer_gain(
+    floating: Floating, heights_m: FloatArray, tilt: FloatArray, times: FloatArray | None = None
+) -> FloatArray:
+    """Return how much likelier the counts are with a layer at each height than without.
+
+    Logarithm of the ratio of Poisson likelihoods; what is expected comes from above and below.
+    Points of one tile at one height count once. `times`: how often to count each point.
+
+    Parameters
+    ----------
+    floating : Floating
+    heights_m : array, shape (h,)
+        Evenly spaced, above the tilted plane through the origin of the samples.
+    tilt : array, shape (2,)
+
+    Returns
+    -------
+    array, shape (h,)
+    """
+    step = heights_m[1] - heights_m[0]
+    height = floating.xyz[:, 2] - floating.xyz[:, :2] @ tilt
+    column = np.rint((height - heights_m[0]) / step).astype(np.int64)
+    inside = (column >= 0) & (column < len(heights_m))
+    once = _first_of_each(floating.tile, column) & inside
+    counts = np.bincount(
+        column[once], None if times is None else times[once], minlength=len(heights_m)
+    )
+    sums = np.concatenate([[0.0], np.cumsum(counts)])
+    layer, in_layer = _within(sums, round(HALF_LAYER_M / step))
+    wide, in_wide = _within(sums, round(HALF_AROUND_M / step))
+    around = np.maximum(in_wide - in_layer, 1)
+    expected = np.maximum(wide - layer, 1.0) * in_layer / around
+    ratio = np.maximum(layer / expected, 1.0)
+    gain = layer * np.log(ratio) - expected * (ratio - 1.0)
+    return np.asarray(-MOST_GAIN * np.expm1(-gain / MOST_GAIN))
+
+
+def _within(sums: FloatArray, reach: int) -> tuple[FloatArray, IntArray]:
+    """Return the counts within so many bins of each, and how many bins that is."""
+    middle = np.arange(len(sums) - 1)
+    low, high = np.maximum(middle - reach, 0), np.minimum(middle + reach + 1, len(sums) - 1)
+    return sums[high] - sums[low], high - low
+
+
+def _first_of_each(tile: IntArray, column: IntArray) -> BoolArray:
+    key = tile * (np.ptp(column) + 1 if len(column) else 1) + column - column.min(initial=0)
+    first = np.zeros(len(tile), bool)
+    first[np.unique(key, return_index=True)[1]] = True
+    return first

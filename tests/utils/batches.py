@@ -1,0 +1,11 @@
+"""A batch of points from what a test has at hand."""
+
+from pcfix.refract.batch import Batch, Learned, Survey
+
+
+def batch_of(
+    xyz, above, water, cameras, settings, views=None, offset=None, *,
+    learned=None, level_sigma_m=None, made_with=None,
+):  # fmt: skip
+    survey = Survey(water, cameras, settings, offset, learned or Learned())
+    return Batch(xyz, above, survey, views, made_with, level_sigma_m)
