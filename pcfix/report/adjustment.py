@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pcfix.grid.maps import MapsBuilder
 from pcfix.report import adjustment_text as words
 from pcfix.report.adjustment_figures import pictures_of
 from pcfix.report.adjustment_tables import adjustment_tables, what_was_free
@@ -16,15 +17,14 @@ from pcfix.report.adjustment_values import (
     carried_by,
     depth_of,
 )
-from pcfix.report.maps import MapsBuilder
 from pcfix.report.page import Layer, Picture, Report, Table, render
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pcfix.adjust.result import Adjusted
+    from pcfix.grid.maps import Maps
     from pcfix.model import FloatArray
-    from pcfix.report.maps import Maps
 
 __all__ = [
     "Before",

@@ -292,6 +292,19 @@ class WaterProposal:
     curves: EvidenceCurves
     ground: FloatArray
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures as plain values."""
+        return {
+            "model": "auto",
+            "level_m": self.level_m,
+            "sigma_level_m": self.sigma_level_m,
+            "at_xy": self.centre_xy.tolist(),
+            "tilt_percent": 100.0 * float(np.hypot(*self.tilt)),
+            "confidence": self.confidence,
+            "evidence": self.evidence,
+            "notes": list(self.reasons),
+        }
+
 
 WATER_CLASSES = (9, 41)
 """ASPRS: water, and water surface of the topo-bathy profile."""

@@ -10,8 +10,9 @@ of five million.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit, prange
@@ -23,6 +24,35 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
+    from pcfix.water.auto import WaterProposal
+    from pcfix.water.fit import WaterFit
+    from pcfix.water.river import RiverFit
+
+    Evidence: TypeAlias = WaterFit | RiverFit | WaterProposal
+
+
+@dataclass(frozen=True, eq=False)
+class FoundSurface:
+    """A water surface and how it was come by.
+
+    Attributes
+    ----------
+    surface : WaterSurface
+    evidence : WaterFit, RiverFit, WaterProposal or None
+        None where the surface was given as it is.
+    points : array, shape (n, 3)
+        Shoreline points that were fitted, metres, the cloud's CRS.
+    notes : tuple of str
+    """
+
+    surface: WaterSurface
+    evidence: Evidence | None = None
+    points: FloatArray | None = None
+    notes: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, Any] | None:
+        """Return the figures of a fit as plain values; None where nothing was fitted."""
+        return None if self.evidence is None else dict(self.evidence.as_dict())
 
 
 class SurfaceAbove(NamedTuple):

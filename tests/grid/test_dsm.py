@@ -18,7 +18,7 @@ from pcfix.flow import dsm as flow
 from pcfix.flow import sorted_points
 from pcfix.flow.dsm import grid_dsm
 from pcfix.io.rasters import read_raster
-from pcfix.report.dsm import dsm_text
+from pcfix.report.text import dsm_text
 from tests.grid.clouds import EAST, NORTH, awkward, scattered, write
 from tests.utils.shared import ROOT
 
