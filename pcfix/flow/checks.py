@@ -21,11 +21,11 @@ from pcfix.flow.surfaces import CloudView, WaterWords, find_surface, view_of
 from pcfix.flow.survey_signs import Evidence
 from pcfix.io.cameras.georeference import adjusted_minus_gnss
 from pcfix.io.cameras.mistakes import likely_mistake
+from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.io.files import check_input, check_output, write_bytes
 from pcfix.io.gnss_positions import read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
-from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.lens.frames import cameras_in_sight
 from pcfix.model import WaterDimension
 from pcfix.options import DEFAULT_REFRACTIVE_INDEX
