@@ -11,8 +11,9 @@ import numpy as np
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import NOISE_CLASSES, WaterPlane
 from pcfix.water import search
+from pcfix.water.cues import gain_of
 from pcfix.water.fit import fit_water
-from pcfix.water.samples import gain_of, layer_gain, points_above, sample_cloud
+from pcfix.water.samples import layer_gain, points_above, sample_cloud
 from pcfix.water.search import INSTEAD, LAYER, judge
 
 if TYPE_CHECKING:
