@@ -61,7 +61,7 @@ def cameras(
     """Say what a camera file holds, whether it fits a cloud, and whether it absorbed refraction."""
     import json
 
-    from pcfix.flow.cameras import check_cameras
+    from pcfix.flow.checks import check_cameras
     from pcfix.io.files import check_output, write_text
     from pcfix.report.cameras import cameras_text
 

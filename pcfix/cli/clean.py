@@ -89,7 +89,7 @@ def clean(
 ) -> None:
     """Flag the noise of a cloud: outliers, weak intersections, points off the bed."""
     from pcfix.flow.clean import clean_file
-    from pcfix.report.cleaning import cleaning_text
+    from pcfix.report.text import cleaning_text
 
     settings = CleanSettings(
         neighbours=neighbours,

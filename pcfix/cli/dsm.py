@@ -71,7 +71,7 @@ def dsm(
 ) -> None:
     """Grid a cloud to a GeoTIFF: height, count and spread."""
     from pcfix.flow.dsm import grid_dsm
-    from pcfix.report.dsm import dsm_text
+    from pcfix.report.text import dsm_text
 
     with progress_bar("Gridding", quiet) as progress:
         result = grid_dsm(

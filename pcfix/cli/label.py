@@ -54,7 +54,7 @@ def label(
 ) -> None:
     """Give the points below the water surface class 40, and change nothing else."""
     from pcfix.flow.label import label_file
-    from pcfix.report.label import labelling_text
+    from pcfix.report.text import labelling_text
 
     settings = words.label_settings(band_m=band, dead_band_m=dead_band, reset=reset)
     with progress_bar("Labelling", quiet) as progress:

@@ -87,7 +87,7 @@ def refraction_effect(
     words: EffectWords, out_dir: Path, *, index: float, seed: int, overwrite: bool
 ) -> str:
     """Write the effect of refraction into a folder and return the summary."""
-    from pcfix.flow.effect_files import write_refraction_effect
+    from pcfix.flow.papers import write_refraction_effect
     from pcfix.simulate.refraction_effect import APPARENT_DEPTHS_M, OVERLAP
 
     heights, depths = words.effect_heights, words.effect_depths

@@ -30,8 +30,8 @@ def water(
     """Read, fit or find a water surface, and say how well it is known."""
     import json
 
+    from pcfix.flow.checks import check_water
     from pcfix.flow.surfaces import WaterWords
-    from pcfix.flow.water import check_water
     from pcfix.io.files import check_output, write_text
     from pcfix.report.water import water_text
 

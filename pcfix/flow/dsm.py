@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import time
+import warnings
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -17,18 +18,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.flow.sorted_points import BLOCK_CELLS, SortedPoints, inside
-from pcfix.grid.heights import (
-    cell_numbers,
-    cell_uncertainty,
-    fill_holes,
-    inverse_distance,
-    margin_cells,
-    triangulated,
-)
-from pcfix.grid.model import NO_LIGHT, DsmSettings, DsmSummary, Method, SurfaceChoice, hillshade
-from pcfix.io.files import check_input, check_output, replaced_when_whole, write_text
-from pcfix.io.las.source import LasSource, metric_crs
+from pcfix.errors import InputError, PcfixWarning
+from pcfix.flow.points import CHUNK_POINTS
+from pcfix.grid.delaunay import fill_holes, margin_cells
+from pcfix.grid.heights import Gridding, grid_window
+from pcfix.grid.lattice import Occupancy, Window, cells_of, fits, lattice_over, refuse_size
+from pcfix.grid.model import NO_LIGHT, DsmSettings, DsmSummary, Tally, hillshade
+from pcfix.io.files import Bins, check_input, check_output, replaced_when_whole, write_text
+from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.rasters import (
     add_overviews,
     check_cog,
@@ -39,21 +36,30 @@ from pcfix.io.rasters import (
     read_heights,
     write_part,
 )
+from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
+    import laspy
     import numpy.typing as npt
     from rasterio.io import DatasetReader, DatasetWriter
 
-    from pcfix.grid.lattice import Window
-    from pcfix.model import FloatArray, IntArray
+    from pcfix.model import BoolArray, FloatArray, IntArray
+    from pcfix.options.steps import DsmMethod, SurfaceChoice
 
     AnyPath = str | os.PathLike[str]
     Progress = Callable[[int, int], None]
 
+BLOCK_CELLS = 1024
+"""Longest side of a window; a power of two."""
+BIN_POINTS = 200_000
+"""So many points a square of the store has, on average."""
+SIGMA_Z = "SigmaZ"
+FEWEST_A_CELL = 0.9
+"""Points, on average where there are any; fewer are worth a warning."""
 BLOCK_POINTS = 2_000_000
 TIN_BLOCK_POINTS = 400_000
 """Windows are halved until they have no more points than this."""
@@ -62,7 +68,7 @@ TIN_REACH_CELLS = 3.0
 """Circles around triangles may be as wide as the larger of the two, or as --fill."""
 
 BANDS = {"height": "metre", "count": "", "spread": "metre"}
-HEIGHT, COUNT, SPREAD, UNCERTAINTY = 1, 2, 3, 4
+HEIGHT, *_ = ALL_BANDS = (1, 2, 3, 4)
 WITH_SIGMA = {**BANDS, "uncertainty": "metre"}
 """Of clouds that have standard errors of Z."""
 
@@ -72,7 +78,7 @@ def grid_dsm(
     output: AnyPath,
     *,
     resolution_m: float,
-    method: Method = "mean",
+    method: DsmMethod = "mean",
     surface: SurfaceChoice = "all",
     fill_m: float | None = None,
     hillshade: AnyPath | None = None,
@@ -166,39 +172,13 @@ def grid_dsm(
 
 
 @dataclass
-class _Tally:
-    """Cells so far."""
-
-    cells: int = 0
-    filled: int = 0
-    known: int = 0
-    with_sigma: int = 0
-    sigma_sum_m: float = 0.0
-    sigma_max_m: float = 0.0
-
-    def add(self, uncertainty_m: FloatArray) -> None:
-        """Add the uncertainties of some cells, NaN where there are none."""
-        sigma = uncertainty_m[~np.isnan(uncertainty_m)]
-        self.with_sigma += sigma.size
-        self.sigma_sum_m += float(sigma.sum())
-        self.sigma_max_m = max(self.sigma_max_m, float(sigma.max(initial=0.0)))
-
-    def uncertainty_m(self) -> dict[str, float] | None:
-        """Return mean and largest; None where no cell has one."""
-        if not self.with_sigma:
-            return None
-        mean = self.sigma_sum_m / self.with_sigma
-        return {"mean": round(mean, 4), "max": round(self.sigma_max_m, 4)}
-
-
-@dataclass
 class _Run:
     """One cloud on its way into a raster."""
 
     source: Path
     settings: DsmSettings
     progress: Progress | None
-    tally: _Tally = field(default_factory=_Tally)
+    tally: Tally = field(default_factory=Tally)
 
     def write(self, draft: Path, shade: Path | None, folder: Path, *, cog: bool) -> None:
         """Write the raster, and its hillshade if a path is given."""
@@ -221,42 +201,19 @@ class _Run:
     def grid(self, heights: DatasetWriter, dsm: DatasetWriter) -> None:
         """Write heights to one raster, the other bands to another (or the same)."""
         done, lattice = 0, self.lattice
+        how = Gridding(lattice, self.settings.method, self.reach_m, self.near.spacing_m)
         limit = TIN_BLOCK_POINTS if self.settings.method == "tin" else BLOCK_POINTS
         for window in self.sorted.windows(limit):
-            height, count, spread, uncertainty = self.block(window)
-            write_part(heights, height, window, HEIGHT)
-            write_part(dsm, count, window, COUNT)
-            write_part(dsm, spread, window, SPREAD)
-            if uncertainty is not None:
-                write_part(dsm, uncertainty, window, UNCERTAINTY)
-                self.tally.add(uncertainty)
-            known = ~np.isnan(height)
-            self.tally.cells += int((count > 0).sum())
-            self.tally.filled += int((known & (count == 0)).sum())
-            self.tally.known += int(known.sum())
+            points = self.sorted.points_in(window.grown(how.margin_cells))
+            bands = grid_window(*points, window, how)
+            for raster, band, values in zip(
+                (heights, dsm, dsm, dsm), ALL_BANDS, bands, strict=True
+            ):
+                if values is not None:
+                    write_part(raster, values, window, band)
+            self.tally.add(bands)
             done += window.height * window.width
             self.report(0.5 + 0.5 * done / (lattice.height * lattice.width))
-
-    def block(self, window: Window) -> tuple[FloatArray, IntArray, FloatArray, FloatArray | None]:
-        """Return height, count, spread and, where it is known, uncertainty of a window."""
-        method, size = self.settings.method, self.settings.resolution_m
-        margin = {"idw": 1, "tin": int(np.ceil(self.reach_m / size)) + 1}.get(method, 0)
-        xyz, cell = self.sorted.points_in(window.grown(margin))
-        inner = inside(cell, window)
-        code = (cell[inner, 1] - window.row) * window.width + cell[inner, 0] - window.column
-        numbers = cell_numbers(code, xyz[inner, 2], window.height * window.width)
-        shape = window.height, window.width
-        if method == "idw":
-            height = inverse_distance(self.lattice.positions(xyz), cell, xyz[:, 2], window)
-        elif method == "tin":
-            position, z, spacing = self.lattice.positions(xyz), xyz[:, 2], self.near.spacing_m
-            height = triangulated(position, z, window, self.reach_m / size, spacing / size)
-        else:
-            height = getattr(numbers, method).reshape(shape)
-        uncertainty = None
-        if self.sorted.has_sigma:
-            uncertainty = cell_uncertainty(code, xyz[inner, 3], numbers.points.size).reshape(shape)
-        return height, numbers.points.reshape(shape), numbers.spread.reshape(shape), uncertainty
 
     @property
     def reach_m(self) -> float:
@@ -341,3 +298,147 @@ def _finish(plain: Path, target: Path, *, cog: bool) -> None:
         copy_as_cog(plain, target)
     else:
         add_overviews(plain)
+
+
+class SortedPoints:
+    """The points that a raster is made of, and the raster's lattice.
+
+    Parameters
+    ----------
+    source : LasSource
+    settings : DsmSettings
+    folder : Path
+        For the points; the caller makes and removes it.
+    progress : callable
+        Called with (points done, points in all) after each chunk.
+
+    Attributes
+    ----------
+    near : Occupancy
+        How many points there are, and how close together.
+    lattice : Lattice
+    has_sigma : bool
+        Whether the cloud has standard errors of Z, as a correction leaves them.
+
+    Raises
+    ------
+    PcfixError
+        If no points are left, or the raster would be too large.
+    """
+
+    def __init__(
+        self, source: LasSource, settings: DsmSettings, folder: Path, progress: Progress
+    ) -> None:
+        """Read the cloud, store the wanted points, and lay out the raster."""
+        resolution = settings.resolution_m
+        self._resolution_m = resolution
+        area = _header_area_m2(source, resolution)
+        corner = cells_of(_header_corner(source), resolution)[0]
+        self.has_sigma = SIGMA_Z in source.header.point_format.dimension_names
+        side = _side_with(BIN_POINTS, len(source) / area, resolution)
+        self._bins = Bins(folder, side, corner, 4 if self.has_sigma else 3)
+        self.near = Occupancy(area, len(source), resolution)
+        done = 0
+        for points in source.chunks(CHUNK_POINTS):
+            xyz = self._numbers(points)[_wanted(points, settings.surface)]
+            self.near.add(xyz)
+            if len(xyz) and fits(self.near.low, self.near.high, resolution):
+                self._bins.add(cells_of(xyz, resolution), xyz)
+            # too large a raster is refused below, when the whole extent is known
+            done += len(points)
+            progress(done, len(source))
+        _refuse_none(self.near.points, source.path, settings.surface)
+        low, high = self.near.low, self.near.high
+        refuse_size(low, high, resolution, str(source.path))
+        _warn_of_fine_cells(self.near.spacing_m, resolution)
+        self.lattice = lattice_over(low, high, resolution)
+
+    def _numbers(self, points: laspy.ScaleAwarePointRecord) -> FloatArray:
+        """Return coordinates, and beside them the standard error of Z where there is one."""
+        xyz = coordinates(points)
+        return np.column_stack([xyz, np.asarray(points[SIGMA_Z])]) if self.has_sigma else xyz
+
+    def windows(self, limit: int) -> Iterator[Window]:
+        """Yield windows that cover the raster, small enough to have about `limit` points."""
+        for window in self.lattice.windows(BLOCK_CELLS):
+            yield from self._halved(window, BLOCK_CELLS, limit)
+
+    def _halved(self, window: Window, side: int, limit: int) -> Iterator[Window]:
+        """Yield a window, or its quarters where it has too many points."""
+        if side <= self._bins.side or self._bins.count(self._stored(window)) <= limit:
+            yield window
+            return
+        half = side // 2
+        for row in range(window.row, window.row_stop, half):
+            for column in range(window.column, window.column_stop, half):
+                quarter = Window(row, row + half, column, column + half).clipped(window)
+                yield from self._halved(quarter, half, limit)
+
+    def _stored(self, window: Window) -> Window:
+        """Return a window of the raster as the store counts cells."""
+        row, column = self.lattice.first_row, self.lattice.first_column
+        return Window(
+            window.row + row, window.row_stop + row, window.column + column,
+            window.column_stop + column,
+        )  # fmt: skip
+
+    def points_in(self, window: Window) -> tuple[FloatArray, IntArray]:
+        """Return the points of a window, and their columns and rows in the raster.
+
+        The first are metres in the world frame, shape (n, 3), or (n, 4) with the standard error
+        of Z, zero of points that were not corrected; the second have shape (n, 2).
+        """
+        xyz = self._bins.read(self._stored(window))
+        first = [self.lattice.first_column, self.lattice.first_row]
+        cell = cells_of(xyz, self._resolution_m) - first
+        rows = window.holds(cell)
+        return xyz[rows], cell[rows]
+
+
+def _wanted(points: laspy.ScaleAwarePointRecord, surface: SurfaceChoice) -> BoolArray:
+    classes = np.asarray(points["classification"])
+    wanted = classes == BATHYMETRIC_POINT if surface == "bed" else ~np.isin(classes, NOISE_CLASSES)
+    return np.asarray(wanted & ~np.asarray(points["withheld"]).astype(bool))
+
+
+def _side_with(points: int, points_per_m2: float, resolution_m: float) -> int:
+    """Return the power of two, up to `BLOCK_CELLS`, of cells along a square with so many points."""
+    cells = max(np.sqrt(points / points_per_m2) / resolution_m, 1.0)
+    return int(min(2 ** np.floor(np.log2(cells)), BLOCK_CELLS))
+
+
+def _header_area_m2(source: LasSource, resolution_m: float) -> float:
+    """Return the area the header states. It only sets sizes, so it need not be right."""
+    area = float(np.prod(source.header.maxs[:2] - source.header.mins[:2]))
+    return max(area, resolution_m**2) if np.isfinite(area) else resolution_m**2
+
+
+def _header_corner(source: LasSource) -> FloatArray:
+    """Return the north-west corner that the header states, shape (1, 2), if it makes sense."""
+    corner = np.array([[source.header.mins[0], source.header.maxs[1]]])
+    return corner if (np.abs(corner) < 1e9).all() else np.zeros((1, 2))
+
+
+def _refuse_none(points: int, source: Path, surface: SurfaceChoice) -> None:
+    if points:
+        return
+    if surface == "bed":
+        raise InputError(
+            f"{source}: has no point of class {BATHYMETRIC_POINT} (bed) that is not withheld;"
+            " correct the cloud first, or grid the surface all."
+        )
+    raise InputError(
+        f"{source}: all points are noise (classes 7 and 18) or withheld; classify it again."
+    )
+
+
+def _warn_of_fine_cells(spacing_m: float, resolution_m: float) -> None:
+    if resolution_m**2 < FEWEST_A_CELL * spacing_m**2:
+        density = (resolution_m / spacing_m) ** 2
+        warnings.warn(
+            f"the resolution {resolution_m:g} m is finer than the points allow: they lie"
+            f" {spacing_m:.2g} m apart, so there are {density:.2g} a cell on average; take a"
+            " resolution of at least their distance.",
+            PcfixWarning,
+            stacklevel=5,
+        )

@@ -20,13 +20,14 @@ from pcfix.model import Cameras
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from pcfix.flow.surfaces import CloudView, FoundSurface, WaterModel
+    from pcfix.flow.surfaces import CloudView, WaterModel
     from pcfix.io.cameras.formats import Angles
     from pcfix.io.views import ViewList
     from pcfix.label.areas import WaterMask
     from pcfix.model import FloatArray, TiePoints, WaterSurface
     from pcfix.options import ViewsAre
     from pcfix.port.shapes import Port
+    from pcfix.water.surface import FoundSurface
 
     AnyPath = str | PathLike[str]
 

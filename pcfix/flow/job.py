@@ -22,7 +22,7 @@ from pcfix.model import Correction, Outcome, Summary, WaterDimension, WaterPlane
 from pcfix.options import LabelSettings, Settings
 from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.learning import kind_of_views
-from pcfix.report.tally import Tally
+from pcfix.refract.tally import Tally
 from pcfix.version import __version__
 from pcfix.water.checks import WaterMeeting, check_above_water, check_tilt, refuse_under_water
 from pcfix.water.surface import is_submerged, surface_above

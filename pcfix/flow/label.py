@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import asdict, astuple, dataclass, field
+from dataclasses import asdict, astuple
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from pcfix.io.las.writing import (
     noted_header,
     output_evlrs,
 )
-from pcfix.label.labelling import Labelling, Part, sets_class
+from pcfix.label.labelling import Labelling, LabelSummary, Part, sets_class
 from pcfix.model import WaterPlane
 from pcfix.options import LabelSettings
 from pcfix.threads import threads
@@ -49,42 +49,6 @@ if TYPE_CHECKING:
 
     AnyPath = str | PathLike[str]
     Classes = npt.NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
-class LabelSummary:
-    """What a labelling did, in numbers; `as_dict` is what ``--summary`` writes.
-
-    Attributes
-    ----------
-    points, submerged, water_surface : int
-        In all; of class 40 now because they are submerged; of class 41 because in the band.
-    stale : int
-        Points that came as class 40 or 41 and are neither: class 1 with `reset`, else as they
-        came.
-    water_unknown : int
-        Points without a known height of the water.
-    labelling : dict or None
-        What was left out, by the rules beyond the surface.
-    """
-
-    input: str
-    output: str
-    pcfix: str
-    points: int
-    submerged: int
-    water_surface: int
-    stale: int
-    water_unknown: int
-    water: str
-    settings: dict[str, Any]
-    labelling: dict[str, Any] | None
-    seconds: float
-    warnings: list[str] = field(default_factory=list)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        return vars(self).copy()
 
 
 class Counts:

@@ -18,7 +18,7 @@ from pcfix.flow.job import PLAIN, Job
 from pcfix.label.labelling import Labelling
 from pcfix.model import Correction, Outcome, WaterPlane
 from pcfix.port.intersection import correct_through_port
-from pcfix.report.tally import Tally
+from pcfix.refract.tally import Tally
 from pcfix.version import __version__
 from pcfix.water.surface import SurfaceAbove
 

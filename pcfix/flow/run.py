@@ -33,8 +33,8 @@ from pcfix.io.las.source import LasSource
 from pcfix.io.rasters import open_raster, preview, write_dod
 from pcfix.model import Summary
 from pcfix.options import DEFAULT_REFRACTIVE_INDEX, ErrorBudget, LabelSettings, Settings
-from pcfix.report.evaluation import evaluation, in_a_sentence
-from pcfix.report.run_adjustment import (
+from pcfix.report.comparison import evaluation, in_a_sentence
+from pcfix.report.run import (
     adjustment_sentence,
     adjustment_table,
     reason_sentence,

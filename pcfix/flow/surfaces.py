@@ -5,13 +5,14 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from os import PathLike
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.water import read_water
+from pcfix.water.surface import FoundSurface
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -21,12 +22,10 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
     from pcfix.model import FloatArray, WaterSurface
-    from pcfix.water.auto import WaterProposal
     from pcfix.water.fit import WaterFit
     from pcfix.water.river import RiverFit
 
     AnyPath = str | PathLike[str]
-    Evidence: TypeAlias = WaterFit | RiverFit | WaterProposal
 
 WaterModel = Literal["auto", "level", "plane", "along", "river"]
 AUTO = "auto"
@@ -108,44 +107,6 @@ class WaterWords:
     water: WaterSurface | float | AnyPath
     model: WaterModel = "auto"
     crs: str | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class FoundSurface:
-    """A water surface and how it was come by.
-
-    Attributes
-    ----------
-    surface : WaterSurface
-    evidence : WaterFit, RiverFit, WaterProposal or None
-        None where the surface was given as it is.
-    points : array, shape (n, 3)
-        Shoreline points that were fitted, metres, the cloud's CRS.
-    notes : tuple of str
-    """
-
-    surface: WaterSurface
-    evidence: Evidence | None = None
-    points: FloatArray | None = None
-    notes: tuple[str, ...] = ()
-
-    def as_dict(self) -> dict[str, Any] | None:
-        """Return the figures of a fit as plain values; None where nothing was fitted."""
-        found = self.evidence
-        if found is None:
-            return None
-        if hasattr(found, "as_dict"):
-            return dict(found.as_dict())
-        return {
-            "model": "auto",
-            "level_m": found.level_m,
-            "sigma_level_m": found.sigma_level_m,
-            "at_xy": found.centre_xy.tolist(),
-            "tilt_percent": 100.0 * float(np.hypot(*found.tilt)),
-            "confidence": found.confidence,
-            "evidence": found.evidence,
-            "notes": list(found.reasons),
-        }
 
 
 def find_surface(words: WaterWords, view: CloudView | None) -> FoundSurface:

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pcfix.errors import SettingError
+from pcfix.options.steps import MIN_RESOLUTION_M
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from pcfix.model import FloatArray, IntArray
+    from pcfix.model import BoolArray, FloatArray, IntArray
 
 
 MAX_CELLS = 4_000_000_000
-MIN_RESOLUTION_M = 1e-4
 EDGE_M = 1e-7
 """A point this near to an edge lies on it: 5432000.1 / 0.1 in floating point may fall short."""
 
@@ -46,14 +46,18 @@ class Window(NamedTuple):
             self.row - cells, self.row_stop + cells, self.column - cells, self.column_stop + cells
         )
 
+    def holds(self, cell: IntArray) -> BoolArray:
+        """Return which columns and rows, shape (n, 2), are in the window."""
+        column, row = cell.T
+        across = (column >= self.column) & (column < self.column_stop)
+        return np.asarray(across & (row >= self.row) & (row < self.row_stop))
+
     def clipped(self, other: Window) -> Window:
         """Return what this window and another have in common."""
         return Window(
-            max(self.row, other.row),
-            min(self.row_stop, other.row_stop),
-            max(self.column, other.column),
-            min(self.column_stop, other.column_stop),
-        )
+            max(self.row, other.row), min(self.row_stop, other.row_stop),
+            max(self.column, other.column), min(self.column_stop, other.column_stop),
+        )  # fmt: skip
 
     def within(self, other: Window) -> tuple[slice, slice]:
         """Return the rows and columns of this window in an array that covers `other`."""
@@ -115,12 +119,8 @@ class Lattice:
 
     def positions(self, xyz: FloatArray) -> FloatArray:
         """Return columns and rows of points, shape (n, 2), cells from the top left corner."""
-        return np.column_stack(
-            [
-                (xyz[:, 0] - self.left_m) / self.resolution_m,
-                (self.top_m - xyz[:, 1]) / self.resolution_m,
-            ]
-        )
+        away = np.column_stack([xyz[:, 0] - self.left_m, self.top_m - xyz[:, 1]])
+        return np.asarray(away / self.resolution_m)
 
 
 def cells_of(xyz: FloatArray, resolution_m: float) -> IntArray:

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from pcfix.errors import SettingError
 from pcfix.grid.lattice import check_resolution
+from pcfix.options.steps import MAX_HOLE_CELLS, DsmMethod, SurfaceChoice
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
+    from pcfix.grid.heights import Gridded
     from pcfix.model import FloatArray
-
-
-Method = Literal["mean", "median", "min", "max", "idw", "tin"]
-SurfaceChoice = Literal["all", "bed"]
-
-MAX_HOLE_CELLS = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +30,7 @@ class DsmSettings:
     """
 
     resolution_m: float
-    method: Method = "mean"
+    method: DsmMethod = "mean"
     surface: SurfaceChoice = "all"
     fill_m: float | None = None
     azimuth_deg: float = 315.0
@@ -42,7 +38,7 @@ class DsmSettings:
 
     def __post_init__(self) -> None:
         check_resolution(self.resolution_m)
-        _check_choice("method", self.method, get_args(Method))
+        _check_choice("method", self.method, get_args(DsmMethod))
         _check_choice("surface", self.surface, get_args(SurfaceChoice))
         if not math.isfinite(self.azimuth_deg):
             raise SettingError(f"The azimuth is {self.azimuth_deg:g}; it must be in degrees.")
@@ -129,6 +125,37 @@ class DsmSummary:
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""
         return asdict(self)
+
+
+@dataclass
+class Tally:
+    """Cells of a DSM so far, and what their uncertainties come to."""
+
+    cells: int = 0
+    filled: int = 0
+    known: int = 0
+    with_sigma: int = 0
+    sigma_sum_m: float = 0.0
+    sigma_max_m: float = 0.0
+
+    def add(self, bands: Gridded) -> None:
+        """Add a part of the raster."""
+        known = ~np.isnan(bands.height)
+        self.cells += int((bands.points > 0).sum())
+        self.filled += int((known & (bands.points == 0)).sum())
+        self.known += int(known.sum())
+        if bands.uncertainty is not None:
+            sigma = bands.uncertainty[~np.isnan(bands.uncertainty)]
+            self.with_sigma += sigma.size
+            self.sigma_sum_m += float(sigma.sum())
+            self.sigma_max_m = max(self.sigma_max_m, float(sigma.max(initial=0.0)))
+
+    def uncertainty_m(self) -> dict[str, float] | None:
+        """Return mean and largest; None where no cell has one."""
+        if not self.with_sigma:
+            return None
+        mean = self.sigma_sum_m / self.with_sigma
+        return {"mean": round(mean, 4), "max": round(self.sigma_max_m, 4)}
 
 
 NO_LIGHT = 0

@@ -49,13 +49,7 @@ def add_dimension(columns: tuple[Column, ...]) -> str:
 
 
 def check_dimensions(ins: Dimensions, columns: tuple[Column, ...]) -> None:
-    """Refuse a cloud without the dimensions that are to be filled.
-
-    Raises
-    ------
-    SettingError
-        With the value that ``add_dimension`` should have.
-    """
+    """Refuse a cloud without the dimensions to be filled; say what ``add_dimension`` should be."""
     missing = [c.name for c in columns if c.name not in ins]
     if missing:
         raise SettingError(
@@ -68,13 +62,7 @@ def check_dimensions(ins: Dimensions, columns: tuple[Column, ...]) -> None:
 
 
 def dimension(ins: Dimensions, name: str) -> FloatArray:
-    """Return one dimension as float64.
-
-    Raises
-    ------
-    SettingError
-        If the cloud has no such dimension.
-    """
+    """Return one dimension as float64; a `SettingError` if the cloud has none such."""
     if name not in ins:
         raise SettingError(f"{NAME}: has no dimension {name}; it has {', '.join(ins)}.")
     values: FloatArray = ins[name].astype(np.float64)
@@ -88,11 +76,7 @@ class Results:
         self, ins: Dimensions, columns: tuple[Column, ...], flags: Flags, scales: FloatArray | None
     ) -> None:
         self._columns, self._flags, self._scales = columns, flags, scales
-        names = [
-            *"XYZ",
-            *(column.name for column in columns),
-            *([OUTCOME] if OUTCOME in ins else []),
-        ]
+        names = [*"XYZ", *(column.name for column in columns), *{OUTCOME}.intersection(ins)]
         # PDAL's own arrays are written to and given back: they are copies of its points
         self._added: Dimensions = {name: np.ascontiguousarray(ins[name]) for name in names}
         for name in names[3:]:
@@ -110,9 +94,9 @@ class Results:
             out[axis][rows][correction.moved] += moved[correction.moved, i] * scales[i]
         changed = changed_rows(correction, self._flags.withheld[rows], withhold=withhold)
         for column in self._columns:
-            mine = rows_of(column, correction, changed)
-            values = in_steps(column, correction, moved, classes, mine)
-            out[column.name][rows][mine] = values * column_scale(column, scales)
+            filled = rows_of(column, correction, changed)
+            values = in_steps(column, correction, moved, classes, filled)
+            out[column.name][rows][filled] = values * column_scale(column, scales)
         out["Classification"][rows][correction.corrected] = BATHYMETRIC_POINT
         if OUTCOME in out:
             out[OUTCOME][rows] = correction.outcome
@@ -140,7 +124,8 @@ class Flags:
         self._ins = ins
         self.classes = np.array(ins["Classification"], order="C")
         self._class_flags = np.array(ins["ClassFlags"]) if "ClassFlags" in ins else None
-        if "Withheld" not in ins and _is_packed(metadata):
+        formats = _reader_values(metadata, "dataformat_id")
+        if "Withheld" not in ins and any(int(format_id) < 6 for format_id in formats):
             packed = self.classes >> 5
             self.classes &= 31
             if self._class_flags is None:
@@ -166,11 +151,6 @@ class Flags:
                 self.withheld, self._class_flags | _WITHHELD_FLAG, self._class_flags
             ).astype(self._class_flags.dtype)
         return out
-
-
-def _is_packed(metadata: dict[str, Any] | None) -> bool:
-    """Whether a LAS file of point format 0 to 5 is among the inputs."""
-    return any(int(format_id) < 6 for format_id in _reader_values(metadata, "dataformat_id"))
 
 
 def scales_of(metadata: dict[str, Any] | None) -> FloatArray | None:

@@ -208,19 +208,11 @@ def read_tide(path: str | os.PathLike[str]) -> TideTable:
 def level_offsets(
     tide: TideTable, times: ImageTimes, labels: Sequence[str]
 ) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return how much higher than on average the water stood when each image was taken.
+    """Return how much higher than on average the water stood when each of k images was taken.
 
     The level is linear between the rows of the table, and beyond its ends for at most as long as
     the two rows there are apart. The average is over the images, each counting once; the surface
     that is given as the water's is that of the average.
-
-    Parameters
-    ----------
-    tide : TideTable
-    times : ImageTimes
-        Of k images.
-    labels : sequence of str
-        Their names, for messages.
 
     Returns
     -------

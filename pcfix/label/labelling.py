@@ -10,7 +10,7 @@ the eight cells around it are negative together.
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -313,3 +313,39 @@ class LeftOut:
 
 def _extent(west: float, east: float, south: float, north: float) -> str:
     return f"x {west:.1f} to {east:.1f}, y {south:.1f} to {north:.1f}"
+
+
+@dataclass(frozen=True)
+class LabelSummary:
+    """What a labelling did, in numbers; `as_dict` is what ``--summary`` writes.
+
+    Attributes
+    ----------
+    points, submerged, water_surface : int
+        In all; of class 40 now because they are submerged; of class 41 because in the band.
+    stale : int
+        Points that came as class 40 or 41 and are neither: class 1 with `reset`, else as they
+        came.
+    water_unknown : int
+        Points without a known height of the water.
+    labelling : dict or None
+        What was left out, by the rules beyond the surface.
+    """
+
+    input: str
+    output: str
+    pcfix: str
+    points: int
+    submerged: int
+    water_surface: int
+    stale: int
+    water_unknown: int
+    water: str
+    settings: dict[str, Any]
+    labelling: dict[str, Any] | None
+    seconds: float
+    warnings: list[str] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return vars(self).copy()

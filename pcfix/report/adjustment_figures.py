@@ -8,8 +8,7 @@ import numpy as np
 
 from pcfix.adjust.block import sensor_groups
 from pcfix.adjust.values import carried_by, nice_step, rms
-from pcfix.report.figures import AFTER, BEFORE, WATER, new_figure
-from pcfix.report.page import Picture
+from pcfix.report.page import AFTER, BEFORE, WATER, Picture, label_plan, new_figure
 from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
@@ -92,11 +91,7 @@ def _arrows(figure: Figure, axes: Axes, a: Adjusted, vectors: FloatArray, rows: 
     (west, south), (east, north) = drawn.min(axis=0), drawn.max(axis=0)
     axes.set_xlim(west - 0.05 * side, east + 0.05 * side)
     axes.set_ylim(south - 0.05 * side, north + 0.05 * side)
-    axes.set_aspect("equal")
-    axes.ticklabel_format(style="plain", useOffset=False)
-    axes.tick_params(axis="x", labelrotation=30)
-    axes.set_xlabel("East (m)")
-    axes.set_ylabel("North (m)")
+    label_plan(axes)
 
 
 def _by_depth(d: Plain, before: Before | None) -> list[Picture]:

@@ -1,22 +1,148 @@
-"""A block of cameras in words and as a picture."""
+"""What ``pcfix cameras`` says of a block of cameras: the figures, in words and as a picture."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pcfix.lens.frames import footprint
-from pcfix.report.figures import AFTER, WATER, new_figure
+from pcfix.report.page import AFTER, WATER, label_plan, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from pcfix.flow.cameras import CamerasReport, GnssResiduals, Sensor
-    from pcfix.model import FloatArray
+    from pcfix.adjust.diagnosis import Diagnosis
+    from pcfix.model import Cameras, FloatArray
 
 MOST_FOOTPRINTS = 400
 MOST_POINTS = 8000
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """The images of one interior orientation; None where the file does not say."""
+
+    name: str
+    images: int
+    width: float
+    height: float
+    focal: float
+    unit: str
+    focal_mm: float | None
+    pixel_size_um: float | None
+    projection: str
+    distorted: bool
+    gsd_m: float | None
+
+
+@dataclass(frozen=True)
+class GnssResiduals:
+    """Adjusted centres minus positions of the GNSS, metres east, north, up."""
+
+    images: int
+    mean_m: tuple[float | None, ...]
+    sd_m: tuple[float | None, ...]
+    largest_m: float
+    largest_image: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How cameras and cloud lie to each other.
+
+    Attributes
+    ----------
+    seen_by : dict
+        Share of the cloud's points that 0, 1, 2, 3 or more cameras have in their frame.
+    distance_m : float
+        In plan, between the boxes around block and cloud.
+    below_ground : int
+        Cameras lower than the cloud's highest point within their reach in plan.
+    verdict : str
+        What is likely wrong; empty where they fit.
+    """
+
+    cloud: str
+    points_sampled: int
+    seen_by: dict[str, float]
+    distance_m: float
+    below_ground: int
+    verdict: str
+
+    @property
+    def fits(self) -> bool:
+        """Whether nothing looks wrong."""
+        return not self.verdict
+
+
+@dataclass(frozen=True, eq=False)
+class CamerasReport:
+    """What ``pcfix cameras`` says.
+
+    Attributes
+    ----------
+    path, source : str
+    cameras : Cameras
+        In the cloud's CRS, where there is a cloud.
+    crs_read, crs : str or None
+        Of the file, and of `cameras`.
+    sensors : tuple of Sensor
+    height_above_water_m : tuple of 3 float, or None
+        Least, mean, most; above the water where it is known, else None.
+    tilt_deg : tuple of 2 float, or None
+        Median and largest angle of the optical axes from nadir.
+    gnss : GnssResiduals or None
+    fit : Fit or None
+    sample_xyz : array, shape (m, 3)
+        Points of the cloud, for a picture; none without a cloud.
+    level_m : float or None
+        Mean height of the water.
+    problem : str
+        Why `cameras` are not in a map and so have no heights; empty where they are.
+    diagnosis : Diagnosis or None
+        Whether the poses have absorbed the refraction; None without a cloud or water.
+    remedy : str
+        The command that mends them.
+    """
+
+    path: str
+    source: str
+    cameras: Cameras
+    crs_read: str | None
+    crs: str | None
+    sensors: tuple[Sensor, ...]
+    height_above_water_m: tuple[float, float, float] | None
+    tilt_deg: tuple[float, float] | None
+    gnss: GnssResiduals | None
+    fit: Fit | None
+    sample_xyz: FloatArray
+    level_m: float | None
+    problem: str = ""
+    diagnosis: Diagnosis | None = None
+    remedy: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        fit = None if self.fit is None else {**asdict(self.fit), "fits": self.fit.fits}
+        return {
+            "path": self.path,
+            "source": self.source,
+            "images_posed": len(self.cameras),
+            "images_unposed": list(self.cameras.unposed),
+            "crs_read": self.crs_read,
+            "crs": self.crs,
+            "sensors": [asdict(sensor) for sensor in self.sensors],
+            "height_above_water_m": self.height_above_water_m,
+            "tilt_deg": self.tilt_deg,
+            "problem": self.problem,
+            "gnss": None if self.gnss is None else asdict(self.gnss),
+            "fit": fit,
+            "refraction": None if self.diagnosis is None else self.diagnosis.as_dict(),
+            "notes": list(self.cameras.notes),
+        }
 
 
 def cameras_text(report: CamerasReport) -> str:
@@ -119,10 +245,10 @@ def block_figure(report: CamerasReport) -> Figure:
     figure, (plan, side) = new_figure(8.0, 8.5, nrows=2, height_ratios=[5, 2])
     level = _level(report)
     if len(xyz):
-        some = xyz[:: max(1, len(xyz) // MOST_POINTS)]
-        dots = plan.scatter(*some[:, :2].T, c=some[:, 2], s=2, cmap="cividis", label="cloud")
+        shown = xyz[:: max(1, len(xyz) // MOST_POINTS)]
+        dots = plan.scatter(*shown[:, :2].T, c=shown[:, 2], s=2, cmap="cividis", label="cloud")
         figure.colorbar(dots, ax=plan, label="Height of the cloud (m)", shrink=0.8)
-        side.plot(some[:, 0], some[:, 2], ".", color="0.6", markersize=1, label="cloud")
+        side.plot(shown[:, 0], shown[:, 2], ".", color="0.6", markersize=1, label="cloud")
     borders = _footprints(report, level)
     for border in borders:
         plan.plot(*np.vstack([border, border[:1]]).T, color=WATER, linewidth=0.6, alpha=0.6)
@@ -132,12 +258,10 @@ def block_figure(report: CamerasReport) -> Figure:
     side.plot(cameras.centres[:, 0], cameras.centres[:, 2], "^", color=AFTER, markersize=4)
     if report.level_m is not None:
         side.axhline(report.level_m, color=WATER, label="water")
-    plan.set_aspect("equal")
-    for axes in (plan, side):
-        axes.ticklabel_format(style="plain", useOffset=False)
-        axes.tick_params(axis="x", labelrotation=20)
-        axes.set_xlabel("East (m)")
-    plan.set_ylabel("North (m)")
+    label_plan(plan, 20.0)
+    side.ticklabel_format(style="plain", useOffset=False)
+    side.tick_params(axis="x", labelrotation=20)
+    side.set_xlabel("East (m)")
     side.set_ylabel("Height (m)")
     plan.legend(loc="upper right")
     if side.get_legend_handles_labels()[0]:

@@ -1,8 +1,12 @@
-"""The page that a surveyor hands to a client: one HTML file with everything inside."""
+"""The page that a surveyor hands to a client: one HTML file with everything inside.
+
+And what all its pictures share; matplotlib is loaded when one is drawn.
+"""
 
 from __future__ import annotations
 
 import base64
+import io
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,17 +14,54 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.report.figures import png_of
-
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from pcfix.grid.maps import Maps
     from pcfix.model import FloatArray
-    from pcfix.report.maps import Maps
 
 _NO_DATA = -32768
 _STEPS = 32_000
 """Of the 16 bits in which the page holds the values of its map."""
+
+BEFORE, AFTER, WATER, REFERENCE = "#b3541e", "#0b5e8a", "#4aa3c7", "#222222"
+"""Colours that differ in lightness too, for those who cannot tell the hues apart."""
+
+
+def new_figure(width_in: float = 8.0, height_in: float = 4.5, **grid: Any) -> tuple[Figure, Any]:
+    """Return a figure and its axes, drawn without a screen."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(**grid)
+
+
+def png_of(figure: Figure, dpi: int = 130) -> bytes:
+    """Return a figure as a PNG file."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=dpi)
+    return stream.getvalue()
+
+
+def new_map(extent_m: tuple[float, float, float, float]) -> tuple[Figure, Any]:
+    """Return a figure of the shape of an area: west, east, south and north, metres."""
+    west, east, south, north = extent_m
+    height_in = float(np.clip(6.5 * (north - south) / (east - west) + 0.8, 2.8, 9.0))
+    figure, axes = new_figure(8.0, height_in)
+    label_plan(axes)
+    return figure, axes
+
+
+def label_plan(axes: Axes, turned_deg: float = 30.0) -> None:
+    """Name the axes of a plan; equal scales, whole coordinates, turned so that they have room."""
+    axes.set_aspect("equal")
+    axes.ticklabel_format(style="plain", useOffset=False)
+    axes.tick_params(axis="x", labelrotation=turned_deg)
+    axes.set_xlabel("East (m)")
+    axes.set_ylabel("North (m)")
 
 
 @dataclass(frozen=True)

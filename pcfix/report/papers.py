@@ -1,23 +1,209 @@
-"""Tables of papers, remade: text, rows for a CSV file, and pictures."""
+"""Papers, remade: the effect of refraction on a pair of vertical images, Shan's iteration, a flume.
+
+Each as text, as rows for a CSV file, and as pictures.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.flow.flume_methods import METHODS
-from pcfix.report.figures import AFTER, BEFORE, REFERENCE, WATER, new_figure
+from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, new_figure
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from pcfix.flow.flume_methods import DepthBins
-    from pcfix.simulate.refraction_effect import Iteration
+    from pcfix.model import FloatArray, IntArray
+    from pcfix.simulate.refraction_effect import AerialCamera, Effect, Iteration
 
+COLUMNS = (
+    "camera", "focal_mm", "flying_height_m", "overlap", "base_m", "refractive_index",
+    "apparent_depth_m", "error_centre_m", "error_corner_m", "error_mean_m",
+    "true_depth_centre_m", "true_depth_corner_m", "factor_centre", "factor_corner",
+    "largest_shift_xy_m",
+)  # fmt: skip
+"""Of the table; errors are apparent minus true depth, factors true depth over apparent depth."""
+LINES = ":", "-", "--", "-."
+METHODS = ("uncorrected", "I", "II", "III", "pcfix")
 _COLOURS = {
     "uncorrected": REFERENCE, "I": BEFORE, "II": WATER, "III": "#8a8a8a", "pcfix": AFTER,
 }  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class DepthBins:
+    """The errors of the methods, bin by bin of true depth.
+
+    Attributes
+    ----------
+    edges_m : array, shape (b + 1,)
+    points : array, shape (b,)
+        Points of each bin; the check points are not among them.
+    rmse_m, mean_m : array, shape (b + 1, len(METHODS))
+        Of the heights; the last row is for all points.
+    offset_m, slope, r2 : float
+        The regression of method III, and its coefficient of determination.
+    """
+
+    edges_m: FloatArray
+    points: IntArray
+    rmse_m: FloatArray
+    mean_m: FloatArray
+    offset_m: float
+    slope: float
+    r2: float
+
+
+def effect_text(effects: list[Effect]) -> str:
+    """Return the errors at the largest depth, a line per camera and flying height."""
+    deepest = max(one.apparent_depth_m for one in effects)
+    index, overlap = effects[0].refractive_index, effects[0].pair.overlap
+    lines = [
+        f"apparent minus true depth of a bed that looks {deepest:g} m deep; overlap"
+        f" {100.0 * overlap:g} %, refractive index {index:g}",
+        f"{'camera':<14}{'flying height':>15}{'base':>11}{'centre':>11}{'corner':>11}{'mean':>11}",
+    ]
+    for one in effects:
+        if one.apparent_depth_m == deepest:
+            pair = one.pair
+            lines.append(
+                f"{pair.camera.name:<14}{pair.flying_height_m:>13g} m{pair.base_m:>9.2f} m"
+                f"{one.centre_m:>9.3f} m{one.corner_m:>9.3f} m{one.mean_m:>9.3f} m"
+            )
+    return "\n".join(lines)
+
+
+def effect_rows(effects: list[Effect]) -> list[dict[str, Any]]:
+    """Return a row of `COLUMNS` per camera, flying height and depth."""
+    return [dict(zip(COLUMNS, _row(one), strict=True)) for one in effects]
+
+
+def _row(one: Effect) -> tuple[Any, ...]:
+    pair, depth = one.pair, one.apparent_depth_m
+    centre, corner = depth - one.centre_m, depth - one.corner_m
+    errors = one.centre_m, one.corner_m, one.mean_m
+    return (
+        pair.camera.name, pair.camera.focal_mm, pair.flying_height_m, pair.overlap,
+        round(pair.base_m, 4), one.refractive_index, depth, *(round(e, 5) for e in errors),
+        round(centre, 5), round(corner, 5), round(centre / depth, 5), round(corner / depth, 5),
+        round(float(one.shift_m.max()), 5),
+    )  # fmt: skip
+
+
+def csv_text(rows: list[dict[str, Any]]) -> str:
+    """Return a table as CSV, its columns those of the first row."""
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return stream.getvalue()
+
+
+def error_map_figure(effects: list[Effect]) -> Figure:
+    """Draw the error over the model of one camera at one depth, a map per flying height."""
+    low = min(float(one.error_m.min()) for one in effects)
+    high = max(float(one.error_m.max()) for one in effects)
+    levels = _levels(low, high)
+    figure, panels = new_figure(1.6 + 2.9 * len(effects), 5.4, ncols=len(effects), squeeze=False)
+    for axes, one in zip(panels[0], effects, strict=True):
+        filled = axes.contourf(one.x_m, one.y_m, one.error_m, levels, cmap="viridis")
+        _draw_contours(axes, one, levels)
+        _mark_places(axes, one)
+    figure.colorbar(filled, ax=panels[0], label="Apparent minus true depth (m)", shrink=0.9)
+    first = effects[0]
+    figure.suptitle(
+        f"{first.pair.camera.name}, {first.pair.camera.focal_mm:g} mm, overlap"
+        f" {100.0 * first.pair.overlap:g} %:\nbed that looks {first.apparent_depth_m:g} m deep,"
+        f" n = {first.refractive_index:g}"
+    )
+    return figure
+
+
+def _draw_contours(axes: Axes, one: Effect, levels: Any) -> None:
+    """Draw white lines with numbers; a dark rim keeps these readable on light colours too."""
+    from matplotlib.patheffects import withStroke
+
+    lines = axes.contour(
+        one.x_m, one.y_m, one.error_m, levels, colors="white", linewidths=0.7, linestyles="solid"
+    )
+    for text in axes.clabel(
+        lines, fontsize=8, fmt=lambda level: f"{level:g}".replace("-", "\N{MINUS SIGN}")
+    ):
+        text.set_path_effects([withStroke(linewidth=2.0, foreground=REFERENCE)])
+
+
+def _levels(low: float, high: float) -> Any:
+    """Return round values, about ten, from below `low` to above `high`."""
+    rough = max(high - low, 1e-6) / 9.0
+    power = 10.0 ** np.floor(np.log10(rough))
+    step = next(power * k for k in (1.0, 2.0, 2.5, 5.0, 10.0) if power * k >= rough)
+    first = np.floor(low / step)
+    return step * np.arange(first, max(np.ceil(high / step), first + 1.0) + 1.0)
+
+
+def _mark_places(axes: Axes, one: Effect) -> None:
+    """Name the values of centre and corner, and the axes."""
+    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5}
+    axes.plot(0.0, 0.0, "+", color=REFERENCE)
+    axes.annotate(
+        f"{one.centre_m:.2f} m", (0.0, 0.0), xytext=(0, 6), textcoords="offset points",
+        ha="center", fontsize=9, bbox=box, zorder=20,
+    )  # fmt: skip
+    axes.annotate(
+        f"{one.corner_m:.2f} m", (one.x_m[-1], one.y_m[-1]), xytext=(-3, -3),
+        textcoords="offset points", ha="right", va="top", fontsize=9, bbox=box, zorder=20,
+    )  # fmt: skip
+    axes.set_title(f"{one.pair.flying_height_m:g} m above the water", fontsize=10)
+    axes.set_aspect("equal")
+    axes.set_xlabel("Along the flight (m)")
+    axes.set_ylabel("Across the flight (m)")
+
+
+def depth_figure(effects: list[Effect]) -> Figure:
+    """Draw error and correction factor against the apparent depth, centre and corner."""
+    figure, panels = new_figure(10.5, 6.0, nrows=1, ncols=2)
+    cameras = list(dict.fromkeys(one.pair.camera for one in effects))
+    colours = (BEFORE, AFTER, REFERENCE)
+    for camera, colour in zip(cameras, colours, strict=False):
+        _draw_camera(panels, camera, effects, colour)
+    for axes, label in zip(
+        panels, ("Apparent minus true depth (m)", "True over apparent depth"), strict=True
+    ):
+        axes.set_xlabel("Apparent depth (m)")
+        axes.set_ylabel(label)
+        axes.grid(color="0.9")
+    index = effects[0].refractive_index
+    panels[1].axhline(index, color="0.5", linewidth=1.0)
+    panels[1].annotate(
+        f"n = {index:g}", (1.0, index), xycoords=("axes fraction", "data"), xytext=(-4, -3),
+        textcoords="offset points", ha="right", va="top", fontsize=9,
+    )  # fmt: skip
+    handles, labels = panels[1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(cameras))
+    return figure
+
+
+def _draw_camera(panels: Any, camera: AerialCamera, effects: list[Effect], colour: str) -> None:
+    own = [one for one in effects if one.pair.camera == camera]
+    heights = list(dict.fromkeys(one.pair.flying_height_m for one in own))
+    for i, height in enumerate(heights):
+        line = [one for one in own if one.pair.flying_height_m == height]
+        depth = np.array([one.apparent_depth_m for one in line])
+        order = np.argsort(depth)
+        for place, mark in (("centre", "o"), ("corner", "s")):
+            error = np.array([getattr(one, f"{place}_m") for one in line])
+            style = {
+                "linestyle": LINES[i % len(LINES)], "marker": mark, "color": colour,
+                "markersize": 4, "markerfacecolor": "white" if place == "centre" else colour,
+                "label": f"{camera.name} {height:g} m, {place}",
+            }  # fmt: skip
+            panels[0].plot(depth[order], error[order], **style)
+            panels[1].plot(depth[order], 1.0 - error[order] / depth[order], **style)
 
 
 def shan_text(table: list[Iteration], title: str) -> str:

@@ -1,13 +1,18 @@
-"""A run in a dozen lines of text."""
+"""What a command did, in a dozen lines: of correct, label, clean and dsm."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pcfix.options import DEFAULT_REFRACTIVE_INDEX
-from pcfix.report.tvu import budget_words, tvu_sentence
+import numpy as np
+
+from pcfix.options import DEFAULT_REFRACTIVE_INDEX, LEVEL_M
+from pcfix.refract.tally import ORDERS
 
 if TYPE_CHECKING:
+    from pcfix.clean.settings import CleanSummary
+    from pcfix.grid.model import DsmSummary
+    from pcfix.label.labelling import LabelSummary
     from pcfix.model import Summary
 
 BED_PER_LEVEL = 0.44
@@ -18,8 +23,7 @@ def summary_text(summary: Summary) -> str:
     """Return what a person wants to know of a run."""
     s = summary
     lines = [
-        f"{s.input} -> {s.output}",
-        f"points       {s.points:,} in {s.seconds:.1f} s ({s.points_per_s:,.0f} points/s)",
+        *_head(s),
         f"submerged    {s.submerged:,} ({share(s.submerged, s.points)} of the points)",
         f"corrected    {s.corrected:,} ({share(s.corrected, s.submerged)} of the submerged)",
     ]
@@ -27,8 +31,7 @@ def summary_text(summary: Summary) -> str:
     for reason, count in s.uncorrected.items():
         if count:
             lines.append(f"  not        {count:,}: {reason} ({_FATE[s.settings['uncorrected']]})")
-    if s.water_unknown:
-        lines.append(f"no surface   {s.water_unknown:,} points have no known water above them")
+    lines += _no_surface(s)
     if s.depth_m:
         depth = s.depth_m
         lines.append(
@@ -52,6 +55,20 @@ def summary_text(summary: Summary) -> str:
         *_uncertainty(s),
     ]
     return "\n".join([*lines, *left_out_lines(s.labelling)])
+
+
+def _head(s: Summary | LabelSummary | CleanSummary) -> list[str]:
+    rate = s.points / max(s.seconds, 1e-9)
+    return [
+        f"{s.input} -> {s.output}",
+        f"points       {s.points:,} in {s.seconds:.1f} s ({rate:,.0f} points/s)",
+    ]
+
+
+def _no_surface(s: Summary | LabelSummary) -> list[str]:
+    if not s.water_unknown:
+        return []
+    return [f"no surface   {s.water_unknown:,} points have no known water above them"]
 
 
 _FATE = {"withhold": "unmoved, withheld", "keep": "unmoved", "drop": "dropped"}
@@ -152,3 +169,124 @@ def share(part: int, whole: int) -> str:
     """Return a percentage, with a digit more where it is small."""
     percent = 100.0 * part / max(whole, 1)
     return f"{percent:.0f} %" if percent >= 10 or percent == 0 else f"{percent:.1f} %"
+
+
+def strictest_order(uncertainty: dict[str, Any]) -> str | None:
+    """Return the strictest order whose TVU 95 % of the points keep, if any."""
+    for order in ORDERS:
+        if uncertainty["s44"][order.name] >= 0.95:
+            return order.name
+    return None
+
+
+def budget_words(errors: dict[str, Any], level_from_fit: float | None = None) -> str:
+    """Return the standard deviations that were assumed, as ``image 0.5 px, level 0.020 m``.
+
+    Parameters
+    ----------
+    errors : dict
+        `pcfix.options.ErrorBudget` as plain values.
+    level_from_fit : float, optional
+        Standard error of the level that a fit gave, where the user stated none.
+    """
+    level = errors["level_m"]
+    source = ""
+    if level is None:
+        level, source = LEVEL_M, " (assumed)"
+        if level_from_fit is not None and np.isfinite(level_from_fit):
+            level, source = level_from_fit, " (fitted)"
+    parts = [f"image {errors['image_px']:g} px", f"level {level:.3f} m{source}"]
+    parts.append(f"index {errors['index']:g}")
+    more = (
+        ("tilt", "tilt_deg", "deg"),
+        ("waves", "waves_deg", "deg"),
+        ("camera positions", "centre_m", "m"),
+        ("attitude", "attitude_deg", "deg"),
+    )
+    parts += [f"{name} {errors[key]:g} {unit}" for name, key, unit in more if errors[key] > 0.0]
+    return ", ".join(parts)
+
+
+def tvu_sentence(uncertainty: dict[str, Any]) -> str:
+    """Return which order of S-44 the standard errors would allow, in words."""
+    order = strictest_order(uncertainty)
+    if order is None:
+        within = uncertainty["s44"][ORDERS[-1].name]
+        return f"fewer than 95 % of the points keep any order of IHO S-44 ({within:.0%} order 2)"
+    within = uncertainty["s44"][order]
+    number = "order" if order[0].isdigit() else ""
+    name = f"{number} {order}".strip() + ("" if number else " Order")
+    return f"{100.0 * within:.4g} % of the points are within the TVU of IHO S-44 {name}"
+
+
+def labelling_text(summary: LabelSummary) -> str:
+    """Return what a person wants to know of a labelling."""
+    s = summary
+    lines = [
+        *_head(s),
+        f"class 40     {s.submerged:,} ({share(s.submerged, s.points)} of the points)",
+    ]
+    if s.settings["band_m"]:
+        lines.append(f"class 41     {s.water_surface:,} within {s.settings['band_m']:g} m")
+    if s.stale:
+        fate = "now class 1" if s.settings["reset"] else "left so; --reset makes them class 1"
+        lines.append(f"class before {s.stale:,} came as class 40 or 41 and are neither: {fate}")
+    lines += _no_surface(s)
+    return "\n".join([*lines, *left_out_lines(s.labelling), f"water        {s.water}"])
+
+
+def cleaning_text(summary: CleanSummary) -> str:
+    """Return what a person wants to know of a cleaning."""
+    s = summary
+    fate = "dropped" if s.dropped else "class 7, withheld"
+    lines = [
+        *_head(s),
+        f"set aside    {s.set_aside:,} withheld or noise already",
+        f"noise        {s.noise:,} ({share(s.noise, s.points)} of the points; {fate})",
+    ]
+    for reason, count in s.reasons.items():
+        if count:
+            lines.append(f"  {reason.replace('_', ' '):<13}{count:,}")
+    lines += [f"not run      {test}" for test in s.not_run]
+    if s.submerged:
+        lines.append(f"bed          {s.submerged:,} submerged points tested against it")
+    if s.neighbour_distance_m:
+        near = s.neighbour_distance_m
+        lines.append(
+            f"neighbours   mean distance {near['mean']:.3f} m, sd {near['sd']:.3f} m,"
+            f" limit {near['limit']:.3f} m"
+        )
+    return "\n".join(lines)
+
+
+def dsm_text(summary: DsmSummary) -> str:
+    """Return what a person wants to know of a DSM."""
+    s = summary
+    left, bottom, right, top = s.bounds_m
+    total = s.width * s.height
+    wanted = {"all": "land and bed", "bed": "bed, class 40"}[s.settings["surface"]]
+    lines = [
+        f"{s.input} -> {s.output}",
+        f"points       {s.points_used:,} of {s.points:,} ({wanted}) in {s.seconds:.1f} s",
+        f"raster       {s.width:,} x {s.height:,} cells of {s.settings['resolution_m']:g} m,"
+        f" {s.settings['method']}",
+        f"bounds       x {left:.10g} to {right:.10g}, y {bottom:.10g} to {top:.10g} m",
+        f"CRS          {s.crs or 'the cloud states none'}",
+        f"with points  {s.cells:,} cells ({share(s.cells, total)}),"
+        f" {s.points_per_cell:.1f} points each",
+    ]
+    if s.hole_m is not None:
+        lines.append(
+            f"bridged      {s.filled:,} cells ({share(s.filled, total)}),"
+            f" across holes up to {s.hole_m:.3g} m"
+        )
+    lines.append(f"empty        {s.empty:,} cells ({share(s.empty, total)})")
+    if s.uncertainty_m is not None:
+        sigma = s.uncertainty_m
+        lines.append(
+            f"uncertainty  of the bed's cells, formal, standard: mean {sigma['mean']:.3f} m,"
+            f" largest {sigma['max']:.3f} m (band 4)"
+        )
+    if s.hillshade is not None:
+        lines.append(f"hillshade    {s.hillshade}")
+    return "\n".join(lines)

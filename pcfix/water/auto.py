@@ -11,8 +11,9 @@ import numpy as np
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import NOISE_CLASSES, WaterPlane
 from pcfix.water import search
+from pcfix.water.cues import gain_of
 from pcfix.water.fit import fit_water
-from pcfix.water.samples import gain_of, layer_gain, points_above, sample_cloud
+from pcfix.water.samples import layer_gain, points_above, sample_cloud
 from pcfix.water.search import INSTEAD, LAYER, judge
 
 if TYPE_CHECKING:
@@ -291,6 +292,19 @@ class WaterProposal:
     shoreline: FloatArray
     curves: EvidenceCurves
     ground: FloatArray
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures as plain values."""
+        return {
+            "model": "auto",
+            "level_m": self.level_m,
+            "sigma_level_m": self.sigma_level_m,
+            "at_xy": self.centre_xy.tolist(),
+            "tilt_percent": 100.0 * float(np.hypot(*self.tilt)),
+            "confidence": self.confidence,
+            "evidence": self.evidence,
+            "notes": list(self.reasons),
+        }
 
 
 WATER_CLASSES = (9, 41)

@@ -89,15 +89,14 @@ def index_words(
     temperature_c: float | None,
     wavelength_um: float | None,
 ) -> float | str:
-    """Return what `index_of` takes, of an index or what decides it.
-
-    Raises
-    ------
-    SettingError
-        If both are given.
-    """
+    """Return what `index_of` takes, of an index or what decides it; refuse both at once."""
     if salinity is None and temperature_c is None and wavelength_um is None:
-        return DEFAULT_REFRACTIVE_INDEX if index is None else _plain(index)
+        if index is None:
+            return DEFAULT_REFRACTIVE_INDEX
+        try:
+            return float(index)
+        except ValueError:
+            return index
     if index is not None:
         raise SettingError(
             "index and salinity, temperature or wavelength say the same twice; give one of them."
@@ -106,14 +105,6 @@ def index_words(
     temperature = given.temperature_c if temperature_c is None else temperature_c
     wavelength = given.wavelength_um if wavelength_um is None else wavelength_um
     return f"{given.salinity_psu!r},{temperature!r},{wavelength!r}"
-
-
-def _plain(index: float | str) -> float | str:
-    """Return a number as one, and a word as it is."""
-    try:
-        return float(index)
-    except ValueError:
-        return index
 
 
 def index_of(given: float | str) -> tuple[float, str]:

@@ -10,8 +10,9 @@ of five million.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit, prange
@@ -23,6 +24,35 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
+    from pcfix.water.auto import WaterProposal
+    from pcfix.water.fit import WaterFit
+    from pcfix.water.river import RiverFit
+
+    Evidence: TypeAlias = WaterFit | RiverFit | WaterProposal
+
+
+@dataclass(frozen=True, eq=False)
+class FoundSurface:
+    """A water surface and how it was come by.
+
+    Attributes
+    ----------
+    surface : WaterSurface
+    evidence : WaterFit, RiverFit, WaterProposal or None
+        None where the surface was given as it is.
+    points : array, shape (n, 3)
+        Shoreline points that were fitted, metres, the cloud's CRS.
+    notes : tuple of str
+    """
+
+    surface: WaterSurface
+    evidence: Evidence | None = None
+    points: FloatArray | None = None
+    notes: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, Any] | None:
+        """Return the figures of a fit as plain values; None where nothing was fitted."""
+        return None if self.evidence is None else dict(self.evidence.as_dict())
 
 
 class SurfaceAbove(NamedTuple):
@@ -255,41 +285,30 @@ def facets_above(
 
 APART_M = 0.01
 """Facets that overlap are of no harm where their heights differ by less."""
-_EDGE = 1e-9  # of a barycentric coordinate: an edge belongs to both sides
-_AT_ONCE = 200_000
 
 
 def in_two_sheets(tin: Tin) -> tuple[BoolArray, FloatArray]:
-    """Return which facets have another above or below their centre, and all plan areas, m2."""
-    centres = tin.corners.mean(axis=1)
-    column, row = (centres // tin.cell_m).astype(np.int64).T
-    cell = row * tin.columns + column
-    double = np.zeros(len(centres), np.bool_)
-    for first in range(0, len(centres), _AT_ONCE):
-        facet = np.arange(first, min(first + _AT_ONCE, len(centres)))
-        double[facet] = _meet_others(tin, facet, centres[facet], cell[facet])
+    """Return which facets have another above or below their centre, and all plan areas, m2.
+
+    A height field has one height above each place: its mesh must be one sheet.
+    """
+    double = _meet_others(tin, tin.corners.mean(axis=1))
     edge1, edge2 = tin.corners[:, 1] - tin.corners[:, 0], tin.corners[:, 2] - tin.corners[:, 0]
     area_m2 = np.abs(edge1[:, 0] * edge2[:, 1] - edge1[:, 1] * edge2[:, 0]) / 2.0
     return double, area_m2
 
 
-def _meet_others(tin: Tin, facet: IntArray, centres: FloatArray, cell: IntArray) -> BoolArray:
+@njit(cache=True, error_model="numpy", nogil=True)
+def _meet_others(tin: Tin, centres: FloatArray) -> BoolArray:  # pragma: no cover - compiled
     """Return which facets' centres lie in another facet of another height."""
-    counts = tin.cell_start[cell + 1] - tin.cell_start[cell]
-    mine = np.repeat(np.arange(len(facet)), counts)
-    within = np.arange(len(mine)) - np.repeat(np.cumsum(counts) - counts, counts)
-    other = tin.cell_facet[tin.cell_start[cell][mine] + within]
-    place = centres[mine]
-    planes = tin.planes[other] - tin.planes[facet[mine]]
-    apart_m = np.abs(planes[:, 0] + (planes[:, 1:] * place).sum(axis=1))
-    hit = (apart_m > APART_M) & _holds(tin.corners[other], place)
-    return np.bincount(mine[hit], minlength=len(facet)) > 0
-
-
-def _holds(corners: FloatArray, place: FloatArray) -> BoolArray:
-    """Whether each place lies in its triangle."""
-    (ax, ay), (bx, by) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
-    px, py = (place - corners[:, 0]).T
-    area = ax * by - ay * bx
-    s, t = (px * by - py * bx) / area, (ax * py - ay * px) / area
-    return np.asarray((s >= -_EDGE) & (t >= -_EDGE) & (s + t <= 1.0 + _EDGE))
+    double = np.zeros(len(centres), np.bool_)
+    for f in range(len(centres)):
+        u, v = centres[f]
+        cell = int(v // tin.cell_m) * tin.columns + int(u // tin.cell_m)
+        for k in range(tin.cell_start[cell], tin.cell_start[cell + 1]):
+            other = tin.cell_facet[k]
+            a, b, c = tin.planes[other] - tin.planes[f]
+            if abs(a + (b * u + c * v)) > APART_M and _inside(tin.corners[other], u, v):
+                double[f] = True
+                break
+    return double

@@ -191,7 +191,7 @@ def report(seed: int, pictures: Path | None) -> tuple[float, float] | None:
     )
     print(f"   {'; '.join(found.reasons)}")
     if pictures is not None:
-        from pcfix.report.shoreline import shoreline_figure
+        from pcfix.report.water import shoreline_figure
 
         shoreline_figure(found).savefig(pictures / f"auto_{seed}.png", dpi=110)
     return error, found.sigma_level_m

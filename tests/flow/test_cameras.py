@@ -10,7 +10,7 @@ import pytest
 from pyproj import Transformer
 
 import pcfix
-from pcfix.flow.cameras import check_cameras
+from pcfix.flow.checks import check_cameras
 from pcfix.lens.imaging import project
 from pcfix.report.cameras import cameras_text
 from tests.utils.program import run_pcfix

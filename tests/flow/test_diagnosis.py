@@ -7,7 +7,7 @@ import pytest
 
 import pcfix
 from pcfix.errors import PcfixWarning, SettingError
-from pcfix.flow.cameras import check_cameras
+from pcfix.flow.checks import check_cameras
 from pcfix.flow.diagnosis import command_of
 from pcfix.flow.inputs import Inputs
 from pcfix.report.cameras import cameras_text

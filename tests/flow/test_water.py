@@ -9,8 +9,8 @@ import rasterio
 from scipy.spatial.transform import Rotation
 
 import pcfix
+from pcfix.flow.checks import check_water
 from pcfix.flow.surfaces import WaterWords
-from pcfix.flow.water import check_water
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT
 

@@ -8,8 +8,8 @@ import pytest
 
 import pcfix
 from pcfix.errors import SettingError
-from pcfix.flow.flume_methods import METHODS, depth_bins, mean_of_cameras
-from pcfix.report.papers import depth_bins_figure, depth_bins_rows, depth_bins_text
+from pcfix.flow.papers import depth_bins, mean_of_cameras
+from pcfix.report.papers import METHODS, depth_bins_figure, depth_bins_rows, depth_bins_text
 from pcfix.simulate.flume import GSD_M, simulate_flume
 from tests.utils.twins import light_path
 

@@ -13,9 +13,9 @@ import pytest
 
 import pcfix
 from pcfix.flow.report import write_report
-from pcfix.report.figures import histogram_figure, relief
-from pcfix.report.maps import MapsBuilder
+from pcfix.grid.maps import MapsBuilder
 from pcfix.report.page import Layer, Report, Table, render
+from pcfix.report.run import histogram_figure, relief
 from tests.utils.browser import needs_browser, open_page
 
 SCENE = Path(__file__).parents[2] / "samples" / "scene"

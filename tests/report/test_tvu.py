@@ -12,16 +12,10 @@ import pytest
 
 import pcfix
 from pcfix.options import ErrorBudget
-from pcfix.report.figures import png_of, tvu_figure
-from pcfix.report.text import summary_text
-from pcfix.report.tvu import (
-    ORDERS,
-    UncertaintyTally,
-    budget_words,
-    largest_tvu_m,
-    strictest_order,
-    tvu_sentence,
-)
+from pcfix.refract.tally import ORDERS, UncertaintyTally, largest_tvu_m
+from pcfix.report.page import png_of
+from pcfix.report.run import tvu_figure
+from pcfix.report.text import budget_words, strictest_order, summary_text, tvu_sentence
 
 # Edition 6, table 1: the largest TVU at the surface and at 40 m, m, by hand
 BY_HAND = {

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from pcfix.errors import GeometryError, SettingError
-from pcfix.report.shoreline import shoreline_figure
+from pcfix.report.water import shoreline_figure
 from pcfix.water.auto import find_water
-from pcfix.water.samples import Break, gain_of, gather, tile_moments
+from pcfix.water.cues import Break, gain_of, gather, tile_moments
 from tests.utils.shared import needs
 
 RENDERED, needs_rendered = needs("rendered_a", "cloud.las")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -96,6 +97,12 @@ def crs(path: Path, definition: str) -> str:
             " with an EPSG code."
         ) from error
     return text
+
+
+def utm_as_code(text: str) -> str:
+    """Return ODM's "WGS84 UTM 16N" as an EPSG code, any other text as it is."""
+    utm = re.match(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS])", text, re.IGNORECASE)
+    return f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + int(utm[1])}" if utm else text
 
 
 TOLERANCE = 1e-12

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -38,20 +37,11 @@ EARTH_RADII_M = (6.2e6, 7.0e6)
 """Cameras are at no other distance from the centre of the earth."""
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
+class Frame(NamedTuple):
     """A frame that is tied to the earth.
 
-    Attributes
-    ----------
-    crs : CRS
-        In which `enter` gives its points: not geocentric.
-    enter : callable
-        From points (n, 3) of the frame to points of `crs`.
-    direct : bool
-        The frame is `crs` itself.
-    topocentric : bool
-        Axes east, north, up at a place.
+    `enter` takes points (n, 3) of it to `crs`, which is not geocentric, and is the frame itself
+    where it is `direct`. A `topocentric` one has axes east, north, up at a place.
     """
 
     crs: CRS
@@ -127,20 +117,11 @@ def _from_geocentric(geocentric: CRS, geographic: CRS) -> Callable[[FloatArray],
 LOCAL = "local"
 
 
-@dataclass(frozen=True, eq=False)
-class Statement:
+class Statement(NamedTuple):
     """What file and user say of the frame of cameras.
 
-    Attributes
-    ----------
-    crs : str or None
-        As in `Cameras`.
-    project : CRS or None
-        In which the software delivers its clouds.
-    chosen : bool
-        The user says so.
-    trusted : bool
-        The user says so, and heights that are not stated are the cloud's.
+    `crs` is as in `Cameras`, `project` that in which the software delivers its clouds. It is
+    `chosen` where the user says so, and `trusted` where heights not stated are the cloud's.
     """
 
     crs: str | None
@@ -183,32 +164,32 @@ def _is_geocentric(crs: str | None, name: str) -> bool:
     return parse_crs(crs, name).is_geocentric
 
 
-def completed(cloud: CRS, frame: Frame, said: Statement) -> CRS:
+def completed(cloud: CRS, frame: Frame, stated: Statement) -> CRS:
     """Return the cloud's CRS, with the heights that its software uses where it states none."""
     if heights_of(cloud) != "unstated":
         return cloud
-    vertical = parts(frame.crs if said.project is None else said.project)[1]
+    vertical = parts(frame.crs if stated.project is None else stated.project)[1]
     return cloud if vertical is None else with_heights(cloud, vertical)
 
 
-def agree(frame: Frame, target: CRS, said: Statement) -> bool:
+def agree(frame: Frame, target: CRS, stated: Statement) -> bool:
     """Whether heights go over as they are: the user says so, or the CRSs do."""
-    return (said.trusted and not frame.direct) or heights_agree(frame.crs, target)
+    return (stated.trusted and not frame.direct) or heights_agree(frame.crs, target)
 
 
-def height_notes(frame: Frame, target: CRS, said: Statement, name: str) -> tuple[str, ...]:
+def height_notes(frame: Frame, target: CRS, stated: Statement, name: str) -> tuple[str, ...]:
     """Return what is guessed about heights."""
     mine, cloud = heights_of(frame.crs), heights_of(target)
     unit, size = plan_unit(frame.crs)
     if mine == "unstated" and frame.crs.is_projected and size != 1.0:
         return (f"{name}: heights are taken to be in {unit}, as x and y are.",)
-    if said.trusted:
+    if stated.trusted:
         return ()
     if mine == "unstated" and cloud != "unstated":
         return (
             f"{name}: does not say what its heights are; taken to be the cloud's ({target.name}).",
         )
-    if mine == "ellipsoidal" and cloud == "unstated" and _is_guess(frame, target, said):
+    if mine == "ellipsoidal" and cloud == "unstated" and _is_guess(frame, target, stated):
         return (
             f"{name}: the cloud's CRS ({target.name}) does not say what its heights are; taken to"
             f" be ellipsoidal, of {frame.crs.name}.",
@@ -216,12 +197,12 @@ def height_notes(frame: Frame, target: CRS, said: Statement, name: str) -> tuple
     return ()
 
 
-def _is_guess(frame: Frame, target: CRS, said: Statement) -> bool:
+def _is_guess(frame: Frame, target: CRS, stated: Statement) -> bool:
     """Whether the software may mean other heights than the ellipsoidal ones of the frame."""
     axes = [e.semi_major_metre for e in (frame.crs.ellipsoid, target.ellipsoid) if e is not None]
     if axes and max(axes) - min(axes) > 1.0:
         return True
-    return said.project is None and not frame.topocentric
+    return stated.project is None and not frame.topocentric
 
 
 def without_grid(frame: Frame, target: CRS) -> str:

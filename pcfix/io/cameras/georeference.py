@@ -62,18 +62,8 @@ STEP_M = 10.0
 class Georeference:
     """The way from the frame of a camera file into another.
 
-    Attributes
-    ----------
-    frame : Frame or None
-        Where the numbers come from; None where they are taken as they are.
-    transformation : Transformation or None
-    offset : array, shape (3,)
-        Added before all else.
-    crs : str or None
-        Where the numbers end, as `Cameras.crs` says it.
-    notes : tuple of str
-    name : str
-        For messages.
+    `frame` is where the numbers come from, None where they are taken as they are; `offset`, shape
+    (3,), is added before all else; `crs` is where they end, as `Cameras.crs` says it.
     """
 
     frame: Frame | None
@@ -192,19 +182,19 @@ def georeference(
     if offset.shape != (3,) or not np.isfinite(offset).all():
         raise InputError(f"{name}: the offset {offset_m} is not three numbers x, y, z.")
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
-    said = statement(cameras, cameras_crs, name)
-    tied = is_tied(said.crs, name)
+    stated = statement(cameras, cameras_crs, name)
+    tied = is_tied(stated.crs, name)
     if cloud is None:
-        return _without_cloud_crs(said, cameras, offset, name, tied=tied)
+        return _without_cloud_crs(stated, cameras, offset, name, tied=tied)
     if tied:
         if is_local(cloud):
             raise InputError(
-                f"{name}: is in {shortened(said.crs or '')}, but the cloud is in a local frame"
+                f"{name}: is in {shortened(stated.crs or '')}, but the cloud is in a local frame"
                 f" ({cloud.name}); set the cloud's CRS, or give --cameras-crs local to take the"
                 " numbers as they are."
             )
-        return _into(cloud, said, cameras, offset, name)
-    if said.crs is not None and not said.chosen and not is_local(cloud):
+        return _into(cloud, stated, cameras, offset, name)
+    if stated.crs is not None and not stated.chosen and not is_local(cloud):
         raise InputError(
             f"{name}: is in a local frame, not tied to the earth, but the cloud is in"
             f" {cloud.name}; export the cameras in that CRS, or, if their numbers are in it up to"
@@ -214,27 +204,27 @@ def georeference(
 
 
 def _without_cloud_crs(
-    said: Statement, cameras: Cameras, offset: FloatArray, name: str, *, tied: bool
+    stated: Statement, cameras: Cameras, offset: FloatArray, name: str, *, tied: bool
 ) -> Georeference:
     """Return the way to where the software delivers clouds: mostly where the cameras are."""
-    as_it_is = Georeference(None, None, offset, said.crs, (), name)
+    as_it_is = Georeference(None, None, offset, stated.crs, (), name)
     if not tied:
         return as_it_is
-    frame = frame_of(said.crs or "", name)
+    frame = frame_of(stated.crs or "", name)
     if frame.topocentric:
-        return replace(as_it_is, notes=(_taken(name, shortened(said.crs or "")),))
+        return replace(as_it_is, notes=(_taken(name, shortened(stated.crs or "")),))
     if frame.direct and frame.crs.is_projected:
         unit, size = plan_unit(frame.crs)
         words = frame.crs.name + ("" if size == 1.0 else f", unit {unit},")
         return replace(as_it_is, notes=(_taken(name, words),))
-    if frame.direct or said.project is None or not said.project.is_projected:
+    if frame.direct or stated.project is None or not stated.project.is_projected:
         kind = "degrees" if frame.direct else "geocentric coordinates"
         raise InputError(
             f"{name}: is in {kind} ({frame.crs.name}) and the cloud names no CRS; set the cloud's"
             " CRS."
         )
-    found = _into(said.project, said, cameras, offset, name)
-    return replace(found, notes=(_taken(name, said.project.name), *found.notes))
+    found = _into(stated.project, stated, cameras, offset, name)
+    return replace(found, notes=(_taken(name, stated.project.name), *found.notes))
 
 
 def _taken(name: str, crs: str) -> str:
@@ -242,20 +232,20 @@ def _taken(name: str, crs: str) -> str:
 
 
 def _into(
-    cloud: CRS, said: Statement, cameras: Cameras, offset: FloatArray, name: str
+    cloud: CRS, stated: Statement, cameras: Cameras, offset: FloatArray, name: str
 ) -> Georeference:
     """Return the way from a frame tied to the earth into a CRS."""
     check_projected_metres(cloud, "the cloud")
-    frame = frame_of(said.crs or "", name)
+    frame = frame_of(stated.crs or "", name)
     if frame.direct and frame.crs.is_geographic and offset.any():
         raise InputError(
             f"{name}: an offset in metres cannot be added to degrees ({frame.crs.name})."
         )
     at = cameras.centres + offset
     frame.check(at, cameras.labels, name)
-    target = completed(cloud, frame, said)
-    crs, notes = crs_text(target), height_notes(frame, target, said, name)
-    heights, instead = not agree(frame, target, said), without_grid(frame, target)
+    target = completed(cloud, frame, stated)
+    crs, notes = crs_text(target), height_notes(frame, target, stated, name)
+    heights, instead = not agree(frame, target, stated), without_grid(frame, target)
     if frame.direct and not heights and is_same_numbers(frame.crs, target):
         return Georeference(frame, None, offset, crs, notes, name)
     step = transformation(
@@ -282,7 +272,7 @@ class GnssDifferences:
 
 
 def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> GnssDifferences:
-    """Return how far the adjusted centres are from where the GNSS said that they were.
+    """Return how far the adjusted centres are from where the GNSS stated that they were.
 
     Parameters
     ----------

@@ -90,14 +90,23 @@ def read(source: Source) -> Cameras:
         )
     frames = _frames(source, posed)
     lenses = None if frames is None else tuple(map(_lens, posed, frames))
+    note = (
+        f"{path}: XMP files do not tell the size of the images, and those are not beside them; put"
+        " them there or give --sensor. Frames are taken as boundless."
+    )
     relative = any(image.fields.get("Coordinates", "absolute") != "absolute" for image in posed)
     return Cameras(
         labels=tuple(image.label for image in posed),
         centres=np.array([_numbers(image, "Position", 3) for image in posed]),
-        rotations=np.array([_rotation(image) for image in posed]),
+        rotations=np.array(
+            [
+                checks.rotation(i.path, i.label, _numbers(i, "Rotation", 9).reshape(3, 3))
+                for i in posed
+            ]
+        ),
         lenses=lenses,
         crs="local" if relative else None,
-        notes=() if lenses else (_note(path),),
+        notes=() if lenses else (note,),
         unposed=tuple(image.label for image in images if not _is_posed(image)),
         source="RealityCapture",
     )
@@ -105,13 +114,6 @@ def read(source: Source) -> Cameras:
 
 def _is_posed(image: Image) -> bool:
     return {"Rotation", "Position"} <= image.fields.keys()
-
-
-def _note(path: Path) -> str:
-    return (
-        f"{path}: XMP files do not tell the size of the images, and those are not beside them; put"
-        " them there or give --sensor. Frames are taken as boundless."
-    )
 
 
 def _files(path: Path) -> list[Path]:
@@ -164,11 +166,6 @@ def _frames(source: Source, images: list[Image]) -> Sequence[tuple[float, float]
     frames = [image_size(folder, image.label) or given for image in images]
     known = [frame for frame in frames if frame is not None]
     return known if len(known) == len(images) else None
-
-
-def _rotation(image: Image) -> FloatArray:
-    matrix = _numbers(image, "Rotation", 9).reshape(3, 3)
-    return checks.rotation(image.path, image.label, matrix)
 
 
 def _numbers(image: Image, name: str, count: int) -> FloatArray:

@@ -51,18 +51,8 @@ def numbers(path: Path, text: str) -> FloatArray:
 def point_list(path: Path, body: FloatArray, count: int, images: int, width: int) -> PointList:
     """Take apart a list of x y z, red green blue, n, and n views of `width` numbers.
 
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    body : array
-        All numbers of the list.
-    count : int
-        Points that the file announces.
-    images : int
-        How many images there are; the first number of a view counts them from 0.
-    width : int
-        Numbers of a view.
+    `count` is the number of points that the file announces, `images` that of its images, which the
+    first number of a view counts from 0.
     """
     first, views = _starts(path, body, count, width)
     point = np.repeat(np.arange(count), views)
@@ -97,15 +87,7 @@ def _starts(path: Path, body: FloatArray, count: int, width: int) -> tuple[IntAr
 
 
 def tie_points(xyz: FloatArray, point: IntArray, camera: IntArray, uv: FloatArray) -> TiePoints:
-    """Gather observations by point; those of a camera -1 (without a pose) are left out.
-
-    Parameters
-    ----------
-    xyz : array, shape (m, 3)
-    point, camera : array of int, shape (o,)
-        Row of `xyz` and row of the cameras, in any order.
-    uv : array, shape (o, 2)
-    """
+    """Gather observations (o rows, in any order) by point, without those of a camera -1."""
     kept = np.flatnonzero(camera >= 0)
     kept = kept[np.argsort(point[kept], kind="stable")]
     counts = np.bincount(point[kept], minlength=len(xyz))
@@ -125,22 +107,9 @@ def frame_sizes(
     Where an image cannot be opened, its frame is the smallest that holds all tie points that
     images of about the same focal length have, about the middle of the frame.
 
-    Parameters
-    ----------
-    path : Path
-        The camera file; images are looked for where it lies, one folder up, and in ``images``.
-    names : sequence of str, length k
-        What the file calls them, with or without a folder.
-    focal_px : array, shape (k,)
-    smallest_px : array, shape (k, 2)
-        The smallest width and height that hold the tie points of the image; 0 where it has none.
-
-    Returns
-    -------
-    array, shape (k, 2), or None
-        None where nothing tells them.
-    tuple of str
-        What to tell the user.
+    Images are looked for where the camera file lies, one folder up, and in ``images``.
+    `smallest_px`, shape (k, 2), is the smallest width and height that hold the tie points of an
+    image, 0 where it has none. None where nothing tells the frames; the texts are for the user.
     """
     sizes = np.array([image_size(path.parent, name) or (0, 0) for name in names], float)
     missing = sizes[:, 0] == 0

@@ -59,17 +59,9 @@ def corrected_header(
 ) -> laspy.LasHeader:
     """Return the header of a corrected file: LAS 1.4, the input's records, and pcfix's own.
 
-    Parameters
-    ----------
-    source : LasSource
-    columns : tuple of Column
-        Extra dimensions to add.
-    content : dict
-        What the provenance VLR shall say; what the file was before is added to it.
-    wide : bool
-        Whether the columns have their wide types.
-    steps : tuple of int
-        By how many steps each integer axis will be moved; the offsets make up for it.
+    The `columns` are added as extra dimensions, of their `wide` types or the narrow ones, and a VLR
+    with `content` and what the file was before. Each integer axis will be moved by so many `steps`,
+    for which the offsets make up.
 
     Raises
     ------
@@ -281,13 +273,7 @@ labelling_vlr = partial(_note, (3, "pcfix labelling (JSON)"))
 
 
 def own_settings(vlrs: Iterable[VLR]) -> Any:
-    """Return what the VLR of a correction says, None where there is none.
-
-    Raises
-    ------
-    ValueError
-        If it is no JSON.
-    """
+    """Return what the VLR of a correction says, None without one; ValueError if it is no JSON."""
     ours = next((vlr for vlr in vlrs if is_ours(vlr)), None)
     return None if ours is None else json.loads(ours.record_data)
 
@@ -314,13 +300,7 @@ def read_settings(vlrs: Iterable[VLR], path: Path) -> dict[str, Any]:
 
 
 def check_suffix(path: Path) -> bool:
-    """Return whether a name asks for LAZ rather than LAS.
-
-    Raises
-    ------
-    SettingError
-        If it asks for neither.
-    """
+    """Return whether a name asks for LAZ rather than LAS; a `SettingError` if for neither."""
     suffix = path.suffix.lower()
     if suffix not in (".las", ".laz"):
         raise SettingError(f"{path}: give an output name that ends in .las or .laz.")
@@ -328,19 +308,10 @@ def check_suffix(path: Path) -> bool:
 
 
 class LasSink:
-    """An output file that is being written. Use it as a context manager.
+    """An output file that is being written; use it as a context manager.
 
-    Parameters
-    ----------
-    path : Path
-        Its suffix decides between LAS and LAZ.
-    header : laspy.LasHeader
-    evlrs : list of Record
-        To stand behind the points.
-    identity : bytes
-        To stand in the header as it is; see `LasSource.identity`.
-    jobs : int, optional
-        Threads.
+    The suffix of its path decides between LAS and LAZ; `evlrs` stand behind the points, `identity`
+    in the header as it is (see `LasSource`).
     """
 
     def __init__(

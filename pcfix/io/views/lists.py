@@ -74,42 +74,24 @@ class ImageOrder:
 class ViewList:
     """Which cameras made each of n points; `pcfix.io.views.matching` gives it to a cloud's rows.
 
-    Attributes
-    ----------
-    raw : RawList
-        With positions in the frame of the cameras.
-    orders : tuple of ImageOrder
-        What an image number may mean; one, once geometry has told which.
-    share_seen : float or None
-        Share of the listed cameras whose frame holds the point; None while not looked at, or
-        where the cameras have no frames.
-    spacing_m : float or None
-        Between neighbouring points, where there are positions.
-    default_spacings : float
-        A match by position may be off by so many spacings unless the user says otherwise.
-    kind : {"tracks", "depth-maps"}
-        See `pcfix.model.Views`.
+    `share_seen` of the listed cameras have the point in their frame, None while not looked at, or
+    where the cameras have no frames. A match by position may be off by `default_spacings` unless
+    the user says otherwise.
     """
 
-    raw: RawList
-    orders: tuple[ImageOrder, ...]
+    raw: RawList  # with positions in the frame of the cameras
+    orders: tuple[ImageOrder, ...]  # what a number may mean; one, once geometry has told which
     share_seen: float | None
-    spacing_m: float | None
+    spacing_m: float | None  # between neighbouring points, where there are positions
     default_spacings: float
-    kind: Literal["tracks", "depth-maps"]
+    kind: Literal["tracks", "depth-maps"]  # see `pcfix.model.Views`
 
     def __len__(self) -> int:
         return len(self.raw)
 
 
 def read_list(path: Path) -> RawList:
-    """Read the view list of a dense cloud, whichever software wrote it.
-
-    Raises
-    ------
-    InputError
-        If the file is not a whole view list.
-    """
+    """Read the view list of a dense cloud, whichever software wrote it."""
     with path.open("rb") as stream:
         head = stream.read(4)
     if head in _OTHERS:
@@ -244,13 +226,7 @@ def _weights(vertices: Vertices, start: IntArray) -> npt.NDArray[np.float32] | N
 
 
 def tracks_as_list(path: Path, tie_points: TiePoints) -> RawList:
-    """Return the tie points that have a position, each camera once, sorted.
-
-    Raises
-    ------
-    InputError
-        If there are none.
-    """
+    """Return the tie points that have a position, each camera once, sorted."""
     rows = np.flatnonzero(np.isfinite(tie_points.xyz).all(axis=1))
     if rows.size == 0:
         raise InputError(f"{path}: has no tie points with positions; give another view list.")

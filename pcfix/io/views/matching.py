@@ -173,17 +173,19 @@ class ViewMatch:
         """Turn the images of the given rows into cameras, and leave out those without a pose."""
         raw = self._views.raw
         listed = np.flatnonzero(row >= 0)
-        point, entry = entries(raw.start, row[listed])
+        ends, entry = entries(raw.start, row[listed])
         camera = self._views.orders[0].camera[raw.image[entry]].astype(np.int64)
+        weight = None if raw.weight is None else raw.weight[entry].copy()
         posed = camera >= 0
-        counts = np.zeros(len(row), np.int64)
-        counts[listed] = np.bincount(point[posed], minlength=len(listed))
-        self.report.entries += int(posed.sum())
-        self.report.unposed_entries += int(len(posed) - posed.sum())
-        self.report.without_camera += int(np.count_nonzero(counts[listed] == 0))
-        start = np.concatenate([[0], np.cumsum(counts)])
-        weight = None if raw.weight is None else raw.weight[entry[posed]]
-        return Views(start, camera[posed], weight, self._views.kind)
+        if not posed.all():
+            ends = np.concatenate([[0], np.cumsum(posed)])[ends]
+            camera, weight = camera[posed], None if weight is None else weight[posed]
+        start = np.zeros(len(row) + 1, np.int64)
+        start[listed + 1] = np.diff(ends)
+        self.report.entries += len(camera)
+        self.report.unposed_entries += len(posed) - len(camera)
+        self.report.without_camera += int(np.count_nonzero(start[listed + 1] == 0))
+        return Views(np.cumsum(start), camera, weight, self._views.kind)
 
 
 @dataclass

@@ -179,11 +179,9 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -
     if cameras.rotations is None or cameras.lenses is None:
         return replace(views, orders=views.orders[:1])
     step = max(1, len(rows) // SAMPLE_POINTS)
-    point, entry = entries(views.raw.start, rows[::step])
-    image = views.raw.image[entry]
-    shares = [
-        share_seen(cameras, order.camera[image], xyz[::step][point]) for order in views.orders
-    ]
+    ends, entry = entries(views.raw.start, rows[::step])
+    image, seen_xyz = views.raw.image[entry], np.repeat(xyz[::step], np.diff(ends), axis=0)
+    shares = [share_seen(cameras, order.camera[image], seen_xyz) for order in views.orders]
     known = [(share, i) for i, share in enumerate(shares) if share is not None]
     if not known:
         return views
@@ -199,12 +197,13 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -
     return replace(views, orders=(views.orders[best], *others), share_seen=share)
 
 
-def entries(start: IntArray, rows: IntArray) -> tuple[IntArray, IntArray]:
-    """Return, for every entry of the lists of some rows, its place among the rows and its own."""
+def entries(start: IntArray, rows: IntArray) -> tuple[IntArray, slice | IntArray]:
+    """Return where the lists of some rows start one after another, and which entries these are."""
     counts = start[rows + 1] - start[rows]
-    first = np.cumsum(counts) - counts
-    entry = np.repeat(start[rows] - first, counts) + np.arange(counts.sum())
-    return np.repeat(np.arange(len(rows)), counts), entry
+    ends = np.concatenate([[0], np.cumsum(counts)])
+    if len(rows) and rows[-1] - rows[0] == len(rows) - 1 and (np.diff(rows) == 1).all():
+        return ends, slice(int(start[rows[0]]), int(start[rows[-1] + 1]))  # no copy is quicker
+    return ends, np.repeat(start[rows] - ends[:-1], counts) + np.arange(ends[-1])
 
 
 def share_seen(cameras: Cameras, camera: npt.NDArray[np.int32], xyz: FloatArray) -> float | None:

@@ -27,13 +27,7 @@ class Vertices:
     """The records of the vertices, walked over once, so that every count in them holds."""
 
     def __init__(self, path: Path) -> None:
-        """Open and walk over the file.
-
-        Raises
-        ------
-        InputError
-            If it has no header with vertices, or ends early.
-        """
+        """Walk over the file; one without vertices or that ends early is an `InputError`."""
         self.header = header = read_header(path)
         self._layout = layout = _layout(header)
         self._units = _units(path, header)

@@ -4,9 +4,9 @@ The object point is the local origin. A ray is named by its aim: the place where
 level of the water above the point. It pierces the surface at A, bends there, and comes down to the
 height of the point at the place (mx, my): its miss.
 
-The surface is a plane, the bilinear raster or the facets of
-`pcfix.water.surface`. Where there is none, and where it faces away from the camera, all is NaN. Water
-that hides water behind it is not looked for: the ray is taken to cross the surface once.
+The surface is a plane, the bilinear raster or the facets of `pcfix.water.surface`. Where there is
+none, and where it faces away from the camera, all is NaN. Water that hides water behind it is not
+looked for: the ray is taken to cross the surface once.
 """
 
 from __future__ import annotations

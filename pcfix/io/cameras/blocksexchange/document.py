@@ -335,7 +335,9 @@ def read_ties(path: Path, texts: list[TieText], cameras: Cameras, rows: Rows) ->
         tokens = Tokens(where, inside)
         positions = _positions(tokens, rows.srs_of_blocks[block], rows.srs)
         if len(positions):
-            point.append(len(np.concatenate(xyz)) + _point_of_measurement(tokens))
+            point.append(
+                len(np.concatenate(xyz)) + tokens.point[tokens.code == CODES["Measurement"]]
+            )
             xyz.append(positions)
             ids = tokens.owned("PhotoId", tokens.measurement, len(point[-1]))
             camera.append(np.array([rows.of.get((block, name), -1) for name in ids], np.int64))
@@ -361,10 +363,6 @@ def _inside(path: Path, text: bytes) -> tuple[Path, str]:
                 raise InputError(f"{place}: is cut off; export it again.")
             return place, data.decode(errors="replace")
     raise InputError(f"{path}: its tie points are in {plain}, which is not beside it.")
-
-
-def _point_of_measurement(tokens: Tokens) -> IntArray:
-    return np.asarray(tokens.point[tokens.code == CODES["Measurement"]])
 
 
 def _positions(tokens: Tokens, srs_of_block: str, srs: str) -> FloatArray:

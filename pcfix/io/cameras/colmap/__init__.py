@@ -35,6 +35,7 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.colmap.files import lens, read_cameras, read_images, read_points
+from pcfix.io.crs import is_topocentric
 from pcfix.io.files import read_json
 from pcfix.model import Cameras, GnssPositions, Lens, TiePoints
 
@@ -85,7 +86,7 @@ def read(source: Source) -> Cameras:
     gnss, notes = read_priors(model.folder, labels)
     place = read_place(model.folder)
     if place is not None and gnss is not None and gnss.crs is None:
-        gnss = None  # of the model that the database made, which this one may not be
+        gnss = None  # of the model that the database found, which this one may not be
     centres = -np.einsum("kji,kj->ki", rotations, poses[:, 4:])
     return Cameras(
         labels=labels,
@@ -131,17 +132,17 @@ def _rows_of(identifiers: IntArray, wanted: IntArray) -> IntArray:
 
 
 def _lenses(model: Model, cameras: dict[int, Camera], images: list[Image]) -> tuple[Lens, ...]:
-    made: dict[int, Lens] = {}
+    found: dict[int, Lens] = {}
     for image in images:
         if image.camera not in cameras:
             raise InputError(
                 f"{model.part('images')}: image {image.name}: its camera {image.camera} is not in"
                 f" {model.part('cameras').name}; export the model again."
             )
-        if image.camera not in made:
+        if image.camera not in found:
             camera = cameras[image.camera]
-            made[image.camera] = lens(model.part("cameras"), image.camera, camera)
-    return tuple(made[image.camera] for image in images)
+            found[image.camera] = lens(model.part("cameras"), image.camera, camera)
+    return tuple(found[image.camera] for image in images)
 
 
 def _others(model: Model) -> tuple[str, ...]:
@@ -218,11 +219,7 @@ def read_place(folder: Path) -> Place | None:
             f"{path}: needs offset_m, three numbers, and crs, a text or null; write the model"
             " again."
         )
-    return Place(offset, _checked(path, crs))
-
-
-def _checked(path: Path, crs: str | None) -> str | None:
-    return crs if crs is None or crs.upper().startswith("ENU:") else checks.crs(path, crs)
+    return Place(offset, crs if crs is None or is_topocentric(crs) else checks.crs(path, crs))
 
 
 def place_text(offset_m: FloatArray, crs: str | None) -> str:
@@ -240,21 +237,7 @@ _Row: TypeAlias = tuple[str, bytes, bytes | None, int]
 
 
 def read_priors(model: Path, labels: Sequence[str]) -> tuple[GnssPositions | None, tuple[str, ...]]:
-    """Return the priors of images by their names, from the database beside or above a model.
-
-    Parameters
-    ----------
-    model : Path
-        The folder of the model.
-    labels : sequence of str, length k
-
-    Returns
-    -------
-    GnssPositions or None
-        None where there is no database, or no prior of these images in it.
-    tuple of str
-        What to tell the user: that a database cannot be read.
-    """
+    """Return the priors of images from the database beside or above a model, and notes on it."""
     places = (model, *model.resolve().parents[:_FOLDERS_ABOVE])
     path = next((p / _DATABASE for p in places if (p / _DATABASE).is_file()), None)
     if path is None:

@@ -95,28 +95,28 @@ def lens(path: Path, identifier: int, camera: Camera) -> Lens:
     given = dict(zip(model.parameters, camera.values, strict=True))
     focal_x, focal = given.get("fx", given.get("f", 0.0)), given.get("fy", given.get("f", 0.0))
     projection, shape = _projection(model.projection, given)
-    made = Lens(
+    found = Lens(
         *(focal, camera.width, camera.height, given["cx"], given["cy"]),
         b1=focal_x - focal,
         projection=projection,
         shape=shape,
-        radial=_some(given, "k1", "k2", "k3", "k4", "k5", "k6"),
-        denominator=_some(given, "d1", "d2", "d3"),
-        tangential=_some(given, "p2", "p1"),
-        thin_prism=_some(given, "s1", "s2", "s3", "s4"),
+        radial=_coefficients(given, "k1", "k2", "k3", "k4", "k5", "k6"),
+        denominator=_coefficients(given, "d1", "d2", "d3"),
+        tangential=_coefficients(given, "p2", "p1"),
+        thin_prism=_coefficients(given, "s1", "s2", "s3", "s4"),
         in_turn=model.name == "RAD_TAN_THIN_PRISM_FISHEYE",
         sensor=f"{identifier} {model.name}",
     )
-    checks.lens(path, str(identifier), made)
+    checks.lens(path, str(identifier), found)
     if not focal_x > 0.0:
         raise InputError(
             f"{path}: camera {identifier}: focal length fx {focal_x:g} must be positive; export the"
             " model again."
         )
-    return made
+    return found
 
 
-def _some(given: dict[str, float], *names: str) -> tuple[float, ...]:
+def _coefficients(given: dict[str, float], *names: str) -> tuple[float, ...]:
     """Return the values up to the last name that the model has, 0 for those between."""
     there = [i for i, name in enumerate(names) if name in given]
     return tuple(given.get(name, 0.0) for name in names[: there[-1] + 1]) if there else ()

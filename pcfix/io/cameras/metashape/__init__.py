@@ -36,10 +36,11 @@ from pcfix.io.cameras.metashape import documents
 from pcfix.io.cameras.metashape.block import read_block
 from pcfix.io.cameras.metashape.documents import opened
 from pcfix.io.cameras.metashape.sensors import read_calibration
+from pcfix.io.cameras.tracks import tie_points as gathered
 from pcfix.io.cameras.values import number, numbers
 from pcfix.io.crs import is_local, parse_crs
 from pcfix.io.ply import parse_header
-from pcfix.model import Cameras, GnssPositions, TiePoints, Views
+from pcfix.model import Cameras, GnssPositions, TiePoints
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -60,18 +61,7 @@ def recognises(source: Source) -> bool:
 
 
 def read(source: Source) -> Cameras:
-    """Read the aligned images of a chunk, in the world of that chunk.
-
-    Parameters
-    ----------
-    source : Source
-        An XML file, a .psx or .psz, or the ``.files`` folder of a .psx.
-
-    Returns
-    -------
-    Cameras
-        Geocentric with `project_crs` the CRS of the chunk, or in a ``local`` frame.
-    """
+    """Read the aligned images of a chunk: geocentric, or in a ``local`` frame."""
     chunk = documents.open_chunk(source.path)
     block = read_block(chunk)
     gnss, notes = gnss_positions(chunk, block)
@@ -90,19 +80,10 @@ def read(source: Source) -> Cameras:
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
-    """Read the tie points of a project, and the markers, with what was measured of them.
+    """Read the tie points of a project, then the markers, with what was measured of them.
 
-    Parameters
-    ----------
-    source : Source
-    cameras : Cameras
-        What `read` gave for the same source.
-
-    Returns
-    -------
-    TiePoints
-        First the tie points, then the markers; a marker has no position (NaN), as the file tells
-        only where the survey put it. Projections that Metashape itself computed are left out.
+    A marker has no position (NaN), as the file tells only where the survey put it. Projections
+    that Metashape itself computed are left out.
     """
     chunk = documents.open_chunk(source.path)
     return read_ties(chunk, read_block(chunk), len(cameras))
@@ -185,16 +166,13 @@ def _crs(path: Path, chunk: Element, xyz: FloatArray) -> tuple[str, tuple[str, .
     text = own or (chunk.findtext("reference") or "").strip() or LOCAL
     if text.upper() == LOCAL or is_local(crs := parse_crs(text, str(path))):
         return "local", ()
-    if not own and not crs.is_geographic and _are_degrees(xyz):
+    are_degrees = (np.nanmax(np.abs(xyz[:, :2]), axis=0) <= [180.0, 90.0]).all()
+    if not own and not crs.is_geographic and are_degrees:
         return "EPSG:4979", (
             f"{path}: the reference positions of the cameras are degrees, although the CRS of the"
             " chunk is in metres; taken as WGS 84.",
         )
     return text, ()
-
-
-def _are_degrees(xyz: FloatArray) -> bool:
-    return bool(np.nanmax(np.abs(xyz[:, 0])) <= 180.0 and np.nanmax(np.abs(xyz[:, 1])) <= 90.0)
 
 
 def _antenna_notes(path: Path, block: Block) -> tuple[str, ...]:
@@ -252,9 +230,7 @@ def read_ties(chunk: Chunk, block: Block, count: int) -> TiePoints:
             f"{chunk.path}: has neither tie points nor markers that were measured in aligned"
             " images; give the project (.psx with its .files folder), or export the markers."
         )
-    order = np.argsort(seen.point, kind="stable")
-    start = np.concatenate([[0], np.cumsum(np.bincount(seen.point, minlength=len(seen.xyz)))])
-    return TiePoints(seen.xyz, Views(start, seen.camera[order]), seen.uv[order])
+    return gathered(*seen)
 
 
 def _joined(one: Seen, other: Seen) -> Seen:
@@ -347,7 +323,7 @@ def _markers(frame: Document, block: Block) -> Seen:
         marks = [
             m
             for m in marker.iterfind("location")
-            if _is_measured(m) and m.get("camera_id") in row_of
+            if "false" not in (m.get("pinned"), m.get("valid")) and m.get("camera_id") in row_of
         ]
         for mark in marks:
             where = f"marker {marker.get('marker_id')}, camera {mark.get('camera_id')}"
@@ -361,7 +337,3 @@ def _markers(frame: Document, block: Block) -> Seen:
         np.array(camera, dtype=np.int64),
         np.array(uv, dtype=np.float64).reshape(-1, 2),
     )
-
-
-def _is_measured(location: Element) -> bool:
-    return location.get("pinned") != "false" and location.get("valid") != "false"

@@ -13,7 +13,7 @@ import zipfile
 import zlib
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from pcfix.errors import InputError
 from pcfix.io.cameras.values import read_xml
@@ -54,18 +54,8 @@ class Document:
         return self.path.parent / relative.replace("\\", "/")
 
 
-@dataclass(frozen=True)
-class Chunk:
-    """The chunk that is read.
-
-    Attributes
-    ----------
-    path : Path
-        What the user named, for messages.
-    document : Document
-    software : str
-    notes : tuple of str
-    """
+class Chunk(NamedTuple):
+    """The chunk that is read; `path` is what the user named, for messages."""
 
     path: Path
     document: Document
@@ -105,7 +95,7 @@ def open_chunk(path: Path) -> Chunk:
     active = None if chunks is None else chunks.get("active_id")
     candidates.sort(key=lambda chunk: chunk.get("id") != active)
     chosen, others = _choose(top, candidates)
-    return Chunk(path, chosen, _software(chosen.root, top.root), _told(path, chosen, others))
+    return Chunk(path, chosen, _software(chosen.root, top.root), _chunk_notes(path, chosen, others))
 
 
 def _top(path: Path) -> Document:
@@ -138,22 +128,21 @@ def _choose(top: Document, candidates: list[Element]) -> tuple[Document, list[st
         except InputError as error:
             missing.append(error)
             continue
-        (posed if _has_poses(chunk.root) else empty).append(chunk)
+        has_poses = any(
+            c.find("transform") is not None for c in chunk.root.iterfind("cameras//camera")
+        )
+        (posed if has_poses else empty).append(chunk)
     if not posed and missing:
         raise missing[0]
     first, *others = posed or empty[:1]
     return first, [_label(other.root) for other in others]
 
 
-def _has_poses(chunk: Element) -> bool:
-    return any(camera.find("transform") is not None for camera in chunk.iterfind("cameras//camera"))
-
-
 def _label(chunk: Element) -> str:
     return chunk.get("label") or "without a name"
 
 
-def _told(path: Path, chosen: Document, others: list[str]) -> tuple[str, ...]:
+def _chunk_notes(path: Path, chosen: Document, others: list[str]) -> tuple[str, ...]:
     if not others:
         return ()
     return (

@@ -43,6 +43,9 @@ PROJECTIONS: dict[str, Projection] = {
 }
 
 
+_OFF = ("", "0", "false", "disabled", "none")
+
+
 def read_calibration(path: Path) -> Lens:
     """Read a calibration that Metashape saved on its own (root element ``calibration``).
 
@@ -190,20 +193,16 @@ def notes_on(path: Path, sensor: Element) -> tuple[str, ...]:
             f"{path}: sensor {label}: its additional corrections,"
             f" {np.sqrt((values**2).sum() / 2.0):.2f} px rms, are left out."
         )
-    if any(_is_on(p) for p in sensor.iterfind("property") if _is_of_shutter(p)):
+    properties = {p.get("name") or "": p.get("value") or "" for p in sensor.iterfind("property")}
+    if any(
+        name.startswith("rolling_shutter") and value.lower() not in _OFF
+        for name, value in properties.items()
+    ):
         notes.append(
             f"{path}: sensor {label}: its rolling shutter compensation is left out; each image"
             " has one pose."
         )
     return tuple(notes)
-
-
-def _is_of_shutter(entry: Element) -> bool:
-    return (entry.get("name") or "").startswith("rolling_shutter")
-
-
-def _is_on(entry: Element) -> bool:
-    return (entry.get("value") or "").lower() not in ("", "0", "false", "disabled", "none")
 
 
 def _calibration(sensor: Element) -> Element | None:
@@ -252,15 +251,8 @@ DISTORTION = ("k1", "k2", "k3", "p1", "p2")
 
 
 def given_lenses(path: Path) -> dict[str, Lens]:
-    """Return the calibrations that were given, by the name of the sensor.
+    """Return the calibrations that were given, by the name of the sensor; none of other software.
 
-    Parameters
-    ----------
-    path : Path
-        A camera file or folder of any software; there are none but in Metashape's.
-
-    Notes
-    -----
     The calibration of class ``initial`` counts if it has distortion. Without, it is the focal
     length that the images' EXIF states, which says little.
     """

@@ -27,8 +27,8 @@ from __future__ import annotations
 
 import mmap
 import re
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -146,19 +146,8 @@ SCALE_TOLERANCE = 0.1
 _REFERENCE = re.compile(rb'"(latitude|longitude)"\s*:\s*(-?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)')
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """The affine map from a reconstruction to `crs`: p -> matrix p + shift.
-
-    Attributes
-    ----------
-    matrix : array, shape (3, 3)
-    shift : array, shape (3,)
-        Metres.
-    crs : str
-    project_crs : str or None
-        As in `Cameras`.
-    """
+class Frame(NamedTuple):
+    """The affine map from a reconstruction to `crs`: p -> matrix p + shift, metres."""
 
     matrix: FloatArray
     shift: FloatArray

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass
 from pathlib import PurePath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +12,7 @@ from pcfix.io.cameras import checks
 from pcfix.io.cameras.opensfm import left_out
 from pcfix.io.cameras.opensfm.models import is_panorama, lens
 from pcfix.io.cameras.values import json_number, load_json, mapping, rows, vector
+from pcfix.io.crs import GEOCENTRIC_WGS84, GEOGRAPHIC_WGS84, Topocentric
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, GnssPositions, Lens
 
@@ -32,16 +31,8 @@ _FOLDERS = ("", "opensfm", "odm_georeferencing", "odm_georeferencing_25d", "odm_
 _LINK_BYTES = 400
 
 
-@dataclass(frozen=True)
-class Project:
-    """A project folder and the file in it that has the poses.
-
-    Attributes
-    ----------
-    root : Path
-    poses : Path or None
-        shots.geojson or a reconstruction; None where there is neither.
-    """
+class Project(NamedTuple):
+    """A project folder and the file in it that has the poses, shots.geojson or a reconstruction."""
 
     root: Path
     poses: Path | None
@@ -118,8 +109,6 @@ def _link(path: Path) -> str | None:
 WHOLE_M = 2e-3
 """Newer ODM puts the origin at whole metres; reference_lla is rounded a little."""
 
-_UTM = re.compile(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
-
 
 def named_crs(path: Path) -> str:
     """Return the CRS in the first line of a file: a PROJ string, EPSG:n or WGS84 UTM 16N."""
@@ -128,8 +117,7 @@ def named_crs(path: Path) -> str:
 
     text = path.read_bytes()[:4096].decode("utf-8-sig", errors="replace").strip()
     line = text.splitlines()[0].strip() if text else ""
-    utm = _UTM.match(line)
-    crs = _utm_code(int(utm[1]), utm[2].upper() == "N") if utm else line
+    crs = checks.utm_as_code(line)
     try:
         CRS.from_user_input(crs)
     except CRSError as error:
@@ -165,22 +153,17 @@ def from_topocentric(
     """Return topocentric points in a projected CRS, heights on the ellipsoid, shape (n, 3)."""
     from pyproj import Transformer
 
-    lat, lon, height = reference
-    local = Transformer.from_pipeline(
-        f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lat_0={lat!r} +lon_0={lon!r}"
-        f" +h_0={height!r} +step +inv +proj=cart +ellps=WGS84"
+    to_degrees = Transformer.from_crs(GEOCENTRIC_WGS84, GEOGRAPHIC_WGS84, always_xy=True)
+    geographic = np.column_stack(
+        to_degrees.transform(*Topocentric(*reference).to_geocentric(xyz).T)
     )
-    geographic = np.column_stack(local.transform(xyz[:, 0], xyz[:, 1], xyz[:, 2]))
     return np.column_stack([_projected(crs, *geographic[:, :2].T).T, geographic[:, 2]])
 
 
 def _zones(lat: float, lon: float) -> list[str]:
     zone = int((lon + 180.0) // 6.0) if np.isfinite(lon) else 0
-    return [_utm_code((zone + step) % 60 + 1, lat >= 0.0) for step in (0, -1, 1)]
-
-
-def _utm_code(zone: int, north: bool) -> str:
-    return f"EPSG:{(32600 if north else 32700) + zone}"
+    first = 32601 if lat >= 0.0 else 32701
+    return [f"EPSG:{first + (zone + step) % 60}" for step in (0, -1, 1)]
 
 
 def _projected(crs: str, lon: float | FloatArray, lat: float | FloatArray) -> FloatArray:

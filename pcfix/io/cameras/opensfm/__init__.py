@@ -20,9 +20,8 @@ https://opensfm.org/docs.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -98,27 +97,13 @@ NO_GNSS = 999999.0
 """The gps_dop that OpenSfM writes for an image without a position."""
 
 
-@dataclass(frozen=True, eq=False)
-class Reconstruction:
-    """What the largest reconstruction of a file holds.
+class Reconstruction(NamedTuple):
+    """What the largest reconstruction of a file holds, in the frame of the file.
 
-    Attributes
-    ----------
-    path : Path
-    labels : tuple of str, length k
-    centres, rotations : array, shapes (k, 3) and (k, 3, 3)
-        In the frame of the file.
-    lenses : tuple of Lens, length k
-    gnss_xyz, gnss_sigma_m : array, shape (k, 3)
-        Topocentric at `reference`, NaN where there is none.
-    reference : tuple of 3 float, or None
-        Latitude and longitude in degrees, height in metres of the topocentric origin; None where
-        the file has none, or the made-up one that OpenSfM gives to images without positions.
-    points : dict
-        Tie points as in the file.
-    left_out : tuple of str
-        Images that are not among `labels`.
-    notes : tuple of str
+    `gnss_xyz` and `gnss_sigma_m`, shape (k, 3), are topocentric at `reference`, NaN where there is
+    none. `reference` is latitude and longitude in degrees and the height in metres of the
+    topocentric origin; None where the file has none, or the made-up one that OpenSfM gives to
+    images without positions. `left_out` are images that are not among `labels`.
     """
 
     path: Path
@@ -306,13 +291,7 @@ CHUNK_BYTES = 1 << 24
 
 
 def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
-    """Return the points in the frame of the file, and where its images saw them.
-
-    Raises
-    ------
-    InputError
-        If there are no points or no tracks.csv, or a line of it is damaged.
-    """
+    """Return the points in the frame of the file, and where its images saw them."""
     path, points = reconstruction.path, reconstruction.points
     if not points:
         raise InputError(f"{path}: has no tie points.")
@@ -327,7 +306,9 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
     order = np.lexsort((camera, point))
     start = np.concatenate([[0], np.cumsum(np.bincount(point, minlength=len(xyz)))])
     views = Views(start.astype(np.int64), camera[order])
-    return TiePoints(xyz, views, _pixels(xy[order], camera[order], reconstruction.lenses))
+    size = np.array([(lens.width, lens.height) for lens in reconstruction.lenses])[views.camera]
+    uv = xy[order] * size.max(axis=1, initial=0.0)[:, None] + size / 2.0
+    return TiePoints(xyz, views, np.asarray(uv))
 
 
 def _observations(
@@ -380,9 +361,3 @@ def _numbers(path: Path, lines: list[list[bytes]]) -> FloatArray:
     if not np.isfinite(xy).all():
         raise InputError(f"{path}: x or y of an observation is not finite.")
     return xy
-
-
-def _pixels(xy: FloatArray, camera: IntArray, lenses: tuple[Lens, ...]) -> FloatArray:
-    """Return image positions from the upper left corner, from those divided by the larger side."""
-    size = np.array([(lens.width, lens.height) for lens in lenses])[camera]
-    return np.asarray(xy * size.max(axis=1, initial=0.0)[:, None] + size / 2.0)

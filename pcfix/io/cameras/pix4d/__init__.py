@@ -118,22 +118,18 @@ def read_block(source: Source) -> Cameras:
         lenses = lenses_of_images(files.parameters, used, calibrations)
     labels, posed = tuple(poses.labels), set(poses.labels)
     gnss, others = (None, ()) if files.project is None else read_project(files.project, labels)
+    wkt = "" if files.wkt is None else read_text(files.wkt).strip()
     return Cameras(
         labels=labels,
         centres=poses.centres,
         rotations=poses.rotations,
         lenses=lenses,
-        crs=_crs(files.wkt),
+        crs=checks.crs(files.wkt, wkt) if files.wkt and wkt else None,
         notes=(*poses.notes, *checks.repeated(source.path, labels)),
         gnss=gnss,
         unposed=tuple(dict.fromkeys(n for n in (*poses.unposed, *others) if n not in posed)),
         source="Pix4D",
     )
-
-
-def _crs(path: Path | None) -> str | None:
-    text = "" if path is None else read_text(path).strip()
-    return checks.crs(path, text) if path is not None and text else None
 
 
 def _external_only(

@@ -157,7 +157,7 @@ def _without_copies(columns: Columns, xyz: FloatArray) -> tuple[IntArray, tuple[
 WGS84, WGS84_ELLIPSOIDAL = "EPSG:4326", "EPSG:4979"
 GEO = ("label", "x", "y", "z", "yaw", "pitch", "roll", "accuracy_horz", "accuracy_vert")
 """Fields of ODM's geo.txt, the last six optional; more may follow."""
-_GEO_CRS = re.compile(r"(EPSG:\d+|\+proj=.+|WGS84 UTM (\d\d?)\s*([NS]))\s*", re.IGNORECASE)
+_GEO_CRS = re.compile(r"(EPSG:\d+|\+proj=.+|WGS84 UTM \d\d?\s*[NS])\s*", re.IGNORECASE)
 
 
 def read_gnss(path: str | os.PathLike[str]) -> tuple[tuple[str, ...], GnssPositions]:
@@ -274,14 +274,9 @@ def _read_geo(path: Path, lines: list[str]) -> Columns:
     place = {name: GEO.index(name) for name in ("label", "x", "y", "z")}
     place |= {"sigma_x": 7, "sigma_y": 7, "sigma_z": 8}  # its angles may be 0 for unknown
     table = Table(path, list(GEO), rows, numbers)
-    return Columns(table, place, [""] * len(GEO), after_hash=False, crs=_geo_crs(lines[0]))
-
-
-def _geo_crs(line: str) -> str:
-    found = _GEO_CRS.fullmatch(line)
-    if found is None or found[2] is None:
-        return line.strip()
-    return f"EPSG:32{'6' if found[3].upper() == 'N' else '7'}{int(found[2]):02d}"
+    return Columns(
+        table, place, [""] * len(GEO), after_hash=False, crs=checks.utm_as_code(lines[0].strip())
+    )
 
 
 def _is_geographic(name: str | None) -> bool:

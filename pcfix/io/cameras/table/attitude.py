@@ -30,17 +30,7 @@ LOOKS_DOWN_DEG = 80.0
 def read_rotations(columns: Columns, angles: Angles | None, suffix: str = "") -> FloatArray | None:
     """Return world to camera rotations, or None where the table has nothing that turns.
 
-    Parameters
-    ----------
-    columns : Columns
-    angles : Angles or None
-        What the user says that the angles are.
-    suffix : str
-        ``_est`` for the columns of adjusted values.
-
-    Returns
-    -------
-    array, shape (k, 3, 3), or None
+    `angles` is what the user says that they are, `suffix` is ``_est`` for adjusted values.
     """
     opk, ypr = (tuple(a + suffix for a in kind) for kind in (OMEGA_PHI_KAPPA, YAW_PITCH_ROLL))
     for kind in (opk, ypr, QUATERNION, MATRIX):

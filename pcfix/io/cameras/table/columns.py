@@ -165,20 +165,11 @@ METRES = {"": 1.0, "m": 1.0, "metre": 1.0, "metres": 1.0, "meter": 1.0, "meters"
 
 @dataclass(frozen=True)
 class Columns:
-    """A table whose columns are known.
+    """A table whose columns are known; its header has their names, lower case, without units.
 
-    Attributes
-    ----------
-    table : Table
-        Its header has the names of the file, lower case, without their units.
-    place : dict
-        From what a column is, a key of `SPELLINGS`, to its number.
-    unit : list of str
-        Of each column, as the header has it.
-    after_hash : bool
-        Whether the header is a comment.
-    crs : str or None
-        What a comment says.
+    `place` leads from what a column is, a key of `SPELLINGS`, to its number; `unit` is that of each
+    column as the header has it; the header is a comment where `after_hash`; `crs` is what a comment
+    says.
     """
 
     table: Table

@@ -1,165 +1,66 @@
-"""What a camera file says, and whether it fits a cloud."""
+"""What a camera file and a water surface are, and whether they fit a cloud."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from os import PathLike
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from pcfix.adjust.evidence import Evidence
 from pcfix.errors import InputError, SettingError
+from pcfix.flow.diagnosis import (
+    command_of,
+    diagnose,
+    focal_length_of,
+    given_focal_lengths,
+    ties_of,
+)
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.points import CHUNK_POINTS
-from pcfix.flow.surfaces import view_of
+from pcfix.flow.surfaces import CloudView, WaterWords, find_surface, view_of
 from pcfix.io.cameras.georeference import adjusted_minus_gnss
 from pcfix.io.cameras.mistakes import likely_mistake
+from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.io.files import check_input, check_output, write_bytes
+from pcfix.io.gnss_positions import read_gnss
+from pcfix.io.ground_control import read_ground_control
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.lens.frames import cameras_in_sight
 from pcfix.model import WaterDimension
 from pcfix.options import DEFAULT_REFRACTIVE_INDEX
+from pcfix.report.cameras import CamerasReport, Fit, GnssResiduals, Sensor, block_figure
+from pcfix.report.page import png_of
+from pcfix.report.water import WaterReport, water_figure
 from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
-    from os import PathLike
-
     from pcfix.adjust.diagnosis import Diagnosis
-    from pcfix.flow.surfaces import CloudView
     from pcfix.model import Cameras, FloatArray, Lens, WaterSurface
 
-    AnyPath = str | PathLike[str]
+AnyPath = str | PathLike[str]
 
-SAMPLE_POINTS = 50_000
-"""Points of the cloud that are looked for in the frames, evenly spread over the file."""
-
-
+SAMPLE_POINTS, WATER_SAMPLE_POINTS = 50_000, 200_000
+"""Points of the cloud that are looked for in the frames, and below the water; evenly spread."""
 LEAST_SEEN_TWICE = 0.9
 """Share of a cloud that two frames or more should hold, as two made each point."""
 
 
-@dataclass(frozen=True)
-class Sensor:
-    """The images of one interior orientation; None where the file does not say."""
+class Survey(NamedTuple):
+    """What else tells whether the poses have absorbed the refraction."""
 
-    name: str
-    images: int
-    width: float
-    height: float
-    focal: float
-    unit: str
-    focal_mm: float | None
-    pixel_size_um: float | None
-    projection: str
-    distorted: bool
-    gsd_m: float | None
+    gcps: AnyPath | None
+    lens: AnyPath | None
+    reference: AnyPath | None
 
-
-@dataclass(frozen=True)
-class GnssResiduals:
-    """Adjusted centres minus positions of the GNSS, metres east, north, up."""
-
-    images: int
-    mean_m: tuple[float | None, ...]
-    sd_m: tuple[float | None, ...]
-    largest_m: float
-    largest_image: str
-    reason: str
-
-
-@dataclass(frozen=True)
-class Fit:
-    """How cameras and cloud lie to each other.
-
-    Attributes
-    ----------
-    seen_by : dict
-        Share of the cloud's points that 0, 1, 2, 3 or more cameras have in their frame.
-    distance_m : float
-        In plan, between the boxes around block and cloud.
-    below_ground : int
-        Cameras lower than the cloud's highest point within their reach in plan.
-    verdict : str
-        What is likely wrong; empty where they fit.
-    """
-
-    cloud: str
-    points_sampled: int
-    seen_by: dict[str, float]
-    distance_m: float
-    below_ground: int
-    verdict: str
-
-    @property
-    def fits(self) -> bool:
-        """Whether nothing looks wrong."""
-        return not self.verdict
-
-
-@dataclass(frozen=True, eq=False)
-class CamerasReport:
-    """What ``pcfix cameras`` says.
-
-    Attributes
-    ----------
-    path, source : str
-    cameras : Cameras
-        In the cloud's CRS, where there is a cloud.
-    crs_read, crs : str or None
-        Of the file, and of `cameras`.
-    sensors : tuple of Sensor
-    height_above_water_m : tuple of 3 float, or None
-        Least, mean, most; above the water where it is known, else None.
-    tilt_deg : tuple of 2 float, or None
-        Median and largest angle of the optical axes from nadir.
-    gnss : GnssResiduals or None
-    fit : Fit or None
-    sample_xyz : array, shape (m, 3)
-        Points of the cloud, for a picture; none without a cloud.
-    level_m : float or None
-        Mean height of the water.
-    problem : str
-        Why `cameras` are not in a map and so have no heights; empty where they are.
-    diagnosis : Diagnosis or None
-        Whether the poses have absorbed the refraction; None without a cloud or water.
-    remedy : str
-        The command that mends them.
-    """
-
-    path: str
-    source: str
-    cameras: Cameras
-    crs_read: str | None
-    crs: str | None
-    sensors: tuple[Sensor, ...]
-    height_above_water_m: tuple[float, float, float] | None
-    tilt_deg: tuple[float, float] | None
-    gnss: GnssResiduals | None
-    fit: Fit | None
-    sample_xyz: FloatArray
-    level_m: float | None
-    problem: str = ""
-    diagnosis: Diagnosis | None = None
-    remedy: str = ""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        fit = None if self.fit is None else {**asdict(self.fit), "fits": self.fit.fits}
-        return {
-            "path": self.path,
-            "source": self.source,
-            "images_posed": len(self.cameras),
-            "images_unposed": list(self.cameras.unposed),
-            "crs_read": self.crs_read,
-            "crs": self.crs,
-            "sensors": [asdict(sensor) for sensor in self.sensors],
-            "height_above_water_m": self.height_above_water_m,
-            "tilt_deg": self.tilt_deg,
-            "problem": self.problem,
-            "gnss": None if self.gnss is None else asdict(self.gnss),
-            "fit": fit,
-            "refraction": None if self.diagnosis is None else self.diagnosis.as_dict(),
-            "notes": list(self.cameras.notes),
-        }
+    def refuse(self) -> None:
+        """Refuse it without the cloud and the water that it is about."""
+        for name, value in self._asdict().items():
+            if value is not None:
+                raise SettingError(
+                    f"{name} {value}: tells whether the poses have absorbed the refraction; give"
+                    " cloud and water too."
+                )
 
 
 def check_cameras(
@@ -174,7 +75,7 @@ def check_cameras(
     refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
     plot: AnyPath | None = None,
     overwrite: bool = False,
-    **words: Any,
+    **options: Any,
 ) -> CamerasReport:
     """Read cameras and say what they are, and whether they fit a cloud; ``pcfix cameras``.
 
@@ -202,7 +103,7 @@ def check_cameras(
         PNG of the block in plan and from the side.
     overwrite : bool
         Replace a picture that exists.
-    **words
+    **options
         ``sensor``, ``angles``, ``cameras_crs``, ``cameras_offset_m``; see `pcfix.correct_file`.
 
     Returns
@@ -214,35 +115,30 @@ def check_cameras(
     PcfixError
         If a file cannot be read, or the two CRS cannot be reconciled.
     """
-    evidence = (gnss, gcps, lens, reference)
+    survey = Survey(gcps, lens, reference)
     if plot is not None:
-        given = [p for p in (path, cloud, *evidence) if p is not None]
+        given = [p for p in (path, cloud, gnss, *survey) if p is not None]
         check_output(plot, overwrite=overwrite, inputs=given)
-    _check_enough(cloud, water, gcps, lens, reference)
-    inputs = Inputs(path, 0.0 if water is None else water, **words)
+    if cloud is None or water is None:
+        survey.refuse()
+    inputs = Inputs(path, 0.0 if water is None else water, **options)
     read = inputs.read()
     crs, xyz, heights = None, np.zeros((0, 3)), None
     view = None if cloud is None else view_of(check_input(cloud))
     surface = None if water is None else inputs.surface(view).surface
     if cloud is not None:
+        dimension = surface.name if isinstance(surface, WaterDimension) else None
         with LasSource(check_input(cloud)) as source:
             crs = metric_crs(source)
-            dimension = surface.name if isinstance(surface, WaterDimension) else None
-            xyz, heights = _sample(source, dimension)
+            xyz, heights = _sample(source, SAMPLE_POINTS, dimension)
         cameras, problem = inputs.block(crs, read)[0], ""
     else:
         cameras, problem = _without_cloud(inputs, read)
     if gnss is not None:
-        from pcfix.io.gnss_positions import read_gnss
-
         cameras = read_gnss(gnss, cameras)
     diagnosis, remedy = None, ""
     if view is not None and surface is not None:
-        diagnosis = _diagnosis(
-            inputs, cameras, view, surface, refractive_index, gcps, lens, reference
-        )
-        from pcfix.flow.diagnosis import command_of
-
+        diagnosis = _diagnosis(inputs, cameras, view, (surface, refractive_index), survey)
         remedy = command_of(inputs, view.name, gnss=gnss, gcps=gcps, lens=lens)
     level = None
     if surface is not None and not (isinstance(surface, WaterDimension) and heights is None):
@@ -251,57 +147,93 @@ def check_cameras(
         level = float(np.nanmean(known)) if np.isfinite(known).any() else None
     above = None if level is None else cameras.centres[:, 2] - level
     report = CamerasReport(
-        str(path), cameras.source, cameras,
-        read.crs, cameras.crs, _sensors(cameras, above),
-        None if above is None else (float(above.min()), float(above.mean()), float(above.max())),
-        None if problem else _tilt_deg(cameras), _gnss(cameras, str(path)),
-        None if cloud is None else _fit(cameras, str(cloud), xyz, crs), xyz, level, problem,
-        diagnosis, remedy,
-    )  # fmt: skip
+        path=str(path),
+        source=cameras.source,
+        cameras=cameras,
+        crs_read=read.crs,
+        crs=cameras.crs,
+        sensors=_sensors(cameras, above),
+        height_above_water_m=None
+        if above is None
+        else (float(above.min()), float(above.mean()), float(above.max())),
+        tilt_deg=None if problem else _tilt_deg(cameras),
+        gnss=_gnss(cameras, str(path)),
+        fit=None if cloud is None else _fit(cameras, str(cloud), xyz, crs),
+        sample_xyz=xyz,
+        level_m=level,
+        problem=problem,
+        diagnosis=diagnosis,
+        remedy=remedy,
+    )
     if plot is not None:
-        from pcfix.report.cameras import block_figure
-        from pcfix.report.figures import png_of
-
         write_bytes(plot, png_of(block_figure(report)), overwrite=overwrite)
     return report
 
 
-def _check_enough(
-    cloud: AnyPath | None, water: AnyPath | float | None,
-    gcps: AnyPath | None, lens: AnyPath | None, reference: AnyPath | None,
-) -> None:  # fmt: skip
-    """Refuse evidence on the refraction without the cloud and the water that it is about."""
-    for name, value in (("gcps", gcps), ("lens", lens), ("reference", reference)):
-        if value is not None and (cloud is None or water is None):
-            raise SettingError(
-                f"{name} {value}: tells whether the poses have absorbed the refraction; give cloud"
-                " and water too."
-            )
+def check_water(
+    water: WaterWords,
+    cloud: AnyPath | None = None,
+    *,
+    plot: AnyPath | None = None,
+    overwrite: bool = False,
+) -> WaterReport:
+    """Read, fit or find a water surface, and say what it is; ``pcfix water``.
+
+    Parameters
+    ----------
+    water : WaterWords
+    cloud : path, optional
+        LAS or LAZ cloud under it.
+    plot : path, optional
+        PNG of points, residuals or evidence.
+    overwrite : bool
+        Replace a picture that exists.
+
+    Raises
+    ------
+    PcfixError
+        With one sentence on what to mend.
+    """
+    if plot is not None:
+        check_output(plot, overwrite=overwrite, inputs=[] if cloud is None else [cloud])
+    view = None if cloud is None else view_of(check_input(cloud))
+    found = find_surface(water, view)
+    sample = np.zeros((0, 3))
+    below = unknown = None
+    if cloud is not None:
+        with LasSource(check_input(cloud)) as source:
+            sample, _ = _sample(source, WATER_SAMPLE_POINTS)
+        if not isinstance(found.surface, WaterDimension):
+            height = surface_above(found.surface, sample, None).height_m
+            unknown = float(np.mean(~np.isfinite(height)))
+            below = float(np.mean(sample[:, 2] < height))
+    report = WaterReport(
+        str(water.water), found, None if view is None else view.name, below, unknown, sample
+    )
+    if plot is not None:
+        write_bytes(plot, png_of(water_figure(report)), overwrite=overwrite)
+    return report
 
 
 def _diagnosis(
-    inputs: Inputs, cameras: Cameras, view: CloudView, water: WaterSurface,
-    refractive_index: float, gcps: AnyPath | None, lens: AnyPath | None,
-    reference: AnyPath | None,
-) -> Diagnosis:  # fmt: skip
-    """Look for all signs that the poses have absorbed the refraction."""
-    from pcfix.adjust.evidence import Evidence
-    from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, ties_of
-    from pcfix.io.clouds import check_same_crs, read_reference
-    from pcfix.io.ground_control import read_ground_control
-
-    path = str(inputs.cameras)
-    survey = None if reference is None else read_reference(reference)
-    if survey is not None:
+    inputs: Inputs,
+    cameras: Cameras,
+    view: CloudView,
+    water: tuple[WaterSurface, float],
+    survey: Survey,
+) -> Diagnosis:
+    """Look for all signs that the poses have absorbed the refraction; `water` has its index."""
+    path, lens = str(inputs.cameras), survey.lens
+    reference = None if survey.reference is None else read_reference(survey.reference)
+    if reference is not None:
         crs = None if isinstance(view.crs, str) else view.crs
-        check_same_crs(view.name, crs, survey.name, survey.crs)
-    control = None if gcps is None else read_ground_control(gcps, cameras)
-    focal = given_focal_lengths(path) if lens is None else focal_length_of(lens)
-    ties = ties_of(inputs, view.crs)
+        check_same_crs(view.name, crs, reference.name, reference.crs)
     return diagnose(
         Evidence(
-            cameras, path, water, refractive_index,
-            ties=ties, view=view, control=control, calibrated=focal, reference=survey,
+            cameras, path, *water, view=view, reference=reference,
+            control=None if survey.gcps is None else read_ground_control(survey.gcps, cameras),
+            calibrated=given_focal_lengths(path) if lens is None else focal_length_of(lens),
+            ties=ties_of(inputs, view.crs),
         )
     )  # fmt: skip
 
@@ -314,9 +246,11 @@ def _without_cloud(inputs: Inputs, read: Cameras) -> tuple[Cameras, str]:
         return read, str(error)
 
 
-def _sample(source: LasSource, dimension: str | None) -> tuple[FloatArray, FloatArray | None]:
+def _sample(
+    source: LasSource, most: int, dimension: str | None = None
+) -> tuple[FloatArray, FloatArray | None]:
     """Return points evenly spread over the file, and their water heights where asked for."""
-    every = max(1, len(source) // SAMPLE_POINTS)
+    every = max(1, len(source) // most)
     parts, heights = [], []
     for points in source.chunks(CHUNK_POINTS):
         parts.append(coordinates(points)[::every])

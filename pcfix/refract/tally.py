@@ -1,0 +1,197 @@
+"""What a correction came to, added up chunk by chunk in bounded memory, and the orders of S-44.
+
+Vertical uncertainty is in the terms of hydrographic surveys: TVU at 95 %, IHO S-44, edition 6.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from pcfix.model import Outcome
+
+if TYPE_CHECKING:
+    from pcfix.model import BoolArray, Correction, FloatArray
+
+COVERAGE_95 = 1.96
+"""Standard errors of a Gaussian quantity within which 95 % lie, as S-44 takes it in one dimension.
+"""
+REASONS = {
+    Outcome.NO_CAMERA: "no camera has it in its frame, or in its list of views",
+    Outcome.ONE_CAMERA: "one usable ray only",
+    Outcome.PARALLEL_RAYS: "rays nearly parallel",
+}
+_BIN_M = 0.001
+
+
+class Order(NamedTuple):
+    """An order of survey and the two parameters of its largest TVU."""
+
+    name: str
+    a_m: float
+    b: float
+
+
+ORDERS = (
+    Order("Exclusive", 0.15, 0.0075),
+    Order("Special", 0.25, 0.0075),
+    Order("1a/1b", 0.5, 0.013),
+    Order("2", 1.0, 0.023),
+)
+"""IHO S-44, edition 6, table 1, strictest first; 1a and 1b differ in what must be found, not here.
+"""
+
+
+def largest_tvu_m(order: Order, depth_m: FloatArray) -> FloatArray:
+    """Return the largest total vertical uncertainty at 95 % that an order allows.
+
+    IHO S-44, edition 6, section 3.2: sqrt(a^2 + (b d)^2).
+
+    Parameters
+    ----------
+    order : Order
+    depth_m : array
+        Depths d, positive down.
+    """
+    return np.asarray(np.hypot(order.a_m, order.b * depth_m))
+
+
+class _Histogram:
+    """Sum and percentiles, to a millimetre, of values that are added array by array.
+
+    Values beyond `low_m` and `high_m` share the last bins, which only percentiles would notice.
+    """
+
+    def __init__(self, low_m: float, high_m: float) -> None:
+        self.count = 0
+        self._low_m, self._high_m = low_m, high_m
+        self._sum_m = 0.0
+        self._bins = np.zeros(round((high_m - low_m) / _BIN_M) + 1, dtype=np.int64)
+
+    def add(self, values_m: FloatArray) -> None:
+        self.count += len(values_m)
+        self._sum_m += float(values_m.sum())
+        places = np.rint((np.clip(values_m, self._low_m, self._high_m) - self._low_m) / _BIN_M)
+        self._bins += np.bincount(places.astype(np.int64), minlength=len(self._bins))
+
+    def mean_m(self) -> float:
+        return self._sum_m / self.count
+
+    def percentile_m(self, percent: float) -> float:
+        place = int(np.searchsorted(np.cumsum(self._bins), percent / 100.0 * self.count))
+        return place * _BIN_M + self._low_m
+
+
+class UncertaintyTally:
+    """Adds up standard errors of Z."""
+
+    def __init__(self) -> None:
+        self._sigma = _Histogram(0.0, 10.0)
+        self._most_m = 0.0
+        self._within = np.zeros(len(ORDERS), dtype=np.int64)
+
+    def add(self, sigma_z_m: FloatArray, depth_m: FloatArray) -> None:
+        """Add corrected points: standard errors of Z and depths, metres, shape (m,)."""
+        if not len(sigma_z_m):
+            return
+        self._sigma.add(sigma_z_m)
+        self._most_m = max(self._most_m, float(sigma_z_m.max()))
+        tvu_m = COVERAGE_95 * sigma_z_m
+        for i, order in enumerate(ORDERS):
+            self._within[i] += int((tvu_m <= largest_tvu_m(order, depth_m)).sum())
+
+    def as_dict(self) -> dict[str, Any] | None:
+        """Return the figures as plain values; None where no point has a standard error.
+
+        `sigma_z_m` holds mean, percentiles (to a millimetre) and largest; `tvu_95_m` is 1.96 times
+        these; `s44` the share of the points, 0 to 1, within the TVU of each order.
+        """
+        if self._most_m == 0.0:
+            return None
+        percentiles = {f"p{p}": self._sigma.percentile_m(p) for p in (5, 50, 95)}
+        sigma = {"mean": self._sigma.mean_m(), **percentiles, "max": self._most_m}
+        return {
+            "sigma_z_m": _rounded(**sigma),
+            "tvu_95_m": _rounded(**{name: COVERAGE_95 * value for name, value in sigma.items()}),
+            "s44": {
+                order.name: round(int(within) / self._sigma.count, 6)
+                for order, within in zip(ORDERS, self._within, strict=True)
+            },
+        }
+
+
+class Tally:
+    """Counts, extremes, and histograms of shift and standard error in Z, over all chunks so far."""
+
+    def __init__(self, cameras: int) -> None:
+        self.points = 0
+        self.water_unknown = 0
+        self.rays = 0
+        self.outcomes = np.zeros(len(Outcome), dtype=np.int64)
+        self.camera_used: BoolArray = np.zeros(cameras, dtype=np.bool_)
+        self.low: FloatArray = np.full(3, np.inf)
+        self.high: FloatArray = np.full(3, -np.inf)
+        self.lowest_water_m = np.inf
+        self._depth_low_m, self._depth_high_m, self._depth_sum_m = np.inf, -np.inf, 0.0
+        self._shift = _Histogram(-100.0, 100.0)
+        self._uncertainty = UncertaintyTally()
+
+    def add(self, apparent: FloatArray, correction: Correction) -> None:
+        """Add one chunk: the apparent points, shape (n, 3), and their correction."""
+        self.points += len(apparent)
+        self.water_unknown += int((~correction.water_known).sum())
+        self.rays += int(correction.ray_count.sum())
+        self.outcomes += np.bincount(correction.outcome, minlength=len(Outcome))
+        self.camera_used |= correction.camera_used
+        submerged = apparent[correction.submerged]
+        if len(submerged):
+            # axis by axis: numpy is slow along the short one
+            self.low = np.minimum(self.low, [values.min() for values in submerged.T])
+            self.high = np.maximum(self.high, [values.max() for values in submerged.T])
+        self.lowest_water_m = min(self.lowest_water_m, correction.lowest_water_m)
+        moved = correction.corrected
+        if moved.any():
+            depth = correction.depth_m[moved]
+            self._depth_low_m = min(self._depth_low_m, float(depth.min()))
+            self._depth_high_m = max(self._depth_high_m, float(depth.max()))
+            self._depth_sum_m += float(depth.sum())
+            self._shift.add(correction.shift_m[moved, 2])
+            self._uncertainty.add(correction.sigma_z_m[moved], depth)
+
+    @property
+    def submerged(self) -> int:
+        """Points below the surface so far."""
+        neither = self.outcomes[Outcome.LAND] + self.outcomes[Outcome.NOT_CARRIED]
+        return int(self.outcomes.sum() - neither)
+
+    @property
+    def corrected(self) -> int:
+        """Points moved so far."""
+        return int(self.outcomes[Outcome.CORRECTED])
+
+    def uncorrected(self) -> dict[str, int]:
+        """Return how many submerged points were not moved, by reason."""
+        return {text: int(self.outcomes[reason]) for reason, text in REASONS.items()}
+
+    def depth_m(self) -> dict[str, float]:
+        """Return the range and mean of the corrected depth."""
+        if not self.corrected:
+            return {}
+        mean = self._depth_sum_m / self.corrected
+        return _rounded(min=self._depth_low_m, mean=mean, max=self._depth_high_m)
+
+    def shift_z_m(self) -> dict[str, float]:
+        """Return mean and 5 and 95 % points of the shift in Z; percentiles to a millimetre."""
+        if not self.corrected:
+            return {}
+        p5, p95 = (self._shift.percentile_m(percent) for percent in (5, 95))
+        return _rounded(mean=self._shift.mean_m(), p5=p5, p95=p95)
+
+    def uncertainty(self) -> dict[str, Any] | None:
+        """Return standard error of Z, TVU and orders; see `UncertaintyTally.as_dict`."""
+        return self._uncertainty.as_dict()
+
+
+def _rounded(**values: float) -> dict[str, float]:
+    return {name: round(float(value), 4) for name, value in values.items()}

@@ -1,0 +1,427 @@
+"""The page of a run: what a correction came to, in words, pictures and tables.
+
+And what it says of the adjustment that the run began with.
+"""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pcfix.grid.model import NO_LIGHT, hillshade
+from pcfix.model import WaterPlane
+from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
+from pcfix.report.adjustment_text import WHERE, fixed, lens_label, listed, short
+from pcfix.report.page import (
+    AFTER,
+    BEFORE,
+    WATER,
+    Layer,
+    Picture,
+    Report,
+    Table,
+    label_plan,
+    new_figure,
+    new_map,
+)
+from pcfix.report.text import errors_of, share, tvu_sentence
+from pcfix.version import __version__
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from matplotlib.figure import Figure
+
+    from pcfix.grid.maps import Maps
+    from pcfix.model import BoolArray, Cameras, FloatArray, Summary, WaterSurface
+
+Plain = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """A corrected cloud and what it was corrected with.
+
+    Attributes
+    ----------
+    summary : Summary
+    cameras : Cameras
+    water : WaterSurface
+    maps : Maps
+    sample : array, shape (m, 5)
+        Shift, depth and standard error of Z of corrected points, metres; zero where none is.
+    """
+
+    summary: Summary
+    cameras: Cameras
+    water: WaterSurface
+    maps: Maps
+    sample: FloatArray
+
+
+def run_report(
+    corrected: Corrected,
+    files: Table,
+    more: tuple[Sequence[Picture], Sequence[Table]] = ((), ()),
+    verdict: str = "",
+) -> Report:
+    """Return what the page of a run says.
+
+    Parameters
+    ----------
+    corrected : Corrected
+    files : Table
+        The files that went in.
+    more : pair of sequences
+        Pictures and tables of later steps.
+    verdict : str
+        A sentence that they come to.
+    """
+    s, maps = corrected.summary, corrected.maps
+    return Report(
+        title=f"Refraction correction of {Path(s.input).name}",
+        lead=_lead(s) + verdict,
+        facts=_facts(s),
+        warnings=_warnings(s),
+        maps=maps,
+        layers=[
+            Layer("Depth", "m", maps.depth_m),
+            Layer("Height", "m", maps.height_m),
+            Layer("Shift in Z", "m", maps.shift_z_m),
+            Layer("Shift in plan", "m", maps.shift_xy_m),
+            Layer("Rays", "", maps.rays),
+        ],
+        pictures=[*_pictures(corrected), *_uncertainty_picture(corrected.sample, s), *more[0]],
+        tables=[*_orders(s), *more[1]],
+        provenance=[_settings(s), files, _versions()],
+    )
+
+
+def _lead(s: Summary) -> str:
+    mean = s.shift_z_m["mean"]
+    way = "higher" if mean > 0.0 else "deeper"
+    land = ""
+    if s.carried is not None:
+        land = (
+            f" First the whole cloud, land too, was taken from the cameras that made it to the"
+            f" adjusted ones, which moved it by {s.carried['shift_m']['rms']:.2f} m (rms)."
+        )
+    return (
+        f"{s.corrected:,} of {s.points:,} points lay under water and were moved to where the bed"
+        f" is: {abs(mean):.2f} m {way} on average, down to a depth of"
+        f" {s.depth_m['max']:.2f} m.{land}"
+    )
+
+
+def _facts(s: Summary) -> Table:
+    shift, depth = s.shift_z_m, s.depth_m
+    rows = [
+        ["Cloud", Path(s.input).name],
+        ["Water", f"{s.water}; refractive index {s.settings['refractive_index']:g}"],
+        ["Points", f"{s.points:,}"],
+        ["Under water", f"{s.submerged:,} ({share(s.submerged, s.points)} of the points)"],
+        ["Corrected", f"{s.corrected:,} ({share(s.corrected, s.submerged)} of these)"],
+        ["Depth", f"{depth['min']:.2f} to {depth['max']:.2f} m, mean {depth['mean']:.2f} m"],
+        ["Shift in Z", f"mean {shift['mean']:.3f} m; 90 % of the points lie between"
+         f" {shift['p5']:.3f} and {shift['p95']:.3f} m"],
+        ["Cameras", f"{s.cameras_used} of {s.cameras} see corrected points;"
+         f" {s.rays / max(s.corrected, 1):.1f} rays a point"],
+    ]  # fmt: skip
+    if s.uncertainty is not None:
+        tvu = s.uncertainty["tvu_95_m"]
+        rows.append(["Uncertainty", f"TVU at 95 % {tvu['mean']:.3f} m on average, formal;"
+                     f" {tvu_sentence(s.uncertainty)}"])  # fmt: skip
+    return Table("In short", [], rows)
+
+
+def _warnings(s: Summary) -> list[str]:
+    warnings = list(s.warnings)
+    fate = {"withhold": "flagged as withheld", "keep": "left as they were", "drop": "left out"}
+    for reason, count in s.uncorrected.items():
+        if count:
+            warnings.append(
+                f"{count:,} points under water could not be corrected ({reason}); they were not"
+                f" moved and are {fate[s.settings['uncorrected']]}."
+            )
+    if s.water_unknown:
+        warnings.append(f"{s.water_unknown:,} points have no known water surface above them.")
+    return warnings
+
+
+def _pictures(corrected: Corrected) -> list[Picture]:
+    s, maps, water = corrected.summary, corrected.maps, corrected.water
+    cameras = corrected.cameras
+    used = ~np.isin(np.array(cameras.labels), s.cameras_unused)
+    flat = isinstance(water, WaterPlane) and water.b == water.c == 0.0
+    level = water.a if isinstance(water, WaterPlane) and flat else None
+    depth, shift = s.depth_m, s.shift_z_m
+    return [
+        Picture(
+            "depth", "Depth",
+            f"Map of the corrected depth over the shaded relief; {depth['min']:.2f} to"
+            f" {depth['max']:.2f} m, mean {depth['mean']:.2f} m.",
+            map_figure(maps, maps.depth_m, "Depth (m)", "viridis_r"),
+        ),
+        Picture(
+            "shift", "Shift in Z",
+            f"Map of how far the bed moved down; mean {shift['mean']:.2f} m, growing with depth"
+            " and towards flat rays.",
+            map_figure(maps, maps.shift_z_m, "True minus apparent Z (m)", "magma"),
+        ),
+        Picture(
+            "shift_histogram", "How far the points moved",
+            "Histogram of the shift in Z of the corrected points.",
+            histogram_figure(
+                {"shift in Z": corrected.sample[:, 2]}, "True minus apparent Z (m)", gaussian=False
+            ),
+        ),
+        Picture(
+            "cameras", "Cameras",
+            f"Projection centres over the cloud, in plan and seen from the south;"
+            f" {s.cameras_used} of {s.cameras} see corrected points.",
+            cameras_figure(maps, cameras.centres, used, level),
+        ),
+    ]  # fmt: skip
+
+
+def map_figure(maps: Maps, values: FloatArray, label: str, colours: str) -> Figure:
+    """Draw a map of values over the shaded relief."""
+    figure, axes = new_map(maps.extent_m)
+    axes.imshow(
+        relief(maps.height_m, maps.cell_m), extent=maps.extent_m, cmap="gray", vmin=0.0, vmax=1.0
+    )
+    image = axes.imshow(values, extent=maps.extent_m, cmap=colours, alpha=0.75)
+    figure.colorbar(image, ax=axes, label=label, shrink=0.9)
+    return figure
+
+
+def relief(height_m: FloatArray, cell_m: float) -> FloatArray:
+    """Return the shade of a surface lit from the north-west, 45 degrees up, 0 to 1."""
+    light = hillshade(np.pad(height_m, 1, constant_values=np.nan), cell_m, 315.0, 45.0)
+    return np.where(light == NO_LIGHT, np.nan, (light - 1.0) / 254.0)
+
+
+def histogram_figure(groups: dict[str, FloatArray], label: str, *, gaussian: bool = True) -> Figure:
+    """Draw the distribution of one or two groups of values, each with its Gaussian if asked."""
+    figure, axes = new_figure()
+    everything = np.concatenate(list(groups.values()))
+    low, high = np.percentile(everything, [0.5, 99.5])
+    if high <= low:
+        low, high = low - 0.5, high + 0.5
+    edges = np.linspace(low, high, 81)
+    for colour, (name, values) in zip((BEFORE, AFTER), groups.items(), strict=False):
+        mean, deviation = float(values.mean()), float(values.std())
+        axes.hist(
+            values, edges, density=True, color=colour, alpha=0.55,
+            label=f"{name}: mean {mean:.3f}, sd {deviation:.3f}",
+        )  # fmt: skip
+        if gaussian and deviation > 0.0:
+            bell = np.exp(-0.5 * ((edges - mean) / deviation) ** 2)
+            axes.plot(edges, bell / (deviation * np.sqrt(2.0 * np.pi)), color=colour)
+    axes.set_xlabel(label)
+    axes.set_ylabel("Density")
+    axes.legend(loc="best")
+    return figure
+
+
+def cameras_figure(
+    maps: Maps, centres: FloatArray, used: BoolArray, water_m: float | None
+) -> Figure:
+    """Draw the projection centres in plan and in profile, shape (k, 3), over the cloud."""
+    figure, (plan, profile) = new_figure(8.0, 7.0, nrows=2, height_ratios=[3, 2])
+    plan.imshow(maps.height_m, extent=maps.extent_m, cmap="Greys_r", alpha=0.6)
+    marks = (used, "o", AFTER, "used"), (~used, "x", BEFORE, "not used")
+    for chosen, mark, colour, name in marks:
+        if chosen.any():
+            x, y, z = centres[chosen].T
+            plan.plot(x, y, mark, color=colour, label=name, markersize=4)
+            profile.plot(x, z, mark, color=colour, markersize=4)
+    label_plan(plan)
+    plan.legend(loc="best")
+    west, east, _, _ = maps.extent_m
+    columns = np.linspace(west, east, maps.height_m.shape[1])
+    with np.errstate(all="ignore"):
+        low, high = (
+            np.nanpercentile(np.where(np.isnan(maps.height_m), np.nan, maps.height_m), q, axis=0)
+            for q in (5, 95)
+        )
+    profile.fill_between(columns, low, high, color="0.6", label="cloud, 5 to 95 %")
+    if water_m is not None:
+        profile.axhline(water_m, color=WATER, label="water")
+    profile.ticklabel_format(style="plain", useOffset=False)
+    profile.set_xlabel("East (m)")
+    profile.set_ylabel("Height (m)")
+    profile.legend(loc="best")
+    return figure
+
+
+def _uncertainty_picture(sample: FloatArray, s: Summary) -> list[Picture]:
+    """Return TVU over depth, where the cloud has standard errors."""
+    known = sample[:, 4] > 0.0
+    if s.uncertainty is None or not known.any():
+        return []
+    words = (
+        "Total vertical uncertainty at 95 % (1.96 standard errors of Z) over depth, and the"
+        f" largest that the orders of IHO S-44 allow. It is formal: it assumes {errors_of(s)}"
+        " (standard deviations), and no mismatches. S-44 asks for more than the TVU: position,"
+        " features and coverage."
+    )
+    figure = tvu_figure(sample[known, 3], sample[known, 4])
+    return [Picture("uncertainty", "Vertical uncertainty", words, figure)]
+
+
+def tvu_figure(depth_m: FloatArray, sigma_z_m: FloatArray) -> Figure:
+    """Draw TVU at 95 % over depth, and the largest of the orders of IHO S-44 up to one above it.
+
+    Parameters
+    ----------
+    depth_m, sigma_z_m : array, shape (m,)
+        Depths and standard errors of Z of some points.
+    """
+    figure, axes = new_figure()
+    tvu = COVERAGE_95 * sigma_z_m
+    deepest = float(max(depth_m.max(), 1e-3))
+    edges = np.linspace(0.0, deepest * (1.0 + 1e-9), 31)
+    slot = np.clip(np.digitize(depth_m, edges) - 1, 0, 29)
+    filled = [i for i in range(30) if (slot == i).any()]
+    low, middle, high = np.array([np.percentile(tvu[slot == i], [5, 50, 95]) for i in filled]).T
+    centres = 0.5 * (edges[:-1] + edges[1:])[filled]
+    axes.fill_between(
+        centres, low, high, color=WATER, alpha=0.6, linewidth=0.0, label="90 % of the points"
+    )
+    axes.plot(centres, middle, color=AFTER, label="median")
+    depths = np.linspace(0.0, deepest, 100)
+    for order, style in zip(ORDERS, ("-", "--", "-.", ":"), strict=True):
+        largest = largest_tvu_m(order, depths)
+        name = order.name if order.name[0].isalpha() else f"order {order.name}"
+        axes.plot(depths, largest, style, color=BEFORE, label=f"IHO S-44 {name}")
+        if largest[0] > high.max():
+            break  # the laxer ones would only press the points down
+    axes.set_xlim(0.0, deepest)
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("Depth (m)")
+    axes.set_ylabel("TVU at 95 % (m)")
+    axes.legend(loc="best")
+    return figure
+
+
+def _orders(s: Summary) -> list[Table]:
+    """Return the share of the points within each order of IHO S-44."""
+    if s.uncertainty is None:
+        return []
+    shares = s.uncertainty["s44"]
+    rows = [
+        [order.name, f"{order.a_m:g} m", f"{order.b:g}", f"{100.0 * shares[order.name]:.4g} %"]
+        for order in ORDERS
+    ]
+    header = ["order", "a", "b", "points with TVU at 95 % within sqrt(a^2 + (b depth)^2)"]
+    return [Table("Orders of IHO S-44, vertical, formal", header, rows)]
+
+
+def _settings(s: Summary) -> Table:
+    rows = [[name.replace("_", " "), str(value)] for name, value in s.settings.items()]
+    return Table("Settings", ["setting", "value"], rows)
+
+
+def _versions() -> Table:
+    rows: list[list[Any]] = [["pcfix", __version__], ["Python", platform.python_version()]]
+    rows += [[name, version(name)] for name in ("numpy", "scipy", "numba", "laspy", "lazrs")]
+    return Table("Software", ["name", "version"], rows)
+
+
+TITLE = "Refractive bundle adjustment"
+
+
+def adjustment_sentence(d: Plain) -> str:
+    """Return an adjustment in half a line, of the values of `adjustment_dict`."""
+    unit = d["image_unit"]
+    parts = [
+        f"focal length {short(row['before'], row['sigma'])} -> {short(row['after'], row['sigma'])}"
+        f" {unit}"
+        for row in d["lens"][:1]
+        if row["name"] == "f"
+    ]
+    parts.append(f"centres moved {fixed(d['poses']['moved_rms_m'], 3)} m (rms)")
+    residuals = [
+        f"{fixed(d['residuals'][key]['rms_px'], 2)} {unit} {where}"
+        for key, where in WHERE
+        if d["residuals"][key]["rms_px"] is not None
+    ]
+    if residuals:
+        parts.append(f"residuals {' and '.join(residuals)}")
+    return ", ".join(parts)
+
+
+def adjustment_table(d: Plain, page: str) -> Table:
+    """Return what the adjustment changed, with a link to its own page.
+
+    Parameters
+    ----------
+    d : dict
+        Of `pcfix.adjust.values.adjustment_dict`.
+    page : str
+        Address of its report, relative to that of the run.
+    """
+    from markupsafe import Markup
+
+    link = Markup('<a href="{0}">{0}</a>').format(page)
+    rows = [*_lens(d), *_residuals(d), *_poses(d), *_surveyed(d), ["All of it", "", link]]
+    return Table(TITLE, ["", "before", "after"], rows)
+
+
+def reason_sentence(adjusted: bool, why: str) -> str:
+    """Return why a run adjusted or did not, for the head of its page."""
+    if adjusted:
+        return f" The cameras were adjusted first, as {why}."
+    return f" The cameras were not adjusted: {why}."
+
+
+def _lens(d: Plain) -> Iterator[list[str]]:
+    many = len({row["sensor"] for row in d["lens"]}) > 1
+    for row in d["lens"]:
+        of = f" of {row['sensor']}" if many else ""
+        unit = f" {d['image_unit']}" if row["name"] in ("f", "cx", "cy", "b1", "b2") else ""
+        name = lens_label(row) + of
+        yield [
+            name[:1].upper() + name[1:] if len(name) > 2 else name,
+            short(row["before"], row["sigma"]) + unit,
+            short(row["after"], row["sigma"]) + _plus_minus(row["sigma"]) + unit,
+        ]
+
+
+def _plus_minus(sigma: float | None) -> str:
+    return "" if sigma is None else f" ± {sigma:.2g}"
+
+
+def _residuals(d: Plain) -> Iterator[list[str]]:
+    unit = d["image_unit"]
+    for key, where in WHERE:
+        r = d["residuals"][key]
+        if r["points"]:
+            yield [
+                f"Residuals {where} (rms)",
+                f"{fixed(r['rms_before_px'], 3)} {unit}",
+                f"{fixed(r['rms_px'], 3)} {unit}, {fixed(r['rms_m'], 4)} m",
+            ]
+
+
+def _poses(d: Plain) -> Iterator[list[str]]:
+    yield ["Projection centres moved (rms)", "", f"{fixed(d['poses']['moved_rms_m'], 3)} m"]
+    if d["gnss"] is not None:
+        rms = listed(d["gnss"]["rms_m"])
+        yield ["Centres minus GNSS, east, north, up (rms)", "", f"{rms} m"]
+
+
+def _surveyed(d: Plain) -> Iterator[list[str]]:
+    for role in ("control", "check"):
+        if d[role] is not None:
+            one = d[role]
+            yield [
+                f"{role.capitalize()} points, X, Y, Z ({len(one['points'])}, rms)", "",
+                f"{listed(one['rms_m'])} m, {fixed(one['rms_px'], 2)} {d['image_unit']}",
+            ]  # fmt: skip

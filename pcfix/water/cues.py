@@ -1,0 +1,338 @@
+"""The cues whose change with height gives the water away: slope, colour, brightness, noise.
+
+Slope: refraction lifts the bed towards the surface, so its slopes below the waterline are about
+1/1.34 of the true ones (less under slanting rays), and a beach has a break there of known size.
+Colour: water swallows red light first (where it is brown with peat, blue), so that the ratio to
+green is steady on land and falls with the depth from the waterline on: logarithms of light fall
+straight with depth (Lyzenga 1978, Applied Optics 17: 379-383). Brightness and noise change as well,
+but wet sand is dark above the water too, and noise grows with depth: they only bear witness.
+
+Looked for is a broken line against the unbroken one, tile by tile, for every height where it may
+break: y = (smooth within each tile) + trend * height + amplitude * f(depth), where f(d) = D (1 -
+exp(-d / D)) below the height in question and 0 above it; trend and amplitude are the same in all
+tiles. Where the amplitude is free, the trend must be the weaker of the two: what fades under water
+is steady on land. Each tile gives its sums of squares and products once; to add tiles, at their own
+heights under a tilted surface, or to draw them anew, costs little then.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pcfix.model import FloatArray, IntArray
+    from pcfix.water.samples import Samples
+
+LEAST_SIDE = 8.0
+"""Cells (weights added) that a tile must have above a height, and below, to say anything."""
+_TINY = 1e-12
+_STEADY_M = 0.3
+
+
+class Break(NamedTuple):
+    """The break that is looked for.
+
+    scale_m : D, infinite for a straight line below.
+    window_m : observations weigh less towards this far above and below.
+    sign : +1 or -1, what the amplitude must be.
+    amplitude : where physics gives it; else it is free.
+    most : a free amplitude larger than this is not likely, one twice as large is something else.
+    """
+
+    scale_m: float
+    window_m: float
+    sign: float
+    amplitude: float | None = None
+    most: float = np.inf
+
+
+class Moments(NamedTuple):
+    """Sums of t tiles at h heights.
+
+    sums : shape (t, h, 6), of yy, yx, yf, xx, xf, ff after the smooth part is taken out of the
+        y, x (height) and f; each tile in units of its own residual variance.
+    number : shape (t, h), how many observations that is.
+    xy : shape (t, 2), the middle of each tile.
+    heights_m : shape (h,), evenly spaced.
+    what : Break
+    """
+
+    sums: FloatArray
+    number: FloatArray
+    xy: FloatArray
+    heights_m: FloatArray
+    what: Break
+
+    def shifted(self, tilt: FloatArray) -> Moments:
+        """Return the sums at the heights `heights_m` + tilt . xy of each tile."""
+        step = self.heights_m[1] - self.heights_m[0]
+        offset = np.rint(self.xy @ tilt / step).astype(np.int64)
+        column = np.arange(len(self.heights_m)) + offset[:, None]
+        inside = (column >= 0) & (column < len(self.heights_m))
+        rows = np.arange(len(self.sums))[:, None]
+        column = np.clip(column, 0, len(self.heights_m) - 1)
+        sums = self.sums[rows, column] * inside[..., None]
+        return self._replace(sums=sums, number=self.number[rows, column] * inside)
+
+
+class Gain(NamedTuple):
+    """What the break explains, h heights.
+
+    gain : shape (h,), logarithm of the ratio of likelihoods with and without it, scaled down to
+        what the differences between tiles allow.
+    amplitude, sigma : shape (h,), and its standard error from those differences.
+    """
+
+    gain: FloatArray
+    amplitude: FloatArray
+    sigma: FloatArray
+
+
+def gain_of(moments: Moments, times: FloatArray | None = None) -> Gain:
+    """Add up the tiles, each as many times as `times` says."""
+    sums = moments.sums if times is None else moments.sums * times[:, None, None]
+    count = moments.number if times is None else moments.number * times[:, None]
+    yy, yx, yf, xx, xf, ff = np.moveaxis(sums.sum(axis=0), -1, 0)
+    slope, share = yx / (xx + _TINY), xf / (xx + _TINY)
+    sse = np.maximum(yy - slope * yx, 0.0) + _TINY
+    cross, own = yf - share * yx, np.maximum(ff - share * xf, _TINY)
+    amplitude = cross / own
+    what = moments.what
+    if what.amplitude is None:
+        steady = np.clip(2.0 - 2.0 * np.abs(slope / (amplitude + _TINY) - share), 0.0, 1.0)
+        likely = np.clip(2.0 - np.abs(amplitude) / what.most, 0.0, 1.0)
+        saved = np.maximum(what.sign * cross, 0.0) ** 2 / own * steady * likely
+    else:
+        saved = 2.0 * what.amplitude * cross - what.amplitude**2 * own
+    left = np.maximum(sse - saved, 1e-3 * sse)
+    n = count.sum(axis=0)
+    variance = np.maximum(sse - cross**2 / own, 1e-3 * sse) / np.maximum(n, 1.0)
+    trend = slope - amplitude * share
+    scores = (
+        sums[..., 2] - trend * sums[..., 4] - amplitude * sums[..., 5]
+        - share * (sums[..., 1] - trend * sums[..., 3] - amplitude * sums[..., 4])
+    )  # fmt: skip
+    scatter = (scores**2 if times is None else scores**2 / np.maximum(times, 1.0)[:, None]).sum(0)
+    held = np.maximum(variance * own, scatter)
+    sigma = np.sqrt(held) / own
+    temper = variance * own / (held + _TINY)
+    width = max(1, round(_STEADY_M / (moments.heights_m[1] - moments.heights_m[0])))
+    gain = 0.5 * n * np.log(sse / left) * uniform_filter1d(temper, width)
+    return Gain(np.where(own > 1e3 * _TINY, gain, 0.0), amplitude, sigma)
+
+
+def tile_moments(
+    smooth: FloatArray, y: FloatArray, at_m: FloatArray, heights_m: FloatArray, what: Break,
+    *, with_trend: bool,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Return the sums of one tile, shapes (h, 6) and (h,).
+
+    Parameters
+    ----------
+    smooth : array, shape (n, p)
+        Columns of the smooth part.
+    y, at_m : array, shape (n,)
+        The observations and the heights that they belong to.
+    heights_m : array, shape (h,)
+    what : Break
+    with_trend : bool
+        Whether y may change with height in the same way above and below.
+    """
+    depth = heights_m[:, None] - at_m
+    weight = np.maximum(1.0 - (depth / what.window_m) ** 2, 0.0) ** 2
+    total = weight.sum(axis=1)
+    below = (weight * (depth > 0.0)).sum(axis=1)
+    enough = np.minimum(below, total - below) >= LEAST_SIDE
+    sums, count = np.zeros((len(heights_m), 6)), np.zeros(len(heights_m))
+    if enough.any():
+        x = (at_m - at_m.mean()) * float(with_trend)
+        sums[enough] = _sums(smooth, y, x, depth[enough], weight[enough], what.scale_m)
+        squares = (weight[enough] ** 2).sum(axis=1)
+        count[enough] = np.maximum(total[enough] ** 2 / squares - smooth.shape[1], 1.0)
+    return sums, count
+
+
+def _sums(
+    smooth: FloatArray, y: FloatArray, x: FloatArray, depth: FloatArray, weight: FloatArray,
+    scale_m: float,
+) -> FloatArray:  # fmt: skip
+    below = np.maximum(depth, 0.0)
+    f = below if np.isinf(scale_m) else -scale_m * np.expm1(-below / scale_m)
+    p = smooth.shape[1]
+    fixed = np.column_stack([smooth, y, x])
+    products = (fixed[:, :, None] * fixed[:, None, :]).reshape(len(y), -1)
+    whole = np.zeros((len(depth), p + 3, p + 3))
+    whole[:, :-1, :-1] = (weight @ products).reshape(-1, p + 2, p + 2)
+    whole[:, -1, :-1] = whole[:, :-1, -1] = (weight * f) @ fixed
+    whole[:, -1, -1] = (weight * f * f).sum(axis=1)
+    normal, right = whole[:, :p, :p], whole[:, :p, p:]
+    ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(p)
+    rest = whole[:, p:, p:] - np.swapaxes(right, 1, 2) @ np.linalg.solve(normal + ridge, right)
+    return np.asarray(rest[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])
+
+
+def square_tiles(xy: FloatArray, side_m: float, least: int) -> list[IntArray]:
+    """Return the rows of each square tile that holds at least so many; `xy` from zero up."""
+    column, row = (xy / side_m).astype(np.int64).T
+    _, tile = np.unique(row * (column.max() + 1) + column, return_inverse=True)
+    tile = tile.reshape(-1)
+    order = np.argsort(tile, kind="stable")
+    parts = np.split(order, np.cumsum(np.bincount(tile))[:-1])
+    return [part for part in parts if len(part) >= least]
+
+
+def gather(
+    parts: list[tuple[FloatArray, FloatArray]], xy: list[FloatArray], heights_m: FloatArray,
+    what: Break,
+) -> Moments | None:  # fmt: skip
+    """Put tiles together, each in units of its residual variance; None where none says anything."""
+    said = [i for i, (_, count) in enumerate(parts) if count.any()]
+    if not said:
+        return None
+    sums = np.array([parts[i][0] for i in said])
+    count = np.array([parts[i][1] for i in said])
+    variance = sums[..., 0].sum(axis=1) / count.sum(axis=1)
+    least = 0.3 * float(np.median(variance)) + _TINY
+    sums /= np.maximum(variance, least)[:, None, None]
+    return Moments(sums, count, np.array([xy[i] for i in said]), heights_m, what)
+
+
+LIFT = 0.36
+"""n - 1 and a little, as rays slant: how much flatter the bed looks than it is."""
+MOST_FADING = 1.2
+"""Per metre. Clear water gives about 0.3, twice the difference in attenuation over the gamma of
+images; what changes faster than any but the darkest water is ground: plants, or a wet edge."""
+SLOPE_TILE_CELLS, LIGHT_TILE_CELLS = 12.0, 24.0
+_LEAST_CELLS, _LEAST_RELIEF_M = 40, 0.1
+_ROUGHNESS_FLOOR_M = 1e-3
+
+
+class Cue(NamedTuple):
+    """A thing to look at. `places` says whether it fixes the level, or only bears witness."""
+
+    name: str
+    words: str
+    what: Break
+    tile_cells: float
+    places: bool
+
+
+SLOPE = Cue(
+    "slope", "the ground looks flatter below",
+    Break(math.inf, 0.6, 1.0, LIFT), SLOPE_TILE_CELLS, places=True,
+)  # fmt: skip
+RED = Cue(
+    "red/green", "red fades against green below",
+    Break(0.7, 0.8, -1.0, most=MOST_FADING), LIGHT_TILE_CELLS, places=True,
+)  # fmt: skip
+BLUE = RED._replace(name="blue/green", words="blue fades against green below")
+BRIGHT = Cue(
+    "brightness", "the ground is darker below",
+    Break(0.3, 0.8, -1.0), LIGHT_TILE_CELLS, places=False,
+)  # fmt: skip
+NOISE = Cue(
+    "noise", "heights are noisier below",
+    Break(0.7, 0.8, 1.0), LIGHT_TILE_CELLS, places=False,
+)  # fmt: skip
+
+
+def cues_of(samples: Samples) -> tuple[Cue, ...]:
+    """Return the cues that these samples can give."""
+    light: tuple[Cue, ...] = () if samples.colour is None else (RED, BLUE, BRIGHT)
+    if samples.colour is None and samples.intensity is not None:
+        light = (BRIGHT,)
+    return (SLOPE, *light, NOISE)
+
+
+def cue_moments(
+    samples: Samples, cue: Cue, heights_m: FloatArray, tilt: FloatArray
+) -> Moments | None:
+    """Return the sums of a cue over the tiles, heights measured from a tilted surface.
+
+    Parameters
+    ----------
+    samples : Samples
+    cue : Cue
+    heights_m : array, shape (h,)
+        Evenly spaced, from the origin of the samples.
+    tilt : array, shape (2,)
+        dz/dx and dz/dy, through that origin.
+    """
+    fall = samples.xyz[:, :2] @ tilt
+    of_tile = _slope_tile if cue.name == SLOPE.name else _light_tile(samples, cue)
+    parts, middles = [], []
+    tiles = square_tiles(samples.xyz[:, :2], cue.tile_cells * samples.cell_m, _LEAST_CELLS)
+    for rows in tiles:
+        parts.append(of_tile(samples, rows, fall[rows], heights_m, cue.what))
+        middles.append(samples.xyz[rows, :2].mean(axis=0))
+    return gather(parts, middles, heights_m, cue.what)
+
+
+def _slope_tile(
+    samples: Samples, rows: IntArray, fall: FloatArray, heights_m: FloatArray, what: Break
+) -> tuple[FloatArray, FloatArray]:
+    """Break the smooth (quadratic) ground where it passes the height.
+
+    Where that is comes from the smooth ground and not from each height itself: noise would be on
+    both sides of the equation and hide the break.
+    """
+    z = samples.xyz[rows, 2] - fall
+    if z.min() > heights_m[-1] or z.max() < heights_m[0]:
+        return np.zeros((len(heights_m), 6)), np.zeros(len(heights_m))
+    smooth = _quadratic(samples.xyz[rows, :2])
+    ground = smooth @ np.linalg.lstsq(smooth, z, rcond=None)[0]
+    if np.ptp(ground) < _LEAST_RELIEF_M:
+        return np.zeros((len(heights_m), 6)), np.zeros(len(heights_m))
+    return _near(smooth, z, ground, heights_m, what, with_trend=False)
+
+
+def _light_tile(samples: Samples, cue: Cue) -> Callable[..., tuple[FloatArray, FloatArray]]:
+    y = _values(samples, cue)
+
+    def of_tile(
+        samples: Samples, rows: IntArray, fall: FloatArray, heights_m: FloatArray, what: Break
+    ) -> tuple[FloatArray, FloatArray]:
+        at = samples.smooth_m[rows] - fall
+        return _near(np.ones((len(rows), 1)), y[rows], at, heights_m, what, with_trend=True)
+
+    return of_tile
+
+
+def _near(
+    smooth: FloatArray, y: FloatArray, at_m: FloatArray, heights_m: FloatArray, what: Break,
+    *, with_trend: bool,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Return the sums of a tile, reckoned only for heights that it reaches."""
+    first, last = np.searchsorted(heights_m, [at_m.min(), at_m.max()])
+    sums, count = np.zeros((len(heights_m), 6)), np.zeros(len(heights_m))
+    if last > first:
+        reached = slice(first, last)
+        sums[reached], count[reached] = tile_moments(
+            smooth, y, at_m, heights_m[reached], what, with_trend=with_trend
+        )
+    return sums, count
+
+
+def _values(samples: Samples, cue: Cue) -> FloatArray:
+    """Return what a cue looks at, shape (m,)."""
+    if cue.name == NOISE.name:
+        return np.log(samples.rough_m + _ROUGHNESS_FLOOR_M)
+    if samples.colour is None:
+        if samples.intensity is None:
+            raise ValueError("the samples have no light")
+        return samples.intensity
+    red, green, blue = samples.colour.T
+    if cue.name == RED.name:
+        return np.asarray(red - green)
+    return np.asarray(blue - green if cue.name == BLUE.name else samples.colour.mean(axis=1))
+
+
+def _quadratic(xy: FloatArray) -> FloatArray:
+    x, y = ((xy - xy.mean(axis=0)) / max(float(np.ptp(xy)), 1e-9)).T
+    return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
