@@ -35,6 +35,7 @@ if TYPE_CHECKING:
         WaterSurface,
     )
     from pcfix.options import ErrorBudget, Settings
+    from pcfix.refract.tracing import trace
     from pcfix.simulate import simulate_scene
     from pcfix.water.index import refractive_index
 
@@ -57,6 +58,7 @@ _HOME = {
     "refractive_index": "pcfix.water.index",
     "read_water": "pcfix.io.water",
     "simulate_scene": "pcfix.simulate",
+    "trace": "pcfix.refract.tracing",
     "Cameras": "pcfix.model",
     "Correction": "pcfix.model",
     "Lens": "pcfix.model",
@@ -110,6 +112,7 @@ __all__ = [
     "refractive_index",
     "restore_file",
     "simulate_scene",
+    "trace",
 ]
 
 

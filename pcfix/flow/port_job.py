@@ -17,7 +17,7 @@ from pcfix.flow.inputs import mask_of
 from pcfix.flow.job import PLAIN, Job
 from pcfix.label.labelling import Labelling
 from pcfix.model import Correction, Outcome, WaterPlane
-from pcfix.port.intersection import correct_through_port
+from pcfix.port.methods import correct_through_port
 from pcfix.refract.tally import Tally
 from pcfix.version import __version__
 from pcfix.water.surface import SurfaceAbove

@@ -32,13 +32,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.errors import InputError
+from pcfix.io.cameras.checks import number as xml_number
+from pcfix.io.cameras.checks import numbers
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import SPREADS, documents
 from pcfix.io.cameras.odm.project import named_crs
 from pcfix.io.cameras.table import centres, crs
 from pcfix.io.cameras.table.columns import headers, is_header, read_columns
-from pcfix.io.cameras.values import number as xml_number
-from pcfix.io.cameras.values import numbers
 from pcfix.io.crs import is_local, parse_crs
 from pcfix.io.tables import number, read_lines
 from pcfix.io.transformations import LOCAL

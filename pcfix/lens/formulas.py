@@ -1,7 +1,13 @@
-"""Where each number of a lens stands in the flat array that the kernels take.
+"""The formulas of a lens, both ways: its numbers, its projection, Brown's distortion.
 
-The arrays of several lenses, padded with zeros, are the rows of one table. See
-`pcfix.lens.imaging.coefficients`, which fills it, and `pcfix.model.Lens` for the names.
+Its numbers stand in the flat array that the kernels take; those of several lenses, padded with
+zeros, are the rows of one table. `pcfix.lens.imaging.coefficients` fills it; the formulas and the
+names are in `pcfix.model.Lens`. `angle` answers NaN beyond the image of the largest angle.
+
+Of Brown's formula, places are relative to the centre of distortion. It is used inside the largest
+disc in which the symmetric part of its Jacobian is positive definite: on a disc that is enough for
+no two places to have one image. Without tangential terms it is the disc up to the fold, where
+d r' / d r = 0.
 """
 
 from __future__ import annotations

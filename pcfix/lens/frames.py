@@ -1,4 +1,14 @@
-"""The frame of one lens in its camera frame: what lies around it, and how its image moves.
+"""Which cameras have a point in their frame, and which can have one of a whole tile.
+
+The frame of a central projection without distortion is a pyramid with its tip in the
+projection centre. Four planes bound it; a point is in the frame when it is on the inner side of
+all four.
+
+A distorted frame has curved sides, and the point has to be projected. Most tiles are spared
+that: those outside of a pyramid around the frame (of a cone, where the frame is too wide), and
+those whose middle falls so far from the border of the image that no ray of the tile can cross
+it. How far that is says the `scale` of the lens: no turn of a ray by an angle moves its image by
+more than `scale` times that angle, in the frame and within a `margin` around it.
 
 The border of the image is sent out through the lens, densely; where all of it is there, what it
 encloses is the frame, as a lens is used only where it is one to one.

@@ -222,6 +222,9 @@ def image_and_gradients(
 ) -> tuple[float, float, Gradients]:
     """Return where a lens images a direction, and how that moves.
 
+    The formulas are those of `pcfix.model.Lens`, in the same three steps: projection, Brown's
+    distortion, image. The chain rule joins them.
+
     Parameters
     ----------
     c : array

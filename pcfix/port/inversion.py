@@ -64,7 +64,7 @@ def consistent_through_port(
     views : Views
         Their cameras.
     cameras, port, settings
-        As of `pcfix.port.intersection.intersect_through_port`.
+        As of `pcfix.port.methods.intersect_through_port`.
     start : Intersection
         What `snell` makes of them, from where the search begins.
 

@@ -1,4 +1,18 @@
-"""A ray at the face of a port, in vectors of three numbers."""
+"""The light through the port of a housing: from a point to its image, and back out.
+
+Everything is in the camera frame, with the projection centre as the origin: metres, x right, y
+down, z forward. Two questions are answered for each kind of port:
+
+`through_port`: a point in the water is given. In which direction w does its light come to the
+projection centre? A lens images the point where it images w. With the derivatives by the point and
+by the refractive index of the water, which a bundle adjustment needs.
+
+`ray_through`: a direction is given that the lens looks to. Where does that ray leave the port, and
+how does it go on through the water?
+
+The two are solved apart, the first by an equation in one unknown, the second by Snell's law at one
+face after the other, so that each proves the other right.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +75,22 @@ def through_flat(
     normal: Vector, distance: float, thickness: float, glass: float, n: float,
     point: Vector, out: FloatArray,
 ) -> None:  # fmt: skip
-    """Find the direction of a point behind a flat port, as `pcfix.port.light.through_port`.
+    r"""Find the direction of a point behind a flat port, as `pcfix.port.light.through_port`.
+
+    Picture the projection centre, and the unit normal N of the port, towards the water. The light
+    crosses the layers air, glass, water, thick d, T and D along N; D belongs to the point X. The
+    part of X across N is s. As at the surface of a lake (`pcfix.refract.rays`) the direction at the
+    projection centre is
+
+        w = N + k s
+
+    so that t = k \|s\| is the tangent of the angle of incidence in air, and with Snell's law the
+    sideways distances add up to \|s\|. With S(m) = sqrt(m^2 + (m^2 - 1) k^2 s.s):
+
+        G(k) = k (d + T / S(g) + D / S(n)) - 1 = 0
+
+    G rises and bends down, so that Newton's method started at k = 1 / (d + T / g + D / n), where G
+    <= 0, comes to the only root from the left and needs no bracket. Nothing is divided by \|s\|.
 
     Of G(k, D, s.s, n) = 0, implicitly, with grad D = N and grad s.s = 2 s.
     """
@@ -209,7 +238,31 @@ def through_dome(
     centre: Vector, a: float, thickness: float, glass: float, n: float,
     point: Vector, out: FloatArray,
 ) -> None:  # fmt: skip
-    """Find the direction of a point behind a dome, as `pcfix.port.light.through_port`.
+    r"""Find the direction of a point behind a dome, as `pcfix.port.light.through_port`.
+
+    Picture it from the centre of the dome. The projection centre lies at o, the point X at the
+    distance R in the unit direction e; light between them stays in the plane of the two. It crosses
+    the inner sphere, of radius a, at
+
+        A = a (cos theta e + sin theta f),    f the unit vector across e, towards o
+
+    and comes to the projection centre along w = A - o. In shells the product of refractive index
+    and distance from the centre at which the ray's line passes, p, is the same in each (Bouguer).
+    So between two radii in a medium m the ray turns about the centre by asin(p / m r1) - asin(p / m
+    r2), and
+
+        theta = asin(p / g a) - asin(p / g b) + asin(p / n b) - asin(p / n R)
+
+    with the outer radius b, the glass g and the water n. Of theta between 0, where the left side is
+    the smaller one, and the straight line from X to the projection centre, where it is the larger
+    one as glass and water turn a ray less than air does, exactly one solves it: the difference
+    rises all the way (for g and n of at least 1).
+
+    So that a point, centre and camera in one line are no special case, the unknown is q =
+    sin(theta) / \|o across\|, with \|o across\|^2 = u and o.e = v, and both sides are divided by
+    \|o across\|; asin(y sqrt(u)) / sqrt(u) is a power series in u. Then
+
+        w = a (cos theta - q v) e + (a q - 1) o
 
     Implicitly, with grad R = e, grad v = (o - v e) / R and grad u = -2 v grad v.
     """

@@ -1,4 +1,4 @@
-r"""What the methods of the literature share: one camera's ray through level water.
+"""Methods of the literature, for comparison; all share one camera's ray through level water.
 
 Picture the vertical plane through a camera C and the apparent point P. The line of sight meets
 the surface at A, at the angle a from the vertical, and goes on under water at the angle b, with
@@ -131,6 +131,22 @@ BASE_TO_HEIGHT = (0.3, 0.6)
 
 def in_pairs(batch: Batch) -> Batch:
     """Return the batch with the best pair of each point instead of all its rays.
+
+    Their papers had two images; a cloud of today has many, and does not say which two. Here each
+    point gets, of the cameras that were chosen for it, the pair
+
+    - whose ratio of base to height is nearest to the range `BASE_TO_HEIGHT`: below it the depth is
+      weak, above it images no longer match well; and
+    - among those within the range (or equally far from it) the pair whose more slanting ray is the
+      steepest, which lies on both sides of the point where there is such a pair. There the two rays
+      have nearly the same incidence, for which the methods are exact.
+
+    The point was made by more images than these, or by others, so that the pair has another
+    incidence than the rays that set the apparent depth. With nine nadir images over a point (32 m
+    apart, 80 m up) that costs some 5 % of the depth at worst.
+
+    With the cameras at the plan distances e_1 and e_2 (vectors) and heights z_1 and z_2 from the
+    point, the ratio is |e_1 / z_1 - e_2 / z_2|: base by height where both are equally high.
 
     Points with one ray keep it and those with none have none, so that the batch still says what
     becomes of them.

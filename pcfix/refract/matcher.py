@@ -268,6 +268,9 @@ _STEPS = 2.0
 class Bed(NamedTuple):
     """Heights on a grid; NaN where nothing is known.
 
+    See `pcfix.refract.fusion`. It is a raster that only helps to choose among the likely beds of a
+    point; no point is put onto it.
+
     Attributes
     ----------
     height_m : array, shape (rows, columns)

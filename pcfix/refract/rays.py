@@ -1,4 +1,4 @@
-r"""One ray: how it bends at the water surface, and what it says about where the point is.
+r"""One ray at the water surface, forwards and backwards.
 
 Picture a camera C looking down at the apparent point P. The line from C to P meets the water
 surface at A and there bends towards the vertical; the true point lies somewhere on the bent ray
@@ -11,6 +11,42 @@ the kernels live from that.
 
 The functions hold arithmetic only: scalars in, scalars out, no reordering of sums
 (``fastmath`` stays off), so that the bits do not depend on tiles, chunks or threads.
+
+**Piercing a mesh or raster.** Starting from the plane above the point, meet it; take the plane of
+the surface there, meet that one, and so on. Water is nearly flat, so this is over in one to three
+steps.
+
+On a mesh the planes are the facets'; on a crease between two, where it would go to and fro, the
+last of `PIERCING_STEPS` stands. On a raster they are the tangent planes of the bilinear surface;
+each step keeps to the bracket in which the line passes the surface, and halves it where a tangent
+plane leads out of it, until the line is within `CLOSE_M` of the surface. Beyond the edge of either,
+and over its gaps, the last plane goes on.
+
+**Backwards, from a true point to a camera.** Picture a point Q below a plane with the unit normal
+N, and a camera C at the height H above it. Seen from the foot of C the point lies at the sideways
+vector s, at the depth D. In air the light comes from the direction
+
+    w = -N + k s
+
+scaled so that its part along the normal is one: w is t = k \|s\| sideways for each metre down, t
+the tangent of the angle of incidence. With Snell's law the sideways distances in air and water add
+up to \|s\|:
+
+    H t + D t / sqrt(n^2 + (n^2 - 1) t^2) = \|s\|
+
+or, divided by \|s\|, with S = sqrt(n^2 + (n^2 - 1) k^2 s.s)
+
+    G(k) = k (H + D / S) - 1 = 0
+
+G rises and bends down, so that Newton's method started at k = 1 / (H + D / n), where G <= 0, comes
+to the only root from the left and needs no bracket. Nothing is divided by \|s\|: straight below
+the camera is no special case. A point above the plane sends its light straight, k = 1 / (H + D);
+the two meet at D = 0.
+
+On a mesh or raster the plane is the tangent plane where the light leaves the water, found by
+going there, taking the plane there, and so on.
+
+The plane is N.x = h.
 """
 
 from __future__ import annotations

@@ -70,13 +70,13 @@ def waves(slope_deg):
 
 def compare(points, centres, water):
     """Print one line for each method."""
-    truth = trace(points, centres, water, INDEX, method="scattershot")
+    truth = trace(centres, points, water, refractive_index=INDEX, method="scattershot")
     for method in METHODS:
-        trace(points[:100], centres[:100], water, INDEX, method=method)
+        trace(centres[:100], points[:100], water, refractive_index=INDEX, method=method)
         started = time.perf_counter()
-        found = trace(points, centres, water, INDEX, method=method)
+        found = trace(centres, points, water, refractive_index=INDEX, method=method)
         seconds = time.perf_counter() - started
-        alone = trace(points, centres, water, INDEX, method=method, narrow=False)
+        alone = trace(centres, points, water, refractive_index=INDEX, method=method, narrow=False)
         ray = (alone.converged & ~alone.on_crease).mean()
         apart = np.linalg.norm(found.piercing_xyz - truth.piercing_xyz, axis=1)
         other = apart[apart > 1e-4]
@@ -99,7 +99,9 @@ def steepest(method):
         below = depth * np.tan(np.arcsin(np.sin(i) / INDEX))
         points = leaves + np.column_stack([below, np.zeros(500), -depth])
         centres = np.column_stack([np.zeros((500, 2)), height])
-        found = trace(points, centres, WaterPlane(0.0), INDEX, method=method, narrow=False)
+        found = trace(
+            centres, points, WaterPlane(0.0), refractive_index=INDEX, method=method, narrow=False
+        )
         apart = np.linalg.norm(found.piercing_xyz - leaves, axis=1)
         if not (apart < 1e-6).all():
             break
@@ -113,9 +115,9 @@ def roughest(method, count):
     last = "none"
     for slope in SLOPES_DEG:
         water = waves(slope)
-        truth = trace(points, centres, water, INDEX, method="scattershot")
+        truth = trace(centres, points, water, refractive_index=INDEX, method="scattershot")
         there = truth.converged & ~truth.on_crease
-        found = trace(points, centres, water, INDEX, method=method, narrow=False)
+        found = trace(centres, points, water, refractive_index=INDEX, method=method, narrow=False)
         if (found.converged & ~found.on_crease)[there].mean() < 0.99:
             break
         last = f"{slope:g}"

@@ -8,7 +8,7 @@ import pytest
 
 import pcfix
 from pcfix.errors import GeometryError, SettingError
-from pcfix.port.intersection import correct_through_port
+from pcfix.port.methods import correct_through_port
 from pcfix.port.shapes import FlatPort
 from pcfix.report.text import summary_text
 from tests.utils.port_scenes import simulate_port

@@ -12,13 +12,9 @@ from pcfix.errors import SettingError
 from pcfix.lens.imaging import unproject
 from pcfix.model import Outcome
 from pcfix.options import ErrorBudget
-from pcfix.port.intersection import (
-    correct_through_port,
-    intersect_rays,
-    intersect_through_port,
-    port_views,
-)
+from pcfix.port.intersection import intersect_rays, port_views
 from pcfix.port.inversion import port_covariances
+from pcfix.port.methods import correct_through_port, intersect_through_port
 from pcfix.port.shapes import DomePort, FlatPort
 from tests.utils.port_scenes import simulate_port
 

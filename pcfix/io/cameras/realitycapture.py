@@ -35,9 +35,9 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
+from pcfix.io.cameras.checks import number, numbers, read_xml
 from pcfix.io.cameras.table.sensor import read_sensor
 from pcfix.io.cameras.tracks import image_size
-from pcfix.io.cameras.values import number, numbers, read_xml
 from pcfix.model import Cameras, Lens
 
 if TYPE_CHECKING:

@@ -11,12 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import laspy
 import numpy as np
 
 from pcfix.errors import InputError
 
 if TYPE_CHECKING:
+    import laspy
     import numpy.typing as npt
 
     from pcfix.model import BoolArray, Correction, FloatArray
@@ -237,6 +237,8 @@ def is_marked_uncorrected(points: laspy.ScaleAwarePointRecord) -> BoolArray:
 
 def upgraded(point_format: laspy.PointFormat) -> laspy.PointFormat:
     """Return the output's point format, with the input's extra dimensions."""
+    import laspy  # it loads pyproj, which PDAL's stage must not before it runs
+
     new = laspy.PointFormat(UPGRADE[point_format.id])
     new.dimensions.extend(point_format.extra_dimensions)
     return new
@@ -249,6 +251,8 @@ def convert(
 
     Values that both formats have come over bit for bit; dimensions that are new are zero.
     """
+    import laspy
+
     array: Records = np.zeros(len(points), point_format.dtype())
     new = laspy.ScaleAwarePointRecord(array, point_format, points.scales, points.offsets)
     if points.point_format.id == point_format.id and _one_begins_the_other(points.array, array):

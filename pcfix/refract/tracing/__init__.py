@@ -1,8 +1,8 @@
 """Where light from object points leaves the water towards the projection centres.
 
 This is the refractive collinearity of Mulsow's multimedia bundle: the image of a point is that of
-its piercing point. Four methods find it, `kotowski`, `afrt`, `mdfrt` and `scattershot`, each in a
-module of its own; they agree where all of them arrive.
+its piercing point. Four methods find it, `kotowski`, `afrt`, `mdfrt` and `scattershot`
+(`pcfix.refract.tracing.tracers`); they agree where all of them arrive.
 
 The first three look for a refracted ray that hits the point. On facets, and on the bilinear
 patches of a raster, there may be none: through a crease that is a trough light comes that obeys
@@ -20,6 +20,7 @@ from numba import njit, prange
 
 from pcfix.errors import SettingError
 from pcfix.model import WaterMesh, WaterPlane, WaterRaster
+from pcfix.options import DEFAULT_REFRACTIVE_INDEX
 from pcfix.refract.tracing.tracers import (
     Water,
     afrt,
@@ -34,6 +35,8 @@ from pcfix.threads import one_caller
 from pcfix.water.surface import build_field, build_tin
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy.typing as npt
 
     from pcfix.model import BoolArray, FloatArray, IntArray
@@ -88,45 +91,59 @@ class Tracing:
 
 
 def trace(
-    points: npt.ArrayLike,
-    centres: npt.ArrayLike,
-    surface: Surface,
-    refractive_index: float,
+    origin: npt.ArrayLike,
+    target: npt.ArrayLike,
+    surfaces: Surface | float | Sequence[Surface | float],
     *,
+    refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
     method: str = "kotowski",
     narrow: bool = True,
 ) -> Tracing:
-    """Trace light backwards from projection centres to object points.
+    """Trace light backwards, from projection centres to object points under water.
 
     Parameters
     ----------
-    points : array, shape (n, 3) or (3,)
-        True object points, metres, world frame. One that is above the water, or has none above
-        it, is seen straight.
-    centres : array, shape (n, 3) or (3,)
-        The projection centre that each is seen from, metres, world frame.
-    surface : WaterPlane, WaterRaster or WaterMesh
-    refractive_index : float
-        Of water against air.
-    method : str
-        One of `METHODS`.
-    narrow : bool
+    origin : array, shape (n, 3) or (3,)
+        Projection centres, metres, world frame.
+    target : array, shape (n, 3) or (3,)
+        The true object point that each of them sees, metres, world frame. One that is above the
+        water, or has none above it, is seen straight.
+    surfaces : WaterPlane, WaterRaster, WaterMesh or float, or a sequence with one of them
+        What the light passes on its way: the water's surface, or its level in metres.
+    refractive_index : float, default 1.34
+        Of the water against air, at least 1.
+    method : {"kotowski", "afrt", "mdfrt", "scattershot"}
+        How the path is found; see `pcfix.refract.tracing.tracers`. They agree where all arrive.
+    narrow : bool, default True
         Where the method finds no ray, look for the shortest path near by.
 
     Returns
     -------
     Tracing
-        Nothing is found for a camera that is not above the water, nor where the light would
-        leave the water beyond its edge. Positions are good to about 1e-9 m, on creases 1e-6 m.
+        Where the light leaves the water, and its direction at the projection centre. Nothing is
+        found for a camera that is not above the water, nor where the light would leave the water
+        beyond its edge. Positions are good to about 1e-9 m, on creases 1e-6 m.
 
     Raises
     ------
     SettingError
         If the shapes do not fit, the method or surface is unknown or the index is below one.
+
+    Notes
+    -----
+    With the unit vectors u from the centre to the piercing point and v from there to the target,
+    u - n v stands upright on the surface (Snell); the optical length is stationary (Fermat).
+
+    Examples
+    --------
+    >>> import pcfix
+    >>> found = pcfix.trace([20.0, 0.0, 100.0], [0.0, 0.0, -2.0], 0.0)
+    >>> found.piercing_xyz.round(3).tolist()
+    [[0.292, 0.0, 0.0]]
     """
-    xyz, seen_from = _pairs(points, centres)
+    xyz, seen_from = _pairs(target, origin)
     code, n = _checked(refractive_index, method)
-    plane, tin, field = _as_kernels_take(surface)
+    plane, tin, field = _as_kernels_take(surfaces)
     result = np.empty((len(xyz), _WIDTH))
     with one_caller():
         _trace(xyz, seen_from, plane, tin, field, n, code, narrow, result)
@@ -142,14 +159,14 @@ def trace(
     )
 
 
-def _pairs(points: npt.ArrayLike, centres: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return points and centres as two arrays of the same shape (n, 3)."""
-    xyz, seen_from = np.atleast_2d(points), np.atleast_2d(centres)
+def _pairs(target: npt.ArrayLike, origin: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Return targets and origins as two arrays of the same shape (n, 3)."""
+    xyz, seen_from = np.atleast_2d(target), np.atleast_2d(origin)
     fit = xyz.ndim == seen_from.ndim == 2 and xyz.shape[1] == seen_from.shape[1] == 3
     if not (fit and (len(xyz) == len(seen_from) or 1 in (len(xyz), len(seen_from)))):
         raise SettingError(
-            f"points of shape {np.shape(points)} and centres of shape {np.shape(centres)} do not"
-            " make pairs: give both as (n, 3), or one of them as (3,)."
+            f"an origin of shape {np.shape(origin)} and a target of shape {np.shape(target)} do"
+            " not make pairs: give both as (n, 3), or one of them as (3,)."
         )
     both = np.broadcast_arrays(xyz, seen_from)
     return np.ascontiguousarray(both[0], float), np.ascontiguousarray(both[1], float)
@@ -165,8 +182,18 @@ def _checked(refractive_index: float, method: str) -> tuple[int, float]:
     return METHODS.index(method), n
 
 
-def _as_kernels_take(surface: Surface) -> tuple[FloatArray, Tin | None, Field | None]:
+def _as_kernels_take(
+    surfaces: Surface | float | Sequence[Surface | float],
+) -> tuple[FloatArray, Tin | None, Field | None]:
     """Return plane, mesh and raster of a surface; what it is not is zero or None."""
+    if isinstance(surfaces, list | tuple):
+        if len(surfaces) != 1:
+            raise SettingError(
+                f"light is traced through one surface, not {len(surfaces)}: layers of several"
+                " media are not known."
+            )
+        surfaces = surfaces[0]
+    surface = WaterPlane(float(surfaces)) if isinstance(surfaces, int | float) else surfaces
     plane = np.zeros(3)
     if isinstance(surface, WaterPlane):
         plane[:] = surface.a, surface.b, surface.c

@@ -159,6 +159,11 @@ def gradients(
 ) -> Gradients:
     """Differentiate the directions of a tracing.
 
+    By the implicit function theorem at the solution (`light_and_gradients`). The surface is taken
+    as its tangent plane where the light leaves the water: exact for planes and facets; on a raster
+    the slope's own change from place to place (its curvature) is left out; on a crease the plane is
+    the one that bends the light as the crease does.
+
     Parameters
     ----------
     points, centres : array, shape (n, 3) or (3,)

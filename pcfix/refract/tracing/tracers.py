@@ -4,9 +4,9 @@ The object point is the local origin. A ray is named by its aim: the place where
 level of the water above the point. It pierces the surface at A, bends there, and comes down to the
 height of the point at the place (mx, my): its miss.
 
-The surface is a plane, the bilinear raster or the facets of `pcfix.water.surface`. Where there is
-none, and where it faces away from the camera, all is NaN. Water that hides water behind it is not
-looked for: the ray is taken to cross the surface once.
+The surface is a plane, or the bilinear raster or the facets of `pcfix.water.surface`. Where there
+is none, and where it faces away from the camera, all is NaN. Water that hides water behind it is
+not looked for: the ray is taken to cross the surface once.
 """
 
 from __future__ import annotations
@@ -144,6 +144,21 @@ HALVINGS = 24
 def kotowski(water: Water, level: float, ex: float, ey: float, ez: float, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, steps, found).
 
+    The idea is that of Kotowski 1988, Phototriangulation in multi-media photogrammetry: ray tracing
+    through refracting surfaces of any form inside the bundle, which Mulsow 2010, A flexible
+    multi-media bundle approach, takes up. Only the openings of both could be had; that the piercing
+    point is iterated from the straight line by Newton's method is how they were read, and the
+    equations are our own.
+
+    With the unit vectors u from the camera to A and v from A to the point, Snell's law says that u
+    - n v stands upright on the surface, hence on its tangents (1, 0, b) and (0, 1, c):
+
+        g = (u_x - n v_x + b (u_z - n v_z), u_y - n v_y + c (u_z - n v_z)) = 0
+
+    g is also the gradient of the optical length by the place of A (Fermat). The third condition, A
+    on the surface, is kept by taking z from it. A bilinear raster has the second derivative z_xy
+    only; planes and facets have none.
+
     A step that makes g grow is halved until it is short; from one patch of a broken surface to the
     next g may grow on the right way. So is one beyond the edge of the water.
     """
@@ -219,6 +234,14 @@ AFRT_STEPS = 60
 def afrt(water: Water, level: float, ex: float, ey: float, ez: float, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, steps, found).
 
+    The name is in Mulsow 2024, whose text could not be had; this is how it was read. The straight
+    ray to an apparent point P, at the height of the object point, is traced forward through the
+    water and comes out beside the object point; P is moved by as much the other way, the ray is
+    traced again, and so on. It starts with P in the object point. On calm water, from a height H
+    over a depth D, this alone would gain a factor of about (1 + H / D) / (1 - 1 / n) a step; from
+    the second step on Broyden's secant makes use of what the last steps did. No derivative of the
+    surface is needed, and one ray a step.
+
     After a step s = -B m the good Broyden update of the inverse B is
     B + t (s'B) / (s'(s - t)), with t = -B m of the new miss. A step is at most the depth or,
     where that is more, what the straight line goes sideways in the water.
@@ -259,6 +282,13 @@ NARROW_M = 1e-6
 @njit(cache=True, error_model="numpy", nogil=True)
 def mdfrt(water: Water, level: float, ex: float, ey: float, ez: float, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, steps, found).
+
+    The name is in Mulsow 2024, whose text could not be had; this is how it was read. A ray and two
+    beside it are traced forward through the water. Where the three come down to the height of the
+    object point gives the mapping from direction to place, linearised; it is solved for the
+    direction that hits the point, the rays are traced about that one and nearer to each other, and
+    so on. It starts with the straight line. That is Newton's method with differences instead of
+    derivatives: three rays a step, few steps.
 
     A step that makes the miss grow is halved until it is short; so is one beyond the edge of the
     water.
@@ -306,6 +336,14 @@ NEIGHBOUR_M = 1e-4
 @njit(cache=True, error_model="numpy", nogil=True)
 def scattershot(water: Water, level: float, ex: float, ey: float, ez: float, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, shots, found).
+
+    The name is in Mulsow 2024, whose text could not be had; this is how it was read. Rays to the
+    knots of a grid on the surface are followed to the object point; the grid is drawn together
+    about the best one again and again. No start value, no derivative, no law of refraction even:
+    the best one is that of the least optical length (Fermat). So where a broken surface sends light
+    along several paths the quickest is taken, and a path may leave through a crease, which no
+    refracted ray does. Near the end a length is too blunt (it changes with the square of the
+    distance), so the refracted rays are looked at, and how near to the point they come.
 
     On calm water that is between the plan place of the point and the straight line; the first
     shot covers these and as much as the point is deep all around.

@@ -34,7 +34,7 @@ def moved_by(points, centres, plane, name, j, step, method):
         plane[1 + j] += step
     else:
         n += step
-    return trace(points, centres, WaterPlane(*plane), n, method=method).direction
+    return trace(centres, points, WaterPlane(*plane), refractive_index=n, method=method).direction
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -42,7 +42,7 @@ def moved_by(points, centres, plane, name, j, step, method):
 @pytest.mark.parametrize(("name", "columns"), list(zip(STEPS, (3, 3, 1, 2, 1), strict=True)))
 def test_on_planes_they_are_the_differences(method, plane, name, columns):
     points, centres = scene()
-    found = trace(points, centres, WaterPlane(*plane), INDEX, method=method)
+    found = trace(centres, points, WaterPlane(*plane), refractive_index=INDEX, method=method)
     ours = getattr(gradients(points, centres, found, INDEX), name).reshape(len(points), 3, columns)
     for j in range(columns):
         d = STEPS[name]
@@ -62,12 +62,16 @@ def test_a_raster_and_a_mesh_have_those_of_their_tangent_planes():
     z = plane.a + plane.b * x[None, :] + plane.c * x[::-1, None]
     corners = np.array([[i, j, plane.a + plane.b * i + plane.c * j]
                         for i in (-60.0, 60.0) for j in (-60.0, 60.0)])  # fmt: skip
-    expected = gradients(points, centres, trace(points, centres, plane, INDEX), INDEX)
+    expected = gradients(
+        points, centres, trace(centres, points, plane, refractive_index=INDEX), INDEX
+    )
     for water in (
         WaterRaster(z, -60.0, 60.0, (1.0, 1.0)),
         WaterMesh(corners, np.array([[0, 2, 1], [1, 2, 3]])),
     ):
-        ours = gradients(points, centres, trace(points, centres, water, INDEX), INDEX)
+        ours = gradients(
+            points, centres, trace(centres, points, water, refractive_index=INDEX), INDEX
+        )
         for name in STEPS:
             # the same path to 1e-9 m
             np.testing.assert_allclose(
@@ -77,7 +81,7 @@ def test_a_raster_and_a_mesh_have_those_of_their_tangent_planes():
 
 def test_the_pivot_is_where_the_tilt_leaves_the_level_alone():
     points, centres = scene(5)
-    found = trace(points, centres, WaterPlane(0.0), INDEX)
+    found = trace(centres, points, WaterPlane(0.0), refractive_index=INDEX)
     at, origin = (gradients(points, centres, found, INDEX, pivot=p) for p in ((7.0, -2.0), (0, 0)))
     shifted = at.by_slopes + np.array([7.0, -2.0]) * at.by_level[:, :, None]
     np.testing.assert_allclose(shifted, origin.by_slopes, rtol=0.0, atol=1e-15)
@@ -85,7 +89,9 @@ def test_the_pivot_is_where_the_tilt_leaves_the_level_alone():
 
 def test_straight_light_knows_nothing_of_the_water():
     point, centre = np.array([[2.0, 1.0, 3.0]]), np.array([[8.0, -4.0, 40.0]])
-    ours = gradients(point, centre, trace(point, centre, WaterPlane(0.0), INDEX), INDEX)
+    ours = gradients(
+        point, centre, trace(centre, point, WaterPlane(0.0), refractive_index=INDEX), INDEX
+    )
     way = (point - centre)[0]
     size = np.linalg.norm(way)
     straight = (np.eye(3) - np.outer(way, way) / size**2) / size
@@ -98,7 +104,7 @@ def test_straight_light_knows_nothing_of_the_water():
 
 def test_what_was_lost_has_none_and_other_points_are_refused():
     points, centres = np.array([[0.0, 0.0, -3.0]]), np.array([[1.0, 0.0, -1.0]])
-    lost = trace(points, centres, WaterPlane(0.0), INDEX)
+    lost = trace(centres, points, WaterPlane(0.0), refractive_index=INDEX)
     assert np.isnan(gradients(points, centres, lost, INDEX).by_point).all()
     with pytest.raises(SettingError, match="tracing of 1 paths"):
         gradients(np.zeros((4, 3)), centres, lost, INDEX)

@@ -8,6 +8,7 @@ import pytest
 from scipy.interpolate import RegularGridInterpolator
 from scipy.optimize import minimize_scalar
 
+import pcfix
 from pcfix.errors import SettingError
 from pcfix.model import WaterDimension, WaterMesh, WaterPlane, WaterRaster
 from pcfix.refract.tracing import METHODS, trace
@@ -78,7 +79,7 @@ def normal_at(surface, x, y, d=1e-5):
 def test_paths_through_planes_are_those_of_brentq(method, plane):
     points, centres = pairs(60)
     points[:, 2] += plane[0] + points[:, :2] @ plane[1:]
-    found = trace(points, centres, WaterPlane(*plane), INDEX, method=method)
+    found = trace(centres, points, WaterPlane(*plane), refractive_index=INDEX, method=method)
     assert found.converged.all()
     assert not found.on_crease.any()
     for p, c, a, d in zip(points, centres, found.piercing_xyz, found.direction, strict=True):
@@ -95,7 +96,7 @@ def test_light_that_was_bent_forwards_comes_back(method, incidence_deg):
     leaves = np.array([40.0 * math.tan(i), 0.0, 0.0])
     down = bend(np.array([math.sin(i), 0.0, -math.cos(i)]), np.array([0.0, 0.0, 1.0]), INDEX)
     point = leaves + 6.0 * down
-    found = trace(point, [0.0, 0.0, 40.0], WaterPlane(0.0), INDEX, method=method)
+    found = trace([0.0, 0.0, 40.0], point, WaterPlane(0.0), refractive_index=INDEX, method=method)
     # at 89 degrees a miss of 1e-9 m is 1e-9 / cos^2 of the incidence at the surface
     np.testing.assert_allclose(found.piercing_xyz[0], leaves, rtol=0.0, atol=4e-6)
 
@@ -106,7 +107,7 @@ def test_paths_under_waves_obey_snell(method, slope_deg):
     water = raster(waves(slope_deg))
     surface = bilinear(water)
     points, centres = pairs(80, steepest_deg=45.0)
-    found = trace(points, centres, water, INDEX, method=method)
+    found = trace(centres, points, water, refractive_index=INDEX, method=method)
     assert found.converged.all()
     tested = 0
     for i in np.flatnonzero(~found.on_crease):
@@ -129,7 +130,7 @@ def test_a_path_through_a_crease_is_the_shortest(method):
     water = raster(waves(12.0), cell=1.0)
     surface = bilinear(water)
     points, centres = pairs(150, seed=4, steepest_deg=40.0)
-    found = trace(points, centres, water, INDEX, method=method)
+    found = trace(centres, points, water, refractive_index=INDEX, method=method)
     creases = np.flatnonzero(found.on_crease)
     assert len(creases) > 3
 
@@ -148,7 +149,7 @@ def test_a_path_through_a_crease_is_the_shortest(method):
 def test_light_through_a_trough_leaves_in_its_crease(method):
     point, centre = np.array([0.001, 0.0, -5.0]), np.array([0.0, 20.0, 30.0])
     water = folded(0.05)
-    found = trace(point, centre, water, INDEX, method=method)
+    found = trace(centre, point, water, refractive_index=INDEX, method=method)
     assert found.converged[0]
     assert found.on_crease[0]
 
@@ -168,7 +169,14 @@ def test_light_through_a_trough_leaves_in_its_crease(method):
 
 @pytest.mark.parametrize("method", METHODS[:3])
 def test_without_narrowing_no_ray_is_no_path(method):
-    found = trace([0.001, 0, -5], [0, 20, 30], folded(0.05), INDEX, method=method, narrow=False)
+    found = trace(
+        [0, 20, 30],
+        [0.001, 0, -5],
+        folded(0.05),
+        refractive_index=INDEX,
+        method=method,
+        narrow=False,
+    )
     assert not found.converged[0]
     assert np.isnan(found.direction).all()
 
@@ -176,7 +184,7 @@ def test_without_narrowing_no_ray_is_no_path(method):
 def test_scattershot_takes_the_quickest_of_several_paths():
     # under a ridge two rays hit the point; the one from the camera's side is the shorter
     water, point, centre = folded(-0.3), np.array([0.0, 0.0, -9.0]), np.array([0.5, 3.0, 30.0])
-    found = trace(point, centre, water, INDEX, method="scattershot")
+    found = trace(centre, point, water, refractive_index=INDEX, method="scattershot")
 
     def surface(x, y):
         return -0.3 * abs(x)
@@ -203,7 +211,7 @@ def test_a_plane_as_raster_or_mesh_is_that_plane_far_from_the_origin(method):
         plane[0] - plane[1] * UTM[0] - plane[2] * UTM[1], plane[1], plane[2]
     )  # a of 40 km: good to 1e-11 m
     for water in (raster(surface, origin=UTM), mesh, moved):
-        found = trace(points + UTM, centres + UTM, water, INDEX, method=method)
+        found = trace(centres + UTM, points + UTM, water, refractive_index=INDEX, method=method)
         for p, c, d in zip(points, centres, found.direction, strict=True):
             truth = direction(through_plane(p, c, plane, INDEX), c)
             # northings of 5e6 m are good to 1e-9 m, seen from 15 m
@@ -213,7 +221,7 @@ def test_a_plane_as_raster_or_mesh_is_that_plane_far_from_the_origin(method):
 @each_method
 def test_without_refraction_light_goes_straight(method):
     points, centres = pairs(20, steepest_deg=45.0)
-    found = trace(points, centres, raster(waves(5.0)), 1.0, method=method)
+    found = trace(centres, points, raster(waves(5.0)), refractive_index=1.0, method=method)
     straight = (points - centres) / np.linalg.norm(points - centres, axis=1)[:, None]
     np.testing.assert_allclose(found.direction, straight, rtol=0.0, atol=1e-9)
 
@@ -225,7 +233,7 @@ def test_points_above_the_water_and_beside_it_are_seen_straight(method, water):
     if isinstance(water, WaterPlane):
         points = points[:1]
     centre = np.array([5.0, 3.0, 40.0])
-    found = trace(points, centre, water, INDEX, method=method)
+    found = trace(centre, points, water, refractive_index=INDEX, method=method)
     assert found.converged.all()
     assert not found.iterations.any()
     np.testing.assert_array_equal(found.piercing_xyz, points)
@@ -237,7 +245,7 @@ def test_points_above_the_water_and_beside_it_are_seen_straight(method, water):
 def test_what_cannot_be_seen_is_lost_and_hurts_no_other(method):
     points = np.array([[0.0, 0.0, -3.0], [0.0, 0.0, -3.0], [59.9, 0.0, -9.0], [np.nan, 0.0, -1.0]])
     centres = np.array([[1, 0, 30.0], [1, 0, -0.5], [120, 0, 20.0], [1, 0, 30.0]])
-    found = trace(points, centres, raster(waves(1.0)), INDEX, method=method)
+    found = trace(centres, points, raster(waves(1.0)), refractive_index=INDEX, method=method)
     # seen; camera in the water; leaves beyond the edge; no point
     assert found.converged.tolist() == [True, False, False, False]
     assert np.isnan(found.direction[1:]).all()
@@ -248,7 +256,7 @@ def test_what_cannot_be_seen_is_lost_and_hurts_no_other(method):
 def test_a_camera_lower_than_the_water_over_the_point_sees_it_through_a_tilted_plane(method):
     plane = (0.0, 0.1, 0.0)
     point, centre = np.array([30.0, 0.0, 1.0]), np.array([5.0, 0.0, 2.5])
-    found = trace(point, centre, WaterPlane(*plane), INDEX, method=method)
+    found = trace(centre, point, WaterPlane(*plane), refractive_index=INDEX, method=method)
     truth = through_plane(point, centre, plane, INDEX)
     # a miss of 1e-9 m, grazing at 85 degrees
     np.testing.assert_allclose(found.piercing_xyz[0], truth, rtol=0.0, atol=1e-6)
@@ -258,11 +266,11 @@ def test_a_camera_lower_than_the_water_over_the_point_sees_it_through_a_tilted_p
 def test_any_number_of_threads_gives_the_same_bits(method):
     points, centres = pairs(200, steepest_deg=45.0)
     water = raster(waves(4.0))
-    many = trace(points, centres, water, INDEX, method=method)
+    many = trace(centres, points, water, refractive_index=INDEX, method=method)
     before = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
-        one = trace(points, centres, water, INDEX, method=method)
+        one = trace(centres, points, water, refractive_index=INDEX, method=method)
     finally:
         numba.set_num_threads(before)
     np.testing.assert_array_equal(many.piercing_xyz, one.piercing_xyz)
@@ -275,17 +283,49 @@ def test_any_number_of_threads_gives_the_same_bits(method):
         ({"method": "newton"}, "none of kotowski, afrt, mdfrt, scattershot"),
         ({"refractive_index": 0.75}, "below 1"),
         ({"refractive_index": math.nan}, "below 1"),
-        ({"points": np.zeros((4, 3))}, r"shape \(4, 3\)"),
-        ({"points": np.zeros((2, 2))}, "do not make pairs"),
-        ({"surface": WaterDimension("w_surf")}, "plane, raster or mesh"),
+        ({"target": np.zeros((4, 3))}, r"shape \(4, 3\)"),
+        ({"target": np.zeros((2, 2))}, "do not make pairs"),
+        ({"surfaces": WaterDimension("w_surf")}, "plane, raster or mesh"),
+        ({"surfaces": [0.0, WaterPlane(-1.0)]}, "one surface, not 2"),
     ],
 )
 def test_what_does_not_fit_is_refused(change, says):
     given = {
-        "points": np.zeros((3, 3)),
-        "centres": np.ones((3, 3)),
-        "surface": WaterPlane(0.0),
+        "target": np.zeros((3, 3)),
+        "origin": np.ones((3, 3)),
+        "surfaces": WaterPlane(0.0),
         "refractive_index": INDEX,
     }
     with pytest.raises(SettingError, match=says):
         trace(**(given | change))
+
+
+@pytest.mark.parametrize("plane", [WaterPlane(0.0), WaterPlane(0.2, 0.03, -0.02)])
+def test_the_public_door_obeys_snell_and_fermat_by_every_method(plane):
+    points, centres = pairs(40)
+    points[:, 2] += plane.a + points[:, :2] @ [plane.b, plane.c]
+    normal = np.array([-plane.b, -plane.c, 1.0]) / np.linalg.norm([plane.b, plane.c, 1.0])
+    first = pcfix.trace(centres, points, plane, refractive_index=INDEX).piercing_xyz
+
+    def length(a):
+        return np.linalg.norm(a - centres, axis=1) + INDEX * np.linalg.norm(points - a, axis=1)
+
+    for method in METHODS:
+        found = pcfix.trace(centres, points, [plane], refractive_index=INDEX, method=method)
+        a = found.piercing_xyz
+        # a miss of 1e-9 m at the point is less than that at the surface, up to grazing light
+        np.testing.assert_allclose(a, first, rtol=0.0, atol=6e-9)
+        wet = (points - a) / np.linalg.norm(points - a, axis=1)[:, None]
+        sines = np.linalg.norm(np.cross(found.direction, normal), axis=1)
+        below = np.linalg.norm(np.cross(wet, normal), axis=1)
+        np.testing.assert_allclose(sines, INDEX * below, rtol=0.0, atol=1e-8)
+        for side in np.eye(3)[:2]:
+            for step in (1e-3 * side, -1e-3 * side):
+                aside = np.array([*step[:2], plane.b * step[0] + plane.c * step[1]])
+                assert (length(a + aside) > length(a)).all()
+
+
+def test_a_level_may_be_a_number():
+    points, centres = pairs(5)
+    one, other = (pcfix.trace(centres, points, water) for water in (0.3, WaterPlane(0.3)))
+    np.testing.assert_array_equal(one.piercing_xyz, other.piercing_xyz)

@@ -40,7 +40,7 @@ from pcfix.io.cameras.blocksexchange.document import (
     read_document,
     read_ties,
 )
-from pcfix.io.cameras.values import number
+from pcfix.io.cameras.checks import number
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
 from pcfix.model import Cameras, GnssPositions
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
+from pcfix.io.cameras.checks import number, read_xml
 from pcfix.io.cameras.tracks import tie_points
-from pcfix.io.cameras.values import number, read_xml
 from pcfix.model import Lens
 
 if TYPE_CHECKING:

@@ -32,12 +32,12 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 
 from pcfix.errors import InputError
+from pcfix.io.cameras.checks import number, numbers
 from pcfix.io.cameras.metashape import documents
 from pcfix.io.cameras.metashape.block import read_block
 from pcfix.io.cameras.metashape.documents import opened
 from pcfix.io.cameras.metashape.sensors import read_calibration
 from pcfix.io.cameras.tracks import tie_points as gathered
-from pcfix.io.cameras.values import number, numbers
 from pcfix.io.crs import is_local, parse_crs
 from pcfix.io.ply import parse_header
 from pcfix.model import Cameras, GnssPositions, TiePoints

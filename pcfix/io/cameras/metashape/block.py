@@ -10,9 +10,8 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import ROUNDING
+from pcfix.io.cameras.checks import ROUNDING, number, numbers
 from pcfix.io.cameras.metashape import sensors
-from pcfix.io.cameras.values import number, numbers
 from pcfix.io.crs import METRES, crs_text, is_local, parse_crs, shortened, unbound
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from pcfix.errors import InputError
-from pcfix.io.cameras.values import read_xml
+from pcfix.io.cameras.checks import read_xml
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

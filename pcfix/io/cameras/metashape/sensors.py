@@ -21,9 +21,9 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
+from pcfix.io.cameras.checks import number, numbers, read_xml
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import documents
-from pcfix.io.cameras.values import number, numbers, read_xml
 from pcfix.model import Lens
 
 if TYPE_CHECKING:

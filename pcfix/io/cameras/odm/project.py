@@ -9,9 +9,9 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
+from pcfix.io.cameras.checks import json_number, load_json, mapping, rows, vector
 from pcfix.io.cameras.opensfm import left_out
 from pcfix.io.cameras.opensfm.models import is_panorama, lens
-from pcfix.io.cameras.values import json_number, load_json, mapping, rows, vector
 from pcfix.io.crs import GEOCENTRIC_WGS84, GEOGRAPHIC_WGS84, Topocentric
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, GnssPositions, Lens

@@ -26,8 +26,8 @@ from typing import IO, TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError
+from pcfix.io.cameras.checks import json_number, load_json, mapping, rows, vector
 from pcfix.io.cameras.opensfm.models import is_panorama, lens
-from pcfix.io.cameras.values import json_number, load_json, mapping, rows, vector
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, GnssPositions, TiePoints, Views
 

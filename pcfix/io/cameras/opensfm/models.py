@@ -25,10 +25,9 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import is_same_lens
+from pcfix.io.cameras.checks import is_same_lens, json_number
 from pcfix.io.cameras.frames import frame_of, is_tied
 from pcfix.io.cameras.georeference import georeference
-from pcfix.io.cameras.values import json_number
 from pcfix.io.crs import (
     GEOCENTRIC_WGS84,
     GEOGRAPHIC_WGS84,
