@@ -524,6 +524,8 @@ class Summary:
     labelling: dict[str, Any] | None = None
     uncertainty: dict[str, Any] | None = None
     carried: dict[str, Any] | None = None
+    absorbed: bool = False
+    """Whether it warned that the poses have absorbed the refraction; for later steps of a run."""
 
     @property
     def points_per_s(self) -> float:
@@ -537,6 +539,6 @@ class Summary:
         cameras to adjusted ones.
         """
         some = ("labelling", "carried")
-        values = {name: value for name, value in vars(self).items() if name not in some}
+        values = {name: vars(self)[name] for name in vars(self) if name not in (*some, "absorbed")}
         more = {name: getattr(self, name) for name in some if getattr(self, name) is not None}
         return {**values, **more, "points_per_s": round(self.points_per_s)}

@@ -311,6 +311,7 @@ class Job:
             water_fit=self.found.as_dict(),
             uncertainty=self.tally.uncertainty(),
             carried=None if self.carrying is None else self.carrying.as_dict(),
+            absorbed=any(self._bent),
         )
 
     def _summary(

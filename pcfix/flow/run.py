@@ -291,7 +291,7 @@ def run_all(
     _say_adjusted(first, out_dir, was_done, say)
     request = request.with_adjusted(out_dir, first)
     corrected = step("correct", [files.corrected], lambda: _correct(request, files, jobs, progress))
-    if not first["is_said"] and is_worth_saying(first, corrected["warnings"]):
+    if not first["is_said"] and is_worth_saying(first, corrected.get("absorbed", False)):
         first = {**first, "is_said": True}
         _say_adjusted(first, out_dir, was_done, say)
     step("clean", [files.cleaned], lambda: _clean(request, files, jobs))

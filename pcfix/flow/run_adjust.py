@@ -39,9 +39,6 @@ MODELS = ("colmap", "opensfm/reconstruction.json", "cameras.csv")
 LEAST_POSITIONS = 3
 """Of the GNSS, that say where a block is, how it is turned, and its scale."""
 
-BENT = "have absorbed the refraction"
-"""In the warning of `pcfix.adjust.diagnosis.Diagnosis.sentence`."""
-
 
 class Decision(NamedTuple):
     """Whether a run adjusts, why, and whether that is worth a line."""
@@ -146,17 +143,17 @@ def adjust_first(
     }  # fmt: skip
 
 
-def is_worth_saying(step: dict[str, Any], warnings_of_correction: Sequence[str]) -> bool:
+def is_worth_saying(step: dict[str, Any], absorbed: bool) -> bool:
     """Whether it matters that a run did not adjust: if asked, or if the poses turn out to be bent.
 
     Parameters
     ----------
     step : dict
         Of `adjust_first`.
-    warnings_of_correction : sequence of str
+    absorbed : bool
+        Of the summary of the correction.
     """
-    bent = any(BENT in warning for warning in warnings_of_correction)
-    return step["is_said"] or bool(step["why"] and bent)
+    return step["is_said"] or bool(step["why"] and absorbed)
 
 
 def _decide(step: AdjustStep) -> Decision:
