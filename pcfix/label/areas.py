@@ -251,12 +251,12 @@ class Grid:
     @property
     def fits(self) -> bool:
         """Whether the grid is the one that the points so far would have."""
-        mine, theirs = self.lattice, lattice_over(self.low, self.high)
-        across, up = theirs.first_column - mine.first_column, theirs.first_row - mine.first_row
+        own, fitting = self.lattice, lattice_over(self.low, self.high)
+        across, up = fitting.first_column - own.first_column, fitting.first_row - own.first_row
         return (
-            mine.side_m == theirs.side_m
-            and 0 <= across <= mine.columns - theirs.columns
-            and 0 <= up <= mine.rows - theirs.rows
+            own.side_m == fitting.side_m
+            and 0 <= across <= own.columns - fitting.columns
+            and 0 <= up <= own.rows - fitting.rows
         )
 
     def surroundings(self, *, connected: bool, least_pool_m2: float | None) -> Surroundings:

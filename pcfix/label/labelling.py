@@ -262,10 +262,10 @@ class LeftOut:
             With where mask and points lie, or with the classes.
         """
         if self.respected and self.below == self.outside_mask + self.respected:
-            listed = ", ".join(map(str, self._settings.respect_classes))
+            respected = ", ".join(map(str, self._settings.respect_classes))
             raise GeometryError(
                 f"{name}: all {self.respected:,} points below the water come with the classes to"
-                f" respect ({listed}); respect fewer."
+                f" respect ({respected}); respect fewer."
             )
         if self._mask is None or self.outside_mask < max(self.below, 1):
             return

@@ -130,8 +130,8 @@ def fuse_depth_maps(
     place = intersect(bed[0], sight, rig, sight.ideal)
     maps = depth_maps(matching, place)
     seed, group = _groups(matching, maps, luck)
-    made = np.flatnonzero(seed >= 0)
-    place[made] = maps.points(seed[made], maps.averaged[seed[made]])
+    seeded = np.flatnonzero(seed >= 0)
+    place[seeded] = maps.points(seed[seeded], maps.averaged[seed[seeded]])
     maps = depth_maps(matching, place)
     rows = np.flatnonzero((group >= 0) & (group == seed[sight.point]))
     rows = rows[_at(matching, maps, rows, place)]
@@ -154,8 +154,8 @@ def _matching(
     rows = sight.rows(len(rig.true))
 
     def there(table: IntArray) -> IntArray:
-        mine = table[sight.camera]
-        return np.where(mine >= 0, rows[sight.point[:, None], mine], -1)
+        others = table[sight.camera]
+        return np.where(others >= 0, rows[sight.point[:, None], others], -1)
 
     partner = there(partners.matched)
     partner[(partner >= 0).sum(axis=1) < LEAST_PARTNERS] = -1
@@ -383,9 +383,9 @@ def _means(
 ) -> FloatArray:
     """Return weighted means of each point's rows, shape (n, 3), or the other value."""
     total = np.bincount(point, weight, len(otherwise))
-    made, means = total > 0.0, otherwise.copy()
+    held, means = total > 0.0, otherwise.copy()
     for axis in range(3):
         # the sums are of differences, so that nothing is lost where the values are the same
         apart = weight * (values[:, axis] - otherwise[point, axis])
-        means[made, axis] += np.bincount(point, apart, len(otherwise))[made] / total[made]
+        means[held, axis] += np.bincount(point, apart, len(otherwise))[held] / total[held]
     return means

@@ -82,7 +82,7 @@ class Sight:
     ideal: FloatArray
 
     @property
-    def made(self) -> np.ndarray:
+    def paired(self) -> np.ndarray:
         """Which points have pairs, shape (n,)."""
         return np.asarray(np.diff(self.start) > 0)
 
@@ -134,11 +134,11 @@ def intersect(truth: FloatArray, sight: Sight, rig: Rig, pixels: FloatArray) -> 
 
     A point without pairs stays where it is.
     """
-    made, apparent = sight.made, truth.copy()
-    if made.any():
-        starts = np.concatenate([sight.start[:-1][made], sight.start[-1:]])
-        apparent[made] = triangulate(
-            pixels, rig.given, sight.camera, starts, rig.optics.lens, truth[made]
+    paired, apparent = sight.paired, truth.copy()
+    if paired.any():
+        starts = np.concatenate([sight.start[:-1][paired], sight.start[-1:]])
+        apparent[paired] = triangulate(
+            pixels, rig.given, sight.camera, starts, rig.optics.lens, truth[paired]
         )
     return apparent
 
@@ -248,12 +248,12 @@ def openmvs_partners(
     table, known = np.full((k, max(MOST, count)), -1), np.zeros(k, int)
     matched = np.full((k, count), -1)
     for i in range(k):
-        mine = np.flatnonzero(cell[i] >= 0)
-        common = cell[:, mine] >= 0
+        visible = np.flatnonzero(cell[i] >= 0)
+        common = cell[:, visible] >= 0
         common[i] = False
-        angle = _angles_deg(cameras.centres, i, ties[mine])
-        scale = depth[:, mine] / depth[i, mine]
-        area = _shares_of_cells(common, cell[i, mine])
+        angle = _angles_deg(cameras.centres, i, ties[visible])
+        scale = depth[:, visible] / depth[i, visible]
+        area = _shares_of_cells(common, cell[i, visible])
         score = (common * _weights(angle, scale)).sum(axis=1) * np.maximum(area, 0.01)
         order = np.argsort(-score, kind="stable")
         order = order[common.sum(axis=1)[order] >= LEAST_COMMON]
@@ -371,9 +371,9 @@ def match_pairs(
         truth[point],
     )
     start = starts_of(point, len(truth))
-    xyz, made = truth.copy(), np.diff(start) > 0
+    xyz, paired = truth.copy(), np.diff(start) > 0
     for axis in range(3):
-        xyz[made, axis] = _medians(places[:, axis], point, start)[made]
+        xyz[paired, axis] = _medians(places[:, axis], point, start)[paired]
     used = np.zeros(len(sight.point), bool)
     used[both] = True
     views = Views(starts_of(sight.point[used], len(truth)), sight.camera[used])

@@ -336,7 +336,7 @@ def from_classes(water: FloatArray, samples: Samples) -> WaterProposal:
         "share accepted": float(fit.accepted.mean()),
     }
     counts, edges = np.histogram(thinned[:, 2], 60)
-    said = (
+    reasons = (
         f"{len(water):,} points are classified as water and scatter by {fit.sigma_m:.3f} m",
         *fit.notes,
     )
@@ -349,7 +349,7 @@ def from_classes(water: FloatArray, samples: Samples) -> WaterProposal:
         sigma_tilt=fit.sigma_tilt_percent / 100.0,
         confidence=float(fit.accepted.mean()),
         evidence=figures,
-        reasons=said,
+        reasons=reasons,
         shoreline=accepted,
         curves=EvidenceCurves((edges[1:] + edges[:-1]) / 2.0, {"classified points": counts + 0.0}),
         ground=samples.xyz + samples.origin,

@@ -192,15 +192,15 @@ def gather(
     what: Break,
 ) -> Moments | None:  # fmt: skip
     """Put tiles together, each in units of its residual variance; None where none says anything."""
-    said = [i for i, (_, count) in enumerate(parts) if count.any()]
-    if not said:
+    telling = [i for i, (_, count) in enumerate(parts) if count.any()]
+    if not telling:
         return None
-    sums = np.array([parts[i][0] for i in said])
-    count = np.array([parts[i][1] for i in said])
+    sums = np.array([parts[i][0] for i in telling])
+    count = np.array([parts[i][1] for i in telling])
     variance = sums[..., 0].sum(axis=1) / count.sum(axis=1)
     least = 0.3 * float(np.median(variance)) + _TINY
     sums /= np.maximum(variance, least)[:, None, None]
-    return Moments(sums, count, np.array([xy[i] for i in said]), heights_m, what)
+    return Moments(sums, count, np.array([xy[i] for i in telling]), heights_m, what)
 
 
 LIFT = 0.36
@@ -217,7 +217,7 @@ class Cue(NamedTuple):
     """A thing to look at. `places` says whether it fixes the level, or only bears witness."""
 
     name: str
-    words: str
+    meaning: str
     what: Break
     tile_cells: float
     places: bool
@@ -231,7 +231,7 @@ RED = Cue(
     "red/green", "red fades against green below",
     Break(0.7, 0.8, -1.0, most=MOST_FADING), LIGHT_TILE_CELLS, places=True,
 )  # fmt: skip
-BLUE = RED._replace(name="blue/green", words="blue fades against green below")
+BLUE = RED._replace(name="blue/green", meaning="blue fades against green below")
 BRIGHT = Cue(
     "brightness", "the ground is darker below",
     Break(0.3, 0.8, -1.0), LIGHT_TILE_CELLS, places=False,

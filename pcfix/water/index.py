@@ -127,19 +127,19 @@ def index_of(given: float | str) -> tuple[float, str]:
     SettingError
         If it is none of these, or a value is outside its range.
     """
-    words = str(given).strip().lower()
-    water = WATERS.get(words)
+    text = str(given).strip().lower()
+    water = WATERS.get(text)
     try:
-        if water is None and "," in words:
-            water = Water(*(float(word) for word in words.split(",")))
+        if water is None and "," in text:
+            water = Water(*(float(word) for word in text.split(",")))
         if water is None:
-            return float(words), ""
+            return float(text), ""
     except (ValueError, TypeError):
         raise SettingError(
             f"index '{given}' is neither a number nor {' nor '.join(WATERS)}, nor salinity,"
             " temperature and wavelength as 35,15,0.53."
         ) from None
-    name = f"{words}: " if words in WATERS else ""
+    name = f"{text}: " if text in WATERS else ""
     return refractive_index(*water), (
         f"{name}{water.salinity_psu:g} PSU, {water.temperature_c:g} C, {water.wavelength_um:g} um"
     )

@@ -53,8 +53,8 @@ class Peak(NamedTuple):
 def look(samples: Samples, floating: Floating, heights_m: FloatArray, tilt: FloatArray) -> Looked:
     """Sum up all cues at the given heights above a tilted plane."""
     cues = [(cue, cue_moments(samples, cue, heights_m, tilt)) for cue in cues_of(samples)]
-    said = [(cue, sums) for cue, sums in cues if sums is not None]
-    return Looked(said, floating, heights_m, tilt)
+    known = [(cue, sums) for cue, sums in cues if sums is not None]
+    return Looked(known, floating, heights_m, tilt)
 
 
 def all_heights(samples: Samples) -> FloatArray:
@@ -283,7 +283,7 @@ def _rival(whole: Looked, peak: Peak) -> tuple[float, float]:
 
 def _witnesses(near: Looked, evidence: dict[str, float]) -> list[str]:
     """Return the sentences of cues that only say that there is water below about here."""
-    said = []
+    sentences = []
     close = np.abs(near.heights_m - near.heights_m[len(near.heights_m) // 2]) <= WITNESS_REACH_M
     for cue, sums in near.cues:
         if cue.places:
@@ -292,8 +292,8 @@ def _witnesses(near: Looked, evidence: dict[str, float]) -> list[str]:
         sigmas = float((cue.what.sign * gain.amplitude / (gain.sigma + 1e-12))[close].max())
         evidence[f"{cue.name} sigmas"] = sigmas
         if sigmas >= WITNESS_SIGMAS:
-            said.append(f"{cue.words} ({sigmas:.0f} standard errors)")
-    return said
+            sentences.append(f"{cue.meaning} ({sigmas:.0f} standard errors)")
+    return sentences
 
 
 def _refuse_one_sided(samples: Samples, peak: Peak, evidence: dict[str, float]) -> None:
@@ -346,17 +346,17 @@ def _height(samples: Samples, peak: Peak) -> str:
 def _reasons(
     near: Looked, found: dict[str, float], witnesses: list[str], evidence: dict[str, float]
 ) -> tuple[str, ...]:
-    said = []
+    sentences = []
     middle = len(near.heights_m) // 2
     for cue, sums in placing(near):
         gain = gain_of(sums)
         if found[cue.name] >= LEAST_EACH:
             size, sigma = float(gain.amplitude[middle]), float(gain.sigma[middle])
             evidence[f"{cue.name} amplitude"], evidence[f"{cue.name} sigma"] = size, sigma
-            said.append(f"{cue.words}: {_size(cue.name, size, sigma)}")
+            sentences.append(f"{cue.meaning}: {_size(cue.name, size, sigma)}")
     if found[LAYER] >= LEAST_EACH:
-        said.append(f"points float in a thin layer (evidence {found[LAYER]:.0f})")
-    return (*said, *witnesses)
+        sentences.append(f"points float in a thin layer (evidence {found[LAYER]:.0f})")
+    return (*sentences, *witnesses)
 
 
 def _size(name: str, size: float, sigma: float) -> str:

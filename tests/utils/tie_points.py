@@ -196,7 +196,7 @@ def _above(xyz: FloatArray, plane: WaterPlane) -> FloatArray:
 def _seen(xyz: FloatArray, rig: Rig, streams: Streams) -> tuple[FloatArray, Sight]:
     """Return those points that enough images show, and where."""
     sight = see(xyz, rig, streams.detection)
-    made = sight.made
+    made = sight.paired
     start = np.concatenate([sight.start[:-1][made], sight.start[-1:]])
     point = np.repeat(np.arange(int(made.sum())), np.diff(start))
     return xyz[made], replace(sight, start=start, point=point)
