@@ -176,9 +176,7 @@ def _pictures(corrected: Corrected) -> list[Picture]:
         Picture(
             "shift_histogram", "How far the points moved",
             "Histogram of the shift in Z of the corrected points.",
-            histogram_figure(
-                {"shift in Z": corrected.sample[:, 2]}, "True minus apparent Z (m)", gaussian=False
-            ),
+            histogram_figure(corrected.sample[:, 2], "shift in Z", "True minus apparent Z (m)"),
         ),
         Picture(
             "cameras", "Cameras",
@@ -206,23 +204,15 @@ def relief(height_m: FloatArray, cell_m: float) -> FloatArray:
     return np.where(light == NO_LIGHT, np.nan, (light - 1.0) / 254.0)
 
 
-def histogram_figure(groups: dict[str, FloatArray], label: str, *, gaussian: bool = True) -> Figure:
-    """Draw the distribution of one or two groups of values, each with its Gaussian if asked."""
+def histogram_figure(values: FloatArray, name: str, label: str) -> Figure:
+    """Draw the distribution of some values."""
     figure, axes = new_figure()
-    everything = np.concatenate(list(groups.values()))
-    low, high = np.percentile(everything, [0.5, 99.5])
+    low, high = np.percentile(values, [0.5, 99.5])
     if high <= low:
         low, high = low - 0.5, high + 0.5
+    text = f"{name}: mean {values.mean():.3f}, sd {values.std():.3f}"
     edges = np.linspace(low, high, 81)
-    for colour, (name, values) in zip((BEFORE, AFTER), groups.items(), strict=False):
-        mean, deviation = float(values.mean()), float(values.std())
-        axes.hist(
-            values, edges, density=True, color=colour, alpha=0.55,
-            label=f"{name}: mean {mean:.3f}, sd {deviation:.3f}",
-        )  # fmt: skip
-        if gaussian and deviation > 0.0:
-            bell = np.exp(-0.5 * ((edges - mean) / deviation) ** 2)
-            axes.plot(edges, bell / (deviation * np.sqrt(2.0 * np.pi)), color=colour)
+    axes.hist(values, edges, density=True, color=BEFORE, alpha=0.55, label=text)
     axes.set_xlabel(label)
     axes.set_ylabel("Density")
     axes.legend(loc="best")

@@ -164,5 +164,5 @@ def test_a_slope_facing_the_light_is_bright():
 
 
 def test_values_all_alike_have_a_histogram():
-    figure = histogram_figure({"before": np.full(10, 2.0), "after": np.full(10, 2.0)}, "m")
+    figure = histogram_figure(np.full(10, 2.0), "before", "m")
     assert len(figure.axes[0].patches) > 0
