@@ -14,11 +14,12 @@ from pcfix.version import __version__
 if TYPE_CHECKING:
     from pcfix.clean.points import clean_points
     from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
+    from pcfix.flow.adjust import adjust_cameras
     from pcfix.flow.clean import clean_file
     from pcfix.flow.compare import compare_clouds
+    from pcfix.flow.correct import correct_file, correct_points
     from pcfix.flow.dsm import grid_dsm
-    from pcfix.flow.files import correct_file
-    from pcfix.flow.points import correct_points
+    from pcfix.flow.label import label_file, label_points
     from pcfix.flow.restore import restore_file
     from pcfix.io.cameras import read_cameras
     from pcfix.io.water import read_water
@@ -32,64 +33,46 @@ if TYPE_CHECKING:
         WaterDimension,
         WaterMesh,
         WaterPlane,
+        WaterRaster,
         WaterSurface,
     )
-    from pcfix.options import ErrorBudget, Settings
+    from pcfix.options.correct import CorrectOptions as Options
     from pcfix.refract.tracing import trace
     from pcfix.simulate import simulate_scene
     from pcfix.water.index import refractive_index
 
-
-_HOME = {
-    "clean_file": "pcfix.flow.clean",
-    "clean_points": "pcfix.clean.points",
-    "compare_clouds": "pcfix.flow.compare",
-    "grid_dsm": "pcfix.flow.dsm",
-    "adjust_cameras": "pcfix.flow.adjust",
-    "correct_file": "pcfix.flow.files",
-    "correct_points": "pcfix.flow.points",
-    "restore_file": "pcfix.flow.restore",
-    "label_file": "pcfix.flow.label",
-    "label_points": "pcfix.flow.label",
-    "ErrorBudget": "pcfix.options",
-    "LabelSettings": "pcfix.options",
-    "WaterRaster": "pcfix.model",
-    "read_cameras": "pcfix.io.cameras",
-    "refractive_index": "pcfix.water.index",
-    "read_water": "pcfix.io.water",
-    "simulate_scene": "pcfix.simulate",
-    "trace": "pcfix.refract.tracing",
-    "Cameras": "pcfix.model",
-    "Correction": "pcfix.model",
-    "Lens": "pcfix.model",
-    "Outcome": "pcfix.model",
-    "Settings": "pcfix.options",
-    "Summary": "pcfix.model",
-    "Views": "pcfix.model",
-    "WaterDimension": "pcfix.model",
-    "WaterMesh": "pcfix.model",
-    "WaterPlane": "pcfix.model",
-    "WaterSurface": "pcfix.model",
-    "PcfixError": "pcfix.errors",
-    "InputError": "pcfix.errors",
-    "SettingError": "pcfix.errors",
-    "GeometryError": "pcfix.errors",
-    "PcfixWarning": "pcfix.errors",
+_NAMES = {
+    "pcfix.clean.points": "clean_points",
+    "pcfix.errors": "GeometryError InputError PcfixError PcfixWarning SettingError",
+    "pcfix.flow.adjust": "adjust_cameras",
+    "pcfix.flow.clean": "clean_file",
+    "pcfix.flow.compare": "compare_clouds",
+    "pcfix.flow.correct": "correct_file correct_points",
+    "pcfix.flow.dsm": "grid_dsm",
+    "pcfix.flow.label": "label_file label_points",
+    "pcfix.flow.restore": "restore_file",
+    "pcfix.io.cameras": "read_cameras",
+    "pcfix.io.water": "read_water",
+    "pcfix.model": "Cameras Correction Lens Outcome Summary Views WaterDimension WaterMesh"
+    " WaterPlane WaterRaster WaterSurface",
+    "pcfix.options.correct": "Options",
+    "pcfix.refract.tracing": "trace",
+    "pcfix.simulate": "simulate_scene",
+    "pcfix.water.index": "refractive_index",
 }
+_HOME = {name: home for home, names in _NAMES.items() for name in names.split()}
 
 __all__ = [
     "Cameras",
     "Correction",
-    "ErrorBudget",
     "GeometryError",
     "InputError",
-    "LabelSettings",
     "Lens",
+    "Options",
     "Outcome",
     "PcfixError",
     "PcfixWarning",
     "SettingError",
-    "Settings",
     "Summary",
     "Views",
     "WaterDimension",

@@ -23,8 +23,7 @@ import os
 import sys
 import time
 import warnings
-from functools import partial
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -42,74 +41,20 @@ from pcfix.io.pdal import (
     node,
     scales_of,
 )
+from pcfix.options.declare import OptionSet, named, options_of
+
+Set = TypeVar("Set", bound=OptionSet)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from pcfix.flow.inputs import Inputs
     from pcfix.flow.job import Points
     from pcfix.flow.surfaces import CloudView
-    from pcfix.model import FloatArray, Summary, WaterSurface
-    from pcfix.options import ErrorBudget, LabelSettings, Settings
+    from pcfix.model import FloatArray, WaterSurface
+    from pcfix.options.declare import Option
 
     Stage: TypeAlias = Callable[[Dimensions, Dimensions], bool]
 
-_CORRECT_OPTIONS: dict[str, tuple[type, ...]] = {
-    "cameras": (str,),
-    "water": (str, float),
-    "sensor": (str,),
-    "angles": (str,),
-    "cameras_crs": (str,),
-    "cameras_offset": (str,),
-    "adjusted_from": (str,),
-    "views": (str,),
-    "water_mask": (str,),
-    "connected": (bool,),
-    "least_pool": (float,),
-    "respect_classes": (str, int),
-    "index": (float, str),
-    "salinity": (float,),
-    "temperature": (float,),
-    "wavelength": (float,),
-    "tide": (str,),
-    "image_times": (str,),
-    "water_model": (str,),
-    "water_crs": (str,),
-    "max_angle": (float,),
-    "max_cameras": (int,),
-    "method": (str,),
-    "camera_set": (str,),
-    "matcher": (str,),
-    "views_are": (str,),
-    "occlusion": (str,),
-    "depth_factor": (float,),
-    "check_depths": (str,),
-    "least_r2": (float,),
-    "sigma_image": (float,),
-    "sigma_level": (float,),
-    "sigma_tilt": (float,),
-    "sigma_index": (float,),
-    "sigma_waves": (float,),
-    "sigma_centre": (float,),
-    "sigma_attitude": (float,),
-    "uncorrected": (str,),
-    "dimensions": (str,),
-    "summary": (str,),
-    "overwrite": (bool,),
-    "jobs": (int,),
-}
-_LABEL_OPTIONS: dict[str, tuple[type, ...]] = {
-    "water": (str, float),
-    "water_model": (str,),
-    "water_crs": (str,),
-    "water_mask": (str,),
-    "band": (float,),
-    "dead_band": (float,),
-    "connected": (bool,),
-    "least_pool": (float,),
-    "respect_classes": (str, int),
-    "reset": (bool,),
-}
 _WORD = {str: "a text", float: "a number", int: "a whole number", bool: "true or false"}
 
 
@@ -168,120 +113,88 @@ def _run(
 
 
 def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
+    from pcfix.flow.inputs import paths_in
     from pcfix.flow.job import Job
+    from pcfix.io.files import check_output, write_text
     from pcfix.io.las.columns import columns_for
+    from pcfix.options.correct import CorrectOptions
     from pcfix.threads import threads
 
     started = time.perf_counter()
-    options = _options(namespace, _CORRECT_OPTIONS, needed=("cameras", "water"))
-    settings = _settings(options)
-    columns = columns_for(settings.dimensions)
+    options = _options(namespace, CorrectOptions, needed=("cameras", "water"))
+    if options.uncorrected == "drop":
+        raise SettingError(
+            "uncorrected 'drop': a stage of PDAL cannot set dimensions and drop points at once;"
+            f' use withhold or keep, add "{OUTCOME}=uint8" to add_dimension, and let'
+            f' filters.range keep "{OUTCOME}[0:1]".'
+        )
+    columns = columns_for(options.dimensions)
     check_dimensions(ins, columns)
     metadata = namespace.get("metadata")
     scales = scales_of(metadata)
     flags = Flags(ins, metadata)
-    job = Job(
-        NAME,
-        settings,
-        _inputs(options),
-        view=_view(ins, metadata, flags),
-        step_m=0.0 if scales is None else float(scales.max()),
-        label=_label_settings(options),
-    )
-    _prepare_summary(options)
+    step_m = 0.0 if scales is None else float(scales.max())
+    job = Job(NAME, options, _view(ins, metadata, flags), step_m)
+    if options.summary is not None:
+        check_output(options.summary, overwrite=options.overwrite, inputs=paths_in(options))
     results = Results(ins, columns, flags, scales)
-    with threads(options.get("jobs")):
+    with threads(options.jobs):
         job.look_around(lambda: (points for _, points in _chunks(ins, job.water, flags)))
         for rows, points in _chunks(ins, job.water, flags):
-            correction = job.correct(*points)
-            results.add(rows, correction, settings.uncorrected == "withhold")
+            results.add(rows, job.correct(*points), options.uncorrected == "withhold")
     job.check_fit()
     outs.update(results.dimensions)
     summary = job.summary(NAME, NAME, time.perf_counter() - started)
-    _write_summary(options, summary)
+    if options.summary is not None:
+        text = json.dumps(summary.as_dict(), indent=2) + "\n"
+        write_text(options.summary, text, overwrite=options.overwrite)
     namespace["out_metadata"] = metadata_of(summary)
 
 
 def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
-    from pcfix.flow.inputs import mask_of
-    from pcfix.flow.job import parts_of
-    from pcfix.flow.label import Counts
-    from pcfix.flow.surfaces import WaterWords, find_surface
-    from pcfix.label.labelling import Labelling
-    from pcfix.water.checks import check_submerged, check_tilt
+    from pcfix.flow.label import LabellingStep
+    from pcfix.options.correct import StageLabelOptions
 
-    options = _options(namespace, _LABEL_OPTIONS, needed=("water",))
+    options = _options(namespace, StageLabelOptions, needed=("water",))
     metadata = namespace.get("metadata")
-    flags, counts = Flags(ins, metadata), Counts()
-    view = _view(ins, metadata, flags)
-    words = WaterWords(
-        options["water"], options.get("water_model", "auto"), options.get("water_crs")
-    )
-    water = find_surface(words, view).surface
-    check_tilt(water)
-    mask = mask_of(options.get("water_mask"), view.crs, view.low, view.high)
-    labelling = Labelling(_label_settings(options), mask)
+    flags = Flags(ins, metadata)
+    step = LabellingStep(NAME, options, _view(ins, metadata, flags))
+    step.look_around(lambda: (points for _, points in _chunks(ins, step.water, flags)))
     classes = flags.classes.copy()
-    if labelling.looks_around:
-        chunks = partial(_chunks, ins, water, flags)
-        labelling.look_around(
-            lambda: parts_of((p for _, p in chunks()), water), view.low, view.high
-        )
-    for rows, points in _chunks(ins, water, flags):
-        (part,) = parts_of([points], water)
-        labels = labelling.labels(part)
-        classes[rows] = labels.classes
-        counts.add(part, labels)
-    labelling.check(NAME)
-    check_submerged(counts.submerged + counts.water_surface, NAME, water)
+    for rows, points in _chunks(ins, step.water, flags):
+        classes[rows] = step.classes(points)
+    step.finish()
     outs["Classification"] = classes
     outs.update(flags.dimensions())
-    found = {**vars(counts), "labelling": labelling.report()}
+    found = {**vars(step.counts), "labelling": step.labelling.report()}
     namespace["out_metadata"] = node(
         "pcfix", children=[node(name, value) for name, value in found.items() if value is not None]
     )
 
 
-def _label_settings(options: dict[str, Any]) -> LabelSettings:
-    from pcfix.flow.inputs import classes_of
-    from pcfix.options import LabelSettings
-
-    given = options.get("respect_classes")
-    return LabelSettings(
-        band_m=options.get("band", 0.0),
-        dead_band_m=options.get("dead_band", 0.0),
-        connected=options.get("connected", False),
-        least_pool_m2=options.get("least_pool"),
-        respect_classes=classes_of(None if given is None else str(given)),
-        reset=options.get("reset", False),
-    )
-
-
-def _options(
-    namespace: dict[str, Any], known: dict[str, tuple[type, ...]], needed: tuple[str, ...]
-) -> dict[str, Any]:
+def _options(namespace: dict[str, Any], kind: type[Set], needed: tuple[str, ...]) -> Set:
     """Return the stage's options, of the right types."""
     given = namespace.get("pdalargs") or {}
     if not isinstance(given, dict):
         raise SettingError(f"pdalargs: must be an object of options, not {given!r}.")
-    options = {}
-    for name, value in given.items():
-        if name not in known:
-            raise SettingError(
-                f"pdalargs: there is no option '{name}'; the options are {', '.join(known)}."
-            )
-        if value is not None:
-            options[name] = _converted(name, value, known[name])
+    known = {one.name: one for one in options_of(kind) if one.name != "port"}
+    values = {
+        name: _converted(known[name], value)
+        for name, value in named(given, known.values(), "pdalargs").items()
+        if value is not None
+    }
     for name in needed:
-        if name not in options:
+        if name not in values:
             raise SettingError(f"pdalargs: the option '{name}' is needed.")
-    return options
+    return kind(**values)
 
 
-def _converted(name: str, value: Any, types: tuple[type, ...]) -> Any:
-    for kind in types:
+def _converted(one: Option, value: Any) -> Any:
+    """Return a value of JSON as what the option takes; numbers may be text."""
+    kinds = one.plain_kinds
+    for kind in kinds:
         if isinstance(value, kind) and (kind is bool or not isinstance(value, bool)):
-            return value
+            return str(value) if kind is int and one.declared.parse is not None else value
         if kind in (int, float) and isinstance(value, int | float | str):
             try:
                 number = float(value)
@@ -290,58 +203,8 @@ def _converted(name: str, value: Any, types: tuple[type, ...]) -> Any:
             if isinstance(value, bool) or (kind is int and not number.is_integer()):
                 continue
             return kind(number)
-    words = " or ".join(_WORD[kind] for kind in types)
-    raise SettingError(f"pdalargs: {name} must be {words}, not {json.dumps(value)}.")
-
-
-def _settings(options: dict[str, Any]) -> Settings:
-    from pcfix.options import Settings
-    from pcfix.water.index import index_of, index_words
-
-    if options.get("uncorrected") == "drop":
-        raise SettingError(
-            "uncorrected 'drop': a stage of PDAL cannot set dimensions and drop points at once;"
-            f' use withhold or keep, add "{OUTCOME}=uint8" to add_dimension, and let'
-            f' filters.range keep "{OUTCOME}[0:1]".'
-        )
-    water = (options.get(name) for name in ("salinity", "temperature", "wavelength"))
-    index, origin = index_of(index_words(options.get("index"), *water))
-    return Settings(
-        index,
-        options.get("max_angle"),
-        options.get("max_cameras"),
-        options.get("uncorrected", "withhold"),
-        options.get("dimensions", "all"),
-        origin,
-        errors=_errors(options),
-        **{name: options[name] for name in _METHOD_OPTIONS if name in options},
-    )
-
-
-_METHOD_OPTIONS = ("method", "camera_set", "matcher", "occlusion", "depth_factor", "least_r2")
-_SIGMAS = {
-    "sigma_image": "image_px",
-    "sigma_level": "level_m",
-    "sigma_tilt": "tilt_deg",
-    "sigma_index": "index",
-    "sigma_waves": "waves_deg",
-    "sigma_centre": "centre_m",
-    "sigma_attitude": "attitude_deg",
-}
-
-
-def _errors(options: dict[str, Any]) -> ErrorBudget:
-    from pcfix.options import ErrorBudget
-
-    given = {name: options[word] for word, name in _SIGMAS.items() if word in options}
-    return ErrorBudget(**given)
-
-
-def _inputs(options: dict[str, Any]) -> Inputs:
-    from pcfix.flow.inputs import inputs_of, offset_of
-
-    offset = offset_of(options.get("cameras_offset"))
-    return inputs_of({**options, "cameras_offset_m": offset})
+    words = " or ".join(_WORD[kind] for kind in kinds)
+    raise SettingError(f"pdalargs: {one.name} must be {words}, not {json.dumps(value)}.")
 
 
 def _heights(water: WaterSurface, ins: Dimensions, rows: slice) -> FloatArray | None:
@@ -351,7 +214,7 @@ def _heights(water: WaterSurface, ins: Dimensions, rows: slice) -> FloatArray | 
 
 
 def _slices(n: int) -> Iterator[slice]:
-    from pcfix.flow.points import CHUNK_POINTS
+    from pcfix.io.las.source import CHUNK_POINTS
 
     return (slice(start, start + CHUNK_POINTS) for start in range(0, n, CHUNK_POINTS))
 
@@ -388,25 +251,6 @@ def _corners(ins: Dimensions) -> tuple[FloatArray, FloatArray]:
         return np.full(2, np.nan), np.full(2, np.nan)
     low, high = ([reach(ins[axis]) for axis in "XY"] for reach in (np.min, np.max))
     return np.array(low), np.array(high)
-
-
-def _prepare_summary(options: dict[str, Any]) -> None:
-    from pcfix.io.files import check_output
-
-    if "summary" in options:
-        check_output(
-            options["summary"],
-            overwrite=options.get("overwrite", False),
-            inputs=_inputs(options).paths(),
-        )
-
-
-def _write_summary(options: dict[str, Any], summary: Summary) -> None:
-    from pcfix.io.files import write_text
-
-    if "summary" in options:
-        text = json.dumps(summary.as_dict(), indent=2) + "\n"
-        write_text(options["summary"], text, overwrite=options.get("overwrite", False))
 
 
 def _repair_process(error: BaseException) -> None:

@@ -11,7 +11,7 @@ from pcfix.io.rasters import read_raster
 
 WATER_M = 0.37
 
-pcfix.grid_dsm("corrected.laz", "bed.tif", resolution_m=2.0, surface="bed", overwrite=True)
+pcfix.grid_dsm("corrected.laz", "bed.tif", resolution=2.0, surface="bed", overwrite=True)
 raster = read_raster("bed.tif")
 bed = np.where(raster.array[0] == raster.nodata, np.nan, raster.array[0])
 plt.imshow(WATER_M - bed, cmap="viridis_r")

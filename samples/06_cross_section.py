@@ -11,7 +11,7 @@ import pcfix
 
 scene = Path(__file__).parent / "scene"
 line = "410200,4650340,410320,4650340"  # x1,y1,x2,y2 in the cloud's coordinates
-result = pcfix.compare_clouds("corrected.laz", scene / "lidar.laz", section_lines=[line])
+result = pcfix.compare_clouds("corrected.laz", scene / "lidar.laz", section=[line])
 section = result.sections[0]
 for name, heights in section.heights_m.items():
     plt.plot(section.distance_m, heights, label=name)

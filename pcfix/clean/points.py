@@ -20,7 +20,8 @@ from pcfix.clean.neighbours import (
     mean_of_first,
     used_rows,
 )
-from pcfix.clean.settings import LEAST_NEIGHBOURS, CleanSettings, Reason
+from pcfix.clean.settings import Reason
+from pcfix.options.steps import LEAST_NEIGHBOURS, CleanRules
 from pcfix.errors import InputError, SettingError
 from pcfix.threads import threads
 from pcfix.water.checks import as_surface, checked_points
@@ -42,7 +43,7 @@ PIECE_ROWS = 65_536
 
 
 def flag_weak(
-    settings: CleanSettings,
+    settings: CleanRules,
     reasons: ReasonArray,
     ray_count: npt.NDArray[np.number],
     ray_miss_m: FloatArray | None = None,
@@ -52,7 +53,7 @@ def flag_weak(
 
     Parameters
     ----------
-    settings : CleanSettings
+    settings : CleanRules
     reasons : array of uint8, shape (n,)
         Gets `Reason.FEW_RAYS`, `RAY_MISS` and `INCIDENCE`.
     ray_count : array, shape (n,)
@@ -62,16 +63,16 @@ def flag_weak(
     corrected = ray_count > 0
     if settings.min_rays is not None:
         _set(reasons, corrected & (ray_count < settings.min_rays), Reason.FEW_RAYS)
-    if settings.max_ray_miss_m is not None and ray_miss_m is not None:
-        _set(reasons, corrected & (ray_miss_m > settings.max_ray_miss_m), Reason.RAY_MISS)
-    if settings.max_incidence_deg is not None and incidence_deg is not None:
-        _set(reasons, corrected & (incidence_deg > settings.max_incidence_deg), Reason.INCIDENCE)
+    if settings.max_ray_miss is not None and ray_miss_m is not None:
+        _set(reasons, corrected & (ray_miss_m > settings.max_ray_miss), Reason.RAY_MISS)
+    if settings.max_incidence is not None and incidence_deg is not None:
+        _set(reasons, corrected & (incidence_deg > settings.max_incidence), Reason.INCIDENCE)
 
 
 def flag_sparse(
     xyz: FloatArray,
     used: BoolArray,
-    settings: CleanSettings,
+    settings: CleanRules,
     reasons: ReasonArray,
     *,
     tile_m: float | None = None,
@@ -87,7 +88,7 @@ def flag_sparse(
         Metres, world frame.
     used : array of bool, shape (n,)
         The points to test; more than ``settings.nearest`` of them.
-    settings : CleanSettings
+    settings : CleanRules
     reasons : array of uint8, shape (n,)
         Gets `Reason.STATISTICAL` and `RADIUS`.
     tile_m, empty, jobs
@@ -116,8 +117,8 @@ def flag_sparse(
         distance, _ = near.nearest(tiles.xyz[piece], settings.nearest)
         if mean_m is not None:
             mean_m[rows] = mean_of_first(distance, settings.neighbours)
-        if settings.radius_m is not None:
-            alone = distance[:, settings.radius_neighbours] * SLACK >= settings.radius_m
+        if settings.radius is not None:
+            alone = distance[:, settings.radius_neighbours] * SLACK >= settings.radius
             _set(reasons, rows[alone], Reason.RADIUS)
         if progress is not None:
             progress(len(rows))
@@ -125,7 +126,7 @@ def flag_sparse(
 
 
 def _flag_far(
-    mean_m: FloatArray, used: BoolArray, settings: CleanSettings, reasons: ReasonArray
+    mean_m: FloatArray, used: BoolArray, settings: CleanRules, reasons: ReasonArray
 ) -> dict[str, float]:
     """Flag the points whose mean distance is beyond the limit of all; sums go by file order."""
     count = int(used.sum())
@@ -141,7 +142,7 @@ def _flag_far(
 def flag_off_bed(
     xyz: FloatArray,
     submerged: BoolArray,
-    settings: CleanSettings,
+    settings: CleanRules,
     reasons: ReasonArray,
     *,
     tile_m: float | None = None,
@@ -152,7 +153,7 @@ def flag_off_bed(
     """Flag submerged points below the bed and floating in the water.
 
     The bed about a point is the middle half, by height, of the submerged points nearest to it in
-    plan; see `CleanSettings`.
+    plan; see `CleanRules`.
 
     Parameters
     ----------
@@ -160,7 +161,7 @@ def flag_off_bed(
         Metres, world frame.
     submerged : array of bool, shape (n,)
         The points to test; at least ``settings.bed_neighbours`` of them.
-    settings : CleanSettings
+    settings : CleanRules
     reasons : array of uint8, shape (n,)
         Gets `Reason.BELOW_BED` and `FLOATING`.
     tile_m, empty, jobs, progress
@@ -173,11 +174,11 @@ def flag_off_bed(
         lower, upper = height_quartiles(near, points, settings.bed_neighbours).T
         fence = settings.fences * (upper - lower)
         z = points[:, 2]
-        if settings.below_m is not None:
-            below = lower - z > np.maximum(fence, settings.below_m)
+        if settings.below is not None:
+            below = lower - z > np.maximum(fence, settings.below)
             _set(reasons, rows[below], Reason.BELOW_BED)
-        if settings.floating_m is not None:
-            above = z - upper > np.maximum(fence, settings.floating_m)
+        if settings.floating is not None:
+            above = z - upper > np.maximum(fence, settings.floating)
             _set(reasons, rows[above], Reason.FLOATING)
         if progress is not None:
             progress(len(rows))
@@ -196,7 +197,7 @@ def clean_points(
     ray_miss_m: npt.ArrayLike | None = None,
     incidence_deg: npt.ArrayLike | None = None,
     used: npt.ArrayLike | None = None,
-    settings: CleanSettings | None = None,
+    settings: CleanRules | None = None,
     tile_m: float | None = None,
     jobs: int | None = None,
 ) -> npt.NDArray[np.uint8]:
@@ -216,7 +217,7 @@ def clean_points(
         Metres, degrees in air; see `pcfix.Correction`.
     used : array of bool, shape (n,), optional
         Points to test; the others are no one's neighbour. Default: all.
-    settings : CleanSettings, optional
+    settings : CleanRules, optional
         The thresholds.
     tile_m : float, optional
         Side of the square tiles that are worked on; without effect on the result.
@@ -241,16 +242,17 @@ def clean_points(
 
     >>> import numpy as np
     >>> from pcfix.clean.points import clean_points
-    >>> from pcfix.clean.settings import CleanSettings, Reason
+    >>> from pcfix.clean.settings import Reason
+from pcfix.options.steps import CleanRules
     >>> x, y = (grid.ravel() / 4 for grid in np.mgrid[:30, :30])
     >>> cloud = np.column_stack([x, y, -2 + 0.01 * np.sin(9 * x + 7 * y)])
     >>> cloud[450, 2] += 1
-    >>> reasons = clean_points(cloud, water=0.0, settings=CleanSettings(deviations=None))
+    >>> reasons = clean_points(cloud, water=0.0, settings=CleanRules(deviations=None))
     >>> [(int(row), Reason(int(reasons[row])).name) for row in np.flatnonzero(reasons)]
     [(450, 'FLOATING')]
     """
     points = checked_points(xyz)
-    settings = settings or CleanSettings()
+    settings = settings or CleanRules()
     check_tile(tile_m)
     n = len(points)
     mask = np.ones(n, np.bool_) if used is None else _column("used", used, n).astype(np.bool_)
@@ -303,7 +305,7 @@ def flag_neighbours(
     xyz: FloatArray,
     used: BoolArray,
     submerged: BoolArray,
-    settings: CleanSettings,
+    settings: CleanRules,
     reasons: npt.NDArray[np.uint8],
     *,
     tile_m: float | None = None,
@@ -327,7 +329,7 @@ def flag_neighbours(
     return distances
 
 
-def _check_enough(name: str, used: int, submerged: int, settings: CleanSettings) -> None:
+def _check_enough(name: str, used: int, submerged: int, settings: CleanRules) -> None:
     least = max(LEAST_NEIGHBOURS, settings.nearest)
     if used < least + 1:
         raise InputError(

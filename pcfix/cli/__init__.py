@@ -1,60 +1,57 @@
-"""Door 1, the command line: one file per command; each turns words into one call, no more."""
+"""Door 1, the command line: flags from the tables of options, one function a command."""
 
 from __future__ import annotations
 
 import sys
 import warnings
-from typing import Annotated
+from typing import TYPE_CHECKING
 
-import typer
+from cyclopts import App, CycloptsError
 
-import pcfix
-from pcfix.cli.adjust import adjust
-from pcfix.cli.cameras import cameras
-from pcfix.cli.clean import clean
-from pcfix.cli.compare import compare
-from pcfix.cli.correct import correct, pipeline
-from pcfix.cli.dsm import dsm
-from pcfix.cli.label import label
-from pcfix.cli.restore import restore
-from pcfix.cli.run import run
-from pcfix.cli.simulate import demo, simulate
-from pcfix.cli.water import water
+from pcfix.cli.commands import EXAMPLES
+from pcfix.cli.flags import UsageError, prepare
 from pcfix.errors import PcfixError, show_warning
+from pcfix.version import __version__
 
-app = typer.Typer(
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+app = App(
     name="pcfix",
     help="Refraction correction of through-water photogrammetric point clouds.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    version=f"pcfix {__version__}",
+    version_flags=["--version"],
+    help_flags=["--help", "-h"],
+    help_format="plaintext",
 )
-COMMANDS = (
-    run, correct, adjust, label, clean, dsm, compare, cameras, water, restore, simulate, pipeline,
-)  # fmt: skip
-for command in COMMANDS:
-    app.command(no_args_is_help=True)(command)
-app.command()(demo)
+for command, example in EXAMPLES.items():
+    prepare(command)
+    summary, _, more = str(command.__doc__).partition("\n")
+    lines = [summary, *(line.strip() for line in more.splitlines()), "", f"Example: {example}"]
+    app.command(command, help="\n".join(lines).replace("\n\n\n", "\n\n"))
 
 
-@app.callback(invoke_without_command=True)
-def version(
-    show: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
-) -> None:
-    """Refraction correction of through-water photogrammetric point clouds."""
-    if show:
-        typer.echo(f"pcfix {pcfix.__version__}")
-        raise typer.Exit
-
-
-def main() -> None:
+def main(tokens: Sequence[str] | None = None) -> None:
     """Run the command line; a user's mistake is one line on stderr and exit code 1."""
     warnings.showwarning = show_warning
+    words = list(sys.argv[1:] if tokens is None else tokens)
+    if words in ([], *([name] for name in app if name not in ("demo", "--version"))):
+        app([*words, "--help"])
+        sys.exit(0 if words in (["--help"], ["-h"]) else 2)
     try:
-        app()
+        app(words, exit_on_error=False, print_error=False, result_action="return_value")
+    except CycloptsError as error:
+        if isinstance(error.__cause__, PcfixError):
+            _stop(str(error.__cause__), 1)
+        _stop(f"{error}\nTry 'pcfix {words[0]} --help'.", 2)
+    except UsageError as error:
+        _stop(f"{error}\nTry 'pcfix {words[0]} --help'.", 2)
     except PcfixError as error:
-        typer.echo(f"pcfix: {error}", err=True)
-        sys.exit(1)
+        _stop(str(error), 1)
     except BrokenPipeError:
         sys.exit(1)
+
+
+def _stop(sentence: str, code: int) -> None:
+    sys.stderr.write(f"pcfix: {sentence}\n")
+    sys.exit(code)

@@ -37,10 +37,11 @@ from pcfix.errors import GeometryError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from pcfix.compare.match import CompareSettings, Match
+    from pcfix.compare.match import Match
     from pcfix.compare.sections import Section, SectionLine
     from pcfix.compare.vertical import Pairs
     from pcfix.model import FloatArray
+    from pcfix.options.steps import CompareRules
 
 
 Figure = TypeVar("Figure")
@@ -88,7 +89,7 @@ class Comparison:
         Submerged places by reference depth, and by distance in plan from the nearest dry point.
     m3c2 : AfterBefore of M3c2, or None
     sections : tuple of Section
-    settings : CompareSettings
+    settings : CompareRules
     notes : tuple of str
         What was left out, and why.
     seconds : float
@@ -105,7 +106,7 @@ class Comparison:
     shore_bins: tuple[Bin, ...]
     m3c2: AfterBefore[M3c2] | None
     sections: tuple[Section, ...]
-    settings: CompareSettings
+    settings: CompareRules
     notes: tuple[str, ...]
     seconds: float
 
@@ -255,12 +256,12 @@ def _by_depth(
         if depth_before is None or error_before is None
         else fit_line(depth_before, depth_before - error_before),
     )
-    bins = binned(depth, error, error_before, match.settings.bin_width_m)
+    bins = binned(depth, error, error_before, match.settings.bin_width)
     if len(match.dry_xy) == 0:
         notes.append("the cloud has no dry point, so nothing is said of the distance from shore")
         return fits, bins, ()
     shore = distance_from_shore(after.xy[wet], match.dry_xy)
-    return fits, bins, binned(shore, error, error_before, match.settings.shore_bin_width_m)
+    return fits, bins, binned(shore, error, error_before, match.settings.shore_bin_width)
 
 
 def _m3c2(match: Match, pairs: Pairs | None) -> AfterBefore[M3c2] | None:
@@ -287,7 +288,7 @@ def _sections(match: Match, lines: Sequence[SectionLine]) -> tuple[Section, ...]
         "reference": match.reference.xyz,
     }
     known = {name: xyz for name, xyz in layers.items() if xyz is not None and len(xyz)}
-    return tuple(section_along(line, known, match.settings.corridor_m) for line in lines)
+    return tuple(section_along(line, known, match.settings.corridor) for line in lines)
 
 
 def _counts(match: Match, after: Pairs | None) -> Counts:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -10,64 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.compare.nearest import Neighbours, mean_spacing_m
-from pcfix.compare.statistics import check_width
-from pcfix.compare.vertical import DEFAULT_NEIGHBOURS, check_neighbours
-from pcfix.errors import GeometryError, InputError, SettingError
+from pcfix.errors import GeometryError, InputError
 from pcfix.model import BoolArray, FloatArray, WaterSurface  # noqa: TC001 - dataclass fields
 
 if TYPE_CHECKING:
     from pcfix.model import IntArray
+    from pcfix.options.steps import CompareRules
 
 
 GAP_SPACINGS, MIN_GAP_M = 5.0, 1.0
 """How far outside the other cloud a point still counts, unless the user says so."""
-
-
-@dataclass(frozen=True, slots=True)
-class CompareSettings:
-    """What the user of a comparison may choose.
-
-    Attributes
-    ----------
-    submerged : bool
-        Compare only points under water.
-    vertical : bool
-        Whether signed differences are wanted, and all that rests on them.
-    m3c2 : bool
-        Whether M3C2 is wanted.
-    neighbours : int
-        Points of each fitted plane, at least 6.
-    bin_width_m, shore_bin_width_m : float
-        Of the tables by depth and by distance from the shore.
-    max_gap_m : float or None
-        How far in plan from the nearest point of the other cloud a point still counts; None: 5
-        mean spacings of that cloud, at least 1 m.
-    sections : int
-        Automatic cross-sections.
-    corridor_m : float
-        Half-width of a cross-section.
-    """
-
-    submerged: bool = False
-    vertical: bool = True
-    m3c2: bool = False
-    neighbours: int = DEFAULT_NEIGHBOURS
-    bin_width_m: float = 1.0
-    shore_bin_width_m: float = 10.0
-    max_gap_m: float | None = None
-    sections: int = 0
-    corridor_m: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Check every value against its rule."""
-        check_neighbours(self.neighbours)
-        check_width(self.bin_width_m)
-        check_width(self.shore_bin_width_m)
-        for name, value in (("max-gap", self.max_gap_m), ("corridor", self.corridor_m)):
-            if value is not None and not (math.isfinite(value) and value > 0.0):
-                raise SettingError(f"{name} {value:g} is not positive; give metres.")
-        if self.sections < 0:
-            raise SettingError(f"sections {self.sections} is negative; give how many.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +110,7 @@ class Match:
         Points of the reference that the cloud reaches, metres.
     outside, not_submerged : int
         Points that were not chosen.
-    settings : CompareSettings
+    settings : CompareRules
     """
 
     whole: SurveyCloud
@@ -170,7 +121,7 @@ class Match:
     places: FloatArray
     outside: int
     not_submerged: int
-    settings: CompareSettings
+    settings: CompareRules
 
     @cached_property
     def apparent(self) -> FloatArray | None:
@@ -198,15 +149,13 @@ class Match:
         return np.asarray(self.water_points[row, 2])
 
 
-def match(
-    whole: SurveyCloud, target: Reference, settings: CompareSettings, *, given: bool
-) -> Match:
+def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, given: bool) -> Match:
     """Choose the points to compare.
 
     Parameters
     ----------
     whole, target
-    settings : CompareSettings
+    settings : CompareRules
     given : bool
         Whether the user gave the water surface; else what the cloud says counts, its classes too.
 
@@ -263,8 +212,8 @@ def _only_wet_places(found: Match) -> Match:
     )
 
 
-def _gap(xyz: FloatArray, settings: CompareSettings) -> float:
-    return settings.max_gap_m or max(GAP_SPACINGS * mean_spacing_m(xyz[:, :2]), MIN_GAP_M)
+def _gap(xyz: FloatArray, settings: CompareRules) -> float:
+    return settings.max_gap or max(GAP_SPACINGS * mean_spacing_m(xyz[:, :2]), MIN_GAP_M)
 
 
 def _bounds(xyz: FloatArray) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,9 +24,11 @@ from pcfix.io.cameras.table.sensor import write_table
 from pcfix.io.files import check_input
 from pcfix.model import TiePoints, Views, WaterPlane
 from pcfix.options.declare import taken
-from pcfix.options.survey import AdjustRules
+from pcfix.options.survey import AdjustOptions, AdjustRules
 
 if TYPE_CHECKING:
+    from pcfix.options.declare import File
+    from pcfix.model import Cameras
     from collections.abc import Callable
     from os import PathLike
 
@@ -43,29 +46,12 @@ SUMMARY = "adjustment.json"
 
 
 def adjust_cameras(
-    model: AnyPath | Cameras,
-    out_dir: AnyPath | None = None,
+    model: File | Cameras,
+    out_dir: File | None = None,
     *,
-    water: WaterSurface | float | AnyPath | None,
-    cloud: AnyPath | None = None,
-    gcps: AnyPath | GroundControl | None = None,
-    gnss: AnyPath | None = None,
-    lens: AnyPath | None = None,
-    gcps_crs: str | None = None,
-    gnss_crs: str | None = None,
-    sensor: AnyPath | None = None,
-    angles: Angles | None = None,
-    cameras_crs: str | None = None,
-    cameras_offset_m: tuple[float, float, float] | None = None,
-    views: AnyPath | None = None,
-    views_are: ViewsAre = "auto",
-    water_mask: AnyPath | None = None,
-    water_model: WaterModel = "auto",
-    water_crs: str | None = None,
-    port: Port | None = None,
-    overwrite: bool = False,
+    options: AdjustOptions | None = None,
     progress: Callable[[LogRow], None] | None = None,
-    **options: Any,
+    **keywords: Any,
 ) -> Adjusted:
     """Adjust the poses of a block with the water in the light's way; ``pcfix adjust``.
 
@@ -76,31 +62,12 @@ def adjust_cameras(
     out_dir : path, optional
         A new folder: the adjusted model as ``colmap/`` and ``opensfm/``, where one lens will do
         as ``cameras.csv``, ``adjustment.json`` and ``report.html``. Nothing is written without.
-    water : float, str, path or WaterSurface
-        See `pcfix.correct_file`. None with a `port`.
-    cloud : path, optional
-        LAS or LAZ, apparent. Some of its points stand for tie points where there are none.
-    gcps : path, optional
-        See `pcfix.io.ground_control.read_ground_control`.
-    gnss : path, optional
-        See `pcfix.io.gnss_positions.read_gnss`. Default: what the model has beside it.
-    lens : path, optional
-        A calibration, see `pcfix.io.cameras.table.sensor.read_sensor`; it is held fixed unless
-        `lens_unknowns` say otherwise.
-    gcps_crs, gnss_crs : str, optional
-        Of these, instead of what they say.
-    views : path, optional
-        View list of the cloud.
-    sensor, angles, cameras_crs, cameras_offset_m, views_are, water_mask, water_model, water_crs
-        See `pcfix.correct_file`.
-    port : Port, optional
-        A housing port instead of the water.
-    overwrite : bool
-        Replace a folder that an earlier adjustment wrote.
+    options : AdjustOptions, optional
+        Or its attributes as keywords, as of ``pcfix adjust``: water (or port), cloud (apparent;
+        some of its points stand for tie points where there are none), gcps, gnss, lens (held
+        fixed unless lens_unknowns say otherwise) and others.
     progress : callable, optional
         Called with the `LogRow` of each step.
-    **options
-        Those of `pcfix.options.survey.AdjustRules`.
 
     Returns
     -------
@@ -112,15 +79,14 @@ def adjust_cameras(
         If an input cannot be read or does not fit, the block has no datum, or the unknowns cannot
         be told apart. Nothing is written then.
     """
-    rules = taken(AdjustRules, None, options, "adjust_cameras")
-    inputs = Inputs(
-        model, water, sensor=sensor, angles=angles, cameras_crs=cameras_crs,
-        cameras_offset_m=cameras_offset_m, views=views, water_mask=water_mask,
-        water_model=water_model, water_crs=water_crs, views_are=views_are, port=port,
-    )  # fmt: skip
-    survey = Survey(gcps, gnss, lens, gcps_crs, gnss_crs)
+    given = taken(AdjustOptions, options, keywords, "adjust_cameras")
+    inputs = replace(given.part(Inputs), cameras=model)
+    survey = Survey(given.gcps, given.gnss, given.lens, given.gcps_crs, given.gnss_crs)
     target = None if out_dir is None else Path(out_dir)
-    return adjust_into(target, inputs, survey, rules, cloud, overwrite=overwrite, progress=progress)
+    return adjust_into(
+        target, inputs, survey, given.part(AdjustRules), given.cloud,
+        overwrite=given.overwrite, progress=progress,
+    )  # fmt: skip
 
 
 def adjust_into(
@@ -138,18 +104,16 @@ def adjust_into(
     return found
 
 
-def next_step(
-    found: Adjusted, model: str, out_dir: str, cloud: str | None, offset: str | None = None
-) -> str:
-    """Return the command that takes the cloud over; `offset` is that of the old cameras."""
-    plane = found.water
+def next_step(found: Adjusted, model: File, out_dir: File, options: AdjustOptions) -> str:
+    """Return the command that takes the cloud over."""
+    plane, offset = found.water, options.cameras_offset
     level = (
         f"{plane.a:.3f}" if isinstance(plane, WaterPlane) and plane.b == plane.c == 0.0 else "SPEC"
     )
     return (
-        f"pcfix correct {cloud or 'CLOUD'} OUTPUT --cameras {out_dir}/colmap"
+        f"pcfix correct {options.cloud or 'CLOUD'} OUTPUT --cameras {out_dir}/colmap"
         f" --adjusted-from {model} --water {level}"
-        + ("" if offset is None else f" --cameras-offset {offset}")
+        + ("" if offset is None else f" --cameras-offset {','.join(f'{v:g}' for v in offset)}")
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,7 +19,7 @@ from pcfix.flow.diagnosis import (
 )
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.points import CHUNK_POINTS
-from pcfix.flow.surfaces import CloudView, WaterWords, find_surface, view_of
+from pcfix.flow.surfaces import CloudView, find_surface, view_of
 from pcfix.io.cameras.georeference import adjusted_minus_gnss
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.clouds import check_same_crs, read_reference
@@ -28,7 +29,10 @@ from pcfix.io.ground_control import read_ground_control
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.lens.frames import cameras_in_sight
 from pcfix.model import WaterDimension
-from pcfix.options import DEFAULT_REFRACTIVE_INDEX
+from pcfix.flow.runner import write_summary
+from pcfix.options.declare import taken
+from pcfix.options.survey import CamerasCheckOptions, WaterCheckOptions
+from pcfix.water.index import index_of
 from pcfix.report.cameras import CamerasReport, Fit, GnssResiduals, Sensor, block_figure
 from pcfix.report.page import png_of
 from pcfix.report.water import WaterReport, water_figure
@@ -37,6 +41,7 @@ from pcfix.water.surface import surface_above
 if TYPE_CHECKING:
     from pcfix.adjust.diagnosis import Diagnosis
     from pcfix.model import Cameras, FloatArray, Lens, WaterSurface
+    from pcfix.options.declare import File
 
 AnyPath = str | PathLike[str]
 
@@ -64,18 +69,7 @@ class Survey(NamedTuple):
 
 
 def check_cameras(
-    path: AnyPath,
-    cloud: AnyPath | None = None,
-    *,
-    water: AnyPath | float | None = None,
-    gnss: AnyPath | None = None,
-    gcps: AnyPath | None = None,
-    lens: AnyPath | None = None,
-    reference: AnyPath | None = None,
-    refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
-    plot: AnyPath | None = None,
-    overwrite: bool = False,
-    **options: Any,
+    path: File, options: CamerasCheckOptions | None = None, **keywords: Any
 ) -> CamerasReport:
     """Read cameras and say what they are, and whether they fit a cloud; ``pcfix cameras``.
 
@@ -83,28 +77,9 @@ def check_cameras(
     ----------
     path : path
         See `pcfix.read_cameras`.
-    cloud : path, optional
-        LAS or LAZ that was made from these images.
-    water : float, str or path, optional
-        See `pcfix.read_water`; for the height above the water and the GSD there, and, with a
-        cloud, whether the poses have absorbed the refraction; see `pcfix.adjust.diagnosis`.
-    gnss : path, optional
-        See `pcfix.io.gnss_positions.read_gnss`; instead of what the camera file has.
-    gcps : path, optional
-        See `pcfix.io.ground_control.read_ground_control`.
-    lens : path, optional
-        The calibration of the camera: one of Metashape's, or a table as of `sensor`. Default: the
-        one that a file of Metashape says to have begun with.
-    reference : path, optional
-        A survey of land or bed: see `pcfix.io.clouds.read_reference`.
-    refractive_index : float
-        Of the water, relative to air.
-    plot : path, optional
-        PNG of the block in plan and from the side.
-    overwrite : bool
-        Replace a picture that exists.
-    **options
-        ``sensor``, ``angles``, ``cameras_crs``, ``cameras_offset_m``; see `pcfix.correct_file`.
+    options : CamerasCheckOptions, optional
+        Or its attributes as keywords. With a cloud and water it is also said whether the poses
+        have absorbed the refraction, see `pcfix.adjust.diagnosis`.
 
     Returns
     -------
@@ -115,13 +90,18 @@ def check_cameras(
     PcfixError
         If a file cannot be read, or the two CRS cannot be reconciled.
     """
-    survey = Survey(gcps, lens, reference)
+    given = taken(CamerasCheckOptions, options, keywords, "check_cameras")
+    cloud, water, gnss, plot = given.cloud, given.water, given.gnss, given.plot
+    survey = Survey(given.gcps, given.lens, given.reference)
+    if given.summary is not None:
+        check_output(given.summary, overwrite=given.overwrite, inputs=[path])
     if plot is not None:
-        given = [p for p in (path, cloud, gnss, *survey) if p is not None]
-        check_output(plot, overwrite=overwrite, inputs=given)
+        files = [p for p in (path, cloud, gnss, *survey) if p is not None]
+        check_output(plot, overwrite=given.overwrite, inputs=files)
     if cloud is None or water is None:
         survey.refuse()
-    inputs = Inputs(path, 0.0 if water is None else water, **options)
+    inputs = replace(given, water=0.0 if water is None else water).part(Inputs)
+    inputs = replace(inputs, cameras=path)
     read = inputs.read()
     crs, xyz, heights = None, np.zeros((0, 3)), None
     view = None if cloud is None else view_of(check_input(cloud))
@@ -138,8 +118,8 @@ def check_cameras(
         cameras = read_gnss(gnss, cameras)
     diagnosis, remedy = None, ""
     if view is not None and surface is not None:
-        diagnosis = _diagnosis(inputs, cameras, view, (surface, refractive_index), survey)
-        remedy = command_of(inputs, view.name, gnss=gnss, gcps=gcps, lens=lens)
+        diagnosis = _diagnosis(inputs, cameras, view, (surface, index_of(given.index)[0]), survey)
+        remedy = command_of(inputs, view.name, gnss=gnss, gcps=given.gcps, lens=given.lens)
     level = None
     if surface is not None and not (isinstance(surface, WaterDimension) and heights is None):
         at = cameras.centres if heights is None else xyz
@@ -166,38 +146,36 @@ def check_cameras(
         remedy=remedy,
     )
     if plot is not None:
-        write_bytes(plot, png_of(block_figure(report)), overwrite=overwrite)
+        write_bytes(plot, png_of(block_figure(report)), overwrite=given.overwrite)
+    write_summary(given, report.as_dict())
     return report
 
 
 def check_water(
-    water: WaterWords,
-    cloud: AnyPath | None = None,
-    *,
-    plot: AnyPath | None = None,
-    overwrite: bool = False,
+    spec: Any, options: WaterCheckOptions | None = None, **keywords: Any
 ) -> WaterReport:
     """Read, fit or find a water surface, and say what it is; ``pcfix water``.
 
     Parameters
     ----------
-    water : WaterWords
-    cloud : path, optional
-        LAS or LAZ cloud under it.
-    plot : path, optional
-        PNG of points, residuals or evidence.
-    overwrite : bool
-        Replace a picture that exists.
+    spec : WaterSurface, float, str or path
+        See `pcfix.flow.surfaces.find_surface`.
+    options : WaterCheckOptions, optional
+        Or its attributes as keywords.
 
     Raises
     ------
     PcfixError
         With one sentence on what to mend.
     """
+    given = taken(WaterCheckOptions, options, keywords, "check_water")
+    cloud, plot = given.cloud, given.plot
+    if given.summary is not None:
+        check_output(given.summary, overwrite=given.overwrite)
     if plot is not None:
-        check_output(plot, overwrite=overwrite, inputs=[] if cloud is None else [cloud])
+        check_output(plot, overwrite=given.overwrite, inputs=[] if cloud is None else [cloud])
     view = None if cloud is None else view_of(check_input(cloud))
-    found = find_surface(water, view)
+    found = find_surface(spec, given, view)
     sample = np.zeros((0, 3))
     below = unknown = None
     if cloud is not None:
@@ -208,10 +186,11 @@ def check_water(
             unknown = float(np.mean(~np.isfinite(height)))
             below = float(np.mean(sample[:, 2] < height))
     report = WaterReport(
-        str(water.water), found, None if view is None else view.name, below, unknown, sample
+        str(spec), found, None if view is None else view.name, below, unknown, sample
     )
     if plot is not None:
-        write_bytes(plot, png_of(water_figure(report)), overwrite=overwrite)
+        write_bytes(plot, png_of(water_figure(report)), overwrite=given.overwrite)
+    write_summary(given, report.as_dict())
     return report
 
 
@@ -252,7 +231,7 @@ def _sample(
     """Return points evenly spread over the file, and their water heights where asked for."""
     every = max(1, len(source) // most)
     parts, heights = [], []
-    for points in source.chunks(CHUNK_POINTS):
+    for points in source.chunks():
         parts.append(coordinates(points)[::every])
         if dimension is not None:
             heights.append(source.dimension(points, dimension)[::every])

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pcfix.clean.points import check_tile, flag_neighbours, flag_weak
-from pcfix.clean.settings import CleanSettings, CleanSummary, Reason
+from pcfix.clean.settings import CleanSummary, Reason
+from pcfix.options.steps import CleanRules
 from pcfix.errors import InputError
-from pcfix.flow.points import CHUNK_POINTS
-from pcfix.flow.surfaces import WaterWords, find_surface, view_of
+from pcfix.flow.surfaces import find_surface, view_of
 from pcfix.io.files import check_input, check_output, scratch_arrays, write_text
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource, coordinates
@@ -27,6 +27,9 @@ from pcfix.io.las.writing import (
     output_evlrs,
 )
 from pcfix.model import HIGH_NOISE, LOW_NOISE, WaterDimension
+from pcfix.options.declare import File, taken
+from pcfix.options.shared import WaterOptions
+from pcfix.options.steps import CleanOptions, CleanRules
 from pcfix.threads import threads
 from pcfix.version import __version__
 from pcfix.water.checks import check_submerged
@@ -49,17 +52,13 @@ _PASSES = 4
 
 
 def clean_file(
-    input: AnyPath,
-    output: AnyPath,
+    input: File,
+    output: File,
     *,
-    water: WaterSurface | float | AnyPath | None = None,
-    settings: CleanSettings | None = None,
-    drop: bool = False,
-    summary: AnyPath | None = None,
-    overwrite: bool = False,
-    jobs: int | None = None,
+    options: CleanOptions | None = None,
     tile_m: float | None = None,
     progress: Callable[[int, int], None] | None = None,
+    **keywords: Any,
 ) -> CleanSummary:
     """Flag or drop the noise of a LAS or LAZ cloud; what ``pcfix clean`` runs.
 
@@ -73,19 +72,9 @@ def clean_file(
     input, output : path
         The names end in ``.las`` or ``.laz``; the output is LAS 1.4, see `correct_file`. While
         it works, it needs 90 bytes a point of disk beside the output.
-    water : WaterSurface, float, str or path, optional
-        Which points are submerged, and so tested against the bed; see `pcfix.read_water`.
-        Default: those that pcfix corrected, known by the dimension RayCount.
-    settings : CleanSettings, optional
-        The thresholds of the tests.
-    drop : bool
-        Leave noise out of the output.
-    summary : path, optional
-        Write the summary there, as JSON.
-    overwrite : bool
-        Replace an output that exists.
-    jobs : int, optional
-        Threads; default all cores. The result does not depend on it.
+    options : CleanOptions, optional
+        Or its attributes as keywords, as of ``pcfix clean``: the thresholds of the tests, water,
+        drop and others.
     tile_m : float, optional
         Side of the square tiles that are worked on. The result does not depend on it.
     progress : callable, optional
@@ -101,7 +90,9 @@ def clean_file(
         With one sentence on what to mend; no output is left behind.
     """
     started = time.perf_counter()
-    settings = settings or CleanSettings()
+    given = taken(CleanOptions, options, keywords, "clean_file")
+    settings, water, drop, jobs = given.part(CleanRules), given.water, given.drop, given.jobs
+    summary, overwrite = given.summary, given.overwrite
     check_tile(tile_m)
     source = check_input(input)
     inputs = [p for p in (input, water) if isinstance(p, str | PathLike)]
@@ -173,7 +164,7 @@ class _Found(NamedTuple):
 
 
 def _find(
-    las: LasSource, water: WaterSurface | None, settings: CleanSettings, means: _Means
+    las: LasSource, water: WaterSurface | None, settings: CleanRules, means: _Means
 ) -> _Found:
     """Read the cloud and run the tests."""
     cloud = _read(las, water, settings, means)
@@ -210,18 +201,18 @@ class _Cloud(NamedTuple):
 
 
 def _surface(water: WaterSurface | float | AnyPath | None, path: Path) -> WaterSurface | None:
-    return None if water is None else find_surface(WaterWords(water), view_of(path)).surface
+    return None if water is None else find_surface(water, WaterOptions(), view_of(path)).surface
 
 
 def _read(
-    las: LasSource, water: WaterSurface | None, settings: CleanSettings, means: _Means
+    las: LasSource, water: WaterSurface | None, settings: CleanRules, means: _Means
 ) -> _Cloud:
     """Read coordinates and masks, and flag weak intersections on the way."""
     n, names = len(las), set(las.header.point_format.dimension_names)
     used, submerged, reasons = np.zeros(n, np.bool_), np.zeros(n, np.bool_), np.zeros(n, np.uint8)
     cloud = _Cloud(means.empty((n, 3), np.float64), used, submerged, reasons)
     first = 0
-    for points in las.chunks(CHUNK_POINTS):
+    for points in las.chunks():
         rows = slice(first, first + len(points))
         xyz = coordinates(points)
         classes = np.asarray(points["classification"])
@@ -254,12 +245,12 @@ def _submerged(
     return is_submerged(xyz[:, 2], surface_above(water, xyz, heights))
 
 
-def _not_run(names: set[str], water: WaterSurface | None, settings: CleanSettings) -> list[str]:
+def _not_run(names: set[str], water: WaterSurface | None, settings: CleanRules) -> list[str]:
     """Return which tests the file does not allow, and why."""
     needs = (
         ("few rays", "RayCount", settings.min_rays),
-        ("ray miss", "RayMiss", settings.max_ray_miss_m),
-        ("incidence", "Incidence", settings.max_incidence_deg),
+        ("ray miss", "RayMiss", settings.max_ray_miss),
+        ("incidence", "Incidence", settings.max_incidence),
     )
     missing = [
         f"{test}: the cloud has no dimension {dimension if 'RayCount' in names else 'RayCount'}"
@@ -272,7 +263,7 @@ def _not_run(names: set[str], water: WaterSurface | None, settings: CleanSetting
 
 
 def _check_cloud(
-    las: LasSource, cloud: _Cloud, water: WaterSurface | None, settings: CleanSettings
+    las: LasSource, cloud: _Cloud, water: WaterSurface | None, settings: CleanRules
 ) -> None:
     """Refuse a cloud that leaves nothing to test."""
     if not cloud.used.any():
@@ -311,7 +302,7 @@ def _write(
         evlrs, identity = output_evlrs(source), corrected_identity(source)
         with LasSink(target, header, evlrs, identity, jobs) as sink:
             first = 0
-            for points in source.chunks(CHUNK_POINTS):
+            for points in source.chunks():
                 new = convert(points, header.point_format)
                 noise = reasons[first : first + len(new)] != 0
                 first += len(new)

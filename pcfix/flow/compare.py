@@ -5,45 +5,31 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pcfix.compare.figures import Comparison, bins_table, figures_of
 from pcfix.compare.m3c2 import load_py4dgeo
-from pcfix.compare.match import CompareSettings, match
+from pcfix.compare.match import match
 from pcfix.compare.sections import parse_line
-from pcfix.compare.vertical import DEFAULT_NEIGHBOURS
 from pcfix.errors import SettingError
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference
 from pcfix.io.files import check_input, check_output, write_text
+from pcfix.options.declare import File, taken
+from pcfix.options.shared import WaterOptions
+from pcfix.options.steps import CompareOptions, CompareRules
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from os import PathLike
-
-    from pcfix.compare.sections import SectionLine
-    from pcfix.model import WaterSurface
 
     AnyPath = str | PathLike[str]
 
 
 def compare_clouds(
-    cloud: AnyPath,
-    reference: AnyPath,
+    cloud: File,
+    reference: File,
     *,
-    out_dir: AnyPath | None = None,
-    submerged: bool = False,
-    water: WaterSurface | float | AnyPath | None = None,
-    vertical: bool = True,
-    m3c2: bool = False,
-    neighbours: int = DEFAULT_NEIGHBOURS,
-    bin_width_m: float = 1.0,
-    shore_bin_width_m: float = 10.0,
-    max_gap_m: float | None = None,
-    section_lines: Sequence[SectionLine | str] = (),
-    sections: int = 0,
-    corridor_m: float = 1.0,
-    summary: AnyPath | None = None,
-    overwrite: bool = False,
+    options: CompareOptions | None = None,
+    **keywords: Any,
 ) -> Comparison:
     """Measure how far a cloud is from a reference; what ``pcfix compare`` runs.
 
@@ -58,25 +44,11 @@ def compare_clouds(
     reference : path
         LAS or LAZ; CSV check points (x, y, z); or a GeoTIFF of heights. At check points the
         cloud's surface is measured, not the reference's at each point of the cloud.
-    out_dir : path, optional
-        Folder for ``compare.json``, ``depth_bins.csv``, ``shore_bins.csv`` and
-        ``section_*.csv``; made where its parent exists.
-    submerged : bool
-        Compare only points of class 40 or, where `water` is given, below it.
-    water : WaterSurface, float, str or path, optional
-        See `pcfix.read_water`; default what the cloud itself says.
-    vertical : bool
-        False leaves out everything but C2C and M3C2.
-    m3c2 : bool
-        Also M3C2, by py4dgeo.
-    neighbours, bin_width_m, shore_bin_width_m, max_gap_m, sections, corridor_m
-        See `CompareSettings`.
-    section_lines : sequence of SectionLine or str
-        Cross-sections, as ``x1,y1,x2,y2`` in the cloud's coordinates.
-    summary : path, optional
-        Write the figures there too, as JSON.
-    overwrite : bool
-        Replace files that exist.
+    options : CompareOptions, optional
+        Or its attributes as keywords, as of ``pcfix compare``: out_dir (a folder for
+        ``compare.json``, ``depth_bins.csv``, ``shore_bins.csv`` and ``section_*.csv``, made where
+        its parent exists), submerged, water, m3c2, section (texts ``x1,y1,x2,y2`` or
+        `pcfix.compare.sections.SectionLine`) and others.
 
     Returns
     -------
@@ -88,22 +60,21 @@ def compare_clouds(
         With one sentence on what to mend.
     """
     started = time.perf_counter()
-    settings = CompareSettings(
-        submerged, vertical, m3c2, neighbours, bin_width_m, shore_bin_width_m, max_gap_m,
-        sections, corridor_m,
-    )  # fmt: skip
-    lines = [parse_line(line) if isinstance(line, str) else line for line in section_lines]
+    given = taken(CompareOptions, options, keywords, "compare_clouds")
+    lines = [parse_line(line) if isinstance(line, str) else line for line in given.section]
+    out_dir, summary, overwrite = given.out_dir, given.summary, given.overwrite
     _check_outputs(out_dir, summary, [cloud, reference], overwrite=overwrite)
-    if m3c2:
+    if given.m3c2:
         load_py4dgeo()
-    given = None
-    if water is not None:
-        from pcfix.flow.surfaces import WaterWords, find_surface, view_of  # not quick to load
+    water = None
+    if given.water is not None:
+        from pcfix.flow.surfaces import find_surface, view_of  # not quick to load
 
-        given = find_surface(WaterWords(water), view_of(check_input(cloud))).surface
-    target, whole = read_reference(reference), read_cloud(cloud, given)
+        view = view_of(check_input(cloud))
+        water = find_surface(given.water, WaterOptions(), view).surface
+    target, whole = read_reference(reference), read_cloud(cloud, water)
     check_same_crs(whole.name, whole.crs, target.name, target.crs)
-    matched = match(whole, target, settings, given=given is not None)
+    matched = match(whole, target, given.part(CompareRules), given=water is not None)
     result = figures_of(matched, lines, started)
     _write(result, out_dir, summary, overwrite=overwrite)
     return result

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pcfix.compare.statistics import errors_against_truth
-from pcfix.flow.points import correct_points
+from pcfix.flow.correct import correct_points
 from pcfix.flow.run import Request, run_all
 from pcfix.io.las.source import read_xyz
 from pcfix.io.scenes import write_scene
@@ -74,7 +74,7 @@ def _table(scene: Scene, folder: Path, overwrite: bool) -> str:
 def _by_snell(scene: Scene) -> FloatArray:
     """Return what ``pcfix correct`` makes of the cloud without any option."""
     return correct_points(
-        scene.apparent_xyz, scene.cameras, scene.water, refractive_index=scene.refractive_index
+        scene.apparent_xyz, scene.cameras, scene.water, index=scene.refractive_index
     ).xyz
 
 
@@ -85,7 +85,7 @@ def _corrected(scene: Scene, folder: Path, overwrite: bool) -> FloatArray:
         cameras=str(folder / "cameras.csv"),
         water=str(scene.water_level_m),
         reference=str(folder / "lidar.laz"),
-        refractive_index=scene.refractive_index,
+        index=scene.refractive_index,
         method="consistent",
         views=str(folder / "fused.ply.vis"),
         views_are="tracks",

@@ -113,8 +113,8 @@ def command_of(inputs: Inputs, cloud: str, **more: AnyPath | None) -> str:
     given: dict[str, Any] = {
         "sensor": inputs.sensor, "cameras-crs": inputs.cameras_crs, "angles": inputs.angles, **more
     }  # fmt: skip
-    if inputs.cameras_offset_m is not None:
-        given["cameras-offset"] = ",".join(f"{value:.12g}" for value in inputs.cameras_offset_m)
+    if inputs.cameras_offset is not None:
+        given["cameras-offset"] = ",".join(f"{value:.12g}" for value in inputs.cameras_offset)
     for name, value in given.items():
         if value is not None:
             words += [f"--{name}", str(value)]

@@ -14,16 +14,15 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning
-from pcfix.flow.points import CHUNK_POINTS
+from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.grid.delaunay import fill_holes, margin_cells
 from pcfix.grid.heights import Gridding, grid_window
 from pcfix.grid.lattice import Occupancy, Window, cells_of, fits, lattice_over, refuse_size
-from pcfix.grid.model import NO_LIGHT, DsmSettings, DsmSummary, Tally, hillshade
+from pcfix.grid.model import NO_LIGHT, DsmSummary, Tally, hillshade
 from pcfix.io.files import Bins, check_input, check_output, replaced_when_whole, write_text
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.rasters import (
@@ -74,20 +73,12 @@ WITH_SIGMA = {**BANDS, "uncertainty": "metre"}
 
 
 def grid_dsm(
-    input: AnyPath,
-    output: AnyPath,
+    input: File,
+    output: File,
     *,
-    resolution_m: float,
-    method: DsmMethod = "mean",
-    surface: SurfaceChoice = "all",
-    fill_m: float | None = None,
-    hillshade: AnyPath | None = None,
-    azimuth_deg: float = 315.0,
-    altitude_deg: float = 45.0,
-    cog: bool = False,
-    summary: AnyPath | None = None,
-    overwrite: bool = False,
+    options: DsmOptions | None = None,
     progress: Progress | None = None,
+    **keywords: Any,
 ) -> DsmSummary:
     """Grid a cloud to a GeoTIFF of heights; what ``pcfix dsm`` runs.
 
@@ -106,30 +97,14 @@ def grid_dsm(
         LAS or LAZ, in metres.
     output : path
         The name ends in ``.tif`` or ``.tiff``.
-    resolution_m : float
-        Side of a cell. The bounds of the raster are multiples of it; a point on an edge belongs
-        to the cell east or north of it.
-    method : {"mean", "median", "min", "max", "idw", "tin"}
-        The first four are of the points in the cell. "idw" weights points around the centre of
-        cells that have some with 1 / distance squared; "tin" takes the height at the centre from
-        Delaunay's triangles.
-    surface : {"all", "bed"}
-        All points but noise (classes 7 and 18), or only the bed (class 40). Withheld points are
-        never used.
-    fill_m : float, optional
-        Fill holes up to this wide. With "tin" it is the width of the widest circle without a
-        point that is bridged, by default five times the spacing of the points and at least three
-        cells.
-    hillshade : path, optional
-        Write a GeoTIFF of uint8 there: 1 dark to 255 bright, nodata 0.
-    azimuth_deg, altitude_deg : float
-        Where the sun of the hillshade stands: clockwise from north, and above the horizon.
-    cog : bool
-        Write cloud optimised GeoTIFF, the hillshade too.
-    summary : path, optional
-        Write the summary there, as JSON.
-    overwrite : bool
-        Replace outputs that exist.
+    options : DsmOptions, optional
+        Or its attributes as keywords, as of ``pcfix dsm``, resolution (m) among them. The bounds
+        of the raster are multiples of it; a point on an edge belongs to the cell east or north of
+        it. Of the methods "idw" weights points around the centre of cells that have some with 1 /
+        distance squared; "tin" takes the height at the centre from Delaunay's triangles, and fill
+        is the width of the widest circle without a point that is bridged, by default five times
+        the spacing of the points and at least three cells. Withheld points and noise (classes 7
+        and 18) are never used. The hillshade is uint8: 1 dark to 255 bright, nodata 0.
     progress : callable, optional
         Called with (points done, points in all), reading and gridding counting half each.
 
@@ -148,7 +123,11 @@ def grid_dsm(
         If the cells are so small that most would have no point.
     """
     started = time.perf_counter()
-    settings = DsmSettings(resolution_m, method, surface, fill_m, azimuth_deg, altitude_deg)
+    given = taken(DsmOptions, options, keywords, "grid_dsm")
+    if given.resolution is None:
+        raise SettingError("resolution is missing: give the side of a cell, metres.")
+    settings = given.part(DsmRules)
+    summary, overwrite, cog, hillshade = given.summary, given.overwrite, given.cog, given.hillshade
     source = check_input(input)
     target = check_tif(output, overwrite=overwrite, inputs=[source])
     shade, inputs = None, [source, target]
@@ -176,7 +155,7 @@ class _Run:
     """One cloud on its way into a raster."""
 
     source: Path
-    settings: DsmSettings
+    settings: DsmRules
     progress: Progress | None
     tally: Tally = field(default_factory=Tally)
 
@@ -190,7 +169,7 @@ class _Run:
         tags = {"PCFIX": json.dumps({"pcfix": __version__, **asdict(self.settings)})}
         bands = WITH_SIGMA if self.sorted.has_sigma else BANDS
         with new_raster(plain, self.lattice, self.crs, bands, tags=tags) as dsm:
-            if self.settings.fill_m is None or self.settings.method == "tin":
+            if self.settings.fill is None or self.settings.method == "tin":
                 self.grid(dsm, dsm)
             else:
                 self.grid_and_fill(dsm, folder / "unfilled.tif")
@@ -219,14 +198,14 @@ class _Run:
     def reach_m(self) -> float:
         """Width of the widest circle around a triangle of the TIN."""
         spacings = TIN_REACH_SPACINGS * self.near.spacing_m
-        cells = TIN_REACH_CELLS * self.settings.resolution_m
-        return max(spacings, cells, self.settings.fill_m or 0.0)
+        cells = TIN_REACH_CELLS * self.settings.resolution
+        return max(spacings, cells, self.settings.fill or 0.0)
 
     def grid_and_fill(self, dsm: DatasetWriter, unfilled: Path) -> None:
         """Write heights to a raster of their own, and from there, with holes filled, to the DSM."""
         with new_raster(unfilled, self.lattice, None, {"height": "metre"}) as heights:
             self.grid(heights, dsm)
-        widest = (self.settings.fill_m or 0.0) / self.settings.resolution_m
+        widest = (self.settings.fill or 0.0) / self.settings.resolution
         with open_raster(unfilled) as heights:
             for window in self.lattice.windows(BLOCK_CELLS):
                 around = window.grown(margin_cells(widest)).clipped(self.lattice.window)
@@ -255,7 +234,7 @@ class _Run:
         height = np.full((wide.height, wide.width), np.nan)
         height[around.within(wide)] = read_heights(heights, around)
         s = self.settings
-        return hillshade(height, s.resolution_m, s.azimuth_deg, s.altitude_deg)
+        return hillshade(height, s.resolution, s.azimuth, s.altitude)
 
     def report_reading(self, done: int, total: int) -> None:
         """Tell how far reading is, the first half."""
@@ -285,7 +264,7 @@ class _Run:
             empty=lattice.width * lattice.height - tally.known,
             points_per_cell=self.near.points / tally.cells,
             spacing_m=self.near.spacing_m,
-            hole_m=self.reach_m if settings.method == "tin" else settings.fill_m,
+            hole_m=self.reach_m if settings.method == "tin" else settings.fill,
             settings=asdict(settings),
             seconds=round(seconds, 3),
             uncertainty_m=tally.uncertainty_m(),
@@ -306,7 +285,7 @@ class SortedPoints:
     Parameters
     ----------
     source : LasSource
-    settings : DsmSettings
+    settings : DsmRules
     folder : Path
         For the points; the caller makes and removes it.
     progress : callable
@@ -327,10 +306,10 @@ class SortedPoints:
     """
 
     def __init__(
-        self, source: LasSource, settings: DsmSettings, folder: Path, progress: Progress
+        self, source: LasSource, settings: DsmRules, folder: Path, progress: Progress
     ) -> None:
         """Read the cloud, store the wanted points, and lay out the raster."""
-        resolution = settings.resolution_m
+        resolution = settings.resolution
         self._resolution_m = resolution
         area = _header_area_m2(source, resolution)
         corner = cells_of(_header_corner(source), resolution)[0]
@@ -339,7 +318,7 @@ class SortedPoints:
         self._bins = Bins(folder, side, corner, 4 if self.has_sigma else 3)
         self.near = Occupancy(area, len(source), resolution)
         done = 0
-        for points in source.chunks(CHUNK_POINTS):
+        for points in source.chunks():
             xyz = self._numbers(points)[_wanted(points, settings.surface)]
             self.near.add(xyz)
             if len(xyz) and fits(self.near.low, self.near.high, resolution):

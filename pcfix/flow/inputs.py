@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,83 +11,39 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
-from pcfix.flow.surfaces import WaterWords, find_surface
+from pcfix.flow.surfaces import find_surface
 from pcfix.io.cameras import read_cameras, read_tie_points
 from pcfix.io.cameras.georeference import georeference
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.model import Cameras
+from pcfix.options.declare import File, options_of
+from pcfix.options.shared import InputOptions
+from pcfix.port.shapes import port_of
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from pcfix.flow.surfaces import CloudView, WaterModel
-    from pcfix.io.cameras.formats import Angles
+    from pcfix.flow.surfaces import CloudView
+    from pcfix.water.surface import FoundSurface
     from pcfix.io.views import ViewList
     from pcfix.label.areas import WaterMask
-    from pcfix.model import FloatArray, TiePoints, WaterSurface
-    from pcfix.options import ViewsAre
-    from pcfix.port.shapes import Port
-    from pcfix.water.surface import FoundSurface
+    from pcfix.model import FloatArray, TiePoints
 
     AnyPath = str | PathLike[str]
 
 
-@dataclass(frozen=True)
-class Inputs:
-    """Cameras, view lists and water as the user names them.
+@dataclass(frozen=True, kw_only=True)
+class Inputs(InputOptions):
+    """Cameras, view lists and water as the user names them, and how they are read.
 
-    Attributes
-    ----------
-    cameras : Cameras or path
-        See `pcfix.read_cameras`. Cameras that are given as such are in the cloud's CRS.
-    water, water_model, water_crs
-        See `pcfix.flow.surfaces.WaterWords`.
-    sensor, angles
-        See `pcfix.read_cameras`.
-    cameras_crs : str or None
-        Of the cameras, instead of what their file says; ``local`` takes the numbers as they are.
-    cameras_offset_m : tuple of 3 float, or None
-        Added to the projection centres, in the axes of the camera file.
-    views : path or None
-        See `pcfix.io.views.read_views`; the camera file itself for the tracks of its tie points.
-    views_are : {"auto", "tracks", "depth-maps"}
-        What the list means; see `pcfix.model.Views`. auto: what its kind of file says.
-    check_depths : path or None
-        See `pcfix.io.tables.read_check_depths`.
-    water_mask : path or None
-        See `pcfix.io.vectors.read_water_polygons`.
-    tide : path or None
-        See `pcfix.io.tides.read_tide`: each image gets its own level, the water shifted along the
-        vertical; the water is that of the images' mean level.
-    image_times : path or None
-        See `pcfix.io.tides.read_image_times`. Default, with a tide: the camera file, of
-        two the one that the cloud was made with.
-    port : Port or None
-        Of the housing of cameras under water, instead of `water`.
-    adjusted_from : Cameras, path or None
-        Which the cloud was made with, where `cameras` were adjusted since. Views, offset and CRS
-        are then told apart by `pcfix.flow.old_cameras`.
+    `cameras` and `adjusted_from` may be `pcfix.Cameras`, then in the cloud's CRS; `water` may be a
+    `pcfix.WaterSurface`, `port` a `Port`. With `adjusted_from`, views, offset and CRS are told
+    apart by `pcfix.flow.old_cameras`.
     """
 
-    cameras: Cameras | AnyPath
-    water: WaterSurface | float | AnyPath | None
-    sensor: AnyPath | None = None
-    angles: Angles | None = None
-    cameras_crs: str | None = None
-    cameras_offset_m: tuple[float, float, float] | None = None
-    views: AnyPath | None = None
-    water_mask: AnyPath | None = None
-    tide: AnyPath | None = None
-    image_times: AnyPath | None = None
-    water_model: WaterModel = "auto"
-    water_crs: str | None = None
-    views_are: ViewsAre = "auto"
-    check_depths: AnyPath | None = None
-    port: Port | None = None
-    adjusted_from: Cameras | AnyPath | None = None
-
-    def __post_init__(self) -> None:
+    def check(self) -> None:
         """Check that the light bends somewhere, and at one place only."""
+        super().check()
         if self.water is None and self.port is None:
             raise SettingError(
                 "water is missing: give the water surface, or the port of a cloud that was taken"
@@ -98,20 +54,18 @@ class Inputs:
                 "water and port exclude each other: a camera in a housing sees no water surface;"
                 " leave out the water for a cloud that was taken under water, else the port."
             )
+        if isinstance(self.port, str):
+            object.__setattr__(self, "port", port_of(self.port))
 
-    def paths(self) -> list[AnyPath]:
+    def paths(self) -> list[File]:
         """Return what may be files, which no output may replace."""
-        mask = None if self.water_mask is None else file_of(self.water_mask)
-        water = file_of(self.water) if isinstance(self.water, str | PathLike) else None
-        given = (self.cameras, water, self.sensor, self.views, mask, self.adjusted_from)
-        moving = (self.tide, self.image_times, self.check_depths)
-        return [one for one in (*given, *moving) if isinstance(one, str | PathLike)]
+        return paths_in(self)
 
     def surface(self, view: CloudView | None = None) -> FoundSurface:
         """Return the water surface over a cloud; see `pcfix.flow.surfaces.find_surface`."""
         if self.water is None:
             raise SettingError("there is no water surface before a port.")
-        return find_surface(WaterWords(self.water, self.water_model, self.water_crs), view)
+        return find_surface(self.water, self, view)
 
     def level_offset_m(self, cameras: Cameras) -> FloatArray | None:
         """Return how much higher the water stood at each image, shape (k,), where it moved.
@@ -167,7 +121,7 @@ class Inputs:
             return self.cameras, self._of_kind(read_views(self.views, self.cameras))
         read = self.read() if read is None else read
         way = georeference(
-            read, cloud_crs, cameras_crs=self.cameras_crs, offset_m=self.cameras_offset_m,
+            read, cloud_crs, cameras_crs=self.cameras_crs, offset_m=self.cameras_offset,
             name=str(self.cameras),
         )  # fmt: skip
         cameras = way.cameras(read)
@@ -201,7 +155,7 @@ class Inputs:
         if placed and not known.any():
             return None
         way = georeference(
-            read, cloud_crs, cameras_crs=self.cameras_crs, offset_m=self.cameras_offset_m,
+            read, cloud_crs, cameras_crs=self.cameras_crs, offset_m=self.cameras_offset,
             name=str(self.cameras),
         )  # fmt: skip
         xyz = np.full((len(ties.xyz), 3), np.nan)
@@ -238,50 +192,18 @@ def mask_of(
     return WaterMask(polygons.area, polygons.name, low, high, polygons.notes)
 
 
-def file_of(path: AnyPath) -> Path:
-    """Return a vector file, which may be named with a layer."""
+def paths_in(options: Any) -> list[File]:
+    """Return what among the options of a command may be files that it reads."""
+    names = [one.name for one in options_of(InputOptions)] + ["water_mask"]
+    given = [file_of(getattr(options, name, None)) for name in names if name not in NO_FILES]
+    return [one for one in given if isinstance(one, str | PathLike)]
+
+
+NO_FILES = ("port", "water_model", "water_crs", "views_are", "angles", "cameras_crs")
+
+
+def file_of(path: Any) -> Any:
+    """Return a vector file, which may be named with a layer; what is no path comes back."""
+    if not isinstance(path, str | PathLike):
+        return path
     return Path(str(path).partition(LAYER_MARK)[0])
-
-
-def classes_of(text: str | None) -> tuple[int, ...]:
-    """Return the class numbers of ``2,5,6``.
-
-    Raises
-    ------
-    SettingError
-        If they are not whole numbers.
-    """
-    words = [] if text is None else text.split(",")
-    try:
-        return tuple(int(word) for word in words)
-    except ValueError:
-        raise SettingError(
-            f"respect-classes '{text}' must be whole numbers with commas between, as 2,5,6."
-        ) from None
-
-
-def inputs_of(options: dict[str, Any]) -> Inputs:
-    """Return the inputs among some options, which have the names of its attributes."""
-    names = [field.name for field in fields(Inputs)]
-    return Inputs(**{name: options[name] for name in names if name in options})
-
-
-def offset_of(text: str | None) -> tuple[float, float, float] | None:
-    """Return the three numbers of ``X,Y,Z``.
-
-    Raises
-    ------
-    SettingError
-        If they are not three finite numbers.
-    """
-    if text is None:
-        return None
-    try:
-        x, y, z = (float(word) for word in text.split(","))
-    except ValueError:
-        x = y = z = np.nan
-    if not np.isfinite([x, y, z]).all():
-        raise SettingError(
-            f"cameras-offset '{text}' must be three numbers X,Y,Z in metres, as 500000,4650000,0."
-        )
-    return x, y, z

@@ -2,50 +2,43 @@
 
 from __future__ import annotations
 
-import json
-import time
-from dataclasses import asdict, astuple
+from dataclasses import astuple
 from os import PathLike
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.flow.files import file_points, water_heights
-from pcfix.flow.inputs import file_of, mask_of
-from pcfix.flow.job import parts_of
-from pcfix.flow.points import CHUNK_POINTS
-from pcfix.flow.surfaces import WaterWords, find_surface, view_of
-from pcfix.io.files import check_input, check_output, write_text
+from pcfix.flow.correct import file_points, water_heights
+from pcfix.flow.inputs import mask_of, paths_in
+from pcfix.flow.runner import file_task
+from pcfix.flow.surfaces import find_surface, view_of
+from pcfix.flow.through_water import parts_of
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource, coordinates
-from pcfix.io.las.writing import (
-    LasSink,
-    check_suffix,
-    corrected_identity,
-    labelling_vlr,
-    noted_header,
-    output_evlrs,
-)
+from pcfix.io.las.writing import labelling_vlr, noted_header
 from pcfix.label.labelling import Labelling, LabelSummary, Part, sets_class
 from pcfix.model import WaterPlane
-from pcfix.options import LabelSettings
+from pcfix.options.correct import LabelOptions, LabelRules
+from pcfix.options.declare import taken
 from pcfix.threads import threads
 from pcfix.version import __version__
 from pcfix.water.checks import as_surface, check_submerged, check_tilt, checked_points
 from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
+    from collections.abc import Callable, Iterable
 
     import laspy
     import numpy.typing as npt
 
-    from pcfix.flow.surfaces import WaterModel
-    from pcfix.label.areas import WaterMask
+    from pcfix.flow.job import Points
+    from pcfix.flow.runner import Progress
+    from pcfix.flow.surfaces import CloudView
     from pcfix.label.labelling import Labels
+    from pcfix.label.areas import WaterMask
     from pcfix.model import FloatArray, WaterSurface
+    from pcfix.options.declare import File
 
     AnyPath = str | PathLike[str]
     Classes = npt.NDArray[np.uint8]
@@ -72,9 +65,10 @@ def label_points(
     water: WaterSurface | float | npt.ArrayLike,
     *,
     classes: npt.ArrayLike | None = None,
-    water_mask: WaterMask | AnyPath | None = None,
+    water_mask: WaterMask | File | None = None,
     crs: str | None = None,
-    settings: LabelSettings | None = None,
+    options: LabelRules | None = None,
+    **keywords: Any,
 ) -> Classes:
     """Return the classes of points, 40 where they are submerged.
 
@@ -90,7 +84,8 @@ def label_points(
         See `label_file`.
     crs : str, optional
         Of the points, for a mask from a file.
-    settings : LabelSettings, optional
+    options : LabelRules, optional
+        Or its attributes as keywords: band, dead_band, connected, respect_classes and others.
 
     Returns
     -------
@@ -107,6 +102,7 @@ def label_points(
     >>> label_points([[0, 0, 1.0], [5, 0, -1.0]], 0.0).tolist()
     [0, 40]
     """
+    rules = taken(LabelRules, options, keywords, "label_points")
     points = checked_points(xyz)
     given = np.zeros(len(points), np.uint8) if classes is None else np.asarray(classes)
     if given.shape != (len(points),) or given.dtype != np.uint8:
@@ -117,7 +113,7 @@ def label_points(
     surface, heights = as_surface(water, len(points))
     if water_mask is None or isinstance(water_mask, str | PathLike):
         water_mask = mask_of(water_mask, crs, *corners(points))
-    labelling = Labelling(settings or LabelSettings(), water_mask)
+    labelling = Labelling(rules, water_mask)
     part = Part(points, surface_above(surface, points, heights), given)
     if labelling.looks_around:
         labelling.look_around(lambda: [part], *corners(points))
@@ -137,18 +133,12 @@ def corners(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def label_file(
-    input: AnyPath,
-    output: AnyPath,
+    input: File,
+    output: File,
     *,
-    water: WaterSurface | float | AnyPath,
-    water_model: WaterModel = "auto",
-    water_crs: str | None = None,
-    water_mask: AnyPath | None = None,
-    settings: LabelSettings | None = None,
-    summary: AnyPath | None = None,
-    overwrite: bool = False,
-    jobs: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    options: LabelOptions | None = None,
+    progress: Progress | None = None,
+    **keywords: Any,
 ) -> LabelSummary:
     """Give the submerged points of a LAS or LAZ cloud class 40; what ``pcfix label`` runs.
 
@@ -159,17 +149,13 @@ def label_file(
     Parameters
     ----------
     input, output : path
-        The names end in ``.las`` or ``.laz``; the output is LAS 1.4, see `correct_file`.
-    water, water_model, water_crs
-        See `pcfix.flow.surfaces.WaterWords`.
-    water_mask : path, optional
-        Polygons (GeoPackage, Shapefile, GeoJSON, WKT), outside which, and in whose holes, no
-        point is submerged. A point on the border is inside. They are brought to the cloud's CRS.
-    settings : LabelSettings, optional
-        Band, dead band, connectivity and classes to respect. With a dead band or connectivity
-        the cloud is read twice. The result does not depend on the size of chunks.
-    summary, overwrite, jobs, progress
-        See `correct_file`.
+        The names end in ``.las`` or ``.laz``; the output is LAS 1.4, see `pcfix.correct_file`.
+    options : LabelOptions, optional
+        Or its attributes as keywords, as of ``pcfix label``: water, water_mask, band and others.
+        With a dead band or connectivity the cloud is read twice. The result does not depend on
+        the size of chunks. A point on the border of the mask is inside.
+    progress : callable, optional
+        See `pcfix.correct_file`.
 
     Returns
     -------
@@ -180,98 +166,91 @@ def label_file(
     PcfixError
         With one sentence on what to mend; no output is left behind.
     """
-    started = time.perf_counter()
-    settings = settings or LabelSettings()
-    path = check_input(input)
-    given = [file_of(one) for one in (input, water) if isinstance(one, str | PathLike)]
-    given += [] if water_mask is None else [file_of(water_mask)]
-    target = check_output(output, overwrite=overwrite, inputs=given)
-    check_suffix(target)
-    if summary is not None:
-        check_output(summary, overwrite=overwrite, inputs=[*given, target])
-    with threads(jobs):
-        words = WaterWords(water, water_model, water_crs)
-        surface, labelling = _surface_and_rules(path, words, water_mask, settings, jobs)
-        counts = _write(path, target, surface, labelling, jobs, progress)
+    given = taken(LabelOptions, options, keywords, "label_file")
+    task = file_task(input, output, given, reads=paths_in(given), progress=progress)
+    with threads(given.jobs):
+        view = view_of(task.source)
+        step = LabellingStep(str(task.source), given, view)
+        step.look_around(lambda: file_points(task.source, step.water, given.jobs))
+        task.run(step)
     result = LabelSummary(
-        input=str(path),
-        output=str(target),
+        input=str(task.source),
+        output=str(task.target),
         pcfix=__version__,
-        **vars(counts),
-        water=str(surface),
-        settings=asdict(settings),
-        labelling=labelling.report(),
-        seconds=round(time.perf_counter() - started, 3),
-        warnings=list(labelling.notes),
+        **vars(step.counts),
+        water=str(step.water),
+        settings=step.labelling.settings.as_dict(),
+        labelling=step.labelling.report(),
+        seconds=round(task.seconds, 3),
+        warnings=list(step.labelling.notes),
     )
-    if summary is not None:
-        write_text(summary, json.dumps(result.as_dict(), indent=2) + "\n", overwrite=overwrite)
+    task.tell(result.as_dict())
     return result
 
 
-def _surface_and_rules(
-    path: Path,
-    words: WaterWords,
-    water_mask: AnyPath | None,
-    settings: LabelSettings,
-    jobs: int | None,
-) -> tuple[WaterSurface, Labelling]:
-    """Return the water and the rules, with the surroundings of all points where they need them."""
-    view = view_of(path)
-    surface = find_surface(words, view).surface
-    check_tilt(surface)
-    labelling = Labelling(settings, mask_of(water_mask, view.crs, view.low, view.high))
-    if labelling.looks_around:
-        labelling.look_around(
-            lambda: parts_of(file_points(path, surface, jobs), surface), view.low, view.high
-        )
-    return surface, labelling
+class LabellingStep:
+    """The step that labels points: of a file, and of the arrays that PDAL hands over.
 
+    Parameters
+    ----------
+    name : str
+        What is being labelled, for messages.
+    options : LabelOptions
+    view : CloudView
+        Of the whole cloud.
 
-def _write(
-    path: Path,
-    target: Path,
-    water: WaterSurface,
-    labelling: Labelling,
-    jobs: int | None,
-    progress: Callable[[int, int], None] | None,
-) -> Counts:
-    """Read, label and write chunk by chunk."""
-    counts = Counts()
-    with LasSource(path, jobs) as source:
-        header = _labelled_header(source, water, labelling)
-        evlrs, identity = output_evlrs(source), corrected_identity(source)
-        with LasSink(target, header, evlrs, identity, jobs) as sink:
-            for points in source.chunks(CHUNK_POINTS):
-                part = _part(points, water, source)
-                labels = labelling.labels(part)
-                counts.add(part, labels)
-                new = convert(points, header.point_format)
-                new.array["classification"] = labels.classes
-                sink.write(new)
-                if progress is not None:
-                    progress(counts.points, len(source))
-            labelling.check(str(path))
-            check_submerged(counts.submerged + counts.water_surface, str(path), water)
-    return counts
+    Raises
+    ------
+    PcfixError
+        If the water or the mask cannot be read or do not fit.
+    """
 
+    def __init__(self, name: str, options: LabelOptions, view: CloudView) -> None:
+        self._name, self._view = name, view
+        self.water = find_surface(options.water, options, view).surface
+        check_tilt(self.water)
+        mask = mask_of(options.water_mask, view.crs, view.low, view.high)
+        self.labelling = Labelling(options.part(LabelRules), mask)
+        self.counts = Counts()
 
-def _part(points: laspy.ScaleAwarePointRecord, water: WaterSurface, source: LasSource) -> Part:
-    xyz = coordinates(points)
-    surface = surface_above(water, xyz, water_heights(water, source, points))
-    return Part(xyz, surface, np.asarray(points["classification"]))
+    def look_around(self, chunks: Callable[[], Iterable[Points]]) -> None:
+        """Learn the surroundings of all points, where the rules need them."""
+        if self.labelling.looks_around:
+            self.labelling.look_around(
+                lambda: parts_of(chunks(), self.water), self._view.low, self._view.high
+            )
 
+    def header(self, source: LasSource) -> laspy.LasHeader:
+        """Return the header of a labelled file, with a record of what was done."""
+        water, mask = self.water, self.labelling.mask
+        content = {
+            "pcfix": __version__,
+            "settings": self.labelling.settings.as_dict(),
+            "water": str(water),
+            "water_plane": list(astuple(water)) if isinstance(water, WaterPlane) else None,
+            "water_mask": None if mask is None else mask.name,
+        }
+        return noted_header(source, labelling_vlr(content))
 
-def _labelled_header(
-    source: LasSource, water: WaterSurface, labelling: Labelling
-) -> laspy.LasHeader:
-    """Return the header of a labelled file, with a record of what was done."""
-    mask = labelling.mask
-    content = {
-        "pcfix": __version__,
-        "settings": asdict(labelling.settings),
-        "water": str(water),
-        "water_plane": list(astuple(water)) if isinstance(water, WaterPlane) else None,
-        "water_mask": None if mask is None else mask.name,
-    }
-    return noted_header(source, labelling_vlr(content))
+    def classes(self, points: Points) -> Classes:
+        """Return the classes of some points, and count them."""
+        (part,) = parts_of([points], self.water)
+        labels = self.labelling.labels(part)
+        self.counts.add(part, labels)
+        return labels.classes
+
+    def chunk(
+        self, points: laspy.ScaleAwarePointRecord, source: LasSource, header: laspy.LasHeader
+    ) -> laspy.ScaleAwarePointRecord:
+        """Return labelled points of a file."""
+        heights = water_heights(self.water, source, points)
+        came = coordinates(points), heights, np.asarray(points["classification"])
+        new = convert(points, header.point_format)
+        new.array["classification"] = self.classes(came)
+        return new
+
+    def finish(self) -> None:
+        """Refuse a cloud of which no point lies below the water, or inside the mask."""
+        self.labelling.check(self._name)
+        counts = self.counts
+        check_submerged(counts.submerged + counts.water_surface, self._name, self.water)

@@ -125,7 +125,7 @@ def told_apart(inputs: Inputs) -> tuple[Inputs, Inputs]:
     made_with = inputs.cameras if inputs.adjusted_from is None else inputs.adjusted_from
     old = replace(inputs, cameras=made_with, adjusted_from=None)
     new = replace(inputs, views=None, adjusted_from=None)
-    if inputs.cameras_crs is None and inputs.cameras_offset_m is None:
+    if inputs.cameras_crs is None and inputs.cameras_offset is None:
         return old, new
     read = old.read(), new.read()
     tied = [
@@ -134,13 +134,13 @@ def told_apart(inputs: Inputs) -> tuple[Inputs, Inputs]:
     ]
     silent = [not one or all(tied) for one in tied]
     old, new = (
-        one if is_silent else replace(one, cameras_crs=None, cameras_offset_m=None)
+        one if is_silent else replace(one, cameras_crs=None, cameras_offset=None)
         for one, is_silent in zip((old, new), silent, strict=True)
     )
-    if inputs.cameras_offset_m is not None and not any(tied):
-        moves = _who_moves(*read, np.array(inputs.cameras_offset_m))
+    if inputs.cameras_offset is not None and not any(tied):
+        moves = _who_moves(*read, np.array(inputs.cameras_offset))
         old, new = (
-            one if moved else replace(one, cameras_offset_m=None)
+            one if moved else replace(one, cameras_offset=None)
             for one, moved in zip((old, new), moves, strict=True)
         )
     return old, new

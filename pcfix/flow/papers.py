@@ -23,6 +23,9 @@ own true position, not against the bed below or above it.
 
 from __future__ import annotations
 
+from pcfix.errors import SettingError
+from pcfix.water.index import index_of
+
 import json
 from dataclasses import asdict
 from pathlib import Path
@@ -62,6 +65,8 @@ from pcfix.simulate.refraction_effect import (
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
+    from pcfix.options.declare import File
+    from pcfix.options.scenes import SimulateOptions
     import os
 
     from pcfix.model import BoolArray, FloatArray, IntArray
@@ -75,32 +80,15 @@ PUBLISHED = (
 )
 
 
-def write_refraction_effect(
-    out_dir: str | os.PathLike[str],
-    *,
-    camera: AerialCamera | None = None,
-    overlap: float = OVERLAP,
-    flying_heights_m: tuple[float, ...] | None = None,
-    apparent_depths_m: tuple[float, ...] = APPARENT_DEPTHS_M,
-    refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
-    seed: int = 1,
-    overwrite: bool = False,
-) -> str:
+def write_refraction_effect(out_dir: File, options: SimulateOptions) -> str:
     """Write tables, settings and pictures, and return a short text about them.
 
     Parameters
     ----------
-    camera : AerialCamera, optional
-        Default: the two cameras of Skarlatos & Agrafiotis (2018).
-    overlap : float
-        Share of the image's short side, 0 to 1.
-    flying_heights_m : tuple of float, optional
-        Above the water. Default: those of `FLYING_HEIGHTS_M`, and 50, 100 and 200 m for a camera
-        of one's own.
-    apparent_depths_m : tuple of float
-    refractive_index : float
-    seed : int
-        Of the flume's random numbers.
+    out_dir : path
+    options : SimulateOptions
+        Those called effect_..., index and seed. Without a camera of one's own the two of
+        Skarlatos & Agrafiotis (2018) are taken.
 
     Raises
     ------
@@ -108,13 +96,16 @@ def write_refraction_effect(
         If an argument is outside its rule, or a file exists and `overwrite` is not set; then
         none is written.
     """
+    camera, overlap = _camera(options), options.effect_overlap or OVERLAP
+    apparent_depths_m = options.effect_depths or APPARENT_DEPTHS_M
+    index, seed = index_of(options.index)[0], options.seed
     heights = {
-        one: flying_heights_m or FLYING_HEIGHTS_M.get(one, (50.0, 100.0, 200.0))
+        one: options.effect_heights or FLYING_HEIGHTS_M.get(one, (50.0, 100.0, 200.0))
         for one in ([camera] if camera else FLYING_HEIGHTS_M)
     }
-    found = effects(heights, apparent_depths_m, overlap=overlap, refractive_index=refractive_index)
+    found = effects(heights, apparent_depths_m, overlap=overlap, refractive_index=index)
     shan = _shan_tables(found)
-    bins = depth_bins(simulate_flume(refractive_index=refractive_index, seed=seed))
+    bins = depth_bins(simulate_flume(refractive_index=index, seed=seed))
     files = _pictures(found, bins) | {
         "refraction_effect.csv": csv_text(effect_rows(found)).encode(),
         "shan_iterations.csv": _shan_csv(shan).encode(),
@@ -123,17 +114,31 @@ def write_refraction_effect(
             cameras=[asdict(one) | {"flying_heights_m": h} for one, h in heights.items()],
             overlap=overlap,
             apparent_depths_m=apparent_depths_m,
-            refractive_index=refractive_index,
+            refractive_index=index,
             seed=seed,
         ),
     }
-    _write(Path(out_dir), files, overwrite)
+    _write(Path(out_dir), files, options.overwrite)
     pair, table = list(shan.items())[len(next(iter(heights.values()))) // 2]
     title = f"{_name(pair)}, bed {max(apparent_depths_m):g} m deep"
     parts = [effect_text(found), shan_text(table, title), depth_bins_text(bins)]
     if camera is None:
         parts[0] += f"\n{PUBLISHED}"
     return "\n\n".join([*parts, f"{out_dir}: {', '.join(sorted(files))}"])
+
+
+def _camera(options: SimulateOptions) -> AerialCamera | None:
+    """Return the camera of one's own, where one is given."""
+    focal, frame = options.effect_focal_mm, options.effect_frame_px
+    pixel = options.effect_pixel_um
+    if focal is None and frame is None and pixel is None:
+        return None
+    if focal is None or frame is None or pixel is None:
+        raise SettingError(
+            "a camera needs --effect-focal-mm, --effect-frame-px and --effect-pixel-um; give all"
+            " three."
+        )
+    return AerialCamera("camera", focal, *frame, pixel)
 
 
 def _shan_tables(found: list[Effect]) -> dict[StereoPair, list[Iteration]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pcfix.errors import InputError
-from pcfix.flow.files import job_for
+from pcfix.flow.correct import job_for
 from pcfix.io.las.columns import UPGRADE, columns_for
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix
@@ -16,41 +16,30 @@ if TYPE_CHECKING:
 
     import laspy
 
-    from pcfix.flow.inputs import Inputs
     from pcfix.io.las.columns import Column
-    from pcfix.options import LabelSettings, Settings
+    from pcfix.options.correct import CorrectOptions
 
 WAVEFORM_FORMATS = (9, 10)
 
 
-def pipeline_for(
-    input: Path,
-    output: Path,
-    settings: Settings,
-    inputs: Inputs,
-    options: dict[str, Any],
-    label: LabelSettings | None = None,
-) -> dict[str, Any]:
+def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str, Any]:
     """Return the pipeline, ready for JSON.
 
     Parameters
     ----------
     input, output : Path
-        As of `correct_file`. PDAL replaces an output that exists.
-    settings : Settings
-    inputs : Inputs
-    options : dict
-        The stage's options as the user gave them; those that are None are left out.
-    label : LabelSettings, optional
-        As of `correct_file`.
+        As of `pcfix.correct_file`. PDAL replaces an output that exists.
+    options : CorrectOptions
+        Those that are not the default become the stage's.
 
     Raises
     ------
     PcfixError
-        If `correct_file` would refuse them at its start, or PDAL cannot write the point format.
+        If `pcfix.correct_file` would refuse them at its start, or PDAL cannot write the point
+        format.
     """
     check_suffix(output)
-    job_for(input, settings, inputs, label)
+    job_for(input, options)
     with LasSource(input) as source:
         point_format = source.header.point_format
     if UPGRADE[point_format.id] in WAVEFORM_FORMATS:
@@ -58,10 +47,15 @@ def pipeline_for(
             f"{input}: has waveforms (point format {point_format.id}), which PDAL does not write;"
             " use 'pcfix correct'."
         )
-    columns = columns_for(settings.dimensions)
-    drop = settings.uncorrected == "drop"
-    if drop:
-        options = {**options, "uncorrected": "keep"}
+    columns = columns_for(options.dimensions)
+    drop = options.uncorrected == "drop"
+    given = {
+        "cameras": None,
+        "water": None,
+        **options.plain(),
+        "uncorrected": "keep" if drop else options.uncorrected,
+        "dimensions": options.dimensions,
+    }
     added = [add_dimension(columns), CLASS_FLAGS, f"{OUTCOME}=uint8" if drop else ""]
     stage = {
         "type": "filters.python",
@@ -69,7 +63,7 @@ def pipeline_for(
         "module": "pcfix_stage",
         "function": "correct",
         "add_dimension": ",".join(filter(None, added)),
-        "pdalargs": {name: value for name, value in options.items() if value is not None},
+        "pdalargs": given,
     }
     dropping = {"type": "filters.range", "limits": f"{OUTCOME}[0:1]"}
     writer = {

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.flow.points import CHUNK_POINTS
 from pcfix.grid.maps import MapsBuilder
 from pcfix.io.files import sha256, write_bytes, write_text
 from pcfix.io.las.columns import SHIFTS
@@ -100,7 +99,7 @@ def _read(path: Path) -> tuple[Maps, FloatArray]:
         builder = MapsBuilder(source.header.mins[:2], source.header.maxs[:2], len(source))
         every = max(1, len(source) // SAMPLE_POINTS)
         sample = []
-        for points in source.chunks(CHUNK_POINTS):
+        for points in source.chunks():
             shift = np.column_stack([np.asarray(points[name]) for name in SHIFTS])
             rays = np.asarray(points["RayCount"]).astype(np.int64)
             moved = rays > 0

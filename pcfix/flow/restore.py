@@ -2,37 +2,35 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.flow.points import CHUNK_POINTS
-from pcfix.io.files import check_input, check_output
+from pcfix.flow.runner import file_task
 from pcfix.io.las.columns import SHIFTS, columns_for, is_corrected, is_marked_uncorrected, shifted
-from pcfix.io.las.source import LasSource
-from pcfix.io.las.writing import LasSink, check_suffix, output_evlrs, read_settings, restored_header
+from pcfix.io.las.writing import read_settings, restored_header
+from pcfix.options.declare import taken
+from pcfix.options.shared import JobOptions
 from pcfix.threads import threads
 
 if TYPE_CHECKING:
-    import os
     from collections.abc import Callable
 
     import laspy
-    import numpy.typing as npt
 
-    from pcfix.options import Dimensions
-
-    AnyPath = str | os.PathLike[str]
+    from pcfix.io.las.source import LasSource
+    from pcfix.options.correct import Dimensions
+    from pcfix.options.declare import File
 
 
 def restore_file(
-    input: AnyPath,
-    output: AnyPath,
+    input: File,
+    output: File,
     *,
-    overwrite: bool = False,
-    jobs: int | None = None,
+    options: JobOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
+    **keywords: Any,
 ) -> int:
     """Give back the apparent cloud that a corrected one came from, bit for bit.
 
@@ -42,8 +40,10 @@ def restore_file(
         A cloud that pcfix corrected with ``dimensions="all"``.
     output : path
         The cloud as it was: coordinates, classes, flags, point format, version.
-    overwrite, jobs, progress
-        See `correct_file`.
+    options : JobOptions, optional
+        Or its attributes as keywords: overwrite, jobs.
+    progress : callable, optional
+        See `pcfix.correct_file`.
 
     Returns
     -------
@@ -55,23 +55,42 @@ def restore_file(
     InputError
         If pcfix did not correct the file, or without the dimensions that undo it.
     """
-    source_path = check_input(input)
-    target = check_output(output, overwrite=overwrite, inputs=[source_path])
-    check_suffix(target)
-    with LasSource(source_path, jobs) as source, threads(jobs):
-        content = read_settings(source.vlrs, source_path)
+    given = taken(JobOptions, options, keywords, "restore_file")
+    task = file_task(input, output, given, progress=progress)
+    step = Restoring()
+    with threads(given.jobs):
+        task.run(step)
+    return step.points
+
+
+class Restoring:
+    """The step that takes points back."""
+
+    def __init__(self) -> None:
+        self.points, self.identity, self._offset = 0, b"", np.zeros(3, np.int64)
+
+    def header(self, source: LasSource) -> laspy.LasHeader:
+        """Return the header as it was before the correction."""
+        content = read_settings(source.vlrs, source.path)
         names = _ours(source, content["settings"]["dimensions"])
-        header = restored_header(source, content["before"], names)
-        identity = content["before"]["identity"].encode("latin-1")
-        offset = np.array(content["before"]["steps"])
-        with LasSink(target, header, output_evlrs(source), identity, jobs) as sink:
-            done = 0
-            for points in source.chunks(CHUNK_POINTS):
-                sink.write(_restored(points, header, offset))
-                done += len(points)
-                if progress is not None:
-                    progress(done, len(source))
-    return done
+        self.identity = content["before"]["identity"].encode("latin-1")
+        self._offset = np.array(content["before"]["steps"])
+        return restored_header(source, content["before"], names)
+
+    def chunk(
+        self, points: laspy.ScaleAwarePointRecord, source: LasSource, header: laspy.LasHeader
+    ) -> laspy.ScaleAwarePointRecord:
+        """Return points with their coordinates, classes and flags of before."""
+        self.points += len(points)
+        moved = is_corrected(points)
+        points.array["classification"][moved] = points.array["SourceClass"][moved]
+        withheld = np.asarray(points["withheld"]).astype(bool)
+        points["withheld"][:] = (withheld & ~is_marked_uncorrected(points)).astype(np.uint8)
+        shift = np.column_stack([points.array[name] for name in SHIFTS]).astype(np.int64)
+        return shifted(points, header, -shift - self._offset)
+
+    def finish(self) -> None:
+        """Nothing can be wrong with what was so before."""
 
 
 def _ours(source: LasSource, dimensions: Dimensions) -> set[str]:
@@ -89,16 +108,3 @@ def _ours(source: LasSource, dimensions: Dimensions) -> set[str]:
             " corrected; use the original cloud."
         )
     return names
-
-
-def _restored(
-    points: laspy.ScaleAwarePointRecord,
-    header: laspy.LasHeader,
-    offset: npt.NDArray[np.int64],
-) -> laspy.ScaleAwarePointRecord:
-    moved = is_corrected(points)
-    points.array["classification"][moved] = points.array["SourceClass"][moved]
-    withheld = np.asarray(points["withheld"]).astype(bool)
-    points["withheld"][:] = (withheld & ~is_marked_uncorrected(points)).astype(np.uint8)
-    shift = np.column_stack([points.array[name] for name in SHIFTS]).astype(np.int64)
-    return shifted(points, header, -shift - offset)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,9 +12,9 @@ from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.clean import clean_file
 from pcfix.flow.compare import compare_clouds
+from pcfix.flow.correct import correct_file
 from pcfix.flow.dsm import grid_dsm
-from pcfix.flow.files import correct_file
-from pcfix.flow.inputs import Inputs, file_of
+from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.flow.old_cameras import read_blocks
 from pcfix.flow.report import write_report
 from pcfix.flow.run_adjust import (
@@ -32,23 +32,21 @@ from pcfix.io.files import files_in
 from pcfix.io.las.source import LasSource
 from pcfix.io.rasters import open_raster, preview, write_dod
 from pcfix.model import Summary
-from pcfix.options import DEFAULT_REFRACTIVE_INDEX, ErrorBudget, LabelSettings, Settings
+from pcfix.options.correct import CorrectOptions
+from pcfix.options.declare import named, options_of
+from pcfix.options.survey import RunOptions
 from pcfix.report.comparison import evaluation, in_a_sentence
 from pcfix.report.run import (
     adjustment_sentence,
     adjustment_table,
     reason_sentence,
 )
-from pcfix.water.index import index_of
+from pcfix.water.index import with_index
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from pcfix.compare.figures import Comparison
-    from pcfix.flow.surfaces import WaterModel
-    from pcfix.io.cameras.formats import Angles
-    from pcfix.options import CameraSet, MatcherKind, Method, Occlusion, ViewsAre
-    from pcfix.options.survey import AdjustWhen
     from pcfix.report.page import Picture, Table
 
 RECORD = "run.json"
@@ -59,115 +57,23 @@ POINTS_PER_CELL = 4.0
 """Where no resolution is given, cells hold so many points on average."""
 
 
-_SETTINGS = (
-    "max_angle_deg",
-    "max_cameras",
-    "method",
-    "camera_set",
-    "matcher",
-    "occlusion",
-    "depth_factor",
-    "least_r2",
-)
-"""Of a request, what goes as it is to `pcfix.Settings` and `correct_file`."""
+@dataclass(frozen=True, kw_only=True)
+class Request(RunOptions):
+    """Everything that the results of a run depend on; ``run.json`` keeps it."""
 
+    input: str = ""
 
-@dataclass(frozen=True)
-class Request:
-    """Everything that the results of a run depend on, in plain values; ``run.json`` keeps it.
-
-    Attributes
-    ----------
-    input, cameras, water, sensor, angles, cameras_crs, cameras_offset_m, adjusted_from, views,
-    water_mask, tide, image_times, water_model, water_crs, connected, least_pool_m2,
-    respect_classes, refractive_index, max_angle_deg, max_cameras, method, camera_set, matcher,
-    views_are, occlusion, depth_factor, check_depths, least_r2
-        See `pcfix.correct_file`; files by their paths.
-    adjust : {"auto", "yes", "no"}
-        Whether the cameras are adjusted first, with the light bent at the water. auto: where they
-        have absorbed the refraction (see `pcfix.adjust.diagnosis`), and GNSS positions or control
-        points say where the block is.
-    gcps, gnss, lens : str or None
-        See `pcfix.adjust_cameras`.
-    errors : dict or None
-        The values of an `pcfix.ErrorBudget`.
-    reference : str or None
-        See `pcfix.flow.compare.compare_clouds`.
-    resolution_m : float or None
-        Of the rasters; None: four points a cell on average.
-    m3c2 : bool
-        Compare by M3C2 too.
-    """
-
-    input: str
-    cameras: str
-    water: str
-    sensor: str | None = None
-    angles: Angles | None = None
-    cameras_crs: str | None = None
-    cameras_offset_m: tuple[float, float, float] | None = None
-    adjusted_from: str | None = None
-    views: str | None = None
-    water_mask: str | None = None
-    tide: str | None = None
-    image_times: str | None = None
-    water_model: WaterModel = "auto"
-    water_crs: str | None = None
-    connected: bool = False
-    least_pool_m2: float | None = None
-    respect_classes: tuple[int, ...] = ()
-    reference: str | None = None
-    refractive_index: float | str = DEFAULT_REFRACTIVE_INDEX
-    max_angle_deg: float | None = None
-    max_cameras: int | None = None
-    method: Method = "snell"
-    camera_set: CameraSet = "auto"
-    matcher: MatcherKind = "depth-maps"
-    views_are: ViewsAre = "auto"
-    occlusion: Occlusion = "auto"
-    depth_factor: float | None = None
-    check_depths: str | None = None
-    least_r2: float = 0.5
-    adjust: AdjustWhen = "auto"
-    gcps: str | None = None
-    gnss: str | None = None
-    lens: str | None = None
-    errors: dict[str, float | None] | None = None
-    resolution_m: float | None = None
-    m3c2: bool = False
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        self.settings()
-        self.label()
+    def check(self) -> None:
+        """Check what options say together."""
+        super().check()
+        with_index(self.part(RunOptions))
         self.adjust_step()
-        if self.resolution_m is not None and not 0.0 < self.resolution_m < math.inf:
-            raise SettingError(f"resolution {self.resolution_m:g} is not positive; give metres.")
-        if self.m3c2 and self.reference is None:
-            raise SettingError("m3c2 compares with a reference; give --reference too.")
-
-    def settings(self) -> Settings:
-        """Return how points are corrected."""
-        index, index_from = index_of(self.refractive_index)
-        values = {name: getattr(self, name) for name in _SETTINGS}
-        return Settings(index, refractive_index_from=index_from, errors=self.budget(), **values)
-
-    def budget(self) -> ErrorBudget:
-        """Return the standard deviations of what goes in."""
-        given: dict[str, Any] = self.errors or {}
-        return ErrorBudget(**given)
-
-    def inputs(self) -> dict[str, Any]:
-        """Return what `pcfix.flow.inputs.Inputs` takes; a run is about a water surface, no port."""
-        names = [field.name for field in fields(Inputs) if field.name != "port"]
-        return {name: getattr(self, name) for name in names}
 
     def adjust_step(self) -> AdjustStep:
         """Return what the first step is asked for."""
         return AdjustStep(
-            self.input, Inputs(**self.inputs()), self.refractive_index, self.adjust,
-            self.gcps, self.gnss, self.lens,
-        )  # fmt: skip
+            self.input, self.part(Inputs), self.index, self.adjust, self.gcps, self.gnss, self.lens
+        )
 
     def with_adjusted(self, folder: Path, step: dict[str, Any]) -> Request:
         """Return the request of the steps that follow: with the adjusted cameras where they are."""
@@ -180,19 +86,14 @@ class Request:
             adjust="no", gcps=None, gnss=None, lens=None,
         )  # fmt: skip
 
-    def label(self) -> LabelSettings:
-        """Return the rules by which points are left out."""
-        return LabelSettings(
-            connected=self.connected,
-            least_pool_m2=self.least_pool_m2,
-            respect_classes=tuple(self.respect_classes),
-        )
+    def record(self) -> dict[str, Any]:
+        """Return plain values, without what the results do not depend on."""
+        values = self.as_dict()
+        return {name: values[name] for name in values if name not in ("overwrite", "jobs")}
 
     def files(self) -> list[Path]:
         """Return the input files, each of which exists."""
-        mask = None if self.water_mask is None else str(file_of(self.water_mask))
-        names = [self.input, self.cameras, self.sensor, self.views, mask, self.reference]
-        names += [self.tide, self.image_times, self.check_depths, self.adjusted_from]
+        names = [self.input, *paths_in(replace(self, water=None)), self.reference]
         names += [self.gcps, self.gnss, self.lens]
         found = [path for name in names if name is not None for path in files_in(name)]
         return [*found, Path(self.water)] if Path(self.water).is_file() else found
@@ -200,10 +101,15 @@ class Request:
 
 def request_of(record: Path) -> Request:
     """Return what an earlier run was asked for, from its ``run.json``."""
+    # runs before there were adjustments did without
+    kept = {"adjust": "no", **read_record(record)["request"]}
+    input = kept.pop("input", "")
+    kept.pop("index_from", None)
     try:
-        # runs before there were adjustments did without
-        return Request(**{"adjust": "no", **read_record(record)["request"]})
-    except TypeError as error:
+        with warnings.catch_warnings():  # a record of old may have old names
+            warnings.simplefilter("ignore", PcfixWarning)
+            return Request(input=input, **named(kept, options_of(RunOptions), str(record)))
+    except (SettingError, TypeError) as error:
         raise InputError(f"{record}: is not the record of a run ({error}).") from error
 
 
@@ -270,7 +176,7 @@ def run_all(
     if not out_dir.parent.is_dir():
         raise SettingError(f"{out_dir}: the folder {out_dir.parent} does not exist; make it first.")
     out_dir.mkdir(exist_ok=True)
-    record = Record(out_dir / RECORD, asdict(request), inputs)
+    record = Record(out_dir / RECORD, request.record(), inputs)
     if not (overwrite or record.resumes) and any(out_dir.iterdir()):
         raise SettingError(
             f"{out_dir}: holds other files, or a run of another request; add --overwrite to"
@@ -323,20 +229,8 @@ def _correct(
     jobs: int | None,
     progress: Callable[[int, int], None] | None,
 ) -> dict[str, Any]:
-    summary = correct_file(
-        request.input,
-        files.corrected,
-        **request.inputs(),
-        connected=request.connected,
-        least_pool_m2=request.least_pool_m2,
-        respect_classes=tuple(request.respect_classes),
-        refractive_index=request.refractive_index,
-        errors=request.budget(),
-        **{name: getattr(request, name) for name in _SETTINGS},
-        overwrite=True,
-        jobs=jobs,
-        progress=progress,
-    )
+    options = replace(request, overwrite=True, jobs=jobs).part(CorrectOptions)
+    summary = correct_file(request.input, files.corrected, options=options, progress=progress)
     return vars(summary)
 
 
@@ -347,12 +241,12 @@ def _clean(request: Request, files: Files, jobs: int | None) -> dict[str, Any]:
 
 
 def _grid(request: Request, files: Files) -> dict[str, Any]:
-    resolution = request.resolution_m or _resolution_m(files.cleaned)
+    resolution = request.resolution or _resolution_m(files.cleaned)
     whole = grid_dsm(
-        files.cleaned, files.dsm, resolution_m=resolution, hillshade=files.hillshade, overwrite=True
+        files.cleaned, files.dsm, resolution=resolution, hillshade=files.hillshade, overwrite=True
     )
     bed = grid_dsm(
-        files.cleaned, files.dsm_bed, resolution_m=resolution, surface="bed", overwrite=True
+        files.cleaned, files.dsm_bed, resolution=resolution, surface="bed", overwrite=True
     )
     return {"dsm": whole.as_dict(), "bed": bed.as_dict()}
 
@@ -380,7 +274,7 @@ def _compare(request: Request, files: Files) -> dict[str, Any]:
                 resolution = float(dsm.res[0])
             with warnings.catch_warnings():  # the cells are those of the cloud
                 warnings.simplefilter("ignore", PcfixWarning)
-                grid_dsm(reference, heights, resolution_m=resolution, overwrite=True)
+                grid_dsm(reference, heights, resolution=resolution, overwrite=True)
         write_dod(files.dsm, heights, files.compare / DOD, overwrite=True)
     return {"figures": result.as_dict(), "sections": _plain_sections(result)}
 
@@ -420,7 +314,7 @@ def _report(
         dod = preview(files.compare / DOD) if _rasters(request) else None
         pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
         verdict += in_a_sentence(compared["figures"])
-    inputs_again = Inputs(**{**request.inputs(), "views": None})
+    inputs_again = replace(request, views=None).part(Inputs)
     with warnings.catch_warnings():  # they were shown when the cloud was corrected
         warnings.simplefilter("ignore", PcfixWarning)
         with LasSource(files.corrected) as source:

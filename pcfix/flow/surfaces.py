@@ -15,6 +15,7 @@ from pcfix.io.water import read_water
 from pcfix.water.surface import FoundSurface
 
 if TYPE_CHECKING:
+    from pcfix.options.shared import WaterOptions
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
@@ -33,7 +34,6 @@ SAMPLE_POINTS = 2_000_000
 """Points of a cloud that are looked at for a surface, evenly spread."""
 SHORE_RADIUS_M = 1.0
 """About shoreline points without a height, which they take from the cloud."""
-CHUNK_POINTS = 1_000_000
 
 
 class Seen(NamedTuple):
@@ -78,7 +78,7 @@ def view_of(path: Path, jobs: int | None = None) -> CloudView:
     def chunks() -> Iterator[Seen]:
         with LasSource(path, jobs) as source:
             names = set(source.header.point_format.dimension_names)
-            for some in source.chunks(CHUNK_POINTS):
+            for some in source.chunks():
                 rgb = None
                 if {"red", "green", "blue"} <= names:
                     rgb = np.column_stack([some["red"], some["green"], some["blue"]])
@@ -88,33 +88,19 @@ def view_of(path: Path, jobs: int | None = None) -> CloudView:
     return CloudView(str(path), crs, low, high, points, chunks)
 
 
-@dataclass(frozen=True)
-class WaterWords:
-    """The water surface as the user names it.
-
-    Attributes
-    ----------
-    water : WaterSurface, float, str or path
-        See `pcfix.read_water`; besides, a vector file of shoreline points or lines, to which a
-        surface is fitted, or ``auto``: the surface is sought in the cloud.
-    model : {"auto", "level", "plane", "along", "river"}
-        What is fitted to shoreline points; see `pcfix.water.fit.fit_water` and
-        `pcfix.water.river.fit_river`.
-    crs : str or None
-        Of shoreline points, instead of what their file says.
-    """
-
-    water: WaterSurface | float | AnyPath
-    model: WaterModel = "auto"
-    crs: str | None = None
-
-
-def find_surface(words: WaterWords, view: CloudView | None) -> FoundSurface:
+def find_surface(
+    water: WaterSurface | float | AnyPath, options: WaterOptions, view: CloudView | None
+) -> FoundSurface:
     """Return the water surface that the user means, for a cloud.
 
     Parameters
     ----------
-    words : WaterWords
+    water : WaterSurface, float, str or path
+        See `pcfix.read_water`; besides, a vector file of shoreline points or lines, to which a
+        surface is fitted, or ``auto``: the surface is sought in the cloud.
+    options : WaterOptions
+        What is fitted to shoreline points (see `pcfix.water.fit.fit_water` and
+        `pcfix.water.river.fit_river`), and their CRS.
     view : CloudView or None
         Without a cloud only surfaces that do not need one.
 
@@ -125,13 +111,12 @@ def find_surface(words: WaterWords, view: CloudView | None) -> FoundSurface:
     """
     from pcfix.io.vectors import is_vector_file
 
-    water = words.water
     if not isinstance(water, str | PathLike | float | int):
         return FoundSurface(water)
     if str(water).strip().lower() == AUTO:
         return _sought(view)
     if isinstance(water, str | PathLike) and is_vector_file(water):
-        return _fitted(words, water, view)
+        return _fitted(options, water, view)
     if view is None:
         return FoundSurface(read_water(water))
     return FoundSurface(read_water(water, view.crs, _bounds(view.low, view.high)))
@@ -170,23 +155,23 @@ def _thinned(seen: Seen, every: int) -> Seen:
     )
 
 
-def _fitted(words: WaterWords, path: AnyPath, view: CloudView | None) -> FoundSurface:
+def _fitted(options: WaterOptions, path: AnyPath, view: CloudView | None) -> FoundSurface:
     """Return the surface fitted to shoreline points."""
     from pcfix.io.vectors import read_shoreline
     from pcfix.water.fit import fit_water
     from pcfix.water.river import fit_river
 
-    shore = read_shoreline(path, None if view is None else view.crs, crs=words.crs)
+    shore = read_shoreline(path, None if view is None else view.crs, crs=options.water_crs)
     xyz, notes = shore.xyz, list(shore.notes)
     if np.isnan(xyz[:, 2]).any():
         xyz = _with_heights(xyz, shore.name, view, notes)
     found: WaterFit | RiverFit
-    if words.model == "river":
+    if options.water_model == "river":
         corners = (xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0))
         low, high = corners if view is None else (view.low, view.high)
         found = fit_river(xyz, _bounds(low, high), name=shore.name)
     else:
-        found = fit_water(xyz, model=words.model)
+        found = fit_water(xyz, model=options.water_model)
     for note in notes:
         warnings.warn(note, PcfixWarning, stacklevel=2)
     return FoundSurface(found.surface, found, xyz, (*notes, *found.notes))

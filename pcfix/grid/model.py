@@ -20,53 +20,6 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class DsmSettings:
-    """How a cloud becomes a raster; see `pcfix.grid_dsm`.
-
-    Raises
-    ------
-    SettingError
-        If a value is outside its rule.
-    """
-
-    resolution_m: float
-    method: DsmMethod = "mean"
-    surface: SurfaceChoice = "all"
-    fill_m: float | None = None
-    azimuth_deg: float = 315.0
-    altitude_deg: float = 45.0
-
-    def __post_init__(self) -> None:
-        check_resolution(self.resolution_m)
-        _check_choice("method", self.method, get_args(DsmMethod))
-        _check_choice("surface", self.surface, get_args(SurfaceChoice))
-        if not math.isfinite(self.azimuth_deg):
-            raise SettingError(f"The azimuth is {self.azimuth_deg:g}; it must be in degrees.")
-        if not 0.0 < self.altitude_deg <= 90.0:
-            raise SettingError(
-                f"The altitude of the sun is {self.altitude_deg:g} degrees; it must be above 0 and"
-                " at most 90."
-            )
-        if self.fill_m is not None:
-            _check_fill(self.fill_m, self.resolution_m)
-
-
-def _check_choice(name: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise SettingError(f"The {name} is {value!r}; it must be one of {', '.join(known)}.")
-
-
-def _check_fill(fill_m: float, resolution_m: float) -> None:
-    if not (math.isfinite(fill_m) and fill_m > 0.0):
-        raise SettingError(f"The width of holes to fill is {fill_m:g} m; it must be positive.")
-    if fill_m > MAX_HOLE_CELLS * resolution_m:
-        raise SettingError(
-            f"Holes up to {fill_m:g} m are more than {MAX_HOLE_CELLS:,} cells of {resolution_m:g} m"
-            f" wide; fill up to {MAX_HOLE_CELLS * resolution_m:g} m, or take a coarser resolution."
-        )
-
-
-@dataclass(frozen=True, slots=True)
 class DsmSummary:
     """What a DSM came to; the keys of ``pcfix dsm --summary`` are these names.
 

@@ -80,12 +80,12 @@ class Labelling:
     def is_plain(self) -> bool:
         """Whether all that counts for being submerged is to lie below the surface."""
         s = self.settings
-        return self.mask is None and not (s.respect_classes or s.connected or s.dead_band_m)
+        return self.mask is None and not (s.respect_classes or s.connected or s.dead_band)
 
     @property
     def looks_around(self) -> bool:
         """Whether `look_around` must see the whole cloud first."""
-        return self.settings.connected or self.settings.dead_band_m > 0.0
+        return self.settings.connected or self.settings.dead_band > 0.0
 
     def look_around(
         self, parts: Callable[[], Iterable[Part]], low: FloatArray, high: FloatArray
@@ -103,7 +103,7 @@ class Labelling:
         if not (np.isfinite([low, high]).all() and (low <= high).all()):
             low = high = np.zeros(2)
         while True:
-            grid = Grid(low, high, settings.dead_band_m)
+            grid = Grid(low, high, settings.dead_band)
             for part in parts():
                 x, y, z = np.ascontiguousarray(part.xyz.T)
                 height = z - part.surface.height_m
@@ -112,7 +112,7 @@ class Labelling:
                 break
             low, high = grid.low, grid.high
         self._around = grid.surroundings(
-            connected=settings.connected, least_pool_m2=settings.least_pool_m2
+            connected=settings.connected, least_pool_m2=settings.least_pool
         )
         self.restart()
 
@@ -120,7 +120,7 @@ class Labelling:
         self, x: FloatArray, y: FloatArray, height: FloatArray, classes: Classes
     ) -> BoolArray:
         """Return which points count; high ones do not matter without a dead band."""
-        counts = np.ones(len(x), np.bool_) if self.settings.dead_band_m else height < 0.0
+        counts = np.ones(len(x), np.bool_) if self.settings.dead_band else height < 0.0
         if self.settings.respect_classes:
             counts &= ~np.isin(classes, self.settings.respect_classes)
         if self.mask is not None:
@@ -143,7 +143,7 @@ class Labelling:
         if self.is_plain:
             return below
         height = xyz[:, 2] - surface.height_m
-        wet = below | self._within(height, self.settings.dead_band_m)
+        wet = below | self._within(height, self.settings.dead_band)
         rows = np.flatnonzero(wet)
         wet[rows] = self._decided(xyz[rows], height[rows], classes[rows])
         return wet
@@ -156,7 +156,7 @@ class Labelling:
             old = sets_class(part.classes) & ~np.isin(part.classes, self.settings.respect_classes)
             new[old] = UNCLASSIFIED
         at_surface = np.zeros(len(wet), np.bool_)
-        if self.settings.band_m > 0.0:
+        if self.settings.band > 0.0:
             at_surface[self._at_surface(*part)] = True
         wet &= ~at_surface
         new[wet], new[at_surface] = BATHYMETRIC_POINT, WATER_SURFACE
@@ -167,7 +167,7 @@ class Labelling:
 
         With `connected` they need water that stays in their cell or beside it.
         """
-        near = self._within(xyz[:, 2] - surface.height_m, self.settings.band_m)
+        near = self._within(xyz[:, 2] - surface.height_m, self.settings.band)
         near &= ~np.isin(classes, self.settings.respect_classes)
         rows = np.flatnonzero(near)
         x, y = np.ascontiguousarray(xyz[rows, :2].T)
@@ -196,7 +196,7 @@ class Labelling:
     ) -> BoolArray:
         """Return what the surroundings leave of the submerged points."""
         row, column = around.cells(x, y)
-        unsure = self._within(height, self.settings.dead_band_m)
+        unsure = self._within(height, self.settings.dead_band)
         if unsure.any():
             wet = wet & (~unsure | around.is_wet[row, column])
         if around.pools is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from pcfix.errors import SettingError
 from pcfix.options.declare import OptionSet, at_least, not_negative, option, within
@@ -15,6 +15,7 @@ from pcfix.options.shared import (
     IndexOptions,
     InputOptions,
     JobOptions,
+    LandRules,
     NeededOptions,
     SubmergedOptions,
     SummaryOption,
@@ -130,6 +131,19 @@ class BudgetOptions(OptionSet):
 class RefractionOptions(BudgetOptions, MethodOptions):
     """What the correction of points goes by; `pcfix.correct_points` takes these."""
 
+    @property
+    def max_angle_deg(self) -> float | None:  # TRANSITION
+        return self.max_angle
+
+    @property
+    def errors(self) -> Any:  # TRANSITION
+        from pcfix.options.settings import ErrorBudget
+
+        return ErrorBudget(
+            self.sigma_image, self.sigma_level, self.sigma_tilt, self.sigma_index,
+            self.sigma_waves, self.sigma_centre, self.sigma_attitude,
+        )  # fmt: skip
+
 
 @dataclass(frozen=True, kw_only=True)
 class ResultOptions(OptionSet):
@@ -154,8 +168,20 @@ class CorrectOptions(JobOptions, SummaryOption, ScienceOptions, SubmergedOptions
 
 
 @dataclass(frozen=True, kw_only=True)
-class LabelRules(SubmergedOptions):
+class LabelRules(LandRules):
     """Which points count as submerged, beyond lying below the surface; see `pcfix.label`."""
+
+    @property
+    def band_m(self) -> float:  # TRANSITION
+        return self.band
+
+    @property
+    def dead_band_m(self) -> float:  # TRANSITION
+        return self.dead_band
+
+    @property
+    def least_pool_m2(self) -> float | None:  # TRANSITION
+        return self.least_pool
 
     panel = WATER
 
@@ -188,5 +214,14 @@ class LabelRules(SubmergedOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LabelOptions(JobOptions, SummaryOption, LabelRules, WaterOptions, NeededOptions):
+class StageLabelOptions(LabelRules, SubmergedOptions, WaterOptions, NeededOptions):
+    """The options of the stage ``label`` of PDAL, which writes no files."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelOptions(JobOptions, SummaryOption, StageLabelOptions):
     """The options of ``pcfix label``."""
+
+
+Options = CorrectOptions
+"""The name of the front door."""

@@ -10,9 +10,10 @@ from __future__ import annotations
 import difflib
 import math
 import os
+import sys
 import types
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from functools import cache
 from inspect import get_annotations
@@ -26,7 +27,6 @@ from typing import (
     Union,
     get_args,
     get_origin,
-    get_type_hints,
 )
 
 from pcfix.errors import PcfixWarning, SettingError
@@ -100,6 +100,15 @@ class Option(NamedTuple):
         union = get_origin(self.type) in (Union, types.UnionType)
         kinds = get_args(self.type) if union else (self.type,)
         return tuple(kind for kind in kinds if kind is not type(None))
+
+    @property
+    def plain_kinds(self) -> tuple[type, ...]:
+        """The types that its value may have in JSON, in the order in which they are tried."""
+        if self.declared.parse is not None:
+            return (float, str) if float in self.kinds else (str, int)
+        if self.type is Any:
+            return (str, float)
+        return self.kinds if self.kinds in ((bool,), (int,), (float,)) else (str,)
 
     def checked(self, value: Any) -> Any:
         """Return a value as its type.
@@ -184,16 +193,17 @@ def _plain(value: Any) -> Any:
 
 
 @cache
-def options_of(kind: type) -> tuple[Option, ...]:
+def options_of(kind: Any) -> tuple[Option, ...]:
     """Return the options of a class, in the order of its help."""
-    hints = get_type_hints(kind)
-    panels = {
-        name: base.__dict__.get("panel", "")
-        for base in reversed(kind.__mro__)
-        for name in get_annotations(base)
-    }
+    homes = {name: base for base in reversed(kind.__mro__) for name in get_annotations(base)}
     return tuple(
-        Option(one.name, hints[one.name], one.default, panels[one.name], one.metadata["declared"])
+        Option(
+            one.name,
+            eval(str(one.type), vars(sys.modules[homes[one.name].__module__])),
+            one.default,
+            homes[one.name].__dict__.get("panel", ""),
+            one.metadata["declared"],
+        )
         for one in fields(kind)
         if "declared" in one.metadata
     )
@@ -229,10 +239,10 @@ def taken(
         )
     if given is not None:
         return given if isinstance(given, kind) else given.part(kind)
-    return kind(**{**defaults, **named(kind, keywords, where)})
+    return kind(**{**defaults, **named(keywords, options_of(kind), where)})
 
 
-def named(kind: type, given: Mapping[str, Any], where: str) -> dict[str, Any]:
+def named(given: Mapping[str, Any], known: Iterable[Option], where: str) -> dict[str, Any]:
     """Return values under the names of today, and warn of older ones.
 
     Raises
@@ -240,32 +250,29 @@ def named(kind: type, given: Mapping[str, Any], where: str) -> dict[str, Any]:
     SettingError
         If a name is unknown; the message names the nearest known one.
     """
-    known = {one.name for one in options_of(kind)}
-    renamed = {old: one.name for one in options_of(kind) for old in one.declared.old}
+    options = list(known)
+    names = [one.name for one in options]
+    renamed = {old: one.name for one in options for old in one.declared.old}
     found: dict[str, Any] = {}
-    for name, value in _without_budget(given, known).items():
-        if name in known:
-            found[name] = value
-        elif name in renamed:
+    for name, value in _without_budget(given, names).items():
+        if name in renamed:
             warnings.warn(
                 f"{where}: {name} is called {renamed[name]} now; the old name goes with the next"
                 " version.",
                 PcfixWarning,
                 stacklevel=4,
             )
-            found[renamed[name]] = value
-        else:
-            raise SettingError(_unknown(name, known, where))
+        elif name not in names:
+            near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+            mean = f" did you mean {near[0]}?" if near else ""
+            raise SettingError(
+                f"{where}: there is no option '{name}';{mean} the options are {', '.join(names)}."
+            )
+        found[renamed.get(name, name)] = value
     return found
 
 
-def _unknown(name: str, known: set[str], where: str) -> str:
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    mean = f"; did you mean {near[0]}?" if near else ";"
-    return f"{where}: there is no option '{name}'{mean} The options are {', '.join(sorted(known))}."
-
-
-def _without_budget(given: Mapping[str, Any], known: set[str]) -> dict[str, Any]:
+def _without_budget(given: Mapping[str, Any], known: list[str]) -> dict[str, Any]:
     """Return options with those of an old record's ``errors`` by their own names."""
     if "errors" not in given or "sigma_image" not in known:
         return dict(given)

@@ -23,9 +23,38 @@ WaterModel = Literal["auto", "level", "plane", "along", "river"]
 
 DEFAULT_REFRACTIVE_INDEX = 1.34
 
-NEED, WATER, CAMERAS = "What you need", "Water", "Cameras"
-METHOD, BUDGET, OUTPUT = "Rays and method", "Error budget", "Output"
-"""Panels of the help, in its order."""
+PANELS = (
+    NEED,
+    FLIGHT,
+    CAMERA,
+    WATER,
+    CAMERAS,
+    METHOD,
+    BUDGET,
+    TESTS,
+    RASTER,
+    FIGURES,
+    UNKNOWNS,
+    (CLOUDS),
+    EFFECT,
+    OUTPUT,
+) = (
+    "What you need",
+    "Flight",
+    "Camera",
+    "Water",
+    "Cameras",
+    "Rays and method",
+    "Error budget",
+    "Tests",
+    "Raster",
+    "Figures",
+    "What moves, and how much counts",
+    "Clouds",
+    "With --refraction-effect",
+    "Output",
+)
+"""The panels of the help, in its order."""
 
 _INDEX = within(
     1.0, 1.5, "give the index of water relative to air, about 1.333 for fresh and 1.34 for sea"
@@ -101,16 +130,11 @@ class WaterOptions(OptionSet):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SubmergedOptions(OptionSet):
+class LandRules(OptionSet):
     """Which points below the surface are land all the same."""
 
     panel = WATER
 
-    water_mask: File | None = option(
-        None,
-        "Polygons (.gpkg, .shp, .geojson, .wkt) inside which points may be submerged.",
-        default_is="everywhere",
-    )
     connected: bool = option(
         False, "Leave out pools that are apart from the water; what was left out is reported."
     )
@@ -138,6 +162,19 @@ class SubmergedOptions(OptionSet):
             raise SettingError("least-pool is of no use without connected; give both, or neither.")
         numbers = tuple(sorted({int(number) for number in self.respect_classes}))
         object.__setattr__(self, "respect_classes", numbers)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubmergedOptions(LandRules):
+    """Where, and which, points may be submerged."""
+
+    panel = WATER
+
+    water_mask: File | None = option(
+        None,
+        "Polygons (.gpkg, .shp, .geojson, .wkt) inside which points may be submerged.",
+        default_is="everywhere",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

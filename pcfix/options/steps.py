@@ -8,7 +8,15 @@ from typing import Any, Literal
 
 from pcfix.errors import SettingError
 from pcfix.options.declare import File, OptionSet, at_least, must_be, option, positive
-from pcfix.options.shared import OUTPUT, JobOptions, OverwriteOption, SummaryOption
+from pcfix.options.shared import (
+    FIGURES,
+    OUTPUT,
+    RASTER,
+    TESTS,
+    JobOptions,
+    OverwriteOption,
+    SummaryOption,
+)
 
 LEAST_NEIGHBOURS, MOST_NEIGHBOURS = 6, 500
 MAX_HOLE_CELLS = 1000
@@ -18,7 +26,6 @@ LEAST_PLANE_POINTS, PLANE_POINTS = 6, 8
 
 DsmMethod = Literal["mean", "median", "min", "max", "idw", "tin"]
 SurfaceChoice = Literal["all", "bed"]
-TESTS, RASTER, FIGURES = "Tests", "Raster", "Figures"
 
 METRES = "is not positive; give metres."
 
@@ -121,6 +128,7 @@ class CleanRules(OptionSet):
         if not (self.statistical or self.radius is not None or self.weak or self.below_or_floating):
             raise SettingError("No test is left to run: leave at least one of them on.")
 
+
     @property
     def below_or_floating(self) -> bool:
         """Whether any test against the bed runs."""
@@ -163,7 +171,7 @@ class DsmRules(OptionSet):
 
     panel = RASTER
 
-    resolution: float = option(
+    resolution: float | None = option(
         None, "Side of a cell.", unit="m", needed=True, rule=_resolution, old=("resolution_m",)
     )
     method: DsmMethod = option("mean", "How a cell gets its height.")
@@ -196,7 +204,7 @@ class DsmRules(OptionSet):
                 f"The altitude of the sun is {self.altitude:g} degrees; it must be above 0 and"
                 " at most 90."
             )
-        fill, side = self.fill, self.resolution
+        fill, side = self.fill, self.resolution or math.inf
         if fill is not None and not (math.isfinite(fill) and fill > 0.0):
             raise SettingError(f"The width of holes to fill is {fill:g} m; it must be positive.")
         if fill is not None and fill > MAX_HOLE_CELLS * side:

@@ -12,6 +12,7 @@ from pcfix.options.declare import File, OptionSet, one_or_more, option, positive
 from pcfix.options.shared import (
     CAMERAS,
     OUTPUT,
+    UNKNOWNS,
     CameraFileOptions,
     IndexOptions,
     JobOptions,
@@ -31,8 +32,6 @@ Datum = Literal["observed", "free"]
 Ties = Literal["auto", "measured", "cloud"]
 AdjustWhen = Literal["auto", "yes", "no"]
 WATER_UNKNOWNS = ("level", "tilt", "index")
-
-UNKNOWNS = "What moves, and how much counts"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -127,7 +127,7 @@ def port_views(
     Views
         In the order of the cameras, or of `views`.
     """
-    limit = settings.max_angle_deg
+    limit = settings.max_angle
     order = spatial_order(xyz)
     count = np.zeros(len(xyz) + 1, np.int64)
     common = (

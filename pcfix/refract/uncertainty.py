@@ -113,7 +113,7 @@ _XZ, _YZ, _ZZ = 2, 4, 5
 
 def level_sigma_of(batch: Batch) -> FloatArray:
     """Return the standard deviation of the water above each point, metres, shape (m,)."""
-    stated, fitted = batch.survey.settings.errors.level_m, batch.level_sigma_m
+    stated, fitted = batch.survey.settings.sigma_level, batch.level_sigma_m
     known = stated if stated is not None else LEVEL_M if fitted is None else fitted
     full = np.array(np.broadcast_to(known, len(batch)), np.float64)
     full[np.isnan(full)] = LEVEL_M

@@ -122,7 +122,7 @@ def _facts(s: Summary) -> Table:
     shift, depth = s.shift_z_m, s.depth_m
     rows = [
         ["Cloud", Path(s.input).name],
-        ["Water", f"{s.water}; refractive index {s.settings['refractive_index']:g}"],
+        ["Water", f"{s.water}; refractive index {s.settings['index']:g}"],
         ["Points", f"{s.points:,}"],
         ["Under water", f"{s.submerged:,} ({share(s.submerged, s.points)} of the points)"],
         ["Corrected", f"{s.corrected:,} ({share(s.corrected, s.submerged)} of these)"],

@@ -49,7 +49,7 @@ def summary_text(summary: Summary) -> str:
         f"cameras      {s.cameras_used} of {s.cameras} used"
         + (f"; {unused} see no corrected point: {names}" if unused else ""),
         f"rays         {s.rays:,} ({s.rays / max(s.corrected, 1):.1f} a point)",
-        f"water        {s.water}, refractive index {s.settings['refractive_index']:.6g}",
+        f"water        {s.water}, refractive index {s.settings['index']:.6g}",
         *_index(s),
         *_water_fit(s),
         *_uncertainty(s),
@@ -97,13 +97,13 @@ def _carried(s: Summary) -> list[str]:
 def _index(s: Summary) -> list[str]:
     """Say what a water's own index changes: straight down, depth is in proportion to it."""
     settings = s.settings
-    if not settings["refractive_index_from"] or not s.depth_m:
+    if not settings["index_from"] or not s.depth_m:
         return []
-    change = 1.0 - DEFAULT_REFRACTIVE_INDEX / settings["refractive_index"]
+    change = 1.0 - DEFAULT_REFRACTIVE_INDEX / settings["index"]
     mean, most = (100.0 * change * s.depth_m[name] for name in ("mean", "max"))
     way = "deeper" if change > 0.0 else "shallower"
     return [
-        f"  index      of {settings['refractive_index_from']}; against"
+        f"  index      of {settings['index_from']}; against"
         f" {DEFAULT_REFRACTIVE_INDEX:g} the bed is {abs(mean):.1f} cm {way} on average,"
         f" {abs(most):.1f} cm at most"
     ]
@@ -140,7 +140,7 @@ def _uncertainty(s: Summary) -> list[str]:
 def errors_of(s: Summary) -> str:
     """Return the budget of a run in words."""
     fitted = None if s.water_fit is None else s.water_fit["sigma_level_m"]
-    return budget_words(s.settings["errors"], fitted)
+    return budget_words(s.settings, fitted)
 
 
 def left_out_lines(labelling: dict[str, Any] | None) -> list[str]:
@@ -185,23 +185,23 @@ def budget_words(errors: dict[str, Any], level_from_fit: float | None = None) ->
     Parameters
     ----------
     errors : dict
-        `pcfix.options.ErrorBudget` as plain values.
+        The settings of a summary, with the options ``sigma_...``.
     level_from_fit : float, optional
         Standard error of the level that a fit gave, where the user stated none.
     """
-    level = errors["level_m"]
+    level = errors["sigma_level"]
     source = ""
     if level is None:
         level, source = LEVEL_M, " (assumed)"
         if level_from_fit is not None and np.isfinite(level_from_fit):
             level, source = level_from_fit, " (fitted)"
-    parts = [f"image {errors['image_px']:g} px", f"level {level:.3f} m{source}"]
-    parts.append(f"index {errors['index']:g}")
+    parts = [f"image {errors['sigma_image']:g} px", f"level {level:.3f} m{source}"]
+    parts.append(f"index {errors['sigma_index']:g}")
     more = (
-        ("tilt", "tilt_deg", "deg"),
-        ("waves", "waves_deg", "deg"),
-        ("camera positions", "centre_m", "m"),
-        ("attitude", "attitude_deg", "deg"),
+        ("tilt", "sigma_tilt", "deg"),
+        ("waves", "sigma_waves", "deg"),
+        ("camera positions", "sigma_centre", "m"),
+        ("attitude", "sigma_attitude", "deg"),
     )
     parts += [f"{name} {errors[key]:g} {unit}" for name, key, unit in more if errors[key] > 0.0]
     return ", ".join(parts)
@@ -226,8 +226,8 @@ def labelling_text(summary: LabelSummary) -> str:
         *_head(s),
         f"class 40     {s.submerged:,} ({share(s.submerged, s.points)} of the points)",
     ]
-    if s.settings["band_m"]:
-        lines.append(f"class 41     {s.water_surface:,} within {s.settings['band_m']:g} m")
+    if s.settings["band"]:
+        lines.append(f"class 41     {s.water_surface:,} within {s.settings['band']:g} m")
     if s.stale:
         fate = "now class 1" if s.settings["reset"] else "left so; --reset makes them class 1"
         lines.append(f"class before {s.stale:,} came as class 40 or 41 and are neither: {fate}")
@@ -268,7 +268,7 @@ def dsm_text(summary: DsmSummary) -> str:
     lines = [
         f"{s.input} -> {s.output}",
         f"points       {s.points_used:,} of {s.points:,} ({wanted}) in {s.seconds:.1f} s",
-        f"raster       {s.width:,} x {s.height:,} cells of {s.settings['resolution_m']:g} m,"
+        f"raster       {s.width:,} x {s.height:,} cells of {s.settings['resolution']:g} m,"
         f" {s.settings['method']}",
         f"bounds       x {left:.10g} to {right:.10g}, y {bottom:.10g} to {top:.10g} m",
         f"CRS          {s.crs or 'the cloud states none'}",

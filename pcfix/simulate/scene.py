@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterPlane
+from pcfix.options.declare import taken
+from pcfix.options.scenes import BlockKind, SceneOptions
 from pcfix.simulate.block import Block, fly_block, misplaced
 from pcfix.simulate.depth_maps import fuse_depth_maps
-from pcfix.simulate.settings import BlockKind, SceneSettings
+from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.sight import (
     SAMPLE,
     TIES,
@@ -153,10 +155,11 @@ class Streams(NamedTuple):
 
 
 def simulate_scene(
-    points: int = 100_000,
+    points: int | None = None,
     *,
+    options: SceneOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
-    **settings: Any,
+    **keywords: Any,
 ) -> Scene:
     """Make a scene with known truth: ground and water under a block of images.
 
@@ -167,14 +170,12 @@ def simulate_scene(
 
     Parameters
     ----------
-    points : int
-        Points of the cloud.
+    points : int, optional
+        Points of the cloud; default 100,000.
+    options : SceneOptions, optional
+        Or its attributes as keywords, as of ``pcfix simulate``.
     progress : callable, optional
         Called with (points done, points in all).
-    **settings
-        Everything else, by the names of `pcfix.simulate.settings.SceneSettings`: block and
-        lens, pose and image noise, waves and tilt of the water, the bed, the kind of cloud,
-        LiDAR, and the seed.
 
     Returns
     -------
@@ -192,10 +193,12 @@ def simulate_scene(
     >>> scene.pairs.shape[1]
     2
     """
-    chosen = SceneSettings(points=points, **settings)
+    if points is not None:
+        keywords["points"] = points
+    chosen = taken(SceneOptions, options, keywords, "simulate_scene").part(SceneSettings)
     site = lay_out(chosen)
     terrain, flown, given, rng = site.terrain, site.flown, site.given, site.streams.main
-    truth = points_on(terrain, points, rng)
+    truth = points_on(terrain, chosen.points, rng)
     partners = _partners(chosen, truth, site)
     parts = _parts(truth, site, partners, progress)
     area_m2 = terrain.length_m * terrain.width_m
@@ -209,7 +212,7 @@ def simulate_scene(
         cameras=cameras,
         yaw_pitch_roll_deg=given.yaw_pitch_roll_deg,
         lidar_xyz=lidar + ORIGIN_M,
-        water_level_m=chosen.water_level_m,
+        water_level_m=chosen.water,
         refractive_index=chosen.refractive_index,
         gsd_m=chosen.flight.gsd_m,
         sensor_mm=chosen.flight.sensor,
@@ -238,7 +241,7 @@ def lay_out(chosen: SceneSettings) -> Site:
     streams, extent = Streams.of(chosen.seed), _extent(chosen)
     plane = chosen.water_plane(extent)
     terrain = Terrain.random(chosen.bed, extent, plane, chosen.depth_m, streams.main)
-    flown = fly_block(extent, chosen.water_level_m, chosen.flight, streams.main)
+    flown = fly_block(extent, chosen.water, chosen.flight, streams.main)
     given = misplaced(flown, chosen.position_noise_m, chosen.attitude_noise_deg, streams.poses)
     waves = None
     if chosen.wave_slope_deg > 0.0:
@@ -250,8 +253,8 @@ def lay_out(chosen: SceneSettings) -> Site:
         given=given.cameras,
         optics=chosen.optics,
         water=Water(plane, chosen.refractive_index, waves),
-        lowest_m=chosen.water_level_m - chosen.depth_m - fall_m,
-        image_noise_px=chosen.image_noise_px,
+        lowest_m=chosen.water - chosen.depth_m - fall_m,
+        image_noise_px=chosen.image_noise,
         detection=chosen.detection,
     )
     return Site(terrain, flown, given, rig, streams)

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import replace
+from typing import NamedTuple, TypeVar
 
 from pcfix.errors import SettingError
-from pcfix.options import DEFAULT_REFRACTIVE_INDEX
+from pcfix.options.correct import MethodOptions
+from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
+
+Options = TypeVar("Options", bound=MethodOptions)
 
 SALINITY_PSU, TEMPERATURE_C, WAVELENGTH_UM = (0.0, 40.0), (0.0, 30.0), (0.4, 0.7)
 """Where the formula was fitted (its salinities end at 35; natural seas go a little beyond)."""
@@ -83,28 +87,35 @@ def refractive_index(
     )
 
 
-def index_words(
-    index: float | str | None,
-    salinity: float | None,
-    temperature_c: float | None,
-    wavelength_um: float | None,
-) -> float | str:
-    """Return what `index_of` takes, of an index or what decides it; refuse both at once."""
-    if salinity is None and temperature_c is None and wavelength_um is None:
-        if index is None:
-            return DEFAULT_REFRACTIVE_INDEX
-        try:
-            return float(index)
-        except ValueError:
-            return index
-    if index is not None:
-        raise SettingError(
-            "index and salinity, temperature or wavelength say the same twice; give one of them."
-        )
-    given = Water(35.0 if salinity is None else salinity)
-    temperature = given.temperature_c if temperature_c is None else temperature_c
-    wavelength = given.wavelength_um if wavelength_um is None else wavelength_um
-    return f"{given.salinity_psu!r},{temperature!r},{wavelength!r}"
+def with_index(options: Options) -> Options:
+    """Return options whose refractive index is a number, and which say what water it is of.
+
+    Parameters
+    ----------
+    options : MethodOptions
+        With an index, or where they have them salinity, temperature or wavelength.
+
+    Raises
+    ------
+    SettingError
+        If both are given, or a value is outside its range.
+    """
+    names = ("salinity", "temperature", "wavelength")
+    water = [getattr(options, name, None) for name in names]
+    index = options.index
+    if any(value is not None for value in water):
+        if index != DEFAULT_REFRACTIVE_INDEX:
+            raise SettingError(
+                "index and salinity, temperature or wavelength say the same twice; give one of"
+                " them."
+            )
+        given = Water(35.0 if water[0] is None else water[0])
+        temperature = given.temperature_c if water[1] is None else water[1]
+        wavelength = given.wavelength_um if water[2] is None else water[2]
+        index = f"{given.salinity_psu!r},{temperature!r},{wavelength!r}"
+    number, origin = index_of(index)
+    silent = {name: None for name in names if hasattr(options, name)}
+    return replace(options, index=number, index_from=origin or options.index_from, **silent)
 
 
 def index_of(given: float | str) -> tuple[float, str]:

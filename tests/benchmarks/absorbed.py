@@ -91,7 +91,7 @@ def mend_and_correct(name, way, folder, scratch, offset, where, truth, given) ->
     started = time.perf_counter()
     found = pcfix.adjust_cameras(
         folder / "sparse", out, water=LEVEL, cloud=folder / "cloud.las", gcps=gcps,
-        gnss=folder / "gnss.csv", cameras_offset_m=offset, views=folder / "dense.vis", **way,
+        gnss=folder / "gnss.csv", cameras_offset=offset, views=folder / "dense.vis", **way,
     )  # fmt: skip
     seconds = time.perf_counter() - started
     off = found.cameras.centres - np.array([where[label] for label in found.cameras.labels])
@@ -108,7 +108,7 @@ def mend_and_correct(name, way, folder, scratch, offset, where, truth, given) ->
         target = out / "corrected.las"
         pcfix.correct_file(
             folder / "cloud.las", target, cameras=out / "colmap", water=LEVEL,
-            adjusted_from=folder / "sparse", cameras_offset_m=offset, overwrite=True, **options,
+            adjusted_from=folder / "sparse", cameras_offset=offset, overwrite=True, **options,
         )  # fmt: skip
         print(f"   {label:26s} {errors(target, truth, given.every)}", flush=True)
 

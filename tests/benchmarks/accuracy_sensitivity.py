@@ -65,7 +65,7 @@ def _corrected(scene: Any, water: Any = None, n: float | None = None, **errors: 
         scene.water if water is None else water,
         method="consistent",
         views=scene.views,
-        refractive_index=scene.refractive_index if n is None else n,
+        index=scene.refractive_index if n is None else n,
         errors=replace(NOTHING, **errors),
     )
 

@@ -10,14 +10,12 @@ import laspy
 import numpy as np
 import pytest
 import typer
+from pcfix.cli.clean import clean
 from typer.testing import CliRunner
 
 import pcfix
 from pcfix.clean.points import clean_points
-from pcfix.clean.settings import CleanSettings
-from pcfix.cli.clean import clean
 from pcfix.errors import GeometryError, InputError, SettingError
-from pcfix.flow import clean as flow_clean
 from pcfix.flow.clean import clean_file
 from pcfix.io.las.source import read_xyz
 from tests.clean.scenes import spoilt_scene
@@ -35,7 +33,7 @@ from tests.utils.clouds import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-MANY = CleanSettings(deviations=0.5, fences=0.2)
+MANY = {"deviations": 0.5, "fences": 0.2}
 """On a cloud of white noise, a third of the points."""
 RUN = CliRunner()
 OURS = (b"pcfix", 2)
@@ -84,10 +82,10 @@ def _assert_nothing_lost(before: RawLas, after: RawLas, noise: np.ndarray) -> No
 def test_nothing_is_lost(tmp_path: Path, point_format: int, suffix: str) -> None:
     source = write_cloud(tmp_path / f"in{suffix}", point_format)
     target = tmp_path / f"out{suffix}"
-    result = clean_file(source, target, water=WATER_M, settings=MANY)
+    result = clean_file(source, target, water=WATER_M, **MANY)
     before, after = read_raw(source), read_raw(target)
     aside = _before(before)
-    noise = clean_points(read_xyz(source), water=WATER_M, used=~aside, settings=MANY) != 0
+    noise = clean_points(read_xyz(source), water=WATER_M, used=~aside, **MANY) != 0
     assert 100 < result.noise == noise.sum()
     assert not (noise & aside).any()
     assert (after.version, after.point_format >= 6) == ((1, 4), True)
@@ -97,15 +95,15 @@ def test_nothing_is_lost(tmp_path: Path, point_format: int, suffix: str) -> None
 
 def test_bytes_that_no_one_describes_stay(tmp_path: Path) -> None:
     source = add_undescribed_bytes(write_cloud(tmp_path / "in.las", 6, plain=True), 5)
-    clean_file(source, tmp_path / "out.las", water=WATER_M, settings=MANY)
+    clean_file(source, tmp_path / "out.las", water=WATER_M, **MANY)
     old, new = read_raw(source), read_raw(tmp_path / "out.las")
     assert np.array_equal(old.points[:, -5:], new.points[:, -5:])
 
 
 def test_drop_leaves_the_other_rows_as_they_are(tmp_path: Path) -> None:
     source = write_cloud(tmp_path / "in.laz", 7)
-    clean_file(source, tmp_path / "flagged.laz", water=WATER_M, settings=MANY)
-    result = clean_file(source, tmp_path / "out.laz", water=WATER_M, settings=MANY, drop=True)
+    clean_file(source, tmp_path / "flagged.laz", water=WATER_M, **MANY)
+    result = clean_file(source, tmp_path / "out.laz", water=WATER_M, **MANY, drop=True)
     before, flagged = read_raw(source), read_raw(tmp_path / "flagged.laz")
     noise = (_before(flagged)) & ~_before(before)
     after = read_raw(tmp_path / "out.laz")
@@ -121,7 +119,7 @@ def test_chunks_and_tiles_do_not_change_the_file(
     s = spoilt_scene(20_000, 100)
     source = _plain(tmp_path / "in.laz", s.xyz)
     clean_file(source, tmp_path / "one.las", water=s.water_level_m)
-    monkeypatch.setattr(flow_clean, "CHUNK_POINTS", 3000)
+    monkeypatch.setattr("pcfix.io.las.source.CHUNK_POINTS", 3000)
     clean_file(source, tmp_path / "two.las", water=s.water_level_m, tile_m=tile_m, jobs=1)
     assert (tmp_path / "one.las").read_bytes() == (tmp_path / "two.las").read_bytes()
 
@@ -157,7 +155,7 @@ def test_restore_after_cleaning_gives_the_apparent_cloud(tmp_path: Path, uncorre
     steps = [tmp_path / name for name in ("corrected.laz", "cleaned.laz", "restored.laz")]
     cameras = block()
     pcfix.correct_file(source, steps[0], cameras=cameras, water=WATER_M, uncorrected=uncorrected)
-    result = clean_file(steps[0], steps[1], settings=MANY)
+    result = clean_file(steps[0], steps[1], **MANY)
     assert result.not_run == []
     assert result.reasons["below_bed"] > 0
     pcfix.restore_file(steps[1], steps[2])
@@ -175,7 +173,7 @@ def test_restore_after_cleaning_gives_the_apparent_cloud(tmp_path: Path, uncorre
 
 def test_restore_of_a_cloud_that_was_cleaned_first_gives_the_cleaned_one(tmp_path: Path) -> None:
     write_cloud(tmp_path / "in.las", 7)
-    clean_file(tmp_path / "in.las", tmp_path / "a.las", water=WATER_M, settings=MANY)
+    clean_file(tmp_path / "in.las", tmp_path / "a.las", water=WATER_M, **MANY)
     pcfix.correct_file(tmp_path / "a.las", tmp_path / "b.las", cameras=block(), water=WATER_M)
     pcfix.restore_file(tmp_path / "b.las", tmp_path / "c.las")
     assert (tmp_path / "c.las").read_bytes() == (tmp_path / "a.las").read_bytes()
@@ -186,10 +184,10 @@ def test_weak_intersections_of_a_corrected_cloud(tmp_path: Path) -> None:
     pcfix.correct_file(tmp_path / "in.las", tmp_path / "a.las", cameras=block(), water=WATER_M)
     las = laspy.read(tmp_path / "a.las")
     limit = float(np.median(las.Incidence[las.RayCount > 0]))
-    only = CleanSettings(
-        deviations=None, below_m=None, floating_m=None, max_incidence_deg=limit, max_ray_miss_m=9.0
-    )
-    result = clean_file(tmp_path / "a.las", tmp_path / "b.las", settings=only)
+    result = clean_file(
+        tmp_path / "a.las", tmp_path / "b.las", deviations=None, below=None, floating=None,
+        max_incidence=limit, max_ray_miss=9.0,
+    )  # fmt: skip
     aside = _before(read_raw(tmp_path / "a.las"))
     weak = (las.RayCount > 0) & (np.array(las.Incidence) > limit) & ~aside
     assert result.reasons["incidence"] == weak.sum() > 50

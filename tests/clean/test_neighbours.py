@@ -8,7 +8,8 @@ import pytest
 from pcfix.clean import neighbours
 from pcfix.clean.neighbours import Neighbours, height_quartiles, make_tiles, mean_of_first
 from pcfix.clean.points import clean_points
-from pcfix.clean.settings import CleanSettings, Reason
+from pcfix.clean.settings import Reason
+from pcfix.options.steps import CleanRules
 from pcfix.io.water import load_open3d
 from tests.clean.scenes import spoilt_scene
 
@@ -104,7 +105,7 @@ def test_points_over_each_other_are_bounded(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize("tile_m", [8.0, 31.0, 400.0])
 def test_reasons_do_not_depend_on_tiles(tile_m: float) -> None:
     s = spoilt_scene()
-    settings = CleanSettings(deviations=2.0, radius_m=1.0)
+    settings = CleanRules(deviations=2.0, radius=1.0)
     whole = clean_points(s.xyz, water=s.water_level_m, settings=settings)
     cut = clean_points(s.xyz, water=s.water_level_m, settings=settings, tile_m=tile_m, jobs=1)
     assert np.array_equal(cut, whole)
@@ -118,19 +119,19 @@ def test_statistical_outliers_are_those_of_open3d(deviations: float, k: int) -> 
     o3d, xyz = load_open3d(), spoilt_scene().xyz
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz))
     _, kept = cloud.remove_statistical_outlier(k, deviations)
-    settings = CleanSettings(neighbours=k, deviations=deviations, below_m=None, floating_m=None)
+    settings = CleanRules(neighbours=k, deviations=deviations, below=None, floating=None)
     found = clean_points(xyz, settings=settings, tile_m=20.0)
     assert np.array_equal(np.flatnonzero(found == 0), np.asarray(kept))
     assert len(kept) < len(xyz)
 
 
-@pytest.mark.parametrize(("radius_m", "least"), [(0.6, 1), (1.0, 6)])
+@pytest.mark.parametrize(("radius", "least"), [(0.6, 1), (1.0, 6)])
 def test_radius_outliers_are_those_of_open3d(radius_m: float, least: int) -> None:
     o3d, xyz = load_open3d(), spoilt_scene().xyz
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz))
     _, kept = cloud.remove_radius_outlier(least, radius_m)  # it counts the point itself
-    settings = CleanSettings(
-        deviations=None, radius_m=radius_m, radius_neighbours=least, below_m=None, floating_m=None
+    settings = CleanRules(
+        deviations=None, radius=radius_m, radius_neighbours=least, below=None, floating=None
     )
     found = clean_points(xyz, settings=settings, tile_m=20.0)
     assert np.array_equal(np.flatnonzero(found == 0), np.asarray(kept))

@@ -9,13 +9,14 @@ import pytest
 
 from pcfix.clean import points as door
 from pcfix.clean.points import clean_points
-from pcfix.clean.settings import CleanSettings, Reason
+from pcfix.clean.settings import Reason
+from pcfix.options.steps import CleanRules
 from pcfix.errors import InputError, SettingError
 from pcfix.model import WaterPlane
 from tests.clean.scenes import spoilt_scene
 
 
-def _scene_reasons(settings: CleanSettings | None = None) -> np.ndarray:
+def _scene_reasons(settings: CleanRules | None = None) -> np.ndarray:
     s = spoilt_scene()
     return clean_points(
         s.xyz,
@@ -51,7 +52,7 @@ def test_a_clean_scene_loses_next_to_nothing() -> None:
 
 
 def test_reasons_name_the_side() -> None:
-    s, reasons = spoilt_scene(), _scene_reasons(CleanSettings(deviations=None))
+    s, reasons = spoilt_scene(), _scene_reasons(CleanRules(deviations=None))
     assert not (reasons[s.below] & Reason.FLOATING).any()
     assert not (reasons[s.floating] & Reason.BELOW_BED).any()
     assert not reasons[s.air].any()
@@ -66,7 +67,7 @@ def test_a_quay_wall_and_a_rock_are_terrain() -> None:
     face = rng.uniform((20.0, 0.0, -8.0), (20.01, 40.0, -5.0), (1200, 3))
     xyz = np.vstack([xyz, face])
     xyz[:, 2] += rng.normal(0.0, 0.03, len(xyz))
-    reasons = clean_points(xyz, water=0.0, settings=CleanSettings(deviations=None))
+    reasons = clean_points(xyz, water=0.0, settings=CleanRules(deviations=None))
     # the rock's crown of 1.5 m holds 70 points, more than twice a neighbourhood
     assert (reasons > 0).mean() < 1e-3
 
@@ -78,7 +79,7 @@ def test_dry_points_are_not_tested_against_the_bed() -> None:
     ground = rng.uniform((0, 0, 1.0), (30, 30, 1.0), (300, 3))
     bed = rng.uniform((40, 0, -2.1), (70, 30, -2.0), (9000, 3))
     xyz = np.vstack([canopy, ground, bed])
-    assert not clean_points(xyz, water=0.0, settings=CleanSettings(deviations=None)).any()
+    assert not clean_points(xyz, water=0.0, settings=CleanRules(deviations=None)).any()
 
 
 @pytest.mark.parametrize("how", ["level", "plane", "heights", "rays"])
@@ -91,7 +92,7 @@ def test_any_water_tells_the_same_points_apart(how: str) -> None:
         "heights": np.full(len(rays), level),
         "rays": None,
     }[how]
-    settings = CleanSettings(min_rays=None, max_ray_miss_m=None, max_incidence_deg=None)
+    settings = CleanRules(min_rays=None, max_ray_miss=None, max_incidence=None)
     found = clean_points(s.xyz, water=water, ray_count=rays, settings=settings)
     assert np.array_equal(found, clean_points(s.xyz, water=level, settings=settings))
 
@@ -103,7 +104,7 @@ def test_weak_intersections() -> None:
     rays[10:] = 3
     rays[20], miss[21], angle[22] = 2, 0.51, 75.1
     rays[23], miss[23] = 2, 0.6
-    only = CleanSettings(deviations=None, below_m=None, floating_m=None)
+    only = CleanRules(deviations=None, below=None, floating=None)
     found = clean_points(xyz, ray_count=rays, ray_miss_m=miss, incidence_deg=angle, settings=only)
     weak = {20: 4, 21: 8, 22: 16, 23: 12}
     assert found.tolist() == [weak.get(i, 0) for i in range(50)]
@@ -136,23 +137,23 @@ def test_the_input_is_not_changed() -> None:
         ({"neighbours": 20.5}, "neighbours 20.5"),
         ({"deviations": 0.0}, "deviations 0.0 must be above 0"),
         ({"deviations": np.nan}, "deviations nan"),
-        ({"radius_m": -1.0}, "radius -1.0"),
+        ({"radius": -1.0}, "radius -1.0"),
         ({"radius_neighbours": 0}, "radius-neighbours 0"),
         ({"min_rays": 1}, "min-rays 1"),
-        ({"max_ray_miss_m": np.inf}, "max-ray-miss inf"),
-        ({"max_incidence_deg": 91.0}, "max-incidence 91.0 must be above 0 and at most 90"),
+        ({"max_ray_miss": np.inf}, "max-ray-miss inf"),
+        ({"max_incidence": 91.0}, "max-incidence 91.0 must be above 0 and at most 90"),
         ({"bed_neighbours": 501}, "bed-neighbours 501"),
         ({"fences": 0.0}, "fences 0.0"),
-        ({"below_m": "deep"}, "below deep"),
-        ({"floating_m": -0.1}, "floating -0.1"),
+        ({"below": "deep"}, "below deep"),
+        ({"floating": -0.1}, "floating -0.1"),
         (
             {
                 "deviations": None,
                 "min_rays": None,
-                "max_ray_miss_m": None,
-                "max_incidence_deg": None,
-                "below_m": None,
-                "floating_m": None,
+                "max_ray_miss": None,
+                "max_incidence": None,
+                "below": None,
+                "floating": None,
             },
             "No test is left",
         ),
@@ -160,7 +161,7 @@ def test_the_input_is_not_changed() -> None:
 )
 def test_settings_outside_their_rule(choice: dict, message: str) -> None:
     with pytest.raises(SettingError, match=message):
-        CleanSettings(**choice)
+        CleanRules(**choice)
 
 
 def test_bad_arrays() -> None:
@@ -174,7 +175,7 @@ def test_bad_arrays() -> None:
     with pytest.raises(InputError, match=r"has 20 points .* too few for a neighbourhood of 20"):
         clean_points(xyz[:20])
     with pytest.raises(InputError, match=r"has 5 points .* too few for a neighbourhood of 6"):
-        clean_points(xyz[:5], settings=CleanSettings(neighbours=6))
+        clean_points(xyz[:5], settings=CleanRules(neighbours=6))
     level = np.sort(xyz[:, 2])[10]
     with pytest.raises(InputError, match="has 10 submerged points"):
         clean_points(xyz, water=level)

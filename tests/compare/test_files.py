@@ -10,12 +10,12 @@ import laspy
 import numpy as np
 import pytest
 import rasterio
+from pcfix.cli.compare import compare
 from pyproj import CRS
 from typer.testing import CliRunner
 
 import pcfix
 from pcfix.cli import app
-from pcfix.cli.compare import compare
 from pcfix.compare.m3c2 import m3c2_distances
 from pcfix.flow.compare import compare_clouds
 from tests.utils.shared import ROOT
@@ -186,7 +186,7 @@ def test_noise_and_withheld_points_do_not_count(tmp_path):
 def test_points_outside_the_reference_are_left_out_and_counted(tmp_path):
     reference = write_las(tmp_path / "ref.las", plane(10_000, 7, side_m=30.0))
     cloud = plane(10_000, 8, side_m=60.0)
-    found = compare_clouds(write_las(tmp_path / "a.las", cloud), reference, max_gap_m=1.0)
+    found = compare_clouds(write_las(tmp_path / "a.las", cloud), reference, max_gap=1.0)
     inside = (cloud[:, :2] <= [EAST_M + 30.0, NORTH_M + 30.0]).all(axis=1).sum()
     within = (cloud[:, :2] <= [EAST_M + 33.0, NORTH_M + 33.0]).all(axis=1).sum()
     assert inside <= found.counts.compared <= within
@@ -354,7 +354,7 @@ def test_files_are_written_whole_and_not_over_others(tmp_path, corrected):
     out = tmp_path / "out"
     options = {"out_dir": out, "sections": 2, "summary": tmp_path / "s.json"}
     line = "410210,4650290,410310,4650300"
-    found = compare_clouds(corrected, LIDAR, section_lines=[line], **options)
+    found = compare_clouds(corrected, LIDAR, section=[line], **options)
     assert sorted(p.name for p in out.iterdir()) == [
         "compare.json", "depth_bins.csv",
         "section_01.csv", "section_02.csv", "section_03.csv", "shore_bins.csv",
@@ -374,7 +374,7 @@ def test_files_are_written_whole_and_not_over_others(tmp_path, corrected):
 
 
 def test_sections_show_the_bed_before_and_after(corrected):
-    (found,) = compare_clouds(corrected, LIDAR, sections=1, corridor_m=2.0).sections
+    (found,) = compare_clouds(corrected, LIDAR, sections=1, corridor=2.0).sections
     heights = found.heights_m
     assert list(heights) == ["water", "apparent", "corrected", "reference"]
     deep = heights["reference"] < -3.0

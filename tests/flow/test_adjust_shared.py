@@ -30,7 +30,7 @@ def test_bed_and_land_come_home(tmp_path, monkeypatch, ties, bed_gsd, land_gsd):
     monkeypatch.setattr("pcfix.flow.adjust_job.usable_ties", partial(usable_ties, most=TIES))
     offset = tuple(np.loadtxt(FREE / "offset.txt"))
     found = adjust_cameras(
-        FREE / "sparse", water=WATER_M, cameras_offset_m=offset, cloud=FREE / "cloud.las",
+        FREE / "sparse", water=WATER_M, cameras_offset=offset, cloud=FREE / "cloud.las",
         gnss=FREE / "gnss.csv", gcps=FREE / "gcps.csv" if ties == "measured" else None, ties=ties,
     )  # fmt: skip
     right = pcfix.read_cameras(TRUE / "colmap")
@@ -42,7 +42,7 @@ def test_bed_and_land_come_home(tmp_path, monkeypatch, ties, bed_gsd, land_gsd):
     assert abs(found.cameras.lenses[0].focal - FOCAL_PX) < 1.0
     pcfix.correct_file(
         FREE / "cloud.las", tmp_path / "out.las", cameras=found.cameras, water=WATER_M,
-        adjusted_from=FREE / "sparse", cameras_offset_m=offset,
+        adjusted_from=FREE / "sparse", cameras_offset=offset,
     )  # fmt: skip
     bed, land = (np.sqrt((e**2).mean()) for e in errors_gsd(laspy.read(tmp_path / "out.las")))
     assert bed < bed_gsd

@@ -127,7 +127,7 @@ def test_cameras_in_another_zone_are_brought_over(tmp_path, plain):
 def test_cameras_shifted_to_the_origin_take_an_offset(tmp_path, plain):
     shift = np.array([410_000.0, 4_650_000.0, 0.0])
     path = table(tmp_path / "cameras.csv", lambda xyz: xyz - shift)
-    found, _ = corrected(tmp_path, "o.las", cameras=path, cameras_offset_m=tuple(shift))
+    found, _ = corrected(tmp_path, "o.las", cameras=path, cameras_offset=tuple(shift))
     assert same(found, plain[0], steps=1)
 
 
@@ -171,7 +171,7 @@ def test_views_of_a_real_cloud_change_the_rays(tmp_path):
     with pytest.warns(pcfix.PcfixWarning, match="dense.ply: has 83,334 points"):
         summary = pcfix.correct_file(
         RENDERED / "cloud.las", tmp_path / "c.las", cameras=RENDERED / "colmap", water=0.37,
-        cameras_offset_m=tuple(offset), views=RENDERED / "dense.vis",
+        cameras_offset=tuple(offset), views=RENDERED / "dense.vis",
     )  # fmt: skip
     assert summary.corrected == summary.submerged
     assert summary.rays / summary.corrected == pytest.approx(5.5, abs=0.1)  # of the list's README

@@ -176,7 +176,7 @@ def test_the_doors_agree(cloud, old, tmp_path):
 def test_chunks_leave_no_trace(cloud, old, tmp_path, monkeypatch):
     correct(cloud, cameras=adjusted(old), adjusted_from=old)
     whole = (tmp_path / "out.las").read_bytes()
-    monkeypatch.setattr("pcfix.flow.files.CHUNK_POINTS", 333)
+    monkeypatch.setattr("pcfix.io.las.source.CHUNK_POINTS", 333)
     monkeypatch.setattr("pcfix.adjust.carry.POINTS_AT_ONCE", 100)
     correct(cloud, cameras=adjusted(old), adjusted_from=old, jobs=1)
     assert (tmp_path / "out.las").read_bytes() == whole
@@ -283,7 +283,7 @@ def test_an_offset_is_for_the_file_that_does_not_say_where_it_lies(tmp_path, old
             table.write_text("# CoordinateSystem: EPSG:32633\n" + table.read_text())
     inputs = Inputs(
         tmp_path / "new.csv", WATER_M, adjusted_from=tmp_path / "old.csv",
-        cameras_offset_m=tuple(offset),
+        cameras_offset=tuple(offset),
     )  # fmt: skip
     before, after = told_apart(inputs)
     if local == "neither":  # then it is of both, as it is of one file that says its CRS
@@ -315,7 +315,7 @@ def test_a_block_that_had_swallowed_the_water(tmp_path, views):
     """With true poses; before, land lies 19 GSD (of 5 cm) too low and the bed is 27 off."""
     told = pcfix.correct_file(
         FREE / "cloud.las", tmp_path / "out.las", cameras=TRUE / "colmap", water=0.37,
-        adjusted_from=FREE / "sparse", cameras_offset_m=tuple(np.loadtxt(FREE / "offset.txt")),
+        adjusted_from=FREE / "sparse", cameras_offset=tuple(np.loadtxt(FREE / "offset.txt")),
         views=None if views is None else FREE / views,
     )  # fmt: skip
     las = laspy.read(tmp_path / "out.las")

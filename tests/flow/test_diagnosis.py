@@ -34,7 +34,7 @@ def said(source, output, **given):
 def test_a_correction_with_bent_poses_warns_once(tmp_path):
     model = BENT / "sparse"
     found, summary = said(
-        BENT / "cloud.las", tmp_path / "out.laz", cameras=model, cameras_offset_m=OFFSET_M,
+        BENT / "cloud.las", tmp_path / "out.laz", cameras=model, cameras_offset=OFFSET_M,
         water=LEVEL_M,
     )  # fmt: skip
     assert len(found) == 1
@@ -48,7 +48,7 @@ def test_a_correction_with_bent_poses_warns_once(tmp_path):
 def test_a_correction_with_true_poses_does_not(tmp_path):
     found, _ = said(
         TRUE / "cloud.las", tmp_path / "out.laz", cameras=TRUE / "colmap",
-        cameras_offset_m=OFFSET_M, water=LEVEL_M,
+        cameras_offset=OFFSET_M, water=LEVEL_M,
     )  # fmt: skip
     assert found == []
 
@@ -65,7 +65,7 @@ def test_the_sample_does_not(tmp_path):
 @pytest.mark.filterwarnings("ignore:.*names no CRS")
 def test_every_sign_speaks_of_bent_poses():
     report = check_cameras(
-        BENT / "sparse", BENT / "cloud.las", water=LEVEL_M, cameras_offset_m=OFFSET_M,
+        BENT / "sparse", BENT / "cloud.las", water=LEVEL_M, cameras_offset=OFFSET_M,
         gnss=BENT / "gnss.csv", gcps=BENT / "gcps.csv", reference=TRUE / "lidar.laz",
     )  # fmt: skip
     signs = report.as_dict()["refraction"]["signs"]
@@ -93,7 +93,7 @@ def test_poses_and_gnss_are_enough():
 @pytest.mark.filterwarnings("ignore:.*names no CRS")
 def test_no_sign_speaks_of_true_poses():
     report = check_cameras(
-        TRUE / "colmap", TRUE / "cloud.las", water=LEVEL_M, cameras_offset_m=OFFSET_M,
+        TRUE / "colmap", TRUE / "cloud.las", water=LEVEL_M, cameras_offset=OFFSET_M,
         gnss=BENT / "gnss.csv", gcps=BENT / "gcps.csv", reference=TRUE / "lidar.laz",
     )  # fmt: skip
     assert report.diagnosis.absorbed is False
@@ -119,7 +119,7 @@ def test_evidence_needs_cloud_and_water():
 
 
 def test_the_command_names_what_was_given():
-    inputs = Inputs("my model", 0.5, cameras_offset_m=(1.0, 2.0, 3.0), cameras_crs="EPSG:25830")
+    inputs = Inputs("my model", 0.5, cameras_offset=(1.0, 2.0, 3.0), cameras_crs="EPSG:25830")
     command = command_of(inputs, "cloud.laz", gnss="gnss.csv", gcps=None)
     assert command == (
         "pcfix adjust 'my model' OUT --water 0.5 --cloud cloud.laz --cameras-crs EPSG:25830"

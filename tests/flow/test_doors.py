@@ -43,7 +43,7 @@ def test_command_line_and_python_give_the_same_file(scene, tmp_path):
         tmp_path / "b.las",
         cameras=scene / "cameras.csv",
         water=0.37,
-        max_angle_deg=45,
+        max_angle=45,
     )
     assert (tmp_path / "a.las").read_bytes() == (tmp_path / "b.las").read_bytes()
 
@@ -82,7 +82,7 @@ def test_piped_output_is_the_summary_and_nothing_else(scene, tmp_path):
 
 
 def test_progress_counts_every_point(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("pcfix.flow.files.CHUNK_POINTS", 700)
+    monkeypatch.setattr("pcfix.io.las.source.CHUNK_POINTS", 700)
     calls = []
     pcfix.correct_file(
         scene / "cloud.laz",

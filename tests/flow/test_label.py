@@ -10,7 +10,6 @@ import pcfix
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.label import label_file, label_points
 from pcfix.flow.run import Request, request_of
-from pcfix.options import LabelSettings
 from tests.pdal_stage.test_arrays import arrays_of, metadata_of, run
 from tests.utils.clouds import (
     EAST_M,
@@ -87,8 +86,7 @@ def test_labelled_corrected_and_restored(tmp_path):
     pcfix.correct_file(
         tmp_path / "labelled.las", tmp_path / "corrected.las", cameras=block(), water=WATER_M
     )
-    again = LabelSettings(dead_band_m=0.1)
-    label_file(tmp_path / "corrected.las", tmp_path / "twice.las", water=WATER_M, settings=again)
+    label_file(tmp_path / "corrected.las", tmp_path / "twice.las", water=WATER_M, dead_band=0.1)
     pcfix.restore_file(tmp_path / "twice.las", tmp_path / "back.las")
     first, last = laspy.read(tmp_path / "labelled.las"), laspy.read(tmp_path / "back.las")
     np.testing.assert_array_equal(first.xyz, last.xyz)
@@ -104,14 +102,6 @@ CHOICES = [
 ]
 
 
-def settings_of(choices):
-    names = {"band": "band_m", "dead_band": "dead_band_m", "least_pool": "least_pool_m2"}
-    words = {names.get(name, name): value for name, value in choices.items()}
-    if "respect_classes" in words:
-        words["respect_classes"] = tuple(map(int, words["respect_classes"].split(",")))
-    return LabelSettings(**words)
-
-
 def options_of(choices):
     pairs = [(f"--{name.replace('_', '-')}", value) for name, value in choices.items()]
     return [w for name, value in pairs for w in ([name] if value is True else [name, str(value)])]
@@ -124,7 +114,7 @@ def invoke(*words):
 @pytest.mark.parametrize("choices", CHOICES)
 def test_label_through_every_door(tmp_path, mask, choices, monkeypatch):
     path = write_cloud(tmp_path / "in.las", 7)
-    las, said = laspy.read(path), settings_of(choices)
+    las = laspy.read(path)
     words = ["--water", WATER_M, "--water-mask", mask, *options_of(choices)]
     summary = tmp_path / "s.json"
     done = invoke("label", path, tmp_path / "a.las", *words, "--summary", summary)
@@ -132,7 +122,7 @@ def test_label_through_every_door(tmp_path, mask, choices, monkeypatch):
     found = np.asarray(laspy.read(tmp_path / "a.las").classification)
     arrays = label_points(
         las.xyz, WATER_M, classes=np.asarray(las.classification), water_mask=mask,
-        crs="EPSG:32633", settings=said,
+        crs="EPSG:32633", **choices,
     )  # fmt: skip
     np.testing.assert_array_equal(found, arrays)
     outs, report = run("label", arrays_of(las), metadata(las), water=WATER_M,
@@ -144,9 +134,8 @@ def test_label_through_every_door(tmp_path, mask, choices, monkeypatch):
         written["submerged"] + written["water_surface"] <= (found == 40).sum() + (found == 41).sum()
     )
     assert written["labelling"]["outside_mask"] > 0
-    for module in ("files", "label", "points"):
-        monkeypatch.setattr(f"pcfix.flow.{module}.CHUNK_POINTS", 333)
-    label_file(path, tmp_path / "b.las", water=WATER_M, water_mask=mask, settings=said)
+    monkeypatch.setattr("pcfix.io.las.source.CHUNK_POINTS", 333)
+    label_file(path, tmp_path / "b.las", water=WATER_M, water_mask=mask, **choices)
     assert (tmp_path / "a.las").read_bytes() == (tmp_path / "b.las").read_bytes()
 
 
@@ -154,20 +143,19 @@ def test_label_through_every_door(tmp_path, mask, choices, monkeypatch):
 def test_correct_through_every_door(tmp_path, mask, choices):
     path = write_cloud(tmp_path / "in.las", 7)
     cameras = cameras_csv(tmp_path / "cameras.csv", block())
-    las, said = laspy.read(path), settings_of(choices)
+    las = laspy.read(path)
     words = ["--cameras", cameras, "--water", WATER_M, "--water-mask", mask, *options_of(choices)]
     assert invoke("correct", path, tmp_path / "a.las", *words).returncode == 0
     result = pcfix.correct_file(
         path, tmp_path / "b.las", cameras=cameras, water=WATER_M, water_mask=mask,
-        connected=said.connected, least_pool_m2=said.least_pool_m2,
-        respect_classes=said.respect_classes,
+        **choices,
     )  # fmt: skip
     assert (tmp_path / "a.las").read_bytes() == (tmp_path / "b.las").read_bytes()
     out = laspy.read(tmp_path / "a.las")
     classes = np.asarray(las.classification)
     unlabelled = np.where(classes == 40, 0, classes).astype(np.uint8)
     labels = label_points(
-        las.xyz, WATER_M, classes=unlabelled, water_mask=mask, crs="EPSG:32633", settings=said
+        las.xyz, WATER_M, classes=unlabelled, water_mask=mask, crs="EPSG:32633", **choices
     )
     submerged = labels == 40
     arrays = pcfix.correct_points(
@@ -371,8 +359,8 @@ def test_run_keeps_them_in_its_record(tmp_path, mask):
     assert ("warning" in done.stderr) == (las.header.parse_crs() is not None)
     request = request_of(tmp_path / "out" / "run.json")
     assert request.water_mask == str(half)
-    assert request.label() == LabelSettings(respect_classes=(9,))
+    assert request.respect_classes == (9,) and not request.connected
     moved = np.asarray(laspy.read(tmp_path / "out" / "corrected.laz").RayCount) > 0
     np.testing.assert_array_equal(moved, (las.z < 0.37) & (las.x <= middle))
     with pytest.raises(SettingError, match="least-pool is of no use"):
-        Request("a.las", "b.csv", "0", least_pool_m2=4.0)
+        Request(input="a.las", cameras="b.csv", water="0", least_pool=4.0)

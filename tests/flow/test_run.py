@@ -148,7 +148,9 @@ def test_a_record_repeats_its_run(finished, tmp_path):
 
 
 def test_without_a_reference_there_is_a_report_all_the_same(tmp_path):
-    request = Request(str(SCENE / "cloud.laz"), str(SCENE / "cameras.csv"), "0.37")
+    request = Request(
+        input=str(SCENE / "cloud.laz"), cameras=str(SCENE / "cameras.csv"), water="0.37"
+    )
     page = run_all(request, tmp_path / "out")
     assert "Cross-section" not in page.read_text()
     assert not (tmp_path / "out" / "compare").exists()
@@ -160,7 +162,7 @@ def test_check_points_as_reference(tmp_path):
     lines = [f"{x:.3f},{y:.3f},{z:.3f}" for x, y, z in lidar.xyz[rows]]
     (tmp_path / "check.csv").write_text("\n".join(["x,y,z", *lines]))
     request = Request(
-        str(SCENE / "cloud.laz"), str(SCENE / "cameras.csv"), "0.37",
+        input=str(SCENE / "cloud.laz"), cameras=str(SCENE / "cameras.csv"), water="0.37",
         reference=str(tmp_path / "check.csv"),
     )  # fmt: skip
     with pytest.warns(pcfix.PcfixWarning, match="CRS"):

@@ -18,7 +18,7 @@ import pytest
 
 from pcfix.adjust.intersect import intersect_fixed, plain_block
 from pcfix.errors import GeometryError, PcfixWarning, SettingError
-from pcfix.flow.files import correct_file
+from pcfix.flow.correct import correct_file
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.run import Request, request_of, run_all
 from pcfix.flow.run_adjust import adjust_first
@@ -45,8 +45,9 @@ class Scene(NamedTuple):
     def request(self, cameras="bent", **words):
         """Return a request; the models do not say where they lie."""
         return Request(
-            str(self.folder / f"{cameras}.las"), str(self.folder / cameras), str(LEVEL_M),
-            cameras_offset_m=ORIGIN_M, **words,
+            input=str(self.folder / f"{cameras}.las"), cameras=str(self.folder / cameras),
+            water=str(LEVEL_M),
+            cameras_offset=ORIGIN_M, **words,
         )  # fmt: skip
 
     @property
@@ -182,7 +183,7 @@ def test_auto_without_a_datum_says_what_is_missing(scene, tmp_path):
     with pytest.warns(PcfixWarning):
         correct_file(
             scene.folder / "bent.las", tmp_path / "plain.laz", cameras=scene.folder / "bent",
-            cameras_offset_m=ORIGIN_M, water=LEVEL_M,
+            cameras_offset=ORIGIN_M, water=LEVEL_M,
         )  # fmt: skip
     one, other = (laspy.read(tmp_path / name) for name in ("out/corrected.laz", "plain.laz"))
     np.testing.assert_array_equal(one.points.array, other.points.array)
@@ -249,7 +250,7 @@ def test_inputs_are_not_replaced(scene, finished, tmp_path):
     shutil.copytree(finished[0] / "adjusted", tmp_path / "out" / "adjusted")
     request = replace(
         scene.request(adjust="yes", gnss=scene.gnss),
-        cameras=str(tmp_path / "out" / "adjusted" / "colmap"), cameras_offset_m=None,
+        cameras=str(tmp_path / "out" / "adjusted" / "colmap"), cameras_offset=None,
     )  # fmt: skip
     with pytest.raises(SettingError, match="give another OUT_DIR"):
         run_all(request, tmp_path / "out", overwrite=True)
@@ -263,12 +264,12 @@ def test_inputs_are_not_replaced(scene, finished, tmp_path):
         ({"adjust": "no", "lens": "lens.xml"}, "lens is of use to an adjustment only"),
         ({"adjust": "yes", "adjusted_from": "old"}, "the cameras are adjusted already"),
         ({"adjust": "yes", "tide": "tide.csv"}, "each image its own water level"),
-        ({"adjust": "perhaps"}, "must be among auto, yes, no"),
+        ({"adjust": "perhaps"}, "is not one of auto, yes, no"),
     ],
 )
 def test_words_that_do_not_go_together(words, sentence):
     with pytest.raises(SettingError, match=sentence):
-        Request("cloud.las", "cameras.csv", "0", **words)
+        Request(input="cloud.las", cameras="cameras.csv", water="0", **words)
 
 
 def test_records_from_before_adjustments_do_without(finished, tmp_path):

@@ -137,8 +137,7 @@ def test_every_door_takes_shoreline_points(tmp_path):
     known = ["--sigma-level", 0.02]
     said = invoke("correct", CLOUD, tmp_path / "a.las", "--cameras", CAMERAS, *water, *known)
     assert "fitted     level, 20 of 20 points" in said
-    errors = pcfix.ErrorBudget(level_m=0.02)
-    pcfix.correct_file(CLOUD, tmp_path / "b.las", cameras=CAMERAS, water=LEVEL_M, errors=errors)
+    pcfix.correct_file(CLOUD, tmp_path / "b.las", cameras=CAMERAS, water=LEVEL_M, sigma_level=0.02)
     one, other = (laspy.read(tmp_path / name).points.array for name in ("a.las", "b.las"))
     np.testing.assert_array_equal(one, other)
     invoke("label", CLOUD, tmp_path / "c.las", *water)

@@ -35,7 +35,7 @@ def cloud(tmp_path_factory):
 )
 def test_every_cell(cloud, tmp_path, method, resolution):
     path, xyz = cloud
-    summary = grid_dsm(path, tmp_path / "d.tif", resolution_m=float(resolution), method=method)
+    summary = grid_dsm(path, tmp_path / "d.tif", resolution=float(resolution), method=method)
     steps = np.rint((xyz - (EAST, NORTH, 0.0)) / float(SCALE))
     axes = [exact(steps[:, i], SCALE, (int(EAST), int(NORTH), 0)[i]) for i in range(3)]
     if method == "tin":

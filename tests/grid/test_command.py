@@ -6,9 +6,9 @@ import json
 
 import pytest
 import typer
+from pcfix.cli.dsm import dsm
 from typer.testing import CliRunner
 
-from pcfix.cli.dsm import dsm
 from pcfix.io.rasters import read_raster
 from tests.grid.clouds import scattered, write
 

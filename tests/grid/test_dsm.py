@@ -72,9 +72,7 @@ def test_order_of_points_does_not_matter(tmp_path, method):
     xyz = scattered(3000, 20.0, 20.0)
     for name, rows in (("a", xyz), ("b", xyz[::-1])):
         write(tmp_path / f"{name}.las", rows)
-        grid_dsm(
-            tmp_path / f"{name}.las", tmp_path / f"{name}.tif", resolution_m=0.5, method=method
-        )
+        grid_dsm(tmp_path / f"{name}.las", tmp_path / f"{name}.tif", resolution=0.5, method=method)
     one, other = (read_raster(tmp_path / f"{n}.tif").array for n in "ab")
     np.testing.assert_array_equal(one, other)
 
@@ -96,7 +94,7 @@ def test_a_plane(tmp_path, method):
     )
     x, y = x + EAST, y + NORTH
     cloud = write(tmp_path / "plane.las", np.column_stack([x, y, sloping(x, y)]))
-    grid_dsm(cloud, tmp_path / "plane.tif", resolution_m=1.0, method=method)
+    grid_dsm(cloud, tmp_path / "plane.tif", resolution=1.0, method=method)
     found = heights(tmp_path / "plane.tif")
     centre_x, centre_y = np.meshgrid(EAST + np.arange(20) + 0.5, NORTH + 14.5 - np.arange(15))
     corner = {"min": -0.125, "max": 0.125}.get(method, 0.0)
@@ -110,7 +108,7 @@ def test_a_plane_between_scattered_points(tmp_path):
     xyz = scattered(3000, 30.0, 20.0)
     xyz[:, 2] = sloping(xyz[:, 0], xyz[:, 1])
     cloud = write(tmp_path / "plane.las", xyz)
-    grid_dsm(cloud, tmp_path / "plane.tif", resolution_m=0.5, method="tin")
+    grid_dsm(cloud, tmp_path / "plane.tif", resolution=0.5, method="tin")
     found = heights(tmp_path / "plane.tif")
     x, y = np.meshgrid(EAST + 0.25 + np.arange(60) / 2, NORTH + 19.75 - np.arange(40) / 2)
     known = ~np.isnan(found)
@@ -135,7 +133,7 @@ def test_uncertainty_is_the_root_mean_square_of_the_points(tmp_path, method):
     sigma = np.round(np.random.default_rng(1).uniform(0.01, 0.3, 4000), 4)
     sigma[xyz[:, 0] < EAST + 8.0] = 0.0  # land
     path = with_sigma(tmp_path / "cloud.las", xyz, sigma)
-    summary = grid_dsm(path, tmp_path / "d.tif", resolution_m=1.0, method=method)
+    summary = grid_dsm(path, tmp_path / "d.tif", resolution=1.0, method=method)
     with rasterio.open(tmp_path / "d.tif") as dsm:
         assert dsm.descriptions == ("height", "count", "spread", "uncertainty")
         found = dsm.read(4)
@@ -155,7 +153,7 @@ def test_uncertainty_is_the_root_mean_square_of_the_points(tmp_path, method):
 
 def test_a_cloud_without_standard_errors_has_no_such_band(tmp_path):
     summary = grid_dsm(
-        write(tmp_path / "c.las", scattered(500, 5.0, 5.0)), tmp_path / "d.tif", resolution_m=1.0
+        write(tmp_path / "c.las", scattered(500, 5.0, 5.0)), tmp_path / "d.tif", resolution=1.0
     )
     assert summary.uncertainty_m is None
     with rasterio.open(tmp_path / "d.tif") as dsm:
@@ -167,7 +165,7 @@ def test_the_file(tmp_path, cog):
     cloud = write(tmp_path / "cloud.laz", scattered(20_000, 80.0, 70.0), crs="EPSG:32633+5773")
     shade = tmp_path / "shade.tif"
     with pytest.warns(PcfixWarning, match=r"resolution 0\.2 m is finer .* apart, so there are 0\."):
-        grid_dsm(cloud, tmp_path / "d.tif", resolution_m=0.2, hillshade=shade, cog=cog)
+        grid_dsm(cloud, tmp_path / "d.tif", resolution=0.2, hillshade=shade, cog=cog)
     with rasterio.open(tmp_path / "d.tif") as dsm:
         assert dsm.descriptions == ("height", "count", "spread")
         assert dsm.dtypes == ("float32",) * 3
@@ -195,7 +193,7 @@ def test_the_file(tmp_path, cog):
 @pytest.mark.skipif(shutil.which("gdalinfo") is None, reason="gdalinfo is not installed")
 def test_gdalinfo_reads_it(tmp_path):
     cloud = write(tmp_path / "cloud.laz", scattered(2000, 9.99, 7.99))
-    grid_dsm(cloud, tmp_path / "d.tif", resolution_m=0.5)
+    grid_dsm(cloud, tmp_path / "d.tif", resolution=0.5)
     command = ["gdalinfo", "-json", "-checksum", str(tmp_path / "d.tif")]
     answer = subprocess.run(command, capture_output=True, text=True, check=True)
     info = json.loads(answer.stdout)
@@ -211,9 +209,9 @@ def test_fills_are_marked(tmp_path):
     large = (np.abs(x - 20.0) < 3.1) & (np.abs(y - 10.0) < 3.1)
     x, y = (v[~(small | large)] for v in (x, y))
     cloud = write(tmp_path / "c.las", np.column_stack([x + EAST, y + NORTH, 5.0 + x / 4.0]))
-    plain = grid_dsm(cloud, tmp_path / "plain.tif", resolution_m=1.0)
+    plain = grid_dsm(cloud, tmp_path / "plain.tif", resolution=1.0)
     assert (plain.cells, plain.filled, plain.empty) == (600 - 45, 0, 45)
-    summary = grid_dsm(cloud, tmp_path / "filled.tif", resolution_m=1.0, fill_m=3.0)
+    summary = grid_dsm(cloud, tmp_path / "filled.tif", resolution=1.0, fill=3.0)
     found = read_raster(tmp_path / "filled.tif").array
     filled = (found[1] == 0) & (found[0] != -9999.0)
     assert filled[12:15, 5:8].all()
@@ -242,7 +240,7 @@ def test_the_scene_against_its_truth(tmp_path, method, fill):
     found = {}
     for name, path in inputs.items():
         target = tmp_path / f"{name}.tif"
-        summary = grid_dsm(path, target, resolution_m=2.0, method=method, fill_m=fill)
+        summary = grid_dsm(path, target, resolution=2.0, method=method, fill=fill)
         left, _, _, top = summary.bounds_m
         column, row = round((left - 410_200.0) / 2.0), round((4_650_382.0 - top) / 2.0)
         found[name] = np.full((43, 62), np.nan)
@@ -261,12 +259,12 @@ def test_surfaces(tmp_path):
     xyz = np.column_stack([np.arange(8) + EAST, np.full(8, NORTH), np.arange(8.0)])
     classes = np.array([2, 40, 40, 7, 18, 9, 1, 40])
     cloud = write(tmp_path / "c.las", xyz, classes, withheld=np.array([0, 0, 1, 0, 0, 0, 0, 0]))
-    everything = grid_dsm(cloud, tmp_path / "all.tif", resolution_m=1.0)
+    everything = grid_dsm(cloud, tmp_path / "all.tif", resolution=1.0)
     assert everything.points_used == 5
     np.testing.assert_array_equal(
         heights(tmp_path / "all.tif")[0], [0, 1, np.nan, np.nan, np.nan, 5, 6, 7]
     )
-    bed = grid_dsm(cloud, tmp_path / "bed.tif", resolution_m=3.0, surface="bed", method="max")
+    bed = grid_dsm(cloud, tmp_path / "bed.tif", resolution=3.0, surface="bed", method="max")
     assert (bed.points_used, bed.width) == (2, 3)
     np.testing.assert_array_equal(heights(tmp_path / "bed.tif")[0], [1, np.nan, 7])
 
@@ -279,7 +277,7 @@ def test_the_header_may_be_wrong(tmp_path):
         stream.seek(179)
         stream.write(np.array([1e300, -5.0, np.nan, 0.0, 9.0, 9.0]).tobytes())
     for path in (right, wrong):
-        grid_dsm(path, path.with_suffix(".tif"), resolution_m=0.7, method="median")
+        grid_dsm(path, path.with_suffix(".tif"), resolution=0.7, method="median")
     one, other = (read_raster(p.with_suffix(".tif")) for p in (right, wrong))
     np.testing.assert_array_equal(one.array, other.array)
     assert one.transform == other.transform
@@ -319,16 +317,16 @@ def test_bad_settings(tmp_path, monkeypatch, case):
 def test_too_many_cells(tmp_path):
     cloud = write(tmp_path / "c.las", scattered(5000, 900.0, 300.0))
     with pytest.raises(SettingError, match=r"899,\d{3} x 299,\d{3} cells.* 4 gig.*0\.00822 m or"):
-        grid_dsm(cloud, tmp_path / "d.tif", resolution_m=0.001)
+        grid_dsm(cloud, tmp_path / "d.tif", resolution=0.001)
     assert [p.name for p in tmp_path.iterdir()] == ["c.las"]
 
 
 def test_no_points_left(tmp_path):
     cloud = write(tmp_path / "c.las", scattered(50, 10.0, 10.0), classes=np.full(50, 7))
     with pytest.raises(InputError, match="all points are noise"):
-        grid_dsm(cloud, tmp_path / "d.tif", resolution_m=2.0)
+        grid_dsm(cloud, tmp_path / "d.tif", resolution=2.0)
     with pytest.raises(InputError, match=r"no point of class 40 .bed. that is not withheld"):
-        grid_dsm(cloud, tmp_path / "d.tif", resolution_m=2.0, surface="bed")
+        grid_dsm(cloud, tmp_path / "d.tif", resolution=2.0, surface="bed")
     assert [p.name for p in tmp_path.iterdir()] == ["c.las"]
 
 
@@ -338,14 +336,14 @@ def test_not_in_metres(tmp_path, crs, unit):
     xyz = scattered(50, 10.0, 10.0) - (EAST, NORTH, 0.0) + offsets
     cloud = write(tmp_path / "c.las", xyz, crs=crs, offsets=offsets)
     with pytest.raises(InputError, match=f"is in {unit}; reproject the cloud to one in metres"):
-        grid_dsm(cloud, tmp_path / "d.tif", resolution_m=2.0)
+        grid_dsm(cloud, tmp_path / "d.tif", resolution=2.0)
 
 
 def test_no_cog_driver(tmp_path, monkeypatch):
     cloud = write(tmp_path / "c.las", scattered(50, 10.0, 10.0))
     monkeypatch.setattr(rasterio.Env, "drivers", lambda self: {"GTiff": "GeoTIFF"})
     with pytest.raises(SettingError, match=r"has no COG driver.*leave --cog out"):
-        grid_dsm(cloud, tmp_path / "d.tif", resolution_m=2.0, cog=True)
+        grid_dsm(cloud, tmp_path / "d.tif", resolution=2.0, cog=True)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a raster", None])
@@ -363,7 +361,7 @@ def test_very_few_points(tmp_path, method, count):
     """Points on one line make no triangle; all else has a height in each cell."""
     xyz = np.column_stack([EAST + np.arange(count), np.full(count, NORTH), np.full(count, 4.0)])
     cloud = write(tmp_path / "c.las", xyz, crs=None)
-    summary = grid_dsm(cloud, tmp_path / "d.tif", resolution_m=1.0, method=method)
+    summary = grid_dsm(cloud, tmp_path / "d.tif", resolution=1.0, method=method)
     assert (summary.width, summary.height, summary.crs) == (count, 1, None)
     expected = np.nan if method == "tin" else 4.0
     np.testing.assert_array_equal(heights(tmp_path / "d.tif"), np.full((1, count), expected))
@@ -380,7 +378,7 @@ def test_no_harm_when_it_fails(tmp_path, monkeypatch):
 
     monkeypatch.setattr(flow, "write_part", full)
     with pytest.raises(InputError, match=r"cannot be written .No space left"):
-        grid_dsm(cloud, tmp_path / "d.tif", resolution_m=1.0, overwrite=True)
+        grid_dsm(cloud, tmp_path / "d.tif", resolution=1.0, overwrite=True)
     assert {p.name for p in tmp_path.iterdir()} == {"c.las", "d.tif"}
     assert (tmp_path / "d.tif").read_bytes() == b"older"
 
@@ -391,7 +389,7 @@ def test_summary_and_progress(tmp_path):
     summary = grid_dsm(
         cloud,
         tmp_path / "d.tif",
-        resolution_m=1.0,
+        resolution=1.0,
         summary=tmp_path / "s.json",
         progress=lambda done, total: steps.append((done, total)),
     )

@@ -531,7 +531,7 @@ def test_a_cloud_without_extra_dimensions_stays_without_when_none_are_asked_for(
 def test_shifts_beyond_16_bits_are_written_with_32(
     tmp_path: Path, deep_rows: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pcfix.flow.files.CHUNK_POINTS", 500)
+    monkeypatch.setattr("pcfix.io.las.source.CHUNK_POINTS", 500)
     las = random_cloud(1, scales=(0.0001,) * 3, offsets=(EAST_M, NORTH_M, 0.0))
     z = las.points.array["Z"]
     deep = slice(None) if deep_rows == "all" else slice(len(z) - 1, None)
@@ -614,8 +614,7 @@ def test_chunks_leave_no_trace(
 ) -> None:
     whole = round_trip(write_cloud(tmp_path / f"cloud{suffix}", number))
     expected = whole.output.read_bytes(), whole.back.read_bytes()
-    monkeypatch.setattr("pcfix.flow.files.CHUNK_POINTS", 100)
-    monkeypatch.setattr("pcfix.flow.restore.CHUNK_POINTS", 100)
+    monkeypatch.setattr("pcfix.io.las.source.CHUNK_POINTS", 100)
     (tmp_path / "again").mkdir()
     again = tmp_path / "again" / whole.source.name
     again.write_bytes(whole.source.read_bytes())

@@ -96,7 +96,7 @@ def test_chunks_leave_no_trace(cloud, tmp_path, monkeypatch):
     path, ins, metadata = cloud
     options = {"cameras": str(tmp_path / "cameras.csv"), "water": WATER_M}
     whole, _ = run("correct", ins, metadata, **options)
-    monkeypatch.setattr("pcfix.flow.points.CHUNK_POINTS", 111)
+    monkeypatch.setattr("pcfix.io.las.source.CHUNK_POINTS", 111)
     pieces, _ = run("correct", arrays_of(laspy.read(path)), metadata, **options)
     for name in whole:
         np.testing.assert_array_equal(whole[name], pieces[name])

@@ -252,7 +252,7 @@ def test_correct_recipe_on_the_river(tmp_path: Path) -> None:
     with pytest.warns(pcfix.PcfixWarning, match="7 labels occur more than once"):
         pcfix.correct_file(
             RIVER / "points.las", tmp_path / "cli.las", cameras=cameras, water="dim:w_surf",
-            refractive_index=1.337, max_angle_deg=35.0,
+            index=1.337, max_angle=35.0,
         )  # fmt: skip
     cli, stage = laspy.read(tmp_path / "cli.las"), laspy.read(tmp_path / "out.las")
     for name in [*"XYZ", "classification", "withheld", "RayCount"]:

@@ -272,7 +272,7 @@ def errors_gsd(name, **choices):
     """Return the errors in z of the points under water, GSD."""
     scene = scene_of(name)
     result = pcfix.correct_points(
-        scene.xyz, scene.cameras, scene.water, refractive_index=scene.refractive_index, **choices
+        scene.xyz, scene.cameras, scene.water, index=scene.refractive_index, **choices
     )
     moved = (result.outcome == Outcome.CORRECTED) & (np.diff(scene.views.start) > 1)
     assert moved.mean() > 0.99

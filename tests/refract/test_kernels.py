@@ -116,7 +116,7 @@ def test_max_cameras_takes_the_steepest(points, cameras):
 
 
 def test_max_angle_limits_the_rays(points, cameras):
-    result = pcfix.correct_points(points, cameras, 0.0, max_angle_deg=15.0)
+    result = pcfix.correct_points(points, cameras, 0.0, max_angle=15.0)
     assert 0 < result.incidence_deg.max() <= 15.0 + 1e-6
     assert set(result.outcome.tolist()) >= {pcfix.Outcome.CORRECTED, pcfix.Outcome.NO_CAMERA}
 

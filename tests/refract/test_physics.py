@@ -28,7 +28,7 @@ def bed(seed=1, n=200, deepest=10.0):
 
 
 def test_index_of_one_changes_nothing():
-    result = pcfix.correct_points(bed(), block(), 0.0, refractive_index=1.0)
+    result = pcfix.correct_points(bed(), block(), 0.0, index=1.0)
     assert result.corrected.all()
     assert np.abs(result.shift_m).max() < NANOMETRE
 
@@ -38,7 +38,7 @@ def test_straight_down_depth_grows_by_n(n):
     # two cameras almost overhead: in the paraxial limit depth is multiplied by n; the next
     # term is about depth * tan^2(0.3 deg) / 2 = 0.1 mm at 5 m
     cameras = pcfix.Cameras(("a", "b"), np.array([[-0.5, 0, 100.0], [0.5, 0, 100.0]]))
-    result = pcfix.correct_points([[0, 0, -5.0]], cameras, 0.0, refractive_index=n)
+    result = pcfix.correct_points([[0, 0, -5.0]], cameras, 0.0, index=n)
     assert result.depth_m[0] == pytest.approx(5.0 * n, abs=1.5e-4)
     assert np.abs(result.shift_m[0, :2]).max() < NANOMETRE
 
@@ -97,7 +97,7 @@ def test_out_through_the_surface_and_back_comes_home(x, y, depth, slope, n):
     directions = [(a - c) / np.linalg.norm(a - c) for a, c in zip(crossings, centres, strict=True)]
     apparent = stacked_intersection(centres, directions)
     cameras = pcfix.Cameras(("a", "b"), centres)
-    result = pcfix.correct_points([apparent], cameras, pcfix.WaterPlane(*plane), refractive_index=n)
+    result = pcfix.correct_points([apparent], cameras, pcfix.WaterPlane(*plane), index=n)
     # the crossing is known to 1e-9 m, and a base of 40 m over 70 m multiplies that by a few
     assert result.xyz[0] == pytest.approx(point, abs=1e-7)
 
@@ -114,10 +114,10 @@ def test_result_turns_and_rises_with_the_scene(depth, n, turn, level):
     rotation = np.array(
         [[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]]
     )
-    here = pcfix.correct_points([point], named(centres), 0.0, refractive_index=n).xyz[0]
+    here = pcfix.correct_points([point], named(centres), 0.0, index=n).xyz[0]
     up = np.array([0, 0, level])
     there = pcfix.correct_points(
-        [rotation @ point + up], named(centres @ rotation.T + up), level, refractive_index=n
+        [rotation @ point + up], named(centres @ rotation.T + up), level, index=n
     ).xyz[0]
     assert there == pytest.approx(rotation @ here + up, abs=1e-7)  # det may be as low as 1e-2
 

@@ -38,7 +38,7 @@ SCENES = {
 
 @lru_cache
 def scene_of(name, noise_px, points=1500):
-    return simulate_scene(points, cloud="pairs", image_noise_px=noise_px, **SCENES[name])
+    return simulate_scene(points, cloud="pairs", image_noise=noise_px, **SCENES[name])
 
 
 def under_water(scene):

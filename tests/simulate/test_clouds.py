@@ -29,7 +29,7 @@ MICROMETRE = 1e-6
 )
 def test_without_refraction_and_noise_the_truth_comes_home(kind, more):
     scene = pcfix.simulate_scene(
-        150, cloud=kind, refractive_index=1.0, image_noise_px=0.0, lidar_per_m2=0.1, **more
+        150, cloud=kind, index=1.0, image_noise=0.0, lidar_per_m2=0.1, **more
     )
     assert np.diff(scene.views.start).mean() > 3
     assert scene.xyz == pytest.approx(scene.true_xyz, abs=MICROMETRE)
@@ -83,7 +83,7 @@ def views_of(scene, i):
 
 
 def test_tracks_agree_with_a_slow_twin():
-    scene = pcfix.simulate_scene(60, image_noise_px=0.0, tilt_percent=1.0, detection=0.7, **POSES)
+    scene = pcfix.simulate_scene(60, image_noise=0.0, tilt_percent=1.0, detection=0.7, **POSES)
     twin = Twin(scene)
     for i in range(0, 60, 10):
         slow = twin.straight(views_of(scene, i), twin.truth[i], twin.xyz[i] + 0.1)
@@ -91,7 +91,7 @@ def test_tracks_agree_with_a_slow_twin():
 
 
 def test_pairs_agree_with_a_slow_twin():
-    scene = pcfix.simulate_scene(60, cloud="pairs", image_noise_px=0.0, tilt_percent=1.0, **POSES)
+    scene = pcfix.simulate_scene(60, cloud="pairs", image_noise=0.0, tilt_percent=1.0, **POSES)
     twin = Twin(scene)
     for i in (5, 33, 59):
         pairs = scene.pairs[scene.pairs_start[i] : scene.pairs_start[i + 1]]
@@ -231,7 +231,7 @@ def depth_of(twin, scene, k, fused, bed, shown):
 
 
 def test_depth_maps_see_every_bed_at_about_the_same_place():
-    scene = pcfix.simulate_scene(400, cloud="depth-maps", image_noise_px=0.3, obliques_deg=25.0)
+    scene = pcfix.simulate_scene(400, cloud="depth-maps", image_noise=0.3, obliques_deg=25.0)
     made = np.diff(scene.views.start) > 0
     assert made.mean() > 0.95
     assert scene.views.weight.min() > 0.0

@@ -74,7 +74,7 @@ def test_the_correction_agrees_with_it():
     x, y = (side.ravel() for side in np.meshgrid(model.x_m, model.y_m))
     apparent = np.column_stack([x, y, np.full(len(x), -15.0)])
     cameras = pcfix.Cameras(("left", "right"), PAIR.centres)
-    corrected = pcfix.correct_points(apparent, cameras, 0.0, refractive_index=1.34).xyz
+    corrected = pcfix.correct_points(apparent, cameras, 0.0, index=1.34).xyz
     assert corrected[:, 2] == pytest.approx(model.error_m.ravel() - 15.0, abs=1e-8)  # m
 
 

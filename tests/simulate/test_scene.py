@@ -73,7 +73,7 @@ def test_known_cameras_and_views_bring_it_within_one_gsd(nadir):
 
 
 def test_without_refraction_there_is_nothing_to_correct():
-    scene = pcfix.simulate_scene(1000, refractive_index=1.0, image_noise_px=0.0)
+    scene = pcfix.simulate_scene(1000, index=1.0, image_noise=0.0)
     assert scene.apparent_xyz == pytest.approx(scene.true_xyz, abs=1e-7)
 
 

@@ -5,9 +5,9 @@ import json
 
 import numpy as np
 import pytest
+from pcfix.cli.simulate import SceneWords
 
 import pcfix
-from pcfix.cli.simulate import SceneWords
 from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.terrain import STEPS
 

@@ -98,7 +98,7 @@ def test_limit_holds_at_the_facet_that_the_ray_pierces(limit_deg):
     points = np.column_stack([rng.uniform(10, 40, (30, 2)), rng.uniform(-9, -3, 30)]) + UTM
     centres = np.column_stack([rng.uniform(0, 50, (12, 2)), rng.uniform(55, 65, 12)]) + UTM
     cameras = pcfix.Cameras(tuple("abcdefghijkl"), centres)
-    result = pcfix.correct_points(points, cameras, mesh, max_angle_deg=limit_deg)
+    result = pcfix.correct_points(points, cameras, mesh, max_angle=limit_deg)
     for i, point in enumerate(points):
         angles = np.array([local_incidence_deg(vertices[triangles], c, point) for c in centres])
         assert result.ray_count[i] in (0, np.sum(angles <= limit_deg))

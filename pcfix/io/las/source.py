@@ -44,6 +44,9 @@ _DAMAGED = (
 )
 """What the LAS libraries raise."""
 
+CHUNK_POINTS = 1_000_000
+"""Points that are worked on at a time, which bounds the memory."""
+
 
 class Record(VLR):  # type: ignore[misc]  # laspy is untyped
     """A record that remembers the bytes before its data."""
@@ -188,14 +191,15 @@ class LasSource:
         if len(self) == 0:
             raise InputError(f"{self.path}: holds no points.")
 
-    def chunks(self, size: int) -> Iterator[laspy.ScaleAwarePointRecord]:
-        """Yield all points, in order, at most `size` at a time.
+    def chunks(self, size: int | None = None) -> Iterator[laspy.ScaleAwarePointRecord]:
+        """Yield all points, in order, at most `size` at a time, by default `CHUNK_POINTS`.
 
         Raises
         ------
         InputError
             If the file ends before its last point.
         """
+        size = size or CHUNK_POINTS
         read = 0
         while read < len(self):
             with las_errors(self.path):

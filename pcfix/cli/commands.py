@@ -1,0 +1,278 @@
+"""The commands, each of which turns its flags into one call, no more."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+import pcfix
+from pcfix.cli.flags import FLAGS, Quiet, UsageError, check_needed, progress_bar, say, status_line
+from pcfix.options.correct import CorrectOptions, LabelOptions
+from pcfix.options.declare import options_of
+from pcfix.options.scenes import DemoOptions, SimulateOptions
+from pcfix.options.shared import JobOptions
+from pcfix.options.steps import CleanOptions, CompareOptions, DsmOptions
+from pcfix.options.survey import (
+    AdjustOptions,
+    CamerasCheckOptions,
+    RunOptions,
+    WaterCheckOptions,
+)
+
+Input = Annotated[Path, Parameter(help="LAS or LAZ cloud.")]
+Output = Annotated[Path, Parameter(help="LAS or LAZ to write.")]
+
+
+def run(
+    input: Annotated[Path | None, Parameter(help="LAS or LAZ cloud.")] = None,
+    out_dir: Annotated[Path | None, Parameter(help="Folder for all results.")] = None,
+    /,
+    *,
+    options: Annotated[RunOptions, FLAGS] = RunOptions(),
+    config: Annotated[
+        Path | None, Parameter(help="run.json of an earlier run, to repeat it.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Adjust, correct, clean, grid, compare and report; resumes where it stopped.
+
+    With --config give only the folder: pcfix run OUT_DIR --config run.json.
+    """
+    from pcfix.flow.run import Request, request_of, run_all
+
+    if config is not None:
+        folder = out_dir or input
+        if folder is None or options.cameras is not None or options.water is not None:
+            raise UsageError("with --config give OUT_DIR alone")
+        request = request_of(config)
+    else:
+        if None in (input, out_dir, options.cameras, options.water):
+            raise UsageError("INPUT, OUT_DIR, --cameras and --water are needed")
+        values = {one.name: getattr(options, one.name) for one in options_of(RunOptions)}
+        request, folder = Request(input=str(input), **values), out_dir
+    with progress_bar("Correcting", quiet) as progress:
+        run_all(
+            request,
+            Path(str(folder)),
+            overwrite=options.overwrite,
+            jobs=options.jobs,
+            say=lambda text: say(text, quiet),
+            progress=progress,
+        )
+
+
+def correct(
+    input: Input,
+    output: Output,
+    /,
+    *,
+    options: Annotated[CorrectOptions, FLAGS] = CorrectOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Move the points below the water surface to where they are."""
+    check_needed(options, water=False)
+    if options.water is None and options.port is None:
+        raise UsageError("--water is needed, or --port for a cloud taken under water")
+    from pcfix.report.text import summary_text
+
+    with progress_bar("Correcting", quiet) as progress:
+        result = pcfix.correct_file(input, output, options=options, progress=progress)
+    say(summary_text(result), quiet)
+
+
+def pipeline(
+    input: Input, output: Output, /, *, options: Annotated[CorrectOptions, FLAGS] = CorrectOptions()
+) -> None:
+    """Print the PDAL pipeline of the same 'pcfix correct', as JSON."""
+    from pcfix.flow.pipeline import pipeline_for
+
+    check_needed(options)
+    say(json.dumps(pipeline_for(input, output, options), indent=2))
+
+
+def adjust(
+    model: Annotated[Path, Parameter(help="Camera poses, with tie points or beside a cloud.")],
+    out: Annotated[Path, Parameter(help="Folder for the adjusted model.")],
+    /,
+    *,
+    options: Annotated[AdjustOptions, FLAGS] = AdjustOptions(),
+    quiet: Quiet = False,
+    jobs: Annotated[int | None, Parameter(help="Threads.", group="Output")] = None,
+) -> None:
+    """Adjust poses, lens and points with the light bent at the water."""
+    if (options.water is None) == (options.port is None):
+        raise UsageError("give --water, or --port for images taken under water")
+    from pcfix.flow.adjust import next_step
+    from pcfix.report.adjustment import adjustment_text, before_of
+    from pcfix.threads import threads
+
+    with threads(jobs), status_line("Adjusting", quiet) as progress:
+        found = pcfix.adjust_cameras(model, out, options=options, progress=progress)
+    say(adjustment_text(found, before_of(found)), quiet)
+    say(f"Next: {next_step(found, model, out, options)}", quiet)
+
+
+def label(
+    input: Input,
+    output: Output,
+    /,
+    *,
+    options: Annotated[LabelOptions, FLAGS] = LabelOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Give the points below the water surface class 40, and change nothing else."""
+    check_needed(options)
+    from pcfix.report.text import labelling_text
+
+    with progress_bar("Labelling", quiet) as progress:
+        result = pcfix.label_file(input, output, options=options, progress=progress)
+    say(labelling_text(result), quiet)
+
+
+def clean(
+    input: Input,
+    output: Output,
+    /,
+    *,
+    options: Annotated[CleanOptions, FLAGS] = CleanOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Flag the noise of a cloud: outliers, weak intersections, points off the bed."""
+    from pcfix.report.text import cleaning_text
+
+    with progress_bar("Cleaning", quiet) as progress:
+        result = pcfix.clean_file(input, output, options=options, progress=progress)
+    say(cleaning_text(result), quiet)
+
+
+def dsm(
+    input: Input,
+    output: Annotated[Path, Parameter(help="GeoTIFF to write.")],
+    /,
+    *,
+    options: Annotated[DsmOptions, FLAGS] = DsmOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Grid a cloud to a GeoTIFF: height, count and spread."""
+    check_needed(options)
+    from pcfix.report.text import dsm_text
+
+    with progress_bar("Gridding", quiet) as progress:
+        result = pcfix.grid_dsm(input, output, options=options, progress=progress)
+    say(dsm_text(result), quiet)
+
+
+def compare(
+    cloud: Input,
+    reference: Annotated[
+        Path, Parameter(help="LAS or LAZ, CSV check points (x,y,z), or a GeoTIFF of heights.")
+    ],
+    /,
+    *,
+    options: Annotated[CompareOptions, FLAGS] = CompareOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Measure how far a cloud is from a reference, before and after correction."""
+    from pcfix.report.comparison import comparison_text
+
+    result = pcfix.compare_clouds(cloud, reference, options=options)
+    say(comparison_text(result), quiet)
+
+
+def cameras(
+    path: Annotated[Path, Parameter(help="File or folder of camera poses.")],
+    /,
+    *,
+    options: Annotated[CamerasCheckOptions, FLAGS] = CamerasCheckOptions(),
+) -> None:
+    """Say what a camera file holds, whether it fits a cloud, and whether it absorbed refraction."""
+    from pcfix.flow.checks import check_cameras
+    from pcfix.report.cameras import cameras_text
+
+    say(cameras_text(check_cameras(path, options)))
+
+
+def water(
+    spec: Annotated[str, Parameter(help="As --water of 'pcfix correct'.")],
+    /,
+    *,
+    options: Annotated[WaterCheckOptions, FLAGS] = WaterCheckOptions(),
+) -> None:
+    """Read, fit or find a water surface, and say how well it is known."""
+    from pcfix.flow.checks import check_water
+    from pcfix.report.water import water_text
+
+    say(water_text(check_water(spec, options)))
+
+
+def restore(
+    input: Input,
+    output: Output,
+    /,
+    *,
+    options: Annotated[JobOptions, FLAGS] = JobOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Give back the cloud as it was before 'pcfix correct', bit for bit."""
+    with progress_bar("Restoring", quiet) as progress:
+        points = pcfix.restore_file(input, output, options=options, progress=progress)
+    say(f"{input} -> {output}: {points:,} points as they were", quiet)
+
+
+def simulate(
+    out_dir: Annotated[Path, Parameter(help="Folder for the scene.")],
+    /,
+    *,
+    options: Annotated[SimulateOptions, FLAGS] = SimulateOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Make a scene with known truth: cloud, cameras, truth, LiDAR."""
+    if options.refraction_effect:
+        from pcfix.flow.papers import write_refraction_effect
+
+        say(write_refraction_effect(out_dir, options), quiet)
+        return
+    from pcfix.io.scenes import write_scene
+
+    with progress_bar("Simulating", quiet) as progress:
+        scene = pcfix.simulate_scene(options=options, progress=progress)
+        write_scene(scene, out_dir, overwrite=options.overwrite)
+    say(f"{out_dir}: {scene.description}", quiet)
+
+
+def demo(
+    out_dir: Annotated[Path, Parameter(help="Folder to make.")] = Path("pcfix-demo"),
+    /,
+    *,
+    options: Annotated[DemoOptions, FLAGS] = DemoOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Simulate, correct, and show how far the cloud is from the truth."""
+    from pcfix.flow.demo import run_demo
+
+    with progress_bar("Simulating and correcting", quiet) as progress:
+        table = run_demo(
+            out_dir, points=options.points, overwrite=options.overwrite, progress=progress
+        )
+    say(table)
+
+
+EXAMPLES = {
+    run: "pcfix run cloud.laz out --cameras cameras.xml --water 0.37 --reference lidar.laz",
+    correct: "pcfix correct cloud.laz corrected.laz --cameras cameras.csv --water 0.37",
+    adjust: "pcfix adjust sparse adjusted --water 0.37 --cloud cloud.laz --gnss gnss.csv",
+    label: "pcfix label cloud.laz labelled.laz --water shore.csv",
+    clean: "pcfix clean corrected.laz cleaned.laz",
+    dsm: "pcfix dsm cleaned.laz bed.tif --resolution 0.5 --surface bed",
+    compare: "pcfix compare cleaned.laz lidar.laz --submerged",
+    cameras: "pcfix cameras cameras.xml --cloud cloud.laz --water 0.37 --plot block.png",
+    water: "pcfix water shore.csv --cloud cloud.laz --plot water.png",
+    restore: "pcfix restore corrected.laz cloud.laz",
+    simulate: "pcfix simulate scene --points 20000",
+    pipeline: "pcfix pipeline cloud.laz corrected.laz --cameras cameras.csv --water 0.37",
+    demo: "pcfix demo",
+}
+"""The commands in the order of the help, each with a line that shows it at work."""

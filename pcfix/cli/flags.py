@@ -1,0 +1,132 @@
+"""Options as flags of the command line, a bar that shows progress, and what is said at the end."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
+
+from cyclopts import Group, Parameter
+
+from pcfix.options.declare import Option, OptionSet, options_of
+from pcfix.options.shared import PANELS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+FLAGS = Parameter(name="*")
+"""Of a command's argument: each option of its class is a flag."""
+
+_GROUPS = {name: Group(name, sort_key=order) for order, name in enumerate(PANELS)}
+
+
+class UsageError(Exception):
+    """Flags that say nothing together; exit code 2."""
+
+
+def prepare(command: Callable[..., None]) -> None:
+    """Tell cyclopts of the options of a command: their types as text, panels and help."""
+    kind = get_args(get_type_hints(command, include_extras=True)["options"])[0]
+    by_name = {one.name: one for one in options_of(kind)}
+    hints = {name: Annotated[_type(one), _parameter(one)] for name, one in by_name.items()}
+    hints["index_from"] = Annotated[str, Parameter(parse=False)]
+    for base in kind.__mro__:
+        own = vars(base).get("__annotations__", {})
+        own.update({name: hints[name] for name in own.keys() & hints.keys()})
+    kind.__init__.__annotations__.update({**hints, "return": None})
+
+
+def check_needed(options: OptionSet, *, water: bool = True) -> None:
+    """Refuse a command without the options that it needs; `water` tells whether that is one."""
+    for one in options_of(type(options)):
+        wanted = one.declared.needed and (water or one.name != "water")
+        if wanted and getattr(options, one.name) is None:
+            raise UsageError(f"{one.flag} is needed")
+
+
+def _type(one: Option) -> Any:
+    """Return what the text of the command line becomes; what has a parser stays text."""
+    if one.declared.metavar == "PATH" or os.PathLike[str] in one.kinds:
+        return Path | None
+    return str | None if one.declared.parse is not None or one.type is Any else one.type
+
+
+def _parameter(one: Option) -> Parameter:
+    declared, default = one.declared, one.default
+    told = declared.default_is or ("" if default in (None, (), False) else str(default))
+    unit = f" [{declared.unit}]" if declared.unit else ""
+    has_opposite = one.type is bool and (default or one.name == "connected")
+    return Parameter(
+        help=f"{declared.help}{unit}{' (needed)' if declared.needed else ''}",
+        group=_GROUPS[one.panel],
+        negative_bool="no-" if has_opposite else (),
+        negative_none="no-" if one.name in ("below", "floating") else (),
+        negative_iterable=(),
+        show_default=(lambda value: told) if told else False,
+    )
+
+
+Quiet = Annotated[
+    bool,
+    Parameter(
+        name=["--quiet", "-q"],
+        negative=(),
+        group=_GROUPS["Output"],
+        help="No summary and no progress.",
+        show_default=False,
+    ),
+]
+
+
+@contextmanager
+def progress_bar(title: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
+    """Show a bar with points/s and the time left on a terminal; nothing when piped."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=None, rate="")
+        started = time.perf_counter()
+
+        def update(done: int, total: int) -> None:
+            rate = done / (time.perf_counter() - started)
+            bar.update(task, completed=done, total=total, rate=f"{rate:,.0f} points/s")
+
+        yield update
+
+
+@contextmanager
+def status_line(title: str, quiet: bool) -> Iterator[Callable[[str], None] | None]:
+    """Show a line of text that changes on a terminal; nothing when piped."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(title) as status:
+        yield lambda text: status.update(f"{title}: {text}")
+
+
+def say(text: str, quiet: bool = False) -> None:
+    """Print a summary, unless it is not wanted."""
+    if not quiet:
+        sys.stdout.write(text + "\n")

@@ -1,0 +1,306 @@
+"""The correction of a LAS or LAZ file, and of arrays: two doors to one calculation."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pcfix.errors import InputError, SettingError
+from pcfix.flow.carrying import Carrying
+from pcfix.flow.inputs import paths_in
+from pcfix.flow.job import Job
+from pcfix.flow.old_cameras import paired
+from pcfix.flow.points import correct_checked
+from pcfix.flow.runner import FileTask, file_task
+from pcfix.flow.surfaces import view_of
+from pcfix.io.las.columns import (
+    OutOfRangeError,
+    TooNarrowError,
+    changed_rows,
+    columns_for,
+    fill,
+    shift_steps,
+    shifted,
+)
+from pcfix.io.las.source import LasSource, centring_steps, coordinates
+from pcfix.io.las.writing import corrected_header
+from pcfix.model import BATHYMETRIC_POINT, Cameras, Summary, Views, WaterDimension
+from pcfix.options.correct import CorrectOptions, RefractionOptions, ScienceOptions
+from pcfix.options.declare import taken
+from pcfix.refract.batch import Batch, MadeWith, Survey
+from pcfix.refract.learning import learn_of_points
+from pcfix.threads import threads
+from pcfix.water.checks import as_surface, check_above_water, checked_points
+from pcfix.water.index import with_index
+from pcfix.water.surface import is_submerged, surface_above
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    import laspy
+    import numpy.typing as npt
+
+    from pcfix.flow.job import Points
+    from pcfix.flow.points import Label
+    from pcfix.flow.runner import Progress
+    from pcfix.model import Correction, FloatArray, WaterSurface
+    from pcfix.options.declare import File
+    from pcfix.refract.regression import DepthRegression
+
+
+def correct_points(
+    xyz: npt.ArrayLike,
+    cameras: Cameras,
+    water: WaterSurface | float | npt.ArrayLike,
+    *,
+    options: RefractionOptions | None = None,
+    views: Views | None = None,
+    may_be_submerged: npt.ArrayLike | None = None,
+    level_offset_m: npt.ArrayLike | None = None,
+    adjusted_from: Cameras | None = None,
+    regression: DepthRegression | None = None,
+    **keywords: Any,
+) -> Correction:
+    """Correct apparent points for refraction at the water surface.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 3)
+        Points as the SfM software placed them, metres, world frame. Those below the water
+        surface are moved, the others come back bit for bit.
+    cameras : Cameras
+        Poses in the same frame; see `pcfix.read_cameras`.
+    water : WaterSurface, float, or array of shape (n,)
+        The water surface (see `pcfix.read_water`), its level in metres, or its height above
+        each point, NaN where it is not known.
+    options : RefractionOptions, optional
+        Or its attributes as keywords, as of ``pcfix correct``: index, method, max_angle (degrees
+        from the surface normal), max_cameras, camera_set, matcher, depth_factor, sigma_image and
+        the other standard errors; occlusion is off unless asked for, as these points may not be
+        the whole cloud.
+    views : Views, optional
+        Which cameras made each point, rows of `adjusted_from` where that is given, else of
+        `cameras`. Default: as the option `camera_set` says.
+    may_be_submerged : array of bool, shape (n,), optional
+        The other points are land, even below the surface; `pcfix.label_points` finds them.
+        Default: all.
+    level_offset_m : array, shape (k,), optional
+        How much higher than `water` the surface stood when each camera took its image, as
+        `pcfix.io.tides.level_offsets` finds it. Each ray bends at its own surface; which points
+        are submerged, and how deep, goes by `water`. Default: zero.
+    adjusted_from : Cameras, optional
+        Those that the points were made with, in the same frame, where `cameras` are the same
+        images (matched by their labels) adjusted since. All points, land too, are first taken
+        from those to these; see `pcfix.flow.carrying`.
+    regression : DepthRegression, optional
+        With the method regression; see `pcfix.refract.regression`.
+
+    Returns
+    -------
+    Correction
+        One row per input point, in the same order.
+
+    Raises
+    ------
+    SettingError
+        If an argument is outside its rule, or a coordinate is not finite.
+    GeometryError
+        If a camera stands under the water.
+
+    Notes
+    -----
+    With the method snell, for each camera the line from the projection centre to the apparent
+    point is bent where it pierces the surface (Snell in vector form, Skarlatos & Agrafiotis
+    2018, eq 10); the true point is the one nearest to all bent rays in the sense of least squares
+    (eq 11, for any number of rays). Nothing is iterated and no sum depends on the number of
+    threads.
+
+    Examples
+    --------
+    Two cameras 100 m above a bed that looks 2 m deep:
+
+    >>> import numpy as np, pcfix
+    >>> cameras = pcfix.Cameras(("a", "b"), np.array([[-20.0, 0, 100], [20.0, 0, 100]]))
+    >>> result = pcfix.correct_points([[0.0, 0.0, -2.0]], cameras, 0.0)
+    >>> result.xyz.round(3).tolist()
+    [[0.0, 0.0, -2.703]]
+    """
+    given = taken(RefractionOptions, options, keywords, "correct_points", occlusion="off")
+    settings = with_index(given.part(ScienceOptions))
+    points = checked_points(xyz)
+    surface, dimension = as_surface(water, len(points))
+    offset = None if level_offset_m is None else _offsets(level_offset_m, len(cameras))
+    check_above_water(cameras, surface, offset)
+    if views is not None:
+        _check_views(views, len(points), len(adjusted_from or cameras))
+    label = None if may_be_submerged is None else _only(may_be_submerged, len(points))
+    step, made_with = None, None
+    if adjusted_from is not None:
+        pair = paired(adjusted_from, cameras)
+        step = Carrying(pair).step(points, views)
+        made_with = MadeWith(points, pair.old)
+        points, views, label = step.xyz, step.views, step.rule(label)
+    above = surface_above(surface, points, dimension)
+    batch = Batch(points, above, Survey(surface, cameras, settings, offset), views, made_with)
+    learned = learn_of_points(batch, regression)
+    batch = replace(batch, survey=replace(batch.survey, learned=learned))
+    found = correct_checked(batch, label)
+    return found if step is None else step.whole(found)
+
+
+def _offsets(level_offset_m: npt.ArrayLike, k: int) -> FloatArray:
+    offset = np.ascontiguousarray(level_offset_m, dtype=np.float64)
+    if offset.shape != (k,) or not np.isfinite(offset).all():
+        raise SettingError(
+            f"level_offset_m must be {k} finite numbers, one per camera, not of shape"
+            f" {offset.shape}."
+        )
+    return offset
+
+
+def _only(may_be_submerged: npt.ArrayLike, n: int) -> Label:
+    """Return the rule that of the points below the surface some are land."""
+    allowed = np.asarray(may_be_submerged)
+    if allowed.shape != (n,) or allowed.dtype != np.bool_:
+        raise SettingError(
+            f"may_be_submerged must be {n} booleans, not {allowed.dtype} of shape {allowed.shape}."
+        )
+    return lambda xyz, surface: is_submerged(xyz[:, 2], surface) & allowed
+
+
+def _check_views(views: Views, n: int, k: int) -> None:
+    if len(views.start) != n + 1 or views.start[0] != 0 or views.start[-1] != len(views.camera):
+        raise SettingError(f"views must have {n + 1} starts, from 0 to the number of entries.")
+    if (np.diff(views.start) < 0).any():
+        raise SettingError("views: the starts must not decrease.")
+    if len(views.camera) and not 0 <= views.camera.min() <= views.camera.max() < k:
+        raise SettingError(f"views name camera {views.camera.max()}, but there are {k}.")
+
+
+def correct_file(
+    input: File,
+    output: File,
+    *,
+    options: CorrectOptions | None = None,
+    progress: Progress | None = None,
+    **keywords: Any,
+) -> Summary:
+    """Correct a LAS or LAZ cloud; what ``pcfix correct`` runs.
+
+    Parameters
+    ----------
+    input, output : path
+        The names end in ``.las`` or ``.laz``; the output is LAS 1.4, point format 6, 7 or 8 (9
+        or 10 for inputs with waveforms).
+    options : CorrectOptions, optional
+        Or its attributes as keywords, as of ``pcfix correct``: ``cameras`` (a path or
+        `pcfix.Cameras`), ``water`` (what `pcfix.read_water` takes, a `pcfix.WaterSurface`,
+        shoreline points in a vector file, or ``auto``) and many more.
+    progress : callable, optional
+        Called with (points done, points in all) after each chunk.
+
+    Returns
+    -------
+    Summary
+
+    Raises
+    ------
+    PcfixError
+        With one sentence on what to mend; no output is left behind.
+    """
+    given = taken(CorrectOptions, options, keywords, "correct_file")
+    task = file_task(input, output, given, reads=paths_in(given), progress=progress)
+    step = Correcting(job_for(task.source, given), given.jobs)
+    with threads(given.jobs):
+        step.job.look_around(lambda: file_points(task.source, step.job.water, given.jobs))
+        _run_until_it_fits(task, step)
+    result = step.job.summary(str(task.source), str(task.target), task.seconds)
+    task.tell(result.as_dict())
+    return result
+
+
+def job_for(path: Path, options: CorrectOptions) -> Job:
+    """Return the job of correcting a LAS or LAZ file."""
+    view = view_of(path)
+    with LasSource(path) as source:
+        step_m = float(max(source.header.scales))
+    return Job(str(path), options, view, step_m)
+
+
+def file_points(path: Path, water: WaterSurface, jobs: int | None = None) -> Iterator[Points]:
+    """Yield all points of a LAS or LAZ file, chunk by chunk."""
+    with LasSource(path, jobs) as source:
+        for points in source.chunks():
+            heights = water_heights(water, source, points)
+            yield coordinates(points), heights, np.asarray(points["classification"])
+
+
+def water_heights(
+    water: WaterSurface, source: LasSource, points: laspy.ScaleAwarePointRecord
+) -> FloatArray | None:
+    """Return the heights of the water of a chunk, shape (n,), where they are a dimension."""
+    return source.dimension(points, water.name) if isinstance(water, WaterDimension) else None
+
+
+class Correcting:
+    """The step that corrects points.
+
+    Parameters
+    ----------
+    job : Job
+    jobs : int or None
+        Threads.
+    """
+
+    def __init__(self, job: Job, jobs: int | None) -> None:
+        self.job, self._jobs = job, jobs
+        self._columns = columns_for(job.options.dimensions)
+        self.wide = False
+        self.steps: tuple[int, ...] = (0, 0, 0)
+
+    def header(self, source: LasSource) -> laspy.LasHeader:
+        """Return the header with the new dimensions and the record of what is done."""
+        return corrected_header(
+            source, self._columns, self.job.provenance(), wide=self.wide, steps=self.steps
+        )
+
+    def chunk(
+        self, points: laspy.ScaleAwarePointRecord, source: LasSource, header: laspy.LasHeader
+    ) -> laspy.ScaleAwarePointRecord:
+        """Return corrected points with their new dimensions, classes and flags."""
+        heights = water_heights(self.job.water, source, points)
+        classes = np.asarray(points["classification"])
+        correction = self.job.correct(coordinates(points), heights, classes)
+        moved = shift_steps(correction, header.scales)
+        new = shifted(points, header, moved + np.array(self.steps))
+        withheld = np.asarray(new["withheld"]).astype(bool)
+        withhold = self.job.options.uncorrected == "withhold"
+        changed = changed_rows(correction, withheld, withhold=withhold)
+        fill(new, self._columns, correction, moved, changed)
+        new.array["classification"][correction.corrected] = BATHYMETRIC_POINT
+        if withhold:
+            new["withheld"][:] = (withheld | correction.uncorrected).astype(np.uint8)
+        return new[~correction.uncorrected] if self.job.options.uncorrected == "drop" else new
+
+    def finish(self) -> None:
+        """Refuse a result in which cloud, water and cameras did not meet."""
+        self.job.check_fit()
+
+
+def _run_until_it_fits(task: FileTask, step: Correcting) -> None:
+    """Write with narrow types and the input's offsets, and again where a cloud is beyond them."""
+    while True:
+        try:
+            return task.run(step)
+        except TooNarrowError:
+            step.wide = True
+        except OutOfRangeError as axis:
+            old, step.steps = step.steps, centring_steps(task.source, task.jobs)
+            if step.steps == old:
+                raise InputError(
+                    f"{task.source}: the scale of {axis} is too fine to hold the result in 32"
+                    " bits; write the cloud with a coarser scale first."
+                ) from axis
+        step.job.restart()

@@ -1,0 +1,243 @@
+"""A correction through a water surface: what it learns first, what it does, what it checks."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pcfix.adjust.carry import Carrying
+from pcfix.flow.diagnosis import diagnose_in_passing
+from pcfix.flow.learning import Learning
+from pcfix.flow.old_cameras import old_tie_points
+from pcfix.flow.points import correct_checked
+from pcfix.label.labelling import Part
+from pcfix.model import WaterDimension, WaterPlane
+from pcfix.refract.batch import Batch, Survey
+from pcfix.refract.learning import kind_of_views
+from pcfix.water.checks import WaterMeeting, check_above_water, check_tilt, refuse_under_water
+from pcfix.water.surface import is_submerged, surface_above
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from pcfix.flow.inputs import Inputs
+    from pcfix.flow.job import ListedViews, Points
+    from pcfix.flow.old_cameras import Blocks
+    from pcfix.flow.points import Label
+    from pcfix.flow.surfaces import CloudView
+    from pcfix.label.labelling import Labelling
+    from pcfix.model import Correction, FloatArray, TiePoints, ViewKind, Views, WaterSurface
+    from pcfix.options.correct import CorrectOptions
+    from pcfix.refract.batch import MadeWith
+    from pcfix.refract.tally import Tally
+
+
+class ThroughWater:
+    """The light bends at a water surface, and the cloud may come from other cameras.
+
+    Parameters
+    ----------
+    options : CorrectOptions
+    inputs : Inputs
+    blocks : Blocks
+    view : CloudView
+
+    Raises
+    ------
+    PcfixError
+        If the water cannot be read or found, a camera stands under it, or the method lacks
+        something that it cannot do without.
+    """
+
+    settings: dict[str, Any]
+
+    @staticmethod
+    def check(options: CorrectOptions) -> None:
+        """Refuse options that are of no use here; there are none."""
+
+    def __init__(
+        self, options: CorrectOptions, inputs: Inputs, blocks: Blocks, view: CloudView
+    ) -> None:
+        self.settings = {}
+        self._options, self._inputs, self._view = options, inputs, view
+        self._cameras = blocks.cameras
+        self.carrying = None if blocks.pair is None else Carrying(blocks.pair)
+        self.found = inputs.surface(view)
+        self.water = self.found.surface
+        self.level_offset_m = inputs.level_offset_m(self._cameras)
+        check_above_water(self._cameras, self.water, self.level_offset_m)
+        check_tilt(self.water)
+        self._learning = Learning(
+            Survey(self.water, self._cameras, options, self.level_offset_m), inputs, view,
+            None if blocks.views is None else blocks.views.kind,
+            None if blocks.pair is None else self._old_ties,
+        )  # fmt: skip
+        self.survey = self._learning.survey
+        self._kind: ViewKind | None = None
+        self._kind_notes: list[str] = []
+        self._bent = ""
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the chunks so far."""
+        self._meeting = WaterMeeting(self.water)
+        if self.carrying is not None:
+            self.carrying.restart()
+
+    def look_around(
+        self,
+        chunks: Callable[[], Iterable[Points]],
+        labelling: Labelling,
+        views: ListedViews,
+    ) -> None:
+        """Learn what must be known of the whole cloud, before the first chunk is corrected."""
+        around, makers = chunks, None
+        if self.carrying is not None:
+            around = partial(self._carried, chunks, self.carrying, views)
+            makers = partial(self._makers, chunks, self.carrying)
+        if labelling.looks_around:
+            labelling.look_around(
+                lambda: parts_of(around(), self.water), self._view.low, self._view.high
+            )
+        learned = self._learning.of_cloud(around, makers)
+        self.survey = replace(self.survey, learned=learned)
+
+    @staticmethod
+    def _carried(
+        chunks: Callable[[], Iterable[Points]], carrying: Carrying, views: ListedViews
+    ) -> Iterator[Points]:
+        """Yield the whole cloud as it lies with the adjusted cameras."""
+        listed, row = views.all_anew(), 0
+        for xyz, heights, classes in chunks():
+            yield carrying.step(xyz, listed(xyz, row)).xyz, heights, classes
+            row += len(xyz)
+
+    @staticmethod
+    def _makers(chunks: Callable[[], Iterable[Points]], carrying: Carrying) -> Iterator[MadeWith]:
+        """Yield what made the points of the whole cloud."""
+        for xyz, _, _ in chunks():
+            yield carrying.made_with(xyz)
+
+    def _old_ties(self) -> TiePoints | None:
+        """Return the tie points of the old model, else those of the adjusted one taken back."""
+        if self.carrying is None:
+            return None
+        ties, are_old = old_tie_points(self._inputs, self.carrying.pair, self._view.crs)
+        return ties if ties is None or are_old else self.carrying.of_new_ties(ties)
+
+    def correct(self, points: Points, views: Views | None, labelling: Labelling) -> Correction:
+        """Correct one chunk; see `pcfix.flow.job.Job.correct`."""
+        xyz, heights, classes = points
+        label: Label = partial(labelling.submerged, classes=classes)
+        step, made_with = None, None
+        if self.carrying is not None:
+            step, made_with = self.carrying.step(xyz, views), self.carrying.made_with(xyz)
+            xyz, views, label = step.xyz, step.views, step.rule(label)
+        above = surface_above(self.water, xyz, heights)
+        batch = self._of_kind(Batch(xyz, above, self.survey, views, made_with))
+        correction = correct_checked(batch, label, self._level_sigma_m)
+        if self.carrying is not None and step is not None:
+            correction = step.whole(correction)
+            self.carrying.add(step, correction)
+        self._meeting.add(xyz, correction)
+        return correction
+
+    def _of_kind(self, batch: Batch) -> Batch:
+        """Return a chunk with its views as what they are; the first one tells what they list."""
+        if batch.views is None or self.survey.learned.matcher is None:
+            return batch
+        if self._inputs.views_are != "auto":
+            return batch
+        if self._kind is None:
+            rows = np.flatnonzero(is_submerged(batch.xyz[:, 2], batch.surface))
+            found = kind_of_views(batch.take(rows))
+            self._kind = batch.views.kind if found is None else found.kind
+            self._kind_notes = [] if found is None else [str(found)]
+        return replace(batch, views=replace(batch.views, kind=self._kind))
+
+    def _level_sigma_m(self, xy: FloatArray) -> FloatArray | None:
+        """Return the standard error of the water's height at places, where its fit says one."""
+        found = self.found.evidence
+        if found is None:
+            return None
+        if hasattr(found, "sigma_at"):
+            return np.asarray(found.sigma_at(xy))
+        sigma = getattr(found, "sigma_level_m", None)
+        return None if sigma is None else np.full(len(xy), float(sigma))
+
+    def provenance(self) -> dict[str, Any]:
+        """Return what a file shall say of the water."""
+        plane = list(astuple(self.water)) if isinstance(self.water, WaterPlane) else None
+        carried = {} if self.carrying is None else self.carrying.provenance()
+        return {"water": str(self.water), "water_plane": plane, **carried}
+
+    def check_carried(self, name: str) -> None:
+        """Refuse a cloud that could not be taken to the adjusted cameras."""
+        if self.carrying is not None:
+            self.carrying.check(name)
+
+    def check_meeting(self, name: str, tally: Tally) -> None:
+        """Refuse water that does not lie where the cloud is."""
+        self._meeting.check_submerged(name)
+        if isinstance(self.water, WaterDimension):
+            refuse_under_water(self._cameras, tally.lowest_water_m, str(self.water))
+        self._meeting.check_reach(name)
+
+    def out_of_sight(self, tally: Tally) -> str:
+        """Return what to say where no camera has a submerged point in sight."""
+        middle = (tally.low + tally.high) / 2.0
+        distance = float(np.hypot(*(self._cameras.centres - middle)[:, :2].T).min())
+        limit = self._options.max_angle
+        return (
+            "no camera has a submerged point in sight"
+            + (f" within {limit:g} degrees" if limit else "")
+            + f"; the nearest stands {_distance(distance)} in plan from the middle of the"
+            f" {tally.submerged:,} submerged points; check that cameras and cloud have the"
+            " same CRS, and that pitch 0 means straight down."
+        )
+
+    def look_back(self) -> None:
+        """Warn if what the correction was made with says that the poses are bent."""
+        self._bent = diagnose_in_passing(
+            self._inputs, self._cameras, self.water, self._options.refractive_index, self._view
+        )
+
+    def notes(self, tally: Tally) -> list[str]:
+        """Return what was done on the user's behalf."""
+        bent = [self._bent] if self._bent else []
+        return [
+            *self._learning.notes,
+            *self._kind_notes,
+            *self.found.notes,
+            *self._meeting.notes,
+            *bent,
+        ]
+
+    def figures(self, tally: Tally) -> dict[str, Any]:
+        """Return what the summary says of depths and water."""
+        moved, water = self.level_offset_m, str(self.water)
+        if moved is not None:
+            times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
+            water = f"{water}, {times}"
+        return {
+            "depth_m": tally.depth_m(),
+            "water": water,
+            "water_fit": self.found.as_dict(),
+            "uncertainty": tally.uncertainty(),
+            "carried": None if self.carrying is None else self.carrying.as_dict(),
+            "absorbed": bool(self._bent),
+        }
+
+
+def parts_of(chunks: Iterable[Points], water: WaterSurface) -> Iterable[Part]:
+    """Return chunks with the water above them."""
+    return (
+        Part(xyz, surface_above(water, xyz, heights), classes) for xyz, heights, classes in chunks
+    )
+
+
+def _distance(metres: float) -> str:
+    return f"{metres / 1000.0:,.1f} km" if metres >= 10_000.0 else f"{metres:,.1f} m"

@@ -1,0 +1,317 @@
+"""The options of made-up scenes: simulate, demo, and the effect of refraction on a stereo pair."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from pcfix.errors import SettingError
+from pcfix.options.declare import OptionSet, Rule, at_least, option
+from pcfix.options.shared import (
+    CAMERA,
+    CLOUDS,
+    EFFECT,
+    FLIGHT,
+    OUTPUT,
+    WATER,
+    IndexOptions,
+    OverwriteOption,
+)
+
+BlockKind = Literal["nadir", "oblique"]
+BedKind = Literal["shore", "flat", "slope", "steps", "river"]
+CloudKind = Literal["tracks", "pairs", "depth-maps"]
+
+
+def _range(name: str, unit: str, least: float, most: float, what: str) -> Rule:
+    """Return the rule of a range, with what it is of."""
+
+    def rule(option: str, value: Any) -> str | None:
+        if least <= value <= most:
+            return None
+        if least == 0 and value < 0:
+            return f"{name} {value:g}{unit} is negative: give {what}."
+        return f"{name} {value:g}{unit} is outside {least:g} to {most:g}: give {what}."
+
+    return rule
+
+
+def _numbers(count: int, *, above_zero: bool = True) -> Rule:
+    """Return the rule of so many finite numbers."""
+
+    def rule(option: str, values: Any) -> str | None:
+        name = option.replace("-", "_")
+        if len(values) != count or not all(abs(value) < float("inf") for value in values):
+            return f"{name} {values} must be {count} finite numbers."
+        if above_zero and min(values) <= 0:
+            return f"{name} {values} must be positive: width and height."
+        return None
+
+    return rule
+
+
+def _seed(option: str, value: Any) -> str | None:
+    return f"seed {value} is negative: give a whole number from 0." if value < 0 else None
+
+
+def _level(option: str, value: Any) -> str | None:
+    return None if abs(value) < float("inf") else f"water level {value} must be a finite height, m."
+
+
+def _points(option: str, value: Any) -> str | None:
+    return None if value >= 1 else f"points {value} is less than 1."
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightOptions(OptionSet):
+    """How the block is flown."""
+
+    panel = FLIGHT
+
+    block: BlockKind = option("nadir", "Nadir images only, or obliques too.")
+    cameras: int | None = option(
+        None,
+        "About so many nadir images; the area grows or shrinks with it.",
+        rule=at_least(9, "a block needs some overlap"),
+        default_is="as the area needs",
+    )
+    flying_height_m: float = option(
+        80.0,
+        "Above the water.",
+        rule=_range("flying height", " m", 0.5, 10_000, "the height above the water"),
+    )
+    area_m: tuple[float, float] = option(
+        (120.0, 80.0), "Extent along and across the strips.", rule=_numbers(2)
+    )
+    forward_overlap: float = option(
+        0.8,
+        "Share of an image in the next, at the water.",
+        rule=_range("forward overlap", "", 0.3, 0.95, "the share of an image in the next"),
+    )
+    side_overlap: float = option(
+        0.7,
+        "Share of a strip in the next, at the water.",
+        rule=_range("side overlap", "", 0.0, 0.95, "the share of a strip in the next"),
+    )
+    obliques_deg: float | None = option(
+        None,
+        "Fly obliques at this angle from straight down.",
+        rule=_range("obliques", " deg", 1, 60, "the angle from straight down"),
+        default_is="20 in oblique blocks",
+    )
+    oblique_directions: int = option(
+        4,
+        "Headings of obliques, from north.",
+        rule=_range("oblique directions", "", 1, 36, "how many ways obliques look"),
+    )
+    oblique_share: float | None = option(
+        None,
+        "Share of the images that are obliques, 1: all.",
+        rule=_range("oblique share", "", 0.01, 1.0, "the share of images that are obliques"),
+        default_is="each direction a third as dense as the nadir images",
+    )
+    position_noise_m: float = option(
+        0.0,
+        "Error (sd) of the projection centres given.",
+        rule=_range("position noise", " m", 0, 100, "a standard deviation"),
+    )
+    attitude_noise_deg: float = option(
+        0.0,
+        "Error (sd) of the yaw, pitch, roll given.",
+        rule=_range("attitude noise", " deg", 0, 5, "a standard deviation"),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraOptions(OptionSet):
+    """The camera, and how well it measures."""
+
+    panel = CAMERA
+
+    focal_mm: float = option(
+        8.8, "Focal length.", rule=_range("focal length", " mm", 0.5, 2000, "that of the lens")
+    )
+    sensor_mm: tuple[float, float] = option(
+        (13.2, 8.8), "Width and height of the sensor; pixels are square.", rule=_numbers(2)
+    )
+    sensor_px: tuple[int, int] = option((5472, 3648), "The same in pixels.", rule=_numbers(2))
+    distortion: tuple[float, float, float, float, float] = option(
+        (0.0, 0.0, 0.0, 0.0, 0.0),
+        "Brown's k1 k2 k3 p1 p2, in Metashape's order; all known to the user.",
+        rule=_numbers(5, above_zero=False),
+    )
+    image_noise: float = option(
+        0.5,
+        "Noise of image points (sd).",
+        unit="px",
+        rule=_range("image noise", " px", 0, 100, "a standard deviation"),
+        old=("image_noise_px",),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneWaterOptions(IndexOptions):
+    """The water and the ground."""
+
+    panel = WATER
+
+    water: float = option(
+        0.37, "Water level, mid area.", unit="m", rule=_level, old=("water_level_m",)
+    )
+    wave_slope_deg: float = option(
+        0.0,
+        "Slope (sd, along an axis) of waves.",
+        rule=_range("wave slope", " deg", 0, 10, "the standard deviation along one axis"),
+    )
+    wave_length_m: float = option(
+        1.0, "Of waves.", rule=_range("wavelength", " m", 0.01, 1000, "from crest to crest")
+    )
+    tilt_percent: float | None = option(
+        None,
+        "How steeply the water falls.",
+        rule=_range("tilt", " %", 0, 20, "how far the water falls in 100 m"),
+        default_is="0, of a river 0.3",
+    )
+    tilt_heading_deg: float = option(
+        90.0,
+        "Where it falls to, clockwise from north.",
+        rule=_range("tilt heading", " deg", -360, 360, "where the water falls to, from north"),
+    )
+    bed: BedKind = option("shore", "Shape of the ground.")
+    greatest_depth_m: float | None = option(
+        None,
+        "Below the water.",
+        rule=_range("greatest depth", " m", 0.01, 1000, "metres below the water"),
+        default_is="shore 12, flat 3, slope 6, steps 6, river 2.5",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneCloudOptions(OptionSet):
+    """The cloud that is made of the images, and the LiDAR."""
+
+    panel = CLOUDS
+
+    points: int = option(100_000, "Points of the cloud.", rule=_points)
+    cloud: CloudKind = option(
+        "tracks", "Of all images at once, the median of stereo pairs, or fused depth maps."
+    )
+    detection: float = option(
+        1.0,
+        "Probability that an image that shows a point takes part; three at least do.",
+        rule=_range("detection", "", 0.01, 1.0, "a probability"),
+    )
+    neighbours: int | None = option(
+        None,
+        "Images that each is matched with.",
+        rule=_range("neighbours", "", 1, 20, "how many images each is matched with"),
+        default_is="pairs 4, depth-maps 5",
+    )
+    lidar_per_m2: float = option(
+        2.0,
+        "Points of the LiDAR per m2.",
+        rule=_range("lidar density", " points/m2", 0, 10_000, "points per square metre"),
+    )
+    lidar_noise_m: float = option(
+        0.05,
+        "Error (sd) of its heights.",
+        rule=_range("lidar noise", " m", 0, 10, "a standard deviation"),
+    )
+    seed: int = option(
+        1,
+        "Of the random numbers; each kind of noise has its own, so that switching one on changes"
+        " neither terrain nor block.",
+        rule=_seed,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions(SceneCloudOptions, SceneWaterOptions, CameraOptions, FlightOptions):
+    """What a simulated scene can be asked for."""
+
+
+def _effect_numbers(option: str, text: str) -> tuple[float, ...]:
+    try:
+        found = tuple(dict.fromkeys(float(word) for word in text.split(",")))
+    except ValueError:
+        raise SettingError(f"--{option} {text} is not a list of numbers, as 50,100.") from None
+    if len(found) > 6:
+        raise SettingError(f"--{option} {text} has {len(found)} numbers; give 6 at most.")
+    return found
+
+
+def _frame(option: str, text: str) -> tuple[int, int]:
+    try:
+        width, height = (int(side) for side in text.lower().split("x"))
+    except ValueError:
+        raise SettingError(
+            f"--{option} {text} is not WIDTHxHEIGHT in pixels, as 4000x3000."
+        ) from None
+    return width, height
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectOptions(OptionSet):
+    """A pair of vertical images, and how far refraction puts its points wrong."""
+
+    panel = EFFECT
+
+    effect_focal_mm: float | None = option(
+        None,
+        "Focal length of a camera of your own, with --effect-frame-px and --effect-pixel-um.",
+        default_is="the paper's two cameras",
+    )
+    effect_frame_px: tuple[int, int] | None = option(
+        None,
+        "Its frame, as 4000x3000; the height is flown along.",
+        parse=_frame,
+        metavar="WIDTHxHEIGHT",
+    )
+    effect_pixel_um: float | None = option(None, "Its pixel size.")
+    effect_overlap: float | None = option(
+        None, "Overlap of the two images, 0 to 1.", default_is="0.8"
+    )
+    effect_heights: tuple[float, ...] | None = option(
+        None,
+        "Above the water, metres.",
+        parse=_effect_numbers,
+        default_is="50,100,200; UltraCam 500,1000,3000",
+        metavar="M,M",
+    )
+    effect_depths: tuple[float, ...] | None = option(
+        None,
+        "Depths that the cloud shows, metres; maps are drawn of the largest.",
+        parse=_effect_numbers,
+        default_is="1,2,5,10,15",
+        metavar="M,M",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulateOptions(OverwriteOption, EffectOptions, SceneOptions):
+    """The options of ``pcfix simulate``."""
+
+    panel = OUTPUT
+
+    refraction_effect: bool = option(
+        False,
+        "No scene, but how far refraction puts points wrong in a pair of vertical images"
+        " (Skarlatos & Agrafiotis 2018, Figures 4 to 6): maps, tables.",
+    )
+
+    def check(self) -> None:
+        """Refuse options that say nothing without --refraction-effect."""
+        super().check()
+        given = [name for name in self.plain() if name.startswith("effect_")]
+        if given and not self.refraction_effect:
+            flag = given[0].replace("_", "-")
+            raise SettingError(f"--{flag} goes with --refraction-effect; add it or leave it out.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions(OverwriteOption):
+    """The options of ``pcfix demo``."""
+
+    panel = OUTPUT
+
+    points: int = option(50_000, "Points of each scene.")
