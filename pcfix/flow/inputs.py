@@ -41,6 +41,8 @@ class Inputs(InputOptions):
     apart by `pcfix.flow.old_cameras`.
     """
 
+    water_mask: File | None = None
+
     def check(self) -> None:
         """Check that the light bends somewhere, and at one place only."""
         super().check()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import numpy as np
 
 from pcfix.adjust.carry import Carrying
 from pcfix.errors import GeometryError, PcfixWarning
@@ -23,6 +22,7 @@ from pcfix.version import __version__
 from pcfix.water.index import with_index
 
 if TYPE_CHECKING:
+    import numpy as np
     from collections.abc import Callable, Iterable
 
     import numpy.typing as npt

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from pcfix.flow.job import Points
     from pcfix.flow.runner import Progress
     from pcfix.flow.surfaces import CloudView
-    from pcfix.label.labelling import Labels
     from pcfix.label.areas import WaterMask
+    from pcfix.label.labelling import Labels
     from pcfix.model import FloatArray, WaterSurface
     from pcfix.options.declare import File
 
