@@ -27,18 +27,13 @@ from pcfix.options.declare import taken
 from pcfix.options.survey import AdjustOptions, AdjustRules
 
 if TYPE_CHECKING:
-    from pcfix.options.declare import File
-    from pcfix.model import Cameras
     from collections.abc import Callable
     from os import PathLike
 
     from pcfix.adjust.problem import LogRow
     from pcfix.adjust.result import Adjusted
-    from pcfix.flow.surfaces import WaterModel
-    from pcfix.io.cameras.formats import Angles
-    from pcfix.model import Cameras, GroundControl, WaterSurface
-    from pcfix.options import ViewsAre
-    from pcfix.port.shapes import Port
+    from pcfix.model import Cameras
+    from pcfix.options.declare import File
 
     AnyPath = str | PathLike[str]
 

@@ -18,7 +18,7 @@ from pcfix.flow.diagnosis import (
     ties_of,
 )
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.points import CHUNK_POINTS
+from pcfix.flow.runner import write_summary
 from pcfix.flow.surfaces import CloudView, find_surface, view_of
 from pcfix.io.cameras.georeference import adjusted_minus_gnss
 from pcfix.io.cameras.mistakes import likely_mistake
@@ -29,13 +29,12 @@ from pcfix.io.ground_control import read_ground_control
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.lens.frames import cameras_in_sight
 from pcfix.model import WaterDimension
-from pcfix.flow.runner import write_summary
 from pcfix.options.declare import taken
 from pcfix.options.survey import CamerasCheckOptions, WaterCheckOptions
-from pcfix.water.index import index_of
 from pcfix.report.cameras import CamerasReport, Fit, GnssResiduals, Sensor, block_figure
 from pcfix.report.page import png_of
 from pcfix.report.water import WaterReport, water_figure
+from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:

@@ -12,7 +12,6 @@ import numpy as np
 
 from pcfix.clean.points import check_tile, flag_neighbours, flag_weak
 from pcfix.clean.settings import CleanSummary, Reason
-from pcfix.options.steps import CleanRules
 from pcfix.errors import InputError
 from pcfix.flow.surfaces import find_surface, view_of
 from pcfix.io.files import check_input, check_output, scratch_arrays, write_text

@@ -36,6 +36,8 @@ from pcfix.io.rasters import (
     write_part,
 )
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES
+from pcfix.options.declare import File, taken
+from pcfix.options.steps import DsmOptions, DsmRules
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
@@ -47,7 +49,7 @@ if TYPE_CHECKING:
     from rasterio.io import DatasetReader, DatasetWriter
 
     from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.options.steps import DsmMethod, SurfaceChoice
+    from pcfix.options.steps import SurfaceChoice
 
     AnyPath = str | os.PathLike[str]
     Progress = Callable[[int, int], None]

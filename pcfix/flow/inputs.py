@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
     from pcfix.flow.surfaces import CloudView
-    from pcfix.water.surface import FoundSurface
     from pcfix.io.views import ViewList
     from pcfix.label.areas import WaterMask
     from pcfix.model import FloatArray, TiePoints
+    from pcfix.water.surface import FoundSurface
 
     AnyPath = str | PathLike[str]
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import warnings
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-
-from pcfix.adjust.carry import Carrying
 from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.flow.inputs import Inputs, mask_of
 from pcfix.flow.old_cameras import read_blocks
@@ -22,9 +20,9 @@ from pcfix.version import __version__
 from pcfix.water.index import with_index
 
 if TYPE_CHECKING:
-    import numpy as np
     from collections.abc import Callable, Iterable
 
+    import numpy as np
     import numpy.typing as npt
 
     from pcfix.flow.surfaces import CloudView

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import astuple
 from os import PathLike
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 

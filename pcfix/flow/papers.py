@@ -23,9 +23,6 @@ own true position, not against the bed below or above it.
 
 from __future__ import annotations
 
-from pcfix.errors import SettingError
-from pcfix.water.index import index_of
-
 import json
 from dataclasses import asdict
 from pathlib import Path
@@ -33,9 +30,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.flow.points import correct_points
+from pcfix.errors import SettingError
+from pcfix.flow.correct import correct_points
 from pcfix.io.files import check_output, write_bytes
-from pcfix.options import DEFAULT_REFRACTIVE_INDEX
 from pcfix.report.page import png_of
 from pcfix.report.papers import (
     DepthBins,
@@ -63,13 +60,12 @@ from pcfix.simulate.refraction_effect import (
     shan_iterations,
 )
 from pcfix.version import __version__
+from pcfix.water.index import index_of
 
 if TYPE_CHECKING:
+    from pcfix.model import BoolArray, FloatArray, IntArray
     from pcfix.options.declare import File
     from pcfix.options.scenes import SimulateOptions
-    import os
-
-    from pcfix.model import BoolArray, FloatArray, IntArray
 
 BIN_M = 0.1
 CHECKS_PER_BIN = 10

@@ -15,7 +15,6 @@ from pcfix.io.water import read_water
 from pcfix.water.surface import FoundSurface
 
 if TYPE_CHECKING:
-    from pcfix.options.shared import WaterOptions
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
     from pcfix.model import FloatArray, WaterSurface
+    from pcfix.options.shared import WaterOptions
     from pcfix.water.fit import WaterFit
     from pcfix.water.river import RiverFit
 

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-
-from pcfix.errors import SettingError
-from pcfix.grid.lattice import check_resolution
-from pcfix.options.steps import MAX_HOLE_CELLS, DsmMethod, SurfaceChoice
 
 if TYPE_CHECKING:
     import numpy.typing as npt

@@ -133,10 +133,12 @@ class RefractionOptions(BudgetOptions, MethodOptions):
 
     @property
     def max_angle_deg(self) -> float | None:  # TRANSITION
+        """Return it under its old name."""
         return self.max_angle
 
     @property
     def errors(self) -> Any:  # TRANSITION
+        """Return it under its old name."""
         from pcfix.options.settings import ErrorBudget
 
         return ErrorBudget(
@@ -173,14 +175,17 @@ class LabelRules(LandRules):
 
     @property
     def band_m(self) -> float:  # TRANSITION
+        """Return it under its old name."""
         return self.band
 
     @property
     def dead_band_m(self) -> float:  # TRANSITION
+        """Return it under its old name."""
         return self.dead_band
 
     @property
     def least_pool_m2(self) -> float | None:  # TRANSITION
+        """Return it under its old name."""
         return self.least_pool
 
     panel = WATER

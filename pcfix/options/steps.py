@@ -128,7 +128,6 @@ class CleanRules(OptionSet):
         if not (self.statistical or self.radius is not None or self.weak or self.below_or_floating):
             raise SettingError("No test is left to run: leave at least one of them on.")
 
-
     @property
     def below_or_floating(self) -> bool:
         """Whether any test against the bed runs."""

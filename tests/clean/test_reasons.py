@@ -10,9 +10,9 @@ import pytest
 from pcfix.clean import points as door
 from pcfix.clean.points import clean_points
 from pcfix.clean.settings import Reason
-from pcfix.options.steps import CleanRules
 from pcfix.errors import InputError, SettingError
 from pcfix.model import WaterPlane
+from pcfix.options.steps import CleanRules
 from tests.clean.scenes import spoilt_scene
 
 
