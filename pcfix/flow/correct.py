@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.adjust.carry import Carrying
 from pcfix.errors import InputError, SettingError
-from pcfix.flow.carrying import Carrying
 from pcfix.flow.inputs import paths_in
 from pcfix.flow.job import Job
 from pcfix.flow.old_cameras import paired
@@ -94,7 +94,7 @@ def correct_points(
     adjusted_from : Cameras, optional
         Those that the points were made with, in the same frame, where `cameras` are the same
         images (matched by their labels) adjusted since. All points, land too, are first taken
-        from those to these; see `pcfix.flow.carrying`.
+        from those to these; see `pcfix.adjust.carry`.
     regression : DepthRegression, optional
         With the method regression; see `pcfix.refract.regression`.
 

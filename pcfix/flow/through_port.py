@@ -15,7 +15,7 @@ import numpy as np
 from pcfix.errors import GeometryError, SettingError
 from pcfix.flow.points import spread_over
 from pcfix.model import Correction, WaterPlane
-from pcfix.port.intersection import correct_through_port
+from pcfix.port.methods import correct_through_port
 from pcfix.water.surface import SurfaceAbove
 
 if TYPE_CHECKING:
