@@ -194,10 +194,11 @@ def mask_of(
     return WaterMask(polygons.area, polygons.name, low, high, polygons.notes)
 
 
-def paths_in(options: Any) -> list[File]:
-    """Return what among the options of a command may be files that it reads."""
+def paths_in(options: Any, but: tuple[str, ...] = ()) -> list[File]:
+    """Return what among the options of a command, `but` some, may be files that it reads."""
     names = [one.name for one in options_of(InputOptions)] + ["water_mask"]
-    given = [file_of(getattr(options, name, None)) for name in names if name not in NO_FILES]
+    left_out = (*NO_FILES, *but)
+    given = [file_of(getattr(options, name, None)) for name in names if name not in left_out]
     return [one for one in given if isinstance(one, str | PathLike)]
 
 

@@ -93,7 +93,7 @@ class Request(RunOptions):
 
     def files(self) -> list[Path]:
         """Return the input files, each of which exists."""
-        names = [self.input, *paths_in(replace(self, water=None)), self.reference]
+        names = [self.input, *paths_in(self, but=("water",)), self.reference]
         names += [self.gcps, self.gnss, self.lens]
         found = [path for name in names if name is not None for path in files_in(name)]
         return [*found, Path(self.water)] if Path(self.water).is_file() else found
