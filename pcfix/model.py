@@ -440,7 +440,7 @@ class Correction:
     incidence_deg : array, shape (n,)
         The largest incidence angle in air among the rays used.
     sigma_z_m : array, shape (n,)
-        Formal standard error of Z: what the errors in `pcfix.ErrorBudget` come to by the law of
+        Formal standard error of Z: what the options ``sigma_...`` come to by the law of
         propagation. It is as good as the budget, and knows nothing of mismatches, of rays that
         did not make the point, or of what a method leaves out.
     camera_used : array of bool, shape (k,)

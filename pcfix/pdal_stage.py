@@ -48,8 +48,7 @@ Set = TypeVar("Set", bound=OptionSet)
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from pcfix.flow.job import Points
-    from pcfix.flow.surfaces import CloudView
+    from pcfix.flow.surfaces import CloudView, Points
     from pcfix.model import FloatArray, WaterSurface
     from pcfix.options.declare import Option
 

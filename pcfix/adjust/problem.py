@@ -51,6 +51,12 @@ class LogRow(NamedTuple):
     observations: int
     rms_px: float
 
+    def __str__(self) -> str:
+        return (
+            f"round {self.round}, step {self.step}, {self.observations:,} observations,"
+            f" {self.rms_px:.3f} px"
+        )
+
 
 @dataclass(eq=False)
 class Problem:

@@ -24,7 +24,7 @@ app = App(
     help_flags=["--help", "-h"],
     help_format="plaintext",
 )
-for command, example in EXAMPLES.items():
+for command, example in EXAMPLES:
     prepare(command)
     summary, _, more = str(command.__doc__).partition("\n")
     lines = [summary, *(line.strip() for line in more.splitlines()), "", f"Example: {example}"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -260,19 +261,19 @@ def demo(
     say(table)
 
 
-EXAMPLES = {
-    run: "pcfix run cloud.laz out --cameras cameras.xml --water 0.37 --reference lidar.laz",
-    correct: "pcfix correct cloud.laz corrected.laz --cameras cameras.csv --water 0.37",
-    adjust: "pcfix adjust sparse adjusted --water 0.37 --cloud cloud.laz --gnss gnss.csv",
-    label: "pcfix label cloud.laz labelled.laz --water shore.csv",
-    clean: "pcfix clean corrected.laz cleaned.laz",
-    dsm: "pcfix dsm cleaned.laz bed.tif --resolution 0.5 --surface bed",
-    compare: "pcfix compare cleaned.laz lidar.laz --submerged",
-    cameras: "pcfix cameras cameras.xml --cloud cloud.laz --water 0.37 --plot block.png",
-    water: "pcfix water shore.csv --cloud cloud.laz --plot water.png",
-    restore: "pcfix restore corrected.laz cloud.laz",
-    simulate: "pcfix simulate scene --points 20000",
-    pipeline: "pcfix pipeline cloud.laz corrected.laz --cameras cameras.csv --water 0.37",
-    demo: "pcfix demo",
-}
+EXAMPLES: tuple[tuple[Callable[..., None], str], ...] = (
+    (run, "pcfix run cloud.laz out --cameras cameras.xml --water 0.37 --reference lidar.laz"),
+    (correct, "pcfix correct cloud.laz corrected.laz --cameras cameras.csv --water 0.37"),
+    (adjust, "pcfix adjust sparse adjusted --water 0.37 --cloud cloud.laz --gnss gnss.csv"),
+    (label, "pcfix label cloud.laz labelled.laz --water shore.csv"),
+    (clean, "pcfix clean corrected.laz cleaned.laz"),
+    (dsm, "pcfix dsm cleaned.laz bed.tif --resolution 0.5 --surface bed"),
+    (compare, "pcfix compare cleaned.laz lidar.laz --submerged"),
+    (cameras, "pcfix cameras cameras.xml --cloud cloud.laz --water 0.37 --plot block.png"),
+    (water, "pcfix water shore.csv --cloud cloud.laz --plot water.png"),
+    (restore, "pcfix restore corrected.laz cloud.laz"),
+    (simulate, "pcfix simulate scene --points 20000"),
+    (pipeline, "pcfix pipeline cloud.laz corrected.laz --cameras cameras.csv --water 0.37"),
+    (demo, "pcfix demo"),
+)
 """The commands in the order of the help, each with a line that shows it at work."""

@@ -115,8 +115,8 @@ def progress_bar(title: str, quiet: bool) -> Iterator[Callable[[int, int], None]
 
 
 @contextmanager
-def status_line(title: str, quiet: bool) -> Iterator[Callable[[str], None] | None]:
-    """Show a line of text that changes on a terminal; nothing when piped."""
+def status_line(title: str, quiet: bool) -> Iterator[Callable[[Any], None] | None]:
+    """Show on a terminal what happens, a line that changes; nothing when piped."""
     if quiet or not sys.stderr.isatty():
         yield None
         return

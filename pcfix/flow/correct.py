@@ -43,9 +43,9 @@ if TYPE_CHECKING:
     import laspy
     import numpy.typing as npt
 
-    from pcfix.flow.job import Points
     from pcfix.flow.points import Label
     from pcfix.flow.runner import Progress
+    from pcfix.flow.surfaces import Points
     from pcfix.model import Correction, FloatArray, WaterSurface
     from pcfix.options.declare import File
     from pcfix.refract.regression import DepthRegression

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import warnings
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
-from pcfix.errors import GeometryError, PcfixWarning
+from pcfix.errors import GeometryError
 from pcfix.flow.inputs import Inputs, mask_of
-from pcfix.flow.old_cameras import read_blocks
+from pcfix.flow.old_cameras import ListedViews, read_blocks
 from pcfix.flow.through_port import ThroughPort
 from pcfix.flow.through_water import ThroughWater
 from pcfix.io.cameras.mistakes import likely_mistake
-from pcfix.io.views import ViewMatch
 from pcfix.label.labelling import Labelling
 from pcfix.model import Outcome, Summary
 from pcfix.options.correct import LabelRules, ScienceOptions
@@ -25,59 +23,9 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from pcfix.flow.surfaces import CloudView
-    from pcfix.io.views import ViewList, ViewReport
-    from pcfix.model import Cameras, Correction, FloatArray, Views, WaterSurface
+    from pcfix.flow.surfaces import CloudView, Points
+    from pcfix.model import Correction, FloatArray, WaterSurface
     from pcfix.options.correct import CorrectOptions
-
-    Points: TypeAlias = tuple[FloatArray, FloatArray | None, npt.NDArray[np.uint8]]
-    """Some points: coordinates (n, 3), water heights where those are a dimension, classes."""
-
-
-class ListedViews:
-    """The view list of a cloud, given to its points chunk by chunk; empty without a list."""
-
-    def __init__(
-        self, views: ViewList | None, cameras: Cameras, points: int, step_m: float
-    ) -> None:
-        self.list, self._cameras, self._points, self._step_m = views, cameras, points, step_m
-        self.restart()
-
-    def restart(self) -> None:
-        """Go back to the first row of the cloud."""
-        self._match = self._anew()
-
-    def _anew(self) -> ViewMatch | None:
-        if self.list is None:
-            return None
-        return ViewMatch(self.list, self._cameras, points=self._points, step_m=self._step_m)
-
-    def all_anew(self) -> Callable[[FloatArray, int], Views | None]:
-        """Return the views of the whole cloud from its first row on, apart from the count here."""
-        match = self._anew()
-        return lambda xyz, row: None if match is None else match.for_chunk(xyz, row)
-
-    def of(self, xyz: FloatArray, row: int) -> Views | None:
-        """Return the views of a chunk, shape (n, 3), that begins at a row."""
-        return None if self._match is None else self._match.for_chunk(xyz, row)
-
-    @property
-    def report(self) -> ViewReport | None:
-        """How the list fits so far."""
-        return None if self._match is None else self._match.report
-
-    @property
-    def path(self) -> str | None:
-        """The file of the list."""
-        return None if self.list is None else str(self.list.raw.path)
-
-    def check(self) -> None:
-        """Refuse a list that does not belong to the cloud, and warn of one that hardly does."""
-        if self.report is None:
-            return
-        self.report.check()
-        for sentence in self.report.warnings():
-            warnings.warn(sentence, PcfixWarning, stacklevel=3)
 
 
 class Job:

@@ -19,7 +19,7 @@ from pcfix.io.las.source import LasSource, coordinates
 from pcfix.io.las.writing import labelling_vlr, noted_header
 from pcfix.label.labelling import Labelling, LabelSummary, Part, sets_class
 from pcfix.model import WaterPlane
-from pcfix.options.correct import LabelOptions, LabelRules
+from pcfix.options.correct import LabelOptions, LabelRules, StageLabelOptions
 from pcfix.options.declare import taken
 from pcfix.threads import threads
 from pcfix.version import __version__
@@ -32,9 +32,8 @@ if TYPE_CHECKING:
     import laspy
     import numpy.typing as npt
 
-    from pcfix.flow.job import Points
     from pcfix.flow.runner import Progress
-    from pcfix.flow.surfaces import CloudView
+    from pcfix.flow.surfaces import CloudView, Points
     from pcfix.label.areas import WaterMask
     from pcfix.label.labelling import Labels
     from pcfix.model import FloatArray, WaterSurface
@@ -205,7 +204,7 @@ class LabellingStep:
         If the water or the mask cannot be read or do not fit.
     """
 
-    def __init__(self, name: str, options: LabelOptions, view: CloudView) -> None:
+    def __init__(self, name: str, options: StageLabelOptions, view: CloudView) -> None:
         self._name, self._view = name, view
         self.water = find_surface(options.water, options, view).surface
         check_tilt(self.water)

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from pcfix.flow.inputs import Inputs
-    from pcfix.flow.job import Points
-    from pcfix.flow.surfaces import CloudView
+    from pcfix.flow.surfaces import CloudView, Points
     from pcfix.model import TiePoints, ViewKind
     from pcfix.refract.batch import MadeWith, Survey
     from pcfix.refract.occlusion import Occluder

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -9,16 +10,19 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pcfix.adjust.carry import Pair, pair_of, renumbered
-from pcfix.errors import GeometryError, SettingError
+from pcfix.errors import GeometryError, PcfixWarning, SettingError
 from pcfix.io.labels import match_labels
+from pcfix.io.views import ViewMatch
 from pcfix.model import Cameras
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from pyproj import CRS
 
     from pcfix.flow.inputs import Inputs
-    from pcfix.io.views import ViewList
-    from pcfix.model import FloatArray, IntArray, TiePoints
+    from pcfix.io.views import ViewList, ViewReport
+    from pcfix.model import FloatArray, IntArray, TiePoints, Views
 
 LOCAL = "local"
 
@@ -184,3 +188,49 @@ def old_tie_points(
         return new.tie_points(cloud_crs), False
     views, entry = renumbered(ties.views, pair.row)
     return replace(ties, views=views, image_xy=ties.image_xy[entry]), True
+
+
+class ListedViews:
+    """The view list of a cloud, given to its points chunk by chunk; empty without a list."""
+
+    def __init__(
+        self, views: ViewList | None, cameras: Cameras, points: int, step_m: float
+    ) -> None:
+        self.list, self._cameras, self._points, self._step_m = views, cameras, points, step_m
+        self.restart()
+
+    def restart(self) -> None:
+        """Go back to the first row of the cloud."""
+        self._match = self._anew()
+
+    def _anew(self) -> ViewMatch | None:
+        if self.list is None:
+            return None
+        return ViewMatch(self.list, self._cameras, points=self._points, step_m=self._step_m)
+
+    def all_anew(self) -> Callable[[FloatArray, int], Views | None]:
+        """Return the views of the whole cloud from its first row on, apart from the count here."""
+        match = self._anew()
+        return lambda xyz, row: None if match is None else match.for_chunk(xyz, row)
+
+    def of(self, xyz: FloatArray, row: int) -> Views | None:
+        """Return the views of a chunk, shape (n, 3), that begins at a row."""
+        return None if self._match is None else self._match.for_chunk(xyz, row)
+
+    @property
+    def report(self) -> ViewReport | None:
+        """How the list fits so far."""
+        return None if self._match is None else self._match.report
+
+    @property
+    def path(self) -> str | None:
+        """The file of the list."""
+        return None if self.list is None else str(self.list.raw.path)
+
+    def check(self) -> None:
+        """Refuse a list that does not belong to the cloud, and warn of one that hardly does."""
+        if self.report is None:
+            return
+        self.report.check()
+        for sentence in self.report.warnings():
+            warnings.warn(sentence, PcfixWarning, stacklevel=3)

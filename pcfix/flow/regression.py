@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     from pcfix.io.tables import CheckDepths
     from pcfix.label.labelling import Part
     from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.options import Settings
+    from pcfix.options.correct import ScienceOptions
 
 
 def learn_regression(
     path: str | os.PathLike[str],
     parts: Iterable[Part],
-    settings: Settings,
+    settings: ScienceOptions,
     radius_m: float | None = None,
 ) -> DepthRegression:
     """Fit true depth = a + b * apparent depth to the check depths of a file.
@@ -45,7 +45,7 @@ def learn_regression(
     parts : iterable of Part
         The whole cloud as it came, each point with the water above it; gone through once, in
         bounded memory. Points of noise (classes 7 and 18) do not count.
-    settings : Settings
+    settings : ScienceOptions
         For `least_r2`.
     radius_m : float, optional
         How far from a check depth submerged points may lie. Default: four times the distance
@@ -138,7 +138,7 @@ def _fitted(checks: CheckDepths, apparent_m: FloatArray, true_m: FloatArray) -> 
         raise GeometryError(f"{checks.name}: {error}") from error
 
 
-def _check_r2(checks: CheckDepths, found: DepthRegression, settings: Settings) -> None:
+def _check_r2(checks: CheckDepths, found: DepthRegression, settings: ScienceOptions) -> None:
     if found.r2 < settings.least_r2:
         raise GeometryError(
             f"{checks.name}: the regression explains too little: r2 {found.r2:.3f} of"

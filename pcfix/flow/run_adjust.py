@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from pcfix.flow.inputs import Inputs
     from pcfix.flow.surfaces import CloudView
     from pcfix.model import Cameras, WaterSurface
+    from pcfix.options.declare import File
 
 FOLDER = "adjusted"
 MODELS = ("colmap", "opensfm/reconstruction.json", "cameras.csv")
@@ -68,9 +69,9 @@ class AdjustStep:
     inputs: Inputs
     index: float | str
     when: AdjustWhen = "auto"
-    gcps: str | None = None
-    gnss: str | None = None
-    lens: str | None = None
+    gcps: File | None = None
+    gnss: File | None = None
+    lens: File | None = None
 
     def __post_init__(self) -> None:
         """Refuse what does not go with each other."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from os import PathLike
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from pcfix.water.river import RiverFit
 
     AnyPath = str | PathLike[str]
+
+    Points: TypeAlias = tuple[FloatArray, FloatArray | None, npt.NDArray[np.uint8]]
+    """Some points: coordinates (n, 3), water heights where those are a dimension, classes."""
 
 WaterModel = Literal["auto", "level", "plane", "along", "river"]
 AUTO = "auto"

@@ -22,9 +22,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from pcfix.flow.inputs import Inputs
-    from pcfix.flow.job import ListedViews, Points
-    from pcfix.flow.old_cameras import Blocks
-    from pcfix.flow.surfaces import CloudView
+    from pcfix.flow.old_cameras import Blocks, ListedViews
+    from pcfix.flow.surfaces import CloudView, Points
     from pcfix.label.labelling import Labelling
     from pcfix.model import Views
     from pcfix.options.correct import CorrectOptions

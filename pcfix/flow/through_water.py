@@ -24,10 +24,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from pcfix.flow.inputs import Inputs
-    from pcfix.flow.job import ListedViews, Points
-    from pcfix.flow.old_cameras import Blocks
+    from pcfix.flow.old_cameras import Blocks, ListedViews
     from pcfix.flow.points import Label
-    from pcfix.flow.surfaces import CloudView
+    from pcfix.flow.surfaces import CloudView, Points
     from pcfix.label.labelling import Labelling
     from pcfix.model import Correction, FloatArray, TiePoints, ViewKind, Views, WaterSurface
     from pcfix.options.correct import CorrectOptions

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from pcfix.label.areas import Surroundings, WaterMask
     from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.options import LabelSettings
+    from pcfix.options.correct import LabelRules
     from pcfix.water.surface import SurfaceAbove
 
     Classes = npt.NDArray[np.uint8]
@@ -58,11 +58,11 @@ class Labelling:
 
     Parameters
     ----------
-    settings : LabelSettings
+    settings : LabelRules
     mask : WaterMask or None
     """
 
-    def __init__(self, settings: LabelSettings, mask: WaterMask | None = None) -> None:
+    def __init__(self, settings: LabelRules, mask: WaterMask | None = None) -> None:
         self.settings, self.mask = settings, mask
         self._around: Surroundings | None = None
         self.restart()
@@ -225,14 +225,14 @@ class LeftOut:
 
     Parameters
     ----------
-    settings : LabelSettings
+    settings : LabelRules
     mask : WaterMask or None
     around : Surroundings or None
         Where there are pools, they are counted one by one.
     """
 
     def __init__(
-        self, settings: LabelSettings, mask: WaterMask | None, around: Surroundings | None
+        self, settings: LabelRules, mask: WaterMask | None, around: Surroundings | None
     ) -> None:
         self._settings, self._mask, self._around = settings, mask, around
         self.below = self.outside_mask = self.respected = 0

@@ -3,33 +3,3 @@
 `pcfix.options.declare` says how; the other files are the tables: what several commands share, a
 correction, what follows it, what goes before it, and made-up scenes.
 """
-
-from pcfix.options.settings import (
-    DEFAULT_REFRACTIVE_INDEX,
-    LEVEL_M,
-    CameraSet,
-    Dimensions,
-    ErrorBudget,
-    LabelSettings,
-    MatcherKind,
-    Method,
-    Occlusion,
-    Settings,
-    Uncorrected,
-    ViewsAre,
-)
-
-__all__ = [
-    "DEFAULT_REFRACTIVE_INDEX",
-    "LEVEL_M",
-    "CameraSet",
-    "Dimensions",
-    "ErrorBudget",
-    "LabelSettings",
-    "MatcherKind",
-    "Method",
-    "Occlusion",
-    "Settings",
-    "Uncorrected",
-    "ViewsAre",
-]

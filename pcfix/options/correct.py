@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from pcfix.errors import SettingError
 from pcfix.options.declare import OptionSet, at_least, not_negative, option, within
@@ -131,21 +131,6 @@ class BudgetOptions(OptionSet):
 class RefractionOptions(BudgetOptions, MethodOptions):
     """What the correction of points goes by; `pcfix.correct_points` takes these."""
 
-    @property
-    def max_angle_deg(self) -> float | None:  # TRANSITION
-        """Return it under its old name."""
-        return self.max_angle
-
-    @property
-    def errors(self) -> Any:  # TRANSITION
-        """Return it under its old name."""
-        from pcfix.options.settings import ErrorBudget
-
-        return ErrorBudget(
-            self.sigma_image, self.sigma_level, self.sigma_tilt, self.sigma_index,
-            self.sigma_waves, self.sigma_centre, self.sigma_attitude,
-        )  # fmt: skip
-
 
 @dataclass(frozen=True, kw_only=True)
 class ResultOptions(OptionSet):
@@ -172,21 +157,6 @@ class CorrectOptions(JobOptions, SummaryOption, ScienceOptions, SubmergedOptions
 @dataclass(frozen=True, kw_only=True)
 class LabelRules(LandRules):
     """Which points count as submerged, beyond lying below the surface; see `pcfix.label`."""
-
-    @property
-    def band_m(self) -> float:  # TRANSITION
-        """Return it under its old name."""
-        return self.band
-
-    @property
-    def dead_band_m(self) -> float:  # TRANSITION
-        """Return it under its old name."""
-        return self.dead_band
-
-    @property
-    def least_pool_m2(self) -> float | None:  # TRANSITION
-        """Return it under its old name."""
-        return self.least_pool
 
     panel = WATER
 

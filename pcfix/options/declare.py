@@ -15,7 +15,6 @@ import types
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
-from functools import cache
 from inspect import get_annotations
 from typing import (
     Any,
@@ -192,21 +191,25 @@ def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-@cache
-def options_of(kind: Any) -> tuple[Option, ...]:
+_KNOWN: dict[type, tuple[Option, ...]] = {}
+
+
+def options_of(kind: type) -> tuple[Option, ...]:
     """Return the options of a class, in the order of its help."""
-    homes = {name: base for base in reversed(kind.__mro__) for name in get_annotations(base)}
-    return tuple(
-        Option(
-            one.name,
-            eval(str(one.type), vars(sys.modules[homes[one.name].__module__])),
-            one.default,
-            homes[one.name].__dict__.get("panel", ""),
-            one.metadata["declared"],
+    if kind not in _KNOWN:
+        homes = {name: base for base in reversed(kind.__mro__) for name in get_annotations(base)}
+        _KNOWN[kind] = tuple(
+            Option(
+                one.name,
+                eval(str(one.type), vars(sys.modules[homes[one.name].__module__])),
+                one.default,
+                homes[one.name].__dict__.get("panel", ""),
+                one.metadata["declared"],
+            )
+            for one in fields(kind)
+            if "declared" in one.metadata
         )
-        for one in fields(kind)
-        if "declared" in one.metadata
-    )
+    return _KNOWN[kind]
 
 
 def taken(

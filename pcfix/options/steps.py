@@ -170,7 +170,7 @@ class DsmRules(OptionSet):
 
     panel = RASTER
 
-    resolution: float | None = option(
+    resolution: float = option(
         None, "Side of a cell.", unit="m", needed=True, rule=_resolution, old=("resolution_m",)
     )
     method: DsmMethod = option("mean", "How a cell gets its height.")

@@ -36,7 +36,7 @@ from pcfix.threads import one_caller
 if TYPE_CHECKING:
     from pcfix.lens.frames import Frames
     from pcfix.model import Cameras, FloatArray, IntArray
-    from pcfix.options import Settings
+    from pcfix.options.correct import ScienceOptions
     from pcfix.port.light import Vector
     from pcfix.port.shapes import Port
 
@@ -53,7 +53,7 @@ def intersect_rays(
     views: Views,
     cameras: Cameras,
     port: Port,
-    settings: Settings,
+    settings: ScienceOptions,
 ) -> Intersection:
     """Intersect rays behind the port: forward intersection from places in the images.
 
@@ -108,7 +108,7 @@ def port_views(
     xyz: FloatArray,
     cameras: Cameras,
     port: Port,
-    settings: Settings,
+    settings: ScienceOptions,
     views: Views | None = None,
     shift_m: FloatArray | None = None,
 ) -> Views:

@@ -38,7 +38,7 @@ from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Views
-    from pcfix.options import Settings
+    from pcfix.options.correct import ScienceOptions
     from pcfix.port.shapes import Port
     from pcfix.refract.batch import Intersection
 
@@ -52,7 +52,7 @@ def consistent_through_port(
     views: Views,
     cameras: Cameras,
     port: Port,
-    settings: Settings,
+    settings: ScienceOptions,
     start: Intersection,
 ) -> Intersection:
     """Move points so that straight rays to the true ones' images meet in the apparent ones.
@@ -108,7 +108,7 @@ def consistent_through_port(
 
 
 def port_covariances(
-    true_xyz: FloatArray, views: Views, cameras: Cameras, port: Port, settings: Settings
+    true_xyz: FloatArray, views: Views, cameras: Cameras, port: Port, settings: ScienceOptions
 ) -> FloatArray:
     """Return the covariance of points behind a port.
 
@@ -117,8 +117,8 @@ def port_covariances(
     true_xyz : array, shape (m, 3)
         Metres, world frame.
     views, cameras, port, settings
-        As of `consistent_through_port`; of ``settings.errors`` those of the images, the refractive
-        index, the projection centres and the attitudes count. There is no surface to err.
+        As of `consistent_through_port`; of the standard deviations those of the images, the
+        refractive index, the projection centres and the attitudes count. There is no surface to err.
 
     Returns
     -------
@@ -126,7 +126,7 @@ def port_covariances(
         xx, xy, xz, yy, yz, zz in metres squared, world frame; zeros where fewer than two rays
         meet. Cameras without a lens stand in with that of a survey drone.
     """
-    errors, result = settings.errors, np.zeros((len(true_xyz), 6))
+    result = np.zeros((len(true_xyz), 6))
     with one_caller():
         _covariances(
             np.ascontiguousarray(true_xyz),
@@ -134,10 +134,10 @@ def port_covariances(
             *_block(cameras),
             coefficients(port),
             settings.refractive_index,
-            errors.image_px * _pixels(cameras),
-            errors.index,
-            errors.centre_m,
-            float(np.radians(errors.attitude_deg)),
+            settings.sigma_image * _pixels(cameras),
+            settings.sigma_index,
+            settings.sigma_centre,
+            float(np.radians(settings.sigma_attitude)),
             result,
         )
     return result

@@ -15,7 +15,7 @@ from pcfix.refract.methods import batches, joined
 
 if TYPE_CHECKING:
     from pcfix.model import Cameras, FloatArray, IntArray, Views
-    from pcfix.options import Settings
+    from pcfix.options.correct import ScienceOptions
     from pcfix.port.shapes import Port
 
 
@@ -23,7 +23,7 @@ def correct_through_port(
     xyz: FloatArray,
     cameras: Cameras,
     port: Port,
-    settings: Settings,
+    settings: ScienceOptions,
     views: Views | None = None,
 ) -> Intersection:
     """Return where the points of a cloud are that straight rays made under water, and how well.
@@ -46,7 +46,7 @@ def intersect_through_port(
     xyz: FloatArray,
     cameras: Cameras,
     port: Port,
-    settings: Settings,
+    settings: ScienceOptions,
     views: Views | None = None,
 ) -> tuple[Intersection, Views]:
     """Return where the points of a cloud are that straight rays made under water.
@@ -60,7 +60,7 @@ def intersect_through_port(
         belongs to `pcfix adjust` first.
     port : Port
         The same before each camera.
-    settings : Settings
+    settings : ScienceOptions
         Refractive index of the water; the largest angle is that in air at the inner face, and of
         more than the most cameras those with the smallest are taken. With the method consistent
         the residuals of the straight rays count, with any other they are taken for zero.
@@ -105,7 +105,7 @@ ROUNDS = 6
 
 
 def _intersect_chosen(
-    xyz: FloatArray, chosen: Views, cameras: Cameras, port: Port, settings: Settings
+    xyz: FloatArray, chosen: Views, cameras: Cameras, port: Port, settings: ScienceOptions
 ) -> Intersection:
     """Intersect the rays through apparent points, shape (m, 3), with their cameras known."""
     owner = np.repeat(np.arange(len(xyz)), np.diff(chosen.start))

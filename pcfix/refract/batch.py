@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Views, WaterSurface
-    from pcfix.options import Settings
+    from pcfix.options.correct import ScienceOptions
     from pcfix.refract.matcher import Bed, Matcher
     from pcfix.refract.occlusion import Occluder
     from pcfix.refract.regression import DepthRegression
@@ -81,7 +81,7 @@ class Survey:
         Needed for its shape where it is a mesh or raster.
     cameras : Cameras
         Projection centres and frames, world frame.
-    settings : Settings
+    settings : ScienceOptions
     level_offset_m : array, shape (k,), or None
         How much higher the water stood when each camera took its image. None: nowhere.
     learned : Learned
@@ -89,7 +89,7 @@ class Survey:
 
     water: WaterSurface
     cameras: Cameras
-    settings: Settings
+    settings: ScienceOptions
     level_offset_m: FloatArray | None = None
     learned: Learned = field(default_factory=Learned)
 

@@ -20,7 +20,7 @@ from pcfix.lens.frames import (
     no_frames,
 )
 from pcfix.model import NOMINAL_FOCAL_PX, Views, WaterMesh, WaterPlane, WaterRaster
-from pcfix.options import Settings
+from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.rays import pierce_mesh, pierce_raster
 from pcfix.threads import one_caller
@@ -166,7 +166,9 @@ def views_in_frame(xyz: FloatArray, cameras: Cameras) -> Views:
     """Return the cameras whose frame holds each point, shape (m, 3), above the water or below."""
     xyz = np.ascontiguousarray(xyz)
     at_themselves = SurfaceAbove(xyz[:, 2].copy(), np.zeros((len(xyz), 2)))
-    return chosen_views(Batch(xyz, at_themselves, Survey(WaterPlane(0.0), cameras, Settings())))
+    return chosen_views(
+        Batch(xyz, at_themselves, Survey(WaterPlane(0.0), cameras, ScienceOptions()))
+    )
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)

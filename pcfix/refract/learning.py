@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     from typing import Literal
 
     from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, ViewKind
-    from pcfix.options import Settings
+    from pcfix.options.correct import ScienceOptions
     from pcfix.refract.matcher import Bed
     from pcfix.refract.regression import DepthRegression
 
 
-def check_method(settings: Settings, cameras: Cameras) -> None:
+def check_method(settings: ScienceOptions, cameras: Cameras) -> None:
     """Refuse a method that these cameras are not enough for."""
     if settings.camera_set == "mvs" and (cameras.lenses is None or cameras.rotations is None):
         raise SettingError(
@@ -43,7 +43,7 @@ def check_method(settings: Settings, cameras: Cameras) -> None:
         check_consistent(cameras)
 
 
-def wants_matcher(settings: Settings, views: ViewKind | None) -> bool:
+def wants_matcher(settings: ScienceOptions, views: ViewKind | None) -> bool:
     """Return whether the images' partners must be known, with views of a kind or without any."""
     if views is None:
         return settings.models_matcher

@@ -110,7 +110,7 @@ def shift_of_land(batch: Batch) -> FloatArray:
     dry = replace(
         survey,
         water=WaterPlane(0.0),
-        settings=replace(survey.settings, refractive_index=1.0, dimensions="none"),
+        settings=replace(survey.settings, index=1.0, dimensions="none"),
         level_offset_m=None,
         learned=survey.learned._replace(bed=None),
     )

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     Heights = npt.NDArray[np.float32]
     from pcfix.model import Cameras
-    from pcfix.options import Settings
+    from pcfix.options.correct import ScienceOptions
 
 
 MOST_CELLS = 2**24
@@ -241,7 +241,7 @@ OBLIQUE_DEG = 15.0
 stay within a few degrees; obliques are flown at 20 and more."""
 
 
-def wants_occlusion(cameras: Cameras, settings: Settings) -> bool:
+def wants_occlusion(cameras: Cameras, settings: ScienceOptions) -> bool:
     """Return whether cameras are to be left out to which the cloud hides the point.
 
     As the settings say; auto: where the axis of some camera is more than `OBLIQUE_DEG` off the

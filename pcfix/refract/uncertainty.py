@@ -26,7 +26,7 @@ import numpy as np
 from numba import njit, prange
 
 from pcfix.model import Outcome
-from pcfix.options import LEVEL_M
+from pcfix.options.correct import LEVEL_M
 from pcfix.refract import sensitivity as s
 from pcfix.refract.choice import TILE, gather, points_of, rig_of, rule_of
 from pcfix.refract.sensitivity import Budget
@@ -52,7 +52,8 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
     Parameters
     ----------
     batch : Batch
-        With the cameras that gave rays; the standard deviations are ``settings.errors`` and, where
+        With the cameras that gave rays; the standard deviations are those of the
+        settings and, where
         these do not have it, that of the level is `level_sigma_m`, else `LEVEL_M`.
     shift_m : array, shape (m, 3)
         True minus apparent, by whichever method.
@@ -122,15 +123,15 @@ def level_sigma_of(batch: Batch) -> FloatArray:
 
 def budget_of(survey: Survey) -> Budget:
     """Return the error budget for kernels."""
-    errors = survey.settings.errors
+    settings = survey.settings
     x, y = survey.cameras.centres[:, :2].mean(axis=0).tolist()
     return Budget(
-        image_px=errors.image_px,
-        refractive_index=errors.index,
-        tilt=math.radians(errors.tilt_deg),
-        waves=math.radians(errors.waves_deg),
-        centre_m=errors.centre_m,
-        attitude=math.radians(errors.attitude_deg),
+        image_px=settings.sigma_image,
+        refractive_index=settings.sigma_index,
+        tilt=math.radians(settings.sigma_tilt),
+        waves=math.radians(settings.sigma_waves),
+        centre_m=settings.sigma_centre,
+        attitude=math.radians(settings.sigma_attitude),
         pivot_x=x,
         pivot_y=y,
         in_images=survey.settings.method == "consistent",

@@ -89,7 +89,7 @@ def adjustment_page(
     pictures : sequence of Picture, optional
         Of `adjustment_figures`, where they are at hand.
     provenance : sequence of Table
-        Settings, files and versions; a table of what was free goes before them.
+        ScienceOptions, files and versions; a table of what was free goes before them.
     """
     d = adjustment_dict(adjusted, before)
     if pictures is None:

@@ -315,7 +315,7 @@ def _orders(s: Summary) -> list[Table]:
 
 def _settings(s: Summary) -> Table:
     rows = [[name.replace("_", " "), str(value)] for name, value in s.settings.items()]
-    return Table("Settings", ["setting", "value"], rows)
+    return Table("ScienceOptions", ["setting", "value"], rows)
 
 
 def _versions() -> Table:

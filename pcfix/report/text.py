@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.options import DEFAULT_REFRACTIVE_INDEX, LEVEL_M
+from pcfix.options.correct import LEVEL_M
+from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 from pcfix.refract.tally import ORDERS
 
 if TYPE_CHECKING:

@@ -15,7 +15,8 @@ import numpy as np
 from pcfix.errors import SettingError
 from pcfix.lens.rotations import from_yaw_pitch_roll
 from pcfix.model import Cameras, Lens, Views
-from pcfix.options import DEFAULT_REFRACTIVE_INDEX, Settings
+from pcfix.options.correct import ScienceOptions
+from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 from pcfix.simulate.sight import starts_of
 from pcfix.simulate.tracing import piercing_points, project, triangulate
 
@@ -79,7 +80,7 @@ def simulate_flume(
     SettingError
         If an argument is outside its rule.
     """
-    Settings(refractive_index=refractive_index)
+    ScienceOptions(index=refractive_index)
     if points < 1:
         raise SettingError(f"points {points} is less than 1.")
     if image_noise_px < 0.0:

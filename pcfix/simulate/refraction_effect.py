@@ -44,7 +44,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.options import DEFAULT_REFRACTIVE_INDEX, Settings
+from pcfix.options.correct import ScienceOptions
+from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 from pcfix.simulate.tracing import piercing_points
 
 if TYPE_CHECKING:
@@ -192,7 +193,7 @@ def effect(
     SettingError
         If the depth is not above 0, or the refractive index is outside its rule.
     """
-    Settings(refractive_index=refractive_index)
+    ScienceOptions(index=refractive_index)
     if not (np.isfinite(apparent_depth_m) and apparent_depth_m > 0.0):
         raise SettingError(f"apparent depth {apparent_depth_m:g} m is not above 0.")
     along, across = pair.model_m

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from pcfix.errors import SettingError
 from pcfix.options.correct import MethodOptions
@@ -114,7 +114,7 @@ def with_index(options: Options) -> Options:
         wavelength = given.wavelength_um if water[2] is None else water[2]
         index = f"{given.salinity_psu!r},{temperature!r},{wavelength!r}"
     number, origin = index_of(index)
-    silent = {name: None for name in names if hasattr(options, name)}
+    silent: dict[str, Any] = {name: None for name in names if hasattr(options, name)}
     return replace(options, index=number, index_from=origin or options.index_from, **silent)
 
 

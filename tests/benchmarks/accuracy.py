@@ -33,6 +33,7 @@ from typing import Any
 import numpy as np
 
 import pcfix
+from pcfix.options.correct import ScienceOptions
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from pcfix.flow.regression import learn_regression
@@ -139,7 +140,7 @@ def regression_of(case: Case, seed: int) -> Any:
             writer = csv.writer(stream)
             writer.writerow(["x", "y", "depth"])
             writer.writerows(np.column_stack([bed[:, :2], depth]).tolist())
-        return learn_regression(path, [part], pcfix.Settings())
+        return learn_regression(path, [part], ScienceOptions())
 
 
 def accuracy(given: argparse.Namespace) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""How wrong inputs come through to Z, measured, beside the budget that `pcfix.ErrorBudget` says.
+"""How wrong inputs come through to Z, measured, beside what the error budget says.
 
 The method is `consistent` with known tracks. One input is wrong at a time, and the budget has that
 one only. Level, index and tilt are common to the whole scene: measured is the mean change of Z
@@ -17,13 +17,14 @@ import numpy as np
 
 import pcfix
 from pcfix.model import WaterPlane
+from pcfix.options.correct import BudgetOptions
 from tests.benchmarks.accuracy_scenes import SETTINGS, measured_of
 
 SCENES = ("flat", "oblique")
 SEEDS = 5
 LEVEL_M, INDEX, TILT = 0.05, 0.005, 0.001
 CENTRE_M, ATTITUDE_DEG, WAVES_DEG = 0.03, 0.01, 1.0
-NOTHING = pcfix.ErrorBudget(image_px=0.0, level_m=0.0, index=0.0)
+NOTHING = BudgetOptions(sigma_image=0.0, sigma_level=0.0, sigma_index=0.0)
 RANDOM = (
     ("image", "0.5 px", {"image_noise_px": 0.5}, {"image_px": 0.5}),
     ("image", "1 px", {"image_noise_px": 1.0}, {"image_px": 1.0}),
@@ -66,7 +67,7 @@ def _corrected(scene: Any, water: Any = None, n: float | None = None, **errors: 
         method="consistent",
         views=scene.views,
         index=scene.refractive_index if n is None else n,
-        errors=replace(NOTHING, **errors),
+        **vars(replace(NOTHING, **errors)),
     )
 
 

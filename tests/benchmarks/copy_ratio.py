@@ -103,6 +103,7 @@ def kernel(cloud, cameras, sensor):
 
     import pcfix
     from pcfix.io.las.source import read_xyz
+    from pcfix.options.correct import ScienceOptions
     from pcfix.refract.batch import Batch, Survey
     from pcfix.refract.intersect import intersect_in_frame
     from pcfix.water.surface import SurfaceAbove
@@ -111,7 +112,7 @@ def kernel(cloud, cameras, sensor):
     xyz = xyz[xyz[:, 2] < 0.37][:1_000_000]
     block, water = pcfix.read_cameras(cameras, sensor), pcfix.WaterPlane(0.37)
     surface = SurfaceAbove(np.full(len(xyz), 0.37), np.zeros((len(xyz), 2)))
-    survey = Survey(water, block, pcfix.Settings(dimensions="minimal"))
+    survey = Survey(water, block, ScienceOptions(dimensions="minimal"))
     best, found = np.inf, None
     for _ in range(15):
         started = time.perf_counter()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import pcfix.refract.top_surface as top_surface
-from pcfix import Cameras, Settings
+from pcfix import Cameras, ScienceOptions
 from pcfix.refract.top_surface import OccluderBuilder, occluder_of, wants_occlusion
 
 UTM = np.array([512_345.678, 4_987_654.321, 0.0])
@@ -42,19 +42,19 @@ def same(one, other):
     [((0.0, 3.0, -14.0), False), ((0.0, 16.0), True), ((0.0, -30.0), True), ((90.0,), True)],
 )
 def test_auto_goes_by_the_axes(tilts_deg, wanted):
-    assert wants_occlusion(cameras(*tilts_deg), Settings()) is wanted
+    assert wants_occlusion(cameras(*tilts_deg), ScienceOptions()) is wanted
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 40.0])
 def test_on_and_off_are_as_told(tilt_deg):
-    assert wants_occlusion(cameras(tilt_deg), Settings(occlusion="on")) is True
-    assert wants_occlusion(cameras(tilt_deg), Settings(occlusion="off")) is False
+    assert wants_occlusion(cameras(tilt_deg), ScienceOptions(occlusion="on")) is True
+    assert wants_occlusion(cameras(tilt_deg), ScienceOptions(occlusion="off")) is False
 
 
 def test_cameras_without_angles_count_as_nadir():
     block = Cameras(("a",), np.zeros((1, 3)))
-    assert wants_occlusion(block, Settings()) is False
-    assert wants_occlusion(block, Settings(occlusion="on")) is True
+    assert wants_occlusion(block, ScienceOptions()) is False
+    assert wants_occlusion(block, ScienceOptions(occlusion="on")) is True
 
 
 # --- the surface ---------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from pcfix.errors import GeometryError, SettingError
 from pcfix.flow.regression import learn_regression
 from pcfix.label.labelling import Part
 from pcfix.model import Outcome, WaterPlane
-from pcfix.options import Settings
+from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
 from pcfix.refract.methods import correct
 from pcfix.refract.regression import (
@@ -26,7 +26,7 @@ from tests.utils.batches import batch_of
 ORIGIN = np.array([500_000.0, 4_600_000.0])
 LEVEL = WaterPlane(12.0)
 A, B = 0.05, 1.42
-SETTINGS = Settings(method="regression")
+SETTINGS = ScienceOptions(method="regression")
 
 
 def apparent_at(xy):
@@ -229,7 +229,7 @@ def test_a_poor_fit_is_taken_when_told(tmp_path):
     xy = places(10)
     xy[:, 0] = np.sort(xy[:, 0])
     path = table(tmp_path, xy, 3.0 + 0.01 * np.arange(10) + np.arange(10) % 2)
-    told = Settings(method="regression", least_r2=0.0)
+    told = ScienceOptions(method="regression", least_r2=0.0)
     found = learn_regression(path, parts(cloud()), told)
     assert found.r2 < 0.5
     assert "is not what refraction does" in " ".join(found.notes)

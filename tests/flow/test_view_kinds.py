@@ -8,7 +8,7 @@ import pytest
 import pcfix
 from pcfix.io.views import ViewMatch, read_views
 from pcfix.model import Views, WaterPlane
-from pcfix.options import Settings
+from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
 from pcfix.refract.learning import PATCHES, kind_of_views
 from pcfix.refract.matcher import matcher_of
@@ -21,7 +21,7 @@ RENDERED, rendered = needs("rendered_a")
 
 
 def kind_of(xyz, cameras, water, views, n=1.34):
-    settings = Settings(method="consistent", refractive_index=n, dimensions="none")
+    settings = ScienceOptions(method="consistent", index=n, dimensions="none")
     learned = Learned(matcher=matcher_of(cameras, xyz))
     above = surface_above(water, xyz)
     return kind_of_views(batch_of(xyz, above, water, cameras, settings, views, learned=learned))

@@ -8,7 +8,7 @@ import pytest
 from pcfix.errors import GeometryError, SettingError
 from pcfix.label.areas import WaterMask
 from pcfix.label.labelling import Labelling, Part
-from pcfix.options import LabelSettings
+from pcfix.options.correct import LabelRules
 from pcfix.water.surface import SurfaceAbove
 
 EAST, NORTH, WATER_M = 456_000.0, 5_432_000.0, 12.4
@@ -22,7 +22,7 @@ def part_of(xyz, classes=None, level=WATER_M):
 
 def labelled(part, mask=None, pieces=1, corners=None, **choices):
     """Label a cloud in pieces; return the classes and the labelling."""
-    labelling = Labelling(LabelSettings(**choices), mask)
+    labelling = Labelling(LabelRules(**choices), mask)
     rows = np.array_split(np.arange(len(part.xyz)), pieces)
 
     def parts():
@@ -254,4 +254,4 @@ def test_a_line_of_points_and_a_stray_one():
 )
 def test_settings_that_make_no_sense(choices, sentence):
     with pytest.raises(SettingError, match=sentence):
-        LabelSettings(**choices)
+        LabelRules(**choices)

@@ -8,6 +8,7 @@ import pytest
 
 import pcfix
 from pcfix.errors import GeometryError, SettingError
+from pcfix.options.correct import ScienceOptions
 from pcfix.port.methods import correct_through_port
 from pcfix.port.shapes import FlatPort
 from pcfix.report.text import summary_text
@@ -42,7 +43,7 @@ def test_a_file_is_what_the_arrays_are(scene, cloud, tmp_path):
     before, after = laspy.read(cloud), laspy.read(tmp_path / "out.las")
     noise = np.asarray(before.classification) == 7
     found = correct_through_port(
-        np.array(before.xyz)[~noise], scene.cameras, scene.port, pcfix.Settings(method="consistent")
+        np.array(before.xyz)[~noise], scene.cameras, scene.port, ScienceOptions(method="consistent")
     )
     moved = np.array(after.xyz) - np.array(before.xyz)
     assert not moved[noise].any()

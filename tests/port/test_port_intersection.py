@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pcfix import Cameras, Settings
+from pcfix import Cameras, ScienceOptions
 from pcfix.errors import SettingError
 from pcfix.lens.imaging import unproject
 from pcfix.model import Outcome
-from pcfix.options import ErrorBudget
+from pcfix.options.correct import BudgetOptions
 from pcfix.port.intersection import intersect_rays, port_views
 from pcfix.port.inversion import port_covariances
 from pcfix.port.methods import correct_through_port, intersect_through_port
@@ -20,7 +20,7 @@ from tests.utils.port_scenes import simulate_port
 
 FLAT = FlatPort(0.02, 0.008, 1.49, (0.02, -0.01, 1.0))
 DOME = DomePort(0.05, 0.004, 1.49, (0.001, -0.002, -0.01))
-CONSISTENT = Settings(method="consistent")
+CONSISTENT = ScienceOptions(method="consistent")
 NOISE_PX = 0.5
 
 
@@ -46,7 +46,7 @@ def errors_of(scene, found):
 def from_images(scene):
     looking = unproject(scene.cameras.lenses[0], scene.image_xy)
     return intersect_rays(
-        scene.apparent, looking, scene.views, scene.cameras, scene.port, Settings()
+        scene.apparent, looking, scene.views, scene.cameras, scene.port, ScienceOptions()
     )
 
 
@@ -73,7 +73,7 @@ def test_apparent_points_come_home(scene):
 def test_without_residuals_some_of_the_bias_stays(scene):
     # what `snell` leaves: a third of a metre becomes some centimetres, not nothing
     found, _ = intersect_through_port(
-        scene.apparent, scene.cameras, scene.port, Settings(), scene.views
+        scene.apparent, scene.cameras, scene.port, ScienceOptions(), scene.views
     )
     before, after = rms(scene.apparent - scene.truth)[2], rms(errors_of(scene, found))[2]
     assert 0.01 < after < 0.5 * before
@@ -81,8 +81,8 @@ def test_without_residuals_some_of_the_bias_stays(scene):
 
 def test_noise_comes_through_as_the_covariance_says(noisy):
     # three thousand normalised squares have a mean of 1 within 4 sigma = 0.15 (correlations aside)
-    budget = ErrorBudget(image_px=NOISE_PX, index=0.0)
-    settings = Settings(method="consistent", errors=budget)
+    budget = BudgetOptions(sigma_image=NOISE_PX, sigma_index=0.0)
+    settings = ScienceOptions(method="consistent", **vars(budget))
     found = correct_through_port(noisy.apparent, noisy.cameras, noisy.port, settings, noisy.views)
     errors = errors_of(noisy, found)
     c = found.covariance_m2
@@ -101,14 +101,19 @@ def test_covariance_of_the_index_is_its_derivative():
     looking = unproject(scene.cameras.lenses[0], scene.image_xy)
     two = [
         intersect_rays(
-            scene.truth, looking, scene.views, scene.cameras, scene.port, Settings(1.34 + change)
+            scene.truth,
+            looking,
+            scene.views,
+            scene.cameras,
+            scene.port,
+            ScienceOptions(index=1.34 + change),
         ).shift_m
         for change in (-step, step)
     ]
     by_n = (two[1] - two[0]) / (2.0 * step)
-    budget = ErrorBudget(image_px=0.0, index=1.0)
+    budget = BudgetOptions(sigma_image=0.0, sigma_index=1.0)
     cov = port_covariances(
-        scene.truth, scene.views, scene.cameras, scene.port, Settings(errors=budget)
+        scene.truth, scene.views, scene.cameras, scene.port, ScienceOptions(**vars(budget))
     )
     # the intersection weighs rays in space, the covariance residuals in the images: the rays of
     # another index miss each other, and the two differ by some percent
@@ -119,10 +124,10 @@ def test_covariance_of_poses_is_that_of_moved_images():
     # one camera errs at a time: its centre by 0.1 mm, its attitude by 0.1 mrad, in turn
     scene = simulate_port(FLAT, points=25, seed=3)
     for budget, change in (
-        (ErrorBudget(image_px=0.0, index=0.0, centre_m=1e-4), shifted),
-        (ErrorBudget(image_px=0.0, index=0.0, attitude_deg=np.degrees(1e-4)), turned),
+        (BudgetOptions(sigma_image=0.0, sigma_index=0.0, sigma_centre=1e-4), shifted),
+        (BudgetOptions(sigma_image=0.0, sigma_index=0.0, sigma_attitude=np.degrees(1e-4)), turned),
     ):
-        settings = dataclasses.replace(CONSISTENT, errors=budget)
+        settings = dataclasses.replace(CONSISTENT, **vars(budget))
         total = np.zeros(len(scene.truth))
         for camera in range(len(scene.cameras)):
             for axis in range(3):
@@ -230,9 +235,9 @@ def test_cameras_need_angles_and_the_method_lenses():
     bare = Cameras(("a", "b"), np.array([[0.0, 0, 0], [1.0, 0, 0]]))
     xyz = np.array([[0.0, 0, -2]])
     with pytest.raises(SettingError, match="have no angles"):
-        intersect_through_port(xyz, bare, FLAT, Settings())
+        intersect_through_port(xyz, bare, FLAT, ScienceOptions())
     turned = dataclasses.replace(bare, rotations=np.array([np.diag([1.0, -1.0, -1.0])] * 2))
-    found, _ = intersect_through_port(xyz, turned, FLAT, Settings())
+    found, _ = intersect_through_port(xyz, turned, FLAT, ScienceOptions())
     assert found.outcome.tolist() == [Outcome.CORRECTED]
     with pytest.raises(SettingError, match="no lenses"):
         intersect_through_port(xyz, turned, FLAT, CONSISTENT)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from pcfix.errors import PcfixWarning, SettingError
 from pcfix.lens.imaging import coefficients, image_and_gradients
 from pcfix.model import Cameras, Lens, Outcome, Views, WaterMesh, WaterPlane, WaterRaster
-from pcfix.options import Settings
+from pcfix.options.correct import ScienceOptions
 from pcfix.refract.consistent import check_consistent
 from pcfix.refract.methods import correct
 from pcfix.simulate.tracing import triangulate
@@ -101,7 +101,7 @@ def views_of(lists):
 
 
 def run(points, cameras, water, views, *, method="consistent", n=N_WATER, offset=None):
-    settings = Settings(method=method, refractive_index=n)
+    settings = ScienceOptions(method=method, index=n)
     above = surface_above(water, points)
     return correct(batch_of(points, above, water, cameras, settings, views, offset))
 

@@ -11,7 +11,7 @@ import pcfix
 from pcfix.io.views import ViewMatch, read_views
 from pcfix.lens.frames import frames_of
 from pcfix.model import Outcome, Views, WaterPlane
-from pcfix.options import Settings
+from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned, images_of
 from pcfix.refract.depth_maps import _best_pairs, _depth, sight_of
 from pcfix.refract.matcher import WIDTH_M, Bed, Matcher, bed_of
@@ -58,7 +58,7 @@ def matcher(cameras=CAMERAS, matched=MATCHED, averaged=None, fused=None, toleran
 
 
 def run(xyz, water, views, learned, *, cameras=CAMERAS, offset=None, n=N_WATER):
-    settings = Settings(method="consistent", refractive_index=n, dimensions="none")
+    settings = ScienceOptions(method="consistent", index=n, dimensions="none")
     above = surface_above(water, xyz)
     return correct(batch_of(xyz, above, water, cameras, settings, views, offset, learned=learned))
 

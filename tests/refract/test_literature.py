@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import pcfix
 from pcfix.errors import SettingError
 from pcfix.model import Outcome, Views, WaterPlane
-from pcfix.options import Settings
+from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
 from pcfix.refract.literature import BASE_TO_HEIGHT, in_pairs
 from pcfix.refract.methods import correct
@@ -39,7 +39,7 @@ def named(centres):
 def run(method, points, centres, n=1.34, *, water=LEVEL, views=None, offset=None, **more):
     xyz = np.array(points, float)
     learned = Learned(regression=line(more.pop("a", 0.0), more.pop("b", n)))
-    chosen = Settings(n, method=method, max_angle_deg=90.0, **more)
+    chosen = ScienceOptions(index=n, method=method, max_angle=90.0, **more)
     above = surface_above(water, xyz)
     return correct(
         batch_of(xyz, above, water, named(centres), chosen, views, offset, learned=learned)
@@ -257,7 +257,7 @@ def test_pairs_keep_what_becomes_of_points_with_fewer_rays():
     xyz = bed(3)
     above = surface_above(LEVEL, xyz)
     cameras = named(block(3))
-    whole = batch_of(xyz, above, LEVEL, cameras, Settings(), views)
+    whole = batch_of(xyz, above, LEVEL, cameras, ScienceOptions(), views)
     paired = in_pairs(whole)
     assert paired.counts.tolist() == [0, 1, 2]
     expected = [Outcome.NO_CAMERA, Outcome.ONE_CAMERA, Outcome.CORRECTED]
@@ -287,7 +287,7 @@ def test_factor_and_regression_are_lines():
 
 def test_regression_is_refused_where_none_was_learned():
     xyz = bed(3)
-    chosen = Settings(method="regression")
+    chosen = ScienceOptions(method="regression")
     with pytest.raises(SettingError, match="needs a regression"):
         correct(batch_of(xyz, surface_above(LEVEL, xyz), LEVEL, named(block()), chosen))
 

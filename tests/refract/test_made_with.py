@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from pcfix.lens.frames import frames_of
 from pcfix.model import Cameras, Outcome, Views, WaterPlane
-from pcfix.options import Settings
+from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned, MadeWith, as_made, as_now, images_of
 from pcfix.refract.matcher import Bed, Matcher
 from pcfix.refract.methods import correct, shift_of_land
@@ -63,9 +63,7 @@ def matcher(cameras, averages=False):
 
 
 def run(xyz, views, learned, made_with, kind="depth-maps"):
-    settings = Settings(
-        method="consistent", refractive_index=N_WATER, dimensions="none", matcher=kind
-    )
+    settings = ScienceOptions(method="consistent", index=N_WATER, dimensions="none", matcher=kind)
     above = surface_above(WATER, xyz)
     return correct(
         batch_of(xyz, above, WATER, CAMERAS, settings, views, learned=learned, made_with=made_with)
@@ -170,7 +168,7 @@ def test_land_comes_home(with_list):
         np.array([3.0, 4.0, 2.2]), maps, weights, CAMERAS, matched, [(50.0, 0.0, 0.0)] * 8,
         (2.0, 0.0, 0.0), 1.0, TOLERANCE, "angles", made,
     )  # fmt: skip
-    settings = Settings(method="consistent", refractive_index=N_WATER)
+    settings = ScienceOptions(method="consistent", index=N_WATER)
     alone = matcher(made)._replace(fused=np.full((8, 12), -1))
     views = listed([maps]) if with_list else None
     batch = batch_of(

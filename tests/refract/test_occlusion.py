@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix import Cameras, Lens, Settings
+from pcfix import Cameras, Lens, ScienceOptions
 from pcfix.io.views import ViewMatch, read_views
 from pcfix.model import Views, WaterPlane
 from pcfix.refract.batch import Learned
@@ -315,7 +315,7 @@ def test_cliff_spoils_the_bed_below_it_unless_its_shadow_is_known():
     def rms_m(views=None, occluder=None, **words):
         result = correct(
             batch_of(
-                apparent, flat, water, cameras, Settings(**words), views,
+                apparent, flat, water, cameras, ScienceOptions(**words), views,
                 learned=Learned(occluder=occluder),
             )
         )  # fmt: skip

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from pcfix.errors import PcfixWarning, SettingError
 from pcfix.model import Cameras, Lens, Outcome, Views, WaterPlane
-from pcfix.options import Settings
+from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
 from pcfix.refract.matcher import matcher_of
 from pcfix.refract.methods import correct
@@ -53,8 +53,8 @@ def pairs_in(scene, rows):
 
 def corrected(scene, rows, views, *, method="consistent", learned=None, **choices):
     xyz = scene.apparent_xyz[rows]
-    settings = Settings(
-        refractive_index=scene.refractive_index, method=method, dimensions="none", **choices
+    settings = ScienceOptions(
+        index=scene.refractive_index, method=method, dimensions="none", **choices
     )
     above = surface_above(scene.water, xyz)
     return correct(
@@ -118,7 +118,7 @@ def test_a_matcher_with_the_true_partners_gives_the_known_pairs():
     rows = under_water(scene)[:300]
     xyz = scene.apparent_xyz[rows]
     matcher = matcher_of(scene.cameras, xyz)._replace(matched=scene.neighbours)
-    settings = Settings(refractive_index=scene.refractive_index, method="consistent")
+    settings = ScienceOptions(index=scene.refractive_index, method="consistent")
     batch = batch_of(
         xyz, surface_above(scene.water, xyz), scene.water, scene.cameras, settings,
         scene.views.take(rows), learned=Learned(matcher=matcher),
@@ -155,7 +155,7 @@ def listed(lists):
 
 
 def run(points, cameras, water, pairs, *, n=N_WATER, offset=None, **choices):
-    settings = Settings(method="consistent", refractive_index=n, dimensions="none", **choices)
+    settings = ScienceOptions(method="consistent", index=n, dimensions="none", **choices)
     return correct(
         batch_of(points, surface_above(water, points), water, cameras, settings, pairs, offset)
     )
@@ -254,7 +254,7 @@ def test_points_without_a_solution_keep_that_of_snell():
     points, water = np.array([[0.0, 0, -3]]), WaterPlane(0.0)
     with pytest.warns(PcfixWarning, match="no solution for 1 of 1 points"):
         result = run(points, cameras, water, listed([[[0, 1]]]))
-    settings = Settings(method="snell", refractive_index=N_WATER)
+    settings = ScienceOptions(method="snell", index=N_WATER)
     views = Views(np.array([0, 2]), np.array([0, 1]))
     plain = correct(batch_of(points, surface_above(water, points), water, cameras, settings, views))
     assert result.shift_m == pytest.approx(plain.shift_m, abs=1e-9)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from pcfix.model import NOMINAL_WIDTH_PX, Lens, Outcome, Views, WaterPlane
-from pcfix.options import LEVEL_M, ErrorBudget, Settings
+from pcfix.options.correct import LEVEL_M, BudgetOptions, ScienceOptions
 from pcfix.refract import uncertainty
 from pcfix.refract.intersect import intersect_in_frame
 from pcfix.refract.methods import correct, with_rays
@@ -25,7 +25,7 @@ from pcfix.water.surface import SurfaceAbove, surface_above
 from tests.utils.batches import batch_of
 from tests.utils.normalised import INDEX, apparent, block, views_of
 
-NONE = ErrorBudget(image_px=0.0, level_m=0.0, index=0.0)
+NONE = BudgetOptions(sigma_image=0.0, sigma_level=0.0, sigma_index=0.0)
 SOURCES = {
     "image": replace(NONE, image_px=0.7),
     "level": replace(NONE, level_m=0.05),
@@ -34,7 +34,15 @@ SOURCES = {
     "waves": replace(NONE, waves_deg=0.5),
     "centre": replace(NONE, centre_m=0.02),
     "attitude": replace(NONE, attitude_deg=0.02),
-    "all": ErrorBudget(0.5, 0.03, 0.05, 0.003, 0.3, 0.01, 0.01),
+    "all": BudgetOptions(
+        sigma_image=0.5,
+        sigma_level=0.03,
+        sigma_tilt=0.05,
+        sigma_index=0.003,
+        sigma_waves=0.3,
+        sigma_centre=0.01,
+        sigma_attitude=0.01,
+    ),
 }
 LEVEL = WaterPlane(0.0)
 VARIANCES = [0, 3, 5]
@@ -87,7 +95,7 @@ def normalised(method, tilt_deg, source, *size):
     off by then is its bias, and no standard error says anything about that.
     """
     cameras, quiet, noisy = drawn(tilt_deg, source, *size)
-    settings = Settings(method=method, errors=SOURCES[source])
+    settings = ScienceOptions(method=method, **vars(SOURCES[source]))
     nominal = solved(quiet, cameras, settings)
     found = noisy + solved(noisy, cameras, settings, dimensions="minimal").shift_m
     error = found.reshape(-1, len(quiet), 3) - (quiet + nominal.shift_m)
@@ -124,7 +132,7 @@ def test_common_errors_are_the_derivatives_of_consistent(tilt_deg):
     x, y = cameras.centres[:, :2].mean(axis=0)
 
     def z_of(plane=LEVEL, index=INDEX):
-        settings = Settings(method="consistent", refractive_index=index, dimensions="minimal")
+        settings = ScienceOptions(method="consistent", index=index, dimensions="minimal")
         above = surface_above(plane, xyz)
         views = views_of(len(xyz), cameras)
         return correct(batch_of(xyz, above, plane, cameras, settings, views)).shift_m
@@ -145,7 +153,7 @@ def test_common_errors_are_the_derivatives_of_consistent(tilt_deg):
     for name, expected in found.items():
         one = math.degrees(1.0) if name == "tilt_deg" else 1.0
         errors = replace(NONE, **{name: one})
-        sigma = solved(xyz, cameras, Settings(method="consistent", errors=errors)).sigma_z_m
+        sigma = solved(xyz, cameras, ScienceOptions(method="consistent", **vars(errors))).sigma_z_m
         rms = np.sqrt((expected**2).mean())
         assert np.sqrt(((sigma - np.abs(expected)) ** 2).mean()) < 0.03 * rms
 
@@ -159,7 +167,7 @@ def test_common_errors_are_the_derivatives_of_the_intersection(plane):
 
     def found(water=plane, index=INDEX):
         above = surface_above(water, bed)
-        settings = Settings(refractive_index=index)
+        settings = ScienceOptions(index=index)
         return intersect(bed, above, water, cameras, settings)
 
     base = found()
@@ -177,7 +185,7 @@ def test_common_errors_are_the_derivatives_of_the_intersection(plane):
         slope = (found(**up).shift_m - found(**down).shift_m)[moved, 2] / (2.0 * step)
         errors = replace(NONE, **{name: 1.0})
         cov = covariances(
-            bed, base.shift_m, surface_above(plane, bed), cameras, Settings(errors=errors)
+            bed, base.shift_m, surface_above(plane, bed), cameras, ScienceOptions(**vars(errors))
         )
         np.testing.assert_allclose(np.sqrt(cov[moved, 5]), np.abs(slope), rtol=0.01)
     both = 0.0
@@ -186,7 +194,7 @@ def test_common_errors_are_the_derivatives_of_the_intersection(plane):
         both += ((found(up).shift_m - found(down).shift_m)[moved, 2] / (2.0 * step)) ** 2
     errors = replace(NONE, tilt_deg=math.degrees(1.0))
     cov = covariances(
-        bed, base.shift_m, surface_above(plane, bed), cameras, Settings(errors=errors)
+        bed, base.shift_m, surface_above(plane, bed), cameras, ScienceOptions(**vars(errors))
     )
     # in units of slope; near the middle of the block, where little is left, the mean counts
     assert np.sqrt(cov[moved, 5].mean()) == pytest.approx(np.sqrt(both.mean()), rel=0.02)
@@ -194,19 +202,21 @@ def test_common_errors_are_the_derivatives_of_the_intersection(plane):
 
 def test_a_covariance_is_symmetric_and_positive():
     bed, cameras, _ = scene(35.0, points=200)
-    found = intersect(bed, flat(200), LEVEL, cameras, Settings())
-    cov = covariances(bed, found.shift_m, flat(200), cameras, Settings(errors=SOURCES["all"]))
+    found = intersect(bed, flat(200), LEVEL, cameras, ScienceOptions())
+    cov = covariances(
+        bed, found.shift_m, flat(200), cameras, ScienceOptions(**vars(SOURCES["all"]))
+    )
     full = cov[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     assert (np.linalg.eigvalsh(full) > 0.0).all()
 
 
 def test_variances_of_sources_add_up():
     bed, cameras, _ = scene(35.0, points=50)
-    found = intersect(bed, flat(50), LEVEL, cameras, Settings())
+    found = intersect(bed, flat(50), LEVEL, cameras, ScienceOptions())
     all_of_them = SOURCES["all"]
 
     def cov(errors):
-        return covariances(bed, found.shift_m, flat(50), cameras, Settings(errors=errors))
+        return covariances(bed, found.shift_m, flat(50), cameras, ScienceOptions(**vars(errors)))
 
     parts = [
         cov(replace(NONE, **{name: getattr(all_of_them, name)}))
@@ -220,11 +230,11 @@ def test_variances_of_sources_add_up():
 @pytest.mark.parametrize("method", ["snell", "consistent"])
 def test_both_kernels_agree_to_the_bit(method):
     bed, cameras, _ = scene(0.0, points=500)
-    found = intersect(bed, flat(500), LEVEL, cameras, Settings())
+    found = intersect(bed, flat(500), LEVEL, cameras, ScienceOptions())
     seen = found.ray_count == len(cameras)
     assert seen.sum() > 300
-    for errors in (ErrorBudget(), SOURCES["all"]):
-        settings = Settings(method=method, errors=errors)
+    for errors in (BudgetOptions(), SOURCES["all"]):
+        settings = ScienceOptions(method=method, **vars(errors))
         every = intersect(bed, flat(500), LEVEL, cameras, settings).covariance_m2
         views = views_of(500, cameras)
         listed = covariances(bed, found.shift_m, flat(500), cameras, settings, views)
@@ -233,31 +243,31 @@ def test_both_kernels_agree_to_the_bit(method):
 
 def test_only_the_steepest_cameras_count():
     bed, cameras, _ = scene(0.0, points=200)
-    found = intersect(bed, flat(200), LEVEL, cameras, Settings())
+    found = intersect(bed, flat(200), LEVEL, cameras, ScienceOptions())
     steep = np.linalg.norm(cameras.centres[:, :2] - bed[:, None, :2], axis=2)
     nearest = np.sort(np.argsort(steep, axis=1)[:, :4], axis=1)
     views = Views(np.arange(201) * 4, nearest.ravel())
     args = bed, found.shift_m, flat(200), cameras
-    some = covariances(*args, Settings(max_cameras=4))
-    assert (some == covariances(*args, Settings(), views)).all()
-    assert (some != covariances(*args, Settings())).any()
+    some = covariances(*args, ScienceOptions(max_cameras=4))
+    assert (some == covariances(*args, ScienceOptions(), views)).all()
+    assert (some != covariances(*args, ScienceOptions())).any()
 
 
 def test_the_result_does_not_depend_on_the_other_points():
     bed, cameras, _ = scene(35.0, points=700)
-    found = intersect(bed, flat(700), LEVEL, cameras, Settings())
-    whole = covariances(bed, found.shift_m, flat(700), cameras, Settings())
+    found = intersect(bed, flat(700), LEVEL, cameras, ScienceOptions())
+    whole = covariances(bed, found.shift_m, flat(700), cameras, ScienceOptions())
     some = slice(100, 333)
-    part = covariances(bed[some], found.shift_m[some], flat(233), cameras, Settings())
+    part = covariances(bed[some], found.shift_m[some], flat(233), cameras, ScienceOptions())
     assert (whole[some] == part).all()
 
 
 def test_level_is_the_users_else_the_fits_else_a_default():
     bed, cameras, _ = scene(0.0, points=20)
-    found = intersect(bed, flat(20), LEVEL, cameras, Settings())
+    found = intersect(bed, flat(20), LEVEL, cameras, ScienceOptions())
 
     def sigma(given, stated=None):
-        settings = Settings(errors=replace(NONE, level_m=stated))
+        settings = ScienceOptions(**vars(replace(NONE, level_m=stated)))
         args = bed, found.shift_m, flat(20), cameras, settings
         return np.sqrt(covariances(*args, level_sigma_m=given)[:, 5])
 
@@ -274,15 +284,15 @@ def test_level_is_the_users_else_the_fits_else_a_default():
 def test_points_without_a_solution_have_none():
     bed, cameras, _ = scene(0.0, points=3)
     bed[1] = [500.0, 500.0, -3.0]  # out of every frame
-    found = correct(batch_of(bed, flat(3), LEVEL, cameras, Settings()))
+    found = correct(batch_of(bed, flat(3), LEVEL, cameras, ScienceOptions()))
     assert (found.covariance_m2[1] == 0.0).all() and found.sigma_z_m[1] == 0.0
     assert (found.sigma_z_m[[0, 2]] > 0.0).all()
-    assert covariances(bed[:0], bed[:0], flat(0), cameras, Settings()).shape == (0, 6)
+    assert covariances(bed[:0], bed[:0], flat(0), cameras, ScienceOptions()).shape == (0, 6)
 
 
 def test_it_is_skipped_where_nobody_reads_it():
     bed, cameras, _ = scene(0.0, points=3)
-    found = correct(batch_of(bed, flat(3), LEVEL, cameras, Settings(dimensions="minimal")))
+    found = correct(batch_of(bed, flat(3), LEVEL, cameras, ScienceOptions(dimensions="minimal")))
     assert found.covariance_m2 is None and (found.sigma_z_m == 0.0).all()
 
 
@@ -297,7 +307,9 @@ def test_focal_lengths_in_pixels():
 def test_other_methods_get_the_same_budget(method):
     bed, cameras, rng = scene(0.0, points=15)
     quiet = apparent(bed, cameras, NONE, rng)
-    sigma = [solved(quiet, cameras, Settings(method=name)).sigma_z_m for name in (method, "snell")]
+    sigma = [
+        solved(quiet, cameras, ScienceOptions(method=name)).sigma_z_m for name in (method, "snell")
+    ]
     # an approximation for them; they place these points to some decimetres alike
     np.testing.assert_allclose(sigma[0], sigma[1], rtol=0.1)
 
@@ -309,7 +321,7 @@ def test_a_regression_has_the_error_of_its_predictions():
     line = DepthRegression(0.0, 1.4, 0.01, 0.01, 0.99, 0.08, 0.11, 20, 1.0, 9.0)
     found = correct(
         batch_of(
-            bed, flat(5), LEVEL, cameras, Settings(method="regression"),
+            bed, flat(5), LEVEL, cameras, ScienceOptions(method="regression"),
             views_of(5, cameras), learned=Learned(regression=line),
         )
     )  # fmt: skip

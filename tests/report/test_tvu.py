@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.options import ErrorBudget
+from pcfix.options.correct import BudgetOptions
 from pcfix.refract.tally import ORDERS, UncertaintyTally, largest_tvu_m
 from pcfix.report.page import png_of
 from pcfix.report.run import tvu_figure
@@ -77,7 +77,7 @@ def test_the_strictest_order_holds_95_percent():
 
 
 def test_words_name_what_was_assumed():
-    errors = ErrorBudget()
+    errors = BudgetOptions()
     assert "level 0.020 m (assumed)" in budget_words(asdict(errors))
     assert "level 0.007 m (fitted)" in budget_words(asdict(errors), 0.007)
     assert "level 0.020 m (assumed)" in budget_words(asdict(errors), float("nan"))

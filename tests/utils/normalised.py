@@ -13,7 +13,7 @@ from pcfix.simulate.tracing import piercing_points, project, triangulate
 
 if TYPE_CHECKING:
     from pcfix.model import FloatArray
-    from pcfix.options import ErrorBudget
+    from pcfix.options.correct import BudgetOptions
 
 LENS = Lens(3600.0, 5400.0, 3600.0, 2700.0, 1800.0)
 HEIGHT_M = 60.0
@@ -53,7 +53,11 @@ def views_of(points: int, cameras: Cameras) -> Views:
 
 
 def apparent(
-    bed: FloatArray, cameras: Cameras, sigma: ErrorBudget, rng: np.random.Generator, draws: int = 1
+    bed: FloatArray,
+    cameras: Cameras,
+    sigma: BudgetOptions,
+    rng: np.random.Generator,
+    draws: int = 1,
 ) -> FloatArray:
     """Return what SfM software makes of m points on the bed, shape (draws * m, 3).
 
@@ -88,7 +92,7 @@ def apparent(
 
 
 def _misplaced(
-    cameras: Cameras, sigma: ErrorBudget, rng: np.random.Generator, draws: int
+    cameras: Cameras, sigma: BudgetOptions, rng: np.random.Generator, draws: int
 ) -> Cameras:
     """Return where the cameras really were, draw after draw."""
     count = draws * len(cameras)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.model import Cameras, Lens, Views
-from pcfix.options import DEFAULT_REFRACTIVE_INDEX
+from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 from pcfix.port.shapes import DomePort, FlatPort
 from pcfix.simulate.tracing import triangulate
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcfix.model import BoolArray, Correction, FloatArray
-    from pcfix.options import Dimensions
+    from pcfix.options.correct import Dimensions
 
 Records: TypeAlias = Any
 """A numpy array of point records, whose dtype has named fields."""

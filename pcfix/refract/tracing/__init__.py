@@ -20,7 +20,7 @@ from numba import njit, prange
 
 from pcfix.errors import SettingError
 from pcfix.model import WaterMesh, WaterPlane, WaterRaster
-from pcfix.options import DEFAULT_REFRACTIVE_INDEX
+from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 from pcfix.refract.tracing.tracers import (
     Water,
     afrt,
