@@ -56,15 +56,15 @@ def _type(one: Option) -> Any:
 
 def _parameter(one: Option) -> Parameter:
     declared, default = one.declared, one.default
-    told = declared.default_is or ("" if default in (None, (), False) else str(default))
-    unit = f" [{declared.unit}]" if declared.unit else ""
+    told = one.default_text
     has_opposite = one.type is bool and (default or one.name == "connected")
     return Parameter(
-        help=f"{declared.help}{unit}{' (needed)' if declared.needed else ''}",
+        help=f"{one.help_text}{' (needed)' if declared.needed else ''}",
         group=_GROUPS[one.panel],
         negative_bool="no-" if has_opposite else (),
         negative_none="no-" if one.name in ("below", "floating") else (),
         negative_iterable=(),
+        show=not declared.hidden,
         show_default=(lambda value: told) if told else False,
     )
 

@@ -57,6 +57,8 @@ class Declared(NamedTuple):
         What stands for the value in the help.
     old : tuple of str
         Names that it had; they work, with a warning.
+    hidden : bool
+        Left out of help and documents: it says nothing any more.
     """
 
     help: str
@@ -67,6 +69,7 @@ class Declared(NamedTuple):
     parse: Callable[[str, str], Any] | None = None
     metavar: str = ""
     old: tuple[str, ...] = ()
+    hidden: bool = False
 
 
 def option(default: Any, help: str, **more: Any) -> Any:
@@ -99,6 +102,27 @@ class Option(NamedTuple):
         union = get_origin(self.type) in (Union, types.UnionType)
         kinds = get_args(self.type) if union else (self.type,)
         return tuple(kind for kind in kinds if kind is not type(None))
+
+    @property
+    def help_text(self) -> str:
+        """Its sentence, with the unit."""
+        return self.declared.help + (f" [{self.declared.unit}]" if self.declared.unit else "")
+
+    @property
+    def default_text(self) -> str:
+        """Its default, in words where they say more; empty where there is none."""
+        if self.declared.default_is or self.default in (None, ()) or self.default is False:
+            return self.declared.default_is
+        if isinstance(self.default, tuple):
+            return " ".join(f"{value:g}" for value in self.default)
+        return f"{self.default:g}" if isinstance(self.default, float) else str(self.default)
+
+    @property
+    def placeholder(self) -> str:
+        """What stands for its value: a path, a number, or nothing for a switch."""
+        if os.PathLike[str] in self.kinds:
+            return "PATH"
+        return "" if bool in self.kinds else "N" if self.kinds != (str,) else "TEXT"
 
     @property
     def plain_kinds(self) -> tuple[type, ...]:
@@ -210,6 +234,19 @@ def options_of(kind: type) -> tuple[Option, ...]:
             if "declared" in one.metadata
         )
     return _KNOWN[kind]
+
+
+def table_of(kind: type) -> str:
+    """Return the options of a class as a table of a document."""
+    rows = ["| option | meaning | default |", "|---|---|---|"]
+    for one in options_of(kind):
+        if one.declared.hidden:
+            continue
+        value = "\\|".join(one.choices) or one.declared.metavar or one.placeholder
+        default = "needed" if one.declared.needed else one.default_text
+        flag = f"{one.flag} {value}".strip()
+        rows.append(f"| `{flag}` | {one.help_text} | {default} |")
+    return "\n".join(rows)
 
 
 def taken(

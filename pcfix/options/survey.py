@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from pcfix.errors import SettingError
+from pcfix.errors import PcfixWarning, SettingError
 from pcfix.options.correct import RefractionOptions
 from pcfix.options.declare import File, OptionSet, one_or_more, option, positive
 from pcfix.options.shared import (
@@ -129,6 +130,21 @@ def _water_unknowns(option: str, names: Any) -> str | None:
     return wrong and f"free '{wrong}' must be among {', '.join(WATER_UNKNOWNS)}."
 
 
+def _engine(option: str, name: Any) -> str | None:
+    """Refuse an engine that is gone, and warn of an option that says nothing any more."""
+    if name not in ("direct", "pcfix"):
+        return (
+            f"engine '{name}': pcfix 0.1.0 was the last version with COLMAP's engine; leave"
+            " --engine out, as there is one engine only."
+        )
+    warnings.warn(
+        "--engine is of no use any more, as there is one engine only; leave it out.",
+        PcfixWarning,
+        stacklevel=2,
+    )
+    return None
+
+
 def _lens_names(option: str, text: str) -> tuple[str, ...]:
     names = one_or_more(str, "f,k1")(option, text)
     return () if names == ("none",) else names
@@ -199,6 +215,7 @@ class AdjustRules(IndexOptions):
         old=("sigma_px",),
     )
     outliers: bool = option(True, "Look for outliers and leave them out.")
+    engine: str | None = option(None, "There is one only.", rule=_engine, hidden=True)
 
 
 @dataclass(frozen=True, kw_only=True)
