@@ -117,8 +117,9 @@ def port_covariances(
     true_xyz : array, shape (m, 3)
         Metres, world frame.
     views, cameras, port, settings
-        As of `consistent_through_port`; of the standard deviations those of the
-        images, the refractive index, the projection centres and the attitudes count. There is no surface to err.
+        As of `consistent_through_port`; of the standard deviations those of the images, the
+        refractive index, the projection centres and the attitudes count. There is no surface to
+        err.
 
     Returns
     -------
