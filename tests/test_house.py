@@ -1,0 +1,265 @@
+"""The plan of the house: who may import whom, who opens files, how many parameters are many."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+HOUSE = Path(__file__).parents[1] / "pcfix"
+
+# The floors, from the ground up. What shares a floor stands side by side; a file may import from
+# lower floors and from its own room. "pcfix" is the front door, pcfix/__init__.py.
+FLOORS = (
+    ("version", "errors"),
+    ("threads",),
+    ("options",),
+    ("model",),
+    ("lens",),
+    ("water",),
+    ("label",),
+    ("refract",),
+    ("port",),
+    ("adjust",),
+    ("clean", "grid", "compare"),
+    ("simulate",),
+    ("io",),
+    ("report",),
+    ("flow",),
+    ("pcfix",),
+    ("pdal_stage",),
+    ("cli",),
+    ("__main__",),
+)
+# The simulator checks the rooms that correct, so it may not use what they do.
+TWINS = {"simulate": {"label", "refract", "port", "adjust", "clean", "grid", "compare"}}
+
+FILE_LIBRARIES = {"laspy", "rasterio", "pyproj", "fiona", "pyogrio", "PIL"}
+OPENING = {"read_text", "read_bytes", "write_text", "write_bytes"}
+# Files and libraries of files outside io/, with the reason.
+OUTSIDE_IO = {"pcfix.flow.adjust": "its results are a folder that is replaced as a whole"}
+
+MOST_PARAMETERS = 9
+# Kernels that get places to work in, as none are made where millions of points are gone through.
+# `flag_neighbours` is what files and arrays share. The list may get shorter, not longer.
+MANY_PARAMETERS = {
+    "pcfix.clean.points.flag_neighbours",
+    "pcfix.port.intersection._choose",
+    "pcfix.port.intersection._usable",
+    "pcfix.port.inversion._covariances",
+    "pcfix.port.inversion._search_all",
+    "pcfix.refract.consistent._add_slope",
+    "pcfix.refract.consistent._begin",
+    "pcfix.refract.consistent._correct",
+    "pcfix.refract.consistent._gradient",
+    "pcfix.refract.consistent._search",
+    "pcfix.refract.consistent._solve",
+    "pcfix.refract.depth_maps._depth",
+    "pcfix.refract.depth_maps._invert",
+    "pcfix.refract.fusion._invert",
+    "pcfix.refract.fusion._likely",
+    "pcfix.refract.intersect._intersect_one",
+    "pcfix.refract.literature.plumb_line_crossings",
+    "pcfix.refract.rays._settle_on_crease",
+    "pcfix.refract.rays.light_path",
+    "pcfix.refract.rays.nearest_point",
+    "pcfix.refract.rays.pierce_raster",
+    "pcfix.refract.rays.settle",
+    "pcfix.refract.sensitivity._add_nine",
+    "pcfix.refract.sensitivity._in_space",
+    "pcfix.refract.stereo_pairs._invert",
+    "pcfix.refract.tracing.gradients._by_places",
+    "pcfix.refract.tracing.gradients.light_and_gradients",
+    "pcfix.refract.tracing.tracers._draw_together",
+}
+
+
+def name_of(path: Path) -> str:
+    parts = path.relative_to(HOUSE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+@cache
+def trees() -> dict[str, ast.Module]:
+    return {name_of(path): ast.parse(path.read_text("utf-8")) for path in HOUSE.rglob("*.py")}
+
+
+def is_package(name: str) -> bool:
+    return (HOUSE.parent.joinpath(*name.split(".")) / "__init__.py").exists()
+
+
+def imported(name: str, node: ast.AST) -> set[str]:
+    """Return the full names that one statement imports, a file where it names one."""
+    if isinstance(node, ast.Import):
+        return {alias.name for alias in node.names}
+    if not isinstance(node, ast.ImportFrom):
+        return set()
+    base = node.module or ""
+    if node.level:
+        parts = name.split(".")[: None if is_package(name) else -1]
+        parts = parts[: len(parts) - node.level + 1]
+        base = ".".join([*parts, *base.split(".")] if base else parts)
+    whole = {f"{base}.{alias.name}" for alias in node.names}
+    return {one if one in trees() else base for one in whole}
+
+
+@cache
+def imports() -> dict[str, set[str]]:
+    """Return what every file imports: at its top, for its types alone, and inside functions."""
+    return {
+        name: {found for node in ast.walk(tree) for found in imported(name, node)} - {name}
+        for name, tree in trees().items()
+    }
+
+
+def without_types(node: ast.AST) -> Iterator[ast.AST]:
+    """Walk through what is run: all but what stands under ``if TYPE_CHECKING``."""
+    yield node
+    if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+        return
+    for child in ast.iter_child_nodes(node):
+        yield from without_types(child)
+
+
+def room_of(name: str) -> str:
+    return name.split(".")[1] if "." in name else "pcfix"
+
+
+def arrows() -> list[tuple[str, str]]:
+    return [
+        (one, other)
+        for one, others in sorted(imports().items())
+        for other in sorted(others)
+        if other.split(".")[0] == "pcfix"
+    ]
+
+
+def circles() -> list[list[str]]:
+    """Return the groups of files that reach each other (Tarjan 1972)."""
+    graph = {one: others & trees().keys() for one, others in imports().items()}
+    number: dict[str, int] = {}
+    lowest: dict[str, int] = {}
+    stack: list[str] = []
+    found = []
+
+    def visit(name: str) -> None:
+        number[name] = lowest[name] = len(number)
+        stack.append(name)
+        for other in graph[name]:
+            if other not in number:
+                visit(other)
+                lowest[name] = min(lowest[name], lowest[other])
+            elif other in stack:
+                lowest[name] = min(lowest[name], number[other])
+        if lowest[name] == number[name]:
+            at = stack.index(name)
+            if len(stack) - at > 1:
+                found.append(sorted(stack[at:]))
+            del stack[at:]
+
+    for name in graph:
+        if name not in number:
+            visit(name)
+    return found
+
+
+def functions() -> list[tuple[str, int]]:
+    """Return every function and method by its full name, with the number of its parameters."""
+    found = []
+
+    def walk(name: str, node: ast.AST) -> None:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+                inner = f"{name}.{child.name}"
+                if not isinstance(child, ast.ClassDef):
+                    a = child.args
+                    names = [p.arg for p in (*a.posonlyargs, *a.args, *a.kwonlyargs)]
+                    found.append((inner, len(names) - (names[:1] in (["self"], ["cls"]))))
+                walk(inner, child)
+            else:
+                walk(name, child)
+
+    for name, tree in trees().items():
+        walk(name, tree)
+    return found
+
+
+def opened(node: ast.AST) -> str:
+    """Return how a node opens a file, or nothing."""
+    if not isinstance(node, ast.Call):
+        return ""
+    if isinstance(node.func, ast.Name) and node.func.id == "open":
+        return "open"
+    if isinstance(node.func, ast.Attribute) and node.func.attr in OPENING | {"open"}:
+        return f".{node.func.attr}"
+    return ""
+
+
+def test_every_room_has_a_floor() -> None:
+    rooms = {room_of(name) for name in trees()}
+    assert rooms == {room for floor in FLOORS for room in floor}
+
+
+def test_no_arrow_upward() -> None:
+    floor = {room: at for at, floor in enumerate(FLOORS) for room in floor}
+    upward = [
+        f"{one} -> {other}"
+        for one, other in arrows()
+        if room_of(one) != room_of(other) and floor[room_of(other)] >= floor[room_of(one)]
+    ]
+    assert not upward, "\n".join(upward)
+
+
+@pytest.mark.parametrize("room", TWINS)
+def test_the_twin_borrows_nothing(room: str) -> None:
+    borrowed = [a for a in arrows() if room_of(a[0]) == room and room_of(a[1]) in TWINS[room]]
+    assert not borrowed, borrowed
+
+
+def test_no_circle() -> None:
+    assert not circles(), "\n".join(" ".join(circle) for circle in circles())
+
+
+def test_files_are_the_business_of_io() -> None:
+    found = []
+    for name, tree in trees().items():
+        if room_of(name) == "io" or name in OUTSIDE_IO:
+            continue
+        nodes = list(without_types(tree))
+        names = {other.split(".")[0] for node in nodes for other in imported(name, node)}
+        found += [f"{name} imports {library}" for library in sorted(names & FILE_LIBRARIES)]
+        found += [f"{name} line {node.lineno}: {opened(node)}" for node in nodes if opened(node)]
+    assert not found, "\n".join(found)
+
+
+def test_exceptions_still_are_some() -> None:
+    assert OUTSIDE_IO.keys() <= trees().keys()
+    assert {name for name, count in functions() if count > MOST_PARAMETERS} >= MANY_PARAMETERS
+
+
+def test_few_parameters() -> None:
+    many = [f"{n}: {c}" for n, c in functions() if c > MOST_PARAMETERS and n not in MANY_PARAMETERS]
+    assert not many, "\n".join(many)
+
+
+def test_help_loads_nothing_heavy() -> None:
+    program = (
+        "import sys\n"
+        "from pcfix import cli\n"
+        "sys.argv = ['pcfix', '--help']\n"
+        "try:\n    cli.main()\nexcept SystemExit:\n    pass\n"
+        "print(sorted({'numba', 'scipy', 'matplotlib', 'laspy'} & sys.modules.keys()))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert "Usage" in done.stdout
+    assert done.stdout.splitlines()[-1] == "[]"
