@@ -25,7 +25,6 @@ app = App(
     help_format="plaintext",
 )
 for command, example in EXAMPLES:
-    prepare(command)
     summary, _, more = str(command.__doc__).partition("\n")
     lines = [summary, *(line.strip() for line in more.splitlines()), "", f"Example: {example}"]
     app.command(command, help="\n".join(lines).replace("\n\n\n", "\n\n"))
@@ -35,6 +34,9 @@ def main(tokens: Sequence[str] | None = None) -> None:
     """Run the command line; a user's mistake is one line on stderr and exit code 1."""
     warnings.showwarning = show_warning
     words = list(sys.argv[1:] if tokens is None else tokens)
+    for command, _ in EXAMPLES:
+        if command.__name__ in words[:1]:
+            prepare(command)
     if words in ([], *([name] for name in app if name not in ("demo", "--version"))):
         app([*words, "--help"])
         sys.exit(0 if words in (["--help"], ["-h"]) else 2)
