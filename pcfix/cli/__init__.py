@@ -24,10 +24,10 @@ app = App(
     help_flags=["--help", "-h"],
     help_format="plaintext",
 )
-for command, example in EXAMPLES:
+for place, (command, example) in enumerate(EXAMPLES):
     summary, _, more = str(command.__doc__).partition("\n")
     lines = [summary, *(line.strip() for line in more.splitlines()), "", f"Example: {example}"]
-    app.command(command, help="\n".join(lines).replace("\n\n\n", "\n\n"))
+    app.command(command, help="\n".join(lines).replace("\n\n\n", "\n\n"), sort_key=place)
 
 
 def main(tokens: Sequence[str] | None = None) -> None:
