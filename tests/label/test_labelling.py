@@ -70,7 +70,7 @@ def test_dead_band_quietens_the_waterline_and_does_not_move_it():
     x, y, height, xyz = beach()
     near = x < 58.0
     plain = labelled(part_of(xyz))[0] == 40
-    quiet, labelling = labelled(part_of(xyz), dead_band_m=0.1)
+    quiet, labelling = labelled(part_of(xyz), dead_band=0.1)
     quiet = quiet == 40
     before, after = (changes(x[near], y[near], wet[near]) for wet in (plain, quiet))
     assert before > 20.0
@@ -88,7 +88,7 @@ def test_dead_band_quietens_the_waterline_and_does_not_move_it():
 
 def test_dead_band_is_the_vote_of_nine_cells():
     _, _, _, xyz = beach(8000, noise_m=0.1)
-    found, labelling = labelled(part_of(xyz), dead_band_m=0.15)
+    found, labelling = labelled(part_of(xyz), dead_band=0.15)
     side = labelling.report()["cell_m"]
     height = xyz[:, 2] - WATER_M
     votes = defaultdict(int)
@@ -127,10 +127,10 @@ def test_pit_behind_a_berm_is_not_sea_unless_joined():
 def test_large_pools_stay_and_a_threshold_says_which():
     x, _, _, xyz = beach()
     pit = np.hypot(x - 80.0, xyz[:, 1] - NORTH - 20.0) < 2.0
-    assert (labelled(part_of(xyz), connected=True, least_pool_m2=20.0)[0][pit] == 40).all()
-    assert (labelled(part_of(xyz), connected=True, least_pool_m2=60.0)[0][pit] != 40).all()
+    assert (labelled(part_of(xyz), connected=True, least_pool=20.0)[0][pit] == 40).all()
+    assert (labelled(part_of(xyz), connected=True, least_pool=60.0)[0][pit] != 40).all()
     # the largest stays whatever is asked for
-    assert (labelled(part_of(xyz), connected=True, least_pool_m2=1e9)[0][x < 42] == 40).all()
+    assert (labelled(part_of(xyz), connected=True, least_pool=1e9)[0][x < 42] == 40).all()
     two = np.abs(x - 25.0) > 6.0  # dry ground parts the sea in two of like size
     xyz[~two, 2] = WATER_M + 1.0
     assert (labelled(part_of(xyz), connected=True)[0][two & (x < 42)] == 40).all()
@@ -149,9 +149,9 @@ def test_sparse_water_hangs_together():
 @pytest.mark.parametrize(
     "choices",
     [
-        {"dead_band_m": 0.1},
+        {"dead_band": 0.1},
         {"connected": True},
-        {"dead_band_m": 0.08, "connected": True, "band_m": 0.02},
+        {"dead_band": 0.08, "connected": True, "band": 0.02},
     ],
 )
 def test_parts_order_and_corners_leave_no_trace(choices):
@@ -173,10 +173,10 @@ def test_parts_order_and_corners_leave_no_trace(choices):
 def test_band_is_water_surface_on_both_sides():
     x, _, _, xyz = beach(20_000)
     height = xyz[:, 2] - WATER_M
-    found, _ = labelled(part_of(xyz), band_m=0.05)
+    found, _ = labelled(part_of(xyz), band=0.05)
     expected = np.where(np.abs(height) <= 0.05, 41, np.where(height < 0, 40, 0))
     np.testing.assert_array_equal(found, expected)
-    joined, _ = labelled(part_of(xyz), band_m=0.05, connected=True)
+    joined, _ = labelled(part_of(xyz), band=0.05, connected=True)
     assert not np.isin(joined[x > 70.0], (40, 41)).any()
     np.testing.assert_array_equal(joined[x < 48], expected[x < 48])
 
@@ -189,7 +189,7 @@ def test_respected_classes_are_left_in_peace():
     kept = np.isin(classes, (2, 5))
     np.testing.assert_array_equal(found, np.where(wet & ~kept, 40, classes))
     assert labelling.report()["respected"] == (wet & kept).sum()
-    found, _ = labelled(part_of(xyz, classes), respect_classes=(2, 41), reset=True, band_m=0.02)
+    found, _ = labelled(part_of(xyz, classes), respect_classes=(2, 41), reset=True, band=0.02)
     kept = np.isin(classes, (2, 41))
     np.testing.assert_array_equal(found[kept], classes[kept])
     assert (found[(classes == 40) & (xyz[:, 2] > WATER_M + 0.02)] == 1).all()
@@ -224,16 +224,16 @@ def test_mask_that_holds_no_water_says_where_both_lie():
 def test_a_handful_of_points(at, count):
     x, y = np.linspace(-40, 30, count) + at[0], np.linspace(-9, 70, count) + at[1]
     xyz = np.column_stack([x, y, np.zeros(count)])
-    found, _ = labelled(part_of(xyz), connected=True, dead_band_m=0.5)
+    found, _ = labelled(part_of(xyz), connected=True, dead_band=0.5)
     assert found.tolist() == [40] * count
-    found, _ = labelled(part_of(xyz, level=-1.0), connected=True, dead_band_m=0.5)
+    found, _ = labelled(part_of(xyz, level=-1.0), connected=True, dead_band=0.5)
     assert not found.any()
 
 
 def test_a_line_of_points_and_a_stray_one():
     xyz = np.column_stack([EAST + np.arange(4000.0), np.full(4000, NORTH), np.full(4000, 12.0)])
     xyz[0, :2] += 4e6
-    found, labelling = labelled(part_of(xyz), connected=True, least_pool_m2=1e5)
+    found, labelling = labelled(part_of(xyz), connected=True, least_pool=1e5)
     assert (found[1:] == 40).all()
     # 4e6 m across in 4096 cells
     assert labelling.report()["cell_m"] == 1024.0
@@ -242,14 +242,14 @@ def test_a_line_of_points_and_a_stray_one():
 @pytest.mark.parametrize(
     ("choices", "sentence"),
     [
-        ({"band_m": -0.1}, r"band -0.1 must not be negative: give metres"),
-        ({"dead_band_m": -1}, r"dead-band -1 must not be negative"),
-        ({"band_m": float("nan")}, r"band nan must not be negative"),
-        ({"band_m": 0.2, "dead_band_m": 0.1}, r"dead-band 0.1 does not reach beyond band 0.2"),
+        ({"band": -0.1}, r"band -0.1 must not be negative: give metres"),
+        ({"dead_band": -1}, r"dead-band -1 must not be negative"),
+        ({"band": float("nan")}, r"band nan must not be negative"),
+        ({"band": 0.2, "dead_band": 0.1}, r"dead-band 0.1 does not reach beyond band 0.2"),
         ({"respect_classes": (2, 256)}, r"respect-classes: 256 is no class of LAS; .* 0 to 255"),
         ({"respect_classes": (-1,)}, r"respect-classes: -1 is no class"),
-        ({"least_pool_m2": 5.0}, r"least-pool is of no use without connected"),
-        ({"least_pool_m2": -5.0, "connected": True}, r"least-pool -5 must not be negative"),
+        ({"least_pool": 5.0}, r"least-pool is of no use without connected"),
+        ({"least_pool": -5.0, "connected": True}, r"least-pool -5 must not be negative"),
     ],
 )
 def test_settings_that_make_no_sense(choices, sentence):

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pcfix import Cameras, ScienceOptions
+from pcfix import Cameras
 from pcfix.errors import SettingError
 from pcfix.lens.imaging import unproject
 from pcfix.model import Outcome
-from pcfix.options.correct import BudgetOptions
+from pcfix.options.correct import BudgetOptions, ScienceOptions
 from pcfix.port.intersection import intersect_rays, port_views
 from pcfix.port.inversion import port_covariances
 from pcfix.port.methods import correct_through_port, intersect_through_port
@@ -205,7 +205,7 @@ def test_limits_of_angle_and_number(scene):
     three, chosen = run(max_cameras=3)
     assert np.diff(chosen.start).max() == 3
     limit = 0.3 * run()[0].incidence_deg.max()
-    narrow, _ = run(max_angle_deg=limit)
+    narrow, _ = run(max_angle=limit)
     assert narrow.incidence_deg.max() <= limit < three.incidence_deg.max()
     few = narrow.outcome != Outcome.CORRECTED
     assert few.any()

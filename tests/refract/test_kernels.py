@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.refract.intersect import TILE, spatial_order
+from pcfix.refract.choice import TILE, spatial_order
 
 RNG = np.random.default_rng(7)
 N = 5 * TILE + 17

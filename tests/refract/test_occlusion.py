@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix import Cameras, Lens, ScienceOptions
+from pcfix import Cameras, Lens
 from pcfix.io.views import ViewMatch, read_views
 from pcfix.model import Views, WaterPlane
+from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
 from pcfix.refract.methods import correct
 from pcfix.refract.occlusion import hidden, in_sight

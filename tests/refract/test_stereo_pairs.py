@@ -210,7 +210,7 @@ def test_water_that_does_not_refract_changes_nothing():
 def test_a_pair_loses_both_when_it_loses_one():
     cameras = looking(CENTRES, TILTS, HEADINGS, LENS)
     points, steep = np.array([[1.0, 2, -5]]), PAIRS[:4]
-    result = run(points, cameras, WaterPlane(0.0), listed([PAIRS]), max_angle_deg=30.0)
+    result = run(points, cameras, WaterPlane(0.0), listed([PAIRS]), max_angle=30.0)
     expected = run(points, cameras, WaterPlane(0.0), listed([steep]))
     assert result.shift_m == pytest.approx(expected.shift_m, abs=0.0)
     assert result.ray_count.tolist() == [4]
@@ -229,7 +229,7 @@ def test_what_becomes_of_points_without_pairs():
     )
     lists = [[[0, 2]], [], [[2, 2]], [[0, 3]], [[0, 1]], [[0, 1], [1, 2]]]
     points = np.repeat([[0.0, 0, -3]], len(lists), axis=0)
-    result = run(points, cameras, WaterPlane(0.0), listed(lists), max_angle_deg=45.0)
+    result = run(points, cameras, WaterPlane(0.0), listed(lists), max_angle=45.0)
     assert [Outcome(value).name for value in result.outcome] == [
         "CORRECTED",
         "NO_CAMERA",

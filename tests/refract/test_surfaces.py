@@ -102,7 +102,7 @@ def test_an_unknown_cell_makes_four_patches_unknown():
 
 
 @pytest.mark.parametrize("abc", [(0.4, 0.0, 0.0), (0.2, 0.003, -0.002), (-0.1, 0.04, 0.03)])
-@pytest.mark.parametrize("options", [{}, {"max_cameras": 3}, {"max_angle_deg": 25.0}])
+@pytest.mark.parametrize("options", [{}, {"max_cameras": 3}, {"max_angle": 25.0}])
 def test_a_raster_of_a_plane_equals_the_plane(abc, options):
     a, b, c = abc
     there = pcfix.WaterPlane(a - b * UTM[0] - c * UTM[1], b, c)

@@ -27,13 +27,13 @@ from tests.utils.normalised import INDEX, apparent, block, views_of
 
 NONE = BudgetOptions(sigma_image=0.0, sigma_level=0.0, sigma_index=0.0)
 SOURCES = {
-    "image": replace(NONE, image_px=0.7),
-    "level": replace(NONE, level_m=0.05),
-    "tilt": replace(NONE, tilt_deg=0.1),
-    "index": replace(NONE, index=0.004),
-    "waves": replace(NONE, waves_deg=0.5),
-    "centre": replace(NONE, centre_m=0.02),
-    "attitude": replace(NONE, attitude_deg=0.02),
+    "image": replace(NONE, sigma_image=0.7),
+    "level": replace(NONE, sigma_level=0.05),
+    "tilt": replace(NONE, sigma_tilt=0.1),
+    "index": replace(NONE, sigma_index=0.004),
+    "waves": replace(NONE, sigma_waves=0.5),
+    "centre": replace(NONE, sigma_centre=0.02),
+    "attitude": replace(NONE, sigma_attitude=0.02),
     "all": BudgetOptions(
         sigma_image=0.5,
         sigma_level=0.03,
@@ -192,7 +192,7 @@ def test_common_errors_are_the_derivatives_of_the_intersection(plane):
     for direction in ((1.0, 0.0), (0.0, 1.0)):
         up, down = (tilted(*(s * np.array(direction))) for s in (step, -step))
         both += ((found(up).shift_m - found(down).shift_m)[moved, 2] / (2.0 * step)) ** 2
-    errors = replace(NONE, tilt_deg=math.degrees(1.0))
+    errors = replace(NONE, sigma_tilt=math.degrees(1.0))
     cov = covariances(
         bed, base.shift_m, surface_above(plane, bed), cameras, ScienceOptions(**vars(errors))
     )
@@ -267,7 +267,7 @@ def test_level_is_the_users_else_the_fits_else_a_default():
     found = intersect(bed, flat(20), LEVEL, cameras, ScienceOptions())
 
     def sigma(given, stated=None):
-        settings = ScienceOptions(**vars(replace(NONE, level_m=stated)))
+        settings = ScienceOptions(**vars(replace(NONE, sigma_level=stated)))
         args = bed, found.shift_m, flat(20), cameras, settings
         return np.sqrt(covariances(*args, level_sigma_m=given)[:, 5])
 
