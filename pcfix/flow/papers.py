@@ -243,7 +243,7 @@ def _by_pcfix(flume: Flume) -> FloatArray:
         flume.apparent_xyz,
         flume.cameras,
         flume.water_level_m,
-        refractive_index=flume.refractive_index,
+        index=flume.refractive_index,
         views=flume.views,
     )
     return np.asarray(flume.water_level_m - corrected.xyz[:, 2])
