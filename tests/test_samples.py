@@ -26,7 +26,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(folder):
-    """Return a function that runs a script once, in a folder that holds what the first writes."""
+    """Return a function that runs a script, each one once, in one folder."""
     environment = {
         **os.environ, "MPLBACKEND": "agg", "PATH": f"{PROGRAM.parent}:{os.environ['PATH']}"
     }  # fmt: skip
@@ -38,7 +38,6 @@ def run(folder):
             check=False, env=environment,
         )  # fmt: skip
 
-    call(SCRIPTS[0])
     return call
 
 
@@ -46,6 +45,8 @@ def run(folder):
 def test_script(script, folder, run):
     if "pdal" in script.stem and not IS_THERE:
         pytest.skip("no PDAL in this environment")
+    if "Run 01_correct.py first" in script.read_text():
+        run(SCRIPTS[0])
     done = run(script)
     assert (done.returncode, done.stderr) == (0, "")
     number = script.stem[:2]
