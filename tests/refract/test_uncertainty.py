@@ -143,15 +143,15 @@ def test_common_errors_are_the_derivatives_of_consistent(tilt_deg):
 
     both = (step, -step)
     found = {
-        "level_m": slope(plane=[WaterPlane(s) for s in both]),
-        "index": slope(index=[INDEX + s for s in both]),
-        "tilt_deg": np.hypot(
+        "sigma_level": slope(plane=[WaterPlane(s) for s in both]),
+        "sigma_index": slope(index=[INDEX + s for s in both]),
+        "sigma_tilt": np.hypot(
             slope(plane=[WaterPlane(-s * x, s, 0.0) for s in both]),
             slope(plane=[WaterPlane(-s * y, 0.0, s) for s in both]),
         ),
     }
     for name, expected in found.items():
-        one = math.degrees(1.0) if name == "tilt_deg" else 1.0
+        one = math.degrees(1.0) if name == "sigma_tilt" else 1.0
         errors = replace(NONE, **{name: one})
         sigma = solved(xyz, cameras, ScienceOptions(method="consistent", **vars(errors))).sigma_z_m
         rms = np.sqrt((expected**2).mean())
@@ -178,8 +178,8 @@ def test_common_errors_are_the_derivatives_of_the_intersection(plane):
         return replace(plane, a=plane.a - b * x - c * y, b=plane.b + b, c=plane.c + c)
 
     changes = {
-        "level_m": [({"water": replace(plane, a=plane.a + s)}) for s in (step, -step)],
-        "index": [({"index": INDEX + s}) for s in (step, -step)],
+        "sigma_level": [({"water": replace(plane, a=plane.a + s)}) for s in (step, -step)],
+        "sigma_index": [({"index": INDEX + s}) for s in (step, -step)],
     }
     for name, (up, down) in changes.items():
         slope = (found(**up).shift_m - found(**down).shift_m)[moved, 2] / (2.0 * step)
@@ -218,11 +218,7 @@ def test_variances_of_sources_add_up():
     def cov(errors):
         return covariances(bed, found.shift_m, flat(50), cameras, ScienceOptions(**vars(errors)))
 
-    parts = [
-        cov(replace(NONE, **{name: getattr(all_of_them, name)}))
-        for name in ("image_px", "level_m", "tilt_deg", "index", "waves_deg", "centre_m",
-                     "attitude_deg")
-    ]  # fmt: skip
+    parts = [cov(replace(NONE, **{name: getattr(all_of_them, name)})) for name in vars(all_of_them)]
     # rounding only, relative to the variance in z
     np.testing.assert_allclose(sum(parts), cov(all_of_them), rtol=0, atol=1e-9 * parts[0].max())
 

@@ -70,22 +70,22 @@ def apparent(
     per_ray = np.repeat(np.arange(draws), m * k)
     camera = np.tile(np.tile(np.arange(k), m), draws)
     points = np.tile(np.repeat(bed, k, axis=0), (draws, 1))
-    n = (INDEX + sigma.index * rng.normal(size=draws))[per_ray]
-    level = ((sigma.level_m or 0.0) * rng.normal(size=draws))[per_ray]
-    tilt = (math.radians(sigma.tilt_deg) * rng.normal(size=(draws, 2)))[per_ray]
+    n = (INDEX + sigma.sigma_index * rng.normal(size=draws))[per_ray]
+    level = ((sigma.sigma_level or 0.0) * rng.normal(size=draws))[per_ray]
+    tilt = (math.radians(sigma.sigma_tilt) * rng.normal(size=(draws, 2)))[per_ray]
     true = _misplaced(cameras, sigma, rng, draws)
     seen_by = per_ray * k + camera
     centres = true.centres[seen_by]
     middle = np.tile(cameras.centres[:, :2].mean(axis=0), (len(n), 1))
     pivot = np.column_stack([middle, level])
     surface = through_tilted(points, centres, pivot, tilt, n)
-    if sigma.waves_deg:
+    if sigma.sigma_waves:
         # the waves lean about where the light pierces the surface, which hardly moves by that
-        waves = math.radians(sigma.waves_deg) * rng.normal(size=(len(n), 2))
+        waves = math.radians(sigma.sigma_waves) * rng.normal(size=(len(n), 2))
         for _ in range(3):
             surface = through_tilted(points, centres, surface, tilt + waves, n, pivot, tilt)
     pixels, _ = project(surface, true, seen_by, LENS)
-    pixels += sigma.image_px * rng.normal(size=pixels.shape)
+    pixels += sigma.sigma_image * rng.normal(size=pixels.shape)
     start = np.arange(draws * m + 1) * k
     guess = np.tile(bed * [1, 1, 0.75], (draws, 1))
     return triangulate(pixels, cameras, camera, start, LENS, guess)
@@ -96,10 +96,10 @@ def _misplaced(
 ) -> Cameras:
     """Return where the cameras really were, draw after draw."""
     count = draws * len(cameras)
-    turn = Rotation.from_rotvec(math.radians(sigma.attitude_deg) * rng.normal(size=(count, 3)))
+    turn = Rotation.from_rotvec(math.radians(sigma.sigma_attitude) * rng.normal(size=(count, 3)))
     return Cameras(
         tuple(map(str, range(count))),
-        np.tile(cameras.centres, (draws, 1)) + sigma.centre_m * rng.normal(size=(count, 3)),
+        np.tile(cameras.centres, (draws, 1)) + sigma.sigma_centre * rng.normal(size=(count, 3)),
         turn.as_matrix() @ np.tile(cameras.rotations, (draws, 1, 1)),
         cameras.lenses * draws,
     )
