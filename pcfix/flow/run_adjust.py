@@ -67,7 +67,7 @@ class AdjustStep:
 
     cloud: str
     inputs: Inputs
-    index: float | str
+    index: float | str | None
     when: AdjustWhen = "auto"
     gcps: File | None = None
     gnss: File | None = None

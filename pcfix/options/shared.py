@@ -98,11 +98,12 @@ class IndexOptions(OptionSet):
 
     panel = WATER
 
-    index: float | str = option(
-        DEFAULT_REFRACTIVE_INDEX,
+    index: float | str | None = option(
+        None,
         "Refractive index of the water relative to air: a number, fresh or sea.",
         rule=_INDEX,
         parse=index_or_name,
+        default_is=f"{DEFAULT_REFRACTIVE_INDEX:g}",
         metavar="N",
         old=("refractive_index",),
     )
@@ -110,7 +111,7 @@ class IndexOptions(OptionSet):
     @property
     def refractive_index(self) -> float:
         """The number; a water's name becomes one by `pcfix.water.index.with_index`."""
-        return float(self.index)
+        return DEFAULT_REFRACTIVE_INDEX if self.index is None else float(self.index)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -104,7 +104,7 @@ def with_index(options: Options) -> Options:
     water = [getattr(options, name, None) for name in names]
     index = options.index
     if any(value is not None for value in water):
-        if index != DEFAULT_REFRACTIVE_INDEX:
+        if index is not None:
             raise SettingError(
                 "index and salinity, temperature or wavelength say the same twice; give one of"
                 " them."
@@ -118,7 +118,7 @@ def with_index(options: Options) -> Options:
     return replace(options, index=number, index_from=origin or options.index_from, **silent)
 
 
-def index_of(given: float | str) -> tuple[float, str]:
+def index_of(given: float | str | None) -> tuple[float, str]:
     """Return the refractive index that a number or a word means, and what water that is.
 
     Parameters
