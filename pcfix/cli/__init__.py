@@ -38,7 +38,7 @@ def main(tokens: Sequence[str] | None = None) -> None:
         if command.__name__ in words[:1]:
             prepare(command)
     if words in ([], *([name] for name in app if name not in ("demo", "--version"))):
-        app([*words, "--help"])
+        app([*words, "--help"], result_action="return_value")
         sys.exit(0 if words in (["--help"], ["-h"]) else 2)
     try:
         app(words, exit_on_error=False, print_error=False, result_action="return_value")
