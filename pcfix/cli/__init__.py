@@ -45,13 +45,19 @@ def main(tokens: Sequence[str] | None = None) -> None:
     except CycloptsError as error:
         if isinstance(error.__cause__, PcfixError):
             _stop(str(error.__cause__), 1)
-        _stop(f"{error}\nTry 'pcfix {words[0]} --help'.", 2)
+        _stop(f"{error}\n{_try(words)}", 2)
     except UsageError as error:
-        _stop(f"{error}\nTry 'pcfix {words[0]} --help'.", 2)
+        _stop(f"{error}\n{_try(words)}", 2)
     except PcfixError as error:
         _stop(str(error), 1)
     except BrokenPipeError:
         sys.exit(1)
+
+
+def _try(words: list[str]) -> str:
+    """Return where help is."""
+    name = next((c.__name__ for c, _ in EXAMPLES if c.__name__ in words[:1]), "")
+    return f"Try '{' '.join(filter(None, ('pcfix', name, '--help')))}'."
 
 
 def _stop(sentence: str, code: int) -> None:
