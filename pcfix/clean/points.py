@@ -243,7 +243,7 @@ def clean_points(
     >>> import numpy as np
     >>> from pcfix.clean.points import clean_points
     >>> from pcfix.clean.settings import Reason
-    from pcfix.options.steps import CleanRules
+    >>> from pcfix.options.steps import CleanRules
     >>> x, y = (grid.ravel() / 4 for grid in np.mgrid[:30, :30])
     >>> cloud = np.column_stack([x, y, -2 + 0.01 * np.sin(9 * x + 7 * y)])
     >>> cloud[450, 2] += 1

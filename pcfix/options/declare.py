@@ -145,22 +145,25 @@ class Option(NamedTuple):
             value = self.declared.parse(self.flag[2:], value)
         if value is None and (self.default is None or type(None) in get_args(self.type)):
             return None
-        if self.choices and value not in self.choices:
-            raise SettingError(
-                f"{self.flag[2:]} '{value}' is not one of {', '.join(self.choices)}."
-            )
-        value = _converted(self, value)
-        wrong = None if self.declared.rule is None else self.declared.rule(self.flag[2:], value)
+        value = tuple(value) if isinstance(value, list) else value
+        wrong = self._against_rule(value)
+        if wrong is None and self.choices and value not in self.choices:
+            wrong = f"{self.flag[2:]} '{value}' is not one of {', '.join(self.choices)}."
         if wrong is not None:
             raise SettingError(wrong)
-        return value
+        return _converted(self, value)
+
+    def _against_rule(self, value: Any) -> str | None:
+        """Return what its rule says of a value; nothing of what is no number at all."""
+        try:
+            return None if self.declared.rule is None else self.declared.rule(self.flag[2:], value)
+        except TypeError:
+            return None
 
 
 def _converted(one: Option, value: Any) -> Any:
-    """Return numbers as Python's, and sequences as tuples."""
+    """Return numbers as Python's."""
     kinds = one.kinds
-    if isinstance(value, list):
-        return tuple(value)
     if bool in kinds or isinstance(value, str | tuple | os.PathLike):
         if isinstance(value, str) and kinds in ((float,), (int,)):
             raise SettingError(f"{one.flag[2:]} {value!r} must be a number.")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pcfix.errors import SettingError
-from pcfix.options.declare import File, OptionSet, at_least, must_be, option, positive
+from pcfix.options.declare import File, OptionSet, Rule, at_least, must_be, option, positive
 from pcfix.options.shared import (
     FIGURES,
     OUTPUT,
@@ -164,6 +164,17 @@ def _resolution(option: str, value: Any) -> str | None:
     )
 
 
+def _one_of(kind: Any) -> Rule:
+    known = get_args(kind)
+
+    def rule(option: str, value: Any) -> str | None:
+        if value in known:
+            return None
+        return f"The {option} is {value!r}; it must be one of {', '.join(known)}."
+
+    return rule
+
+
 @dataclass(frozen=True, kw_only=True)
 class DsmRules(OptionSet):
     """How a cloud becomes a raster."""
@@ -173,9 +184,11 @@ class DsmRules(OptionSet):
     resolution: float = option(
         None, "Side of a cell.", unit="m", needed=True, rule=_resolution, old=("resolution_m",)
     )
-    method: DsmMethod = option("mean", "How a cell gets its height.")
+    method: DsmMethod = option("mean", "How a cell gets its height.", rule=_one_of(DsmMethod))
     surface: SurfaceChoice = option(
-        "all", "Land and bed without noise, or only the bed (class 40)."
+        "all",
+        "Land and bed without noise, or only the bed (class 40).",
+        rule=_one_of(SurfaceChoice),
     )
     fill: float | None = option(
         None,

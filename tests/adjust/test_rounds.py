@@ -32,7 +32,7 @@ def _one_thread():
 def scene(image_px=0.5, **settings):
     return simulate_tie_points(
         300, area_m=(50, 40), greatest_depth_m=5, position_noise_m=0.3, attitude_noise_deg=0.2,
-        image_noise_px=image_px, **settings,
+        image_noise=image_px, **settings,
     )  # fmt: skip
 
 

@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING
 import laspy
 import numpy as np
 import pytest
-import typer
-from pcfix.cli.clean import clean
-from typer.testing import CliRunner
 
 import pcfix
 from pcfix.clean.points import clean_points
 from pcfix.errors import GeometryError, InputError, SettingError
 from pcfix.flow.clean import clean_file
 from pcfix.io.las.source import read_xyz
+from pcfix.options.steps import CleanRules
 from tests.clean.scenes import spoilt_scene
 from tests.utils.clouds import (
     WATER_M,
@@ -29,13 +27,13 @@ from tests.utils.clouds import (
     read_raw,
     write_cloud,
 )
+from tests.utils.program import run_pcfix
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 MANY = {"deviations": 0.5, "fences": 0.2}
 """On a cloud of white noise, a third of the points."""
-RUN = CliRunner()
 OURS = (b"pcfix", 2)
 
 
@@ -85,7 +83,8 @@ def test_nothing_is_lost(tmp_path: Path, point_format: int, suffix: str) -> None
     result = clean_file(source, target, water=WATER_M, **MANY)
     before, after = read_raw(source), read_raw(target)
     aside = _before(before)
-    noise = clean_points(read_xyz(source), water=WATER_M, used=~aside, **MANY) != 0
+    rules = CleanRules(**MANY)
+    noise = clean_points(read_xyz(source), water=WATER_M, used=~aside, settings=rules) != 0
     assert 100 < result.noise == noise.sum()
     assert not (noise & aside).any()
     assert (after.version, after.point_format >= 6) == ((1, 4), True)
@@ -207,26 +206,20 @@ def test_tests_that_the_cloud_does_not_allow_are_named(tmp_path: Path) -> None:
     assert result.reasons["statistical"] > 0
 
 
-def _commands() -> typer.Typer:
-    app = typer.Typer()
-    app.command()(clean)
-    return app
-
-
 def test_the_command(tmp_path: Path) -> None:
     s = spoilt_scene(20_000, 100)
     source = _plain(tmp_path / "in.laz", s.xyz)
     words = [str(source), str(tmp_path / "out.laz"), "--water", str(s.water_level_m)]
-    done = RUN.invoke(_commands(), [*words, "--summary", str(tmp_path / "s.json")])
-    assert done.exit_code == 0, done.output
+    done = run_pcfix("clean", *words, "--summary", tmp_path / "s.json")
+    assert done.returncode == 0, done.stderr
     said = json.loads((tmp_path / "s.json").read_text())
-    assert f"noise        {said['noise']:,}" in done.output
-    assert "below bed" in done.output
+    assert f"noise        {said['noise']:,}" in done.stdout
+    assert "below bed" in done.stdout
     assert said["settings"]["neighbours"] == 20
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.laz", "out.laz", "s.json"]
     off = ["--no-statistical", "--no-weak", "--no-below", "--overwrite", "--quiet"]
-    done = RUN.invoke(_commands(), [*words, *off, "--summary", str(tmp_path / "s.json")])
-    assert (done.exit_code, done.output) == (0, "")
+    done = run_pcfix("clean", *words, *off, "--summary", tmp_path / "s.json")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     reasons = json.loads((tmp_path / "s.json").read_text())["reasons"]
     assert reasons.pop("floating") > 0
     assert not any(reasons.values())
@@ -281,7 +274,7 @@ def test_a_full_disk_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyP
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("pcfix.io.files._reserve", full)
+    monkeypatch.setattr("os.posix_fallocate", full, raising=False)
     with pytest.raises(InputError, match="temporary space beside it cannot be had"):
         clean_file(source, tmp_path / "out.las")
     assert [p.name for p in tmp_path.iterdir()] == ["in.las"]

@@ -126,12 +126,12 @@ def test_statistical_outliers_are_those_of_open3d(deviations: float, k: int) -> 
 
 
 @pytest.mark.parametrize(("radius", "least"), [(0.6, 1), (1.0, 6)])
-def test_radius_outliers_are_those_of_open3d(radius_m: float, least: int) -> None:
+def test_radius_outliers_are_those_of_open3d(radius: float, least: int) -> None:
     o3d, xyz = load_open3d(), spoilt_scene().xyz
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz))
-    _, kept = cloud.remove_radius_outlier(least, radius_m)  # it counts the point itself
+    _, kept = cloud.remove_radius_outlier(least, radius)  # it counts the point itself
     settings = CleanRules(
-        deviations=None, radius=radius_m, radius_neighbours=least, below=None, floating=None
+        deviations=None, radius=radius, radius_neighbours=least, below=None, floating=None
     )
     found = clean_points(xyz, settings=settings, tile_m=20.0)
     assert np.array_equal(np.flatnonzero(found == 0), np.asarray(kept))

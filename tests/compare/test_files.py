@@ -10,14 +10,12 @@ import laspy
 import numpy as np
 import pytest
 import rasterio
-from pcfix.cli.compare import compare
 from pyproj import CRS
-from typer.testing import CliRunner
 
 import pcfix
-from pcfix.cli import app
 from pcfix.compare.m3c2 import m3c2_distances
 from pcfix.flow.compare import compare_clouds
+from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT
 
 SCENE = ROOT / "samples" / "scene"
@@ -326,7 +324,7 @@ def test_bad_input_is_one_clear_sentence(tmp_path):
     table = tmp_path / "t.csv"
     table.write_text("x,y,h\n1,2,3\n")
     bad = pcfix.InputError
-    refused(pcfix.GeometryError, "5 points are too few.*neighbours", cloud, few, max_gap_m=100.0)
+    refused(pcfix.GeometryError, "5 points are too few.*neighbours", cloud, few, max_gap=100.0)
     refused(bad, "every point is withheld or of a class", noise, cloud)
     refused(bad, "every point is withheld or of a class", cloud, noise)
     refused(bad, "no point is of class 40 or below", cloud, cloud, submerged=True)
@@ -337,9 +335,9 @@ def test_bad_input_is_one_clear_sentence(tmp_path):
     refused(bad, "no such file", cloud, tmp_path / "none.laz")
     refused(bad, "no dimension w_surf", cloud, cloud, water="dim:w_surf")
     setting = pcfix.SettingError
-    refused(setting, "bin width 0", cloud, cloud, bin_width_m=0.0)
-    refused(setting, "max-gap -1", cloud, cloud, max_gap_m=-1.0)
-    refused(setting, "section '1,2' is not", cloud, cloud, section_lines=["1,2"])
+    refused(setting, "bin width 0", cloud, cloud, bin_width=0.0)
+    refused(setting, "max-gap -1", cloud, cloud, max_gap=-1.0)
+    refused(setting, "section '1,2' is not", cloud, cloud, section=["1,2"])
     refused(setting, "does not exist", cloud, cloud, out_dir=tmp_path / "no" / "where")
 
 
@@ -386,14 +384,12 @@ def test_sections_show_the_bed_before_and_after(corrected):
 
 
 def test_the_command_says_what_python_says(tmp_path, corrected, sample):
-    command = app.__class__()
-    command.command()(compare)
-    words = [str(corrected), str(LIDAR), "--out-dir", str(tmp_path / "o"), "--sections", "1"]
-    done = CliRunner().invoke(command, words)
-    assert done.exit_code == 0, done.output
+    words = [corrected, LIDAR, "--out-dir", tmp_path / "o", "--sections", "1"]
+    done = run_pcfix("compare", *words)
+    assert done.returncode == 0, done.stderr
     assert f"dZ after{sample.vertical.after.statistics.mean_m:21.3f}" in done.stdout
     assert "depth fit after" in done.stdout
     said = json.loads((tmp_path / "o" / "compare.json").read_text())
     assert said["c2c"]["after"]["statistics"] == sample.as_dict()["c2c"]["after"]["statistics"]
-    quiet = CliRunner().invoke(command, [str(corrected), str(LIDAR), "--c2c-only", "--quiet"])
-    assert quiet.stdout == ""
+    quiet = run_pcfix("compare", corrected, LIDAR, "--c2c-only", "--quiet")
+    assert (quiet.returncode, quiet.stdout) == (0, "")

@@ -16,6 +16,7 @@ import pcfix
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow import dsm as flow
 from pcfix.flow.dsm import grid_dsm
+from pcfix.io.las import source
 from pcfix.io.rasters import read_raster
 from pcfix.report.text import dsm_text
 from tests.grid.clouds import EAST, NORTH, awkward, scattered, write
@@ -51,7 +52,7 @@ def test_no_seams(awkward_cloud, tmp_path, monkeypatch, method, fill):
 
     def run(name):
         shade = tmp_path / f"{name}_shade.tif"
-        options = {"resolution_m": 0.3, "method": method, "fill_m": fill, "hillshade": shade}
+        options = {"resolution": 0.3, "method": method, "fill": fill, "hillshade": shade}
         grid_dsm(awkward_cloud, tmp_path / f"{name}.tif", **options)
         return read_raster(tmp_path / f"{name}.tif").array, read_raster(shade).array
 
@@ -59,7 +60,7 @@ def test_no_seams(awkward_cloud, tmp_path, monkeypatch, method, fill):
     for name, sizes in SIZES.items():
         with monkeypatch.context() as patch:
             for key, value in sizes.items():
-                patch.setattr(flow, key, value)
+                patch.setattr(source if key == "CHUNK_POINTS" else flow, key, value)
             patch.setattr(flow, "TIN_BLOCK_POINTS", sizes.get("BLOCK_POINTS", 400_000))
             parts = run(name)
         for one, other in zip(whole, parts, strict=True):
@@ -179,7 +180,7 @@ def test_the_file(tmp_path, cog):
         assert dsm.tags(ns="IMAGE_STRUCTURE")["PREDICTOR"] == "3"
         assert (dsm.tags(ns="IMAGE_STRUCTURE").get("LAYOUT") == "COG") is cog
         assert dsm.bounds == pytest.approx((EAST, NORTH, EAST + 80.0, NORTH + 70.0), abs=1e-6)
-        assert json.loads(dsm.tags()["PCFIX"])["resolution_m"] == 0.2
+        assert json.loads(dsm.tags()["PCFIX"])["resolution"] == 0.2
         count = dsm.read(2)
         assert count.sum() == 20_000
         np.testing.assert_array_equal(dsm.read(1) == -9999.0, count == 0)
@@ -284,16 +285,16 @@ def test_the_header_may_be_wrong(tmp_path):
 
 
 BAD = {
-    "zero": ({"resolution_m": 0.0}, "resolution is 0 m; it must be a positive number"),
-    "minus": ({"resolution_m": -1.0}, "resolution is -1 m"),
-    "nan": ({"resolution_m": float("nan")}, "resolution is nan m"),
-    "infinite": ({"resolution_m": float("inf")}, "resolution is inf m"),
+    "zero": ({"resolution": 0.0}, "resolution is 0 m; it must be a positive number"),
+    "minus": ({"resolution": -1.0}, "resolution is -1 m"),
+    "nan": ({"resolution": float("nan")}, "resolution is nan m"),
+    "infinite": ({"resolution": float("inf")}, "resolution is inf m"),
     "method": ({"method": "kriging"}, "method is 'kriging'; it must be one of mean, median, min"),
     "surface": ({"surface": "water"}, "surface is 'water'; it must be one of all, bed"),
-    "fill": ({"fill_m": 0.0}, "holes to fill is 0 m; it must be positive"),
-    "far": ({"fill_m": 2000.0}, "more than 1,000 cells of 1 m"),
-    "sun": ({"altitude_deg": 0.0}, "altitude of the sun is 0 degrees"),
-    "azimuth": ({"azimuth_deg": float("nan")}, "azimuth is nan"),
+    "fill": ({"fill": 0.0}, "holes to fill is 0 m; it must be positive"),
+    "far": ({"fill": 2000.0}, "more than 1,000 cells of 1 m"),
+    "sun": ({"altitude": 0.0}, "altitude of the sun is 0 degrees"),
+    "azimuth": ({"azimuth": float("nan")}, "azimuth is nan"),
     "suffix": ({"output": "d.asc"}, "written as GeoTIFF; end the name in .tif"),
     "shade": ({"hillshade": "h.png"}, "h.png: a raster is written as GeoTIFF"),
     "twice": ({"hillshade": "d.tif"}, "are the same file"),
@@ -308,7 +309,7 @@ def test_bad_settings(tmp_path, monkeypatch, case):
     write(tmp_path / "c.las", scattered(500, 10.0, 10.0))
     Path("there.tif").touch()
     change, message = BAD[case]
-    options = {"output": "d.tif", "resolution_m": 1.0} | change
+    options = {"output": "d.tif", "resolution": 1.0} | change
     with pytest.raises(SettingError, match=message):
         grid_dsm("c.las", options.pop("output"), **options)
     assert {p.name for p in tmp_path.iterdir()} == {"c.las", "there.tif"}

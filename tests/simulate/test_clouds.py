@@ -108,7 +108,7 @@ def test_pairs_agree_with_a_slow_twin():
 
 def test_depth_maps_agree_with_a_slow_twin(monkeypatch):
     """Fermat and scipy, loops over images, and groups as sets."""
-    settings = {"bed": "flat", "image_noise_px": 0.0, "tilt_percent": 1.0, **POSES}
+    settings = {"bed": "flat", "image_noise": 0.0, "tilt_percent": 1.0, **POSES}
     kept = []
     monkeypatch.setattr(
         "pcfix.simulate.scene.openmvs_partners",

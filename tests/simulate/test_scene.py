@@ -94,8 +94,8 @@ def test_oblique_block_is_corrected_better_than_by_the_factor():
         ({"points": 0}, "points 0"),
         ({"block": "round"}, "block 'round'"),
         ({"cameras": 3}, "cameras 3"),
-        ({"image_noise_px": -1.0}, "negative"),
-        ({"refractive_index": 2.0}, "1.0 to 1.5"),
+        ({"image_noise": -1.0}, "negative"),
+        ({"index": 2.0}, "1.0 to 1.5"),
     ],
 )
 def test_bad_arguments_are_refused(arguments, words):

@@ -50,7 +50,7 @@ class Files:
 def write_block(folder: Path, points: int = 1600, **settings: object) -> Files:
     """Simulate a block, adjust it unaware of the water, and write what its user has."""
     given = {
-        "area_m": (50, 40), "greatest_depth_m": 5, "image_noise_px": IMAGE_PX,
+        "area_m": (50, 40), "greatest_depth_m": 5, "image_noise": IMAGE_PX,
         "position_noise_m": 0.3, "attitude_noise_deg": 0.2,
     } | settings  # fmt: skip
     scene, others = parted(simulate_tie_points(points, **given), TIES)

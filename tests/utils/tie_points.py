@@ -168,7 +168,7 @@ def simulate_tie_points(
         control=_control(surveyed, marks, _above(surveyed, plane) < 0.0, control, chosen),
         control_truth=surveyed + ORIGIN_M, control_exact_xy=rig.optics.to_image(marks.ideal),
         water=plane_in_world(plane), refractive_index=chosen.refractive_index,
-        noise=TieNoise(chosen.image_noise_px, gnss_noise_m, survey_noise_m),
+        noise=TieNoise(chosen.image_noise, gnss_noise_m, survey_noise_m),
         settings=chosen.as_dict(),
     )  # fmt: skip
     control_sigma = np.full(surveyed.shape, survey_noise_m or TieNoise.survey_m)
@@ -233,5 +233,5 @@ def _control(
     return GroundControl(
         names, xyz + ORIGIN_M, np.zeros(xyz.shape), is_check, wet,
         marks.point, marks.camera, marks.ideal,
-        np.full(len(marks.point), chosen.image_noise_px or TieNoise.image_px),
+        np.full(len(marks.point), chosen.image_noise or TieNoise.image_px),
     )  # fmt: skip

@@ -78,7 +78,7 @@ def river(folder):
     las = laspy.read(RIVER / "points.las")
     las.points = las.points[np.arange(0, len(las.points), EVERY)]
     las.write(folder / "cloud.las")
-    options = {"water": "dim:w_surf", "refractive_index": 1.337, "max_angle_deg": 35.0}
+    options = {"water": "dim:w_surf", "index": 1.337, "max_angle": 35.0}
     return block, options, RIVER / "cameras.csv"
 
 
