@@ -26,8 +26,8 @@ LEVEL_M, INDEX, TILT = 0.05, 0.005, 0.001
 CENTRE_M, ATTITUDE_DEG, WAVES_DEG = 0.03, 0.01, 1.0
 NOTHING = BudgetOptions(sigma_image=0.0, sigma_level=0.0, sigma_index=0.0)
 RANDOM = (
-    ("image", "0.5 px", {"image_noise_px": 0.5}, {"image_px": 0.5}),
-    ("image", "1 px", {"image_noise_px": 1.0}, {"image_px": 1.0}),
+    ("image", "0.5 px", {"image_noise": 0.5}, {"image_px": 0.5}),
+    ("image", "1 px", {"image_noise": 1.0}, {"image_px": 1.0}),
     ("centres", "3 cm", {"position_noise_m": CENTRE_M}, {"centre_m": CENTRE_M}),
     ("attitude", "0.01 deg", {"attitude_noise_deg": ATTITUDE_DEG}, {"attitude_deg": ATTITUDE_DEG}),
     ("waves", "1 deg", {"wave_slope_deg": WAVES_DEG}, {"waves_deg": WAVES_DEG}),
@@ -54,9 +54,7 @@ def sensitivity(points: int, seed: int) -> list[dict[str, Any]]:
 
 
 def _scene(name: str, points: int, seed: int, **more: Any) -> Any:
-    return pcfix.simulate_scene(
-        points, seed=seed, **{**SETTINGS[name], "image_noise_px": 0.0, **more}
-    )
+    return pcfix.simulate_scene(points, seed=seed, **{**SETTINGS[name], "image_noise": 0.0, **more})
 
 
 def _corrected(scene: Any, water: Any = None, n: float | None = None, **errors: float) -> Any:

@@ -1,13 +1,12 @@
 """What a scene can be asked for: blocks, grounds, water, and what is refused."""
 
-import dataclasses
 import json
 
 import numpy as np
 import pytest
-from pcfix.cli.simulate import SceneWords
 
 import pcfix
+from pcfix.options.scenes import SimulateOptions
 from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.terrain import STEPS
 
@@ -44,15 +43,13 @@ def test_bad_settings_are_refused(arguments, words):
         pcfix.simulate_scene(**arguments)
 
 
-def test_an_unknown_setting_is_python_s_own_error():
-    with pytest.raises(TypeError, match="wavelength"):
+def test_an_unknown_setting_names_the_nearest():
+    with pytest.raises(pcfix.SettingError, match="'wavelength'; did you mean wave_length"):
         pcfix.simulate_scene(10, wavelength=3)
 
 
 def test_the_command_line_has_the_same_defaults():
-    ours = SceneSettings()
-    for field in dataclasses.fields(SceneWords):
-        assert getattr(SceneWords(), field.name) == getattr(ours, field.name)
+    assert SimulateOptions().part(SceneSettings) == SceneSettings()
 
 
 def test_settings_make_the_same_scene_again_after_json():

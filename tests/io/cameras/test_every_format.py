@@ -96,7 +96,7 @@ def simulated(folder):
     las = laspy.LasData(header)
     las.x, las.y, las.z = made.apparent_xyz.T
     las.write(folder / "cloud.las")
-    return block, {"water": made.water_level_m, "max_angle_deg": 35.0}, cameras
+    return block, {"water": made.water_level_m, "max_angle": 35.0}, cameras
 
 
 @pytest.fixture(
