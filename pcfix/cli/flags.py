@@ -64,6 +64,7 @@ def _parameter(one: Option) -> Parameter:
         negative_bool="no-" if has_opposite else (),
         negative_none="no-" if one.name in ("below", "floating") else (),
         negative_iterable=(),
+        allow_repeating=True,  # the last one counts
         show=not declared.hidden,
         show_default=(lambda value: told) if told else False,
     )
@@ -74,6 +75,7 @@ Quiet = Annotated[
     Parameter(
         name=["--quiet", "-q"],
         negative=(),
+        allow_repeating=True,
         group=_GROUPS["Output"],
         help="No summary and no progress.",
         show_default=False,

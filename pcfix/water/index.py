@@ -123,8 +123,8 @@ def index_of(given: float | str | None) -> tuple[float, str]:
 
     Parameters
     ----------
-    given : float or str
-        A number; ``fresh`` or ``sea``; or ``S,T`` or ``S,T,W``: salinity in PSU, temperature in
+    given : float, str or None
+        A number; None is `DEFAULT_REFRACTIVE_INDEX`; ``fresh`` or ``sea``; or ``S,T`` or ``S,T,W``: salinity in PSU, temperature in
         degrees Celsius and wavelength in micrometres.
 
     Returns
@@ -138,6 +138,8 @@ def index_of(given: float | str | None) -> tuple[float, str]:
     SettingError
         If it is none of these, or a value is outside its range.
     """
+    if given is None:
+        return DEFAULT_REFRACTIVE_INDEX, ""
     text = str(given).strip().lower()
     water = WATERS.get(text)
     try:

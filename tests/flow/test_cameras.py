@@ -115,7 +115,7 @@ def test_cameras_in_another_zone_are_brought_over(tmp_path, plain):
         path.write_text("\n".join(",".join(line.split(",")[:4]) for line in lines) + "\n")
         return path
 
-    here = {"max_angle_deg": 40.0, "sensor": None}
+    here = {"max_angle": 40.0, "sensor": None}
     expected, _ = corrected(tmp_path, "a.las", cameras=bare(tmp_path / "a.csv"), **here)
     other = bare(tmp_path / "b.csv", change=moved)
     found, _ = corrected(tmp_path, "b.las", cameras=other, cameras_crs="EPSG:32634", **here)

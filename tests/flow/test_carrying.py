@@ -287,10 +287,10 @@ def test_an_offset_is_for_the_file_that_does_not_say_where_it_lies(tmp_path, old
     )  # fmt: skip
     before, after = told_apart(inputs)
     if local == "neither":  # then it is of both, as it is of one file that says its CRS
-        assert before.cameras_offset_m == after.cameras_offset_m == tuple(offset)
+        assert before.cameras_offset == after.cameras_offset == tuple(offset)
         return
-    assert (before.cameras_offset_m is not None) == (local in ("old", "both"))
-    assert (after.cameras_offset_m is not None) == (local in ("new", "both"))
+    assert (before.cameras_offset is not None) == (local in ("old", "both"))
+    assert (after.cameras_offset is not None) == (local in ("new", "both"))
 
 
 def test_a_run_keeps_it(tmp_path):

@@ -136,7 +136,7 @@ def test_another_request_does_not_replace_a_run_unasked(copied):
     assert (done.returncode, done.stderr) == (0, "")
     assert "done before" not in done.stdout
     record = json.loads((copied / "out" / "run.json").read_text())
-    assert record["request"]["refractive_index"] == 1.33
+    assert record["request"]["index"] == 1.33
 
 
 def test_a_record_repeats_its_run(finished, tmp_path):

@@ -95,8 +95,8 @@ def test_stage_and_command_line_agree(tmp_path: Path, number: int, door: str) ->
 @pytest.mark.parametrize(
     "more",
     [
-        {"uncorrected": "drop", "max_angle_deg": 20.0},
-        {"uncorrected": "keep", "max_cameras": 3, "refractive_index": 1.333},
+        {"uncorrected": "drop", "max_angle": 20.0},
+        {"uncorrected": "keep", "max_cameras": 3, "index": 1.333},
         {"dimensions": "minimal", "jobs": 1},
         {"dimensions": "none"},
     ],
@@ -105,11 +105,8 @@ def test_stage_and_command_line_agree(tmp_path: Path, number: int, door: str) ->
 def test_any_call_has_its_pipeline(tmp_path: Path, more: dict[str, Any]) -> None:
     write_cloud(tmp_path / "cloud.las", 7, plain=True)
     cameras_csv(tmp_path / "cameras.csv", block())
-    names = {"max_angle_deg": "--max-angle", "refractive_index": "--index"}
     words = [
-        word
-        for name, value in more.items()
-        for word in (names.get(name, "--" + name.replace("_", "-")), value)
+        word for name, value in more.items() for word in ("--" + name.replace("_", "-"), value)
     ]
     words += ["--cameras", "cameras.csv", "--water", WATER_M]
     done = run_pipeline(
