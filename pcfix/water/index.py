@@ -124,8 +124,8 @@ def index_of(given: float | str | None) -> tuple[float, str]:
     Parameters
     ----------
     given : float, str or None
-        A number; None is `DEFAULT_REFRACTIVE_INDEX`; ``fresh`` or ``sea``; or ``S,T`` or ``S,T,W``: salinity in PSU, temperature in
-        degrees Celsius and wavelength in micrometres.
+        A number, by default `DEFAULT_REFRACTIVE_INDEX`; ``fresh`` or ``sea``; or ``S,T`` or
+        ``S,T,W``: salinity in PSU, temperature in degrees Celsius and wavelength in micrometres.
 
     Returns
     -------
