@@ -159,7 +159,7 @@ def test_a_free_network_keeps_place_and_scale(files):
 
 def test_level_and_index_are_found_or_doubted(files):
     found = adjust(
-        files, water=files.water + 0.25, refractive_index=1.33, free=("level", "index"),
+        files, water=files.water + 0.25, index=1.33, free=("level", "index"),
         gcps=files.folder / "gcps.csv", lens=files.folder / "lens.csv",
     )  # fmt: skip
     sigma = {row.name: row.sigma for row in found.precision.shared}
