@@ -9,10 +9,11 @@ import pytest
 import pcfix
 from pcfix.cli.commands import EXAMPLES
 from pcfix.errors import PcfixWarning, SettingError
-from pcfix.options.correct import CorrectOptions
+from pcfix.options.correct import CorrectOptions, ScienceOptions
 from pcfix.options.declare import options_of
 from pcfix.options.shared import PANELS
 from pcfix.options.survey import AdjustOptions
+from pcfix.water.index import with_index
 from tests.utils.program import run_pcfix
 
 KINDS = [
@@ -79,3 +80,9 @@ def test_wrong_usage_is_two_lines_and_code_2():
     done = run_pcfix("correct", "a.las", "b.las", "--max-angel", "30")
     assert done.returncode == 2
     assert "--max-angel" in done.stderr
+
+
+def test_a_part_keeps_what_it_has():
+    given = with_index(CorrectOptions(salinity=10.0))
+    part = given.part(ScienceOptions)
+    assert (part.index, part.index_from) == (given.index, "10 PSU, 15 C, 0.53 um")
