@@ -191,13 +191,8 @@ class OptionSet:
 
     def part(self, kind: type[Set]) -> Set:
         """Return those options that another class has too."""
-        return kind(
-            **{
-                one.name: getattr(self, one.name)
-                for one in options_of(kind)
-                if hasattr(self, one.name)
-            }
-        )
+        names = [one.name for one in fields(kind) if hasattr(self, one.name)]
+        return kind(**{name: getattr(self, name) for name in names})
 
     def plain(self) -> dict[str, Any]:
         """Return what was given, other than the defaults, as JSON holds it."""
