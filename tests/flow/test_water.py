@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 import pcfix
 from pcfix.flow.checks import check_water
-from pcfix.flow.surfaces import WaterWords
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT
 
@@ -74,7 +73,7 @@ def write_points(path, xyz, names="x,y,z"):
 def test_tilted_river_from_thirty_points_a_fifth_of_them_wrong(river, tmp_path):
     points, wrong = river.shoreline(seed=5)
     path = write_points(tmp_path / "shore.csv", points)
-    report = check_water(WaterWords(path))
+    report = check_water(path)
     fit = report.found.evidence
     corners = np.array([[x, y] for x in (0, 1) for y in (0, 1)]) * (river.high - river.low)
     corners = corners + river.low
@@ -158,21 +157,21 @@ def test_points_without_heights_take_the_clouds(tmp_path):
     near = xyz[np.abs(xyz[:, 2] - LEVEL_M) < 0.02]
     path = write_points(tmp_path / "shore.csv", near[:, :2], names="x,y")
     with pytest.warns(pcfix.PcfixWarning, match=f"{len(near)} points have no height"):
-        report = check_water(WaterWords(path, "level", CRS), CLOUD)
+        report = check_water(path, water_model="level", water_crs=CRS, cloud=CLOUD)
     # the bank is 3 % steep and rough by some centimetres
     assert report.found.evidence.level_m == pytest.approx(LEVEL_M, abs=0.1)
     with pytest.raises(pcfix.InputError, match="give the cloud too"):
-        check_water(WaterWords(path))
+        check_water(path)
 
 
 def test_auto_finds_the_sample_scene_and_says_by_what(tmp_path):
     said = invoke("water", "auto", "--cloud", CLOUD, "--plot", tmp_path / "auto.png")
     assert "evidence" in said
     assert (tmp_path / "auto.png").stat().st_size > 10_000
-    found = check_water(WaterWords("auto"), CLOUD).found.evidence
+    found = check_water("auto", cloud=CLOUD).found.evidence
     assert abs(found.level_m - LEVEL_M) < 3.0 * found.sigma_level_m
     with pytest.raises(pcfix.SettingError, match="found in a cloud"):
-        check_water(WaterWords("auto"))
+        check_water("auto")
 
 
 def test_a_run_finds_its_water_and_reports_on_that(tmp_path):
@@ -182,7 +181,7 @@ def test_a_run_finds_its_water_and_reports_on_that(tmp_path):
     record = json.loads((tmp_path / "out" / "run.json").read_text())
     summary = record["steps"]["correct"]["result"]
     assert summary["water_fit"]["model"] == "auto"
-    assert summary["settings"]["refractive_index_from"] == "sea: 35 PSU, 15 C, 0.53 um"
+    assert summary["settings"]["index_from"] == "sea: 35 PSU, 15 C, 0.53 um"
     assert "level 0.3" in (tmp_path / "out" / "report.html").read_text()
 
 
