@@ -403,7 +403,7 @@ def test_padding_before_the_points_comes_back(tmp_path: Path) -> None:
 
 
 MISSED = {
-    "angle": (block(), {"max_angle_deg": 20.0}, lambda xyz: rays_within(xyz, block(), 20.0)),
+    "angle": (block(), {"max_angle": 20.0}, lambda xyz: rays_within(xyz, block(), 20.0)),
     "frame": (framed_block(), {}, lambda xyz: rays_in_frame(xyz, framed_block())),
 }
 

@@ -221,7 +221,7 @@ def test_inputs_give_each_camera_its_level(scene, tmp_path):
     ]
     times = table(tmp_path, "\n".join(["label,time", *rows]) + "\n", "times.csv")
     tide = table(tmp_path, TIDE)
-    inputs = Inputs(scene / "cameras.csv", 0.37, tide=tide, image_times=times)
+    inputs = Inputs(cameras=scene / "cameras.csv", water=0.37, tide=tide, image_times=times)
     level = np.interp(minutes, [0, 30, 60], [1.0, 1.3, 1.4])
     assert inputs.level_offset_m(cameras) == pytest.approx(level - level.mean(), abs=1e-9)
     assert {tide, times} <= set(inputs.paths())
@@ -229,10 +229,10 @@ def test_inputs_give_each_camera_its_level(scene, tmp_path):
 
 def test_inputs_that_lack_times_or_a_tide(scene, tmp_path):
     cameras, tide = pcfix.read_cameras(scene / "cameras.csv"), table(tmp_path, TIDE)
-    assert Inputs(cameras, 0.37).level_offset_m(cameras) is None
+    assert Inputs(cameras=cameras, water=0.37).level_offset_m(cameras) is None
     with pytest.raises(pcfix.SettingError, match="a tide needs image-times"):
-        Inputs(cameras, 0.37, tide=tide).level_offset_m(cameras)
+        Inputs(cameras=cameras, water=0.37, tide=tide).level_offset_m(cameras)
     with pytest.raises(pcfix.SettingError, match="image-times is of no use without tide"):
-        Inputs(cameras, 0.37, image_times=tide).level_offset_m(cameras)
+        Inputs(cameras=cameras, water=0.37, image_times=tide).level_offset_m(cameras)
     with pytest.raises(pcfix.InputError, match="must name the columns label, time"):
-        Inputs(scene / "cameras.csv", 0.37, tide=tide).level_offset_m(cameras)
+        Inputs(cameras=scene / "cameras.csv", water=0.37, tide=tide).level_offset_m(cameras)
