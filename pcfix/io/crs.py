@@ -206,11 +206,12 @@ def geographic_3d(crs: CRS) -> CRS:
     from pyproj.crs.enums import Ellipsoidal3DCSAxis
 
     if crs.is_bound and crs.source_crs is not None:
-        return BoundCRS(geographic_3d(crs.source_crs), crs.target_crs, crs.coordinate_operation)
+        bound = BoundCRS(geographic_3d(crs.source_crs), crs.target_crs, crs.coordinate_operation)
+        return CRS(bound)  # to_2d of pyproj's own subclasses fails
     axes = Ellipsoidal3DCS(Ellipsoidal3DCSAxis.LATITUDE_LONGITUDE_HEIGHT)
     found = GeographicCRS(crs.name, crs.datum, axes)
     code = found.to_epsg(min_confidence=100)
-    return found if code is None else CRS.from_epsg(code)
+    return CRS(found) if code is None else CRS.from_epsg(code)
 
 
 def is_topocentric(text: str) -> bool:

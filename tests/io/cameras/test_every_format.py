@@ -148,7 +148,7 @@ def test_same_corrected_cloud(scene, form, tmp_path):
 def test_same_poses(scene, form, tmp_path):
     block = scene.block
     path, options = WRITERS[form](tmp_path, block)
-    crs, offset = (options.pop(name, None) for name in ("cameras_crs", "cameras_offset_m"))
+    crs, offset = (options.pop(name, None) for name in ("cameras_crs", "cameras_offset"))
     read = pcfix.read_cameras(path, **options)
     found = bring_to(read, f"EPSG:{block.epsg}", cameras_crs=crs, offset_m=offset)
     rows = [found.labels.index(label) for label in block.labels]
