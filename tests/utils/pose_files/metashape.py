@@ -63,7 +63,7 @@ def metashape_local(folder: Path, block: Block) -> PoseFile:
     path = folder / "cameras.xml"
     reference = 'LOCAL_CS["Local",LOCAL_DATUM["Local Datum",0],UNIT["metre",1]]'
     metashape_xml(path, block, block.centres - block.origin, block.rotations, reference)
-    return PoseFile(path, {"cameras_crs": "local", "cameras_offset_m": tuple(block.origin)})
+    return PoseFile(path, {"cameras_crs": "local", "cameras_offset": tuple(block.origin)})
 
 
 def metashape_omega_phi_kappa(folder: Path, block: Block) -> PoseFile:

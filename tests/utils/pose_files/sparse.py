@@ -34,7 +34,7 @@ def colmap_text(folder: Path, block: Block) -> PoseFile:
     camera = f"1 PINHOLE {block.width} {block.height} {words(pinhole(block))}\n"
     (folder / "cameras.txt").write_text(camera)
     (folder / "points3D.txt").write_text("# 3D point list\n")
-    return PoseFile(folder, {"cameras_offset_m": tuple(block.origin)})
+    return PoseFile(folder, {"cameras_offset": tuple(block.origin)})
 
 
 def colmap_binary(folder: Path, block: Block) -> PoseFile:
@@ -46,7 +46,7 @@ def colmap_binary(folder: Path, block: Block) -> PoseFile:
     camera = struct.pack("<QIiQQ4d", 1, 1, 1, block.width, block.height, *pinhole(block))
     (folder / "cameras.bin").write_bytes(camera)
     (folder / "points3D.bin").write_bytes(struct.pack("<Q", 0))
-    return PoseFile(folder, {"cameras_offset_m": tuple(block.origin)})
+    return PoseFile(folder, {"cameras_offset": tuple(block.origin)})
 
 
 def bundler(folder: Path, block: Block) -> PoseFile:
