@@ -70,7 +70,7 @@ def test_a_block_that_fits_is_said_to_fit(tmp_path):
 )
 def test_what_is_likely_wrong_is_said(tmp_path, change, said):
     path = table(tmp_path / "cameras.csv", change)
-    report = check_cameras(path, CLOUD, sensor=SENSOR)
+    report = check_cameras(path, cloud=CLOUD, sensor=SENSOR)
     assert not report.fit.fits
     assert re.search(said, report.fit.verdict), report.fit.verdict
     assert report.fit.verdict in cameras_text(report)
@@ -81,7 +81,7 @@ def test_wrong_angles_are_noticed(tmp_path):
     rows = [line.split(",") for line in lines[1:]]
     text = [lines[0], *(",".join([*r[:4], r[4], "60", r[6]]) for r in rows)]
     (tmp_path / "cameras.csv").write_text("\n".join(text) + "\n")
-    report = check_cameras(tmp_path / "cameras.csv", CLOUD, sensor=SENSOR)
+    report = check_cameras(tmp_path / "cameras.csv", cloud=CLOUD, sensor=SENSOR)
     assert "angles" in report.fit.verdict
     assert report.tilt_deg[0] > 50.0
 

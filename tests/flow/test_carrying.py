@@ -264,7 +264,7 @@ def test_a_port_and_the_tracks_of_the_adjusted_model_are_refused(cloud, old, tmp
         pcfix.correct_file(
             cloud, tmp_path / "o.las", cameras=old, adjusted_from=old, port="flat:distance=0.02"
         )
-    given = Inputs("new", WATER_M, views="new", adjusted_from="old")
+    given = Inputs(cameras="new", water=WATER_M, views="new", adjusted_from="old")
     with pytest.raises(SettingError, match="not where the cloud has its points"):
         told_apart(given)
 
@@ -282,7 +282,7 @@ def test_an_offset_is_for_the_file_that_does_not_say_where_it_lies(tmp_path, old
         if said and local not in (name, "both"):
             table.write_text("# CoordinateSystem: EPSG:32633\n" + table.read_text())
     inputs = Inputs(
-        tmp_path / "new.csv", WATER_M, adjusted_from=tmp_path / "old.csv",
+        cameras=tmp_path / "new.csv", water=WATER_M, adjusted_from=tmp_path / "old.csv",
         cameras_offset=tuple(offset),
     )  # fmt: skip
     before, after = told_apart(inputs)
