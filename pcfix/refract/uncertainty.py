@@ -76,11 +76,13 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
     models), which gets that of one adjustment of all its images.
     """
     survey, views, result = batch.survey, batch.rays, np.zeros((len(batch), 6))
+    # the rays are chosen: a mesh may have let through one that its plane above the point would not
+    every_ray = rule_of(survey)._replace(least_cosine2=0.0)
     with one_caller():
         _of_lists(
             points_of(batch), np.ascontiguousarray(shift_m), rig_of(survey),
             (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)),
-            rule_of(survey), budget_of(survey), level_sigma_of(batch), result,
+            every_ray, budget_of(survey), level_sigma_of(batch), result,
         )  # fmt: skip
     return result
 
