@@ -51,7 +51,11 @@ def _type(one: Option) -> Any:
     """Return what the text of the command line becomes; what has a parser stays text."""
     if one.declared.metavar == "PATH" or os.PathLike[str] in one.kinds:
         return Path | None
-    return str | None if one.declared.parse is not None or one.type is Any else one.type
+    if one.declared.parse is not None or one.type is Any:
+        return str | one.type if one.default == () else str | None
+    if one.default == ():
+        return tuple[str, ...]
+    return one.type | None if one.default is None else one.type
 
 
 def _parameter(one: Option) -> Parameter:
