@@ -130,7 +130,7 @@ class Option(NamedTuple):
         if self.declared.parse is not None:
             return (float, str) if float in self.kinds else (str, int)
         if self.type is Any:
-            return (str, float)
+            return (str,) if self.declared.metavar == "PATH" else (str, float)
         return self.kinds if self.kinds in ((bool,), (int,), (float,)) else (str,)
 
     def checked(self, value: Any) -> Any:
@@ -195,9 +195,9 @@ class OptionSet:
         return kind(**{name: getattr(self, name) for name in names})
 
     def plain(self) -> dict[str, Any]:
-        """Return what was given, other than the defaults, as JSON holds it."""
+        """Return what was given, other than the defaults, as a stage of PDAL takes it."""
         return {
-            one.name: _plain(getattr(self, one.name))
+            one.name: _worded(one, getattr(self, one.name))
             for one in options_of(type(self))
             if getattr(self, one.name) != one.default
         }
@@ -205,6 +205,13 @@ class OptionSet:
     def as_dict(self) -> dict[str, Any]:
         """Return all values, as JSON holds them."""
         return {name: _plain(value) for name, value in asdict(self).items()}
+
+
+def _worded(one: Option, value: Any) -> Any:
+    """Return numbers and words as text with commas between, where text is parsed."""
+    if isinstance(value, tuple) and one.declared.parse is not None:
+        return ",".join(f"{v:g}" if isinstance(v, float) else str(v) for v in value)
+    return _plain(value)
 
 
 def _plain(value: Any) -> Any:

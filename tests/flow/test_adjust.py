@@ -12,6 +12,7 @@ import pytest
 import pcfix
 from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.adjust import adjust_cameras, next_step
+from pcfix.options.survey import AdjustOptions
 from pcfix.threads import threads
 from tests.utils.adjust_files import IMAGE_PX, write_block, write_gnss
 from tests.utils.program import run_pcfix
@@ -224,7 +225,8 @@ def test_the_summary_tells_it_in_plain_values(files, written):
 
 def test_the_next_step_does_what_it_says(files, written):
     out, found = written
-    words = next_step(found, str(files.folder / "model"), str(out), str(files.folder / "cloud.las"))
+    options = AdjustOptions(cloud=files.folder / "cloud.las")
+    words = next_step(found, files.folder / "model", out, options)
     target = files.folder / "next.las"
     arguments = words.replace("OUTPUT", str(target)).split()[1:]
     done = run_pcfix(*arguments, "-q")

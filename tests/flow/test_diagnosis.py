@@ -65,7 +65,7 @@ def test_the_sample_does_not(tmp_path):
 @pytest.mark.filterwarnings("ignore:.*names no CRS")
 def test_every_sign_speaks_of_bent_poses():
     report = check_cameras(
-        BENT / "sparse", BENT / "cloud.las", water=LEVEL_M, cameras_offset=OFFSET_M,
+        BENT / "sparse", cloud=BENT / "cloud.las", water=LEVEL_M, cameras_offset=OFFSET_M,
         gnss=BENT / "gnss.csv", gcps=BENT / "gcps.csv", reference=TRUE / "lidar.laz",
     )  # fmt: skip
     signs = report.as_dict()["refraction"]["signs"]
@@ -83,7 +83,7 @@ def test_every_sign_speaks_of_bent_poses():
 @bent
 def test_poses_and_gnss_are_enough():
     report = check_cameras(
-        BENT / "cameras.xml", BENT / "cloud.las", water=LEVEL_M, gnss=BENT / "gnss.csv"
+        BENT / "cameras.xml", cloud=BENT / "cloud.las", water=LEVEL_M, gnss=BENT / "gnss.csv"
     )
     assert report.diagnosis.decided_by.name == "GNSS"
     assert report.diagnosis.absorbed is True
@@ -93,7 +93,7 @@ def test_poses_and_gnss_are_enough():
 @pytest.mark.filterwarnings("ignore:.*names no CRS")
 def test_no_sign_speaks_of_true_poses():
     report = check_cameras(
-        TRUE / "colmap", TRUE / "cloud.las", water=LEVEL_M, cameras_offset=OFFSET_M,
+        TRUE / "colmap", cloud=TRUE / "cloud.las", water=LEVEL_M, cameras_offset=OFFSET_M,
         gnss=BENT / "gnss.csv", gcps=BENT / "gcps.csv", reference=TRUE / "lidar.laz",
     )  # fmt: skip
     assert report.diagnosis.absorbed is False
@@ -106,7 +106,7 @@ def test_a_calibration_tells(tmp_path):
     lens = tmp_path / "lens.csv"
     # true: 1500 px
     lens.write_text("focal_px,width_px,height_px\n1500,1600,1200\n")
-    report = check_cameras(BENT / "cameras.xml", BENT / "cloud.las", water=LEVEL_M, lens=lens)
+    report = check_cameras(BENT / "cameras.xml", cloud=BENT / "cloud.las", water=LEVEL_M, lens=lens)
     assert report.diagnosis.decided_by.name == "focal length"
     # 3.48 px of 1500, at 76 m
     assert report.diagnosis.size[0] == pytest.approx(0.176, abs=0.01)
@@ -119,7 +119,9 @@ def test_evidence_needs_cloud_and_water():
 
 
 def test_the_command_names_what_was_given():
-    inputs = Inputs("my model", 0.5, cameras_offset=(1.0, 2.0, 3.0), cameras_crs="EPSG:25830")
+    inputs = Inputs(
+        cameras="my model", water=0.5, cameras_offset=(1.0, 2.0, 3.0), cameras_crs="EPSG:25830"
+    )
     command = command_of(inputs, "cloud.laz", gnss="gnss.csv", gcps=None)
     assert command == (
         "pcfix adjust 'my model' OUT --water 0.5 --cloud cloud.laz --cameras-crs EPSG:25830"

@@ -81,9 +81,9 @@ def test_words_name_what_was_assumed():
     assert "level 0.020 m (assumed)" in budget_words(asdict(errors))
     assert "level 0.007 m (fitted)" in budget_words(asdict(errors), 0.007)
     assert "level 0.020 m (assumed)" in budget_words(asdict(errors), float("nan"))
-    assert "level 0.100 m," in budget_words(asdict(replace(errors, level_m=0.1)), 0.007)
+    assert "level 0.100 m," in budget_words(asdict(replace(errors, sigma_level=0.1)), 0.007)
     assert "waves" not in budget_words(asdict(errors))
-    assert "waves 2 deg" in budget_words(asdict(replace(errors, waves_deg=2.0)))
+    assert "waves 2 deg" in budget_words(asdict(replace(errors, sigma_waves=2.0)))
 
 
 def test_the_picture_can_be_drawn():
