@@ -86,3 +86,11 @@ def test_a_part_keeps_what_it_has():
     given = with_index(CorrectOptions(salinity=10.0))
     part = given.part(ScienceOptions)
     assert (part.index, part.index_from) == (given.index, "10 PSU, 15 C, 0.53 um")
+
+
+def test_a_stage_gets_every_digit():
+    given = CorrectOptions(cameras_offset=(319900.125, 4650123.4567, 0.0), respect_classes=(2, 5))
+    assert given.plain() == {
+        "cameras_offset": "319900.125,4650123.4567,0", "respect_classes": "2,5",
+    }  # fmt: skip
+    assert CorrectOptions(**given.plain()) == given

@@ -108,7 +108,7 @@ def next_step(found: Adjusted, model: File, out_dir: File, options: AdjustOption
     return (
         f"pcfix correct {options.cloud or 'CLOUD'} OUTPUT --cameras {out_dir}/colmap"
         f" --adjusted-from {model} --water {level}"
-        + ("" if offset is None else f" --cameras-offset {','.join(f'{v:g}' for v in offset)}")
+        + ("" if offset is None else f" --cameras-offset {','.join(f'{v:.15g}' for v in offset)}")
     )
 
 

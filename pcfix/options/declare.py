@@ -210,7 +210,7 @@ class OptionSet:
 def _worded(one: Option, value: Any) -> Any:
     """Return numbers and words as text with commas between, where text is parsed."""
     if isinstance(value, tuple) and one.declared.parse is not None:
-        return ",".join(f"{v:g}" if isinstance(v, float) else str(v) for v in value)
+        return ",".join(f"{v:.15g}" if isinstance(v, float) else str(v) for v in value)
     return _plain(value)
 
 
