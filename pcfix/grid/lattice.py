@@ -157,21 +157,6 @@ def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float) -> Latt
     return Lattice(resolution_m, west, north, east - west + 1, south - north + 1)
 
 
-def check_resolution(resolution_m: float) -> None:
-    """Refuse a cell size that is none.
-
-    Raises
-    ------
-    SettingError
-        If it is not finite or smaller than a tenth of a millimetre.
-    """
-    if not (math.isfinite(resolution_m) and resolution_m >= MIN_RESOLUTION_M):
-        raise SettingError(
-            f"The resolution is {resolution_m:g} m; it must be a positive number of metres, at"
-            f" least {MIN_RESOLUTION_M:g}."
-        )
-
-
 def fits(low: FloatArray, high: FloatArray, resolution_m: float) -> bool:
     """Return whether a raster over the rectangle has no more cells than are allowed."""
     columns, rows = _size(low, high, resolution_m)
