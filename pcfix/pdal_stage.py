@@ -23,6 +23,7 @@ import os
 import sys
 import time
 import warnings
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -41,18 +42,15 @@ from pcfix.io.pdal import (
     node,
     scales_of,
 )
-from pcfix.options.declare import OptionSet, named, options_of
+from pcfix.model import FloatArray, WaterSurface
+from pcfix.options.declare import Option, OptionSet, named, options_of
 
 Set = TypeVar("Set", bound=OptionSet)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
     from pcfix.flow.surfaces import CloudView, Points
-    from pcfix.model import FloatArray, WaterSurface
-    from pcfix.options.declare import Option
 
-    Stage: TypeAlias = Callable[[Dimensions, Dimensions], bool]
+Stage: TypeAlias = Callable[[Dimensions, Dimensions], bool]
 
 _WORD = {str: "a text", float: "a number", int: "a whole number", bool: "true or false"}
 

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import threading
 import warnings
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 from pcfix.errors import SettingError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 @contextmanager

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
+from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens, WaterSurface
+from pcfix.port.shapes import Port
+
 if TYPE_CHECKING:
-    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens, WaterSurface
-    from pcfix.port.shapes import Port
     from pcfix.water.surface import Field, Tin
 
 

@@ -14,27 +14,32 @@ sinks or lifts whole beaches.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit, prange
 
 from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.lens.imaging import image_and_gradients, image_of, lens_table
-from pcfix.model import Cameras, Outcome, Views
+from pcfix.model import (
+    BoolArray,
+    Cameras,
+    Correction,
+    FloatArray,
+    IntArray,
+    Lens,
+    Outcome,
+    TiePoints,
+    Views,
+)
 from pcfix.refract.batch import MadeWith
 from pcfix.refract.choice import spatial_order, views_in_frame
 from pcfix.threads import one_caller
 from pcfix.water.surface import SurfaceAbove, is_submerged
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from typing import TypeAlias
-
-    from pcfix.model import BoolArray, Correction, FloatArray, IntArray, Lens, TiePoints
-
-    Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
+Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
 
 MAX_STEPS = 12
 CLOSE_M = 1e-6

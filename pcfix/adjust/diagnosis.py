@@ -24,10 +24,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.model import BoolArray, FloatArray, IntArray
+
 if TYPE_CHECKING:
     from pcfix.adjust.intersect import Intersected
     from pcfix.adjust.mend import Mended
-    from pcfix.model import BoolArray, FloatArray, IntArray
 
 LEAST_POINTS = 30
 """Tie points under water that a statement takes."""

@@ -7,27 +7,22 @@ eliminated, and is left out.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numba import njit, prange
 
-from pcfix.adjust.block import SQUARES, Given, Loss
-from pcfix.adjust.normal import PARTS, linearise, most_seen, normal_equations, point_block
+from pcfix.adjust.block import SQUARES, Columns, Given, Loss, PointPriors, Seen, State, Surface
+from pcfix.adjust.normal import PARTS, Sums, linearise, most_seen, normal_equations, point_block
 from pcfix.adjust.observe import POINT, WIDTH, scratch
-from pcfix.adjust.problem import priors_at
+from pcfix.adjust.problem import Problem, Solution, priors_at
+from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from scipy.sparse import csc_array
-
-    from pcfix.adjust.block import Columns, PointPriors, Seen, State, Surface
-    from pcfix.adjust.normal import Sums
-    from pcfix.adjust.problem import Problem, Solution
-    from pcfix.model import BoolArray, FloatArray, IntArray
 
 
 DENSE_UP_TO = 6000

@@ -5,8 +5,9 @@ The signs themselves are in `pcfix.adjust.diagnosis`.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -22,21 +23,23 @@ from pcfix.adjust.diagnosis import (
     land_sign,
     tie_point_sign,
 )
+from pcfix.adjust.gather import Datum
 from pcfix.adjust.intersect import intersect_fixed, plain_block
-from pcfix.adjust.mend import deeper, mended
+from pcfix.adjust.mend import Mended, deeper, mended
 from pcfix.adjust.problem import similarity_gradients
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import project
-from pcfix.model import WaterDimension
+from pcfix.model import (
+    Cameras,
+    FloatArray,
+    GroundControl,
+    IntArray,
+    TiePoints,
+    WaterDimension,
+    WaterSurface,
+)
 from pcfix.water.fit import heights_from_cloud, is_near
 from pcfix.water.surface import is_submerged, surface_above
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from pcfix.adjust.gather import Datum
-    from pcfix.adjust.mend import Mended
-    from pcfix.model import Cameras, FloatArray, GroundControl, IntArray, TiePoints, WaterSurface
 
 TIE_POINTS, LEAST_TIE_VIEWS = 3000, 3
 CLOUD_POINTS, POINTS_PER_IMAGE = 1500, 10

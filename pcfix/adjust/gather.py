@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.adjust.block import Block
 from pcfix.errors import GeometryError, SettingError
 from pcfix.lens.imaging import project, unproject
-from pcfix.model import TiePoints, Views, WaterDimension
+from pcfix.model import (
+    BoolArray,
+    Cameras,
+    FloatArray,
+    GroundControl,
+    IntArray,
+    Lens,
+    TiePoints,
+    Views,
+    WaterDimension,
+    WaterSurface,
+)
+from pcfix.port.shapes import Port
 from pcfix.water.surface import surface_above
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pcfix.model import (
-        BoolArray,
-        Cameras,
-        FloatArray,
-        GroundControl,
-        IntArray,
-        Lens,
-        WaterSurface,
-    )
-    from pcfix.port.shapes import Port
 
 LEAST_VIEWS = 2
 LEAST_SEEN = 4

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.adjust.block import Block, Loss, Unknowns
 from pcfix.adjust.normal import point_steps, residuals
 from pcfix.adjust.problem import prepare
-
-if TYPE_CHECKING:
-    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, WaterSurface
-
+from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, WaterSurface
 
 STEPS = 10
 CLOSE_M = 1e-4

@@ -9,35 +9,28 @@ the one under which they fit best is taken.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
 
-from pcfix.adjust.block import Unknowns
+from pcfix.adjust.block import Block, Unknowns
 from pcfix.adjust.gather import some_cameras
 from pcfix.adjust.intersect import intersect_fixed, plain_block
 from pcfix.adjust.normal import residuals
-from pcfix.adjust.problem import Problem, Solution, gnss_weights, prepare, solved_cameras
-from pcfix.adjust.result import adjusted_of
+from pcfix.adjust.problem import LogRow, Problem, Solution, gnss_weights, prepare, solved_cameras
+from pcfix.adjust.result import Adjusted, adjusted_of
 from pcfix.adjust.rounds import check_datum
 from pcfix.adjust.unaware import solve_unaware, straight_columns
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import project
+from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens, WaterSurface
 from pcfix.refract.choice import views_in_frame
 from pcfix.water.surface import is_submerged, surface_above
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pcfix.adjust.block import Block
-    from pcfix.adjust.problem import LogRow
-    from pcfix.adjust.result import Adjusted
-    from pcfix.model import Cameras, FloatArray
-
-    Progress = Callable[[LogRow], None]
-    from pcfix.model import BoolArray, IntArray, Lens, WaterSurface
+Progress = Callable[[LogRow], None]
 
 
 SIGMAS_PX = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 3.0, 5.0, 10.0)

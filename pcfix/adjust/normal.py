@@ -16,12 +16,22 @@ number of threads.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
 
-from pcfix.adjust.block import CAUCHY, HUBER, Given
+from pcfix.adjust.block import (
+    CAUCHY,
+    HUBER,
+    Columns,
+    Given,
+    Loss,
+    PointPriors,
+    Seen,
+    State,
+    Surface,
+)
 from pcfix.adjust.observe import (
     POINT,
     WATER,
@@ -32,11 +42,8 @@ from pcfix.adjust.observe import (
     lens_gradients,
     scratch,
 )
+from pcfix.model import FloatArray, IntArray
 from pcfix.threads import one_caller
-
-if TYPE_CHECKING:
-    from pcfix.adjust.block import Columns, Loss, PointPriors, Seen, State, Surface
-    from pcfix.model import FloatArray, IntArray
 
 PARTS = 8
 LOST = 1e6

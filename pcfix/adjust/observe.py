@@ -9,22 +9,19 @@ is (x x g) by omega.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from pcfix.adjust.block import B1, B2, CX, CY, FOCAL, K1, P1
+from pcfix.adjust.block import B1, B2, CX, CY, FOCAL, K1, P1, Seen, State, Surface
 from pcfix.lens import formulas as places
 from pcfix.lens.formulas import distorted, jacobian, undistorted
 from pcfix.lens.imaging import image_and_gradients, image_of, in_plane
+from pcfix.model import FloatArray
 from pcfix.port.light import through_port
 from pcfix.refract.rays import light_path, plane_at, settle
 from pcfix.refract.tracing.gradients import light_and_gradients
-
-if TYPE_CHECKING:
-    from pcfix.adjust.block import Seen, State, Surface
-    from pcfix.model import FloatArray
 
 POSE, POINT, WATER, WIDTH = 0, 6, 9, 13
 """Columns of the gradients: omega and C, Q, and a, b, c, n."""

@@ -10,20 +10,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.equations import Undamped, point_covariances, solver, undamped
-from pcfix.adjust.problem import similarity_gradients
+from pcfix.adjust.block import Unknowns
+from pcfix.adjust.equations import Reduced, Undamped, point_covariances, solver, undamped
+from pcfix.adjust.problem import Problem, Solution, similarity_gradients
 from pcfix.adjust.solve import BED, LIMITS, MOTIONS, weakest, words_of
 from pcfix.errors import GeometryError
-
-if TYPE_CHECKING:
-    from pcfix.adjust.block import Unknowns
-    from pcfix.adjust.equations import Reduced
-    from pcfix.adjust.problem import Problem, Solution
-    from pcfix.model import FloatArray
+from pcfix.model import FloatArray
 
 DENSE_UP_TO = 12_000
 """Unknowns up to which the whole inverse is computed (1.2 GB)."""

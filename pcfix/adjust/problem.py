@@ -7,7 +7,7 @@ surveyed points, standard deviations of lens, water and index.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,12 +30,19 @@ from pcfix.adjust.block import (
 from pcfix.adjust.normal import cost_of, pair_slots, residuals
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import lens_table
-from pcfix.model import Lens, WaterMesh, WaterPlane, WaterRaster
+from pcfix.model import (
+    BoolArray,
+    Cameras,
+    FloatArray,
+    IntArray,
+    Lens,
+    WaterMesh,
+    WaterPlane,
+    WaterRaster,
+    WaterSurface,
+)
 from pcfix.port.light import coefficients as port_coefficients
 from pcfix.water.surface import build_field, build_tin
-
-if TYPE_CHECKING:
-    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, WaterSurface
 
 NETWORK_SIGMA_M = 1e-4
 """How tightly the mean of the projection centres is held in a free network."""

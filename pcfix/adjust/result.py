@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
+from pcfix.adjust.block import Block, Unknowns
 from pcfix.adjust.gather import LEAST_VIEWS
 from pcfix.adjust.normal import residuals
-from pcfix.adjust.problem import gnss_weights, prepare, solved_cameras, water_of
+from pcfix.adjust.precision import Precision
+from pcfix.adjust.problem import (
+    LogRow,
+    Problem,
+    Solution,
+    gnss_weights,
+    prepare,
+    solved_cameras,
+    water_of,
+)
 from pcfix.adjust.solve import solve
+from pcfix.model import BoolArray, Cameras, FloatArray, WaterSurface
 from pcfix.water.surface import surface_above
-
-if TYPE_CHECKING:
-    from pcfix.adjust.block import Block, Unknowns
-    from pcfix.adjust.precision import Precision
-    from pcfix.adjust.problem import LogRow, Problem, Solution
-    from pcfix.model import BoolArray, Cameras, FloatArray, WaterSurface
 
 Source = Literal["tie points", "cloud"]
 Role = Literal["control", "check"]

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pcfix.adjust.block import CODES, K1, Block, Robust, Unknowns, usable_codes
 from pcfix.adjust.gather import LEAST_VIEWS
 from pcfix.adjust.normal import residuals
-from pcfix.adjust.precision import precision_of
+from pcfix.adjust.precision import Precision, precision_of
 from pcfix.adjust.problem import (
     LogRow,
     Problem,
@@ -18,18 +18,12 @@ from pcfix.adjust.problem import (
     gnss_weights,
     prepare,
 )
-from pcfix.adjust.result import adjusted_of, sigma0_of
+from pcfix.adjust.result import Adjusted, adjusted_of, sigma0_of
 from pcfix.adjust.solve import solve
 from pcfix.errors import GeometryError
+from pcfix.model import BoolArray, Lens
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pcfix.adjust.precision import Precision
-    from pcfix.adjust.result import Adjusted
-    from pcfix.model import BoolArray, Lens
-
-    Progress = Callable[[LogRow], None]
+Progress = Callable[[LogRow], None]
 
 ROUGHLY = 1e-4
 """Gain of a step, relative, below which the first, robust rounds end."""

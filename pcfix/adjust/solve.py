@@ -6,6 +6,7 @@ alike (Mulsow 2024): then they cannot all be free.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -27,13 +28,10 @@ from pcfix.adjust.problem import (
 )
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import lens_table
+from pcfix.model import FloatArray, IntArray, Lens
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from scipy.sparse import csc_array
-
-    from pcfix.model import FloatArray, IntArray, Lens
 
 
 LOSSES = {"squares": SQUARES, "huber": HUBER, "cauchy": CAUCHY}

@@ -23,13 +23,14 @@ the same way.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
 
-from pcfix.adjust.block import SQUARES, Given, Loss
+from pcfix.adjust.block import SQUARES, Columns, Given, Loss, PointPriors, Seen, State, Surface
 from pcfix.adjust.normal import PARTS, linearise, most_seen, point_block
 from pcfix.adjust.observe import (
     POINT,
@@ -42,13 +43,8 @@ from pcfix.adjust.observe import (
 from pcfix.adjust.problem import LogRow, Problem, Solution, counts_of, priors_at
 from pcfix.adjust.solve import moved_by
 from pcfix.errors import GeometryError
+from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.threads import one_caller
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pcfix.adjust.block import Columns, PointPriors, Seen, State, Surface
-    from pcfix.model import BoolArray, FloatArray, IntArray
 
 MAX_STEPS = 25
 CLOSE_M = 1e-7

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.block import CODES, K1, P1, WATER_NAMES, sensor_groups, usable_codes
-from pcfix.model import WaterPlane
+from pcfix.adjust.block import CODES, K1, P1, WATER_NAMES, Unknowns, sensor_groups, usable_codes
+from pcfix.model import BoolArray, FloatArray, Lens, WaterPlane
 from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pcfix.adjust.block import Unknowns
     from pcfix.adjust.precision import Precision
     from pcfix.adjust.result import Adjusted, ControlRow
-    from pcfix.model import BoolArray, FloatArray, Lens
 
 Plain = dict[str, Any]
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.adjust.block import CODES, Unknowns
+from pcfix.adjust.block import CODES, Block, Unknowns
 from pcfix.adjust.gather import (
     FIRST_SIGMA_PX,
     Material,
@@ -20,29 +20,24 @@ from pcfix.adjust.gather import (
 from pcfix.adjust.intersect import intersect_fixed, plain_block
 from pcfix.adjust.mend import Candidate, mend
 from pcfix.adjust.precision import strong_correlations, undetermined
+from pcfix.adjust.problem import LogRow
+from pcfix.adjust.result import Adjusted
 from pcfix.adjust.rounds import Rounds, adjust_ties, check_datum, default_lens
 from pcfix.errors import GeometryError, SettingError
+from pcfix.model import (
+    BoolArray,
+    Cameras,
+    FloatArray,
+    GroundControl,
+    IntArray,
+    TiePoints,
+    Views,
+    WaterSurface,
+)
+from pcfix.options.survey import AdjustRules
 from pcfix.water.surface import surface_above
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pcfix.adjust.block import Block
-    from pcfix.adjust.problem import LogRow
-    from pcfix.adjust.result import Adjusted
-    from pcfix.model import (
-        BoolArray,
-        Cameras,
-        FloatArray,
-        GroundControl,
-        IntArray,
-        TiePoints,
-        Views,
-        WaterSurface,
-    )
-    from pcfix.options.survey import AdjustRules
-
-    Progress = Callable[[LogRow], None]
+Progress = Callable[[LogRow], None]
 
 LEAST_TIES = 100
 SMALL_WATER = 10

@@ -9,21 +9,17 @@ costs a few queries, not a tree of everything.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    import numpy.typing as npt
-
-    from pcfix.model import BoolArray, FloatArray, IntArray
-
+from pcfix.model import BoolArray, FloatArray, IntArray
 
 SLACK = 1.0 + 1e-9
 """Distances nearer to each other than this count as equal: more than rounding, less than any

@@ -6,9 +6,11 @@ They are independent of each other: each looks at all used points, whatever anot
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.clean.neighbours import (
     SLACK,
@@ -22,21 +24,13 @@ from pcfix.clean.neighbours import (
 )
 from pcfix.clean.settings import Reason
 from pcfix.errors import InputError, SettingError
+from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import LEAST_NEIGHBOURS, CleanRules
 from pcfix.threads import threads
 from pcfix.water.checks import as_surface, checked_points
 from pcfix.water.surface import is_submerged, surface_above
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    import numpy.typing as npt
-
-    from pcfix.model import BoolArray, FloatArray, IntArray
-
-    ReasonArray = npt.NDArray[np.uint8]
-    from pcfix.clean.neighbours import Empty
-    from pcfix.model import WaterSurface
+ReasonArray = npt.NDArray[np.uint8]
 
 
 PIECE_ROWS = 65_536

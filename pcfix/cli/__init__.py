@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 from cyclopts import App, CycloptsError
 
@@ -12,9 +12,6 @@ from pcfix.cli.commands import EXAMPLES
 from pcfix.cli.flags import UsageError, prepare
 from pcfix.errors import PcfixError, show_warning
 from pcfix.version import __version__
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 app = App(
     name="pcfix",

@@ -5,17 +5,15 @@ from __future__ import annotations
 import os
 import sys
 import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, get_args, get_type_hints
 
 from cyclopts import Group, Parameter
 
 from pcfix.options.declare import Option, OptionSet, options_of
 from pcfix.options.shared import PANELS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 FLAGS = Parameter(name="*")
 """Of a command's argument: each option of its class is a flag."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
@@ -13,9 +14,11 @@ from pcfix.compare.m3c2 import (
     M3c2,
     m3c2_distances,
 )
+from pcfix.compare.match import Match
 from pcfix.compare.nearest import cloud_to_cloud
 from pcfix.compare.sections import (
     Section,
+    SectionLine,
     lines_downslope,
     section_along,
 )
@@ -29,20 +32,13 @@ from pcfix.compare.statistics import (
     fit_line,
 )
 from pcfix.compare.vertical import (
+    Pairs,
     pairs_at_cloud,
     pairs_at_reference,
 )
 from pcfix.errors import GeometryError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from pcfix.compare.match import Match
-    from pcfix.compare.sections import Section, SectionLine
-    from pcfix.compare.vertical import Pairs
-    from pcfix.model import FloatArray
-    from pcfix.options.steps import CompareRules
-
+from pcfix.model import FloatArray
+from pcfix.options.steps import CompareRules
 
 Figure = TypeVar("Figure")
 

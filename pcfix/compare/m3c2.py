@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import logging
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pcfix.compare.nearest import Neighbours
 from pcfix.compare.statistics import Statistics, statistics_of
 from pcfix.errors import GeometryError, SettingError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from pcfix.model import FloatArray, IntArray
+from pcfix.model import FloatArray, IntArray
 
 MAX_CORE_POINTS = 100_000
 SPACING_SAMPLE = 10_000

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pcfix.compare.nearest import Neighbours, mean_spacing_m
 from pcfix.errors import GeometryError, InputError
-from pcfix.model import BoolArray, FloatArray, WaterSurface  # noqa: TC001 - dataclass fields
-
-if TYPE_CHECKING:
-    from pcfix.model import IntArray
-    from pcfix.options.steps import CompareRules
-
+from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
+from pcfix.options.steps import CompareRules
 
 GAP_SPACINGS, MIN_GAP_M = 5.0, 1.0
 """How far outside the other cloud a point still counts, unless the user says so."""

@@ -8,16 +8,13 @@ close together, and gives up where a neighbour is many rings away.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from pcfix.model import FloatArray, IntArray
-
+from pcfix.model import FloatArray, IntArray
 
 POINTS_PER_CELL = 3.0
 MAX_CELLS = 20_000_000

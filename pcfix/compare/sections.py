@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
-from pcfix.model import FloatArray  # noqa: TC001 - dataclass fields
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
+from pcfix.model import FloatArray
 
 STATIONS = 200
 """Stations of a section at most; they are never closer than a quarter of the corridor's width."""

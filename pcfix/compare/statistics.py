@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.compare.nearest import Neighbours
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import FloatArray
-
-if TYPE_CHECKING:
-    from pcfix.model import FloatArray
-
 
 PERCENTILES = (5, 25, 50, 75, 95)
 NMAD_FACTOR = 1.4826

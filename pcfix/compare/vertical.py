@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.compare.nearest import Neighbours
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import BoolArray, FloatArray
-
-if TYPE_CHECKING:
-    from pcfix.model import BoolArray, FloatArray
-
 
 MIN_NEIGHBOURS = 6
 DEFAULT_NEIGHBOURS = 8

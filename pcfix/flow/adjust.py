@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
+from collections.abc import Callable
 from dataclasses import replace
+from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pcfix.adjust.gather import LEAST_VIEWS
 from pcfix.adjust.gather import taken as taken_ties
+from pcfix.adjust.problem import LogRow
+from pcfix.adjust.result import Adjusted
 from pcfix.adjust.ways import unknowns_of
 from pcfix.errors import InputError, SettingError
 from pcfix.flow.adjust_job import Survey, adjusted, read_job
@@ -22,20 +26,11 @@ from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.io.cameras.opensfm.models import write_opensfm
 from pcfix.io.cameras.table.sensor import write_table
 from pcfix.io.files import check_input
-from pcfix.model import TiePoints, Views, WaterPlane
-from pcfix.options.declare import taken
+from pcfix.model import Cameras, TiePoints, Views, WaterPlane
+from pcfix.options.declare import File, taken
 from pcfix.options.survey import AdjustOptions, AdjustRules
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from os import PathLike
-
-    from pcfix.adjust.problem import LogRow
-    from pcfix.adjust.result import Adjusted
-    from pcfix.model import Cameras
-    from pcfix.options.declare import File
-
-    AnyPath = str | PathLike[str]
+AnyPath = str | PathLike[str]
 
 SUMMARY = "adjustment.json"
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -17,6 +19,8 @@ from pcfix.adjust.gather import (
     usable_ties,
     with_places,
 )
+from pcfix.adjust.problem import LogRow
+from pcfix.adjust.result import Adjusted
 from pcfix.adjust.ways import (
     LEAST_TIES,
     by_cloud,
@@ -27,32 +31,23 @@ from pcfix.adjust.ways import (
     unknowns_of,
 )
 from pcfix.errors import GeometryError, InputError, SettingError
-from pcfix.flow.inputs import mask_of
+from pcfix.flow.inputs import Inputs, mask_of
+from pcfix.flow.surfaces import CloudView
 from pcfix.io.cameras.table.sensor import read_sensor
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
-from pcfix.io.views import ViewMatch
-from pcfix.model import GroundControl, Views
+from pcfix.io.views import ViewList, ViewMatch
+from pcfix.model import Cameras, FloatArray, GroundControl, Lens, TiePoints, Views, WaterSurface
+from pcfix.options.survey import AdjustRules
 from pcfix.refract.choice import views_in_frame
 from pcfix.water.index import index_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from os import PathLike
-
     from pyproj import CRS
 
-    from pcfix.adjust.problem import LogRow
-    from pcfix.adjust.result import Adjusted
-    from pcfix.flow.inputs import Inputs
-    from pcfix.flow.surfaces import CloudView
-    from pcfix.io.views import ViewList
-    from pcfix.model import Cameras, FloatArray, Lens, TiePoints, WaterSurface
-    from pcfix.options.survey import AdjustRules
-
-    AnyPath = str | PathLike[str]
+AnyPath = str | PathLike[str]
 
 CLOUD_POINTS = 6000
 """Points of the cloud that stand for tie points."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from os import PathLike
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from pcfix.adjust.diagnosis import Diagnosis
 from pcfix.adjust.evidence import Evidence
 from pcfix.errors import InputError, SettingError
 from pcfix.flow.diagnosis import (
@@ -28,19 +29,14 @@ from pcfix.io.gnss_positions import read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.lens.frames import cameras_in_sight
-from pcfix.model import WaterDimension
-from pcfix.options.declare import taken
+from pcfix.model import Cameras, FloatArray, Lens, WaterDimension, WaterSurface
+from pcfix.options.declare import File, taken
 from pcfix.options.survey import CamerasCheckOptions, WaterCheckOptions
 from pcfix.report.cameras import CamerasReport, Fit, GnssResiduals, Sensor, block_figure
 from pcfix.report.page import png_of
 from pcfix.report.water import WaterReport, water_figure
 from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
-
-if TYPE_CHECKING:
-    from pcfix.adjust.diagnosis import Diagnosis
-    from pcfix.model import Cameras, FloatArray, Lens, WaterSurface
-    from pcfix.options.declare import File
 
 AnyPath = str | PathLike[str]
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
+from pcfix.clean.neighbours import Empty
 from pcfix.clean.points import check_tile, flag_neighbours, flag_weak
 from pcfix.clean.settings import CleanSummary, Reason
 from pcfix.errors import InputError
@@ -25,7 +29,7 @@ from pcfix.io.las.writing import (
     noted_header,
     output_evlrs,
 )
-from pcfix.model import HIGH_NOISE, LOW_NOISE, WaterDimension
+from pcfix.model import HIGH_NOISE, LOW_NOISE, BoolArray, FloatArray, WaterDimension, WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CleanOptions, CleanRules
@@ -35,16 +39,9 @@ from pcfix.water.checks import check_submerged
 from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
     import laspy
-    import numpy.typing as npt
 
-    from pcfix.clean.neighbours import Empty
-    from pcfix.model import BoolArray, FloatArray, WaterSurface
-
-    AnyPath = str | PathLike[str]
+AnyPath = str | PathLike[str]
 
 """ASPRS classes of low and high noise (LAS 1.4 R15, table 17)."""
 _PASSES = 4

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import time
+from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pcfix.compare.figures import Comparison, bins_table, figures_of
 from pcfix.compare.m3c2 import load_py4dgeo
@@ -18,10 +19,7 @@ from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CompareOptions, CompareRules
 
-if TYPE_CHECKING:
-    from os import PathLike
-
-    AnyPath = str | PathLike[str]
+AnyPath = str | PathLike[str]
 
 
 def compare_clouds(

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.adjust.carry import Carrying
 from pcfix.errors import InputError, SettingError
 from pcfix.flow.inputs import paths_in
 from pcfix.flow.job import Job
 from pcfix.flow.old_cameras import paired
-from pcfix.flow.points import correct_checked
-from pcfix.flow.runner import FileTask, file_task
-from pcfix.flow.surfaces import view_of
+from pcfix.flow.points import Label, correct_checked
+from pcfix.flow.runner import FileTask, Progress, file_task
+from pcfix.flow.surfaces import Points, view_of
 from pcfix.io.las.columns import (
     OutOfRangeError,
     TooNarrowError,
@@ -26,29 +29,28 @@ from pcfix.io.las.columns import (
 )
 from pcfix.io.las.source import LasSource, centring_steps, coordinates
 from pcfix.io.las.writing import corrected_header
-from pcfix.model import BATHYMETRIC_POINT, Cameras, Summary, Views, WaterDimension
+from pcfix.model import (
+    BATHYMETRIC_POINT,
+    Cameras,
+    Correction,
+    FloatArray,
+    Summary,
+    Views,
+    WaterDimension,
+    WaterSurface,
+)
 from pcfix.options.correct import CorrectOptions, RefractionOptions, ScienceOptions
-from pcfix.options.declare import taken
+from pcfix.options.declare import File, taken
 from pcfix.refract.batch import Batch, MadeWith, Survey
 from pcfix.refract.learning import learn_of_points
+from pcfix.refract.regression import DepthRegression
 from pcfix.threads import threads
 from pcfix.water.checks import as_surface, check_above_water, checked_points
 from pcfix.water.index import with_index
 from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
     import laspy
-    import numpy.typing as npt
-
-    from pcfix.flow.points import Label
-    from pcfix.flow.runner import Progress
-    from pcfix.flow.surfaces import Points
-    from pcfix.model import Correction, FloatArray, WaterSurface
-    from pcfix.options.declare import File
-    from pcfix.refract.regression import DepthRegression
 
 
 def correct_points(

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pcfix.compare.statistics import errors_against_truth
 from pcfix.flow.correct import correct_points
 from pcfix.flow.run import Request, run_all
 from pcfix.io.las.source import read_xyz
 from pcfix.io.scenes import write_scene
+from pcfix.model import FloatArray
 from pcfix.simulate.scene import BlockKind, Scene, simulate_scene
-
-if TYPE_CHECKING:
-    import os
-    from collections.abc import Callable
-
-    from pcfix.model import FloatArray
 
 LEAST_DEPTH_M = 0.2  # shallower points have no refraction worth a percentage
 BLOCKS: tuple[BlockKind, ...] = ("nadir", "oblique")

@@ -9,18 +9,17 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pcfix.adjust.diagnosis import Diagnosis
 from pcfix.errors import InputError, PcfixError, PcfixWarning
 from pcfix.io.gnss_positions import gnss_in_frame_of
-from pcfix.model import Cameras
+from pcfix.model import Cameras, TiePoints, WaterSurface
 
 if TYPE_CHECKING:
-    from pcfix.adjust.diagnosis import Diagnosis
     from pcfix.adjust.evidence import Evidence
     from pcfix.flow.inputs import Inputs
     from pcfix.flow.surfaces import CloudView
-    from pcfix.model import TiePoints, WaterSurface
 
-    AnyPath = str | PathLike[str]
+AnyPath = str | PathLike[str]
 
 QUICK_BYTES = 25_000_000
 """Of a model, in passing, where nobody asked: it takes no more than a second or two."""

@@ -8,8 +8,10 @@ chunks, squares and windows end.
 from __future__ import annotations
 
 import json
+import os
 import time
 import warnings
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -17,6 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.grid.delaunay import fill_holes, margin_cells
@@ -35,24 +38,17 @@ from pcfix.io.rasters import (
     read_heights,
     write_part,
 )
-from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES
+from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, BoolArray, FloatArray, IntArray
 from pcfix.options.declare import File, taken
-from pcfix.options.steps import DsmOptions, DsmRules
+from pcfix.options.steps import DsmOptions, DsmRules, SurfaceChoice
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
-    import os
-    from collections.abc import Callable, Iterator
-
     import laspy
-    import numpy.typing as npt
     from rasterio.io import DatasetReader, DatasetWriter
 
-    from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.options.steps import SurfaceChoice
-
-    AnyPath = str | os.PathLike[str]
-    Progress = Callable[[int, int], None]
+AnyPath = str | os.PathLike[str]
+Progress = Callable[[int, int], None]
 
 BLOCK_CELLS = 1024
 """Longest side of a window; a power of two."""

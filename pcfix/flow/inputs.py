@@ -11,25 +11,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
-from pcfix.flow.surfaces import find_surface
+from pcfix.flow.surfaces import CloudView, find_surface
 from pcfix.io.cameras import read_cameras, read_tie_points
 from pcfix.io.cameras.georeference import georeference
 from pcfix.io.vectors import LAYER_MARK
-from pcfix.model import Cameras
+from pcfix.io.views import ViewList
+from pcfix.label.areas import WaterMask
+from pcfix.model import Cameras, FloatArray, TiePoints
 from pcfix.options.declare import File, options_of
 from pcfix.options.shared import InputOptions
 from pcfix.port.shapes import port_of
+from pcfix.water.surface import FoundSurface
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from pcfix.flow.surfaces import CloudView
-    from pcfix.io.views import ViewList
-    from pcfix.label.areas import WaterMask
-    from pcfix.model import FloatArray, TiePoints
-    from pcfix.water.surface import FoundSurface
-
-    AnyPath = str | PathLike[str]
+AnyPath = str | PathLike[str]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from pcfix.errors import GeometryError
 from pcfix.flow.inputs import Inputs, mask_of
 from pcfix.flow.old_cameras import ListedViews, read_blocks
+from pcfix.flow.surfaces import CloudView, Points
 from pcfix.flow.through_port import ThroughPort
 from pcfix.flow.through_water import ThroughWater
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.label.labelling import Labelling
-from pcfix.model import Outcome, Summary
-from pcfix.options.correct import LabelRules, ScienceOptions
+from pcfix.model import Correction, FloatArray, Outcome, Summary, WaterSurface
+from pcfix.options.correct import CorrectOptions, LabelRules, ScienceOptions
 from pcfix.refract.tally import Tally
 from pcfix.version import __version__
 from pcfix.water.index import with_index
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    import numpy as np
-    import numpy.typing as npt
-
-    from pcfix.flow.surfaces import CloudView, Points
-    from pcfix.model import Correction, FloatArray, WaterSurface
-    from pcfix.options.correct import CorrectOptions
 
 
 class Job:

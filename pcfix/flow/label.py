@@ -2,45 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import astuple
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.errors import SettingError
 from pcfix.flow.correct import file_points, water_heights
 from pcfix.flow.inputs import mask_of, paths_in
-from pcfix.flow.runner import file_task
-from pcfix.flow.surfaces import find_surface, view_of
+from pcfix.flow.runner import Progress, file_task
+from pcfix.flow.surfaces import CloudView, Points, find_surface, view_of
 from pcfix.flow.through_water import parts_of
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource, coordinates
 from pcfix.io.las.writing import labelling_vlr, noted_header
-from pcfix.label.labelling import Labelling, LabelSummary, Part, sets_class
-from pcfix.model import WaterPlane
+from pcfix.label.areas import WaterMask
+from pcfix.label.labelling import Labelling, Labels, LabelSummary, Part, sets_class
+from pcfix.model import FloatArray, WaterPlane, WaterSurface
 from pcfix.options.correct import LabelOptions, LabelRules, StageLabelOptions
-from pcfix.options.declare import taken
+from pcfix.options.declare import File, taken
 from pcfix.threads import threads
 from pcfix.version import __version__
 from pcfix.water.checks import as_surface, check_submerged, check_tilt, checked_points
 from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
     import laspy
-    import numpy.typing as npt
 
-    from pcfix.flow.runner import Progress
-    from pcfix.flow.surfaces import CloudView, Points
-    from pcfix.label.areas import WaterMask
-    from pcfix.label.labelling import Labels
-    from pcfix.model import FloatArray, WaterSurface
-    from pcfix.options.declare import File
-
-    AnyPath = str | PathLike[str]
-    Classes = npt.NDArray[np.uint8]
+AnyPath = str | PathLike[str]
+Classes = npt.NDArray[np.uint8]
 
 
 class Counts:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import repeat
 from typing import TYPE_CHECKING
@@ -10,21 +11,17 @@ import numpy as np
 
 from pcfix.errors import SettingError
 from pcfix.label.labelling import Part
-from pcfix.model import NOISE_CLASSES
-from pcfix.refract.batch import Batch, Learned, stacked
+from pcfix.model import NOISE_CLASSES, TiePoints, ViewKind
+from pcfix.refract.batch import Batch, Learned, MadeWith, Survey, stacked
 from pcfix.refract.learning import check_method, wants_matcher, with_matcher
+from pcfix.refract.occlusion import Occluder
+from pcfix.refract.regression import DepthRegression
 from pcfix.refract.top_surface import OccluderBuilder, wants_occlusion
 from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
     from pcfix.flow.inputs import Inputs
     from pcfix.flow.surfaces import CloudView, Points
-    from pcfix.model import TiePoints, ViewKind
-    from pcfix.refract.batch import MadeWith, Survey
-    from pcfix.refract.occlusion import Occluder
-    from pcfix.refract.regression import DepthRegression
 
 
 class Learning:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -12,17 +13,13 @@ import numpy as np
 from pcfix.adjust.carry import Pair, pair_of, renumbered
 from pcfix.errors import GeometryError, PcfixWarning, SettingError
 from pcfix.io.labels import match_labels
-from pcfix.io.views import ViewMatch
-from pcfix.model import Cameras
+from pcfix.io.views import ViewList, ViewMatch, ViewReport
+from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, Views
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from pyproj import CRS
 
     from pcfix.flow.inputs import Inputs
-    from pcfix.io.views import ViewList, ViewReport
-    from pcfix.model import FloatArray, IntArray, TiePoints, Views
 
 LOCAL = "local"
 

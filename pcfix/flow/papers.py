@@ -26,13 +26,15 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pcfix.errors import SettingError
 from pcfix.flow.correct import correct_points
 from pcfix.io.files import check_output, write_bytes
+from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.options.declare import File
+from pcfix.options.scenes import SimulateOptions
 from pcfix.report.page import png_of
 from pcfix.report.papers import (
     DepthBins,
@@ -61,11 +63,6 @@ from pcfix.simulate.refraction_effect import (
 )
 from pcfix.version import __version__
 from pcfix.water.index import index_of
-
-if TYPE_CHECKING:
-    from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.options.declare import File
-    from pcfix.options.scenes import SimulateOptions
 
 BIN_M = 0.1
 CHECKS_PER_BIN = 10

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pcfix.errors import InputError
 from pcfix.flow.correct import job_for
-from pcfix.io.las.columns import UPGRADE, columns_for
+from pcfix.io.las.columns import UPGRADE, Column, columns_for
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix
 from pcfix.io.pdal import CLASS_FLAGS, OUTCOME, STAGE_SOURCE, add_dimension
+from pcfix.options.correct import CorrectOptions
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import laspy
 
-    from pcfix.io.las.columns import Column
-    from pcfix.options.correct import CorrectOptions
 
 WAVEFORM_FORMATS = (9, 10)
 

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from pcfix.model import Correction
+from pcfix.model import BoolArray, Correction, FloatArray, IntArray
+from pcfix.refract.batch import Batch, Intersection
 from pcfix.refract.methods import correct, shift_of_land
 from pcfix.water.surface import SurfaceAbove, is_submerged
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.refract.batch import Batch, Intersection
-
-    Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
+Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
 
 
 def correct_checked(

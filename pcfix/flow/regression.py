@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
-from pcfix.io.tables import read_check_depths
-from pcfix.model import NOISE_CLASSES
+from pcfix.io.tables import CheckDepths, read_check_depths
+from pcfix.label.labelling import Part
+from pcfix.model import NOISE_CLASSES, BoolArray, FloatArray, IntArray
+from pcfix.options.correct import ScienceOptions
 from pcfix.refract.regression import (
     LEAST_COUNT,
     LEAST_NEIGHBOURS,
@@ -19,15 +22,6 @@ from pcfix.refract.regression import (
     fit_depths,
 )
 from pcfix.water.surface import SurfaceAbove
-
-if TYPE_CHECKING:
-    import os
-    from collections.abc import Iterable
-
-    from pcfix.io.tables import CheckDepths
-    from pcfix.label.labelling import Part
-    from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.options.correct import ScienceOptions
 
 
 def learn_regression(

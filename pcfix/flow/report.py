@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.grid.maps import MapsBuilder
+from pcfix.grid.maps import Maps, MapsBuilder
 from pcfix.io.files import sha256, write_bytes, write_text
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates
-from pcfix.report.page import Table, render
+from pcfix.model import Cameras, FloatArray, Summary, WaterSurface
+from pcfix.report.page import Picture, Table, render
 from pcfix.report.run import Corrected, run_report
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from pathlib import Path
-
-    from pcfix.grid.maps import Maps
-    from pcfix.model import Cameras, FloatArray, Summary, WaterSurface
-    from pcfix.report.page import Picture
 
 NEEDED = (*SHIFTS, "WaterDepth", "RayCount")
 SIGMA_Z = "SigmaZ"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,19 +10,15 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.flow.runner import file_task
 from pcfix.io.las.columns import SHIFTS, columns_for, is_corrected, is_marked_uncorrected, shifted
+from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import read_settings, restored_header
-from pcfix.options.declare import taken
+from pcfix.options.correct import Dimensions
+from pcfix.options.declare import File, taken
 from pcfix.options.shared import JobOptions
 from pcfix.threads import threads
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     import laspy
-
-    from pcfix.io.las.source import LasSource
-    from pcfix.options.correct import Dimensions
-    from pcfix.options.declare import File
 
 
 def restore_file(

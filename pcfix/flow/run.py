@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from pcfix.compare.figures import Comparison
 from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.clean import clean_file
@@ -36,18 +38,13 @@ from pcfix.options.correct import CorrectOptions
 from pcfix.options.declare import named, options_of
 from pcfix.options.survey import RunOptions
 from pcfix.report.comparison import evaluation, in_a_sentence
+from pcfix.report.page import Picture, Table
 from pcfix.report.run import (
     adjustment_sentence,
     adjustment_table,
     reason_sentence,
 )
 from pcfix.water.index import with_index
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pcfix.compare.figures import Comparison
-    from pcfix.report.page import Picture, Table
 
 RECORD = "run.json"
 SECTIONS = 3

@@ -3,35 +3,29 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, get_args
+from pathlib import Path
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
-from pcfix.adjust.diagnosis import MOST_STATED_M
+from pcfix.adjust.diagnosis import MOST_STATED_M, Diagnosis
 from pcfix.adjust.evidence import Evidence
 from pcfix.errors import PcfixError, PcfixWarning, SettingError
 from pcfix.flow.adjust import SUMMARY, adjust_into
 from pcfix.flow.adjust_job import Survey
 from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, ties_of
-from pcfix.flow.surfaces import view_of
+from pcfix.flow.inputs import Inputs
+from pcfix.flow.surfaces import CloudView, view_of
 from pcfix.io.files import check_input, read_json
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
-from pcfix.model import WaterDimension
+from pcfix.model import Cameras, WaterDimension, WaterSurface
+from pcfix.options.declare import File
 from pcfix.options.survey import AdjustRules, AdjustWhen
 from pcfix.threads import threads
 from pcfix.water.index import index_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from pcfix.adjust.diagnosis import Diagnosis
-    from pcfix.flow.inputs import Inputs
-    from pcfix.flow.surfaces import CloudView
-    from pcfix.model import Cameras, WaterSurface
-    from pcfix.options.declare import File
 
 FOLDER = "adjusted"
 MODELS = ("colmap", "opensfm/reconstruction.json", "cameras.csv")

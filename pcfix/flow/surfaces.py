@@ -3,33 +3,31 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.water import read_water
+from pcfix.model import FloatArray, WaterSurface
+from pcfix.options.shared import WaterOptions
+from pcfix.water.fit import WaterFit
+from pcfix.water.river import RiverFit
 from pcfix.water.surface import FoundSurface
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    import numpy.typing as npt
     from pyproj import CRS
 
-    from pcfix.model import FloatArray, WaterSurface
-    from pcfix.options.shared import WaterOptions
-    from pcfix.water.fit import WaterFit
-    from pcfix.water.river import RiverFit
+AnyPath = str | PathLike[str]
 
-    AnyPath = str | PathLike[str]
-
-    Points: TypeAlias = tuple[FloatArray, FloatArray | None, npt.NDArray[np.uint8]]
-    """Some points: coordinates (n, 3), water heights where those are a dimension, classes."""
+Points: TypeAlias = tuple[FloatArray, FloatArray | None, npt.NDArray[np.uint8]]
+"""Some points: coordinates (n, 3), water heights where those are a dimension, classes."""
 
 WaterModel = Literal["auto", "level", "plane", "along", "river"]
 AUTO = "auto"

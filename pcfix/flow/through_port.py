@@ -7,27 +7,25 @@ submerged point, 1 mm.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
+from pcfix.flow.old_cameras import Blocks, ListedViews
 from pcfix.flow.points import spread_over
-from pcfix.model import Correction, WaterPlane
+from pcfix.label.labelling import Labelling
+from pcfix.model import Correction, Views, WaterPlane
+from pcfix.options.correct import CorrectOptions
 from pcfix.port.methods import correct_through_port
+from pcfix.refract.tally import Tally
 from pcfix.water.surface import SurfaceAbove
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
     from pcfix.flow.inputs import Inputs
-    from pcfix.flow.old_cameras import Blocks, ListedViews
     from pcfix.flow.surfaces import CloudView, Points
-    from pcfix.label.labelling import Labelling
-    from pcfix.model import Views
-    from pcfix.options.correct import CorrectOptions
-    from pcfix.refract.tally import Tally
 
 
 class ThroughPort:

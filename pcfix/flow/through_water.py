@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import astuple, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -11,27 +12,29 @@ import numpy as np
 from pcfix.adjust.carry import Carrying
 from pcfix.flow.diagnosis import diagnose_in_passing
 from pcfix.flow.learning import Learning
-from pcfix.flow.old_cameras import old_tie_points
-from pcfix.flow.points import correct_checked
-from pcfix.label.labelling import Part
-from pcfix.model import WaterDimension, WaterPlane
-from pcfix.refract.batch import Batch, Survey
+from pcfix.flow.old_cameras import Blocks, ListedViews, old_tie_points
+from pcfix.flow.points import Label, correct_checked
+from pcfix.label.labelling import Labelling, Part
+from pcfix.model import (
+    Correction,
+    FloatArray,
+    TiePoints,
+    ViewKind,
+    Views,
+    WaterDimension,
+    WaterPlane,
+    WaterSurface,
+)
+from pcfix.options.correct import CorrectOptions
+from pcfix.refract.batch import Batch, MadeWith, Survey
 from pcfix.refract.learning import kind_of_views
+from pcfix.refract.tally import Tally
 from pcfix.water.checks import WaterMeeting, check_above_water, check_tilt, refuse_under_water
 from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-
     from pcfix.flow.inputs import Inputs
-    from pcfix.flow.old_cameras import Blocks, ListedViews
-    from pcfix.flow.points import Label
     from pcfix.flow.surfaces import CloudView, Points
-    from pcfix.label.labelling import Labelling
-    from pcfix.model import Correction, FloatArray, TiePoints, ViewKind, Views, WaterSurface
-    from pcfix.options.correct import CorrectOptions
-    from pcfix.refract.batch import MadeWith
-    from pcfix.refract.tally import Tally
 
 
 class ThroughWater:

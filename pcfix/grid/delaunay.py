@@ -11,15 +11,12 @@ a little, always the same way for the same point.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numba import njit
 from scipy.spatial import Delaunay, QhullError
 
-if TYPE_CHECKING:
-    from pcfix.grid.lattice import Window
-    from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.grid.lattice import Window
+from pcfix.model import BoolArray, FloatArray, IntArray
 
 MOVED = 1e-4
 """Of the spacing of the points: how far one is moved for the choice of triangles."""

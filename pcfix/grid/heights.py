@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from pcfix.grid.delaunay import triangulated
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pcfix.grid.lattice import Lattice, Window
-    from pcfix.model import FloatArray, IntArray
-    from pcfix.options.steps import DsmMethod
+from pcfix.grid.lattice import Lattice, Window
+from pcfix.model import FloatArray, IntArray
+from pcfix.options.steps import DsmMethod
 
 
 class Gridding(NamedTuple):

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.errors import SettingError
+from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.options.steps import MIN_RESOLUTION_M
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from pcfix.model import BoolArray, FloatArray, IntArray
-
 
 MAX_CELLS = 4_000_000_000
 EDGE_M = 1e-7

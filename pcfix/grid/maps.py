@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.model import BoolArray, FloatArray, IntArray
 
 LONG_SIDE_CELLS = 360
 POINTS_PER_CELL = 6.0

@@ -6,12 +6,12 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
+
+from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
-    import numpy.typing as npt
-
     from pcfix.grid.heights import Gridded
-    from pcfix.model import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

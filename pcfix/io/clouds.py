@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import warnings
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -15,17 +18,20 @@ from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, las_errors
 from pcfix.io.las.writing import own_settings
 from pcfix.io.tables import read_table
-from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, WaterDimension, WaterPlane
+from pcfix.model import (
+    BATHYMETRIC_POINT,
+    NOISE_CLASSES,
+    BoolArray,
+    FloatArray,
+    WaterDimension,
+    WaterPlane,
+    WaterSurface,
+)
 
 if TYPE_CHECKING:
-    import os
-    from collections.abc import Sequence
-    from pathlib import Path
-
     import laspy
     from pyproj import CRS
 
-    from pcfix.model import BoolArray, FloatArray, WaterSurface
 
 CHUNK_POINTS = 2_000_000
 

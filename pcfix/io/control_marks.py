@@ -27,7 +27,8 @@ Reference: "Ground Control Points" in the manual of OpenDroneMap, https://docs.o
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
@@ -36,21 +37,14 @@ from pcfix.io.cameras.checks import number as xml_number
 from pcfix.io.cameras.checks import numbers
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import SPREADS, documents
+from pcfix.io.cameras.metashape.documents import Chunk
 from pcfix.io.cameras.odm.project import named_crs
 from pcfix.io.cameras.table import centres, crs
-from pcfix.io.cameras.table.columns import headers, is_header, read_columns
+from pcfix.io.cameras.table.columns import Columns, headers, is_header, read_columns
 from pcfix.io.crs import is_local, parse_crs
 from pcfix.io.tables import number, read_lines
 from pcfix.io.transformations import LOCAL
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from xml.etree.ElementTree import Element
-
-    from pcfix.io.cameras.metashape.documents import Chunk
-    from pcfix.io.cameras.table.columns import Columns
-    from pcfix.model import BoolArray, FloatArray
-
+from pcfix.model import BoolArray, FloatArray
 
 SPELLINGS: dict[str, tuple[str, ...]] = {
     "point": (

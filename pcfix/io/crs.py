@@ -16,11 +16,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from pcfix.errors import InputError
+from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
     from pyproj import CRS
-
-    from pcfix.model import FloatArray
 
 
 Heights = Literal["ellipsoidal", "gravity", "unstated"]

@@ -9,22 +9,20 @@ import hashlib
 import json
 import os
 import tempfile
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.errors import InputError, SettingError
+from pcfix.grid.lattice import Window
+from pcfix.model import FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    import numpy.typing as npt
-
     from pcfix.clean.neighbours import Empty
-    from pcfix.grid.lattice import Window
-    from pcfix.model import FloatArray, IntArray
 
 
 def check_input(path: str | os.PathLike[str]) -> Path:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,16 +17,11 @@ from pcfix.io.cameras.frames import is_tied
 from pcfix.io.cameras.georeference import adjusted_minus_gnss
 from pcfix.io.cameras.odm.project import read_images
 from pcfix.io.cameras.table import gnss_positions, open_table
+from pcfix.io.cameras.table.columns import Columns
 from pcfix.io.crs import METRES, is_topocentric, parse_crs
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels, unnamed
-from pcfix.model import Cameras, GnssPositions
-
-if TYPE_CHECKING:
-    import os
-
-    from pcfix.io.cameras.table.columns import Columns
-    from pcfix.model import FloatArray
+from pcfix.model import Cameras, FloatArray, GnssPositions
 
 SIGMAS = {
     "sigma_x": ("sx", "sxy", "sxyz", "sigma"),

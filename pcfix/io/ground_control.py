@@ -5,26 +5,19 @@ The forms of file are in `control_marks`.
 
 from __future__ import annotations
 
+import os
 import warnings
-from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixWarning
-from pcfix.io.control_marks import read_marks
+from pcfix.io.control_marks import Marks, read_marks
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels, unnamed
 from pcfix.io.transformations import LOCAL, way_to_cloud
-from pcfix.model import GroundControl
-
-if TYPE_CHECKING:
-    import os
-
-    import numpy.typing as npt
-
-    from pcfix.io.control_marks import Marks
-    from pcfix.model import Cameras, FloatArray, IntArray
+from pcfix.model import Cameras, FloatArray, GroundControl, IntArray
 
 SIGMA_M, SIGMA_PX = 0.01, 0.5
 """Where the file states none."""

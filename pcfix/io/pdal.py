@@ -7,25 +7,21 @@ have its own types, are C-contiguous, and are as long as its own.
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.errors import SettingError
 from pcfix.io.las.columns import (
+    Column,
     changed_rows,
     column_scale,
     in_steps,
     rows_of,
     shift_steps,
 )
-from pcfix.model import BATHYMETRIC_POINT
-
-if TYPE_CHECKING:
-    import numpy.typing as npt
-
-    from pcfix.io.las.columns import Column
-    from pcfix.model import Correction, FloatArray, Summary
+from pcfix.model import BATHYMETRIC_POINT, Correction, FloatArray, Summary
 
 Dimensions: TypeAlias = "dict[str, npt.NDArray[Any]]"
 

@@ -8,13 +8,10 @@ follow as text or as bytes without padding. `pcfix.io.views.vertices` reads them
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 from pcfix.errors import InputError
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 _TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1"},

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.errors import GeometryError, InputError, SettingError
+from pcfix.grid.lattice import Lattice, Window
 from pcfix.io.files import check_input, check_output, replaced_when_whole
+from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
-    import os
-    from collections.abc import Iterable, Iterator, Mapping
-    from pathlib import Path
-
-    import numpy.typing as npt
     from pyproj import CRS
     from rasterio.io import DatasetReader, DatasetWriter
     from rasterio.transform import Affine
 
-    from pcfix.grid.lattice import Lattice, Window
-    from pcfix.model import FloatArray
-
-    AnyPath = str | os.PathLike[str]
+AnyPath = str | os.PathLike[str]
 
 
 NO_HEIGHT = -9999.0

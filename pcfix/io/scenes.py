@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,13 +14,10 @@ from pyproj import CRS
 
 from pcfix.io.files import check_output, write_bytes
 from pcfix.io.las.writing import LasSink
-from pcfix.model import BATHYMETRIC_POINT
+from pcfix.model import BATHYMETRIC_POINT, Cameras, FloatArray, IntArray, Views
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
-    import os
-
-    from pcfix.model import Cameras, FloatArray, IntArray, Views
     from pcfix.simulate.scene import Scene
 
 GROUND = 2

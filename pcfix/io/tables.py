@@ -4,24 +4,19 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.errors import InputError
 from pcfix.io.files import check_input
-
-if TYPE_CHECKING:
-    import os
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    import numpy.typing as npt
-
-    from pcfix.model import FloatArray
-
+from pcfix.model import FloatArray
 
 TEXT_SUFFIXES = (".wkt", ".csv", ".txt")
 COLUMNS = {

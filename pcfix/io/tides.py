@@ -6,10 +6,12 @@ and images share. The two cannot be compared, so both must be of one kind.
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,13 +19,7 @@ from pcfix.errors import InputError
 from pcfix.io.files import check_input, read_json
 from pcfix.io.labels import match_labels
 from pcfix.io.tables import read_table
-
-if TYPE_CHECKING:
-    import os
-    from collections.abc import Sequence
-
-    from pcfix.model import FloatArray
-
+from pcfix.model import FloatArray
 
 IMAGES = (".jpg", ".jpeg", ".tif", ".tiff", ".png", ".webp", ".heic", ".dng")
 _EXIF_DATE = re.compile(r"^(\d{4}):(\d\d):(\d\d)\b")

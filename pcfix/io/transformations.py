@@ -8,6 +8,7 @@ names the grid, or a note. Heights are shifted only where both sides say what th
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -26,17 +27,13 @@ from pcfix.io.crs import (
     plan_unit,
     shortened,
 )
+from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     from pyproj import CRS, Transformer
     from pyproj.transformer import AreaOfInterest, TransformerGroup
 
-    from pcfix.model import FloatArray
-
-    Points = Callable[[FloatArray], FloatArray]
-    from collections.abc import Callable
+Points = Callable[[FloatArray], FloatArray]
 
 
 SILENT_ACCURACY_M = 1.0

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import shapely
 
 from pcfix.errors import InputError, SettingError
@@ -16,15 +19,10 @@ from pcfix.io.crs import parse_crs
 from pcfix.io.files import check_input
 from pcfix.io.tables import TEXT_SUFFIXES, read_text
 from pcfix.io.transformations import way_to_cloud
+from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
-    import os
-    from collections.abc import Callable
-
-    import numpy.typing as npt
     from pyproj import CRS
-
-    from pcfix.model import FloatArray
 
 
 GDAL_SUFFIXES = (".gpkg", ".shp", ".geojson", ".json")

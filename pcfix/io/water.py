@@ -12,6 +12,7 @@ import math
 import os
 import tempfile
 import warnings
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -21,14 +22,10 @@ import numpy as np
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.io.files import check_input
 from pcfix.io.water_rasters import read_water_raster
-from pcfix.model import WaterDimension, WaterMesh, WaterPlane
+from pcfix.model import FloatArray, IntArray, WaterDimension, WaterMesh, WaterPlane, WaterSurface
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from pyproj import CRS
-
-    from pcfix.model import FloatArray, IntArray, WaterSurface
 
 
 KINDS = (

@@ -8,7 +8,9 @@ cameras go through, which refuse what PROJ can only guess.
 
 from __future__ import annotations
 
+import os
 import warnings
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -17,20 +19,15 @@ from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.crs import is_local, metres_up, parse_crs, parts
 from pcfix.io.rasters import open_raster
 from pcfix.io.transformations import transformation_in_plan, way_to_cloud
-from pcfix.model import WaterRaster
+from pcfix.model import FloatArray, WaterRaster
 
 if TYPE_CHECKING:
-    import os
-    from collections.abc import Callable
-
     from pyproj import CRS
     from rasterio.io import DatasetReader
     from rasterio.transform import Affine
 
-    from pcfix.model import FloatArray
-
-    Bounds = tuple[float, float, float, float]
-    Points = Callable[[FloatArray], FloatArray]
+Bounds = tuple[float, float, float, float]
+Points = Callable[[FloatArray], FloatArray]
 
 
 MARGIN_M = 100.0

@@ -13,18 +13,16 @@ numbers, for the same reason.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit, prange
 
-if TYPE_CHECKING:
-    import numpy.typing as npt
+from pcfix.model import BoolArray, FloatArray, IntArray
 
-    from pcfix.model import BoolArray, FloatArray, IntArray
-
-    States = npt.NDArray[np.uint8]
-    Flags = npt.NDArray[np.uint8]
+States = npt.NDArray[np.uint8]
+Flags = npt.NDArray[np.uint8]
 
 
 OUTSIDE, INSIDE, CROSSED = 0, 1, 2

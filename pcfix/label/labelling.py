@@ -10,28 +10,27 @@ the eight cells around it are negative together.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.errors import GeometryError
-from pcfix.label.areas import Grid
-from pcfix.model import BATHYMETRIC_POINT, UNCLASSIFIED, WATER_SURFACE
-from pcfix.water.surface import is_submerged
+from pcfix.label.areas import Grid, Lattice, Pools, Surroundings, WaterMask
+from pcfix.model import (
+    BATHYMETRIC_POINT,
+    UNCLASSIFIED,
+    WATER_SURFACE,
+    BoolArray,
+    FloatArray,
+    IntArray,
+)
+from pcfix.options.correct import LabelRules
+from pcfix.water.surface import SurfaceAbove, is_submerged
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    import numpy.typing as npt
-
-    from pcfix.label.areas import Surroundings, WaterMask
-    from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.options.correct import LabelRules
-    from pcfix.water.surface import SurfaceAbove
-
-    Classes = npt.NDArray[np.uint8]
-    from pcfix.label.areas import Lattice, Pools
+Classes = npt.NDArray[np.uint8]
 
 
 """ASPRS classes (LAS 1.4 R15, table 17, and its topo-bathy lidar domain profile)."""

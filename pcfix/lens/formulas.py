@@ -12,17 +12,13 @@ d r' / d r = 0.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias, get_args
+from typing import TypeAlias, get_args
 
 import numpy as np
 from numba import njit
 from numpy.polynomial import Polynomial
 
-from pcfix.model import Projection
-
-if TYPE_CHECKING:
-    from pcfix.model import FloatArray, Lens
-
+from pcfix.model import FloatArray, Lens, Projection
 
 KIND, LARGEST_ANGLE, LARGEST_RADIUS = range(3)
 """The projection as a number, and how far it goes: radians, and in its plane."""

@@ -17,7 +17,7 @@ encloses is the frame, as a lens is used only where it is one to one.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit, prange
@@ -41,10 +41,8 @@ from pcfix.lens.formulas import (
     angle,
 )
 from pcfix.lens.imaging import coefficients, image_of, lens_table, project, unproject
+from pcfix.model import Cameras, FloatArray, IntArray, Lens
 from pcfix.threads import one_caller
-
-if TYPE_CHECKING:
-    from pcfix.model import Cameras, FloatArray, IntArray, Lens
 
 
 class FrameShape(NamedTuple):

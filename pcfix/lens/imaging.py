@@ -8,7 +8,7 @@ place in it, and a place beyond the image of the fold has no direction. What is 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numba import njit
@@ -26,10 +26,7 @@ from pcfix.lens.formulas import (
     radius,
     undistorted,
 )
-
-if TYPE_CHECKING:
-    from pcfix.model import FloatArray, IntArray, Lens
-
+from pcfix.model import FloatArray, IntArray, Lens
 
 _KIND, _LARGEST_ANGLE, _INVERSE = places.KIND, places.LARGEST_ANGLE, places.INVERSE
 _CENTRE_X, _CENTRE_Y = places.CENTRE_X, places.CENTRE_Y

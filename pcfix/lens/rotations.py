@@ -7,12 +7,9 @@ All angles are in degrees, one per image; Rx, Ry, Rz are right-handed turns abou
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from pcfix.model import FloatArray
+from pcfix.model import FloatArray
 
 UP_BACK_TO_DOWN_FORWARD = np.diag([1.0, -1.0, -1.0])
 

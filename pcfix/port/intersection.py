@@ -19,26 +19,19 @@ of the true point that they lead to. There may be several such sets; then the po
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numba import njit, prange
 
 from pcfix.errors import SettingError
-from pcfix.lens.frames import frames_of, holds, no_frames
-from pcfix.model import Outcome, Views
-from pcfix.port.light import coefficients, cosine_at_port, ray_through, through_port
+from pcfix.lens.frames import Frames, frames_of, holds, no_frames
+from pcfix.model import Cameras, FloatArray, IntArray, Outcome, Views
+from pcfix.options.correct import ScienceOptions
+from pcfix.port.light import Vector, coefficients, cosine_at_port, ray_through, through_port
+from pcfix.port.shapes import Port
 from pcfix.refract.batch import Intersection
 from pcfix.refract.choice import ANY_NUMBER, TILE, near_cameras, spatial_order
 from pcfix.refract.rays import line_terms, nearest_point
 from pcfix.threads import one_caller
-
-if TYPE_CHECKING:
-    from pcfix.lens.frames import Frames
-    from pcfix.model import Cameras, FloatArray, IntArray
-    from pcfix.options.correct import ScienceOptions
-    from pcfix.port.light import Vector
-    from pcfix.port.shapes import Port
 
 _NO_CAMERA, _ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
 _PARALLEL, _CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)

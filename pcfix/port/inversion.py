@@ -23,24 +23,30 @@ and a column for the refractive index, whose error all rays have in common.
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit, prange
 
 from pcfix.errors import PcfixWarning
 from pcfix.lens.imaging import image_and_gradients, lens_table
-from pcfix.model import NOMINAL_FOCAL_PX, NOMINAL_WIDTH_PX, Lens, Outcome
+from pcfix.model import (
+    NOMINAL_FOCAL_PX,
+    NOMINAL_WIDTH_PX,
+    BoolArray,
+    Cameras,
+    FloatArray,
+    IntArray,
+    Lens,
+    Outcome,
+    Views,
+)
+from pcfix.options.correct import ScienceOptions
 from pcfix.port.intersection import in_camera
 from pcfix.port.light import coefficients, through_port
+from pcfix.port.shapes import Port
+from pcfix.refract.batch import Intersection
 from pcfix.refract.consistent import check_consistent
 from pcfix.threads import one_caller
-
-if TYPE_CHECKING:
-    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Views
-    from pcfix.options.correct import ScienceOptions
-    from pcfix.port.shapes import Port
-    from pcfix.refract.batch import Intersection
 
 MAX_STEPS = 30
 CLOSE_M = 1e-7

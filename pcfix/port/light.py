@@ -16,17 +16,13 @@ face after the other, so that each proves the other right.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numba import njit
 
-from pcfix.port.shapes import DomePort, FlatPort
-
-if TYPE_CHECKING:
-    from pcfix.model import FloatArray
-    from pcfix.port.shapes import Port
-
+from pcfix.model import FloatArray
+from pcfix.port.shapes import DomePort, FlatPort, Port
 
 Vector: TypeAlias = tuple[float, float, float]
 Ray: TypeAlias = tuple[float, float, float, float, float, float]

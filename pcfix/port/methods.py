@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from pcfix.model import Outcome
+from pcfix.model import Cameras, FloatArray, IntArray, Outcome, Views
+from pcfix.options.correct import ScienceOptions
 from pcfix.port.intersection import intersect_rays, port_views, rotations_of
 from pcfix.port.inversion import consistent_through_port, port_covariances
+from pcfix.port.shapes import Port
 from pcfix.refract.batch import Intersection
 from pcfix.refract.choice import spatial_order
 from pcfix.refract.methods import batches, joined
-
-if TYPE_CHECKING:
-    from pcfix.model import Cameras, FloatArray, IntArray, Views
-    from pcfix.options.correct import ScienceOptions
-    from pcfix.port.shapes import Port
 
 
 def correct_through_port(

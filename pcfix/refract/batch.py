@@ -12,23 +12,19 @@ one geometry is a direction in the other, through the lens of either (`MadeWith`
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 from pcfix.lens.imaging import direction_of, image_of, lens_table
-from pcfix.model import Outcome
+from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Outcome, Views, WaterSurface
+from pcfix.options.correct import ScienceOptions
+from pcfix.refract.matcher import Bed, Matcher
+from pcfix.refract.occlusion import Occluder
+from pcfix.refract.regression import DepthRegression
 from pcfix.water.surface import SurfaceAbove
-
-if TYPE_CHECKING:
-    import numpy.typing as npt
-
-    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Views, WaterSurface
-    from pcfix.options.correct import ScienceOptions
-    from pcfix.refract.matcher import Bed, Matcher
-    from pcfix.refract.occlusion import Occluder
-    from pcfix.refract.regression import DepthRegression
 
 
 class Learned(NamedTuple):

@@ -5,33 +5,38 @@ Points are worked on in tiles of neighbours, so that a tile needs to look at few
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit, prange
 
 from pcfix.lens.frames import (
     NOT_DISTORTED,
     NOTHING,
+    Frames,
     frames_of,
     holds,
     judge,
     may_hold,
     no_frames,
 )
-from pcfix.model import NOMINAL_FOCAL_PX, Views, WaterMesh, WaterPlane, WaterRaster
+from pcfix.model import (
+    NOMINAL_FOCAL_PX,
+    Cameras,
+    FloatArray,
+    IntArray,
+    Views,
+    WaterMesh,
+    WaterPlane,
+    WaterRaster,
+    WaterSurface,
+)
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.rays import pierce_mesh, pierce_raster
 from pcfix.threads import one_caller
-from pcfix.water.surface import SurfaceAbove, build_field, build_tin, locate
-
-if TYPE_CHECKING:
-    import numpy.typing as npt
-
-    from pcfix.lens.frames import Frames
-    from pcfix.model import Cameras, FloatArray, IntArray, WaterSurface
-    from pcfix.water.surface import Field, Tin
+from pcfix.water.surface import Field, SurfaceAbove, Tin, build_field, build_tin, locate
 
 TILE = 128
 """Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""

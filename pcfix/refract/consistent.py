@@ -26,15 +26,14 @@ digits, and two or three do; Broyden's update of the inverse mends what is missi
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit, prange
 
 from pcfix.errors import PcfixWarning, SettingError
 from pcfix.lens.imaging import image_and_gradients, image_of, lens_table
-from pcfix.model import Outcome, WaterMesh, WaterRaster
-from pcfix.refract.batch import Intersection
+from pcfix.model import Cameras, FloatArray, IntArray, Outcome, WaterMesh, WaterRaster
+from pcfix.refract.batch import Batch, Intersection
 from pcfix.refract.rays import (
     light_path,
     line_terms,
@@ -46,12 +45,7 @@ from pcfix.refract.rays import (
     slope_of_path,
 )
 from pcfix.threads import one_caller
-from pcfix.water.surface import build_field, build_tin, locate
-
-if TYPE_CHECKING:
-    from pcfix.model import Cameras, FloatArray, IntArray
-    from pcfix.refract.batch import Batch
-    from pcfix.water.surface import Field, Tin
+from pcfix.water.surface import Field, Tin, build_field, build_tin, locate
 
 MAX_STEPS = 30
 CLOSE_M = 1e-7

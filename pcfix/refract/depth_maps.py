@@ -24,22 +24,17 @@ A level bed will do: a slope of it moves the Q_i and the directions a_ij nearly 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, prange
 
-from pcfix.lens.frames import holds
-from pcfix.model import Outcome
-from pcfix.refract.batch import Images, as_made, as_now, images_of
+from pcfix.lens.frames import Frames, holds
+from pcfix.model import FloatArray, IntArray, Outcome
+from pcfix.refract.batch import Batch, Images, Intersection, as_made, as_now, images_of
 from pcfix.refract.matcher import Matcher
 from pcfix.refract.rays import light_path, refracted
 from pcfix.threads import one_caller
-
-if TYPE_CHECKING:
-    from pcfix.lens.frames import Frames
-    from pcfix.model import FloatArray, IntArray
-    from pcfix.refract.batch import Batch, Intersection
 
 MAX_LOOKS = 5
 CLOSE_M = 0.002

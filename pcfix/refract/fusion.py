@@ -14,11 +14,12 @@ height that most points around can have come from, the bed of the surroundings
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numba import njit, prange
 
+from pcfix.lens.frames import Frames
+from pcfix.model import FloatArray, IntArray
+from pcfix.refract.batch import Batch, Images, Intersection
 from pcfix.refract.depth_maps import (
     AMBIGUITY,
     COLUMNS,
@@ -32,11 +33,6 @@ from pcfix.refract.depth_maps import (
 )
 from pcfix.refract.matcher import WIDTH_M, Matcher
 from pcfix.threads import one_caller
-
-if TYPE_CHECKING:
-    from pcfix.lens.frames import Frames
-    from pcfix.model import FloatArray, IntArray
-    from pcfix.refract.batch import Batch, Images, Intersection
 
 AGREE = 0.01
 """Depths that differ by less, relative, are fused."""

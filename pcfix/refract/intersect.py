@@ -13,8 +13,6 @@ water lay below the apparent point saw it through air; its ray goes straight on.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numba import njit, prange
 
@@ -23,6 +21,8 @@ from pcfix.lens.frames import (
     NOT_DISTORTED,
     NOTHING,
     SOME,
+    Frames,
+    Pyramid,
     frames_of,
     in_frame,
     judge,
@@ -31,11 +31,21 @@ from pcfix.lens.frames import (
     may_hold,
     pyramid,
 )
-from pcfix.model import Outcome
-from pcfix.refract.batch import Intersection
-from pcfix.refract.choice import TILE, gather, points_of, rig_of, rule_of, shapes_of
+from pcfix.model import BoolArray, FloatArray, IntArray, Outcome
+from pcfix.refract.batch import Batch, Intersection
+from pcfix.refract.choice import (
+    TILE,
+    Points,
+    Rig,
+    Rule,
+    gather,
+    points_of,
+    rig_of,
+    rule_of,
+    shapes_of,
+)
 from pcfix.refract.rays import line_terms, nearest_point, pierce_mesh, pierce_raster, refracted
-from pcfix.refract.sensitivity import SUMS, TILE_RUNS, add_below
+from pcfix.refract.sensitivity import SUMS, TILE_RUNS, Budget, add_below
 from pcfix.refract.uncertainty import (
     add_errors,
     budget_of,
@@ -44,15 +54,7 @@ from pcfix.refract.uncertainty import (
     with_errors,
 )
 from pcfix.threads import one_caller
-from pcfix.water.surface import locate
-
-if TYPE_CHECKING:
-    from pcfix.lens.frames import Frames, Pyramid
-    from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.refract.batch import Batch
-    from pcfix.refract.choice import Points, Rig, Rule
-    from pcfix.refract.sensitivity import Budget
-    from pcfix.water.surface import Field, Tin
+from pcfix.water.surface import Field, Tin, locate
 
 _NO_CAMERA, _ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
 _PARALLEL, _CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)

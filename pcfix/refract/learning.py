@@ -8,28 +8,22 @@ shifted differently, and scatter. The right one leaves the smoother bed.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.model import Outcome
+from pcfix.model import Cameras, FloatArray, IntArray, Outcome, TiePoints, ViewKind
+from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Learned
 from pcfix.refract.choice import spatial_order
 from pcfix.refract.consistent import check_consistent
 from pcfix.refract.fusion import likely_beds
-from pcfix.refract.matcher import bed_of, matcher_of, matcher_of_ties, places_for
+from pcfix.refract.matcher import Bed, bed_of, matcher_of, matcher_of_ties, places_for
 from pcfix.refract.methods import batches, correct, with_rays
+from pcfix.refract.regression import DepthRegression
 from pcfix.refract.top_surface import occluder_of, wants_occlusion
 from pcfix.water.surface import is_submerged
-
-if TYPE_CHECKING:
-    from typing import Literal
-
-    from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, ViewKind
-    from pcfix.options.correct import ScienceOptions
-    from pcfix.refract.matcher import Bed
-    from pcfix.refract.regression import DepthRegression
 
 
 def check_method(settings: ScienceOptions, cameras: Cameras) -> None:

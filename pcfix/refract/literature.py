@@ -22,19 +22,15 @@ The arrays of rays are those of `pcfix.model.Views`: the rays of point i are the
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit, prange
 
 from pcfix.errors import SettingError
-from pcfix.model import Outcome, Views
+from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, Views
+from pcfix.refract.batch import Batch, Intersection
 from pcfix.refract.rays import line_terms, nearest_point, refracted
 from pcfix.threads import one_caller
-
-if TYPE_CHECKING:
-    from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.refract.batch import Batch, Intersection
 
 
 def apparent_depth(batch: Batch) -> FloatArray:

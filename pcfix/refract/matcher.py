@@ -11,20 +11,15 @@ from the tie points that the matcher itself went by.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
 
-from pcfix.lens.frames import frames_of
+from pcfix.lens.frames import Frames, frames_of
 from pcfix.lens.imaging import project
-from pcfix.model import Views
+from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints, Views
 from pcfix.threads import one_caller
-
-if TYPE_CHECKING:
-    from pcfix.lens.frames import Frames
-    from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
-
 
 MATCHED, AVERAGED, NEIGHBOURS = 5, 8, 12
 BEST_ANGLE_DEG, NARROW_DEG, WIDE_DEG = 12.0, 4.56, 8.4

@@ -6,14 +6,15 @@ others get batches of points with the cameras chosen.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from pcfix.model import WaterMesh, WaterPlane, WaterRaster
+from pcfix.model import FloatArray, IntArray, Views, WaterMesh, WaterPlane, WaterRaster
 from pcfix.refract import literature
-from pcfix.refract.batch import Batch, Intersection
+from pcfix.refract.batch import Batch, Intersection, Survey
 from pcfix.refract.choice import chosen_views, spatial_order
 from pcfix.refract.consistent import consistent
 from pcfix.refract.depth_maps import invert_depth_maps
@@ -26,13 +27,7 @@ from pcfix.refract.stereo_pairs import cameras_of_pairs, invert_pairs
 from pcfix.refract.uncertainty import with_uncertainty
 from pcfix.water.surface import SurfaceAbove
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from pcfix.model import FloatArray, IntArray, Views
-    from pcfix.refract.batch import Survey
-
-    Method: TypeAlias = Callable[[Batch], Intersection]
+Method: TypeAlias = Callable[[Batch], Intersection]
 
 POINTS_AT_ONCE = 100_000
 """Bounds the memory of the lists of cameras: some 50 MB at 40 rays a point."""

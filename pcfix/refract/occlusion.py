@@ -19,20 +19,16 @@ under a roof, where all cells around P stand over it, it matters whether the ray
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit, prange
 
-from pcfix.model import Views
+from pcfix.model import BoolArray, FloatArray, IntArray, Views
 from pcfix.threads import one_caller
 
-if TYPE_CHECKING:
-    import numpy.typing as npt
-
-    from pcfix.model import BoolArray, FloatArray, IntArray
-
-    Heights = npt.NDArray[np.float32]
+Heights = npt.NDArray[np.float32]
 
 NEAR_CELLS = 2.0
 """So far from the point, in plan, its own surroundings do not hide it."""

@@ -51,16 +51,13 @@ The plane is N.x = h.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numba import njit
 
-from pcfix.water.surface import height_at, locate
-
-if TYPE_CHECKING:
-    from pcfix.model import FloatArray
-    from pcfix.water.surface import Field, Tin
+from pcfix.model import FloatArray
+from pcfix.water.surface import Field, Tin, height_at, locate
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pcfix.errors import GeometryError
-from pcfix.water.surface import is_submerged
-
-if TYPE_CHECKING:
-    from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.water.surface import SurfaceAbove
-
+from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.water.surface import SurfaceAbove, is_submerged
 
 LEAST_COUNT, FEW = 3, 10
 """A line through two check depths fits whatever they are; a third is the first that can disagree.

@@ -43,17 +43,14 @@ The functions hold arithmetic only, see `pcfix.refract.rays`; all sums are in th
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit
 
-from pcfix.refract.choice import TILE
+from pcfix.model import FloatArray, IntArray
+from pcfix.refract.choice import TILE, Rig, Rule
 from pcfix.refract.rays import refracted
-
-if TYPE_CHECKING:
-    from pcfix.model import FloatArray, IntArray
-    from pcfix.refract.choice import Rig, Rule
 
 Six: TypeAlias = tuple[float, float, float, float, float, float]
 """A symmetric matrix: xx, xy, xz, yy, yz, zz."""

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numba import njit, prange
 
-from pcfix.model import Outcome
+from pcfix.model import BoolArray, FloatArray, IntArray, Outcome
+from pcfix.refract.batch import Batch, Intersection
 from pcfix.refract.literature import depth_ratio, rays_of
 from pcfix.refract.rays import MIN_DETERMINANT
 from pcfix.threads import one_caller
-
-if TYPE_CHECKING:
-    from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.refract.batch import Batch, Intersection
 
 TOLERANCE = 1e-9
 """Of tan a between two iterations; the depth then changes by less than 1e-9 of itself."""

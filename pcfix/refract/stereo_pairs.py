@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -35,15 +35,11 @@ from numba import njit, prange
 from pcfix.errors import PcfixWarning
 from pcfix.lens.formulas import CODES, KIND
 from pcfix.lens.imaging import image_and_gradients, lens_table
-from pcfix.model import Outcome, Views
-from pcfix.refract.batch import Images, as_made, images_of
+from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, Views
+from pcfix.refract.batch import Batch, Images, Intersection, as_made, images_of
 from pcfix.refract.consistent import check_consistent
 from pcfix.refract.rays import MIN_DETERMINANT, light_path, line_terms, nearest_point, refracted
 from pcfix.threads import one_caller
-
-if TYPE_CHECKING:
-    from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.refract.batch import Batch, Intersection
 
 MAX_STEPS = 40
 CLOSE_M = 1e-6

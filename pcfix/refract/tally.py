@@ -5,14 +5,11 @@ Vertical uncertainty is in the terms of hydrographic surveys: TVU at 95 %, IHO S
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.model import Outcome
-
-if TYPE_CHECKING:
-    from pcfix.model import BoolArray, Correction, FloatArray
+from pcfix.model import BoolArray, Correction, FloatArray, Outcome
 
 COVERAGE_95 = 1.96
 """Standard errors of a Gaussian quantity within which 95 % lie, as S-44 takes it in one dimension.

@@ -8,22 +8,17 @@ frame; so the surface does not depend on the order of the points.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
-from pcfix.model import NOISE_CLASSES
+from pcfix.model import NOISE_CLASSES, Cameras, FloatArray
+from pcfix.options.correct import ScienceOptions
 from pcfix.refract.occlusion import BLOCK, LARGE_BLOCK, MARGIN_BLOCK, Occluder
 
-if TYPE_CHECKING:
-    import numpy.typing as npt
-
-    from pcfix.model import FloatArray
-
-    Heights = npt.NDArray[np.float32]
-    from pcfix.model import Cameras
-    from pcfix.options.correct import ScienceOptions
+Heights = npt.NDArray[np.float32]
 
 
 MOST_CELLS = 2**24

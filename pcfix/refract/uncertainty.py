@@ -20,22 +20,18 @@ of the rays differ, the more the two do.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numba import njit, prange
 
-from pcfix.model import Outcome
+from pcfix.model import FloatArray, IntArray, Outcome
 from pcfix.options.correct import LEVEL_M
 from pcfix.refract import sensitivity as s
-from pcfix.refract.choice import TILE, gather, points_of, rig_of, rule_of
+from pcfix.refract.batch import Batch, Intersection, Survey
+from pcfix.refract.choice import TILE, Points, Rig, Rule, gather, points_of, rig_of, rule_of
 from pcfix.refract.sensitivity import Budget
 from pcfix.threads import one_caller
-
-if TYPE_CHECKING:
-    from pcfix.model import FloatArray, IntArray
-    from pcfix.refract.batch import Batch, Intersection, Survey
-    from pcfix.refract.choice import Points, Rig, Rule
 
 Three: TypeAlias = tuple[float, float, float]
 Four: TypeAlias = tuple[float, float, float, float]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +14,8 @@ from pcfix.adjust.values import (
     carried_by,
     depth_of,
 )
-from pcfix.grid.maps import MapsBuilder
+from pcfix.grid.maps import Maps, MapsBuilder
+from pcfix.model import FloatArray
 from pcfix.report.adjustment_figures import pictures_of
 from pcfix.report.adjustment_text import (
     WATER_WORDS,
@@ -33,11 +35,7 @@ from pcfix.report.adjustment_text import (
 from pcfix.report.page import Layer, Picture, Report, Table, render
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from pcfix.adjust.result import Adjusted
-    from pcfix.grid.maps import Maps
-    from pcfix.model import FloatArray
 
 
 __all__ = [

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.adjust.block import sensor_groups
-from pcfix.adjust.values import carried_by, nice_step, rms
+from pcfix.adjust.values import Before, carried_by, nice_step, rms
+from pcfix.model import BoolArray, FloatArray
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, label_plan, new_figure
 from pcfix.water.surface import surface_above
 
@@ -16,8 +17,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from pcfix.adjust.result import Adjusted
-    from pcfix.adjust.values import Before
-    from pcfix.model import BoolArray, FloatArray
 
 Plain = dict[str, Any]
 

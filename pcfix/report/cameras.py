@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.adjust.diagnosis import Diagnosis
 from pcfix.lens.frames import footprint
+from pcfix.model import Cameras, FloatArray
 from pcfix.report.page import AFTER, WATER, label_plan, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from pcfix.adjust.diagnosis import Diagnosis
-    from pcfix.model import Cameras, FloatArray
 
 MOST_FOOTPRINTS = 400
 MOST_POINTS = 8000

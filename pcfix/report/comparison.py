@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.model import FloatArray
 from pcfix.report.page import (
     AFTER,
     BEFORE,
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from pcfix.compare.figures import AfterBefore, Comparison
     from pcfix.compare.m3c2 import M3c2
     from pcfix.compare.statistics import Bin, Line, Statistics
-    from pcfix.model import FloatArray
 
 Plain = dict[str, Any]
 _TIMES = (("before", "as it came", BEFORE), ("after", "corrected", AFTER))

@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.grid.maps import Maps
+from pcfix.model import FloatArray
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from pcfix.grid.maps import Maps
-    from pcfix.model import FloatArray
 
 _NO_DATA = -32768
 _STEPS = 32_000

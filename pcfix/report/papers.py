@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.model import FloatArray, IntArray
 from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from pcfix.model import FloatArray, IntArray
     from pcfix.simulate.refraction_effect import AerialCamera, Effect, Iteration
 
 COLUMNS = (

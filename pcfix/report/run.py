@@ -6,6 +6,7 @@ And what it says of the adjustment that the run began with.
 from __future__ import annotations
 
 import platform
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -13,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.grid.maps import Maps
 from pcfix.grid.model import NO_LIGHT, hillshade
-from pcfix.model import WaterPlane
+from pcfix.model import BoolArray, Cameras, FloatArray, Summary, WaterPlane, WaterSurface
 from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
 from pcfix.report.adjustment_text import WHERE, fixed, lens_label, listed, short
 from pcfix.report.page import (
@@ -33,12 +35,8 @@ from pcfix.report.text import errors_of, share, tvu_sentence
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
     from matplotlib.figure import Figure
 
-    from pcfix.grid.maps import Maps
-    from pcfix.model import BoolArray, Cameras, FloatArray, Summary, WaterSurface
 
 Plain = dict[str, Any]
 

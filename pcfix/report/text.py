@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.clean.settings import CleanSummary
+from pcfix.grid.model import DsmSummary
+from pcfix.model import Summary
 from pcfix.options.correct import LEVEL_M
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 from pcfix.refract.tally import ORDERS
 
 if TYPE_CHECKING:
-    from pcfix.clean.settings import CleanSummary
-    from pcfix.grid.model import DsmSummary
     from pcfix.label.labelling import LabelSummary
-    from pcfix.model import Summary
 
 BED_PER_LEVEL = 0.44
 """How far a bed moves with the level, measured over whole blocks; straight down it is n - 1."""

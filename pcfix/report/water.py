@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.model import BoolArray, FloatArray
 from pcfix.report.page import AFTER, BEFORE, WATER, label_plan, new_figure
 from pcfix.water.auto import WaterProposal
 from pcfix.water.fit import WaterFit
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from pcfix.model import BoolArray, FloatArray
     from pcfix.water.surface import FoundSurface
 
 MOST_POINTS = 8000

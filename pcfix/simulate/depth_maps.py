@@ -32,17 +32,13 @@ point for which the picture was begun.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.model import Views
-from pcfix.simulate.sight import intersect, starts_of
+from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens, Views
+from pcfix.simulate.sight import Partners, Rig, Sight, intersect, starts_of
 from pcfix.simulate.tracing import bed_points, piercing_points_of_planes, project
-
-if TYPE_CHECKING:
-    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens
-    from pcfix.simulate.sight import Partners, Rig, Sight
 
 AVERAGED_WITHIN = 0.012
 AGREE = 0.01

@@ -8,20 +8,16 @@ only the image points have noise; so what remains after a correction is the corr
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pcfix.errors import SettingError
 from pcfix.lens.rotations import from_yaw_pitch_roll
-from pcfix.model import Cameras, Lens, Views
+from pcfix.model import Cameras, FloatArray, Lens, Views
 from pcfix.options.correct import ScienceOptions
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 from pcfix.simulate.sight import starts_of
 from pcfix.simulate.tracing import piercing_points, project, triangulate
-
-if TYPE_CHECKING:
-    from pcfix.model import FloatArray
 
 LENGTH_M, WIDTH_M, DEEPEST_M, GRAVEL_M = 6.0, 1.0, 0.6, 0.008
 WATER_LEVEL_M = 1.0

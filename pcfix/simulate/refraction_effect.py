@@ -39,18 +39,15 @@ one at the depth divided by s, which lies on the image ray.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.errors import SettingError
+from pcfix.model import FloatArray
 from pcfix.options.correct import ScienceOptions
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 from pcfix.simulate.tracing import piercing_points
-
-if TYPE_CHECKING:
-    from pcfix.model import FloatArray
-
 
 NODES = 61
 """Nodes of a model along its flight and across it; odd, so that the centre is one."""

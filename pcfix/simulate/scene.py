@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,9 +27,6 @@ from pcfix.simulate.sight import (
 )
 from pcfix.simulate.terrain import Terrain
 from pcfix.simulate.tracing import Water, Waves
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 __all__ = ["BlockKind", "Scene", "SceneSettings", "simulate_scene"]
 

@@ -9,19 +9,13 @@ residuals in the images), and the point is the median of these places in x, y an
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.model import Views
-from pcfix.simulate.block import reach_m
-from pcfix.simulate.tracing import project, triangulate
-
-if TYPE_CHECKING:
-    from pcfix.model import Cameras, FloatArray, IntArray
-    from pcfix.simulate.block import Optics
-    from pcfix.simulate.tracing import Water
-
+from pcfix.model import Cameras, FloatArray, IntArray, Views
+from pcfix.simulate.block import Optics, reach_m
+from pcfix.simulate.tracing import Water, project, triangulate
 
 LEAST_VIEWS = 3
 

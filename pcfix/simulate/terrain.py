@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import expit
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pcfix.model import FloatArray, WaterPlane
+from pcfix.model import FloatArray, WaterPlane
 
 BedKind = Literal["shore", "flat", "slope", "steps", "river"]
 

@@ -17,13 +17,10 @@ All arrays are flat over (point, camera) pairs, sorted by point.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from pcfix.model import Cameras, FloatArray, IntArray, Lens, WaterPlane
-
+from pcfix.model import Cameras, FloatArray, IntArray, Lens, WaterPlane
 
 _NEWTON_STEPS = 60
 _CONVERGED_M = 1e-11

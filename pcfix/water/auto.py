@@ -4,25 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.errors import GeometryError, SettingError
-from pcfix.model import NOISE_CLASSES, WaterPlane
+from pcfix.model import NOISE_CLASSES, FloatArray, IntArray, WaterPlane
 from pcfix.water import search
 from pcfix.water.cues import gain_of
 from pcfix.water.fit import fit_water
-from pcfix.water.samples import layer_gain, points_above, sample_cloud
-from pcfix.water.search import INSTEAD, LAYER, judge
-
-if TYPE_CHECKING:
-    import numpy.typing as npt
-
-    from pcfix.model import FloatArray, IntArray
-    from pcfix.water.samples import Floating, Samples
-    from pcfix.water.search import Looked, Peak
-
+from pcfix.water.samples import Floating, Samples, layer_gain, points_above, sample_cloud
+from pcfix.water.search import INSTEAD, LAYER, Looked, Peak, judge
 
 _Column: TypeAlias = "npt.NDArray[Any] | None"
 

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.errors import GeometryError, PcfixWarning, SettingError
-from pcfix.model import WaterDimension, WaterMesh, WaterPlane, WaterRaster, WaterSurface
+from pcfix.model import (
+    Cameras,
+    Correction,
+    FloatArray,
+    WaterDimension,
+    WaterMesh,
+    WaterPlane,
+    WaterRaster,
+    WaterSurface,
+)
 from pcfix.water.surface import surface_above
-
-if TYPE_CHECKING:
-    import numpy.typing as npt
-
-    from pcfix.model import Cameras, Correction, FloatArray
 
 MOST_TILT = 0.05
 """Rise per metre of a whole surface. Rapids reach 2 %; a weir is steeper, but only in part."""

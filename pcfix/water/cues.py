@@ -18,16 +18,14 @@ heights under a tilted surface, or to draw them anew, costs little then.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pcfix.model import FloatArray, IntArray
-    from pcfix.water.samples import Samples
+from pcfix.model import FloatArray, IntArray
+from pcfix.water.samples import Samples
 
 LEAST_SIDE = 8.0
 """Cells (weights added) that a tile must have above a height, and below, to say anything."""

@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
-from pcfix.model import BoolArray, FloatArray, WaterPlane
-from pcfix.water.robust import robust_regression
-
-if TYPE_CHECKING:
-    from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.water.robust import Regression
-
+from pcfix.model import BoolArray, FloatArray, IntArray, WaterPlane
+from pcfix.water.robust import Regression, robust_regression
 
 Model = Literal["auto", "level", "plane", "along"]
 MAX_TILT_PERCENT = 5.0

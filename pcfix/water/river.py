@@ -15,14 +15,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.errors import GeometryError
-from pcfix.model import BoolArray, FloatArray, WaterMesh
+from pcfix.model import BoolArray, FloatArray, IntArray, WaterMesh
 from pcfix.water.robust import Profile, fit_profile
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
     from scipy.spatial import cKDTree
-
-    from pcfix.model import FloatArray, IntArray
 
 
 FEWEST = 10

@@ -20,13 +20,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb, inf
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from pcfix.model import BoolArray, FloatArray, IntArray
-
+from pcfix.model import BoolArray, FloatArray, IntArray
 
 START_C, FINAL_C = 1.547645, 4.685061
 """Tukey's constants: against half of the data; with 95 % of the efficiency of least squares."""

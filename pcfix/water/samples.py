@@ -7,16 +7,13 @@ the ground too, but at all heights.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-if TYPE_CHECKING:
-    import numpy.typing as npt
-
-    from pcfix.model import BoolArray, FloatArray, IntArray
-
+from pcfix.model import BoolArray, FloatArray, IntArray
 
 MOST_CELLS = 100_000
 POINTS_PER_CELL = 4.0

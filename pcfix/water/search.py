@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.errors import GeometryError
+from pcfix.model import BoolArray, FloatArray
 from pcfix.water.cues import BRIGHT, SLOPE, Cue, Moments, cue_moments, cues_of, gain_of
-from pcfix.water.samples import Floating, layer_gain
-
-if TYPE_CHECKING:
-    from pcfix.model import BoolArray, FloatArray
-    from pcfix.water.samples import Samples
+from pcfix.water.samples import Floating, Samples, layer_gain
 
 LARGEST_TILT, USUAL_TILT = 0.006, 0.002
 TILT_STEP_M, MOST_TILT_STEPS = 0.15, 9

@@ -15,18 +15,25 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit, prange
 
 from pcfix.errors import GeometryError, SettingError
-from pcfix.model import WaterDimension, WaterMesh, WaterPlane, WaterRaster
+from pcfix.model import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    WaterDimension,
+    WaterMesh,
+    WaterPlane,
+    WaterRaster,
+    WaterSurface,
+)
+from pcfix.water.fit import WaterFit
+from pcfix.water.river import RiverFit
 
 if TYPE_CHECKING:
-    import numpy.typing as npt
-
-    from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
     from pcfix.water.auto import WaterProposal
-    from pcfix.water.fit import WaterFit
-    from pcfix.water.river import RiverFit
 
     Evidence: TypeAlias = WaterFit | RiverFit | WaterProposal
 

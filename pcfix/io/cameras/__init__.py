@@ -7,9 +7,9 @@ entry of `FORMATS`, from which its line in README.md of this folder follows.
 
 from __future__ import annotations
 
+import os
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import (
@@ -28,11 +28,7 @@ from pcfix.io.cameras import (
 )
 from pcfix.io.cameras.formats import Angles, CameraFormat, Source, SparseReader
 from pcfix.io.files import check_input
-
-if TYPE_CHECKING:
-    import os
-
-    from pcfix.model import Cameras, TiePoints
+from pcfix.model import Cameras, TiePoints
 
 FORMATS = (
     CameraFormat(

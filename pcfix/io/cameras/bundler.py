@@ -19,18 +19,15 @@ are taken as `pcfix.io.cameras.tracks` says. The CRS is not told.
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks, tracks
+from pcfix.io.cameras.formats import Source
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pcfix.io.cameras.formats import Source
 
 _BUNDLER, _MVE = re.compile(r"#\s*Bundle file v(\d+\.\d+)"), re.compile(r"drews 1\.0")
 _VERSION = "0.3"

@@ -5,21 +5,16 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
+from collections.abc import Collection, Sequence
 from dataclasses import replace
-from typing import IO, TYPE_CHECKING, Any
-from xml.etree.ElementTree import ParseError
+from pathlib import Path
+from typing import IO, Any
+from xml.etree.ElementTree import Element, ParseError
 
 import numpy as np
 
 from pcfix.errors import InputError
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
-    from pathlib import Path
-    from xml.etree.ElementTree import Element
-
-    from pcfix.model import FloatArray, Lens
-
+from pcfix.model import FloatArray, Lens
 
 ROUNDING = 1e-3
 """Of a rotation's elements: files with four decimals pass, a mirrored or scaled one does not."""

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, runtime_checkable
+from pathlib import Path
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 from pcfix.io.files import check_input
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pcfix.model import Cameras, TiePoints
+from pcfix.model import Cameras, TiePoints
 
 Angles = Literal["omega-phi-kappa", "yaw-pitch-roll", "aircraft"]
 

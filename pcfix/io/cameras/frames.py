@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -24,13 +25,10 @@ from pcfix.io.crs import (
     with_heights,
 )
 from pcfix.io.transformations import heights_agree
+from pcfix.model import Cameras, FloatArray
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     from pyproj import CRS
-
-    from pcfix.model import Cameras, FloatArray
 
 
 EARTH_RADII_M = (6.2e6, 7.0e6)

@@ -51,8 +51,6 @@ from pcfix.model import Cameras, FloatArray, GnssPositions
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from pcfix.model import FloatArray
-
 
 STEP_M = 10.0
 """Half the distance over which directions are compared."""

@@ -23,22 +23,16 @@ include/XML_GEN/ParamChantierPhotogram.xml of https://github.com/micmacIGN/micma
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import PurePosixPath
-from typing import TYPE_CHECKING
+from pathlib import Path, PurePosixPath
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import number, numbers, read_xml
-from pcfix.model import Cameras, Lens
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from xml.etree.ElementTree import Element
-
-    from pcfix.io.cameras.formats import Source
-    from pcfix.model import FloatArray
+from pcfix.io.cameras.formats import Source
+from pcfix.model import Cameras, FloatArray, Lens
 
 PREFIX, SUFFIX = "Orientation-", ".xml"
 UNIFIED = ("eModele_DRad_PPaEqPPs", "eModele_Fraser_PPaEqPPs")

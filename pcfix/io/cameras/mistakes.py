@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pcfix.io.crs import parse_crs, parts, unbound
+from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from pyproj import CRS
 
-    from pcfix.model import FloatArray
 
 FOOT_M = 0.3048
 MARGIN_M = 100.0

@@ -24,18 +24,15 @@ Sizes of the images are taken as `pcfix.io.cameras.tracks` says. The CRS is not 
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks, tracks
+from pcfix.io.cameras.formats import Source
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pcfix.io.cameras.formats import Source
 
 _HEAD = re.compile(r"NVM_V3(_R9T)?\b(.*)")
 _FIXED = re.compile(r"\s*FixedK\s+(.*)")

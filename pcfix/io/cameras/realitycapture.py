@@ -28,24 +28,20 @@ to check any of this.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import number, numbers, read_xml
+from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.table.sensor import read_sensor
 from pcfix.io.cameras.tracks import image_size
-from pcfix.model import Cameras, Lens
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from pcfix.io.cameras.formats import Source
-    from pcfix.model import FloatArray
+from pcfix.model import Cameras, FloatArray, Lens
 
 NAMESPACE = "http://www.capturingreality.com/ns/xcr/"
 DESCRIPTION = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"

@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path, PureWindowsPath
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.model import TiePoints, Views
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from pcfix.model import FloatArray, IntArray
-
+from pcfix.model import FloatArray, IntArray, TiePoints, Views
 
 _BEFORE_VIEWS = 7
 """Numbers of a point before its views: x, y, z, red, green, blue, count of views."""

@@ -7,15 +7,13 @@ and, of folders, the names inside.
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, NamedTuple, NoReturn
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 
 from pcfix.errors import InputError
+from pcfix.io.cameras.formats import Source
 from pcfix.io.tables import number
-
-if TYPE_CHECKING:
-    from pcfix.io.cameras.formats import Source
 
 ANY_CAMERAS = "give the file or folder with the camera poses"
 OMEGA_PHI_KAPPA = (

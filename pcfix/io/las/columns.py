@@ -12,15 +12,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.errors import InputError
+from pcfix.model import BoolArray, Correction, FloatArray
+from pcfix.options.correct import Dimensions
 
 if TYPE_CHECKING:
     import laspy
-    import numpy.typing as npt
 
-    from pcfix.model import BoolArray, Correction, FloatArray
-    from pcfix.options.correct import Dimensions
 
 Records: TypeAlias = Any
 """A numpy array of point records, whose dtype has named fields."""

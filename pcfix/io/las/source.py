@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
 
 import laspy
 import lazrs
@@ -21,15 +23,10 @@ from laspy.vlrs.vlrlist import VLRList
 from pcfix.errors import InputError
 from pcfix.io.crs import METRES
 from pcfix.io.files import check_input
+from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-    from typing import BinaryIO
-
     from pyproj import CRS
-
-    from pcfix.model import FloatArray
 
 
 WAVEFORM_PACKETS = ("LASF_Spec", 65535)

@@ -7,10 +7,12 @@ the target, which is renamed when it is whole.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from copy import deepcopy
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import laspy
 import lazrs
@@ -23,21 +25,15 @@ from pcfix.io.files import replaced_when_whole
 from pcfix.io.las.columns import Column, column_scale, upgraded
 from pcfix.io.las.source import (
     IDENTITY_PLACE,
+    LasSource,
     Record,
     RecordList,
     append_evlrs,
     backend,
     las_errors,
 )
+from pcfix.model import FloatArray
 from pcfix.version import __version__
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-    from pathlib import Path
-
-    from pcfix.io.las.source import LasSource
-    from pcfix.model import FloatArray
-
 
 EXTRA_BYTES = ("LASF_Spec", 4)
 USER_ID = "pcfix"

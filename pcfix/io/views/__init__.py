@@ -6,8 +6,11 @@ lists to the rows of a cloud, chunk by chunk.
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from pathlib import Path
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -15,13 +18,7 @@ from pcfix.io.files import check_input
 from pcfix.io.views.lists import ImageOrder, RawList, ViewList, read_list, tracks_as_list
 from pcfix.io.views.matching import ViewMatch, ViewReport, spacing_m
 from pcfix.io.views.orders import fitted, image_orders
-
-if TYPE_CHECKING:
-    import os
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
-
-    from pcfix.model import Cameras, FloatArray, TiePoints
+from pcfix.model import Cameras, FloatArray, TiePoints
 
 __all__ = ["ViewList", "ViewMatch", "ViewReport", "read_views", "track_views"]
 

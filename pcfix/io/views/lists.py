@@ -18,20 +18,16 @@ and apps/InterfaceCOLMAP. A depth map was itself matched against other images, w
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NoReturn
+from pathlib import Path
+from typing import Any, Literal, NoReturn
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.errors import InputError
 from pcfix.io.ply import read_header
 from pcfix.io.views.vertices import Vertices, copy_field, list_starts
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy.typing as npt
-
-    from pcfix.model import FloatArray, IntArray, TiePoints
+from pcfix.model import FloatArray, IntArray, TiePoints
 
 _HEAD = 8
 _IMAGES, _WEIGHTS = "view_indices", "view_weights"

@@ -16,14 +16,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.errors import InputError, SettingError
+from pcfix.io.views.lists import ViewList
 from pcfix.io.views.orders import entries, fitted
-from pcfix.model import Views
+from pcfix.model import Cameras, FloatArray, IntArray, Views
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
-
-    from pcfix.io.views.lists import ViewList
-    from pcfix.model import Cameras, FloatArray, IntArray
 
 
 _QUERIES = 250_000

@@ -16,25 +16,19 @@ numbers misread by one, a quarter of the cameras of an ordinary block look elsew
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.errors import InputError
 from pcfix.io.cameras.colmap.files import read_images
 from pcfix.io.labels import match_labels
-from pcfix.io.views.lists import ImageOrder
+from pcfix.io.views.lists import ImageOrder, RawList, ViewList
 from pcfix.lens.imaging import project
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    import numpy.typing as npt
-
-    from pcfix.io.views.lists import RawList, ViewList
-    from pcfix.model import Cameras, FloatArray, IntArray
+from pcfix.model import Cameras, FloatArray, IntArray
 
 LEAST_SHARE = 0.95
 """Of listed cameras whose frame holds the point: 1.00 on a real dense cloud, 0.75 with the image

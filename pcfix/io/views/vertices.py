@@ -6,21 +6,16 @@ A unit is a byte, or a number of a text; see `pcfix.io.ply` for the format.
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 from pcfix.errors import InputError
-from pcfix.io.ply import read_header
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy.typing as npt
-
-    from pcfix.io.ply import Header
-    from pcfix.model import FloatArray, IntArray
+from pcfix.io.ply import Header, read_header
+from pcfix.model import FloatArray, IntArray
 
 
 class Vertices:

@@ -12,14 +12,16 @@ Fermat but no one facet's normal. Where they end without a ray, `trace` lets the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit, prange
 
 from pcfix.errors import SettingError
-from pcfix.model import WaterMesh, WaterPlane, WaterRaster
+from pcfix.model import BoolArray, FloatArray, IntArray, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 from pcfix.refract.tracing.tracers import (
     Water,
@@ -32,15 +34,7 @@ from pcfix.refract.tracing.tracers import (
     scattershot,
 )
 from pcfix.threads import one_caller
-from pcfix.water.surface import build_field, build_tin
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    import numpy.typing as npt
-
-    from pcfix.model import BoolArray, FloatArray, IntArray
-    from pcfix.water.surface import Field, Tin
+from pcfix.water.surface import Field, Tin, build_field, build_tin
 
 Surface: TypeAlias = WaterPlane | WaterRaster | WaterMesh
 

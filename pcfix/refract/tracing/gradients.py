@@ -27,21 +27,16 @@ likewise by y. A point above the plane has S = 1, n = 1 and k = 1 / (H + D).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit, prange
 
 from pcfix.errors import SettingError
+from pcfix.model import FloatArray
 from pcfix.refract.rays import light_path
+from pcfix.refract.tracing import Tracing
 from pcfix.threads import one_caller
-
-if TYPE_CHECKING:
-    import numpy.typing as npt
-
-    from pcfix.model import FloatArray
-    from pcfix.refract.tracing import Tracing
-
 
 COLUMNS = 12
 DIRECTION, BY_POINT, BY_CENTRE, BY_LEVEL, BY_SLOPES, BY_INDEX = 0, 1, 4, 7, 8, 10

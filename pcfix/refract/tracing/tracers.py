@@ -11,17 +11,14 @@ not looked for: the ray is taken to cross the surface once.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit
 
+from pcfix.model import FloatArray
 from pcfix.refract.rays import plane_at, refracted
-
-if TYPE_CHECKING:
-    from pcfix.model import FloatArray
-    from pcfix.water.surface import Field, Tin
-
+from pcfix.water.surface import Field, Tin
 
 Found: TypeAlias = tuple[float, float, int, bool]
 """Plan place (x, y) where a tracer ended, its number of steps, and whether it hit the point."""

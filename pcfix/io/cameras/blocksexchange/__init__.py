@@ -25,8 +25,9 @@ order of P1 and P2 and the factor pi / 2 follow converters that cite those pages
 
 from __future__ import annotations
 
-from pathlib import PureWindowsPath
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path, PureWindowsPath
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
@@ -41,16 +42,9 @@ from pcfix.io.cameras.blocksexchange.document import (
     read_ties,
 )
 from pcfix.io.cameras.checks import number
+from pcfix.io.cameras.formats import Source
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
-from pcfix.model import Cameras, GnssPositions
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from xml.etree.ElementTree import Element
-
-    from pcfix.io.cameras.formats import Source
-    from pcfix.model import FloatArray, Lens, TiePoints
-
+from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
 
 __all__ = ["read", "recognises", "tie_points"]
 

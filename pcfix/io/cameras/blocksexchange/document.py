@@ -7,24 +7,18 @@ import math
 import re
 import zipfile
 import zlib
-from pathlib import PureWindowsPath
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path, PureWindowsPath
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import number, read_xml
+from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.tracks import tie_points
-from pcfix.model import Lens
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from xml.etree.ElementTree import Element
-
-    from pcfix.io.cameras.formats import Source
-    from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, TiePoints
-
+from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens, TiePoints
 
 COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
 TIE_POINTS = re.compile(rb"<TiePoints>(.*?)</TiePoints>", re.DOTALL)

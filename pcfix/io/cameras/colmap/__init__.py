@@ -27,26 +27,27 @@ from __future__ import annotations
 import json
 import re
 import sqlite3
+from collections.abc import Sequence
 from contextlib import closing, suppress
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from pathlib import Path
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.colmap.files import lens, read_cameras, read_images, read_points
+from pcfix.io.cameras.colmap.files import (
+    Camera,
+    Image,
+    lens,
+    read_cameras,
+    read_images,
+    read_points,
+)
+from pcfix.io.cameras.formats import Source
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import read_json
-from pcfix.model import Cameras, GnssPositions, Lens, TiePoints
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from pcfix.io.cameras.colmap.files import Camera, Image
-    from pcfix.io.cameras.formats import Source
-    from pcfix.model import FloatArray, IntArray
-
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
 
 _PART = re.compile(r"(cameras|images|points3D|rigs|frames)\.(bin|txt)")
 _CAMERA_LINE = re.compile(r"^\s*\d+\s+[A-Z][A-Z_0-9]+(\s+\S+){2}", re.MULTILINE)

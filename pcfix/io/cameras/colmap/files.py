@@ -15,20 +15,15 @@ from __future__ import annotations
 
 import mmap
 import struct
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
-from pcfix.model import Lens, Projection
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from pcfix.model import FloatArray, IntArray
-
+from pcfix.model import FloatArray, IntArray, Lens, Projection
 
 _SMALLEST_OMEGA = 1e-6
 """Below, in radians, the FOV model is a perspective one to double precision."""

@@ -8,9 +8,10 @@ points in the order of the tie points. Positions are written minus an offset, wh
 
 from __future__ import annotations
 
+import os
 import struct
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,11 +20,7 @@ from pcfix.io.cameras.checks import is_same_lens
 from pcfix.io.cameras.colmap import FILE, place_text
 from pcfix.io.cameras.colmap.files import BY_NAME, MODELS, Camera, lens
 from pcfix.io.files import check_output, write_bytes
-
-if TYPE_CHECKING:
-    import os
-
-    from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
+from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 
 PREFERRED = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),

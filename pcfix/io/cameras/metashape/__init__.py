@@ -27,30 +27,23 @@ References: "Agisoft Metashape User Manual, Professional Edition", appendix "Cam
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from pathlib import Path
+from typing import NamedTuple, TypeAlias
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras.checks import number, numbers
+from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import documents
-from pcfix.io.cameras.metashape.block import read_block
-from pcfix.io.cameras.metashape.documents import opened
+from pcfix.io.cameras.metashape.block import Block, Image, read_block
+from pcfix.io.cameras.metashape.documents import Archive, Chunk, Document, opened
 from pcfix.io.cameras.metashape.sensors import read_calibration
 from pcfix.io.cameras.tracks import tie_points as gathered
 from pcfix.io.crs import is_local, parse_crs
 from pcfix.io.ply import parse_header
-from pcfix.model import Cameras, GnssPositions, TiePoints
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from xml.etree.ElementTree import Element
-
-    from pcfix.io.cameras.formats import Source
-    from pcfix.io.cameras.metashape.block import Block, Image
-    from pcfix.io.cameras.metashape.documents import Archive, Chunk, Document
-    from pcfix.model import FloatArray, IntArray
-
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, TiePoints
 
 __all__ = ["read", "read_calibration", "recognises", "tie_points"]
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
@@ -12,17 +14,12 @@ from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import ROUNDING, number, numbers
 from pcfix.io.cameras.metashape import sensors
+from pcfix.io.cameras.metashape.documents import Chunk
 from pcfix.io.crs import METRES, crs_text, is_local, parse_crs, shortened, unbound
+from pcfix.model import FloatArray, Lens
 
 if TYPE_CHECKING:
-    from pathlib import Path
-    from typing import Any
-    from xml.etree.ElementTree import Element
-
     from pyproj import CRS
-
-    from pcfix.io.cameras.metashape.documents import Chunk
-    from pcfix.model import FloatArray, Lens
 
 
 @dataclass(frozen=True)

@@ -11,20 +11,16 @@ import re
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
 
 from pcfix.errors import InputError
 from pcfix.io.cameras.checks import read_xml
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-    from xml.etree.ElementTree import Element
-
-    from pcfix.io.cameras.formats import Source
-
+from pcfix.io.cameras.formats import Source
 
 ZIP_MAGIC = b"PK\x03\x04"
 ROOT = re.compile(r"\s*(?:<\?.*?\?>\s*|<!--.*?-->\s*)*<(\w+)", re.DOTALL)

@@ -15,7 +15,8 @@ document is not.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
@@ -24,14 +25,7 @@ from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import number, numbers, read_xml
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import documents
-from pcfix.model import Lens
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from xml.etree.ElementTree import Element
-
-    from pcfix.model import FloatArray, Projection
-
+from pcfix.model import FloatArray, Lens, Projection
 
 RADIAL = ("k1", "k2", "k3", "k4")
 PARAMETERS = {"f", "fx", "fy", "cx", "cy", "b1", "b2", "skew", *RADIAL, "p1", "p2", "p3", "p4"}

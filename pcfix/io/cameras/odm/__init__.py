@@ -28,7 +28,8 @@ from __future__ import annotations
 import mmap
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,6 +40,7 @@ from pcfix.io.cameras.odm.project import (
     SHOTS,
     TOPOCENTRIC,
     TRANSFORMATION,
+    Project,
     crs_of_place,
     from_topocentric,
     locate,
@@ -48,16 +50,14 @@ from pcfix.io.cameras.odm.project import (
     whole_file,
     whole_metres,
 )
-from pcfix.io.cameras.opensfm import left_out, read_reconstruction, read_tie_points, topocentric
-from pcfix.model import Cameras
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pcfix.io.cameras.odm.project import Project
-    from pcfix.io.cameras.opensfm import Reconstruction
-    from pcfix.model import FloatArray, TiePoints
-
+from pcfix.io.cameras.opensfm import (
+    Reconstruction,
+    left_out,
+    read_reconstruction,
+    read_tie_points,
+    topocentric,
+)
+from pcfix.model import Cameras, FloatArray, TiePoints
 
 ALIGNED_M = 0.1
 

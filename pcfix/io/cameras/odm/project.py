@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import PurePath
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path, PurePath
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,13 +14,7 @@ from pcfix.io.cameras.opensfm import left_out
 from pcfix.io.cameras.opensfm.models import is_panorama, lens
 from pcfix.io.crs import GEOCENTRIC_WGS84, GEOGRAPHIC_WGS84, Topocentric
 from pcfix.lens.rotations import from_rotation_vectors
-from pcfix.model import Cameras, GnssPositions, Lens
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pcfix.model import FloatArray
-
+from pcfix.model import Cameras, FloatArray, GnssPositions, Lens
 
 SHOTS = "shots.geojson"
 RECONSTRUCTION = "reconstruction.json"

@@ -20,24 +20,18 @@ https://opensfm.org/docs.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePath
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras.checks import json_number, load_json, mapping, rows, vector
+from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.opensfm.models import is_panorama, lens
 from pcfix.lens.rotations import from_rotation_vectors
-from pcfix.model import Cameras, GnssPositions, TiePoints, Views
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-    from pathlib import Path
-
-    from pcfix.io.cameras.formats import Source
-    from pcfix.model import FloatArray, IntArray, Lens
-
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints, Views
 
 TOPOCENTRIC_LIMIT_M = 1e5
 

@@ -16,10 +16,12 @@ Cameras in no CRS keep their numbers, and no reference is written. The file of t
 from __future__ import annotations
 
 import json
+import os
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,14 +41,7 @@ from pcfix.io.crs import (
 )
 from pcfix.io.files import check_output, write_text
 from pcfix.io.transformations import transformation_in_plan, transformation_in_space
-from pcfix.model import Lens
-
-if TYPE_CHECKING:
-    import os
-    from collections.abc import Iterator
-
-    from pcfix.model import Cameras, FloatArray, IntArray, Projection, TiePoints
-
+from pcfix.model import Cameras, FloatArray, IntArray, Lens, Projection, TiePoints
 
 PANORAMAS = frozenset({"equirectangular", "spherical"})
 

@@ -22,16 +22,19 @@ References: Pix4D, "What does the Output Params Folder contain?" (support.pix4d.
 from __future__ import annotations
 
 from collections import defaultdict
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
+from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.pix4d.files import (
     EXTERNAL,
     GEOGRAPHIC,
     PARAMETERS,
+    Files,
     find,
     first_line,
     holds_tables,
@@ -41,6 +44,8 @@ from pcfix.io.cameras.pix4d.files import (
     read_text,
 )
 from pcfix.io.cameras.pix4d.tables import (
+    Calibration,
+    Image,
     lens_of_calibration,
     lenses_of_images,
     read_calibrations,
@@ -48,16 +53,7 @@ from pcfix.io.cameras.pix4d.tables import (
     read_offsets,
     read_parameters,
 )
-from pcfix.model import Cameras
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pcfix.io.cameras.formats import Source
-    from pcfix.io.cameras.pix4d.files import Files
-    from pcfix.io.cameras.pix4d.tables import Calibration, Image
-    from pcfix.model import FloatArray, Lens, TiePoints
-
+from pcfix.model import Cameras, FloatArray, Lens, TiePoints
 
 __all__ = ["read", "recognises", "tie_points"]
 

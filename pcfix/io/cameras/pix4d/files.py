@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import PurePath, PureWindowsPath
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path, PurePath, PureWindowsPath
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import number, read_xml
+from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.tracks import tie_points as gathered
-from pcfix.model import GnssPositions
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-    from xml.etree.ElementTree import Element
-
-    from pcfix.io.cameras.formats import Source
-    from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
-
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
 
 PARAMETERS = "calibrated_camera_parameters.txt"
 EXTERNAL = "calibrated_external_camera_parameters.txt"

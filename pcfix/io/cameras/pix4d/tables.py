@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,13 +13,7 @@ from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.pix4d.files import read_text
 from pcfix.lens.rotations import from_omega_phi_kappa
-from pcfix.model import Lens
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pcfix.model import FloatArray
-
+from pcfix.model import FloatArray, Lens
 
 FIELDS = {
     "camera matrix": "matrix",

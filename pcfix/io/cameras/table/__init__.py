@@ -36,28 +36,22 @@ its f, px, py and the order of t1, t2 are those of AliceVision's reader of the s
 
 from __future__ import annotations
 
+import os
 import re
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
+from pcfix.io.cameras.formats import Angles, Source
 from pcfix.io.cameras.table.attitude import read_rotations
 from pcfix.io.cameras.table.columns import EXIF, Columns, axes, headers, is_header, read_columns
 from pcfix.io.cameras.table.sensor import read_lenses, read_sensor
 from pcfix.io.files import check_input
 from pcfix.io.tables import Table, number, read_lines
 from pcfix.lens.rotations import from_yaw_pitch_roll as rotations_from_yaw_pitch_roll
-from pcfix.model import Cameras, GnssPositions
-
-if TYPE_CHECKING:
-    import os
-    from pathlib import Path
-
-    from pcfix.io.cameras.formats import Angles, Source
-    from pcfix.model import FloatArray, IntArray, Lens
-
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens
 
 __all__ = [
     "read",

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
+from pcfix.io.cameras.formats import Angles
+from pcfix.io.cameras.table.columns import Columns
 from pcfix.lens import rotations
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pcfix.io.cameras.formats import Angles
-    from pcfix.io.cameras.table.columns import Columns
-    from pcfix.model import FloatArray
+from pcfix.model import FloatArray
 
 OMEGA_PHI_KAPPA = ("omega", "phi", "kappa")
 YAW_PITCH_ROLL = ("yaw", "pitch", "roll")

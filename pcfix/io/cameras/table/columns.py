@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.io.tables import delimiter_of, number, read_lines, split_header, table_below
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-    from pathlib import Path
-
-    from pcfix.io.tables import Table
-    from pcfix.model import FloatArray, IntArray
-
+from pcfix.io.tables import Table, delimiter_of, number, read_lines, split_header, table_below
+from pcfix.model import FloatArray, IntArray
 
 SPELLINGS: dict[str, tuple[str, ...]] = {
     "label": (

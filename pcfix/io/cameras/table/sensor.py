@@ -12,27 +12,20 @@ from __future__ import annotations
 
 import csv
 import io
+import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import is_same_lens
+from pcfix.io.cameras.table.columns import Columns
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input, check_output, write_text
-from pcfix.io.tables import read_lines, read_table, split_header
-from pcfix.model import Lens
-
-if TYPE_CHECKING:
-    import os
-    from collections.abc import Sequence
-
-    from pcfix.io.cameras.table.columns import Columns
-    from pcfix.io.tables import Table
-    from pcfix.model import Cameras
-
+from pcfix.io.tables import Table, read_lines, read_table, split_header
+from pcfix.model import Cameras, Lens
 
 MILLIMETRES = ("focal", "sensor_x", "sensor_y")
 PIXELS = ("focal_px", "width_px", "height_px")
