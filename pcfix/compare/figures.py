@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
-from pcfix.compare.m3c2 import (
-    M3c2,
-    m3c2_distances,
-)
+from pcfix.compare.m3c2 import M3c2, m3c2_distances
 from pcfix.compare.match import Match
 from pcfix.compare.nearest import cloud_to_cloud
-from pcfix.compare.sections import (
-    Section,
-    SectionLine,
-    lines_downslope,
-    section_along,
-)
+from pcfix.compare.sections import Section, SectionLine, lines_downslope, section_along
 from pcfix.compare.statistics import (
     Bin,
     Distribution,
@@ -31,15 +24,12 @@ from pcfix.compare.statistics import (
     distribution_of,
     fit_line,
 )
-from pcfix.compare.vertical import (
-    Pairs,
-    pairs_at_cloud,
-    pairs_at_reference,
-)
+from pcfix.compare.vertical import Pairs, pairs_at_cloud, pairs_at_reference
 from pcfix.errors import GeometryError
 from pcfix.model import FloatArray
 from pcfix.options.steps import CompareRules
 
+Given = TypeVar("Given")
 Figure = TypeVar("Figure")
 
 
@@ -169,36 +159,34 @@ def figures_of(match: Match, lines: Sequence[SectionLine], started: float) -> Co
     GeometryError
         If there are too few points for planes, or M3C2 finds nothing.
     """
-    notes, apparent = _notes(match), match.apparent
-    after = before = vertical = None
+    notes, clouds = _notes(match), (match.cloud.xyz, match.apparent)
+    pairs = None
     if match.settings.vertical:
         _check_enough(match)
-        after = _pairs(match, match.cloud.xyz)
-        before = None if apparent is None else _pairs(match, apparent)
-        vertical = AfterBefore(
-            distribution_of(after.error_m),
-            None if before is None else distribution_of(before.error_m),
-        )
-    fits, depth_bins, shore_bins = _by_depth(match, after, before, notes)
+        pairs = _both(partial(_pairs, match), *clouds)
+    fits, depth_bins, shore_bins = _by_depth(match, pairs, notes)
     return Comparison(
         cloud=match.whole.name,
         reference=match.reference.name,
         measured_at="reference" if match.reference.sparse else "cloud",
-        counts=_counts(match, after),
-        c2c=AfterBefore(
-            distribution_of(_c2c(match, match.cloud.xyz)),
-            None if apparent is None else distribution_of(_c2c(match, apparent)),
-        ),
-        vertical=vertical,
+        counts=_counts(match, pairs),
+        c2c=_both(lambda xyz: distribution_of(_c2c(match, xyz)), *clouds),
+        vertical=pairs and _both(lambda p: distribution_of(p.error_m), pairs.after, pairs.before),
         depth=fits,
         depth_bins=depth_bins,
         shore_bins=shore_bins,
-        m3c2=_m3c2(match, before or after),
+        m3c2=_m3c2(match, pairs),
         sections=_sections(match, lines),
         settings=match.settings,
         notes=tuple(notes),
         seconds=round(time.perf_counter() - started, 3),
     )
+
+
+def _both(
+    figure: Callable[[Given], Figure], after: Given, before: Given | None
+) -> AfterBefore[Figure]:
+    return AfterBefore(figure(after), None if before is None else figure(before))
 
 
 def _check_enough(match: Match) -> None:
@@ -227,31 +215,29 @@ def _c2c(match: Match, xyz: FloatArray) -> FloatArray:
 
 
 def _by_depth(
-    match: Match, after: Pairs | None, before: Pairs | None, notes: list[str]
+    match: Match, pairs: AfterBefore[Pairs] | None, notes: list[str]
 ) -> tuple[AfterBefore[Line | None] | None, tuple[Bin, ...], tuple[Bin, ...]]:
     """Return the fits and tables of the submerged places, as far as the water is known."""
-    surface = None if after is None else match.water_at(after.xy)
-    if after is None or surface is None:
-        if after is not None:
-            notes.append("no water surface is known, so nothing is said of depth; give --water")
-        return None, (), ()
+    nothing = None, (), ()
+    if pairs is None:
+        return nothing
+    after, before = pairs.after, pairs.before
+    surface = match.water_at(after.xy)
+    if surface is None:
+        notes.append("no water surface is known, so nothing is said of depth; give --water")
+        return nothing
     wet = after.reference_m < surface if match.reference.sparse else match.wet
     wet = wet & np.isfinite(surface)
     if not wet.any():
         notes.append("no compared point is under water, so nothing is said of depth")
-        return None, (), ()
+        return nothing
     depth, error = (surface - after.reference_m)[wet], after.error_m[wet]
-    depth_before = error_before = None
+    fits, error_before = AfterBefore(fit_line(depth, depth - error), None), None
     if before is not None:
         over = match.water_at(before.xy)
         depth_before = ((surface if over is None else over) - before.reference_m)[wet]
         error_before = before.error_m[wet]
-    fits = AfterBefore(
-        fit_line(depth, depth - error),
-        None
-        if depth_before is None or error_before is None
-        else fit_line(depth_before, depth_before - error_before),
-    )
+        fits = replace(fits, before=fit_line(depth_before, depth_before - error_before))
     bins = binned(depth, error, error_before, match.settings.bin_width)
     if len(match.dry_xy) == 0:
         notes.append("the cloud has no dry point, so nothing is said of the distance from shore")
@@ -260,16 +246,16 @@ def _by_depth(
     return fits, bins, binned(shore, error, error_before, match.settings.shore_bin_width)
 
 
-def _m3c2(match: Match, pairs: Pairs | None) -> AfterBefore[M3c2] | None:
+def _m3c2(match: Match, pairs: AfterBefore[Pairs] | None) -> AfterBefore[M3c2] | None:
     if not match.settings.m3c2:
         return None
-    far = _c2c(match, match.cloud.xyz) if pairs is None else np.abs(pairs.error_m)
+    if pairs is None:
+        far = _c2c(match, match.cloud.xyz)
+    else:
+        far = np.abs((pairs.before or pairs.after).error_m)
     reach = max(MIN_REACH_M, REACH_FACTOR * float(np.percentile(far, 99)))
-    target, apparent = match.reference.xyz, match.apparent
-    return AfterBefore(
-        m3c2_distances(match.cloud.xyz, target, reach),
-        None if apparent is None else m3c2_distances(apparent, target, reach),
-    )
+    target = match.reference.xyz
+    return _both(lambda xyz: m3c2_distances(xyz, target, reach), match.cloud.xyz, match.apparent)
 
 
 def _sections(match: Match, lines: Sequence[SectionLine]) -> tuple[Section, ...]:
@@ -287,7 +273,7 @@ def _sections(match: Match, lines: Sequence[SectionLine]) -> tuple[Section, ...]
     return tuple(section_along(line, known, match.settings.corridor) for line in lines)
 
 
-def _counts(match: Match, after: Pairs | None) -> Counts:
+def _counts(match: Match, pairs: AfterBefore[Pairs] | None) -> Counts:
     whole, reference = match.whole, match.reference
     return Counts(
         cloud=len(whole) + whole.left_out,
@@ -297,7 +283,7 @@ def _counts(match: Match, after: Pairs | None) -> Counts:
         outside_overlap=match.outside,
         not_submerged=match.not_submerged,
         compared=len(match.places) if reference.sparse else len(match.cloud),
-        by_nearest=0 if after is None else int(after.by_nearest.sum()),
+        by_nearest=0 if pairs is None else int(pairs.after.by_nearest.sum()),
     )
 
 

@@ -19,7 +19,7 @@ from pcfix.model import FloatArray, IntArray
 MAX_CORE_POINTS = 100_000
 SPACING_SAMPLE = 10_000
 NORMAL_SPACINGS, CYLINDER_SPACINGS = 6.0, 3.0
-"""Default scales, in point spacings of the sparser cloud: a cylinder holds about 28 points."""
+"""Scales, in point spacings of the sparser cloud: a cylinder holds about 28 points."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,16 +78,8 @@ def sample_rows(count: int, most: int) -> IntArray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
-def m3c2_distances(
-    xyz: FloatArray,
-    reference: FloatArray,
-    max_distance_m: float,
-    *,
-    core_points: int = MAX_CORE_POINTS,
-    normal_radius_m: float | None = None,
-    cylinder_radius_m: float | None = None,
-) -> M3c2:
-    """Return M3C2 distances of a cloud from a reference.
+def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float) -> M3c2:
+    """Return M3C2 distances of a cloud from a reference, at `MAX_CORE_POINTS` points at most.
 
     Parameters
     ----------
@@ -97,10 +89,6 @@ def m3c2_distances(
         The same frame.
     max_distance_m : float
         Half the length of the cylinders.
-    core_points : int
-        At most so many, evenly spread.
-    normal_radius_m, cylinder_radius_m : float, optional
-        Default 6 and 3 times the point spacing of the sparser cloud.
 
     Raises
     ------
@@ -110,10 +98,9 @@ def m3c2_distances(
         If no cylinder holds points of both clouds.
     """
     spacing = max(point_spacing_m(xyz), point_spacing_m(reference), 1e-3)
-    normal = normal_radius_m or NORMAL_SPACINGS * spacing
-    cylinder = cylinder_radius_m or CYLINDER_SPACINGS * spacing
+    normal, cylinder = NORMAL_SPACINGS * spacing, CYLINDER_SPACINGS * spacing
     origin = np.floor(reference.mean(axis=0))
-    core = xyz[sample_rows(len(xyz), core_points)] - origin
+    core = xyz[sample_rows(len(xyz), MAX_CORE_POINTS)] - origin
     distance, detection = _run(
         xyz - origin, reference - origin, core, normal, cylinder, max_distance_m
     )

@@ -19,35 +19,16 @@ GAP_SPACINGS, MIN_GAP_M = 5.0, 1.0
 
 @dataclass(frozen=True, eq=False)
 class SurveyCloud:
-    """Points that count; n of them.
+    """The n points of a cloud that count; world frame, metres."""
 
-    Attributes
-    ----------
-    name : str
-        For messages.
-    xyz : array, shape (n, 3)
-        Metres, world frame.
-    crs : pyproj.CRS or None
-    left_out : int
-        Points withheld, or of a class that does not count.
-    shift_m : array, shape (n, 3), or None
-        True minus apparent, of a cloud that pcfix corrected.
-    bathymetric : array of bool, shape (n,)
-        Class 40.
-    water_m : array, shape (n,)
-        Height of the water surface above each point; NaN where the cloud does not say.
-    water : WaterSurface or None
-        The surface itself, where it is known away from the points too.
-    """
-
-    name: str
-    xyz: FloatArray
-    crs: Any
-    left_out: int
-    shift_m: FloatArray | None
-    bathymetric: BoolArray
-    water_m: FloatArray
-    water: WaterSurface | None = None
+    name: str  # for messages
+    xyz: FloatArray  # (n, 3)
+    crs: Any  # pyproj.CRS or None
+    left_out: int  # points withheld, or of a class that does not count
+    shift_m: FloatArray | None  # (n, 3), true minus apparent, of a cloud that pcfix corrected
+    bathymetric: BoolArray  # (n,), class 40
+    water_m: FloatArray  # (n,), height of the water above each point; NaN where not known
+    water: WaterSurface | None = None  # itself, where it is known away from the points too
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -65,57 +46,26 @@ class SurveyCloud:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Heights that are taken as true.
+    """Heights that are taken as true: m points in the world frame."""
 
-    Attributes
-    ----------
-    name : str
-        For messages.
-    xyz : array, shape (m, 3)
-        Metres, world frame.
-    crs : pyproj.CRS or None
-    left_out : int
-        Points withheld, of noise, or of water; cells without data.
-    sparse : bool
-        Whether these are single check points, not a sampled surface.
-    """
-
-    name: str
-    xyz: FloatArray
-    crs: Any
-    left_out: int = 0
-    sparse: bool = False
+    name: str  # for messages
+    xyz: FloatArray  # (m, 3), metres
+    crs: Any  # pyproj.CRS or None
+    left_out: int = 0  # points withheld, of noise, or of water; cells without data
+    sparse: bool = False  # whether these are single check points, not a sampled surface
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """A cloud and a reference, of each the points that are compared.
+    """A cloud and a reference, of each the points that are compared."""
 
-    Attributes
-    ----------
-    whole : SurveyCloud
-        All points that are neither withheld nor noise.
-    cloud : SurveyCloud
-        Those of them to compare; n points.
-    wet : array of bool, shape (n,)
-        Which of these are under water.
-    dry_xy : array, shape (d, 2)
-        Where the whole cloud is above the water, metres.
-    reference : Reference
-    places : array, shape (p, 3)
-        Points of the reference that the cloud reaches, metres.
-    outside, not_submerged : int
-        Points that were not chosen.
-    settings : CompareRules
-    """
-
-    whole: SurveyCloud
-    cloud: SurveyCloud
-    wet: BoolArray
-    dry_xy: FloatArray
+    whole: SurveyCloud  # all points that are neither withheld nor noise
+    cloud: SurveyCloud  # the n points of it to compare
+    wet: BoolArray  # (n,), which of these are under water
+    dry_xy: FloatArray  # (d, 2), where the whole cloud is above the water, metres
     reference: Reference
-    places: FloatArray
-    outside: int
+    places: FloatArray  # (p, 3), points of the reference that the cloud reaches, metres
+    outside: int  # points that were not chosen, as the next
     not_submerged: int
     settings: CompareRules
 

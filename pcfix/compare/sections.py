@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -105,15 +104,8 @@ def section_along(line: SectionLine, layers: dict[str, FloatArray], half_width_m
     layers : dict of array, shape (n, 3)
         Clouds by name, metres, world frame.
     half_width_m : float
-        Points up to this far from the line count.
-
-    Raises
-    ------
-    SettingError
-        If the half-width is not positive.
+        Points up to this far from the line count; positive.
     """
-    if not (np.isfinite(half_width_m) and half_width_m > 0.0):
-        raise SettingError(f"corridor {half_width_m:g} is not positive; give metres.")
     step = max(line.length_m / STATIONS, 0.5 * half_width_m)
     stations = np.linspace(0.0, line.length_m, max(round(line.length_m / step), 1) + 1)
     window = max(step, half_width_m)
@@ -152,13 +144,9 @@ def lines_downslope(xyz: FloatArray, count: int) -> tuple[SectionLine, ...]:
 
     Raises
     ------
-    SettingError
-        If `count` is less than one.
     GeometryError
         If the points lie on a line in plan.
     """
-    if count < 1:
-        raise SettingError(f"sections {count} is less than 1.")
     origin = xyz.mean(axis=0)
     local = xyz - origin
     covariance = local[:, :2].T @ local[:, :2]
@@ -176,6 +164,6 @@ def lines_downslope(xyz: FloatArray, count: int) -> tuple[SectionLine, ...]:
         share = along[(across >= low) & (across <= high)]
         if len(share) and np.ptp(share) > 0.0:
             middle = origin[:2] + 0.5 * (low + high) * left
-            ends: Sequence[float] = [*(middle + share.min() * down), *(middle + share.max() * down)]
-            lines.append(SectionLine(*map(float, ends)))
+            ends = np.append(middle + share.min() * down, middle + share.max() * down)
+            lines.append(SectionLine(*ends.tolist()))
     return tuple(lines)

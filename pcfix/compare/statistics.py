@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -202,7 +201,7 @@ def fit_line(reference_depth_m: FloatArray, depth_m: FloatArray) -> Line | None:
 def binned(
     by_m: FloatArray, after_m: FloatArray, before_m: FloatArray | None, width_m: float
 ) -> tuple[Bin, ...]:
-    """Return the errors in bins of reference depth, or of distance.
+    """Return the bins of reference depth, or of distance, that hold points, in order.
 
     Parameters
     ----------
@@ -211,18 +210,13 @@ def binned(
     after_m, before_m : array, shape (n,)
         Errors, metres.
     width_m : float
-
-    Returns
-    -------
-    tuple of Bin
-        Those that hold points, in order.
+        Positive.
 
     Raises
     ------
     SettingError
-        If the width is not positive, or makes too many bins.
+        If the width makes too many bins.
     """
-    check_width(width_m)
     if len(by_m) == 0:
         return ()
     place = np.floor(by_m / width_m)
@@ -242,51 +236,18 @@ def binned(
     )
 
 
-def check_width(width_m: float) -> None:
-    """Refuse a bin width that is not positive.
-
-    Raises
-    ------
-    SettingError
-    """
-    if not (np.isfinite(width_m) and width_m > 0.0):
-        raise SettingError(f"bin width {width_m:g} is not positive; give metres, such as 1.")
-
-
 def distance_from_shore(xy: FloatArray, dry_xy: FloatArray) -> FloatArray:
-    """Return the distance in plan to the nearest dry point.
-
-    Parameters
-    ----------
-    xy : array, shape (n, 2)
-        Metres, world frame.
-    dry_xy : array, shape (m, 2)
-        Points above the water, the same frame.
-
-    Returns
-    -------
-    array, shape (n,)
-        Metres.
-    """
-    distance, _ = Neighbours(dry_xy).nearest(xy)
-    return distance
+    """Return the distance in plan, metres, of places (n, 2) to the nearest dry point of (m, 2)."""
+    return Neighbours(dry_xy).nearest(xy)[0]
 
 
-class TruthErrors(NamedTuple):
-    """Errors in metres."""
-
-    mean_z_m: float
-    rmse_z_m: float
-    rmse_xy_m: float
-
-
-def errors_against_truth(xyz: FloatArray, true_xyz: FloatArray) -> TruthErrors:
-    """Return the errors of points, both arrays of shape (n, 3), metres, same frame.
+def errors_against_truth(xyz: FloatArray, true_xyz: FloatArray) -> tuple[float, float, float]:
+    """Return mean and rms error of Z, and in plan, of points (n, 3), metres, same frame.
 
     The error in plan is the root mean square length of the horizontal difference.
     """
     error = xyz - true_xyz
-    return TruthErrors(
+    return (
         float(error[:, 2].mean()),
         float(np.sqrt((error[:, 2] ** 2).mean())),
         float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean())),

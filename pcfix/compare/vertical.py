@@ -8,11 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.compare.nearest import Neighbours
-from pcfix.errors import GeometryError, SettingError
 from pcfix.model import BoolArray, FloatArray
 
-MIN_NEIGHBOURS = 6
-DEFAULT_NEIGHBOURS = 8
 MIN_SHAPE = 1e-3
 """Least ratio of the neighbours' variances across and along; below, they lie on a line."""
 MAX_REACH = 3.0
@@ -30,24 +27,7 @@ class Heights(NamedTuple):
     by_nearest: BoolArray
 
 
-def check_neighbours(neighbours: int) -> None:
-    """Refuse a number of neighbours that cannot carry a plane.
-
-    Raises
-    ------
-    SettingError
-        If it is less than six.
-    """
-    if neighbours < MIN_NEIGHBOURS:
-        raise SettingError(
-            f"neighbours {neighbours} is less than {MIN_NEIGHBOURS}: a plane through so few"
-            " points follows their noise; 8 is usual."
-        )
-
-
-def heights_at(
-    xy: FloatArray, surface: FloatArray, neighbours: int = DEFAULT_NEIGHBOURS
-) -> Heights:
+def heights_at(xy: FloatArray, surface: FloatArray, neighbours: int) -> Heights:
     """Return the height of a surface at places in plan.
 
     At each place a plane is fitted to the nearest points of the surface (nearest in plan, least
@@ -61,25 +41,12 @@ def heights_at(
     surface : array, shape (m, 3)
         The same frame.
     neighbours : int
-        Points a plane, at least 6.
+        Points a plane; the surface has at least as many.
 
     Returns
     -------
     Heights
-
-    Raises
-    ------
-    SettingError
-        If `neighbours` is less than six.
-    GeometryError
-        If the surface has fewer points than that.
     """
-    check_neighbours(neighbours)
-    if len(surface) < neighbours:
-        raise GeometryError(
-            f"A surface of {len(surface)} points is too few for planes through {neighbours};"
-            " give more points."
-        )
     index = Neighbours(surface[:, :2])
     sorted_surface = surface[index.row]
     height, by_nearest = np.empty(len(xy)), np.empty(len(xy), np.bool_)
@@ -109,32 +76,17 @@ def _plane_at_origin(near: FloatArray) -> Heights:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Two heights at each of n places.
+    """Two heights at each of n places, world Z."""
 
-    Attributes
-    ----------
-    xy : array, shape (n, 2)
-        Metres, world frame.
-    measured_m, reference_m : array, shape (n,)
-        World Z of the cloud and of the reference there.
-    by_nearest : array of bool, shape (n,)
-        Where one of the two is the height of a single nearest point; see `heights_at`.
-    """
-
-    xy: FloatArray
-    measured_m: FloatArray
-    reference_m: FloatArray
-    by_nearest: BoolArray
+    xy: FloatArray  # (n, 2), metres, world frame
+    measured_m: FloatArray  # (n,), of the cloud
+    reference_m: FloatArray  # (n,)
+    by_nearest: BoolArray  # (n,), where one of the two is that of a single point: see `heights_at`
 
     @property
     def error_m(self) -> FloatArray:
         """Measured minus reference, shape (n,): positive where the cloud is too high."""
         return np.asarray(self.measured_m - self.reference_m)
-
-    @property
-    def reference_xyz(self) -> FloatArray:
-        """Reference points at the places, shape (n, 3)."""
-        return np.column_stack([self.xy, self.reference_m])
 
 
 def pairs_at_cloud(xyz: FloatArray, reference: FloatArray, neighbours: int) -> Pairs:

@@ -172,8 +172,6 @@ def cell_uncertainty(cell: IntArray, sigma_m: FloatArray, size: int) -> FloatArr
 
 def _sums(values: FloatArray, first: IntArray) -> FloatArray:
     """Return the sum of each run of values; runs begin at `first`."""
-    if not len(values):
-        return np.empty(0)
     return np.asarray(np.add.reduceat(values, first))
 
 
@@ -189,35 +187,17 @@ NEAREST_CELLS = 1e-4
 """A point nearer to a centre weighs as if it were this far from it."""
 
 
-def inverse_distance(
-    position: FloatArray, cell: IntArray, z: FloatArray, window: Window
-) -> FloatArray:
+def inverse_distance(block: Block) -> FloatArray:
     """Return the mean of the heights around each centre, weighted with 1 / distance squared.
 
     The nearer a point, the more it counts; points farther than `REACH_CELLS` do not count, and
-    cells without a point of their own get NaN.
-
-    Parameters
-    ----------
-    position : array, shape (n, 2)
-        Columns and rows, in cells from the top left corner of the raster.
-    cell : array of int, shape (n, 2)
-        Column and row of the cell of each point, in the same frame. They must cover the window
-        with a margin of one cell.
-    z : array, shape (n,)
-        Heights, metres.
-    window : Window
-
-    Returns
-    -------
-    array, shape (window.height, window.width)
-        Metres.
+    cells without a point of their own get NaN. The points cover the window with a margin of a cell.
     """
-    wide = window.grown(1)
-    code = (cell[:, 1] - wide.row) * wide.width + cell[:, 0] - wide.column
-    order = np.lexsort((z, code))
+    wide = block.window.grown(1)
+    code = (block.cell[:, 1] - wide.row) * wide.width + block.cell[:, 0] - wide.column
+    order = np.lexsort((block.z, code))
     start = np.searchsorted(code[order], np.arange(wide.height * wide.width + 1))
-    return np.asarray(_weighted(position[order], z[order], start, *window))
+    return np.asarray(_weighted(block.position[order], block.z[order], start, *block.window))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -266,7 +246,7 @@ HEIGHTS: dict[DsmMethod, Height] = {
     "median": Height(lambda block: block.numbers.median),
     "min": Height(lambda block: block.numbers.min),
     "max": Height(lambda block: block.numbers.max),
-    "idw": Height(lambda b: inverse_distance(b.position, b.cell, b.z, b.window), lambda reach: 1),
+    "idw": Height(inverse_distance, lambda reach: 1),
     "tin": Height(
         lambda b: triangulated(b.position, b.z, b.window, b.reach, b.spacing),
         lambda reach: int(np.ceil(reach)) + 1,

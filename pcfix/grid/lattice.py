@@ -200,24 +200,12 @@ MOST_SQUARES = 4_000_000
 class Occupancy:
     """The extent of a cloud, and in which squares of the plan it has points.
 
-    Parameters
-    ----------
-    area_m2 : float
-        Of the rectangle around the cloud.
-    points : int
-        How many there are in all; with the area, this sets the size of the squares.
-    finest_m : float
-        The squares are not smaller than this.
-
-    Attributes
-    ----------
-    points : int
-        So far.
-    low, high : array, shape (2,)
-        South-west and north-east corner of their extent, metres, world frame.
+    `points` counts them so far; `low` and `high`, shape (2,), are the south-west and north-east
+    corner of their extent, metres, world frame.
     """
 
     def __init__(self, area_m2: float, points: int, finest_m: float) -> None:
+        """Take squares by area and number of all points to come, none smaller than the finest."""
         wanted = max(POINTS_A_SQUARE / points, 1.0 / MOST_SQUARES) * area_m2
         self.side_m = max(float(np.sqrt(wanted)), finest_m)
         self.points = 0

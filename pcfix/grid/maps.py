@@ -15,22 +15,14 @@ POINTS_PER_CELL = 6.0
 
 @dataclass(frozen=True, eq=False)
 class Maps:
-    """Means of the points of each cell; NaN where there are none.
+    """Means of the points of each cell, shape (rows, columns); NaN where there are none.
 
-    Attributes
-    ----------
-    west_m, north_m : float
-        Outer corner of the upper left cell, in the cloud's CRS.
-    cell_m : float
-        Side of a cell.
-    height_m, depth_m, shift_z_m, shift_xy_m, rays : array, shape (rows, columns)
-        Height of all points; depth, shift and number of rays of the corrected ones. The first
-        row lies in the north.
+    The first row lies in the north. Depth, shift and number of rays are of the corrected points.
     """
 
-    west_m: float
+    west_m: float  # the outer corner of the upper left cell, in the cloud's CRS
     north_m: float
-    cell_m: float
+    cell_m: float  # side of a cell
     height_m: FloatArray
     depth_m: FloatArray
     shift_z_m: FloatArray

@@ -3,6 +3,7 @@
 import csv
 import importlib
 import json
+import math
 import sys
 import warnings
 
@@ -13,7 +14,7 @@ import rasterio
 from pyproj import CRS
 
 import pcfix
-from pcfix.compare.m3c2 import m3c2_distances
+from pcfix.compare import m3c2
 from pcfix.flow.compare import compare_clouds
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT
@@ -148,9 +149,9 @@ def test_m3c2_finds_the_lift_too_and_its_sign(tmp_path):
 @py4dgeo
 def test_m3c2_takes_fewer_core_points_and_says_nothing(tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(m3c2, "MAX_CORE_POINTS", 700)
     first, again = (
-        m3c2_distances(lifted(plane(5000, 3), 0.1), plane(9000, 4), 1.0, core_points=700)
-        for _ in range(2)
+        m3c2.m3c2_distances(lifted(plane(5000, 3), 0.1), plane(9000, 4), 1.0) for _ in range(2)
     )
     assert first == again
     assert first.core_points == 700
@@ -335,7 +336,9 @@ def test_bad_input_is_one_clear_sentence(tmp_path):
     refused(bad, "no such file", cloud, tmp_path / "none.laz")
     refused(bad, "no dimension w_surf", cloud, cloud, water="dim:w_surf")
     setting = pcfix.SettingError
-    refused(setting, "bin width 0", cloud, cloud, bin_width=0.0)
+    for width in (0.0, -1.0, math.nan, math.inf):
+        refused(setting, "bin width", cloud, cloud, bin_width=width)
+    refused(setting, "neighbours 5 is less than 6", cloud, cloud, neighbours=5)
     refused(setting, "max-gap -1", cloud, cloud, max_gap=-1.0)
     refused(setting, "section '1,2' is not", cloud, cloud, section=["1,2"])
     refused(setting, "does not exist", cloud, cloud, out_dir=tmp_path / "no" / "where")
