@@ -6,23 +6,23 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.compare.match import Reference, SurveyCloud
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.crs import is_same, parts
 from pcfix.io.files import check_input
 from pcfix.io.las.columns import SHIFTS
-from pcfix.io.las.source import LasSource, coordinates, las_errors
+from pcfix.io.las.source import LasSource, coordinates, stated_crs
 from pcfix.io.las.writing import own_settings
+from pcfix.io.rasters import place_of
 from pcfix.io.tables import read_table
 from pcfix.model import (
     BATHYMETRIC_POINT,
     NOISE_CLASSES,
-    BoolArray,
-    FloatArray,
     WaterDimension,
     WaterPlane,
     WaterSurface,
@@ -57,39 +57,28 @@ def read_cloud(
         If the file is damaged, no point counts, or it lacks the dimension that `water` names.
     """
     with LasSource(path) as source:
-        crs = _crs(source)
+        crs = stated_crs(source, "its CRS cannot be read", "export it again")
         own = water or own_water(source)
         chunks = source.chunks(CHUNK_POINTS)
         parts = [_part(source, p, own, given=water is not None, skip=skip_classes) for p in chunks]
         count = len(source)
-    xyz = np.concatenate([part.xyz for part in parts])
+    xyz, water_m, bathymetric, *shifts = (np.concatenate(of) for of in zip(*parts, strict=True))
     if len(xyz) == 0:
         raise InputError(
             f"{path}: every point is withheld or of a class that does not count"
             f" ({', '.join(map(str, skip_classes))}); there is nothing to compare."
         )
-    shifts = [part.shift_m for part in parts if part.shift_m is not None]
-    water_m = np.concatenate([part.water_m for part in parts])
     exact = water is not None or not np.isfinite(water_m).any()
     return SurveyCloud(
         str(path),
         xyz,
         crs,
         count - len(xyz),
-        np.concatenate(shifts) if shifts else None,
-        np.concatenate([part.bathymetric for part in parts]),
+        shifts[0] if shifts else None,
+        bathymetric,
         water_m,
         own if exact and not isinstance(own, WaterDimension) else None,
     )
-
-
-class _Part(NamedTuple):
-    """The points of a chunk that count; see `SurveyCloud`."""
-
-    xyz: FloatArray
-    shift_m: FloatArray | None
-    bathymetric: BoolArray
-    water_m: FloatArray
 
 
 def _part(
@@ -99,15 +88,12 @@ def _part(
     *,
     given: bool,
     skip: Sequence[int],
-) -> _Part:
-    """Return the points of a chunk that count."""
+) -> list[npt.NDArray[Any]]:
+    """Return place, water and whether of the bed of a chunk's points that count; perhaps shifts."""
     classes = np.asarray(points["classification"])
     keep = ~(np.isin(classes, skip) | np.asarray(points["withheld"]).astype(bool))
     xyz = coordinates(points)
     names = set(points.point_format.extra_dimension_names)
-    shift = None
-    if names.issuperset(SHIFTS):
-        shift = np.column_stack([np.asarray(points[name], np.float64) for name in SHIFTS])[keep]
     heights = None
     if isinstance(water, WaterDimension):
         heights = source.dimension(points, water.name)
@@ -120,7 +106,11 @@ def _part(
         above = surface_above(water, xyz, heights).height_m
     else:
         above = np.full(len(xyz), np.nan)
-    return _Part(xyz[keep], shift, classes[keep] == BATHYMETRIC_POINT, above[keep])
+    found = [xyz[keep], above[keep], classes[keep] == BATHYMETRIC_POINT]
+    if names.issuperset(SHIFTS):
+        shift = np.column_stack([np.asarray(points[name], np.float64) for name in SHIFTS])
+        found.append(shift[keep])
+    return found
 
 
 def own_water(source: LasSource) -> WaterSurface | None:
@@ -133,19 +123,6 @@ def own_water(source: LasSource) -> WaterSurface | None:
         raise InputError(
             f"{source.path}: pcfix's own VLR is damaged ({error}); correct the original again."
         ) from error
-
-
-def _crs(source: LasSource) -> CRS | None:
-    from pyproj.exceptions import CRSError
-
-    try:
-        with las_errors(source.path):
-            crs: CRS | None = source.header.parse_crs()
-    except CRSError as error:
-        raise InputError(
-            f"{source.path}: its CRS cannot be read ({error}); export it again."
-        ) from error
-    return crs
 
 
 WATER_CLASSES = (9, 41, 42, 45)
@@ -196,8 +173,7 @@ def _read_grid(path: Path) -> Reference:
     row, column = np.nonzero(np.isfinite(height))
     if len(row) == 0:
         raise InputError(f"{path}: no cell holds a height.")
-    t, u, v = transform, column + 0.5, row + 0.5
-    x, y = t.a * u + t.b * v + t.c, t.d * u + t.e * v + t.f
+    x, y = place_of(transform, column + 0.5, row + 0.5)
     xyz = np.column_stack([x, y, height[row, column]])
     crs = CRS.from_wkt(wkt) if wkt else None
     return Reference(str(path), xyz, crs, height.size - len(xyz))

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,25 +30,6 @@ TILE = 256
 _SUFFIXES = (".tif", ".tiff")
 
 
-class Raster(NamedTuple):
-    """A raster in memory: `array` (bands, rows, columns) as stored, the first row at the top.
-
-    `transform` goes from (column, row) of a cell's corner to x and y in the raster's CRS; `nodata`
-    is the value of cells that have none.
-    """
-
-    array: npt.NDArray[Any]
-    transform: Affine
-    crs: Any
-    nodata: float | None
-
-
-def read_raster(path: AnyPath) -> Raster:
-    """Return a whole raster of any format that GDAL reads; see `open_raster`."""
-    with open_raster(path) as source:
-        return Raster(source.read(), source.transform, source.crs, source.nodata)
-
-
 @contextmanager
 def open_raster(path: AnyPath) -> Iterator[DatasetReader]:
     """Open a raster to read parts of it.
@@ -69,6 +50,12 @@ def open_raster(path: AnyPath) -> Iterator[DatasetReader]:
         ) from error
     with source:
         yield source
+
+
+def place_of(transform: Affine, column: Any, row: Any) -> tuple[Any, Any]:
+    """Return the place of a column and row: numbers or arrays of them."""
+    t = transform
+    return t.a * column + t.b * row + t.c, t.d * column + t.e * row + t.f
 
 
 def read_heights(source: DatasetReader, window: Window) -> FloatArray:

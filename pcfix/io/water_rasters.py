@@ -11,13 +11,13 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.crs import is_local, metres_up, parse_crs, parts
-from pcfix.io.rasters import open_raster
+from pcfix.io.rasters import open_raster, place_of
 from pcfix.io.transformations import transformation_in_plan, way_to_cloud
 from pcfix.model import FloatArray, WaterRaster
 
@@ -214,12 +214,6 @@ class Part(NamedTuple):
 
     heights: FloatArray
     transform: Affine
-
-
-def place_of(transform: Affine, column: Any, row: Any) -> tuple[Any, Any]:
-    """Return the place of a column and row: numbers or arrays of them."""
-    t = transform
-    return t.a * column + t.b * row + t.c, t.d * column + t.e * row + t.f
 
 
 def check_size(cells: int, name: str) -> None:

@@ -6,8 +6,7 @@ import json
 
 import pytest
 
-from pcfix.io.rasters import read_raster
-from tests.grid.clouds import scattered, write
+from tests.grid.clouds import read_raster, scattered, write
 from tests.utils.program import run_pcfix
 
 

@@ -2,8 +2,8 @@
 
 The extra dimensions are integers with a scale, so that LAZ packs them well. Each has a narrow type,
 which nearly every cloud fits, and a wide one; a cloud with a value outside the narrow range is
-written again with the wide types. `COLUMNS` is all that is said of them: files, PDAL's stage and
-the documentation take name, type, unit and meaning from it.
+written again with the wide types. `COLUMNS` is all that is said of them: files and PDAL's stage
+take name, type and unit from it, and a test holds the documentation to it.
 """
 
 from __future__ import annotations
@@ -50,81 +50,45 @@ class TooNarrowError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One extra dimension.
-
-    Attributes
-    ----------
-    name : str
-    of : str
-        The attribute of `pcfix.Correction` that it holds; empty for the class before.
-    narrow, wide : str
-        Types.
-    scale : float
-        0 means the file's own scale of that axis; 1 means a count.
-    description : str
-        In the file, at most 31 letters.
-    meaning : str
-        In the documentation.
-    saturates : bool
-        The largest value means "or more".
-    least : int or None
-        In steps of the scale.
-    """
+    """One extra dimension."""
 
     name: str
-    of: str
-    narrow: str
+    of: str  # the attribute of `pcfix.Correction` that it holds; empty for the class before
+    narrow: str  # types
     wide: str
-    scale: float
-    description: str
-    meaning: str
-    saturates: bool = False
-    least: int | None = None
+    scale: float  # 0 means the file's own scale of that axis; 1 means a count
+    description: str  # in the file, at most 31 letters
+    saturates: bool = False  # the largest value means "or more"
+    least: int | None = None  # in steps of the scale
 
     def dtype(self, *, wide: bool) -> np.dtype[Any]:
         """Return the numpy type."""
         return np.dtype(self.wide if wide else self.narrow)
 
 
-_SHIFT = ("shift_m", "int16", "int32", 0.0)
 COLUMNS = (
     *(
-        Column(f"Shift{axis}", *_SHIFT, f"true minus apparent {axis}", "true minus apparent")
+        Column(f"Shift{axis}", "shift_m", "int16", "int32", 0.0, f"true minus apparent {axis}")
         for axis in "XYZ"
     ),
     Column(
         *("WaterDepth", "depth_m", "uint16", "uint32", 0.001, "below the water surface, m"),
-        "below the surface along the vertical; apparent depth where not corrected",
         least=1,  # a submerged point is never at zero depth
     ),
     Column(
         *("RayMiss", "ray_miss_m", "uint16", "uint32", 0.0001, "rms distance from the rays, m"),
-        'rms distance of the point from its rays; the largest value means "or more"',
         saturates=True,
     ),
     Column(
         *("SigmaZ", "sigma_z_m", "uint16", "uint32", 0.0001, "formal standard error of Z, m"),
-        "standard error of Z by the law of propagation, from the `--sigma-...` options; it knows"
-        " nothing of mismatches and of wrong cameras",
         saturates=True,
     ),
-    Column(
-        *("Incidence", "incidence_deg", "uint16", "uint16", 0.1, "largest angle in air, deg"),
-        "largest incidence angle in air of a ray used",
-    ),
-    Column(
-        *("RayCount", "ray_count", "uint16", "uint16", 1.0, "rays intersected"),
-        "rays intersected; of dense clouds the depth maps that count",
-        saturates=True,
-    ),
-    Column(
-        *("SourceClass", "", "uint8", "uint8", 1.0, "class before the correction"),
-        "class before",
-    ),
+    Column("Incidence", "incidence_deg", "uint16", "uint16", 0.1, "largest angle in air, deg"),
+    Column("RayCount", "ray_count", "uint16", "uint16", 1.0, "rays intersected", saturates=True),
+    Column("SourceClass", "", "uint8", "uint8", 1.0, "class before the correction"),
 )
 SHIFTS = ("ShiftX", "ShiftY", "ShiftZ")
 MINIMAL = ("ShiftZ", "RayCount")
-_UNITS = {0.0: "file's scale", 0.001: "1 mm", 0.0001: "0.1 mm", 0.1: "0.1°", 1.0: ""}
 
 
 def columns_for(dimensions: Dimensions) -> tuple[Column, ...]:
@@ -133,17 +97,6 @@ def columns_for(dimensions: Dimensions) -> tuple[Column, ...]:
         return COLUMNS
     names = MINIMAL if dimensions == "minimal" else ()
     return tuple(column for column in COLUMNS if column.name in names)
-
-
-def documented_columns() -> str:
-    """Return the table of the documentation, as Markdown."""
-    lines = ["| extra dimension | type | unit | |", "|---|---|---|---|"]
-    for c in COLUMNS:
-        kind = c.narrow if c.narrow == c.wide else f"{c.narrow} ({c.wide})"
-        lines.append(
-            f"| `{c.name}` | {kind} | {_UNITS[c.scale]} | {c.meaning} |".replace("  ", " ")
-        )
-    return "\n".join(lines) + "\n"
 
 
 def column_scale(column: Column, scales: FloatArray) -> float:

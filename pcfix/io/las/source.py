@@ -256,6 +256,18 @@ def read_xyz(path: str | os.PathLike[str]) -> FloatArray:
         return np.vstack([coordinates(points) for points in source.chunks(10_000_000)])
 
 
+def stated_crs(source: LasSource, complaint: str, remedy: str) -> CRS | None:
+    """Return the coordinate system of a cloud, or None; an `InputError` if it cannot be read."""
+    from pyproj.exceptions import CRSError
+
+    try:
+        with las_errors(source.path):
+            crs: CRS | None = source.header.parse_crs()
+    except CRSError as error:
+        raise InputError(f"{source.path}: {complaint} ({error}); {remedy}.") from error
+    return crs
+
+
 def metric_crs(source: LasSource) -> CRS | None:
     """Return the coordinate system of a cloud in metres, or None if it states none.
 
@@ -264,15 +276,7 @@ def metric_crs(source: LasSource) -> CRS | None:
     InputError
         If its plan coordinates are in degrees, feet or another unit.
     """
-    from pyproj.exceptions import CRSError
-
-    try:
-        with las_errors(source.path):
-            crs: CRS | None = source.header.parse_crs()
-    except CRSError as error:
-        raise InputError(
-            f"{source.path}: its coordinate system cannot be read ({error}); set it again."
-        ) from error
+    crs = stated_crs(source, "its coordinate system cannot be read", "set it again")
     if crs is None:
         return None
     units = {axis.unit_name for axis in crs.axis_info[:2]}

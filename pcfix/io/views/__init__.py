@@ -7,7 +7,7 @@ lists to the rows of a cloud, chunk by chunk.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -31,11 +31,7 @@ as a dense point does not."""
 
 
 def read_views(
-    path: str | os.PathLike[str],
-    cameras: Cameras,
-    *,
-    names: Sequence[str] | None = None,
-    to_cloud: Transformation | None = None,
+    path: str | os.PathLike[str], cameras: Cameras, *, to_cloud: Transformation | None = None
 ) -> ViewList:
     """Read the view list of a dense cloud.
 
@@ -43,18 +39,12 @@ def read_views(
     ----------
     path : path
         COLMAP's ``fused.ply.vis``, or the dense PLY file of OpenMVS with its ``view_indices``. For
-        COLMAP the ``fused.ply`` will do where the list lies beside it.
+        COLMAP the ``fused.ply`` will do where the list lies beside it. Images are counted as in a
+        sparse model beside the list, or as the cameras are, whichever the geometry confirms.
     cameras : Cameras
         In the cloud's frame.
-    names : sequence of str, optional
-        The images in the order in which the list counts them. Default: those of a sparse model
-        beside the list, or of the cameras, whichever the geometry confirms.
     to_cloud : callable, optional
         Takes positions, shape (n, 3), from the list's frame to the cloud's. Default: the same.
-
-    Returns
-    -------
-    ViewList
 
     Raises
     ------
@@ -62,8 +52,8 @@ def read_views(
         If the file is not a whole view list, names images that are not there, or its cameras
         do not see its points.
     """
-    raw = _moved(read_list(check_input(path)), to_cloud)
-    return _fitted(raw, image_orders(raw, cameras, names), "depth-maps", cameras)
+    raw = read_list(check_input(path))
+    return _fitted(raw, image_orders(raw, cameras), "depth-maps", cameras, to_cloud)
 
 
 def track_views(
@@ -73,36 +63,13 @@ def track_views(
     *,
     to_cloud: Transformation | None = None,
 ) -> ViewList:
-    """Take the tracks of a sparse model as a view list.
+    """Take the tracks of a sparse model, read from `path`, as a view list; see `read_views`.
 
-    Parameters
-    ----------
-    path : Path
-        Where the tie points are from, for messages.
-    tie_points : TiePoints
-    cameras : Cameras
-        Those that the tie points count, in the cloud's frame.
-    to_cloud : callable, optional
-        Takes positions, shape (n, 3), from the frame of the tie points to the cloud's.
-
-    Returns
-    -------
-    ViewList
-
-    Raises
-    ------
-    InputError
-        If no tie point has a position, or the cameras do not see them.
+    The tie points count the cameras. One without positions, or whose cameras do not see its points,
+    is an `InputError`.
     """
-    raw = _moved(tracks_as_list(path, tie_points), to_cloud)
     order = ImageOrder("the cameras of the tie points", np.arange(len(cameras), dtype=np.int32))
-    return _fitted(raw, (order,), "tracks", cameras)
-
-
-def _moved(raw: RawList, to_cloud: Transformation | None) -> RawList:
-    if raw.xyz is None or to_cloud is None:
-        return raw
-    return replace(raw, xyz=np.ascontiguousarray(to_cloud(raw.xyz), np.float64))
+    return _fitted(tracks_as_list(path, tie_points), (order,), "tracks", cameras, to_cloud)
 
 
 def _fitted(
@@ -110,9 +77,13 @@ def _fitted(
     orders: tuple[ImageOrder, ...],
     kind: Literal["tracks", "depth-maps"],
     cameras: Cameras,
+    to_cloud: Transformation | None,
 ) -> ViewList:
     """Return a list whose cameras see its points, as far as it says where these are."""
     if raw.xyz is None:
         return ViewList(raw, orders, None, None, _SPACINGS[kind], kind)
-    views = ViewList(raw, orders, None, spacing_m(raw.xyz), _SPACINGS[kind], kind)
-    return fitted(views, cameras, raw.xyz, np.arange(len(views)))
+    if to_cloud is not None:
+        raw = replace(raw, xyz=np.ascontiguousarray(to_cloud(raw.xyz), np.float64))
+    xyz = np.asarray(raw.xyz)
+    views = ViewList(raw, orders, None, spacing_m(xyz), _SPACINGS[kind], kind)
+    return fitted(views, cameras, xyz, np.arange(len(views)))

@@ -71,8 +71,7 @@ class ViewList:
     """Which cameras made each of n points; `pcfix.io.views.matching` gives it to a cloud's rows.
 
     `share_seen` of the listed cameras have the point in their frame, None while not looked at, or
-    where the cameras have no frames. A match by position may be off by `default_spacings` unless
-    the user says otherwise.
+    where the cameras have no frames. A match by position may be off by `default_spacings`.
     """
 
     raw: RawList  # with positions in the frame of the cameras

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import InputError
 from pcfix.io.views.lists import ViewList
 from pcfix.io.views.orders import entries, fitted
 from pcfix.model import Cameras, FloatArray, IntArray, Views
@@ -41,54 +41,22 @@ class ViewMatch:
     """A view list and a cloud whose chunks come in order; `report` says how they went together."""
 
     def __init__(
-        self,
-        views: ViewList,
-        cameras: Cameras,
-        *,
-        points: int | None = None,
-        step_m: float = 0.0,
-        tolerance_m: float | None = None,
-        jobs: int | None = None,
+        self, views: ViewList, cameras: Cameras, *, points: int | None = None, step_m: float = 0.0
     ) -> None:
-        """Check that the list can belong to the cloud.
+        """Check that a list, read with these cameras, can belong to a cloud of so many points.
 
-        Parameters
-        ----------
-        views : ViewList
-        cameras : Cameras
-            Those the list was read with.
-        points : int, optional
-            Of the whole cloud; needed where the list has no positions.
-        step_m : float
-            To which the cloud's coordinates are rounded, the scale of a LAS file.
-        tolerance_m : float, optional
-            For a match by position. Default: what rounding explains, or a twentieth of the
-            spacing of a dense list, or the spacing of tie points.
-        jobs : int, optional
-            Threads. Default: all.
-
-        Raises
-        ------
-        InputError
-            If the list has no positions and another number of points.
-        SettingError
-            If the tolerance is not positive.
+        The cloud's coordinates are rounded to `step_m`, the scale of a LAS file. A list without
+        positions that has another number of points is an `InputError`.
         """
-        if tolerance_m is not None and not (np.isfinite(tolerance_m) and tolerance_m > 0.0):
-            raise SettingError(f"the tolerance {tolerance_m} must be more than 0 metres.")
         self._views, self._cameras = views, cameras
-        self._workers = -1 if jobs is None else jobs
         self._tree: cKDTree | None = None
         raw = views.raw
-        self.report = ViewReport(
-            f"{raw.what} {raw.path}",
-            len(views),
-            notes=list(raw.notes),
-            weights=raw.weight is not None,
-        )
+        source, weights = f"{raw.what} {raw.path}", raw.weight is not None
+        self.report = ViewReport(source, len(views), notes=list(raw.notes), weights=weights)
         if raw.xyz is not None:
-            rounding_m = _ROUNDING * (step_m / 2 + raw.resolution_m)
-            self._set_tolerances(views.spacing_m or 0.0, tolerance_m, rounding_m)
+            self._set_tolerances(
+                views.spacing_m or 0.0, _ROUNDING * (step_m / 2 + raw.resolution_m)
+            )
         elif points != len(views):
             raise InputError(
                 f"{raw.path}: has the lists of {len(views):,} points, the cloud has"
@@ -98,12 +66,10 @@ class ViewMatch:
             )
         self._note_order()
 
-    def _set_tolerances(
-        self, spacing_m: float, tolerance_m: float | None, rounding_m: float
-    ) -> None:
-        own = max(rounding_m, self._views.default_spacings * spacing_m)
-        self.report.tolerance_m = own if tolerance_m is None else tolerance_m
-        self._same_m = min(max(rounding_m, _SAME * spacing_m), self.report.tolerance_m)
+    def _set_tolerances(self, spacing_m: float, rounding_m: float) -> None:
+        """Take what rounding explains, or a share of the spacing: see `ViewList`."""
+        self.report.tolerance_m = max(rounding_m, self._views.default_spacings * spacing_m)
+        self._same_m = max(rounding_m, _SAME * spacing_m)
         if rounding_m > spacing_m / 2:
             self.report.notes.append(
                 f"{self._views.raw.path}: positions agree with the cloud's to {rounding_m:.2g} m at"
@@ -160,7 +126,7 @@ class ViewMatch:
             self._tree = cKDTree(listed, balanced_tree=False, compact_nodes=False)
         tolerance_m = self.report.tolerance_m or 0.0
         reach = float(np.nextafter(tolerance_m, np.inf))
-        found_at, row = self._tree.query(xyz, distance_upper_bound=reach, workers=self._workers)
+        found_at, row = self._tree.query(xyz, distance_upper_bound=reach, workers=-1)
         distance = np.asarray(found_at)
         found = np.isfinite(distance)
         self.report.add_distances(distance[found])
@@ -210,11 +176,6 @@ class ViewReport:
     def points(self) -> int:
         """Points of the cloud so far."""
         return self.by_row + self.by_position + self.unmatched
-
-    @property
-    def matched_share(self) -> float:
-        """Share of the points that have a list."""
-        return (self.by_row + self.by_position) / max(self.points, 1)
 
     @property
     def cameras_per_point(self) -> float:

@@ -16,7 +16,6 @@ numbers misread by one, a quarter of the cameras of an ordinary block look elsew
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,21 +48,20 @@ _CAMERA = ("0", "CAMERA")
 _FRAME_HEAD, _DATA = struct.Struct("<II7dI"), struct.Struct("<iIQ")
 
 
-def image_orders(
-    raw: RawList, cameras: Cameras, names: Sequence[str] | None
-) -> tuple[ImageOrder, ...]:
+def image_orders(raw: RawList, cameras: Cameras) -> tuple[ImageOrder, ...]:
     """Return the orders that the image numbers may follow, the likeliest first.
 
     Raises
     ------
     InputError
-        If a number is beyond the images of all of them, or the names are not those of the cameras.
+        If a number is beyond the images of all of them, or the images are not those of the cameras.
     """
-    if names is not None:
-        found = [_by_name("the given names", names, cameras)]
-    else:
-        found = [_by_name(what, order, cameras) for what, order in _model_orders(raw.path.parent)]
-        found.append(ImageOrder("the cameras as given", np.arange(len(cameras), dtype=np.int32)))
+    found = []
+    for what, names in _model_orders(raw.path.parent):
+        row = match_labels(names, cameras.labels).row.astype(np.int32)
+        unposed = tuple(name for name, r in zip(names, row, strict=True) if r < 0)
+        found.append(ImageOrder(what, row, unposed))
+    found.append(ImageOrder("the cameras as given", np.arange(len(cameras), dtype=np.int32)))
     most = int(raw.image.max()) if raw.image.size else -1
     fitting = [order for order in found if most < len(order.camera)]
     if not fitting:
@@ -84,11 +82,6 @@ def image_orders(
     for order in known:
         distinct.setdefault(order.camera.tobytes(), order)
     return tuple(distinct.values())
-
-
-def _by_name(what: str, names: Sequence[str], cameras: Cameras) -> ImageOrder:
-    row = match_labels(names, cameras.labels).row.astype(np.int32)
-    return ImageOrder(what, row, tuple(n for n, r in zip(names, row, strict=True) if r < 0))
 
 
 def _model_orders(folder: Path) -> list[tuple[str, list[str]]]:
