@@ -231,10 +231,10 @@ def _to_cameras(
             f"{name}: the cameras are in axes east, north, up ({target}); bring them to the"
             " cloud's CRS first."
         )
-    way = way_to_cloud(source, target, xyz, name, heights=True)
-    if way.forward is None:
-        return xyz, way.notes
-    moved = way.forward(xyz)
+    forward, notes = way_to_cloud(source, target, xyz, name, heights=True)
+    if forward is None:
+        return xyz, notes
+    moved = forward(xyz)
     lost = ~np.isfinite(moved).all(axis=1)
     if lost.any():
         row = int(rows[np.argmax(lost)])
@@ -243,7 +243,7 @@ def _to_cameras(
             f"{marks.at(row)}: {x:.10g}, {y:.10g}, {z:.6g} has no place in the cloud's CRS; check"
             " the CRS of the points."
         )
-    return moved, way.notes
+    return moved, notes
 
 
 def _check_near(marks: Marks, cameras: Cameras, xyz: FloatArray, rows: IntArray) -> None:

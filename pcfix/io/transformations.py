@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from pyproj.transformer import AreaOfInterest, TransformerGroup
 
 Points = Callable[[FloatArray], FloatArray]
-
+Way = tuple[Points | None, tuple[str, ...]]
 
 SILENT_ACCURACY_M = 1.0
 """A transformation that is worse than this gets a note."""
@@ -230,17 +230,10 @@ def _install(grids: Sequence[str]) -> str:
 LOCAL = "local"
 
 
-class Way(NamedTuple):
-    """A `Transformation`, or none where the numbers stay as they are."""
-
-    forward: Points | None
-    notes: tuple[str, ...] = ()
-
-
 def way_to_cloud(
     crs: str | None, cloud_crs: str | CRS | None, at: FloatArray, name: str, *, heights: bool
 ) -> Way:
-    """Return the way from a file's CRS into the cloud's.
+    """Return the way from a file's CRS into the cloud's, None where numbers stay, and notes.
 
     Parameters
     ----------
@@ -262,37 +255,37 @@ def way_to_cloud(
     if crs is None:
         tied = cloud is not None and not is_local(cloud)
         note = "" if cloud is None else f"; taken to be in the cloud's ({cloud.name})."
-        return Way(None, (f"{name}: names no CRS{note}",) if tied else ())
+        return None, (f"{name}: names no CRS{note}",) if tied else ()
     if crs.strip().lower() == LOCAL:
-        return Way(None)
+        return None, ()
     source = parse_crs(crs, name)
     if cloud is None:
-        return _without_cloud_crs(source, name)
+        return None, _without_cloud_crs(source, name)
     if is_local(cloud) and is_local(source):
-        return Way(None)
+        return None, ()
     _check_kinds(source, cloud, name)
     agree = not heights or heights_agree(source, cloud)
     notes = _height_notes(source, cloud, name) if heights and agree else ()
     if agree and is_same_numbers(source, cloud, heights=heights):
-        return Way(None, notes)
+        return None, notes
     instead = (
         "or, if the heights of the file are known to agree with the cloud's, give the file's CRS as"
         f" {shortened(crs_text(parts(source)[0]))}, the horizontal CRS alone"
     )
     step = transformation(source, cloud, at, name, heights=not agree, instead=instead)
-    return Way(step.forward, (*step.notes, *notes))
+    return step.forward, (*step.notes, *notes)
 
 
-def _without_cloud_crs(source: CRS, name: str) -> Way:
-    """Return what to do where the cloud names no CRS: numbers in metres are taken as they are."""
+def _without_cloud_crs(source: CRS, name: str) -> tuple[str, ...]:
+    """Return notes where the cloud names no CRS: numbers in metres are taken as they are."""
     if is_local(source):
-        return Way(None)
+        return ()
     if not source.is_projected or plan_unit(source)[1] != 1.0:
         unit = f"the unit {plan_unit(source)[0]}" if source.is_projected else "degrees"
         raise InputError(
             f"{name}: is in {unit} ({source.name}) and the cloud names no CRS; set the cloud's CRS."
         )
-    return Way(None, (f"{name}: the cloud names no CRS; taken to be in {source.name} too.",))
+    return (f"{name}: the cloud names no CRS; taken to be in {source.name} too.",)
 
 
 def _check_kinds(source: CRS, cloud: CRS, name: str) -> None:

@@ -18,7 +18,7 @@ from pcfix.errors import InputError, SettingError
 from pcfix.io.crs import parse_crs
 from pcfix.io.files import check_input
 from pcfix.io.tables import TEXT_SUFFIXES, read_text
-from pcfix.io.transformations import way_to_cloud
+from pcfix.io.transformations import LOCAL, way_to_cloud
 from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
@@ -108,7 +108,9 @@ def read_vectors(path: str | os.PathLike[str], *, crs: str | None = None) -> Vec
         geometries, found, name = _read_gdal(source, layer)
     else:
         raise InputError(f"{source}: is not a vector file that pcfix reads; give {KINDS}.")
-    return _checked(_without_gaps(Vectors(geometries, crs or found, name)))
+    vectors = _without_gaps(Vectors(geometries, crs or found, name))
+    _check_degrees(vectors)
+    return vectors
 
 
 def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool) -> Vectors:
@@ -210,13 +212,13 @@ def _without_gaps(vectors: Vectors) -> Vectors:
     return replace(vectors, geometries=vectors.geometries[~gone], notes=notes)
 
 
-def _checked(vectors: Vectors) -> Vectors:
+def _check_degrees(vectors: Vectors) -> None:
     """Refuse a CRS that is unknown, and degrees that are none."""
-    if vectors.crs is None or vectors.crs.strip().lower() == "local":
-        return vectors
+    if vectors.crs is None or vectors.crs.strip().lower() == LOCAL:
+        return
     crs = parse_crs(vectors.crs, vectors.name)
     if not crs.is_geographic or crs.axis_info[0].unit_name != "degree":
-        return vectors
+        return
     x, y = vectors.coordinates[:, 0], vectors.coordinates[:, 1]
     wrong = (np.abs(x) > 360.0) | (np.abs(y) > 90.0)
     if wrong.any():
@@ -225,7 +227,6 @@ def _checked(vectors: Vectors) -> Vectors:
             f"{vectors.name}: {x[i]:.10g}, {y[i]:.10g} is no longitude and latitude, but its CRS"
             f" is {crs.name} (as it is for every GeoJSON that names none); say which CRS it is in."
         )
-    return vectors
 
 
 class Shoreline(NamedTuple):
@@ -240,10 +241,7 @@ class Shoreline(NamedTuple):
 
 
 class WaterPolygons(NamedTuple):
-    """Where there is water: `area` is a valid shapely (Multi)Polygon in the cloud's CRS.
-
-    Its holes are dry.
-    """
+    """A valid shapely (Multi)Polygon in the cloud's CRS where there is water; its holes are dry."""
 
     area: Any
     name: str
@@ -255,38 +253,24 @@ def read_shoreline(
     cloud_crs: str | CRS | None = None,
     *,
     crs: str | None = None,
-    spacing_m: float = SPACING_M,
 ) -> Shoreline:
     """Read shoreline points, from points, lines and rings of polygons, holes included.
 
     A line with heights gives its vertices, as these were measured; what lies between them was
     not, and would make the fit look better than it is. A line without heights gives a point at
-    least every `spacing_m`, as each takes a height of its own from the cloud.
-
-    Parameters
-    ----------
-    path, crs
-        See `read_vectors`.
-    cloud_crs : str, CRS or None
-    spacing_m : float, default 1.0
-
-    Raises
-    ------
-    InputError, SettingError
-        See `read_vectors` and `in_cloud_crs`; or if `spacing_m` is not positive.
+    least every `SPACING_M`, as each takes a height of its own from the cloud. For the arguments
+    and errors see `read_vectors` and `in_cloud_crs`.
     """
-    if not spacing_m > 0.0:
-        raise SettingError(f"spacing {spacing_m:g} m must be positive.")
     vectors = in_cloud_crs(read_vectors(path, crs=crs), cloud_crs, heights=True)
     lines, points = _lines_and_points(vectors.geometries)
     level = shapely.has_z(lines)
-    count = float(shapely.length(lines[~level]).sum()) / spacing_m
+    count = float(shapely.length(lines[~level]).sum()) / SPACING_M
     if count > MOST_POINTS:
         raise InputError(
             f"{vectors.name}: would give {count:.3g} points; check its CRS and unit, or thin it"
             " out."
         )
-    parts = [points, lines[level], shapely.segmentize(lines[~level], spacing_m)]
+    parts = [points, lines[level], shapely.segmentize(lines[~level], SPACING_M)]
     xyz = np.vstack([_vertices(part) for part in parts])
     known = xyz[np.isfinite(xyz[:, 2]), 2]
     if len(known) < FEW or known.any():
@@ -324,25 +308,16 @@ def _vertices(geometries: npt.NDArray[Any]) -> FloatArray:
 
 
 def read_water_polygons(
-    path: str | os.PathLike[str],
-    cloud_crs: str | CRS | None = None,
-    *,
-    crs: str | None = None,
+    path: str | os.PathLike[str], cloud_crs: str | CRS | None = None
 ) -> WaterPolygons:
     """Read the polygons inside which points may be submerged, as one area.
-
-    Parameters
-    ----------
-    path, crs
-        See `read_vectors`.
-    cloud_crs : str, CRS or None
 
     Raises
     ------
     InputError
         If there is no polygon with an area, or they cannot be read or brought to the cloud's CRS.
     """
-    vectors = in_cloud_crs(read_vectors(path, crs=crs), cloud_crs, heights=False)
+    vectors = in_cloud_crs(read_vectors(path), cloud_crs, heights=False)
     parts = shapely.force_2d(_simple(vectors.geometries))
     is_polygon = shapely.get_type_id(parts) == shapely.GeometryType.POLYGON
     if not is_polygon.any():

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -18,7 +17,7 @@ import numpy as np
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.crs import is_local, metres_up, parse_crs, parts
 from pcfix.io.rasters import open_raster, place_of
-from pcfix.io.transformations import transformation_in_plan, way_to_cloud
+from pcfix.io.transformations import Points, transformation_in_plan, way_to_cloud
 from pcfix.model import FloatArray, WaterRaster
 
 if TYPE_CHECKING:
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from rasterio.transform import Affine
 
 Bounds = tuple[float, float, float, float]
-Points = Callable[[FloatArray], FloatArray]
 
 
 MARGIN_M = 100.0
@@ -121,14 +119,14 @@ def _ways(
     stated = None if source.crs is None else source.crs.to_wkt()
     corners = np.array([place_of(source.transform, *corner) for corner in _corners(source)])
     at = np.column_stack([corners, np.zeros(len(corners))])
-    way = way_to_cloud(stated, cloud_crs, at, name, heights=True)
-    if way.forward is None or stated is None or cloud_crs is None:
-        return None, lambda xyz: xyz, way.notes
-    cloud, crs, forward = parse_crs(cloud_crs, "the cloud"), parse_crs(stated, name), way.forward
+    forward, notes = way_to_cloud(stated, cloud_crs, at, name, heights=True)
+    if forward is None or stated is None or cloud_crs is None:
+        return None, lambda xyz: xyz, notes
+    cloud, crs = parse_crs(cloud_crs, "the cloud"), parse_crs(stated, name)
     near = forward(at) if bounds is None else _edge(bounds)
     back = transformation_in_plan(cloud, crs, near, name)
     unit = [1.0, 1.0, metres_up(crs)]
-    return lambda xyz: forward(xyz / unit), back.forward, way.notes
+    return lambda xyz: forward(xyz / unit), back.forward, notes
 
 
 def _corners(source: DatasetReader) -> list[tuple[float, float]]:
