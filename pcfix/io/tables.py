@@ -6,7 +6,7 @@ import csv
 import math
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -37,6 +37,7 @@ _WKT = re.compile(
     r"\s*(ZM|Z|M)?\s*(\(|EMPTY)",
     re.IGNORECASE,
 )
+_NO_HEIGHT = ("", "nan", "na", "null", "none")
 _SRID = re.compile(r"\s*SRID\s*=\s*(\d+)\s*;", re.IGNORECASE)
 _CRS = re.compile(r"#\s*crs\s*[:=]\s*(.+)$", re.IGNORECASE)
 
@@ -62,22 +63,21 @@ class Table(NamedTuple):
         """Return one column as text."""
         return [row[self.header.index(name)] for row in self.rows]
 
-    def numbers(self, name: str) -> list[float]:
-        """Return one column as finite numbers.
+    def numbers(self, name: str, unknown: Container[str] = ()) -> list[float]:
+        """Return one column as finite numbers, NaN where its text, in lower case, is `unknown`.
 
         Raises
         ------
         InputError
-            If a field is not a finite number; the message names its row and column.
+            If another field is not a finite number; the message names its row and column.
         """
-        values = []
-        for line, text in zip(self.line, self.column(name), strict=True):
-            value = number(text)
-            if not math.isfinite(value):
+        texts = self.column(name)
+        values = [number(text) for text in texts]
+        for line, text, value in zip(self.line, texts, values, strict=True):
+            if not math.isfinite(value) and text.lower() not in unknown:
                 raise InputError(
                     f"{self.path}: line {line}, column {name}: '{text}' is not a finite number."
                 )
-            values.append(value)
         return values
 
 
@@ -261,22 +261,9 @@ def _points(table: Table, x: str, y: str) -> npt.NDArray[Any]:
     name = _column(table.header, "z")
     if name is None:
         return np.asarray(shapely.points(plan))
-    z = _numbers_or_none(table, name)
+    z = np.array(table.numbers(name, _NO_HEIGHT))
     points = np.asarray(shapely.points(np.column_stack([plan, z])))
     return np.where(np.isfinite(z), points, shapely.force_2d(points))
-
-
-def _numbers_or_none(table: Table, name: str) -> FloatArray:
-    """Return a column as numbers, NaN for empty fields and NaN; other text is refused."""
-    texts = table.column(name)
-    values = np.array([number(text) for text in texts])
-    for row in np.flatnonzero(~np.isfinite(values)):
-        if texts[row].lower() not in ("", "nan", "na", "null", "none"):
-            raise InputError(
-                f"{table.path}: line {table.line[row]}, column {name}: '{texts[row]}' is not a"
-                " finite number."
-            )
-    return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,10 +304,9 @@ def read_check_depths(path: str | os.PathLike[str]) -> CheckDepths:
     """
     source = check_input(path)
     table = read_table(source, ())
-    names, units = zip(*(_split_unit(name) for name in table.header), strict=True)
-    place = {role: _place(table, names, role) for role in DEPTH_SPELLINGS}
-    what = "z" if place["depth"] is None else "depth"
-    missing = [role for role in ("x", "y", what) if place[role] is None]
+    columns = {role: _depth_column(table, role) for role in DEPTH_SPELLINGS}
+    what = "z" if columns["depth"] is None else "depth"
+    missing = [role for role in ("x", "y", what) if columns[role] is None]
     if missing:
         raise InputError(
             f"{source}: line 1 must name the columns x, y and depth (or z);"
@@ -328,13 +314,10 @@ def read_check_depths(path: str | os.PathLike[str]) -> CheckDepths:
             f" {', '.join(table.header)})."
         )
     values = []
-    for role in ("x", "y", what):
-        column = place[role] or 0
-        if units[column] not in _METRES:
-            raise InputError(
-                f"{source}: column {table.header[column]} is in '{units[column]}'; give metres."
-            )
-        values.append(np.array(table.numbers(table.header[column]), np.float64))
+    for name, unit in filter(None, (columns[role] for role in ("x", "y", what))):
+        if unit not in _METRES:
+            raise InputError(f"{source}: column {name} is in '{unit}'; give metres.")
+        values.append(np.array(table.numbers(name), np.float64))
     found = CheckDepths(
         str(source), np.column_stack(values[:2]), values[2], what == "z", table.line
     )
@@ -358,11 +341,12 @@ def _split_unit(name: str) -> tuple[str, str]:
     return name.strip().replace(" ", "_"), unit.strip()
 
 
-def _place(table: Table, names: tuple[str, ...], role: str) -> int | None:
-    """Return the number of a column; easting beside x is refused."""
-    there = [i for i, name in enumerate(names) if name in DEPTH_SPELLINGS[role]]
+def _depth_column(table: Table, role: str) -> tuple[str, str] | None:
+    """Return a column's name in the header and its unit; easting beside x is refused."""
+    split = [(name, *_split_unit(name)) for name in table.header]
+    there = [(name, unit) for name, bare, unit in split if bare in DEPTH_SPELLINGS[role]]
     if len(there) > 1:
-        twice = ", ".join(table.header[i] for i in there)
+        twice = ", ".join(name for name, _ in there)
         raise InputError(
             f"{table.path}: line 1: the columns {twice} may all be {role}; take out all but one."
         )
