@@ -161,7 +161,7 @@ class Bins:
 
     def __init__(self, folder: Path, side: int, corner: Iterable[int], numbers: int = 3) -> None:
         self._numbers = numbers
-        self._folder, self._side = folder, side
+        self._folder, self.side = folder, side
         self._corner = np.array(list(corner), np.int64)
         self._points: dict[tuple[int, int], int] = {}
 
@@ -170,7 +170,7 @@ class Bins:
 
         Those of one cell keep their order.
         """
-        square = (cell - self._corner) // self._side
+        square = (cell - self._corner) // self.side
         order = np.lexsort((square[:, 0], square[:, 1]))
         square, xyz = square[order], xyz[order]
         first = np.flatnonzero((np.diff(square, axis=0, prepend=square[:1] - 1) != 0).any(axis=1))
@@ -193,17 +193,12 @@ class Bins:
         """Return how many points `read` would return."""
         return sum(self._points[place] for place in self._touched(cells))
 
-    @property
-    def side(self) -> int:
-        """Cells along a square."""
-        return self._side
-
     def _touched(self, cells: Window) -> list[tuple[int, int]]:
         """Return the squares with points that touch a window."""
         column, row = self._corner.tolist()
-        left, right = (cells.column - column) // self._side, (cells.column_stop - 1 - column)
-        top, bottom = (cells.row - row) // self._side, (cells.row_stop - 1 - row)
-        columns, rows = range(left, right // self._side + 1), range(top, bottom // self._side + 1)
+        left, right = (cells.column - column) // self.side, (cells.column_stop - 1 - column)
+        top, bottom = (cells.row - row) // self.side, (cells.row_stop - 1 - row)
+        columns, rows = range(left, right // self.side + 1), range(top, bottom // self.side + 1)
         return [(c, r) for r in rows for c in columns if (c, r) in self._points]
 
     def _file(self, place: tuple[int, int]) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -43,52 +44,45 @@ OTHERS = {
 _FINE_GSD_M = 0.005  # clouds of finer images get steps of 0.1 mm
 
 
-def files_of(scene: Scene) -> dict[str, str]:
-    """Return the names of a scene's files and what is in them."""
-    there = {
-        "fused.ply.vis": scene.views.weight is None,
-        "dense.ply": scene.views.weight is not None,
-        "true_cameras.csv": scene.true_cameras is not scene.cameras,
-        "neighbours.csv": scene.neighbours is not None,
-        "pairs.npz": scene.pairs is not None,
-    }
-    return FILES | {name: text for name, text in OTHERS.items() if there[name]}
-
-
 def write_scene(scene: Scene, out_dir: str | os.PathLike[str], *, overwrite: bool) -> None:
-    """Write the files of `files_of` into a folder, made if need be.
+    """Write `FILES`, and those of `OTHERS` that the scene has, into a folder, made if need be.
 
     Raises
     ------
     SettingError
         If one of them exists and `overwrite` is not set; then none is written.
     """
-    folder, files = Path(out_dir), files_of(scene)
+    folder, contents = Path(out_dir), _contents(scene)
+    files = FILES | {name: text for name, text in OTHERS.items() if name in contents}
+    contents["scene.json"] = _facts(scene, files)
     folder.mkdir(parents=True, exist_ok=True)
     for name in files:
         check_output(folder / name, overwrite=overwrite)
     _write_clouds(scene, folder)
+    for name, content in contents.items():
+        write_bytes(folder / name, content, overwrite=overwrite)
+
+
+def _contents(scene: Scene) -> dict[str, bytes]:
+    """Return the files of a scene that are neither clouds nor about the others."""
     contents = {
-        "sensor.csv": _sensor_csv(scene).encode(),
+        "sensor.csv": _sensor_csv(scene),
         "cameras.csv": _cameras_csv(scene.cameras, scene.yaw_pitch_roll_deg),
-        "scene.json": _facts(scene, files).encode(),
     }
-    if "true_cameras.csv" in files:
-        true = _cameras_csv(scene.true_cameras, scene.true_yaw_pitch_roll_deg)
-        contents["true_cameras.csv"] = true
-    if scene.neighbours is not None:
-        labels = scene.cameras.labels
-        contents["neighbours.csv"] = _neighbours_csv(labels, scene.neighbours).encode()
     if scene.views.weight is None:
         contents["fused.ply.vis"] = colmap_vis(scene.views)
     else:
         contents["dense.ply"] = openmvs_ply(scene.apparent_xyz, scene.views)
+    if scene.true_cameras is not scene.cameras:
+        true = _cameras_csv(scene.true_cameras, scene.true_yaw_pitch_roll_deg)
+        contents["true_cameras.csv"] = true
+    if scene.neighbours is not None:
+        contents["neighbours.csv"] = _neighbours_csv(scene.cameras.labels, scene.neighbours)
     if scene.pairs is not None and scene.pairs_start is not None:
         arrays = io.BytesIO()
         np.savez_compressed(arrays, start=scene.pairs_start, pairs=scene.pairs)
         contents["pairs.npz"] = arrays.getvalue()
-    for name, content in contents.items():
-        write_bytes(folder / name, content, overwrite=overwrite)
+    return contents
 
 
 def colmap_vis(views: Views) -> bytes:
@@ -142,7 +136,7 @@ def _put(data: np.ndarray, places: np.ndarray, records: np.ndarray) -> None:
         data[places + byte] = raw[:, byte]
 
 
-def _facts(scene: Scene, files: dict[str, str]) -> str:
+def _facts(scene: Scene, files: dict[str, str]) -> bytes:
     """Return ``scene.json``; `water` is what ``--water`` takes."""
     plane = scene.water
     tilted = f"plane:{plane.a!r},{plane.b!r},{plane.c!r}"
@@ -156,27 +150,36 @@ def _facts(scene: Scene, files: dict[str, str]) -> str:
         "arguments": scene.settings,
         "files": files,
     }
-    return json.dumps(facts, indent=2) + "\n"
+    return (json.dumps(facts, indent=2) + "\n").encode()
 
 
-def _sensor_csv(scene: Scene) -> str:
+def _sensor_csv(scene: Scene) -> bytes:
     lens = None if scene.cameras.lenses is None else scene.cameras.lenses[0]
     if lens is None or not lens.radial:
-        return "focal,sensor_x,sensor_y\n" + ",".join(map(str, scene.sensor_mm)) + "\n"
+        return _csv(["focal", "sensor_x", "sensor_y"], [map(str, scene.sensor_mm)])
     p1, p2 = lens.tangential
     values = {"focal_px": lens.focal, "width_px": lens.width, "height_px": lens.height}
     values |= dict(zip(("k1", "k2", "k3"), lens.radial, strict=True))
     values |= {"p1": p2, "p2": p1}  # OpenCV counts them the other way round
-    return ",".join(values) + "\n" + ",".join(map(repr, values.values())) + "\n"
+    return _csv(values, [map(repr, values.values())])
 
 
-def _neighbours_csv(labels: tuple[str, ...], neighbours: IntArray) -> str:
-    head = ",".join(["label", *(f"neighbour_{i + 1}" for i in range(neighbours.shape[1]))])
-    rows = [
-        ",".join([label, *(labels[i] if i >= 0 else "" for i in row)])
-        for label, row in zip(labels, neighbours, strict=True)
-    ]
-    return "\n".join([head, *rows]) + "\n"
+def _neighbours_csv(labels: tuple[str, ...], neighbours: IntArray) -> bytes:
+    head = ["label", *(f"neighbour_{i + 1}" for i in range(neighbours.shape[1]))]
+    rows = zip(labels, neighbours, strict=True)
+    return _csv(head, ([one, *(labels[i] if i >= 0 else "" for i in row)] for one, row in rows))
+
+
+def _cameras_csv(cameras: Cameras, yaw_pitch_roll_deg: FloatArray) -> bytes:
+    rows = zip(cameras.labels, cameras.centres, yaw_pitch_roll_deg, strict=True)
+    return _csv(
+        ["label", "x", "y", "z", "yaw", "pitch", "roll"],
+        ([one, *(f"{v:.4f}" for v in xyz), *(f"{v:.6f}" for v in turn)] for one, xyz, turn in rows),
+    )
+
+
+def _csv(head: Iterable[str], rows: Iterable[Iterable[str]]) -> bytes:
+    return "".join(",".join(row) + "\n" for row in (head, *rows)).encode()
 
 
 def _write_clouds(scene: Scene, folder: Path) -> None:
@@ -187,16 +190,6 @@ def _write_clouds(scene: Scene, folder: Path) -> None:
     _write_cloud(folder / "cloud.laz", scene.apparent_xyz, place, _colours(scene))
     _write_cloud(folder / "truth.laz", scene.true_xyz, place)
     _write_cloud(folder / "lidar.laz", scene.lidar_xyz, place, classes=classes)
-
-
-def _cameras_csv(cameras: Cameras, yaw_pitch_roll_deg: FloatArray) -> bytes:
-    lines = ["label,x,y,z,yaw,pitch,roll"]
-    for label, centre, angles in zip(
-        cameras.labels, cameras.centres, yaw_pitch_roll_deg, strict=True
-    ):
-        numbers = [f"{v:.4f}" for v in centre] + [f"{v:.6f}" for v in angles]
-        lines.append(",".join([label, *numbers]))
-    return ("\n".join(lines) + "\n").encode()
 
 
 def _colours(scene: Scene) -> FloatArray:

@@ -123,7 +123,8 @@ def _finite(values: list[str] | list[float], text: str) -> list[float]:
 
 
 def _mesh(path: Path) -> WaterMesh:
-    vertices, triangles = read_mesh(path)
+    read = _read_obj if path.suffix.lower() == ".obj" else _read_ply
+    vertices, triangles = read(path)
     if len(triangles) == 0:
         raise InputError(f"{path}: holds no triangles; export the water surface as a mesh.")
     if not np.isfinite(vertices).all():
@@ -133,11 +134,6 @@ def _mesh(path: Path) -> WaterMesh:
     mesh = WaterMesh(vertices, triangles, path.name)
     check_mesh(mesh, path)
     return mesh
-
-
-def read_mesh(path: Path) -> tuple[FloatArray, IntArray]:
-    """Return vertices, shape (v, 3), and triangles, shape (t, 3), of an OBJ or PLY file."""
-    return _read_obj(path) if path.suffix.lower() == ".obj" else _read_ply(path)
 
 
 def check_mesh(mesh: WaterMesh, path: Path) -> None:
@@ -174,6 +170,7 @@ def _note(sentence: str) -> None:
 
 
 def _read_obj(path: Path) -> tuple[FloatArray, IntArray]:
+    """Return vertices, shape (v, 3), and triangles, shape (t, 3)."""
     vertices: list[list[float]] = []
     triangles: list[list[int]] = []
     for number, line in enumerate(path.read_text("latin-1").splitlines(), start=1):
