@@ -50,13 +50,7 @@ class M3c2:
 
 
 def load_py4dgeo() -> Any:
-    """Import py4dgeo.
-
-    Raises
-    ------
-    SettingError
-        If it is not installed; the message names the extra.
-    """
+    """Import py4dgeo; where it is not installed, a `SettingError` names the extra."""
     try:
         with _silence():
             return import_module("py4dgeo")

@@ -80,10 +80,7 @@ class Section:
 def parse_line(text: str) -> SectionLine:
     """Return the line that the words ``x1,y1,x2,y2`` describe.
 
-    Raises
-    ------
-    SettingError
-        If these are not four numbers, or the points are one.
+    A `SettingError` if these are not four numbers, or the points are one.
     """
     try:
         x1, y1, x2, y2 = (float(part) for part in text.split(","))

@@ -134,12 +134,8 @@ def read_reference(path: str | os.PathLike[str]) -> Reference:
     """Read a reference; the end of its name says what it is.
 
     ``.las``, ``.laz``: all points but those withheld and those of noise or water; ``.csv``,
-    ``.txt``: columns x, y, z; ``.tif``, ``.tiff``: the centres of all cells with data.
-
-    Raises
-    ------
-    InputError
-        If it is none of these, damaged or empty.
+    ``.txt``: columns x, y, z; ``.tif``, ``.tiff``: the centres of all cells with data. An
+    `InputError` if it is none of these, damaged or empty.
     """
     source = check_input(path)
     suffix = source.suffix.lower()
@@ -182,13 +178,8 @@ def _read_grid(path: Path) -> Reference:
 def check_same_crs(cloud: str, crs: CRS | None, reference: str, other: CRS | None) -> None:
     """Refuse to compare what does not lie in one CRS; warn where one has none.
 
-    Nothing is transformed here: heights moved silently between datums would look like errors of
-    the cloud.
-
-    Raises
-    ------
-    InputError
-        If the CRS differ in plan or in height, or are in degrees.
+    Nothing is transformed here: heights moved silently between datums would look like errors of the
+    cloud. An `InputError` if the CRS differ in plan or in height, or are in degrees.
     """
     for name, one in ((cloud, crs), (reference, other)):
         if one is not None and one.is_geographic:

@@ -101,10 +101,7 @@ class Marks:
 def read_marks(path: Path) -> Marks:
     """Read a table of marks, OpenDroneMap's ``gcp_list.txt``, or markers of Metashape.
 
-    Raises
-    ------
-    InputError
-        If it is none of these, or a field is not what it should be.
+    An `InputError` if it is none of these, or a field is not what it should be.
     """
     if documents.recognises(Source(path)):
         return _from_metashape(path)

@@ -30,11 +30,8 @@ METRES = ("metre", "meter")
 def parse_crs(given: str | CRS, name: str) -> CRS:
     """Return the CRS that a text names, as EPSG code, WKT of any flavour, PROJ string or name.
 
-    Raises
-    ------
-    InputError
-        If PROJ does not know it, or it says where nothing lies (a vertical CRS alone); the message
-        has the `name` of the file or option that gave it.
+    An `InputError` if PROJ does not know it, or it says where nothing lies (a vertical CRS alone);
+    the message has the `name` of the file or option that gave it.
     """
     from pyproj import CRS
     from pyproj.exceptions import CRSError
@@ -141,10 +138,8 @@ def metres_up(crs: CRS) -> float:
 def check_projected_metres(crs: CRS, name: str) -> None:
     """Refuse a CRS in which a cloud cannot be computed.
 
-    Raises
-    ------
-    InputError
-        If it is geographic or geocentric, or in another unit than metres, heights included.
+    An `InputError` if it is geographic or geocentric, or in another unit than metres, heights
+    included.
     """
     if not crs.is_projected:
         kind = "degrees" if crs.is_geographic else "no map projection"
@@ -230,10 +225,7 @@ class Topocentric:
     def from_text(cls, text: str, name: str) -> Topocentric:
         """Read ``ENU:latitude,longitude,height``; the height may be left out and is then 0.
 
-        Raises
-        ------
-        InputError
-            If these are not two or three numbers, or no place on the earth.
+        An `InputError` if these are not two or three numbers, or no place on the earth.
         """
         try:
             numbers = [float(part) for part in text.partition(":")[2].split(",")]

@@ -46,10 +46,7 @@ def check_output(
 ) -> Path:
     """Return the path of a file that may be written.
 
-    Raises
-    ------
-    SettingError
-        If it is one of the inputs, exists without `overwrite`, or has no folder to be in.
+    A `SettingError` if it is one of the inputs, exists without `overwrite`, or has no folder.
     """
     target = Path(path)
     for source in inputs:
@@ -118,10 +115,7 @@ def write_text(path: str | os.PathLike[str], text: str, *, overwrite: bool) -> N
 def scratch_arrays(target: Path) -> Iterator[Empty]:
     """Give a maker of arrays in temporary files beside the target, gone when the block ends.
 
-    Raises
-    ------
-    InputError
-        If the disk cannot hold them.
+    An `InputError` if the disk cannot hold them.
     """
     try:
         folder = tempfile.TemporaryDirectory(

@@ -68,10 +68,7 @@ class Header(NamedTuple):
 def parse_header(name: str, head: bytes) -> Header:
     """Return what the first bytes of a PLY file say of its vertices.
 
-    Raises
-    ------
-    InputError
-        If it is not one, or has no vertices.
+    An `InputError` if it is not one, or has no vertices.
     """
     end = re.search(rb"end_header[ \t]*\r?\n", head)
     if not head.startswith(b"ply") or end is None:

@@ -34,10 +34,7 @@ _SUFFIXES = (".tif", ".tiff")
 def open_raster(path: AnyPath) -> Iterator[DatasetReader]:
     """Open a raster to read parts of it.
 
-    Raises
-    ------
-    InputError
-        If there is no such file, or it is none.
+    An `InputError` if there is no such file, or it is none.
     """
     import rasterio
 

@@ -47,10 +47,7 @@ _FINE_GSD_M = 0.005  # clouds of finer images get steps of 0.1 mm
 def write_scene(scene: Scene, out_dir: str | os.PathLike[str], *, overwrite: bool) -> None:
     """Write `FILES`, and those of `OTHERS` that the scene has, into a folder, made if need be.
 
-    Raises
-    ------
-    SettingError
-        If one of them exists and `overwrite` is not set; then none is written.
+    A `SettingError` if one of them exists and `overwrite` is not set; then none is written.
     """
     folder, contents = Path(out_dir), _contents(scene)
     files = FILES | {name: text for name, text in OTHERS.items() if name in contents}

@@ -66,10 +66,8 @@ class Table(NamedTuple):
     def numbers(self, name: str, unknown: Container[str] = ()) -> list[float]:
         """Return one column as finite numbers, NaN where its text, in lower case, is `unknown`.
 
-        Raises
-        ------
-        InputError
-            If another field is not a finite number; the message names its row and column.
+        An `InputError` if another field is not a finite number; the message names its row and
+        column.
         """
         texts = self.column(name)
         values = [number(text) for text in texts]
@@ -115,10 +113,7 @@ def read_lines(path: Path) -> list[str]:
 def read_table(path: Path, required: Sequence[str]) -> Table:
     """Read a table; comma, semicolon, tab or space, with or without a byte order mark.
 
-    Raises
-    ------
-    InputError
-        If a required column is missing; see `table_below`.
+    An `InputError` if a required column is missing; see `table_below`.
     """
     lines = read_lines(path)
     header, delimiter = split_header(lines[0] if lines else "")
@@ -142,12 +137,8 @@ def table_below(
 ) -> Table:
     """Return the rows below the header, which is ``lines[at]``.
 
-    Empty lines do not count and, with `comments`, nor do those that begin with #.
-
-    Raises
-    ------
-    InputError
-        If a row has another number of fields than the header, or there are no rows.
+    Empty lines do not count and, with `comments`, nor do those that begin with #. An `InputError`
+    if a row has another number of fields than the header, or there are no rows.
     """
     rows, numbers = [], []
     below = ["" if comments and line.startswith("#") else line for line in lines[at + 1 :]]
@@ -187,12 +178,8 @@ def read_text(path: Path) -> tuple[npt.NDArray[Any], str | None]:
     """Return the geometries of a text file, and the CRS that it names.
 
     A comment ``# crs: EPSG:25830`` above the rest names it, or ``SRID=25830;`` before a WKT;
-    longitude and latitude are taken to be of WGS 84.
-
-    Raises
-    ------
-    InputError
-        If it is neither WKT nor a table of points, or damaged.
+    longitude and latitude are taken to be of WGS 84. An `InputError` if it is neither WKT nor a
+    table of points, or damaged.
     """
     lines = read_lines(path)
     stated = [found.group(1).strip() for line in lines[:20] if (found := _CRS.match(line.strip()))]

@@ -181,10 +181,8 @@ class TideTable(NamedTuple):
 def read_tide(path: str | os.PathLike[str]) -> TideTable:
     """Read a table with the columns ``time`` (ISO 8601) and ``level_m``.
 
-    Raises
-    ------
-    InputError
-        If a time or level is not one, times do not increase, or some have a zone and some not.
+    An `InputError` if a time or level is not one, times do not increase, or some have a zone and
+    some not.
     """
     table = read_table(check_input(path), ["time", "level_m"])
     level = table.numbers("level_m")

@@ -92,12 +92,8 @@ def is_same_numbers(source: CRS, target: CRS, *, heights: bool = True) -> bool:
 def transformation_in_plan(source: CRS, target: CRS, at: FloatArray, name: str) -> Transformation:
     """Return the horizontal transformation; heights change their unit and nothing else.
 
-    It is needed `at` places of `source`, shape (n, 3); neither CRS is geocentric.
-
-    Raises
-    ------
-    InputError
-        If the datums differ by a grid that is not installed and PROJ has nothing else.
+    It is needed `at` places of `source`, shape (n, 3); neither CRS is geocentric. An `InputError`
+    if the datums differ by a grid that is not installed and PROJ has nothing else.
     """
     factor = metres_up(source) / metres_up(target)
     plans = parts(source)[0], parts(target)[0]
@@ -114,10 +110,7 @@ def transformation_in_plan(source: CRS, target: CRS, at: FloatArray, name: str) 
 def transformation_in_space(source: CRS, target: CRS, at: FloatArray, name: str) -> Transformation:
     """Return the transformation of plan and heights; see `transformation_in_plan`.
 
-    Raises
-    ------
-    HeightsError
-        If the heights cannot be brought over, as where a grid is not installed.
+    A `HeightsError` if the heights cannot be brought over, as where a grid is not installed.
     """
     step, notes = _operation(source, target, at, name, heights=True)
     return Transformation(lambda xyz: np.column_stack(step.transform(*xyz.T)), notes)

@@ -116,10 +116,8 @@ def read_vectors(path: str | os.PathLike[str], *, crs: str | None = None) -> Vec
 def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool) -> Vectors:
     """Return geometries in the cloud's CRS; see `way_to_cloud`. Without `heights` z stays.
 
-    Raises
-    ------
-    InputError
-        If the two CRS or their heights cannot be brought together, or a vertex has no place there.
+    An `InputError` if the two CRS or their heights cannot be brought together, or a vertex has no
+    place there.
     """
     at = vectors.coordinates
     heights = heights and bool(np.isfinite(at[:, 2]).any())
@@ -312,10 +310,8 @@ def read_water_polygons(
 ) -> WaterPolygons:
     """Read the polygons inside which points may be submerged, as one area.
 
-    Raises
-    ------
-    InputError
-        If there is no polygon with an area, or they cannot be read or brought to the cloud's CRS.
+    An `InputError` if there is no polygon with an area, or they cannot be read or brought to the
+    cloud's CRS.
     """
     vectors = in_cloud_crs(read_vectors(path), cloud_crs, heights=False)
     parts = shapely.force_2d(_simple(vectors.geometries))

@@ -223,12 +223,8 @@ def load_open3d() -> Any:
     """Import open3d, with the libusb that it needs.
 
     Its camera drivers link to the system's libusb-1.0, which servers often lack; the one of the
-    package libusb-package serves as well.
-
-    Raises
-    ------
-    InputError
-        If it cannot be imported; the message says what to install.
+    package libusb-package serves as well. An `InputError` if it cannot be imported; the message
+    says what to install.
     """
     try:
         try:

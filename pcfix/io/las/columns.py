@@ -137,10 +137,7 @@ def fill(
 ) -> None:
     """Write the columns of the given rows, and the shift of all; the others keep zero.
 
-    Raises
-    ------
-    TooNarrowError
-        If a value does not fit its type and the type may be widened.
+    A `TooNarrowError` if a value does not fit its type and the type may be widened.
     """
     classes = np.array(points["classification"])
     for column in columns:
@@ -247,10 +244,7 @@ def shifted(
 ) -> laspy.ScaleAwarePointRecord:
     """Return points in the header's format, moved by whole steps of its scale, shape (n, 3).
 
-    Raises
-    ------
-    OutOfRangeError
-        If a coordinate does not fit 32 bits.
+    An `OutOfRangeError` if a coordinate does not fit 32 bits.
     """
     new = convert(points, header.point_format)
     for axis, name in enumerate("XYZ"):

@@ -191,10 +191,7 @@ class LasSource:
     def chunks(self, size: int | None = None) -> Iterator[laspy.ScaleAwarePointRecord]:
         """Yield all points, in order, at most `size` at a time, by default `CHUNK_POINTS`.
 
-        Raises
-        ------
-        InputError
-            If the file ends before its last point.
+        An `InputError` if the file ends before its last point.
         """
         size = size or CHUNK_POINTS
         read = 0
@@ -212,10 +209,7 @@ class LasSource:
     def dimension(self, points: laspy.ScaleAwarePointRecord, name: str) -> FloatArray:
         """Return one dimension of a chunk, scaled, as float64.
 
-        Raises
-        ------
-        InputError
-            If the cloud has no such dimension.
+        An `InputError` if the cloud has no such dimension.
         """
         names = list(self.header.point_format.dimension_names)
         if name not in names:
@@ -271,10 +265,7 @@ def stated_crs(source: LasSource, complaint: str, remedy: str) -> CRS | None:
 def metric_crs(source: LasSource) -> CRS | None:
     """Return the coordinate system of a cloud in metres, or None if it states none.
 
-    Raises
-    ------
-    InputError
-        If its plan coordinates are in degrees, feet or another unit.
+    An `InputError` if its plan coordinates are in degrees, feet or another unit.
     """
     crs = stated_crs(source, "its coordinate system cannot be read", "set it again")
     if crs is None:

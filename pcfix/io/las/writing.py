@@ -57,12 +57,8 @@ def corrected_header(
 
     The `columns` are added as extra dimensions, of their `wide` types or the narrow ones, and a VLR
     with `content` and what the file was before. Each integer axis will be moved by so many `steps`,
-    for which the offsets make up.
-
-    Raises
-    ------
-    InputError
-        If the cloud already has a dimension of one of these names, or was corrected before.
+    for which the offsets make up. An `InputError` if the cloud already has a dimension of one of
+    these names, or was corrected before.
     """
     _refuse_twice(source, columns)
     old = source.header
@@ -277,10 +273,7 @@ def own_settings(vlrs: Iterable[VLR]) -> Any:
 def read_settings(vlrs: Iterable[VLR], path: Path) -> dict[str, Any]:
     """Return what the VLR of a correction says.
 
-    Raises
-    ------
-    InputError
-        If there is none, or it is damaged.
+    An `InputError` if there is none, or it is damaged.
     """
     try:
         content: dict[str, Any] | None = own_settings(vlrs)

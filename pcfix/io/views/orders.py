@@ -51,10 +51,8 @@ _FRAME_HEAD, _DATA = struct.Struct("<II7dI"), struct.Struct("<iIQ")
 def image_orders(raw: RawList, cameras: Cameras) -> tuple[ImageOrder, ...]:
     """Return the orders that the image numbers may follow, the likeliest first.
 
-    Raises
-    ------
-    InputError
-        If a number is beyond the images of all of them, or the images are not those of the cameras.
+    An `InputError` if a number is beyond the images of all of them, or the images are not those of
+    the cameras.
     """
     found = []
     for what, names in _model_orders(raw.path.parent):
