@@ -47,11 +47,12 @@ def read_water_raster(
     cloud_crs: str | CRS | None = None,
     bounds: Bounds | None = None,
 ) -> WaterRaster:
-    """Read the heights of the water from a raster of any format that GDAL reads.
+    """Read the heights of the water, in the cloud's CRS and metres; warn of what is taken on trust.
 
     Parameters
     ----------
     path : path
+        A raster of any format that GDAL reads.
     cloud_crs : str, CRS or None
         Projected, in metres. A raster that names no CRS, or a cloud that names none, is taken
         to share the other's.
@@ -59,21 +60,11 @@ def read_water_raster(
         West, south, east and north end of the cloud, metres: only what lies within `MARGIN_M`
         of it is read. Default, and where one is not finite: the whole raster.
 
-    Returns
-    -------
-    WaterRaster
-        In the cloud's CRS and heights, metres.
-
     Raises
     ------
     InputError
         If it cannot be read, has several bands or no heights there, or cannot be brought to the
         cloud's CRS and heights.
-
-    Warns
-    -----
-    PcfixWarning
-        Of what was taken for granted.
     """
     if bounds is not None:
         west, south, east, north = bounds
@@ -88,9 +79,8 @@ def read_water_raster(
         if not known.any():
             there = "" if bounds is None else " near the cloud"
             raise InputError(f"{name}: holds no height{there}; check its nodata value.")
-        notes += (*_unstated_nodata(source, part.heights, name), *_unstated_feet(source, name))
         title = source.name.replace("\\", "/").rpartition("/")[2]
-    for note in notes:
+    for note in notes + part.notes:
         warnings.warn(note, PcfixWarning, stacklevel=3)
     t = part.transform
     if to_cloud is None and t.b == t.d == 0.0 and t.a > 0.0 > t.e:  # north-up: as it is
@@ -139,10 +129,9 @@ def _edge(bounds: Bounds) -> FloatArray:
     west, south, east, north = bounds
     share = np.linspace(0.0, 1.0, _EDGE_POINTS)
     x, y = west + share * (east - west), south + share * (north - south)
-    sides = [(x, np.full_like(x, end)) for end in (y[0], y[-1])]
-    sides += [(np.full_like(y, end), y) for end in (x[0], x[-1])]
-    plan = np.hstack([np.stack(side) for side in sides]).T
-    return np.column_stack([plan, np.zeros(len(plan))])
+    along_x = np.concatenate([x, x, np.full_like(y, x[0]), np.full_like(y, x[-1])])
+    along_y = np.concatenate([np.full_like(x, y[0]), np.full_like(x, y[-1]), y, y])
+    return np.column_stack([along_x, along_y, np.zeros(len(along_x))])
 
 
 def _read(source: DatasetReader, name: str, near: FloatArray | None) -> Part:
@@ -162,15 +151,26 @@ def _read(source: DatasetReader, name: str, near: FloatArray | None) -> Part:
     check_size((bottom - top) * (right - left), name)
     window = Window(left, top, right - left, bottom - top)
     stored = source.read(1, window=window, masked=True).astype(np.float64).filled(np.nan)
-    heights = (stored * source.scales[0] + source.offsets[0]) * _metres(source, name)
+    unit_m, notes = _metres(source, name)
+    heights = (stored * source.scales[0] + source.offsets[0]) * unit_m
     if source.nodata is None:
         heights[np.abs(heights) > IMPOSSIBLE_M] = np.nan
     heights[np.isinf(heights)] = np.nan
-    return Part(heights, source.window_transform(window))
+    unknown = int(np.isnan(heights).sum())
+    if source.nodata is None and unknown:
+        note = (
+            f"{name}: states no nodata value; {unknown:,} cells that are not finite or beyond"
+            f" {IMPOSSIBLE_M:g} m are taken as unknown."
+        )
+        notes = (note, *notes)
+    return Part(heights, source.window_transform(window), notes)
 
 
-def _metres(source: DatasetReader, name: str) -> float:
-    """Return how many metres one unit of the heights is: the band's unit, else the CRS's."""
+def _metres(source: DatasetReader, name: str) -> tuple[float, tuple[str, ...]]:
+    """Return how many metres one unit of the heights is: the band's unit, else the CRS's.
+
+    A note says where heights are taken to be in feet only because positions are.
+    """
     stated = (source.units[0] or "").strip()
     if stated.lower() not in _UNITS_M:
         raise InputError(
@@ -179,39 +179,23 @@ def _metres(source: DatasetReader, name: str) -> float:
         )
     factor = _UNITS_M[stated.lower()]
     if factor is not None or source.crs is None:
-        return factor or 1.0
+        return factor or 1.0, ()
     crs = parse_crs(source.crs.to_wkt(), name)
-    return 1.0 if is_local(crs) else metres_up(crs)
-
-
-def _unstated_feet(source: DatasetReader, name: str) -> tuple[str, ...]:
-    """Return a note where heights are taken to be in feet only because positions are."""
-    if source.units[0] or source.crs is None:
-        return ()
-    crs = parse_crs(source.crs.to_wkt(), name)
-    if is_local(crs) or parts(crs)[1] is not None or metres_up(crs) == 1.0:
-        return ()
-    return (
+    factor = 1.0 if is_local(crs) else metres_up(crs)
+    if factor == 1.0 or source.units[0] or parts(crs)[1] is not None:
+        return factor, ()
+    return factor, (
         f"{name}: does not say in which unit its heights are; taken to be in that of its CRS"
-        f" ({metres_up(crs):.4f} m).",
-    )
-
-
-def _unstated_nodata(source: DatasetReader, heights: FloatArray, name: str) -> tuple[str, ...]:
-    unknown = int(np.isnan(heights).sum())
-    if source.nodata is not None or unknown == 0:
-        return ()
-    return (
-        f"{name}: states no nodata value; {unknown:,} cells that are not finite or beyond"
-        f" {IMPOSSIBLE_M:g} m are taken as unknown.",
+        f" ({factor:.4f} m).",
     )
 
 
 class Part(NamedTuple):
-    """Part of a raster: heights, and the transform from (column, row) of it to its CRS."""
+    """Part of a raster: heights, the transform from (column, row) of it to its CRS, and notes."""
 
     heights: FloatArray
     transform: Affine
+    notes: tuple[str, ...]
 
 
 def check_size(cells: int, name: str) -> None:

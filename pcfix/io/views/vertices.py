@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -18,25 +18,28 @@ from pcfix.io.ply import Header, read_header
 from pcfix.model import FloatArray, IntArray
 
 
+Places: TypeAlias = dict[tuple[str, bool], tuple[int, tuple[int, int]]]
+
+
 class Vertices:
     """The records of the vertices, walked over once, so that every count in them holds."""
 
     def __init__(self, path: Path) -> None:
         """Walk over the file; one without vertices or that ends early is an `InputError`."""
         self.header = header = read_header(path)
-        self._layout = layout = _layout(header)
         self._units = _units(path, header)
-        least = int((layout.prefix + layout.item * (layout.prefix == 0)).sum())
+        self._item, self._prefix, self._field = _layout(header)
+        least = int((self._prefix + self._item * (self._prefix == 0)).sum())
         if header.vertices * least > len(self._units):
             self._complain(header.vertices)
-        starts = np.zeros((len(layout.lists), header.vertices + 1), np.int64)
-        which = np.array(list(layout.lists.values()), np.int64)
-        end = list_starts(
-            self._units, layout.item, layout.prefix, header.order == ">", which, starts
-        )
+        names = [p.name for p in header.properties if p.length]
+        starts = np.zeros((len(names), header.vertices + 1), np.int64)
+        which = np.array([self._field[name, True][0] for name in names], np.int64)
+        big = header.order == ">"
+        end = list_starts(self._units, self._item, self._prefix, big, which, starts)
         if end < 0:
             self._complain(-1 - end)
-        self._starts = dict(zip(layout.lists, starts, strict=True))
+        self._starts = dict(zip(names, starts, strict=True))
 
     def _complain(self, row: int) -> None:
         raise InputError(
@@ -46,57 +49,46 @@ class Vertices:
 
     def numbers(self, *names: str) -> FloatArray:
         """Return properties that are no lists as columns, shape (n, names)."""
-        values = np.empty((self.header.vertices, len(names)))
-        for i, name in enumerate(names):
-            field, part = self._layout.scalars[name]
-            item = self.header.item(name, is_list=False) or ""
-            values[:, i] = self._copy(item, field, part, self.header.vertices)
-        return values
+        count = self.header.vertices
+        columns = [self._copy(name, count, is_list=False) for name in names]
+        return np.column_stack(columns).astype(np.float64)
 
     def lists(self, name: str) -> tuple[IntArray, npt.NDArray[Any]]:
         """Return where the lists of a property start, shape (n + 1,), and their items."""
-        start, item = self._starts[name], self.header.item(name, is_list=True) or ""
-        return start, self._copy(item, self._layout.lists[name], (0, 0), int(start[-1]))
+        start = self._starts[name]
+        return start, self._copy(name, int(start[-1]), is_list=True)
 
-    def _copy(self, item: str, field: int, part: tuple[int, int], count: int) -> npt.NDArray[Any]:
-        header, layout = self.header, self._layout
+    def _copy(self, name: str, count: int, *, is_list: bool) -> npt.NDArray[Any]:
+        header, (field, part) = self.header, self._field[name, is_list]
+        item = header.item(name, is_list=is_list) or ""
         out = np.empty(count * header.size(item), self._units.dtype)
         copy_field(
-            *(self._units, layout.item, layout.prefix, header.order == ">", field),
+            *(self._units, self._item, self._prefix, header.order == ">", field),
             *(part, header.vertices, out),
         )
         return out.view(header.order + item) if header.order else out
 
 
-class _Layout(NamedTuple):
-    """A record, with neighbouring numbers taken as one field.
+def _layout(header: Header) -> tuple[IntArray, IntArray, Places]:
+    """Return the fields of a record, with neighbouring numbers taken as one.
 
-    `item` and `prefix` have the units of each field's items and of its list's length, `lists` the
-    field of each list, `scalars` the field of each number and its first and last unit in that.
+    The units of each field's items; those of its list's length, 0 for numbers; and by name, and
+    whether it is a list, the field of each property and its first and last unit among the numbers.
     """
-
-    item: IntArray
-    prefix: IntArray
-    lists: dict[str, int]
-    scalars: dict[str, tuple[int, tuple[int, int]]]
-
-
-def _layout(header: Header) -> _Layout:
     fields: list[list[int]] = []
-    lists: dict[str, int] = {}
-    scalars: dict[str, tuple[int, tuple[int, int]]] = {}
+    places: Places = {}
     for p in header.properties:
         size = header.size(p.item)
         if p.length:
-            lists[p.name] = len(fields)
+            places[p.name, True] = len(fields), (0, 0)
             fields.append([size, header.size(p.length)])
             continue
         if not fields or fields[-1][1]:
             fields.append([0, 0])
-        scalars[p.name] = len(fields) - 1, (fields[-1][0], fields[-1][0] + size)
+        places[p.name, False] = len(fields) - 1, (fields[-1][0], fields[-1][0] + size)
         fields[-1][0] += size
     item, prefix = np.array(fields, np.int64).reshape(-1, 2).T.copy()
-    return _Layout(item, prefix, lists, scalars)
+    return item, prefix, places
 
 
 def _units(path: Path, header: Header) -> npt.NDArray[Any]:
