@@ -98,17 +98,9 @@ class Match:
 def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, given: bool) -> Match:
     """Choose the points to compare.
 
-    Parameters
-    ----------
-    whole, target
-    settings : CompareRules
-    given : bool
-        Whether the user gave the water surface; else what the cloud says counts, its classes too.
-
-    Raises
-    ------
-    PcfixError
-        If nothing is under water where that was asked for, or the two do not overlap.
+    Where the user has `given` the water surface it counts, else what the cloud says, its classes
+    too. A `PcfixError` if nothing is under water where that was asked for, or the two do not
+    overlap.
     """
     below = whole.xyz[:, 2] < whole.water_m
     wet = below if given else whole.bathymetric | below
@@ -174,21 +166,9 @@ MAX_TABLE = 50_000_000
 def near_in_plan(xy: FloatArray, other_xy: FloatArray, limit_m: float) -> BoolArray:
     """Return which points have a point of the other cloud about them in plan.
 
-    The plan is cut into squares of side `limit_m`; a point counts when its own square or one of
-    the eight around it holds a point of the other cloud. So all within the limit count, and none
-    beyond 2.83 times the limit.
-
-    Parameters
-    ----------
-    xy : array, shape (n, 2)
-        Metres, world frame.
-    other_xy : array, shape (m, 2)
-        The same frame.
-    limit_m : float
-
-    Returns
-    -------
-    array of bool, shape (n,)
+    The plan is cut into squares of side `limit_m`; a point, (n, 2) in metres, counts when its own
+    square or one of the eight around it holds a point of the other cloud, (m, 2). So all within the
+    limit count, and none beyond 2.83 times the limit.
     """
     low = np.array([other_xy[:, 0].min(), other_xy[:, 1].min()]) - 2.0 * limit_m
     columns = int(np.ptp(other_xy[:, 0]) / limit_m) + 6

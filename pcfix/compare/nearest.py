@@ -186,13 +186,7 @@ MAX_STRIPS = 30_000
 
 
 def mean_spacing_m(xy: FloatArray) -> float:
-    """Return the side of the square that each point has to itself in the cloud's bounding box.
-
-    Parameters
-    ----------
-    xy : array, shape (n, 2)
-        Metres, world frame.
-    """
+    """Return the side of the square that each point (n, 2) has in the cloud's bounding box, m."""
     extent = np.array([np.ptp(xy[:, 0]), np.ptp(xy[:, 1])])
     if extent.min() <= 0.0:
         return float(extent.max() / len(xy))
@@ -200,15 +194,10 @@ def mean_spacing_m(xy: FloatArray) -> float:
 
 
 def strip_order(xy: FloatArray) -> IntArray:
-    """Return the row numbers of points in the order of a walk along narrow strips.
+    """Return the row numbers of points in the order of a walk along narrow strips of the plan.
 
     A tree is built and asked several times faster in this order than in a random one, as each
-    point finds in the processor's cache what its predecessor needed.
-
-    Parameters
-    ----------
-    xy : array, shape (n, 2) or (n, 3)
-        Metres, world frame; only the plan position counts.
+    point, (n, 2) or (n, 3) in metres, finds in the processor's cache what its predecessor needed.
     """
     longest = max(np.ptp(xy[:, 0]), np.ptp(xy[:, 1]))
     width = max(mean_spacing_m(xy[:, :2]) * POINTS_ACROSS, longest / MAX_STRIPS, 1e-9)
@@ -220,17 +209,9 @@ def strip_order(xy: FloatArray) -> IntArray:
 
 
 class Neighbours:
-    """The nearest of m points to any place.
+    """The nearest of m points, shape (m, 2) in plan or (m, 3) in space, metres, to any place.
 
-    Parameters
-    ----------
-    points : array, shape (m, d)
-        Metres; d is 2 (in plan) or 3 (in space).
-
-    Attributes
-    ----------
-    row : array, shape (m,)
-        Row in `points` of each number that `find` returns.
+    `row`, shape (m,), has the row in `points` of each number that `find` returns.
     """
 
     def __init__(self, points: FloatArray) -> None:
@@ -243,23 +224,10 @@ class Neighbours:
     def find(
         self, places: FloatArray, count: int = 1
     ) -> Iterator[tuple[IntArray, FloatArray, IntArray]]:
-        """Yield row numbers of places, and distance and number of their nearest points.
+        """Yield c row numbers of places, and distance and number of their nearest points.
 
-        Parameters
-        ----------
-        places : array, shape (n, d)
-            Metres, the frame of the points.
-        count : int
-            How many neighbours; at most m.
-
-        Yields
-        ------
-        rows : array, shape (c,)
-            Of `places`.
-        distance_m : array, shape (c, count)
-            Nearest first.
-        number : array, shape (c, count)
-            Into `row`.
+        Places (n, d) are in the frame of the points. Distances (m) and numbers, into `row`, have
+        the shape (c, count), the nearest first; there are at least `count` points.
         """
         order = strip_order(places)
         for start in range(0, len(order), CHUNK_POINTS):

@@ -178,17 +178,14 @@ def _shown(values: npt.NDArray[np.generic]) -> str:
 
 def _check_once(marks: Marks, point: IntArray, camera: IntArray) -> None:
     """Refuse a point that is measured twice in an image."""
-    pairs = np.column_stack([point, camera])[camera >= 0]
-    rows = np.flatnonzero(camera >= 0)
-    _, first, back = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
-    again = first[back.ravel()] != np.arange(len(pairs))
-    if again.any():
-        i = int(np.argmax(again))
-        before = marks.where[rows[first[back.ravel()[i]]]]
-        raise InputError(
-            f"{marks.at(rows[i])}: the point is measured in this image at {before} already; take"
-            " one of the two out."
-        )
+    first: dict[tuple[int, int], int] = {}
+    for row in np.flatnonzero(camera >= 0).tolist():
+        before = first.setdefault((int(point[row]), int(camera[row])), row)
+        if before != row:
+            raise InputError(
+                f"{marks.at(row)}: the point is measured in this image at {marks.where[before]}"
+                " already; take one of the two out."
+            )
 
 
 def _check_frames(marks: Marks, cameras: Cameras, camera: IntArray) -> None:

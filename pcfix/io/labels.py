@@ -13,16 +13,10 @@ from pcfix.model import IntArray
 
 
 class Matched(NamedTuple):
-    """What names were found to mean.
+    """What n names were found to mean."""
 
-    row : array of int, shape (n,)
-        Row of the labels of each name, -1 where there is none or it could be several.
-    ambiguous : tuple of str
-        Names that could be several labels, or share one with another name.
-    """
-
-    row: IntArray
-    ambiguous: tuple[str, ...]
+    row: IntArray  # (n,), of the labels; -1 where there is none or it could be several
+    ambiguous: tuple[str, ...]  # names that could be several labels, or share one with another name
 
 
 def match_labels(
@@ -30,16 +24,7 @@ def match_labels(
 ) -> Matched:
     """Find each name among labels: whole, without its folder, without its extension.
 
-    Parameters
-    ----------
-    names : sequence of str, length n
-    labels : sequence of str
-    one_to_one : bool
-        Whether a label is meant by one name at most; else names may share a label.
-
-    Returns
-    -------
-    Matched
+    A label is meant by one name at most where the match is `one_to_one`.
     """
     row = np.full(len(names), -1, np.int64)
     unclear: set[int] = set()

@@ -32,28 +32,14 @@ class Property(NamedTuple):
 
 
 class Header(NamedTuple):
-    """What a PLY file says of its vertices.
+    """What a PLY file says of its vertices."""
 
-    name : str
-        Of the file, for messages.
-    order : {"", "<", ">"}
-        Text, or the order of the bytes.
-    vertices : int
-        Promised, not checked.
-    properties : tuple of Property
-        Of a vertex.
-    skipped : tuple of (int, tuple of Property)
-        The elements that come before the vertices.
-    end : int
-        Bytes of the header.
-    """
-
-    name: str
-    order: str
-    vertices: int
-    properties: tuple[Property, ...]
-    skipped: tuple[tuple[int, tuple[Property, ...]], ...]
-    end: int
+    name: str  # of the file, for messages
+    order: str  # of the bytes, "<" or ">"; empty for text
+    vertices: int  # promised, not checked
+    properties: tuple[Property, ...]  # of a vertex
+    skipped: tuple[tuple[int, tuple[Property, ...]], ...]  # elements that come before the vertices
+    end: int  # bytes of the header
 
     def item(self, name: str, *, is_list: bool) -> str | None:
         """Return the type of a number, or of a list's items; None without such a property."""

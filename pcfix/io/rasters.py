@@ -177,28 +177,11 @@ PREVIEW_CELLS = 600
 
 
 def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = False) -> int:
-    """Write the first band of one raster minus that of another, metres.
+    """Write the first band of one raster minus that of another, metres, and count its cells.
 
-    Parameters
-    ----------
-    dsm : Path
-        Its cells and CRS are those of the output.
-    reference : Path
-        A raster of heights, which is resampled (bilinear) where its cells are others.
-    output : Path
-        GeoTIFF of one band, float32; -9999 where either has no height.
-    overwrite : bool
-        Replace an output that exists.
-
-    Returns
-    -------
-    int
-        Cells that have a difference.
-
-    Raises
-    ------
-    GeometryError
-        If the two have no cell in common.
+    The output is a GeoTIFF of one band, float32, with the cells and the CRS of `dsm`; -9999 where
+    either has no height. Where the cells of the reference are others it is resampled (bilinear).
+    A `GeometryError` if the two have no cell in common.
     """
     from rasterio.enums import Resampling
     from rasterio.vrt import WarpedVRT

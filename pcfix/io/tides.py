@@ -64,7 +64,7 @@ def read_image_times(path: str | os.PathLike[str], labels: Sequence[str]) -> Ima
     table = read_table(found, ["label", "time"])
     row = _rows(table.column("label"), labels, str(path))
     texts, where = table.column("time"), [f"line {table.line[r]}" for r in row]
-    return ImageTimes(*_seconds(str(path), where, [texts[r] for r in row]), str(path))
+    return _times(str(path), where, [texts[r] for r in row])
 
 
 def _from_exif(folder: Path, labels: Sequence[str]) -> ImageTimes:
@@ -73,7 +73,7 @@ def _from_exif(folder: Path, labels: Sequence[str]) -> ImageTimes:
         raise InputError(f"{folder}: holds no images; give the folder with those of the block.")
     chosen = [files[row] for row in _rows([str(p) for p in files], labels, str(folder))]
     where = [f"image {file.name}" for file in chosen]
-    return ImageTimes(*_seconds(str(folder), where, [_exif_time(f) for f in chosen]), str(folder))
+    return _times(str(folder), where, [_exif_time(file) for file in chosen])
 
 
 def _exif_time(file: Path) -> str:
@@ -133,8 +133,8 @@ def _rows(names: Sequence[str], labels: Sequence[str], source: str) -> list[int]
     return rows
 
 
-def _seconds(source: str, where: Sequence[str], texts: Sequence[str]) -> tuple[FloatArray, bool]:
-    """Return seconds since 1970 of times as text, and whether they have zones: all, or none."""
+def _times(source: str, where: Sequence[str], texts: Sequence[str]) -> ImageTimes:
+    """Return times that are given as text: all have zones, or none."""
     moments = [_moment(source, at, text) for at, text in zip(where, texts, strict=True)]
     zoned = [moment.tzinfo is not None for moment in moments]
     if any(zoned) != all(zoned):
@@ -144,7 +144,7 @@ def _seconds(source: str, where: Sequence[str], texts: Sequence[str]) -> tuple[F
             f" have {'none' if zoned[odd] else 'one'}; write all times alike."
         )
     utc = [m if m.tzinfo is not None else m.replace(tzinfo=UTC) for m in moments]
-    return np.array([moment.timestamp() for moment in utc]), zoned[0]
+    return ImageTimes(np.array([moment.timestamp() for moment in utc]), zoned[0], source)
 
 
 def _moment(source: str, where: str, text: str) -> datetime:
@@ -187,8 +187,8 @@ def read_tide(path: str | os.PathLike[str]) -> TideTable:
     table = read_table(check_input(path), ["time", "level_m"])
     level = table.numbers("level_m")
     where = [f"line {line}" for line in table.line]
-    seconds, zoned = _seconds(str(path), where, table.column("time"))
-    late = np.flatnonzero(np.diff(seconds) <= 0.0)
+    times = _times(str(path), where, table.column("time"))
+    late = np.flatnonzero(np.diff(times.time_s) <= 0.0)
     if late.size:
         raise InputError(
             f"{path}: line {table.line[late[0] + 1]}: the time is not later than the one before;"
@@ -196,7 +196,7 @@ def read_tide(path: str | os.PathLike[str]) -> TideTable:
         )
     if len(level) < 2:
         raise InputError(f"{path}: has one row; a level that moves needs two at least.")
-    return TideTable(seconds, np.array(level), zoned, str(path))
+    return TideTable(times.time_s, np.array(level), times.zoned, times.name)
 
 
 def level_offsets(

@@ -17,7 +17,6 @@ from pcfix.errors import InputError
 from pcfix.io.ply import Header, read_header
 from pcfix.model import FloatArray, IntArray
 
-
 Places: TypeAlias = dict[tuple[str, bool], tuple[int, tuple[int, int]]]
 
 
