@@ -53,18 +53,10 @@ class Vectors:
     name: str
     notes: tuple[str, ...] = ()
 
-    def __len__(self) -> int:
-        return len(self.geometries)
-
     @cached_property
     def coordinates(self) -> FloatArray:
         """All vertices, shape (n, 3); z is NaN where a geometry has none."""
         return np.asarray(shapely.get_coordinates(self.geometries, include_z=True), np.float64)
-
-    @property
-    def kinds(self) -> str:
-        """The types of geometry that are there, for messages."""
-        return ", ".join(sorted({geometry.geom_type for geometry in self.geometries}))
 
 
 def is_vector_file(path: str | os.PathLike[str]) -> bool:
@@ -317,8 +309,9 @@ def read_water_polygons(
     parts = shapely.force_2d(_simple(vectors.geometries))
     is_polygon = shapely.get_type_id(parts) == shapely.GeometryType.POLYGON
     if not is_polygon.any():
+        kinds = ", ".join(sorted({geometry.geom_type for geometry in vectors.geometries}))
         raise InputError(
-            f"{vectors.name}: holds no polygon ({vectors.kinds}); a mask needs polygons of water."
+            f"{vectors.name}: holds no polygon ({kinds}); a mask needs polygons of water."
         )
     polygons, notes = _valid(parts[is_polygon], vectors.name)
     if not is_polygon.all():

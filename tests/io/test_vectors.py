@@ -91,7 +91,7 @@ def test_points_of_a_table_may_lack_a_height(tmp_path):
 def test_null_and_empty_geometries_are_counted(tmp_path):
     shapes = [None, shapely.Point(), *shapely.points(SHORE)]
     found = read_vectors(write(tmp_path / "a.gpkg", shapes))
-    assert len(found) == 2
+    assert len(found.geometries) == 2
     assert found.notes == (f"{tmp_path / 'a.gpkg'}: 2 features without coordinates are left out.",)
 
 
@@ -110,7 +110,7 @@ def test_a_layer_is_named_where_there_are_several(tmp_path):
     with pytest.raises(InputError, match="has no layer bank with geometries; it has shore, gauge"):
         read_vectors(f"{path}|layername=bank")
     for found in (read_vectors(f"{path}|layername=gauge"), read_vectors(f"{path}|gauge")):
-        assert len(found) == 1
+        assert len(found.geometries) == 1
         assert found.name == f"{path}, layer gauge"
 
 

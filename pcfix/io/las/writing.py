@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import laspy
 import lazrs
@@ -63,8 +63,8 @@ def corrected_header(
     _refuse_twice(source, columns)
     old = source.header
     params, records = _extra_bytes(columns, old.scales, wide=wide)
-    new = _upgraded(source, params)
-    new.header.offsets = old.offsets - np.array(steps) * old.scales
+    header, vlrs, described, changes = _upgraded(source, params)
+    header.offsets = old.offsets - np.array(steps) * old.scales
     before = {
         "version": str(old.version),
         "point_format": old.point_format.id,
@@ -72,12 +72,11 @@ def corrected_header(
         "global_encoding": old.global_encoding.value,
         "offsets": old.offsets.tolist(),
         "steps": list(steps),
-        "added_wkt": new.added_wkt,
-        "undescribed": new.undescribed,
+        **changes,
     }
-    vlrs = [*new.vlrs, _note(_SETTINGS, {**content, "before": before})]
-    _set_records(new.header, vlrs, new.described + records)
-    return new.header
+    note = _note(_SETTINGS, {**content, "before": before})
+    _set_records(header, [*vlrs, note], described + records)
+    return header
 
 
 def noted_header(source: LasSource, note: VLR) -> laspy.LasHeader:
@@ -85,23 +84,18 @@ def noted_header(source: LasSource, note: VLR) -> laspy.LasHeader:
 
     Notes of earlier times stay before it.
     """
-    new = _upgraded(source, [])
-    _set_records(new.header, [*new.vlrs, note], new.described)
-    return new.header
+    header, vlrs, described, _ = _upgraded(source, [])
+    _set_records(header, [*vlrs, note], described)
+    return header
 
 
-class _Upgraded(NamedTuple):
-    """A header of LAS 1.4, and the records and the description of dimensions to put in it."""
+def _upgraded(
+    source: LasSource, params: list[laspy.ExtraBytesParams]
+) -> tuple[laspy.LasHeader, list[VLR], bytes, dict[str, Any]]:
+    """Return the input's header in LAS 1.4 with dimensions added, and what is yet to be put in it.
 
-    header: laspy.LasHeader
-    vlrs: list[VLR]
-    described: bytes
-    added_wkt: bool
-    undescribed: list[str]
-
-
-def _upgraded(source: LasSource, params: list[laspy.ExtraBytesParams]) -> _Upgraded:
-    """Return the input's header in LAS 1.4 with dimensions added; its records not yet set."""
+    That is records, and the description of the dimensions; what these have more goes last.
+    """
     old = source.header
     header = _copied(old)
     point_format = upgraded(old.point_format)
@@ -118,7 +112,7 @@ def _upgraded(source: LasSource, params: list[laspy.ExtraBytesParams]) -> _Upgra
     for dimension in undescribed:
         described += bytes(ExtraBytesStruct(dimension.name.encode(), (0, dimension.num_bits // 8)))
     names = [dimension.name for dimension in undescribed]
-    return _Upgraded(header, vlrs, described, wkt is not None, names)
+    return header, vlrs, described, {"added_wkt": wkt is not None, "undescribed": names}
 
 
 def corrected_identity(source: LasSource) -> bytes:

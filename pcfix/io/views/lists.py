@@ -25,8 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError
-from pcfix.io.ply import read_header
-from pcfix.io.views.vertices import Vertices, copy_field, list_starts
+from pcfix.io.ply import Vertices, copy_field, list_starts, read_header
 from pcfix.model import FloatArray, IntArray, TiePoints
 
 _HEAD = 8
