@@ -43,18 +43,9 @@ def read_cloud(
 ) -> SurveyCloud:
     """Read the points that count of a LAS or LAZ cloud that fits in memory.
 
-    Parameters
-    ----------
-    path : path
-    water : WaterSurface, optional
-        Default: what a cloud that pcfix corrected says of its own.
-    skip_classes : sequence of int
-        Points of these classes, and withheld ones, are left out.
-
-    Raises
-    ------
-    InputError
-        If the file is damaged, no point counts, or it lacks the dimension that `water` names.
+    Those of `skip_classes`, and withheld ones, are left out. The `water` is by default what a cloud
+    that pcfix corrected says of its own. An `InputError` if the file is damaged, no point counts,
+    or it lacks the dimension that `water` names.
     """
     with LasSource(path) as source:
         crs = stated_crs(source, "its CRS cannot be read", "export it again")

@@ -47,7 +47,10 @@ class GnssInFrame(NamedTuple):
 
 
 def read_gnss(path: str | os.PathLike[str], cameras: Cameras, *, crs: str | None = None) -> Cameras:
-    """Read where the GNSS said that the images were taken.
+    """Return cameras with `gnss`: where the GNSS said that the images were taken.
+
+    It is in its own CRS, NaN for images without a position and for standard deviations that are not
+    stated. Warns of images without a position, and of positions of images that are not there.
 
     Parameters
     ----------
@@ -60,17 +63,6 @@ def read_gnss(path: str | os.PathLike[str], cameras: Cameras, *, crs: str | None
     cameras : Cameras
     crs : str, optional
         Of the positions, instead of what the file says. Where nobody says, that of the cameras.
-
-    Returns
-    -------
-    Cameras
-        With `gnss`, in its own CRS: NaN for images without a position, and for standard
-        deviations that are not stated.
-
-    Warns
-    -----
-    PcfixWarning
-        When images have no position, or positions are of images that are not there.
 
     Raises
     ------
@@ -197,20 +189,11 @@ def _notes(path: Path, cameras: Cameras, known: int, unknown: list[str]) -> tupl
 
 
 def gnss_in_frame_of(cameras: Cameras, name: str = "cameras") -> GnssInFrame:
-    """Return the positions of the GNSS in the frame of the cameras.
+    """Return the positions of the GNSS in the frame of the cameras, read from the file `name`.
 
-    Parameters
-    ----------
-    cameras : Cameras
-        In a projected CRS in metres, or in the frame of its `gnss`.
-    name : str
-        Of their file, for messages.
-
-    Returns
-    -------
-    GnssInFrame
-        Standard deviations east and north are taken as those along x and y, whatever the meridian
-        convergence; of a height that cannot be compared there is none.
+    The cameras are in a projected CRS in metres, or in the frame of their `gnss`. Standard
+    deviations east and north are taken as those along x and y, whatever the meridian convergence;
+    of a height that cannot be compared there is none.
     """
     nothing = np.full((len(cameras), 3), np.nan)
     if cameras.gnss is None:

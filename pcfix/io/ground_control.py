@@ -32,7 +32,11 @@ def read_ground_control(
     *,
     crs: str | None = None,
 ) -> GroundControl:
-    """Read surveyed points and where the images show them.
+    """Read surveyed points and where the images show them, in the CRS of the cameras.
+
+    Stated standard deviations along x and y are taken over unturned, whatever the angle between the
+    axes of the two CRS; where none is stated, they are `SIGMA_M` and `SIGMA_PX`. Warns of marks in
+    images without a pose, which are left out, and of what is taken for granted about the CRS.
 
     Parameters
     ----------
@@ -44,19 +48,6 @@ def read_ground_control(
         In the cloud's CRS, with lenses in pixels.
     crs : str, optional
         Of the points, instead of what the file says; ``local`` takes the numbers as they are.
-
-    Returns
-    -------
-    GroundControl
-        In the CRS of the cameras. Stated standard deviations along x and y are taken over
-        unturned, whatever the angle between the axes of the two CRS; where none is stated, they
-        are `SIGMA_M` and `SIGMA_PX`.
-
-    Warns
-    -----
-    PcfixWarning
-        When marks in images without a pose are left out, or something is taken for granted about
-        the CRS.
 
     Raises
     ------

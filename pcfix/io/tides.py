@@ -206,18 +206,8 @@ def level_offsets(
 
     The level is linear between the rows of the table, and beyond its ends for at most as long as
     the two rows there are apart. The average is over the images, each counting once; the surface
-    that is given as the water's is that of the average.
-
-    Returns
-    -------
-    offset_m : array, shape (k,)
-        With the mean zero.
-    notes : tuple of str
-
-    Raises
-    ------
-    InputError
-        If the table does not cover an image, or zones are given on one side only.
+    that is given as the water's is that of the average. With the offsets, shape (k,), metres, come
+    notes. A table that does not cover an image is an `InputError`, as are zones on one side only.
     """
     if tide.zoned != times.zoned:
         with_zone, without = (tide, times) if tide.zoned else (times, tide)

@@ -228,6 +228,9 @@ def way_to_cloud(
 ) -> Way:
     """Return the way from a file's CRS into the cloud's, None where numbers stay, and notes.
 
+    An `InputError` if the two cannot be brought together; a `HeightsError` if only their heights
+    cannot.
+
     Parameters
     ----------
     crs : str or None
@@ -238,11 +241,6 @@ def way_to_cloud(
         Where it is needed, see `transformation_in_plan`; the file, for messages.
     heights : bool
         Whether z counts. Where it does not, it is not looked at.
-
-    Raises
-    ------
-    InputError
-        If the two cannot be brought together; `HeightsError` if only their heights cannot.
     """
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
     if crs is None:

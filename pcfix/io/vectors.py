@@ -65,7 +65,7 @@ def is_vector_file(path: str | os.PathLike[str]) -> bool:
 
 
 def read_vectors(path: str | os.PathLike[str], *, crs: str | None = None) -> Vectors:
-    """Read one layer of a vector file.
+    """Read one layer of a vector file, in its own CRS.
 
     Parameters
     ----------
@@ -76,11 +76,6 @@ def read_vectors(path: str | os.PathLike[str], *, crs: str | None = None) -> Vec
         ``river.gpkg|layername=shore``.
     crs : str, optional
         What the file's CRS is, over what it says itself. ``local``: the cloud's, whatever it says.
-
-    Returns
-    -------
-    Vectors
-        In the CRS of the file.
 
     Raises
     ------

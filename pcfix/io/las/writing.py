@@ -94,7 +94,7 @@ def _upgraded(
 ) -> tuple[laspy.LasHeader, list[VLR], bytes, dict[str, Any]]:
     """Return the input's header in LAS 1.4 with dimensions added, and what is yet to be put in it.
 
-    That is records, and the description of the dimensions; what these have more goes last.
+    That is its records and the description of its dimensions; last, what of these is new.
     """
     old = source.header
     header = _copied(old)
