@@ -146,18 +146,9 @@ MIN_REACH_M, REACH_FACTOR = 1.0, 1.5
 def figures_of(match: Match, lines: Sequence[SectionLine], started: float) -> Comparison:
     """Return all figures that the settings ask for.
 
-    Parameters
-    ----------
-    match : Match
-    lines : sequence of SectionLine
-        Cross-sections, beside the automatic ones.
-    started : float
-        When the comparison began, on `time.perf_counter`.
-
-    Raises
-    ------
-    GeometryError
-        If there are too few points for planes, or M3C2 finds nothing.
+    The cross-sections along `lines` come beside the automatic ones; the comparison `started` at a
+    time of `time.perf_counter`. A `GeometryError` if there are too few points for planes, or M3C2
+    finds nothing.
     """
     notes, clouds = _notes(match), (match.cloud.xyz, match.apparent)
     pairs = None

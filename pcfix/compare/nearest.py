@@ -248,20 +248,9 @@ class Neighbours:
 def cloud_to_cloud(xyz: FloatArray, reference: FloatArray) -> FloatArray:
     """Return the distance from each point to the nearest point of the reference.
 
-    It has no sign, and is never zero where the two clouds sample a surface at different places:
-    half the spacing of the reference is its floor. See `vertical` for a signed difference.
-
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Metres, world frame.
-    reference : array, shape (m, 3)
-        The same frame.
-
-    Returns
-    -------
-    array, shape (n,)
-        Metres.
+    Both have the shape (n, 3), metres, world frame. The distance has no sign, and is never zero
+    where the two clouds sample a surface at different places: half the spacing of the reference is
+    its floor. See `vertical` for a signed difference.
     """
     origin = np.floor(reference[0])
     places, grid = xyz - origin, build_cells(reference - origin)

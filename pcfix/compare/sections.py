@@ -93,15 +93,9 @@ def parse_line(text: str) -> SectionLine:
 
 
 def section_along(line: SectionLine, layers: dict[str, FloatArray], half_width_m: float) -> Section:
-    """Return the heights of several clouds along a line.
+    """Return the heights of several clouds, (n, 3) by name, metres, world frame, along a line.
 
-    Parameters
-    ----------
-    line : SectionLine
-    layers : dict of array, shape (n, 3)
-        Clouds by name, metres, world frame.
-    half_width_m : float
-        Points up to this far from the line count; positive.
+    Points up to a positive `half_width_m` from the line count.
     """
     step = max(line.length_m / STATIONS, 0.5 * half_width_m)
     stations = np.linspace(0.0, line.length_m, max(round(line.length_m / step), 1) + 1)
@@ -130,19 +124,9 @@ def _medians(
 def lines_downslope(xyz: FloatArray, count: int) -> tuple[SectionLine, ...]:
     """Return evenly spaced lines down the steepest direction of a bed.
 
-    The direction is that of the plane fitted to all points; each line runs over the extent of
-    the points in its own share of the bed, from high to low.
-
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        The bed, metres, world frame.
-    count : int
-
-    Raises
-    ------
-    GeometryError
-        If the points lie on a line in plan.
+    The direction is that of the plane fitted to all points (n, 3), metres, world frame; each line
+    runs over the extent of the points in its own share of the bed, from high to low. Points that
+    lie on a line in plan are a `GeometryError`.
     """
     origin = xyz.mean(axis=0)
     local = xyz - origin

@@ -79,18 +79,7 @@ class Distribution:
 
 
 def statistics_of(values: FloatArray) -> Statistics:
-    """Return the statistics of a sample.
-
-    Parameters
-    ----------
-    values : array, shape (n,)
-        Metres, finite.
-
-    Raises
-    ------
-    GeometryError
-        If the sample is empty.
-    """
+    """Return the statistics of a sample, shape (n,), metres, finite; none is a `GeometryError`."""
     if len(values) == 0:
         raise GeometryError("There is no difference to take statistics of: no point is left.")
     marks = np.percentile(values, (*PERCENTILES, 0, 100))
@@ -181,9 +170,7 @@ class Bin:
 def fit_line(reference_depth_m: FloatArray, depth_m: FloatArray) -> Line | None:
     """Fit depth against reference depth, both of shape (n,), metres.
 
-    Returns
-    -------
-    Line, or None where fewer than three depths, or only equal ones, leave it undefined.
+    None where fewer than three depths, or only equal ones, leave the line undefined.
     """
     if len(depth_m) < 3:
         return None
@@ -203,19 +190,8 @@ def binned(
 ) -> tuple[Bin, ...]:
     """Return the bins of reference depth, or of distance, that hold points, in order.
 
-    Parameters
-    ----------
-    by_m : array, shape (n,)
-        What to sort by, metres. Bin edges are multiples of the width.
-    after_m, before_m : array, shape (n,)
-        Errors, metres.
-    width_m : float
-        Positive.
-
-    Raises
-    ------
-    SettingError
-        If the width makes too many bins.
+    Errors after and before, shape (n,), metres, are sorted `by_m`; edges of bins are multiples of
+    the width. A width that makes too many bins is a `SettingError`.
     """
     if len(by_m) == 0:
         return ()

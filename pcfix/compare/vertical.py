@@ -30,22 +30,10 @@ class Heights(NamedTuple):
 def heights_at(xy: FloatArray, surface: FloatArray, neighbours: int) -> Heights:
     """Return the height of a surface at places in plan.
 
-    At each place a plane is fitted to the nearest points of the surface (nearest in plan, least
-    squares in Z) and evaluated there. Where these points lie on a line, or the place lies far
-    outside them, a plane has no meaning, and the height of the nearest point is taken.
-
-    Parameters
-    ----------
-    xy : array, shape (n, 2)
-        Metres, world frame.
-    surface : array, shape (m, 3)
-        The same frame.
-    neighbours : int
-        Points a plane; the surface has at least as many.
-
-    Returns
-    -------
-    Heights
+    At each place (n, 2) a plane is fitted to that many nearest points of the surface (m, 3), which
+    has no fewer, and evaluated there: nearest in plan, least squares in Z; metres, world frame.
+    Where these points lie on a line, or the place lies far outside them, a plane has no meaning,
+    and the height of the nearest point is taken.
     """
     index = Neighbours(surface[:, :2])
     sorted_surface = surface[index.row]

@@ -108,7 +108,9 @@ def cell_numbers(cell: IntArray, z: FloatArray, size: int) -> Cells:
     """Return the numbers of each cell.
 
     Heights are summed in ascending order, as differences from the lowest of their cell, so that
-    neither the order of the points nor the height above the datum touches the result.
+    neither the order of the points nor the height above the datum touches the result. `spread` is
+    the root mean square distance of the heights from their mean (their population standard
+    deviation): 0 in a cell with one point.
 
     Parameters
     ----------
@@ -118,12 +120,6 @@ def cell_numbers(cell: IntArray, z: FloatArray, size: int) -> Cells:
         Heights, metres.
     size : int
         Number of cells, n.
-
-    Returns
-    -------
-    Cells
-        Heights in metres. `spread` is the root mean square distance of the heights from their
-        mean (their population standard deviation): 0 in a cell with one point.
     """
     order = np.lexsort((z, cell))
     z, count = z[order], np.bincount(cell, minlength=size)
@@ -145,20 +141,8 @@ def cell_uncertainty(cell: IntArray, sigma_m: FloatArray, size: int) -> FloatArr
     It is not divided by the square root of their number. What the points of a cell are wrong by
     comes in good part from level, index and tilt of the water and from poses, which they share,
     and which more points do not average out; to take all of it as shared is the cautious side.
-
-    Parameters
-    ----------
-    cell : array of int, shape (k,)
-        The cell of each point, from 0 to size - 1.
-    sigma_m : array, shape (k,)
-        Standard errors, metres; points with none have 0 and do not count.
-    size : int
-        Number of cells, n.
-
-    Returns
-    -------
-    array, shape (n,)
-        Metres; NaN where no point has a standard error.
+    Points and cells are those of `cell_numbers`. Points with a standard error (m) of 0 have none
+    and do not count; NaN where no point of a cell has one.
     """
     known = sigma_m > 0.0
     cell, sigma_m = cell[known], sigma_m[known]

@@ -120,20 +120,10 @@ class Lattice:
 
 
 def cells_of(xyz: FloatArray, resolution_m: float) -> IntArray:
-    """Return in which cells points lie, counted from x = 0 and y = 0.
+    """Return columns eastwards and rows southwards of points, counted from x = 0 and y = 0.
 
-    A point on an edge belongs to the cell east or north of it.
-
-    Parameters
-    ----------
-    xyz : array, shape (n, 2) or (n, 3)
-        Metres, world frame.
-    resolution_m : float
-
-    Returns
-    -------
-    array of int, shape (n, 2)
-        Columns eastwards and rows southwards.
+    Points have the shape (n, 2) or (n, 3), metres, world frame. One on an edge belongs to the cell
+    east or north of it.
     """
     cells = np.floor((xyz[:, :2] + EDGE_M) / resolution_m).astype(np.int64)
     cells[:, 1] = -cells[:, 1] - 1
@@ -141,14 +131,7 @@ def cells_of(xyz: FloatArray, resolution_m: float) -> IntArray:
 
 
 def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float) -> Lattice:
-    """Return the cells that cover a rectangle.
-
-    Parameters
-    ----------
-    low, high : array, shape (2,)
-        Its south-west and north-east corners, metres, world frame; see `fits`.
-    resolution_m : float
-    """
+    """Return the cells that cover a rectangle between two corners, metres; see `fits`."""
     (west, south), (east, north) = cells_of(np.array([low, high]), resolution_m).tolist()
     return Lattice(resolution_m, west, north, east - west + 1, south - north + 1)
 
@@ -160,13 +143,7 @@ def fits(low: FloatArray, high: FloatArray, resolution_m: float) -> bool:
 
 
 def refuse_size(low: FloatArray, high: FloatArray, resolution_m: float, name: str) -> None:
-    """Refuse a raster with more cells than are allowed.
-
-    Raises
-    ------
-    SettingError
-        With the smallest resolution that is.
-    """
+    """Refuse a raster with more cells than are allowed, with the smallest resolution that is."""
     if fits(low, high, resolution_m):
         return
     columns, rows = _size(low, high, resolution_m)

@@ -50,7 +50,9 @@ def read_gnss(path: str | os.PathLike[str], cameras: Cameras, *, crs: str | None
     """Return cameras with `gnss`: where the GNSS said that the images were taken.
 
     It is in its own CRS, NaN for images without a position and for standard deviations that are not
-    stated. Warns of images without a position, and of positions of images that are not there.
+    stated. Warns of images without a position, and of positions of images that are not there. An
+    `InputError` if the file cannot be read, one image has two positions, or no image of the block
+    has one.
 
     Parameters
     ----------
@@ -63,11 +65,6 @@ def read_gnss(path: str | os.PathLike[str], cameras: Cameras, *, crs: str | None
     cameras : Cameras
     crs : str, optional
         Of the positions, instead of what the file says. Where nobody says, that of the cameras.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, one image has two positions, or no image of the block has one.
     """
     source = Path(path) if Path(path).is_dir() else check_input(path)
     if crs is not None and crs.strip().lower() != "local":

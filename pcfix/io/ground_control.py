@@ -36,7 +36,9 @@ def read_ground_control(
 
     Stated standard deviations along x and y are taken over unturned, whatever the angle between the
     axes of the two CRS; where none is stated, they are `SIGMA_M` and `SIGMA_PX`. Warns of marks in
-    images without a pose, which are left out, and of what is taken for granted about the CRS.
+    images without a pose, which are left out, and of what is taken for granted about the CRS. An
+    `InputError` if a field is not what it should be, rows contradict each other, a mark lies
+    outside its image or in one that is not in the model, or the CRS cannot be brought together.
 
     Parameters
     ----------
@@ -48,12 +50,6 @@ def read_ground_control(
         In the cloud's CRS, with lenses in pixels.
     crs : str, optional
         Of the points, instead of what the file says; ``local`` takes the numbers as they are.
-
-    Raises
-    ------
-    InputError
-        If a field is not what it should be, rows contradict each other, a mark lies outside its
-        image or in one that is not in the model, or the CRS cannot be brought together.
     """
     source = check_input(path)
     marks = read_marks(source)

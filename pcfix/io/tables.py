@@ -274,6 +274,9 @@ class CheckDepths:
 def read_check_depths(path: str | os.PathLike[str]) -> CheckDepths:
     """Read check depths from a table with a header line.
 
+    An `InputError` if there is no such file, a column is missing, not in metres or there twice, a
+    field is not a finite number, or a depth is negative.
+
     Parameters
     ----------
     path : path
@@ -282,12 +285,6 @@ def read_check_depths(path: str | os.PathLike[str]) -> CheckDepths:
         that the correction is given, positive down, or ``z``, the height of the bed in the
         cloud's heights. Where both are there the depth counts. Other columns are passed over,
         a standard error too: all check depths count alike.
-
-    Raises
-    ------
-    InputError
-        If there is no such file, a column is missing, not in metres or there twice, a field is
-        not a finite number, or a depth is negative.
     """
     source = check_input(path)
     table = read_table(source, ())

@@ -41,6 +41,8 @@ class ImageTimes(NamedTuple):
 def read_image_times(path: str | os.PathLike[str], labels: Sequence[str]) -> ImageTimes:
     """Find out when images were taken.
 
+    An `InputError` if the time of an image is not there, or some have a zone and some not.
+
     Parameters
     ----------
     path : path
@@ -50,11 +52,6 @@ def read_image_times(path: str | os.PathLike[str], labels: Sequence[str]) -> Ima
         count as UTC; where the images' EXIF data states no zone they hold local time.
     labels : sequence of str
         Names of the k images; a folder or an extension may be missing on either side.
-
-    Raises
-    ------
-    InputError
-        If the time of an image is not there, or some have a zone and some not.
     """
     found = Path(path)
     if found.is_dir():

@@ -49,6 +49,9 @@ def read_water_raster(
 ) -> WaterRaster:
     """Read the heights of the water, in the cloud's CRS and metres; warn of what is taken on trust.
 
+    An `InputError` if it cannot be read, has several bands or no heights there, or cannot be
+    brought to the cloud's CRS and heights.
+
     Parameters
     ----------
     path : path
@@ -59,12 +62,6 @@ def read_water_raster(
     bounds : tuple of 4 float, optional
         West, south, east and north end of the cloud, metres: only what lies within `MARGIN_M`
         of it is read. Default, and where one is not finite: the whole raster.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, has several bands or no heights there, or cannot be brought to the
-        cloud's CRS and heights.
     """
     if bounds is not None:
         west, south, east, north = bounds

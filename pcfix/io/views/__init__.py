@@ -35,6 +35,9 @@ def read_views(
 ) -> ViewList:
     """Read the view list of a dense cloud.
 
+    An `InputError` if the file is not a whole view list, names images that are not there, or its
+    cameras do not see its points.
+
     Parameters
     ----------
     path : path
@@ -45,12 +48,6 @@ def read_views(
         In the cloud's frame.
     to_cloud : callable, optional
         Takes positions, shape (n, 3), from the list's frame to the cloud's. Default: the same.
-
-    Raises
-    ------
-    InputError
-        If the file is not a whole view list, names images that are not there, or its cameras
-        do not see its points.
     """
     raw = read_list(check_input(path))
     return _fitted(raw, image_orders(raw, cameras), "depth-maps", cameras, to_cloud)
