@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy.typing as npt
 from pcfix.compare.match import Reference, SurveyCloud
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.crs import is_same, parts
-from pcfix.io.files import check_input
+from pcfix.io.files import AnyPath, check_input
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, stated_crs
 from pcfix.io.las.writing import own_settings
@@ -33,11 +32,8 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
 
-CHUNK_POINTS = 2_000_000
-
-
 def read_cloud(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     water: WaterSurface | None = None,
     skip_classes: Sequence[int] = NOISE_CLASSES,
 ) -> SurveyCloud:
@@ -50,8 +46,10 @@ def read_cloud(
     with LasSource(path) as source:
         crs = stated_crs(source, "its CRS cannot be read", "export it again")
         own = water or own_water(source)
-        chunks = source.chunks(CHUNK_POINTS)
-        parts = [_part(source, p, own, given=water is not None, skip=skip_classes) for p in chunks]
+        parts = [
+            _part(source, points, own, given=water is not None, skip=skip_classes)
+            for points in source.chunks()
+        ]
         count = len(source)
     xyz, water_m, bathymetric, *shifts = (np.concatenate(of) for of in zip(*parts, strict=True))
     if len(xyz) == 0:
@@ -121,7 +119,7 @@ WATER_CLASSES = (9, 41, 42, 45)
 KINDS = "a cloud (.las, .laz), check points (.csv, .txt) or a grid (.tif, .tiff)"
 
 
-def read_reference(path: str | os.PathLike[str]) -> Reference:
+def read_reference(path: AnyPath) -> Reference:
     """Read a reference; the end of its name says what it is.
 
     ``.las``, ``.laz``: all points but those withheld and those of noise or water; ``.csv``,

@@ -5,7 +5,6 @@ The forms of file are in `control_marks`.
 
 from __future__ import annotations
 
-import os
 import warnings
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy.typing as npt
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.control_marks import Marks, read_marks
 from pcfix.io.crs import is_topocentric
-from pcfix.io.files import check_input
+from pcfix.io.files import AnyPath, check_input
 from pcfix.io.labels import match_labels, unnamed
 from pcfix.io.transformations import LOCAL, way_to_cloud
 from pcfix.model import Cameras, FloatArray, GroundControl, IntArray
@@ -27,10 +26,7 @@ _NAMED = 5
 
 
 def read_ground_control(
-    path: str | os.PathLike[str],
-    cameras: Cameras,
-    *,
-    crs: str | None = None,
+    path: AnyPath, cameras: Cameras, *, crs: str | None = None
 ) -> GroundControl:
     """Read surveyed points and where the images show them, in the CRS of the cameras.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,15 +12,13 @@ import numpy.typing as npt
 
 from pcfix.errors import GeometryError, InputError, SettingError
 from pcfix.grid.lattice import Lattice, Window
-from pcfix.io.files import check_input, check_output, replaced_when_whole
+from pcfix.io.files import AnyPath, check_input, check_output, replaced_when_whole
 from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
     from pyproj import CRS
     from rasterio.io import DatasetReader, DatasetWriter
     from rasterio.transform import Affine
-
-AnyPath = str | os.PathLike[str]
 
 
 NO_HEIGHT = -9999.0
@@ -73,9 +70,7 @@ def _slices(window: Window) -> tuple[tuple[int, int], tuple[int, int]]:
     return (window.row, window.row_stop), (window.column, window.column_stop)
 
 
-def check_tif(
-    path: AnyPath, *, overwrite: bool, inputs: Iterable[str | os.PathLike[str]] = ()
-) -> Path:
+def check_tif(path: AnyPath, *, overwrite: bool, inputs: Iterable[AnyPath] = ()) -> Path:
     """Return the path of a GeoTIFF that may be written, by its suffix and `check_output`."""
     target = check_output(path, overwrite=overwrite, inputs=inputs)
     if target.suffix.lower() not in _SUFFIXES:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +12,7 @@ import laspy
 import numpy as np
 from pyproj import CRS
 
-from pcfix.io.files import check_output, write_bytes
+from pcfix.io.files import AnyPath, check_output, write_bytes
 from pcfix.io.las.writing import LasSink
 from pcfix.model import BATHYMETRIC_POINT, Cameras, FloatArray, IntArray, Views
 from pcfix.version import __version__
@@ -44,7 +43,7 @@ OTHERS = {
 _FINE_GSD_M = 0.005  # clouds of finer images get steps of 0.1 mm
 
 
-def write_scene(scene: Scene, out_dir: str | os.PathLike[str], *, overwrite: bool) -> None:
+def write_scene(scene: Scene, out_dir: AnyPath, *, overwrite: bool) -> None:
     """Write `FILES`, and those of `OTHERS` that the scene has, into a folder, made if need be.
 
     A `SettingError` if one of them exists and `overwrite` is not set; then none is written.

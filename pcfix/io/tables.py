@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 import re
 from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError
-from pcfix.io.files import check_input
+from pcfix.io.files import AnyPath, check_input
 from pcfix.model import FloatArray
 
 TEXT_SUFFIXES = (".wkt", ".csv", ".txt")
@@ -271,7 +270,7 @@ class CheckDepths:
         return f"{self.name}: line {self.line[row]} ({self.xy[row, 0]:.2f}, {self.xy[row, 1]:.2f})"
 
 
-def read_check_depths(path: str | os.PathLike[str]) -> CheckDepths:
+def read_check_depths(path: AnyPath) -> CheckDepths:
     """Read check depths from a table with a header line.
 
     An `InputError` if there is no such file, a column is missing, not in metres or there twice, a

@@ -6,7 +6,6 @@ and images share. The two cannot be compared, so both must be of one kind.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -16,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.io.files import check_input, read_json
+from pcfix.io.files import AnyPath, check_input, read_json
 from pcfix.io.labels import match_labels
 from pcfix.io.tables import read_table
 from pcfix.model import FloatArray
@@ -38,7 +37,7 @@ class ImageTimes(NamedTuple):
     name: str
 
 
-def read_image_times(path: str | os.PathLike[str], labels: Sequence[str]) -> ImageTimes:
+def read_image_times(path: AnyPath, labels: Sequence[str]) -> ImageTimes:
     """Find out when images were taken.
 
     An `InputError` if the time of an image is not there, or some have a zone and some not.
@@ -175,7 +174,7 @@ class TideTable(NamedTuple):
     name: str
 
 
-def read_tide(path: str | os.PathLike[str]) -> TideTable:
+def read_tide(path: AnyPath) -> TideTable:
     """Read a table with the columns ``time`` (ISO 8601) and ``level_m``.
 
     An `InputError` if a time or level is not one, times do not increase, or some have a zone and

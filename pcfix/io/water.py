@@ -20,7 +20,7 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
-from pcfix.io.files import check_input
+from pcfix.io.files import AnyPath, check_input
 from pcfix.io.water_rasters import read_water_raster
 from pcfix.model import FloatArray, IntArray, WaterDimension, WaterMesh, WaterPlane, WaterSurface
 
@@ -43,7 +43,7 @@ LEAST_FACET_M2 = 1e-6
 
 
 def read_water(
-    spec: float | str | os.PathLike[str],
+    spec: float | AnyPath,
     cloud_crs: str | CRS | None = None,
     bounds: tuple[float, float, float, float] | None = None,
 ) -> WaterSurface:

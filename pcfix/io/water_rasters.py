@@ -8,7 +8,6 @@ cameras go through, which refuse what PROJ can only guess.
 
 from __future__ import annotations
 
-import os
 import warnings
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,6 +15,7 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.crs import is_local, metres_up, parse_crs, parts
+from pcfix.io.files import AnyPath
 from pcfix.io.rasters import open_raster, place_of
 from pcfix.io.transformations import Points, transformation_in_plan, way_to_cloud
 from pcfix.model import FloatArray, WaterRaster
@@ -43,7 +43,7 @@ _AT_ONCE = 1_000_000
 
 
 def read_water_raster(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     cloud_crs: str | CRS | None = None,
     bounds: Bounds | None = None,
 ) -> WaterRaster:

@@ -22,7 +22,7 @@ from laspy.vlrs.vlrlist import VLRList
 
 from pcfix.errors import InputError
 from pcfix.io.crs import METRES
-from pcfix.io.files import check_input
+from pcfix.io.files import AnyPath, check_input
 from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ class LasSource:
     what laspy would not.
     """
 
-    def __init__(self, path: str | os.PathLike[str], jobs: int | None = None) -> None:
+    def __init__(self, path: AnyPath, jobs: int | None = None) -> None:
         """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable."""
         self.path = check_input(path)
         with las_errors(self.path):
@@ -188,17 +188,16 @@ class LasSource:
         if len(self) == 0:
             raise InputError(f"{self.path}: holds no points.")
 
-    def chunks(self, size: int | None = None) -> Iterator[laspy.ScaleAwarePointRecord]:
-        """Yield all points, in order, at most `size` at a time, by default `CHUNK_POINTS`.
+    def chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
+        """Yield all points, in order, at most `CHUNK_POINTS` at a time.
 
         An `InputError` if the file ends before its last point.
         """
-        size = size or CHUNK_POINTS
         read = 0
         while read < len(self):
             with las_errors(self.path):
-                points = self._reader.read_points(size)
-            if len(points) < min(size, len(self) - read):
+                points = self._reader.read_points(CHUNK_POINTS)
+            if len(points) < min(CHUNK_POINTS, len(self) - read):
                 raise InputError(
                     f"{self.path}: is cut short: the header promises {len(self):,} points,"
                     f" the file holds {read + len(points):,}; copy it again."
@@ -233,21 +232,21 @@ def coordinates(points: laspy.ScaleAwarePointRecord) -> FloatArray:
     return xyz
 
 
-def centring_steps(path: str | os.PathLike[str], jobs: int | None = None) -> tuple[int, ...]:
+def centring_steps(path: AnyPath, jobs: int | None = None) -> tuple[int, ...]:
     """Return by how many steps each integer axis must be moved to have its middle at zero."""
     with LasSource(path, jobs) as source:
         bounds = [
             [(int(p.array[axis].min()), int(p.array[axis].max())) for axis in "XYZ"]
-            for p in source.chunks(10_000_000)
+            for p in source.chunks()
         ]
     low, high = np.min(bounds, axis=0)[:, 0], np.max(bounds, axis=0)[:, 1]
     return tuple((-(low + high) // 2).tolist())
 
 
-def read_xyz(path: str | os.PathLike[str]) -> FloatArray:
+def read_xyz(path: AnyPath) -> FloatArray:
     """Return all coordinates of a cloud that fits in memory, shape (n, 3), metres."""
     with LasSource(path) as source:
-        return np.vstack([coordinates(points) for points in source.chunks(10_000_000)])
+        return np.vstack([coordinates(points) for points in source.chunks()])
 
 
 def stated_crs(source: LasSource, complaint: str, remedy: str) -> CRS | None:

@@ -6,7 +6,6 @@ lists to the rows of a cloud, chunk by chunk.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from pcfix.io.files import check_input
+from pcfix.io.files import AnyPath, check_input
 from pcfix.io.views.lists import ImageOrder, RawList, ViewList, read_list, tracks_as_list
 from pcfix.io.views.matching import ViewMatch, ViewReport, spacing_m
 from pcfix.io.views.orders import fitted, image_orders
@@ -31,7 +30,7 @@ as a dense point does not."""
 
 
 def read_views(
-    path: str | os.PathLike[str], cameras: Cameras, *, to_cloud: Transformation | None = None
+    path: AnyPath, cameras: Cameras, *, to_cloud: Transformation | None = None
 ) -> ViewList:
     """Read the view list of a dense cloud.
 
