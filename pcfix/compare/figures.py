@@ -162,7 +162,9 @@ def figures_of(match: Match, lines: Sequence[SectionLine], started: float) -> Co
         measured_at="reference" if match.reference.sparse else "cloud",
         counts=_counts(match, pairs),
         c2c=_both(lambda xyz: distribution_of(_c2c(match, xyz)), *clouds),
-        vertical=pairs and _both(lambda p: distribution_of(p.error_m), pairs.after, pairs.before),
+        vertical=None
+        if pairs is None
+        else _both(lambda p: distribution_of(p.error_m), pairs.after, pairs.before),
         depth=fits,
         depth_bins=depth_bins,
         shore_bins=shore_bins,
@@ -223,7 +225,8 @@ def _by_depth(
         notes.append("no compared point is under water, so nothing is said of depth")
         return nothing
     depth, error = (surface - after.reference_m)[wet], after.error_m[wet]
-    fits, error_before = AfterBefore(fit_line(depth, depth - error), None), None
+    fits = AfterBefore(fit_line(depth, depth - error), None)
+    error_before: FloatArray | None = None
     if before is not None:
         over = match.water_at(before.xy)
         depth_before = ((surface if over is None else over) - before.reference_m)[wet]

@@ -1,4 +1,4 @@
-"""Text files: tables with a header line, geometries as WKT or points, check depths."""
+"""Tables as text files with a header line, and the check depths in one."""
 
 from __future__ import annotations
 
@@ -8,37 +8,13 @@ import re
 from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from pcfix.errors import InputError
 from pcfix.io.files import AnyPath, check_input
 from pcfix.model import FloatArray
-
-TEXT_SUFFIXES = (".wkt", ".csv", ".txt")
-COLUMNS = {
-    "x": ("x", "easting", "east", "e", "x_m", "easting_m"),
-    "y": ("y", "northing", "north", "n", "y_m", "northing_m"),
-    "longitude": ("longitude", "lon", "long", "lng"),
-    "latitude": ("latitude", "lat"),
-    "z": (
-        *("z", "height", "h", "altitude", "alt", "elevation", "elev", "level"),
-        *("z_m", "height_m", "altitude_m", "elevation_m", "level_m"),
-    ),
-    "wkt": ("wkt", "geometry", "geom", "wkt_geom"),
-}
-"""What a column is, and its names; the first that is there counts."""
-_UNIT = re.compile(r"\s*[\[(]\s*(m|metres?|meters?|deg|degrees?|°)\s*[\])]$")
-_WKT = re.compile(
-    r"\s*(SRID\s*=\s*\d+\s*;)?\s*((MULTI)?(POINT|LINESTRING|POLYGON)|LINEARRING|GEOMETRYCOLLECTION)"
-    r"\s*(ZM|Z|M)?\s*(\(|EMPTY)",
-    re.IGNORECASE,
-)
-_NO_HEIGHT = ("", "nan", "na", "null", "none")
-_SRID = re.compile(r"\s*SRID\s*=\s*(\d+)\s*;", re.IGNORECASE)
-_CRS = re.compile(r"#\s*crs\s*[:=]\s*(.+)$", re.IGNORECASE)
 
 DEPTH_SPELLINGS = {
     "x": ("x", "easting", "east"),
@@ -171,85 +147,6 @@ def _split(
         raise InputError(
             f"{path}: line {first + reader.line_num - 1} is not CSV ({error})."
         ) from error
-
-
-def read_text(path: Path) -> tuple[npt.NDArray[Any], str | None]:
-    """Return the geometries of a text file, and the CRS that it names.
-
-    A comment ``# crs: EPSG:25830`` above the rest names it, or ``SRID=25830;`` before a WKT;
-    longitude and latitude are taken to be of WGS 84. An `InputError` if it is neither WKT nor a
-    table of points, or damaged.
-    """
-    lines = read_lines(path)
-    stated = [found.group(1).strip() for line in lines[:20] if (found := _CRS.match(line.strip()))]
-    kept = [
-        (i, line)
-        for i, line in enumerate(lines, start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if not kept:
-        raise InputError(f"{path}: is empty.")
-    if _WKT.match(kept[0][1]):
-        geometries, srid = _from_wkt(path, kept)
-    else:
-        geometries, srid = _from_table(path, lines, kept[0][0] - 1)
-    return geometries, stated[0] if stated else srid
-
-
-def _from_wkt(path: Path, lines: list[tuple[int, str]]) -> tuple[npt.NDArray[Any], str | None]:
-    """Return the geometry of each numbered line, and the CRS that they name."""
-    import shapely
-
-    geometries = np.empty(len(lines), dtype=object)
-    srids: set[str | None] = set()
-    for row, (line, text) in enumerate(lines):
-        named = _SRID.match(text)
-        srids.add(f"EPSG:{named.group(1)}" if named else None)
-        try:
-            geometries[row] = shapely.from_wkt(_SRID.sub("", text).strip())
-        except (shapely.errors.ShapelyError, ValueError) as error:
-            raise InputError(
-                f"{path}: line {line} is not WKT ({str(error).split(':', 1)[-1].strip()}); write"
-                " one whole geometry a line."
-            ) from error
-    if len(srids) > 1:
-        raise InputError(f"{path}: the lines name different SRIDs; write one CRS a file.")
-    return geometries, srids.pop()
-
-
-def _from_table(path: Path, lines: list[str], at: int) -> tuple[npt.NDArray[Any], str | None]:
-    """Return the points, or the geometries, of a table whose header is ``lines[at]``."""
-    names, delimiter = split_header(lines[at])
-    header = [_UNIT.sub("", name) for name in names]
-    table = table_below(path, lines, header, delimiter, at=at, comments=True)
-    if (wkt := _column(header, "wkt")) is not None:
-        numbered = list(zip(table.line, table.column(wkt), strict=True))
-        return _from_wkt(path, numbered)
-    for x, y, crs in (("x", "y", None), ("longitude", "latitude", "EPSG:4326")):
-        plan = _column(header, x), _column(header, y)
-        if plan[0] is not None and plan[1] is not None:
-            return _points(table, plan[0], plan[1]), crs
-    raise InputError(
-        f"{path}: line {at + 1} must name the columns x and y (or easting and northing, longitude"
-        f" and latitude), with z or height where there is one; it has: {', '.join(names)}."
-    )
-
-
-def _column(header: list[str], role: str) -> str | None:
-    return next((name for name in COLUMNS[role] if name in header), None)
-
-
-def _points(table: Table, x: str, y: str) -> npt.NDArray[Any]:
-    """Return the points of a table; where the height of one is empty it has none."""
-    import shapely
-
-    plan = np.column_stack([table.numbers(x), table.numbers(y)])
-    name = _column(table.header, "z")
-    if name is None:
-        return np.asarray(shapely.points(plan))
-    z = np.array(table.numbers(name, _NO_HEIGHT))
-    points = np.asarray(shapely.points(np.column_stack([plan, z])))
-    return np.where(np.isfinite(z), points, shapely.force_2d(points))
 
 
 @dataclass(frozen=True, eq=False)
