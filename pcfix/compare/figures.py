@@ -119,20 +119,23 @@ def _plain(value: Any) -> Any:
     return value
 
 
+_BIN_COLUMNS = {
+    "count_{}": "count",
+    "bias_{}_m": "mean_m",
+    "sd_{}_m": "sd_m",
+    "rmse_{}_m": "rmse_m",
+    "nmad_{}_m": "nmad_m",
+}
+
+
 def bins_table(bins: Iterable[Bin]) -> str:
     """Return bins as CSV text; the columns of `before` are empty where it is not known."""
-    figures = ("count", "mean_m", "sd_m", "rmse_m", "nmad_m")
-    names = [n.replace("mean_m", "bias_m") for n in figures]
-    head = [
-        f"{n}_{when}" if n == "count" else f"{n[:-2]}_{when}_m"
-        for when in ("after", "before")
-        for n in names
-    ]
+    head = [name.format(when) for when in ("after", "before") for name in _BIN_COLUMNS]
     lines = [",".join(["from_m", "to_m", *head])]
     for one in bins:
         fields = [f"{one.from_m:g}", f"{one.to_m:g}"]
         for statistics in (one.after, one.before):
-            for name in figures:
+            for name in _BIN_COLUMNS.values():
                 value = "" if statistics is None else getattr(statistics, name)
                 fields.append(f"{value:.4f}" if isinstance(value, float) else str(value))
         lines.append(",".join(fields))

@@ -65,21 +65,12 @@ class Window(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Lattice:
-    """The cells of one raster.
-
-    Attributes
-    ----------
-    resolution_m : float
-    first_column, first_row : int
-        How many cells the left edge lies east of x = 0, and the top edge south of y = 0.
-    width, height : int
-        In cells.
-    """
+    """The cells of one raster."""
 
     resolution_m: float
-    first_column: int
-    first_row: int
-    width: int
+    first_column: int  # how many cells the left edge lies east of x = 0
+    first_row: int  # how many cells the top edge lies south of y = 0
+    width: int  # in cells, as the next
     height: int
 
     @property
