@@ -17,7 +17,7 @@ from pcfix.io.files import AnyPath, check_input
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, stated_crs
 from pcfix.io.las.writing import own_settings
-from pcfix.io.rasters import place_of
+from pcfix.io.rasters import place_of, read_masked
 from pcfix.io.tables import read_table
 from pcfix.model import (
     BATHYMETRIC_POINT,
@@ -147,14 +147,14 @@ def _read_grid(path: Path) -> Reference:
 
     try:
         with rasterio.open(path) as grid:
-            band = grid.read(1, masked=True)
+            band = read_masked(grid)
             transform, wkt = grid.transform, grid.crs.to_wkt() if grid.crs else None
             scale, offset = grid.scales[0], grid.offsets[0]
     except rasterio.errors.RasterioError as error:
         raise InputError(f"{path}: is not a readable GeoTIFF ({error}).") from error
     if transform.is_identity:
         raise InputError(f"{path}: does not say where it lies; give a georeferenced GeoTIFF.")
-    height = band.astype(np.float64).filled(np.nan) * scale + offset
+    height = band * scale + offset
     row, column = np.nonzero(np.isfinite(height))
     if len(row) == 0:
         raise InputError(f"{path}: no cell holds a height.")

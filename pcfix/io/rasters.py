@@ -59,6 +59,11 @@ def read_heights(source: DatasetReader, window: Window) -> FloatArray:
     return np.asarray(height)
 
 
+def read_masked(raster: Any, **how: Any) -> FloatArray:
+    """Return the first band as float64, NaN where it has no value; `how` is of rasterio's read."""
+    return np.asarray(raster.read(1, masked=True, **how).astype(np.float64).filled(np.nan))
+
+
 def write_part(target: DatasetWriter, values: npt.NDArray[Any], window: Window, band: int) -> None:
     """Write part of a band, shape (rows, columns); NaN becomes the raster's nodata."""
     if np.issubdtype(values.dtype, np.floating):
@@ -196,7 +201,7 @@ def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = Fal
             with same, rasterio.open(draft, "w", **profile) as sink:
                 sink.set_band_description(1, "difference")
                 for _, window in sink.block_windows(1):
-                    difference = _heights(one, window) - _heights(same, window)
+                    difference = read_masked(one, window=window) - read_masked(same, window=window)
                     known += int(np.isfinite(difference).sum())
                     whole = np.where(np.isfinite(difference), difference, NO_HEIGHT)
                     sink.write(whole.astype(np.float32), 1, window=window)
@@ -211,13 +216,6 @@ def preview(path: Path) -> tuple[FloatArray, tuple[float, float, float, float]]:
     with open_raster(path) as source:
         scale = max(1.0, max(source.height, source.width) / PREVIEW_CELLS)
         shape = max(1, int(source.height / scale)), max(1, int(source.width / scale))
-        values = source.read(1, out_shape=shape, masked=True).astype(np.float64).filled(np.nan)
+        values = read_masked(source, out_shape=shape)
         west, south, east, north = source.bounds
     return values, (west, east, south, north)
-
-
-def _heights(raster: Any, window: Any) -> FloatArray:
-    values: FloatArray = (
-        raster.read(1, window=window, masked=True).astype(np.float64).filled(np.nan)
-    )
-    return values

@@ -16,7 +16,7 @@ import numpy as np
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.crs import is_local, metres_up, parse_crs, parts
 from pcfix.io.files import AnyPath
-from pcfix.io.rasters import open_raster, place_of
+from pcfix.io.rasters import open_raster, place_of, read_masked
 from pcfix.io.transformations import Points, transformation_in_plan, way_to_cloud
 from pcfix.model import FloatArray, WaterRaster
 
@@ -147,7 +147,7 @@ def _read(source: DatasetReader, name: str, near: FloatArray | None) -> Part:
         )
     check_size((bottom - top) * (right - left), name)
     window = Window(left, top, right - left, bottom - top)
-    stored = source.read(1, window=window, masked=True).astype(np.float64).filled(np.nan)
+    stored = read_masked(source, window=window)
     unit_m, notes = _metres(source, name)
     heights = (stored * source.scales[0] + source.offsets[0]) * unit_m
     if source.nodata is None:

@@ -16,6 +16,8 @@ numbers misread by one, a quarter of the cameras of an ordinary block look elsew
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -82,18 +84,14 @@ def image_orders(raw: RawList, cameras: Cameras) -> tuple[ImageOrder, ...]:
     return tuple(distinct.values())
 
 
-def _model_orders(folder: Path) -> list[tuple[str, list[str]]]:
-    """Return the orders of the images of the sparse models of a workspace, and their names.
+def _model_orders(folder: Path) -> Iterator[tuple[str, list[str]]]:
+    """Yield the orders of the images of the sparse models of a workspace, and their names.
 
     A damaged model gives none.
     """
-    orders: list[tuple[str, list[str]]] = []
     for place in _PLACES:
-        try:
-            orders += _orders(folder / place)
-        except (InputError, OSError, struct.error, ValueError, IndexError, KeyError):
-            continue
-    return orders
+        with suppress(InputError, OSError, struct.error, ValueError, IndexError, KeyError):
+            yield from _orders(folder / place)
 
 
 def _orders(model: Path) -> list[tuple[str, list[str]]]:
