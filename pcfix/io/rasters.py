@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,25 @@ NO_HEIGHT = -9999.0
 """Value of cells without a height; every program that reads GeoTIFF knows this one."""
 TILE = 256
 _SUFFIXES = (".tif", ".tiff")
+
+
+class Raster(NamedTuple):
+    """A raster in memory: `array` (bands, rows, columns) as stored, the first row at the top.
+
+    `transform` goes from (column, row) of a cell's corner to x and y in the raster's CRS; `nodata`
+    is the value of cells that have none.
+    """
+
+    array: npt.NDArray[Any]
+    transform: Affine
+    crs: Any
+    nodata: float | None
+
+
+def read_raster(path: AnyPath) -> Raster:
+    """Return a whole raster of any format that GDAL reads; see `open_raster`."""
+    with open_raster(path) as source:
+        return Raster(source.read(), source.transform, source.crs, source.nodata)
 
 
 @contextmanager

@@ -2,30 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import laspy
 import numpy as np
 from pyproj import CRS
 
-from pcfix.io.rasters import open_raster
-
 EAST, NORTH = 456_000.0, 5_432_000.0
 SCALE = "0.001"
-
-
-class Raster(NamedTuple):
-    """A raster in memory, bands first, as stored."""
-
-    array: np.ndarray
-    transform: Any
-    crs: Any
-    nodata: float | None
-
-
-def read_raster(path):
-    with open_raster(path) as source:
-        return Raster(source.read(), source.transform, source.crs, source.nodata)
 
 
 def write(path, xyz, classes=None, withheld=None, crs=32633, offsets=(EAST, NORTH, 0.0)):

@@ -6,7 +6,8 @@ import json
 
 import pytest
 
-from tests.grid.clouds import read_raster, scattered, write
+from pcfix.io.rasters import read_raster
+from tests.grid.clouds import scattered, write
 from tests.utils.program import run_pcfix
 
 

@@ -17,8 +17,9 @@ from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow import dsm as flow
 from pcfix.flow.dsm import grid_dsm
 from pcfix.io.las import source
+from pcfix.io.rasters import read_raster
 from pcfix.report.text import dsm_text
-from tests.grid.clouds import EAST, NORTH, awkward, read_raster, scattered, write
+from tests.grid.clouds import EAST, NORTH, awkward, scattered, write
 from tests.utils.shared import ROOT
 
 SCENE = ROOT / "samples" / "scene"
