@@ -11,7 +11,7 @@ from pcfix.cli.commands import EXAMPLES
 from pcfix.errors import PcfixWarning, SettingError
 from pcfix.options.correct import CorrectOptions, ScienceOptions
 from pcfix.options.declare import options_of
-from pcfix.options.shared import PANELS
+from pcfix.options.shared import Panel
 from pcfix.options.survey import AdjustOptions
 from pcfix.water.index import with_index
 from tests.utils.program import run_pcfix
@@ -27,7 +27,7 @@ def test_every_option_says_what_it_is(kind):
     names = [one.name for one in options_of(kind)]
     assert len(set(names)) == len(names)
     for one in options_of(kind):
-        assert one.panel in PANELS
+        assert one.panel in list(Panel)
         assert one.declared.help.endswith(".")
         assert one.default is None or one.checked(one.default) == one.default
     kind(**{name: value for name, value in FREE.items() if name in names})

@@ -6,8 +6,8 @@ They are independent of each other: each looks at all used points, whatever anot
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -32,8 +32,39 @@ from pcfix.water.surface import is_submerged, surface_above
 
 ReasonArray = npt.NDArray[np.uint8]
 
-
 PIECE_ROWS = 65_536
+
+
+class Cloud(NamedTuple):
+    """What the tests need of n points.
+
+    Attributes
+    ----------
+    xyz : array, shape (n, 3)
+        Metres, world frame.
+    used, submerged : array of bool, shape (n,)
+        The points to test, and those of them to test against the bed; the others are no one's
+        neighbour.
+    reasons : array of uint8, shape (n,)
+        Bits of `Reason`; the tests set them.
+    """
+
+    xyz: FloatArray
+    used: BoolArray
+    submerged: BoolArray
+    reasons: ReasonArray
+
+
+class Resources(NamedTuple):
+    """With what the tests work, without effect on the result; see `make_tiles`, `Neighbours`.
+
+    `progress` is called with the number of points after each piece.
+    """
+
+    tile_m: float | None = None
+    empty: Empty = in_memory
+    jobs: int | None = None
+    progress: Callable[[int], None] | None = None
 
 
 def flag_weak(
@@ -63,32 +94,15 @@ def flag_weak(
         _set(reasons, corrected & (incidence_deg > settings.max_incidence), Reason.INCIDENCE)
 
 
-def flag_sparse(
-    xyz: FloatArray,
-    used: BoolArray,
-    settings: CleanRules,
-    reasons: ReasonArray,
-    *,
-    tile_m: float | None = None,
-    empty: Empty = in_memory,
-    jobs: int | None = None,
-    progress: Callable[[int], None] | None = None,
-) -> dict[str, float]:
-    """Flag statistical and radius outliers.
+def flag_sparse(cloud: Cloud, settings: CleanRules, resources: Resources) -> dict[str, float]:
+    """Flag statistical and radius outliers: `Reason.STATISTICAL` and `RADIUS`.
 
     Parameters
     ----------
-    xyz : array, shape (n, 3)
-        Metres, world frame.
-    used : array of bool, shape (n,)
-        The points to test; more than ``settings.nearest`` of them.
+    cloud : Cloud
+        More than ``settings.nearest`` points are used.
     settings : CleanRules
-    reasons : array of uint8, shape (n,)
-        Gets `Reason.STATISTICAL` and `RADIUS`.
-    tile_m, empty, jobs
-        See `make_tiles` and `Neighbours`; without effect on the result.
-    progress : callable, optional
-        Called with the number of points after each piece.
+    resources : Resources
 
     Returns
     -------
@@ -103,79 +117,63 @@ def flag_sparse(
     zero, and where it is the same for all points, open3d takes them for outliers and pcfix does
     not.
     """
-    tiles = make_tiles(xyz, used, tile_m, empty)
-    near = Neighbours(tiles, 3, jobs)
-    mean_m = np.zeros(len(xyz)) if settings.statistical else None
-    for piece in tiles.pieces(PIECE_ROWS):
-        rows = tiles.row[piece]
-        distance, _ = near.nearest(tiles.xyz[piece], settings.nearest)
+    mean_m = np.zeros(len(cloud.xyz)) if settings.statistical else None
+    for near, rows, xyz in _pieces(cloud.xyz, cloud.used, 3, resources):
+        distance, _ = near.nearest(xyz, settings.nearest)
         if mean_m is not None:
             mean_m[rows] = mean_of_first(distance, settings.neighbours)
         if settings.radius is not None:
             alone = distance[:, settings.radius_neighbours] * SLACK >= settings.radius
-            _set(reasons, rows[alone], Reason.RADIUS)
-        if progress is not None:
-            progress(len(rows))
-    return {} if mean_m is None else _flag_far(mean_m, used, settings, reasons)
+            _set(cloud.reasons, rows[alone], Reason.RADIUS)
+    return {} if mean_m is None else _flag_far(mean_m, cloud, settings)
 
 
-def _flag_far(
-    mean_m: FloatArray, used: BoolArray, settings: CleanRules, reasons: ReasonArray
-) -> dict[str, float]:
+def _pieces(
+    xyz: FloatArray, used: BoolArray, axes: int, resources: Resources
+) -> Iterator[tuple[Neighbours, IntArray, FloatArray]]:
+    """Yield the used points piece by piece, with their rows and what finds their neighbours."""
+    tiles = make_tiles(xyz, used, resources.tile_m, resources.empty)
+    near = Neighbours(tiles, axes, resources.jobs)
+    for piece in tiles.pieces(PIECE_ROWS):
+        yield near, tiles.row[piece], tiles.xyz[piece]
+        if resources.progress is not None:
+            resources.progress(piece.stop - piece.start)
+
+
+def _flag_far(mean_m: FloatArray, cloud: Cloud, settings: CleanRules) -> dict[str, float]:
     """Flag the points whose mean distance is beyond the limit of all; sums go by file order."""
-    count = int(used.sum())
+    used, count = cloud.used, int(cloud.used.sum())
     mean = math.fsum(float(mean_m[rows].sum()) for rows in used_rows(used)) / count
     squares = math.fsum(float(((mean_m[rows] - mean) ** 2).sum()) for rows in used_rows(used))
     sd = math.sqrt(squares / (count - 1))
     limit = mean + (settings.deviations or 0.0) * sd
     for rows in used_rows(used):
-        _set(reasons, rows[mean_m[rows] > limit * SLACK], Reason.STATISTICAL)
+        _set(cloud.reasons, rows[mean_m[rows] > limit * SLACK], Reason.STATISTICAL)
     return {"mean": mean, "sd": sd, "limit": limit}
 
 
-def flag_off_bed(
-    xyz: FloatArray,
-    submerged: BoolArray,
-    settings: CleanRules,
-    reasons: ReasonArray,
-    *,
-    tile_m: float | None = None,
-    empty: Empty = in_memory,
-    jobs: int | None = None,
-    progress: Callable[[int], None] | None = None,
-) -> None:
+def flag_off_bed(cloud: Cloud, settings: CleanRules, resources: Resources) -> None:
     """Flag submerged points below the bed and floating in the water.
 
-    The bed about a point is the middle half, by height, of the submerged points nearest to it in
-    plan; see `CleanRules`.
+    They get `Reason.BELOW_BED` and `FLOATING`. The bed about a point is the middle half, by
+    height, of the submerged points nearest to it in plan; see `CleanRules`.
 
     Parameters
     ----------
-    xyz : array, shape (n, 3)
-        Metres, world frame.
-    submerged : array of bool, shape (n,)
-        The points to test; at least ``settings.bed_neighbours`` of them.
+    cloud : Cloud
+        At least ``settings.bed_neighbours`` points are submerged.
     settings : CleanRules
-    reasons : array of uint8, shape (n,)
-        Gets `Reason.BELOW_BED` and `FLOATING`.
-    tile_m, empty, jobs, progress
-        See `flag_sparse`.
+    resources : Resources
     """
-    tiles = make_tiles(xyz, submerged, tile_m, empty)
-    near = Neighbours(tiles, 2, jobs)
-    for piece in tiles.pieces(PIECE_ROWS):
-        rows, points = tiles.row[piece], tiles.xyz[piece]
-        lower, upper = height_quartiles(near, points, settings.bed_neighbours).T
-        fence = settings.fences * (upper - lower)
-        z = points[:, 2]
+    for near, rows, xyz in _pieces(cloud.xyz, cloud.submerged, 2, resources):
+        lower, upper = height_quartiles(near, xyz, settings.bed_neighbours).T
+        fence, z = settings.fences * (upper - lower), xyz[:, 2]
         if settings.below is not None:
             below = lower - z > np.maximum(fence, settings.below)
-            _set(reasons, rows[below], Reason.BELOW_BED)
+            _set(cloud.reasons, rows[below], Reason.BELOW_BED)
         if settings.floating is not None:
             above = z - upper > np.maximum(fence, settings.floating)
-            _set(reasons, rows[above], Reason.FLOATING)
-        if progress is not None:
-            progress(len(rows))
+            _set(cloud.reasons, rows[above], Reason.FLOATING)
 
 
 def _set(reasons: ReasonArray, where: BoolArray | IntArray, reason: Reason) -> None:
@@ -249,17 +247,16 @@ def clean_points(
     settings = settings or CleanRules()
     check_tile(tile_m)
     n = len(points)
-    mask = np.ones(n, np.bool_) if used is None else _column("used", used, n).astype(np.bool_)
-    rays = None if ray_count is None else _column("ray_count", ray_count, n)
+    given, rays = _column("used", used, n), _column("ray_count", ray_count, n)
+    mask = np.ones(n, np.bool_) if given is None else given.astype(np.bool_)
     reasons = np.zeros(n, np.uint8)
     if rays is not None:
-        miss = None if ray_miss_m is None else _column("ray_miss_m", ray_miss_m, n)
-        angle = None if incidence_deg is None else _column("incidence_deg", incidence_deg, n)
-        flag_weak(settings, reasons, rays, miss, angle)
+        miss = _column("ray_miss_m", ray_miss_m, n)
+        flag_weak(settings, reasons, rays, miss, _column("incidence_deg", incidence_deg, n))
         reasons[~mask] = 0
-    submerged = mask & _submerged(points, water, rays)
+    cloud = Cloud(points, mask, mask & _submerged(points, water, rays), reasons)
     with threads(jobs):
-        flag_neighbours("xyz", points, mask, submerged, settings, reasons, tile_m=tile_m, jobs=jobs)
+        flag_neighbours("xyz", cloud, settings, Resources(tile_m, jobs=jobs))
     return reasons
 
 
@@ -274,7 +271,9 @@ def check_tile(tile_m: float | None) -> None:
         raise SettingError(f"tile_m {tile_m:g} must be above 0: give metres, or None.")
 
 
-def _column(name: str, values: npt.ArrayLike, n: int) -> npt.NDArray[np.float64]:
+def _column(name: str, values: npt.ArrayLike | None, n: int) -> FloatArray | None:
+    if values is None:
+        return None
     column = np.asarray(values, dtype=np.float64)
     if column.shape != (n,):
         raise SettingError(
@@ -295,17 +294,7 @@ def _submerged(
 
 
 def flag_neighbours(
-    name: str,
-    xyz: FloatArray,
-    used: BoolArray,
-    submerged: BoolArray,
-    settings: CleanRules,
-    reasons: npt.NDArray[np.uint8],
-    *,
-    tile_m: float | None = None,
-    empty: Empty = in_memory,
-    jobs: int | None = None,
-    progress: Callable[[int], None] | None = None,
+    name: str, cloud: Cloud, settings: CleanRules, resources: Resources
 ) -> dict[str, float]:
     """Run the tests that look at neighbours: see `flag_sparse` and `flag_off_bed`.
 
@@ -315,11 +304,10 @@ def flag_neighbours(
         If there are fewer used or submerged points than a neighbourhood has; no submerged ones
         are allowed.
     """
-    _check_enough(name, int(used.sum()), int(submerged.sum()), settings)
-    work: dict[str, Any] = {"tile_m": tile_m, "empty": empty, "jobs": jobs, "progress": progress}
-    distances = flag_sparse(xyz, used, settings, reasons, **work) if settings.nearest else {}
-    if settings.below_or_floating and submerged.any():
-        flag_off_bed(xyz, submerged, settings, reasons, **work)
+    _check_enough(name, int(cloud.used.sum()), int(cloud.submerged.sum()), settings)
+    distances = flag_sparse(cloud, settings, resources) if settings.nearest else {}
+    if settings.below_or_floating and cloud.submerged.any():
+        flag_off_bed(cloud, settings, resources)
     return distances
 
 

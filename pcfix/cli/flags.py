@@ -13,12 +13,12 @@ from typing import Annotated, Any, get_args, get_type_hints
 from cyclopts import Group, Parameter
 
 from pcfix.options.declare import Option, OptionSet, options_of
-from pcfix.options.shared import PANELS
+from pcfix.options.shared import Panel
 
 FLAGS = Parameter(name="*")
 """Of a command's argument: each option of its class is a flag."""
 
-_GROUPS = {name: Group(name, sort_key=order) for order, name in enumerate(PANELS)}
+_GROUPS = {name: Group(name.value, sort_key=order) for order, name in enumerate(Panel)}
 
 
 class UsageError(Exception):
@@ -78,7 +78,7 @@ Quiet = Annotated[
         name=["--quiet", "-q"],
         negative=(),
         allow_repeating=True,
-        group=_GROUPS["Output"],
+        group=_GROUPS[Panel.OUTPUT],
         help="No summary and no progress.",
         show_default=False,
     ),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +16,7 @@ from pcfix.flow.job import Job
 from pcfix.flow.old_cameras import paired
 from pcfix.flow.points import Label, correct_checked
 from pcfix.flow.runner import FileTask, Progress, file_task
-from pcfix.flow.surfaces import Points, view_of
+from pcfix.flow.surfaces import file_points, view_of, water_heights
 from pcfix.io.las.columns import (
     OutOfRangeError,
     TooNarrowError,
@@ -36,7 +35,6 @@ from pcfix.model import (
     FloatArray,
     Summary,
     Views,
-    WaterDimension,
     WaterSurface,
 )
 from pcfix.options.correct import CorrectOptions, RefractionOptions, ScienceOptions
@@ -230,21 +228,6 @@ def job_for(path: Path, options: CorrectOptions) -> Job:
     with LasSource(path) as source:
         step_m = float(max(source.header.scales))
     return Job(str(path), options, view, step_m)
-
-
-def file_points(path: Path, water: WaterSurface, jobs: int | None = None) -> Iterator[Points]:
-    """Yield all points of a LAS or LAZ file, chunk by chunk."""
-    with LasSource(path, jobs) as source:
-        for points in source.chunks():
-            heights = water_heights(water, source, points)
-            yield coordinates(points), heights, np.asarray(points["classification"])
-
-
-def water_heights(
-    water: WaterSurface, source: LasSource, points: laspy.ScaleAwarePointRecord
-) -> FloatArray | None:
-    """Return the heights of the water of a chunk, shape (n,), where they are a dimension."""
-    return source.dimension(points, water.name) if isinstance(water, WaterDimension) else None
 
 
 class Correcting:

@@ -11,10 +11,16 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import SettingError
-from pcfix.flow.correct import file_points, water_heights
 from pcfix.flow.inputs import mask_of, paths_in
 from pcfix.flow.runner import Progress, file_task
-from pcfix.flow.surfaces import CloudView, Points, find_surface, view_of
+from pcfix.flow.surfaces import (
+    CloudView,
+    Points,
+    file_points,
+    find_surface,
+    view_of,
+    water_heights,
+)
 from pcfix.flow.through_water import parts_of
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource, coordinates

@@ -15,13 +15,14 @@ import numpy.typing as npt
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.water import read_water
-from pcfix.model import FloatArray, WaterSurface
+from pcfix.model import FloatArray, WaterDimension, WaterSurface
 from pcfix.options.shared import WaterOptions
 from pcfix.water.fit import WaterFit
 from pcfix.water.river import RiverFit
 from pcfix.water.surface import FoundSurface
 
 if TYPE_CHECKING:
+    import laspy
     from pyproj import CRS
 
 AnyPath = str | PathLike[str]
@@ -87,6 +88,21 @@ def view_of(path: Path, jobs: int | None = None) -> CloudView:
                 yield Seen(coordinates(some), rgb, np.asarray(classes), np.asarray(returns))
 
     return CloudView(str(path), crs, low, high, points, chunks)
+
+
+def file_points(path: Path, water: WaterSurface, jobs: int | None = None) -> Iterator[Points]:
+    """Yield all points of a LAS or LAZ file, chunk by chunk."""
+    with LasSource(path, jobs) as source:
+        for points in source.chunks():
+            heights = water_heights(water, source, points)
+            yield coordinates(points), heights, np.asarray(points["classification"])
+
+
+def water_heights(
+    water: WaterSurface, source: LasSource, points: laspy.ScaleAwarePointRecord
+) -> FloatArray | None:
+    """Return the heights of the water of a chunk, shape (n,), where they are a dimension."""
+    return source.dimension(points, water.name) if isinstance(water, WaterDimension) else None
 
 
 def find_surface(

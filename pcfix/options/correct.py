@@ -8,15 +8,12 @@ from typing import Literal
 from pcfix.errors import SettingError
 from pcfix.options.declare import OptionSet, at_least, not_negative, option, within
 from pcfix.options.shared import (
-    BUDGET,
-    METHOD,
-    OUTPUT,
-    WATER,
     IndexOptions,
     InputOptions,
     JobOptions,
     LandRules,
     NeededOptions,
+    Panel,
     SubmergedOptions,
     SummaryOption,
     WaterOptions,
@@ -41,7 +38,7 @@ _SIGMA = not_negative("give a standard deviation")
 class MethodOptions(IndexOptions):
     """Which rays count, and how the true point follows from the apparent one."""
 
-    panel = METHOD
+    panel = Panel.METHOD
 
     method: Method = option("snell", "How the true point follows from the apparent one.")
     camera_set: CameraSet = option(
@@ -102,7 +99,7 @@ class MethodOptions(IndexOptions):
 class BudgetOptions(OptionSet):
     """Standard deviations of what goes into a correction; see `pcfix.refract.uncertainty`."""
 
-    panel = BUDGET
+    panel = Panel.BUDGET
 
     sigma_image: float = option(
         0.5, "Standard deviation of an image coordinate.", unit="px", rule=_SIGMA
@@ -136,7 +133,7 @@ class RefractionOptions(BudgetOptions, MethodOptions):
 class ResultOptions(OptionSet):
     """What is written of a correction."""
 
-    panel = OUTPUT
+    panel = Panel.OUTPUT
 
     uncorrected: Uncorrected = option(
         "withhold", "Submerged points with fewer than two usable rays: flagged, kept or left out."
@@ -158,7 +155,7 @@ class CorrectOptions(JobOptions, SummaryOption, ScienceOptions, SubmergedOptions
 class LabelRules(LandRules):
     """Which points count as submerged, beyond lying below the surface; see `pcfix.label`."""
 
-    panel = WATER
+    panel = Panel.WATER
 
     band: float = option(
         0.0,

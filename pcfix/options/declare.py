@@ -15,6 +15,7 @@ import types
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
+from functools import cache
 from inspect import get_annotations
 from typing import (
     Any,
@@ -220,25 +221,21 @@ def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-_KNOWN: dict[type, tuple[Option, ...]] = {}
-
-
+@cache
 def options_of(kind: type) -> tuple[Option, ...]:
     """Return the options of a class, in the order of its help."""
-    if kind not in _KNOWN:
-        homes = {name: base for base in reversed(kind.__mro__) for name in get_annotations(base)}
-        _KNOWN[kind] = tuple(
-            Option(
-                one.name,
-                eval(str(one.type), vars(sys.modules[homes[one.name].__module__])),
-                one.default,
-                homes[one.name].__dict__.get("panel", ""),
-                one.metadata["declared"],
-            )
-            for one in fields(kind)
-            if "declared" in one.metadata
+    homes = {name: base for base in reversed(kind.__mro__) for name in get_annotations(base)}
+    return tuple(
+        Option(
+            one.name,
+            eval(str(one.type), vars(sys.modules[homes[one.name].__module__])),
+            one.default,
+            homes[one.name].__dict__.get("panel", ""),
+            one.metadata["declared"],
         )
-    return _KNOWN[kind]
+        for one in fields(kind)
+        if "declared" in one.metadata
+    )
 
 
 def table_of(kind: type) -> str:
@@ -326,64 +323,59 @@ def _without_budget(given: Mapping[str, Any], known: list[str]) -> dict[str, Any
     return {**rest, **{f"sigma_{name.rpartition('_')[0] or name}": budget[name] for name in budget}}
 
 
+def rule(holds: Callable[[Any], bool], sentence: str) -> Rule:
+    """Return the rule that something holds; else a sentence with {option} and {value} in it."""
+
+    def check(option: str, value: Any) -> str | None:
+        return None if holds(value) else sentence.format(option=option, value=value)
+
+    return check
+
+
 def within(low: float, high: float, remedy: str, *, name: str = "", above: bool = False) -> Rule:
     """Return the rule of a range, without its lower end where `above`."""
-
-    def rule(option: str, value: Any) -> str | None:
-        if isinstance(value, str):
-            return None
-        if (low < value if above else low <= value) and value <= high:
-            return None
-        ends = f"{low:.1f} to {high:.1f}" if name else f"{low:g} to {high:g}"
-        return f"{name or option} {value:g} is outside {ends}{remedy and ': ' + remedy}."
-
-    return rule
+    ends = f"{low:.1f} to {high:.1f}" if name else f"{low:g} to {high:g}"
+    return rule(
+        lambda value: (
+            isinstance(value, str) or ((low < value if above else low <= value) and value <= high)
+        ),
+        f"{name or '{option}'} {{value:g}} is outside {ends}{remedy and ': ' + remedy}.",
+    )
 
 
 def not_negative(remedy: str) -> Rule:
     """Return the rule of what is finite and at least 0."""
-
-    def rule(option: str, value: Any) -> str | None:
-        if math.isfinite(value) and value >= 0.0:
-            return None
-        return f"{option} {value:g} must not be negative: {remedy}."
-
-    return rule
+    return rule(
+        lambda value: math.isfinite(value) and value >= 0.0,
+        f"{{option}} {{value:g}} must not be negative: {remedy}.",
+    )
 
 
 def at_least(low: float, remedy: str) -> Rule:
     """Return the rule of a lower end."""
-
-    def rule(option: str, value: Any) -> str | None:
-        return f"{option} {value:g} is less than {low:g}: {remedy}." if value < low else None
-
-    return rule
+    return rule(
+        lambda value: not value < low, f"{{option}} {{value:g}} is less than {low:g}: {remedy}."
+    )
 
 
 def must_be(low: float, high: float, remedy: str, *, whole: bool = False) -> Rule:
     """Return the rule of finite numbers from low to high; a low of zero is itself not allowed."""
     least = "above 0" if low == 0.0 else f"at least {low:g}"
     most = f" and at most {high:g}" if math.isfinite(high) else ""
-    words = f"{'a whole number ' if whole else ''}{least}{most}"
 
-    def rule(option: str, value: Any) -> str | None:
+    def holds(value: Any) -> bool:
         number = math.nan if isinstance(value, str) else float(value)
-        integer = not whole or number == math.floor(number)
-        above = number > low if low == 0.0 else number >= low
-        if math.isfinite(number) and integer and above and number <= high:
-            return None
-        return f"{option} {value} must be {words}: {remedy}."
+        if not math.isfinite(number) or (whole and number != math.floor(number)):
+            return False
+        return (number > low if low == 0.0 else number >= low) and number <= high
 
-    return rule
+    words = f"{'a whole number ' if whole else ''}{least}{most}"
+    return rule(holds, f"{{option}} {{value}} must be {words}: {remedy}.")
 
 
-def positive(words: str) -> Rule:
-    """Return the rule of what is above zero and finite; `words` end the sentence."""
-
-    def rule(option: str, value: Any) -> str | None:
-        return None if 0.0 < value < math.inf else f"{option} {value:g} {words}"
-
-    return rule
+def positive(sentence: str) -> Rule:
+    """Return the rule of what is above zero and finite."""
+    return rule(lambda value: 0.0 < value < math.inf, sentence)
 
 
 def one_or_more(kind: type, example: str) -> Callable[[str, str], tuple[Any, ...]]:

@@ -2,38 +2,36 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from pcfix.errors import SettingError
-from pcfix.options.declare import OptionSet, Rule, at_least, option
-from pcfix.options.shared import (
-    CAMERA,
-    CLOUDS,
-    EFFECT,
-    FLIGHT,
-    OUTPUT,
-    WATER,
-    IndexOptions,
-    OverwriteOption,
-)
+from pcfix.options.declare import OptionSet, Rule, at_least, option, rule
+from pcfix.options.shared import IndexOptions, OverwriteOption, Panel
 
 BlockKind = Literal["nadir", "oblique"]
 BedKind = Literal["shore", "flat", "slope", "steps", "river"]
 CloudKind = Literal["tracks", "pairs", "depth-maps"]
 
 
-def _range(name: str, unit: str, least: float, most: float, what: str) -> Rule:
-    """Return the rule of a range, with what it is of."""
+_UNITS = {"m": " m", "mm": " mm", "deg": " deg", "percent": " %"}
 
-    def rule(option: str, value: Any) -> str | None:
+
+def _range(least: float, most: float, what: str, subject: str = "") -> Rule:
+    """Return the rule of a range, and what it is of: the option with its unit, or a `subject`."""
+
+    def check(option: str, value: Any) -> str | None:
         if least <= value <= most:
             return None
+        name, _, unit = option.rpartition("-")
+        name, unit = (name, _UNITS[unit]) if unit in _UNITS else (option, "")
+        found = (subject or name.replace("-", " ") + " {:g}" + unit).format(value)
         if least == 0 and value < 0:
-            return f"{name} {value:g}{unit} is negative: give {what}."
-        return f"{name} {value:g}{unit} is outside {least:g} to {most:g}: give {what}."
+            return f"{found} is negative: give {what}."
+        return f"{found} is outside {least:g} to {most:g}: give {what}."
 
-    return rule
+    return check
 
 
 def _numbers(count: int, *, above_zero: bool = True) -> Rule:
@@ -50,23 +48,11 @@ def _numbers(count: int, *, above_zero: bool = True) -> Rule:
     return rule
 
 
-def _seed(option: str, value: Any) -> str | None:
-    return f"seed {value} is negative: give a whole number from 0." if value < 0 else None
-
-
-def _level(option: str, value: Any) -> str | None:
-    return None if abs(value) < float("inf") else f"water level {value} must be a finite height, m."
-
-
-def _points(option: str, value: Any) -> str | None:
-    return None if value >= 1 else f"points {value} is less than 1."
-
-
 @dataclass(frozen=True, kw_only=True)
 class FlightOptions(OptionSet):
     """How the block is flown."""
 
-    panel = FLIGHT
+    panel = Panel.FLIGHT
 
     block: BlockKind = option("nadir", "Nadir images only, or obliques too.")
     cameras: int | None = option(
@@ -76,9 +62,7 @@ class FlightOptions(OptionSet):
         default_is="as the area needs",
     )
     flying_height_m: float = option(
-        80.0,
-        "Above the water.",
-        rule=_range("flying height", " m", 0.5, 10_000, "the height above the water"),
+        80.0, "Above the water.", rule=_range(0.5, 10_000, "the height above the water")
     )
     area_m: tuple[float, float] = option(
         (120.0, 80.0), "Extent along and across the strips.", rule=_numbers(2)
@@ -86,39 +70,35 @@ class FlightOptions(OptionSet):
     forward_overlap: float = option(
         0.8,
         "Share of an image in the next, at the water.",
-        rule=_range("forward overlap", "", 0.3, 0.95, "the share of an image in the next"),
+        rule=_range(0.3, 0.95, "the share of an image in the next"),
     )
     side_overlap: float = option(
         0.7,
         "Share of a strip in the next, at the water.",
-        rule=_range("side overlap", "", 0.0, 0.95, "the share of a strip in the next"),
+        rule=_range(0.0, 0.95, "the share of a strip in the next"),
     )
     obliques_deg: float | None = option(
         None,
         "Fly obliques at this angle from straight down.",
-        rule=_range("obliques", " deg", 1, 60, "the angle from straight down"),
+        rule=_range(1, 60, "the angle from straight down"),
         default_is="20 in oblique blocks",
     )
     oblique_directions: int = option(
-        4,
-        "Headings of obliques, from north.",
-        rule=_range("oblique directions", "", 1, 36, "how many ways obliques look"),
+        4, "Headings of obliques, from north.", rule=_range(1, 36, "how many ways obliques look")
     )
     oblique_share: float | None = option(
         None,
         "Share of the images that are obliques, 1: all.",
-        rule=_range("oblique share", "", 0.01, 1.0, "the share of images that are obliques"),
+        rule=_range(0.01, 1.0, "the share of images that are obliques"),
         default_is="each direction a third as dense as the nadir images",
     )
     position_noise_m: float = option(
         0.0,
         "Error (sd) of the projection centres given.",
-        rule=_range("position noise", " m", 0, 100, "a standard deviation"),
+        rule=_range(0, 100, "a standard deviation"),
     )
     attitude_noise_deg: float = option(
-        0.0,
-        "Error (sd) of the yaw, pitch, roll given.",
-        rule=_range("attitude noise", " deg", 0, 5, "a standard deviation"),
+        0.0, "Error (sd) of the yaw, pitch, roll given.", rule=_range(0, 5, "a standard deviation")
     )
 
 
@@ -126,10 +106,10 @@ class FlightOptions(OptionSet):
 class CameraOptions(OptionSet):
     """The camera, and how well it measures."""
 
-    panel = CAMERA
+    panel = Panel.CAMERA
 
     focal_mm: float = option(
-        8.8, "Focal length.", rule=_range("focal length", " mm", 0.5, 2000, "that of the lens")
+        8.8, "Focal length.", rule=_range(0.5, 2000, "that of the lens", "focal length {:g} mm")
     )
     sensor_mm: tuple[float, float] = option(
         (13.2, 8.8), "Width and height of the sensor; pixels are square.", rule=_numbers(2)
@@ -144,7 +124,7 @@ class CameraOptions(OptionSet):
         0.5,
         "Noise of image points (sd).",
         unit="px",
-        rule=_range("image noise", " px", 0, 100, "a standard deviation"),
+        rule=_range(0, 100, "a standard deviation", "image noise {:g} px"),
         old=("image_noise_px",),
     )
 
@@ -153,35 +133,41 @@ class CameraOptions(OptionSet):
 class SceneWaterOptions(IndexOptions):
     """The water and the ground."""
 
-    panel = WATER
+    panel = Panel.WATER
 
     water: float = option(
-        0.37, "Water level, mid area.", unit="m", rule=_level, old=("water_level_m",)
+        0.37,
+        "Water level, mid area.",
+        unit="m",
+        rule=rule(
+            lambda value: abs(value) < math.inf, "water level {value} must be a finite height, m."
+        ),
+        old=("water_level_m",),
     )
     wave_slope_deg: float = option(
         0.0,
         "Slope (sd, along an axis) of waves.",
-        rule=_range("wave slope", " deg", 0, 10, "the standard deviation along one axis"),
+        rule=_range(0, 10, "the standard deviation along one axis"),
     )
     wave_length_m: float = option(
-        1.0, "Of waves.", rule=_range("wavelength", " m", 0.01, 1000, "from crest to crest")
+        1.0, "Of waves.", rule=_range(0.01, 1000, "from crest to crest", "wavelength {:g} m")
     )
     tilt_percent: float | None = option(
         None,
         "How steeply the water falls.",
-        rule=_range("tilt", " %", 0, 20, "how far the water falls in 100 m"),
+        rule=_range(0, 20, "how far the water falls in 100 m"),
         default_is="0, of a river 0.3",
     )
     tilt_heading_deg: float = option(
         90.0,
         "Where it falls to, clockwise from north.",
-        rule=_range("tilt heading", " deg", -360, 360, "where the water falls to, from north"),
+        rule=_range(-360, 360, "where the water falls to, from north"),
     )
     bed: BedKind = option("shore", "Shape of the ground.")
     greatest_depth_m: float | None = option(
         None,
         "Below the water.",
-        rule=_range("greatest depth", " m", 0.01, 1000, "metres below the water"),
+        rule=_range(0.01, 1000, "metres below the water"),
         default_is="shore 12, flat 3, slope 6, steps 6, river 2.5",
     )
 
@@ -190,38 +176,42 @@ class SceneWaterOptions(IndexOptions):
 class SceneCloudOptions(OptionSet):
     """The cloud that is made of the images, and the LiDAR."""
 
-    panel = CLOUDS
+    panel = Panel.CLOUDS
 
-    points: int = option(100_000, "Points of the cloud.", rule=_points)
+    points: int = option(
+        100_000,
+        "Points of the cloud.",
+        rule=rule(lambda value: value >= 1, "points {value} is less than 1."),
+    )
     cloud: CloudKind = option(
         "tracks", "Of all images at once, the median of stereo pairs, or fused depth maps."
     )
     detection: float = option(
         1.0,
         "Probability that an image that shows a point takes part; three at least do.",
-        rule=_range("detection", "", 0.01, 1.0, "a probability"),
+        rule=_range(0.01, 1.0, "a probability"),
     )
     neighbours: int | None = option(
         None,
         "Images that each is matched with.",
-        rule=_range("neighbours", "", 1, 20, "how many images each is matched with"),
+        rule=_range(1, 20, "how many images each is matched with"),
         default_is="pairs 4, depth-maps 5",
     )
     lidar_per_m2: float = option(
         2.0,
         "Points of the LiDAR per m2.",
-        rule=_range("lidar density", " points/m2", 0, 10_000, "points per square metre"),
+        rule=_range(0, 10_000, "points per square metre", "lidar density {:g} points/m2"),
     )
     lidar_noise_m: float = option(
-        0.05,
-        "Error (sd) of its heights.",
-        rule=_range("lidar noise", " m", 0, 10, "a standard deviation"),
+        0.05, "Error (sd) of its heights.", rule=_range(0, 10, "a standard deviation")
     )
     seed: int = option(
         1,
         "Of the random numbers; each kind of noise has its own, so that switching one on changes"
         " neither terrain nor block.",
-        rule=_seed,
+        rule=rule(
+            lambda value: not value < 0, "seed {value} is negative: give a whole number from 0."
+        ),
     )
 
 
@@ -254,7 +244,7 @@ def _frame(option: str, text: str) -> tuple[int, int]:
 class EffectOptions(OptionSet):
     """A pair of vertical images, and how far refraction puts its points wrong."""
 
-    panel = EFFECT
+    panel = Panel.EFFECT
 
     effect_focal_mm: float | None = option(
         None,
@@ -291,7 +281,7 @@ class EffectOptions(OptionSet):
 class SimulateOptions(OverwriteOption, EffectOptions, SceneOptions):
     """The options of ``pcfix simulate``."""
 
-    panel = OUTPUT
+    panel = Panel.OUTPUT
 
     refraction_effect: bool = option(
         False,
@@ -312,6 +302,6 @@ class SimulateOptions(OverwriteOption, EffectOptions, SceneOptions):
 class DemoOptions(OverwriteOption):
     """The options of ``pcfix demo``."""
 
-    panel = OUTPUT
+    panel = Panel.OUTPUT
 
     points: int = option(50_000, "Points of each scene.")

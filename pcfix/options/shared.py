@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any, Literal, TypeAlias
 
 from pcfix.errors import SettingError
@@ -23,38 +24,25 @@ WaterModel = Literal["auto", "level", "plane", "along", "river"]
 
 DEFAULT_REFRACTIVE_INDEX = 1.34
 
-PANELS = (
-    NEED,
-    FLIGHT,
-    CAMERA,
-    WATER,
-    CAMERAS,
-    METHOD,
-    BUDGET,
-    TESTS,
-    RASTER,
-    FIGURES,
-    UNKNOWNS,
-    (CLOUDS),
-    EFFECT,
-    OUTPUT,
-) = (
-    "What you need",
-    "Flight",
-    "Camera",
-    "Water",
-    "Cameras",
-    "Rays and method",
-    "Error budget",
-    "Tests",
-    "Raster",
-    "Figures",
-    "What moves, and how much counts",
-    "Clouds",
-    "With --refraction-effect",
-    "Output",
-)
-"""The panels of the help, in its order."""
+
+class Panel(StrEnum):
+    """The panels of the help, in its order."""
+
+    NEED = "What you need"
+    FLIGHT = "Flight"
+    CAMERA = "Camera"
+    WATER = "Water"
+    CAMERAS = "Cameras"
+    METHOD = "Rays and method"
+    BUDGET = "Error budget"
+    TESTS = "Tests"
+    RASTER = "Raster"
+    FIGURES = "Figures"
+    UNKNOWNS = "What moves, and how much counts"
+    CLOUDS = "Clouds"
+    EFFECT = "With --refraction-effect"
+    OUTPUT = "Output"
+
 
 _INDEX = within(
     1.0, 1.5, "give the index of water relative to air, about 1.333 for fresh and 1.34 for sea"
@@ -96,7 +84,7 @@ Offset: TypeAlias = tuple[float, float, float]
 class IndexOptions(OptionSet):
     """The refractive index of the water."""
 
-    panel = WATER
+    panel = Panel.WATER
 
     index: float | str | None = option(
         None,
@@ -118,7 +106,7 @@ class IndexOptions(OptionSet):
 class WaterOptions(OptionSet):
     """How a water surface is fitted to shoreline points."""
 
-    panel = WATER
+    panel = Panel.WATER
 
     water_model: WaterModel = option(
         "auto",
@@ -134,7 +122,7 @@ class WaterOptions(OptionSet):
 class LandRules(OptionSet):
     """Which points below the surface are land all the same."""
 
-    panel = WATER
+    panel = Panel.WATER
 
     connected: bool = option(
         False, "Leave out pools that are apart from the water; what was left out is reported."
@@ -169,7 +157,7 @@ class LandRules(OptionSet):
 class SubmergedOptions(LandRules):
     """Where, and which, points may be submerged."""
 
-    panel = WATER
+    panel = Panel.WATER
 
     water_mask: File | None = option(
         None,
@@ -182,7 +170,7 @@ class SubmergedOptions(LandRules):
 class CameraFileOptions(OptionSet):
     """How a camera file is read."""
 
-    panel = CAMERAS
+    panel = Panel.CAMERAS
 
     sensor: File | None = option(
         None,
@@ -216,7 +204,7 @@ class CameraFileOptions(OptionSet):
 class ViewOptions(OptionSet):
     """Which cameras made each point."""
 
-    panel = CAMERAS
+    panel = Panel.CAMERAS
 
     views: File | None = option(
         None,
@@ -234,7 +222,7 @@ class ViewOptions(OptionSet):
 class OverwriteOption(OptionSet):
     """What becomes of files that exist."""
 
-    panel = OUTPUT
+    panel = Panel.OUTPUT
 
     overwrite: bool = option(False, "Replace an output that exists.")
 
@@ -243,7 +231,7 @@ class OverwriteOption(OptionSet):
 class JobOptions(OverwriteOption):
     """How the work is done."""
 
-    panel = OUTPUT
+    panel = Panel.OUTPUT
 
     jobs: int | None = option(
         None, "Threads.", rule=at_least(1, "give a number of threads"), default_is="all cores"
@@ -254,7 +242,7 @@ class JobOptions(OverwriteOption):
 class SummaryOption(OptionSet):
     """What is told of the work."""
 
-    panel = OUTPUT
+    panel = Panel.OUTPUT
 
     summary: File | None = option(None, "Write the summary there, as JSON.")
 
@@ -263,7 +251,7 @@ class SummaryOption(OptionSet):
 class NeededOptions(OptionSet):
     """Where the light bends."""
 
-    panel = NEED
+    panel = Panel.NEED
 
     water: Any = option(
         None,
@@ -278,7 +266,7 @@ class NeededOptions(OptionSet):
 class PortOptions(OptionSet):
     """A housing under water."""
 
-    panel = WATER
+    panel = Panel.WATER
 
     port: Any = option(
         None,
@@ -293,7 +281,7 @@ class PortOptions(OptionSet):
 class CamerasOptions(OptionSet):
     """The exterior orientation."""
 
-    panel = NEED
+    panel = Panel.NEED
 
     cameras: Any = option(
         None,
@@ -308,7 +296,7 @@ class CamerasOptions(OptionSet):
 class TideOptions(OptionSet):
     """Water that moves, and what water it is."""
 
-    panel = WATER
+    panel = Panel.WATER
 
     tide: File | None = option(
         None, "CSV time,level_m: each image gets the water level of its time."
@@ -327,7 +315,7 @@ class TideOptions(OptionSet):
 class HistoryOptions(OptionSet):
     """What came before the correction."""
 
-    panel = CAMERAS
+    panel = Panel.CAMERAS
 
     adjusted_from: Any = option(
         None,

@@ -7,16 +7,8 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from pcfix.errors import SettingError
-from pcfix.options.declare import File, OptionSet, Rule, at_least, must_be, option, positive
-from pcfix.options.shared import (
-    FIGURES,
-    OUTPUT,
-    RASTER,
-    TESTS,
-    JobOptions,
-    OverwriteOption,
-    SummaryOption,
-)
+from pcfix.options.declare import File, OptionSet, Rule, at_least, must_be, option, positive, rule
+from pcfix.options.shared import JobOptions, OverwriteOption, Panel, SummaryOption
 
 LEAST_NEIGHBOURS, MOST_NEIGHBOURS = 6, 500
 MAX_HOLE_CELLS = 1000
@@ -27,7 +19,7 @@ LEAST_PLANE_POINTS, PLANE_POINTS = 6, 8
 DsmMethod = Literal["mean", "median", "min", "max", "idw", "tin"]
 SurfaceChoice = Literal["all", "bed"]
 
-METRES = "is not positive; give metres."
+METRES = positive("{option} {value:g} is not positive; give metres.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +33,7 @@ class CleanRules(OptionSet):
     to the neighbours finds, in a cloud of even spacing, also its edges and corners.
     """
 
-    panel = TESTS
+    panel = Panel.TESTS
 
     statistical: bool = option(True, "Test the mean distance to the nearest points in space.")
     neighbours: int = option(
@@ -144,7 +136,7 @@ class CleanRules(OptionSet):
 class CleanOptions(JobOptions, SummaryOption, CleanRules):
     """The options of ``pcfix clean``."""
 
-    panel = OUTPUT
+    panel = Panel.OUTPUT
 
     water: Any = option(
         None,
@@ -155,34 +147,27 @@ class CleanOptions(JobOptions, SummaryOption, CleanRules):
     drop: bool = option(False, "Leave noise out; else class 7 and the withheld flag.")
 
 
-def _resolution(option: str, value: Any) -> str | None:
-    if math.isfinite(value) and value >= MIN_RESOLUTION_M:
-        return None
-    return (
-        f"The resolution is {value:g} m; it must be a positive number of metres, at least"
-        f" {MIN_RESOLUTION_M:g}."
-    )
+_RESOLUTION = rule(
+    lambda value: math.isfinite(value) and value >= MIN_RESOLUTION_M,
+    "The resolution is {value:g} m; it must be a positive number of metres, at least"
+    f" {MIN_RESOLUTION_M:g}.",
+)
 
 
 def _one_of(kind: Any) -> Rule:
     known = get_args(kind)
-
-    def rule(option: str, value: Any) -> str | None:
-        if value in known:
-            return None
-        return f"The {option} is {value!r}; it must be one of {', '.join(known)}."
-
-    return rule
+    sentence = f"The {{option}} is {{value!r}}; it must be one of {', '.join(known)}."
+    return rule(lambda value: value in known, sentence)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DsmRules(OptionSet):
     """How a cloud becomes a raster."""
 
-    panel = RASTER
+    panel = Panel.RASTER
 
     resolution: float = option(
-        None, "Side of a cell.", unit="m", needed=True, rule=_resolution, old=("resolution_m",)
+        None, "Side of a cell.", unit="m", needed=True, rule=_RESOLUTION, old=("resolution_m",)
     )
     method: DsmMethod = option("mean", "How a cell gets its height.", rule=_one_of(DsmMethod))
     surface: SurfaceChoice = option(
@@ -194,35 +179,35 @@ class DsmRules(OptionSet):
         None,
         "Fill holes up to so many metres wide; they get count 0.",
         unit="m",
+        rule=positive("The width of holes to fill is {value:g} m; it must be positive."),
         old=("fill_m",),
     )
     azimuth: float = option(
         315.0,
         "Sun of the hillshade, clockwise from north.",
         unit="deg",
+        rule=rule(math.isfinite, "The azimuth is {value:g}; it must be in degrees."),
         old=("azimuth_deg",),
     )
     altitude: float = option(
-        45.0, "Sun of the hillshade, above the horizon.", unit="deg", old=("altitude_deg",)
+        45.0,
+        "Sun of the hillshade, above the horizon.",
+        unit="deg",
+        rule=rule(
+            lambda value: 0.0 < value <= 90.0,
+            "The altitude of the sun is {value:g} degrees; it must be above 0 and at most 90.",
+        ),
+        old=("altitude_deg",),
     )
 
     def check(self) -> None:
-        """Check the values."""
+        """Check what options say together."""
         super().check()
-        if not math.isfinite(self.azimuth):
-            raise SettingError(f"The azimuth is {self.azimuth:g}; it must be in degrees.")
-        if not 0.0 < self.altitude <= 90.0:
+        most = MAX_HOLE_CELLS * (self.resolution or math.inf)
+        if self.fill is not None and self.fill > most:
             raise SettingError(
-                f"The altitude of the sun is {self.altitude:g} degrees; it must be above 0 and"
-                " at most 90."
-            )
-        fill, side = self.fill, self.resolution or math.inf
-        if fill is not None and not (math.isfinite(fill) and fill > 0.0):
-            raise SettingError(f"The width of holes to fill is {fill:g} m; it must be positive.")
-        if fill is not None and fill > MAX_HOLE_CELLS * side:
-            raise SettingError(
-                f"Holes up to {fill:g} m are more than {MAX_HOLE_CELLS:,} cells of {side:g} m"
-                f" wide; fill up to {MAX_HOLE_CELLS * side:g} m, or take a coarser resolution."
+                f"Holes up to {self.fill:g} m are more than {MAX_HOLE_CELLS:,} cells of"
+                f" {self.resolution:g} m wide; fill up to {most:g} m, or take a coarser resolution."
             )
 
 
@@ -230,7 +215,7 @@ class DsmRules(OptionSet):
 class DsmOptions(OverwriteOption, SummaryOption, DsmRules):
     """The options of ``pcfix dsm``."""
 
-    panel = OUTPUT
+    panel = Panel.OUTPUT
 
     hillshade: File | None = option(None, "Write a hillshade there (.tif).")
     cog: bool = option(False, "Write cloud optimised GeoTIFF.")
@@ -240,26 +225,19 @@ class DsmOptions(OverwriteOption, SummaryOption, DsmRules):
 class M3c2Option(OptionSet):
     """Whether M3C2 is wanted."""
 
-    panel = FIGURES
+    panel = Panel.FIGURES
 
     m3c2: bool = option(False, "Compare by M3C2 too, with py4dgeo: the extra m3c2.")
 
 
-def _not_negative_count(option: str, value: Any) -> str | None:
-    return f"{option} {value} is negative; give how many." if value < 0 else None
-
-
-def _bin_width(option: str, value: Any) -> str | None:
-    if math.isfinite(value) and value > 0.0:
-        return None
-    return f"bin width {value:g} is not positive; give metres, such as 1."
+_BIN_WIDTH = positive("bin width {value:g} is not positive; give metres, such as 1.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class CompareRules(M3c2Option):
     """What is measured of two clouds."""
 
-    panel = FIGURES
+    panel = Panel.FIGURES
 
     submerged: bool = option(False, "Only points of class 40, or below --water.")
     c2c_only: bool = option(False, "Distances to the nearest point, nothing signed.")
@@ -271,32 +249,30 @@ class CompareRules(M3c2Option):
         ),
     )
     bin_width: float = option(
-        1.0, "Of the table by depth.", unit="m", rule=_bin_width, old=("bin_width_m",)
+        1.0, "Of the table by depth.", unit="m", rule=_BIN_WIDTH, old=("bin_width_m",)
     )
     shore_bin_width: float = option(
         10.0,
         "Of the table by distance from shore.",
         unit="m",
-        rule=_bin_width,
+        rule=_BIN_WIDTH,
         old=("shore_bin_width_m",),
     )
     max_gap: float | None = option(
         None,
         "How far outside the reference a point counts.",
         unit="m",
-        rule=positive(METRES),
+        rule=METRES,
         default_is="5 point spacings, at least 1",
         old=("max_gap_m",),
     )
     sections: int = option(
-        0, "So many automatic cross-sections, down the slope.", rule=_not_negative_count
+        0,
+        "So many automatic cross-sections, down the slope.",
+        rule=rule(lambda value: not value < 0, "{option} {value} is negative; give how many."),
     )
     corridor: float = option(
-        1.0,
-        "Half-width of a cross-section.",
-        unit="m",
-        rule=positive(METRES),
-        old=("corridor_m",),
+        1.0, "Half-width of a cross-section.", unit="m", rule=METRES, old=("corridor_m",)
     )
 
     @property
@@ -309,14 +285,11 @@ class CompareRules(M3c2Option):
 class CompareOptions(OverwriteOption, SummaryOption, CompareRules):
     """The options of ``pcfix compare``."""
 
-    panel = OUTPUT
+    panel = Panel.OUTPUT
 
     out_dir: File | None = option(None, "Folder for compare.json, depth tables and sections (CSV).")
     water: Any = option(
-        None,
-        "As of 'pcfix correct'.",
-        default_is="what the cloud says",
-        metavar="SPEC",
+        None, "As of 'pcfix correct'.", default_is="what the cloud says", metavar="SPEC"
     )
     section: tuple[Any, ...] = option(
         (),

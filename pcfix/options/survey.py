@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -11,14 +10,12 @@ from pcfix.errors import PcfixWarning, SettingError
 from pcfix.options.correct import RefractionOptions
 from pcfix.options.declare import File, OptionSet, one_or_more, option, positive
 from pcfix.options.shared import (
-    CAMERAS,
-    OUTPUT,
-    UNKNOWNS,
     CameraFileOptions,
     IndexOptions,
     JobOptions,
     NeededOptions,
     OverwriteOption,
+    Panel,
     PortOptions,
     SubmergedOptions,
     SummaryOption,
@@ -39,7 +36,7 @@ WATER_UNKNOWNS = ("level", "tilt", "index")
 class SurveyedOptions(OptionSet):
     """What surveys say of the images."""
 
-    panel = CAMERAS
+    panel = Panel.CAMERAS
 
     gcps: Any = option(
         None,
@@ -64,7 +61,7 @@ class CamerasCheckOptions(
 ):
     """The options of ``pcfix cameras``."""
 
-    panel = CAMERAS
+    panel = Panel.CAMERAS
 
     cloud: File | None = option(None, "LAS or LAZ cloud that they shall fit.")
     water: Any = option(
@@ -83,7 +80,7 @@ class CamerasCheckOptions(
 class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions):
     """The options of ``pcfix water``."""
 
-    panel = OUTPUT
+    panel = Panel.OUTPUT
 
     cloud: File | None = option(None, "LAS or LAZ cloud under it.")
     plot: File | None = option(None, "PNG of points and residuals, or of evidence.")
@@ -95,7 +92,7 @@ class RunOptions(
 ):
     """The options of ``pcfix run``: everything that its results depend on is in ``run.json``."""
 
-    panel = OUTPUT
+    panel = Panel.OUTPUT
 
     reference: File | None = option(
         None, "LiDAR cloud, CSV check points or GeoTIFF to compare with."
@@ -104,7 +101,7 @@ class RunOptions(
         None,
         "Of the rasters.",
         unit="m",
-        rule=positive(METRES),
+        rule=METRES,
         default_is="4 points a cell",
         old=("resolution_m",),
     )
@@ -121,8 +118,7 @@ class RunOptions(
             raise SettingError("m3c2 compares with a reference; give --reference too.")
 
 
-def _sigma(option: str, value: Any) -> str | None:
-    return None if 0.0 < value < math.inf else f"the standard deviation {value:g} must be positive."
+_SIGMA = positive("the standard deviation {value:g} must be positive.")
 
 
 def _water_unknowns(option: str, names: Any) -> str | None:
@@ -154,7 +150,7 @@ def _lens_names(option: str, text: str) -> tuple[str, ...]:
 class AdjustRules(IndexOptions):
     """How a block is adjusted."""
 
-    panel = UNKNOWNS
+    panel = Panel.UNKNOWNS
 
     free: tuple[str, ...] = option(
         (),
@@ -165,20 +161,13 @@ class AdjustRules(IndexOptions):
         metavar="NAMES",
     )
     sigma_level: float | None = option(
-        None, "Let the level move about its value.", unit="m", rule=_sigma, old=("level_sigma_m",)
+        None, "Let the level move about its value.", unit="m", rule=_SIGMA, old=("level_sigma_m",)
     )
     sigma_tilt: float | None = option(
-        None,
-        "Let the tilt move about its value.",
-        unit="deg",
-        rule=_sigma,
-        old=("tilt_sigma_deg",),
+        None, "Let the tilt move about its value.", unit="deg", rule=_SIGMA, old=("tilt_sigma_deg",)
     )
     sigma_index: float | None = option(
-        None,
-        "Let the refractive index move about its value.",
-        rule=_sigma,
-        old=("index_sigma",),
+        None, "Let the refractive index move about its value.", rule=_SIGMA, old=("index_sigma",)
     )
     lens_unknowns: tuple[str, ...] | None = option(
         None,
@@ -202,7 +191,7 @@ class AdjustRules(IndexOptions):
         None,
         "Of GNSS positions without one.",
         unit="m",
-        rule=_sigma,
+        rule=_SIGMA,
         default_is="from how they fit",
         old=("gnss_sigma_m",),
     )
@@ -210,7 +199,7 @@ class AdjustRules(IndexOptions):
         None,
         "Of tie points in the images.",
         unit="px",
-        rule=_sigma,
+        rule=_SIGMA,
         default_is="from their residuals",
         old=("sigma_px",),
     )
@@ -231,7 +220,7 @@ class AdjustOptions(
 ):
     """The options of ``pcfix adjust``."""
 
-    panel = CAMERAS
+    panel = Panel.CAMERAS
 
     cloud: File | None = option(
         None, "The cloud that these poses made; it stands in where there are no tie points."
