@@ -112,7 +112,7 @@ def _run(
 def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
     from pcfix.flow.inputs import paths_in
     from pcfix.flow.job import Job
-    from pcfix.io.files import check_output, write_text
+    from pcfix.flow.runner import check_summary, write_summary
     from pcfix.io.las.columns import columns_for
     from pcfix.options.correct import CorrectOptions
     from pcfix.threads import threads
@@ -132,8 +132,7 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
     flags = Flags(ins, metadata)
     step_m = 0.0 if scales is None else float(scales.max())
     job = Job(NAME, options, _view(ins, metadata, flags), step_m)
-    if options.summary is not None:
-        check_output(options.summary, overwrite=options.overwrite, inputs=paths_in(options))
+    check_summary(options, paths_in(options))
     results = Results(ins, columns, flags, scales)
     with threads(options.jobs):
         job.look_around(lambda: (points for _, points in _chunks(ins, job.water, flags)))
@@ -142,9 +141,7 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
     job.check_fit()
     outs.update(results.dimensions)
     summary = job.summary(NAME, NAME, time.perf_counter() - started)
-    if options.summary is not None:
-        text = json.dumps(summary.as_dict(), indent=2) + "\n"
-        write_text(options.summary, text, overwrite=options.overwrite)
+    write_summary(options, summary.as_dict())
     namespace["out_metadata"] = metadata_of(summary)
 
 

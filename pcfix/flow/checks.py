@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from os import PathLike
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,15 +19,14 @@ from pcfix.flow.diagnosis import (
     ties_of,
 )
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.runner import write_summary
-from pcfix.flow.surfaces import CloudView, find_surface, view_of
+from pcfix.flow.runner import check_summary, write_summary
+from pcfix.flow.surfaces import CloudView, file_points, find_surface, view_of
 from pcfix.io.cameras.georeference import adjusted_minus_gnss
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.io.files import check_input, check_output, write_bytes
 from pcfix.io.gnss_positions import read_gnss
 from pcfix.io.ground_control import read_ground_control
-from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.lens.frames import cameras_in_sight
 from pcfix.model import Cameras, FloatArray, Lens, WaterDimension, WaterSurface
 from pcfix.options.declare import File, taken
@@ -38,29 +37,10 @@ from pcfix.report.water import WaterReport, water_figure
 from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
 
-AnyPath = str | PathLike[str]
-
 SAMPLE_POINTS, WATER_SAMPLE_POINTS = 50_000, 200_000
 """Points of the cloud that are looked for in the frames, and below the water; evenly spread."""
 LEAST_SEEN_TWICE = 0.9
 """Share of a cloud that two frames or more should hold, as two made each point."""
-
-
-class Survey(NamedTuple):
-    """What else tells whether the poses have absorbed the refraction."""
-
-    gcps: AnyPath | None
-    lens: AnyPath | None
-    reference: AnyPath | None
-
-    def refuse(self) -> None:
-        """Refuse it without the cloud and the water that it is about."""
-        for name, value in self._asdict().items():
-            if value is not None:
-                raise SettingError(
-                    f"{name} {value}: tells whether the poses have absorbed the refraction; give"
-                    " cloud and water too."
-                )
 
 
 def check_cameras(
@@ -86,54 +66,49 @@ def check_cameras(
         If a file cannot be read, or the two CRS cannot be reconciled.
     """
     given = taken(CamerasCheckOptions, options, keywords, "check_cameras")
-    cloud, water, gnss, plot = given.cloud, given.water, given.gnss, given.plot
-    survey = Survey(given.gcps, given.lens, given.reference)
-    if given.summary is not None:
-        check_output(given.summary, overwrite=given.overwrite, inputs=[path])
+    cloud, plot = given.cloud, given.plot
+    check_summary(given, [path])
     if plot is not None:
-        files = [p for p in (path, cloud, gnss, *survey) if p is not None]
-        check_output(plot, overwrite=given.overwrite, inputs=files)
-    if cloud is None or water is None:
-        survey.refuse()
-    inputs = replace(given, water=0.0 if water is None else water).part(Inputs)
-    inputs = replace(inputs, cameras=path)
+        files = [path, cloud, given.gnss, given.gcps, given.lens, given.reference]
+        known = [file for file in files if file is not None]
+        check_output(plot, overwrite=given.overwrite, inputs=known)
+    if cloud is None or given.water is None:
+        _refuse_surveys(given)
+    water = 0.0 if given.water is None else given.water
+    inputs = replace(replace(given, water=water).part(Inputs), cameras=path)
     read = inputs.read()
-    crs, xyz, heights = None, np.zeros((0, 3)), None
     view = None if cloud is None else view_of(check_input(cloud))
-    surface = None if water is None else inputs.surface(view).surface
-    if cloud is not None:
-        dimension = surface.name if isinstance(surface, WaterDimension) else None
-        with LasSource(check_input(cloud)) as source:
-            crs = metric_crs(source)
-            xyz, heights = _sample(source, SAMPLE_POINTS, dimension)
-        cameras, problem = inputs.block(crs, read)[0], ""
+    surface = None if given.water is None else inputs.surface(view).surface
+    xyz, heights = np.zeros((0, 3)), None
+    if view is not None:
+        xyz, heights = _sample(view, SAMPLE_POINTS, surface)
+        cameras, problem = inputs.block(view.crs, read)[0], ""
     else:
         cameras, problem = _without_cloud(inputs, read)
-    if gnss is not None:
-        cameras = read_gnss(gnss, cameras)
+    if given.gnss is not None:
+        cameras = read_gnss(given.gnss, cameras)
     diagnosis, remedy = None, ""
     if view is not None and surface is not None:
-        diagnosis = _diagnosis(inputs, cameras, view, (surface, index_of(given.index)[0]), survey)
-        remedy = command_of(inputs, view.name, gnss=gnss, gcps=given.gcps, lens=given.lens)
+        diagnosis = _diagnosis(given, inputs, cameras, view, surface)
+        surveys = {name: getattr(given, name) for name in ("gnss", "gcps", "lens")}
+        remedy = command_of(inputs, view.name, **surveys)
     level = None
     if surface is not None and not (isinstance(surface, WaterDimension) and heights is None):
         at = cameras.centres if heights is None else xyz
-        known = surface_above(surface, at, heights).height_m
-        level = float(np.nanmean(known)) if np.isfinite(known).any() else None
+        known_m = surface_above(surface, at, heights).height_m
+        level = float(np.nanmean(known_m)) if np.isfinite(known_m).any() else None
     above = None if level is None else cameras.centres[:, 2] - level
     report = CamerasReport(
         path=str(path),
-        source=cameras.source,
         cameras=cameras,
         crs_read=read.crs,
-        crs=cameras.crs,
         sensors=_sensors(cameras, above),
         height_above_water_m=None
         if above is None
         else (float(above.min()), float(above.mean()), float(above.max())),
         tilt_deg=None if problem else _tilt_deg(cameras),
         gnss=_gnss(cameras, str(path)),
-        fit=None if cloud is None else _fit(cameras, str(cloud), xyz, crs),
+        fit=None if view is None else _fit(cameras, str(cloud), xyz, view.crs),
         sample_xyz=xyz,
         level_m=level,
         problem=problem,
@@ -165,47 +140,54 @@ def check_water(
     """
     given = taken(WaterCheckOptions, options, keywords, "check_water")
     cloud, plot = given.cloud, given.plot
-    if given.summary is not None:
-        check_output(given.summary, overwrite=given.overwrite)
+    check_summary(given)
     if plot is not None:
         check_output(plot, overwrite=given.overwrite, inputs=[] if cloud is None else [cloud])
     view = None if cloud is None else view_of(check_input(cloud))
     found = find_surface(spec, given, view)
-    sample = np.zeros((0, 3))
-    below = unknown = None
-    if cloud is not None:
-        with LasSource(check_input(cloud)) as source:
-            sample, _ = _sample(source, WATER_SAMPLE_POINTS)
+    sample, below, unknown = np.zeros((0, 3)), None, None
+    if view is not None:
+        sample, _ = _sample(view, WATER_SAMPLE_POINTS)
         if not isinstance(found.surface, WaterDimension):
             height = surface_above(found.surface, sample, None).height_m
             unknown = float(np.mean(~np.isfinite(height)))
             below = float(np.mean(sample[:, 2] < height))
-    report = WaterReport(
-        str(spec), found, None if view is None else view.name, below, unknown, sample
-    )
+    name = None if view is None else view.name
+    report = WaterReport(str(spec), found, name, below, unknown, sample)
     if plot is not None:
         write_bytes(plot, png_of(water_figure(report)), overwrite=given.overwrite)
     write_summary(given, report.as_dict())
     return report
 
 
+def _refuse_surveys(given: CamerasCheckOptions) -> None:
+    """Refuse surveys without the cloud and the water that they are about."""
+    for name in ("gcps", "lens", "reference"):
+        value = getattr(given, name)
+        if value is not None:
+            raise SettingError(
+                f"{name} {value}: tells whether the poses have absorbed the refraction; give"
+                " cloud and water too."
+            )
+
+
 def _diagnosis(
+    given: CamerasCheckOptions,
     inputs: Inputs,
     cameras: Cameras,
     view: CloudView,
-    water: tuple[WaterSurface, float],
-    survey: Survey,
+    surface: WaterSurface,
 ) -> Diagnosis:
-    """Look for all signs that the poses have absorbed the refraction; `water` has its index."""
-    path, lens = str(inputs.cameras), survey.lens
-    reference = None if survey.reference is None else read_reference(survey.reference)
+    """Look for all signs that the poses have absorbed the refraction."""
+    path, lens, gcps = str(inputs.cameras), given.lens, given.gcps
+    reference = None if given.reference is None else read_reference(given.reference)
     if reference is not None:
         crs = None if isinstance(view.crs, str) else view.crs
         check_same_crs(view.name, crs, reference.name, reference.crs)
     return diagnose(
         Evidence(
-            cameras, path, *water, view=view, reference=reference,
-            control=None if survey.gcps is None else read_ground_control(survey.gcps, cameras),
+            cameras, path, surface, index_of(given.index)[0], view=view, reference=reference,
+            control=None if gcps is None else read_ground_control(gcps, cameras),
             calibrated=given_focal_lengths(path) if lens is None else focal_length_of(lens),
             ties=ties_of(inputs, view.crs),
         )
@@ -221,15 +203,15 @@ def _without_cloud(inputs: Inputs, read: Cameras) -> tuple[Cameras, str]:
 
 
 def _sample(
-    source: LasSource, most: int, dimension: str | None = None
+    view: CloudView, most: int, water: WaterSurface | None = None
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Return points evenly spread over the file, and their water heights where asked for."""
-    every = max(1, len(source) // most)
+    """Return points evenly spread over the file, and their water heights where there are any."""
+    every = max(1, view.points // most)
     parts, heights = [], []
-    for points in source.chunks():
-        parts.append(coordinates(points)[::every])
-        if dimension is not None:
-            heights.append(source.dimension(points, dimension)[::every])
+    for xyz, height, _ in file_points(Path(view.name), water):
+        parts.append(xyz[::every])
+        if height is not None:
+            heights.append(height[::every])
     return np.vstack(parts), np.concatenate(heights) if heights else None
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import time
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +11,12 @@ from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.compare.match import match
 from pcfix.compare.sections import parse_line
 from pcfix.errors import SettingError
+from pcfix.flow.runner import check_summary, json_text, write_summary
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference
 from pcfix.io.files import check_input, check_output, write_text
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CompareOptions, CompareRules
-
-AnyPath = str | PathLike[str]
 
 
 def compare_clouds(
@@ -60,8 +57,7 @@ def compare_clouds(
     started = time.perf_counter()
     given = taken(CompareOptions, options, keywords, "compare_clouds")
     lines = [parse_line(line) if isinstance(line, str) else line for line in given.section]
-    out_dir, summary, overwrite = given.out_dir, given.summary, given.overwrite
-    _check_outputs(out_dir, summary, [cloud, reference], overwrite=overwrite)
+    _check_outputs(given, [cloud, reference])
     if given.m3c2:
         load_py4dgeo()
     water = None
@@ -74,16 +70,14 @@ def compare_clouds(
     check_same_crs(whole.name, whole.crs, target.name, target.crs)
     matched = match(whole, target, given.part(CompareRules), given=water is not None)
     result = figures_of(matched, lines, started)
-    _write(result, out_dir, summary, overwrite=overwrite)
+    _write(result, given)
     return result
 
 
-def _check_outputs(
-    out_dir: AnyPath | None, summary: AnyPath | None, inputs: list[AnyPath], *, overwrite: bool
-) -> None:
+def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:
     """Refuse what cannot be written, before anything is computed."""
-    if out_dir is not None:
-        folder = Path(out_dir)
+    if given.out_dir is not None:
+        folder = Path(given.out_dir)
         if folder.exists() and not folder.is_dir():
             raise SettingError(f"{folder}: is a file; give a folder.")
         if not folder.parent.is_dir():
@@ -91,29 +85,21 @@ def _check_outputs(
         names = ["compare.json", "depth_bins.csv", "shore_bins.csv"]
         if folder.is_dir():
             for path in [*(folder / name for name in names), *folder.glob("section_*.csv")]:
-                check_output(path, overwrite=overwrite, inputs=inputs)
-    if summary is not None:
-        check_output(summary, overwrite=overwrite, inputs=inputs)
+                check_output(path, overwrite=given.overwrite, inputs=inputs)
+    check_summary(given, inputs)
 
 
-def _write(
-    result: Comparison, out_dir: AnyPath | None, summary: AnyPath | None, *, overwrite: bool
-) -> None:
-    text = json.dumps(result.as_dict(), indent=2, allow_nan=False) + "\n"
-    if out_dir is not None:
-        folder = Path(out_dir)
+def _write(result: Comparison, given: CompareOptions) -> None:
+    if given.out_dir is not None:
+        folder = Path(given.out_dir)
         folder.mkdir(exist_ok=True)
-        files = {"compare.json": text}
-        if result.depth_bins:
-            files["depth_bins.csv"] = bins_table(result.depth_bins)
-        if result.shore_bins:
-            files["shore_bins.csv"] = bins_table(result.shore_bins)
-        for number, section in enumerate(result.sections, start=1):
-            files[f"section_{number:02d}.csv"] = section.table()
+        tables = {"depth_bins.csv": result.depth_bins, "shore_bins.csv": result.shore_bins}
+        files = {"compare.json": json_text(result.as_dict())}
+        files |= {name: bins_table(bins) for name, bins in tables.items() if bins}
+        files |= {f"section_{n:02d}.csv": s.table() for n, s in enumerate(result.sections, start=1)}
         for name, content in files.items():
-            write_text(folder / name, content, overwrite=overwrite)
+            write_text(folder / name, content, overwrite=given.overwrite)
         for path in folder.glob("section_*.csv"):  # of an earlier comparison with more of them
             if path.name not in files:
                 path.unlink()
-    if summary is not None:
-        write_text(summary, text, overwrite=overwrite)
+    write_summary(given, result.as_dict())

@@ -8,10 +8,8 @@ chunks, squares and windows end.
 from __future__ import annotations
 
 import json
-import os
-import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -22,11 +20,12 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.flow.runner import FileTask, Progress, file_task
 from pcfix.grid.delaunay import fill_holes, margin_cells
 from pcfix.grid.heights import Gridding, grid_window
 from pcfix.grid.lattice import Occupancy, Window, cells_of, fits, lattice_over, refuse_size
 from pcfix.grid.model import NO_LIGHT, DsmSummary, Tally, hillshade
-from pcfix.io.files import Bins, check_input, check_output, replaced_when_whole, write_text
+from pcfix.io.files import Bins, replaced_when_whole
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.rasters import (
     add_overviews,
@@ -46,9 +45,6 @@ from pcfix.version import __version__
 if TYPE_CHECKING:
     import laspy
     from rasterio.io import DatasetReader, DatasetWriter
-
-AnyPath = str | os.PathLike[str]
-Progress = Callable[[int, int], None]
 
 BLOCK_CELLS = 1024
 """Longest side of a window; a power of two."""
@@ -120,31 +116,20 @@ def grid_dsm(
     PcfixWarning
         If the cells are so small that most would have no point.
     """
-    started = time.perf_counter()
     given = taken(DsmOptions, options, keywords, "grid_dsm")
     if given.resolution is None:
         raise SettingError("resolution is missing: give the side of a cell, metres.")
-    settings = given.part(DsmRules)
-    summary, overwrite, cog, hillshade = given.summary, given.overwrite, given.cog, given.hillshade
-    source = check_input(input)
-    target = check_tif(output, overwrite=overwrite, inputs=[source])
-    shade, inputs = None, [source, target]
-    if hillshade is not None:
-        shade = check_tif(hillshade, overwrite=overwrite, inputs=inputs)
-        inputs.append(shade)
-    if summary is not None:
-        check_output(summary, overwrite=overwrite, inputs=inputs)
-    if cog:
+    more = [] if given.hillshade is None else [given.hillshade]
+    task = file_task(input, output, given, more=more, check=check_tif, progress=progress)
+    if given.cog:
         check_cog()
-    run = _Run(source, settings, progress)
+    run = _Run(task, given.part(DsmRules), given.cog)
     with ExitStack() as stack:
-        draft = stack.enter_context(replaced_when_whole(target))
-        shade_draft = stack.enter_context(replaced_when_whole(shade)) if shade else None
-        folder = TemporaryDirectory(dir=target.parent, prefix=".pcfix-dsm-")
-        run.write(draft, shade_draft, Path(stack.enter_context(folder)), cog=cog)
-    result = run.summary(target, shade, time.perf_counter() - started)
-    if summary is not None:
-        write_text(summary, json.dumps(result.as_dict(), indent=2) + "\n", overwrite=overwrite)
+        drafts = [stack.enter_context(replaced_when_whole(Path(one))) for one in (output, *more)]
+        folder = TemporaryDirectory(dir=task.target.parent, prefix=".pcfix-dsm-")
+        run.write(Path(stack.enter_context(folder)), *drafts)
+    result = run.summary(None if given.hillshade is None else str(Path(given.hillshade)))
+    task.tell(result.as_dict())
     return result
 
 
@@ -152,18 +137,20 @@ def grid_dsm(
 class _Run:
     """One cloud on its way into a raster."""
 
-    source: Path
+    task: FileTask
     settings: DsmRules
-    progress: Progress | None
+    cog: bool
     tally: Tally = field(default_factory=Tally)
 
-    def write(self, draft: Path, shade: Path | None, folder: Path, *, cog: bool) -> None:
+    def write(self, folder: Path, draft: Path, shade: Path | None = None) -> None:
         """Write the raster, and its hillshade if a path is given."""
-        with LasSource(self.source) as source:
+        with LasSource(self.task.source) as source:
             self.crs, self.points = metric_crs(source), len(source)
-            self.sorted = SortedPoints(source, self.settings, folder, self.report_reading)
+            self.sorted = SortedPoints(
+                source, self.settings, folder, lambda done, total: self.report(0.5 * done / total)
+            )
         self.near, self.lattice = self.sorted.near, self.sorted.lattice
-        plain = folder / "dsm.tif" if cog else draft
+        plain = folder / "dsm.tif" if self.cog else draft
         tags = {"PCFIX": json.dumps({"pcfix": __version__, **asdict(self.settings)})}
         bands = WITH_SIGMA if self.sorted.has_sigma else BANDS
         with new_raster(plain, self.lattice, self.crs, bands, tags=tags) as dsm:
@@ -172,8 +159,8 @@ class _Run:
             else:
                 self.grid_and_fill(dsm, folder / "unfilled.tif")
         if shade is not None:
-            self.shade(plain, shade, folder, cog=cog)
-        _finish(plain, draft, cog=cog)
+            self.shade(plain, shade, folder)
+        self.finish(plain, draft)
 
     def grid(self, heights: DatasetWriter, dsm: DatasetWriter) -> None:
         """Write heights to one raster, the other bands to another (or the same)."""
@@ -213,9 +200,9 @@ class _Run:
         self.tally.filled -= self.tally.known
         self.tally.known += self.tally.filled
 
-    def shade(self, dsm: Path, target: Path, folder: Path, *, cog: bool) -> None:
+    def shade(self, dsm: Path, target: Path, folder: Path) -> None:
         """Write the hillshade of a DSM."""
-        plain = folder / "hillshade.tif" if cog else target
+        plain = folder / "hillshade.tif" if self.cog else target
         band = {"hillshade": ""}
         with (
             open_raster(dsm) as heights,
@@ -223,7 +210,7 @@ class _Run:
         ):
             for window in self.lattice.windows(BLOCK_CELLS):
                 write_part(out, self.light(heights, window), window, 1)
-        _finish(plain, target, cog=cog)
+        self.finish(plain, target)
 
     def light(self, heights: DatasetReader, window: Window) -> npt.NDArray[np.uint8]:
         """Return the hillshade of a window."""
@@ -234,22 +221,25 @@ class _Run:
         s = self.settings
         return hillshade(height, s.resolution, s.azimuth, s.altitude)
 
-    def report_reading(self, done: int, total: int) -> None:
-        """Tell how far reading is, the first half."""
-        self.report(0.5 * done / total)
+    def finish(self, plain: Path, target: Path) -> None:
+        """Add overviews; a cloud optimised file is a copy, which brings its own."""
+        if self.cog:
+            copy_as_cog(plain, target)
+        else:
+            add_overviews(plain)
 
     def report(self, share: float) -> None:
         """Tell how much is done, in points."""
-        if self.progress is not None:
-            self.progress(round(share * self.points), self.points)
+        if self.task.progress is not None:
+            self.task.progress(round(share * self.points), self.points)
 
-    def summary(self, target: Path, shade: Path | None, seconds: float) -> DsmSummary:
+    def summary(self, hillshade: str | None) -> DsmSummary:
         """Return the numbers of the run."""
         settings, lattice, tally = self.settings, self.lattice, self.tally
         return DsmSummary(
-            input=str(self.source),
-            output=str(target),
-            hillshade=None if shade is None else str(shade),
+            input=str(self.task.source),
+            output=str(self.task.target),
+            hillshade=hillshade,
             pcfix=__version__,
             crs=None if self.crs is None else self.crs.name,
             width=lattice.width,
@@ -264,17 +254,9 @@ class _Run:
             spacing_m=self.near.spacing_m,
             hole_m=self.reach_m if settings.method == "tin" else settings.fill,
             settings=asdict(settings),
-            seconds=round(seconds, 3),
+            seconds=round(self.task.seconds, 3),
             uncertainty_m=tally.uncertainty_m(),
         )
-
-
-def _finish(plain: Path, target: Path, *, cog: bool) -> None:
-    """Add overviews; a cloud optimised file is a copy, which brings its own."""
-    if cog:
-        copy_as_cog(plain, target)
-    else:
-        add_overviews(plain)
 
 
 class SortedPoints:

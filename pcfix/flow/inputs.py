@@ -26,8 +26,6 @@ from pcfix.water.surface import FoundSurface
 if TYPE_CHECKING:
     from pyproj import CRS
 
-AnyPath = str | PathLike[str]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs(InputOptions):
@@ -163,7 +161,7 @@ class Inputs(InputOptions):
 
 
 def mask_of(
-    path: AnyPath | None, cloud_crs: str | CRS | None, low: FloatArray, high: FloatArray
+    path: File | None, cloud_crs: str | CRS | None, low: FloatArray, high: FloatArray
 ) -> WaterMask | None:
     """Return the mask in the cloud's CRS, where a file was named, and warn of what was done to it.
 

@@ -38,7 +38,6 @@ from pcfix.water.surface import surface_above
 if TYPE_CHECKING:
     import laspy
 
-AnyPath = str | PathLike[str]
 Classes = npt.NDArray[np.uint8]
 
 

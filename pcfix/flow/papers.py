@@ -23,7 +23,6 @@ own true position, not against the bed below or above it.
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 
@@ -31,6 +30,7 @@ import numpy as np
 
 from pcfix.errors import SettingError
 from pcfix.flow.correct import correct_points
+from pcfix.flow.runner import json_text
 from pcfix.io.files import check_output, write_bytes
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.options.declare import File
@@ -163,7 +163,7 @@ def _pictures(found: list[Effect], bins: DepthBins) -> dict[str, bytes]:
 
 
 def _settings(**facts: object) -> bytes:
-    return (json.dumps({"made_by": f"pcfix {__version__}"} | facts, indent=2) + "\n").encode()
+    return json_text({"made_by": f"pcfix {__version__}"} | facts).encode()
 
 
 def _write(folder: Path, files: dict[str, bytes], overwrite: bool) -> None:

@@ -86,11 +86,29 @@ class FileTask:
         write_summary(self, summary)
 
 
+def json_text(content: dict[str, Any]) -> str:
+    """Return plain values as pcfix writes them."""
+    return json.dumps(content, indent=2) + "\n"
+
+
+def check_summary(options: Any, inputs: Iterable[File] = ()) -> None:
+    """Refuse a summary that could not be written, before anything is computed."""
+    summary = getattr(options, "summary", None)
+    if summary is not None:
+        check_output(summary, overwrite=options.overwrite, inputs=inputs)
+
+
 def write_summary(options: Any, summary: dict[str, Any]) -> None:
     """Write a summary as JSON where the options, with overwrite, name a file for it."""
     if options.summary is not None:
-        text = json.dumps(summary, indent=2) + "\n"
-        write_text(options.summary, text, overwrite=options.overwrite)
+        write_text(options.summary, json_text(summary), overwrite=options.overwrite)
+
+
+def check_cloud(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:
+    """Return the path of a cloud that may be written, by its suffix and `check_output`."""
+    target = check_output(path, overwrite=overwrite, inputs=inputs)
+    check_suffix(target)
+    return target
 
 
 def file_task(
@@ -99,6 +117,8 @@ def file_task(
     options: Any,
     *,
     reads: Iterable[Any] = (),
+    more: Iterable[File] = (),
+    check: Callable[..., Path] = check_cloud,
     progress: Progress | None = None,
 ) -> FileTask:
     """Return the task of a command, once its files may be read and written.
@@ -110,6 +130,10 @@ def file_task(
         With overwrite, and where the command has them summary and jobs.
     reads : iterable
         What else is read; values that are no paths do not count.
+    more : iterable of path
+        What else is written, by the rule of the output.
+    check : callable
+        Returns the path of an output; see `check_cloud`.
     progress : callable, optional
 
     Raises
@@ -119,10 +143,10 @@ def file_task(
     """
     started = time.perf_counter()
     source = check_input(input)
-    given = [one for one in (input, *reads) if isinstance(one, str | PathLike)]
-    target = check_output(output, overwrite=options.overwrite, inputs=given)
-    check_suffix(target)
-    summary = getattr(options, "summary", None)
-    if summary is not None:
-        check_output(summary, overwrite=options.overwrite, inputs=[*given, target])
-    return FileTask(source, target, summary, options.overwrite, options.jobs, progress, started)
+    known = [one for one in (input, *reads) if isinstance(one, str | PathLike)]
+    for path in (output, *more):
+        known.append(check(path, overwrite=options.overwrite, inputs=known))
+    check_summary(options, known)
+    target = Path(output)
+    summary, jobs = (getattr(options, name, None) for name in ("summary", "jobs"))
+    return FileTask(source, target, summary, options.overwrite, jobs, progress, started)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pcfix.errors import InputError
+from pcfix.flow.runner import json_text
 from pcfix.io.files import file_state, read_json, write_text
 
 
@@ -73,7 +74,7 @@ class Record:
 
     def _note(self, name: str, step: dict[str, Any]) -> None:
         self._content["steps"][name] = step
-        write_text(self._path, json.dumps(self._content, indent=2) + "\n", overwrite=True)
+        write_text(self._path, json_text(self._content), overwrite=True)
 
 
 def read_record(path: Path) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.water import read_water
 from pcfix.model import FloatArray, WaterDimension, WaterSurface
+from pcfix.options.declare import File
 from pcfix.options.shared import WaterOptions
 from pcfix.water.fit import WaterFit
 from pcfix.water.river import RiverFit
@@ -25,12 +26,9 @@ if TYPE_CHECKING:
     import laspy
     from pyproj import CRS
 
-AnyPath = str | PathLike[str]
-
 Points: TypeAlias = tuple[FloatArray, FloatArray | None, npt.NDArray[np.uint8]]
 """Some points: coordinates (n, 3), water heights where those are a dimension, classes."""
 
-WaterModel = Literal["auto", "level", "plane", "along", "river"]
 AUTO = "auto"
 SAMPLE_POINTS = 2_000_000
 """Points of a cloud that are looked at for a surface, evenly spread."""
@@ -90,7 +88,9 @@ def view_of(path: Path, jobs: int | None = None) -> CloudView:
     return CloudView(str(path), crs, low, high, points, chunks)
 
 
-def file_points(path: Path, water: WaterSurface, jobs: int | None = None) -> Iterator[Points]:
+def file_points(
+    path: Path, water: WaterSurface | None, jobs: int | None = None
+) -> Iterator[Points]:
     """Yield all points of a LAS or LAZ file, chunk by chunk."""
     with LasSource(path, jobs) as source:
         for points in source.chunks():
@@ -99,14 +99,14 @@ def file_points(path: Path, water: WaterSurface, jobs: int | None = None) -> Ite
 
 
 def water_heights(
-    water: WaterSurface, source: LasSource, points: laspy.ScaleAwarePointRecord
+    water: WaterSurface | None, source: LasSource, points: laspy.ScaleAwarePointRecord
 ) -> FloatArray | None:
     """Return the heights of the water of a chunk, shape (n,), where they are a dimension."""
     return source.dimension(points, water.name) if isinstance(water, WaterDimension) else None
 
 
 def find_surface(
-    water: WaterSurface | float | AnyPath, options: WaterOptions, view: CloudView | None
+    water: WaterSurface | float | File, options: WaterOptions, view: CloudView | None
 ) -> FoundSurface:
     """Return the water surface that the user means, for a cloud.
 
@@ -172,7 +172,7 @@ def _thinned(seen: Seen, every: int) -> Seen:
     )
 
 
-def _fitted(options: WaterOptions, path: AnyPath, view: CloudView | None) -> FoundSurface:
+def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundSurface:
     """Return the surface fitted to shoreline points."""
     from pcfix.io.vectors import read_shoreline
     from pcfix.water.fit import fit_water

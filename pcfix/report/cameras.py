@@ -84,11 +84,11 @@ class CamerasReport:
 
     Attributes
     ----------
-    path, source : str
+    path : str
     cameras : Cameras
         In the cloud's CRS, where there is a cloud.
-    crs_read, crs : str or None
-        Of the file, and of `cameras`.
+    crs_read : str or None
+        Of the file.
     sensors : tuple of Sensor
     height_above_water_m : tuple of 3 float, or None
         Least, mean, most; above the water where it is known, else None.
@@ -109,10 +109,8 @@ class CamerasReport:
     """
 
     path: str
-    source: str
     cameras: Cameras
     crs_read: str | None
-    crs: str | None
     sensors: tuple[Sensor, ...]
     height_above_water_m: tuple[float, float, float] | None
     tilt_deg: tuple[float, float] | None
@@ -126,22 +124,22 @@ class CamerasReport:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        fit = None if self.fit is None else {**asdict(self.fit), "fits": self.fit.fits}
+        cameras, fit = self.cameras, self.fit
         return {
             "path": self.path,
-            "source": self.source,
-            "images_posed": len(self.cameras),
-            "images_unposed": list(self.cameras.unposed),
+            "source": cameras.source,
+            "images_posed": len(cameras),
+            "images_unposed": list(cameras.unposed),
             "crs_read": self.crs_read,
-            "crs": self.crs,
+            "crs": cameras.crs,
             "sensors": [asdict(sensor) for sensor in self.sensors],
             "height_above_water_m": self.height_above_water_m,
             "tilt_deg": self.tilt_deg,
             "problem": self.problem,
-            "gnss": None if self.gnss is None else asdict(self.gnss),
-            "fit": fit,
-            "refraction": None if self.diagnosis is None else self.diagnosis.as_dict(),
-            "notes": list(self.cameras.notes),
+            "gnss": self.gnss and asdict(self.gnss),
+            "fit": fit and {**asdict(fit), "fits": fit.fits},
+            "refraction": self.diagnosis and self.diagnosis.as_dict(),
+            "notes": list(cameras.notes),
         }
 
 
@@ -151,7 +149,7 @@ def cameras_text(report: CamerasReport) -> str:
     unposed = len(cameras.unposed)
     names = ", ".join(cameras.unposed[:5]) + (", ..." if unposed > 5 else "")
     lines = [
-        f"{r.path}: {r.source or 'cameras'}",
+        f"{r.path}: {cameras.source or 'cameras'}",
         f"images       {len(cameras):,} with a pose"
         + (f", {unposed:,} without: {names}" if unposed else ""),
         *(_sensor(sensor) for sensor in r.sensors),
@@ -161,8 +159,8 @@ def cameras_text(report: CamerasReport) -> str:
     if cameras.rotations is None:
         lines.append("angles       none: every camera counts as seeing every point")
     lines.append(f"CRS          {_short(r.crs_read) or 'the file states none'}")
-    if r.crs != r.crs_read:
-        lines.append(f"  now        {_short(r.crs) or 'the cloud states none'}")
+    if cameras.crs != r.crs_read:
+        lines.append(f"  now        {_short(cameras.crs) or 'the cloud states none'}")
     if r.problem:
         lines.append(f"  problem    {r.problem}")
     else:
