@@ -39,6 +39,7 @@ class MethodOptions(IndexOptions):
     """Which rays count, and how the true point follows from the apparent one."""
 
     panel = Panel.METHOD
+    old_units = True
 
     method: Method = option("snell", "How the true point follows from the apparent one.")
     camera_set: CameraSet = option(
@@ -57,7 +58,6 @@ class MethodOptions(IndexOptions):
         unit="deg",
         rule=within(0.0, 90.0, "give degrees from the surface normal", above=True),
         default_is="no limit; 80 without angles",
-        old=("max_angle_deg",),
     )
     max_cameras: int | None = option(
         None,
@@ -156,6 +156,7 @@ class LabelRules(LandRules):
     """Which points count as submerged, beyond lying below the surface; see `pcfix.label`."""
 
     panel = Panel.WATER
+    old_units = True
 
     band: float = option(
         0.0,
@@ -163,7 +164,6 @@ class LabelRules(LandRules):
         unit="m",
         rule=not_negative("give metres from the water surface, or 0 for none"),
         default_is="no class 41",
-        old=("band_m",),
     )
     dead_band: float = option(
         0.0,
@@ -171,7 +171,6 @@ class LabelRules(LandRules):
         unit="m",
         rule=not_negative("give metres from the water surface, or 0 for none"),
         default_is="none",
-        old=("dead_band_m",),
     )
     reset: bool = option(False, "Points that come as class 40 or 41 and are neither become 1.")
 

@@ -14,7 +14,7 @@ import sys
 import types
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import Field, asdict, dataclass, field, fields
 from functools import cache
 from inspect import get_annotations
 from typing import (
@@ -178,9 +178,14 @@ def _converted(one: Option, value: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class OptionSet:
-    """The base of all classes of options: every value is checked against its rule."""
+    """The base of all classes of options: every value is checked against its rule.
+
+    A class says in which `panel` of the help its own options stand, and whether they, where they
+    have a unit, once had it in their names (`old_units`: ``radius_m`` is `radius` now).
+    """
 
     panel: ClassVar[str] = ""
+    old_units: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         for one in options_of(type(self)):
@@ -226,16 +231,17 @@ def options_of(kind: type) -> tuple[Option, ...]:
     """Return the options of a class, in the order of its help."""
     homes = {name: base for base in reversed(kind.__mro__) for name in get_annotations(base)}
     return tuple(
-        Option(
-            one.name,
-            eval(str(one.type), vars(sys.modules[homes[one.name].__module__])),
-            one.default,
-            homes[one.name].__dict__.get("panel", ""),
-            one.metadata["declared"],
-        )
-        for one in fields(kind)
-        if "declared" in one.metadata
+        _option(one, homes[one.name]) for one in fields(kind) if "declared" in one.metadata
     )
+
+
+def _option(one: Field[Any], home: type) -> Option:
+    """Return the option of a field, with what the class that declares it says of all of its own."""
+    own, declared = vars(home), one.metadata["declared"]
+    if own.get("old_units") and declared.unit:
+        declared = declared._replace(old=(f"{one.name}_{declared.unit}",))
+    kind = eval(str(one.type), vars(sys.modules[home.__module__]))
+    return Option(one.name, kind, one.default, own.get("panel", ""), declared)
 
 
 def table_of(kind: type) -> str:

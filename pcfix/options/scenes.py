@@ -107,6 +107,7 @@ class CameraOptions(OptionSet):
     """The camera, and how well it measures."""
 
     panel = Panel.CAMERA
+    old_units = True
 
     focal_mm: float = option(
         8.8, "Focal length.", rule=_range(0.5, 2000, "that of the lens", "focal length {:g} mm")
@@ -125,7 +126,6 @@ class CameraOptions(OptionSet):
         "Noise of image points (sd).",
         unit="px",
         rule=_range(0, 100, "a standard deviation", "image noise {:g} px"),
-        old=("image_noise_px",),
     )
 
 

@@ -123,6 +123,7 @@ class LandRules(OptionSet):
     """Which points below the surface are land all the same."""
 
     panel = Panel.WATER
+    old_units = True
 
     connected: bool = option(
         False, "Leave out pools that are apart from the water; what was left out is reported."
@@ -133,7 +134,6 @@ class LandRules(OptionSet):
         unit="m2",
         rule=not_negative("give square metres"),
         default_is="a tenth of the largest water",
-        old=("least_pool_m2",),
     )
     respect_classes: tuple[int, ...] = option(
         (),
@@ -171,6 +171,7 @@ class CameraFileOptions(OptionSet):
     """How a camera file is read."""
 
     panel = Panel.CAMERAS
+    old_units = True
 
     sensor: File | None = option(
         None,
@@ -196,7 +197,6 @@ class CameraFileOptions(OptionSet):
         unit="m",
         parse=_three_numbers,
         metavar="X,Y,Z",
-        old=("cameras_offset_m",),
     )
 
 

@@ -34,6 +34,7 @@ class CleanRules(OptionSet):
     """
 
     panel = Panel.TESTS
+    old_units = True
 
     statistical: bool = option(True, "Test the mean distance to the nearest points in space.")
     neighbours: int = option(
@@ -53,7 +54,6 @@ class CleanRules(OptionSet):
         unit="m",
         rule=must_be(0.0, math.inf, "ten times the spacing of the points is usual"),
         default_is="no such test",
-        old=("radius_m",),
     )
     radius_neighbours: int = option(
         3, "See --radius.", rule=must_be(1, MOST_NEIGHBOURS, "3 is usual", whole=True)
@@ -71,14 +71,12 @@ class CleanRules(OptionSet):
         "Noise if the rays miss by more (RayMiss).",
         unit="m",
         rule=must_be(0.0, math.inf, "a few times the ground sampling distance or more"),
-        old=("max_ray_miss_m",),
     )
     max_incidence: float | None = option(
         75.0,
         "Noise if a ray had a larger incidence angle.",
         unit="deg",
         rule=must_be(0.0, 90.0, "degrees from the normal of the water surface"),
-        old=("max_incidence_deg",),
     )
     bed_neighbours: int = option(
         32,
@@ -96,14 +94,12 @@ class CleanRules(OptionSet):
         "Least height under the bed of noise.",
         unit="m",
         rule=must_be(0.0, math.inf, "metres, more than the noise of the bed"),
-        old=("below_m",),
     )
     floating: float | None = option(
         0.5,
         "Least height over the bed of noise.",
         unit="m",
         rule=must_be(0.0, math.inf, "metres, more than the height of plants and stones"),
-        old=("floating_m",),
     )
 
     def check(self) -> None:
@@ -165,10 +161,9 @@ class DsmRules(OptionSet):
     """How a cloud becomes a raster."""
 
     panel = Panel.RASTER
+    old_units = True
 
-    resolution: float = option(
-        None, "Side of a cell.", unit="m", needed=True, rule=_RESOLUTION, old=("resolution_m",)
-    )
+    resolution: float = option(None, "Side of a cell.", unit="m", needed=True, rule=_RESOLUTION)
     method: DsmMethod = option("mean", "How a cell gets its height.", rule=_one_of(DsmMethod))
     surface: SurfaceChoice = option(
         "all",
@@ -180,14 +175,12 @@ class DsmRules(OptionSet):
         "Fill holes up to so many metres wide; they get count 0.",
         unit="m",
         rule=positive("The width of holes to fill is {value:g} m; it must be positive."),
-        old=("fill_m",),
     )
     azimuth: float = option(
         315.0,
         "Sun of the hillshade, clockwise from north.",
         unit="deg",
         rule=rule(math.isfinite, "The azimuth is {value:g}; it must be in degrees."),
-        old=("azimuth_deg",),
     )
     altitude: float = option(
         45.0,
@@ -197,7 +190,6 @@ class DsmRules(OptionSet):
             lambda value: 0.0 < value <= 90.0,
             "The altitude of the sun is {value:g} degrees; it must be above 0 and at most 90.",
         ),
-        old=("altitude_deg",),
     )
 
     def check(self) -> None:
@@ -238,6 +230,7 @@ class CompareRules(M3c2Option):
     """What is measured of two clouds."""
 
     panel = Panel.FIGURES
+    old_units = True
 
     submerged: bool = option(False, "Only points of class 40, or below --water.")
     c2c_only: bool = option(False, "Distances to the nearest point, nothing signed.")
@@ -248,15 +241,9 @@ class CompareRules(M3c2Option):
             LEAST_PLANE_POINTS, "a plane through so few points follows their noise; 8 is usual"
         ),
     )
-    bin_width: float = option(
-        1.0, "Of the table by depth.", unit="m", rule=_BIN_WIDTH, old=("bin_width_m",)
-    )
+    bin_width: float = option(1.0, "Of the table by depth.", unit="m", rule=_BIN_WIDTH)
     shore_bin_width: float = option(
-        10.0,
-        "Of the table by distance from shore.",
-        unit="m",
-        rule=_BIN_WIDTH,
-        old=("shore_bin_width_m",),
+        10.0, "Of the table by distance from shore.", unit="m", rule=_BIN_WIDTH
     )
     max_gap: float | None = option(
         None,
@@ -264,16 +251,13 @@ class CompareRules(M3c2Option):
         unit="m",
         rule=METRES,
         default_is="5 point spacings, at least 1",
-        old=("max_gap_m",),
     )
     sections: int = option(
         0,
         "So many automatic cross-sections, down the slope.",
         rule=rule(lambda value: not value < 0, "{option} {value} is negative; give how many."),
     )
-    corridor: float = option(
-        1.0, "Half-width of a cross-section.", unit="m", rule=METRES, old=("corridor_m",)
-    )
+    corridor: float = option(1.0, "Half-width of a cross-section.", unit="m", rule=METRES)
 
     @property
     def vertical(self) -> bool:

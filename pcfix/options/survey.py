@@ -93,17 +93,13 @@ class RunOptions(
     """The options of ``pcfix run``: everything that its results depend on is in ``run.json``."""
 
     panel = Panel.OUTPUT
+    old_units = True
 
     reference: File | None = option(
         None, "LiDAR cloud, CSV check points or GeoTIFF to compare with."
     )
     resolution: float | None = option(
-        None,
-        "Of the rasters.",
-        unit="m",
-        rule=METRES,
-        default_is="4 points a cell",
-        old=("resolution_m",),
+        None, "Of the rasters.", unit="m", rule=METRES, default_is="4 points a cell"
     )
     adjust: AdjustWhen = option(
         "auto",
