@@ -160,7 +160,7 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     step.finish()
     outs["Classification"] = classes
     outs.update(flags.dimensions())
-    found = {**vars(step.counts), "labelling": step.labelling.report()}
+    found = {**step.counts, "labelling": step.labelling.report()}
     namespace["out_metadata"] = node(
         "pcfix", children=[node(name, value) for name, value in found.items() if value is not None]
     )

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -178,17 +178,8 @@ _MOST_TILES_A_SIDE = 300
 _SAMPLE = 100_000
 
 
-class Empty(Protocol):
-    """`numpy.empty`, or a maker of arrays on disk."""
-
-    def __call__(self, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-        """Return an array whose values are not set."""
-        ...
-
-
-def in_memory(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-    """Return an array in memory: the usual `Empty`."""
-    return np.empty(shape, dtype)
+Empty = Callable[[tuple[int, ...], npt.DTypeLike], npt.NDArray[Any]]
+"""Makes an array of a shape and type, values not set: `numpy.empty`, or one on disk."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +221,7 @@ def used_rows(used: BoolArray) -> Iterator[IntArray]:
 
 
 def make_tiles(
-    xyz: FloatArray, used: BoolArray, tile_m: float | None = None, empty: Empty = in_memory
+    xyz: FloatArray, used: BoolArray, tile_m: float | None = None, empty: Empty = np.empty
 ) -> Tiles:
     """Sort the used points into square tiles.
 

@@ -17,7 +17,6 @@ from pcfix.clean.neighbours import (
     Empty,
     Neighbours,
     height_quartiles,
-    in_memory,
     make_tiles,
     mean_of_first,
     used_rows,
@@ -62,7 +61,7 @@ class Resources(NamedTuple):
     """
 
     tile_m: float | None = None
-    empty: Empty = in_memory
+    empty: Empty = np.empty
     jobs: int | None = None
     progress: Callable[[int], None] | None = None
 

@@ -16,8 +16,6 @@ from pcfix.simulate.scene import BlockKind, Scene, simulate_scene
 
 LEAST_DEPTH_M = 0.2  # shallower points have no refraction worth a percentage
 BLOCKS: tuple[BlockKind, ...] = ("nadir", "oblique")
-
-
 REPORT = "run"
 
 
@@ -52,10 +50,13 @@ def _table(scene: Scene, folder: Path, overwrite: bool) -> str:
     times_n = scene.apparent_xyz.copy()
     depth = scene.water_level_m - times_n[below, 2]
     times_n[below, 2] = scene.water_level_m - scene.refractive_index * depth
+    by_snell = correct_points(
+        scene.apparent_xyz, scene.cameras, scene.water, index=scene.refractive_index
+    )
     rows = [
         ("as it came", scene.apparent_xyz),
         (f"depth times {scene.refractive_index:g}", times_n),
-        ("snell, every camera", _by_snell(scene)),
+        ("snell, every camera", by_snell.xyz),
         ("consistent, own cameras", _corrected(scene, folder, overwrite)),
     ]
     head = f"error of {deep.sum():,} bed points"
@@ -65,13 +66,6 @@ def _table(scene: Scene, folder: Path, overwrite: bool) -> str:
         cells = (f"{100 * e:.1f} cm {e / scene.gsd_m:6.1f} GSD" for e in errors)
         lines.append(f"{name:<30}" + "".join(f"{cell:>20}" for cell in cells))
     return "\n".join(lines)
-
-
-def _by_snell(scene: Scene) -> FloatArray:
-    """Return what ``pcfix correct`` makes of the cloud without any option."""
-    return correct_points(
-        scene.apparent_xyz, scene.cameras, scene.water, index=scene.refractive_index
-    ).xyz
 
 
 def _corrected(scene: Scene, folder: Path, overwrite: bool) -> FloatArray:

@@ -13,7 +13,7 @@ import numpy as np
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.surfaces import CloudView, find_surface
 from pcfix.io.cameras import read_cameras, read_tie_points
-from pcfix.io.cameras.georeference import georeference
+from pcfix.io.cameras.georeference import Georeference, georeference
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.io.views import ViewList
 from pcfix.label.areas import WaterMask
@@ -117,10 +117,7 @@ class Inputs(InputOptions):
                 return self.cameras, None
             return self.cameras, self._of_kind(read_views(self.views, self.cameras))
         read = self.read() if read is None else read
-        way = georeference(
-            read, cloud_crs, cameras_crs=self.cameras_crs, offset_m=self.cameras_offset,
-            name=str(self.cameras),
-        )  # fmt: skip
+        way = self._georeferenced(read, cloud_crs)
         cameras = way.cameras(read)
         for note in way.notes:
             warnings.warn(note, PcfixWarning, stacklevel=2)
@@ -131,6 +128,13 @@ class Inputs(InputOptions):
             tracks = track_views(Path(self.views), ties, cameras, to_cloud=way.points)
             return cameras, self._of_kind(tracks)
         return cameras, self._of_kind(read_views(self.views, cameras, to_cloud=way.points))
+
+    def _georeferenced(self, read: Cameras, cloud_crs: str | CRS | None) -> Georeference:
+        """Return the way from the frame of the camera file to the cloud's CRS."""
+        return georeference(
+            read, cloud_crs, cameras_crs=self.cameras_crs, offset_m=self.cameras_offset,
+            name=str(self.cameras),
+        )  # fmt: skip
 
     def _of_kind(self, views: ViewList) -> ViewList:
         """Return a view list as what the user says that it is."""
@@ -151,10 +155,7 @@ class Inputs(InputOptions):
         known = np.isfinite(ties.xyz).all(axis=1)
         if placed and not known.any():
             return None
-        way = georeference(
-            read, cloud_crs, cameras_crs=self.cameras_crs, offset_m=self.cameras_offset,
-            name=str(self.cameras),
-        )  # fmt: skip
+        way = self._georeferenced(read, cloud_crs)
         xyz = np.full((len(ties.xyz), 3), np.nan)
         xyz[known] = way.points(ties.xyz[known])
         return replace(ties, xyz=xyz)
@@ -181,7 +182,6 @@ def mask_of(
     if path is None:
         return None
     from pcfix.io.vectors import read_water_polygons
-    from pcfix.label.areas import WaterMask
 
     polygons = read_water_polygons(path, cloud_crs)
     for note in polygons.notes:

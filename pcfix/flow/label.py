@@ -26,7 +26,7 @@ from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource, coordinates
 from pcfix.io.las.writing import labelling_vlr, noted_header
 from pcfix.label.areas import WaterMask
-from pcfix.label.labelling import Labelling, Labels, LabelSummary, Part, sets_class
+from pcfix.label.labelling import Labelling, LabelSummary, Part, sets_class
 from pcfix.model import FloatArray, WaterPlane, WaterSurface
 from pcfix.options.correct import LabelOptions, LabelRules, StageLabelOptions
 from pcfix.options.declare import File, taken
@@ -40,21 +40,8 @@ if TYPE_CHECKING:
 
 Classes = npt.NDArray[np.uint8]
 
-
-class Counts:
-    """Adds up what becomes of points, under the names of `LabelSummary`."""
-
-    def __init__(self) -> None:
-        self.submerged = self.water_surface = self.stale = self.water_unknown = self.points = 0
-
-    def add(self, part: Part, labels: Labels) -> None:
-        """Add some points and what they become."""
-        self.points += len(part.classes)
-        self.submerged += int(labels.submerged.sum())
-        self.water_surface += int(labels.at_surface.sum())
-        labelled = labels.submerged | labels.at_surface
-        self.stale += int((sets_class(part.classes) & ~labelled).sum())
-        self.water_unknown += int(np.isnan(part.surface.height_m).sum())
+COUNTS = ("submerged", "water_surface", "stale", "water_unknown", "points")
+"""What becomes of points, under the names of `LabelSummary`."""
 
 
 def label_points(
@@ -174,7 +161,7 @@ def label_file(
         input=str(task.source),
         output=str(task.target),
         pcfix=__version__,
-        **vars(step.counts),
+        **step.counts,
         water=str(step.water),
         settings=step.labelling.settings.as_dict(),
         labelling=step.labelling.report(),
@@ -208,7 +195,7 @@ class LabellingStep:
         check_tilt(self.water)
         mask = mask_of(options.water_mask, view.crs, view.low, view.high)
         self.labelling = Labelling(options.part(LabelRules), mask)
-        self.counts = Counts()
+        self.counts = dict.fromkeys(COUNTS, 0)
 
     def look_around(self, chunks: Callable[[], Iterable[Points]]) -> None:
         """Learn the surroundings of all points, where the rules need them."""
@@ -233,7 +220,11 @@ class LabellingStep:
         """Return the classes of some points, and count them."""
         (part,) = parts_of([points], self.water)
         labels = self.labelling.labels(part)
-        self.counts.add(part, labels)
+        stale = sets_class(part.classes) & ~(labels.submerged | labels.at_surface)
+        unknown = np.isnan(part.surface.height_m)
+        found = labels.submerged, labels.at_surface, stale, unknown, np.ones(len(unknown), np.bool_)
+        for name, rows in zip(COUNTS, found, strict=True):
+            self.counts[name] += int(rows.sum())
         return labels.classes
 
     def chunk(
@@ -241,13 +232,13 @@ class LabellingStep:
     ) -> laspy.ScaleAwarePointRecord:
         """Return labelled points of a file."""
         heights = water_heights(self.water, source, points)
-        came = coordinates(points), heights, np.asarray(points["classification"])
+        classes = np.asarray(points["classification"])
         new = convert(points, header.point_format)
-        new.array["classification"] = self.classes(came)
+        new.array["classification"] = self.classes((coordinates(points), heights, classes))
         return new
 
     def finish(self) -> None:
         """Refuse a cloud of which no point lies below the water, or inside the mask."""
         self.labelling.check(self._name)
-        counts = self.counts
-        check_submerged(counts.submerged + counts.water_surface, self._name, self.water)
+        below = self.counts["submerged"] + self.counts["water_surface"]
+        check_submerged(below, self._name, self.water)

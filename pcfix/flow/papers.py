@@ -99,22 +99,26 @@ def write_refraction_effect(out_dir: File, options: SimulateOptions) -> str:
     found = effects(heights, apparent_depths_m, overlap=overlap, refractive_index=index)
     shan = _shan_tables(found)
     bins = depth_bins(simulate_flume(refractive_index=index, seed=seed))
+    settings = {
+        "made_by": f"pcfix {__version__}",
+        "cameras": [asdict(one) | {"flying_heights_m": h} for one, h in heights.items()],
+        "overlap": overlap,
+        "apparent_depths_m": apparent_depths_m,
+        "refractive_index": index,
+        "seed": seed,
+    }
     files = _pictures(found, bins) | {
         "refraction_effect.csv": csv_text(effect_rows(found)).encode(),
-        "shan_iterations.csv": _shan_csv(shan).encode(),
+        "shan_iterations.csv": csv_text(
+            [row for pair, table in shan.items() for row in shan_rows(pair, table)]
+        ).encode(),
         "flume_depth_bins.csv": csv_text(depth_bins_rows(bins)).encode(),
-        "refraction_effect.json": _settings(
-            cameras=[asdict(one) | {"flying_heights_m": h} for one, h in heights.items()],
-            overlap=overlap,
-            apparent_depths_m=apparent_depths_m,
-            refractive_index=index,
-            seed=seed,
-        ),
+        "refraction_effect.json": json_text(settings).encode(),
     }
     _write(Path(out_dir), files, options.overwrite)
     pair, table = list(shan.items())[len(next(iter(heights.values()))) // 2]
-    title = f"{_name(pair)}, bed {max(apparent_depths_m):g} m deep"
-    parts = [effect_text(found), shan_text(table, title), depth_bins_text(bins)]
+    shan_lines = shan_text(pair, table, max(apparent_depths_m))
+    parts = [effect_text(found), shan_lines, depth_bins_text(bins)]
     if camera is None:
         parts[0] += f"\n{PUBLISHED}"
     return "\n\n".join([*parts, f"{out_dir}: {', '.join(sorted(files))}"])
@@ -141,17 +145,6 @@ def _shan_tables(found: list[Effect]) -> dict[StereoPair, list[Iteration]]:
     return {pair: shan_iterations(pair, deepest, found[0].refractive_index) for pair in pairs}
 
 
-def _shan_csv(shan: dict[StereoPair, list[Iteration]]) -> str:
-    rows = []
-    for pair, table in shan.items():
-        rows += shan_rows(table, camera=pair.camera.name, flying_height_m=pair.flying_height_m)
-    return csv_text(rows)
-
-
-def _name(pair: StereoPair) -> str:
-    return f"{pair.camera.name} from {pair.flying_height_m:g} m"
-
-
 def _pictures(found: list[Effect], bins: DepthBins) -> dict[str, bytes]:
     deepest = max(one.apparent_depth_m for one in found)
     figures = {"refraction_effect_depth.png": depth_figure(found)}
@@ -160,10 +153,6 @@ def _pictures(found: list[Effect], bins: DepthBins) -> dict[str, bytes]:
         figures[f"refraction_effect_{camera.name.lower()}.png"] = error_map_figure(own)
     figures["flume_depth_bins.png"] = depth_bins_figure(bins)
     return {name: png_of(figure) for name, figure in figures.items()}
-
-
-def _settings(**facts: object) -> bytes:
-    return json_text({"made_by": f"pcfix {__version__}"} | facts).encode()
 
 
 def _write(folder: Path, files: dict[str, bytes], overwrite: bool) -> None:
@@ -182,12 +171,16 @@ def depth_bins(flume: Flume, seed: int = 1) -> DepthBins:
     rng = np.random.default_rng(seed)
     check = _check_points(which, rng)
     slope, offset, r2 = _regression(flume, check, rng)
+    corrected = correct_points(
+        flume.apparent_xyz, flume.cameras, flume.water_level_m, index=flume.refractive_index,
+        views=flume.views,
+    )  # fmt: skip
     estimates = [
         flume.apparent_depth_m,
         flume.refractive_index * flume.apparent_depth_m,
         mean_of_cameras(flume),
         offset + slope * flume.apparent_depth_m,
-        _by_pcfix(flume),
+        flume.water_level_m - corrected.xyz[:, 2],
     ]
     errors = flume.true_depth_m[:, None] - np.column_stack(estimates)
     groups = [(which == i) & ~check for i in range(bins)]
@@ -233,14 +226,3 @@ def mean_of_cameras(flume: Flume) -> FloatArray:
         np.tan(r), np.tan(i), out=np.full(len(r), flume.refractive_index), where=i > 0
     )
     return np.asarray(flume.apparent_depth_m * np.bincount(owner, ratio) / counts)
-
-
-def _by_pcfix(flume: Flume) -> FloatArray:
-    corrected = correct_points(
-        flume.apparent_xyz,
-        flume.cameras,
-        flume.water_level_m,
-        index=flume.refractive_index,
-        views=flume.views,
-    )
-    return np.asarray(flume.water_level_m - corrected.xyz[:, 2])

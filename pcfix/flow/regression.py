@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pcfix.errors import GeometryError, SettingError
+from pcfix.errors import GeometryError
 from pcfix.io.tables import CheckDepths, read_check_depths
 from pcfix.label.labelling import Part
 from pcfix.model import NOISE_CLASSES, BoolArray, FloatArray, IntArray
@@ -28,7 +28,6 @@ def learn_regression(
     path: str | os.PathLike[str],
     parts: Iterable[Part],
     settings: ScienceOptions,
-    radius_m: float | None = None,
 ) -> DepthRegression:
     """Fit true depth = a + b * apparent depth to the check depths of a file.
 
@@ -41,9 +40,6 @@ def learn_regression(
         bounded memory. Points of noise (classes 7 and 18) do not count.
     settings : ScienceOptions
         For `least_r2`.
-    radius_m : float, optional
-        How far from a check depth submerged points may lie. Default: four times the distance
-        between neighbouring points of the cloud, around the check depths.
 
     Returns
     -------
@@ -53,8 +49,6 @@ def learn_regression(
     ------
     InputError
         If the file cannot be read or is not one of check depths.
-    SettingError
-        If the radius is not positive.
     GeometryError
         If a height lies above the water, fewer than three check depths lie on submerged points,
         the depths leave the line open, or it explains too little of them (`least_r2`).
@@ -62,26 +56,32 @@ def learn_regression(
     Notes
     -----
     The apparent depth at a check depth is the median of the nearest submerged points, 3 to 16,
-    within the radius. Check depths with fewer are left out, and a note says how many; an outlier
-    is noted too, but stays in.
+    within four times the distance between neighbouring points there. Check depths with fewer are
+    left out, and a note says how many; an outlier is noted too, but stays in.
     """
-    if radius_m is not None and not radius_m > 0.0:
-        raise SettingError(f"radius {radius_m:g} m must be positive.")
     checks = read_check_depths(path)
     around = ApparentDepths(checks.xy)
     for part in parts:
         rows = np.flatnonzero(~np.isin(part.classes, NOISE_CLASSES))
         surface = SurfaceAbove(part.surface.height_m[rows], part.surface.slope[rows])
         around.add(part.xyz[rows], surface)
-    radius = REACH * around.spacing_m if radius_m is None else radius_m
+    radius = REACH * around.spacing_m
     apparent, level, covered = around.medians(radius)
     left_out = _left_out(checks, around.distance_m[:, 0], covered, radius)
     if left_out and covered.sum() < LEAST_COUNT:
         raise GeometryError(left_out)
     rows = np.flatnonzero(covered)
     true = _true_depths(checks, level, rows)
-    found = _fitted(checks, apparent[rows], true)
-    _check_r2(checks, found, settings)
+    try:
+        found = fit_depths(apparent[rows], true)
+    except GeometryError as error:
+        raise GeometryError(f"{checks.name}: {error}") from error
+    if found.r2 < settings.least_r2:
+        raise GeometryError(
+            f"{checks.name}: the regression explains too little: r2 {found.r2:.3f} of"
+            f" {found.count} check depths is below {settings.least_r2:g}; check their CRS and the"
+            " water's height, or accept it with a lower --least-r2."
+        )
     notes = (left_out,) if left_out else ()
     return replace(found, notes=(*notes, *found.notes, *_outlier_notes(checks, found, rows)))
 
@@ -123,22 +123,6 @@ def _true_depths(checks: CheckDepths, level_m: FloatArray, rows: IntArray) -> Fl
             " the bed with the cloud's vertical datum, or depths in a column depth."
         )
     return np.asarray(depth)
-
-
-def _fitted(checks: CheckDepths, apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:
-    try:
-        return fit_depths(apparent_m, true_m)
-    except GeometryError as error:
-        raise GeometryError(f"{checks.name}: {error}") from error
-
-
-def _check_r2(checks: CheckDepths, found: DepthRegression, settings: ScienceOptions) -> None:
-    if found.r2 < settings.least_r2:
-        raise GeometryError(
-            f"{checks.name}: the regression explains too little: r2 {found.r2:.3f} of"
-            f" {found.count} check depths is below {settings.least_r2:g}; check their CRS and the"
-            " water's height, or accept it with a lower --least-r2."
-        )
 
 
 def _outlier_notes(checks: CheckDepths, found: DepthRegression, rows: IntArray) -> tuple[str, ...]:

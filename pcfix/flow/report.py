@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -66,9 +66,9 @@ def write_report(
         If the cloud lacks the dimensions.
     """
     maps, sample = _read(corrected)
-    report = run_report(
-        Corrected(summary, cameras, water, maps, sample), _files(inputs), more, verdict
-    )
+    rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in inputs]
+    files = Table("Input files", ["file", "bytes", "SHA-256"], rows)
+    report = run_report(Corrected(summary, cameras, water, maps, sample), files, more, verdict)
     figures = out_dir / "figures"
     figures.mkdir(exist_ok=True)
     for picture in report.pictures:
@@ -103,8 +103,3 @@ def _read(path: Path) -> tuple[Maps, FloatArray]:
             sigma = np.asarray(points[SIGMA_Z]) if has else np.zeros(len(depth))
             sample.append(np.column_stack([shift, depth, sigma])[moved][::every])
     return builder.maps(), np.vstack(sample)
-
-
-def _files(paths: Iterable[Path]) -> Table:
-    rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in paths]
-    return Table("Input files", ["file", "bytes", "SHA-256"], rows)

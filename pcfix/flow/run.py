@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -110,26 +111,15 @@ def request_of(record: Path) -> Request:
         raise InputError(f"{record}: is not the record of a run ({error}).") from error
 
 
-@dataclass(frozen=True)
 class Files:
     """Where a run leaves what it makes."""
 
-    folder: Path
-
-    def __getattr__(self, name: str) -> Path:
-        """Return the path of a result."""
-        return self.folder / _NAMES[name]
-
-
-_NAMES = {
-    "corrected": "corrected.laz",
-    "cleaned": "cleaned.laz",
-    "dsm": "dsm.tif",
-    "dsm_bed": "dsm_bed.tif",
-    "hillshade": "hillshade.tif",
-    "compare": "compare",
-    "report": "report.html",
-}
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.corrected, self.cleaned = folder / "corrected.laz", folder / "cleaned.laz"
+        self.dsm, self.dsm_bed = folder / "dsm.tif", folder / "dsm_bed.tif"
+        self.hillshade = folder / "hillshade.tif"
+        self.compare, self.report = folder / "compare", folder / "report.html"
 
 
 def run_all(
@@ -197,7 +187,9 @@ def run_all(
     if not first["is_said"] and is_worth_saying(first, corrected.get("absorbed", False)):
         first = {**first, "is_said": True}
         _say_adjusted(first, out_dir, was_done, say)
-    step("clean", [files.cleaned], lambda: _clean(request, files, jobs))
+    # the surface of a dimension is still in the cloud, and what was corrected is known anyway
+    clean = partial(clean_file, files.corrected, files.cleaned, overwrite=True, jobs=jobs)
+    step("clean", [files.cleaned], lambda: clean().as_dict())
     step("dsm", [files.dsm, files.dsm_bed, files.hillshade], lambda: _grid(request, files))
     compared = None
     if request.reference is not None:
@@ -229,12 +221,6 @@ def _correct(
     options = replace(request, overwrite=True, jobs=jobs).part(CorrectOptions)
     summary = correct_file(request.input, files.corrected, options=options, progress=progress)
     return vars(summary)
-
-
-def _clean(request: Request, files: Files, jobs: int | None) -> dict[str, Any]:
-    # the surface of a dimension is still in the cloud, and what was corrected is known anyway
-    summary = clean_file(files.corrected, files.cleaned, overwrite=True, jobs=jobs)
-    return summary.as_dict()
 
 
 def _grid(request: Request, files: Files) -> dict[str, Any]:
@@ -311,6 +297,8 @@ def _report(
         dod = preview(files.compare / DOD) if _rasters(request) else None
         pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
         verdict += in_a_sentence(compared["figures"])
+    if first["adjusted"]:
+        tables.insert(0, adjustment_table(figures_of(files.folder), f"{FOLDER}/report.html"))
     inputs_again = replace(request, views=None).part(Inputs)
     with warnings.catch_warnings():  # they were shown when the cloud was corrected
         warnings.simplefilter("ignore", PcfixWarning)
@@ -325,15 +313,8 @@ def _report(
         cameras=cameras,
         water=water or inputs_again.surface(view).surface,
         inputs=inputs,
-        more=(pictures, [*_adjusted_table(first, files.folder), *tables]),
+        more=(pictures, tables),
         verdict=verdict,
         overwrite=True,
     )
     return str(page)
-
-
-def _adjusted_table(first: dict[str, Any], folder: Path) -> list[Table]:
-    """Return what the adjustment changed, where there was one."""
-    if not first["adjusted"]:
-        return []
-    return [adjustment_table(figures_of(folder), f"{FOLDER}/report.html")]

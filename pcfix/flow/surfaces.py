@@ -150,26 +150,14 @@ def _sought(view: CloudView | None) -> FoundSurface:
     if view is None:
         raise SettingError("water 'auto' is found in a cloud; give the cloud too.")
     every = max(1, view.points // SAMPLE_POINTS)
-    parts = [_thinned(seen, every) for seen in view.chunks()]
-
-    def whole(name: str) -> Any:
-        arrays = [getattr(part, name) for part in parts]
-        return None if any(a is None for a in arrays) else np.concatenate(arrays)
-
-    proposal = find_water(
-        whole("xyz"),
-        rgb=whole("rgb"),
-        classes=whole("classes"),
-        number_of_returns=whole("returns"),
-    )
+    parts = [[a if a is None else a[::every] for a in seen] for seen in view.chunks()]
+    whole: list[Any] = [
+        None if any(a is None for a in arrays) else np.concatenate(arrays)
+        for arrays in zip(*parts, strict=True)
+    ]
+    xyz, rgb, classes, returns = whole
+    proposal = find_water(xyz, rgb=rgb, classes=classes, number_of_returns=returns)
     return FoundSurface(proposal.surface, proposal, proposal.shoreline)
-
-
-def _thinned(seen: Seen, every: int) -> Seen:
-    return Seen(
-        seen.xyz[::every],
-        *(None if values is None else values[::every] for values in seen[1:]),
-    )
 
 
 def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundSurface:

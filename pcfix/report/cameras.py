@@ -259,8 +259,7 @@ def block_figure(report: CamerasReport) -> Figure:
     label_plan(plan, 20.0)
     side.ticklabel_format(style="plain", useOffset=False)
     side.tick_params(axis="x", labelrotation=20)
-    side.set_xlabel("East (m)")
-    side.set_ylabel("Height (m)")
+    side.set(xlabel="East (m)", ylabel="Height (m)")
     plan.legend(loc="upper right")
     if side.get_legend_handles_labels()[0]:
         side.legend(loc="best")

@@ -243,8 +243,7 @@ def _errors(bins: list[Plain], label: str) -> Figure:
             middle = [(b["from_m"] + b["to_m"]) / 2.0 for b in known]
             mean, sd = ([b[when][key] for b in known] for key in ("mean_m", "sd_m"))
             axes.errorbar(middle, mean, sd, fmt="o-", color=colour, capsize=3, label=name)
-    axes.set_xlabel(label)
-    axes.set_ylabel("Cloud minus reference, Z (m)")
+    axes.set(xlabel=label, ylabel="Cloud minus reference, Z (m)")
     axes.legend(loc="best")
     return figure
 
@@ -274,8 +273,7 @@ def _section(section: Plain) -> Figure:
         if key in section["heights_m"]:
             heights = np.array(section["heights_m"][key], float)
             axes.plot(section["distance_m"], heights, label=names.get(key, key), **look)
-    axes.set_xlabel("Distance along the line (m)")
-    axes.set_ylabel("Height (m)")
+    axes.set(xlabel="Distance along the line (m)", ylabel="Height (m)")
     axes.legend(loc="best")
     return figure
 

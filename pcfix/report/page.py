@@ -61,8 +61,7 @@ def label_plan(axes: Axes, turned_deg: float = 30.0) -> None:
     axes.set_aspect("equal")
     axes.ticklabel_format(style="plain", useOffset=False)
     axes.tick_params(axis="x", labelrotation=turned_deg)
-    axes.set_xlabel("East (m)")
-    axes.set_ylabel("North (m)")
+    axes.set(xlabel="East (m)", ylabel="North (m)")
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from pcfix.simulate.refraction_effect import AerialCamera, Effect, Iteration
+    from pcfix.simulate.refraction_effect import AerialCamera, Effect, Iteration, StereoPair
 
 COLUMNS = (
     "camera", "focal_mm", "flying_height_m", "overlap", "base_m", "refractive_index",
@@ -159,9 +159,7 @@ def _mark_places(axes: Axes, one: Effect) -> None:
         textcoords="offset points", ha="right", va="top", fontsize=9, bbox=box, zorder=20,
     )  # fmt: skip
     axes.set_title(f"{one.pair.flying_height_m:g} m above the water", fontsize=10)
-    axes.set_aspect("equal")
-    axes.set_xlabel("Along the flight (m)")
-    axes.set_ylabel("Across the flight (m)")
+    axes.set(aspect="equal", xlabel="Along the flight (m)", ylabel="Across the flight (m)")
 
 
 def depth_figure(effects: list[Effect]) -> Figure:
@@ -174,8 +172,7 @@ def depth_figure(effects: list[Effect]) -> Figure:
     for axes, label in zip(
         panels, ("Apparent minus true depth (m)", "True over apparent depth"), strict=True
     ):
-        axes.set_xlabel("Apparent depth (m)")
-        axes.set_ylabel(label)
+        axes.set(xlabel="Apparent depth (m)", ylabel=label)
         axes.grid(color="0.9")
     index = effects[0].refractive_index
     panels[1].axhline(index, color="0.5", linewidth=1.0)
@@ -206,10 +203,11 @@ def _draw_camera(panels: Any, camera: AerialCamera, effects: list[Effect], colou
             panels[1].plot(depth[order], 1.0 - error[order] / depth[order], **style)
 
 
-def shan_text(table: list[Iteration], title: str) -> str:
-    """Return the residuals of Shan's iteration, a line each."""
+def shan_text(pair: StereoPair, table: list[Iteration], depth_m: float) -> str:
+    """Return the residuals of Shan's iteration over a bed, a line each."""
     lines = [
-        f"Shan's iteration, {title}: residual of the depth",
+        f"Shan's iteration, {pair.camera.name} from {pair.flying_height_m:g} m, bed"
+        f" {depth_m:g} m deep: residual of the depth",
         f"{'iteration':>9}{'mean':>16}{'largest':>16}{'change of tan a':>18}",
     ]
     for one in table:
@@ -218,11 +216,12 @@ def shan_text(table: list[Iteration], title: str) -> str:
     return "\n".join(lines)
 
 
-def shan_rows(table: list[Iteration], **facts: Any) -> list[dict[str, Any]]:
+def shan_rows(pair: StereoPair, table: list[Iteration]) -> list[dict[str, Any]]:
     """Return the iterations as rows, each with the facts of its pair."""
     return [
-        facts
-        | {
+        {
+            "camera": pair.camera.name,
+            "flying_height_m": pair.flying_height_m,
             "iteration": one.number,
             "mean_residual_m": float(f"{one.mean_m:.4g}"),
             "max_residual_m": float(f"{one.max_m:.4g}"),
@@ -265,8 +264,7 @@ def depth_bins_figure(bins: DepthBins) -> Figure:
         axes.bar(left, 1e3 * bins.rmse_m[:-1, i], width, color=_COLOURS[method], label=method)
     axes.set_yscale("log")
     axes.set_xticks(places, _bin_names(bins)[:-1])
-    axes.set_xlabel("True depth (m)")
-    axes.set_ylabel("RMSE of heights (mm)")
+    axes.set(xlabel="True depth (m)", ylabel="RMSE of heights (mm)")
     axes.grid(axis="y", color="0.9")
     axes.set_axisbelow(True)
     figure.legend(loc="outside upper center", ncols=len(METHODS))

@@ -211,8 +211,7 @@ def histogram_figure(values: FloatArray, name: str, label: str) -> Figure:
     text = f"{name}: mean {values.mean():.3f}, sd {values.std():.3f}"
     edges = np.linspace(low, high, 81)
     axes.hist(values, edges, density=True, color=BEFORE, alpha=0.55, label=text)
-    axes.set_xlabel(label)
-    axes.set_ylabel("Density")
+    axes.set(xlabel=label, ylabel="Density")
     axes.legend(loc="best")
     return figure
 
@@ -242,8 +241,7 @@ def cameras_figure(
     if water_m is not None:
         profile.axhline(water_m, color=WATER, label="water")
     profile.ticklabel_format(style="plain", useOffset=False)
-    profile.set_xlabel("East (m)")
-    profile.set_ylabel("Height (m)")
+    profile.set(xlabel="East (m)", ylabel="Height (m)")
     profile.legend(loc="best")
     return figure
 
@@ -290,10 +288,7 @@ def tvu_figure(depth_m: FloatArray, sigma_z_m: FloatArray) -> Figure:
         axes.plot(depths, largest, style, color=BEFORE, label=f"IHO S-44 {name}")
         if largest[0] > high.max():
             break  # the laxer ones would only press the points down
-    axes.set_xlim(0.0, deepest)
-    axes.set_ylim(bottom=0.0)
-    axes.set_xlabel("Depth (m)")
-    axes.set_ylabel("TVU at 95 % (m)")
+    axes.set(xlim=(0.0, deepest), ylim=(0.0, None), xlabel="Depth (m)", ylabel="TVU at 95 % (m)")
     axes.legend(loc="best")
     return figure
 

@@ -203,16 +203,7 @@ def _station(points: FloatArray, fit: WaterFit | RiverFit) -> FloatArray:
 
 
 def shoreline_figure(found: WaterProposal) -> Figure:
-    """Draw the shoreline in plan, and heights and evidence beside it.
-
-    Parameters
-    ----------
-    found : WaterProposal
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw the shoreline in plan, and heights and evidence beside it."""
     figure, axes = new_figure(
         11.0, 6.5, nrows=2, ncols=2, width_ratios=[3, 2], height_ratios=[2, 3]
     )
@@ -251,14 +242,8 @@ def _plan(axes: Axes, figure: Figure, found: WaterProposal) -> None:
     dots = axes.scatter(
         x, y, c=above_m, s=size, cmap="BrBG_r", vmin=-reach, vmax=reach, linewidths=0, marker="s"
     )
-    figure.colorbar(
-        dots,
-        ax=axes,
-        label="Apparent height above the surface (m)",
-        location="bottom",
-        shrink=0.7,
-        aspect=30,
-    )
+    label = "Apparent height above the surface (m)"
+    figure.colorbar(dots, ax=axes, label=label, location="bottom", shrink=0.7, aspect=30)
     shore_x, shore_y = (found.shoreline[:, :2] - corner).T
     name = f"shoreline, {len(found.shoreline):,} places"
     axes.plot(shore_x, shore_y, ".", color="#c2185b", markersize=3, label=name)
@@ -273,9 +258,7 @@ def _histogram(axes: Axes, found: WaterProposal) -> None:
     heights = _above(found, found.ground) + found.level_m
     axes.hist(heights, bins=90, range=(low, high), color="0.65")
     _level(axes, found)
-    axes.set_xlim(low, high)
-    axes.set_xlabel("Apparent height (m)")
-    axes.set_ylabel("Cells")
+    axes.set(xlim=(low, high), xlabel="Apparent height (m)", ylabel="Cells")
     axes.legend(loc="best")
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.errors import GeometryError, SettingError
+from pcfix.errors import GeometryError
 from pcfix.flow.regression import learn_regression
 from pcfix.label.labelling import Part
 from pcfix.model import Outcome, WaterPlane
@@ -257,12 +257,6 @@ def test_one_depth_leaves_the_slope_open(tmp_path):
     xyz[:, 2] = 10.0
     with pytest.raises(GeometryError, match=r"one apparent depth, 2\.000 m"):
         learn_regression(table(tmp_path, places(9), np.full(9, 2.7)), parts(xyz), SETTINGS)
-
-
-def test_a_radius_must_be_positive(tmp_path):
-    path = table(tmp_path, places(9), np.full(9, 2.7))
-    with pytest.raises(SettingError, match="radius"):
-        learn_regression(path, parts(cloud()), SETTINGS, radius_m=0.0)
 
 
 def test_it_is_applied(tmp_path):

@@ -86,8 +86,8 @@ def test_without_refraction_there_is_nothing_to_iterate():
 
 def test_the_page_of_the_iterations():
     table = shan_iterations(PAIR, 15.0)
-    text = shan_text(table, "SwingletCAM from 100 m, bed 15 m deep")
+    text = shan_text(PAIR, table, 15.0)
     assert len(text.splitlines()) == len(table) + 2
-    rows = shan_rows(table, camera="SwingletCAM")
+    rows = shan_rows(PAIR, table)
     assert rows[0]["camera"] == "SwingletCAM" and rows[0]["change_tan_a"] == ""
     assert rows[1]["max_residual_m"] == pytest.approx(table[1].max_m, rel=1e-3)
