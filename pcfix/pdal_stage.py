@@ -42,7 +42,7 @@ from pcfix.io.pdal import (
     node,
     scales_of,
 )
-from pcfix.model import FloatArray, WaterSurface
+from pcfix.model import WaterDimension, WaterSurface
 from pcfix.options.declare import Option, OptionSet, named, options_of
 
 Set = TypeVar("Set", bound=OptionSet)
@@ -188,7 +188,7 @@ def _converted(one: Option, value: Any) -> Any:
     kinds = one.plain_kinds
     for kind in kinds:
         if isinstance(value, kind) and (kind is bool or not isinstance(value, bool)):
-            return str(value) if kind is int and one.declared.parse is not None else value
+            return str(value) if kind is int and one.parse is not None else value
         if kind in (int, float) and isinstance(value, int | float | str):
             try:
                 number = float(value)
@@ -199,12 +199,6 @@ def _converted(one: Option, value: Any) -> Any:
             return kind(number)
     words = " or ".join(_WORD[kind] for kind in kinds)
     raise SettingError(f"pdalargs: {one.name} must be {words}, not {json.dumps(value)}.")
-
-
-def _heights(water: WaterSurface, ins: Dimensions, rows: slice) -> FloatArray | None:
-    from pcfix.model import WaterDimension
-
-    return dimension(ins, water.name)[rows] if isinstance(water, WaterDimension) else None
 
 
 def _slices(n: int) -> Iterator[slice]:
@@ -219,12 +213,13 @@ def _chunks(ins: Dimensions, water: WaterSurface, flags: Flags) -> Iterator[tupl
 
     for rows in _slices(len(ins["X"])):
         xyz = checked_points(np.column_stack([ins[axis][rows] for axis in "XYZ"]))
-        yield rows, (xyz, _heights(water, ins, rows), flags.classes[rows])
+        heights = dimension(ins, water.name)[rows] if isinstance(water, WaterDimension) else None
+        yield rows, (xyz, heights, flags.classes[rows])
 
 
 def _view(ins: Dimensions, metadata: dict[str, Any] | None, flags: Flags) -> CloudView:
     """Return the cloud as a water surface needs it."""
-    from pcfix.flow.surfaces import CloudView, Seen
+    from pcfix.flow.surfaces import CloudView, Seen, corners
 
     def chunks() -> Iterator[Seen]:
         colours = ("Red", "Green", "Blue")
@@ -236,15 +231,7 @@ def _view(ins: Dimensions, metadata: dict[str, Any] | None, flags: Flags) -> Clo
             returns = ins["NumberOfReturns"][rows] if "NumberOfReturns" in ins else None
             yield Seen(xyz, rgb, flags.classes[rows], returns)
 
-    return CloudView(NAME, crs_of(metadata), *_corners(ins), len(ins["X"]), chunks)
-
-
-def _corners(ins: Dimensions) -> tuple[FloatArray, FloatArray]:
-    """Return the south-west and north-east corner of the cloud, metres; NaN where it is empty."""
-    if not len(ins["X"]):
-        return np.full(2, np.nan), np.full(2, np.nan)
-    low, high = ([reach(ins[axis]) for axis in "XY"] for reach in (np.min, np.max))
-    return np.array(low), np.array(high)
+    return CloudView(NAME, crs_of(metadata), *corners(ins["X"], ins["Y"]), len(ins["X"]), chunks)
 
 
 def _repair_process(error: BaseException) -> None:

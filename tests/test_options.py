@@ -28,7 +28,7 @@ def test_every_option_says_what_it_is(kind):
     assert len(set(names)) == len(names)
     for one in options_of(kind):
         assert one.panel in list(Panel)
-        assert one.declared.help.endswith(".")
+        assert one.help.endswith(".")
         assert one.default is None or one.checked(one.default) == one.default
     kind(**{name: value for name, value in FREE.items() if name in names})
 

@@ -40,16 +40,16 @@ def prepare(command: Callable[..., None]) -> None:
 def check_needed(options: OptionSet, *, water: bool = True) -> None:
     """Refuse a command without the options that it needs; `water` tells whether that is one."""
     for one in options_of(type(options)):
-        wanted = one.declared.needed and (water or one.name != "water")
+        wanted = one.needed and (water or one.name != "water")
         if wanted and getattr(options, one.name) is None:
             raise UsageError(f"{one.flag} is needed")
 
 
 def _type(one: Option) -> Any:
     """Return what the text of the command line becomes; what has a parser stays text."""
-    if one.declared.metavar == "PATH" or os.PathLike[str] in one.kinds:
+    if one.metavar == "PATH" or os.PathLike[str] in one.kinds:
         return Path | None
-    if one.declared.parse is not None or one.type is Any:
+    if one.parse is not None or one.type is Any:
         return str | one.type if one.default == () else str | None
     if one.default == ():
         return tuple[str, ...]
@@ -57,17 +57,16 @@ def _type(one: Option) -> Any:
 
 
 def _parameter(one: Option) -> Parameter:
-    declared, default = one.declared, one.default
     told = one.default_text
-    has_opposite = one.type is bool and (default or one.name == "connected")
+    has_opposite = one.type is bool and (one.default or one.name == "connected")
     return Parameter(
-        help=f"{one.help_text}{' (needed)' if declared.needed else ''}",
+        help=f"{one.help_text}{' (needed)' if one.needed else ''}",
         group=_GROUPS[one.panel],
         negative_bool="no-" if has_opposite else (),
         negative_none="no-" if one.name in ("below", "floating") else (),
         negative_iterable=(),
         allow_repeating=True,  # the last one counts
-        show=not declared.hidden,
+        show=not one.hidden,
         show_default=(lambda value: told) if told else False,
     )
 

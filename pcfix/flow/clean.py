@@ -11,7 +11,7 @@ from pcfix.clean.neighbours import Empty
 from pcfix.clean.points import Cloud, Resources, check_tile, flag_neighbours, flag_weak
 from pcfix.clean.settings import CleanSummary, Reason
 from pcfix.errors import InputError
-from pcfix.flow.runner import FileTask, Progress, file_task
+from pcfix.flow.runner import FileTask, Progress, Step, file_task
 from pcfix.flow.surfaces import find_surface, view_of, water_heights
 from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
@@ -82,7 +82,7 @@ def clean_file(
     return result
 
 
-class Cleaning:
+class Cleaning(Step):
     """The step that flags noise or leaves it out, once it was found in the whole cloud.
 
     Parameters
@@ -227,9 +227,6 @@ class Cleaning:
         new.array["classification"][noise] = LOW_NOISE
         new["withheld"][:] = np.asarray(new["withheld"]) | noise
         return new
-
-    def finish(self) -> None:
-        """Nothing can be wrong that was not found before."""
 
     def summary(self) -> CleanSummary:
         """Return the numbers of the cleaning."""

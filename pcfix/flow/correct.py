@@ -15,7 +15,7 @@ from pcfix.flow.inputs import paths_in
 from pcfix.flow.job import Job
 from pcfix.flow.old_cameras import paired
 from pcfix.flow.points import Label, correct_checked
-from pcfix.flow.runner import FileTask, Progress, file_task
+from pcfix.flow.runner import FileTask, Progress, Step, file_task
 from pcfix.flow.surfaces import file_points, view_of, water_heights
 from pcfix.io.las.columns import (
     OutOfRangeError,
@@ -230,7 +230,7 @@ def job_for(path: Path, options: CorrectOptions) -> Job:
     return Job(str(path), options, view, step_m)
 
 
-class Correcting:
+class Correcting(Step):
     """The step that corrects points.
 
     Parameters

@@ -12,10 +12,11 @@ import numpy.typing as npt
 
 from pcfix.errors import SettingError
 from pcfix.flow.inputs import mask_of, paths_in
-from pcfix.flow.runner import Progress, file_task
+from pcfix.flow.runner import Progress, Step, file_task
 from pcfix.flow.surfaces import (
     CloudView,
     Points,
+    corners,
     file_points,
     find_surface,
     view_of,
@@ -27,7 +28,7 @@ from pcfix.io.las.source import LasSource, coordinates
 from pcfix.io.las.writing import labelling_vlr, noted_header
 from pcfix.label.areas import WaterMask
 from pcfix.label.labelling import Labelling, LabelSummary, Part, sets_class
-from pcfix.model import FloatArray, WaterPlane, WaterSurface
+from pcfix.model import WaterPlane, WaterSurface
 from pcfix.options.correct import LabelOptions, LabelRules, StageLabelOptions
 from pcfix.options.declare import File, taken
 from pcfix.threads import threads
@@ -96,24 +97,12 @@ def label_points(
         )
     surface, heights = as_surface(water, len(points))
     if water_mask is None or isinstance(water_mask, str | PathLike):
-        water_mask = mask_of(water_mask, crs, *corners(points))
+        water_mask = mask_of(water_mask, crs, *corners(*points[:, :2].T))
     labelling = Labelling(rules, water_mask)
     part = Part(points, surface_above(surface, points, heights), given)
     if labelling.looks_around:
-        labelling.look_around(lambda: [part], *corners(points))
+        labelling.look_around(lambda: [part], *corners(*points[:, :2].T))
     return labelling.labels(part).classes
-
-
-def corners(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the south-west and north-east corner of points, shapes (2,); NaN where there are none.
-
-    They are metres, as the points are, shape (n, 3).
-    """
-    if not len(xyz):
-        return np.full(2, np.nan), np.full(2, np.nan)
-    # axis by axis: numpy is slow along the short one
-    low = np.array([xyz[:, 0].min(), xyz[:, 1].min()])
-    return low, np.array([xyz[:, 0].max(), xyz[:, 1].max()])
 
 
 def label_file(
@@ -172,7 +161,7 @@ def label_file(
     return result
 
 
-class LabellingStep:
+class LabellingStep(Step):
     """The step that labels points: of a file, and of the arrays that PDAL hands over.
 
     Parameters

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.flow.runner import file_task
+from pcfix.flow.runner import Step, file_task
 from pcfix.io.las.columns import SHIFTS, columns_for, is_corrected, is_marked_uncorrected, shifted
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import read_settings, restored_header
@@ -60,11 +60,11 @@ def restore_file(
     return step.points
 
 
-class Restoring:
+class Restoring(Step):
     """The step that takes points back."""
 
     def __init__(self) -> None:
-        self.points, self.identity, self._offset = 0, b"", np.zeros(3, np.int64)
+        self.points, self._offset = 0, np.zeros(3, np.int64)
 
     def header(self, source: LasSource) -> laspy.LasHeader:
         """Return the header as it was before the correction."""
@@ -85,9 +85,6 @@ class Restoring:
         points["withheld"][:] = (withheld & ~is_marked_uncorrected(points)).astype(np.uint8)
         shift = np.column_stack([points.array[name] for name in SHIFTS]).astype(np.int64)
         return shifted(points, header, -shift - self._offset)
-
-    def finish(self) -> None:
-        """Nothing can be wrong with what was so before."""
 
 
 def _ours(source: LasSource, dimensions: Dimensions) -> set[str]:

@@ -24,6 +24,9 @@ Progress = Callable[[int, int], None]
 class Step(Protocol):
     """What happens to the points of a file."""
 
+    identity: bytes | None = None
+    """Of the output, by its first bytes; None for that of every corrected file."""
+
     def header(self, source: LasSource) -> laspy.LasHeader:
         """Return the header of the output, and be ready for the first chunk."""
 
@@ -34,6 +37,7 @@ class Step(Protocol):
 
     def finish(self) -> None:
         """Refuse a result that cannot be right; nothing is left behind then."""
+        return
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,7 @@ class FileTask:
         """Take every chunk through a step; the target appears when all went well."""
         with LasSource(self.source, self.jobs) as source:
             header = step.header(source)
-            identity = getattr(step, "identity", None) or corrected_identity(source)
+            identity = step.identity or corrected_identity(source)
             with LasSink(self.target, header, output_evlrs(source), identity, self.jobs) as sink:
                 done = 0
                 for points in source.chunks():

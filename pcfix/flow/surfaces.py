@@ -69,6 +69,13 @@ class CloudView:
     chunks: Callable[[], Iterator[Seen]]
 
 
+def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the south-west and north-east corner of points, shapes (2,); NaN without points."""
+    if not len(x):
+        return np.full(2, np.nan), np.full(2, np.nan)
+    return np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
+
+
 def view_of(path: Path, jobs: int | None = None) -> CloudView:
     """Return the view of a LAS or LAZ file."""
     with LasSource(path, jobs) as source:

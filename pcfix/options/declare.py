@@ -38,8 +38,8 @@ Rule: TypeAlias = Callable[[str, Any], str | None]
 Set = TypeVar("Set", bound="OptionSet")
 
 
-class Declared(NamedTuple):
-    """What is declared of an option beside its name, type and default.
+class Option(NamedTuple):
+    """An option of a class.
 
     Attributes
     ----------
@@ -60,6 +60,8 @@ class Declared(NamedTuple):
         Names that it had; they work, with a warning.
     hidden : bool
         Left out of help and documents: it says nothing any more.
+    name, type, default, panel
+        From its field and its class; see `options_of`.
     """
 
     help: str
@@ -71,21 +73,10 @@ class Declared(NamedTuple):
     metavar: str = ""
     old: tuple[str, ...] = ()
     hidden: bool = False
-
-
-def option(default: Any, help: str, **more: Any) -> Any:
-    """Declare an option; for the names of `more` see `Declared`."""
-    return field(default=default, metadata={"help": help, "declared": Declared(help, **more)})
-
-
-class Option(NamedTuple):
-    """An option of a class: its name, type, default and panel, and what is `Declared`."""
-
-    name: str
-    type: Any
-    default: Any
-    panel: str
-    declared: Declared
+    name: str = ""
+    type: Any = None
+    default: Any = None
+    panel: str = ""
 
     @property
     def flag(self) -> str:
@@ -107,13 +98,13 @@ class Option(NamedTuple):
     @property
     def help_text(self) -> str:
         """Its sentence, with the unit."""
-        return self.declared.help + (f" [{self.declared.unit}]" if self.declared.unit else "")
+        return self.help + (f" [{self.unit}]" if self.unit else "")
 
     @property
     def default_text(self) -> str:
         """Its default, in words where they say more; empty where there is none."""
-        if self.declared.default_is or self.default in (None, ()) or self.default is False:
-            return self.declared.default_is
+        if self.default_is or self.default in (None, ()) or self.default is False:
+            return self.default_is
         if isinstance(self.default, tuple):
             return " ".join(f"{value:g}" for value in self.default)
         return f"{self.default:g}" if isinstance(self.default, float) else str(self.default)
@@ -128,10 +119,10 @@ class Option(NamedTuple):
     @property
     def plain_kinds(self) -> tuple[type, ...]:
         """The types that its value may have in JSON, in the order in which they are tried."""
-        if self.declared.parse is not None:
+        if self.parse is not None:
             return (float, str) if float in self.kinds else (str, int)
         if self.type is Any:
-            return (str,) if self.declared.metavar == "PATH" else (str, float)
+            return (str,) if self.metavar == "PATH" else (str, float)
         return self.kinds if self.kinds in ((bool,), (int,), (float,)) else (str,)
 
     def checked(self, value: Any) -> Any:
@@ -142,8 +133,8 @@ class Option(NamedTuple):
         SettingError
             If it is another type, not among the choices, or outside the rule.
         """
-        if isinstance(value, str) and self.declared.parse is not None:
-            value = self.declared.parse(self.flag[2:], value)
+        if isinstance(value, str) and self.parse is not None:
+            value = self.parse(self.flag[2:], value)
         if value is None and (self.default is None or type(None) in get_args(self.type)):
             return None
         value = tuple(value) if isinstance(value, list) else value
@@ -157,7 +148,7 @@ class Option(NamedTuple):
     def _against_rule(self, value: Any) -> str | None:
         """Return what its rule says of a value; nothing of what is no number at all."""
         try:
-            return None if self.declared.rule is None else self.declared.rule(self.flag[2:], value)
+            return None if self.rule is None else self.rule(self.flag[2:], value)
         except TypeError:
             return None
 
@@ -174,6 +165,11 @@ def _converted(one: Option, value: Any) -> Any:
             raise SettingError(f"{one.flag[2:]} {value} must be a whole number.")
         return int(value)
     return float(value) if float in kinds and hasattr(value, "__float__") else value
+
+
+def option(default: Any, help: str, **more: Any) -> Any:
+    """Declare an option; for the names of `more` see `Option`."""
+    return field(default=default, metadata={"help": help, "option": Option(help, **more)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,7 +211,7 @@ class OptionSet:
 
 def _worded(one: Option, value: Any) -> Any:
     """Return numbers and words as text with commas between, where text is parsed."""
-    if isinstance(value, tuple) and one.declared.parse is not None:
+    if isinstance(value, tuple) and one.parse is not None:
         return ",".join(f"{v:.15g}" if isinstance(v, float) else str(v) for v in value)
     return _plain(value)
 
@@ -230,28 +226,28 @@ def _plain(value: Any) -> Any:
 def options_of(kind: type) -> tuple[Option, ...]:
     """Return the options of a class, in the order of its help."""
     homes = {name: base for base in reversed(kind.__mro__) for name in get_annotations(base)}
-    return tuple(
-        _option(one, homes[one.name]) for one in fields(kind) if "declared" in one.metadata
-    )
+    return tuple(_option(one, homes[one.name]) for one in fields(kind) if "option" in one.metadata)
 
 
 def _option(one: Field[Any], home: type) -> Option:
     """Return the option of a field, with what the class that declares it says of all of its own."""
-    own, declared = vars(home), one.metadata["declared"]
+    own, declared = vars(home), one.metadata["option"]
     if own.get("old_units") and declared.unit:
         declared = declared._replace(old=(f"{one.name}_{declared.unit}",))
     kind = eval(str(one.type), vars(sys.modules[home.__module__]))
-    return Option(one.name, kind, one.default, own.get("panel", ""), declared)
+    panel = own.get("panel", "")
+    named = {"name": one.name, "type": kind, "default": one.default, "panel": panel}
+    return declared._replace(**named)
 
 
 def table_of(kind: type) -> str:
     """Return the options of a class as a table of a document."""
     rows = ["| option | meaning | default |", "|---|---|---|"]
     for one in options_of(kind):
-        if one.declared.hidden:
+        if one.hidden:
             continue
-        value = "\\|".join(one.choices) or one.declared.metavar or one.placeholder
-        default = "needed" if one.declared.needed else one.default_text
+        value = "\\|".join(one.choices) or one.metavar or one.placeholder
+        default = "needed" if one.needed else one.default_text
         flag = f"{one.flag} {value}".strip()
         rows.append(f"| `{flag}` | {one.help_text} | {default} |")
     return "\n".join(rows)
@@ -300,7 +296,7 @@ def named(given: Mapping[str, Any], known: Iterable[Option], where: str) -> dict
     """
     options = list(known)
     names = [one.name for one in options]
-    renamed = {old: one.name for one in options for old in one.declared.old}
+    renamed = {old: one.name for one in options for old in one.old}
     found: dict[str, Any] = {}
     for name, value in _without_budget(given, names).items():
         if name in renamed:
