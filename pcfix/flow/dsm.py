@@ -166,13 +166,12 @@ class _Run:
         """Write heights to one raster, the other bands to another (or the same)."""
         done, lattice = 0, self.lattice
         how = Gridding(lattice, self.settings.method, self.reach_m, self.near.spacing_m)
+        rasters = (heights, dsm, dsm, dsm)
         limit = TIN_BLOCK_POINTS if self.settings.method == "tin" else BLOCK_POINTS
         for window in self.sorted.windows(limit):
             points = self.sorted.points_in(window.grown(how.margin_cells))
             bands = grid_window(*points, window, how)
-            for raster, band, values in zip(
-                (heights, dsm, dsm, dsm), ALL_BANDS, bands, strict=True
-            ):
+            for raster, band, values in zip(rasters, ALL_BANDS, bands, strict=True):
                 if values is not None:
                     write_part(raster, values, window, band)
             self.tally.add(bands)
@@ -291,11 +290,11 @@ class SortedPoints:
         """Read the cloud, store the wanted points, and lay out the raster."""
         resolution = settings.resolution
         self._resolution_m = resolution
-        area = _header_area_m2(source, resolution)
-        corner = cells_of(_header_corner(source), resolution)[0]
+        area, corner = _stated_extent(source, resolution)
         self.has_sigma = SIGMA_Z in source.header.point_format.dimension_names
-        side = _side_with(BIN_POINTS, len(source) / area, resolution)
-        self._bins = Bins(folder, side, corner, 4 if self.has_sigma else 3)
+        cells = max(np.sqrt(BIN_POINTS / (len(source) / area)) / resolution, 1.0)
+        side = int(min(2 ** np.floor(np.log2(cells)), BLOCK_CELLS))  # of a square with so many
+        self._bins = Bins(folder, side, cells_of(corner, resolution)[0], 4 if self.has_sigma else 3)
         self.near = Occupancy(area, len(source), resolution)
         done = 0
         for points in source.chunks():
@@ -360,35 +359,24 @@ def _wanted(points: laspy.ScaleAwarePointRecord, surface: SurfaceChoice) -> Bool
     return np.asarray(wanted & ~np.asarray(points["withheld"]).astype(bool))
 
 
-def _side_with(points: int, points_per_m2: float, resolution_m: float) -> int:
-    """Return the power of two, up to `BLOCK_CELLS`, of cells along a square with so many points."""
-    cells = max(np.sqrt(points / points_per_m2) / resolution_m, 1.0)
-    return int(min(2 ** np.floor(np.log2(cells)), BLOCK_CELLS))
-
-
-def _header_area_m2(source: LasSource, resolution_m: float) -> float:
-    """Return the area the header states. It only sets sizes, so it need not be right."""
-    area = float(np.prod(source.header.maxs[:2] - source.header.mins[:2]))
-    return max(area, resolution_m**2) if np.isfinite(area) else resolution_m**2
-
-
-def _header_corner(source: LasSource) -> FloatArray:
-    """Return the north-west corner that the header states, shape (1, 2), if it makes sense."""
-    corner = np.array([[source.header.mins[0], source.header.maxs[1]]])
-    return corner if (np.abs(corner) < 1e9).all() else np.zeros((1, 2))
+def _stated_extent(source: LasSource, resolution_m: float) -> tuple[float, FloatArray]:
+    """Return area and north-west corner, shape (1, 2), of the header; they need not be right."""
+    low, high = source.header.mins[:2], source.header.maxs[:2]
+    area, corner = float(np.prod(high - low)), np.array([[low[0], high[1]]])
+    area = max(area, resolution_m**2) if np.isfinite(area) else resolution_m**2
+    return area, corner if (np.abs(corner) < 1e9).all() else np.zeros((1, 2))
 
 
 def _refuse_none(points: int, source: Path, surface: SurfaceChoice) -> None:
-    if points:
-        return
-    if surface == "bed":
+    if not points and surface == "bed":
         raise InputError(
             f"{source}: has no point of class {BATHYMETRIC_POINT} (bed) that is not withheld;"
             " correct the cloud first, or grid the surface all."
         )
-    raise InputError(
-        f"{source}: all points are noise (classes 7 and 18) or withheld; classify it again."
-    )
+    if not points:
+        raise InputError(
+            f"{source}: all points are noise (classes 7 and 18) or withheld; classify it again."
+        )
 
 
 def _warn_of_fine_cells(spacing_m: float, resolution_m: float) -> None:

@@ -26,9 +26,8 @@ from pcfix.report.text import share
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from pcfix.compare.figures import AfterBefore, Comparison
-    from pcfix.compare.m3c2 import M3c2
-    from pcfix.compare.statistics import Bin, Line, Statistics
+    from pcfix.compare.figures import Comparison
+    from pcfix.compare.statistics import Bin, Statistics
 
 Plain = dict[str, Any]
 _TIMES = (("before", "as it came", BEFORE), ("after", "corrected", AFTER))
@@ -54,23 +53,37 @@ def comparison_text(comparison: Comparison) -> str:
         lines.append(f"  no plane   {n.by_nearest:,}: the nearest point's height was taken")
     lines += ["", HEAD, *_rows(c), *_normal(c)]
     if c.depth is not None:
-        lines += ["", *_fits("depth fit", c.depth.before, c.depth.after)]
+        lines += [
+            "",
+            *(
+                f"depth fit {when:<7} depth = {line.intercept_m:+.3f} m + {line.slope:.4f} x"
+                f" reference depth, r2 {line.r2:.4f}"
+                for when, line in (("before", c.depth.before), ("after", c.depth.after))
+                if line is not None
+            ),
+        ]
     for title, bins in (("depth", c.depth_bins), ("from shore", c.shore_bins)):
         lines += _bin_lines(title, bins)
     if c.m3c2 is not None:
-        lines += ["", *_m3c2(c.m3c2)]
+        m = c.m3c2.after
+        lines += [
+            "",
+            f"M3C2: {m.statistics.count:,} of {m.core_points:,} core points, normals"
+            f" {m.normal_radius_m:.2f} m, cylinder {m.cylinder_radius_m:.2f} m; mean level of"
+            f" detection {m.mean_level_of_detection_m:.3f} m,"
+            f" {100 * m.significant_share:.0f} % of the distances beyond it",
+        ]
     return "\n".join([*lines, *(f"note: {note}" for note in c.notes)])
 
 
 def _rows(c: Comparison) -> list[str]:
     rows = []
     for title, pair in (("dZ", c.vertical), ("C2C", c.c2c), ("M3C2", c.m3c2)):
-        if pair is None:
-            continue
-        if pair.before is not None:
+        if pair is not None and pair.before is not None:
             rows.append(_row(f"{title} before", pair.before.statistics))
-        when = "" if pair.before is None else " after"
-        rows.append(_row(f"{title}{when}", pair.after.statistics))
+            title += " after"
+        if pair is not None:
+            rows.append(_row(title, pair.after.statistics))
     return rows
 
 
@@ -91,15 +104,6 @@ def _normal(c: Comparison) -> list[str]:
     ]
 
 
-def _fits(title: str, before: Line | None, after: Line | None) -> list[str]:
-    return [
-        f"{title} {when:<7} depth = {line.intercept_m:+.3f} m + {line.slope:.4f} x reference depth,"
-        f" r2 {line.r2:.4f}"
-        for when, line in (("before", before), ("after", after))
-        if line is not None
-    ]
-
-
 def _bin_lines(title: str, bins: tuple[Bin, ...]) -> list[str]:
     if not bins:
         return []
@@ -114,16 +118,6 @@ def _bin_lines(title: str, bins: tuple[Bin, ...]) -> list[str]:
             + (f"{b.mean_m:11.3f}{b.rmse_m:9.3f}" if b is not None else "")
         )
     return lines
-
-
-def _m3c2(pair: AfterBefore[M3c2]) -> list[str]:
-    m = pair.after
-    return [
-        f"M3C2: {m.statistics.count:,} of {m.core_points:,} core points, normals"
-        f" {m.normal_radius_m:.2f} m, cylinder {m.cylinder_radius_m:.2f} m; mean level of"
-        f" detection {m.mean_level_of_detection_m:.3f} m,"
-        f" {100 * m.significant_share:.0f} % of the distances beyond it"
-    ]
 
 
 def evaluation(

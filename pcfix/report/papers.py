@@ -80,19 +80,20 @@ def effect_text(effects: list[Effect]) -> str:
 
 def effect_rows(effects: list[Effect]) -> list[dict[str, Any]]:
     """Return a row of `COLUMNS` per camera, flying height and depth."""
-    return [dict(zip(COLUMNS, _row(one), strict=True)) for one in effects]
-
-
-def _row(one: Effect) -> tuple[Any, ...]:
-    pair, depth = one.pair, one.apparent_depth_m
-    centre, corner = depth - one.centre_m, depth - one.corner_m
-    errors = one.centre_m, one.corner_m, one.mean_m
-    return (
-        pair.camera.name, pair.camera.focal_mm, pair.flying_height_m, pair.overlap,
-        round(pair.base_m, 4), one.refractive_index, depth, *(round(e, 5) for e in errors),
-        round(centre, 5), round(corner, 5), round(centre / depth, 5), round(corner / depth, 5),
-        round(float(one.shift_m.max()), 5),
-    )  # fmt: skip
+    rows = []
+    for one in effects:
+        pair, depth = one.pair, one.apparent_depth_m
+        centre, corner = depth - one.centre_m, depth - one.corner_m
+        metres = (
+            one.centre_m, one.corner_m, one.mean_m, centre, corner, centre / depth, corner / depth,
+            float(one.shift_m.max()),
+        )  # fmt: skip
+        facts = (
+            pair.camera.name, pair.camera.focal_mm, pair.flying_height_m, pair.overlap,
+            round(pair.base_m, 4), one.refractive_index, depth,
+        )  # fmt: skip
+        rows.append(dict(zip(COLUMNS, [*facts, *(round(m, 5) for m in metres)], strict=True)))
+    return rows
 
 
 def csv_text(rows: list[dict[str, Any]]) -> str:
