@@ -14,9 +14,9 @@ from pcfix.errors import InputError, SettingError
 from pcfix.flow.inputs import paths_in
 from pcfix.flow.job import Job
 from pcfix.flow.old_cameras import paired
-from pcfix.flow.points import Label, correct_checked
 from pcfix.flow.runner import FileTask, Progress, Step, file_task
 from pcfix.flow.surfaces import file_points, view_of, water_heights
+from pcfix.flow.through_water import Label, correct_checked
 from pcfix.io.las.columns import (
     OutOfRangeError,
     TooNarrowError,

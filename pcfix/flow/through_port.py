@@ -15,7 +15,7 @@ import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
 from pcfix.flow.old_cameras import Blocks, ListedViews
-from pcfix.flow.points import spread_over
+from pcfix.flow.through_water import spread_over
 from pcfix.label.labelling import Labelling
 from pcfix.model import Correction, Views, WaterPlane
 from pcfix.options.correct import CorrectOptions

@@ -36,7 +36,7 @@ import pcfix
 from pcfix.options.correct import ScienceOptions
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from pcfix.flow.regression import learn_regression
+from pcfix.flow.learning import learn_regression
 from pcfix.label.labelling import Part
 from pcfix.water.surface import surface_above
 from tests.benchmarks.accuracy_scenes import NAMES, Case, make
