@@ -282,9 +282,7 @@ def _column(name: str, values: npt.ArrayLike | None, n: int) -> FloatArray | Non
 
 
 def _submerged(
-    points: FloatArray,
-    water: WaterSurface | float | npt.ArrayLike | None,
-    rays: FloatArray | None,
+    points: FloatArray, water: WaterSurface | float | npt.ArrayLike | None, rays: FloatArray | None
 ) -> BoolArray:
     if water is not None:
         surface, heights = as_surface(water, len(points))

@@ -16,12 +16,7 @@ from pcfix.options.declare import options_of
 from pcfix.options.scenes import DemoOptions, SimulateOptions
 from pcfix.options.shared import JobOptions
 from pcfix.options.steps import CleanOptions, CompareOptions, DsmOptions
-from pcfix.options.survey import (
-    AdjustOptions,
-    CamerasCheckOptions,
-    RunOptions,
-    WaterCheckOptions,
-)
+from pcfix.options.survey import AdjustOptions, CamerasCheckOptions, RunOptions, WaterCheckOptions
 
 Input = Annotated[Path, Parameter(help="LAS or LAZ cloud.")]
 Output = Annotated[Path, Parameter(help="LAS or LAZ to write.")]

@@ -11,13 +11,7 @@ import numpy as np
 from pcfix.adjust.diagnosis import Diagnosis
 from pcfix.adjust.evidence import Evidence
 from pcfix.errors import InputError, SettingError
-from pcfix.flow.diagnosis import (
-    command_of,
-    diagnose,
-    focal_length_of,
-    given_focal_lengths,
-    ties_of,
-)
+from pcfix.flow.diagnosis import command_of, diagnose, focal_length_of, given_focal_lengths, ties_of
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import CloudView, file_points, find_surface, view_of

@@ -133,11 +133,7 @@ class Cleaning(Step):
             self._task.progress(self._passed // _PASSES, len(self.cloud.used))
 
     def _read(
-        self,
-        points: laspy.ScaleAwarePointRecord,
-        source: LasSource,
-        rows: slice,
-        names: set[str],
+        self, points: laspy.ScaleAwarePointRecord, source: LasSource, rows: slice, names: set[str]
     ) -> None:
         """Read coordinates and masks, and flag weak intersections on the way."""
         cloud, xyz = self.cloud, coordinates(points)

@@ -20,11 +20,7 @@ from pcfix.options.steps import CompareOptions, CompareRules
 
 
 def compare_clouds(
-    cloud: File,
-    reference: File,
-    *,
-    options: CompareOptions | None = None,
-    **keywords: Any,
+    cloud: File, reference: File, *, options: CompareOptions | None = None, **keywords: Any
 ) -> Comparison:
     """Measure how far a cloud is from a reference; what ``pcfix compare`` runs.
 

@@ -150,9 +150,7 @@ def _bed_points(view: CloudView) -> int:
 
 
 def learn_regression(
-    path: str | os.PathLike[str],
-    parts: Iterable[Part],
-    settings: ScienceOptions,
+    path: str | os.PathLike[str], parts: Iterable[Part], settings: ScienceOptions
 ) -> DepthRegression:
     """Fit true depth = a + b * apparent depth to the check depths of a file.
 

@@ -41,11 +41,7 @@ from pcfix.options.declare import named, options_of
 from pcfix.options.survey import RunOptions
 from pcfix.report.comparison import evaluation, in_a_sentence
 from pcfix.report.page import Picture, Table
-from pcfix.report.run import (
-    adjustment_sentence,
-    adjustment_table,
-    reason_sentence,
-)
+from pcfix.report.run import adjustment_sentence, adjustment_table, reason_sentence
 from pcfix.water.index import with_index
 
 RECORD = "run.json"
@@ -214,10 +210,7 @@ def _say_adjusted(
 
 
 def _correct(
-    request: Request,
-    files: Files,
-    jobs: int | None,
-    progress: Callable[[int, int], None] | None,
+    request: Request, files: Files, jobs: int | None, progress: Callable[[int, int], None] | None
 ) -> dict[str, Any]:
     options = replace(request, overwrite=True, jobs=jobs).part(CorrectOptions)
     summary = correct_file(request.input, files.corrected, options=options, progress=progress)
@@ -284,12 +277,7 @@ def _plain_sections(result: Comparison) -> list[dict[str, Any]]:
     ]
 
 
-def _report(
-    request: Request,
-    files: Files,
-    inputs: list[Path],
-    done: dict[str, Any],
-) -> str:
+def _report(request: Request, files: Files, inputs: list[Path], done: dict[str, Any]) -> str:
     pictures: list[Picture] = []
     tables: list[Table] = []
     first, compared = done["adjust"], done["compare"]

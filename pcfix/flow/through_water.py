@@ -95,10 +95,7 @@ class ThroughWater:
             self.carrying.restart()
 
     def look_around(
-        self,
-        chunks: Callable[[], Iterable[Points]],
-        labelling: Labelling,
-        views: ListedViews,
+        self, chunks: Callable[[], Iterable[Points]], labelling: Labelling, views: ListedViews
     ) -> None:
         """Learn what must be known of the whole cloud, before the first chunk is corrected."""
         around, makers = chunks, None

@@ -11,16 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.model import FloatArray
-from pcfix.report.page import (
-    AFTER,
-    BEFORE,
-    REFERENCE,
-    WATER,
-    Picture,
-    Table,
-    new_figure,
-    new_map,
-)
+from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, Picture, Table, new_figure, new_map
 from pcfix.report.text import share
 
 if TYPE_CHECKING:
