@@ -122,7 +122,9 @@ class Learning:
         """Add the model of the matcher, by the tie points where the camera file has some."""
         if not wants_matcher(self.survey.settings, self._views):
             return learned
-        step = max(1, self._view.points // _bed_points(self._view))
+        area_m2 = np.prod(np.maximum(np.subtract(self._view.high, self._view.low)[:2], 1.0))
+        wanted = np.clip(BED_POINTS_A_M2 * float(area_m2), FEWEST_BED_POINTS, MOST_BED_POINTS)
+        step = max(1, self._view.points // int(wanted))
         survey = replace(self.survey, learned=learned)
         taken: list[Batch] = []
         done = 0
@@ -142,11 +144,6 @@ class Learning:
 BED_POINTS_A_M2 = 5.0
 FEWEST_BED_POINTS, MOST_BED_POINTS = 250_000, 1_000_000
 """Of the cloud, evenly spread over its order, tell the bed of the surroundings."""
-
-
-def _bed_points(view: CloudView) -> int:
-    area_m2 = float(np.prod(np.maximum(np.subtract(view.high, view.low)[:2], 1.0)))
-    return int(np.clip(BED_POINTS_A_M2 * area_m2, FEWEST_BED_POINTS, MOST_BED_POINTS))
 
 
 def learn_regression(

@@ -194,11 +194,12 @@ class ThroughWater:
         """Return what to say where no camera has a submerged point in sight."""
         middle = (tally.low + tally.high) / 2.0
         distance = float(np.hypot(*(self._cameras.centres - middle)[:, :2].T).min())
+        away = f"{distance / 1000.0:,.1f} km" if distance >= 10_000.0 else f"{distance:,.1f} m"
         limit = self._options.max_angle
         return (
             "no camera has a submerged point in sight"
             + (f" within {limit:g} degrees" if limit else "")
-            + f"; the nearest stands {_distance(distance)} in plan from the middle of the"
+            + f"; the nearest stands {away} in plan from the middle of the"
             f" {tally.submerged:,} submerged points; check that cameras and cloud have the"
             " same CRS, and that pitch 0 means straight down."
         )
@@ -241,10 +242,6 @@ def parts_of(chunks: Iterable[Points], water: WaterSurface) -> Iterable[Part]:
     return (
         Part(xyz, surface_above(water, xyz, heights), classes) for xyz, heights, classes in chunks
     )
-
-
-def _distance(metres: float) -> str:
-    return f"{metres / 1000.0:,.1f} km" if metres >= 10_000.0 else f"{metres:,.1f} m"
 
 
 def correct_checked(

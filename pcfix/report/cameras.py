@@ -10,14 +10,13 @@ import numpy as np
 from pcfix.adjust.diagnosis import Diagnosis
 from pcfix.lens.frames import footprint
 from pcfix.model import Cameras, FloatArray
-from pcfix.report.page import AFTER, WATER, label_plan, new_figure
+from pcfix.report.page import AFTER, WATER, draw_cloud, label_plan, label_side, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
 MOST_FOOTPRINTS = 400
-MOST_POINTS = 8000
 
 
 @dataclass(frozen=True)
@@ -242,10 +241,8 @@ def block_figure(report: CamerasReport) -> Figure:
     cameras, xyz = report.cameras, report.sample_xyz
     figure, (plan, side) = new_figure(8.0, 8.5, nrows=2, height_ratios=[5, 2])
     level = _level(report)
-    if len(xyz):
-        shown = xyz[:: max(1, len(xyz) // MOST_POINTS)]
-        dots = plan.scatter(*shown[:, :2].T, c=shown[:, 2], s=2, cmap="cividis", label="cloud")
-        figure.colorbar(dots, ax=plan, label="Height of the cloud (m)", shrink=0.8)
+    shown = draw_cloud(figure, plan, xyz, label="cloud")
+    if len(shown):
         side.plot(shown[:, 0], shown[:, 2], ".", color="0.6", markersize=1, label="cloud")
     borders = _footprints(report, level)
     for border in borders:
@@ -257,9 +254,8 @@ def block_figure(report: CamerasReport) -> Figure:
     if report.level_m is not None:
         side.axhline(report.level_m, color=WATER, label="water")
     label_plan(plan, 20.0)
-    side.ticklabel_format(style="plain", useOffset=False)
+    label_side(side)
     side.tick_params(axis="x", labelrotation=20)
-    side.set(xlabel="East (m)", ylabel="Height (m)")
     plan.legend(loc="upper right")
     if side.get_legend_handles_labels()[0]:
         side.legend(loc="best")

@@ -293,14 +293,14 @@ def _bins(compared: Plain) -> list[Table]:
         header += [
             f"{n}, {w}" for w in ("as it came", "corrected") for n in ("bias", "RMSE", "NMAD")
         ]
-        tables.append(Table("By depth (m)", header, [_bin(b) for b in compared["depth_bins"]]))
+        rows = [
+            [f"{b['from_m']:g} to {b['to_m']:g}", f"{b['after']['count']:,}"]
+            + [
+                "" if b[when] is None else f"{b[when][key]:.3f}"
+                for when, _, _ in _TIMES
+                for key in ("mean_m", "rmse_m", "nmad_m")
+            ]
+            for b in compared["depth_bins"]
+        ]
+        tables.append(Table("By depth (m)", header, rows))
     return tables
-
-
-def _bin(one: Plain) -> list[str]:
-    figures = [
-        "" if one[when] is None else f"{one[when][key]:.3f}"
-        for when, _, _ in _TIMES
-        for key in ("mean_m", "rmse_m", "nmad_m")
-    ]
-    return [f"{one['from_m']:g} to {one['to_m']:g}", f"{one['after']['count']:,}", *figures]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
+MOST_POINTS = 8000
 _NO_DATA = -32768
 _STEPS = 32_000
 """Of the 16 bits in which the page holds the values of its map."""
@@ -62,6 +62,21 @@ def label_plan(axes: Axes, turned_deg: float = 30.0) -> None:
     axes.ticklabel_format(style="plain", useOffset=False)
     axes.tick_params(axis="x", labelrotation=turned_deg)
     axes.set(xlabel="East (m)", ylabel="North (m)")
+
+
+def label_side(axes: Axes) -> None:
+    """Name the axes of a view from the south."""
+    axes.ticklabel_format(style="plain", useOffset=False)
+    axes.set(xlabel="East (m)", ylabel="Height (m)")
+
+
+def draw_cloud(figure: Figure, plan: Axes, xyz: FloatArray, **look: Any) -> FloatArray:
+    """Draw points of a cloud in plan, coloured by their heights; return those that are shown."""
+    shown = xyz[:: max(1, len(xyz) // MOST_POINTS)]
+    if len(shown):
+        dots = plan.scatter(*shown[:, :2].T, c=shown[:, 2], s=2, cmap="cividis", **look)
+        figure.colorbar(dots, ax=plan, label="Height of the cloud (m)", shrink=0.8)
+    return shown
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from pcfix.report.page import (
     Report,
     Table,
     label_plan,
+    label_side,
     new_figure,
     new_map,
 )
@@ -81,6 +82,9 @@ def run_report(
         A sentence that they come to.
     """
     s, maps = corrected.summary, corrected.maps
+    settings = [[name.replace("_", " "), str(value)] for name, value in s.settings.items()]
+    versions = [["pcfix", __version__], ["Python", platform.python_version()]]
+    versions += [[name, version(name)] for name in ("numpy", "scipy", "numba", "laspy", "lazrs")]
     return Report(
         title=f"Refraction correction of {Path(s.input).name}",
         lead=_lead(s) + verdict,
@@ -96,7 +100,11 @@ def run_report(
         ],
         pictures=[*_pictures(corrected), *_uncertainty_picture(corrected.sample, s), *more[0]],
         tables=[*_orders(s), *more[1]],
-        provenance=[_settings(s), files, _versions()],
+        provenance=[
+            Table("ScienceOptions", ["setting", "value"], settings),
+            files,
+            Table("Software", ["name", "version"], versions),
+        ],
     )
 
 
@@ -240,8 +248,7 @@ def cameras_figure(
     profile.fill_between(columns, low, high, color="0.6", label="cloud, 5 to 95 %")
     if water_m is not None:
         profile.axhline(water_m, color=WATER, label="water")
-    profile.ticklabel_format(style="plain", useOffset=False)
-    profile.set(xlabel="East (m)", ylabel="Height (m)")
+    label_side(profile)
     profile.legend(loc="best")
     return figure
 
@@ -306,20 +313,6 @@ def _orders(s: Summary) -> list[Table]:
     return [Table("Orders of IHO S-44, vertical, formal", header, rows)]
 
 
-def _settings(s: Summary) -> Table:
-    rows = [[name.replace("_", " "), str(value)] for name, value in s.settings.items()]
-    return Table("ScienceOptions", ["setting", "value"], rows)
-
-
-def _versions() -> Table:
-    rows: list[list[Any]] = [["pcfix", __version__], ["Python", platform.python_version()]]
-    rows += [[name, version(name)] for name in ("numpy", "scipy", "numba", "laspy", "lazrs")]
-    return Table("Software", ["name", "version"], rows)
-
-
-TITLE = "Refractive bundle adjustment"
-
-
 def adjustment_sentence(d: Plain) -> str:
     """Return an adjustment in half a line, of the values of `adjustment_dict`."""
     unit = d["image_unit"]
@@ -354,7 +347,7 @@ def adjustment_table(d: Plain, page: str) -> Table:
 
     link = Markup('<a href="{0}">{0}</a>').format(page)
     rows = [*_lens(d), *_residuals(d), *_poses(d), *_surveyed(d), ["All of it", "", link]]
-    return Table(TITLE, ["", "before", "after"], rows)
+    return Table("Refractive bundle adjustment", ["", "before", "after"], rows)
 
 
 def reason_sentence(adjusted: bool, why: str) -> str:
@@ -370,15 +363,12 @@ def _lens(d: Plain) -> Iterator[list[str]]:
         of = f" of {row['sensor']}" if many else ""
         unit = f" {d['image_unit']}" if row["name"] in ("f", "cx", "cy", "b1", "b2") else ""
         name = lens_label(row) + of
+        plus_minus = "" if row["sigma"] is None else f" ± {row['sigma']:.2g}"
         yield [
             name[:1].upper() + name[1:] if len(name) > 2 else name,
             short(row["before"], row["sigma"]) + unit,
-            short(row["after"], row["sigma"]) + _plus_minus(row["sigma"]) + unit,
+            short(row["after"], row["sigma"]) + plus_minus + unit,
         ]
-
-
-def _plus_minus(sigma: float | None) -> str:
-    return "" if sigma is None else f" ± {sigma:.2g}"
 
 
 def _residuals(d: Plain) -> Iterator[list[str]]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.model import BoolArray, FloatArray
-from pcfix.report.page import AFTER, BEFORE, WATER, label_plan, new_figure
+from pcfix.report.page import AFTER, BEFORE, WATER, draw_cloud, label_plan, new_figure
 from pcfix.water.auto import WaterProposal
 from pcfix.water.fit import WaterFit
 from pcfix.water.river import RiverFit
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
     from pcfix.water.surface import FoundSurface
 
-MOST_POINTS = 8000
 MOST_LISTED = 10
 WITNESSES = ("brightness", "noise")
 """Cues that do not fix the level are drawn thinly."""
@@ -157,10 +156,7 @@ def water_figure(report: WaterReport) -> Figure:
     if isinstance(found.evidence, WaterProposal):
         return shoreline_figure(found.evidence)
     figure, (plan, side) = new_figure(8.0, 7.5, nrows=2, height_ratios=[3, 2])
-    sample = report.sample_xyz[:: max(1, len(report.sample_xyz) // MOST_POINTS)]
-    if len(sample):
-        dots = plan.scatter(*sample[:, :2].T, c=sample[:, 2], s=2, cmap="cividis")
-        figure.colorbar(dots, ax=plan, label="Height of the cloud (m)", shrink=0.8)
+    draw_cloud(figure, plan, report.sample_xyz)
     if found.evidence is not None and found.points is not None:
         _points(plan, side, found.points, found.evidence)
     label_plan(plan, 20.0)
@@ -214,17 +210,13 @@ def shoreline_figure(found: WaterProposal) -> Figure:
     _plan(plan, figure, found)
     _histogram(axes[0, 1], found)
     _evidence(axes[1, 1], found)
-    figure.suptitle(_title(found))
-    return figure
-
-
-def _title(found: WaterProposal) -> str:
     tilt = 100.0 * float(np.hypot(*found.tilt))
     kind = f", tilt {tilt:.2f} %" if tilt > 0.0 else ""
-    return (
+    figure.suptitle(
         f"Water {found.level_m:.3f} ± {found.sigma_level_m:.3f} m{kind},"
         f" confidence {found.confidence:.2f}"
     )
+    return figure
 
 
 def _above(found: WaterProposal, xyz: FloatArray) -> FloatArray:
