@@ -17,15 +17,7 @@ from pcfix.flow.old_cameras import paired
 from pcfix.flow.runner import FileTask, Progress, Step, file_task
 from pcfix.flow.surfaces import file_points, view_of, water_heights
 from pcfix.flow.through_water import Label, correct_checked
-from pcfix.io.las.columns import (
-    OutOfRangeError,
-    TooNarrowError,
-    changed_rows,
-    columns_for,
-    fill,
-    shift_steps,
-    shifted,
-)
+from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps, coordinates
 from pcfix.io.las.writing import corrected_header
 from pcfix.model import (
@@ -242,7 +234,7 @@ class Correcting(Step):
 
     def __init__(self, job: Job, jobs: int | None) -> None:
         self.job, self._jobs = job, jobs
-        self._columns = columns_for(job.options.dimensions)
+        self._columns = columns.columns_for(job.options.dimensions)
         self.wide = False
         self.steps: tuple[int, ...] = (0, 0, 0)
 
@@ -259,12 +251,12 @@ class Correcting(Step):
         heights = water_heights(self.job.water, source, points)
         classes = np.asarray(points["classification"])
         correction = self.job.correct(coordinates(points), heights, classes)
-        moved = shift_steps(correction, header.scales)
-        new = shifted(points, header, moved + np.array(self.steps))
+        moved = columns.shift_steps(correction, header.scales)
+        new = columns.shifted(points, header, moved + np.array(self.steps))
         withheld = np.asarray(new["withheld"]).astype(bool)
         withhold = self.job.options.uncorrected == "withhold"
-        changed = changed_rows(correction, withheld, withhold=withhold)
-        fill(new, self._columns, correction, moved, changed)
+        changed = columns.changed_rows(correction, withheld, withhold=withhold)
+        columns.fill(new, self._columns, correction, moved, changed)
         new.array["classification"][correction.corrected] = BATHYMETRIC_POINT
         if withhold:
             new["withheld"][:] = (withheld | correction.uncorrected).astype(np.uint8)
@@ -280,9 +272,9 @@ def _run_until_it_fits(task: FileTask, step: Correcting) -> None:
     while True:
         try:
             return task.run(step)
-        except TooNarrowError:
+        except columns.TooNarrowError:
             step.wide = True
-        except OutOfRangeError as axis:
+        except columns.OutOfRangeError as axis:
             old, step.steps = step.steps, centring_steps(task.source, task.jobs)
             if step.steps == old:
                 raise InputError(

@@ -25,18 +25,9 @@ from pcfix.grid.delaunay import fill_holes, margin_cells
 from pcfix.grid.heights import Gridding, grid_window
 from pcfix.grid.lattice import Occupancy, Window, cells_of, fits, lattice_over, refuse_size
 from pcfix.grid.model import NO_LIGHT, DsmSummary, Tally, hillshade
+from pcfix.io import rasters
 from pcfix.io.files import Bins, replaced_when_whole
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
-from pcfix.io.rasters import (
-    add_overviews,
-    check_cog,
-    check_tif,
-    copy_as_cog,
-    new_raster,
-    open_raster,
-    read_heights,
-    write_part,
-)
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, BoolArray, FloatArray, IntArray
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import DsmOptions, DsmRules, SurfaceChoice
@@ -120,9 +111,9 @@ def grid_dsm(
     if given.resolution is None:
         raise SettingError("resolution is missing: give the side of a cell, metres.")
     more = [] if given.hillshade is None else [given.hillshade]
-    task = file_task(input, output, given, more=more, check=check_tif, progress=progress)
+    task = file_task(input, output, given, more=more, check=rasters.check_tif, progress=progress)
     if given.cog:
-        check_cog()
+        rasters.check_cog()
     run = _Run(task, given.part(DsmRules), given.cog)
     with ExitStack() as stack:
         drafts = [stack.enter_context(replaced_when_whole(Path(one))) for one in (output, *more)]
@@ -153,7 +144,7 @@ class _Run:
         plain = folder / "dsm.tif" if self.cog else draft
         tags = {"PCFIX": json.dumps({"pcfix": __version__, **asdict(self.settings)})}
         bands = WITH_SIGMA if self.sorted.has_sigma else BANDS
-        with new_raster(plain, self.lattice, self.crs, bands, tags=tags) as dsm:
+        with rasters.new_raster(plain, self.lattice, self.crs, bands, tags=tags) as dsm:
             if self.settings.fill is None or self.settings.method == "tin":
                 self.grid(dsm, dsm)
             else:
@@ -166,14 +157,14 @@ class _Run:
         """Write heights to one raster, the other bands to another (or the same)."""
         done, lattice = 0, self.lattice
         how = Gridding(lattice, self.settings.method, self.reach_m, self.near.spacing_m)
-        rasters = (heights, dsm, dsm, dsm)
+        into = (heights, dsm, dsm, dsm)
         limit = TIN_BLOCK_POINTS if self.settings.method == "tin" else BLOCK_POINTS
         for window in self.sorted.windows(limit):
             points = self.sorted.points_in(window.grown(how.margin_cells))
             bands = grid_window(*points, window, how)
-            for raster, band, values in zip(rasters, ALL_BANDS, bands, strict=True):
+            for raster, band, values in zip(into, ALL_BANDS, bands, strict=True):
                 if values is not None:
-                    write_part(raster, values, window, band)
+                    rasters.write_part(raster, values, window, band)
             self.tally.add(bands)
             done += window.height * window.width
             self.report(0.5 + 0.5 * done / (lattice.height * lattice.width))
@@ -187,14 +178,14 @@ class _Run:
 
     def grid_and_fill(self, dsm: DatasetWriter, unfilled: Path) -> None:
         """Write heights to a raster of their own, and from there, with holes filled, to the DSM."""
-        with new_raster(unfilled, self.lattice, None, {"height": "metre"}) as heights:
+        with rasters.new_raster(unfilled, self.lattice, None, {"height": "metre"}) as heights:
             self.grid(heights, dsm)
         widest = (self.settings.fill or 0.0) / self.settings.resolution
-        with open_raster(unfilled) as heights:
+        with rasters.open_raster(unfilled) as heights:
             for window in self.lattice.windows(BLOCK_CELLS):
                 around = window.grown(margin_cells(widest)).clipped(self.lattice.window)
-                height = fill_holes(read_heights(heights, around), window, around, widest)
-                write_part(dsm, height, window, HEIGHT)
+                height = fill_holes(rasters.read_heights(heights, around), window, around, widest)
+                rasters.write_part(dsm, height, window, HEIGHT)
                 self.tally.filled += int((~np.isnan(height)).sum())
         self.tally.filled -= self.tally.known
         self.tally.known += self.tally.filled
@@ -204,11 +195,13 @@ class _Run:
         plain = folder / "hillshade.tif" if self.cog else target
         band = {"hillshade": ""}
         with (
-            open_raster(dsm) as heights,
-            new_raster(plain, self.lattice, self.crs, band, dtype="uint8", nodata=NO_LIGHT) as out,
+            rasters.open_raster(dsm) as heights,
+            rasters.new_raster(
+                plain, self.lattice, self.crs, band, dtype="uint8", nodata=NO_LIGHT
+            ) as out,
         ):
             for window in self.lattice.windows(BLOCK_CELLS):
-                write_part(out, self.light(heights, window), window, 1)
+                rasters.write_part(out, self.light(heights, window), window, 1)
         self.finish(plain, target)
 
     def light(self, heights: DatasetReader, window: Window) -> npt.NDArray[np.uint8]:
@@ -216,16 +209,16 @@ class _Run:
         wide = window.grown(1)
         around = wide.clipped(self.lattice.window)
         height = np.full((wide.height, wide.width), np.nan)
-        height[around.within(wide)] = read_heights(heights, around)
+        height[around.within(wide)] = rasters.read_heights(heights, around)
         s = self.settings
         return hillshade(height, s.resolution, s.azimuth, s.altitude)
 
     def finish(self, plain: Path, target: Path) -> None:
         """Add overviews; a cloud optimised file is a copy, which brings its own."""
         if self.cog:
-            copy_as_cog(plain, target)
+            rasters.copy_as_cog(plain, target)
         else:
-            add_overviews(plain)
+            rasters.add_overviews(plain)
 
     def report(self, share: float) -> None:
         """Tell how much is done, in points."""

@@ -35,20 +35,8 @@ from pcfix.io.files import check_output, write_bytes
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.options.declare import File
 from pcfix.options.scenes import SimulateOptions
+from pcfix.report import papers
 from pcfix.report.page import png_of
-from pcfix.report.papers import (
-    DepthBins,
-    csv_text,
-    depth_bins_figure,
-    depth_bins_rows,
-    depth_bins_text,
-    depth_figure,
-    effect_rows,
-    effect_text,
-    error_map_figure,
-    shan_rows,
-    shan_text,
-)
 from pcfix.simulate.flume import Flume, simulate_flume
 from pcfix.simulate.refraction_effect import (
     APPARENT_DEPTHS_M,
@@ -108,17 +96,17 @@ def write_refraction_effect(out_dir: File, options: SimulateOptions) -> str:
         "seed": seed,
     }
     files = _pictures(found, bins) | {
-        "refraction_effect.csv": csv_text(effect_rows(found)).encode(),
-        "shan_iterations.csv": csv_text(
-            [row for pair, table in shan.items() for row in shan_rows(pair, table)]
+        "refraction_effect.csv": papers.csv_text(papers.effect_rows(found)).encode(),
+        "shan_iterations.csv": papers.csv_text(
+            [row for pair, table in shan.items() for row in papers.shan_rows(pair, table)]
         ).encode(),
-        "flume_depth_bins.csv": csv_text(depth_bins_rows(bins)).encode(),
+        "flume_depth_bins.csv": papers.csv_text(papers.depth_bins_rows(bins)).encode(),
         "refraction_effect.json": json_text(settings).encode(),
     }
     _write(Path(out_dir), files, options.overwrite)
     pair, table = list(shan.items())[len(next(iter(heights.values()))) // 2]
-    shan_lines = shan_text(pair, table, max(apparent_depths_m))
-    parts = [effect_text(found), shan_lines, depth_bins_text(bins)]
+    shan_lines = papers.shan_text(pair, table, max(apparent_depths_m))
+    parts = [papers.effect_text(found), shan_lines, papers.depth_bins_text(bins)]
     if camera is None:
         parts[0] += f"\n{PUBLISHED}"
     return "\n\n".join([*parts, f"{out_dir}: {', '.join(sorted(files))}"])
@@ -145,13 +133,13 @@ def _shan_tables(found: list[Effect]) -> dict[StereoPair, list[Iteration]]:
     return {pair: shan_iterations(pair, deepest, found[0].refractive_index) for pair in pairs}
 
 
-def _pictures(found: list[Effect], bins: DepthBins) -> dict[str, bytes]:
+def _pictures(found: list[Effect], bins: papers.DepthBins) -> dict[str, bytes]:
     deepest = max(one.apparent_depth_m for one in found)
-    figures = {"refraction_effect_depth.png": depth_figure(found)}
+    figures = {"refraction_effect_depth.png": papers.depth_figure(found)}
     for camera in dict.fromkeys(one.pair.camera for one in found):
         own = [f for f in found if f.pair.camera == camera and f.apparent_depth_m == deepest]
-        figures[f"refraction_effect_{camera.name.lower()}.png"] = error_map_figure(own)
-    figures["flume_depth_bins.png"] = depth_bins_figure(bins)
+        figures[f"refraction_effect_{camera.name.lower()}.png"] = papers.error_map_figure(own)
+    figures["flume_depth_bins.png"] = papers.depth_bins_figure(bins)
     return {name: png_of(figure) for name, figure in figures.items()}
 
 
@@ -163,7 +151,7 @@ def _write(folder: Path, files: dict[str, bytes], overwrite: bool) -> None:
         write_bytes(folder / name, data, overwrite=overwrite)
 
 
-def depth_bins(flume: Flume, seed: int = 1) -> DepthBins:
+def depth_bins(flume: Flume, seed: int = 1) -> papers.DepthBins:
     """Correct the flume's cloud by every method and return the errors by depth."""
     bins = int(np.ceil(flume.true_depth_m.max() / BIN_M - 1e-9))
     edges = BIN_M * np.arange(bins + 1)
@@ -185,7 +173,7 @@ def depth_bins(flume: Flume, seed: int = 1) -> DepthBins:
     errors = flume.true_depth_m[:, None] - np.column_stack(estimates)
     groups = [(which == i) & ~check for i in range(bins)]
     rows = [errors[group] for group in [*groups, ~check]]
-    return DepthBins(
+    return papers.DepthBins(
         edges_m=np.asarray(edges, dtype=np.float64),
         points=np.array([group.sum() for group in groups]),
         rmse_m=np.array([np.sqrt((row**2).mean(axis=0)) for row in rows]),

@@ -377,7 +377,7 @@ def test_no_harm_when_it_fails(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(flow, "write_part", full)
+    monkeypatch.setattr(flow.rasters, "write_part", full)
     with pytest.raises(InputError, match=r"cannot be written .No space left"):
         grid_dsm(cloud, tmp_path / "d.tif", resolution=1.0, overwrite=True)
     assert {p.name for p in tmp_path.iterdir()} == {"c.las", "d.tif"}
