@@ -137,7 +137,7 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
     with threads(options.jobs):
         job.look_around(lambda: (points for _, points in _chunks(ins, job.water, flags)))
         for rows, points in _chunks(ins, job.water, flags):
-            results.add(rows, job.correct(*points), options.uncorrected == "withhold")
+            results.add(rows, job.correct(points), options.uncorrected == "withhold")
     job.check_fit()
     outs.update(results.dimensions)
     summary = job.summary(NAME, NAME, time.perf_counter() - started)

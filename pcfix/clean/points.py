@@ -96,12 +96,7 @@ def flag_weak(
 def flag_sparse(cloud: Cloud, settings: CleanRules, resources: Resources) -> dict[str, float]:
     """Flag statistical and radius outliers: `Reason.STATISTICAL` and `RADIUS`.
 
-    Parameters
-    ----------
-    cloud : Cloud
-        More than ``settings.nearest`` points are used.
-    settings : CleanRules
-    resources : Resources
+    More than ``settings.nearest`` points are used.
 
     Returns
     -------
@@ -155,14 +150,8 @@ def flag_off_bed(cloud: Cloud, settings: CleanRules, resources: Resources) -> No
     """Flag submerged points below the bed and floating in the water.
 
     They get `Reason.BELOW_BED` and `FLOATING`. The bed about a point is the middle half, by
-    height, of the submerged points nearest to it in plan; see `CleanRules`.
-
-    Parameters
-    ----------
-    cloud : Cloud
-        At least ``settings.bed_neighbours`` points are submerged.
-    settings : CleanRules
-    resources : Resources
+    height, of the submerged points nearest to it in plan; see `CleanRules`. At least
+    ``settings.bed_neighbours`` points are submerged.
     """
     for near, rows, xyz in _pieces(cloud.xyz, cloud.submerged, 2, resources):
         lower, upper = height_quartiles(near, xyz, settings.bed_neighbours).T

@@ -12,12 +12,12 @@ from pcfix.clean.points import Cloud, Resources, check_tile, flag_neighbours, fl
 from pcfix.clean.settings import CleanSummary, Reason
 from pcfix.errors import InputError
 from pcfix.flow.runner import FileTask, Progress, Step, file_task
-from pcfix.flow.surfaces import find_surface, view_of, water_heights
+from pcfix.flow.surfaces import find_surface, points_of, view_of
 from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
-from pcfix.io.las.source import LasSource, coordinates
+from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import cleaning_vlr, noted_header
-from pcfix.model import LOW_NOISE, NOISE_CLASSES, BoolArray, FloatArray
+from pcfix.model import LOW_NOISE, NOISE_CLASSES
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CleanOptions, CleanRules
@@ -83,13 +83,7 @@ def clean_file(
 
 
 class Cleaning(Step):
-    """The step that flags noise or leaves it out, once it was found in the whole cloud.
-
-    Parameters
-    ----------
-    task : FileTask
-    options : CleanOptions
-    """
+    """The step that flags noise or leaves it out, once it was found in the whole cloud."""
 
     cloud: Cloud
 
@@ -136,9 +130,9 @@ class Cleaning(Step):
         self, points: laspy.ScaleAwarePointRecord, source: LasSource, rows: slice, names: set[str]
     ) -> None:
         """Read coordinates and masks, and flag weak intersections on the way."""
-        cloud, xyz = self.cloud, coordinates(points)
-        noise = np.isin(np.asarray(points["classification"]), NOISE_CLASSES)
-        used = ~(np.asarray(points["withheld"]).astype(np.bool_) | noise)
+        cloud, (xyz, heights, classes) = self.cloud, points_of(points, source, self._water)
+        withheld = np.asarray(points["withheld"]).astype(np.bool_)
+        used = ~(withheld | np.isin(classes, NOISE_CLASSES))
         rays, miss, incidence = (
             source.dimension(points, name) if name in names else None
             for name in ("RayCount", "RayMiss", "Incidence")
@@ -147,19 +141,11 @@ class Cleaning(Step):
             flag_weak(self._rules, cloud.reasons[rows], rays, miss, incidence)
             cloud.reasons[rows][~used] = 0
         cloud.xyz[rows], cloud.used[rows] = xyz, used
-        cloud.submerged[rows] = used & self._submerged(points, source, xyz, rays)
-
-    def _submerged(
-        self,
-        points: laspy.ScaleAwarePointRecord,
-        source: LasSource,
-        xyz: FloatArray,
-        rays: FloatArray | None,
-    ) -> BoolArray:
-        if self._water is None:
-            return np.zeros(len(xyz), np.bool_) if rays is None else rays > 0
-        heights = water_heights(self._water, source, points)
-        return is_submerged(xyz[:, 2], surface_above(self._water, xyz, heights))
+        if self._water is not None:
+            above = surface_above(self._water, xyz, heights)
+            cloud.submerged[rows] = used & is_submerged(xyz[:, 2], above)
+        elif rays is not None:
+            cloud.submerged[rows] = used & (rays > 0)
 
     def _check(self, name: str) -> None:
         """Refuse a cloud that leaves nothing to test."""

@@ -15,10 +15,10 @@ from pcfix.flow.inputs import paths_in
 from pcfix.flow.job import Job
 from pcfix.flow.old_cameras import paired
 from pcfix.flow.runner import FileTask, Progress, Step, file_task
-from pcfix.flow.surfaces import file_points, view_of, water_heights
+from pcfix.flow.surfaces import file_points, points_of, view_of
 from pcfix.flow.through_water import Label, correct_checked
 from pcfix.io.las import columns
-from pcfix.io.las.source import LasSource, centring_steps, coordinates
+from pcfix.io.las.source import LasSource, centring_steps
 from pcfix.io.las.writing import corrected_header
 from pcfix.model import (
     BATHYMETRIC_POINT,
@@ -205,7 +205,7 @@ def correct_file(
     """
     given = taken(CorrectOptions, options, keywords, "correct_file")
     task = file_task(input, output, given, reads=paths_in(given), progress=progress)
-    step = Correcting(job_for(task.source, given), given.jobs)
+    step = Correcting(job_for(task.source, given))
     with threads(given.jobs):
         step.job.look_around(lambda: file_points(task.source, step.job.water, given.jobs))
         _run_until_it_fits(task, step)
@@ -223,17 +223,10 @@ def job_for(path: Path, options: CorrectOptions) -> Job:
 
 
 class Correcting(Step):
-    """The step that corrects points.
+    """The step that corrects points."""
 
-    Parameters
-    ----------
-    job : Job
-    jobs : int or None
-        Threads.
-    """
-
-    def __init__(self, job: Job, jobs: int | None) -> None:
-        self.job, self._jobs = job, jobs
+    def __init__(self, job: Job) -> None:
+        self.job = job
         self._columns = columns.columns_for(job.options.dimensions)
         self.wide = False
         self.steps: tuple[int, ...] = (0, 0, 0)
@@ -248,9 +241,7 @@ class Correcting(Step):
         self, points: laspy.ScaleAwarePointRecord, source: LasSource, header: laspy.LasHeader
     ) -> laspy.ScaleAwarePointRecord:
         """Return corrected points with their new dimensions, classes and flags."""
-        heights = water_heights(self.job.water, source, points)
-        classes = np.asarray(points["classification"])
-        correction = self.job.correct(coordinates(points), heights, classes)
+        correction = self.job.correct(points_of(points, source, self.job.water))
         moved = columns.shift_steps(correction, header.scales)
         new = columns.shifted(points, header, moved + np.array(self.steps))
         withheld = np.asarray(new["withheld"]).astype(bool)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from itertools import compress
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from pcfix.errors import GeometryError
 from pcfix.flow.inputs import Inputs, mask_of
@@ -16,7 +16,7 @@ from pcfix.flow.through_port import ThroughPort
 from pcfix.flow.through_water import ThroughWater
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.label.labelling import Labelling
-from pcfix.model import Correction, FloatArray, Outcome, Summary, WaterSurface
+from pcfix.model import Correction, Outcome, Summary, WaterSurface
 from pcfix.options.correct import CorrectOptions, LabelRules, ScienceOptions
 from pcfix.refract.tally import Tally
 from pcfix.version import __version__
@@ -73,22 +73,10 @@ class Job:
         """Learn what must be known of the whole cloud, before the first chunk is corrected."""
         self.medium.look_around(chunks, self.labelling, self.views)
 
-    def correct(
-        self, xyz: FloatArray, heights: FloatArray | None, classes: npt.NDArray[np.uint8]
-    ) -> Correction:
-        """Correct one chunk of n points.
-
-        Parameters
-        ----------
-        xyz : array, shape (n, 3)
-            Metres.
-        heights : array, shape (n,), or None
-            Where the water is a dimension.
-        classes : array, shape (n,)
-            That the points come with.
-        """
-        views = self.views.of(xyz, self.tally.points)
-        correction = self.medium.correct((xyz, heights, classes), views, self.labelling)
+    def correct(self, points: Points) -> Correction:
+        """Correct one chunk."""
+        views = self.views.of(points[0], self.tally.points)
+        correction = self.medium.correct(points, views, self.labelling)
         self.tally.add(correction.apparent_xyz, correction)
         return correction
 
@@ -129,11 +117,7 @@ class Job:
     def summary(self, input: str, output: str, seconds: float) -> Summary:
         """Return the numbers of all chunks."""
         tally, report = self.tally, self.views.report
-        unused = [
-            label
-            for label, used in zip(self.cameras.labels, tally.camera_used, strict=True)
-            if not used
-        ]
+        unused = list(compress(self.cameras.labels, np.logical_not(tally.camera_used)))
         uncorrected = tally.uncorrected()
         stuck = sum(uncorrected.values()) + int(tally.outcomes[Outcome.NOT_CARRIED])
         return Summary(

@@ -19,12 +19,12 @@ from pcfix.flow.surfaces import (
     corners,
     file_points,
     find_surface,
+    points_of,
     view_of,
-    water_heights,
 )
 from pcfix.flow.through_water import parts_of
 from pcfix.io.las.columns import convert
-from pcfix.io.las.source import LasSource, coordinates
+from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import labelling_vlr, noted_header
 from pcfix.label.areas import WaterMask
 from pcfix.label.labelling import Labelling, LabelSummary, Part, sets_class
@@ -220,10 +220,9 @@ class LabellingStep(Step):
         self, points: laspy.ScaleAwarePointRecord, source: LasSource, header: laspy.LasHeader
     ) -> laspy.ScaleAwarePointRecord:
         """Return labelled points of a file."""
-        heights = water_heights(self.water, source, points)
-        classes = np.asarray(points["classification"])
+        found = self.classes(points_of(points, source, self.water))
         new = convert(points, header.point_format)
-        new.array["classification"] = self.classes((coordinates(points), heights, classes))
+        new.array["classification"] = found
         return new
 
     def finish(self) -> None:

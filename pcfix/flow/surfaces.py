@@ -100,16 +100,18 @@ def file_points(
 ) -> Iterator[Points]:
     """Yield all points of a LAS or LAZ file, chunk by chunk."""
     with LasSource(path, jobs) as source:
-        for points in source.chunks():
-            heights = water_heights(water, source, points)
-            yield coordinates(points), heights, np.asarray(points["classification"])
+        for chunk in source.chunks():
+            yield points_of(chunk, source, water)
 
 
-def water_heights(
-    water: WaterSurface | None, source: LasSource, points: laspy.ScaleAwarePointRecord
-) -> FloatArray | None:
-    """Return the heights of the water of a chunk, shape (n,), where they are a dimension."""
-    return source.dimension(points, water.name) if isinstance(water, WaterDimension) else None
+def points_of(
+    chunk: laspy.ScaleAwarePointRecord, source: LasSource, water: WaterSurface | None
+) -> Points:
+    """Return the n points of a chunk."""
+    heights = None
+    if isinstance(water, WaterDimension):
+        heights = source.dimension(chunk, water.name)
+    return coordinates(chunk), heights, np.asarray(chunk["classification"])
 
 
 def find_surface(

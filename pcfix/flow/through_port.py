@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 class ThroughPort:
     """The light bends at a port that is fixed to the camera.
 
-    The parameters are those of `pcfix.flow.through_water.ThroughWater`.
-
     Raises
     ------
     SettingError

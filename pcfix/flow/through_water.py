@@ -45,13 +45,6 @@ Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
 class ThroughWater:
     """The light bends at a water surface, and the cloud may come from other cameras.
 
-    Parameters
-    ----------
-    options : CorrectOptions
-    inputs : Inputs
-    blocks : Blocks
-    view : CloudView
-
     Raises
     ------
     PcfixError
