@@ -252,16 +252,7 @@ class _Run:
 
 
 class SortedPoints:
-    """The points that a raster is made of, and the raster's lattice.
-
-    Parameters
-    ----------
-    source : LasSource
-    settings : DsmRules
-    folder : Path
-        For the points; the caller makes and removes it.
-    progress : callable
-        Called with (points done, points in all) after each chunk.
+    """The points that a raster is made of, in a folder of the caller, and the raster's lattice.
 
     Attributes
     ----------

@@ -44,8 +44,6 @@ from pcfix.simulate.refraction_effect import (
     OVERLAP,
     AerialCamera,
     Effect,
-    Iteration,
-    StereoPair,
     effects,
     shan_iterations,
 )
@@ -85,7 +83,9 @@ def write_refraction_effect(out_dir: File, options: SimulateOptions) -> str:
         for one in ([camera] if camera else FLYING_HEIGHTS_M)
     }
     found = effects(heights, apparent_depths_m, overlap=overlap, refractive_index=index)
-    shan = _shan_tables(found)
+    deepest = max(one.apparent_depth_m for one in found)
+    pairs = dict.fromkeys(one.pair for one in found)
+    shan = {pair: shan_iterations(pair, deepest, index) for pair in pairs}
     bins = depth_bins(simulate_flume(refractive_index=index, seed=seed))
     settings = {
         "made_by": f"pcfix {__version__}",
@@ -95,7 +95,7 @@ def write_refraction_effect(out_dir: File, options: SimulateOptions) -> str:
         "refractive_index": index,
         "seed": seed,
     }
-    files = _pictures(found, bins) | {
+    files = _pictures(found, bins, deepest) | {
         "refraction_effect.csv": papers.csv_text(papers.effect_rows(found)).encode(),
         "shan_iterations.csv": papers.csv_text(
             [row for pair, table in shan.items() for row in papers.shan_rows(pair, table)]
@@ -126,15 +126,7 @@ def _camera(options: SimulateOptions) -> AerialCamera | None:
     return AerialCamera("camera", focal, *frame, pixel)
 
 
-def _shan_tables(found: list[Effect]) -> dict[StereoPair, list[Iteration]]:
-    """Return the iterations of each pair over a bed as deep as the deepest apparent one."""
-    deepest = max(one.apparent_depth_m for one in found)
-    pairs = dict.fromkeys(one.pair for one in found)
-    return {pair: shan_iterations(pair, deepest, found[0].refractive_index) for pair in pairs}
-
-
-def _pictures(found: list[Effect], bins: papers.DepthBins) -> dict[str, bytes]:
-    deepest = max(one.apparent_depth_m for one in found)
+def _pictures(found: list[Effect], bins: papers.DepthBins, deepest: float) -> dict[str, bytes]:
     figures = {"refraction_effect_depth.png": papers.depth_figure(found)}
     for camera in dict.fromkeys(one.pair.camera for one in found):
         own = [f for f in found if f.pair.camera == camera and f.apparent_depth_m == deepest]

@@ -46,11 +46,8 @@ class FileTask:
 
     Attributes
     ----------
-    source, target : Path
     summary : path or None
         Where the summary goes, as JSON.
-    overwrite : bool
-    jobs : int or None
     progress : callable or None
         Called with (points done, points in all) after each chunk.
     started : float

@@ -14,6 +14,7 @@ import sys
 import types
 import warnings
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import Field, asdict, dataclass, field, fields
 from functools import cache
 from inspect import get_annotations
@@ -138,19 +139,14 @@ class Option(NamedTuple):
         if value is None and (self.default is None or type(None) in get_args(self.type)):
             return None
         value = tuple(value) if isinstance(value, list) else value
-        wrong = self._against_rule(value)
+        wrong = None
+        with suppress(TypeError):  # of what is no number at all
+            wrong = None if self.rule is None else self.rule(self.flag[2:], value)
         if wrong is None and self.choices and value not in self.choices:
             wrong = f"{self.flag[2:]} '{value}' is not one of {', '.join(self.choices)}."
         if wrong is not None:
             raise SettingError(wrong)
         return _converted(self, value)
-
-    def _against_rule(self, value: Any) -> str | None:
-        """Return what its rule says of a value; nothing of what is no number at all."""
-        try:
-            return None if self.rule is None else self.rule(self.flag[2:], value)
-        except TypeError:
-            return None
 
 
 def _converted(one: Option, value: Any) -> Any:
@@ -382,16 +378,14 @@ def positive(sentence: str) -> Rule:
 
 def one_or_more(kind: type, example: str) -> Callable[[str, str], tuple[Any, ...]]:
     """Return the parser of words or numbers with commas between."""
+    kinds = {int: "whole numbers", float: "numbers", str: "words"}
 
     def parse(option: str, text: str) -> tuple[Any, ...]:
         try:
             return tuple(kind(word.strip()) for word in text.split(",") if word.strip())
         except ValueError:
             raise SettingError(
-                f"{option} '{text}' must be {_KINDS[kind]} with commas between, as {example}."
+                f"{option} '{text}' must be {kinds[kind]} with commas between, as {example}."
             ) from None
 
     return parse
-
-
-_KINDS = {int: "whole numbers", float: "numbers", str: "words"}
