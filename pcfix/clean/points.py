@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from dataclasses import dataclass
+from enum import IntFlag
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +23,6 @@ from pcfix.clean.neighbours import (
     mean_of_first,
     used_rows,
 )
-from pcfix.clean.settings import Reason
 from pcfix.errors import InputError, SettingError
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import LEAST_NEIGHBOURS, CleanRules
@@ -32,6 +33,18 @@ from pcfix.water.surface import is_submerged, surface_above
 ReasonArray = npt.NDArray[np.uint8]
 
 PIECE_ROWS = 65_536
+
+
+class Reason(IntFlag):
+    """Why a point is noise; one point may have several reasons, one bit each."""
+
+    STATISTICAL = 1
+    RADIUS = 2
+    FEW_RAYS = 4
+    RAY_MISS = 8
+    INCIDENCE = 16
+    BELOW_BED = 32
+    FLOATING = 64
 
 
 class Cloud(NamedTuple):
@@ -222,8 +235,7 @@ def clean_points(
 
     >>> import numpy as np
     >>> from pcfix.clean.points import clean_points
-    >>> from pcfix.clean.settings import Reason
-    >>> from pcfix.options.steps import CleanRules
+    >>>     >>> from pcfix.options.steps import CleanRules
     >>> x, y = (grid.ravel() / 4 for grid in np.mgrid[:30, :30])
     >>> cloud = np.column_stack([x, y, -2 + 0.01 * np.sin(9 * x + 7 * y)])
     >>> cloud[450, 2] += 1
@@ -310,3 +322,52 @@ def _check_enough(name: str, used: int, submerged: int, settings: CleanRules) ->
             f" {settings.bed_neighbours} on the bed; choose fewer bed-neighbours, or leave out the"
             " tests below and floating."
         )
+
+
+@dataclass(frozen=True)
+class CleanSummary:
+    """What a cleaning did, in numbers; `as_dict` is what ``--summary`` writes.
+
+    Attributes
+    ----------
+    input, output, pcfix : str
+        The files and the version.
+    points : int
+        Points read.
+    set_aside : int
+        Points that came withheld or as noise (class 7 or 18): neither tested nor a neighbour.
+    submerged : int
+        Points that were tested against the bed.
+    noise : int
+        Points flagged.
+    reasons : dict
+        Points for each `Reason`; a point may count under several.
+    dropped : int
+        Points left out of the output.
+    neighbour_distance_m : dict
+        Of the statistical test: mean, sd and limit of the mean distances to the neighbours.
+    not_run : list of str
+        Tests that were asked for and could not be run, and why.
+    water : str or None
+    settings : dict
+    seconds : float
+    """
+
+    input: str
+    output: str
+    pcfix: str
+    points: int
+    set_aside: int
+    submerged: int
+    noise: int
+    reasons: dict[str, int]
+    dropped: int
+    neighbour_distance_m: dict[str, float]
+    not_run: list[str]
+    water: str | None
+    settings: dict[str, Any]
+    seconds: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return dict(vars(self))

@@ -8,8 +8,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.clean.neighbours import Empty
-from pcfix.clean.points import Cloud, Resources, check_tile, flag_neighbours, flag_weak
-from pcfix.clean.settings import CleanSummary, Reason
+from pcfix.clean.points import (
+    CleanSummary,
+    Cloud,
+    Reason,
+    Resources,
+    check_tile,
+    flag_neighbours,
+    flag_weak,
+)
 from pcfix.errors import InputError
 from pcfix.flow.runner import FileTask, Progress, Step, file_task
 from pcfix.flow.surfaces import find_surface, points_of, view_of

@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pcfix.compare.figures import Comparison
 from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.clean import clean_file
@@ -253,19 +252,7 @@ def _compare(request: Request, files: Files) -> dict[str, Any]:
                 warnings.simplefilter("ignore", PcfixWarning)
                 grid_dsm(reference, heights, resolution=resolution, overwrite=True)
         write_dod(files.dsm, heights, files.compare / DOD, overwrite=True)
-    return {"figures": result.as_dict(), "sections": _plain_sections(result)}
-
-
-def _rasters(request: Request) -> list[str]:
-    """Return the rasters that a comparison leaves: none with check points."""
-    suffix = Path(str(request.reference)).suffix.lower()
-    if suffix in CLOUDS:
-        return [DOD, REFERENCE_DSM]
-    return [DOD] if suffix in (".tif", ".tiff") else []
-
-
-def _plain_sections(result: Comparison) -> list[dict[str, Any]]:
-    return [
+    sections = [
         {
             "distance_m": section.distance_m.tolist(),
             "heights_m": {
@@ -275,6 +262,15 @@ def _plain_sections(result: Comparison) -> list[dict[str, Any]]:
         }
         for section in result.sections
     ]
+    return {"figures": result.as_dict(), "sections": sections}
+
+
+def _rasters(request: Request) -> list[str]:
+    """Return the rasters that a comparison leaves: none with check points."""
+    suffix = Path(str(request.reference)).suffix.lower()
+    if suffix in CLOUDS:
+        return [DOD, REFERENCE_DSM]
+    return [DOD] if suffix in (".tif", ".tiff") else []
 
 
 def _report(request: Request, files: Files, inputs: list[Path], done: dict[str, Any]) -> str:

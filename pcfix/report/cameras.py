@@ -240,11 +240,15 @@ def block_figure(report: CamerasReport) -> Figure:
     """Draw the block in plan, with the footprints of its frames, and from the south."""
     cameras, xyz = report.cameras, report.sample_xyz
     figure, (plan, side) = new_figure(8.0, 8.5, nrows=2, height_ratios=[5, 2])
-    level = _level(report)
+    level = report.level_m  # where to draw footprints: at the water, else amid the cloud
+    if level is None:
+        level = float(np.median(xyz[:, 2])) if len(xyz) else np.nan
     shown = draw_cloud(figure, plan, xyz, label="cloud")
     if len(shown):
         side.plot(shown[:, 0], shown[:, 2], ".", color="0.6", markersize=1, label="cloud")
-    borders = _footprints(report, level)
+    rows = range(0, len(cameras), max(1, len(cameras) // MOST_FOOTPRINTS))
+    borders = [footprint(cameras, row, level) for row in rows]
+    borders = [border for border in borders if len(border) and np.isfinite(border).all()]
     for border in borders:
         plan.plot(*np.vstack([border, border[:1]]).T, color=WATER, linewidth=0.6, alpha=0.6)
     plan.plot(*cameras.centres[:, :2].T, "^", color=AFTER, markersize=4, label="cameras")
@@ -260,16 +264,3 @@ def block_figure(report: CamerasReport) -> Figure:
     if side.get_legend_handles_labels()[0]:
         side.legend(loc="best")
     return figure
-
-
-def _level(report: CamerasReport) -> float:
-    """Return where to draw footprints: at the water, else at the middle of the cloud."""
-    if report.level_m is not None:
-        return report.level_m
-    return float(np.median(report.sample_xyz[:, 2])) if len(report.sample_xyz) else np.nan
-
-
-def _footprints(report: CamerasReport, level_m: float) -> list[FloatArray]:
-    rows = range(0, len(report.cameras), max(1, len(report.cameras) // MOST_FOOTPRINTS))
-    borders = (footprint(report.cameras, row, level_m) for row in rows)
-    return [border for border in borders if len(border) and np.isfinite(border).all()]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.clean.settings import CleanSummary
+from pcfix.clean.points import CleanSummary
 from pcfix.grid.model import DsmSummary
 from pcfix.model import Summary
 from pcfix.options.correct import LEVEL_M

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from pcfix.clean import points as door
-from pcfix.clean.points import clean_points
-from pcfix.clean.settings import Reason
+from pcfix.clean.points import Reason, clean_points
 from pcfix.errors import InputError, SettingError
 from pcfix.model import WaterPlane
 from pcfix.options.steps import CleanRules
