@@ -34,7 +34,8 @@ from pcfix.water.checks import check_submerged
 from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:
-    import laspy
+    from laspy import LasHeader
+    from laspy import ScaleAwarePointRecord as Chunk
 
 _PASSES = 4
 
@@ -133,9 +134,7 @@ class Cleaning(Step):
         if self._task.progress is not None:
             self._task.progress(self._passed // _PASSES, len(self.cloud.used))
 
-    def _read(
-        self, points: laspy.ScaleAwarePointRecord, source: LasSource, rows: slice, names: set[str]
-    ) -> None:
+    def _read(self, points: Chunk, source: LasSource, rows: slice, names: set[str]) -> None:
         """Read coordinates and masks, and flag weak intersections on the way."""
         cloud, (xyz, heights, classes) = self.cloud, points_of(points, source, self._water)
         withheld = np.asarray(points["withheld"]).astype(np.bool_)
@@ -194,7 +193,7 @@ class Cleaning(Step):
             },
         }
 
-    def header(self, source: LasSource) -> laspy.LasHeader:
+    def header(self, source: LasSource) -> LasHeader:
         """Return the header with the record of what is done."""
         if self._drop and self.cloud.reasons.all():
             raise InputError(
@@ -203,9 +202,7 @@ class Cleaning(Step):
             )
         return noted_header(source, cleaning_vlr({**self._content(), "drop": self._drop}))
 
-    def chunk(
-        self, points: laspy.ScaleAwarePointRecord, source: LasSource, header: laspy.LasHeader
-    ) -> laspy.ScaleAwarePointRecord:
+    def chunk(self, points: Chunk, source: LasSource, header: LasHeader) -> Chunk:
         """Return points with their noise flagged or left out."""
         new = convert(points, header.point_format)
         noise = self.cloud.reasons[self._written : self._written + len(new)] != 0

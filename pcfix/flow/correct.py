@@ -40,7 +40,8 @@ from pcfix.water.index import with_index
 from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:
-    import laspy
+    from laspy import LasHeader
+    from laspy import ScaleAwarePointRecord as Chunk
 
 
 def correct_points(
@@ -231,15 +232,13 @@ class Correcting(Step):
         self.wide = False
         self.steps: tuple[int, ...] = (0, 0, 0)
 
-    def header(self, source: LasSource) -> laspy.LasHeader:
+    def header(self, source: LasSource) -> LasHeader:
         """Return the header with the new dimensions and the record of what is done."""
         return corrected_header(
             source, self._columns, self.job.provenance(), wide=self.wide, steps=self.steps
         )
 
-    def chunk(
-        self, points: laspy.ScaleAwarePointRecord, source: LasSource, header: laspy.LasHeader
-    ) -> laspy.ScaleAwarePointRecord:
+    def chunk(self, points: Chunk, source: LasSource, header: LasHeader) -> Chunk:
         """Return corrected points with their new dimensions, classes and flags."""
         correction = self.job.correct(points_of(points, source, self.job.water))
         moved = columns.shift_steps(correction, header.scales)

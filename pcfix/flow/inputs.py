@@ -189,19 +189,15 @@ def mask_of(
     return WaterMask(polygons.area, polygons.name, low, high, polygons.notes)
 
 
-def paths_in(options: Any, but: tuple[str, ...] = ()) -> list[File]:
-    """Return what among the options of a command, `but` some, may be files that it reads."""
-    names = [one.name for one in options_of(InputOptions)] + ["water_mask"]
-    left_out = (*NO_FILES, *but)
-    given = [file_of(getattr(options, name, None)) for name in names if name not in left_out]
-    return [one for one in given if isinstance(one, str | PathLike)]
-
-
 NO_FILES = ("port", "water_model", "water_crs", "views_are", "angles", "cameras_crs")
 
 
-def file_of(path: Any) -> Any:
-    """Return a vector file, which may be named with a layer; what is no path comes back."""
-    if not isinstance(path, str | PathLike):
-        return path
-    return Path(str(path).partition(LAYER_MARK)[0])
+def paths_in(options: Any, but: tuple[str, ...] = ()) -> list[File]:
+    """Return what among the options of a command, `but` some, may be files that it reads.
+
+    A vector file may be named with a layer, which is left out.
+    """
+    names = [one.name for one in options_of(InputOptions)] + ["water_mask"]
+    given = [getattr(options, name, None) for name in names if name not in (*NO_FILES, *but)]
+    paths = [str(one) for one in given if isinstance(one, str | PathLike)]
+    return [Path(path.partition(LAYER_MARK)[0]) for path in paths]

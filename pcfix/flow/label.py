@@ -37,7 +37,8 @@ from pcfix.water.checks import as_surface, check_submerged, check_tilt, checked_
 from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
-    import laspy
+    from laspy import LasHeader
+    from laspy import ScaleAwarePointRecord as Chunk
 
 Classes = npt.NDArray[np.uint8]
 
@@ -193,7 +194,7 @@ class LabellingStep(Step):
                 lambda: parts_of(chunks(), self.water), self._view.low, self._view.high
             )
 
-    def header(self, source: LasSource) -> laspy.LasHeader:
+    def header(self, source: LasSource) -> LasHeader:
         """Return the header of a labelled file, with a record of what was done."""
         water, mask = self.water, self.labelling.mask
         content = {
@@ -216,9 +217,7 @@ class LabellingStep(Step):
             self.counts[name] += int(rows.sum())
         return labels.classes
 
-    def chunk(
-        self, points: laspy.ScaleAwarePointRecord, source: LasSource, header: laspy.LasHeader
-    ) -> laspy.ScaleAwarePointRecord:
+    def chunk(self, points: Chunk, source: LasSource, header: LasHeader) -> Chunk:
         """Return labelled points of a file."""
         found = self.classes(points_of(points, source, self.water))
         new = convert(points, header.point_format)

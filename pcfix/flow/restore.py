@@ -18,7 +18,8 @@ from pcfix.options.shared import JobOptions
 from pcfix.threads import threads
 
 if TYPE_CHECKING:
-    import laspy
+    from laspy import LasHeader
+    from laspy import ScaleAwarePointRecord as Chunk
 
 
 def restore_file(
@@ -66,7 +67,7 @@ class Restoring(Step):
     def __init__(self) -> None:
         self.points, self._offset = 0, np.zeros(3, np.int64)
 
-    def header(self, source: LasSource) -> laspy.LasHeader:
+    def header(self, source: LasSource) -> LasHeader:
         """Return the header as it was before the correction."""
         content = read_settings(source.vlrs, source.path)
         names = _ours(source, content["settings"]["dimensions"])
@@ -74,9 +75,7 @@ class Restoring(Step):
         self._offset = np.array(content["before"]["steps"])
         return restored_header(source, content["before"], names)
 
-    def chunk(
-        self, points: laspy.ScaleAwarePointRecord, source: LasSource, header: laspy.LasHeader
-    ) -> laspy.ScaleAwarePointRecord:
+    def chunk(self, points: Chunk, source: LasSource, header: LasHeader) -> Chunk:
         """Return points with their coordinates, classes and flags of before."""
         self.points += len(points)
         moved = is_corrected(points)

@@ -16,7 +16,8 @@ from pcfix.io.las.writing import LasSink, check_suffix, corrected_identity, outp
 from pcfix.options.declare import File
 
 if TYPE_CHECKING:
-    import laspy
+    from laspy import LasHeader
+    from laspy import ScaleAwarePointRecord as Chunk
 
 Progress = Callable[[int, int], None]
 
@@ -27,12 +28,10 @@ class Step(Protocol):
     identity: bytes | None = None
     """Of the output, by its first bytes; None for that of every corrected file."""
 
-    def header(self, source: LasSource) -> laspy.LasHeader:
+    def header(self, source: LasSource) -> LasHeader:
         """Return the header of the output, and be ready for the first chunk."""
 
-    def chunk(
-        self, points: laspy.ScaleAwarePointRecord, source: LasSource, header: laspy.LasHeader
-    ) -> laspy.ScaleAwarePointRecord:
+    def chunk(self, points: Chunk, source: LasSource, header: LasHeader) -> Chunk:
         """Return what becomes of some points."""
 
     def finish(self) -> None:

@@ -23,7 +23,7 @@ from pcfix.water.river import RiverFit
 from pcfix.water.surface import FoundSurface
 
 if TYPE_CHECKING:
-    import laspy
+    from laspy import ScaleAwarePointRecord as Chunk
     from pyproj import CRS
 
 Points: TypeAlias = tuple[FloatArray, FloatArray | None, npt.NDArray[np.uint8]]
@@ -104,9 +104,7 @@ def file_points(
             yield points_of(chunk, source, water)
 
 
-def points_of(
-    chunk: laspy.ScaleAwarePointRecord, source: LasSource, water: WaterSurface | None
-) -> Points:
+def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Points:
     """Return the n points of a chunk."""
     heights = None
     if isinstance(water, WaterDimension):
