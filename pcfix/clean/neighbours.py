@@ -236,7 +236,7 @@ def make_tiles(
     empty : callable
         Makes the arrays.
     """
-    lattice = _Lattice.over(xyz, used, tile_m)
+    lattice = _Lattice(xyz, used, tile_m)
     counts = np.zeros(lattice.columns * lattice.rows, np.int64)
     for rows in used_rows(used):
         counts += np.bincount(lattice.tile_of(xyz[rows]), minlength=len(counts))
@@ -256,29 +256,23 @@ def make_tiles(
     return Tiles(sorted_xyz, row, start, low, high)
 
 
-@dataclass(frozen=True)
 class _Lattice:
-    """Where the tiles lie; points beyond its edges belong to the tile at the edge."""
+    """Where the tiles lie; points beyond its edges belong to the tile at the edge.
 
-    origin: FloatArray
-    side_m: float
-    columns: int
-    rows: int
+    It covers all but the outermost hundredth of the points, so that no outlier stretches it.
+    """
 
-    @classmethod
-    def over(cls, xyz: FloatArray, used: BoolArray, tile_m: float | None) -> _Lattice:
-        """Cover all but the outermost hundredth of the points, so that no outlier stretches it."""
+    def __init__(self, xyz: FloatArray, used: BoolArray, tile_m: float | None) -> None:
         step = max(1, len(used) // _SAMPLE)
         sample = xyz[::step][used[::step]]
         if not len(sample):
             sample = np.array(xyz[int(np.argmax(used))])[None, :]
-        low, high = np.percentile(sample[:, :2], (1.0, 99.0), axis=0)
-        extent = np.maximum(high - low, 1e-3)
+        self.origin, high = np.percentile(sample[:, :2], (1.0, 99.0), axis=0)
+        extent = np.maximum(high - self.origin, 1e-3)
         share = POINTS_PER_TILE / int(used.sum())
         side = math.sqrt(float(extent.prod()) * share) if tile_m is None else tile_m
-        side = max(side, float(extent.max()) / _MOST_TILES_A_SIDE)
-        columns, rows = np.ceil(extent / side).astype(int).tolist()
-        return cls(low, side, columns, rows)
+        self.side_m = max(side, float(extent.max()) / _MOST_TILES_A_SIDE)
+        self.columns, self.rows = np.ceil(extent / self.side_m).astype(int).tolist()
 
     def tile_of(self, xyz: FloatArray) -> IntArray:
         """Return the number of the tile of each point, shape (n,)."""

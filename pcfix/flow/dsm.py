@@ -17,7 +17,6 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.runner import FileTask, Progress, file_task
@@ -35,7 +34,7 @@ from pcfix.version import __version__
 
 if TYPE_CHECKING:
     import laspy
-    from rasterio.io import DatasetReader, DatasetWriter
+    from rasterio.io import DatasetWriter
 
 BLOCK_CELLS = 1024
 """Longest side of a window; a power of two."""
@@ -193,7 +192,7 @@ class _Run:
     def shade(self, dsm: Path, target: Path, folder: Path) -> None:
         """Write the hillshade of a DSM."""
         plain = folder / "hillshade.tif" if self.cog else target
-        band = {"hillshade": ""}
+        band, s = {"hillshade": ""}, self.settings
         with (
             rasters.open_raster(dsm) as heights,
             rasters.new_raster(
@@ -201,17 +200,13 @@ class _Run:
             ) as out,
         ):
             for window in self.lattice.windows(BLOCK_CELLS):
-                rasters.write_part(out, self.light(heights, window), window, 1)
+                wide = window.grown(1)
+                around = wide.clipped(self.lattice.window)
+                height = np.full((wide.height, wide.width), np.nan)
+                height[around.within(wide)] = rasters.read_heights(heights, around)
+                light = hillshade(height, s.resolution, s.azimuth, s.altitude)
+                rasters.write_part(out, light, window, 1)
         self.finish(plain, target)
-
-    def light(self, heights: DatasetReader, window: Window) -> npt.NDArray[np.uint8]:
-        """Return the hillshade of a window."""
-        wide = window.grown(1)
-        around = wide.clipped(self.lattice.window)
-        height = np.full((wide.height, wide.width), np.nan)
-        height[around.within(wide)] = rasters.read_heights(heights, around)
-        s = self.settings
-        return hillshade(height, s.resolution, s.azimuth, s.altitude)
 
     def finish(self, plain: Path, target: Path) -> None:
         """Add overviews; a cloud optimised file is a copy, which brings its own."""
