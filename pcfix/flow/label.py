@@ -19,10 +19,10 @@ from pcfix.flow.surfaces import (
     corners,
     file_points,
     find_surface,
+    parts_of,
     points_of,
     view_of,
 )
-from pcfix.flow.through_water import parts_of
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import labelling_vlr, noted_header

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
+from pcfix.flow.surfaces import parts_of
 from pcfix.io.tables import CheckDepths, read_check_depths
 from pcfix.label.labelling import Part
 from pcfix.model import NOISE_CLASSES, BoolArray, FloatArray, IntArray, TiePoints, ViewKind
@@ -78,23 +79,20 @@ class Learning:
     def of_cloud(
         self,
         chunks: Callable[[], Iterable[Points]],
-        came: Callable[[], Iterable[MadeWith]] | None = None,
+        makers: Callable[[], Iterable[MadeWith]] | None = None,
     ) -> Learned:
         """Return what is learned of the whole cloud, whose chunks may be asked for again.
 
         And, chunk by chunk, what made the points, where that are not these cameras.
         """
         learned = Learned(regression=self._regression(chunks), occluder=self._occluder(chunks))
-        return self._with_matcher(learned, chunks, came)
+        return self._with_matcher(learned, chunks, makers)
 
     def _regression(self, chunks: Callable[[], Iterable[Points]]) -> DepthRegression | None:
         path = self._inputs.check_depths
         if path is None:
             return None
-        parts = (
-            Part(xyz, surface_above(self.survey.water, xyz, heights), classes)
-            for xyz, heights, classes in chunks()
-        )
+        parts = parts_of(chunks(), self.survey.water)
         found = learn_regression(path, parts, self.survey.settings)
         again = "" if found.cv_rmse_m is None else f", cross-validated {found.cv_rmse_m:.3f} m"
         self.notes += [
@@ -117,7 +115,7 @@ class Learning:
         self,
         learned: Learned,
         chunks: Callable[[], Iterable[Points]],
-        came: Callable[[], Iterable[MadeWith]] | None,
+        makers: Callable[[], Iterable[MadeWith]] | None,
     ) -> Learned:
         """Add the model of the matcher, by the tie points where the camera file has some."""
         if not wants_matcher(self.survey.settings, self._views):
@@ -128,15 +126,15 @@ class Learning:
         survey = replace(self.survey, learned=learned)
         taken: list[Batch] = []
         done = 0
-        makers = repeat(None) if came is None else came()
-        for (xyz, heights, classes), made_with in zip(chunks(), makers, strict=False):
+        made = repeat(None) if makers is None else makers()
+        for (xyz, heights, classes), made_with in zip(chunks(), made, strict=False):
             rows = np.arange(-done % step, len(xyz), step)
             rows = rows[~np.isin(classes[rows], NOISE_CLASSES)]
             above = surface_above(
                 survey.water, xyz[rows], None if heights is None else heights[rows]
             )
-            made = None if made_with is None else made_with.take(rows)
-            taken.append(Batch(xyz[rows], above, survey, made_with=made))
+            of_rows = None if made_with is None else made_with.take(rows)
+            taken.append(Batch(xyz[rows], above, survey, made_with=of_rows))
             done += len(xyz)
         return with_matcher(stacked(taken), self._views, self._ties())
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -15,12 +15,13 @@ import numpy.typing as npt
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.water import read_water
+from pcfix.label.labelling import Part
 from pcfix.model import FloatArray, WaterDimension, WaterSurface
 from pcfix.options.declare import File
 from pcfix.options.shared import WaterOptions
 from pcfix.water.fit import WaterFit
 from pcfix.water.river import RiverFit
-from pcfix.water.surface import FoundSurface
+from pcfix.water.surface import FoundSurface, surface_above
 
 if TYPE_CHECKING:
     from laspy import ScaleAwarePointRecord as Chunk
@@ -110,6 +111,13 @@ def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Po
     if isinstance(water, WaterDimension):
         heights = source.dimension(chunk, water.name)
     return coordinates(chunk), heights, np.asarray(chunk["classification"])
+
+
+def parts_of(chunks: Iterable[Points], water: WaterSurface) -> Iterable[Part]:
+    """Return chunks with the water above them."""
+    return (
+        Part(xyz, surface_above(water, xyz, heights), classes) for xyz, heights, classes in chunks
+    )
 
 
 def find_surface(

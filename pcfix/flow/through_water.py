@@ -13,7 +13,8 @@ from pcfix.adjust.carry import Carrying
 from pcfix.flow.diagnosis import diagnose_in_passing
 from pcfix.flow.learning import Learning
 from pcfix.flow.old_cameras import Blocks, ListedViews, old_tie_points
-from pcfix.label.labelling import Labelling, Part
+from pcfix.flow.surfaces import parts_of
+from pcfix.label.labelling import Labelling
 from pcfix.model import (
     BoolArray,
     Correction,
@@ -24,7 +25,6 @@ from pcfix.model import (
     Views,
     WaterDimension,
     WaterPlane,
-    WaterSurface,
 )
 from pcfix.options.correct import CorrectOptions
 from pcfix.refract.batch import Batch, Intersection, MadeWith, Survey
@@ -228,13 +228,6 @@ class ThroughWater:
             "carried": None if self.carrying is None else self.carrying.as_dict(),
             "absorbed": bool(self._bent),
         }
-
-
-def parts_of(chunks: Iterable[Points], water: WaterSurface) -> Iterable[Part]:
-    """Return chunks with the water above them."""
-    return (
-        Part(xyz, surface_above(water, xyz, heights), classes) for xyz, heights, classes in chunks
-    )
 
 
 def correct_checked(
