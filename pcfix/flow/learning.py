@@ -6,12 +6,12 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import repeat
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
-from pcfix.flow.surfaces import parts_of
+from pcfix.flow.inputs import Inputs
+from pcfix.flow.surfaces import CloudView, Points, parts_of
 from pcfix.io.tables import CheckDepths, read_check_depths
 from pcfix.label.labelling import Part
 from pcfix.model import NOISE_CLASSES, BoolArray, FloatArray, IntArray, TiePoints, ViewKind
@@ -29,10 +29,6 @@ from pcfix.refract.regression import (
 )
 from pcfix.refract.top_surface import OccluderBuilder, wants_occlusion
 from pcfix.water.surface import SurfaceAbove, surface_above
-
-if TYPE_CHECKING:
-    from pcfix.flow.inputs import Inputs
-    from pcfix.flow.surfaces import CloudView, Points
 
 
 class Learning:

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
+from pcfix.flow.inputs import Inputs
 from pcfix.flow.old_cameras import Blocks, ListedViews
+from pcfix.flow.surfaces import CloudView, Points
 from pcfix.flow.through_water import spread_over
 from pcfix.label.labelling import Labelling
 from pcfix.model import Correction, Views, WaterPlane
@@ -22,10 +24,6 @@ from pcfix.options.correct import CorrectOptions
 from pcfix.port.methods import correct_through_port
 from pcfix.refract.tally import Tally
 from pcfix.water.surface import SurfaceAbove
-
-if TYPE_CHECKING:
-    from pcfix.flow.inputs import Inputs
-    from pcfix.flow.surfaces import CloudView, Points
 
 
 class ThroughPort:

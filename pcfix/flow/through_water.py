@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import astuple, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from pcfix.adjust.carry import Carrying
 from pcfix.flow.diagnosis import diagnose_in_passing
+from pcfix.flow.inputs import Inputs
 from pcfix.flow.learning import Learning
 from pcfix.flow.old_cameras import Blocks, ListedViews, old_tie_points
-from pcfix.flow.surfaces import parts_of
+from pcfix.flow.surfaces import CloudView, Points, parts_of
 from pcfix.label.labelling import Labelling
 from pcfix.model import (
     BoolArray,
@@ -33,11 +34,6 @@ from pcfix.refract.methods import correct, shift_of_land
 from pcfix.refract.tally import Tally
 from pcfix.water.checks import WaterMeeting, check_above_water, check_tilt, refuse_under_water
 from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
-
-if TYPE_CHECKING:
-    from pcfix.flow.inputs import Inputs
-    from pcfix.flow.surfaces import CloudView, Points
-
 
 Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
 
