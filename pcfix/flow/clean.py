@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from pcfix.clean.points import (
     flag_weak,
 )
 from pcfix.errors import InputError
-from pcfix.flow.runner import FileTask, Progress, Step, file_task
+from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
 from pcfix.flow.surfaces import find_surface, points_of, view_of
 from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
@@ -32,10 +32,6 @@ from pcfix.threads import threads
 from pcfix.version import __version__
 from pcfix.water.checks import check_submerged
 from pcfix.water.surface import is_submerged, surface_above
-
-if TYPE_CHECKING:
-    from laspy import LasHeader
-    from laspy import ScaleAwarePointRecord as Chunk
 
 _PASSES = 4
 
@@ -193,7 +189,7 @@ class Cleaning(Step):
             },
         }
 
-    def header(self, source: LasSource) -> LasHeader:
+    def header(self, source: LasSource) -> Header:
         """Return the header with the record of what is done."""
         if self._drop and self.cloud.reasons.all():
             raise InputError(
@@ -202,7 +198,7 @@ class Cleaning(Step):
             )
         return noted_header(source, cleaning_vlr({**self._content(), "drop": self._drop}))
 
-    def chunk(self, points: Chunk, source: LasSource, header: LasHeader) -> Chunk:
+    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Chunk:
         """Return points with their noise flagged or left out."""
         new = convert(points, header.point_format)
         noise = self.cloud.reasons[self._written : self._written + len(new)] != 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ from pcfix.errors import InputError, SettingError
 from pcfix.flow.inputs import paths_in
 from pcfix.flow.job import Job
 from pcfix.flow.old_cameras import paired
-from pcfix.flow.runner import FileTask, Progress, Step, file_task
+from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
 from pcfix.flow.surfaces import file_points, points_of, view_of
 from pcfix.flow.through_water import Label, correct_checked
 from pcfix.io.las import columns
@@ -38,10 +38,6 @@ from pcfix.threads import threads
 from pcfix.water.checks import as_surface, check_above_water, checked_points
 from pcfix.water.index import with_index
 from pcfix.water.surface import is_submerged, surface_above
-
-if TYPE_CHECKING:
-    from laspy import LasHeader
-    from laspy import ScaleAwarePointRecord as Chunk
 
 
 def correct_points(
@@ -232,13 +228,13 @@ class Correcting(Step):
         self.wide = False
         self.steps: tuple[int, ...] = (0, 0, 0)
 
-    def header(self, source: LasSource) -> LasHeader:
+    def header(self, source: LasSource) -> Header:
         """Return the header with the new dimensions and the record of what is done."""
         return corrected_header(
             source, self._columns, self.job.provenance(), wide=self.wide, steps=self.steps
         )
 
-    def chunk(self, points: Chunk, source: LasSource, header: LasHeader) -> Chunk:
+    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Chunk:
         """Return corrected points with their new dimensions, classes and flags."""
         correction = self.job.correct(points_of(points, source, self.job.water))
         moved = columns.shift_steps(correction, header.scales)

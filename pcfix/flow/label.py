@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import astuple
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import SettingError
 from pcfix.flow.inputs import mask_of, paths_in
-from pcfix.flow.runner import Progress, Step, file_task
+from pcfix.flow.runner import Chunk, Header, Progress, Step, file_task
 from pcfix.flow.surfaces import (
     CloudView,
     Points,
@@ -35,10 +35,6 @@ from pcfix.threads import threads
 from pcfix.version import __version__
 from pcfix.water.checks import as_surface, check_submerged, check_tilt, checked_points
 from pcfix.water.surface import surface_above
-
-if TYPE_CHECKING:
-    from laspy import LasHeader
-    from laspy import ScaleAwarePointRecord as Chunk
 
 Classes = npt.NDArray[np.uint8]
 
@@ -194,7 +190,7 @@ class LabellingStep(Step):
                 lambda: parts_of(chunks(), self.water), self._view.low, self._view.high
             )
 
-    def header(self, source: LasSource) -> LasHeader:
+    def header(self, source: LasSource) -> Header:
         """Return the header of a labelled file, with a record of what was done."""
         water, mask = self.water, self.labelling.mask
         content = {
@@ -217,7 +213,7 @@ class LabellingStep(Step):
             self.counts[name] += int(rows.sum())
         return labels.classes
 
-    def chunk(self, points: Chunk, source: LasSource, header: LasHeader) -> Chunk:
+    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Chunk:
         """Return labelled points of a file."""
         found = self.classes(points_of(points, source, self.water))
         new = convert(points, header.point_format)

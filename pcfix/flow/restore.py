@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.flow.runner import Step, file_task
+from pcfix.flow.runner import Chunk, Header, Step, file_task
 from pcfix.io.las.columns import SHIFTS, columns_for, is_corrected, is_marked_uncorrected, shifted
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import read_settings, restored_header
@@ -16,10 +16,6 @@ from pcfix.options.correct import Dimensions
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import JobOptions
 from pcfix.threads import threads
-
-if TYPE_CHECKING:
-    from laspy import LasHeader
-    from laspy import ScaleAwarePointRecord as Chunk
 
 
 def restore_file(
@@ -67,7 +63,7 @@ class Restoring(Step):
     def __init__(self) -> None:
         self.points, self._offset = 0, np.zeros(3, np.int64)
 
-    def header(self, source: LasSource) -> LasHeader:
+    def header(self, source: LasSource) -> Header:
         """Return the header as it was before the correction."""
         content = read_settings(source.vlrs, source.path)
         names = _ours(source, content["settings"]["dimensions"])
@@ -75,7 +71,7 @@ class Restoring(Step):
         self._offset = np.array(content["before"]["steps"])
         return restored_header(source, content["before"], names)
 
-    def chunk(self, points: Chunk, source: LasSource, header: LasHeader) -> Chunk:
+    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Chunk:
         """Return points with their coordinates, classes and flags of before."""
         self.points += len(points)
         moved = is_corrected(points)

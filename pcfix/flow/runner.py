@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from pcfix.io.files import check_input, check_output, write_text
 from pcfix.io.las.source import LasSource
@@ -16,10 +16,11 @@ from pcfix.io.las.writing import LasSink, check_suffix, corrected_identity, outp
 from pcfix.options.declare import File
 
 if TYPE_CHECKING:
-    from laspy import LasHeader
-    from laspy import ScaleAwarePointRecord as Chunk
+    import laspy
 
-Progress = Callable[[int, int], None]
+Chunk: TypeAlias = "laspy.ScaleAwarePointRecord"
+Header: TypeAlias = "laspy.LasHeader"
+Progress: TypeAlias = Callable[[int, int], None]
 
 
 class Step(Protocol):
@@ -28,10 +29,10 @@ class Step(Protocol):
     identity: bytes | None = None
     """Of the output, by its first bytes; None for that of every corrected file."""
 
-    def header(self, source: LasSource) -> LasHeader:
+    def header(self, source: LasSource) -> Header:
         """Return the header of the output, and be ready for the first chunk."""
 
-    def chunk(self, points: Chunk, source: LasSource, header: LasHeader) -> Chunk:
+    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Chunk:
         """Return what becomes of some points."""
 
     def finish(self) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.flow.runner import Chunk
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.water import read_water
 from pcfix.label.labelling import Part
@@ -24,7 +25,6 @@ from pcfix.water.river import RiverFit
 from pcfix.water.surface import FoundSurface, surface_above
 
 if TYPE_CHECKING:
-    from laspy import ScaleAwarePointRecord as Chunk
     from pyproj import CRS
 
 Points: TypeAlias = tuple[FloatArray, FloatArray | None, npt.NDArray[np.uint8]]
