@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     import laspy
 
 
-WAVEFORM_FORMATS = (9, 10)
-
-
 def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str, Any]:
     """Return the pipeline, ready for JSON.
 
@@ -40,7 +37,7 @@ def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str
     job_for(input, options)
     with LasSource(input) as source:
         point_format = source.header.point_format
-    if UPGRADE[point_format.id] in WAVEFORM_FORMATS:
+    if UPGRADE[point_format.id] in (9, 10):
         raise InputError(
             f"{input}: has waveforms (point format {point_format.id}), which PDAL does not write;"
             " use 'pcfix correct'."

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 Points: TypeAlias = tuple[FloatArray, FloatArray | None, npt.NDArray[np.uint8]]
 """Some points: coordinates (n, 3), water heights where those are a dimension, classes."""
 
-AUTO = "auto"
 SAMPLE_POINTS = 2_000_000
 """Points of a cloud that are looked at for a surface, evenly spread."""
 SHORE_RADIUS_M = 1.0
@@ -145,7 +144,7 @@ def find_surface(
 
     if not isinstance(water, str | PathLike | float | int):
         return FoundSurface(water)
-    if str(water).strip().lower() == AUTO:
+    if str(water).strip().lower() == "auto":
         return _sought(view)
     if isinstance(water, str | PathLike) and is_vector_file(water):
         return _fitted(options, water, view)

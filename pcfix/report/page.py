@@ -40,10 +40,10 @@ def new_figure(width_in: float = 8.0, height_in: float = 4.5, **grid: Any) -> tu
     return figure, figure.subplots(**grid)
 
 
-def png_of(figure: Figure, dpi: int = 130) -> bytes:
+def png_of(figure: Figure) -> bytes:
     """Return a figure as a PNG file."""
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=dpi)
+    figure.savefig(stream, format="png", dpi=130)
     return stream.getvalue()
 
 
@@ -88,9 +88,9 @@ class Picture:
     alt: str
     figure: Figure
 
-    def png(self, dpi: int = 130) -> bytes:
+    def png(self) -> bytes:
         """Return the picture as a file."""
-        return png_of(self.figure, dpi)
+        return png_of(self.figure)
 
     @property
     def data(self) -> str:
@@ -149,6 +149,9 @@ def render(report: Report) -> str:
 
 
 def _map_data(report: Report) -> dict[str, Any]:
+    from matplotlib import colormaps
+
+    colours = colormaps["viridis"](np.linspace(0, 1, 64))[:, :3] * 255
     west, _, _, north = report.maps.extent_m
     rows, columns = report.maps.height_m.shape
     return {
@@ -158,7 +161,7 @@ def _map_data(report: Report) -> dict[str, Any]:
         "north": north,
         "cell": report.maps.cell_m,
         "noData": _NO_DATA,
-        "colours": _colours(),
+        "colours": colours.astype(int).tolist(),
         "layers": [_packed(layer) for layer in report.layers],
     }
 
@@ -181,12 +184,3 @@ def _packed(layer: Layer) -> dict[str, Any]:
         "high": float(max(shown[1], shown[0] + 1e-9)),
         "values": base64.b64encode(whole.tobytes()).decode(),
     }
-
-
-def _colours() -> list[list[int]]:
-    from matplotlib import colormaps
-
-    shades: list[list[int]] = (
-        (colormaps["viridis"](np.linspace(0, 1, 64))[:, :3] * 255).astype(int).tolist()
-    )
-    return shades
