@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.model import FloatArray, IntArray
 from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, new_figure
+from pcfix.simulate.hsu_wang import METHODS, DepthBins
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,34 +28,9 @@ COLUMNS = (
 )  # fmt: skip
 """Of the table; errors are apparent minus true depth, factors true depth over apparent depth."""
 LINES = ":", "-", "--", "-."
-METHODS = ("uncorrected", "I", "II", "III", "pcfix")
 _COLOURS = {
     "uncorrected": REFERENCE, "I": BEFORE, "II": WATER, "III": "#8a8a8a", "pcfix": AFTER,
 }  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class DepthBins:
-    """The errors of the methods, bin by bin of true depth.
-
-    Attributes
-    ----------
-    edges_m : array, shape (b + 1,)
-    points : array, shape (b,)
-        Points of each bin; the check points are not among them.
-    rmse_m, mean_m : array, shape (b + 1, len(METHODS))
-        Of the heights; the last row is for all points.
-    offset_m, slope, r2 : float
-        The regression of method III, and its coefficient of determination.
-    """
-
-    edges_m: FloatArray
-    points: IntArray
-    rmse_m: FloatArray
-    mean_m: FloatArray
-    offset_m: float
-    slope: float
-    r2: float
 
 
 def effect_text(effects: list[Effect]) -> str:

@@ -8,9 +8,10 @@ import pytest
 
 import pcfix
 from pcfix.errors import SettingError
-from pcfix.flow.papers import depth_bins, mean_of_cameras
-from pcfix.report.papers import METHODS, depth_bins_figure, depth_bins_rows, depth_bins_text
+from pcfix.flow.papers import flume_bins
+from pcfix.report.papers import depth_bins_figure, depth_bins_rows, depth_bins_text
 from pcfix.simulate.flume import GSD_M, simulate_flume
+from pcfix.simulate.hsu_wang import METHODS, mean_of_cameras
 from tests.utils.twins import light_path
 
 COLUMN = {name: i for i, name in enumerate(METHODS)}
@@ -23,7 +24,7 @@ def flume():
 
 @pytest.fixture(scope="module")
 def bins(flume):
-    return depth_bins(flume)
+    return flume_bins(flume)
 
 
 def test_the_flume_is_what_it_says(flume):
