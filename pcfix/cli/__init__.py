@@ -30,30 +30,30 @@ for place, (command, example) in enumerate(EXAMPLES):
 def main(tokens: Sequence[str] | None = None) -> None:
     """Run the command line; a user's mistake is one line on stderr and exit code 1."""
     warnings.showwarning = show_warning
-    words = list(sys.argv[1:] if tokens is None else tokens)
+    arguments = list(sys.argv[1:] if tokens is None else tokens)
     for command, _ in EXAMPLES:
-        if command.__name__ in words[:1]:
+        if command.__name__ in arguments[:1]:
             prepare(command)
-    if words in ([], *([name] for name in app if name not in ("demo", "--version"))):
-        app([*words, "--help"], result_action="return_value")
-        sys.exit(0 if words in (["--help"], ["-h"]) else 2)
+    if arguments in ([], *([name] for name in app if name not in ("demo", "--version"))):
+        app([*arguments, "--help"], result_action="return_value")
+        sys.exit(0 if arguments in (["--help"], ["-h"]) else 2)
     try:
-        app(words, exit_on_error=False, print_error=False, result_action="return_value")
+        app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
         if isinstance(error.__cause__, PcfixError):
             _stop(str(error.__cause__), 1)
-        _stop(f"{error}\n{_try(words)}", 2)
+        _stop(f"{error}\n{_try(arguments)}", 2)
     except UsageError as error:
-        _stop(f"{error}\n{_try(words)}", 2)
+        _stop(f"{error}\n{_try(arguments)}", 2)
     except PcfixError as error:
         _stop(str(error), 1)
     except BrokenPipeError:
         sys.exit(1)
 
 
-def _try(words: list[str]) -> str:
+def _try(arguments: list[str]) -> str:
     """Return where help is."""
-    name = next((c.__name__ for c, _ in EXAMPLES if c.__name__ in words[:1]), "")
+    name = next((c.__name__ for c, _ in EXAMPLES if c.__name__ in arguments[:1]), "")
     return f"Try '{' '.join(filter(None, ('pcfix', name, '--help')))}'."
 
 

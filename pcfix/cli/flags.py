@@ -57,7 +57,7 @@ def _type(one: Option) -> Any:
 
 
 def _parameter(one: Option) -> Parameter:
-    told = one.default_text
+    default = one.default_text
     has_opposite = one.type is bool and (one.default or one.name == "connected")
     return Parameter(
         help=f"{one.help_text}{' (needed)' if one.needed else ''}",
@@ -67,7 +67,7 @@ def _parameter(one: Option) -> Parameter:
         negative_iterable=(),
         allow_repeating=True,  # the last one counts
         show=not one.hidden,
-        show_default=(lambda value: told) if told else False,
+        show_default=(lambda value: default) if default else False,
     )
 
 

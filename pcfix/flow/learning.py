@@ -122,8 +122,8 @@ class Learning:
         survey = replace(self.survey, learned=learned)
         taken: list[Batch] = []
         done = 0
-        made = repeat(None) if makers is None else makers()
-        for (xyz, heights, classes), made_with in zip(chunks(), made, strict=False):
+        of_chunks = repeat(None) if makers is None else makers()
+        for (xyz, heights, classes), made_with in zip(chunks(), of_chunks, strict=False):
             rows = np.arange(-done % step, len(xyz), step)
             rows = rows[~np.isin(classes[rows], NOISE_CLASSES)]
             above = surface_above(

@@ -85,12 +85,12 @@ def view_of(path: Path, jobs: int | None = None) -> CloudView:
     def chunks() -> Iterator[Seen]:
         with LasSource(path, jobs) as source:
             names = set(source.header.point_format.dimension_names)
-            for some in source.chunks():
+            for chunk in source.chunks():
                 rgb = None
                 if {"red", "green", "blue"} <= names:
-                    rgb = np.column_stack([some["red"], some["green"], some["blue"]])
-                classes, returns = some["classification"], some["number_of_returns"]
-                yield Seen(coordinates(some), rgb, np.asarray(classes), np.asarray(returns))
+                    rgb = np.column_stack([chunk["red"], chunk["green"], chunk["blue"]])
+                classes, returns = chunk["classification"], chunk["number_of_returns"]
+                yield Seen(coordinates(chunk), rgb, np.asarray(classes), np.asarray(returns))
 
     return CloudView(str(path), crs, low, high, points, chunks)
 

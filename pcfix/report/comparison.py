@@ -169,13 +169,13 @@ def _histograms(compared: Plain) -> list[Picture]:
     for key, title, label in kinds:
         if compared[key] is not None:
             bells = " with fitted Gaussians" if key == "vertical" else ""
-            words = " ".join(
+            moments = " ".join(
                 f"{name.capitalize()}: mean {s['mean_m']:.3f} m, standard deviation"
                 f" {s['sd_m']:.3f} m."
                 for when, name, _ in _TIMES
                 if compared[key][when] is not None and (s := compared[key][when]["statistics"])
             )
-            alt = f"{title}: histograms{bells}. {words}"
+            alt = f"{title}: histograms{bells}. {moments}"
             figure = _histogram(compared[key], label, bell=key == "vertical")
             pictures.append(Picture(f"histogram_{key}", title, alt, figure))
     return pictures

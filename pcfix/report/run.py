@@ -258,14 +258,14 @@ def _uncertainty_picture(sample: FloatArray, s: Summary) -> list[Picture]:
     known = sample[:, 4] > 0.0
     if s.uncertainty is None or not known.any():
         return []
-    words = (
+    text = (
         "Total vertical uncertainty at 95 % (1.96 standard errors of Z) over depth, and the"
         f" largest that the orders of IHO S-44 allow. It is formal: it assumes {errors_of(s)}"
         " (standard deviations), and no mismatches. S-44 asks for more than the TVU: position,"
         " features and coverage."
     )
     figure = tvu_figure(sample[known, 3], sample[known, 4])
-    return [Picture("uncertainty", "Vertical uncertainty", words, figure)]
+    return [Picture("uncertainty", "Vertical uncertainty", text, figure)]
 
 
 def tvu_figure(depth_m: FloatArray, sigma_z_m: FloatArray) -> Figure:
