@@ -181,7 +181,7 @@ class LabellingStep(Step):
         check_tilt(self.water)
         mask = mask_of(options.water_mask, view.crs, view.low, view.high)
         self.labelling = Labelling(options.part(LabelRules), mask)
-        self.counts = dict.fromkeys(COUNTS, 0)
+        self.counts: dict[str, Any] = dict.fromkeys(COUNTS, 0)
 
     def look_around(self, chunks: Callable[[], Iterable[Points]]) -> None:
         """Learn the surroundings of all points, where the rules need them."""

@@ -164,7 +164,8 @@ def _sought(view: CloudView | None) -> FoundSurface:
     if view is None:
         raise SettingError("water 'auto' is found in a cloud; give the cloud too.")
     every = max(1, view.points // SAMPLE_POINTS)
-    parts = [[a if a is None else a[::every] for a in seen] for seen in view.chunks()]
+    chunks: Iterable[tuple[Any, ...]] = view.chunks()
+    parts = [[a if a is None else a[::every] for a in seen] for seen in chunks]
     whole: list[Any] = [
         None if any(a is None for a in arrays) else np.concatenate(arrays)
         for arrays in zip(*parts, strict=True)

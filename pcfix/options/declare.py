@@ -26,6 +26,7 @@ from typing import (
     TypeAlias,
     TypeVar,
     Union,
+    cast,
     get_args,
     get_origin,
 )
@@ -227,13 +228,12 @@ def options_of(kind: type) -> tuple[Option, ...]:
 
 def _option(one: Field[Any], home: type) -> Option:
     """Return the option of a field, with what the class that declares it says of all of its own."""
-    own, declared = vars(home), one.metadata["option"]
+    own, declared = vars(home), cast(Option, one.metadata["option"])
     if own.get("old_units") and declared.unit:
         declared = declared._replace(old=(f"{one.name}_{declared.unit}",))
     kind = eval(str(one.type), vars(sys.modules[home.__module__]))
     panel = own.get("panel", "")
-    named = {"name": one.name, "type": kind, "default": one.default, "panel": panel}
-    return declared._replace(**named)
+    return declared._replace(name=one.name, type=kind, default=one.default, panel=panel)
 
 
 def table_of(kind: type) -> str:
