@@ -49,9 +49,8 @@ OUTSIDE_IO = {"pcfix.flow.adjust": "its results are a folder that is replaced as
 
 MOST_PARAMETERS = 9
 # Kernels that get places to work in, as none are made where millions of points are gone through.
-# `flag_neighbours` is what files and arrays share. The list may get shorter, not longer.
+# The list may get shorter, not longer.
 MANY_PARAMETERS = {
-    "pcfix.clean.points.flag_neighbours",
     "pcfix.port.intersection._choose",
     "pcfix.port.intersection._usable",
     "pcfix.port.inversion._covariances",
