@@ -59,19 +59,20 @@ def read(source: Source) -> Cameras:
     """Read the poses of images with a focal length, and their lenses where sizes are known."""
     bundle = _read(source)
     names, notes = _names(bundle)
-    posed = bundle.posed
-    if not len(posed):
+    posed = bundle.posed.tolist()
+    if not posed:
         raise InputError(f"{bundle.path}: no image has a pose (all focal lengths are 0).")
     poses = [_pose(bundle, names[i], bundle.cameras[i]) for i in posed]
-    labels = tuple(names[i] for i in posed)
+    rotations, centres = zip(*poses, strict=True)
+    labels, rows = tuple(names[i] for i in posed), set(posed)
     lenses, more = _lenses(bundle, labels)
     return Cameras(
         labels=labels,
-        centres=np.array([centre for _, centre in poses]),
-        rotations=np.array([rotation for rotation, _ in poses]),
+        centres=np.array(centres),
+        rotations=np.array(rotations),
         lenses=lenses,
         notes=(*notes, *more),
-        unposed=tuple(name for i, name in enumerate(names) if i not in set(posed.tolist())),
+        unposed=tuple(name for i, name in enumerate(names) if i not in rows),
         source="MVE" if bundle.mve else f"Bundler v{_VERSION}",
     )
 
@@ -84,12 +85,8 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
         raise InputError(f"{bundle.path}: MVE writes no image coordinates; no tie points.")
     if not len(points.xyz) or cameras.lenses is None:
         raise InputError(f"{bundle.path}: has no points; no tie points.")
-    row = np.full(len(bundle.cameras), -1)
-    row[bundle.posed] = np.arange(len(cameras))
-    camera = row[points.image]
-    middle = np.array([[lens.principal_x, lens.principal_y] for lens in cameras.lenses])
-    uv = middle[camera] + points.rest[:, 1:] * (1.0, -1.0)
-    return tracks.tie_points(points.xyz, points.point, camera, uv)
+    places = points.rest[:, 1:] * (1.0, -1.0)
+    return tracks.from_principal_point(points, bundle.posed, cameras, places)
 
 
 def _read(source: Source) -> Bundle:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from collections import Counter
-from collections.abc import Collection, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 from xml.etree.ElementTree import Element, ParseError
@@ -14,6 +14,7 @@ from xml.etree.ElementTree import Element, ParseError
 import numpy as np
 
 from pcfix.errors import InputError
+from pcfix.io.files import check_output, write_bytes
 from pcfix.model import FloatArray, Lens
 
 ROUNDING = 1e-3
@@ -34,6 +35,12 @@ def rotation(path: Path, label: str, matrix: FloatArray) -> FloatArray:
     for _ in range(2):  # Newton's iteration to the polar factor; the rounding is squared each time
         matrix = 1.5 * matrix - 0.5 * matrix @ matrix.T @ matrix
     return matrix
+
+
+def rotations(path: Path, labels: Sequence[str], matrices: Iterable[FloatArray]) -> FloatArray:
+    """Return the proper rotations next to those of images, shape (k, 3, 3)."""
+    pairs = zip(labels, matrices, strict=True)
+    return np.array([rotation(path, label, matrix) for label, matrix in pairs])
 
 
 def repeated(path: Path, labels: Sequence[str], dropped: int = 0) -> tuple[str, ...]:
@@ -64,11 +71,8 @@ def quaternion(path: Path, label: str, wxyz: FloatArray) -> FloatArray:
 
 def lens(path: Path, name: str, given: Lens) -> Lens:
     """Return the lens when its numbers can be those of a camera."""
-    numbers = (
-        *(given.focal, given.width, given.height, given.principal_x, given.principal_y),
-        *(given.b1, given.b2, given.b3, *given.shape, *given.radial, *given.denominator),
-        *(*given.tangential, *given.thin_prism, *given.distortion_centre),
-    )
+    lists = (given.shape, given.radial, given.denominator, given.tangential, given.thin_prism)
+    numbers = (*_lengths(given), *itertools.chain(*lists), *given.distortion_centre)
     if not np.isfinite(numbers).all():
         raise InputError(f"{path}: camera {name}: its calibration has a number that is not finite.")
     if not min(given.focal, given.width, given.height) > 0.0:
@@ -81,20 +85,27 @@ def lens(path: Path, name: str, given: Lens) -> Lens:
 
 def crs(path: Path, definition: str) -> str:
     """Return what a file says of its CRS: ``local``, or a definition that PROJ understands."""
-    from pyproj import CRS
-    from pyproj.exceptions import CRSError
-
     text = definition.strip()
     if text.lower() == "local" or text.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")):
         return "local"
-    try:
-        CRS.from_user_input(text)
-    except CRSError as error:
+    if not names_crs(text):
         raise InputError(
             f"{path}: the CRS '{text[:80]}' is not one that PROJ knows; export the poses in a CRS"
             " with an EPSG code."
-        ) from error
+        )
     return text
+
+
+def names_crs(text: str) -> bool:
+    """Whether PROJ understands a text as a CRS."""
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    try:
+        CRS.from_user_input(text)
+    except CRSError:
+        return False
+    return True
 
 
 def utm_as_code(text: str) -> str:
@@ -112,29 +123,25 @@ def is_same_lens(one: Lens, other: Lens) -> bool:
 
     Zeros at the end of a list of coefficients count for nothing, nor does what the lens is called.
     """
-    first, second = _plain(one), _plain(other)
-    if (first.projection, first.unit) != (second.projection, second.unit):
+    (kind, lists), (other_kind, other_lists) = _coefficients(one), _coefficients(other)
+    off = np.abs(np.subtract(_lengths(one), _lengths(other))).max()
+    if kind != other_kind or off > TOLERANCE * one.focal * 10.0:
         return False
-    if (first.inverse, first.in_turn) != (second.inverse, second.in_turn):
-        return False
-    lengths = np.array([_lengths(lens) for lens in (first, second)])
-    if np.abs(lengths[0] - lengths[1]).max() > TOLERANCE * first.focal * 10.0:
-        return False
-    pairs = ((first.shape, second.shape), (first.distortion_centre, second.distortion_centre))
-    lists = ((_series(first)[i], _series(second)[i]) for i in range(4))
-    return all(_are_close(a, b) for a, b in (*pairs, *lists))
-
-
-def _plain(lens: Lens) -> Lens:
-    """Return the lens without switches that switch nothing."""
-    radial, denominator, tangential, prism = _series(lens)
-    bent = bool(radial or denominator or tangential or prism)
-    return replace(
-        lens,
-        inverse=lens.inverse and bent,
-        in_turn=lens.in_turn and bool(tangential or prism),
-        distortion_centre=lens.distortion_centre if bent else (0.0, 0.0),
+    return all(
+        len(a) == len(b) and np.allclose(a, b, rtol=TOLERANCE, atol=0.0)
+        for a, b in zip(lists, other_lists, strict=True)
     )
+
+
+def _coefficients(lens: Lens) -> tuple[tuple[object, ...], tuple[tuple[float, ...], ...]]:
+    """Return the kind of a lens, without switches that switch nothing, and its coefficients."""
+    lists = (lens.radial, lens.denominator, lens.tangential, lens.thin_prism)
+    radial, denominator, tangential, prism = map(without_zeros, lists)
+    turns = bool(tangential or prism)
+    bent = bool(radial or denominator or turns)
+    kind = (lens.projection, lens.unit, lens.inverse and bent, lens.in_turn and turns)
+    centre = lens.distortion_centre if bent else (0.0, 0.0)
+    return kind, (lens.shape, centre, radial, denominator, tangential, prism)
 
 
 def _lengths(lens: Lens) -> tuple[float, ...]:
@@ -142,20 +149,10 @@ def _lengths(lens: Lens) -> tuple[float, ...]:
     return (*frame, lens.b1, lens.b2, lens.b3)
 
 
-def _series(lens: Lens) -> tuple[tuple[float, ...], ...]:
-    lists = (lens.radial, lens.denominator, lens.tangential, lens.thin_prism)
-    return tuple(_without_zeros(each) for each in lists)
-
-
-def _without_zeros(values: Sequence[float]) -> tuple[float, ...]:
+def without_zeros(values: Sequence[float]) -> tuple[float, ...]:
+    """Return the values up to the last that is not zero."""
     last = max((i for i, value in enumerate(values) if value != 0.0), default=-1)
     return tuple(values[: last + 1])
-
-
-def _are_close(one: Sequence[float], other: Sequence[float]) -> bool:
-    return len(one) == len(other) and bool(
-        np.allclose(np.array(one, float), np.array(other, float), rtol=TOLERANCE, atol=0.0)
-    )
 
 
 def read_xml(path: Path, stream: IO[bytes] | None = None) -> Element:
@@ -213,6 +210,15 @@ def load_json(path: Path) -> Any:
         raise InputError(
             f"{path}: the JSON is damaged or cut off ({error}); copy it again from the project."
         ) from error
+
+
+def write_new(folder: Path, contents: Mapping[str, bytes]) -> None:
+    """Write files into a folder, made if need be; none where one of them exists."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in contents:
+        check_output(folder / name, overwrite=False)
+    for name, data in contents.items():
+        write_bytes(folder / name, data, overwrite=False)
 
 
 def mapping(path: Path, where: str, value: Any) -> dict[str, Any]:

@@ -51,7 +51,7 @@ class Part(NamedTuple):
     names: list[str]
     rows: FloatArray
     points: tracks.PointList
-    fixed: FloatArray | None
+    fixed: tuple[float, ...] | None
 
     @property
     def posed(self) -> IntArray:
@@ -68,19 +68,18 @@ def read(source: Source) -> Cameras:
     """Read the poses and lenses of the largest model."""
     parts = _parts(source.path)
     part, notes = _largest(parts)
-    posed = part.posed
-    labels = tuple(part.names[i] for i in posed)
-    poses = [_pose(part, i) for i in posed]
+    labels = tuple(part.names[i] for i in part.posed)
+    rotations, centres = zip(*(_pose(part, i) for i in part.posed), strict=True)
     lenses, more = _lenses(part, labels)
     taken = set(labels)
-    everything = (name for other in parts for name in other.names)
+    everything = dict.fromkeys(name for other in parts for name in other.names)
     return Cameras(
         labels=labels,
-        centres=np.array([centre for _, centre in poses]),
-        rotations=np.array([rotation for rotation, _ in poses]),
+        centres=np.array(centres),
+        rotations=np.array(rotations),
         lenses=lenses,
         notes=(*notes, *more),
-        unposed=tuple(dict.fromkeys(name for name in everything if name not in taken)),
+        unposed=tuple(name for name in everything if name not in taken),
         source="VisualSFM",
     )
 
@@ -88,14 +87,9 @@ def read(source: Source) -> Cameras:
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the points of the largest model and where the images saw them."""
     part, _ = _largest(_parts(source.path))
-    points = part.points
-    if not len(points.image) or cameras.lenses is None:
+    if not len(part.points.image) or cameras.lenses is None:
         raise InputError(f"{source.path}: has no points; no tie points.")
-    row = np.full(len(part.rows), -1)
-    row[part.posed] = np.arange(len(cameras))
-    camera = row[points.image]
-    middle = np.array([[lens.principal_x, lens.principal_y] for lens in cameras.lenses])
-    return tracks.tie_points(points.xyz, points.point, camera, middle[camera] + _placed(part)[0])
+    return tracks.from_principal_point(part.points, part.posed, cameras, _placed(part)[0])
 
 
 def _parts(path: Path) -> list[Part]:
@@ -135,7 +129,7 @@ def _count(path: Path, lines: list[str], at: int, what: str) -> int:
     return int(text)
 
 
-def _fixed(path: Path, text: str) -> FloatArray | None:
+def _fixed(path: Path, text: str) -> tuple[float, ...] | None:
     """Return fx, cx, fy, cy of the first line."""
     found = _FIXED.match(text)
     if found is None:
@@ -143,7 +137,7 @@ def _fixed(path: Path, text: str) -> FloatArray | None:
     values = tracks.numbers(path, found[1])
     if len(values) < 4 or not (np.isfinite(values).all() and (values[:4] > 0.0).all()):
         raise InputError(f"{path}: line 1: FixedK must be followed by positive fx, cx, fy and cy.")
-    return values[:4]
+    return tuple(values[:4].tolist())
 
 
 def _cameras(path: Path, lines: list[str], width: int) -> tuple[list[str], FloatArray]:
@@ -199,8 +193,7 @@ def _lenses(part: Part, labels: tuple[str, ...]) -> tuple[tuple[Lens, ...] | Non
         return None, notes
     lenses = []
     for label, row, (w, h) in zip(labels, rows.tolist(), frames.tolist(), strict=True):
-        fixed = (row[0], w / 2.0, row[0], h / 2.0) if part.fixed is None else part.fixed.tolist()
-        fx, cx, fy, cy = fixed
+        fx, cx, fy, cy = (row[0], w / 2.0, row[0], h / 2.0) if part.fixed is None else part.fixed
         lens = Lens(fy, w, h, cx, cy, b1=fx - fy, radial=(row[-2],), inverse=True)
         lenses.append(checks.lens(part.path, f"of image {label}", lens))
     return tuple(lenses), notes
@@ -211,7 +204,7 @@ def _placed(part: Part) -> tuple[FloatArray, FloatArray]:
     image, seen = part.points.image, part.points.rest[:, 1:].copy()
     least = np.zeros((len(part.rows), 2))
     if part.fixed is not None:
-        least[:] = 2.0 * part.fixed[[1, 3]]
+        least[:] = 2.0 * np.array(part.fixed[1::2])
     elif _from_corner(part):
         expected = _expected(part)
         for focal in np.unique(part.rows[part.posed, 0]):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.model import FloatArray, IntArray, TiePoints, Views
+from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, TiePoints, Views
 
 _BEFORE_VIEWS = 7
 """Numbers of a point before its views: x, y, z, red, green, blue, count of views."""
@@ -67,17 +67,17 @@ def point_list(path: Path, body: FloatArray, count: int, images: int, width: int
 
 def _starts(path: Path, body: FloatArray, count: int, width: int) -> tuple[IntArray, IntArray]:
     """Return where each point begins, and how many views it has."""
-    first, views, at = [], [], 0
+    first, views = np.empty((2, count), np.int64)
+    at = 0
     for i in range(count):
         n = float(body[at + _BEFORE_VIEWS - 1]) if at + _BEFORE_VIEWS <= len(body) else 0.5
         if n < 0 or not n.is_integer() or at + _BEFORE_VIEWS + width * n > len(body):
             raise InputError(
                 f"{path}: is cut off or damaged at point {i} of {count}; export it again."
             )
-        first.append(at)
-        views.append(int(n))
+        first[i], views[i] = at, int(n)
         at += _BEFORE_VIEWS + width * int(n)
-    return np.array(first, np.int64), np.array(views, np.int64)
+    return first, views
 
 
 def tie_points(xyz: FloatArray, point: IntArray, camera: IntArray, uv: FloatArray) -> TiePoints:
@@ -87,6 +87,29 @@ def tie_points(xyz: FloatArray, point: IntArray, camera: IntArray, uv: FloatArra
     counts = np.bincount(point[kept], minlength=len(xyz))
     start = np.concatenate([[0], np.cumsum(counts)])
     return TiePoints(xyz, Views(start, camera[kept]), uv[kept])
+
+
+def from_principal_point(
+    points: PointList, posed: IntArray, cameras: Cameras, places: FloatArray
+) -> TiePoints:
+    """Gather views by point; `places` are from the principal points, `posed` rows of the images."""
+    row = np.full(max(posed.max(), points.image.max(initial=0)) + 1, -1)
+    row[posed] = np.arange(len(cameras))
+    camera = row[points.image]
+    lenses = cameras.lenses or ()
+    middle = np.array([[lens.principal_x, lens.principal_y] for lens in lenses])
+    return tie_points(points.xyz, points.point, camera, middle[camera] + places)
+
+
+NO_TIE_POINTS = TiePoints(
+    np.empty((0, 3)), Views(np.zeros(1, np.int64), np.empty(0, np.int64)), np.empty((0, 2))
+)
+
+
+def are_seen(tie_points: TiePoints) -> BoolArray:
+    """Return which points have a position and a view."""
+    seen = np.diff(tie_points.views.start) > 0
+    return np.asarray(np.isfinite(tie_points.xyz).all(axis=1) & seen)
 
 
 _SAME_CAMERA = 1.1
@@ -125,22 +148,13 @@ def frame_sizes(
 
 def _bounds(focal_px: FloatArray, smallest_px: FloatArray) -> FloatArray:
     """Return for each image the bound of all images of about its focal length."""
+    order = np.argsort(focal_px)
+    steps = focal_px[order][1:] > _SAME_CAMERA * focal_px[order][:-1]
     bounds = np.empty_like(smallest_px)
-    group = _same_camera(focal_px)
-    for i in range(int(group.max()) + 1):
-        members = group == i
+    for members in np.split(order, np.flatnonzero(steps) + 1):
         bound = smallest_px[members].max(axis=0)
         bounds[members] = bound if bound.all() else smallest_px.max(axis=0)
     return bounds
-
-
-def _same_camera(focal_px: FloatArray) -> IntArray:
-    """Return a number for each image, the same for those of neighbouring focal lengths."""
-    order = np.argsort(focal_px)
-    steps = focal_px[order][1:] > _SAME_CAMERA * focal_px[order][:-1]
-    group = np.empty(len(order), np.int64)
-    group[order] = np.concatenate([[0], np.cumsum(steps)])
-    return group
 
 
 def image_size(folder: Path, name: str) -> tuple[int, int] | None:

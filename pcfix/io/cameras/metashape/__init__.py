@@ -27,9 +27,12 @@ References: "Agisoft Metashape User Manual, Professional Edition", appendix "Cam
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 from xml.etree.ElementTree import Element
+from zipfile import ZipFile
 
 import numpy as np
 
@@ -37,8 +40,8 @@ from pcfix.errors import InputError
 from pcfix.io.cameras.checks import number, numbers
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import documents
-from pcfix.io.cameras.metashape.block import Block, Image, read_block
-from pcfix.io.cameras.metashape.documents import Archive, Chunk, Document, opened
+from pcfix.io.cameras.metashape.block import Block, read_block
+from pcfix.io.cameras.metashape.documents import Chunk, Document, opened, read_entry, recognises
 from pcfix.io.cameras.metashape.sensors import read_calibration
 from pcfix.io.cameras.tracks import tie_points as gathered
 from pcfix.io.crs import is_local, parse_crs
@@ -48,28 +51,12 @@ from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, TiePoints
 __all__ = ["read", "read_calibration", "recognises", "tie_points"]
 
 
-def recognises(source: Source) -> bool:
-    """Whether it is a document with a chunk, or a project that holds one."""
-    return documents.recognises(source)
-
-
 def read(source: Source) -> Cameras:
     """Read the aligned images of a chunk: geocentric, or in a ``local`` frame."""
     chunk = documents.open_chunk(source.path)
     block = read_block(chunk)
     gnss, notes = gnss_positions(chunk, block)
-    return Cameras(
-        labels=tuple(image.label for image in block.images),
-        centres=block.centres,
-        rotations=block.rotations,
-        lenses=block.lenses,
-        crs=block.world.crs,
-        project_crs=block.world.project_crs,
-        gnss=gnss,
-        unposed=block.unposed,
-        notes=(*chunk.notes, *block.notes, *notes),
-        source=chunk.software,
-    )
+    return replace(block.cameras, gnss=gnss, notes=(*chunk.notes, *block.cameras.notes, *notes))
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
@@ -79,7 +66,27 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     that Metashape itself computed are left out.
     """
     chunk = documents.open_chunk(source.path)
-    return read_ties(chunk, read_block(chunk), len(cameras))
+    block = read_block(chunk)
+    if len(block.images) != len(cameras):
+        raise InputError(
+            f"{chunk.path}: has {len(block.images)} aligned images, but the cameras are"
+            f" {len(cameras)}; read the cameras from the same file."
+        )
+    first = chunk.element.find("frames/frame")
+    frame = None if first is None else chunk.document.follow(first)
+    seen = [] if frame is None else [*_tie_points(frame, block), _markers(frame, block)]
+    if not any(len(part.point) for part in seen):
+        raise InputError(
+            f"{chunk.path}: has neither tie points nor markers that were measured in aligned"
+            " images; give the project (.psx with its .files folder), or export the markers."
+        )
+    before = np.cumsum([0, *(len(part.xyz) for part in seen)])
+    return gathered(
+        np.vstack([part.xyz for part in seen]),
+        np.concatenate([part.point + n for part, n in zip(seen, before, strict=False)]),
+        np.concatenate([part.camera for part in seen]),
+        np.vstack([part.uv for part in seen]),
+    )
 
 
 Spreads: TypeAlias = tuple[tuple[str, tuple[int, ...]], ...]
@@ -107,47 +114,35 @@ def gnss_positions(chunk: Chunk, block: Block) -> tuple[GnssPositions | None, tu
     given = [image.element.find("reference") for image in block.images]
     ticked = [None if r is None or r.get("enabled") == "false" else r for r in given]
     used = given if all(reference is None for reference in ticked) else ticked
-    xyz = np.array([_xyz(path, i, r) for i, r in zip(block.images, used, strict=True)])
+    stated = [{} if reference is None else reference.attrib for reference in used]
+    places = [f"image {image.label}, reference" for image in block.images]
+    xyz = np.array(
+        [
+            [number(path, where, given[axis]) if axis in given else np.nan for axis in "xyz"]
+            for where, given in zip(places, stated, strict=True)
+        ]
+    )
     if not np.isfinite(xyz[:, :2]).all(axis=1).any():
         return None, ()
-    start = _defaults(path, chunk.element)
-    rows = [_sigma(path, i, r, start) for i, r in zip(block.images, used, strict=True)]
-    sigma = np.where(np.isfinite(xyz), np.array(rows), np.nan)
+    settings = {
+        (entry.get("name") or "").replace("/", "_"): entry.get("value") or ""
+        for entry in chunk.element.iterfind("settings/property")
+    }
+    nothing = np.full(3, np.nan)
+    start = _sigma(path, "settings of the chunk", settings, DEFAULTS, nothing)
+    rows = [_sigma(path, *row, SPREADS, start) for row in zip(places, stated, strict=True)]
+    sigma = np.where(np.isfinite(xyz) & (np.array(rows) > 0.0), np.array(rows), np.nan)
     crs, notes = _crs(path, chunk.element, xyz)
     return GnssPositions(xyz, sigma, crs), (*notes, *_antenna_notes(path, block))
 
 
-def _xyz(path: Path, image: Image, reference: Element | None) -> list[float]:
-    if reference is None:
-        return [np.nan] * 3
-    where = f"image {image.label}, reference"
-    words = (reference.get(axis) for axis in "xyz")
-    return [np.nan if word is None else number(path, where, word) for word in words]
-
-
-def _sigma(path: Path, image: Image, reference: Element | None, start: FloatArray) -> FloatArray:
-    """Return the stated standard deviations, from the widest statement to the narrowest."""
-    stated = {} if reference is None else reference.attrib
-    sigma = _stated(path, f"image {image.label}, reference", stated, SPREADS, start)
-    return np.where(sigma > 0.0, sigma, np.nan)
-
-
-def _defaults(path: Path, chunk: Element) -> FloatArray:
-    """Return what the settings of the chunk state for every camera."""
-    settings = {
-        (entry.get("name") or "").replace("/", "_"): entry.get("value") or ""
-        for entry in chunk.iterfind("settings/property")
-    }
-    return _stated(path, "settings of the chunk", settings, DEFAULTS, np.full(3, np.nan))
-
-
-def _stated(
-    path: Path, where: str, given: dict[str, str], spreads: Spreads, start: FloatArray
+def _sigma(
+    path: Path, where: str, stated: dict[str, str], spreads: Spreads, start: FloatArray
 ) -> FloatArray:
-    """Return `start` with what is given: one number for its axes, or one for each."""
+    """Return `start` with what is stated, the widest first: one number for its axes, or each."""
     sigma = start.copy()
     for name, axes in spreads:
-        if text := given.get(name):
+        if text := stated.get(name):
             count = 1 if len(text.split()) == 1 else len(axes)
             sigma[list(axes)] = numbers(path, f"{where}, {name}", text, count)
     return sigma
@@ -169,25 +164,21 @@ def _crs(path: Path, chunk: Element, xyz: FloatArray) -> tuple[str, tuple[str, .
 
 
 def _antenna_notes(path: Path, block: Block) -> tuple[str, ...]:
-    found = {id(image.sensor): image.sensor for image in block.images}
-    return tuple(
-        f"{path}: sensor {sensor.get('label')}: its GNSS antenna has an offset from the camera; the"
-        " GNSS positions are those of the antenna."
-        for sensor in found.values()
-        if sensor is not None and _has_antenna_offset(path, sensor)
-    )
-
-
-def _has_antenna_offset(path: Path, sensor: Element) -> bool:
-    antenna = sensor.find("antenna")
-    if antenna is None:
-        return False
-    reference = antenna.find("reference")
-    words = (antenna.findtext("location") or "").split()
-    if reference is not None:
-        words += [reference.get(axis) or "0" for axis in "xyz"]
-        words += (reference.get("location") or "").split()
-    return any(number(path, "GNSS antenna", word) != 0.0 for word in words)
+    notes = []
+    for sensor in dict.fromkeys(image.sensor for image in block.images):
+        antenna = None if sensor is None else sensor.find("antenna")
+        if sensor is None or antenna is None:
+            continue
+        words = (antenna.findtext("location") or "").split()
+        if (reference := antenna.find("reference")) is not None:
+            words += [reference.get(axis) or "0" for axis in "xyz"]
+            words += (reference.get("location") or "").split()
+        if any(number(path, "GNSS antenna", word) != 0.0 for word in words):
+            notes.append(
+                f"{path}: sensor {sensor.get('label')}: its GNSS antenna has an offset from the"
+                " camera; the GNSS positions are those of the antenna."
+            )
+    return tuple(notes)
 
 
 POINTS = ("x", "y", "z", "id")
@@ -203,68 +194,30 @@ class Seen(NamedTuple):
     uv: FloatArray
 
 
-NOTHING = Seen(np.empty((0, 3)), np.empty(0, int), np.empty(0, int), np.empty((0, 2)))
-
-
-def read_ties(chunk: Chunk, block: Block, count: int) -> TiePoints:
-    """Read what the first frame of a chunk has; see `pcfix.io.cameras.metashape.tie_points`."""
-    if len(block.images) != count:
-        raise InputError(
-            f"{chunk.path}: has {len(block.images)} aligned images, but the cameras are {count};"
-            " read the cameras from the same file."
-        )
-    frames = chunk.element.find("frames/frame")
-    seen = NOTHING
-    if frames is not None:
-        frame = chunk.document.follow(frames)
-        seen = _joined(_tie_points(frame, block), _markers(frame, block))
-    if not len(seen.point):
-        raise InputError(
-            f"{chunk.path}: has neither tie points nor markers that were measured in aligned"
-            " images; give the project (.psx with its .files folder), or export the markers."
-        )
-    return gathered(*seen)
-
-
-def _joined(one: Seen, other: Seen) -> Seen:
-    return Seen(
-        np.vstack([one.xyz, other.xyz]),
-        np.concatenate([one.point, other.point + len(one.xyz)]),
-        np.concatenate([one.camera, other.camera]),
-        np.vstack([one.uv, other.uv]),
-    )
-
-
-def _tie_points(frame: Document, block: Block) -> Seen:
-    """Return the points of every component that has a place; their archive may be left out."""
-    for element in (*frame.root.iterfind("point_cloud"), *frame.root.iterfind("tie_points")):
-        if not frame.leads_to_a_file(element):
-            continue
-        document = frame.follow(element)
-        if document.root.find("projections") is not None:
-            with opened(document.path) as archive:
-                return _from_archive(archive, document.root, block)
-    return NOTHING
-
-
-def _from_archive(archive: Archive, root: Element, block: Block) -> Seen:
-    files = {p.get("camera_id") or "": p.get("path") or "" for p in root.iterfind("projections")}
-    seen = NOTHING
-    for points in root.iterfind("points"):
-        component = points.get("component_id")
-        rows = [
-            i
-            for i, image in enumerate(block.images)
-            if image.id in files
-            and (component == image.component or None in (component, image.component))
-        ]
-        if rows:
-            seen = _joined(seen, _component(archive, points.get("path") or "", rows, files, block))
-    return seen
+def _tie_points(frame: Document, block: Block) -> Iterator[Seen]:
+    """Yield the points of every component that has a place; their archive may be left out."""
+    clouds = (*frame.root.iterfind("point_cloud"), *frame.root.iterfind("tie_points"))
+    found = (frame.follow(cloud) for cloud in clouds if frame.leads_to_a_file(cloud))
+    document = next((d for d in found if d.root.find("projections") is not None), None)
+    if document is None:
+        return
+    listed = document.root.iterfind("projections")
+    files = {entry.get("camera_id") or "": entry.get("path") or "" for entry in listed}
+    with opened(document.path) as archive:
+        for points in document.root.iterfind("points"):
+            component = points.get("component_id")
+            rows = [
+                i
+                for i, image in enumerate(block.images)
+                if image.id in files
+                and (component == image.component or None in (component, image.component))
+            ]
+            if rows:
+                yield _component(archive, points.get("path") or "", rows, files, block)
 
 
 def _component(
-    archive: Archive, points: str, rows: list[int], files: dict[str, str], block: Block
+    archive: ZipFile, points: str, rows: list[int], files: dict[str, str], block: Block
 ) -> Seen:
     """Return the points of one component and where the images in `rows` saw them."""
     vertices = _vertices(archive, points, POINTS)
@@ -284,9 +237,9 @@ def _component(
     return Seen(xyz, np.concatenate(point), np.concatenate(camera), np.concatenate(uv))
 
 
-def _vertices(archive: Archive, name: str, needed: tuple[str, ...]) -> np.ndarray:
+def _vertices(archive: ZipFile, name: str, needed: tuple[str, ...]) -> np.ndarray:
     """Return the vertices of a binary PLY in an archive, with the properties that are needed."""
-    where, data = f"{archive.path}: {name}", archive.read(name)
+    where, data = f"{archive.filename}: {name}", read_entry(archive, name)
     header = parse_header(where, data)
     kinds = [(p.name, header.order + p.item) for p in header.properties if not p.length]
     if not header.order or header.skipped or len({*kinds}) < len(header.properties):
@@ -303,7 +256,7 @@ def _vertices(archive: Archive, name: str, needed: tuple[str, ...]) -> np.ndarra
         )
     vertices = np.frombuffer(data, kind, header.vertices, header.end)
     if vertices["id"].dtype.kind not in "iu":
-        raise InputError(f"{archive.path}: the id of {name} is not a whole number.")
+        raise InputError(f"{archive.filename}: the id of {name} is not a whole number.")
     return vertices
 
 
@@ -313,17 +266,16 @@ def _markers(frame: Document, block: Block) -> Seen:
     point, camera, uv = [], [], []
     count = 0
     for marker in frame.root.iterfind("markers//marker"):
-        marks = [
-            m
-            for m in marker.iterfind("location")
-            if "false" not in (m.get("pinned"), m.get("valid")) and m.get("camera_id") in row_of
-        ]
-        for mark in marks:
+        before = len(point)
+        for mark in marker.iterfind("location"):
+            row = row_of.get(mark.get("camera_id") or "")
+            if row is None or "false" in (mark.get("pinned"), mark.get("valid")):
+                continue
             where = f"marker {marker.get('marker_id')}, camera {mark.get('camera_id')}"
             point.append(count)
-            camera.append(row_of[mark.get("camera_id") or ""])
+            camera.append(row)
             uv.append([number(frame.path, where, mark.get(axis)) for axis in "xy"])
-        count += bool(marks)
+        count += len(point) > before
     return Seen(
         np.full((count, 3), np.nan),
         np.array(point, dtype=np.int64),

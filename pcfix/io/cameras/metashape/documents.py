@@ -70,13 +70,14 @@ def recognises(source: Source) -> bool:
         return "project.zip" in source.names
     text = source.text
     if source.head.startswith(ZIP_MAGIC):
-        text = head_of_document(source.path, len(source.head)).decode("utf-8", errors="replace")
+        try:
+            with zipfile.ZipFile(source.path) as archive, archive.open("doc.xml") as stream:
+                text = stream.read(len(source.head)).decode("utf-8", errors="replace")
+        except (*DAMAGES, KeyError):
+            return False
     root = ROOT.match(text)
-    return (
-        root is not None
-        and root[1] in INSIDE
-        and INSIDE[root[1]].search(text, root.end()) is not None
-    )
+    inside = INSIDE.get(root[1]) if root else None
+    return bool(root and inside and inside.search(text, root.end()))
 
 
 def open_chunk(path: Path) -> Chunk:
@@ -90,8 +91,14 @@ def open_chunk(path: Path) -> Chunk:
     chunks = top.root.find("chunks")
     active = None if chunks is None else chunks.get("active_id")
     candidates.sort(key=lambda chunk: chunk.get("id") != active)
-    chosen, others = _choose(top, candidates)
-    return Chunk(path, chosen, _software(chosen.root, top.root), _chunk_notes(path, chosen, others))
+    chosen, *others = _with_poses(top, candidates)
+    name, *names = (each.root.get("label") or "without a name" for each in (chosen, *others))
+    note = (
+        f"{path}: {len(others) + 1} chunks have aligned images; read is {name}, not"
+        f" {', '.join(names[:10])}{', ...' if len(names) > 10 else ''}: make another chunk the"
+        " active one, or export its cameras, to read that."
+    )
+    return Chunk(path, chosen, _software(chosen.root, top.root), (note,) if others else ())
 
 
 def _top(path: Path) -> Document:
@@ -110,11 +117,11 @@ def _top(path: Path) -> Document:
 
 def _from_archive(path: Path) -> Document:
     with opened(path) as archive:
-        return Document(archive.document(), path)
+        return Document(read_xml(path, io.BytesIO(read_entry(archive, "doc.xml"))), path)
 
 
-def _choose(top: Document, candidates: list[Element]) -> tuple[Document, list[str]]:
-    """Return the first chunk with poses, and the labels of the others that have some."""
+def _with_poses(top: Document, candidates: list[Element]) -> list[Document]:
+    """Return the chunks with poses, or the first where none has some."""
     posed: list[Document] = []
     empty: list[Document] = []
     missing: list[InputError] = []
@@ -124,40 +131,19 @@ def _choose(top: Document, candidates: list[Element]) -> tuple[Document, list[st
         except InputError as error:
             missing.append(error)
             continue
-        has_poses = any(
-            c.find("transform") is not None for c in chunk.root.iterfind("cameras//camera")
-        )
-        (posed if has_poses else empty).append(chunk)
+        cameras = chunk.root.iterfind("cameras//camera")
+        (posed if any(c.find("transform") is not None for c in cameras) else empty).append(chunk)
     if not posed and missing:
         raise missing[0]
-    first, *others = posed or empty[:1]
-    return first, [_label(other.root) for other in others]
-
-
-def _label(chunk: Element) -> str:
-    return chunk.get("label") or "without a name"
-
-
-def _chunk_notes(path: Path, chosen: Document, others: list[str]) -> tuple[str, ...]:
-    if not others:
-        return ()
-    return (
-        f"{path}: {len(others) + 1} chunks have aligned images; read is {_label(chosen.root)}, not"
-        f" {', '.join(others[:10])}{', ...' if len(others) > 10 else ''}: make another chunk the"
-        " active one, or export its cameras, to read that.",
-    )
+    return posed or empty[:1]
 
 
 def _software(chunk: Element, top: Element) -> str:
     """Return program and version, or that of the document where the file names no program."""
-    about = {
-        entry.get("name"): entry.get("value", "")
-        for element in (top, chunk)
-        for entry in element.iterfind("meta/property")
-    }
-    version = about.get("Info/LastSavedSoftwareVersion") or about.get(
-        "Info/OriginalSoftwareVersion"
-    )
+    entries = (*top.iterfind("meta/property"), *chunk.iterfind("meta/property"))
+    about = {entry.get("name"): entry.get("value", "") for entry in entries}
+    version = about.get("Info/LastSavedSoftwareVersion")
+    version = version or about.get("Info/OriginalSoftwareVersion")
     if version:
         return f"{about.get('Info/OriginalSoftwareName') or 'Agisoft Metashape'} {version}"
     document = top.get("version") or chunk.get("version")
@@ -176,59 +162,34 @@ DAMAGES = (
 )
 
 
-class Archive:
-    """An open zip; `path` is for messages."""
-
-    def __init__(self, path: Path, opened: zipfile.ZipFile) -> None:
-        self.path = path
-        self._zip = opened
-        self._names = frozenset(opened.namelist())
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._names
-
-    def read(self, name: str) -> bytes:
-        """Return the content of an entry."""
-        if name not in self._names:
-            raise InputError(
-                f"{self.path}: has no {name}; the project is incomplete, save it again."
-            )
-        entry = self._zip.getinfo(name)
-        if entry.file_size > min(MOST_BYTES, FREE_BYTES + MOST_RATIO * entry.compress_size):
-            raise InputError(
-                f"{self.path}: {name} would unpack to {entry.file_size / 1e6:.0f} MB from"
-                f" {entry.compress_size / 1e6:.3f} MB, which no project does; it is not read."
-            )
-        with _damage(self.path):
-            return self._zip.read(name)
-
-    def document(self) -> Element:
-        """Return the root of the document that every archive of a project has."""
-        return read_xml(self.path, io.BytesIO(self.read("doc.xml")))
-
-
 @contextmanager
-def opened(path: Path) -> Iterator[Archive]:
+def opened(path: Path) -> Iterator[zipfile.ZipFile]:
     """Open an archive."""
     if not path.is_file():
         raise InputError(f"{path}: is missing; keep all files of the project together.")
     with _damage(path):
         archive = zipfile.ZipFile(path)
     with archive:
-        yield Archive(path, archive)
+        yield archive
 
 
-def head_of_document(path: Path, count: int) -> bytes:
-    """Return the first bytes of ``doc.xml`` of a zip, or nothing where there is none."""
-    try:
-        with zipfile.ZipFile(path) as archive, archive.open("doc.xml") as stream:
-            return stream.read(count)
-    except (*DAMAGES, KeyError):
-        return b""
+def read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
+    """Return the content of an entry, unless it is made to burst."""
+    path = archive.filename
+    if name not in archive.NameToInfo:
+        raise InputError(f"{path}: has no {name}; the project is incomplete, save it again.")
+    entry = archive.getinfo(name)
+    if entry.file_size > min(MOST_BYTES, FREE_BYTES + MOST_RATIO * entry.compress_size):
+        raise InputError(
+            f"{path}: {name} would unpack to {entry.file_size / 1e6:.0f} MB from"
+            f" {entry.compress_size / 1e6:.3f} MB, which no project does; it is not read."
+        )
+    with _damage(path):
+        return archive.read(name)
 
 
 @contextmanager
-def _damage(path: Path) -> Iterator[None]:
+def _damage(path: Path | str | None) -> Iterator[None]:
     try:
         yield
     except DAMAGES as error:

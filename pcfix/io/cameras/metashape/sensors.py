@@ -14,6 +14,7 @@ document is not.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -22,7 +23,7 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import number, numbers, read_xml
+from pcfix.io.cameras.checks import number, numbers, read_xml, without_zeros
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import documents
 from pcfix.model import FloatArray, Lens, Projection
@@ -41,13 +42,7 @@ _OFF = ("", "0", "false", "disabled", "none")
 
 
 def read_calibration(path: Path) -> Lens:
-    """Read a calibration that Metashape saved on its own (root element ``calibration``).
-
-    Returns
-    -------
-    Lens
-        In pixels.
-    """
+    """Read a calibration that Metashape saved on its own (root element ``calibration``), pixels."""
     root = read_xml(path)
     if root.tag != "calibration":
         raise InputError(
@@ -61,10 +56,10 @@ def read_calibration(path: Path) -> Lens:
             f" {', '.join(PROJECTIONS)}."
         )
     width, height = (number(path, side, root.findtext(side)) for side in ("width", "height"))
-    return lens_of_calibration(path, path.stem, kind, root, (width, height))
+    return _lens_of_calibration(path, path.stem, kind, root, (width, height))
 
 
-def lens_of_calibration(
+def _lens_of_calibration(
     path: Path, sensor: str, kind: str, calibration: Element, size: tuple[float, float]
 ) -> Lens:
     """Return the lens of a calibration of a known kind, for an image of a size in pixels."""
@@ -77,53 +72,23 @@ def lens_of_calibration(
         raise InputError(
             f"{path}: sensor {sensor}: its calibration has no focal length (f); export it again."
         )
-    numbers = _old(given, size) if "f" not in given else _new(given, size)
-    radial = _short([given.get(name, 0.0) for name in RADIAL])
-    found = Lens(
-        focal=numbers["focal"],
-        width=size[0],
-        height=size[1],
-        principal_x=numbers["x"],
-        principal_y=numbers["y"],
-        b1=numbers["b1"],
-        b2=numbers["b2"],
+    value = defaultdict(float, given)
+    width, height = size
+    if "f" in given:
+        focal, x, y = value["f"], width / 2.0 + value["cx"], height / 2.0 + value["cy"]
+        b1, b2, p1, p2 = (value[name] for name in ("b1", "b2", "p1", "p2"))
+    else:
+        focal = given.get("fy", value["fx"])
+        x, y = given.get("cx", width / 2.0), given.get("cy", height / 2.0)
+        b1, b2, p1, p2 = given.get("fx", focal) - focal, value["skew"], value["p2"], value["p1"]
+    lens = Lens(
+        *(focal, width, height, x, y, b1, b2),
         projection=PROJECTIONS[kind],
-        radial=radial,
-        tangential=_short(
-            [numbers["p1"], numbers["p2"], given.get("p3", 0.0), given.get("p4", 0.0)]
-        ),
+        radial=without_zeros([value[name] for name in RADIAL]),
+        tangential=without_zeros([p1, p2, value["p3"], value["p4"]]),
         sensor=sensor,
     )
-    return checks.lens(path, sensor, found)
-
-
-def _new(given: dict[str, float], size: tuple[float, float]) -> dict[str, float]:
-    return {
-        "focal": given["f"],
-        "x": size[0] / 2.0 + given.get("cx", 0.0),
-        "y": size[1] / 2.0 + given.get("cy", 0.0),
-        **{name: given.get(name, 0.0) for name in ("b1", "b2", "p1", "p2")},
-    }
-
-
-def _old(given: dict[str, float], size: tuple[float, float]) -> dict[str, float]:
-    focal = given.get("fy", given.get("fx", 0.0))
-    return {
-        "focal": focal,
-        "x": given.get("cx", size[0] / 2.0),
-        "y": given.get("cy", size[1] / 2.0),
-        "b1": given.get("fx", focal) - focal,
-        "b2": given.get("skew", 0.0),
-        "p1": given.get("p2", 0.0),
-        "p2": given.get("p1", 0.0),
-    }
-
-
-def _short(values: list[float]) -> tuple[float, ...]:
-    """Return the values up to the last that is not zero."""
-    while values and values[-1] == 0.0:
-        values = values[:-1]
-    return tuple(values)
+    return checks.lens(path, sensor, lens)
 
 
 def name_of(sensor: Element) -> str:
@@ -144,18 +109,33 @@ def is_central(sensor: Element) -> bool:
 
 def lens_of(path: Path, sensor: Element, image: str) -> Lens:
     """Return the adjusted calibration of a sensor, else the initial one, else its data sheet."""
-    label = name_of(sensor)
+    label, kind = name_of(sensor), kind_of(sensor)
     found = _calibration(sensor)
-    if found is None:
-        return _nominal(path, sensor, image)
-    size = _resolution(path, label, found) or _resolution(path, label, sensor)
-    if size is None:
+    size = None if found is None else _resolution(path, label, found)
+    size = size or _resolution(path, label, sensor)
+    pixel_mm = _property(path, sensor, "pixel_width")
+    if found is not None:
+        if size is None:
+            raise InputError(
+                f"{path}: image {image}: its sensor {label} has no resolution; export the cameras"
+                " again."
+            )
+        lens = _lens_of_calibration(path, label, kind, found, size)
+        return replace(lens, pixel_size_mm=pixel_mm)
+    focal_mm = _property(path, sensor, "focal_length")
+    if size is None or focal_mm is None or pixel_mm is None:
         raise InputError(
-            f"{path}: image {image}: its sensor {label} has no resolution; export the cameras"
-            " again."
+            f"{path}: image {image}: its sensor {label} has no calibration; align or optimise the"
+            " cameras in Metashape and export them again."
         )
-    lens = lens_of_calibration(path, label, kind_of(sensor), found, size)
-    return replace(lens, pixel_size_mm=_property(path, sensor, "pixel_width"))
+    width, height = size
+    lens = Lens(  # what Metashape itself starts from: the data sheet, no distortion
+        *(focal_mm / pixel_mm, width, height, width / 2.0, height / 2.0),
+        projection=PROJECTIONS[kind],
+        pixel_size_mm=pixel_mm,
+        sensor=label,
+    )
+    return checks.lens(path, label, lens)
 
 
 def offset_of(path: Path, sensor: Element) -> FloatArray:
@@ -187,10 +167,10 @@ def notes_on(path: Path, sensor: Element) -> tuple[str, ...]:
             f"{path}: sensor {label}: its additional corrections,"
             f" {np.sqrt((values**2).sum() / 2.0):.2f} px rms, are left out."
         )
-    properties = {p.get("name") or "": p.get("value") or "" for p in sensor.iterfind("property")}
     if any(
-        name.startswith("rolling_shutter") and value.lower() not in _OFF
-        for name, value in properties.items()
+        (entry.get("name") or "").startswith("rolling_shutter")
+        and (entry.get("value") or "").lower() not in _OFF
+        for entry in sensor.iterfind("property")
     ):
         notes.append(
             f"{path}: sensor {label}: its rolling shutter compensation is left out; each image"
@@ -215,30 +195,11 @@ def _resolution(path: Path, label: str, element: Element) -> tuple[float, float]
     return number(path, where, found.get("width")), number(path, where, found.get("height"))
 
 
-def _nominal(path: Path, sensor: Element, image: str) -> Lens:
-    """Return what Metashape itself starts from: the data sheet, no distortion."""
-    label = name_of(sensor)
-    size = _resolution(path, label, sensor)
-    focal_mm, pixel_mm = (_property(path, sensor, n) for n in ("focal_length", "pixel_width"))
-    if size is None or focal_mm is None or pixel_mm is None:
-        raise InputError(
-            f"{path}: image {image}: its sensor {label} has no calibration; align or optimise the"
-            " cameras in Metashape and export them again."
-        )
-    width, height = size
-    projection = PROJECTIONS[kind_of(sensor)]
-    lens = Lens(focal_mm / pixel_mm, width, height, width / 2.0, height / 2.0, sensor=label)
-    checks.lens(path, label, lens)
-    return replace(lens, projection=projection, pixel_size_mm=pixel_mm)
-
-
 def _property(path: Path, sensor: Element, name: str) -> float | None:
     """Return a positive property of a sensor, or None."""
-    for entry in sensor.iterfind("property"):
-        if entry.get("name") == name:
-            value = number(path, f"sensor {name_of(sensor)}, {name}", entry.get("value"))
-            return value if value > 0.0 else None
-    return None
+    text = next((p.get("value") for p in sensor.iterfind("property") if p.get("name") == name), "0")
+    value = number(path, f"sensor {name_of(sensor)}, {name}", text)
+    return value if value > 0.0 else None
 
 
 DISTORTION = ("k1", "k2", "k3", "p1", "p2")
@@ -250,19 +211,15 @@ def given_lenses(path: Path) -> dict[str, Lens]:
     The calibration of class ``initial`` counts if it has distortion. Without, it is the focal
     length that the images' EXIF states, which says little.
     """
-    source = Source(path, None, None)
-    if not documents.recognises(source):
+    if not documents.recognises(Source(path)):
         return {}
     found: dict[str, Lens] = {}
     for sensor in documents.open_chunk(path).element.iterfind("sensors/sensor"):
         given = [one for one in sensor.findall("calibration") if one.get("class") == "initial"]
-        size = None if not given else given[-1].find("resolution")
-        if size is None or kind_of(sensor) not in PROJECTIONS:
-            continue
-        if not any((given[-1].findtext(name) or "0").strip(" 0.-") for name in DISTORTION):
+        if not given or not is_central(sensor):
             continue
         label = name_of(sensor)
-        where = f"sensor {label}, resolution"
-        pixels = (number(path, where, size.get("width")), number(path, where, size.get("height")))
-        found[label] = lens_of_calibration(path, label, kind_of(sensor), given[-1], pixels)
+        size = _resolution(path, label, given[-1])
+        if size and any((given[-1].findtext(k) or "0").strip(" 0.-") for k in DISTORTION):
+            found[label] = _lens_of_calibration(path, label, kind_of(sensor), given[-1], size)
     return found
