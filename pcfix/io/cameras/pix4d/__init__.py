@@ -30,30 +30,11 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.formats import Source
-from pcfix.io.cameras.pix4d.files import (
-    EXTERNAL,
-    GEOGRAPHIC,
-    PARAMETERS,
-    Files,
-    find,
-    first_line,
-    holds_tables,
-    is_project,
-    read_observations,
-    read_project,
-    read_text,
-)
-from pcfix.io.cameras.pix4d.tables import (
-    Calibration,
-    Image,
-    lens_of_calibration,
-    lenses_of_images,
-    read_calibrations,
-    read_external,
-    read_offsets,
-    read_parameters,
-)
-from pcfix.model import Cameras, FloatArray, Lens, TiePoints
+from pcfix.io.cameras.pix4d import files as project
+from pcfix.io.cameras.pix4d import tables
+from pcfix.io.cameras.pix4d.files import EXTERNAL, GEOGRAPHIC, PARAMETERS, Files
+from pcfix.io.cameras.pix4d.files import read_observations as tie_points
+from pcfix.model import Cameras, FloatArray, Lens
 
 __all__ = ["read", "recognises", "tie_points"]
 
@@ -67,18 +48,42 @@ HEADERS = (
 def recognises(source: Source) -> bool:
     """Whether a file begins like one of the tables or a project, or a folder holds a table."""
     if source.path.is_dir():
-        return holds_tables(source.path)
-    return is_project(source) or first_line(source.text).lower().split() in HEADERS
+        return project.holds_tables(source.path)
+    return project.is_project(source) or project.first_line(source.text).lower().split() in HEADERS
 
 
 def read(source: Source) -> Cameras:
     """Read poses and lenses, in the CRS of the project."""
-    return read_block(source)
-
-
-def tie_points(source: Source, cameras: Cameras) -> TiePoints:
-    """Read the image measurements; only control points have coordinates."""
-    return read_observations(source, cameras)
+    files = project.find(source)
+    if not files.keys() & {"parameters", "external"}:
+        raise InputError(
+            f"{source.path}: has no {PARAMETERS} or {EXTERNAL} beside it; give the params folder"
+            f" of the project ({GEOGRAPHIC} alone does not suffice)."
+        )
+    calibrations = tables.read_calibrations(files["calibration"]) if "calibration" in files else []
+    if "parameters" in files:
+        images = tables.read_parameters(files["parameters"])
+        poses = _poses(files, images)
+        used = [images[row] for row in poses.rows]
+        lenses = tables.lenses_of_images(files["parameters"], used, calibrations)
+    else:
+        poses, lenses = _external_only(files, calibrations)
+    labels, posed = tuple(poses.labels), set(poses.labels)
+    gnss, others = (
+        project.read_project(files["project"], labels) if "project" in files else (None, ())
+    )
+    wkt = project.read_text(files["wkt"]).strip() if "wkt" in files else ""
+    return Cameras(
+        labels=labels,
+        centres=poses.centres,
+        rotations=poses.rotations,
+        lenses=lenses,
+        crs=checks.crs(files["wkt"], wkt) if wkt else None,
+        notes=(*poses.notes, *checks.repeated(source.path, labels)),
+        gnss=gnss,
+        unposed=tuple(dict.fromkeys(n for n in (*poses.unposed, *others) if n not in posed)),
+        source="Pix4D",
+    )
 
 
 AGREE_M = 0.01
@@ -96,80 +101,39 @@ class Poses(NamedTuple):
     notes: tuple[str, ...]
 
 
-def read_block(source: Source) -> Cameras:
-    """Read poses and lenses; see the docstring of the package."""
-    files = find(source)
-    if files is None or (files.parameters is None and files.external is None):
-        raise InputError(
-            f"{source.path}: has no {PARAMETERS} or {EXTERNAL} beside it; give the params folder"
-            f" of the project ({GEOGRAPHIC} alone does not suffice)."
-        )
-    calibrations = [] if files.calibration is None else read_calibrations(files.calibration)
-    if files.parameters is None:
-        poses, lenses = _external_only(files, calibrations)
-    else:
-        images = read_parameters(files.parameters)
-        poses = _poses(files, images)
-        used = [images[row] for row in poses.rows]
-        lenses = lenses_of_images(files.parameters, used, calibrations)
-    labels, posed = tuple(poses.labels), set(poses.labels)
-    gnss, others = (None, ()) if files.project is None else read_project(files.project, labels)
-    wkt = "" if files.wkt is None else read_text(files.wkt).strip()
-    return Cameras(
-        labels=labels,
-        centres=poses.centres,
-        rotations=poses.rotations,
-        lenses=lenses,
-        crs=checks.crs(files.wkt, wkt) if files.wkt and wkt else None,
-        notes=(*poses.notes, *checks.repeated(source.path, labels)),
-        gnss=gnss,
-        unposed=tuple(dict.fromkeys(n for n in (*poses.unposed, *others) if n not in posed)),
-        source="Pix4D",
-    )
-
-
 def _external_only(
-    files: Files, calibrations: list[Calibration]
+    files: Files, calibrations: list[tables.Calibration]
 ) -> tuple[Poses, tuple[Lens, ...] | None]:
     """Return the poses of the absolute table, with a lens where all images must share it."""
-    if files.external is None:
-        raise InputError("There is no table of exterior orientation.")
-    labels, centres, rotations = read_external(files.external)
+    labels, centres, rotations = tables.read_external(files["external"])
     lens = None
-    if files.calibration is not None and len(calibrations) == 1:
-        lens = lens_of_calibration(files.calibration, calibrations[0])
+    if len(calibrations) == 1:
+        lens = tables.lens_of_calibration(files["calibration"], calibrations[0])
     note = (
-        f"{files.external}: there is no {PARAMETERS} beside it that tells the lens of each image;"
-        " frames are taken as boundless."
+        f"{files['external']}: there is no {PARAMETERS} beside it that tells the lens of each"
+        " image; frames are taken as boundless."
     )
     poses = Poses(labels, centres, rotations, [], [], () if lens else (note,))
     return poses, None if lens is None else (lens,) * len(labels)
 
 
-def _poses(files: Files, images: list[Image]) -> Poses:
-    if files.parameters is None:
-        raise InputError("There are no camera parameters.")
+def _poses(files: Files, images: list[tables.Image]) -> Poses:
     labels = [image.label for image in images]
-    rotations = np.array(
-        [
-            checks.rotation(files.parameters, i.label, i.fields["rotation"].reshape(3, 3))
-            for i in images
-        ]
-    )
+    turns = [image.fields["rotation"].reshape(3, 3) for image in images]
+    rotations = checks.rotations(files["parameters"], labels, turns)
     centres, notes = _absolute(files, images)
-    if files.external is None:
+    if "external" not in files:
         return _those_known(labels, centres, rotations, notes)
-    names, there, turned = read_external(files.external)
+    names, there, turned = tables.read_external(files["external"])
     row_of = _matched(labels, rotations, names, turned)
     both = [i for i, row in enumerate(row_of) if row is not None]
     rows = [row for row in row_of if row is not None]
-    notes = _compared(files.external, centres[both], rotations[both], there[rows], turned[rows])
+    notes = _compared(files["external"], centres[both], rotations[both], there[rows], turned[rows])
     if notes:
         centres = np.full_like(centres, np.nan)
     centres[both], rotations[both] = there[rows], turned[rows]
     poses = _those_known(labels, centres, rotations, notes)
-    there_only = sorted(set(names) - set(labels))
-    return poses._replace(unposed=poses.unposed + there_only)
+    return poses._replace(unposed=poses.unposed + sorted(set(names) - set(labels)))
 
 
 def _those_known(
@@ -181,18 +145,18 @@ def _those_known(
     return Poses([labels[i] for i in rows], centres[known], rotations[known], rows, unposed, notes)
 
 
-def _absolute(files: Files, images: list[Image]) -> tuple[FloatArray, tuple[str, ...]]:
+def _absolute(files: Files, images: list[tables.Image]) -> tuple[FloatArray, tuple[str, ...]]:
     """Return the centres with the offset added; NaN where several offsets name no such image."""
     local = np.array([image.fields["centre"] for image in images])
-    if files.offset is None and files.external is not None:
+    if "offset" not in files and "external" in files:
         return np.full_like(local, np.nan), ()
-    if files.offset is None:
+    if "offset" not in files:
         note = (
-            f"{files.parameters}: its positions are relative to an offset and there is no"
+            f"{files['parameters']}: its positions are relative to an offset and there is no"
             " offset.xyz beside it; add the offset to the cameras yourself."
         )
         return local, (note,)
-    offsets = read_offsets(files.offset)
+    offsets = tables.read_offsets(files["offset"])
     if len({values.tobytes() for _, values in offsets}) == 1:
         return local + offsets[0][1], ()
     added = np.full_like(local, np.nan)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePath, PureWindowsPath
-from typing import NamedTuple
+from typing import TypeAlias
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -21,22 +20,21 @@ from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TieP
 PARAMETERS = "calibrated_camera_parameters.txt"
 EXTERNAL = "calibrated_external_camera_parameters.txt"
 GEOGRAPHIC = "calibrated_external_camera_parameters_wgs84.txt"
-CALIBRATION = "pix4d_calibrated_internal_camera_parameters.cam"
 
 
-@dataclass(frozen=True)
-class Files:
-    """What there is of a project; None where there is no such file."""
-
-    parameters: Path | None
-    external: Path | None
-    calibration: Path | None
-    offset: Path | None
-    wkt: Path | None
-    bingo: Path | None
-    ties: Path | None
-    gcps: Path | None
-    project: Path | None
+NAMES = {
+    "parameters": PARAMETERS,
+    "external": EXTERNAL,
+    "calibration": "pix4d_calibrated_internal_camera_parameters.cam",
+    "offset": "offset.xyz",
+    "wkt": "wkt.prj",
+    "bingo": "tp_bingo.txt",
+    "ties": "tp_pix4d.txt",
+    "gcps": "measured_estimated_gcps_position.txt",
+}
+"""How a project calls its files, after its own name."""
+Files: TypeAlias = dict[str, Path]
+"""What there is of a project, by the names in `NAMES`, and ``project``."""
 
 
 def first_line(text: str) -> str:
@@ -61,54 +59,45 @@ def read_text(path: Path) -> str:
 def holds_tables(root: Path) -> bool:
     """Whether a folder, or one in which a project keeps its tables, holds one."""
     try:
-        return any(
-            _prefix(path.name, PARAMETERS, EXTERNAL) is not None
-            for folder in _folders(root)
-            for path in folder.iterdir()
-        )
+        return any(_prefixes(folder) for folder in _folders(root))
     except OSError:
         return False
 
 
-def find(source: Source) -> Files | None:
+def find(source: Source) -> Files:
     """Return the files of the project that a folder holds, or that a file belongs to."""
     path = source.path
     if is_project(source):
-        return _in_folders(path.with_suffix(""), path)
+        files = _in_folders(path.with_suffix(""))
+        return {**files, "project": path} if files else files
     if path.is_dir():
-        return _in_folders(path, None)
-    return _of_file(source)
-
-
-def _of_file(source: Source) -> Files:
-    """Return a table and what lies beside it under the same project name."""
-    path = source.path
-    prefix = _prefix(path.name, PARAMETERS, EXTERNAL, GEOGRAPHIC) or ""
-    files = _named(path.parent, prefix)
+        return _in_folders(path)
+    files = _named(path.parent, _prefix(path.name, PARAMETERS, EXTERNAL, GEOGRAPHIC) or "")
     columns = first_line(source.text).lower().split()
     if columns[:1] == ["filename"]:
-        return replace(files, parameters=path)
-    if columns[1:2] == ["x"]:
-        return replace(files, external=path)
+        files["parameters"] = path
+    elif columns[1:2] == ["x"]:
+        files["external"] = path
     return files
 
 
-def _in_folders(root: Path, project: Path | None) -> Files | None:
+def _in_folders(root: Path) -> Files:
     for folder in _folders(root):
-        prefixes = {
-            prefix
-            for path in folder.iterdir()
-            if (prefix := _prefix(path.name, PARAMETERS, EXTERNAL)) is not None
-        }
+        prefixes = _prefixes(folder)
         if len(prefixes) > 1:
             raise InputError(
                 f"{folder}: holds the tables of several projects"
                 f" ({', '.join(sorted(prefixes))}); give one of the files instead."
             )
         if prefixes:
-            files = _named(folder, prefixes.pop())
-            return files if project is None else replace(files, project=project)
-    return None
+            return _named(folder, prefixes.pop())
+    return {}
+
+
+def _prefixes(folder: Path) -> set[str]:
+    """Return the names of the projects that have a table of poses in a folder."""
+    found = (_prefix(path.name, PARAMETERS, EXTERNAL) for path in folder.iterdir())
+    return {prefix for prefix in found if prefix is not None}
 
 
 def _folders(root: Path) -> Iterator[Path]:
@@ -130,47 +119,25 @@ def _prefix(name: str, *endings: str) -> str | None:
 
 
 def _named(folder: Path, prefix: str) -> Files:
-    def existing(name: str) -> Path | None:
-        path = folder / (prefix + name)
-        return path if path.is_file() else None
-
-    return Files(
-        parameters=existing(PARAMETERS),
-        external=existing(EXTERNAL),
-        calibration=existing(CALIBRATION),
-        offset=existing("offset.xyz"),
-        wkt=existing("wkt.prj"),
-        bingo=existing("tp_bingo.txt"),
-        ties=existing("tp_pix4d.txt"),
-        gcps=existing("measured_estimated_gcps_position.txt"),
-        project=_project(folder, prefix.rstrip("_")),
-    )
-
-
-def _project(params: Path, name: str) -> Path | None:
-    """Return the project file, which lies beside the folder of the project or in it."""
-    root = params.resolve().parent.parent
-    for path in (root.parent / f"{root.name}.p4d", root / f"{name}.p4d"):
-        if path.is_file():
-            return path
-    return None
+    """Return the files of one prefix; the project lies beside or in the folder of the project."""
+    root = folder.resolve().parent.parent
+    files = {kind: folder / (prefix + name) for kind, name in NAMES.items()}
+    for project in (root / f"{prefix.rstrip('_')}.p4d", root.parent / f"{root.name}.p4d"):
+        if project.is_file():
+            files["project"] = project
+    return {kind: path for kind, path in files.items() if path.is_file()}
 
 
 WGS84 = "EPSG:4326"
 
 
-class Prior(NamedTuple):
-    """What the project says of one image; `kind` is the element that has the position."""
-
-    kind: str
-    xyz: FloatArray
-    sigma_m: FloatArray
-
-
 def read_project(
     path: Path, labels: tuple[str, ...]
 ) -> tuple[GnssPositions | None, tuple[str, ...]]:
-    """Read the initial positions of images, and the names of enabled images without a pose."""
+    """Read the initial positions of images, and the names of enabled images without a pose.
+
+    The positions are those of the kind that the first image has: in WGS 84, or in a CRS.
+    """
     root = read_xml(path)
     priors: dict[str, list[Prior | None]] = defaultdict(list)
     for image in root.iter("image"):
@@ -179,7 +146,28 @@ def read_project(
             priors[name].append(_prior(path, name, image))
     found = [priors[label].pop(0) if priors.get(label) else None for label in labels]
     others = tuple(name for name, rest in priors.items() for _ in rest)
-    return _positions(path, root, found), others
+    kind = next((prior[0] for prior in found if prior is not None), None)
+    if kind is None:
+        return None, others
+    xyz, sigma_m = np.full((2, len(found), 3), np.nan)
+    for i, prior in enumerate(found):
+        if prior is not None and prior[0] == kind:
+            _, xyz[i], sigma_m[i] = prior
+    if kind == "gps":
+        return GnssPositions(xyz, sigma_m, WGS84), others
+    tags = ((str(element.tag).lower(), element) for element in root.iter())
+    wkt = next((element for tag, element in tags if tag in ("wktimage", "wktimages")), None)
+    text = "" if wkt is None else wkt.get("value") or wkt.text or ""
+    crs = checks.crs(path, text) if text.strip() else None
+    return GnssPositions(xyz, sigma_m, crs), others
+
+
+Prior: TypeAlias = tuple[str, FloatArray, FloatArray]
+"""The element that has the position of an image, that, and its standard deviations, metres."""
+
+
+Prior: TypeAlias = tuple[str, FloatArray, FloatArray]
+"""The element that has the position of an image, that, and its standard deviations, metres."""
 
 
 def _prior(path: Path, name: str, image: Element) -> Prior | None:
@@ -189,97 +177,62 @@ def _prior(path: Path, name: str, image: Element) -> Prior | None:
         if position is not None:
             where = f"image {name}, {kind}"
             xyz = np.array([number(path, where, position.get(axis)) for axis in axes])
-            plan, height = (_tolerance(path, name, image, axis) for axis in ("XY", "Z"))
-            return Prior(kind, xyz, np.array([plan, plan, height]))
+            sigma_m = np.full(3, np.nan)
+            for tag, rows in (("toleranceXY", slice(2)), ("toleranceZ", slice(2, 3))):
+                if (element := image.find(tag)) is not None:
+                    sigma_m[rows] = number(path, f"image {name}, {tag}", element.get("value"))
+            return kind, xyz, sigma_m
     return None
-
-
-def _tolerance(path: Path, name: str, image: Element, axis: str) -> float:
-    element = image.find(f"tolerance{axis}")
-    if element is None:
-        return np.nan
-    return number(path, f"image {name}, tolerance{axis}", element.get("value"))
-
-
-def _positions(path: Path, root: Element, found: list[Prior | None]) -> GnssPositions | None:
-    """Return one row per camera; positions of the kind that the first image has."""
-    kinds = [prior.kind for prior in found if prior is not None]
-    if not kinds:
-        return None
-    xyz, sigma_m = np.full((len(found), 3), np.nan), np.full((len(found), 3), np.nan)
-    for i, prior in enumerate(found):
-        if prior is not None and prior.kind == kinds[0]:
-            xyz[i], sigma_m[i] = prior.xyz, prior.sigma_m
-    crs = WGS84 if kinds[0] == "gps" else _crs_of_images(path, root)
-    return GnssPositions(xyz, sigma_m, crs)
-
-
-def _crs_of_images(path: Path, root: Element) -> str | None:
-    for element in root.iter():
-        if isinstance(element.tag, str) and element.tag.lower() in ("wktimage", "wktimages"):
-            text = element.get("value") or element.text or ""
-            return checks.crs(path, text) if text.strip() else None
-    return None
-
-
-class Measured(NamedTuple):
-    """Lines of measurements: names of points, cameras (-1: not posed), x and y as text."""
-
-    points: list[str]
-    cameras: list[int]
-    xy: list[list[str]]
-    sensor_mm: list[tuple[str, str]]
-    last_line: list[int]
 
 
 def read_observations(source: Source, cameras: Cameras) -> TiePoints:
     """Read ``tp_bingo.txt``, or ``tp_pix4d.txt`` where there is no other."""
     files = find(source)
-    path = None if files is None else files.bingo or files.ties
-    if files is None or path is None:
+    path = files.get("bingo") or files.get("ties")
+    if path is None:
         raise InputError(
             f"{source.path}: has no tp_bingo.txt or tp_pix4d.txt beside it, and so no tie points."
         )
     if cameras.lenses is None:
         raise InputError(f"{path}: its measurements need the lenses, which the cameras lack.")
-    measured = _measured(path, _rows(cameras))
-    camera = np.array(measured.cameras, dtype=np.int64)
-    xy = _finite(path, measured.xy).reshape(-1, 2)
-    if path == files.bingo:
-        xy = _from_centre_mm(path, xy, measured, camera, cameras.lenses)
+    labels = list(enumerate(cameras.labels))[::-1]  # of equal names the first counts
+    stems = {PurePath(label).stem: i for i, label in labels}
+    measured = _measured(path, stems | {label: i for i, label in labels})
+    camera = np.array([row for _, row, *_ in measured], dtype=np.int64)
     posed = camera >= 0
-    names, point = np.unique(np.array(measured.points)[posed], return_inverse=True)
-    if len(names) == 0:
+    if not posed.any():
         raise InputError(f"{path}: measures nothing in the images that are posed.")
-    known = {} if files.gcps is None else _estimated(files.gcps)
+    xy = _finite(path, [row[2:4] for row in measured])
+    if path == files.get("bingo"):
+        sensor = _finite(path, [row[4:] for row in measured])
+        xy = _from_centre_mm(path, xy, sensor, camera, cameras.lenses)
+    points = np.array([name for name, *_ in measured])
+    names, point = np.unique(points[posed], return_inverse=True)
+    known = _estimated(files["gcps"]) if "gcps" in files else {}
     unknown = np.full(3, np.nan)
     xyz = np.array([known.get(name.partition("_")[2], unknown) for name in names.tolist()])
     return gathered(xyz, point, camera[posed], xy[posed])
 
 
-def _rows(cameras: Cameras) -> dict[str, int]:
-    """Return the row of each image by its name, with and without extension."""
-    rows = {PurePath(label).stem: i for i, label in reversed(list(enumerate(cameras.labels)))}
-    rows.update({label: i for i, label in reversed(list(enumerate(cameras.labels)))})
-    return rows
+def _measured(path: Path, rows: dict[str, int]) -> list[tuple[str, int, str, str, str, str]]:
+    """Read the lines: an image (and the size of its sensor), its points, and -99.
 
-
-def _measured(path: Path, rows: dict[str, int]) -> Measured:
-    """Read the lines: an image (and the size of its sensor), its points, and -99."""
-    found = Measured([], [], [], [], [])
-    camera, inside = -1, False
+    Out come rows of the name of the point, the camera (-1: not posed), x and y, and the width and
+    height of the sensor, as in H_23.52_15.68 after the name of the image.
+    """
+    found = []
+    image: tuple[int, str, str] | None = None
     for line in read_text(path).splitlines():
         words = line.split()
         if not words or words[0] == "-99":
-            inside = False
-        elif not inside:
-            camera, inside = _image(line, rows), True
-            found.sensor_mm.append(_sensor(words[-1]))
-            found.last_line.append(len(found.points))
+            image = None
+        elif image is None:
+            text, size = line.strip(), words[-1].split("_")
+            width, height = size[-2:] if len(size) >= 3 else ("nan", "nan")
+            image = (rows.get(text, rows.get(text.rpartition(" ")[0].strip(), -1)), width, height)
         elif len(words) in (3, 4):
-            found.points.append(words[0])
-            found.cameras.append(camera)
-            found.xy.append(words[1:3])
+            camera, width, height = image
+            found.append((words[0], camera, words[1], words[2], width, height))
         else:
             raise InputError(
                 f"{path}: '{line.strip()[:60]}' is not a point and its x and y; the file is"
@@ -288,31 +241,17 @@ def _measured(path: Path, rows: dict[str, int]) -> Measured:
     return found
 
 
-def _image(line: str, rows: dict[str, int]) -> int:
-    """Return the row of the image that a line names, with or without a sensor after it."""
-    text = line.strip()
-    return rows.get(text, rows.get(text.rpartition(" ")[0].strip(), -1))
-
-
-def _sensor(word: str) -> tuple[str, str]:
-    """Return width and height out of a word like H_23.52_15.68."""
-    parts = word.split("_")
-    return (parts[-2], parts[-1]) if len(parts) >= 3 else ("nan", "nan")
-
-
-def _finite(path: Path, words: list[list[str]] | list[tuple[str, str]]) -> FloatArray:
+def _finite(path: Path, rows: Sequence[Sequence[str]]) -> FloatArray:
     try:
-        return np.array(words, dtype=float)
+        return np.array(rows, dtype=float)
     except ValueError as error:
         raise InputError(f"{path}: {error}; the file is damaged, export it again.") from error
 
 
 def _from_centre_mm(
-    path: Path, xy: FloatArray, measured: Measured, camera: IntArray, lenses: tuple[Lens, ...]
+    path: Path, xy: FloatArray, sensor: FloatArray, camera: IntArray, lenses: tuple[Lens, ...]
 ) -> FloatArray:
     """Turn mm from the image centre, y up, into the unit of the lens from the upper left."""
-    lengths = np.diff([*measured.last_line, len(xy)])
-    sensor = np.repeat(_finite(path, measured.sensor_mm).reshape(-1, 2), lengths, axis=0)
     frame = np.array([(lens.width, lens.height) for lens in lenses])[camera]
     if not (sensor[camera >= 0] > 0.0).all():
         raise InputError(f"{path}: the line of an image lacks its sensor size H_width_height.")

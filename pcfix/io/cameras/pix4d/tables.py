@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -49,39 +51,31 @@ class Calibration(NamedTuple):
 def read_parameters(path: Path) -> list[Image]:
     """Read the camera parameters; their layout is what the header names with sizes."""
     lines = [line for line in read_text(path).splitlines() if line.strip()]
-    layout = _layout(path, lines)
-    body = lines[_header_length(lines) :]
-    images, row = [], 0
-    while row < len(body):
-        image, row = _image(path, body, row, layout)
+    header = [
+        number
+        for number, line in enumerate(lines[:20], start=1)
+        if SHAPE.match(line) or line.strip().lower().startswith("camera model")
+    ]
+    row = max(header, default=1)
+    layout = _layout(path, lines[:row])
+    images = []
+    while row < len(lines):
+        image, row = _image(path, lines, row, layout)
         images.append(image)
     if not images:
         raise InputError(f"{path}: has a header but no images.")
     return images
 
 
-def _header_length(lines: list[str]) -> int:
-    """Return the number of lines up to the last that has a size in brackets or an equation."""
-    last = 0
-    for number, line in enumerate(lines[:20], start=1):
-        if SHAPE.match(line) or line.strip().lower().startswith("camera model"):
-            last = number
-    return max(last, 1)
-
-
-def _layout(path: Path, lines: list[str]) -> list[tuple[str, int]]:
+def _layout(path: Path, header: list[str]) -> list[tuple[str, int]]:
     """Return the name and count of numbers of each field; fields that are not known are empty."""
     layout = []
-    for line in lines[: _header_length(lines)]:
-        match = SHAPE.match(line)
-        if match:
-            words = match[1].lower()
-            name = next((name for word, name in FIELDS.items() if word in words), "")
-            layout.append((name, int(match[2]) * int(match[3])))
-    if (
-        not {("centre", 3), ("rotation", 9)} <= set(layout)
-        or sum(count for _, count in layout) > MOST_NUMBERS
-    ):
+    for match in filter(None, map(SHAPE.match, header)):
+        words = match[1].lower()
+        name = next((name for word, name in FIELDS.items() if word in words), "")
+        layout.append((name, int(match[2]) * int(match[3])))
+    total = sum(count for _, count in layout)
+    if not {("centre", 3), ("rotation", 9)} <= set(layout) or total > MOST_NUMBERS:
         raise InputError(
             f"{path}: the header does not name the fields 'camera position t [3x1]' and 'camera"
             " rotation R [3x3]'; give calibrated_external_camera_parameters.txt instead."
@@ -90,36 +84,31 @@ def _layout(path: Path, lines: list[str]) -> list[tuple[str, int]]:
 
 
 def _image(
-    path: Path, body: list[str], row: int, layout: list[tuple[str, int]]
+    path: Path, lines: list[str], row: int, layout: list[tuple[str, int]]
 ) -> tuple[Image, int]:
-    label, width, height = _name_and_size(path, body[row])
-    need = sum(count for _, count in layout)
+    """Return the image that begins in a row, and the row after it."""
+    head = lines[row].rsplit(None, 2)
+    if len(head) != 3:
+        raise InputError(
+            f"{path}: '{lines[row].strip()[:60]}' should be the name, width and height of an"
+            " image; the file is cut off or damaged, export it again."
+        )
+    label = head[0].strip()
+    width, height = _numbers(path, f"image {head[0]}", head[1:]).tolist()
+    ends = np.cumsum([count for _, count in layout])
     words: list[str] = []
     row += 1
-    while len(words) < need and row < len(body):
-        words += body[row].split()
+    while len(words) < ends[-1] and row < len(lines):
+        words += lines[row].split()
         row += 1
-    if len(words) != need:
+    if len(words) != ends[-1]:
         raise InputError(
-            f"{path}: image {label}: has {len(words)} numbers instead of {need}; the file is cut"
-            " off or damaged, export it again."
+            f"{path}: image {label}: has {len(words)} numbers instead of {ends[-1]}; the file is"
+            " cut off or damaged, export it again."
         )
-    values = _numbers(path, f"image {label}", words)
-    ends = np.cumsum([count for _, count in layout])
-    parts = np.split(values, ends[:-1])
+    parts = np.split(_numbers(path, f"image {label}", words), ends[:-1])
     fields = {name: part for (name, _), part in zip(layout, parts, strict=True) if name}
     return Image(label, width, height, fields), row
-
-
-def _name_and_size(path: Path, line: str) -> tuple[str, float, float]:
-    words = line.rsplit(None, 2)
-    if len(words) != 3:
-        raise InputError(
-            f"{path}: '{line.strip()[:60]}' should be the name, width and height of an image; the"
-            " file is cut off or damaged, export it again."
-        )
-    width, height = _numbers(path, f"image {words[0]}", words[1:])
-    return words[0].strip(), float(width), float(height)
 
 
 def _numbers(path: Path, where: str, words: list[str]) -> FloatArray:
@@ -181,20 +170,18 @@ def read_calibrations(path: Path) -> list[Calibration]:
 
 SAME_FOCAL = 1e-6
 """Relative: the two files write the same number in pixels and in millimetres."""
+POWERS = ("p0", "p1", "p2", "p3", "p4")
 
 
 def lenses_of_images(
     path: Path, images: list[Image], calibrations: list[Calibration]
 ) -> tuple[Lens, ...] | None:
     """Return the lens of each image; None when an image has none."""
-    known: dict[tuple[object, ...], Lens | None] = {}
+    known: dict[object, Lens | None] = {}
     lenses = []
     for image in images:
-        names = ("matrix", "radial", "tangential", "affine", "polynomial", "principal")
-        numbers = tuple(
-            image.fields[name].tobytes() if name in image.fields else b"" for name in names
-        )
-        key = (image.width, image.height, *numbers)
+        own = [(k, v.tobytes()) for k, v in image.fields.items() if k not in ("centre", "rotation")]
+        key = (image.width, image.height, *own)
         if key not in known:
             known[key] = _lens(path, image, calibrations)
         lens = known[key]
@@ -206,11 +193,19 @@ def lenses_of_images(
 
 def _lens(path: Path, image: Image, calibrations: list[Calibration]) -> Lens | None:
     """Return the lens in pixels, from the block of the image or the only calibration."""
-    fields = image.fields
-    if {"affine", "polynomial"} <= fields.keys() and {"principal", "matrix"} & fields.keys():
-        lens = _fisheye_of_image(image)
-    elif "matrix" in fields:
-        lens = _perspective_of_image(image)
+    fields = {name: values.tolist() for name, values in image.fields.items()}
+    matrix = fields.get("matrix")
+    if {"affine", "polynomial"} <= fields.keys() and (matrix or "principal" in fields):
+        x, y = fields["principal"][:2] if "principal" in fields else (matrix[2], matrix[5])
+        lens = _fisheye(image, (x, y), fields["affine"], fields["polynomial"])
+    elif matrix:
+        fx, skew, x, _, fy, y, *_ = matrix
+        t1, t2 = (*fields.get("tangential", ()), 0.0, 0.0)[:2]
+        lens = Lens(
+            *(fy, image.width, image.height, x, y, fx - fy, skew),
+            radial=tuple(fields.get("radial", ())),
+            tangential=(t2, t1),
+        )
     elif len(calibrations) == 1:
         return lens_of_calibration(path, calibrations[0], image)
     else:
@@ -219,49 +214,18 @@ def _lens(path: Path, image: Image, calibrations: list[Calibration]) -> Lens | N
     return replace(lens, pixel_size_mm=_pixel_size_mm(lens, calibrations))
 
 
-def _perspective_of_image(image: Image) -> Lens:
-    k = image.fields["matrix"].reshape(3, 3)
-    t1, t2 = (*image.fields.get("tangential", ()), 0.0, 0.0)[:2]
-    return Lens(
-        focal=float(k[1, 1]),
-        width=image.width,
-        height=image.height,
-        principal_x=float(k[0, 2]),
-        principal_y=float(k[1, 2]),
-        b1=float(k[0, 0] - k[1, 1]),
-        b2=float(k[0, 1]),
-        radial=_floats(image.fields.get("radial")),
-        tangential=(float(t2), float(t1)),
-    )
-
-
-def _fisheye_of_image(image: Image) -> Lens:
-    fields = image.fields
-    x, y = fields["principal"][:2] if "principal" in fields else fields["matrix"][[2, 5]]
-    return _fisheye(
-        image, (float(x), float(y)), _floats(fields["affine"]), _floats(fields["polynomial"])
-    )
-
-
 def _fisheye(
     image: Image,
     principal: tuple[float, float],
-    affine: tuple[float, ...],
-    polynomial: tuple[float, ...],
+    affine: Sequence[float],
+    polynomial: Sequence[float],
 ) -> Lens:
     """Return the lens (u, v) = principal + [c d; e f] rho, rho the polynomial of 2 theta / pi."""
     c, d, e, f = affine
     return Lens(
-        focal=f,
-        width=image.width,
-        height=image.height,
-        principal_x=principal[0],
-        principal_y=principal[1],
-        b1=c - f,
-        b2=d,
-        b3=e,
+        *(f, image.width, image.height, *principal, c - f, d, e),
         projection="polynomial",
-        shape=polynomial,
+        shape=tuple(polynomial),
     )
 
 
@@ -274,29 +238,22 @@ def lens_of_calibration(
     where the calibration does not say enough.
     """
     values = {name: numbers[0] for name, numbers in calibration.values.items()}
+    value = defaultdict(float, {"p1": 1.0} | values)
     width_mm, height_mm = calibration.sensor_mm
-    if not {"px", "py"} <= values.keys() or not min(width_mm, height_mm) > 0.0:
+    if not {"px", "py", "f"} <= values.keys() or not min(width_mm, height_mm) > 0.0:
         return None
-    if {"c", "f"} <= values.keys():
+    if "c" in values:
         if image is None:
             return None
         scale = image.width / width_mm
-        affine = (values["c"], values.get("d", 0.0), values.get("e", 0.0), values["f"])
-        powers = (values.get("p0", 0.0), values.get("p1", 1.0))
-        higher = tuple(values.get(f"p{i}", 0.0) for i in (2, 3, 4))
         principal = (values["px"] * scale, values["py"] * scale)
-        lens = _fisheye(image, principal, affine, powers + higher)
+        affine, polynomial = ([value[name] for name in names] for names in ("cdef", POWERS))
+        lens = _fisheye(image, principal, affine, polynomial)
         return replace(checks.lens(path, image.label, lens), pixel_size_mm=1.0 / scale)
-    if "f" not in values:
-        return None
     lens = Lens(
-        focal=values["f"],
-        width=width_mm,
-        height=height_mm,
-        principal_x=values["px"],
-        principal_y=values["py"],
-        radial=tuple(values.get(f"k{i}", 0.0) for i in (1, 2, 3)),
-        tangential=(values.get("t2", 0.0), values.get("t1", 0.0)),
+        *(values["f"], width_mm, height_mm, values["px"], values["py"]),
+        radial=(value["k1"], value["k2"], value["k3"]),
+        tangential=(value["t2"], value["t1"]),
     )
     return checks.lens(path, "calibration", lens)
 
@@ -311,7 +268,3 @@ def _pixel_size_mm(lens: Lens, calibrations: list[Calibration]) -> float | None:
         if abs(expected - lens.focal) <= SAME_FOCAL * lens.focal:
             return pixel
     return None
-
-
-def _floats(values: FloatArray | None) -> tuple[float, ...]:
-    return () if values is None else tuple(float(value) for value in values)
