@@ -9,9 +9,9 @@ from pyproj import CRS, Transformer
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import read_cameras
-from pcfix.io.cameras.georeference import bring_to
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.model import Cameras, GnssPositions
+from tests.utils.reprojection import bring_to
 from tests.utils.shared import needs
 
 FREE, free = needs("rendered_a_free")

@@ -6,11 +6,10 @@ from pyproj import CRS, Transformer
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import read_cameras
-from pcfix.io.cameras.georeference import bring_to
 from pcfix.io.ground_control import read_ground_control
 from pcfix.lens.imaging import project
 from pcfix.model import Cameras, Lens
-from tests.utils.reprojection import check_file
+from tests.utils.reprojection import bring_to, check_file
 from tests.utils.shared import needs
 
 FREE, free = needs("rendered_a_free")

@@ -6,7 +6,13 @@ from pathlib import PurePath
 import numpy as np
 from pyproj import CRS, Transformer
 
+from pcfix.io.cameras.georeference import georeference
 from pcfix.lens.imaging import project
+
+
+def bring_to(cameras, cloud_crs, **options):
+    """Return cameras in the CRS of a cloud."""
+    return georeference(cameras, cloud_crs, **options).cameras(cameras)
 
 
 def check_file(sample):

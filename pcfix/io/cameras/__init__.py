@@ -101,7 +101,7 @@ def read_cameras(
     -------
     Cameras
         World to camera rotations in OpenCV axes, all in the frame of the file:
-        `pcfix.io.cameras.georeference.bring_to` takes them to the cloud's CRS.
+        `pcfix.io.cameras.georeference.georeference` takes them to the cloud's CRS.
 
     Warns
     -----

@@ -130,36 +130,33 @@ class Statement(NamedTuple):
 
 def statement(cameras: Cameras, cameras_crs: str | None, name: str) -> Statement:
     """Return what holds of what the file says and the user's ``--cameras-crs``."""
-    clouds = cameras.project_crs
-    if clouds is None or is_topocentric(clouds) or not is_tied(clouds, name):
-        project = None
-    else:
-        project = parse_crs(clouds, name)
+    project = _on_earth(cameras.project_crs, name)
     given = (cameras_crs or "").strip()
     if not given:
         return Statement(cameras.crs, project)
-    if is_topocentric(given) or not is_tied(given, "--cameras-crs"):
+    crs = _on_earth(given, "--cameras-crs")
+    if crs is None:
         return Statement(given, None, chosen=True, trusted=True)
-    crs = parse_crs(given, "--cameras-crs")
-    trusted = heights_of(crs) == "unstated"
     if crs.is_geocentric:
         return Statement(given, project, chosen=True)
-    if _is_geocentric(cameras.crs, name):
+    trusted = heights_of(crs) == "unstated"
+    own = _on_earth(cameras.crs, name)
+    if own is not None and own.is_geocentric:
         return Statement(cameras.crs, crs, chosen=True, trusted=trusted)
     return Statement(given, None, chosen=True, trusted=trusted)
 
 
 def is_tied(crs: str | None, name: str) -> bool:
     """Whether a frame has its place on the earth."""
-    if crs is None or crs.strip().lower() == LOCAL:
-        return False
-    return is_topocentric(crs) or not is_local(parse_crs(crs, name))
+    return crs is not None and (is_topocentric(crs) or _on_earth(crs, name) is not None)
 
 
-def _is_geocentric(crs: str | None, name: str) -> bool:
-    if crs is None or is_topocentric(crs) or not is_tied(crs, name):
-        return False
-    return parse_crs(crs, name).is_geocentric
+def _on_earth(crs: str | None, name: str) -> CRS | None:
+    """Return a CRS that is tied to the earth; None for axes at a place and local frames."""
+    if crs is None or crs.strip().lower() == LOCAL or is_topocentric(crs):
+        return None
+    parsed = parse_crs(crs, name)
+    return None if is_local(parsed) else parsed
 
 
 def completed(cloud: CRS, frame: Frame, stated: Statement) -> CRS:
@@ -187,20 +184,15 @@ def height_notes(frame: Frame, target: CRS, stated: Statement, name: str) -> tup
         return (
             f"{name}: does not say what its heights are; taken to be the cloud's ({target.name}).",
         )
-    if mine == "ellipsoidal" and cloud == "unstated" and _is_guess(frame, target, stated):
+    axes = [e.semi_major_metre for e in (frame.crs.ellipsoid, target.ellipsoid) if e is not None]
+    other_datum = bool(axes) and max(axes) - min(axes) > 1.0
+    is_guess = other_datum or (stated.project is None and not frame.topocentric)
+    if mine == "ellipsoidal" and cloud == "unstated" and is_guess:
         return (
             f"{name}: the cloud's CRS ({target.name}) does not say what its heights are; taken to"
             f" be ellipsoidal, of {frame.crs.name}.",
         )
     return ()
-
-
-def _is_guess(frame: Frame, target: CRS, stated: Statement) -> bool:
-    """Whether the software may mean other heights than the ellipsoidal ones of the frame."""
-    axes = [e.semi_major_metre for e in (frame.crs.ellipsoid, target.ellipsoid) if e is not None]
-    if axes and max(axes) - min(axes) > 1.0:
-        return True
-    return stated.project is None and not frame.topocentric
 
 
 def without_grid(frame: Frame, target: CRS) -> str:

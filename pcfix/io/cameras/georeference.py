@@ -20,17 +20,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.io.cameras.frames import (
-    Frame,
-    Statement,
-    agree,
-    completed,
-    frame_of,
-    height_notes,
-    is_tied,
-    statement,
-    without_grid,
-)
+from pcfix.io.cameras import frames
+from pcfix.io.cameras.frames import Frame, Statement
 from pcfix.io.crs import (
     METRES,
     check_projected_metres,
@@ -126,15 +117,15 @@ class Georeference:
         return centres
 
 
-def bring_to(
+def georeference(
     cameras: Cameras,
     cloud_crs: str | CRS | None,
     *,
     cameras_crs: str | None = None,
     offset_m: tuple[float, float, float] | None = None,
     name: str = "cameras",
-) -> Cameras:
-    """Return cameras in the cloud's CRS.
+) -> Georeference:
+    """Return the way into the cloud's CRS, for cameras, tie points and others.
 
     Parameters
     ----------
@@ -152,46 +143,21 @@ def bring_to(
     name : str
         What is being read, for messages.
 
-    Returns
-    -------
-    Cameras
-        `crs` says where they are now. `gnss` is left in its own CRS; see `adjusted_minus_gnss`.
-
     Raises
     ------
     InputError
         If a CRS is unknown, the two cannot be brought together, a vertical grid is missing, or
         the file calls its frame local and the cloud's is not.
     """
-    there = georeference(cameras, cloud_crs, cameras_crs=cameras_crs, offset_m=offset_m, name=name)
-    return there.cameras(cameras)
-
-
-def georeference(
-    cameras: Cameras,
-    cloud_crs: str | CRS | None,
-    *,
-    cameras_crs: str | None = None,
-    offset_m: tuple[float, float, float] | None = None,
-    name: str = "cameras",
-) -> Georeference:
-    """Return the way into the cloud's CRS, for cameras, tie points and others; see `bring_to`."""
     offset = np.zeros(3) if offset_m is None else np.asarray(offset_m, np.float64)
     if offset.shape != (3,) or not np.isfinite(offset).all():
         raise InputError(f"{name}: the offset {offset_m} is not three numbers x, y, z.")
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
-    stated = statement(cameras, cameras_crs, name)
-    tied = is_tied(stated.crs, name)
+    stated = frames.statement(cameras, cameras_crs, name)
+    if frames.is_tied(stated.crs, name):
+        return _from_earth(cloud, stated, cameras, offset, name)
     if cloud is None:
-        return _without_cloud_crs(stated, cameras, offset, name, tied=tied)
-    if tied:
-        if is_local(cloud):
-            raise InputError(
-                f"{name}: is in {shortened(stated.crs or '')}, but the cloud is in a local frame"
-                f" ({cloud.name}); set the cloud's CRS, or give --cameras-crs local to take the"
-                " numbers as they are."
-            )
-        return _into(cloud, stated, cameras, offset, name)
+        return Georeference(None, None, offset, stated.crs, (), name)
     if stated.crs is not None and not stated.chosen and not is_local(cloud):
         raise InputError(
             f"{name}: is in a local frame, not tied to the earth, but the cloud is in"
@@ -201,49 +167,61 @@ def georeference(
     return Georeference(None, None, offset, crs_text(cloud), (), name)
 
 
-def _without_cloud_crs(
-    stated: Statement, cameras: Cameras, offset: FloatArray, name: str, *, tied: bool
+def _from_earth(
+    cloud: CRS | None, stated: Statement, cameras: Cameras, offset: FloatArray, name: str
 ) -> Georeference:
-    """Return the way to where the software delivers clouds: mostly where the cameras are."""
-    as_it_is = Georeference(None, None, offset, stated.crs, (), name)
-    if not tied:
-        return as_it_is
-    frame = frame_of(stated.crs or "", name)
-    if frame.topocentric:
-        return replace(as_it_is, notes=(_taken(name, shortened(stated.crs or "")),))
-    if frame.direct and frame.crs.is_projected:
+    """Return the way from a frame that is tied to the earth.
+
+    Where the cloud names no CRS, it leads to where the software delivers clouds: mostly where the
+    cameras are.
+    """
+    crs = stated.crs or ""
+    if cloud is not None and is_local(cloud):
+        raise InputError(
+            f"{name}: is in {shortened(crs)}, but the cloud is in a local frame ({cloud.name}); set"
+            " the cloud's CRS, or give --cameras-crs local to take the numbers as they are."
+        )
+    frame = frames.frame_of(crs, name)
+    if cloud is not None:
+        return _into(cloud, frame, stated, cameras, offset, name)
+    as_it_is = frame.topocentric or (frame.direct and frame.crs.is_projected)
+    if as_it_is:
         unit, size = plan_unit(frame.crs)
         words = frame.crs.name + ("" if size == 1.0 else f", unit {unit},")
-        return replace(as_it_is, notes=(_taken(name, words),))
-    if frame.direct or stated.project is None or not stated.project.is_projected:
+        words = shortened(crs) if frame.topocentric else words
+        found = Georeference(None, None, offset, stated.crs, (), name)
+    elif frame.direct or stated.project is None or not stated.project.is_projected:
         kind = "degrees" if frame.direct else "geocentric coordinates"
         raise InputError(
             f"{name}: is in {kind} ({frame.crs.name}) and the cloud names no CRS; set the cloud's"
             " CRS."
         )
-    found = _into(stated.project, stated, cameras, offset, name)
-    return replace(found, notes=(_taken(name, stated.project.name), *found.notes))
-
-
-def _taken(name: str, crs: str) -> str:
-    return f"{name}: the cloud names no CRS; taken to be in {crs} as the cameras are."
+    else:
+        words = stated.project.name
+        found = _into(stated.project, frame, stated, cameras, offset, name)
+    note = f"{name}: the cloud names no CRS; taken to be in {words} as the cameras are."
+    return replace(found, notes=(note, *found.notes))
 
 
 def _into(
-    cloud: CRS, stated: Statement, cameras: Cameras, offset: FloatArray, name: str
+    cloud: CRS,
+    frame: Frame,
+    stated: Statement,
+    cameras: Cameras,
+    offset: FloatArray,
+    name: str,
 ) -> Georeference:
     """Return the way from a frame tied to the earth into a CRS."""
     check_projected_metres(cloud, "the cloud")
-    frame = frame_of(stated.crs or "", name)
     if frame.direct and frame.crs.is_geographic and offset.any():
         raise InputError(
             f"{name}: an offset in metres cannot be added to degrees ({frame.crs.name})."
         )
     at = cameras.centres + offset
     frame.check(at, cameras.labels, name)
-    target = completed(cloud, frame, stated)
-    crs, notes = crs_text(target), height_notes(frame, target, stated, name)
-    heights, instead = not agree(frame, target, stated), without_grid(frame, target)
+    target = frames.completed(cloud, frame, stated)
+    crs, notes = crs_text(target), frames.height_notes(frame, target, stated, name)
+    heights, instead = not frames.agree(frame, target, stated), frames.without_grid(frame, target)
     if frame.direct and not heights and is_same_numbers(frame.crs, target):
         return Georeference(frame, None, offset, crs, notes, name)
     step = transformation(
@@ -287,45 +265,39 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> GnssDifferen
     gnss, nothing = cameras.gnss, np.full((len(cameras), 3), np.nan)
     if gnss is None:
         return GnssDifferences(nothing, f"{name}: has no positions of the GNSS.")
+    crs = cameras.crs or ""
     if gnss.crs is None or gnss.crs == cameras.crs:
-        return _of_one_frame(cameras, gnss, name)
-    if not is_tied(cameras.crs, name) or not is_tied(gnss.crs, name):
+        return GnssDifferences(_of_one_frame(cameras, gnss, name))
+    if not frames.is_tied(cameras.crs, name) or not frames.is_tied(gnss.crs, name):
         return GnssDifferences(
             nothing,
             f"{name}: positions of the GNSS and adjusted centres are not both tied to the earth,"
             " so they cannot be compared.",
         )
-    reason = _heights_unknown(cameras.crs or "", gnss.crs, name)
-    try:
-        if not reason:
+    kinds = [heights_of(frames.frame_of(each, name).crs) for each in (crs, gnss.crs)]
+    reason = (
+        f"{name}: the CRS of the {'cameras' if kinds[0] == 'unstated' else 'GNSS'} does not"
+        " say what its heights are, the other does; only plan is compared."
+    )
+    if not {"gravity", "unstated"} <= {*kinds}:
+        try:
             return GnssDifferences(_differences(cameras, gnss, name))
-    except HeightsError as error:
-        reason = str(error).partition("; or, if")[0] + "; only plan is compared."
+        except HeightsError as error:
+            reason = str(error).partition("; or, if")[0] + "; only plan is compared."
     flat = replace(gnss, crs=_in_plan(gnss.crs, name))
-    found = _differences(replace(cameras, crs=_in_plan(cameras.crs or "", name)), flat, name)
+    found = _differences(replace(cameras, crs=_in_plan(crs, name)), flat, name)
     return GnssDifferences(found * [1.0, 1.0, np.nan], reason)
 
 
-def _of_one_frame(cameras: Cameras, gnss: GnssPositions, name: str) -> GnssDifferences:
+def _of_one_frame(cameras: Cameras, gnss: GnssPositions, name: str) -> FloatArray:
     """Return the differences where both are in one frame, or the GNSS's is taken to be that."""
     difference = cameras.centres - gnss.xyz
-    if not is_tied(cameras.crs, name) or is_topocentric(cameras.crs or ""):
-        return GnssDifferences(difference)
-    frame = frame_of(cameras.crs or "", name)
+    if not frames.is_tied(cameras.crs, name) or is_topocentric(cameras.crs or ""):
+        return difference
+    frame = frames.frame_of(cameras.crs or "", name)
     if frame.direct:
-        return GnssDifferences(difference / frame.per_metre(cameras.centres))
-    return GnssDifferences(_differences(cameras, replace(gnss, crs=cameras.crs), name))
-
-
-def _heights_unknown(cameras_crs: str, gnss_crs: str, name: str) -> str:
-    """Return why heights cannot be compared where just one side counts from a vertical datum."""
-    adjusted, gnss = (heights_of(frame_of(crs, name).crs) for crs in (cameras_crs, gnss_crs))
-    if "gravity" in (adjusted, gnss) and "unstated" in (adjusted, gnss):
-        return (
-            f"{name}: the CRS of the {'cameras' if adjusted == 'unstated' else 'GNSS'} does not"
-            " say what its heights are, the other does; only plan is compared."
-        )
-    return ""
+        return np.asarray(difference / frame.per_metre(cameras.centres))
+    return _differences(cameras, replace(gnss, crs=cameras.crs), name)
 
 
 def _in_plan(crs: str, name: str) -> str:
@@ -359,7 +331,7 @@ def _common(cameras: Cameras, name: str) -> CRS:
     from pyproj.crs import ProjectedCRS
     from pyproj.crs.coordinate_operation import TransverseMercatorConversion
 
-    frame = frame_of(cameras.crs or "", name)
+    frame = frames.frame_of(cameras.crs or "", name)
     units = {axis.unit_name for axis in frame.crs.axis_info}
     if frame.crs.is_projected and units.issubset(METRES):
         return frame.crs

@@ -9,10 +9,10 @@ import pytest
 from pcfix.errors import InputError, SettingError
 from pcfix.io.cameras import read_cameras, read_tie_points
 from pcfix.io.cameras.colmap.writing import colmap_camera, write_colmap
-from pcfix.io.cameras.georeference import bring_to
 from pcfix.lens.imaging import project
 from pcfix.model import Lens, TiePoints, Views
 from tests.utils.blocks import PLAIN, small_block, some_ties
+from tests.utils.reprojection import bring_to
 from tests.utils.shared import needs
 
 FREE, free = needs("rendered_a_free")
@@ -71,12 +71,11 @@ def same_ties(found, given):
     assert found.image_xy.tolist() == given.image_xy.tolist()
 
 
-@pytest.mark.parametrize("binary", [True, False])
 @pytest.mark.parametrize("offset", [None, (0.0, 0.0, 0.0), (319900.5, 3842700.25, 10.0)])
-def test_there_and_back(tmp_path, binary, offset):
+def test_there_and_back(tmp_path, offset):
     cameras = small_block(tuple(LENSES.values()), k=16)
     ties = some_ties(cameras)
-    write_colmap(tmp_path / "m", cameras, ties, binary=binary, offset_m=offset)
+    write_colmap(tmp_path / "m", cameras, ties, offset_m=offset)
     found = read_cameras(tmp_path / "m")
     same_block(found, cameras, 1e-9 if offset != (0.0, 0.0, 0.0) else 3e-9)
     same_ties(read_tie_points(tmp_path / "m", found), ties)
@@ -85,11 +84,7 @@ def test_there_and_back(tmp_path, binary, offset):
         assert project(read, rays) == pytest.approx(project(wrote, rays), abs=1e-9)
     same_block(bring_to(found, "EPSG:32636"), cameras, 3e-9)
     names = {path.name for path in (tmp_path / "m").iterdir()}
-    suffix = "bin" if binary else "txt"
-    assert names == {
-        *(f"{n}.{suffix}" for n in ("cameras", "images", "points3D")),
-        "georeference.json",
-    }
+    assert names == {"cameras.bin", "images.bin", "points3D.bin", "georeference.json"}
 
 
 def test_the_default_offset_is_near_the_block(tmp_path):
@@ -100,14 +95,12 @@ def test_the_default_offset_is_near_the_block(tmp_path):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("binary", [True, False])
-def test_colmap_reads_it(tmp_path, binary):
+def test_colmap_reads_it(tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     cameras = small_block(tuple(LENSES.values()), k=16)
     ties = some_ties(cameras)
-    error = np.linspace(0.1, 0.9, len(ties.xyz))
     offset = np.array([319900.0, 3842700.0, 0.0])
-    write_colmap(tmp_path, cameras, ties, binary=binary, offset_m=tuple(offset), error_px=error)
+    write_colmap(tmp_path, cameras, ties, offset_m=tuple(offset))
     model = pycolmap.Reconstruction(str(tmp_path))
     assert len(model.points3D) == len(ties.xyz)
     rays = np.random.default_rng(1).uniform([-0.3, -0.3, 1], [0.3, 0.3, 1], (20, 3))
@@ -124,7 +117,6 @@ def test_colmap_reads_it(tmp_path, binary):
     for i, xyz in enumerate(ties.xyz):
         point = model.points3D[i + 1]
         assert point.xyz == pytest.approx(xyz - offset, abs=1e-9)
-        assert point.error == error[i]
         views = [
             (e.image_id - 1, model.images[e.image_id].points2D[e.point2D_idx].xy)
             for e in point.track.elements
@@ -159,14 +151,11 @@ def test_a_lens_that_no_model_holds(tmp_path, lens):
     assert not (tmp_path / "m").exists()
 
 
-@pytest.mark.parametrize("binary", [True, False])
-def test_points_that_nothing_can_hold_are_left_out(tmp_path, binary):
+def test_points_that_nothing_can_hold_are_left_out(tmp_path):
     xyz = np.array([[1.0, 2, 3], [np.nan] * 3, [4.0, 5, 6], [7.0, 8, 9]])
     views = Views(np.array([0, 2, 4, 4, 6]), np.array([0, 1, 0, 1, 2, 0]))
     uv = np.arange(12.0).reshape(6, 2)
-    write_colmap(
-        tmp_path, small_block(), TiePoints(xyz, views, uv), binary=binary, offset_m=(0, 0, 0)
-    )
+    write_colmap(tmp_path, small_block(), TiePoints(xyz, views, uv), offset_m=(0, 0, 0))
     found = read_tie_points(tmp_path, read_cameras(tmp_path))
     assert found.xyz.tolist() == [[1.0, 2, 3], [7.0, 8, 9]]
     assert found.views.start.tolist() == [0, 2, 4]
@@ -176,26 +165,19 @@ def test_points_that_nothing_can_hold_are_left_out(tmp_path, binary):
     ]
 
 
-@pytest.mark.parametrize("binary", [True, False])
-def test_a_block_without_tie_points(tmp_path, binary):
+def test_a_block_without_tie_points(tmp_path):
     cameras = small_block()
-    write_colmap(tmp_path, cameras, binary=binary)
+    write_colmap(tmp_path, cameras)
     same_block(read_cameras(tmp_path), cameras)
     with pytest.raises(InputError, match="no tie points"):
         read_tie_points(tmp_path, cameras)
 
 
 def test_nothing_is_replaced_unasked(tmp_path):
-    cameras = small_block()
-    write_colmap(tmp_path, cameras)
-    with pytest.raises(SettingError, match=r"cameras.bin: the output exists; add --overwrite"):
-        write_colmap(tmp_path, cameras)
-    write_colmap(tmp_path, cameras, overwrite=True)
-    with pytest.raises(SettingError, match=r"holds cameras.bin of another COLMAP model"):
-        write_colmap(tmp_path, cameras, binary=False, overwrite=True)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(SettingError, match="is a file"):
-        write_colmap(tmp_path / "file", cameras)
+    (tmp_path / "points3D.bin").write_text("mine")
+    with pytest.raises(SettingError, match=r"points3D.bin: the output exists"):
+        write_colmap(tmp_path, small_block())
+    assert [path.name for path in tmp_path.iterdir()] == ["points3D.bin"]
 
 
 def test_cameras_that_are_not_whole(tmp_path):
@@ -206,8 +188,6 @@ def test_cameras_that_are_not_whole(tmp_path):
     with pytest.raises(InputError, match="has no place in COLMAP's files"):
         write_colmap(tmp_path, odd)
     spaced = replace(small_block(), labels=("a b.jpg", *small_block().labels[1:]))
-    with pytest.raises(InputError, match=r"image name 'a b.jpg'.*write the binary form"):
-        write_colmap(tmp_path, spaced, binary=False)
     write_colmap(tmp_path, spaced)
     same_block(read_cameras(tmp_path), spaced)
 

@@ -19,9 +19,9 @@ from pyproj import CRS
 from scipy.spatial.transform import Rotation
 
 import pcfix
-from pcfix.io.cameras.georeference import bring_to
 from tests.utils.pose_files import WRITERS
 from tests.utils.pose_files.block import Y_UP, Block, convergence
+from tests.utils.reprojection import bring_to
 from tests.utils.shared import needs
 
 RIVER, river_is_there = needs("river")

@@ -12,9 +12,9 @@ from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
 from pcfix.errors import InputError
-from pcfix.io.cameras.georeference import bring_to, georeference
+from pcfix.io.cameras.georeference import georeference
 from pcfix.model import Cameras, GnssPositions
-from tests.utils.reprojection import check_file
+from tests.utils.reprojection import bring_to, check_file
 from tests.utils.shared import needs
 
 UCLM, uclm = needs("cameras", "metashape", "uclm_sorolla")

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 
-from pcfix.io.cameras.georeference import adjusted_minus_gnss, bring_to
+from pcfix.io.cameras.georeference import adjusted_minus_gnss
 from pcfix.model import Cameras, GnssPositions
-from tests.utils.reprojection import check_file
+from tests.utils.reprojection import bring_to, check_file
 from tests.utils.shared import needs
 
 WHEAT, wheat = needs("cameras", "metashape", "easyidp_wheat_psx")

@@ -70,5 +70,3 @@ def test_nothing_is_replaced_unasked(tmp_path):
     with pytest.raises(SettingError, match=r"sensor.csv: the output exists"):
         write_table(tmp_path, small_block())
     assert not (tmp_path / "cameras.csv").exists()
-    write_table(tmp_path, small_block(), overwrite=True)
-    assert read_cameras(tmp_path / "cameras.csv").crs == "EPSG:32636"

@@ -25,6 +25,7 @@ order of P1 and P2 and the factor pi / 2 follow converters that cite those pages
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path, PureWindowsPath
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
@@ -33,14 +34,7 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.blocksexchange.document import (
-    Photogroup,
-    ReferenceSystems,
-    Rows,
-    is_archive_of_block,
-    read_document,
-    read_ties,
-)
+from pcfix.io.cameras.blocksexchange import document
 from pcfix.io.cameras.checks import number
 from pcfix.io.cameras.formats import Source
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
@@ -51,22 +45,21 @@ __all__ = ["read", "recognises", "tie_points"]
 
 def recognises(source: Source) -> bool:
     """Whether the root element is BlocksExchange, in a plain file or a zip archive."""
-    return "<BlocksExchange" in source.text or is_archive_of_block(source)
+    return "<BlocksExchange" in source.text or document.is_archive_of_block(source)
 
 
 def read(source: Source) -> Cameras:
     """Read poses and lenses, in the CRS of the block."""
-    return read_photos(source.path, read_document(source.path)[0])[0]
+    return read_photos(source.path, document.read_document(source.path)[0])[0]
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the tie points of the block; those of a CRS of their own lose their coordinates."""
-    root, texts = read_document(source.path)
-    return read_ties(source.path, texts, cameras, read_photos(source.path, root)[1])
+    root, texts = document.read_document(source.path)
+    return document.read_ties(source.path, texts, cameras, read_photos(source.path, root)[1])
 
 
 EXIF_CRS = "EPSG:4326"
-AXES = ("x", "y", "z")
 MAIN_COMPONENT = "1"
 
 
@@ -83,55 +76,45 @@ class Photo(NamedTuple):
     prior: tuple[str, FloatArray] | None
 
 
-def read_photos(path: Path, root: Element) -> tuple[Cameras, Rows]:
+def read_photos(path: Path, root: Element) -> tuple[Cameras, document.Rows]:
     """Read all photos of a document."""
-    systems = ReferenceSystems(path, root)
     blocks = list(root.iter("Block"))
     photos: list[Photo] = []
     unposed: list[str] = []
-    groups: dict[tuple[int, str], Photogroup] = {}
+    groups: dict[tuple[int, str], document.Photogroup] = {}
     for number_of_block, block in enumerate(blocks):
         for element in block.iter("Photogroup"):
-            group = Photogroup(path, element)
-            srs = _text(element, "SRSId") or _text(block, "SRSId")
+            group = document.Photogroup(path, element)
+            srs = document.text_of(element, "SRSId") or document.text_of(block, "SRSId")
             found, without = _of_group(path, number_of_block, group, srs)
             photos += found
             unposed += without
             groups.update({photo.key: group for photo in found})
-        for element in block.iterfind("BulkPhotos/Photo"):
-            unposed.append(_label(element))
+        unposed += [_label(element) for element in block.iterfind("BulkPhotos/Photo")]
     photos, others, notes = _of_one_frame(path, photos)
-    _refuse_copies(path, photos, len(blocks))
-    srs = _one_srs(path, photos)
-    crs = systems.of(srs)
-    row_of = {photo.key: row for row, photo in enumerate(photos)}
-    rows = Rows(row_of, groups, srs, [_text(block, "SRSId") for block in blocks])
-    return _cameras(photos, systems, crs, tuple(unposed + others), notes), rows
-
-
-def _cameras(
-    photos: list[Photo],
-    systems: ReferenceSystems,
-    crs: str,
-    unposed: tuple[str, ...],
-    notes: tuple[str, ...],
-) -> Cameras:
+    srs = photos[0].srs
     rotations = [photo.rotation for photo in photos if photo.rotation is not None]
     lenses = [photo.lens for photo in photos if photo.lens is not None]
-    return Cameras(
+    cameras = Cameras(
         labels=tuple(photo.label for photo in photos),
         centres=np.array([photo.centre for photo in photos]),
         rotations=np.array(rotations) if rotations else None,
         lenses=tuple(lenses) if rotations and len(lenses) == len(photos) else None,
-        crs=crs,
+        crs=document.crs_of(path, root, srs),
         notes=notes,
-        gnss=_gnss(photos, systems),
-        unposed=unposed,
+        gnss=_gnss(path, root, photos),
+        unposed=tuple(unposed + others),
         source="BlocksExchange",
+    )
+    row_of = {photo.key: row for row, photo in enumerate(photos)}
+    return cameras, document.Rows(
+        row_of, groups, srs, [document.text_of(block, "SRSId") for block in blocks]
     )
 
 
-def _of_group(path: Path, block: int, group: Photogroup, srs: str) -> tuple[list[Photo], list[str]]:
+def _of_group(
+    path: Path, block: int, group: document.Photogroup, srs: str
+) -> tuple[list[Photo], list[str]]:
     """Return the photos of a group that have a position, and the names of the others."""
     lens, axes = group.lens(), group.axes()
     found, without = [], []
@@ -142,13 +125,13 @@ def _of_group(path: Path, block: int, group: Photogroup, srs: str) -> tuple[list
             without.append(label)
             continue
         photo = Photo(
-            key=(block, _text(element, "Id")),
+            key=(block, document.text_of(element, "Id")),
             label=label,
-            centre=_position(path, f"image {label}, Center", centre),
+            centre=_numbers(path, f"image {label}, Center", centre, "xyz"),
             rotation=_rotation(path, label, element.find("Pose/Rotation"), axes),
             lens=lens,
             srs=srs,
-            component=_text(element, "Component") or MAIN_COMPONENT,
+            component=document.text_of(element, "Component") or MAIN_COMPONENT,
             prior=_prior(path, label, element, srs),
         )
         found.append(photo)
@@ -159,47 +142,37 @@ def _of_one_frame(
     path: Path, photos: list[Photo]
 ) -> tuple[list[Photo], list[str], tuple[str, ...]]:
     """Return the photos that belong together, the names of the others, and what to tell."""
-    main = [photo for photo in photos if photo.component == MAIN_COMPONENT]
-    whole = main or photos
+    whole = [photo for photo in photos if photo.component == MAIN_COMPONENT] or photos
     turned = [photo for photo in whole if photo.rotation is not None]
     kept = turned or whole
     if not kept:
         raise InputError(
             f"{path}: no photo has a pose; export the block after the aerotriangulation."
         )
-    ids = {photo.key for photo in kept}
-    notes = []
+    boundless = next((photo.label for photo in kept if photo.lens is None), None)
+    notes: tuple[str, ...] = ()
     if not turned:
-        notes.append(f"{path}: no photo has a rotation, only positions are read.")
-    elif any(photo.lens is None for photo in kept):
-        name = next(photo.label for photo in kept if photo.lens is None)
-        notes.append(
-            f"{path}: image {name}: its photogroup has no frame or focal length; frames are taken"
-            " as boundless."
+        notes = (f"{path}: no photo has a rotation, only positions are read.",)
+    elif boundless is not None:
+        notes = (
+            f"{path}: image {boundless}: its photogroup has no frame or focal length; frames are"
+            " taken as boundless.",
         )
-    return kept, [photo.label for photo in photos if photo.key not in ids], tuple(notes)
-
-
-def _refuse_copies(path: Path, photos: list[Photo], blocks: int) -> None:
-    """Refuse a photo that is in two blocks, as only one of its poses can be the one."""
-    if blocks > 1:
-        seen: dict[str, int] = {}
-        for photo in photos:
-            if seen.setdefault(photo.label, photo.key[0]) != photo.key[0]:
-                raise InputError(
-                    f"{path}: image {photo.label} is in several blocks of the file; export the one"
-                    " block that the cloud was made from."
-                )
-
-
-def _one_srs(path: Path, photos: list[Photo]) -> str:
-    ids = sorted({photo.srs for photo in photos})
-    if len(ids) > 1:
+    block_of: dict[str, int] = {}
+    for photo in kept:
+        if block_of.setdefault(photo.label, photo.key[0]) != photo.key[0]:
+            raise InputError(
+                f"{path}: image {photo.label} is in several blocks of the file; export the one"
+                " block that the cloud was made from."
+            )
+    systems = sorted({photo.srs for photo in kept})
+    if len(systems) > 1:
         raise InputError(
             f"{path}: the positions are in several spatial reference systems (ids"
-            f" {', '.join(i or 'local' for i in ids)}); export the block in one."
+            f" {', '.join(i or 'local' for i in systems)}); export the block in one."
         )
-    return ids[0]
+    ids = {photo.key for photo in kept}
+    return kept, [photo.label for photo in photos if photo.key not in ids], notes
 
 
 def _rotation(
@@ -208,11 +181,12 @@ def _rotation(
     """Return world to x right, y down, z forward; None where there is no rotation."""
     if element is None or len(element) == 0:
         return None
-    names = [f"M_{row}{column}" for row in range(3) for column in range(3)]
+    where = f"image {label}"
     if element.find("M_00") is not None:
-        matrix = _numbers(path, label, element, names).reshape(3, 3)
+        names = [f"M_{row}{column}" for row in range(3) for column in range(3)]
+        matrix = _named_numbers(path, where, element, names).reshape(3, 3)
     elif element.find("Omega") is not None:
-        angles = _numbers(path, label, element, ["Omega", "Phi", "Kappa"])
+        angles = _named_numbers(path, where, element, ["Omega", "Phi", "Kappa"])
         matrix = from_photogrammetric(from_omega_phi_kappa(*angles.reshape(3, 1)))[0]
     elif element.find("Pitch") is not None:
         raise InputError(
@@ -228,16 +202,16 @@ def _prior(path: Path, label: str, element: Element, srs: str) -> tuple[str, Flo
     """Return the SRS id ("exif" for that of EXIF) and position before the adjustment."""
     centre = element.find("Pose/Metadata/Center")
     if centre is not None:
-        own = _text(element, "Pose/Metadata/SRSId")
-        return own or srs, _position(path, f"image {label}, Metadata", centre)
+        own = document.text_of(element, "Pose/Metadata/SRSId")
+        return own or srs, _numbers(path, f"image {label}, Metadata", centre, "xyz")
     gps = element.find("ExifData/GPS")
     names = ["Longitude", "Latitude", "Altitude"]
     if gps is not None and all(gps.findtext(name) for name in names):
-        return "exif", _numbers(path, f"{label}, GPS", gps, names)
+        return "exif", _named_numbers(path, f"image {label}, GPS", gps, names)
     return None
 
 
-def _gnss(photos: list[Photo], systems: ReferenceSystems) -> GnssPositions | None:
+def _gnss(path: Path, root: Element, photos: list[Photo]) -> GnssPositions | None:
     """Return one row per photo; positions in the CRS that the first of them has."""
     srs = next((photo.prior[0] for photo in photos if photo.prior is not None), None)
     if srs is None:
@@ -246,25 +220,19 @@ def _gnss(photos: list[Photo], systems: ReferenceSystems) -> GnssPositions | Non
     for row, photo in enumerate(photos):
         if photo.prior is not None and photo.prior[0] == srs:
             xyz[row] = photo.prior[1]
-    crs = EXIF_CRS if srs == "exif" else systems.of(srs)
+    crs = EXIF_CRS if srs == "exif" else document.crs_of(path, root, srs)
     return GnssPositions(xyz, np.full_like(xyz, np.nan), crs)
 
 
-def _position(path: Path, where: str, element: Element) -> FloatArray:
-    return np.array([number(path, where, element.findtext(axis)) for axis in AXES])
+def _numbers(path: Path, where: str, element: Element, names: Iterable[str]) -> FloatArray:
+    return np.array([number(path, where, element.findtext(name)) for name in names])
 
 
-def _numbers(path: Path, label: str, element: Element, names: list[str]) -> FloatArray:
-    return np.array(
-        [number(path, f"image {label}, {name}", element.findtext(name)) for name in names]
-    )
+def _named_numbers(path: Path, where: str, element: Element, names: list[str]) -> FloatArray:
+    return np.array([number(path, f"{where}, {name}", element.findtext(name)) for name in names])
 
 
 def _label(element: Element) -> str:
     """Return the name of the image file, or the id of a photo without one."""
-    name = PureWindowsPath(_text(element, "ImagePath")).name
-    return name or f"photo {_text(element, 'Id')}"
-
-
-def _text(element: Element, name: str) -> str:
-    return (element.findtext(name) or "").strip()
+    name = PureWindowsPath(document.text_of(element, "ImagePath")).name
+    return name or f"photo {document.text_of(element, 'Id')}"

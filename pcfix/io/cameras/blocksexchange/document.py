@@ -7,6 +7,7 @@ import math
 import re
 import zipfile
 import zlib
+from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
@@ -20,6 +21,7 @@ from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.tracks import tie_points
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens, TiePoints
 
+ZIP_MAGIC = b"PK\x03\x04"
 COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
 TIE_POINTS = re.compile(rb"<TiePoints>(.*?)</TiePoints>", re.DOTALL)
 LARGEST_RATIO = 200
@@ -28,7 +30,7 @@ LARGEST_RATIO = 200
 
 def is_archive_of_block(source: Source) -> bool:
     """Whether a file is a zip archive with a BlocksExchange document; never an error."""
-    if not source.head.startswith(b"PK\x03\x04"):
+    if not source.head.startswith(ZIP_MAGIC):
         return False
     try:
         with zipfile.ZipFile(source.path) as archive:
@@ -38,21 +40,14 @@ def is_archive_of_block(source: Source) -> bool:
         return False
 
 
-class TieText(NamedTuple):
-    """The inside of an element TiePoints, and the number of its block."""
-
-    block: int
-    text: bytes
-
-
-def read_document(path: Path) -> tuple[Element, list[TieText]]:
-    """Return the root element without its tie points, and those as text.
+def read_document(path: Path) -> tuple[Element, list[tuple[int, bytes]]]:
+    """Return the root element without its tie points, and those as text with their block's number.
 
     There can be millions of measurements, which a tree of elements would take minutes for.
     """
     data = read_bytes(path)
     found = [
-        TieText(data.count(b"<Block>", 0, match.start()) - 1, match[1])
+        (data.count(b"<Block>", 0, match.start()) - 1, match[1])
         for match in TIE_POINTS.finditer(data)
     ]
     return read_xml(path, io.BytesIO(TIE_POINTS.sub(b"", data))), found
@@ -60,19 +55,16 @@ def read_document(path: Path) -> tuple[Element, list[TieText]]:
 
 def read_bytes(path: Path) -> bytes:
     """Return a file, or the XML document in a zip archive, without comments."""
-    return COMMENT.sub(b"", _unpacked(path))
-
-
-def _unpacked(path: Path) -> bytes:
-    with path.open("rb") as stream:
-        packed = stream.read(4) == b"PK\x03\x04"
-    if not packed:
-        return path.read_bytes()
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return archive.read(_document_name(path, archive))
-    except (OSError, zipfile.BadZipFile, zlib.error, RuntimeError, ValueError) as error:
-        raise InputError(f"{path}: the archive is damaged ({error}); export it again.") from error
+    data = path.read_bytes()
+    if data.startswith(ZIP_MAGIC):
+        try:
+            with zipfile.ZipFile(path) as archive:
+                data = archive.read(_document_name(path, archive))
+        except (OSError, zipfile.BadZipFile, zlib.error, RuntimeError, ValueError) as error:
+            raise InputError(
+                f"{path}: the archive is damaged ({error}); export it again."
+            ) from error
+    return COMMENT.sub(b"", data)
 
 
 def _document_name(path: Path, archive: zipfile.ZipFile) -> str:
@@ -84,47 +76,37 @@ def _document_name(path: Path, archive: zipfile.ZipFile) -> str:
     raise InputError(f"{path}: the archive has no XML document.")
 
 
-class ReferenceSystems:
-    """The spatial reference systems of a document by their ids."""
-
-    def __init__(self, path: Path, root: Element) -> None:
-        self._path = path
-        self._definitions = {_text(srs, "Id"): _text(srs, "Definition") for srs in root.iter("SRS")}
-
-    def of(self, srs_id: str) -> str:
-        """Return the CRS of an id as `Cameras` has it; without an id the frame is local."""
-        if not srs_id:
-            return "local"
-        if srs_id not in self._definitions:
-            raise InputError(
-                f"{self._path}: there is no spatial reference system with the id {srs_id}; export"
-                " the block again."
-            )
-        definition = self._definitions[srs_id]
-        if definition.upper().startswith("ENU:"):
-            return self._local_frame(definition)
-        return checks.crs(self._path, definition)
-
-    def _local_frame(self, definition: str) -> str:
-        """Return ENU:latitude,longitude,height; the height is 0 where none is given."""
-        words = definition[4:].split(",")
-        try:
-            numbers = [float(word) for word in words]
-        except ValueError:
-            numbers = []
-        if len(numbers) not in (2, 3) or not abs(numbers[0]) <= 90 or not abs(numbers[1]) <= 360:
-            raise InputError(
-                f"{self._path}: '{definition[:80]}' is not ENU:latitude,longitude in degrees."
-            )
-        return "ENU:" + ",".join(word.strip() for word in [*words, "0"][:3])
+def crs_of(path: Path, root: Element, srs_id: str) -> str:
+    """Return the CRS of an id as `Cameras` has it; without an id the frame is local."""
+    if not srs_id:
+        return "local"
+    definitions = {text_of(srs, "Id"): text_of(srs, "Definition") for srs in root.iter("SRS")}
+    if srs_id not in definitions:
+        raise InputError(
+            f"{path}: there is no spatial reference system with the id {srs_id}; export the block"
+            " again."
+        )
+    definition = definitions[srs_id]
+    if not definition.upper().startswith("ENU:"):
+        return checks.crs(path, definition)
+    words = definition[4:].split(",")
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (2, 3) or not abs(numbers[0]) <= 90 or not abs(numbers[1]) <= 360:
+        raise InputError(f"{path}: '{definition[:80]}' is not ENU:latitude,longitude in degrees.")
+    return "ENU:" + ",".join(word.strip() for word in [*words, "0"][:3])
 
 
-def _text(element: Element, name: str) -> str:
+def text_of(element: Element, name: str) -> str:
+    """Return the text of an element inside another, empty where there is none."""
     return (element.findtext(name) or "").strip()
 
 
 FIRST_PIXEL = 0.5
 """The centre of the first pixel, seen from its corner."""
+BROWN = (("K1", "K2", "K3"), ("P1", "P2"))
 DIRECTIONS = {"Right": (1, 0), "Left": (-1, 0), "Down": (0, 1), "Up": (0, -1)}
 ORIENTATIONS = {
     f"X{x}Y{y}": np.array([(*DIRECTIONS[x], 0.0), (*DIRECTIONS[y], 0.0)])
@@ -145,9 +127,8 @@ class Photogroup:
     def number(self, name: str) -> float | None:
         """Return the number of an element, or None where the group has no such element."""
         text = self.element.findtext(name)
-        if text is None or not text.strip():
-            return None
-        return number(self.path, f"photogroup {self.name}, {name}", text)
+        where = f"photogroup {self.name}, {name}"
+        return number(self.path, where, text) if text and text.strip() else None
 
     def numbers(self, parent: str, names: tuple[str, ...]) -> list[float]:
         """Return numbers below an element, 0 for those that are not there."""
@@ -155,7 +136,7 @@ class Photogroup:
 
     def axes(self) -> FloatArray:
         """Return the matrix from camera axes to x right, y down, z forward."""
-        name = (self.element.findtext("CameraOrientation") or "XRightYDown").strip()
+        name = text_of(self.element, "CameraOrientation") or "XRightYDown"
         if name not in ORIENTATIONS:
             raise InputError(
                 f"{self.path}: photogroup {self.name}: the camera orientation '{name}' is not one"
@@ -178,35 +159,37 @@ class Photogroup:
 
     def lens(self) -> Lens | None:
         """Return the lens, or None where the group lacks frame or focal length."""
-        kind = (self.element.findtext("CameraModelType") or "Perspective").strip()
+        kind = text_of(self.element, "CameraModelType") or "Perspective"
         if kind not in ("Perspective", "Fisheye"):
             raise InputError(
                 f"{self.path}: photogroup {self.name}: the camera model {kind} is not supported;"
                 " export Perspective or Fisheye photos."
             )
-        self._refuse_other_distortions()
-        has_matrix = kind == "Fisheye" and self.element.find("FisheyeFocalMatrix") is not None
-        focal = self._focal_px()
-        if not min(self.size()) > 0.0 or (focal is None and not has_matrix):
-            return None
-        lens = self._perspective(focal or 0.0) if kind == "Perspective" else self._fisheye(focal)
-        return checks.lens(self.path, f"of photogroup {self.name}", lens)
-
-    def _refuse_other_distortions(self) -> None:
-        for child in self.element:
-            tag = str(child.tag)
+        for tag in (str(child.tag) for child in self.element):
             if "Distortion" in tag and tag not in ("Distortion", "FisheyeDistortion"):
                 raise InputError(
                     f"{self.path}: photogroup {self.name}: the distortion {tag} is not supported;"
                     " export BlocksExchange 3.2 or older, or undistorted photos."
                 )
-
-    def _focal_px(self) -> float | None:
-        focal_px, focal_mm = self.number("FocalLengthPixels"), self.number("FocalLength")
-        pixel = self.pixel_size_mm()
-        if focal_px is None and focal_mm is not None and pixel is not None:
-            return focal_mm / pixel
-        return focal_px
+        matrix, (width, height) = self._matrix(kind), self.size()
+        if matrix is None or not min(width, height) > 0.0:
+            return None
+        m00, m01, m10, m11 = matrix
+        u, v = self.principal_point()
+        lens = Lens(
+            *(m11, width, height, u, v, m00 - m11, m01, m10),
+            pixel_size_mm=self.pixel_size_mm(),
+            sensor=self.name,
+        )
+        if kind == "Perspective":
+            radial, tangential = (self.numbers("Distortion", names) for names in BROWN)
+            lens = replace(lens, radial=tuple(radial), tangential=tuple(tangential))
+        else:
+            shape = [0.0, 1.0, 0.0, 0.0, 0.0]
+            if self.element.find("FisheyeDistortion") is not None:
+                shape = self.numbers("FisheyeDistortion", ("P0", "P1", "P2", "P3", "P4"))
+            lens = replace(lens, projection="polynomial", shape=tuple(shape))
+        return checks.lens(self.path, f"of photogroup {self.name}", lens)
 
     def principal_point(self) -> tuple[float, float]:
         """Return the principal point in pixels from the corner; the centre where none is given."""
@@ -221,48 +204,20 @@ class Photogroup:
         u, v = np.array(self.size()) / 2.0 + offset
         return float(u), float(v)
 
-    def _perspective(self, focal: float) -> Lens:
+    def _matrix(self, kind: str) -> list[float] | None:
+        """Return the focal lengths and skews, a matrix by rows, or None where there are none."""
+        if kind == "Fisheye" and self.element.find("FisheyeFocalMatrix") is not None:
+            return self.numbers("FisheyeFocalMatrix", ("M_00", "M_01", "M_10", "M_11"))
+        focal, focal_mm = self.number("FocalLengthPixels"), self.number("FocalLength")
+        pixel = self.pixel_size_mm()
+        if focal is None and focal_mm is not None and pixel is not None:
+            focal = focal_mm / pixel
+        if focal is None:
+            return None
+        if kind == "Fisheye":
+            return [math.pi / 2.0 * focal, 0.0, 0.0, math.pi / 2.0 * focal]
         aspect = self.number("AspectRatio")
-        down = focal if aspect is None else focal * aspect
-        width, height = self.size()
-        u, v = self.principal_point()
-        return Lens(
-            focal=down,
-            width=width,
-            height=height,
-            principal_x=u,
-            principal_y=v,
-            b1=focal - down,
-            b2=self.number("Skew") or 0.0,
-            radial=tuple(self.numbers("Distortion", ("K1", "K2", "K3"))),
-            tangential=tuple(self.numbers("Distortion", ("P1", "P2"))),
-            pixel_size_mm=self.pixel_size_mm(),
-            sensor=self.name,
-        )
-
-    def _fisheye(self, focal: float | None) -> Lens:
-        m00, m01, m10, m11 = self.numbers("FisheyeFocalMatrix", ("M_00", "M_01", "M_10", "M_11"))
-        if self.element.find("FisheyeFocalMatrix") is None and focal is not None:
-            m00 = m11 = math.pi / 2.0 * focal
-        shape = [0.0, 1.0, 0.0, 0.0, 0.0]
-        if self.element.find("FisheyeDistortion") is not None:
-            shape = self.numbers("FisheyeDistortion", ("P0", "P1", "P2", "P3", "P4"))
-        width, height = self.size()
-        u, v = self.principal_point()
-        return Lens(
-            focal=m11,
-            width=width,
-            height=height,
-            principal_x=u,
-            principal_y=v,
-            b1=m00 - m11,
-            b2=m01,
-            b3=m10,
-            projection="polynomial",
-            shape=tuple(shape),
-            pixel_size_mm=self.pixel_size_mm(),
-            sensor=self.name,
-        )
+        return [focal, self.number("Skew") or 0.0, 0.0, focal if aspect is None else focal * aspect]
 
 
 class Rows(NamedTuple):
@@ -294,16 +249,13 @@ class Tokens:
         begun = np.where(self.code < len(BEGINS), np.arange(len(self.code)), 0)
         self.inside = self.code[np.maximum.accumulate(begun)] if len(begun) else self.code
 
-    def rows(self, name: str, within: str) -> IntArray:
-        """Return the rows of a tag inside the latest element of a name."""
-        return np.flatnonzero((self.code == CODES[name]) & (self.inside == CODES[within]))
-
     def numbers(self, names: tuple[str, ...], within: str) -> FloatArray:
         """Return one row per point (within Position) or measurement; NaN where there is none."""
         number = self.point if within == "Position" else self.measurement
         values = np.full((int(number[-1]) + 1 if len(number) else 0, len(names)), np.nan)
+        inside = self.inside == CODES[within]
         for column, name in enumerate(names):
-            rows = self.rows(name, within)
+            rows = np.flatnonzero((self.code == CODES[name]) & inside)
             try:
                 values[number[rows], column] = np.array([self.texts[row] for row in rows], float)
             except ValueError as error:
@@ -321,7 +273,9 @@ class Tokens:
         return texts
 
 
-def read_ties(path: Path, texts: list[TieText], cameras: Cameras, rows: Rows) -> TiePoints:
+def read_ties(
+    path: Path, texts: list[tuple[int, bytes]], cameras: Cameras, rows: Rows
+) -> TiePoints:
     """Read all tie points that a posed photo saw."""
     xyz, point, camera, uv = [np.empty((0, 3))], [], [], [np.empty((0, 2))]
     for block, text in texts:
@@ -376,20 +330,17 @@ def _places(
     """Return u, v in pixels from the corner, of places in pixels or in mm."""
     uv = tokens.numbers(("x", "y"), "Measurement") + FIRST_PIXEL
     missing: BoolArray = ~np.isfinite(uv).all(axis=1) & (camera >= 0)
-    if missing.any():
-        mm = tokens.numbers(("xmm", "ymm"), "Measurement")
-        for row in np.flatnonzero(missing):
-            uv[row] = _from_mm(mm[row], groups[row])
-            if not np.isfinite(uv[row]).all():
-                raise InputError(
-                    f"{tokens.path}: photo {ids[row]}: a measurement of a tie point has no x and"
-                    " y, or is in mm and the photogroup has no pixel size."
-                )
+    if not missing.any():
+        return uv
+    mm = tokens.numbers(("xmm", "ymm"), "Measurement")
+    for row in np.flatnonzero(missing):
+        group = groups[row]
+        pixel = None if group is None else group.pixel_size_mm()
+        if group is not None and pixel is not None:
+            uv[row] = group.principal_point() + group.axes()[:2, :2] @ mm[row] / pixel
+        if pixel is None or not np.isfinite(uv[row]).all():
+            raise InputError(
+                f"{tokens.path}: photo {ids[row]}: a measurement of a tie point has no x and y, or"
+                " is in mm and the photogroup has no pixel size."
+            )
     return uv
-
-
-def _from_mm(mm: FloatArray, group: Photogroup | None) -> FloatArray:
-    pixel = None if group is None else group.pixel_size_mm()
-    if group is None or pixel is None:
-        return np.full(2, np.nan)
-    return np.asarray(group.principal_point() + group.axes()[:2, :2] @ mm / pixel)

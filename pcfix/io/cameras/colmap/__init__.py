@@ -30,20 +30,13 @@ import sqlite3
 from collections.abc import Sequence
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.colmap.files import (
-    Camera,
-    Image,
-    lens,
-    read_cameras,
-    read_images,
-    read_points,
-)
+from pcfix.io.cameras.colmap import files
 from pcfix.io.cameras.formats import Source
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import read_json
@@ -75,8 +68,8 @@ def recognises(source: Source) -> bool:
 def read(source: Source) -> Cameras:
     """Read the poses of registered images and their lenses."""
     model = _model(source)
-    cameras = read_cameras(model.part("cameras"))
-    images: list[Image] = read_images(model.part("images"), points=False)
+    cameras = files.read_cameras(model.part("cameras"))
+    images: list[files.Image] = files.read_images(model.part("images"), points=False)
     posed = [image for image in images if image.posed]
     path = model.part("images")
     if not posed:
@@ -89,13 +82,17 @@ def read(source: Source) -> Cameras:
     if place is not None and gnss is not None and gnss.crs is None:
         gnss = None  # of the model that the database found, which this one may not be
     centres = -np.einsum("kji,kj->ki", rotations, poses[:, 4:])
+    others = (
+        f"{model.folder}: is the largest of {model.others + 1} models of the block, which are not"
+        " tied to each other; the images of the others are left out."
+    )
     return Cameras(
         labels=labels,
         centres=centres if place is None else centres + place.offset_m,
         rotations=rotations,
         lenses=_lenses(model, cameras, posed),
         crs=None if place is None else place.crs,
-        notes=(*_others(model), *notes),
+        notes=(others, *notes) if model.others else notes,
         gnss=gnss,
         unposed=tuple(image.name for image in images if not image.posed),
         source="COLMAP",
@@ -108,8 +105,8 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     path = model.part("points3D")
     if not path.is_file():
         raise InputError(f"{path}: there is no such file, so there are no tie points.")
-    points = read_points(path)
-    images = [i for i in read_images(model.part("images"), points=True) if i.posed]
+    points = files.read_points(path)
+    images = [i for i in files.read_images(model.part("images"), points=True) if i.posed]
     if not len(points.identifiers) or not any(len(image.points) for image in images):
         raise InputError(f"{path}: the model has no points that its images saw; no tie points.")
     seen = np.concatenate([image.points for image in images])
@@ -132,27 +129,19 @@ def _rows_of(identifiers: IntArray, wanted: IntArray) -> IntArray:
     return np.where(identifiers[row] == wanted, row, -1)
 
 
-def _lenses(model: Model, cameras: dict[int, Camera], images: list[Image]) -> tuple[Lens, ...]:
-    found: dict[int, Lens] = {}
+def _lenses(
+    model: Model, cameras: dict[int, files.Camera], images: list[files.Image]
+) -> tuple[Lens, ...]:
     for image in images:
         if image.camera not in cameras:
             raise InputError(
                 f"{model.part('images')}: image {image.name}: its camera {image.camera} is not in"
                 f" {model.part('cameras').name}; export the model again."
             )
-        if image.camera not in found:
-            camera = cameras[image.camera]
-            found[image.camera] = lens(model.part("cameras"), image.camera, camera)
+    path = model.part("cameras")
+    used = dict.fromkeys(image.camera for image in images)
+    found = {number: files.lens(path, number, cameras[number]) for number in used}
     return tuple(found[image.camera] for image in images)
-
-
-def _others(model: Model) -> tuple[str, ...]:
-    if not model.others:
-        return ()
-    return (
-        f"{model.folder}: is the largest of {model.others + 1} models of the block, which are not"
-        " tied to each other; the images of the others are left out.",
-    )
 
 
 def _model(source: Source) -> Model:
@@ -168,27 +157,28 @@ def _find(path: Path) -> Model | None:
         part = _PART.fullmatch(path.name)
         return _in_folder(path.parent, part[2]) if part else None
     for folder in (path, path / "sparse"):
-        found = _in_folder(folder, "bin") or _in_folder(folder, "txt")
+        found = _in_folder(folder, "bin", "txt")
         if found or not folder.is_dir():
             return found
         numbered = [p for p in folder.iterdir() if p.name.isdecimal()]
-        models = [m for p in numbered if (m := _in_folder(p, "bin") or _in_folder(p, "txt"))]
+        models = [m for p in numbered if (m := _in_folder(p, "bin", "txt"))]
         if models:
             models.sort(key=lambda m: (-m.part("images").stat().st_size, m.folder.name))
             return models[0]._replace(others=len(models) - 1)
     return None
 
 
-def _in_folder(folder: Path, suffix: str) -> Model | None:
-    model = Model(folder, suffix)
-    cameras, images = model.part("cameras"), model.part("images")
-    if not (cameras.is_file() and images.is_file()):
-        return None
-    if suffix == "txt":
+def _in_folder(folder: Path, *suffixes: str) -> Model | None:
+    for model in (Model(folder, suffix) for suffix in suffixes):
+        cameras = model.part("cameras")
+        if not (cameras.is_file() and model.part("images").is_file()):
+            continue
+        if model.suffix == "bin":
+            return model
         with cameras.open(encoding="utf-8-sig", errors="replace") as stream:
-            if not _CAMERA_LINE.search(stream.read(4096)):
-                return None
-    return model
+            if _CAMERA_LINE.search(stream.read(4096)):
+                return model
+    return None
 
 
 FILE = "georeference.json"
@@ -234,8 +224,6 @@ _FOLDERS_ABOVE = 3
 _WGS84 = 0
 _WGS84_CRS = "EPSG:4979"
 
-_Row: TypeAlias = tuple[str, bytes, bytes | None, int]
-
 
 def read_priors(model: Path, labels: Sequence[str]) -> tuple[GnssPositions | None, tuple[str, ...]]:
     """Return the priors of images from the database beside or above a model, and notes on it."""
@@ -248,13 +236,25 @@ def read_priors(model: Path, labels: Sequence[str]) -> tuple[GnssPositions | Non
     except sqlite3.Error as error:
         return None, (f"{path}: the pose priors cannot be read ({error}); they are left out.",)
     row_of = {label: i for i, label in enumerate(labels)}
-    found = [(row_of[row[0]], row) for row in rows if row[0] in row_of]
-    if len({row[-1] for _, row in found}) > 1:
+    found = [(row_of[name], *row) for name, *row in rows if name in row_of]
+    systems = {system for *_, system in found}
+    if len(systems) > 1:
         return None, (f"{path}: the pose priors are in several systems; they are left out.",)
-    return _positions(found, len(labels)), ()
+    xyz, sigma = np.full((2, len(labels), 3), np.nan)
+    for i, position, covariance, _ in found:
+        xyz[i] = np.frombuffer(position, "<f8")
+        if isinstance(covariance, bytes) and len(covariance) == 9 * 8:
+            variances = np.frombuffer(covariance, "<f8").reshape(3, 3).diagonal()
+            sigma[i] = np.sqrt(np.where(variances >= 0.0, variances, np.nan))
+    xyz[~np.isfinite(xyz).all(axis=1)] = np.nan
+    if np.isnan(xyz).all():
+        return None, ()
+    wgs84 = systems == {_WGS84}
+    xyz = xyz[:, [1, 0, 2]] if wgs84 else xyz
+    return GnssPositions(xyz, sigma, _WGS84_CRS if wgs84 else None), ()
 
 
-def _rows(path: Path) -> list[_Row]:
+def _rows(path: Path) -> list[tuple[Any, ...]]:
     """Return name, position, covariance and coordinate system; nothing is written or locked."""
     whole = not path.with_name(path.name + "-wal").exists()
     uri = path.resolve().as_uri() + ("?immutable=1" if whole else "?mode=ro")
@@ -270,17 +270,3 @@ def _rows(path: Path) -> list[_Row]:
             f" WHERE {camera} AND typeof(position) = 'blob' AND length(position) = 24"
             " AND typeof(images.name) = 'text'"
         ).fetchall()
-
-
-def _positions(found: Sequence[tuple[int, _Row]], count: int) -> GnssPositions | None:
-    xyz, sigma = np.full((2, count, 3), np.nan)
-    for row, (_, position, covariance, _) in found:
-        xyz[row] = np.frombuffer(position, "<f8")
-        if isinstance(covariance, bytes) and len(covariance) == 9 * 8:
-            variances = np.frombuffer(covariance, "<f8").reshape(3, 3).diagonal()
-            sigma[row] = np.sqrt(np.where(variances >= 0.0, variances, np.nan))
-    xyz[~np.isfinite(xyz).all(axis=1)] = np.nan
-    if np.isnan(xyz).all():
-        return None
-    wgs84 = found[0][1][-1] == _WGS84
-    return GnssPositions(xyz[:, [1, 0, 2]] if wgs84 else xyz, sigma, _WGS84_CRS if wgs84 else None)

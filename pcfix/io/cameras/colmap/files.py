@@ -17,7 +17,7 @@ import mmap
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,8 @@ from pcfix.model import FloatArray, IntArray, Lens, Projection
 
 _SMALLEST_OMEGA = 1e-6
 """Below, in radians, the FOV model is a perspective one to double precision."""
+SHAPES = {"fov": ("omega",), "division": ("k",), "eucm": ("alpha", "beta")}
+"""COLMAP's names of the parameters of a projection."""
 
 
 class Model(NamedTuple):
@@ -120,17 +122,10 @@ def _coefficients(given: dict[str, float], *names: str) -> tuple[float, ...]:
 def _projection(
     projection: Projection, given: dict[str, float]
 ) -> tuple[Projection, tuple[float, ...]]:
-    match projection:
-        case "division":
-            return projection, (given["k"],)
-        case "eucm":
-            return projection, (given["alpha"], given["beta"])
-        case "fov" if abs(given["omega"]) < _SMALLEST_OMEGA:
-            return "perspective", ()
-        case "fov":
-            return projection, (given["omega"],)
-        case _:
-            return projection, ()
+    """Return the projection and its parameters."""
+    if projection == "fov" and abs(given["omega"]) < _SMALLEST_OMEGA:
+        return "perspective", ()
+    return projection, tuple(given[name] for name in SHAPES.get(projection, ()))
 
 
 class Image(NamedTuple):
@@ -164,101 +159,97 @@ NO_XY: FloatArray = np.empty((0, 2))
 NO_POINTS: IntArray = np.empty(0, np.int64)
 
 
-def cut_off(path: Path) -> InputError:
-    """Return the error for a file that ends too early."""
-    return InputError(f"{path}: is cut off or damaged; export the model again.")
+class _Bytes:
+    """A binary file that is read piece by piece; unmapped when nothing refers to it any more."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.at = path, 0
+        with path.open("rb") as stream:
+            empty = path.stat().st_size == 0
+            self.data = b"" if empty else mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+
+    def skip(self, size: int) -> int:
+        """Return where the next bytes begin, and go on after them."""
+        begin = self.at
+        if size > len(self.data) - begin:
+            raise self.cut_off()
+        self.at += size
+        return begin
+
+    def take(self, form: struct.Struct) -> tuple[Any, ...]:
+        """Return the next numbers."""
+        return form.unpack_from(self.data, self.skip(form.size))
+
+    def name(self) -> str:
+        """Return the next text."""
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            raise self.cut_off()
+        return bytes(self.data[self.skip(end + 1 - self.at) : end]).decode("utf-8", "replace")
+
+    def count(self, least_bytes: int) -> int:
+        """Return the next count, of rows of at least so many bytes, if they can be there."""
+        (count,) = self.take(_COUNT)
+        if count * least_bytes > len(self.data) - self.at:
+            raise self.cut_off()
+        return int(count)
+
+    def cut_off(self) -> InputError:
+        """Return the error for a file that ends too early."""
+        return InputError(f"{self.path}: is cut off or damaged; export the model again.")
 
 
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")
 _IMAGE = struct.Struct("<I7dI")
-_OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
-_POINT_BYTES, _POINT_TO_COUNT, _POINT_TO_COLOUR = 51, 43, 32
-_VIEW_BYTES = 8
+OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+_POINT_BYTES, _POINT_TO_COLOUR, _VIEW_BYTES = 51, 32, 8
 
 
 def _binary_cameras(path: Path) -> dict[int, Camera]:
-    data = _bytes_of(path)
+    file = _Bytes(path)
     cameras: dict[int, Camera] = {}
-    at = _COUNT.size
-    for _ in range(_count(path, data, 0, _CAMERA.size)):
-        if at + _CAMERA.size > len(data):
-            raise cut_off(path)
-        identifier, number, width, height = _CAMERA.unpack_from(data, at)
+    for _ in range(file.count(_CAMERA.size)):
+        identifier, number, width, height = file.take(_CAMERA)
         if not 0 <= number < len(MODELS):
             raise InputError(
                 f"{path}: camera {identifier} has the model number {number}, which pcfix does not"
                 " know; give the undistorted model (colmap image_undistorter)."
             )
-        values = struct.Struct(f"<{len(MODELS[number].parameters)}d")
-        at += _CAMERA.size
-        if at + values.size > len(data):
-            raise cut_off(path)
-        camera = Camera(MODELS[number], float(width), float(height), values.unpack_from(data, at))
-        cameras[identifier] = camera
-        at += values.size
+        values = file.take(struct.Struct(f"<{len(MODELS[number].parameters)}d"))
+        cameras[identifier] = Camera(MODELS[number], float(width), float(height), values)
     return cameras
 
 
 def _binary_images(path: Path, *, points: bool) -> list[Image]:
-    data = _bytes_of(path)
+    file = _Bytes(path)
     images = []
-    at = _COUNT.size
-    for _ in range(_count(path, data, 0, _IMAGE.size + 1 + _COUNT.size)):
-        if at + _IMAGE.size > len(data):
-            raise cut_off(path)
-        identifier, *pose, camera = _IMAGE.unpack_from(data, at)
-        end = data.find(b"\0", at + _IMAGE.size)
-        name = data[at + _IMAGE.size : end].decode("utf-8", "replace")
-        observations = _count(path, data, end + 1, _OBSERVATION.itemsize) if end > 0 else -1
-        if observations < 0:
-            raise cut_off(path)
+    for _ in range(file.count(_IMAGE.size + 1 + _COUNT.size)):
+        identifier, *pose, camera = file.take(_IMAGE)
+        name = file.name()
+        count = file.count(OBSERVATION.itemsize)
+        begin = file.skip(count * OBSERVATION.itemsize)
         xy, seen = NO_XY, NO_POINTS
-        if points and observations:
-            rows = np.frombuffer(data, _OBSERVATION, observations, end + 1 + _COUNT.size)
+        if points and count:
+            rows = np.frombuffer(file.data, OBSERVATION, count, begin)
             rows = rows[rows["point"] >= 0]
             xy, seen = rows["xy"].astype(np.float64), rows["point"].astype(np.int64)
         images.append(Image(identifier, tuple(pose), camera, name, xy, seen))
-        at = end + 1 + _COUNT.size + observations * _OBSERVATION.itemsize
     return images
 
 
 def _binary_points(path: Path) -> Points:
-    data = _bytes_of(path)
-    count = _count(path, data, 0, _POINT_BYTES)
-    starts = np.empty(count, np.int64)
-    at = _COUNT.size
-    for i in range(count):
-        if at + _POINT_BYTES > len(data):
-            raise cut_off(path)
-        starts[i] = at
-        at += _POINT_BYTES + _VIEW_BYTES * _COUNT.unpack_from(data, at + _POINT_TO_COUNT)[0]
-    if at > len(data):
-        raise cut_off(path)
-    if not count:
+    file = _Bytes(path)
+    starts = np.empty(file.count(_POINT_BYTES), np.int64)
+    for i in range(len(starts)):
+        starts[i] = file.skip(_POINT_BYTES - _COUNT.size)
+        file.skip(_VIEW_BYTES * file.take(_COUNT)[0])
+    if not len(starts):
         return Points(NO_POINTS, np.empty((0, 3)))
-    every_byte = np.frombuffer(data, np.uint8)
+    every_byte = np.frombuffer(file.data, np.uint8)
     rows = np.lib.stride_tricks.sliding_window_view(every_byte, _POINT_TO_COLOUR)[starts]
     place = np.ascontiguousarray(rows[:, _COUNT.size :]).view("<f8")
     return Points(np.ascontiguousarray(rows[:, : _COUNT.size]).view("<i8")[:, 0], place)
-
-
-def _bytes_of(path: Path) -> bytes | mmap.mmap:
-    """Return the content without reading it; unmapped when nothing refers to it any more."""
-    with path.open("rb") as stream:
-        if path.stat().st_size == 0:
-            return b""
-        return mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-
-
-def _count(path: Path, data: bytes | mmap.mmap, at: int, least_bytes: int) -> int:
-    """Return the count of a list whose rows have at least so many bytes, if they can be there."""
-    if at + _COUNT.size > len(data):
-        raise cut_off(path)
-    (count,) = _COUNT.unpack_from(data, at)
-    if count * least_bytes > len(data) - at - _COUNT.size:
-        raise cut_off(path)
-    return int(count)
 
 
 _CAMERA_WORDS = 4
@@ -341,11 +332,10 @@ def _image_points(
 def _text_points(path: Path) -> Points:
     rows = []
     for number, line in _lines(path):
-        words = line.split(None, _POINT_WORDS)[:_POINT_WORDS]
-        if not words:
+        if not line:
             continue
         try:
-            identifier, x, y, z = words
+            identifier, x, y, z = line.split(None, _POINT_WORDS)[:_POINT_WORDS]
             rows.append((int(identifier), float(x), float(y), float(z)))
         except ValueError as error:
             raise _wrong(path, number, "must give a point: number, X, Y, Z, ...") from error

@@ -36,27 +36,8 @@ import numpy as np
 from pcfix.errors import InputError, PcfixError
 from pcfix.io.cameras import opensfm
 from pcfix.io.cameras.formats import Source
-from pcfix.io.cameras.odm.project import (
-    SHOTS,
-    TOPOCENTRIC,
-    TRANSFORMATION,
-    Project,
-    crs_of_place,
-    from_topocentric,
-    locate,
-    positions,
-    read_images,
-    read_shots,
-    whole_file,
-    whole_metres,
-)
-from pcfix.io.cameras.opensfm import (
-    Reconstruction,
-    left_out,
-    read_reconstruction,
-    read_tie_points,
-    topocentric,
-)
+from pcfix.io.cameras.odm import project as files
+from pcfix.io.cameras.odm.project import SHOTS, TOPOCENTRIC, TRANSFORMATION, Project
 from pcfix.model import Cameras, FloatArray, TiePoints
 
 ALIGNED_M = 0.1
@@ -70,12 +51,12 @@ _SHOTS_HEAD = re.compile(
 def recognises(source: Source) -> bool:
     """Whether it is shots.geojson, or a reconstruction in a project of ODM."""
     try:
-        project = locate(source.path)
+        project = files.locate(source.path)
         if project.poses is None:
             return False
         if not source.path.is_dir() and _SHOTS_HEAD.match(source.text):
             return True
-        poses = whole_file(project)
+        poses = files.whole_file(project)
         found = source if poses == source.path else Source(poses)
         if _SHOTS_HEAD.match(found.text):
             return True
@@ -88,20 +69,18 @@ def read(source: Source) -> Cameras:
     """Read the poses, of a folder rather from the reconstruction than from shots.geojson."""
     project, path = _poses(source)
     if not opensfm.recognises(Source(path)):
-        return read_shots(project, path)
-    found = read_reconstruction(path)
-    placed = frame(project, found)
-    gnss, listed = read_images(project.find("images.json"), found.labels)
-    cameras = Cameras(
-        labels=found.labels,
-        centres=placed.points(found.centres),
-        rotations=placed.rotations(found.rotations),
-        lenses=found.lenses,
+        return files.read_shots(project, path)
+    found = opensfm.read_reconstruction(path)
+    own, placed = found.cameras, frame(project, found)
+    gnss, listed = files.read_images(project.find("images.json"), own.labels)
+    cameras = replace(
+        own,
+        centres=placed.points(own.centres),
+        rotations=placed.rotations(np.asarray(own.rotations)),
         crs=placed.crs,
-        notes=found.notes,
         project_crs=placed.project_crs,
-        gnss=gnss or opensfm.gnss(found),
-        unposed=left_out(found.labels, [*found.left_out, *listed]),
+        gnss=gnss or own.gnss,
+        unposed=opensfm.left_out(own.labels, [*own.unposed, *listed]),
         source="OpenDroneMap",
     )
     return cameras if placed.project_crs else _compared(project, cameras)
@@ -110,14 +89,14 @@ def read(source: Source) -> Cameras:
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read points and tracks, in the frame of the poses."""
     project, path = _poses(source)
-    found = read_reconstruction(path)
-    points = read_tie_points(found)
+    found = opensfm.read_reconstruction(path)
+    points = opensfm.read_tie_points(found)
     return replace(points, xyz=frame(project, found).points(points.xyz))
 
 
 def _poses(source: Source) -> tuple[Project, Path]:
-    project = locate(source.path)
-    return project, whole_file(project)
+    project = files.locate(source.path)
+    return project, files.whole_file(project)
 
 
 def _is_odm(project: Project, poses: Path) -> bool:
@@ -125,12 +104,13 @@ def _is_odm(project: Project, poses: Path) -> bool:
     if any(project.find(name) for name in _OWN_FILES):
         return True
     reference = reference_of(poses)
-    return reference is not None and whole_metres(*reference, None) is not None
+    return reference is not None and files.whole_metres(*reference, None) is not None
 
 
 def _compared(project: Project, cameras: Cameras) -> Cameras:
     """Return the cameras with a note where the project was moved after the reconstruction."""
-    apart = distance_to_shots(project, cameras.labels, cameras.centres)
+    truth, own = _in_shots(project, cameras)
+    apart = float(np.median(np.hypot(*(own - truth)[:, :2].T))) if len(own) else 0.0
     if apart < ALIGNED_M:
         return cameras
     note = (
@@ -164,23 +144,23 @@ class Frame(NamedTuple):
         return np.asarray(u @ v)
 
 
-def frame(project: Project, found: Reconstruction) -> Frame:
+def frame(project: Project, found: opensfm.Reconstruction) -> Frame:
     """Decide the frame; see the package for the rules."""
     crs = project.crs()
-    unmoved = Frame(np.eye(3), np.zeros(3), topocentric(found), crs)
+    unmoved = Frame(np.eye(3), np.zeros(3), found.cameras.crs or "", crs)
     if found.reference is None or found.path.name == TOPOCENTRIC:
         return unmoved
     transformation = project.find(TRANSFORMATION)
     turned = _transformed(transformation, found.reference, crs) if transformation else None
     if turned is not None:
         return turned
-    whole = whole_metres(*found.reference[:2], crs)
+    whole = files.whole_metres(*found.reference[:2], crs)
     if whole is None:
         return unmoved
     crs, east, north = whole
     moved = Frame(np.eye(3), np.array([east, north, 0.0]), crs)
-    if _is_topocentric(project, found, found.reference, moved):
-        return Frame(np.eye(3), np.zeros(3), unmoved.crs, crs)
+    if _is_topocentric(project, found.cameras, found.reference, moved):
+        return unmoved._replace(project_crs=crs)
     return moved
 
 
@@ -193,21 +173,13 @@ def reference_of(path: Path) -> tuple[float, float] | None:
     return (values[b"latitude"], values[b"longitude"]) if len(values) == 2 else None
 
 
-def distance_to_shots(project: Project, labels: tuple[str, ...], centres: FloatArray) -> float:
-    """Return the median distance in plan between cameras and those of shots.geojson, metres."""
-    truth, own = _in_shots(project, labels, centres)
-    return float(np.median(np.hypot(*(own - truth)[:, :2].T))) if len(own) else 0.0
-
-
-def _in_shots(
-    project: Project, labels: tuple[str, ...], centres: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _in_shots(project: Project, cameras: Cameras) -> tuple[FloatArray, FloatArray]:
     """Return the centres in shots.geojson and ours of the images that are in both."""
     path = project.find(SHOTS)
-    there = positions(path) if path is not None else {}
-    shared = [i for i, label in enumerate(labels) if label in there]
-    truth = np.array([there[labels[i]] for i in shared]).reshape(-1, 3)
-    return truth, centres[shared]
+    there = files.positions(path) if path is not None else {}
+    shared = [i for i, label in enumerate(cameras.labels) if label in there]
+    truth = np.array([there[cameras.labels[i]] for i in shared]).reshape(-1, 3)
+    return truth, cameras.centres[shared]
 
 
 def _transformed(
@@ -229,27 +201,27 @@ def _transformed(
             f"{path}: is not four rows of four numbers that turn and shift the reconstruction."
         )
     lat, lon, _ = reference
-    named = crs_of_place(lon, lat, shift[0], shift[1], [crs] if crs else None)
+    named = files.crs_of_place(lon, lat, shift[0], shift[1], [crs] if crs else None)
     return Frame(turn, shift, named) if named else None
 
 
 def _is_topocentric(
-    project: Project, found: Reconstruction, reference: tuple[float, float, float], moved: Frame
+    project: Project, cameras: Cameras, reference: tuple[float, float, float], moved: Frame
 ) -> bool:
     """Whether a reconstruction with its origin at whole metres was left as OpenSfM made it.
 
     The centres of shots.geojson tell, or else the GNSS positions, which stay topocentric in any
     case: the two readings differ by the meridian convergence and the scale.
     """
-    truth, own = _in_shots(project, found.labels, found.centres)
-    if len(own) < 3:
-        known = np.isfinite(found.gnss_xyz).all(axis=1)
-        truth = from_topocentric(found.gnss_xyz[known], reference, moved.crs)
-        own = found.centres[known]
+    truth, own = _in_shots(project, cameras)
+    if len(own) < 3 and cameras.gnss is not None:
+        known = np.isfinite(cameras.gnss.xyz).all(axis=1)
+        truth = files.from_topocentric(cameras.gnss.xyz[known], reference, moved.crs)
+        own = cameras.centres[known]
     if len(own) < 3:
         return False
     misses = [
         np.sqrt(np.mean((guess - truth)[:, :2] ** 2))
-        for guess in (from_topocentric(own, reference, moved.crs), moved.points(own))
+        for guess in (files.from_topocentric(own, reference, moved.crs), moved.points(own))
     ]
     return bool(misses[0] < 0.5 * misses[1])

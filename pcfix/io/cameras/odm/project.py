@@ -106,16 +106,11 @@ WHOLE_M = 2e-3
 
 def named_crs(path: Path) -> str:
     """Return the CRS in the first line of a file: a PROJ string, EPSG:n or WGS84 UTM 16N."""
-    from pyproj import CRS
-    from pyproj.exceptions import CRSError
-
     text = path.read_bytes()[:4096].decode("utf-8-sig", errors="replace").strip()
     line = text.splitlines()[0].strip() if text else ""
     crs = checks.utm_as_code(line)
-    try:
-        CRS.from_user_input(crs)
-    except CRSError as error:
-        raise InputError(f"{path}: '{line[:80]}' names no CRS; put its EPSG code there.") from error
+    if not checks.names_crs(crs):
+        raise InputError(f"{path}: '{line[:80]}' names no CRS; put its EPSG code there.")
     return crs
 
 
@@ -167,6 +162,7 @@ def _projected(crs: str, lon: float | FloatArray, lat: float | FloatArray) -> Fl
 
 
 SAME_FOCAL = 1e-6
+GNSS_KEYS = ("longitude", "latitude", "altitude", "gps_xy_stddev", "gps_z_stddev")
 
 
 def read_shots(project: Project, path: Path) -> Cameras:
@@ -211,23 +207,16 @@ def read_images(
     images = [mapping(path, f"entry {i + 1}", entry) for i, entry in enumerate(entries)]
     names = [str(image.get("filename")) for image in images]
     by_name = dict(zip(names, images, strict=True))
-    xyz, sigma = np.full((2, len(labels), 3), np.nan)
+    values = np.full((len(labels), len(GNSS_KEYS)), np.nan)
     for i, label in enumerate(labels):
         image = by_name.get(label) or by_name.get(PurePath(label).stem)
         if image is not None and image.get("latitude") is not None:
-            xyz[i], sigma[i] = _position(path, label, image)
-    if not np.isfinite(xyz).any():
+            for j, key in enumerate(GNSS_KEYS):
+                if image.get(key) is not None:
+                    values[i, j] = json_number(path, f"image {label}, {key}", image[key])
+    if not np.isfinite(values[:, :3]).any():
         return None, names
-    return GnssPositions(xyz, sigma, "EPSG:4326"), names
-
-
-def _position(path: Path, label: str, image: dict[str, Any]) -> tuple[list[float], list[float]]:
-    keys = ("longitude", "latitude", "altitude", "gps_xy_stddev", "gps_z_stddev")
-    values = [
-        np.nan if image.get(key) is None else json_number(path, f"image {label}, {key}", image[key])
-        for key in keys
-    ]
-    return values[:3], [values[3], values[3], values[4]]
+    return GnssPositions(values[:, :3], values[:, [3, 3, 4]], "EPSG:4326"), names
 
 
 def _shots(path: Path) -> dict[str, dict[str, Any]]:
@@ -255,33 +244,30 @@ def _lenses(
     project: Project, path: Path, shots: dict[str, dict[str, Any]]
 ) -> tuple[tuple[Lens, ...], tuple[str, ...]]:
     """Return the lens of each shot, and a note where cameras.json does not have it."""
-    known = _known_lenses(project.find("cameras.json"))
-    plain = 0
-    lenses = []
+    beside = project.find("cameras.json")
+    entries = {} if beside is None else mapping(beside, "the file", load_json(beside))
+    known = {
+        name: lens(beside, name, camera)
+        for name, entry in entries.items()
+        if beside and not is_panorama(camera := mapping(beside, f"camera {name}", entry))
+    }
+    lenses, plain = [], 0
     for label, shot in shots.items():
         size = [shot.get(key) for key in ("width", "height", "focal")]
-        width, height, focal = vector(
-            path, f"image {label}, width, height, focal", size, 3
-        ).tolist()
-        match = _match(known, str(shot.get("camera")), width, height, focal)
-        plain += match is None
-        lenses.append(match or _plain(path, label, width, height, focal))
-    if not plain:
-        return tuple(lenses), ()
+        size_and_focal = vector(path, f"image {label}, width, height, focal", size, 3)
+        width, height, focal = size_and_focal.tolist()
+        found = _match(known, str(shot.get("camera")), width, height, focal)
+        if found is None:
+            plain += 1
+            focal_px = focal * max(width, height)
+            found = Lens(focal_px, width, height, width / 2.0, height / 2.0)
+            checks.lens(path, f"of image {label}", found)
+        lenses.append(found)
     note = (
         f"{path}: cameras.json has no camera of the size and focal length of {plain} images; their"
         " lens is taken as free of distortion."
     )
-    return tuple(lenses), (note,)
-
-
-def _known_lenses(path: Path | None) -> dict[str, Lens]:
-    """Return the lenses of cameras.json, none where there is no such file."""
-    if path is None:
-        return {}
-    entries = mapping(path, "the file", load_json(path))
-    cameras = {name: mapping(path, f"camera {name}", entry) for name, entry in entries.items()}
-    return {name: lens(path, name, c) for name, c in cameras.items() if not is_panorama(c)}
+    return tuple(lenses), (note,) if plain else ()
 
 
 def _match(
@@ -297,13 +283,6 @@ def _match(
         and abs((found.focal + found.b1) / max(width, height) - focal) < SAME_FOCAL
     ]
     return fits[0] if len(fits) == 1 else None
-
-
-def _plain(path: Path, label: str, width: float, height: float, focal: float) -> Lens:
-    scale = max(width, height)
-    return checks.lens(
-        path, f"of image {label}", Lens(focal * scale, width, height, width / 2.0, height / 2.0)
-    )
 
 
 def _crs_of_geometry(path: Path, shots: dict[str, dict[str, Any]]) -> str:

@@ -21,17 +21,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import IO, Any, NamedTuple
 
 import numpy as np
 
 from pcfix.errors import InputError
+from pcfix.io.cameras import tracks
 from pcfix.io.cameras.checks import json_number, load_json, mapping, rows, vector
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.opensfm.models import is_panorama, lens
 from pcfix.lens.rotations import from_rotation_vectors
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints, Views
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, TiePoints
 
 TOPOCENTRIC_LIMIT_M = 1e5
 
@@ -48,39 +50,14 @@ def recognises(source: Source) -> bool:
 
 def read(source: Source) -> Cameras:
     """Read the poses of the largest reconstruction."""
-    found = read_reconstruction(_file(source))
-    crs = topocentric(found)
-    absolute = np.abs(np.median(found.centres[:, :2], axis=0)).max() > TOPOCENTRIC_LIMIT_M
-    return Cameras(
-        labels=found.labels,
-        centres=found.centres,
-        rotations=found.rotations,
-        lenses=found.lenses,
-        crs=None if absolute else crs,
-        notes=found.notes,
-        gnss=gnss(found),
-        unposed=found.left_out,
-        source="OpenSfM",
-    )
+    cameras = read_reconstruction(_file(source)).cameras
+    absolute = np.abs(np.median(cameras.centres[:, :2], axis=0)).max() > TOPOCENTRIC_LIMIT_M
+    return replace(cameras, crs=None) if absolute else cameras
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read points and tracks."""
     return read_tie_points(read_reconstruction(_file(source)))
-
-
-def topocentric(found: Reconstruction) -> str:
-    """Return the frame of a reconstruction that was not moved to a projected CRS."""
-    if found.reference is None:
-        return "local"
-    return "ENU:" + ",".join(repr(value) for value in found.reference)
-
-
-def gnss(found: Reconstruction) -> GnssPositions | None:
-    """Return the positions of the images as the reconstruction keeps them."""
-    if found.reference is None or not np.isfinite(found.gnss_xyz).any():
-        return None
-    return GnssPositions(found.gnss_xyz, found.gnss_sigma_m, topocentric(found))
 
 
 def _file(source: Source) -> Path:
@@ -94,53 +71,47 @@ NO_GNSS = 999999.0
 class Reconstruction(NamedTuple):
     """What the largest reconstruction of a file holds, in the frame of the file.
 
-    `gnss_xyz` and `gnss_sigma_m`, shape (k, 3), are topocentric at `reference`, NaN where there is
-    none. `reference` is latitude and longitude in degrees and the height in metres of the
-    topocentric origin; None where the file has none, or the made-up one that OpenSfM gives to
-    images without positions. `left_out` are images that are not among `labels`.
+    `cameras` and their `gnss` are topocentric at `reference`, else local. `reference` is latitude
+    and longitude in degrees and the height in metres of the topocentric origin; None where the file
+    has none, or the made-up one that OpenSfM gives to images without positions.
     """
 
     path: Path
-    labels: tuple[str, ...]
-    centres: FloatArray
-    rotations: FloatArray
-    lenses: tuple[Lens, ...]
-    gnss_xyz: FloatArray
-    gnss_sigma_m: FloatArray
+    cameras: Cameras
     reference: tuple[float, float, float] | None
     points: dict[str, Any]
-    left_out: tuple[str, ...]
-    notes: tuple[str, ...]
 
 
 def read_reconstruction(path: Path) -> Reconstruction:
     """Read the reconstruction with the most images."""
     chosen, others, notes = _largest(path, load_json(path))
-    cameras = mapping(path, "cameras", chosen.get("cameras"))
-    shots, panoramas = _usable(path, chosen["shots"], cameras)
+    entries = mapping(path, "cameras", chosen.get("cameras"))
+    shots, panoramas = _usable(path, chosen["shots"], entries)
     if panoramas:
         notes.append(
             f"{path}: {len(panoramas)} images of all-round cameras (spherical) are left out; pcfix"
             " needs images with a frame."
         )
-    lenses = {
-        name: lens(path, name, cameras[name]) for name in {s["camera"] for s in shots.values()}
-    }
+    names = {shot["camera"] for shot in shots.values()}
+    lenses = {name: lens(path, name, entries[name]) for name in names}
     rotations, centres = _poses(path, chosen, shots)
     xyz, sigma = _gnss(path, shots)
-    labels = tuple(shots)
-    return Reconstruction(
-        path=path,
-        labels=labels,
+    reference = _reference(path, chosen)
+    crs = "local" if reference is None else "ENU:" + ",".join(map(repr, reference))
+    has_gnss = reference is not None and np.isfinite(xyz).any()
+    cameras = Cameras(
+        labels=tuple(shots),
         centres=centres,
         rotations=rotations,
         lenses=tuple(lenses[shot["camera"]] for shot in shots.values()),
-        gnss_xyz=xyz,
-        gnss_sigma_m=sigma,
-        reference=_reference(path, chosen),
-        points=mapping(path, "points", chosen.get("points", {})),
-        left_out=left_out(labels, [*others, *panoramas, *_listed(path)]),
+        crs=crs,
         notes=tuple(notes),
+        gnss=GnssPositions(xyz, sigma, crs) if has_gnss else None,
+        unposed=left_out(shots, [*others, *panoramas, *_listed(path)]),
+        source="OpenSfM",
+    )
+    return Reconstruction(
+        path, cameras, reference, mapping(path, "points", chosen.get("points", {}))
     )
 
 
@@ -199,14 +170,13 @@ def _poses(
 ) -> tuple[FloatArray, FloatArray]:
     """Return rotations and centres; x_camera = R x + t."""
     riders = _riders(path, chosen)
-    pairs = []
-    for label, shot in shots.items():
-        if "rotation" in shot or label not in riders:
-            pairs.append(_pose(path, f"image {label}", shot))
-        else:
-            pairs.append(_on_rig(path, label, chosen, *riders[label]))
-    rotations = np.array([pair[0] for pair in pairs])
-    shifts = np.array([pair[1] for pair in pairs])
+    pairs = [
+        _pose(path, f"image {label}", shot)
+        if "rotation" in shot or label not in riders
+        else _on_rig(path, label, chosen, *riders[label])
+        for label, shot in shots.items()
+    ]
+    rotations, shifts = (np.array(each) for each in zip(*pairs, strict=True))
     return rotations, -np.einsum("kji,kj->ki", rotations, shifts)
 
 
@@ -243,8 +213,7 @@ def _on_rig(
 
 def _gnss(path: Path, shots: dict[str, dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
     """Return positions and their standard deviation, NaN where an image has none."""
-    xyz = np.full((len(shots), 3), np.nan)
-    sigma = np.full((len(shots), 3), np.nan)
+    xyz, sigma = np.full((2, len(shots), 3), np.nan)
     for i, (label, shot) in enumerate(shots.items()):
         dop = shot.get("gps_dop")
         if shot.get("gps_position") is None or dop == NO_GNSS:
@@ -286,46 +255,53 @@ CHUNK_BYTES = 1 << 24
 
 def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
     """Return the points in the frame of the file, and where its images saw them."""
-    path, points = reconstruction.path, reconstruction.points
+    path, cameras, _, points = reconstruction
     if not points:
         raise InputError(f"{path}: has no tie points.")
-    tracks = path.with_name("tracks.csv")
-    if not tracks.is_file():
+    beside = path.with_name("tracks.csv")
+    if not beside.is_file():
         raise InputError(
             f"{path}: there is no tracks.csv beside it, so its tie points have no rays."
         )
     entries = [mapping(path, f"point {k}", v).get("coordinates") for k, v in points.items()]
     xyz = rows(path, "coordinates of a point", entries, 3)
-    point, camera, xy = _observations(tracks, list(points), reconstruction.labels)
+    point, camera, xy = _observations(beside, list(points), cameras.labels)
     order = np.lexsort((camera, point))
-    start = np.concatenate([[0], np.cumsum(np.bincount(point, minlength=len(xyz)))])
-    views = Views(start.astype(np.int64), camera[order])
-    size = np.array([(lens.width, lens.height) for lens in reconstruction.lenses])[views.camera]
-    uv = xy[order] * size.max(axis=1, initial=0.0)[:, None] + size / 2.0
-    return TiePoints(xyz, views, np.asarray(uv))
+    size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera]
+    uv = xy * size.max(axis=1, initial=0.0)[:, None] + size / 2.0
+    return tracks.tie_points(xyz, point[order], camera[order], uv[order])
 
 
 def _observations(
     path: Path, points: list[str], labels: tuple[str, ...]
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Return point row, camera row and normalised x, y of every line that has both."""
-    point_of = {name.encode(errors="replace"): i for i, name in enumerate(points)}
-    camera_of = {name.encode(errors="replace"): i for i, name in enumerate(labels)}
+    camera_of, point_of = (
+        {name.encode(errors="replace"): i for i, name in enumerate(names)}
+        for names in (labels, points)
+    )
     parts = []
     with path.open("rb") as stream:
         for block in _blocks(stream):
             lines = [line.split(b"\t", 5) for line in block.split(b"\n") if line.strip()]
-            if any(len(fields) < 5 for fields in lines):
-                short = next(fields for fields in lines if len(fields) < 5)
+            short = next((fields for fields in lines if len(fields) < 5), None)
+            if short is not None:
                 raise InputError(
                     f"{path}: the line beginning '{short[0][:40].decode(errors='replace')}' is cut"
                     " off; copy the file again."
                 )
             point = np.array([point_of.get(fields[1], -1) for fields in lines], dtype=np.int64)
             camera = np.array([camera_of.get(fields[0], -1) for fields in lines], dtype=np.int64)
-            xy = _numbers(path, lines)
+            try:
+                values = [float(value) for fields in lines for value in fields[3:5]]
+            except ValueError as error:
+                raise InputError(
+                    f"{path}: x or y of an observation is not a number ({error})."
+                ) from error
+            if not np.isfinite(values).all():
+                raise InputError(f"{path}: x or y of an observation is not finite.")
             keep = (point >= 0) & (camera >= 0)
-            parts.append((point[keep], camera[keep], xy[keep]))
+            parts.append((point[keep], camera[keep], np.array(values).reshape(-1, 2)[keep]))
     if not parts:
         raise InputError(f"{path}: is empty.")
     point, camera, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -344,14 +320,3 @@ def _blocks(stream: IO[bytes]) -> Iterator[bytes]:
         rest = tail
     if rest.strip():
         yield rest
-
-
-def _numbers(path: Path, lines: list[list[bytes]]) -> FloatArray:
-    """Return columns x and y."""
-    try:
-        xy = np.array([float(value) for fields in lines for value in fields[3:5]]).reshape(-1, 2)
-    except ValueError as error:
-        raise InputError(f"{path}: x or y of an observation is not a number ({error}).") from error
-    if not np.isfinite(xy).all():
-        raise InputError(f"{path}: x or y of an observation is not finite.")
-    return xy

@@ -19,17 +19,18 @@ import json
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import is_same_lens, json_number
+from pcfix.io.cameras.checks import is_same_lens, json_number, write_new
 from pcfix.io.cameras.frames import frame_of, is_tied
 from pcfix.io.cameras.georeference import georeference
+from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
 from pcfix.io.crs import (
     GEOCENTRIC_WGS84,
     GEOGRAPHIC_WGS84,
@@ -39,7 +40,6 @@ from pcfix.io.crs import (
     parse_crs,
     shortened,
 )
-from pcfix.io.files import check_output, write_text
 from pcfix.io.transformations import transformation_in_plan, transformation_in_space
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, Projection, TiePoints
 
@@ -73,56 +73,15 @@ def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
             f"{path}: camera {name}: the projection_type '{model}' is none that pcfix knows"
             f" ({', '.join(_MODELS)})."
         )
-    projection, radial = _MODELS[model]
-    width, height = _size(path, name, camera)
-    scale = max(width, height)
-    fx, fy = _focal(path, name, camera)
-    cx, cy, p1, p2, *prism = (
-        _value(path, name, camera, key)
-        for key in ("c_x", "c_y", "p1", "p2", "s0", "s1", "s2", "s3")
-    )
-    return checks.lens(
-        path,
-        name,
-        Lens(
-            focal=fy * scale,
-            width=width,
-            height=height,
-            principal_x=width / 2.0 + cx * scale,
-            principal_y=height / 2.0 + cy * scale,
-            b1=(fx - fy) * scale,
-            projection=projection,
-            shape=(_value(path, name, camera, "transition", 0.5),) if model == "dual" else (),
-            radial=tuple(_value(path, name, camera, f"k{i + 1}") for i in range(radial)),
-            tangential=(p2, p1) if model in _TANGENTIAL else (),
-            thin_prism=tuple(prism) if model == "fisheye624" else (),
-            sensor=name,
-        ),
-    )
 
+    def value(key: str, default: float | None = 0.0) -> float:
+        found = camera.get(key, default)
+        if found is None:
+            raise InputError(f"{path}: camera {name} lacks {key}.")
+        return json_number(path, f"camera {name}, {key}", found)
 
-def _value(
-    path: Path, name: str, camera: dict[str, Any], key: str, default: float | None = 0.0
-) -> float:
-    value = camera.get(key, default)
-    if value is None:
-        raise InputError(f"{path}: camera {name} lacks {key}.")
-    return json_number(path, f"camera {name}, {key}", value)
-
-
-def _focal(path: Path, name: str, camera: dict[str, Any]) -> tuple[float, float]:
-    """Return both focal lengths; models of one focal length have `focal`."""
-    if "focal_x" not in camera:
-        focal = _value(path, name, camera, "focal", None)
-        return focal, focal
-    fx = _value(path, name, camera, "focal_x")
-    return fx, _value(path, name, camera, "focal_y", fx)
-
-
-def _size(path: Path, name: str, camera: dict[str, Any]) -> tuple[float, float]:
-    """Return width and height; old files have them only in the name of the camera."""
-    width, height = (_value(path, name, camera, key) for key in ("width", "height"))
-    named = _SIZE.search(name)
+    width, height = value("width"), value("height")
+    named = _SIZE.search(name)  # the size, in old files
     if not (width and height) and named:
         width, height = float(named[1]), float(named[2])
     if not (width and height):
@@ -130,7 +89,23 @@ def _size(path: Path, name: str, camera: dict[str, Any]) -> tuple[float, float]:
             f"{path}: camera {name}: the size of its images is missing; write their width and"
             " height in pixels into this camera's entry."
         )
-    return width, height
+    scale = max(width, height)
+    fx = value("focal_x") if "focal_x" in camera else value("focal", None)
+    fy = value("focal_y", fx) if "focal_x" in camera else fx
+    keys = ("c_x", "c_y", "p1", "p2", "s0", "s1", "s2", "s3")
+    cx, cy, p1, p2, *prism = (value(key) for key in keys)
+    projection, radial = _MODELS[model]
+    found = Lens(
+        *(fy * scale, width, height, width / 2.0 + cx * scale, height / 2.0 + cy * scale),
+        b1=(fx - fy) * scale,
+        projection=projection,
+        shape=(value("transition", 0.5),) if model == "dual" else (),
+        radial=tuple(value(f"k{i + 1}") for i in range(radial)),
+        tangential=(p2, p1) if model in _TANGENTIAL else (),
+        thin_prism=tuple(prism) if model == "fisheye624" else (),
+        sensor=name,
+    )
+    return checks.lens(path, name, found)
 
 
 TRACKS_HEADER = "OPENSFM_TRACKS_VERSION_v2"
@@ -139,21 +114,10 @@ FEATURE_SCALE = 0.001
 """Of a feature, in units of the larger side; OpenSfM wants some number."""
 
 
-class World(NamedTuple):
-    """A block in the world of the file; `place` is the origin, None where there is none."""
-
-    centres: FloatArray
-    rotations: FloatArray
-    points: FloatArray
-    place: Topocentric | None
-
-
 def write_opensfm(
     path: str | os.PathLike[str],
     cameras: Cameras,
     tie_points: TiePoints | None = None,
-    *,
-    overwrite: bool = False,
 ) -> None:
     """Write a block as an OpenSfM reconstruction.
 
@@ -167,43 +131,38 @@ def write_opensfm(
         topocentric, or in none.
     tie_points : TiePoints, optional
         In the frame of the cameras; those without a position or without a view are left out.
-    overwrite : bool
 
     Raises
     ------
     InputError
         If a lens is none that OpenSfM has, labels repeat, or the CRS cannot be left.
     SettingError
-        If a file exists and `overwrite` is not set.
+        If a file exists.
     """
     target = Path(path)
     _check_whole(target, cameras)
     models = {each: opensfm_camera(target, each) for each in dict.fromkeys(cameras.lenses or ())}
     names = {each: f"pcfix {i}" for i, each in enumerate(models, start=1)}
-    xyz = np.empty((0, 3)) if tie_points is None else tie_points.xyz
-    kept = _kept(tie_points)
-    world = _world(cameras, xyz[kept], str(target))
+    ties = tie_points or NO_TIE_POINTS
+    kept = np.flatnonzero(are_seen(ties))
+    there, points, place = _world(cameras, ties.xyz[kept], str(target))
     chosen: dict[str, Any] = {
         "cameras": {names[each]: model for each, model in models.items()},
-        "shots": _shots(cameras, world, names),
+        "shots": _shots(there, names),
         "points": {
             str(i): {"color": list(GREY), "coordinates": row}
-            for i, row in enumerate(world.points.tolist())
+            for i, row in enumerate(points.tolist())
         },
     }
     texts = {}
-    if world.place is not None:
-        place = world.place
-        lla = (place.latitude_deg, place.longitude_deg, place.height_m)
-        chosen["reference_lla"] = dict(zip(("latitude", "longitude", "altitude"), lla, strict=True))
+    if place is not None:
+        keys = ("latitude", "longitude", "altitude")
+        chosen["reference_lla"] = dict(zip(keys, astuple(place), strict=True))
         texts["reference_lla.json"] = json.dumps(chosen["reference_lla"], indent=2) + "\n"
     if tie_points is not None:
         texts["tracks.csv"] = "\n".join(_tracks(cameras, tie_points, kept)) + "\n"
     texts[target.name] = json.dumps([chosen]) + "\n"
-    for name in texts:
-        check_output(target.with_name(name), overwrite=overwrite)
-    for name, text in texts.items():
-        write_text(target.with_name(name), text, overwrite=overwrite)
+    write_new(target.parent, {name: text.encode() for name, text in texts.items()})
 
 
 def _check_whole(target: Path, cameras: Cameras) -> None:
@@ -218,14 +177,6 @@ def _check_whole(target: Path, cameras: Cameras) -> None:
     for label in cameras.labels:
         if "\t" in label or "\n" in label:
             raise InputError(f"{target}: the image name {label!r} has no place in OpenSfM's files.")
-
-
-def _kept(tie_points: TiePoints | None) -> IntArray:
-    """Return the rows of tie points that have a place and a view."""
-    if tie_points is None:
-        return np.empty(0, np.int64)
-    seen = np.diff(tie_points.views.start) > 0
-    return np.flatnonzero(np.isfinite(tie_points.xyz).all(axis=1) & seen)
 
 
 def opensfm_camera(path: Path, given: Lens) -> dict[str, Any]:
@@ -274,58 +225,53 @@ def _candidates(given: Lens) -> Iterator[dict[str, Any]]:
             }
 
 
-def _world(cameras: Cameras, points: FloatArray, name: str) -> World:
-    """Return the block in the world of the file."""
-    rotations = np.asarray(cameras.rotations)
+def _world(
+    cameras: Cameras, points: FloatArray, name: str
+) -> tuple[Cameras, FloatArray, Topocentric | None]:
+    """Return cameras and points in the world of the file, and its origin where it has one.
+
+    From a projected CRS they go to axes east, north, up at the middle of the block.
+    """
     if cameras.crs is None or not is_tied(cameras.crs, name):
-        return World(cameras.centres, rotations, points, None)
+        return cameras, points, None
     if is_topocentric(cameras.crs):
-        place = Topocentric.from_text(cameras.crs, name)
-        return World(cameras.centres, rotations, points, place)
+        return cameras, points, Topocentric.from_text(cameras.crs, name)
     if not parse_crs(cameras.crs, name).is_projected:
         raise InputError(
             f"{name}: the cameras are in {shortened(cameras.crs)}; bring them to a projected CRS"
             " first."
         )
-    enter = _Entry(cameras, name)
-    centres = enter.points(cameras.centres)
-    there = replace(cameras, centres=centres, crs=enter.text, project_crs=None, gnss=None)
+    source, geographic = frame_of(cameras.crs, name).crs, parse_crs(GEOGRAPHIC_WGS84, name)
+    stated = heights_of(source) != "unstated"
+    way = transformation_in_space if stated else transformation_in_plan
+    to_degrees = way(source, geographic, cameras.centres, name).forward
+    longitude, latitude, _ = to_degrees(np.median(cameras.centres, axis=0)[None])[0].tolist()
+    place = Topocentric(latitude, longitude, 0.0)
+    centres, points = (_topocentric(to_degrees(xyz), place) for xyz in (cameras.centres, points))
+    text = "ENU:" + ",".join(map(repr, astuple(place)))
+    there = replace(cameras, centres=centres, crs=text, project_crs=None, gnss=None)
     turns = georeference(there, cameras.crs, name=name).turns(centres)
-    return World(centres, rotations @ turns, enter.points(points), enter.place)
+    return replace(there, rotations=np.asarray(cameras.rotations) @ turns), points, place
 
 
-class _Entry:
-    """The way from a projected CRS to axes east, north, up at the middle of a block."""
+def _topocentric(degrees: FloatArray, place: Topocentric) -> FloatArray:
+    """Return longitudes, latitudes and heights in the axes at a place, metres."""
+    from pyproj import Transformer
 
-    def __init__(self, cameras: Cameras, name: str) -> None:
-        source = frame_of(cameras.crs or "", name).crs
-        geographic = parse_crs(GEOGRAPHIC_WGS84, name)
-        stated = heights_of(source) != "unstated"
-        way = transformation_in_space if stated else transformation_in_plan
-        self._to_degrees = way(source, geographic, cameras.centres, name).forward
-        degrees = self._to_degrees(np.median(cameras.centres, axis=0)[None])[0]
-        self.place = Topocentric(float(degrees[1]), float(degrees[0]), 0.0)
-        place = (self.place.latitude_deg, self.place.longitude_deg, self.place.height_m)
-        self.text = "ENU:" + ",".join(map(repr, place))
-
-    def points(self, xyz: FloatArray) -> FloatArray:
-        """Return points (n, 3) there, metres."""
-        from pyproj import Transformer
-
-        to_geocentric = Transformer.from_crs(GEOGRAPHIC_WGS84, GEOCENTRIC_WGS84, always_xy=True)
-        to_axes = Transformer.from_pipeline(
-            f"+proj=topocentric +ellps=WGS84 +lat_0={self.place.latitude_deg!r}"
-            f" +lon_0={self.place.longitude_deg!r} +h_0={self.place.height_m!r}"
-        )
-        geocentric = to_geocentric.transform(*self._to_degrees(xyz).T)
-        return np.column_stack(to_axes.transform(*geocentric))
+    to_geocentric = Transformer.from_crs(GEOGRAPHIC_WGS84, GEOCENTRIC_WGS84, always_xy=True)
+    to_axes = Transformer.from_pipeline(
+        f"+proj=topocentric +ellps=WGS84 +lat_0={place.latitude_deg!r}"
+        f" +lon_0={place.longitude_deg!r} +h_0={place.height_m!r}"
+    )
+    return np.column_stack(to_axes.transform(*to_geocentric.transform(*degrees.T)))
 
 
-def _shots(cameras: Cameras, world: World, names: dict[Lens, str]) -> dict[str, Any]:
+def _shots(cameras: Cameras, names: dict[Lens, str]) -> dict[str, Any]:
     from scipy.spatial.transform import Rotation
 
-    turns = Rotation.from_matrix(world.rotations).as_rotvec().tolist()
-    shifts = -np.einsum("kij,kj->ki", world.rotations, world.centres)
+    rotations = np.asarray(cameras.rotations)
+    turns = Rotation.from_matrix(rotations).as_rotvec().tolist()
+    shifts = -np.einsum("kij,kj->ki", rotations, cameras.centres)
     return {
         label: {"rotation": turn, "translation": shift, "camera": names[lens]}
         for label, turn, shift, lens in zip(

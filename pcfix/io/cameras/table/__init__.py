@@ -36,7 +36,6 @@ its f, px, py and the order of t1, t2 are those of AliceVision's reader of the s
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 
@@ -44,22 +43,14 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.formats import Angles, Source
+from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.table.attitude import read_rotations
 from pcfix.io.cameras.table.columns import EXIF, Columns, axes, headers, is_header, read_columns
 from pcfix.io.cameras.table.sensor import read_lenses, read_sensor
-from pcfix.io.files import check_input
 from pcfix.io.tables import Table, number, read_lines
-from pcfix.lens.rotations import from_yaw_pitch_roll as rotations_from_yaw_pitch_roll
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray
 
-__all__ = [
-    "read",
-    "read_gnss",
-    "read_sensor",
-    "recognises",
-    "rotations_from_yaw_pitch_roll",
-]
+__all__ = ["read", "read_sensor", "recognises"]
 
 
 def recognises(source: Source) -> bool:
@@ -79,17 +70,27 @@ def read(source: Source) -> Cameras:
     suffix = "_est" if axes(everything.place, "_est") else ""
     columns, unposed = _with_a_pose(everything, suffix)
     xyz = centres(columns, suffix, needed=True)
-    rotations, lenses = _orientation(columns, source.sensor, source.angles, suffix)
+    rotations = read_rotations(columns, source.angles, suffix)
+    if rotations is None and source.sensor is not None:
+        raise InputError(
+            f"{columns.path}: has no yaw, pitch and roll or other angles, so the sensor"
+            f" {source.sensor} says nothing; add the angles or leave the sensor out."
+        )
+    lenses = None if rotations is None else read_lenses(columns, source.sensor)
     keep, notes = _without_copies(columns, xyz)
     gnss = gnss_positions(columns) if suffix else None
     system, doubt = crs(columns)
+    not_adjusted = (
+        f"{columns.path}: its positions are those of the GNSS, not adjusted ones; export the poses"
+        " from the photogrammetry software if you can."
+    )
     return Cameras(
         labels=tuple(columns.labels[i] for i in keep),
         centres=xyz[keep],
         rotations=None if rotations is None else rotations[keep],
         lenses=None if lenses is None else tuple(lenses[i] for i in keep),
         crs=system,
-        notes=(*notes, *doubt, *_not_adjusted(columns)),
+        notes=(*notes, *doubt, *((not_adjusted,) if are_by_gnss(columns) else ())),
         gnss=gnss and GnssPositions(gnss.xyz[keep], gnss.sigma_m[keep], gnss.crs),
         unposed=unposed,
         source="CSV table",
@@ -111,73 +112,20 @@ def _with_a_pose(columns: Columns, suffix: str) -> tuple[Columns, tuple[str, ...
     return columns.take(np.flatnonzero(~lost)), unposed
 
 
-def _orientation(
-    columns: Columns, sensor: Path | None, angles: Angles | None, suffix: str
-) -> tuple[FloatArray | None, tuple[Lens, ...] | None]:
-    """Return rotations and lenses, or neither where the table has no angles."""
-    rotations = read_rotations(columns, angles, suffix)
-    if rotations is not None:
-        return rotations, read_lenses(columns, sensor)
-    if sensor is not None:
-        raise InputError(
-            f"{columns.path}: has no yaw, pitch and roll or other angles, so the sensor {sensor}"
-            " says nothing; add the angles or leave the sensor out."
-        )
-    return None, None
-
-
-def _not_adjusted(columns: Columns) -> tuple[str, ...]:
-    if not are_by_gnss(columns):
-        return ()
-    return (
-        f"{columns.path}: its positions are those of the GNSS, not adjusted ones; export the poses"
-        " from the photogrammetry software if you can.",
-    )
-
-
 def _without_copies(columns: Columns, xyz: FloatArray) -> tuple[IntArray, tuple[str, ...]]:
     """Return the rows to keep and what to tell: labels are no key, but a copy counts once."""
     labels = columns.labels
-    seen: set[tuple[str, bytes]] = set()
-    keep = []
+    first: dict[tuple[str, bytes], int] = {}
     for i, label in enumerate(labels):
-        key = (label, xyz[i].tobytes())
-        if key not in seen:
-            seen.add(key)
-            keep.append(i)
-    return np.array(keep), checks.repeated(columns.path, labels, len(labels) - len(keep))
+        first.setdefault((label, xyz[i].tobytes()), i)
+    keep = np.array(list(first.values()))
+    return keep, checks.repeated(columns.path, labels, len(labels) - len(keep))
 
 
 WGS84, WGS84_ELLIPSOIDAL = "EPSG:4326", "EPSG:4979"
 GEO = ("label", "x", "y", "z", "yaw", "pitch", "roll", "accuracy_horz", "accuracy_vert")
 """Fields of ODM's geo.txt, the last six optional; more may follow."""
 _GEO_CRS = re.compile(r"(EPSG:\d+|\+proj=.+|WGS84 UTM \d\d?\s*[NS])\s*", re.IGNORECASE)
-
-
-def read_gnss(path: str | os.PathLike[str]) -> tuple[tuple[str, ...], GnssPositions]:
-    """Read where the GNSS said that images were taken.
-
-    Parameters
-    ----------
-    path : path
-        A table with the columns label, x, y, z or label, longitude, latitude, altitude and,
-        where known, sigma_x, sigma_y, sigma_z in metres: a reference table of Metashape (its
-        source values), a list by exiftool, or ODM's geo.txt.
-
-    Returns
-    -------
-    labels : tuple of str, length k
-    positions : GnssPositions
-        k rows, NaN where an image has no position.
-    """
-    columns = open_table(check_input(path))
-    positions = gnss_positions(columns)
-    if positions is None or np.isnan(positions.xyz).any(axis=1).all():
-        raise InputError(
-            f"{columns.path}: has no GNSS positions; give a table with the columns label, x, y, z"
-            " or label, longitude, latitude, altitude."
-        )
-    return tuple(columns.labels), positions
 
 
 def open_table(path: Path) -> Columns:
@@ -204,13 +152,18 @@ def centres(columns: Columns, suffix: str = "", *, needed: bool = False) -> Floa
     if three is None:
         return np.full((len(columns.labels), 3), np.nan)
     xyz = columns.of(three) if needed else columns.where_there(three)
-    for i, side in enumerate(("longitude", "latitude")):
-        if columns.has(f"{side}_ref"):
-            texts = columns.table.column(columns.name(f"{side}_ref"))
+    for i, side in enumerate(("longitude_ref", "latitude_ref")):
+        if columns.has(side):
+            texts = columns.table.column(columns.name(side))
             beyond = [text[:1].upper() in ("S", "W") for text in texts]
             xyz[beyond, i] = -np.abs(xyz[beyond, i])
     if three[0].startswith("longitude") or _is_geographic(crs(columns)[0]):
-        _refuse_impossible_degrees(columns, xyz)
+        for i, (longitude, latitude) in enumerate(xyz[:, :2]):
+            if abs(latitude) > 90.0 or abs(longitude) > 360.0:
+                raise InputError(
+                    f"{columns.where(i)}: longitude {longitude:g}, latitude {latitude:g} is no"
+                    " place on earth; are the columns swapped, or metres?"
+                )
     xyz[np.isnan(xyz).any(axis=1)] = np.nan
     return xyz
 
@@ -228,12 +181,7 @@ def crs(columns: Columns) -> tuple[str | None, tuple[str, ...]]:
         return WGS84_ELLIPSOIDAL if ellipsoidal else WGS84, ()
     if columns.crs.startswith("LOCAL_CS"):
         return "local", ()
-    from pyproj import CRS
-    from pyproj.exceptions import CRSError
-
-    try:
-        CRS(columns.crs)
-    except CRSError:
+    if not checks.names_crs(columns.crs):
         note = (
             f"{columns.path}: its coordinate system '{columns.crs[:60]}' is not understood; the"
             " cloud's is assumed."
@@ -279,12 +227,3 @@ def _is_geographic(name: str | None) -> bool:
     from pyproj import CRS
 
     return bool(CRS(name).is_geographic)
-
-
-def _refuse_impossible_degrees(columns: Columns, xyz: FloatArray) -> None:
-    for i, (longitude, latitude) in enumerate(xyz[:, :2]):
-        if abs(latitude) > 90.0 or abs(longitude) > 360.0:
-            raise InputError(
-                f"{columns.where(i)}: longitude {longitude:g}, latitude {latitude:g} is no place on"
-                " earth; are the columns swapped, or metres?"
-            )

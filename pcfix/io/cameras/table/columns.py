@@ -32,19 +32,23 @@ SPELLINGS: dict[str, tuple[str, ...]] = {
     "yaw": ("yaw", "heading", "gimbalyawdegree"),
     "pitch": ("pitch", "gimbalpitchdegree"),
     "roll": ("roll", "gimbalrolldegree"),
-    **{name: (name,) for name in ("omega", "phi", "kappa", "qw", "qx", "qy", "qz", "enable")},
     "longitude_ref": ("gpslongituderef",),
     "latitude_ref": ("gpslatituderef",),
-    **{name: (name,) for name in ("tx", "ty", "tz", "alpha", "nu")},
-    **{f"r{i}{j}": (f"r{i}{j}",) for i in "123" for j in "123"},
-    **{name: (name,) for name in ("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")},
     "sigma_x": ("sigma_x", "accuracy_x", "accuracy_x/y", "accuracy_x/y/z", "accuracy_horz", "hacc"),
     "sigma_y": ("sigma_y", "accuracy_y", "accuracy_x/y", "accuracy_x/y/z", "accuracy_horz", "hacc"),
     "sigma_z": ("sigma_z", "accuracy_z", "accuracy_x/y/z", "accuracy_vert", "vacc"),
 }
 """What a column is, and its names; where several are there, the first counts."""
 POSE = ("x", "y", "z", "longitude", "latitude", "yaw", "pitch", "roll", "omega", "phi", "kappa")
-SPELLINGS |= {f"{role}_est": (f"{role}_est",) for role in POSE}
+_OWN_NAMES = (
+    *("omega", "phi", "kappa", "qw", "qx", "qy", "qz", "enable", "tx", "ty", "tz", "alpha", "nu"),
+    *(f"r{i}{j}" for i in "123" for j in "123"),
+    *("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2"),
+    *(f"{role}_est" for role in POSE),
+)
+POSE = ("x", "y", "z", "longitude", "latitude", "yaw", "pitch", "roll", "omega", "phi", "kappa")
+
+SPELLINGS |= {name: (name,) for name in _OWN_NAMES}
 POSITION = {"label", "x", "y", "z", "longitude", "latitude", "tx", "ty", "tz"}
 POSITION |= {"x_est", "y_est", "z_est"}
 EXIF = ("gpslongitude", "gpslatitude", "gpsaltitude")
@@ -66,13 +70,11 @@ class Header(NamedTuple):
 
 def known(names: Sequence[str]) -> dict[str, int]:
     """Return what each column is, from its names without units."""
-    place = {}
-    for role, spellings in SPELLINGS.items():
-        for spelling in spellings:
-            if spelling in names:
-                place[role] = names.index(spelling)
-                break
-    return place
+    first = {
+        role: next((spelling for spelling in spellings if spelling in names), None)
+        for role, spellings in SPELLINGS.items()
+    }
+    return {role: names.index(name) for role, name in first.items() if name is not None}
 
 
 def headers(lines: Sequence[str]) -> Iterator[Header]:
@@ -103,20 +105,18 @@ def is_header(names: Sequence[str]) -> bool:
 
 
 def _split_unit(name: str) -> tuple[str, str]:
-    """Return the name of a column and its unit: omega[deg], accuracy_x_(m), X/Easting."""
-    name = name.lstrip("# \"'").lower()
+    """Return the name of a column and its unit: omega[deg], accuracy_x_(m).
+
+    Of X/Longitude it is the name that says more.
+    """
+    name, unit = name.lstrip("# \"'").lower(), ""
     match = None if name in _PLAIN else _UNIT.match(name)
     if match:
         name, unit = (match[1], match[2]) if match[3] is None else (match[3], match[4])
-    else:
-        unit = ""
-    return _one_of_alternatives(name.strip().replace(" ", "_")), unit.strip()
-
-
-def _one_of_alternatives(name: str) -> str:
-    """Return what X/Longitude is: the name that says more."""
+    name = name.strip().replace(" ", "_")
     axis, slash, kind = name.partition("/")
-    return kind if slash and axis in ("x", "y", "z") and kind in _PLAIN else name
+    more = slash and axis in ("x", "y", "z") and kind in _PLAIN
+    return kind if more else name, unit.strip()
 
 
 _PLAIN = {spelling for spellings in SPELLINGS.values() for spelling in spellings}
@@ -151,11 +151,13 @@ def require_position(path: Path, line: int, names: list[str]) -> None:
     )
 
 
-DEGREES = {"": 1.0, "deg": 1.0, "degree": 1.0, "degrees": 1.0, "°": 1.0} | dict.fromkeys(
-    ("gon", "gons", "grad", "grads"), 0.9
-)
-DEGREES |= dict.fromkeys(("rad", "radian", "radians"), 180.0 / np.pi)
-METRES = {"": 1.0, "m": 1.0, "metre": 1.0, "metres": 1.0, "meter": 1.0, "meters": 1.0}
+DEGREES = {
+    **dict.fromkeys(("", "deg", "degree", "degrees", "°"), 1.0),
+    **dict.fromkeys(("gon", "gons", "grad", "grads"), 0.9),
+    **dict.fromkeys(("rad", "radian", "radians"), 180.0 / np.pi),
+}
+METRES = dict.fromkeys(("", "m", "metre", "metres", "meter", "meters"), 1.0)
+LENGTHS = ("x", "y", "z", "sigma_x", "sigma_y", "sigma_z")
 
 
 @dataclass(frozen=True)
@@ -219,9 +221,8 @@ class Columns:
         if role not in self.place:
             return np.full(len(self.table.rows), np.nan)
         texts = [row[self.place[role]] for row in self.table.rows]
-        values = np.array([number(text) for text in texts])
-        if self.name(role) in EXIF:
-            values = np.array([exif_number(text) for text in texts])
+        read = exif_number if self.name(role) in EXIF else number
+        values = np.array([read(text) for text in texts])
         for i in np.flatnonzero(~np.isfinite(values)):
             if needed or texts[i]:
                 raise InputError(
@@ -233,12 +234,9 @@ class Columns:
     def _factor(self, role: str) -> float:
         """Return what the unit of a column is in metres or degrees."""
         base, unit = role.removesuffix("_est"), self.unit[self.place[role]]
-        if base in ("x", "y", "z", "sigma_x", "sigma_y", "sigma_z"):
-            known, wanted = METRES, "metres"
-        elif base in POSE:
-            known, wanted = DEGREES, "degrees"
-        else:
+        if base not in (*LENGTHS, *POSE):
             return 1.0
+        known, wanted = (METRES, "metres") if base in LENGTHS else (DEGREES, "degrees")
         if unit not in known:
             raise InputError(
                 f"{self.path}: column {self.name(role)} is in '{unit}'; give {wanted}."

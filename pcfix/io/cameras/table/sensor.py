@@ -20,10 +20,10 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import is_same_lens
+from pcfix.io.cameras.checks import is_same_lens, write_new
 from pcfix.io.cameras.table.columns import Columns
 from pcfix.io.crs import is_topocentric
-from pcfix.io.files import check_input, check_output, write_text
+from pcfix.io.files import check_input
 from pcfix.io.tables import Table, read_lines, read_table, split_header
 from pcfix.model import Cameras, Lens
 
@@ -60,14 +60,18 @@ def read_sensor(path: Path) -> Lens:
             f"{path}: give one row of positive focal, sensor_x and sensor_y in mm, not"
             f" {len(table.rows)} row(s) beginning {focal:g}, {width:g}, {height:g}."
         )
+    return _centred_mm(focal, width, height)
+
+
+def _centred_mm(focal: float, width: float, height: float) -> Lens:
     return Lens(focal, width, height, width / 2.0, height / 2.0, unit="mm")
 
 
 def read_lenses(columns: Columns, sensor: Path | None) -> tuple[Lens, ...]:
     """Return the lens of each row."""
     own = columns.has("f", "px", "py")
-    beside = columns.path.with_name("sensor.csv")
-    if sensor is None and not beside.is_file():
+    path = sensor or columns.path.with_name("sensor.csv")
+    if sensor is None and not path.is_file():
         raise InputError(
             f"{columns.path}: has the shape of no image: give --sensor a table with the columns"
             " width_px,height_px."
@@ -75,7 +79,6 @@ def read_lenses(columns: Columns, sensor: Path | None) -> tuple[Lens, ...]:
             else f"{columns.path}: has angles, but there is no sensor: give --sensor, put"
             " sensor.csv (focal,sensor_x,sensor_y in mm) beside it, or leave the angles out."
         )
-    path = sensor or beside
     return _own_lenses(columns, path) if own else (read_sensor(path),) * len(columns.labels)
 
 
@@ -87,17 +90,15 @@ def _own_lenses(columns: Columns, sensor: Path) -> tuple[Lens, ...]:
     brown = np.nan_to_num(columns.where_there(DISTORTION))
     seen: dict[bytes, Lens] = {}
     lenses = []
-    for label, (focal, x, y), k in zip(columns.labels, rows, brown, strict=True):
-        key = np.array([focal, x, y, *k]).tobytes()
+    for label, row in zip(columns.labels, np.hstack([rows, brown]), strict=True):
+        key = row.tobytes()
         if key not in seen:
+            focal, x, y, *k = row.tolist()
             lens = Lens(
-                focal=focal * largest / FILM_MM,
-                width=width,
-                height=height,
-                principal_x=width / 2.0 + x * largest,
-                principal_y=height / 2.0 + y * largest,
-                radial=tuple(k[:4].tolist()),
-                tangential=tuple(k[4:].tolist()),
+                *(focal * largest / FILM_MM, width, height),
+                *(width / 2.0 + x * largest, height / 2.0 + y * largest),
+                radial=tuple(k[:4]),
+                tangential=tuple(k[4:]),
             )
             seen[key] = checks.lens(columns.path, label, lens)
         lenses.append(seen[key])
@@ -127,15 +128,11 @@ def _from_pixels(table: Table) -> Lens:
 
     focal, width, height = (value(name) for name in PIXELS)
     cx, cy = value("cx", width / 2.0), value("cy", height / 2.0)
-    radial = [value(f"k{i}") for i in range(1, 7)]
+    k = [value(f"k{i}") for i in range(1, 7)]
     lens = Lens(
-        focal=focal,
-        width=width,
-        height=height,
-        principal_x=cx,
-        principal_y=cy,
-        radial=tuple(radial[:3]),
-        denominator=tuple(radial[3:]) if any(radial[3:]) else (),
+        *(focal, width, height, cx, cy),
+        radial=tuple(k[:3]),
+        denominator=tuple(k[3:]) if any(k[3:]) else (),
         tangential=(value("p2"), value("p1")),
     )
     checks.lens(table.path, table.path.stem, lens)
@@ -157,14 +154,11 @@ def _names(path: Path) -> set[str]:
     return set(split_header(lines[0].strip())[0]) if lines else set()
 
 
-FILES = ("cameras.csv", "sensor.csv")
 POSE = ("label", "x", "y", "z", "qw", "qx", "qy", "qz")
-OWN = ("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+OWN = ("f", "px", "py", *DISTORTION)
 
 
-def write_table(
-    folder: str | os.PathLike[str], cameras: Cameras, *, overwrite: bool = False
-) -> None:
+def write_table(folder: str | os.PathLike[str], cameras: Cameras) -> None:
     """Write ``cameras.csv`` and ``sensor.csv``.
 
     Parameters
@@ -173,14 +167,13 @@ def write_table(
         Made if need be.
     cameras : Cameras
         With rotations and lenses.
-    overwrite : bool
 
     Raises
     ------
     InputError
         If a lens has what the table cannot say, or the cameras have no rotations.
     SettingError
-        If a file exists and `overwrite` is not set.
+        If a file exists.
     """
     target = Path(folder)
     if cameras.rotations is None or cameras.lenses is None:
@@ -191,16 +184,18 @@ def write_table(
             " projected CRS first."
         )
     distinct = list(dict.fromkeys(cameras.lenses))
-    single = len(distinct) == 1
-    sensor = _sensor(target, distinct[0]) if single else _frame_row(target, distinct)
-    own = None if single else [_own(target, lens) for lens in cameras.lenses]
-    texts = (_poses(cameras, own), sensor)
-    if target.is_dir():
-        for name in FILES:
-            check_output(target / name, overwrite=overwrite)
-    target.mkdir(parents=True, exist_ok=True)
-    for name, text in zip(FILES, texts, strict=True):
-        write_text(target / name, text, overwrite=overwrite)
+    if len(distinct) == 1:
+        sensor, poses = _sensor(target, distinct[0]), _poses(cameras, None)
+    else:
+        frames = {(lens.width, lens.height, lens.unit) for lens in distinct}
+        if len(frames) > 1 or distinct[0].unit != "px":
+            raise InputError(
+                f"{target}: a table of poses holds several lenses only in pixels and of one frame;"
+                " take another form."
+            )
+        sensor = _row({"width_px": distinct[0].width, "height_px": distinct[0].height})
+        poses = _poses(cameras, [_own(target, lens) for lens in cameras.lenses])
+    write_new(target, {"cameras.csv": poses.encode(), "sensor.csv": sensor.encode()})
 
 
 def _poses(cameras: Cameras, own: list[list[float]] | None) -> str:
@@ -222,17 +217,10 @@ def _poses(cameras: Cameras, own: list[list[float]] | None) -> str:
 def _sensor(target: Path, lens: Lens) -> str:
     """Return the one row of the lens of all images."""
     if lens.unit == "mm":
-        centred = Lens(
-            *(lens.focal, lens.width, lens.height, lens.width / 2.0, lens.height / 2.0), unit="mm"
-        )
-        _check_held(target, lens, centred)
-        values = {"focal": lens.focal, "sensor_x": lens.width, "sensor_y": lens.height}
-        return _row(values)
-    radial, denominator, tangential = (
-        (*given, *(0.0,) * count)[:count]
-        for given, count in ((lens.radial, 3), (lens.denominator, 3), (lens.tangential, 2))
-    )
-    _check_held(target, lens, _brown(lens, radial, denominator, tangential))
+        sides = (lens.focal, lens.width, lens.height)
+        _check_held(target, lens, _centred_mm(*sides))
+        return _row(dict(zip(MILLIMETRES, sides, strict=True)))
+    radial, denominator, tangential = _brown(target, lens, (3, 3, 2))
     values = {"focal_px": lens.focal, "width_px": lens.width, "height_px": lens.height}
     values |= {"cx": lens.principal_x, "cy": lens.principal_y}
     values |= {f"k{i}": value for i, value in enumerate((*radial, *denominator), start=1)}
@@ -240,38 +228,23 @@ def _sensor(target: Path, lens: Lens) -> str:
     return _row(values)
 
 
-def _frame_row(target: Path, lenses: list[Lens]) -> str:
-    """Return the row of the frame that all lenses have."""
-    frames = {(lens.width, lens.height, lens.unit) for lens in lenses}
-    if len(frames) > 1 or lenses[0].unit != "px":
-        raise InputError(
-            f"{target}: a table of poses holds several lenses only in pixels and of one frame;"
-            " take another form."
-        )
-    return _row({"width_px": lenses[0].width, "height_px": lenses[0].height})
-
-
 def _own(target: Path, lens: Lens) -> list[float]:
     """Return f, px, py, k1 ... k4, t1, t2 of one image, as RealityCapture's tables have them."""
-    radial, tangential = (
-        (*given, *(0.0,) * count)[:count]
-        for given, count in ((lens.radial, 4), (lens.tangential, 2))
-    )
-    _check_held(target, lens, _brown(lens, radial, (), tangential))
+    radial, _, tangential = _brown(target, lens, (4, 0, 2))
     largest = max(lens.width, lens.height)
     x, y = lens.principal_x - lens.width / 2.0, lens.principal_y - lens.height / 2.0
     return [lens.focal * FILM_MM / largest, x / largest, y / largest, *radial, *tangential]
 
 
-def _brown(
-    lens: Lens, radial: Sequence[float], denominator: Sequence[float], tangential: Sequence[float]
-) -> Lens:
-    return Lens(
-        *(lens.focal, lens.width, lens.height, lens.principal_x, lens.principal_y),
-        radial=tuple(radial),
-        denominator=tuple(denominator),
-        tangential=tuple(tangential),
-    )
+def _brown(target: Path, lens: Lens, counts: Sequence[int]) -> list[tuple[float, ...]]:
+    """Return radial, denominator and tangential coefficients, so many, if they are the lens."""
+    given = (lens.radial, lens.denominator, lens.tangential)
+    lists = [(*k, *(0.0,) * n)[:n] for k, n in zip(given, counts, strict=True)]
+    frame = (lens.focal, lens.width, lens.height, lens.principal_x, lens.principal_y)
+    radial, denominator, tangential = lists
+    held = Lens(*frame, radial=radial, denominator=denominator, tangential=tangential)
+    _check_held(target, lens, held)
+    return lists
 
 
 def _check_held(target: Path, lens: Lens, held: Lens) -> None:
