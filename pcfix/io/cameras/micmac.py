@@ -37,6 +37,7 @@ from pcfix.model import Cameras, FloatArray, Lens
 PREFIX, SUFFIX = "Orientation-", ".xml"
 UNIFIED = ("eModele_DRad_PPaEqPPs", "eModele_Fraser_PPaEqPPs")
 """Of `ModUnif`: radial and Fraser's about the principal point; five k, P1, P2, b1, b2."""
+NO_DISTORTION = ("ModNoDist", "eModelePolyDeg0")
 AFFINITY_PX = 0.1
 """Largest distance in the frame that a lens with Fraser's affinity may be off."""
 
@@ -57,11 +58,12 @@ def read(source: Source) -> Cameras:
         paths = sorted(p for p in source.path.glob(f"{PREFIX}*{SUFFIX}") if p.is_file())
     known: dict[Path, Lens] = {}
     poses = [_orientation(path, known) for path in paths]
+    centres, rotations, lenses = zip(*poses, strict=True) if poses else ((), (), ())
     return Cameras(
         labels=tuple(_image(path) for path in paths),
-        centres=np.array([centre for centre, _, _ in poses]),
-        rotations=np.array([rotation for _, rotation, _ in poses]),
-        lenses=tuple(lens for _, _, lens in poses),
+        centres=np.array(centres),
+        rotations=np.array(rotations),
+        lenses=lenses,
         source="MicMac",
     )
 
@@ -72,19 +74,12 @@ def _image(path: Path) -> str:
 
 def _orientation(path: Path, known: dict[Path, Lens]) -> tuple[FloatArray, FloatArray, Lens]:
     """Return centre, rotation world to camera, and lens."""
-    root = read_xml(path)
-    conic = _first(path, root, "OrientationConique")
+    image = f"image {_image(path)}"
+    conic = _first(path, read_xml(path), "OrientationConique")
     projection = conic.findtext("TypeProj", "eProjStenope").strip()
     if projection != "eProjStenope":
-        raise InputError(
-            f"{path}: image {_image(path)}: the projection {projection} is no camera's."
-        )
-    centre, rotation = _exterior(path, _first(path, conic, "Externe"))
-    return centre, rotation, _scanned(path, conic.find("OrIntImaM2C"), _lens(path, conic, known))
-
-
-def _exterior(path: Path, outer: Element) -> tuple[FloatArray, FloatArray]:
-    image = f"image {_image(path)}"
+        raise InputError(f"{path}: {image}: the projection {projection} is no camera's.")
+    outer = _first(path, conic, "Externe")
     convention = outer.findtext("KnownConv", "").strip()
     matrix = outer.find("ParamRotation/CodageMatr")
     if convention not in _IS_INVERSE or matrix is None:
@@ -94,7 +89,8 @@ def _exterior(path: Path, outer: Element) -> tuple[FloatArray, FloatArray]:
         )
     rows = [numbers(path, f"{image}, {tag}", matrix.findtext(tag), 3) for tag in ("L1", "L2", "L3")]
     centre = numbers(path, f"{image}, Centre", outer.findtext("Centre"), 3)
-    return centre, checks.rotation(path, _image(path), np.array(rows)).T
+    rotation = checks.rotation(path, _image(path), np.array(rows)).T
+    return centre, rotation, _scanned(path, conic.find("OrIntImaM2C"), _lens(path, conic, known))
 
 
 def _lens(path: Path, conic: Element, known: dict[Path, Lens]) -> Lens:
@@ -135,7 +131,7 @@ def _calibration(path: Path, element: Element) -> Lens:
     x, y = numbers(path, "PP", element.findtext("PP"), 2).tolist()
     width, height = numbers(path, "SzIm", element.findtext("SzIm"), 2).tolist()
     models = [model for entry in element.iter("CalibDistortion") for model in entry]
-    models = [model for model in models if not _is_none(model)]
+    models = [model for model in models if _name(model) not in NO_DISTORTION]
     if len(models) > 1:
         raise _not_held(path, " after ".join(_name(model) for model in models))
     (cx, cy), radial, rest = (x, y), np.empty(0), np.empty(0)
@@ -165,10 +161,6 @@ def _name(model: Element) -> str:
     return model.findtext("TypeModele", "").strip() or str(model.tag)
 
 
-def _is_none(model: Element) -> bool:
-    return _name(model) in ("ModNoDist", "eModelePolyDeg0")
-
-
 def _not_held(path: Path, name: str) -> InputError:
     return InputError(
         f"{path}: the calibration has the distortion {name}, which pcfix does not model; convert it"
@@ -186,18 +178,16 @@ def _distortion(
         if any(given[9:]):
             raise InputError(f"{path}: {name} has {len(given)} Params instead of 9.")
         values = np.array([*given[:9], *(0.0,) * (9 - len(given))])
-        centre, radial, rest = principal, values[:5], values[5:]
-    elif name in ("ModRad", "ModPhgrStd"):
-        part = model.find("RadialePart")
-        part = model if part is None else part
-        x, y = numbers(path, "CDist", part.findtext("CDist"), 2).tolist()
-        terms = [number(path, "CoeffDist", e.text) for e in part.findall("CoeffDist")]
-        tags = () if name == "ModRad" else ("P1", "P2", "b1", "b2")
-        rest = np.array([number(path, tag, model.findtext(tag, "0")) for tag in tags])
-        centre, radial = (x, y), np.array(terms)
-    else:
+        return principal, values[:5], values[5:]
+    if name not in ("ModRad", "ModPhgrStd"):
         raise _not_held(path, name)
-    return centre, radial, rest
+    inside = model.find("RadialePart")
+    part = model if inside is None else inside
+    x, y = numbers(path, "CDist", part.findtext("CDist"), 2).tolist()
+    terms = [number(path, "CoeffDist", e.text) for e in part.findall("CoeffDist")]
+    tags = () if name == "ModRad" else ("P1", "P2", "b1", "b2")
+    rest = [number(path, tag, model.findtext(tag, "0")) for tag in tags]
+    return (x, y), np.array(terms), np.array(rest)
 
 
 def _scanned(path: Path, element: Element | None, lens: Lens) -> Lens:
@@ -212,19 +202,12 @@ def _scanned(path: Path, element: Element | None, lens: Lens) -> Lens:
     if not origin.any() and (turn == np.eye(2)).all():
         return lens
     inner = turn @ np.array([[lens.focal + lens.b1, lens.b2], [lens.b3, lens.focal]])
-    x, y = origin + turn @ np.array([lens.principal_x, lens.principal_y])
-    width, height = np.abs(turn) @ np.array([lens.width, lens.height])
-    scanned = replace(
-        lens,
-        focal=float(inner[1, 1]),
-        b1=float(inner[0, 0] - inner[1, 1]),
-        b2=float(inner[0, 1]),
-        b3=float(inner[1, 0]),
-        principal_x=float(x),
-        principal_y=float(y),
-        width=float(width),
-        height=float(height),
-    )
+    (m00, m01), (m10, m11) = inner.tolist()
+    place = origin + turn @ np.array([lens.principal_x, lens.principal_y])
+    size = np.abs(turn) @ np.array([lens.width, lens.height])
+    width, height, x, y = np.concatenate([size, place]).tolist()
+    scanned = replace(lens, focal=m11, b1=m00 - m11, b2=m01, b3=m10)
+    scanned = replace(scanned, principal_x=x, principal_y=y, width=width, height=height)
     return checks.lens(path, f"of {where}", scanned)
 
 

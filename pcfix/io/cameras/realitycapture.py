@@ -28,7 +28,6 @@ to check any of this.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -66,6 +65,20 @@ class Image(NamedTuple):
     label: str
     fields: dict[str, str]
 
+    @property
+    def posed(self) -> bool:
+        """Whether it has a pose."""
+        return {"Rotation", "Position"} <= self.fields.keys()
+
+    def numbers(self, name: str, count: int) -> FloatArray:
+        """Return so many numbers of a field."""
+        return numbers(self.path, f"image {self.label}, xcr:{name}", self.fields.get(name), count)
+
+    def number(self, name: str, default: str = "0") -> float:
+        """Return the number of a field."""
+        where = f"image {self.label}, xcr:{name}"
+        return number(self.path, where, self.fields.get(name, default))
+
 
 def recognises(source: Source) -> bool:
     """Whether a file, or one of the .xmp files of a folder, uses RealityCapture's namespace."""
@@ -78,7 +91,7 @@ def read(source: Source) -> Cameras:
     """Read the poses, and the lenses where the size of the images is known."""
     path = source.path
     images = _images(path)
-    posed = [image for image in images if _is_posed(image)]
+    posed = [image for image in images if image.posed]
     if not posed:
         raise InputError(
             f"{path}: has no xcr:Rotation and xcr:Position; export the XMP after the alignment,"
@@ -91,25 +104,19 @@ def read(source: Source) -> Cameras:
         " them there or give --sensor. Frames are taken as boundless."
     )
     relative = any(image.fields.get("Coordinates", "absolute") != "absolute" for image in posed)
+    turns = [
+        checks.rotation(i.path, i.label, i.numbers("Rotation", 9).reshape(3, 3)) for i in posed
+    ]
     return Cameras(
         labels=tuple(image.label for image in posed),
-        centres=np.array([_numbers(image, "Position", 3) for image in posed]),
-        rotations=np.array(
-            [
-                checks.rotation(i.path, i.label, _numbers(i, "Rotation", 9).reshape(3, 3))
-                for i in posed
-            ]
-        ),
+        centres=np.array([image.numbers("Position", 3) for image in posed]),
+        rotations=np.array(turns),
         lenses=lenses,
         crs="local" if relative else None,
         notes=() if lenses else (note,),
-        unposed=tuple(image.label for image in images if not _is_posed(image)),
+        unposed=tuple(image.label for image in images if not image.posed),
         source="RealityCapture",
     )
-
-
-def _is_posed(image: Image) -> bool:
-    return {"Rotation", "Position"} <= image.fields.keys()
 
 
 def _files(path: Path) -> list[Path]:
@@ -150,46 +157,30 @@ def _fields(path: Path) -> dict[str, str]:
     return fields
 
 
-def _frames(source: Source, images: list[Image]) -> Sequence[tuple[float, float]] | None:
+def _frames(source: Source, images: list[Image]) -> list[tuple[float, float]] | None:
     """Return width and height of each image; None when one of them is not known."""
     folder = source.path if source.path.is_dir() else source.path.parent
     beside = folder / "sensor.csv"
     sensor = source.sensor or (beside if beside.is_file() else None)
-    given = None
-    if sensor is not None:
-        lens = read_sensor(sensor)
-        given = (lens.width, lens.height)
+    lens = None if sensor is None else read_sensor(sensor)
+    given = None if lens is None else (lens.width, lens.height)
     frames = [image_size(folder, image.label) or given for image in images]
     known = [frame for frame in frames if frame is not None]
     return known if len(known) == len(images) else None
-
-
-def _numbers(image: Image, name: str, count: int) -> FloatArray:
-    where = f"image {image.label}, xcr:{name}"
-    return numbers(image.path, where, image.fields[name], count)
-
-
-def _number(image: Image, name: str, default: str) -> float:
-    text = image.fields.get(name, default)
-    return number(image.path, f"image {image.label}, xcr:{name}", text)
 
 
 def _lens(image: Image, frame: tuple[float, float]) -> Lens:
     """Return the lens, in the unit of the frame."""
     width, height = frame
     scale = max(frame)
-    across = _number(image, "FocalLength35mm", "") / FILM_MM * scale
-    u, v = (_number(image, f"PrincipalPoint{axis}", "0") * scale for axis in "UV")
-    focal = across * _number(image, "AspectRatio", "1")
+    across = image.number("FocalLength35mm", "") / FILM_MM * scale
+    u, v = (image.number(f"PrincipalPoint{axis}") * scale for axis in "UV")
+    focal = across * image.number("AspectRatio", "1")
     model, radial, tangential = _distortion(image)
     lens = Lens(
-        focal=focal,
-        width=width,
-        height=height,
-        principal_x=width / 2.0 + u,
-        principal_y=height / 2.0 + v,
+        *(focal, width, height, width / 2.0 + u, height / 2.0 + v),
         b1=across - focal,
-        b2=_number(image, "Skew", "0") * scale,
+        b2=image.number("Skew") * scale,
         radial=radial,
         tangential=tangential,
     )
@@ -205,14 +196,11 @@ def _distortion(image: Image) -> tuple[str, tuple[float, ...], tuple[float, ...]
             f"{image.path}: image {image.label}: the distortion model '{model}' is not supported;"
             f" export with one of {', '.join(MODELS)}."
         )
-    text = image.fields.get("DistortionCoeficients", "")
-    given = numbers(
-        image.path, f"image {image.label}, xcr:DistortionCoeficients", text, len(text.split())
-    )
-    k = np.zeros(6)
-    k[: len(given)] = given[:6]
+    name = "DistortionCoeficients"
+    given = image.numbers(name, len(image.fields.get(name, "").split())).tolist()
+    k = [*given, *(0.0,) * 6][:6]
     radial, tangential = MODELS[model]
-    return model, tuple(k[:radial].tolist()), tuple(k[4 : 4 + tangential].tolist())
+    return model, tuple(k[:radial]), tuple(k[4 : 4 + tangential])
 
 
 def _with_division(lens: Lens, scale: float) -> Lens:
@@ -222,9 +210,7 @@ def _with_division(lens: Lens, scale: float) -> Lens:
     length, and a length there is a share of the image divided by that of the focal length.
     """
     across = lens.focal + lens.b1
-    centre = (
-        (lens.width / 2.0 - lens.principal_x) / across,
-        (lens.height / 2.0 - lens.principal_y) / lens.focal,
-    )
+    x = (lens.width / 2.0 - lens.principal_x) / across
+    y = (lens.height / 2.0 - lens.principal_y) / lens.focal
     k = lens.radial[0] * (across / scale) ** 2
-    return replace(lens, radial=(), denominator=(k,), distortion_centre=centre, inverse=True)
+    return replace(lens, radial=(), denominator=(k,), distortion_centre=(x, y), inverse=True)

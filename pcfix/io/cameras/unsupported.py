@@ -115,11 +115,10 @@ def recognises(source: Source) -> bool:
 
 def read(source: Source) -> NoReturn:
     """Refuse the file."""
-    found = _refusal(source)
-    what, remedy = (
-        (found.what, found.remedy) if found else ("a format that pcfix does not read", ANY_CAMERAS)
+    found = _refusal(source) or Refusal("a format that pcfix does not read", b"", ANY_CAMERAS)
+    raise InputError(
+        f"{source.path}: is {found.what}, which pcfix does not read as cameras; {found.remedy}."
     )
-    raise InputError(f"{source.path}: is {what}, which pcfix does not read as cameras; {remedy}.")
 
 
 def _refusal(source: Source) -> Refusal | None:
@@ -136,23 +135,16 @@ def _refusal(source: Source) -> Refusal | None:
 def _bare_numbers(text: str) -> Refusal | None:
     """Return what a text is whose lines are numbers, but for the name of the image."""
     lines = (text.rpartition("\n")[0] or text).splitlines()  # the last may be cut off
-    rows = [_numbers(line) for line in lines if line.strip() and not line.startswith("#")]
+    rows = []
+    for line in lines:
+        if line.strip() and not line.startswith("#"):
+            values = [number(word) for word in re.split(r"[,;\s]+", line.strip())]
+            values = values[1:] if np.isnan(values[0]) else values  # after at most one name
+            rows.append([] if np.isnan(values).any() else values)
     for i in range(len(rows) - 2):
-        three = rows[i : i + 3]
-        if all(len(row) == 3 for row in three) and _is_rotation(np.array(three)):
-            return PATB
+        if all(len(row) == 3 for row in rows[i : i + 3]):
+            three = np.array(rows[i : i + 3])
+            with np.errstate(all="ignore"):
+                if np.abs(three @ three.T - np.eye(3)).max() < 1e-3:
+                    return PATB
     return BARE if rows and all(len(row) >= 3 for row in rows[:20]) else None
-
-
-def _numbers(line: str) -> list[float]:
-    """Return the numbers of a line, after at most one name; nothing where other words are."""
-    words = re.split(r"[,;\s]+", line.strip())
-    values = [number(word) for word in words]
-    if np.isnan(values[0]):
-        values = values[1:]
-    return [] if np.isnan(values).any() else values
-
-
-def _is_rotation(matrix: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> bool:
-    with np.errstate(all="ignore"):
-        return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() < 1e-3)
