@@ -58,12 +58,11 @@ def read(source: Source) -> Cameras:
         paths = sorted(p for p in source.path.glob(f"{PREFIX}*{SUFFIX}") if p.is_file())
     known: dict[Path, Lens] = {}
     poses = [_orientation(path, known) for path in paths]
-    centres, rotations, lenses = zip(*poses, strict=True) if poses else ((), (), ())
     return Cameras(
         labels=tuple(_image(path) for path in paths),
-        centres=np.array(centres),
-        rotations=np.array(rotations),
-        lenses=lenses,
+        centres=np.array([centre for centre, _, _ in poses]),
+        rotations=np.array([rotation for _, rotation, _ in poses]),
+        lenses=tuple(lens for _, _, lens in poses),
         source="MicMac",
     )
 

@@ -28,6 +28,7 @@ to check any of this.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -157,7 +158,7 @@ def _fields(path: Path) -> dict[str, str]:
     return fields
 
 
-def _frames(source: Source, images: list[Image]) -> list[tuple[float, float]] | None:
+def _frames(source: Source, images: list[Image]) -> Sequence[tuple[float, float]] | None:
     """Return width and height of each image; None when one of them is not known."""
     folder = source.path if source.path.is_dir() else source.path.parent
     beside = folder / "sensor.csv"

@@ -164,9 +164,10 @@ class _Bytes:
 
     def __init__(self, path: Path) -> None:
         self.path, self.at = path, 0
+        self.data: bytes | mmap.mmap = b""
         with path.open("rb") as stream:
-            empty = path.stat().st_size == 0
-            self.data = b"" if empty else mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+            if path.stat().st_size:
+                self.data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
 
     def skip(self, size: int) -> int:
         """Return where the next bytes begin, and go on after them."""

@@ -193,8 +193,8 @@ def lenses_of_images(
 
 def _lens(path: Path, image: Image, calibrations: list[Calibration]) -> Lens | None:
     """Return the lens in pixels, from the block of the image or the only calibration."""
-    fields = {name: values.tolist() for name, values in image.fields.items()}
-    matrix = fields.get("matrix")
+    fields: dict[str, list[float]] = {k: v.tolist() for k, v in image.fields.items()}
+    matrix = fields.get("matrix", [])
     if {"affine", "polynomial"} <= fields.keys() and (matrix or "principal" in fields):
         x, y = fields["principal"][:2] if "principal" in fields else (matrix[2], matrix[5])
         lens = _fisheye(image, (x, y), fields["affine"], fields["polynomial"])
