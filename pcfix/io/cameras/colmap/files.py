@@ -186,7 +186,8 @@ class _Bytes:
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise self.cut_off()
-        return bytes(self.data[self.skip(end + 1 - self.at) : end]).decode("utf-8", "replace")
+        begin = self.skip(end + 1 - self.at)
+        return bytes(self.data[begin:end]).decode("utf-8", "replace")
 
     def count(self, least_bytes: int) -> int:
         """Return the next count, of rows of at least so many bytes, if they can be there."""
