@@ -102,17 +102,11 @@ def _cells_over(area: Any, corner: FloatArray, side_m: float) -> _Cells:
         margin = _MARGIN * cell + 4.0 * far
         x, y = west + column * cell, south + row * cell
         boxes = shapely.box(x - margin, y - margin, x + cell + margin, y + cell + margin)
-        states[row, column] = _states_of(area, boxes)
+        state = np.where(shapely.covers(area, boxes), INSIDE, CROSSED).astype(np.uint8)
+        rest: IntArray = np.flatnonzero(state == CROSSED)
+        state[rest[~shapely.intersects(area, boxes[rest])]] = OUTSIDE
+        states[row, column] = state
     return _Cells(west, south, side_m / 2**HALVINGS, states)
-
-
-def _states_of(area: Any, boxes: npt.NDArray[Any]) -> States:
-    import shapely
-
-    state = np.where(shapely.covers(area, boxes), INSIDE, CROSSED).astype(np.uint8)
-    rest: IntArray = np.flatnonzero(state == CROSSED)
-    state[rest[~shapely.intersects(area, boxes[rest])]] = OUTSIDE
-    return state
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
@@ -203,19 +197,9 @@ class Surroundings(NamedTuple):
 class Grid:
     """Adds up points, chunk by chunk.
 
-    Parameters
-    ----------
-    low, high : array, shape (2,)
-        South-west and north-east corner of the cloud, metres; if they turn out to be wrong,
-        `lattice` tells, and the points must be added again.
-    dead_band_m : float
-        Points at most so far from the surface are undecided; 0 for none.
-
-    Attributes
-    ----------
-    lattice : Lattice
-    low, high : array, shape (2,)
-        Of the points so far.
+    Made with the south-west and north-east corner of the cloud, metres, shape (2,): if they turn
+    out to be wrong, `fits` tells, `low` and `high` are those of the points so far, and the points
+    must be added again. Points at most the dead band from the surface are undecided.
     """
 
     def __init__(self, low: FloatArray, high: FloatArray, dead_band_m: float) -> None:
@@ -227,16 +211,9 @@ class Grid:
         self._votes: IntArray = np.zeros(shape if dead_band_m else (1, 1), np.int64)
 
     def add(self, x: FloatArray, y: FloatArray, height_m: FloatArray, counts: BoolArray) -> None:
-        """Add n points.
+        """Add n points, with their heights above the water surface, NaN where that is not known.
 
-        Parameters
-        ----------
-        x, y : array, shape (n,)
-            Metres, world frame.
-        height_m : array, shape (n,)
-            Above the water surface; NaN where that is not known.
-        counts : array of bool, shape (n,)
-            Whether a point may be submerged. The others only show that there is no gap.
+        `counts` says whether a point may be submerged; the others only show that there is no gap.
         """
         if not x.size:
             return
@@ -259,10 +236,16 @@ class Grid:
 
     def surroundings(self, *, connected: bool, least_pool_m2: float | None) -> Surroundings:
         """Return what the points say together; the grid is used up."""
+        from scipy.ndimage import convolve
+
         lattice, flags, votes = self.lattice, self._flags, self._votes
-        while _is_thin(flags, self._water_points):
+        while max(flags.shape) > 2:
+            water_cells = np.count_nonzero(flags & (BELOW | UNDECIDED))
+            if self._water_points >= POINTS_A_CELL * water_cells:
+                break
             lattice, flags, votes = _halved(lattice, flags, votes)
-        is_wet = _majority_below(votes) if self._dead_m else np.zeros((1, 1), np.bool_)
+        # the votes of a cell and its eight neighbours together
+        is_wet = convolve(votes, np.ones((3, 3)), mode="constant") < 0
         if not connected:
             return Surroundings(lattice, is_wet, None, None)
         water = (flags & BELOW) > 0
@@ -272,24 +255,16 @@ class Grid:
         return Surroundings(lattice, is_wet, pools, _grown(pools.stays[pools.number]))
 
 
-def _is_thin(flags: Flags, points: int) -> bool:
-    """Whether the cells with water have too few points on average."""
-    water = np.count_nonzero(flags & (BELOW | UNDECIDED))
-    return max(flags.shape) > 2 and bool(points < POINTS_A_CELL * water)
-
-
 def _halved(lattice: Lattice, flags: Flags, votes: IntArray) -> tuple[Lattice, Flags, IntArray]:
     """Return the same in cells of twice the side."""
     _, column, row, columns, rows = lattice
     west, south = column % 2, row % 2  # the cells to add, for pairs that begin with an even one
     pad = (south, (south + rows) % 2), (west, (west + columns) % 2)
-    quads = _quads(flags, pad)
-    new = Lattice(lattice.side_m * 2.0, column // 2, row // 2, quads[0].shape[1], quads[0].shape[0])
-    joined = quads[0] | quads[1] | quads[2] | quads[3]
     if votes.size == flags.size:
-        a, b, c, d = _quads(votes, pad)
-        votes = a + b + c + d
-    return new, joined, votes
+        votes = np.add.reduce(_quads(votes, pad))
+    flags = np.bitwise_or.reduce(_quads(flags, pad))
+    rows, columns = flags.shape
+    return Lattice(lattice.side_m * 2.0, column // 2, row // 2, columns, rows), flags, votes
 
 
 def _quads(
@@ -354,18 +329,3 @@ def _add(
         if dead_m > 0.0:
             votes[r, c] += int(np.rint(_VOTE * min(max(height / dead_m, -1.0), 1.0)))
     return water
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _majority_below(votes: IntArray) -> BoolArray:  # pragma: no cover - compiled
-    """Return where the votes of a cell and its eight neighbours lie below the surface together."""
-    rows, columns = votes.shape
-    below = np.empty((rows, columns), np.bool_)
-    for r in range(rows):
-        for c in range(columns):
-            total = 0
-            for i in range(max(r - 1, 0), min(r + 2, rows)):
-                for j in range(max(c - 1, 0), min(c + 2, columns)):
-                    total += votes[i, j]
-            below[r, c] = total < 0
-    return below
