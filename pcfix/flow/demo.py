@@ -12,7 +12,8 @@ from pcfix.flow.run import Request, run_all
 from pcfix.io.las.source import read_xyz
 from pcfix.io.scenes import write_scene
 from pcfix.model import FloatArray
-from pcfix.simulate.scene import BlockKind, Scene, simulate_scene
+from pcfix.options.scenes import BlockKind
+from pcfix.simulate.scene import Scene, simulate_scene
 
 LEAST_DEPTH_M = 0.2  # shallower points have no refraction worth a percentage
 BLOCKS: tuple[BlockKind, ...] = ("nadir", "oblique")

@@ -37,8 +37,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens, Views
-from pcfix.simulate.sight import Partners, Rig, Sight, intersect, starts_of
-from pcfix.simulate.tracing import bed_points, piercing_points_of_planes, project
+from pcfix.simulate.sight import Part, Partners, Rig, Sight, starts_of
+from pcfix.simulate.tracing import bed_points, piercing_points_of_planes, project, rotations_of
 
 AVERAGED_WITHIN = 0.012
 AGREE = 0.01
@@ -53,26 +53,18 @@ _STEPS = 20
 _CONVERGED_M = 1e-9
 
 
-class DepthCloud(NamedTuple):
-    """Points, shape (n, 3), what they are points of, and the fused cameras with weights."""
-
-    xyz: FloatArray
-    true_xyz: FloatArray
-    views: Views
-
-
 class Matching(NamedTuple):
     """What the depths of all m references, the rows of `sight`, are found with.
 
-    `water` has an anchor and a normal for each row of `sight`; `bed` for each point. Partners and
-    neighbours are rows of `sight` too, -1 for none, shape (m, c), (m, 8) and (m, 12). Partner j of
-    row i shows a place with the error ``noise_px[i, j]`` and counts with ``cost_px2[i, j]`` more.
+    `water` has an anchor and a normal for each row of `sight`; `normals` has that of the bed for
+    each point. Partners and neighbours are rows of `sight` too, -1 for none, shape (m, c), (m, 8)
+    and (m, 12). Partner j of row i shows a place with the error ``noise_px[i, j]`` and counts with
+    ``cost_px2[i, j]`` more.
     """
 
     sight: Sight
-    rig: Rig
     water: tuple[FloatArray, FloatArray]
-    bed: tuple[FloatArray, FloatArray]
+    normals: FloatArray
     partner: IntArray
     averaged: IntArray
     fused: IntArray
@@ -101,29 +93,17 @@ class Maps(NamedTuple):
 
 
 def fuse_depth_maps(
-    bed: tuple[FloatArray, FloatArray],
-    sight: Sight,
-    rig: Rig,
-    partners: Partners,
-    rng: np.random.Generator,
-) -> DepthCloud:
+    sight: Sight, normals: FloatArray, partners: Partners, rng: np.random.Generator
+) -> Part:
     """Return a fused point of each place of the bed.
 
     A place of which fewer than three depth maps agree stays where it is and has no cameras.
-
-    Parameters
-    ----------
-    bed : tuple of array, shape (n, 3)
-        Points of the true surface, and its unit normals.
-    sight : Sight
-    rig : Rig
-    partners : Partners
-    rng : Generator
-        Of noise, and of which point of a place is taken.
+    `normals`, shape (n, 3), are unit normals of the true surface; `rng` makes the noise, and says
+    which point of a place is taken.
     """
-    matching = _matching(bed, sight, rig, partners, rng)
+    matching = _matching(sight, normals, partners, rng)
     luck = rng.uniform(0.0, 1.0, len(sight.point))
-    place = intersect(bed[0], sight, rig, sight.ideal)
+    place = sight.intersected(sight.ideal)
     maps = depth_maps(matching, place)
     seed, group = _groups(matching, maps, luck)
     seeded = np.flatnonzero(seed >= 0)
@@ -135,19 +115,15 @@ def fuse_depth_maps(
     rows = rows[count[sight.point[rows]] >= LEAST_FUSED]
     point, weight = sight.point[rows], 1.0 / maps.averaged[rows] ** 2
     xyz = maps.points(rows, maps.averaged[rows])
-    fused, true = (_means(v, weight, point, bed[0]) for v in (xyz, maps.shown[rows]))
+    fused, true = (_means(v, weight, point, sight.truth) for v in (xyz, maps.shown[rows]))
     views = Views(starts_of(point, len(fused)), sight.camera[rows], weight.astype(np.float32))
-    return DepthCloud(fused, true, views)
+    return Part(fused, true, views)
 
 
 def _matching(
-    bed: tuple[FloatArray, FloatArray],
-    sight: Sight,
-    rig: Rig,
-    partners: Partners,
-    rng: np.random.Generator,
+    sight: Sight, normals: FloatArray, partners: Partners, rng: np.random.Generator
 ) -> Matching:
-    rows = sight.rows(len(rig.true))
+    rig, rows = sight.rig, sight.rows()
 
     def there(table: IntArray) -> IntArray:
         others = table[sight.camera]
@@ -155,12 +131,11 @@ def _matching(
 
     partner = there(partners.matched)
     partner[(partner >= 0).sum(axis=1) < LEAST_PARTNERS] = -1
-    points, centres = bed[0][sight.point], rig.true.centres[sight.camera]
+    points, centres = sight.truth[sight.point], rig.true.centres[sight.camera]
     return Matching(
         sight,
-        rig,
         rig.water.tangent_planes(points, centres, sight.camera),
-        bed,
+        normals,
         partner,
         there(partners.averaged),
         there(partners.fused),
@@ -171,21 +146,15 @@ def _matching(
 
 
 def depth_maps(matching: Matching, place: FloatArray) -> Maps:
-    """Return the depths that all references have along their rays through a place of each point.
-
-    Parameters
-    ----------
-    matching : Matching
-    place : array, shape (n, 3)
-    """
-    sight, rig = matching.sight, matching.rig
+    """Return the depths of all references along their rays through a place of each point."""
+    sight, rig = matching.sight, matching.sight.rig
     point, camera, lens = sight.point, sight.camera, rig.optics.lens
     pixels, depth = project(place[point], rig.given, camera, lens)
     seen = bed_points(
         rig.true.centres[camera],
         _rays(pixels, rig.true, camera, lens),
         matching.water,
-        (matching.bed[0][point], matching.bed[1][point]),
+        (sight.truth[point], matching.normals[point]),
         rig.water.refractive_index,
     )
     origin, ray = rig.given.centres[camera], _rays(pixels, rig.given, camera, lens)
@@ -197,11 +166,9 @@ def depth_maps(matching: Matching, place: FloatArray) -> Maps:
 
 def _rays(pixels: FloatArray, cameras: Cameras, camera: IntArray, lens: Lens) -> FloatArray:
     """Return directions in the world whose component along the optical axis is 1, (m, 3)."""
-    if cameras.rotations is None:
-        raise ValueError("rays need cameras with angles")
     plane = (pixels - [lens.principal_x, lens.principal_y]) / lens.focal
     inside = np.column_stack([plane, np.ones(len(plane))])
-    return np.asarray(np.einsum("mij,mi->mj", cameras.rotations[camera], inside))
+    return np.asarray(np.einsum("mij,mi->mj", rotations_of(cameras)[camera], inside))
 
 
 def _depths(
@@ -212,9 +179,9 @@ def _depths(
     row = matching.partner[reference, slot]
     measured = _measured(matching, row, seen[reference], matching.noise_px[reference, slot])
     edges = reference, measured, matching.sight.camera[row]
-    origin, ray, first = rays
-    depth = _plausible(_least_squares(rays, edges, matching.rig), first)
-    residual, slope = _residuals((origin, ray, depth), edges, matching.rig)
+    (origin, ray, first), rig = rays, matching.sight.rig
+    depth = _plausible(_least_squares(rays, edges, rig), first)
+    residual, slope = _residuals((origin, ray, depth), edges, rig)
     shape = matching.partner.shape
     squares, right, curved = np.full(shape, np.inf), np.zeros(shape), np.ones(shape)
     squares[reference, slot] = (residual**2).sum(axis=1) + matching.cost_px2[reference, slot]
@@ -223,7 +190,7 @@ def _depths(
     best = _best_pair(squares, right, curved)
     taken = (best[reference] == slot[:, None]).any(axis=1)
     pair = reference[taken], measured[taken], edges[2][taken]
-    return _plausible(_least_squares((origin, ray, depth), pair, matching.rig), first)
+    return _plausible(_least_squares((origin, ray, depth), pair, rig), first)
 
 
 def _plausible(depth: FloatArray, first: FloatArray) -> FloatArray:
@@ -247,7 +214,7 @@ def _measured(
     matching: Matching, row: IntArray, seen: FloatArray, noise_px: FloatArray
 ) -> FloatArray:
     """Return where the images of some rows of `sight` show places of the bed, ideal pixels."""
-    rig, camera = matching.rig, matching.sight.camera[row]
+    rig, camera = matching.sight.rig, matching.sight.camera[row]
     anchors, normals = (part[row] for part in matching.water)
     centres, n = rig.true.centres[camera], rig.water.refractive_index
     surface = piercing_points_of_planes(seen, centres, anchors, normals, n)
@@ -284,10 +251,8 @@ def _residuals(
 ) -> tuple[FloatArray, FloatArray]:
     """Return measured minus predicted pixels, and how the predicted move with the depth."""
     (origin, ray, depth), (owner, measured, camera) = rays, edges
-    lens, rotations = rig.optics.lens, rig.given.rotations
-    if rotations is None:
-        raise ValueError("depths need cameras with angles")
-    turned = np.einsum("mij,mj->mi", rotations[camera], ray[owner])
+    lens = rig.optics.lens
+    turned = np.einsum("mij,mj->mi", rotations_of(rig.given)[camera], ray[owner])
     xyz = (origin + depth[:, None] * ray)[owner]
     seen, z = project(xyz, rig.given, camera, lens)
     offset = (seen - [lens.principal_x, lens.principal_y]) / lens.focal
@@ -305,7 +270,7 @@ def _averaged(matching: Matching, maps: Maps) -> tuple[FloatArray, FloatArray]:
     total, shown, agreeing = maps.depth.copy(), maps.seen.copy(), np.ones(len(rows))
     disagreeing = np.zeros(len(rows))
     for neighbour in matching.averaged.T:
-        depth = _met(matching, maps, maps.depth, neighbour, maps.ray)
+        depth = _met(matching, maps, neighbour)
         agrees = np.abs(depth - maps.depth) < AVERAGED_WITHIN * maps.depth
         total[agrees] += depth[agrees]
         shown[agrees] += maps.seen[neighbour[agrees]]
@@ -316,19 +281,17 @@ def _averaged(matching: Matching, maps: Maps) -> tuple[FloatArray, FloatArray]:
     return depth, shown / agreeing[:, None]
 
 
-def _met(
-    matching: Matching, maps: Maps, depth: FloatArray, other: IntArray, ray: FloatArray
-) -> FloatArray:
-    """Return at what length rays from all origins meet the map of another row, NaN for none.
+def _met(matching: Matching, maps: Maps, other: IntArray) -> FloatArray:
+    """Return at what depth each ray meets the map of another row, NaN for none.
 
     There the other map is a plane parallel to the bed, through its own point at its depth.
     """
-    met = np.full(len(ray), np.nan)
+    met = np.full(len(maps.ray), np.nan)
     rows = np.flatnonzero(other >= 0)
-    there = maps.points(other[rows], depth[other[rows]])
-    normal = matching.bed[1][matching.sight.point[rows]]
+    there = maps.points(other[rows], maps.depth[other[rows]])
+    normal = matching.normals[matching.sight.point[rows]]
     gap = np.einsum("mi,mi->m", there - maps.origin[rows], normal)
-    met[rows] = gap / np.einsum("mi,mi->m", ray[rows], normal)
+    met[rows] = gap / np.einsum("mi,mi->m", maps.ray[rows], normal)
     return met
 
 
@@ -362,15 +325,15 @@ def _groups(matching: Matching, maps: Maps, luck: FloatArray) -> tuple[IntArray,
 def _beyond(matching: Matching, maps: Maps, seeds: IntArray, there: IntArray) -> FloatArray:
     """Return how far beyond the points of seeds the maps of other rows are, relative, (s, 12)."""
     at = maps.points(seeds, maps.averaged[seeds])[:, None]
-    normal = matching.bed[1][matching.sight.point[seeds]][:, None]
+    normal = matching.normals[matching.sight.point[seeds]][:, None]
     reach = (maps.averaged[there][..., None] * maps.ray[there] * normal).sum(axis=2)
     return np.asarray(reach / ((at - maps.origin[there]) * normal).sum(axis=2) - 1.0)
 
 
 def _at(matching: Matching, maps: Maps, rows: IntArray, place: FloatArray) -> BoolArray:
     """Return which rows have the depth of their point's place."""
-    point, camera = matching.sight.point[rows], matching.sight.camera[rows]
-    _, z = project(place[point], matching.rig.given, camera, matching.rig.optics.lens)
+    rig, point = matching.sight.rig, matching.sight.point[rows]
+    _, z = project(place[point], rig.given, matching.sight.camera[rows], rig.optics.lens)
     return np.asarray(np.abs(maps.averaged[rows] - z) < AGREE * z)
 
 

@@ -59,13 +59,7 @@ APPARENT_DEPTHS_M = (1.0, 2.0, 5.0, 10.0, 15.0)
 class AerialCamera:
     """A frame camera that looks straight down, the short side of its frame along the flight.
 
-    Attributes
-    ----------
-    name : str
-    focal_mm : float
-    columns, rows : int
-        Pixels across the flight and along it.
-    pixel_um : float
+    Its columns are the pixels across the flight, its rows those along it.
     """
 
     name: str
@@ -76,10 +70,9 @@ class AerialCamera:
 
     def __post_init__(self) -> None:
         """Check that the camera can take an image."""
-        for what, value in (
-            ("focal length", self.focal_mm), ("number of columns", self.columns),
-            ("number of rows", self.rows), ("pixel size", self.pixel_um),
-        ):  # fmt: skip
+        names = "focal length", "number of columns", "number of rows", "pixel size"
+        values = self.focal_mm, self.columns, self.rows, self.pixel_um
+        for what, value in zip(names, values, strict=True):
             if not (np.isfinite(value) and value > 0):
                 raise SettingError(f"{what} {value:g} of the camera is not above 0.")
 
@@ -140,16 +133,9 @@ class StereoPair:
 class Effect:
     """The effect of refraction over one model.
 
-    Attributes
-    ----------
-    pair : StereoPair
-    apparent_depth_m, refractive_index : float
-    x_m, y_m : array, shape (nodes,)
-        Along the flight and across it, from the centre of the model.
-    error_m : array, shape (nodes, nodes)
-        Apparent depth minus true depth; a row has one y.
-    shift_m : array, shape (nodes, nodes)
-        How far in plan the apparent point lies from the true one.
+    x_m, y_m : shape (nodes,), along the flight and across it, from the centre of the model.
+    error_m : shape (nodes, nodes), apparent depth minus true depth; a row has one y.
+    shift_m : shape (nodes, nodes), how far in plan the apparent point lies from the true one.
     """
 
     pair: StereoPair
@@ -214,21 +200,11 @@ def true_points(apparent: FloatArray, centres: FloatArray, refractive_index: flo
     """Return the true points of apparent ones that two images gave.
 
     The lines of sight to the apparent point are broken at the water, z = 0; the true point is the
-    midpoint of the shortest line between the two in the water.
-
-    Parameters
-    ----------
-    apparent : array, shape (..., 3)
-        Metres, z negative.
-    centres : array, shape (2, 3)
-
-    Returns
-    -------
-    array, shape (..., 3)
+    midpoint of the shortest line between the two in the water. Shape (..., 3), metres, z negative.
     """
     (first, a), (second, b) = (_in_water(apparent, c, refractive_index) for c in centres)
     gap = second - first
-    cosine, along_a, along_b = _dot(a, b), _dot(gap, a), _dot(gap, b)
+    cosine, along_a, along_b = ((u * v).sum(axis=-1) for u, v in ((a, b), (gap, a), (gap, b)))
     sine2 = 1.0 - cosine**2
     on_first = first + a * ((along_a - cosine * along_b) / sine2)[..., None]
     on_second = second + b * ((cosine * along_a - along_b) / sine2)[..., None]
@@ -247,27 +223,17 @@ def _in_water(apparent: FloatArray, centre: FloatArray, n: float) -> tuple[Float
     return surface, down
 
 
-def _dot(one: FloatArray, other: FloatArray) -> FloatArray:
-    return np.asarray((one * other).sum(axis=-1))
-
-
 def effects(
-    heights_m: dict[AerialCamera, tuple[float, ...]] | None = None,
-    apparent_depths_m: tuple[float, ...] = APPARENT_DEPTHS_M,
+    heights_m: dict[AerialCamera, tuple[float, ...]],
+    apparent_depths_m: tuple[float, ...],
     *,
     overlap: float = OVERLAP,
     refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
 ) -> list[Effect]:
-    """Return the effect of every camera, flying height and apparent depth, in this order.
-
-    Parameters
-    ----------
-    heights_m : dict, optional
-        Flying heights above the water of each camera. Default: both cameras of the paper.
-    """
+    """Return the effect of every camera, flying height above the water and apparent depth."""
     return [
         effect(StereoPair(camera, height, overlap), depth, refractive_index)
-        for camera, heights in (heights_m or FLYING_HEIGHTS_M).items()
+        for camera, heights in heights_m.items()
         for height in heights
         for depth in apparent_depths_m
     ]
@@ -294,7 +260,6 @@ def shan_iterations(
     true_depth_m: float,
     refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
     nodes: int = 21,
-    tolerance: float = TOLERANCE,
 ) -> list[Iteration]:
     """Return the residuals of every iteration over a level bed of known depth.
 
@@ -311,7 +276,7 @@ def shan_iterations(
         residual = point[:, 2] - true_depth_m
         worst = residual[np.abs(residual).argmax()]
         table.append(Iteration(number, float(residual.mean()), float(worst), change))
-        if change < tolerance:
+        if change < TOLERANCE:
             break
         tangent = following
         s = np.sqrt(refractive_index**2 + (refractive_index**2 - 1.0) * tangent**2)

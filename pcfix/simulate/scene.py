@@ -10,16 +10,16 @@ import numpy as np
 
 from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterPlane
 from pcfix.options.declare import taken
-from pcfix.options.scenes import BlockKind, SceneOptions
+from pcfix.options.scenes import SceneOptions
 from pcfix.simulate.block import Block, fly_block, misplaced
 from pcfix.simulate.depth_maps import fuse_depth_maps
 from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.sight import (
     SAMPLE,
     TIES,
+    Part,
     Partners,
     Rig,
-    intersect,
     match_pairs,
     neighbour_table,
     openmvs_partners,
@@ -27,8 +27,6 @@ from pcfix.simulate.sight import (
 )
 from pcfix.simulate.terrain import Terrain
 from pcfix.simulate.tracing import Water, Waves
-
-__all__ = ["BlockKind", "Scene", "SceneSettings", "simulate_scene"]
 
 ORIGIN_M = np.array([410_200.0, 4_650_300.0, 0.0])  # in UTM zone 33 north
 EPSG = 32633
@@ -115,25 +113,12 @@ class Scene:
         per_point = len(self.views.camera) / len(self.true_xyz)
         tilt = 100.0 * float(np.hypot(self.water.b, self.water.c))
         tilted = f" in the middle, tilted by {tilt:.3g} %" if tilt else ""
+        gsd = f"{100.0 * self.gsd_m:.1f} cm" if self.gsd_m >= 0.005 else f"{self.gsd_m:.2g} m"
         return (
             f"{len(self.true_xyz):,} points seen by {per_point:.0f} of {len(self.cameras)} cameras"
-            f" each, GSD {self._gsd}, water level {self.water_level_m:g} m{tilted},"
+            f" each, GSD {gsd}, water level {self.water_level_m:g} m{tilted},"
             f" refractive index {self.refractive_index:g}"
         )
-
-    @property
-    def _gsd(self) -> str:
-        return f"{100.0 * self.gsd_m:.1f} cm" if self.gsd_m >= 0.005 else f"{self.gsd_m:.2g} m"
-
-
-class Part(NamedTuple):
-    """Some rows of a cloud, local coordinates."""
-
-    xyz: FloatArray
-    true_xyz: FloatArray
-    views: Views
-    pairs_start: IntArray | None = None
-    pairs: IntArray | None = None
 
 
 class Streams(NamedTuple):
@@ -203,24 +188,26 @@ def simulate_scene(
     lidar = points_on(terrain, round(area_m2 * chosen.lidar_per_m2), rng)
     lidar[:, 2] += rng.normal(0.0, chosen.lidar_noise_m, len(lidar))
     cameras = cameras_in_world(given.cameras)
+    views, pairs, pairs_start = _joined(parts)
     return Scene(
         apparent_xyz=np.vstack([part.xyz for part in parts]) + ORIGIN_M,
         true_xyz=np.vstack([part.true_xyz for part in parts]) + ORIGIN_M,
-        views=_joined_views(parts),
+        views=views,
         cameras=cameras,
         yaw_pitch_roll_deg=given.yaw_pitch_roll_deg,
         lidar_xyz=lidar + ORIGIN_M,
         water_level_m=chosen.water,
         refractive_index=chosen.refractive_index,
-        gsd_m=chosen.flight.gsd_m,
-        sensor_mm=chosen.flight.sensor,
+        gsd_m=chosen.gsd_m,
+        sensor_mm=(chosen.focal_mm, *chosen.sensor_mm),
         epsg=EPSG,
         settings=chosen.as_dict(),
         water=plane_in_world(terrain.water),
         true_cameras=cameras if given is flown else cameras_in_world(flown.cameras),
         true_yaw_pitch_roll_deg=flown.yaw_pitch_roll_deg,
         neighbours=partners.matched if isinstance(partners, Partners) else partners,
-        **_joined_pairs(parts),
+        pairs=pairs,
+        pairs_start=pairs_start,
     )
 
 
@@ -239,8 +226,8 @@ def lay_out(chosen: SceneSettings) -> Site:
     streams, extent = Streams.of(chosen.seed), _extent(chosen)
     plane = chosen.water_plane(extent)
     terrain = Terrain.random(chosen.bed, extent, plane, chosen.depth_m, streams.main)
-    flown = fly_block(extent, chosen.water, chosen.flight, streams.main)
-    given = misplaced(flown, chosen.position_noise_m, chosen.attitude_noise_deg, streams.poses)
+    flown = fly_block(extent, chosen, streams.main)
+    given = misplaced(flown, chosen, streams.poses)
     waves = None
     if chosen.wave_slope_deg > 0.0:
         count = len(flown.cameras)
@@ -263,7 +250,7 @@ def _extent(chosen: SceneSettings) -> tuple[float, float]:
     length, width = chosen.area_m
     if chosen.cameras is None:
         return length, width
-    base, spacing = chosen.flight.base_and_spacing_m
+    base, spacing = chosen.base_and_spacing_m
     side = float(np.sqrt(chosen.cameras * base * spacing * length / width))
     reach = max(side - 1.5 * base, base)
     return reach, max(chosen.cameras * base * spacing / side - 1.5 * spacing, spacing / 2.0)
@@ -284,12 +271,10 @@ def _partners(chosen: SceneSettings, truth: FloatArray, site: Site) -> Partners 
     sure = replace(rig, detection=1.0)
     if chosen.cloud == "pairs":
         sample = truth[:: max(1, len(truth) // SAMPLE)][:SAMPLE]
-        every = see(sample, sure, rng)
-        return neighbour_table(sample, every, rig.true.centres, chosen.matched_with)
+        return neighbour_table(see(sample, sure, rng), chosen.matched_with)
     sample = points_on(site.terrain, max(TIES, 10 * len(rig.true)), rng)
     every = see(sample, sure, rng)
-    ties = intersect(sample, every, rig, every.ideal)
-    return openmvs_partners(ties, every, rig.given, rig.optics, chosen.matched_with, rng)
+    return openmvs_partners(every.intersected(every.ideal), every, chosen.matched_with, rng)
 
 
 def _parts(
@@ -315,35 +300,31 @@ def _observe(truth: FloatArray, site: Site, partners: Partners | IntArray | None
     rig, streams = site.rig, site.streams
     sight = see(truth, rig, streams.detection)
     if partners is None:
-        pixels = rig.observed(sight.ideal, streams.main)
-        return Part(intersect(truth, sight, rig, pixels), truth, Views(sight.start, sight.camera))
+        apparent = sight.intersected(rig.observed(sight.ideal, streams.main))
+        return Part(apparent, truth, Views(sight.start, sight.camera))
     if isinstance(partners, Partners):
-        bed = truth, site.terrain.normals(*truth[:, :2].T)
-        return Part(*fuse_depth_maps(bed, sight, rig, partners, streams.matching))
-    found = match_pairs(truth, sight, rig, partners, streams.matching)
-    return Part(found.xyz, truth, found.views, found.start, found.pairs)
+        normals = site.terrain.normals(*truth[:, :2].T)
+        return fuse_depth_maps(sight, normals, partners, streams.matching)
+    return match_pairs(sight, partners, streams.matching)
 
 
-def _joined_views(parts: list[Part]) -> Views:
-    counts = np.concatenate([np.diff(part.views.start) for part in parts])
-    weights = [part.views.weight for part in parts if part.views.weight is not None]
-    return Views(
-        np.concatenate([[0], np.cumsum(counts)]),
-        np.concatenate([part.views.camera for part in parts]),
-        np.concatenate(weights) if weights else None,
+def _joined(parts: list[Part]) -> tuple[Views, IntArray | None, IntArray | None]:
+    """Return the views of all parts, and the pairs and where those of each point begin."""
+
+    def joined(arrays: list[Any]) -> Any:
+        return None if arrays[0] is None else np.concatenate(arrays)
+
+    def starts(arrays: list[Any]) -> Any:
+        if arrays[0] is None:
+            return None
+        return np.concatenate([[0], np.cumsum(np.concatenate([np.diff(one) for one in arrays]))])
+
+    views = Views(
+        starts([part.views.start for part in parts]),
+        joined([part.views.camera for part in parts]),
+        joined([part.views.weight for part in parts]),
     )
-
-
-def _joined_pairs(parts: list[Part]) -> dict[str, IntArray]:
-    starts = [part.pairs_start for part in parts if part.pairs_start is not None]
-    pairs = [part.pairs for part in parts if part.pairs is not None]
-    if not pairs:
-        return {}
-    counts = np.concatenate([np.diff(start) for start in starts])
-    return {
-        "pairs": np.concatenate(pairs),
-        "pairs_start": np.concatenate([[0], np.cumsum(counts)]),
-    }
+    return views, joined([part.pairs for part in parts]), starts([p.pairs_start for p in parts])
 
 
 def cameras_in_world(cameras: Cameras) -> Cameras:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from pcfix.errors import SettingError
 from pcfix.model import WaterPlane
 from pcfix.options.scenes import SceneOptions
-from pcfix.simulate.block import OBLIQUE_PITCH_DEG, Flight, Optics, make_optics
+from pcfix.simulate.optics import Optics, make_optics
 from pcfix.simulate.terrain import BEDS
 from pcfix.water.index import index_of
 
@@ -86,24 +87,21 @@ class SceneSettings(SceneOptions):
         """How many images each is matched with."""
         return _NEIGHBOURS[self.cloud] if self.neighbours is None else self.neighbours
 
-    @property
-    def flight(self) -> Flight:
-        """How the block is flown."""
-        return Flight(
-            height_m=self.flying_height_m,
-            forward_overlap=self.forward_overlap,
-            side_overlap=self.side_overlap,
-            optics=self.optics,
-            sensor=(self.focal_mm, *self.sensor_mm),
-            obliques_deg=OBLIQUE_PITCH_DEG if self.obliques_deg is None else self.obliques_deg,
-            directions=self.oblique_directions if self.has_obliques else 0,
-            oblique_share=self.oblique_share,
-        )
-
-    @property
+    @cached_property
     def optics(self) -> Optics:
         """The camera's."""
         return make_optics(self.focal_mm, self.sensor_mm, self.sensor_px, self.distortion)
+
+    @property
+    def base_and_spacing_m(self) -> tuple[float, float]:
+        """Distance between nadir images of a strip, and between strips."""
+        width, height = (self.flying_height_m * side / self.focal_mm for side in self.sensor_mm)
+        return height * (1.0 - self.forward_overlap), width * (1.0 - self.side_overlap)
+
+    @property
+    def gsd_m(self) -> float:
+        """Ground size of a pixel at the water surface."""
+        return self.flying_height_m / self.optics.lens.focal
 
     def water_plane(self, extent_m: tuple[float, float]) -> WaterPlane:
         """Return the mean water plane over a rectangle from the origin."""

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.model import Cameras, FloatArray, IntArray, Views
-from pcfix.simulate.block import Optics, reach_m
-from pcfix.simulate.tracing import Water, project, triangulate
+from pcfix.simulate.optics import Optics
+from pcfix.simulate.tracing import Water, project, rotations_of, triangulate
 
 LEAST_VIEWS = 3
 
@@ -29,15 +29,8 @@ def starts_of(point: IntArray, count: int) -> IntArray:
 class Rig:
     """All that the images are made with and the software is given.
 
-    Attributes
-    ----------
-    true, given : Cameras
-        The poses of the images, and those that the cloud is intersected with.
-    optics : Optics
-    water : Water
-    lowest_m : float
-        Nothing is below this height.
-    image_noise_px, detection : float
+    `true` are the poses of the images, `given` those that the cloud is intersected with. Nothing is
+    below `lowest_m`.
     """
 
     true: Cameras
@@ -59,17 +52,16 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """Pairs of a point and an image that shows it, sorted by point, then camera.
+    """The m pairs of one of n points and an image that shows it, sorted by point, then camera.
 
-    Attributes
-    ----------
-    start : array, shape (n + 1,)
-        Point i has the pairs from ``start[i]`` to ``start[i + 1]``.
-    point, camera : array, shape (m,)
-    ideal : array, shape (m, 2)
-        Where the image shows it, ideal pixels without noise.
+    truth : shape (n, 3), the points.
+    start : shape (n + 1,), point i has the pairs from ``start[i]`` to ``start[i + 1]``.
+    point, camera : shape (m,).
+    ideal : shape (m, 2), where the image shows the point, ideal pixels without noise.
     """
 
+    rig: Rig
+    truth: FloatArray
     start: IntArray
     point: IntArray
     camera: IntArray
@@ -80,27 +72,34 @@ class Sight:
         """Which points have pairs, shape (n,)."""
         return np.asarray(np.diff(self.start) > 0)
 
-    def rows(self, cameras: int) -> IntArray:
-        """Return the row of each point and camera, shape (n, cameras), -1 where there is none."""
-        rows = np.full((len(self.start) - 1, cameras), -1)
+    def rows(self) -> IntArray:
+        """Return the row of each point and camera, shape (n, k), -1 where there is none."""
+        rows = np.full((len(self.truth), len(self.rig.true)), -1)
         rows[self.point, self.camera] = np.arange(len(self.point))
         return rows
 
+    def intersected(self, pixels: FloatArray) -> FloatArray:
+        """Return where straight rays through ideal pixels, (m, 2), meet with least residuals.
+
+        Shape (n, 3); a point without pairs stays where it is.
+        """
+        paired, apparent = self.paired, self.truth.copy()
+        if paired.any():
+            starts = np.concatenate([self.start[:-1][paired], self.start[-1:]])
+            apparent[paired] = triangulate(
+                pixels, self.rig.given, self.camera, starts, self.rig.optics.lens, apparent[paired]
+            )
+        return apparent
+
 
 def see(truth: FloatArray, rig: Rig, rng: np.random.Generator) -> Sight:
-    """Trace every point into every image; points in fewer than three have no pairs.
+    """Trace every point, shape (n, 3), into every image; those in fewer than three have no pairs.
 
-    Parameters
-    ----------
-    truth : array, shape (n, 3)
-    rig : Rig
-    rng : Generator
-        Of detection.
+    `rng` says what is detected.
     """
     cameras = rig.true
     across = truth[:, None, 0] - cameras.centres[:, 0], truth[:, None, 1] - cameras.centres[:, 1]
-    reach = reach_m(cameras, rig.lowest_m, 0.0, rig.optics)
-    point, camera = np.nonzero(np.hypot(*across) < reach)
+    point, camera = np.nonzero(np.hypot(*across) < _reach_m(rig))
     surface = rig.water.piercing_points(truth[point], cameras.centres[camera], camera)
     ideal, z = project(surface, cameras, camera, rig.optics.lens)
     inside = (z > 0) & rig.optics.frames(ideal, rig.optics.to_image(ideal))
@@ -108,7 +107,17 @@ def see(truth: FloatArray, rig: Rig, rng: np.random.Generator) -> Sight:
     taken = _detected(point, rig.detection, rng)
     taken &= np.bincount(point, minlength=len(truth))[point] >= LEAST_VIEWS
     point, camera, ideal = point[taken], camera[taken], ideal[taken]
-    return Sight(starts_of(point, len(truth)), point, camera, ideal)
+    return Sight(rig, truth, starts_of(point, len(truth)), point, camera, ideal)
+
+
+def _reach_m(rig: Rig) -> FloatArray:
+    """Return how far from below each camera it can see anything, metres, shape (k,).
+
+    Generous: the flattest ray of the frame's corner, prolonged as if there were no refraction.
+    """
+    off_nadir = np.arccos(np.clip(-rotations_of(rig.true)[:, 2, 2], -1.0, 1.0))
+    flattest = np.minimum(np.arctan(rig.optics.reach) + off_nadir, np.radians(80.0))
+    return np.asarray((rig.true.centres[:, 2] - rig.lowest_m) * np.tan(flattest))
 
 
 def _detected(point: IntArray, probability: float, rng: np.random.Generator) -> np.ndarray:
@@ -121,20 +130,6 @@ def _detected(point: IntArray, probability: float, rng: np.random.Generator) -> 
     rank = np.empty(len(point), np.int64)
     rank[order] = np.arange(len(point)) - first
     return np.asarray((luck < probability) | (rank < LEAST_VIEWS))
-
-
-def intersect(truth: FloatArray, sight: Sight, rig: Rig, pixels: FloatArray) -> FloatArray:
-    """Return where straight rays through ideal pixels, (m, 2), meet with least residuals, (n, 3).
-
-    A point without pairs stays where it is.
-    """
-    paired, apparent = sight.paired, truth.copy()
-    if paired.any():
-        starts = np.concatenate([sight.start[:-1][paired], sight.start[-1:]])
-        apparent[paired] = triangulate(
-            pixels, rig.given, sight.camera, starts, rig.optics.lens, truth[paired]
-        )
-    return apparent
 
 
 SAMPLE = 1000
@@ -155,19 +150,28 @@ MOST, AVERAGED = 12, 8
 LEAST_SCORE = 0.03
 
 
+class Part(NamedTuple):
+    """Some points of a cloud, shape (n, 3), what they are points of, and the images of each.
+
+    In a cloud of pairs point i has those from ``pairs_start[i]`` to ``pairs_start[i + 1]``: rows
+    of `pairs`, shape (p, 2), the lower camera first.
+    """
+
+    xyz: FloatArray
+    true_xyz: FloatArray
+    views: Views
+    pairs: IntArray | None = None
+    pairs_start: IntArray | None = None
+
+
 class Partners(NamedTuple):
     """What OpenMVS would use of the other images, for each of k; best first, -1 for none.
 
-    Attributes
-    ----------
-    matched : array, shape (k, c)
-        Those that the depth map is matched with.
-    averaged : array, shape (k, 8)
-        Those whose depth maps are averaged into it.
-    fused : array, shape (k, 12)
-        Those whose depth maps may be fused with it.
-    known : array, shape (k,)
-        How many images have tie points in common with it; the fusion begins with the most.
+    matched : shape (k, c), those that the depth map is matched with.
+    averaged : shape (k, 8), those whose depth maps are averaged into it.
+    fused : shape (k, 12), those whose depth maps may be fused with it.
+    known : shape (k,), how many images have tie points in common with it; the fusion begins with
+        the most.
     """
 
     matched: IntArray
@@ -176,25 +180,18 @@ class Partners(NamedTuple):
     known: IntArray
 
 
-def neighbour_table(truth: FloatArray, sight: Sight, centres: FloatArray, count: int) -> IntArray:
+def neighbour_table(sight: Sight, count: int) -> IntArray:
     """Return the best neighbours of each image, shape (k, count), best first, -1 for none.
 
     An image scores for every point that both show, the more the nearer the angle between their
     rays is to 10 degrees (a bell, wider above): the manner of OpenMVS's choice, not its formula.
-
-    Parameters
-    ----------
-    truth : array, shape (n, 3)
-    sight : Sight
-        Of these points.
-    centres : array, shape (k, 3)
-    count : int
     """
+    centres = sight.rig.true.centres
     k = len(centres)
     score = np.zeros((k, k))
-    for i in range(len(truth)):
+    for i, place in enumerate(sight.truth):
         seen = sight.camera[sight.start[i] : sight.start[i + 1]]
-        ray = centres[seen] - truth[i]
+        ray = centres[seen] - place
         ray /= np.linalg.norm(ray, axis=1)[:, None]
         angle = np.degrees(np.arccos(np.clip(ray @ ray.T, -1.0, 1.0)))
         spread = np.where(angle < OPTIMAL_DEG, SPREAD_BELOW_DEG, SPREAD_ABOVE_DEG)
@@ -207,12 +204,7 @@ def neighbour_table(truth: FloatArray, sight: Sight, centres: FloatArray, count:
 
 
 def openmvs_partners(
-    ties: FloatArray,
-    sight: Sight,
-    cameras: Cameras,
-    optics: Optics,
-    count: int,
-    rng: np.random.Generator,
+    ties: FloatArray, sight: Sight, count: int, rng: np.random.Generator
 ) -> Partners:
     """Return the partners that OpenMVS 2.3 would choose (`Scene::SelectNeighborViews`).
 
@@ -220,25 +212,16 @@ def openmvs_partners(
     with the angle to it, so that nadir and oblique images have few in common. Left out is the
     weight of the region of interest, and the least score, as it counts tie points.
 
-    Parameters
-    ----------
-    ties : array, shape (p, 3)
-        Tie points where the software has them.
-    sight : Sight
-        Of the same points: the images that show them.
-    cameras : Cameras
-    optics : Optics
-    count : int
-        Partners that a depth map is matched with.
-    rng : Generator
-        Of which features are found again.
+    `ties`, shape (p, 3), are tie points where the software has them, and `sight` the images that
+    show them; `count` is how many partners a depth map is matched with; `rng` says which features
+    are found again.
     """
-    if cameras.rotations is None:
-        raise ValueError("partners need cameras with angles")
+    cameras = sight.rig.given
     k = len(cameras)
-    cell = _cells(sight, optics, k)
+    cell = _cells(sight)
     cell[_lost(ties, sight, cameras.centres, rng)] = -1
-    depth = np.einsum("ki,kpi->kp", cameras.rotations[:, 2], ties - cameras.centres[:, None])
+    axes = rotations_of(cameras)[:, 2]
+    depth = np.einsum("ki,kpi->kp", axes, ties - cameras.centres[:, None])
     table, known = np.full((k, max(MOST, count)), -1), np.zeros(k, int)
     matched = np.full((k, count), -1)
     for i in range(k):
@@ -260,11 +243,11 @@ def openmvs_partners(
     return Partners(matched, table[:, :AVERAGED], table[:, :MOST], known)
 
 
-def _cells(sight: Sight, optics: Optics, k: int) -> IntArray:
+def _cells(sight: Sight) -> IntArray:
     """Return in which cell of each image each point lies, shape (k, p), -1 where it is not."""
-    lens = optics.lens
-    cell = np.full((k, len(sight.start) - 1), -1)
-    share = optics.to_image(sight.ideal) / [lens.width, lens.height]
+    optics = sight.rig.optics
+    cell = np.full((len(sight.rig.true), len(sight.truth)), -1)
+    share = optics.to_image(sight.ideal) / [optics.lens.width, optics.lens.height]
     column, row = np.clip((CELLS * share).astype(int), 0, CELLS - 1).T
     cell[sight.camera, sight.point] = row * CELLS + column
     return cell
@@ -324,37 +307,14 @@ def _filtered(order: IntArray, good: np.ndarray) -> IntArray:
     return np.array(kept, int)
 
 
-class PairCloud(NamedTuple):
-    """Points, shape (n, 3), their cameras, and their pairs.
+def match_pairs(sight: Sight, table: IntArray, rng: np.random.Generator) -> Part:
+    """Return the medians of the pairs of each point, shape (n, 3).
 
-    Point i has the pairs ``pairs[start[i]:start[i + 1]]``, shape (p, 2), the lower camera first.
-    """
-
-    xyz: FloatArray
-    views: Views
-    start: IntArray
-    pairs: IntArray
-
-
-def match_pairs(
-    truth: FloatArray, sight: Sight, rig: Rig, table: IntArray, rng: np.random.Generator
-) -> PairCloud:
-    """Return the medians of the pairs of each point.
-
-    A point without a pair stays where it is and has no cameras.
-
-    Parameters
-    ----------
-    truth : array, shape (n, 3)
-    sight : Sight
-    rig : Rig
-    table : array, shape (k, c)
-        Neighbours of each camera, -1 for none.
-    rng : Generator
-        Of the noise, two image points for each pair.
+    A point without a pair stays where it is and has no cameras. `table`, shape (k, c), has the
+    neighbours of each camera, -1 for none; `rng` makes the noise, of two image points a pair.
     """
     one, other = pair_rows(sight, table)
-    point = sight.point[one]
+    rig, truth, point = sight.rig, sight.truth, sight.point[one]
     both = np.column_stack([one, other]).ravel()
     places = triangulate(
         rig.observed(sight.ideal[both], rng),
@@ -371,12 +331,13 @@ def match_pairs(
     used = np.zeros(len(sight.point), bool)
     used[both] = True
     views = Views(starts_of(sight.point[used], len(truth)), sight.camera[used])
-    return PairCloud(xyz, views, start, np.column_stack([sight.camera[one], sight.camera[other]]))
+    pairs = np.column_stack([sight.camera[one], sight.camera[other]])
+    return Part(xyz, truth, views, pairs, start)
 
 
 def pair_rows(sight: Sight, table: IntArray) -> tuple[IntArray, IntArray]:
     """Return the rows of `sight` that are pairs, each once, sorted by point, then camera."""
-    k, rows = len(table), sight.rows(len(table))
+    k, rows = len(table), sight.rows()
     match = np.zeros((k, k + 1), bool)
     match[np.arange(k)[:, None], table] = True  # the column k, or -1, is for "none"
     match = match[:, :k]

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import expit
 
 from pcfix.model import FloatArray, WaterPlane
-
-BedKind = Literal["shore", "flat", "slope", "steps", "river"]
+from pcfix.options.scenes import BedKind
 
 LAND_HEIGHT_M = 3.0
 GREATEST_DEPTH_M = 12.0
@@ -27,18 +26,11 @@ _WALL = 10.0  # a slope steeper than this is the wall of a step, beside which th
 class Terrain:
     """A surface z(x, y) over a rectangle from the origin.
 
-    Attributes
-    ----------
-    kind : BedKind
-        See `BEDS`.
-    length_m, width_m : float
-        Extent in x and y.
-    water : WaterPlane
-        Mean surface, in the same frame.
-    greatest_depth_m : float
-        Vertically below the water.
-    rocks : array, shape (r, 4)
-        Plan position, height and radius of each rock, metres; of a shore.
+    kind : see `BEDS`.
+    length_m, width_m : extent in x and y.
+    water : mean surface, in the same frame.
+    greatest_depth_m : vertically below the water.
+    rocks : shape (r, 4), plan position, height and radius of each rock, metres; of a shore.
     """
 
     kind: BedKind

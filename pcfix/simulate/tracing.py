@@ -11,7 +11,8 @@ light takes the least optical path through this tangent plane. So Snell's law ho
 tilted normal. Left out are the height of the waves and their curvature within the few centimetres
 by which they move the crossing, so that no caustics arise.
 
-All arrays are flat over (point, camera) pairs, sorted by point.
+All arrays are flat over the m (point, camera) pairs, sorted by point: metres, shape (m, 3), where
+nothing else is said.
 """
 
 from __future__ import annotations
@@ -29,17 +30,9 @@ _CONVERGED_M = 1e-11
 def piercing_points(
     points: FloatArray, centres: FloatArray, water_level_m: float, refractive_index: float
 ) -> FloatArray:
-    """Return where the light from each point to its camera passes the level surface.
+    """Return where the light from each point to its camera passes the level surface, (m, 3).
 
-    Parameters
-    ----------
-    points, centres : array, shape (m, 3)
-        Object point and projection centre of each pair. A point above the water is its own
-        "piercing point": its light goes straight.
-
-    Returns
-    -------
-    array, shape (m, 3)
+    A point above the water is its own "piercing point": its light goes straight.
 
     Raises
     ------
@@ -66,22 +59,11 @@ def piercing_points_of_planes(
     normals: FloatArray,
     refractive_index: float,
 ) -> FloatArray:
-    """Return where the light from each point to its camera passes a plane of any attitude.
+    """Return where the light from each point to its camera passes a plane of any attitude, (m, 3).
 
     The picture is that of `piercing_points` with the plane's normal for the plumb line: the feet
-    of both on the plane, and the root of Snell's law between them.
-
-    Parameters
-    ----------
-    points, centres : array, shape (m, 3)
-    anchors, normals : array, shape (m, 3)
-        A point of each pair's plane and its unit normal, away from the water.
-    refractive_index : float
-
-    Returns
-    -------
-    array, shape (m, 3)
-        A point above its plane is its own "piercing point".
+    of both on the plane, and the root of Snell's law between them. `anchors` and `normals` are a
+    point of each pair's plane and its unit normal, away from the water.
     """
     depth = np.einsum("mi,mi->m", anchors - points, normals)
     wet = depth > 0.0
@@ -104,19 +86,10 @@ def bed_points(
     bed: tuple[FloatArray, FloatArray],
     refractive_index: float,
 ) -> FloatArray:
-    """Return what each camera sees along a ray: where it meets the bed, bent at the water.
+    """Return what each camera sees along a ray: where it meets the bed, bent at the water, (m, 3).
 
-    Parameters
-    ----------
-    centres, directions : array, shape (m, 3)
-        Directions of any length.
-    water, bed : tuple of array, shape (m, 3)
-        A point of each ray's water plane and of its bed plane, and their unit normals. A ray that
-        meets the bed above the water is straight.
-
-    Returns
-    -------
-    array, shape (m, 3)
+    Directions are of any length; `water` and `bed` are a point of each ray's water plane and of its
+    bed plane, and their unit normals. A ray that meets the bed above the water is straight.
     """
     (anchors, normals), (places, bed_normals) = water, bed
     straight = _on_plane(centres, directions, places, bed_normals)
@@ -161,14 +134,19 @@ def _root_of_snell(
     raise ArithmeticError("the piercing point was not found")
 
 
+def rotations_of(cameras: Cameras) -> FloatArray:
+    """Return the rotations of simulated cameras, which all have them."""
+    if cameras.rotations is None:
+        raise ValueError("simulated images need cameras with angles")
+    return cameras.rotations
+
+
 def project(
     targets: FloatArray, cameras: Cameras, camera: IntArray, lens: Lens
 ) -> tuple[FloatArray, FloatArray]:
     """Return pixels, shape (m, 2), and the depth along the optical axis, shape (m,)."""
-    if cameras.rotations is None:
-        raise ValueError("projection needs cameras with angles")
     ray = targets - cameras.centres[camera]
-    x, y, z = np.einsum("mij,mj->im", cameras.rotations[camera], ray)
+    x, y, z = np.einsum("mij,mj->im", rotations_of(cameras)[camera], ray)
     u = lens.focal * x / z + lens.principal_x
     v = lens.focal * y / z + lens.principal_y
     return np.column_stack([u, v]), z
@@ -184,41 +162,26 @@ def triangulate(
 ) -> FloatArray:
     """Return what software that knows nothing of water makes of image points.
 
-    The point with the least squared reprojection errors over straight rays, by Gauss-Newton.
-
-    Parameters
-    ----------
-    pixels : array, shape (m, 2)
-    camera : array, shape (m,)
-    start : array, shape (n + 1,)
-        Point i has the pairs from ``start[i]`` to ``start[i + 1]``, two at least.
-    guess : array, shape (n, 3)
-
-    Returns
-    -------
-    array, shape (n, 3)
+    The points, shape (n, 3), with the least squared reprojection errors over straight rays, by
+    Gauss-Newton from a guess. Point i has the pairs from ``start[i]`` to ``start[i + 1]``, two at
+    least.
     """
-    if cameras.rotations is None:
-        raise ValueError("triangulation needs cameras with angles")
-    rows = cameras.rotations[camera]
+    rows = rotations_of(cameras)[camera]
     owner = np.repeat(np.arange(len(start) - 1), np.diff(start))
     points = guess.copy()
     for _ in range(20):
         seen, z = project(points[owner], cameras, camera, lens)
         offset = (seen - [lens.principal_x, lens.principal_y]) / lens.focal
         scale = (lens.focal / z)[:, None]
-        jacobian = [scale * (rows[:, i] - offset[:, i : i + 1] * rows[:, 2]) for i in (0, 1)]
-        residual = pixels - seen
+        u, v = (scale * (rows[:, i] - offset[:, i : i + 1] * rows[:, 2]) for i in (0, 1))
+        residual_u, residual_v = (pixels - seen).T
         normal, right = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
         for i in range(3):
             for j in range(i, 3):
-                total = (
-                    jacobian[0][:, i] * jacobian[0][:, j] + jacobian[1][:, i] * jacobian[1][:, j]
-                )
-                normal[:, i, j] = normal[:, j, i] = np.add.reduceat(total, start[:-1])
-            right[:, i] = np.add.reduceat(
-                jacobian[0][:, i] * residual[:, 0] + jacobian[1][:, i] * residual[:, 1], start[:-1]
-            )
+                product = u[:, i] * u[:, j] + v[:, i] * v[:, j]
+                normal[:, i, j] = normal[:, j, i] = np.add.reduceat(product, start[:-1])
+            product = u[:, i] * residual_u + v[:, i] * residual_v
+            right[:, i] = np.add.reduceat(product, start[:-1])
         step = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
         points += step
         if np.abs(step).max(initial=0.0) < 1e-7:
@@ -232,15 +195,11 @@ _COMPONENTS = 8
 
 @dataclass(frozen=True, eq=False)
 class Waves:
-    """A field of slopes for each of k images, as a sum of sinusoids of one wavelength.
+    """A field of slopes for each of k images, as a sum of c sinusoids of one wavelength.
 
-    Attributes
-    ----------
-    wave_numbers : array, shape (k, c, 2)
-        Radians per metre along the two axes of the mean plane.
-    phases : array, shape (k, c)
-    steepness : float
-        Amplitude of the slope of each sinusoid.
+    wave_numbers : shape (k, c, 2), radians per metre along the two axes of the mean plane.
+    phases : shape (k, c).
+    steepness : amplitude of the slope of each sinusoid.
     """
 
     wave_numbers: FloatArray
@@ -277,34 +236,17 @@ class Waves:
 
 @dataclass(frozen=True, eq=False)
 class Water:
-    """The surface that light is traced through; same frame as the points.
-
-    Attributes
-    ----------
-    plane : WaterPlane
-        The mean surface.
-    refractive_index : float
-    waves : Waves or None
-    """
+    """The surface that light is traced through: its mean, in the frame of the points, and waves."""
 
     plane: WaterPlane
     refractive_index: float
     waves: Waves | None = None
 
     @property
-    def is_level(self) -> bool:
-        """Whether the mean surface is."""
-        return self.plane.b == self.plane.c == 0.0
-
-    @property
     def normal(self) -> FloatArray:
         """Unit normal of the mean surface, up."""
         up = np.array([-self.plane.b, -self.plane.c, 1.0])
         return np.asarray(up / np.linalg.norm(up))
-
-    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return z of the mean surface."""
-        return np.asarray(self.plane.a + self.plane.b * x + self.plane.c * y)
 
     def piercing_points(
         self, points: FloatArray, centres: FloatArray, camera: IntArray
@@ -313,7 +255,7 @@ class Water:
 
         A point above the mean plane is its own "piercing point".
         """
-        if self.waves is None and self.is_level:
+        if self.waves is None and self.plane.b == self.plane.c == 0.0:
             return piercing_points(points, centres, self.plane.a, self.refractive_index)
         anchors, normals = self.tangent_planes(points, centres, camera)
         return piercing_points_of_planes(points, centres, anchors, normals, self.refractive_index)
@@ -323,15 +265,7 @@ class Water:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the plane that the light of each pair passes: a point of it and the unit normal.
 
-        Parameters
-        ----------
-        points, centres : array, shape (m, 3)
-        camera : array, shape (m,)
-            Rows of the cameras, for their waves.
-
-        Returns
-        -------
-        tuple of array, shape (m, 3)
+        All are of shape (m, 3); `camera`, shape (m,), says whose waves there are.
         """
         shape = points.shape
         anchor = np.array([0.0, 0.0, self.plane.a])
@@ -340,15 +274,11 @@ class Water:
             return anchors, normals
         at = piercing_points_of_planes(points, centres, anchors, normals, self.refractive_index)
         wet = (points - anchor) @ self.normal < 0.0
-        east, north = self._axes()
+        east = np.array([1.0, 0.0, self.plane.b])
+        east /= np.linalg.norm(east)
+        north = np.cross(self.normal, east)
         places = (at - anchor) @ np.column_stack([east, north])
         slopes = self.waves.slopes(camera, places)
         rough = self.normal - slopes[:, :1] * east - slopes[:, 1:] * north
         rough /= np.linalg.norm(rough, axis=1)[:, None]
         return np.where(wet[:, None], at, anchors), np.where(wet[:, None], rough, normals)
-
-    def _axes(self) -> tuple[FloatArray, FloatArray]:
-        """Return two unit vectors in the mean plane at right angles, the first towards east."""
-        east = np.array([1.0, 0.0, self.plane.b])
-        east /= np.linalg.norm(east)
-        return east, np.cross(self.normal, east)

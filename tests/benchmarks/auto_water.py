@@ -17,12 +17,13 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from pcfix.errors import GeometryError
-from pcfix.simulate.block import fly, lens, reach_m
+from pcfix.simulate.block import fly_block
+from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.tracing import piercing_points, project, triangulate
 from pcfix.water.auto import find_water
 
 N = 1.34
-HEIGHT_M = 80.0
+HEIGHT_M, DEEPEST_M = 80.0, 12.0
 ORIGIN_M = np.array([410_200.0, 4_650_300.0, 0.0])
 POINTS = 60_000
 _AT_ONCE = 20_000
@@ -60,7 +61,9 @@ def random_scene(seed: int) -> AutoScene:
     see_m = rng.uniform(1.5, 8.0)
     kept = rng.random(POINTS) < 1.0 / (1.0 + np.exp(-(ground + see_m) / (0.1 * see_m)))
     truth = np.column_stack([xy, ground])[kept]
-    block = fly(length, width, 0.0, HEIGHT_M, obliques=rng.random() < 0.3, rng=rng)
+    kind_of_block = "oblique" if rng.random() < 0.3 else "nadir"
+    flight = SceneSettings(flying_height_m=HEIGHT_M, block=kind_of_block)
+    block = fly_block((length, width), flight, rng)
     rgb = _colours(truth, see_m, rng) if coloured else None
     cloud = _apparent(truth, block.cameras, noise_px, rng)
     blurred = np.maximum(-truth[:, 2], 0.0)
@@ -151,9 +154,12 @@ def _apparent(truth, cameras, noise_px, rng) -> np.ndarray:
 
 
 def _triangulated(truth, cameras, noise_px, rng) -> np.ndarray:
-    optics = lens()
+    optics, reach = SceneSettings().optics.lens, SceneSettings().optics.reach
     across = [truth[:, None, i] - cameras.centres[:, i] for i in (0, 1)]
-    point, camera = np.nonzero(np.hypot(*across) < 0.5 * reach_m(cameras, 0.0))
+    off_nadir = np.arccos(np.clip(-cameras.rotations[:, 2, 2], -1.0, 1.0))
+    flattest = np.minimum(np.arctan(reach) + off_nadir, np.radians(80.0))
+    near_m = 0.5 * (cameras.centres[:, 2] + DEEPEST_M) * np.tan(flattest)
+    point, camera = np.nonzero(np.hypot(*across) < near_m)
     pierced = piercing_points(truth[point], cameras.centres[camera], 0.0, N)
     pixels, z = project(pierced, cameras, camera, optics)
     seen = (z > 0) & ((pixels >= 0) & (pixels < [optics.width, optics.height])).all(axis=1)
@@ -174,7 +180,9 @@ def report(seed: int, pictures: Path | None) -> tuple[float, float] | None:
     clock = time.perf_counter()
     print(f"{seed}: {scene.words}")
     try:
-        found = find_water(scene.xyz, rgb=scene.rgb, centres=scene.centres)
+        low = scene.xyz[:, 2] < scene.centres[:, 2].min()
+        rgb = None if scene.rgb is None else scene.rgb[low]
+        found = find_water(scene.xyz[low], rgb=rgb)
     except GeometryError as refusal:
         print(f"   level {scene.plane[0]:.3f} m: REFUSED. {refusal}")
         return None

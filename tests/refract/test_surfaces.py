@@ -11,7 +11,8 @@ from scipy.interpolate import RegularGridInterpolator
 
 import pcfix
 from pcfix.model import WaterRaster
-from pcfix.simulate.block import fly, gsd_m, lens
+from pcfix.simulate.block import fly_block
+from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.tracing import piercing_points, project, triangulate
 from pcfix.water.surface import surface_above
 from tests.utils.twins import correct_under
@@ -302,7 +303,7 @@ def test_offsets_must_be_one_finite_number_per_camera(offset):
 
 def traced(truth, block, levels):
     """Return what SfM makes of points seen through each camera's own level, and their views."""
-    optics, pixels, seen = lens(), [], []
+    optics, pixels, seen = SceneSettings().optics.lens, [], []
     for c, level in enumerate(levels):
         centre = np.broadcast_to(block.centres[c], truth.shape)
         surface = piercing_points(truth, centre, level, 1.34)
@@ -320,7 +321,7 @@ def traced(truth, block, levels):
 def test_two_flights_at_two_levels_leave_no_bias_where_each_image_has_its_own():
     """Traced forwards by other code: the south flown at low water, the north 1 m higher."""
     rng = np.random.default_rng(11)
-    flown = fly(120.0, 200.0, 0.0, 80.0, obliques=False, rng=rng).cameras
+    flown = fly_block((120.0, 200.0), SceneSettings(), rng).cameras
     levels = np.where(flown.centres[:, 1] < 100.0, -0.5, 0.5)
     low, high = np.array([0.0, 0, -9]), np.array([120.0, 200, -2])
     truth = rng.uniform(low, high, (600, 3))
@@ -332,7 +333,7 @@ def test_two_flights_at_two_levels_leave_no_bias_where_each_image_has_its_own():
         return np.array([(corrected.xyz - truth)[side, 2].mean() for side in sides])
 
     still = bias(traced(truth, flown, np.zeros(len(flown)))[0])  # of the method itself
-    assert np.abs(still).max() < gsd_m(80.0)
+    assert np.abs(still).max() < SceneSettings().gsd_m
     own = bias(apparent, level_offset_m=levels)
     assert own == pytest.approx(still, abs=0.005)  # depths differ by half a metre: 0.01 of it
     mean = bias(apparent)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.simulate.block import make_optics
+from pcfix.simulate.optics import make_optics
 from tests.utils.twins import image_slowly
 
 CAMERA = (8.8, (13.2, 8.8), (5472, 3648))
@@ -38,5 +38,5 @@ def test_a_lens_that_folds_is_refused():
 
 
 def test_without_distortion_nothing_is_done():
-    optics, ideal = make_optics(*CAMERA), np.array([[1.0, 2.0]])
+    optics, ideal = make_optics(*CAMERA, ()), np.array([[1.0, 2.0]])
     assert optics.to_image(ideal) is ideal

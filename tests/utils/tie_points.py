@@ -1,6 +1,6 @@
 """A block of images as it goes into a bundle adjustment: tie points, GNSS and control, with truth.
 
-The light is traced by `pcfix.simulate.tracing`, the lens is that of `pcfix.simulate.block`:
+The light is traced by `pcfix.simulate.tracing`, the lens is that of `pcfix.simulate.optics`:
 nothing here is shared with the adjustment. Everything measured is there twice, exact and with
 noise, and `TieScene.measured` draws the noise anew.
 """
@@ -199,7 +199,7 @@ def _seen(xyz: FloatArray, rig: Rig, streams: Streams) -> tuple[FloatArray, Sigh
     made = sight.paired
     start = np.concatenate([sight.start[:-1][made], sight.start[-1:]])
     point = np.repeat(np.arange(int(made.sum())), np.diff(start))
-    return xyz[made], replace(sight, start=start, point=point)
+    return xyz[made], replace(sight, truth=xyz[made], start=start, point=point)
 
 
 def _spread(xyz: FloatArray, above: FloatArray, control: int, checks: int) -> FloatArray:
