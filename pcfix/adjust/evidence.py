@@ -358,7 +358,7 @@ def cloud_heights(view: Cloud, xyz: FloatArray, gsd_m: float) -> FloatArray:
     if not len(xy):
         return np.zeros(0)
     near = [seen.xyz[is_near(xy, seen.xyz, radius)] for seen in view.chunks()]
-    return heights_from_cloud(xy, np.vstack([np.zeros((0, 3)), *near]), radius).height_m
+    return heights_from_cloud(xy, np.vstack([np.zeros((0, 3)), *near]), radius)
 
 
 def signs_of_reference(evidence: Evidence, reference: Reference) -> list[Sign]:

@@ -211,8 +211,8 @@ def _with_heights(
     heights = heights_from_cloud(places, np.vstack(near), SHORE_RADIUS_M)
     notes.append(
         f"{name}: {int(lacking.sum()):,} points have no height and take that of the cloud within"
-        f" {SHORE_RADIUS_M:g} m; {heights.missing:,} found none and do not count."
+        f" {SHORE_RADIUS_M:g} m; {int(np.isnan(heights).sum()):,} found none and do not count."
     )
     filled = xyz.copy()
-    filled[lacking, 2] = heights.height_m
+    filled[lacking, 2] = heights
     return filled

@@ -271,9 +271,9 @@ def _level(axes: Axes, found: WaterProposal) -> None:
 
 def _evidence(axes: Axes, found: WaterProposal) -> None:
     low, high = _limits(found)
-    shown = (found.curves.height_m >= low) & (found.curves.height_m <= high)
-    height = found.curves.height_m[shown]
-    for (name, gain), colour, line in zip(found.curves.gain.items(), COLOURS, LINES, strict=False):
+    shown = (found.curve_height_m >= low) & (found.curve_height_m <= high)
+    height = found.curve_height_m[shown]
+    for (name, gain), colour, line in zip(found.curves.items(), COLOURS, LINES, strict=False):
         width = 0.9 if name in WITNESSES else 1.8
         values = np.maximum(gain[shown], 0.0)
         axes.plot(height, values, color=colour, linestyle=line, linewidth=width, label=name)

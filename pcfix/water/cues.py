@@ -25,7 +25,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from pcfix.model import FloatArray, IntArray
-from pcfix.water.samples import Samples
+from pcfix.water.samples import Samples, square_tiles
 
 LEAST_SIDE = 8.0
 """Cells (weights added) that a tile must have above a height, and below, to say anything."""
@@ -129,20 +129,14 @@ def tile_moments(
     smooth: FloatArray, y: FloatArray, at_m: FloatArray, heights_m: FloatArray, what: Break,
     *, with_trend: bool,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Return the sums of one tile, shapes (h, 6) and (h,).
+    """Return the sums of one tile, shapes (h, 6) and (h,); zero at heights that it does not reach.
 
-    Parameters
-    ----------
-    smooth : array, shape (n, p)
-        Columns of the smooth part.
-    y, at_m : array, shape (n,)
-        The observations and the heights that they belong to.
-    heights_m : array, shape (h,)
-    what : Break
-    with_trend : bool
-        Whether y may change with height in the same way above and below.
+    The observations y, shape (n,), belong to the heights `at_m`; `smooth`, shape (n, p), has the
+    columns of the smooth part. With a trend y may change with height in the same way above and
+    below.
     """
-    depth = heights_m[:, None] - at_m
+    reached = np.arange(*np.searchsorted(heights_m, [at_m.min(), at_m.max()]))
+    depth = heights_m[reached, None] - at_m
     weight = np.maximum(1.0 - (depth / what.window_m) ** 2, 0.0) ** 2
     total = weight.sum(axis=1)
     below = (weight * (depth > 0.0)).sum(axis=1)
@@ -150,9 +144,10 @@ def tile_moments(
     sums, count = np.zeros((len(heights_m), 6)), np.zeros(len(heights_m))
     if enough.any():
         x = (at_m - at_m.mean()) * float(with_trend)
-        sums[enough] = _sums(smooth, y, x, depth[enough], weight[enough], what.scale_m)
-        squares = (weight[enough] ** 2).sum(axis=1)
-        count[enough] = np.maximum(total[enough] ** 2 / squares - smooth.shape[1], 1.0)
+        rows, weight = reached[enough], weight[enough]
+        sums[rows] = _sums(smooth, y, x, depth[enough], weight, what.scale_m)
+        squares = (weight**2).sum(axis=1)
+        count[rows] = np.maximum(total[enough] ** 2 / squares - smooth.shape[1], 1.0)
     return sums, count
 
 
@@ -175,16 +170,6 @@ def _sums(
     return np.asarray(rest[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])
 
 
-def square_tiles(xy: FloatArray, side_m: float, least: int) -> list[IntArray]:
-    """Return the rows of each square tile that holds at least so many; `xy` from zero up."""
-    column, row = (xy / side_m).astype(np.int64).T
-    _, tile = np.unique(row * (column.max() + 1) + column, return_inverse=True)
-    tile = tile.reshape(-1)
-    order = np.argsort(tile, kind="stable")
-    parts = np.split(order, np.cumsum(np.bincount(tile))[:-1])
-    return [part for part in parts if len(part) >= least]
-
-
 def gather(
     parts: list[tuple[FloatArray, FloatArray]], xy: list[FloatArray], heights_m: FloatArray,
     what: Break,
@@ -193,8 +178,7 @@ def gather(
     telling = [i for i, (_, count) in enumerate(parts) if count.any()]
     if not telling:
         return None
-    sums = np.array([parts[i][0] for i in telling])
-    count = np.array([parts[i][1] for i in telling])
+    sums, count = (np.array([parts[i][k] for i in telling]) for k in (0, 1))
     variance = sums[..., 0].sum(axis=1) / count.sum(axis=1)
     least = 0.3 * float(np.median(variance)) + _TINY
     sums /= np.maximum(variance, least)[:, None, None]
@@ -212,123 +196,86 @@ _ROUGHNESS_FLOOR_M = 1e-3
 
 
 class Cue(NamedTuple):
-    """A thing to look at. `places` says whether it fixes the level, or only bears witness."""
+    """A thing to look at.
+
+    places : whether it fixes the level, or only bears witness.
+    values : what is looked at, shape (m,); None for the ground itself.
+    """
 
     name: str
     meaning: str
     what: Break
     tile_cells: float
     places: bool
+    values: Callable[[Samples], FloatArray] | None
 
 
 SLOPE = Cue(
     "slope", "the ground looks flatter below",
-    Break(math.inf, 0.6, 1.0, LIFT), SLOPE_TILE_CELLS, places=True,
+    Break(math.inf, 0.6, 1.0, LIFT), SLOPE_TILE_CELLS, places=True, values=None,
 )  # fmt: skip
 RED = Cue(
     "red/green", "red fades against green below",
     Break(0.7, 0.8, -1.0, most=MOST_FADING), LIGHT_TILE_CELLS, places=True,
+    values=lambda samples: samples.colour[:, 0] - samples.colour[:, 1],
 )  # fmt: skip
-BLUE = RED._replace(name="blue/green", meaning="blue fades against green below")
+BLUE = RED._replace(
+    name="blue/green", meaning="blue fades against green below",
+    values=lambda samples: samples.colour[:, 2] - samples.colour[:, 1],
+)  # fmt: skip
 BRIGHT = Cue(
     "brightness", "the ground is darker below",
     Break(0.3, 0.8, -1.0), LIGHT_TILE_CELLS, places=False,
+    values=lambda samples: samples.colour.mean(axis=1),
 )  # fmt: skip
 NOISE = Cue(
     "noise", "heights are noisier below",
     Break(0.7, 0.8, 1.0), LIGHT_TILE_CELLS, places=False,
+    values=lambda samples: np.log(samples.rough_m + _ROUGHNESS_FLOOR_M),
 )  # fmt: skip
 
 
 def cues_of(samples: Samples) -> tuple[Cue, ...]:
     """Return the cues that these samples can give."""
-    light: tuple[Cue, ...] = () if samples.colour is None else (RED, BLUE, BRIGHT)
-    if samples.colour is None and samples.intensity is not None:
-        light = (BRIGHT,)
-    return (SLOPE, *light, NOISE)
+    return (SLOPE, RED, BLUE, BRIGHT, NOISE) if len(samples.colour) else (SLOPE, NOISE)
 
 
 def cue_moments(
     samples: Samples, cue: Cue, heights_m: FloatArray, tilt: FloatArray
 ) -> Moments | None:
-    """Return the sums of a cue over the tiles, heights measured from a tilted surface.
+    """Return the sums of a cue over the tiles.
 
-    Parameters
-    ----------
-    samples : Samples
-    cue : Cue
-    heights_m : array, shape (h,)
-        Evenly spaced, from the origin of the samples.
-    tilt : array, shape (2,)
-        dz/dx and dz/dy, through that origin.
+    Heights, shape (h,), are evenly spaced above the plane of that tilt through the samples' origin.
     """
-    fall = samples.xyz[:, :2] @ tilt
-    of_tile = _slope_tile if cue.name == SLOPE.name else _light_tile(samples, cue)
+    xy, fall = samples.xyz[:, :2], samples.xyz[:, :2] @ tilt
+    values = None if cue.values is None else cue.values(samples)
     parts, middles = [], []
-    tiles = square_tiles(samples.xyz[:, :2], cue.tile_cells * samples.cell_m, _LEAST_CELLS)
-    for rows in tiles:
-        parts.append(of_tile(samples, rows, fall[rows], heights_m, cue.what))
-        middles.append(samples.xyz[rows, :2].mean(axis=0))
+    for rows in _rows_of_tiles(xy, cue.tile_cells * samples.cell_m):
+        if values is not None:
+            smooth, y = np.ones((len(rows), 1)), values[rows]
+            at = samples.smooth_m[rows] - fall[rows]
+        else:
+            smooth, y = _quadratic(xy[rows]), samples.xyz[rows, 2] - fall[rows]
+            if y.min() > heights_m[-1] or y.max() < heights_m[0]:
+                continue
+            # the ground breaks where it passes the height when smooth, not by each height itself:
+            # noise would be on both sides of the equation and hide the break
+            at = smooth @ np.linalg.lstsq(smooth, y, rcond=None)[0]
+            if np.ptp(at) < _LEAST_RELIEF_M:
+                continue
+        trend = values is not None
+        parts.append(tile_moments(smooth, y, at, heights_m, cue.what, with_trend=trend))
+        middles.append(xy[rows].mean(axis=0))
     return gather(parts, middles, heights_m, cue.what)
 
 
-def _slope_tile(
-    samples: Samples, rows: IntArray, fall: FloatArray, heights_m: FloatArray, what: Break
-) -> tuple[FloatArray, FloatArray]:
-    """Break the smooth (quadratic) ground where it passes the height.
-
-    Where that is comes from the smooth ground and not from each height itself: noise would be on
-    both sides of the equation and hide the break.
-    """
-    z = samples.xyz[rows, 2] - fall
-    if z.min() > heights_m[-1] or z.max() < heights_m[0]:
-        return np.zeros((len(heights_m), 6)), np.zeros(len(heights_m))
-    smooth = _quadratic(samples.xyz[rows, :2])
-    ground = smooth @ np.linalg.lstsq(smooth, z, rcond=None)[0]
-    if np.ptp(ground) < _LEAST_RELIEF_M:
-        return np.zeros((len(heights_m), 6)), np.zeros(len(heights_m))
-    return _near(smooth, z, ground, heights_m, what, with_trend=False)
-
-
-def _light_tile(samples: Samples, cue: Cue) -> Callable[..., tuple[FloatArray, FloatArray]]:
-    y = _values(samples, cue)
-
-    def of_tile(
-        samples: Samples, rows: IntArray, fall: FloatArray, heights_m: FloatArray, what: Break
-    ) -> tuple[FloatArray, FloatArray]:
-        at = samples.smooth_m[rows] - fall
-        return _near(np.ones((len(rows), 1)), y[rows], at, heights_m, what, with_trend=True)
-
-    return of_tile
-
-
-def _near(
-    smooth: FloatArray, y: FloatArray, at_m: FloatArray, heights_m: FloatArray, what: Break,
-    *, with_trend: bool,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Return the sums of a tile, reckoned only for heights that it reaches."""
-    first, last = np.searchsorted(heights_m, [at_m.min(), at_m.max()])
-    sums, count = np.zeros((len(heights_m), 6)), np.zeros(len(heights_m))
-    if last > first:
-        reached = slice(first, last)
-        sums[reached], count[reached] = tile_moments(
-            smooth, y, at_m, heights_m[reached], what, with_trend=with_trend
-        )
-    return sums, count
-
-
-def _values(samples: Samples, cue: Cue) -> FloatArray:
-    """Return what a cue looks at, shape (m,)."""
-    if cue.name == NOISE.name:
-        return np.log(samples.rough_m + _ROUGHNESS_FLOOR_M)
-    if samples.colour is None:
-        if samples.intensity is None:
-            raise ValueError("the samples have no light")
-        return samples.intensity
-    red, green, blue = samples.colour.T
-    if cue.name == RED.name:
-        return np.asarray(red - green)
-    return np.asarray(blue - green if cue.name == BLUE.name else samples.colour.mean(axis=1))
+def _rows_of_tiles(xy: FloatArray, side_m: float) -> list[IntArray]:
+    """Return the rows of each square tile that holds enough cells; `xy` from zero up."""
+    _, tile = np.unique(square_tiles(xy, side_m), return_inverse=True)
+    tile = tile.reshape(-1)
+    order = np.argsort(tile, kind="stable")
+    parts = np.split(order, np.cumsum(np.bincount(tile))[:-1])
+    return [part for part in parts if len(part) >= _LEAST_CELLS]
 
 
 def _quadratic(xy: FloatArray) -> FloatArray:

@@ -9,8 +9,8 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
-from pcfix.model import BoolArray, FloatArray, IntArray, WaterPlane
-from pcfix.water.robust import Regression, robust_regression
+from pcfix.model import BoolArray, FloatArray, WaterPlane
+from pcfix.water.robust import Regression, ShoreFit, of_all, robust_regression, usable_rows
 
 Model = Literal["auto", "level", "plane", "along"]
 MAX_TILT_PERCENT = 5.0
@@ -28,8 +28,8 @@ _NO_SCATTER_M = 1e-6
 _MOSTLY = 0.6
 
 
-@dataclass(frozen=True, eq=False)
-class WaterFit:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WaterFit(ShoreFit):
     """A level or a plane, and how well the points fix it.
 
     Attributes
@@ -46,16 +46,6 @@ class WaterFit:
     covariance : array, shape (3, 3)
         Of `level_m` and `tilt`; zero for what the model does not have, NaN where no point is to
         spare. It knows nothing of errors that all points share, as of a wrong datum.
-    sigma_m : float
-        Standard deviation of one accepted point; NaN where none is to spare.
-    residual_m : array, shape (n,)
-        Point minus surface; NaN of points without a height.
-    accepted : array of bool, shape (n,)
-        The others have no weight.
-    weight : array, shape (n,)
-        0 to 1.
-    notes : tuple of str
-        Why this model, and what to beware of.
     """
 
     model: Model
@@ -64,21 +54,11 @@ class WaterFit:
     level_m: float
     tilt: FloatArray
     covariance: FloatArray
-    sigma_m: float
-    residual_m: FloatArray
-    accepted: BoolArray
-    weight: FloatArray
-    notes: tuple[str, ...] = ()
 
     @property
     def sigma_level_m(self) -> float:
         """Standard error of the level in the middle of the points."""
         return math.sqrt(self.covariance[0, 0])
-
-    @property
-    def sigma_tilt(self) -> FloatArray:
-        """Standard errors of dz/dx and dz/dy, shape (2,)."""
-        return np.sqrt(np.diag(self.covariance)[1:])
 
     @property
     def tilt_percent(self) -> float:
@@ -90,7 +70,7 @@ class WaterFit:
         """Standard error of the slope in its own direction."""
         steepest = math.hypot(*self.tilt)
         if steepest == 0.0:
-            return 100.0 * float(np.hypot(*self.sigma_tilt))
+            return 100.0 * float(np.hypot(*np.sqrt(np.diag(self.covariance)[1:])))
         along = self.tilt / steepest
         return 100.0 * math.sqrt(float(along @ self.covariance[1:, 1:] @ along))
 
@@ -120,11 +100,7 @@ class WaterFit:
             "tilt_percent": self.tilt_percent,
             "sigma_tilt_percent": self.sigma_tilt_percent,
             "downhill_deg": self.downhill_deg,
-            "sigma_point_m": self.sigma_m,
-            "points": len(self.accepted),
-            "accepted": int(self.accepted.sum()),
-            "without_height": int(np.isnan(self.residual_m).sum()),
-            "notes": list(self.notes),
+            **self.figures(),
         }
 
 
@@ -187,13 +163,19 @@ def fit_water(
     points = np.asarray(xyz, np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise SettingError(f"shoreline points must have the shape (n, 3), not {points.shape}.")
-    known = np.flatnonzero(np.isfinite(points).all(axis=1))
+    known = usable_rows(points)
     if len(known) == 0:
         raise GeometryError(f"None of {len(points)} shoreline points has a height.")
-    known = known[np.lexsort(points[known].T)]
-    used = points[known]
-    chosen, found, notes = _choose(used, _plan(used[:, :2]), model)
-    fit = _spread_over(chosen, found, notes, points, known)
+    plan = _plan(points[known, :2])
+    chosen, found, notes = _choose(points[known], plan, model)
+    fit = WaterFit(
+        model=chosen,
+        **_located(points[known[found.weight > 0.0], :2].mean(axis=0), chosen, plan, found),
+        residual_m=of_all(found.residual_m, known, len(points), np.nan),
+        weight=of_all(found.weight, known, len(points), 0.0),
+        sigma_m=found.sigma_m,
+        notes=(*notes, *_doubts(found, len(points) - len(known))),
+    )
     if not fit.tilt_percent <= max_tilt_percent:
         raise GeometryError(
             f"The shoreline points tilt by {fit.tilt_percent:.1f} %, more than"
@@ -203,13 +185,6 @@ def fit_water(
     return fit
 
 
-class _Found(NamedTuple):
-    """A regression and the plan it was made in."""
-
-    plan: _Plan
-    fit: Regression
-
-
 def _plan(xy: FloatArray) -> _Plan:
     """Return the principal axes of places, along first."""
     centre = xy.mean(axis=0)
@@ -217,7 +192,9 @@ def _plan(xy: FloatArray) -> _Plan:
     return _Plan(centre, vectors.T[::-1], np.sqrt(np.maximum(variance[::-1], 0.0)))
 
 
-def _choose(xyz: FloatArray, plan: _Plan, model: Model) -> tuple[Model, _Found, tuple[str, ...]]:
+def _choose(
+    xyz: FloatArray, plan: _Plan, model: Model
+) -> tuple[Model, Regression, tuple[str, ...]]:
     """Return the model, its fit, and why."""
     if model != "auto":
         _check_enough(len(xyz), plan, model)
@@ -228,34 +205,26 @@ def _choose(xyz: FloatArray, plan: _Plan, model: Model) -> tuple[Model, _Found, 
     along, across = plan.spread_m
     tilted: Model = "along" if across < LINE_RATIO * along else "plane"
     found = _regression(xyz, plan, tilted)
-    chance = _chance_of_tilt(found.fit)
+    chance = _chance_of_tilt(found)
     if not chance < SIGNIFICANCE:
         note = f"The tilt of the points is not significant (chance gives it in {chance:.0%})."
         return "level", _regression(xyz, plan, "level"), (f"{note[:-1]}: a level.",)
     significant = f"The tilt of the points is significant (chance gives it in {chance:.2g})."
     if tilted == "along":
-        return tilted, found, (significant, _on_a_line(plan))
-    if across < LONG_RATIO * along and _is_level_across(found.fit):
+        note = (
+            f"The points are nearly on one line (rms {across:.1f} m across, {along:.1f} m along),"
+            " which cannot fix a tilt across it: level across it."
+        )
+        return tilted, found, (significant, note)
+    is_level_across = abs(found.beta[2]) < 2.0 * math.sqrt(found.covariance[2, 2])
+    if across < LONG_RATIO * along and is_level_across:
         note = "No tilt across the direction in which the points lie: level across it."
         return "along", _regression(xyz, plan, "along"), (significant, note)
     return tilted, found, (significant,)
 
 
-def _on_a_line(plan: _Plan) -> str:
-    along, across = plan.spread_m
-    return (
-        f"The points are nearly on one line (rms {across:.1f} m across, {along:.1f} m along), which"
-        " cannot fix a tilt across it: level across it."
-    )
-
-
 def _check_enough(n: int, plan: _Plan, model: Model) -> None:
-    """Refuse a model that the points cannot fix.
-
-    Raises
-    ------
-    GeometryError
-    """
+    """Refuse a model that the points cannot fix."""
     if n < _UNKNOWNS[model]:
         raise GeometryError(
             f"A water surface of the kind '{model}' needs at least {_UNKNOWNS[model]} shoreline"
@@ -271,14 +240,14 @@ def _check_enough(n: int, plan: _Plan, model: Model) -> None:
         )
 
 
-def _regression(xyz: FloatArray, plan: _Plan, model: Model) -> _Found:
+def _regression(xyz: FloatArray, plan: _Plan, model: Model) -> Regression:
     found = robust_regression(plan.columns(xyz[:, :2], model), xyz[:, 2])
     if found is None:
         raise GeometryError(
             f"The {len(xyz)} shoreline points do not fix a surface of the kind '{model}': too many"
             " are on one line; fit a level."
         )
-    return _Found(plan, found)
+    return found
 
 
 def _chance_of_tilt(fit: Regression) -> float:
@@ -294,39 +263,19 @@ def _chance_of_tilt(fit: Regression) -> float:
     return float(f.sf(value, len(tilt), spare))
 
 
-def _is_level_across(fit: Regression) -> bool:
-    return bool(abs(fit.beta[2]) < 2.0 * math.sqrt(fit.covariance[2, 2]))
-
-
-def _spread_over(
-    model: Model, found: _Found, notes: tuple[str, ...], points: FloatArray, known: IntArray
-) -> WaterFit:
-    """Return the fit with one row per input point, about the middle of the accepted ones."""
-    plan, fit = found
-    accepted = fit.weight > 0.0
-    centre = points[known[accepted], :2].mean(axis=0)
-    to_world = plan.to_world(model)
+def _located(centre: FloatArray, model: Model, plan: _Plan, fit: Regression) -> dict[str, Any]:
+    """Return the surface, and level and tilt about a place with their covariance."""
     moved = np.eye(3)
     moved[0, 1:] = centre - plan.centre
-    level, *tilt = moved @ to_world @ fit.beta
-    transform = moved @ to_world
-    surface = WaterPlane(float(level - centre @ tilt), float(tilt[0]), float(tilt[1]))
-    rows = {}
-    for name, values, empty in (("residual_m", fit.residual_m, np.nan), ("weight", fit.weight, 0)):
-        rows[name] = np.full(len(points), empty, np.float64)
-        rows[name][known] = values
-    return WaterFit(
-        model=model,
-        surface=surface,
-        centre_xy=centre,
-        level_m=float(level),
-        tilt=np.array(tilt),
-        covariance=transform @ fit.covariance @ transform.T,
-        sigma_m=fit.sigma_m,
-        accepted=rows["weight"] > 0.0,
-        notes=(*notes, *_doubts(fit, len(points) - len(known))),
-        **rows,
-    )
+    to_world = moved @ plan.to_world(model)
+    level, *tilt = to_world @ fit.beta
+    return {
+        "surface": WaterPlane(float(level - centre @ tilt), float(tilt[0]), float(tilt[1])),
+        "centre_xy": centre,
+        "level_m": float(level),
+        "tilt": np.array(tilt),
+        "covariance": to_world @ fit.covariance @ to_world.T,
+    }
 
 
 def _doubts(fit: Regression, without_height: int) -> tuple[str, ...]:
@@ -351,34 +300,10 @@ NEIGHBOURS = 25
 FEWEST = 3
 
 
-class CloudHeights(NamedTuple):
-    """What the cloud says at n places.
-
-    height_m : shape (n,), the median of its nearest points; NaN where there are too few.
-    used : shape (n,), how many counted, at most `NEIGHBOURS`.
-    spread_m : shape (n,), their robust standard deviation, NaN likewise.
-    """
-
-    height_m: FloatArray
-    used: IntArray
-    spread_m: FloatArray
-
-    @property
-    def missing(self) -> int:
-        """Places without a height."""
-        return int(np.isnan(self.height_m).sum())
-
-
 def is_near(xy: FloatArray, cloud_xyz: FloatArray, radius_m: float) -> BoolArray:
     """Return which points of a cloud lie within a radius of a place, in plan.
 
     A cloud that comes in chunks is thinned with it first; `heights_from_cloud` gives the same.
-
-    Parameters
-    ----------
-    xy : array, shape (n, 2)
-    cloud_xyz : array, shape (m, 3)
-    radius_m : float
     """
     from scipy.spatial import cKDTree
 
@@ -391,7 +316,7 @@ def is_near(xy: FloatArray, cloud_xyz: FloatArray, radius_m: float) -> BoolArray
     return near
 
 
-def heights_from_cloud(xy: FloatArray, cloud_xyz: FloatArray, radius_m: float) -> CloudHeights:
+def heights_from_cloud(xy: FloatArray, cloud_xyz: FloatArray, radius_m: float) -> FloatArray:
     """Return the height of the cloud at places: the median of the nearest points.
 
     On the edge of the water half of the neighbours are dry and half wet, so that on an even bank
@@ -407,8 +332,8 @@ def heights_from_cloud(xy: FloatArray, cloud_xyz: FloatArray, radius_m: float) -
 
     Returns
     -------
-    CloudHeights
-        One row per place.
+    array, shape (n,)
+        NaN where there are fewer than `FEWEST` points.
 
     Raises
     ------
@@ -419,23 +344,14 @@ def heights_from_cloud(xy: FloatArray, cloud_xyz: FloatArray, radius_m: float) -
 
     if not radius_m > 0.0:
         raise SettingError(f"radius {radius_m:g} m around shoreline points must be positive.")
-    xy = np.asarray(xy, np.float64)[:, :2]
+    height = np.full(len(xy), np.nan)
     near = cloud_xyz[is_near(xy, cloud_xyz, radius_m)] if len(xy) else cloud_xyz[:0]
     if len(near) == 0:
-        nothing = np.full(len(xy), np.nan)
-        return CloudHeights(nothing, np.zeros(len(xy), np.int64), nothing)
+        return height
     beyond = np.nextafter(radius_m, np.inf)
     away, row = cKDTree(near[:, :2]).query(xy, NEIGHBOURS, distance_upper_bound=beyond)
     found = np.isfinite(away)
     z = np.where(found, near[np.where(found, row, 0), 2], np.nan)
-    return _medians(z, found.sum(axis=1))
-
-
-def _medians(z: FloatArray, used: IntArray) -> CloudHeights:
-    """Return median and spread of each row, shape (n, k), of which NaN does not count."""
-    enough = used >= FEWEST
-    height, spread = np.full(len(z), np.nan), np.full(len(z), np.nan)
+    enough = found.sum(axis=1) >= FEWEST
     height[enough] = np.nanmedian(z[enough], axis=1)
-    away = np.abs(z[enough] - height[enough, None])
-    spread[enough] = 1.4826 * np.nanmedian(away, axis=1)
-    return CloudHeights(height, used, spread)
+    return height

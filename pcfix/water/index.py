@@ -20,14 +20,14 @@ GREEN_UM = 0.53
 
 
 class Water(NamedTuple):
-    """What decides the refractive index."""
+    """What decides the refractive index; PSU, degrees Celsius and micrometres."""
 
-    salinity_psu: float
-    temperature_c: float = 15.0
-    wavelength_um: float = GREEN_UM
+    salinity: float = 35.0
+    temperature: float = 15.0
+    wavelength: float = GREEN_UM
 
 
-WATERS = {"fresh": Water(0.0), "sea": Water(35.0)}
+WATERS = {"fresh": Water(0.0), "sea": Water()}
 """Waters by name."""
 
 
@@ -90,31 +90,25 @@ def refractive_index(
 def with_index(options: Options) -> Options:
     """Return options whose refractive index is a number, and which say what water it is of.
 
-    Parameters
-    ----------
-    options : MethodOptions
-        With an index, or where they have them salinity, temperature or wavelength.
+    They come with an index, or where they have them salinity, temperature or wavelength.
 
     Raises
     ------
     SettingError
         If both are given, or a value is outside its range.
     """
-    names = ("salinity", "temperature", "wavelength")
-    water = [getattr(options, name, None) for name in names]
+    own = {name: getattr(options, name) for name in Water._fields if hasattr(options, name)}
+    given = {name: value for name, value in own.items() if value is not None}
     index = options.index
-    if any(value is not None for value in water):
+    if given:
         if index is not None:
             raise SettingError(
                 "index and salinity, temperature or wavelength say the same twice; give one of"
                 " them."
             )
-        given = Water(35.0 if water[0] is None else water[0])
-        temperature = given.temperature_c if water[1] is None else water[1]
-        wavelength = given.wavelength_um if water[2] is None else water[2]
-        index = f"{given.salinity_psu!r},{temperature!r},{wavelength!r}"
+        index = ",".join(map(repr, Water(**given)))
     number, origin = index_of(index)
-    silent: dict[str, Any] = {name: None for name in names if hasattr(options, name)}
+    silent: dict[str, Any] = dict.fromkeys(own)
     return replace(options, index=number, index_from=origin or options.index_from, **silent)
 
 
@@ -154,5 +148,5 @@ def index_of(given: float | str | None) -> tuple[float, str]:
         ) from None
     name = f"{text}: " if text in WATERS else ""
     return refractive_index(*water), (
-        f"{name}{water.salinity_psu:g} PSU, {water.temperature_c:g} C, {water.wavelength_um:g} um"
+        f"{name}{water.salinity:g} PSU, {water.temperature:g} C, {water.wavelength:g} um"
     )

@@ -15,21 +15,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.errors import GeometryError
-from pcfix.model import BoolArray, FloatArray, IntArray, WaterMesh
-from pcfix.water.robust import Profile, fit_profile
+from pcfix.model import FloatArray, IntArray, WaterMesh
+from pcfix.water.robust import Profile, ShoreFit, fit_profile, of_all, usable_rows
 
 if TYPE_CHECKING:
-    from scipy.sparse import csr_array
     from scipy.spatial import cKDTree
-
 
 FEWEST = 10
 MOST_CELLS = 200_000
 Bounds = tuple[float, float, float, float]
 
 
-@dataclass(frozen=True, eq=False)
-class RiverFit:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RiverFit(ShoreFit):
     """A water surface along a river, and how well the points fix it.
 
     Attributes
@@ -40,24 +38,11 @@ class RiverFit:
         Downstream.
     profile : Profile
         Height along the axis; its station is the axis's.
-    residual_m : array, shape (n,)
-        Point minus surface; NaN of points without a height.
-    accepted : array of bool, shape (n,)
-    weight : array, shape (n,)
-        0 to 1.
-    sigma_m : float
-        Standard deviation of one accepted point.
-    notes : tuple of str
     """
 
     surface: WaterMesh
     axis: Axis
     profile: Profile
-    residual_m: FloatArray
-    accepted: BoolArray
-    weight: FloatArray
-    sigma_m: float
-    notes: tuple[str, ...]
 
     @property
     def drop_m(self) -> float:
@@ -87,17 +72,11 @@ class RiverFit:
             "drop_m": self.drop_m,
             "sigma_level_m": float(self.profile.sigma_height_m.mean()),
             "falls": self.profile.falls,
-            "sigma_point_m": self.sigma_m,
-            "points": len(self.accepted),
-            "accepted": int(self.accepted.sum()),
-            "without_height": int(np.isnan(self.residual_m).sum()),
-            "notes": list(self.notes),
+            **self.figures(),
         }
 
 
-def fit_river(
-    xyz: FloatArray, bounds: Bounds, *, centreline: FloatArray | None = None, name: str = "river"
-) -> RiverFit:
+def fit_river(xyz: FloatArray, bounds: Bounds, *, name: str = "river") -> RiverFit:
     """Fit the water surface along a river to shoreline points, of which some may be wrong.
 
     Parameters
@@ -106,8 +85,6 @@ def fit_river(
         Metres, world frame, of both banks or one; rows that are not finite are left out.
     bounds : tuple of 4 float
         Least x, least y, greatest x, greatest y of the cloud: what the mesh has to cover.
-    centreline : array, shape (m, 2) or (m, 3), optional
-        A line along the river, in either direction. Default: found from the points.
     name : str
         Of the mesh.
 
@@ -127,19 +104,24 @@ def fit_river(
     and downstream of the last it stays as it is there.
     """
     points = np.asarray(xyz, np.float64)
-    known = np.flatnonzero(np.isfinite(points).all(axis=1))
+    known = usable_rows(points)
     if len(known) < FEWEST:
         raise GeometryError(
             f"A surface along a river needs at least {FEWEST} shoreline points with heights, and"
             f" there are {len(known)}; fit a plane or a level."
         )
-    known = known[np.lexsort(points[known].T)]
     used = points[known]
-    axis = flow_axis(used[:, :2]) if centreline is None else given_axis(centreline)
-    axis = _downstream(axis, used)
+    axis = _downstream(flow_axis(used[:, :2]), used)
     profile = fit_profile(axis.locate(used[:, :2])[0], used[:, 2])
-    surface = _mesh(axis, profile, bounds, name)
-    return _result(surface, axis, profile, len(points), known)
+    return RiverFit(
+        surface=_mesh(axis, profile, bounds, name),
+        axis=axis,
+        profile=profile,
+        residual_m=of_all(profile.residual_m, known, len(points), np.nan),
+        weight=of_all(profile.weight, known, len(points), 0.0),
+        sigma_m=profile.sigma_m,
+        notes=_notes(profile, len(points) - len(known)),
+    )
 
 
 def _downstream(axis: Axis, xyz: FloatArray) -> Axis:
@@ -148,15 +130,11 @@ def _downstream(axis: Axis, xyz: FloatArray) -> Axis:
     upper = station <= np.median(station)
     if upper.all() or np.median(xyz[upper, 2]) >= np.median(xyz[~upper, 2]):
         return axis
-    return axis.reversed()
+    return Axis(axis.xy[::-1].copy(), axis.width_m)
 
 
-def _result(
-    surface: WaterMesh, axis: Axis, profile: Profile, count: int, known: IntArray
-) -> RiverFit:
-    """Return the fit with one row per input point."""
-    residual, weight = np.full(count, np.nan), np.zeros(count)
-    residual[known], weight[known] = profile.residual_m, profile.weight
+def _notes(profile: Profile, without_height: int) -> tuple[str, ...]:
+    """Return what a user should look at."""
     notes = [
         f"Beyond the outermost points the surface stays at {profile.height_m[0]:.2f} m upstream"
         f" and {profile.height_m[-1]:.2f} m downstream."
@@ -166,11 +144,9 @@ def _result(
             "The points do not fall all along the river, so the surface was not held to it; check"
             " the direction of the line along the river, and the points."
         )
-    if count > len(known):
-        notes.append(f"{count - len(known)} points have no height and are left out.")
-    return RiverFit(
-        surface, axis, profile, residual, weight > 0.0, weight, profile.sigma_m, tuple(notes)
-    )
+    if without_height:
+        notes.append(f"{without_height} points have no height and are left out.")
+    return tuple(notes)
 
 
 def _mesh(axis: Axis, profile: Profile, bounds: Bounds, name: str) -> WaterMesh:
@@ -187,15 +163,10 @@ def _mesh(axis: Axis, profile: Profile, bounds: Bounds, name: str) -> WaterMesh:
     x, y = np.linspace(left, right, columns), np.linspace(bottom, top, rows)
     xy = np.column_stack([np.tile(x, rows), np.repeat(y, columns)])
     vertices = np.column_stack([xy, profile.height_at(axis.locate(xy)[0])])
-    return WaterMesh(vertices, _grid_triangles(columns, rows), name)
-
-
-def _grid_triangles(columns: int, rows: int) -> IntArray:
-    """Return two triangles for each cell of a grid, counter-clockwise from above."""
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-    one = np.column_stack([corner, corner + 1, corner + columns])
-    other = np.column_stack([corner + 1, corner + columns + 1, corner + columns])
-    return np.vstack([one, other]).astype(np.int64)
+    halves = (0, 1, columns), (1, columns + 1, columns)  # counter-clockwise from above
+    triangles = np.vstack([corner[:, None] + np.array(half) for half in halves])
+    return WaterMesh(vertices, triangles.astype(np.int64), name)
 
 
 FEWEST_ON_AXIS = 6
@@ -210,16 +181,12 @@ _ROUNDS, _NODES = 10, 300
 class Axis:
     """A line along a river.
 
-    Attributes
-    ----------
-    xy : array, shape (m, 2)
-        Its vertices, metres, world frame.
-    width_m : float
-        Twice the rms distance of the points from it; zero where it was given.
+    xy : shape (m, 2), its vertices, metres, world frame.
+    width_m : twice the rms distance of the points from it.
     """
 
     xy: FloatArray
-    width_m: float = 0.0
+    width_m: float
 
     @cached_property
     def station_m(self) -> FloatArray:
@@ -251,25 +218,6 @@ class Axis:
         away = np.hypot(*(xy - start - share[:, None] * edge).T)
         return self.station_m[i] + share * np.sqrt(length2), away
 
-    def reversed(self) -> Axis:
-        """Return the line from its other end."""
-        return Axis(self.xy[::-1].copy(), self.width_m)
-
-
-def given_axis(xy: FloatArray) -> Axis:
-    """Return the axis along a line (m, 2) that a user gives.
-
-    Raises
-    ------
-    GeometryError
-        If it has no length.
-    """
-    xy = np.asarray(xy, np.float64)[:, :2]
-    kept = np.concatenate([[True], np.hypot(*np.diff(xy, axis=0).T) > 0.0])
-    if kept.sum() < 2:
-        raise GeometryError("The line along the river has no length; give two points or more.")
-    return Axis(xy[kept])
-
 
 def flow_axis(xy: FloatArray) -> Axis:
     """Return the axis of a river from points (n, 2) on its banks, metres.
@@ -290,12 +238,17 @@ def flow_axis(xy: FloatArray) -> Axis:
     station, bandwidth = _stations(net)
     nodes = _smoothed(net, station, bandwidth)
     for _ in range(_ROUNDS):
-        station, away = Axis(nodes).locate(places)
-        width = 2.0 * float(np.sqrt(np.mean(away**2)))
-        bandwidth = max(width, _gap(station), 1e-3)
+        station, width = _located(nodes, places)
+        gap = float(np.quantile(np.diff(np.sort(station)), 0.9))  # one in ten is wider
+        bandwidth = max(width, gap, 1e-3)
         nodes = _smoothed(places, station, bandwidth)
-    _, away = Axis(nodes).locate(places)
-    return Axis(_extended(nodes, bandwidth) + origin, 2.0 * float(np.sqrt(np.mean(away**2))))
+    return Axis(_extended(nodes, bandwidth) + origin, _located(nodes, places)[1])
+
+
+def _located(nodes: FloatArray, places: FloatArray) -> tuple[FloatArray, float]:
+    """Return how far along a line places are, and twice their rms distance from it."""
+    station, away = Axis(nodes, 0.0).locate(places)
+    return station, 2.0 * float(np.sqrt(np.mean(away**2)))
 
 
 def _thinned(xy: FloatArray) -> FloatArray:
@@ -311,28 +264,21 @@ def _thinned(xy: FloatArray) -> FloatArray:
 
 def _stations(xy: FloatArray) -> tuple[FloatArray, float]:
     """Return how far along the river each place is, and how far to smooth, m."""
-    from scipy.sparse.csgraph import dijkstra
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 
-    net, longest = _net(xy)
+    edges, shape = _edges(xy), (len(xy), len(xy))
+    length = np.hypot(*(xy[edges[:, 0]] - xy[edges[:, 1]]).T)
+    tree = minimum_spanning_tree(csr_array((length, edges.T), shape=shape))
+    reach = REACH * float(tree.data.max())
+    kept = length <= reach
+    both = np.vstack([edges[kept], edges[kept][:, ::-1]])
+    net = csr_array((np.tile(length[kept], 2), both.T), shape=shape)
     start = np.argmax(dijkstra(net, indices=np.array([0])), axis=1)
     from_start = dijkstra(net, indices=start)[0]
     end = int(np.argmax(from_start))
     from_end = dijkstra(net, indices=np.array([end]))[0]
-    return (from_start + from_start[end] - from_end) / 2.0, REACH * longest
-
-
-def _net(xy: FloatArray) -> tuple[csr_array, float]:
-    """Return a net between neighbours, and the longest edge that holds it together."""
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import minimum_spanning_tree
-
-    edges = _edges(xy)
-    length = np.hypot(*(xy[edges[:, 0]] - xy[edges[:, 1]]).T)
-    n = len(xy)
-    longest = float(minimum_spanning_tree(csr_array((length, edges.T), shape=(n, n))).data.max())
-    kept = length <= REACH * longest
-    both = np.vstack([edges[kept], edges[kept][:, ::-1]])
-    return csr_array((np.tile(length[kept], 2), both.T), shape=(n, n)), longest
+    return (from_start + from_start[end] - from_end) / 2.0, reach
 
 
 def _edges(xy: FloatArray) -> IntArray:
@@ -364,15 +310,9 @@ def _smoothed(xy: FloatArray, station: FloatArray, bandwidth: float) -> FloatArr
     return np.asarray(local @ xy / size[:, None])
 
 
-def _gap(station: FloatArray) -> float:
-    """Return a wide gap between stations: one in ten is wider."""
-    return float(np.quantile(np.diff(np.sort(station)), 0.9))
-
-
 def _extended(nodes: FloatArray, by_m: float) -> FloatArray:
     """Return a line drawn on at both ends, so that the outermost points lie beside it."""
-    ends = []
-    for end, inner in ((nodes[0], nodes[1]), (nodes[-1], nodes[-2])):
-        outward = (end - inner) / max(float(np.hypot(*(end - inner))), 1e-9)
-        ends.append(end + 2.0 * by_m * outward)
-    return np.vstack([ends[0], nodes, ends[1]])
+    outward = nodes[[0, -1]] - nodes[[1, -2]]
+    outward /= np.maximum(np.hypot(*outward.T), 1e-9)[:, None]
+    first, last = nodes[[0, -1]] + 2.0 * by_m * outward
+    return np.vstack([first, nodes, last])

@@ -17,10 +17,11 @@ penalty of their own (Bollaerts et al. 2006, Statistics in Medicine 25: 1189-120
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb, inf
-from typing import NamedTuple
+from operator import itemgetter
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,6 +33,56 @@ LEAST_SCALE_M = 0.005
 """Residuals are weighed as if they scattered at least so much: the edge of water is no sharper."""
 SUBSETS, SAMPLE, REFINED, FINALISTS = 3000, 400, 20, 3
 _ROUNDS, _CONVERGED_M, _CONVERGED, _ROUGHLY = 200, 1e-10, 1e-7, 1e-2
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ShoreFit:
+    """What the fit of a water surface says of the n shoreline points that it was given.
+
+    Attributes
+    ----------
+    residual_m : array, shape (n,)
+        Point minus surface; NaN of points without a height.
+    weight : array, shape (n,)
+        0 to 1; those without are rejected.
+    sigma_m : float
+        Standard deviation of one accepted point; NaN where none is to spare.
+    notes : tuple of str
+        Why this surface, and what to beware of.
+    """
+
+    residual_m: FloatArray
+    weight: FloatArray
+    sigma_m: float
+    notes: tuple[str, ...]
+
+    @property
+    def accepted(self) -> BoolArray:
+        """Which points have a weight, shape (n,)."""
+        return np.asarray(self.weight > 0.0)
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures of the points as plain values."""
+        return {
+            "sigma_point_m": self.sigma_m,
+            "points": len(self.weight),
+            "accepted": int(self.accepted.sum()),
+            "without_height": int(np.isnan(self.residual_m).sum()),
+            "notes": list(self.notes),
+        }
+
+
+def usable_rows(xyz: FloatArray) -> IntArray:
+    """Return the rows of finite points, in an order that does not depend on that of the points."""
+    known = np.flatnonzero(np.isfinite(xyz).all(axis=1))
+    return known[np.lexsort(xyz[known].T)]
+
+
+def of_all(values: FloatArray, known: IntArray, count: int, otherwise: float) -> FloatArray:
+    """Return the values of known rows with those of the other rows between, shape (count,)."""
+    whole = np.full(count, otherwise)
+    whole[known] = values
+    return whole
 
 
 class Regression(NamedTuple):
@@ -52,29 +103,25 @@ class Regression(NamedTuple):
 
 
 def robust_regression(X: FloatArray, z: FloatArray) -> Regression | None:
-    """Fit z = X beta.
+    """Fit z = X beta; None where no p observations determine beta.
 
-    Parameters
-    ----------
-    X : array, shape (n, p)
-        Columns of similar size, n at least p.
-    z : array, shape (n,)
-        Metres.
-
-    Returns
-    -------
-    Regression or None
-        None where no p observations determine beta.
+    The columns of X, shape (n, p), are of similar size; z, shape (n,), is in metres.
     """
-    rows = _evenly(len(z), SAMPLE)
-    starts = _exact_fits(X[rows], z[rows])
-    if len(starts) == 0:
+    rows = np.unique(np.linspace(0, len(z) - 1, min(len(z), SAMPLE)).astype(np.int64))
+    few, scale_of = (X[rows], z[rows]), itemgetter(1)
+    roughly = [_least_s_scale(*few, start, 3, _ROUGHLY) for start in _exact_fits(*few)]
+    if not roughly:
         return None
-    beta, scale = _best(X[rows], z[rows], starts)
+    finalists = sorted(roughly, key=scale_of)[:FINALISTS]
+    beta, scale = min((_least_s_scale(*few, beta) for beta, _ in finalists), key=scale_of)
     if len(rows) < len(z):
         beta, scale = _least_s_scale(X, z, beta)
     limit = FINAL_C * max(scale, LEAST_SCALE_M)
-    beta = _reweighted(X, z, beta, limit)
+    for _ in range(_ROUNDS):
+        before = beta
+        beta = _weighted(X, z, tukey_weight((z - X @ beta) / limit), beta)
+        if float(np.abs(X @ (beta - before)).max()) < _CONVERGED_M:
+            break
     residual = z - X @ beta
     covariance, sigma = _spread(X, residual, limit)
     return Regression(beta, covariance, sigma, residual, tukey_weight(residual / limit))
@@ -85,7 +132,7 @@ def tukey_weight(u: FloatArray) -> FloatArray:
     return np.asarray(np.where(np.abs(u) < 1.0, (1.0 - u * u) ** 2, 0.0))
 
 
-def s_scale(residual_m: FloatArray, unknowns: int = 0, precision: float = _CONVERGED) -> float:
+def s_scale(residual_m: FloatArray, unknowns: int, precision: float) -> float:
     """Return the scale s with sum rho(r / (c s)) = (n - p) / 2; the standard deviation of normals.
 
     rho(u) = 1 - (1 - u^2)^3, and 1 beyond |u| = 1. Zero where more than half are zero.
@@ -102,11 +149,6 @@ def s_scale(residual_m: FloatArray, unknowns: int = 0, precision: float = _CONVE
         if abs(factor - 1.0) < precision:
             break
     return scale
-
-
-def _evenly(n: int, most: int) -> IntArray:
-    """Return at most `most` of n row numbers, evenly spread."""
-    return np.unique(np.linspace(0, n - 1, min(n, most)).astype(np.int64))
 
 
 def _exact_fits(X: FloatArray, z: FloatArray) -> FloatArray:
@@ -133,16 +175,6 @@ def _subsets(n: int, p: int) -> IntArray:
     return np.asarray(ordered[different][:SUBSETS])
 
 
-def _best(X: FloatArray, z: FloatArray, starts: FloatArray) -> tuple[FloatArray, float]:
-    """Return the fit with the least S-scale that the starts lead to, and that scale."""
-
-    def scale(found: tuple[FloatArray, float]) -> float:
-        return found[1]
-
-    briefly = sorted((_least_s_scale(X, z, start, 3, _ROUGHLY) for start in starts), key=scale)
-    return min((_least_s_scale(X, z, beta) for beta, _ in briefly[:FINALISTS]), key=scale)
-
-
 def _least_s_scale(
     X: FloatArray,
     z: FloatArray,
@@ -162,17 +194,6 @@ def _least_s_scale(
             break
         beta = _weighted(X, z, tukey_weight(residual / (START_C * scale)), beta)
     return best, least
-
-
-def _reweighted(X: FloatArray, z: FloatArray, beta: FloatArray, limit: float) -> FloatArray:
-    """Return beta with Tukey's weights at a fixed limit."""
-    for _ in range(_ROUNDS):
-        after = _weighted(X, z, tukey_weight((z - X @ beta) / limit), beta)
-        moved = float(np.abs(X @ (after - beta)).max())
-        beta = after
-        if moved < _CONVERGED_M:
-            break
-    return beta
 
 
 def _weighted(X: FloatArray, z: FloatArray, weight: FloatArray, beta: FloatArray) -> FloatArray:
@@ -221,18 +242,11 @@ _TO_SIGMA = 1.4826  # from the median of absolute values of normal numbers
 class Profile:
     """Heights along a river.
 
-    Attributes
-    ----------
-    station_m : array, shape (m,)
-        Evenly spaced, from the first point to the last.
-    height_m, sigma_height_m : array, shape (m,)
-    weight : array, shape (n,)
-        Of the points, 0 to 1.
-    residual_m : array, shape (n,)
-    sigma_m : float
-        Standard deviation of one accepted point.
-    falls : bool
-        Whether it was held to fall.
+    station_m : shape (m,), evenly spaced, from the first point to the last.
+    height_m, sigma_height_m : shape (m,), the heights there and their standard errors.
+    weight, residual_m : shape (n,), of the points, weights from 0 to 1.
+    sigma_m : standard deviation of one accepted point.
+    falls : whether it was held to fall.
     """
 
     station_m: FloatArray
@@ -273,41 +287,17 @@ class _Data(NamedTuple):
 
 
 def fit_profile(station_m: FloatArray, z: FloatArray) -> Profile:
-    """Fit the height of the water, which falls with the station.
-
-    Parameters
-    ----------
-    station_m : array, shape (n,)
-        Distance along the river, downstream.
-    z : array, shape (n,)
-        Metres.
-    """
+    """Fit the height of the water, shape (n,), which falls with the station, downstream."""
     order = np.lexsort((z, station_m))
-    at = np.linspace(station_m.min(), station_m.max(), _node_count(len(z)))
+    nodes = int(np.clip(NODES_A_POINT * len(z), 20, MOST_NODES))
+    at = np.linspace(station_m.min(), station_m.max(), nodes)
     position = (station_m[order] - at[0]) / (at[1] - at[0])
     node = np.clip(np.floor(position).astype(np.int64), 0, len(at) - 2)
     data = _Data(node, position - node, z[order], len(at))
-    fits = {
-        falls: _fit(data, _best_penalty(data, falls=falls), falls=falls) for falls in (True, False)
-    }
-    falls = fits[True].sigma <= RISES_IF_WORSE * max(fits[False].sigma, LEAST_SCALE_M)
-    fit = fits[falls]
-    back = np.argsort(order)
-    residual = data.z - data.fitted(fit.height)
-    return Profile(
-        at, fit.height, fit.sigma_height, fit.weight[back], residual[back], fit.sigma, falls
-    )
-
-
-def _node_count(n: int) -> int:
-    return int(np.clip(NODES_A_POINT * n, 20, MOST_NODES))
-
-
-class _Fit(NamedTuple):
-    height: FloatArray
-    weight: FloatArray
-    sigma: float
-    sigma_height: FloatArray
+    falling, free = (_fit(data, at, falls=falls) for falls in (True, False))
+    held = falling.sigma_m <= RISES_IF_WORSE * max(free.sigma_m, LEAST_SCALE_M)
+    fit, back = falling if held else free, np.argsort(order)
+    return replace(fit, weight=fit.weight[back], residual_m=fit.residual_m[back])
 
 
 def _best_penalty(data: _Data, *, falls: bool) -> float:
@@ -323,11 +313,11 @@ def _best_penalty(data: _Data, *, falls: bool) -> float:
     return PENALTIES[int(np.argmin((np.minimum(missed, limit) ** 2).mean(axis=1)))]
 
 
-def _fit(data: _Data, penalty: float, *, falls: bool) -> _Fit:
-    """Return heights with their standard errors."""
+def _fit(data: _Data, station_m: FloatArray, *, falls: bool) -> Profile:
+    """Return heights with their standard errors, the points in the order of the data."""
     from scipy.linalg import solveh_banded
 
-    height, weight, band = _solve(data, penalty, falls=falls)
+    height, weight, band = _solve(data, _best_penalty(data, falls=falls), falls=falls)
     inverse = solveh_banded(band, np.eye(data.nodes), lower=True)
     i, j, share = data.node, data.node + 1, data.share
     variance = (
@@ -335,11 +325,11 @@ def _fit(data: _Data, penalty: float, *, falls: bool) -> _Fit:
         + 2.0 * share * (1.0 - share) * inverse[i, j]
         + share**2 * inverse[j, j]
     )
-    kept = weight > 0.0
+    kept, residual = weight > 0.0, data.z - data.fitted(height)
     spare = kept.sum() - float((weight * variance).sum())
-    residual = (data.z - data.fitted(height))[kept]
-    sigma = float(np.sqrt((residual**2).sum() / max(spare, 1.0)))
-    return _Fit(height, weight, sigma, sigma * np.sqrt(np.diag(inverse)))
+    sigma = float(np.sqrt((residual[kept] ** 2).sum() / max(spare, 1.0)))
+    sigma_height = sigma * np.sqrt(np.diag(inverse))
+    return Profile(station_m, height, sigma_height, weight, residual, sigma, falls)
 
 
 def _solve(

@@ -9,8 +9,8 @@ import numpy as np
 
 from pcfix.errors import GeometryError
 from pcfix.model import BoolArray, FloatArray
-from pcfix.water.cues import BRIGHT, SLOPE, Cue, Moments, cue_moments, cues_of, gain_of
-from pcfix.water.samples import Floating, Samples, layer_gain
+from pcfix.water.cues import BRIGHT, SLOPE, Cue, Gain, Moments, cue_moments, cues_of, gain_of
+from pcfix.water.samples import Samples, layer_gain
 
 LARGEST_TILT, USUAL_TILT = 0.006, 0.002
 TILT_STEP_M, MOST_TILT_STEPS = 0.15, 9
@@ -25,13 +25,13 @@ class Looked(NamedTuple):
     """Everything that was summed up about a cloud, at heights above a tilted plane.
 
     cues : (cue, its sums) of those that say anything.
-    floating : Floating
+    samples : Samples
     heights_m : shape (h,)
     tilt : shape (2,), of the plane through the origin of the samples.
     """
 
     cues: list[tuple[Cue, Moments]]
-    floating: Floating
+    samples: Samples
     heights_m: FloatArray
     tilt: FloatArray
 
@@ -47,11 +47,11 @@ class Peak(NamedTuple):
     score: float
 
 
-def look(samples: Samples, floating: Floating, heights_m: FloatArray, tilt: FloatArray) -> Looked:
+def look(samples: Samples, heights_m: FloatArray, tilt: FloatArray) -> Looked:
     """Sum up all cues at the given heights above a tilted plane."""
     cues = [(cue, cue_moments(samples, cue, heights_m, tilt)) for cue in cues_of(samples)]
     known = [(cue, sums) for cue, sums in cues if sums is not None]
-    return Looked(known, floating, heights_m, tilt)
+    return Looked(known, samples, heights_m, tilt)
 
 
 def all_heights(samples: Samples) -> FloatArray:
@@ -62,22 +62,17 @@ def all_heights(samples: Samples) -> FloatArray:
 
 
 def gains(looked: Looked, tilt: FloatArray, rng: np.random.Generator | None = None) -> FloatArray:
-    """Return what the cues that fix the level gain in all, at each height.
+    """Return what the cues that fix the level gain in all, at each height, shape (h,).
 
-    Parameters
-    ----------
-    looked : Looked
-    tilt : array, shape (2,)
-        On top of that of `looked`.
-    rng : Generator, optional
-        Draw the tiles and floating points anew, with replacement.
+    `tilt`, shape (2,), comes on top of that of `looked`. With `rng` tiles and floating points are
+    drawn anew, with replacement.
     """
     total = np.zeros(len(looked.heights_m))
     for _, sums in placing(looked):
         times = None if rng is None else _drawn(len(sums.sums), rng)
         total += np.maximum(gain_of(sums.shifted(tilt) if tilt.any() else sums, times).gain, 0.0)
-    times = None if rng is None else _drawn(len(looked.floating.xyz), rng)
-    return total + layer_gain(looked.floating, looked.heights_m, looked.tilt + tilt, times)
+    times = None if rng is None else _drawn(len(looked.samples.tile), rng)
+    return total + layer_gain(looked.samples, looked.heights_m, looked.tilt + tilt, times)
 
 
 def placing(looked: Looked) -> list[tuple[Cue, Moments]]:
@@ -96,16 +91,13 @@ def _drawn(count: int, rng: np.random.Generator) -> FloatArray:
 
 def best(looked: Looked, tilts: FloatArray) -> Peak:
     """Return the best height and tilt among those given, shape (k, 2)."""
-    found = [_best_height(looked, tilt) for tilt in tilts]
+    found = []
+    for tilt in tilts:
+        total, whole = gains(looked, tilt), looked.tilt + tilt
+        row = int(np.argmax(total))
+        unusual = 0.5 * float(whole @ whole) / USUAL_TILT**2
+        found.append(Peak(float(looked.heights_m[row]), whole, float(total[row]) - unusual))
     return max(found, key=lambda peak: peak.score)
-
-
-def _best_height(looked: Looked, tilt: FloatArray) -> Peak:
-    total = gains(looked, tilt)
-    row = int(np.argmax(total))
-    whole = looked.tilt + tilt
-    usual = 0.5 * float(whole @ whole) / USUAL_TILT**2
-    return Peak(float(looked.heights_m[row]), whole, float(total[row]) - usual)
 
 
 def axis_of(samples: Samples, peak: Peak) -> FloatArray:
@@ -119,10 +111,14 @@ def axis_of(samples: Samples, peak: Peak) -> FloatArray:
     return np.asarray(np.linalg.svd(xy - xy.mean(axis=0), full_matrices=False)[2][0])
 
 
+def heights_above(samples: Samples, peak: Peak) -> FloatArray:
+    """Return how high the smooth ground of the cells lies above the water, shape (m,)."""
+    return np.asarray(samples.smooth_m - samples.xyz[:, :2] @ peak.tilt - peak.level_m)
+
+
 def near_surface(samples: Samples, peak: Peak) -> BoolArray:
     """Return which cells are as high as the water, shape (m,)."""
-    above_m = samples.smooth_m - samples.xyz[:, :2] @ peak.tilt - peak.level_m
-    return np.asarray(np.abs(above_m) <= WATERLINE_M)
+    return np.asarray(np.abs(heights_above(samples, peak)) <= WATERLINE_M)
 
 
 def tilts_along(axis: FloatArray, step: float, steps: int) -> FloatArray:
@@ -137,29 +133,23 @@ def tilt_step(samples: Samples) -> float:
     return max(TILT_STEP_M / extent, LARGEST_TILT / MOST_TILT_STEPS)
 
 
-def refine(
-    samples: Samples, floating: Floating, start: Peak, axis: FloatArray | None
-) -> tuple[Peak, Looked]:
+def refine(samples: Samples, start: Peak, axis: FloatArray | None) -> tuple[Peak, Looked]:
     """Look again near a surface, in fine steps of height and, along an axis, of tilt."""
     peak, step = start, tilt_step(samples)
     reach = np.arange(-FINE_REACH_M, FINE_REACH_M + FINE_M / 2.0, FINE_M)
     for _ in range(3 if axis is not None else 1):
-        looked = look(samples, floating, peak.level_m + reach, peak.tilt)
+        looked = look(samples, peak.level_m + reach, peak.tilt)
         step /= 2.0
         tilts = NO_TILT[None] if axis is None else tilts_along(axis, step, 2)
         peak = best(looked, tilts)
-    return peak, look(samples, floating, peak.level_m + reach, peak.tilt)
+    return peak, look(samples, peak.level_m + reach, peak.tilt)
 
 
 def drawn(looked: Looked, axis: FloatArray | None, step: float) -> tuple[FloatArray, FloatArray]:
     """Return what draws of the tiles with replacement give beside the surface found.
 
-    Returns
-    -------
-    level_m : array, shape (`DRAWS`,)
-        With the tilt that was found.
-    tilt : array, shape (`TILT_DRAWS`,)
-        Along the axis, beside the one found; empty without an axis.
+    Levels with the tilt that was found, shape (`DRAWS`,), metres, and tilts along the axis, shape
+    (`TILT_DRAWS`,), none without an axis.
     """
     rng = np.random.default_rng(0)
     heights = looked.heights_m - looked.heights_m[len(looked.heights_m) // 2]
@@ -169,14 +159,11 @@ def drawn(looked: Looked, axis: FloatArray | None, step: float) -> tuple[FloatAr
     if axis is None:
         return level, np.empty(0)
     tilts = tilts_along(axis, step / 2.0, TILT_REACH)
-    tilt = [_drawn_tilt(looked, tilts, near, seed) for seed in range(TILT_DRAWS)]
-    return level, np.array(tilt) @ axis
-
-
-def _drawn_tilt(looked: Looked, tilts: FloatArray, near: BoolArray, seed: int) -> FloatArray:
-    """Return the best of the tilts for one draw of the tiles, the same for all tilts."""
-    tops = [gains(looked, tilt, np.random.default_rng(seed))[near].max() for tilt in tilts]
-    return np.asarray(tilts[int(np.argmax(tops))])
+    tops = [  # a draw of the tiles is the same for all tilts
+        [gains(looked, tilt, np.random.default_rng(seed))[near].max() for tilt in tilts]
+        for seed in range(TILT_DRAWS)
+    ]
+    return level, tilts[np.argmax(tops, axis=1)] @ axis
 
 
 LEAST_AGREED, LEAST_EACH = 12.0, 3.0
@@ -194,80 +181,46 @@ INSTEAD = "give the water surface instead: a level, shoreline points, a plane:a,
 LAYER = "floating points"
 
 
-class Verdict(NamedTuple):
-    """Figures and sentences about a surface that was believed."""
+def judge(
+    samples: Samples, peak: Peak, near: Looked, whole: Looked, sigma_m: float
+) -> tuple[float, dict[str, float], tuple[str, ...]]:
+    """Return the confidence in a surface, the figures of its evidence, and sentences about it.
 
-    confidence: float
-    evidence: dict[str, float]
-    reasons: tuple[str, ...]
-
-
-def judge(samples: Samples, peak: Peak, near: Looked, whole: Looked, sigma_m: float) -> Verdict:
-    """Weigh the evidence.
-
-    Parameters
-    ----------
-    samples : Samples
-    peak : Peak
-        The surface.
-    near, whole : Looked
-        About it, with its tilt, and over all heights without one.
-    sigma_m : float
-        Standard error of the level.
+    `near` is what was seen about it, with its tilt, and `whole` over all heights without one;
+    `sigma_m` is the standard error of its level.
 
     Raises
     ------
     GeometryError
         If the evidence is poor, contradictory, or all of the cloud is on one side of the surface.
     """
-    found = _gains_at_surface(near)
-    rival_m, rival = _rival(whole, peak)
+    middle = len(near.heights_m) // 2
+    gain = {cue: gain_of(sums) for cue, sums in near.cues}
+    fixing = [cue for cue, _ in placing(near)]
+    found = {cue.name: float(gain[cue].gain[middle]) for cue in fixing}
+    found[LAYER] = float(layer_gain(samples, near.heights_m, near.tilt)[middle])
     evidence = {f"{name} gain": value for name, value in found.items()}
-    evidence |= {"rival gain": rival, "rival height": rival_m + float(samples.origin[2])}
-    witnesses = _witnesses(near, evidence)
+    rival_m, evidence["rival gain"] = _rival(whole, peak)
+    evidence["rival height"] = rival_m + float(samples.origin[2])
+    witnesses = _witnesses(near, gain, evidence)
     evidence["total gain"] = sum(max(value, 0.0) for value in found.values())
-    _refuse_one_sided(samples, peak, evidence)
-    speaking = _speaking(found)
-    if speaking == [SLOPE.name]:
-        _refuse_other_breaks(samples, peak, near)
-    needed = _needed(speaking)
-    confidence = _refuse_poor(samples, peak, evidence, sigma_m, *needed)
-    return Verdict(confidence, evidence, _reasons(near, found, witnesses, evidence))
-
-
-def _gains_at_surface(near: Looked) -> dict[str, float]:
-    """Return what each cue that fixes the level gains at the surface."""
-    middle = len(near.heights_m) // 2
-    found = {cue.name: float(gain_of(sums).gain[middle]) for cue, sums in placing(near)}
-    found[LAYER] = float(layer_gain(near.floating, near.heights_m, near.tilt)[middle])
-    return found
-
-
-def _speaking(found: dict[str, float]) -> list[str]:
-    """Return the cues that gain enough to count."""
-    least = {LAYER: LEAST_LAYER}
-    return [name for name, gain in found.items() if gain >= least.get(name, LEAST_EACH)]
-
-
-def _refuse_other_breaks(samples: Samples, peak: Peak, near: Looked) -> None:
-    """Refuse a break of slope that nothing confirms and that refraction does not make."""
-    middle = len(near.heights_m) // 2
-    sums = next(sums for cue, sums in near.cues if cue.name == SLOPE.name)
-    size = float(gain_of(sums).amplitude[middle])
-    if not LIFTS[0] <= size <= LIFTS[1]:
-        raise GeometryError(
-            "No water surface was found: the only evidence is a break of slope at"
-            f" {_height(samples, peak)}, where slopes change by {1.0 + size:.2f} times and"
-            f" refraction makes about 1.36: a bank or a terrace, it seems; {INSTEAD}."
-        )
-
-
-def _needed(speaking: list[str]) -> tuple[float, float]:
-    """Return the least evidence, and the largest part of it that another height may have."""
-    if len(speaking) >= 2:
-        return LEAST_AGREED, MOST_RIVAL_AGREED
-    coloured = any("/" in name or name == BRIGHT.name for name in speaking)
-    return (LEAST_COLOUR_ALONE if coloured else LEAST_ALONE), MOST_RIVAL_ALONE
+    evidence["share below"] = float(np.mean(heights_above(samples, peak) < 0.0))
+    speaking = [
+        name for name, g in found.items() if g >= (LEAST_LAYER if name == LAYER else LEAST_EACH)
+    ]
+    lift = float(gain[SLOPE].amplitude[middle]) if speaking == [SLOPE.name] else None
+    least = _refuse_poor(_height(samples, peak), evidence, sigma_m, speaking, lift)
+    sentences = []
+    for cue in fixing:
+        if found[cue.name] >= LEAST_EACH:
+            size, sigma = float(gain[cue].amplitude[middle]), float(gain[cue].sigma[middle])
+            evidence[f"{cue.name} amplitude"], evidence[f"{cue.name} sigma"] = size, sigma
+            sentences.append(f"{cue.meaning}: {_size(cue, size, sigma)}")
+    if found[LAYER] >= LEAST_EACH:
+        sentences.append(f"points float in a thin layer (evidence {found[LAYER]:.0f})")
+    total, rival = evidence["total gain"], evidence["rival gain"]
+    confidence = float(min(1.0 - rival / total, 1.0 - math.exp(-total / (2.0 * least))))
+    return confidence, evidence, (*sentences, *witnesses)
 
 
 def _rival(whole: Looked, peak: Peak) -> tuple[float, float]:
@@ -278,61 +231,64 @@ def _rival(whole: Looked, peak: Peak) -> tuple[float, float]:
     return float(whole.heights_m[row]), float(total[row])
 
 
-def _witnesses(near: Looked, evidence: dict[str, float]) -> list[str]:
+def _witnesses(near: Looked, gain: dict[Cue, Gain], evidence: dict[str, float]) -> list[str]:
     """Return the sentences of cues that only say that there is water below about here."""
     sentences = []
     close = np.abs(near.heights_m - near.heights_m[len(near.heights_m) // 2]) <= WITNESS_REACH_M
-    for cue, sums in near.cues:
-        if cue.places:
-            continue
-        gain = gain_of(sums)
-        sigmas = float((cue.what.sign * gain.amplitude / (gain.sigma + 1e-12))[close].max())
-        evidence[f"{cue.name} sigmas"] = sigmas
-        if sigmas >= WITNESS_SIGMAS:
-            sentences.append(f"{cue.meaning} ({sigmas:.0f} standard errors)")
+    for cue, seen in gain.items():
+        if not cue.places:
+            sigmas = float((cue.what.sign * seen.amplitude / (seen.sigma + 1e-12))[close].max())
+            evidence[f"{cue.name} sigmas"] = sigmas
+            if sigmas >= WITNESS_SIGMAS:
+                sentences.append(f"{cue.meaning} ({sigmas:.0f} standard errors)")
     return sentences
 
 
-def _refuse_one_sided(samples: Samples, peak: Peak, evidence: dict[str, float]) -> None:
-    above_m = samples.smooth_m - samples.xyz[:, :2] @ peak.tilt - peak.level_m
-    wet = float(np.mean(above_m < 0.0))
-    evidence["share below"] = wet
-    if not LEAST_SHARE <= wet <= 1.0 - LEAST_SHARE:
-        side = "below" if wet > 0.5 else "above"
-        raise GeometryError(
-            f"No water surface was found: nearly all of the cloud lies {side} the best candidate,"
-            f" {_height(samples, peak)}, so that there is no shoreline to see; {INSTEAD}."
-        )
-
-
 def _refuse_poor(
-    samples: Samples,
-    peak: Peak,
+    height: str,
     evidence: dict[str, float],
     sigma_m: float,
-    least: float,
-    most_rival: float,
+    speaking: list[str],
+    lift: float | None,
 ) -> float:
-    """Return the confidence, or refuse."""
-    total, rival = evidence["total gain"], evidence["rival gain"]
-    if total < least:
-        raise GeometryError(
-            "No water surface was found: slopes, colours, noise and floating points were searched"
-            f" for a change at one height, and the best, {_height(samples, peak)}, is too weak"
-            f" (evidence {total:.0f}, {least:.0f} needed); {INSTEAD}."
+    """Return the evidence that is needed, or refuse.
+
+    `speaking` are the cues that gain enough to count; `lift` is the change of slope where that
+    alone speaks: a break that refraction does not make is a bank.
+    """
+    total, rival, wet = (evidence[name] for name in ("total gain", "rival gain", "share below"))
+    least, most_rival = LEAST_AGREED, MOST_RIVAL_AGREED
+    if len(speaking) < 2:
+        coloured = any("/" in name or name == BRIGHT.name for name in speaking)
+        least, most_rival = (LEAST_COLOUR_ALONE if coloured else LEAST_ALONE), MOST_RIVAL_ALONE
+    why = ""
+    if not LEAST_SHARE <= wet <= 1.0 - LEAST_SHARE:
+        side = "below" if wet > 0.5 else "above"
+        why = (
+            f"nearly all of the cloud lies {side} the best candidate, {height}, so that there is no"
+            " shoreline to see"
         )
-    if rival > most_rival * total:
-        raise GeometryError(
-            f"No water surface was found: the evidence is contradictory, {_height(samples, peak)}"
-            f" and {evidence['rival height']:.2f} m are nearly as likely (evidence {total:.0f} and"
-            f" {rival:.0f}); {INSTEAD}."
+    elif lift is not None and not LIFTS[0] <= lift <= LIFTS[1]:
+        why = (
+            f"the only evidence is a break of slope at {height}, where slopes change by"
+            f" {1.0 + lift:.2f} times and refraction makes about 1.36: a bank or a terrace, it"
+            " seems"
         )
-    if sigma_m > MOST_SIGMA_M:
-        raise GeometryError(
-            f"No water surface was found: parts of the cloud disagree by {sigma_m:.2f} m about the"
-            f" best candidate, {_height(samples, peak)}; {INSTEAD}."
+    elif total < least:
+        why = (
+            "slopes, colours, noise and floating points were searched for a change at one height,"
+            f" and the best, {height}, is too weak (evidence {total:.0f}, {least:.0f} needed)"
         )
-    return float(min(1.0 - rival / total, 1.0 - math.exp(-total / (2.0 * least))))
+    elif rival > most_rival * total:
+        why = (
+            f"the evidence is contradictory, {height} and {evidence['rival height']:.2f} m are"
+            f" nearly as likely (evidence {total:.0f} and {rival:.0f})"
+        )
+    elif sigma_m > MOST_SIGMA_M:
+        why = f"parts of the cloud disagree by {sigma_m:.2f} m about the best candidate, {height}"
+    if why:
+        raise GeometryError(f"No water surface was found: {why}; {INSTEAD}.")
+    return least
 
 
 def _height(samples: Samples, peak: Peak) -> str:
@@ -340,23 +296,7 @@ def _height(samples: Samples, peak: Peak) -> str:
     return f"{peak.level_m + float(middle) + float(samples.origin[2]):.2f} m"
 
 
-def _reasons(
-    near: Looked, found: dict[str, float], witnesses: list[str], evidence: dict[str, float]
-) -> tuple[str, ...]:
-    sentences = []
-    middle = len(near.heights_m) // 2
-    for cue, sums in placing(near):
-        gain = gain_of(sums)
-        if found[cue.name] >= LEAST_EACH:
-            size, sigma = float(gain.amplitude[middle]), float(gain.sigma[middle])
-            evidence[f"{cue.name} amplitude"], evidence[f"{cue.name} sigma"] = size, sigma
-            sentences.append(f"{cue.meaning}: {_size(cue.name, size, sigma)}")
-    if found[LAYER] >= LEAST_EACH:
-        sentences.append(f"points float in a thin layer (evidence {found[LAYER]:.0f})")
-    return (*sentences, *witnesses)
-
-
-def _size(name: str, size: float, sigma: float) -> str:
-    if name == SLOPE.name:
+def _size(cue: Cue, size: float, sigma: float) -> str:
+    if cue == SLOPE:
         return f"true slopes are {1.0 + size:.2f} ± {sigma:.2f} times the apparent ones"
     return f"the logarithm of the ratio falls by {-size:.2f} ± {sigma:.2f} per metre"

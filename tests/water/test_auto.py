@@ -85,14 +85,13 @@ def test_water_classes_decide():
     assert "classified as water" in found.reasons[0]
 
 
-def test_noise_classes_and_points_above_the_cameras_are_left_out():
+def test_noise_classes_are_left_out():
     xyz, rgb = shore()
     bad = np.array([[EAST_M, NORTH_M, 900.0], [EAST_M, NORTH_M, -900.0]])
-    classes = np.r_[np.full(len(xyz), 1), 1, 7]
+    classes = np.r_[np.full(len(xyz), 1), 18, 7]
     colours = np.vstack([rgb, rgb[:2]])
-    centres = np.array([[EAST_M, NORTH_M, 100.0]])
     clean = find_water(xyz, rgb=rgb)
-    found = find_water(np.vstack([xyz, bad]), rgb=colours, classes=classes, centres=centres)
+    found = find_water(np.vstack([xyz, bad]), rgb=colours, classes=classes)
     assert found.surface == clean.surface
 
 

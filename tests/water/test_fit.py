@@ -304,15 +304,6 @@ def test_the_mesh_of_a_river_is_its_profile():
     assert np.abs(seen - fit.height_at(places))[calm].max() < 0.02  # a cell beside a riffle's end
 
 
-def test_a_given_line_along_the_river_in_either_direction():
-    points, places, true, asked, line = winding(3, 200)
-    one = fit_river(points, bounds_of(places), centreline=line)
-    other = fit_river(points, bounds_of(places), centreline=line[::-1])
-    assert one.height_at(places) == pytest.approx(other.height_at(places), abs=0.02)
-    error = (one.height_at(places) - true)[np.abs(asked - WEIR_M) > 10.0]
-    assert np.sqrt(np.mean(error**2)) < 0.02
-
-
 def test_beyond_the_ends_the_surface_stays_as_it_is_there():
     points, places, _, _, line = winding(4, 200)
     fit = fit_river(points, bounds_of(places, 200.0))
@@ -342,17 +333,16 @@ def test_water_that_rises_in_the_middle_is_not_held_to_fall():
 
 
 @pytest.mark.parametrize(
-    ("points", "bounds", "line", "message"),
+    ("points", "bounds", "message"),
     [
-        (np.zeros((9, 3)), (0, 0, 1, 1), None, "needs at least 10 shoreline points with heights"),
-        (np.zeros((12, 3)), (0, 0, 1, 1), None, "at different places"),
-        (winding(0, 20)[0], (0, 0, 0, 1), None, "hold no area"),
-        (winding(0, 20)[0], (0, 0, 1, 1), np.zeros((3, 2)), "has no length"),
+        (np.zeros((9, 3)), (0, 0, 1, 1), "needs at least 10 shoreline points with heights"),
+        (np.zeros((12, 3)), (0, 0, 1, 1), "at different places"),
+        (winding(0, 20)[0], (0, 0, 0, 1), "hold no area"),
     ],
 )
-def test_what_fixes_no_river(points, bounds, line, message):
+def test_what_fixes_no_river(points, bounds, message):
     with pytest.raises(GeometryError, match=message):
-        fit_river(points, bounds, centreline=line)
+        fit_river(points, bounds)
 
 
 def test_heights_on_an_even_bank_are_those_of_its_edge():
@@ -363,9 +353,9 @@ def test_heights_on_an_even_bank_are_those_of_its_edge():
     shore = np.column_stack([np.full(30, 25.0), np.linspace(5, 45, 30)])
     found = heights_from_cloud(shore, cloud, 1.0)
     # median of 25 points of 0.02 m and a slope of 0.1 over 0.7 m: 0.007 m
-    assert found.height_m == pytest.approx(np.full(30, 3.0), abs=0.03)
+    assert found == pytest.approx(np.full(30, 3.0), abs=0.03)
     near = is_near(shore, cloud, 1.0)
-    assert np.array_equal(heights_from_cloud(shore, cloud[near], 1.0).height_m, found.height_m)
+    assert np.array_equal(heights_from_cloud(shore, cloud[near], 1.0), found)
     distance = np.hypot(*(xy[:, None] - shore[None]).transpose(2, 0, 1)).min(axis=1)
     assert np.array_equal(near, distance <= 1.0)
 
@@ -373,11 +363,9 @@ def test_heights_on_an_even_bank_are_those_of_its_edge():
 def test_places_without_cloud_have_no_height():
     cloud = np.array([[0.0, 0, 1], [0.1, 0, 1], [0, 0.1, 2], [9, 9, 4]])
     found = heights_from_cloud(np.array([[0.0, 0], [9, 9], [50, 50]]), cloud, 0.5)
-    assert found.height_m[0] == 1.0
-    assert np.isnan(found.height_m[1:]).all()
-    assert found.used.tolist() == [3, 1, 0]
-    assert found.missing == 2
-    assert heights_from_cloud(np.array([[70.0, 70]]), cloud, 0.5).missing == 1
+    assert found[0] == 1.0
+    assert np.isnan(found[1:]).all()
+    assert np.isnan(heights_from_cloud(np.array([[70.0, 70]]), cloud, 0.5)).all()
 
 
 def test_chance_of_a_tilt_is_wald_s():
