@@ -22,7 +22,18 @@ import numpy as np
 from numba import njit, prange
 
 from pcfix.errors import GeometryError, PcfixWarning
-from pcfix.lens.imaging import image_and_gradients, image_of, lens_table
+from pcfix.lens.algebra import (
+    dot,
+    minus,
+    plus,
+    plus_square,
+    row_of,
+    scaled,
+    solved,
+    times,
+    vector,
+)
+from pcfix.lens.imaging import image_in_world, image_of, lens_table
 from pcfix.model import (
     BoolArray,
     Cameras,
@@ -117,10 +128,8 @@ def _carry(
             count = 0
             for j in range(start[i], start[i + 1]):
                 c = camera[j]
-                u, v = _image(
-                    xyz[i, 0] - old.centres[c, 0], xyz[i, 1] - old.centres[c, 1],
-                    xyz[i, 2] - old.centres[c, 2], old.rotations[c], old.lenses[old.row[c]],
-                )  # fmt: skip
+                ahead = times(old.rotations[c], minus(row_of(xyz, i), row_of(old.centres, c)))
+                u, v = image_of(old.lenses[old.row[c]], *ahead)
                 if u == u and v == v:
                     image[count, 0], image[count, 1], who[count] = u, v, c
                     count += 1
@@ -129,52 +138,23 @@ def _carry(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _image(dx: float, dy: float, dz: float, r: FloatArray, lens: FloatArray) -> tuple[float, float]:
-    return image_of(
-        lens,
-        r[0, 0] * dx + r[0, 1] * dy + r[0, 2] * dz,
-        r[1, 0] * dx + r[1, 1] * dy + r[1, 2] * dz,
-        r[2, 0] * dx + r[2, 1] * dy + r[2, 2] * dz,
-    )
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
 def _meet(shift: FloatArray, xyz: FloatArray, image: FloatArray, who: IntArray, new: _Side) -> bool:
     """Find the shift after which the cameras image the point nearest to the places; whether so."""
-    x, y, z = 0.0, 0.0, 0.0
+    moved, point = (0.0, 0.0, 0.0), vector(xyz)
     for _ in range(MAX_STEPS):
-        m00, m01, m02, m11, m12, m22, b0, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        m, b = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         for j in range(who.size):
-            c, r = who[j], new.rotations[who[j]]
-            dx = xyz[0] + x - new.centres[c, 0]
-            dy = xyz[1] + y - new.centres[c, 1]
-            dz = xyz[2] + z - new.centres[c, 2]
-            u, v, g = image_and_gradients(
-                new.lenses[new.row[c]],
-                r[0, 0] * dx + r[0, 1] * dy + r[0, 2] * dz,
-                r[1, 0] * dx + r[1, 1] * dy + r[1, 2] * dz,
-                r[2, 0] * dx + r[2, 1] * dy + r[2, 2] * dz,
-            )
-            for a in range(2):
-                off = image[j, a] - (u if a == 0 else v)
-                g0, g1, g2 = g[3 * a], g[3 * a + 1], g[3 * a + 2]
-                jx = g0 * r[0, 0] + g1 * r[1, 0] + g2 * r[2, 0]
-                jy = g0 * r[0, 1] + g1 * r[1, 1] + g2 * r[2, 1]
-                jz = g0 * r[0, 2] + g1 * r[1, 2] + g2 * r[2, 2]
-                m00, m01, m02 = m00 + jx * jx, m01 + jx * jy, m02 + jx * jz
-                m11, m12, m22 = m11 + jy * jy, m12 + jy * jz, m22 + jz * jz
-                b0, b1, b2 = b0 + jx * off, b1 + jy * off, b2 + jz * off
-        c00, c01, c02 = m11 * m22 - m12 * m12, m02 * m12 - m01 * m22, m01 * m12 - m02 * m11
-        c11, c12, c22 = m00 * m22 - m02 * m02, m01 * m02 - m00 * m12, m00 * m11 - m01 * m01
-        det = m00 * c00 + m01 * c01 + m02 * c02
-        if not det > LEAST_CONDITION * m00 * m11 * m22:
+            c = who[j]
+            ahead = minus(plus(point, moved), row_of(new.centres, c))
+            u, v, by_u, by_v = image_in_world(new.lenses[new.row[c]], new.rotations[c], ahead)
+            m, b = plus_square(m, by_u), plus(b, scaled(image[j, 0] - u, by_u))
+            m, b = plus_square(m, by_v), plus(b, scaled(image[j, 1] - v, by_v))
+        det, step = solved(m, b)
+        if not det > LEAST_CONDITION * m[0] * m[3] * m[5]:
             return False
-        sx = (c00 * b0 + c01 * b1 + c02 * b2) / det
-        sy = (c01 * b0 + c11 * b1 + c12 * b2) / det
-        sz = (c02 * b0 + c12 * b1 + c22 * b2) / det
-        x, y, z = x + sx, y + sy, z + sz
-        if sx * sx + sy * sy + sz * sz <= CLOSE_M * CLOSE_M:
-            shift[0], shift[1], shift[2] = x, y, z
+        moved = plus(moved, step)
+        if dot(step, step) <= CLOSE_M * CLOSE_M:
+            shift[0], shift[1], shift[2] = moved
             return True
     return False
 

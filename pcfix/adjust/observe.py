@@ -16,11 +16,21 @@ from numba import njit
 
 from pcfix.adjust.block import B1, B2, CX, CY, FOCAL, K1, P1, Seen, State, Surface
 from pcfix.lens import formulas as places
+from pcfix.lens.algebra import (
+    column_of,
+    cross,
+    dot,
+    minus,
+    normal_of,
+    times,
+    transposed_times,
+    vector,
+)
 from pcfix.lens.formulas import distorted, jacobian, undistorted
 from pcfix.lens.imaging import image_and_gradients, image_of, in_plane
 from pcfix.model import FloatArray
 from pcfix.port.light import through_port
-from pcfix.refract.rays import light_path, plane_at, settle
+from pcfix.refract.rays import direction, lay, light_path, plane_at, settle
 from pcfix.refract.tracing.gradients import light_and_gradients
 
 POSE, POINT, WATER, WIDTH = 0, 6, 9, 13
@@ -58,22 +68,16 @@ def water_plane(
 ) -> bool:
     """Set the plane (N, h) at which light from Q to C leaves the water; whether Q is below it."""
     if surface.field is None and surface.tin is None:
-        up = 1.0 / np.sqrt(1.0 + water[1] * water[1] + water[2] * water[2])
-        plane[0], plane[1], plane[2] = -water[1] * up, -water[2] * up, up
-        plane[3] = up * water[0]
+        plane[0], plane[1], plane[2] = normal_of(water[1], water[2])
+        plane[3] = plane[2] * water[0]
         return bool(water[0] + water[1] * q[0] + water[2] * q[1] > q[2])
     origin = surface.origin.copy()
     origin[2] -= water[0]
     z, b, c = plane_at(surface.tin, surface.field, q[0], q[1], origin)
     if not z > q[2]:
         return False
-    up = 1.0 / np.sqrt(1.0 + b * b + c * c)
-    plane[0], plane[1], plane[2] = -b * up, -c * up, up
-    plane[3] = up * (z - b * q[0] - c * q[1])
-    settle(
-        plane, surface.tin, surface.field, origin,
-        q[0], q[1], q[2], centre[0], centre[1], centre[2], water[3],
-    )  # fmt: skip
+    lay(plane, q[0], q[1], z, b, c)
+    settle(plane, surface.tin, surface.field, origin, vector(q), vector(centre), water[3])
     return True
 
 
@@ -84,23 +88,19 @@ def image(
     """Return where camera c images point p; NaN where it does not."""
     q, centre, r, water = state.xyz[p], state.centres[c], state.rotations[c], state.water
     light, plane = room.light, room.plane
-    dx, dy, dz = q[0] - centre[0], q[1] - centre[1], q[2] - centre[2]
+    w = minus(vector(q), vector(centre))
     refracted = surface.port.size == 0 and seen.wet[p] and surface.there
     if refracted:
         refracted = water_plane(plane, water, surface, q, centre)
     if refracted:
-        nx, ny, nz = plane[0], plane[1], plane[2]
-        k, _, _, _, sx, sy, sz = light_path(
-            q[0], q[1], q[2], centre[0], centre[1], centre[2], nx, ny, nz, plane[3], water[3]
-        )
-        dx, dy, dz = k * sx - nx, k * sy - ny, k * sz - nz
-    x = r[0, 0] * dx + r[0, 1] * dy + r[0, 2] * dz
-    y = r[1, 0] * dx + r[1, 1] * dy + r[1, 2] * dz
-    z = r[2, 0] * dx + r[2, 1] * dy + r[2, 2] * dz
+        normal = vector(plane)
+        path = light_path(vector(q), vector(centre), normal, plane[3], water[3])
+        w = direction(path, normal)
+    x = times(r, w)
     if surface.port.size:
-        through_port(surface.port, water[3], x, y, z, light)
-        x, y, z = light[0, 0], light[1, 0], light[2, 0]
-    return image_of(state.lenses[seen.lens_row[c]], x, y, z)
+        through_port(surface.port, water[3], *x, light)
+        x = column_of(light, 0)
+    return image_of(state.lenses[seen.lens_row[c]], *x)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -117,56 +117,36 @@ def image_and_all_gradients(
     if refracted:
         refracted = water_plane(plane, water, surface, q, centre)
     if refracted:
-        light_and_gradients(
-            q[0], q[1], q[2], centre[0], centre[1], centre[2],
-            plane[0], plane[1], plane[2], plane[3], water[3], light,
-        )  # fmt: skip
+        light_and_gradients(vector(q), vector(centre), vector(plane), plane[3], water[3], light)
     else:
         light[:] = 0.0
         for i in range(3):
             light[i, 0] = q[i] - centre[i]
             light[i, 1 + i], light[i, 4 + i] = 1.0, -1.0
-    x, y, z = _turned(r, light[0, 0], light[1, 0], light[2, 0])
-    ahead[0], ahead[1], ahead[2] = x, y, z
+    x = times(r, column_of(light, 0))
+    ahead[0], ahead[1], ahead[2] = x
     by_n_port = np.zeros(3)
     if surface.port.size:
         bent = np.empty((3, 5))
-        through_port(surface.port, water[3], x, y, z, bent)
+        through_port(surface.port, water[3], *x, bent)
         ahead[:] = bent[:, 0]
         by_n_port[:] = bent[:, 4]
-    u, v, g = image_and_gradients(state.lenses[seen.lens_row[c]], ahead[0], ahead[1], ahead[2])
+    u, v, both = image_and_gradients(state.lenses[seen.lens_row[c]], ahead[0], ahead[1], ahead[2])
     for row in range(2):
-        gx, gy, gz = g[3 * row], g[3 * row + 1], g[3 * row + 2]
+        g = both[3 * row], both[3 * row + 1], both[3 * row + 2]
         along_n = 0.0
         if surface.port.size:
-            along_n = gx * by_n_port[0] + gy * by_n_port[1] + gz * by_n_port[2]
-            gx, gy, gz = (
-                gx * bent[0, 1] + gy * bent[1, 1] + gz * bent[2, 1],
-                gx * bent[0, 2] + gy * bent[1, 2] + gz * bent[2, 2],
-                gx * bent[0, 3] + gy * bent[1, 3] + gz * bent[2, 3],
-            )
-        out[row, 0], out[row, 1], out[row, 2] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
-        wx, wy, wz = (
-            gx * r[0, 0] + gy * r[1, 0] + gz * r[2, 0],
-            gx * r[0, 1] + gy * r[1, 1] + gz * r[2, 1],
-            gx * r[0, 2] + gy * r[1, 2] + gz * r[2, 2],
-        )
+            along_n = dot(g, vector(by_n_port))
+            g = dot(g, column_of(bent, 1)), dot(g, column_of(bent, 2)), dot(g, column_of(bent, 3))
+        out[row, 0], out[row, 1], out[row, 2] = cross(x, g)
+        w = transposed_times(r, g)
         for i in range(3):
-            out[row, POINT + i] = wx * light[0, 1 + i] + wy * light[1, 1 + i] + wz * light[2, 1 + i]
-            out[row, 3 + i] = wx * light[0, 4 + i] + wy * light[1, 4 + i] + wz * light[2, 4 + i]
+            out[row, POINT + i] = dot(w, column_of(light, 1 + i))
+            out[row, 3 + i] = dot(w, column_of(light, 4 + i))
         for i in range(4):
-            out[row, WATER + i] = wx * light[0, 7 + i] + wy * light[1, 7 + i] + wz * light[2, 7 + i]
+            out[row, WATER + i] = dot(w, column_of(light, 7 + i))
         out[row, WATER + 3] += along_n
     return u, v
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _turned(r: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float]:
-    return (
-        r[0, 0] * x + r[0, 1] * y + r[0, 2] * z,
-        r[1, 0] * x + r[1, 1] * y + r[1, 2] * z,
-        r[2, 0] * x + r[2, 1] * y + r[2, 2] * z,
-    )
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -234,8 +234,8 @@ def clean_points(
     A bed of 30 by 30 points, 2 m under the water, and one point 1 m above it:
 
     >>> import numpy as np
-    >>> from pcfix.clean.points import clean_points
-    >>>     >>> from pcfix.options.steps import CleanRules
+    >>> from pcfix.clean.points import Reason, clean_points
+    >>> from pcfix.options.steps import CleanRules
     >>> x, y = (grid.ravel() / 4 for grid in np.mgrid[:30, :30])
     >>> cloud = np.column_stack([x, y, -2 + 0.01 * np.sin(9 * x + 7 * y)])
     >>> cloud[450, 2] += 1

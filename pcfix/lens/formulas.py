@@ -40,11 +40,7 @@ LEAST_RADIALS, LEAST_SHAPES = 4, 2
 
 
 CODES: dict[str, int] = {name: i for i, name in enumerate(get_args(Projection))}
-_PERSPECTIVE, _EQUIDISTANT, _EQUISOLID = (
-    CODES[name] for name in ("perspective", "equidistant", "equisolid")
-)
-_POLYNOMIAL, _FOV, _DUAL = (CODES[name] for name in ("polynomial", "fov", "dual"))
-_DIVISION, _EUCM = CODES["division"], CODES["eucm"]
+PERSPECTIVE, EQUIDISTANT, EQUISOLID, POLYNOMIAL, FOV, DUAL, DIVISION, EUCM = CODES.values()
 
 RIGHT_ANGLE = 0.5 * np.pi
 
@@ -107,23 +103,23 @@ def _shape(c: FloatArray, i: int) -> float:
 def radius(c: FloatArray, theta: float) -> float:
     """Return the distance from the centre of the plane of a direction at an angle."""
     kind, s0, s1 = int(c[KIND]), _shape(c, 0), _shape(c, 1)
-    if kind == _EQUIDISTANT:
+    if kind == EQUIDISTANT:
         return theta
-    if kind == _EQUISOLID:
+    if kind == EQUISOLID:
         return 2.0 * np.sin(0.5 * theta)
-    if kind == _POLYNOMIAL:
+    if kind == POLYNOMIAL:
         return _polynomial(c, theta)[0]
-    if kind == _FOV and s0 != 0.0:
+    if kind == FOV and s0 != 0.0:
         return np.arctan(2.0 * np.tan(0.5 * s0) * np.tan(theta)) / s0
-    if kind == _DUAL:
+    if kind == DUAL:
         return _dual(s0, theta)[0]
     sine, cosine = np.sin(theta), np.cos(theta)
-    if kind == _DIVISION:
+    if kind == DIVISION:
         root = np.sqrt(max(cosine * cosine - 4.0 * s0 * sine * sine, 0.0))
         if cosine < 0.0:
             return (cosine - root) / (2.0 * s0 * sine)
         return 2.0 * sine / (cosine + root)
-    if kind == _EUCM:
+    if kind == EUCM:
         d = np.sqrt(s1 * sine * sine + cosine * cosine)
         return sine / (s0 * d + (1.0 - s0) * cosine)
     return np.tan(theta)
@@ -135,17 +131,17 @@ def angle(c: FloatArray, rho: float) -> float:
     if not rho <= c[LARGEST_RADIUS]:
         return np.nan
     kind, s0, s1 = int(c[KIND]), _shape(c, 0), _shape(c, 1)
-    if kind == _EQUIDISTANT:
+    if kind == EQUIDISTANT:
         return rho
-    if kind == _EQUISOLID:
+    if kind == EQUISOLID:
         return 2.0 * np.arcsin(0.5 * rho)
-    if kind in (_POLYNOMIAL, _DUAL):
+    if kind in (POLYNOMIAL, DUAL):
         return _search(c, rho)
-    if kind == _FOV and s0 != 0.0:
+    if kind == FOV and s0 != 0.0:
         return np.arctan(np.tan(rho * s0) / (2.0 * np.tan(0.5 * s0)))
-    if kind == _DIVISION:
+    if kind == DIVISION:
         return np.arctan2(rho, 1.0 + s0 * rho * rho)
-    if kind == _EUCM:
+    if kind == EUCM:
         q = s1 * rho * rho
         root = np.sqrt(max(1.0 - (2.0 * s0 - 1.0) * q, 0.0))
         up = (1.0 - s0 * s0 * q) / (s0 * root + 1.0 - s0)
@@ -181,7 +177,7 @@ def _search(c: FloatArray, rho: float) -> float:
         return np.nan
     theta = 0.5 * high
     for _ in range(100):
-        if c[KIND] == _DUAL:
+        if c[KIND] == DUAL:
             value, slope = _dual(_shape(c, 0), theta)
         else:
             value, slope = _polynomial(c, theta)

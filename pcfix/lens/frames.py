@@ -22,6 +22,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numba import njit, prange
 
+from pcfix.lens.algebra import Vector, dot, minus, row_of, scaled, times
 from pcfix.lens.formulas import (
     B2,
     B3,
@@ -164,8 +165,7 @@ def _largest_scale(lens: Lens, margin: float) -> float:
     return np.inf if np.isnan(longest).any() else float(longest.max())
 
 
-Plane: TypeAlias = tuple[float, float, float]
-Pyramid: TypeAlias = tuple[Plane, Plane, Plane, Plane]
+Pyramid: TypeAlias = tuple[Vector, Vector, Vector, Vector]
 
 NOT_DISTORTED = -1
 NOTHING, SOME, ALL = 0, 1, 2
@@ -240,50 +240,40 @@ def pyramid(g: FloatArray) -> Pyramid:
 
     As numbers they stay in registers; as an array they would be read again for every point.
     """
-    return (
-        (g[0, 0], g[0, 1], g[0, 2]),
-        (g[1, 0], g[1, 1], g[1, 2]),
-        (g[2, 0], g[2, 1], g[2, 2]),
-        (g[3, 0], g[3, 1], g[3, 2]),
-    )
+    return row_of(g, 0), row_of(g, 1), row_of(g, 2), row_of(g, 3)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def in_frame(g: Pyramid, ex: float, ey: float, ez: float) -> bool:
+def in_frame(g: Pyramid, e: Vector) -> bool:
     """Whether the point at C - e is on the inner side of all four planes."""
     return (
-        (g[0][0] * ex + g[0][1] * ey + g[0][2] * ez <= 0.0)
-        & (g[1][0] * ex + g[1][1] * ey + g[1][2] * ez <= 0.0)
-        & (g[2][0] * ex + g[2][1] * ey + g[2][2] * ez <= 0.0)
-        & (g[3][0] * ex + g[3][1] * ey + g[3][2] * ez <= 0.0)
+        (dot(g[0], e) <= 0.0)
+        & (dot(g[1], e) <= 0.0)
+        & (dot(g[2], e) <= 0.0)
+        & (dot(g[3], e) <= 0.0)
     )
 
 
 @njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
-def _image(lens: FloatArray, r: FloatArray, ex: float, ey: float, ez: float) -> tuple[float, float]:
+def _image(lens: FloatArray, r: FloatArray, e: Vector) -> tuple[float, float]:
     """Return where a lens with rotation r images the point at C - e."""
-    return image_of(
-        lens,
-        -(r[0, 0] * ex + r[0, 1] * ey + r[0, 2] * ez),
-        -(r[1, 0] * ex + r[1, 1] * ey + r[1, 2] * ez),
-        -(r[2, 0] * ex + r[2, 1] * ey + r[2, 2] * ez),
-    )
+    return image_of(lens, *scaled(-1.0, times(r, e)))
 
 
 @njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
-def _images(lens: FloatArray, r: FloatArray, ex: float, ey: float, ez: float) -> bool:
+def _images(lens: FloatArray, r: FloatArray, e: Vector) -> bool:
     """Whether that place is in the frame."""
-    u, v = _image(lens, r, ex, ey, ez)
+    u, v = _image(lens, r, e)
     return (u >= 0.0) & (u <= lens[WIDTH]) & (v >= 0.0) & (v <= lens[HEIGHT])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def holds(frames: Frames, c: int, ex: float, ey: float, ez: float) -> bool:
+def holds(frames: Frames, c: int, e: Vector) -> bool:
     """Whether the frame of camera c holds the point at C - e, distortion included."""
-    if not in_frame(pyramid(frames.planes[c]), ex, ey, ez):
+    if not in_frame(pyramid(frames.planes[c]), e):
         return False
     row = frames.row[c]
-    return row == NOT_DISTORTED or _images(frames.lenses[row], frames.rotations[c], ex, ey, ez)
+    return row == NOT_DISTORTED or _images(frames.lenses[row], frames.rotations[c], e)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -293,7 +283,7 @@ def mark_pyramid(
     """Set to 1 the marks of points in a frame without distortion, to 0 those of others."""
     cx, cy, cz = centre[0], centre[1], centre[2]
     for j in range(marks.size):
-        marks[j] = 1.0 if in_frame(g, cx - x[j], cy - y[j], cz - z[j]) else 0.0
+        marks[j] = 1.0 if in_frame(g, (cx - x[j], cy - y[j], cz - z[j])) else 0.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -320,8 +310,8 @@ def _mark_any(
     """Take any lens, point by point."""
     count = 0
     for j in range(marks.size):
-        ex, ey, ez = centre[0] - x[j], centre[1] - y[j], centre[2] - z[j]
-        inside = in_frame(around, ex, ey, ez) and _images(lens, r, ex, ey, ez)
+        e = centre[0] - x[j], centre[1] - y[j], centre[2] - z[j]
+        inside = in_frame(around, e) and _images(lens, r, e)
         marks[j] = 1.0 if inside else 0.0
         count += 1 if inside else 0
     return count
@@ -380,20 +370,21 @@ def judge(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: Flo
     `ALL`, `NOTHING` or `SOME`; never wrongly one of the first two. The box is taken as the ball
     around it, seen from the camera under the angle `turn` about its middle.
     """
-    ex = centre[0] - 0.5 * (low[0] + high[0])
-    ey = centre[1] - 0.5 * (low[1] + high[1])
-    ez = centre[2] - 0.5 * (low[2] + high[2])
-    far2 = ex * ex + ey * ey + ez * ez
+    e = (
+        centre[0] - 0.5 * (low[0] + high[0]),
+        centre[1] - 0.5 * (low[1] + high[1]),
+        centre[2] - 0.5 * (low[2] + high[2]),
+    )
+    far2 = dot(e, e)
     size2 = (high[0] - low[0]) ** 2 + (high[1] - low[1]) ** 2 + (high[2] - low[2]) ** 2
     if not 0.25 * size2 < far2:
         return SOME
     turn = np.arcsin(np.sqrt(0.25 * size2 / far2)) + 1e-6
-    axis, widest = frames.cone[c, :3], frames.cone[c, 3]
-    along = -(axis[0] * ex + axis[1] * ey + axis[2] * ez) / np.sqrt(far2)
-    if np.arccos(max(-1.0, min(1.0, along))) > widest + turn:
+    along = -dot(row_of(frames.cone, c), e) / np.sqrt(far2)
+    if np.arccos(max(-1.0, min(1.0, along))) > frames.cone[c, 3] + turn:
         return NOTHING
     lens, r = frames.lenses[frames.row[c]], frames.rotations[c]
-    u, v = _image(lens, r, ex, ey, ez)
+    u, v = _image(lens, r, e)
     within = min(min(u, lens[WIDTH] - u), min(v, lens[HEIGHT] - v))
     move, margin = turn * frames.reach[c, 0], frames.reach[c, 1]
     if within > move:
@@ -427,9 +418,7 @@ def _count(xyz: FloatArray, centres: FloatArray, frames: Frames) -> IntArray:
     counts = np.zeros(len(xyz), np.int64)
     for i in prange(len(xyz)):
         for c in range(len(centres)):
-            ex, ey, ez = centres[c, 0] - xyz[i, 0], centres[c, 1] - xyz[i, 1], 0.0
-            ez = centres[c, 2] - xyz[i, 2]
-            counts[i] += holds(frames, c, ex, ey, ez)
+            counts[i] += holds(frames, c, minus(row_of(centres, c), row_of(xyz, i)))
     return counts
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 
 from pcfix.lens import formulas as places
+from pcfix.lens.algebra import Vector, times, transposed_times
 from pcfix.lens.formulas import (
     CODES,
     RIGHT_ANGLE,
@@ -27,12 +28,6 @@ from pcfix.lens.formulas import (
     undistorted,
 )
 from pcfix.model import FloatArray, IntArray, Lens
-
-_KIND, _LARGEST_ANGLE, _INVERSE = places.KIND, places.LARGEST_ANGLE, places.INVERSE
-_CENTRE_X, _CENTRE_Y = places.CENTRE_X, places.CENTRE_Y
-_FOCAL_X, _B2, _B3, _FOCAL_Y = places.FOCAL_X, places.B2, places.B3, places.FOCAL_Y
-_PRINCIPAL_X, _PRINCIPAL_Y = places.PRINCIPAL_X, places.PRINCIPAL_Y
-_PERSPECTIVE = CODES["perspective"]
 
 
 def project(lens: Lens, directions: FloatArray) -> FloatArray:
@@ -76,17 +71,17 @@ def unproject(lens: Lens, image_xy: FloatArray) -> FloatArray:
 def coefficients(lens: Lens) -> FloatArray:
     """Return a lens as the flat array that the kernels take, see `pcfix.lens.formulas`."""
     c = np.zeros(places.TAIL)
-    c[_KIND] = CODES[lens.projection]
+    c[places.KIND] = CODES[lens.projection]
     c[places.TANGENTIAL : places.TANGENTIAL + 4] = _filled(lens.tangential, 4)[:4]
     c[places.THIN_PRISM : places.THIN_PRISM + 4] = _filled(lens.thin_prism, 4)[:4]
-    c[places.IN_TURN], c[_INVERSE] = lens.in_turn, lens.inverse
-    c[_CENTRE_X : _CENTRE_Y + 1] = lens.distortion_centre
-    c[_FOCAL_X : _FOCAL_Y + 1] = lens.focal + lens.b1, lens.b2, lens.b3, lens.focal
-    c[_PRINCIPAL_X : _PRINCIPAL_Y + 1] = lens.principal_x, lens.principal_y
+    c[places.IN_TURN], c[places.INVERSE] = lens.in_turn, lens.inverse
+    c[places.CENTRE_X : places.CENTRE_Y + 1] = lens.distortion_centre
+    c[places.FOCAL_X : places.FOCAL_Y + 1] = lens.focal + lens.b1, lens.b2, lens.b3, lens.focal
+    c[places.PRINCIPAL_X : places.PRINCIPAL_Y + 1] = lens.principal_x, lens.principal_y
     c[places.WIDTH : places.HEIGHT + 1] = lens.width, lens.height
     c[places.PLAIN] = _is_plain(lens)
     c = _with_tail(c, lens)
-    c[_LARGEST_ANGLE] = largest_angle(lens)
+    c[places.LARGEST_ANGLE] = largest_angle(lens)
     c[places.LARGEST_RADIUS] = largest_radius(c)
     c[places.DISC] = largest_disc(lens, c)
     c.setflags(write=False)
@@ -135,11 +130,11 @@ def _is_plain(lens: Lens) -> bool:
 @njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 def in_plane(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]:
     """Return the plane coordinates of a direction, before distortion."""
-    if c[_KIND] == _PERSPECTIVE:
+    if c[places.KIND] == places.PERSPECTIVE:
         return (x / z, y / z) if z > 0.0 else (np.nan, np.nan)
     across = np.sqrt(x * x + y * y)
     theta = np.arctan2(across, z)
-    if not theta <= c[_LARGEST_ANGLE]:
+    if not theta <= c[places.LARGEST_ANGLE]:
         return np.nan, np.nan
     if across == 0.0:
         return (0.0, 0.0) if z > 0.0 else (np.nan, np.nan)
@@ -151,25 +146,25 @@ def in_plane(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]
 def image_of(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]:
     """Return u, v of one direction."""
     px, py = in_plane(c, x, y, z)
-    cx, cy = c[_CENTRE_X], c[_CENTRE_Y]
-    if c[_INVERSE] != 0.0:
+    cx, cy = c[places.CENTRE_X], c[places.CENTRE_Y]
+    if c[places.INVERSE] != 0.0:
         dx, dy = undistorted(c, px - cx, py - cy)
     else:
         dx, dy = distorted(c, px - cx, py - cy)
     dx, dy = dx + cx, dy + cy
-    u = c[_PRINCIPAL_X] + c[_FOCAL_X] * dx + c[_B2] * dy
-    return u, c[_PRINCIPAL_Y] + c[_FOCAL_Y] * dy + c[_B3] * dx
+    u = c[places.PRINCIPAL_X] + c[places.FOCAL_X] * dx + c[places.B2] * dy
+    return u, c[places.PRINCIPAL_Y] + c[places.FOCAL_Y] * dy + c[places.B3] * dx
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def direction_of(c: FloatArray, u: float, v: float) -> tuple[float, float, float]:
     """Return the unit direction of one place in the image."""
-    cx, cy = c[_CENTRE_X], c[_CENTRE_Y]
-    u, v = u - c[_PRINCIPAL_X], v - c[_PRINCIPAL_Y]
-    det = c[_FOCAL_X] * c[_FOCAL_Y] - c[_B2] * c[_B3]
-    dx = (c[_FOCAL_Y] * u - c[_B2] * v) / det - cx
-    dy = (c[_FOCAL_X] * v - c[_B3] * u) / det - cy
-    if c[_INVERSE] != 0.0:
+    cx, cy = c[places.CENTRE_X], c[places.CENTRE_Y]
+    u, v = u - c[places.PRINCIPAL_X], v - c[places.PRINCIPAL_Y]
+    det = c[places.FOCAL_X] * c[places.FOCAL_Y] - c[places.B2] * c[places.B3]
+    dx = (c[places.FOCAL_Y] * u - c[places.B2] * v) / det - cx
+    dy = (c[places.FOCAL_X] * v - c[places.B3] * u) / det - cy
+    if c[places.INVERSE] != 0.0:
         px, py = distorted(c, dx, dy)
     else:
         px, py = undistorted(c, dx, dy)
@@ -201,15 +196,6 @@ def _unproject(c: FloatArray, image: FloatArray) -> FloatArray:
 Gradients: TypeAlias = tuple[float, float, float, float, float, float]
 """Of two numbers by three others: a_x, a_y, a_z, b_x, b_y, b_z."""
 
-_KIND, _SHAPE, _SHAPES, _INVERSE = places.KIND, places.SHAPE, places.SHAPES, places.INVERSE
-_CENTRE_X, _CENTRE_Y, _B2, _B3 = places.CENTRE_X, places.CENTRE_Y, places.B2, places.B3
-_FOCAL_X, _FOCAL_Y = places.FOCAL_X, places.FOCAL_Y
-_PRINCIPAL_X, _PRINCIPAL_Y = places.PRINCIPAL_X, places.PRINCIPAL_Y
-_PERSPECTIVE, _EQUIDISTANT, _EQUISOLID = (
-    CODES[name] for name in ("perspective", "equidistant", "equisolid")
-)
-_POLYNOMIAL, _FOV, _DUAL = (CODES[name] for name in ("polynomial", "fov", "dual"))
-_DIVISION, _EUCM = CODES["division"], CODES["eucm"]
 _NOWHERE = (np.nan,) * 6
 
 
@@ -237,8 +223,8 @@ def image_and_gradients(
         Of u and v by x, y, z, per unit of the direction.
     """
     px, py, (ax, ay, az, bx, by, bz) = _plane_and_gradients(c, x, y, z)
-    px, py = px - c[_CENTRE_X], py - c[_CENTRE_Y]
-    if c[_INVERSE] != 0.0:
+    px, py = px - c[places.CENTRE_X], py - c[places.CENTRE_Y]
+    if c[places.INVERSE] != 0.0:
         dx, dy = undistorted(c, px, py)
         xx, xy, yx, yy = jacobian(c, dx, dy)
         det = xx * yy - xy * yx
@@ -246,18 +232,30 @@ def image_and_gradients(
     else:
         dx, dy = distorted(c, px, py)
         xx, xy, yx, yy = jacobian(c, px, py)
-    dx, dy = dx + c[_CENTRE_X], dy + c[_CENTRE_Y]
-    fx, fy, b2, b3 = c[_FOCAL_X], c[_FOCAL_Y], c[_B2], c[_B3]
+    dx, dy = dx + c[places.CENTRE_X], dy + c[places.CENTRE_Y]
+    fx, fy, b2, b3 = c[places.FOCAL_X], c[places.FOCAL_Y], c[places.B2], c[places.B3]
     ua, ub = fx * xx + b2 * yx, fx * xy + b2 * yy
     va, vb = fy * yx + b3 * xx, fy * yy + b3 * xy
     return (
-        c[_PRINCIPAL_X] + fx * dx + b2 * dy,
-        c[_PRINCIPAL_Y] + fy * dy + b3 * dx,
+        c[places.PRINCIPAL_X] + fx * dx + b2 * dy,
+        c[places.PRINCIPAL_Y] + fy * dy + b3 * dx,
         (
             ua * ax + ub * bx, ua * ay + ub * by, ua * az + ub * bz,
             va * ax + vb * bx, va * ay + vb * by, va * az + vb * bz,
         ),
     )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def image_in_world(
+    c: FloatArray, r: FloatArray, direction: Vector
+) -> tuple[float, float, Vector, Vector]:
+    """Return where a camera with rotation r images a direction, and how u and v move with it.
+
+    The direction and the gradients of u and v are in the world frame.
+    """
+    u, v, g = image_and_gradients(c, *times(r, direction))
+    return u, v, transposed_times(r, g[:3]), transposed_times(r, g[3:])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -269,7 +267,7 @@ def _plane_and_gradients(
     With the radius rho(theta), q^2 = x^2 + y^2 and r^2 = q^2 + z^2 they are (rho / q) (x, y),
     and theta = atan2(q, z) has the gradient (z / r^2) by q and (-q / r^2) by z.
     """
-    if c[_KIND] == _PERSPECTIVE:
+    if c[places.KIND] == places.PERSPECTIVE:
         if not z > 0.0:
             return np.nan, np.nan, _NOWHERE
         px, py = x / z, y / z
@@ -295,25 +293,25 @@ def _plane_and_gradients(
 @njit(cache=True, error_model="numpy", nogil=True)
 def _radius_slope(c: FloatArray, theta: float, rho: float) -> float:
     """Return d rho / d theta of `pcfix.lens.formulas.radius`."""
-    kind = int(c[_KIND])
-    s0, s1 = c[int(c[_SHAPE])], c[int(c[_SHAPE]) + 1]
+    kind = int(c[places.KIND])
+    s0, s1 = c[int(c[places.SHAPE])], c[int(c[places.SHAPE]) + 1]
     sine, cosine = np.sin(theta), np.cos(theta)
-    if kind == _EQUIDISTANT:
+    if kind == places.EQUIDISTANT:
         return 1.0
-    if kind == _EQUISOLID:
+    if kind == places.EQUISOLID:
         return np.cos(0.5 * theta)
-    if kind == _POLYNOMIAL:
+    if kind == places.POLYNOMIAL:
         return _polynomial_slope(c, theta)
-    if kind == _FOV and s0 != 0.0:
+    if kind == places.FOV and s0 != 0.0:
         twice = 2.0 * np.tan(0.5 * s0)
         return twice / (s0 * (cosine * cosine + twice * twice * sine * sine))
-    if kind == _DUAL:
+    if kind == places.DUAL:
         return 1.0 if s0 == 0.0 else s0 / (cosine * cosine) + 1.0 - s0
-    if kind == _DIVISION:
+    if kind == places.DIVISION:
         # rho cos = (1 + s0 rho^2) sin, differentiated; safe beyond a right angle
         above = (1.0 + s0 * rho * rho) * cosine + rho * sine
         return above / (cosine - 2.0 * s0 * rho * sine)
-    if kind == _EUCM:
+    if kind == places.EUCM:
         d = np.sqrt(s1 * sine * sine + cosine * cosine)
         below = s0 * d + (1.0 - s0) * cosine
         below_slope = s0 * (s1 - 1.0) * sine * cosine / d - (1.0 - s0) * sine
@@ -325,6 +323,6 @@ def _radius_slope(c: FloatArray, theta: float, rho: float) -> float:
 def _polynomial_slope(c: FloatArray, theta: float) -> float:
     """Return the slope of Pix4D's polynomial, in which a right angle counts as 1."""
     q, slope = theta / RIGHT_ANGLE, 0.0
-    for i in range(int(c[_SHAPES]) - 1, 0, -1):
-        slope = slope * q + i * c[int(c[_SHAPE]) + i]
+    for i in range(int(c[places.SHAPES]) - 1, 0, -1):
+        slope = slope * q + i * c[int(c[places.SHAPE]) + i]
     return slope / RIGHT_ANGLE

@@ -19,18 +19,31 @@ of the true point that they lead to. There may be several such sets; then the po
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit, prange
 
 from pcfix.errors import SettingError
+from pcfix.lens.algebra import (
+    Vector,
+    column_of,
+    minus,
+    plus,
+    row_of,
+    scaled,
+    times,
+    transposed_times,
+)
 from pcfix.lens.frames import Frames, frames_of, holds, no_frames
-from pcfix.model import Cameras, FloatArray, IntArray, Outcome, Views
+from pcfix.lens.imaging import lens_table
+from pcfix.model import NOMINAL_WIDTH_PX, Cameras, FloatArray, IntArray, Lens, Outcome, Views
 from pcfix.options.correct import ScienceOptions
-from pcfix.port.light import Vector, coefficients, cosine_at_port, ray_through, through_port
+from pcfix.port.light import coefficients, cosine_at_port, ray_through, through_port
 from pcfix.port.shapes import Port
 from pcfix.refract.batch import Intersection
-from pcfix.refract.choice import ANY_NUMBER, TILE, near_cameras, spatial_order
-from pcfix.refract.rays import line_terms, nearest_point
+from pcfix.refract.choice import ANY_NUMBER, NOMINAL_FOCAL_PX, TILE, near_cameras, spatial_order
+from pcfix.refract.rays import add_line, nearest_point
 from pcfix.threads import one_caller
 
 _NO_CAMERA, _ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
@@ -38,6 +51,44 @@ _PARALLEL, _CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
 
 # Columns of the result after the shift.
 _MISS, _SIGMA_Z, _COSINE, _OUTCOME = 3, 4, 5, 6
+
+
+class Rig(NamedTuple):
+    """The k cameras and the port before each of them, for kernels.
+
+    Attributes
+    ----------
+    centres, rotations : array, shapes (k, 3) and (k, 3, 3)
+        Metres, world frame; world to camera.
+    row, lenses : array
+        The lens of each camera in a table, see `pcfix.lens.imaging.lens_table`; without lenses
+        that of a survey drone.
+    port : array
+        See `pcfix.port.light.coefficients`.
+    n : float
+        Refractive index of the water.
+    """
+
+    centres: FloatArray
+    rotations: FloatArray
+    row: IntArray
+    lenses: FloatArray
+    port: FloatArray
+    n: float
+
+
+def lenses_of(cameras: Cameras) -> tuple[Lens, ...]:
+    """Return the lenses of cameras; without, those of a survey drone."""
+    nominal = Lens(NOMINAL_FOCAL_PX, NOMINAL_WIDTH_PX, NOMINAL_WIDTH_PX, 0.0, 0.0)
+    return cameras.lenses or (nominal,) * len(cameras)
+
+
+def rig_of(cameras: Cameras, port: Port, settings: ScienceOptions) -> Rig:
+    """Return the cameras and their port for kernels."""
+    centres, rotations = np.ascontiguousarray(cameras.centres), rotations_of(cameras)
+    table = lens_table(lenses_of(cameras))
+    c = coefficients(port)
+    return Rig(centres, np.ascontiguousarray(rotations), *table, c, settings.refractive_index)
 
 
 def intersect_rays(
@@ -74,10 +125,7 @@ def intersect_rays(
             np.ascontiguousarray(directions, np.float64),
             np.ascontiguousarray(views.start, np.int64),
             np.ascontiguousarray(views.camera, np.int64),
-            np.ascontiguousarray(cameras.centres),
-            np.ascontiguousarray(rotations_of(cameras)),
-            coefficients(port),
-            settings.refractive_index,
+            rig_of(cameras, port, settings),
             result,
         )
     outcome = result[:, _OUTCOME].astype(np.uint8)
@@ -121,27 +169,24 @@ def port_views(
         In the order of the cameras, or of `views`.
     """
     limit = settings.max_angle
-    order = spatial_order(xyz)
     count = np.zeros(len(xyz) + 1, np.int64)
     common = (
-        order,
-        (len(xyz) + TILE - 1) // TILE,
+        spatial_order(xyz),
         np.ascontiguousarray(xyz),
-        np.ascontiguousarray(cameras.centres),
-        np.ascontiguousarray(rotations_of(cameras)),
+        rig_of(cameras, port, settings),
         frames_of(cameras) if views is None else no_frames(len(cameras)),
         None if views is None else (views.start, views.camera),
-        coefficients(port),
-        0.0 if limit is None else float(np.cos(np.radians(limit))),
-        settings.max_cameras or ANY_NUMBER,
+        (
+            0.0 if limit is None else float(np.cos(np.radians(limit))),
+            settings.max_cameras or ANY_NUMBER,
+        ),
         None if shift_m is None else np.ascontiguousarray(shift_m),
-        settings.refractive_index,
     )
     with one_caller():
-        _choose(*common, count, np.zeros(0, np.int64), False)
+        _choose(*common, count, np.zeros(0, np.int64))
         start = np.cumsum(count)
         chosen = np.empty(start[-1], np.int64)
-        _choose(*common, start, chosen, True)
+        _choose(*common, start, chosen)
     return Views(start, chosen)
 
 
@@ -157,30 +202,26 @@ def rotations_of(cameras: Cameras) -> FloatArray:
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _choose(
-    order: IntArray, tiles: int, xyz: FloatArray, centres: FloatArray, rotations: FloatArray,
-    frames: Frames, views: tuple[IntArray, IntArray] | None, port: FloatArray,
-    least_cosine: float, most: int, shift: FloatArray | None, n: float,
-    start: IntArray, chosen: IntArray, fill: bool,
+    order: IntArray, xyz: FloatArray, rig: Rig, frames: Frames,
+    views: tuple[IntArray, IntArray] | None, limits: tuple[float, int], shift: FloatArray | None,
+    start: IntArray, chosen: IntArray,
 ) -> None:  # fmt: skip
-    """Count the cameras of point i into ``start[i + 1]``, or fill them in from ``start[i]``."""
-    for t in prange(tiles):
+    """Fill in the cameras of point i from ``start[i]``; without room count to ``start[i + 1]``."""
+    for t in prange((len(xyz) + TILE - 1) // TILE):
         rows = order[t * TILE : (t + 1) * TILE]
         near = rows[:0]
         if views is None:
             low, high = _box(xyz, rows, shift)
-            near = near_cameras(frames, centres, low, high)
+            near = near_cameras(frames, rig.centres, low, high)
         for i in rows:
             candidates = near
             if views is not None:
                 candidates = views[1][views[0][i] : views[0][i + 1]].astype(np.int64)
-            place = xyz[i]
+            place = row_of(xyz, i)
             if shift is not None:
-                place = xyz[i] + shift[i]
-            kept = _usable(
-                candidates, place, centres, rotations, frames, port, least_cosine, most,
-                shift is not None, n,
-            )  # fmt: skip
-            if fill:
+                place = plus(place, row_of(shift, i))
+            kept = _usable(candidates, place, rig, frames, limits, shift is not None)
+            if chosen.size:
                 chosen[start[i] : start[i] + kept.size] = kept
             else:
                 start[i + 1] = kept.size
@@ -207,26 +248,26 @@ def _box(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _usable(
-    candidates: IntArray, point: FloatArray, centres: FloatArray, rotations: FloatArray,
-    frames: Frames, port: FloatArray, least_cosine: float, most: int, through: bool, n: float,
+    candidates: IntArray, point: Vector, rig: Rig, frames: Frames, limits: tuple[float, int],
+    through: bool,
 ) -> IntArray:  # fmt: skip
     """Return the cameras that give a ray, in their order: at most so many, the steepest.
 
     The point is seen along a straight line, or through the port.
     """
+    least_cosine, most = limits
     kept, cosine = np.empty(candidates.size, np.int64), np.empty(candidates.size)
     out = np.empty((3, 5))
     k = 0
     for c in candidates:
-        r = rotations[c]
-        x, y, z = point[0] - centres[c, 0], point[1] - centres[c, 1], point[2] - centres[c, 2]
-        wx, wy, wz = in_camera(r, x, y, z)
+        r, x = rig.rotations[c], minus(point, row_of(rig.centres, c))
+        w = times(r, x)
         if through:
-            through_port(port, n, wx, wy, wz, out)
-            wx, wy, wz = out[0, 0], out[1, 0], out[2, 0]
-            x, y, z = in_world(r, wx, wy, wz)
-        steep = cosine_at_port(port, wx, wy, wz)
-        if steep > 0.0 and steep >= least_cosine and holds(frames, c, -x, -y, -z):
+            through_port(rig.port, rig.n, *w, out)
+            w = column_of(out, 0)
+            x = transposed_times(r, w)
+        steep = cosine_at_port(rig.port, *w)
+        if steep > 0.0 and steep >= least_cosine and holds(frames, c, scaled(-1.0, x)):
             kept[k], cosine[k] = c, steep
             k += 1
     if k <= most:
@@ -236,67 +277,36 @@ def _usable(
     return kept[ranked]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def in_camera(r: FloatArray, x: float, y: float, z: float) -> Vector:
-    """Return a vector of the world in the frame of a camera."""
-    return (
-        r[0, 0] * x + r[0, 1] * y + r[0, 2] * z,
-        r[1, 0] * x + r[1, 1] * y + r[1, 2] * z,
-        r[2, 0] * x + r[2, 1] * y + r[2, 2] * z,
-    )
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def in_world(r: FloatArray, x: float, y: float, z: float) -> Vector:
-    """Return a vector of the frame of a camera in the world."""
-    return (
-        r[0, 0] * x + r[1, 0] * y + r[2, 0] * z,
-        r[0, 1] * x + r[1, 1] * y + r[2, 1] * z,
-        r[0, 2] * x + r[1, 2] * y + r[2, 2] * z,
-    )
-
-
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _intersect(
-    near: FloatArray, directions: FloatArray, start: IntArray, camera: IntArray,
-    centres: FloatArray, rotations: FloatArray, port: FloatArray, n: float, result: FloatArray,
+    near: FloatArray, directions: FloatArray, start: IntArray, camera: IntArray, rig: Rig,
+    result: FloatArray,
 ) -> None:  # fmt: skip
     """Intersect the rays of each point, with the place near it as the origin."""
     for i in prange(len(near)):
-        row, sums = result[i], np.zeros(9)
-        least, k = 1.0, 0
+        sums, least, k = np.zeros(9), 1.0, 0
         for o in range(start[i], start[i + 1]):
-            r, centre = rotations[camera[o]], centres[camera[o]]
-            dx, dy, dz = directions[o, 0], directions[o, 1], directions[o, 2]
-            ax, ay, az, tx, ty, tz = ray_through(port, n, dx, dy, dz)
-            if np.isnan(ax + tx):
+            r, d = rig.rotations[camera[o]], row_of(directions, o)
+            ray = ray_through(rig.port, rig.n, *d)
+            if np.isnan(ray[0] + ray[3]):
                 continue
-            ax, ay, az = in_world(r, ax, ay, az)
-            tx, ty, tz = in_world(r, tx, ty, tz)
-            ax, ay, az = (
-                ax + (centre[0] - near[i, 0]),
-                ay + (centre[1] - near[i, 1]),
-                az + (centre[2] - near[i, 2]),
-            )
-            terms = line_terms(ax, ay, az, tx, ty, tz, 1.0)
-            for j in range(9):
-                sums[j] += terms[j]
-            least = min(least, cosine_at_port(port, dx, dy, dz))
+            away = minus(row_of(rig.centres, camera[o]), row_of(near, i))
+            a, t = plus(transposed_times(r, ray[:3]), away), transposed_times(r, ray[3:])
+            add_line(sums, a, t, 1.0)
+            least = min(least, cosine_at_port(rig.port, *d))
             k += 1
-        _solve(row, sums, k, least)
+        _solve(result[i], sums, k, least)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _solve(row: FloatArray, s: FloatArray, k: int, cosine: float) -> None:
+def _solve(row: FloatArray, sums: FloatArray, k: int, cosine: float) -> None:
     """Solve one point and write its row; a point without a solution keeps a shift of zero."""
     if k < 2:
         row[_OUTCOME] = _ONE_CAMERA if k == 1 else _NO_CAMERA
         return
-    solved, qx, qy, qz, miss, sigma_z = nearest_point(
-        float(k), s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8]
-    )
+    solved, q, miss, sigma_z = nearest_point(float(k), sums)
     if not solved:
         row[_OUTCOME] = _PARALLEL
         return
-    row[0], row[1], row[2] = qx, qy, qz
+    row[0], row[1], row[2] = q
     row[_MISS], row[_SIGMA_Z], row[_COSINE], row[_OUTCOME] = miss, sigma_z, cosine, _CORRECTED

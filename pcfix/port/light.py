@@ -21,25 +21,12 @@ from typing import TypeAlias
 import numpy as np
 from numba import njit
 
+from pcfix.lens.algebra import Vector, beyond, dot, minus, plus, scaled, unit
 from pcfix.model import FloatArray
 from pcfix.port.shapes import DomePort, FlatPort, Port
 
-Vector: TypeAlias = tuple[float, float, float]
 Ray: TypeAlias = tuple[float, float, float, float, float, float]
 """A place and a unit direction."""
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def dot(a: Vector, b: Vector) -> float:
-    """Return a.b."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def unit(a: Vector) -> Vector:
-    """Return a vector of length 1; NaN for one without length."""
-    scale = 1.0 / np.sqrt(dot(a, a)) if dot(a, a) > 0.0 else np.nan
-    return scale * a[0], scale * a[1], scale * a[2]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -58,7 +45,7 @@ def bent(s: Vector, normal: Vector, r: float) -> Vector:
     """
     c = dot(normal, s)
     k = np.sqrt(1.0 - r * r * (1.0 - c * c)) - r * c
-    return r * s[0] + k * normal[0], r * s[1] + k * normal[1], r * s[2] + k * normal[2]
+    return plus(scaled(r, s), scaled(k, normal))
 
 
 FLAT_STEPS = 60
@@ -90,13 +77,9 @@ def through_flat(
 
     Of G(k, D, s.s, n) = 0, implicitly, with grad D = N and grad s.s = 2 s.
     """
-    along = normal[0] * point[0] + normal[1] * point[1] + normal[2] * point[2]
-    aside = (
-        point[0] - along * normal[0],
-        point[1] - along * normal[1],
-        point[2] - along * normal[2],
-    )
-    aside2 = aside[0] * aside[0] + aside[1] * aside[1] + aside[2] * aside[2]
+    along = dot(normal, point)
+    aside = minus(point, scaled(along, normal))
+    aside2 = dot(aside, aside)
     depth = along - distance - thickness
     k = _slope(distance, thickness, depth, aside2, glass, n)
     g2, n2, t2 = glass * glass, n * n, k * k * aside2
@@ -147,10 +130,7 @@ def ray_through_flat(
         inside = (np.nan, np.nan, np.nan)
     f, h = distance / steep, thickness / dot(normal, inside)
     t = bent(inside, normal, glass / n)
-    return (
-        f * s[0] + h * inside[0], f * s[1] + h * inside[1], f * s[2] + h * inside[2],
-        t[0], t[1], t[2],
-    )  # fmt: skip
+    return plus(scaled(f, s), scaled(h, inside)) + t
 
 
 DOME_STEPS = 100
@@ -263,15 +243,14 @@ def through_dome(
     Implicitly, with grad R = e, grad v = (o - v e) / R and grad u = -2 v grad v.
     """
     b = a + thickness
-    x = point[0] - centre[0], point[1] - centre[1], point[2] - centre[2]
+    x = minus(point, centre)
     far = np.sqrt(dot(x, x))
     if not far > b:
         out[:] = np.nan
         return
-    e = unit(x)
-    o = -centre[0], -centre[1], -centre[2]
+    e, o = unit(x), scaled(-1.0, centre)
     v = dot(o, e)
-    across = o[0] - v * e[0], o[1] - v * e[1], o[2] - v * e[2]
+    across = minus(o, scaled(v, e))
     u = dot(across, across)
     q = _place(v, u, far, a, b, glass, n)
     _, by_q, by_v, by_u, by_far, by_n = _miss(q, v, u, far, a, b, glass, n)
@@ -297,15 +276,12 @@ def ray_through_dome(
     centre: Vector, a: float, thickness: float, glass: float, n: float, direction: Vector
 ) -> Ray:
     """Return the ray behind a dome, as `pcfix.port.light.ray_through`."""
-    o = -centre[0], -centre[1], -centre[2]
-    s = unit(direction)
+    o, s = scaled(-1.0, centre), unit(direction)
     inner = _meet(o, s, a)
     inside = bent(s, unit(inner), 1.0 / glass)
     outer = _meet(inner, inside, a + thickness)
     t = bent(inside, unit(outer), glass / n)
-    return (
-        outer[0] + centre[0], outer[1] + centre[1], outer[2] + centre[2], t[0], t[1], t[2],
-    )  # fmt: skip
+    return plus(outer, centre) + t
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -313,14 +289,13 @@ def _meet(start: Vector, s: Vector, radius: float) -> Vector:
     """Return where a ray that starts inside a sphere about the origin, or on it, leaves it."""
     along = dot(start, s)
     f = -along + np.sqrt(along * along + max(radius * radius - dot(start, start), 0.0))
-    return start[0] + f * s[0], start[1] + f * s[1], start[2] + f * s[2]
+    return beyond(start, f, s)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def cosine_at_dome(centre: Vector, a: float, direction: Vector) -> float:
     """Return the cosine of the angle at which a ray from the projection centre meets a dome."""
-    o = -centre[0], -centre[1], -centre[2]
-    s = unit(direction)
+    o, s = scaled(-1.0, centre), unit(direction)
     return dot(s, unit(_meet(o, s, a)))
 
 

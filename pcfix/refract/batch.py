@@ -11,6 +11,7 @@ one geometry is a direction in the other, through the lens of either (`MadeWith`
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -18,6 +19,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from pcfix.errors import PcfixWarning
+from pcfix.lens.algebra import Vector, times, transposed_times
 from pcfix.lens.imaging import direction_of, image_of, lens_table
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Outcome, Views, WaterSurface
 from pcfix.options.correct import ScienceOptions
@@ -153,6 +156,23 @@ class Batch:
         """Rays of each point, shape (m,)."""
         return np.diff(self.rays.start)
 
+    def chosen(self) -> Chosen:
+        """Return the points and their cameras for kernels."""
+        survey = self.survey
+        made_xyz = self.xyz if self.made_with is None else self.made_with.xyz
+        return Chosen(
+            np.ascontiguousarray(self.xyz),
+            np.ascontiguousarray(made_xyz),
+            np.ascontiguousarray(self.surface.height_m),
+            np.ascontiguousarray(self.surface.slope),
+            self.normals(),
+            np.ascontiguousarray(survey.cameras.centres),
+            survey.offset_m,
+            np.ascontiguousarray(self.rays.start, np.int64),
+            np.ascontiguousarray(self.rays.camera, np.int64),
+            survey.settings.refractive_index,
+        )
+
     @property
     def owner(self) -> IntArray:
         """The point of each ray, shape (rays,)."""
@@ -242,6 +262,69 @@ class Intersection(NamedTuple):
     covariance_m2: FloatArray | None = None
 
 
+def warn_of_unsolved(beginning: str, found: BoolArray) -> None:
+    """Warn of the points that are moved without a solution; `found` has one entry for each."""
+    if not found.all():
+        unsolved = int((~found).sum())
+        warnings.warn(
+            f"{beginning} for {unsolved:,} of {len(found):,} points; they have that of snell.",
+            PcfixWarning,
+            stacklevel=3,
+        )
+
+
+class Chosen(NamedTuple):
+    """Points, the water above them and the cameras chosen for each, for kernels; see `Batch`.
+
+    Flat, as kernels that run in parallel have no place for tuples within tuples.
+
+    Attributes
+    ----------
+    xyz, made_xyz : array, shape (m, 3)
+        Apparent points, as they are corrected and as the matcher had them.
+    height : array, shape (m,)
+    slope : array, shape (m, 2)
+    normals : array, shape (m, 3)
+        Of the water above each point.
+    centres, offset : array, shapes (k, 3) and (k,)
+        Projection centres, and how much higher the water stood for each.
+    start, camera : array
+        Those of point i are ``camera[start[i] : start[i + 1]]``.
+    n : float
+        Refractive index.
+    """
+
+    xyz: FloatArray
+    made_xyz: FloatArray
+    height: FloatArray
+    slope: FloatArray
+    normals: FloatArray
+    centres: FloatArray
+    offset: FloatArray
+    start: IntArray
+    camera: IntArray
+    n: float
+
+
+class Optics(NamedTuple):
+    """The k cameras as they image, for kernels.
+
+    Rotations from the world, shape (k, 3, 3); the lens of each as a row of the table `lenses`, see
+    `pcfix.lens.imaging.lens_table`.
+    """
+
+    rotations: FloatArray
+    row: IntArray
+    lenses: FloatArray
+
+
+def optics_of(cameras: Cameras) -> Optics:
+    """Return the angles and lenses of cameras that have them."""
+    return Optics(
+        np.ascontiguousarray(cameras.rotations, np.float64), *lens_table(cameras.lenses or ())
+    )
+
+
 class Images(NamedTuple):
     """The k images in the cameras that made the points and in those of now, for kernels.
 
@@ -283,17 +366,7 @@ def images_of(made_with: MadeWith | None, now: Cameras) -> Images:
     made = made_with.cameras
     if made.lenses is None or now.lenses is None or len(made) != len(now):
         raise ValueError("the same images are needed twice, with angles and lenses")
-    row, lenses = lens_table(made.lenses)
-    row_now, lenses_now = lens_table(now.lenses)
-    return Images(
-        np.ascontiguousarray(made.centres, np.float64),
-        np.ascontiguousarray(made.rotations, np.float64),
-        row,
-        lenses,
-        np.ascontiguousarray(now.rotations, np.float64),
-        row_now,
-        lenses_now,
-    )
+    return Images(np.ascontiguousarray(made.centres, np.float64), *optics_of(made), *optics_of(now))
 
 
 def _are_equal(made: Cameras, now: Cameras) -> bool:
@@ -308,43 +381,32 @@ def _are_equal(made: Cameras, now: Cameras) -> bool:
 
 
 @njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
-def as_made(images: Images, c: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+def as_made(images: Images, c: int, a: Vector) -> Vector:
     """Return where the matcher had what camera c sees in a direction, both in the world frame.
 
     NaN where there is no image; of any length.
     """
     if len(images.centres) == 0:
-        return x, y, z
+        return a
     return _through(
         images.rotations_now[c], images.lenses_now[images.row_now[c]],
-        images.rotations[c], images.lenses[images.row[c]], x, y, z,
+        images.rotations[c], images.lenses[images.row[c]], a,
     )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def as_now(images: Images, c: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+def as_now(images: Images, c: int, a: Vector) -> Vector:
     """Return in which direction camera c sees what the matcher had in a direction."""
     return _through(
         images.rotations[c], images.lenses[images.row[c]],
-        images.rotations_now[c], images.lenses_now[images.row_now[c]], x, y, z,
+        images.rotations_now[c], images.lenses_now[images.row_now[c]], a,
     )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _through(
-    r: FloatArray, lens: FloatArray, to_r: FloatArray, to_lens: FloatArray,
-    x: float, y: float, z: float,
-) -> tuple[float, float, float]:  # fmt: skip
+    r: FloatArray, lens: FloatArray, to_r: FloatArray, to_lens: FloatArray, a: Vector
+) -> Vector:
     """Return the direction of the same place in the image for another pose and lens."""
-    u, v = image_of(
-        lens,
-        r[0, 0] * x + r[0, 1] * y + r[0, 2] * z,
-        r[1, 0] * x + r[1, 1] * y + r[1, 2] * z,
-        r[2, 0] * x + r[2, 1] * y + r[2, 2] * z,
-    )
-    x, y, z = direction_of(to_lens, u, v)
-    return (
-        to_r[0, 0] * x + to_r[1, 0] * y + to_r[2, 0] * z,
-        to_r[0, 1] * x + to_r[1, 1] * y + to_r[2, 1] * z,
-        to_r[0, 2] * x + to_r[1, 2] * y + to_r[2, 2] * z,
-    )
+    u, v = image_of(lens, *times(r, a))
+    return transposed_times(to_r, direction_of(to_lens, u, v))

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
+from pcfix.lens.algebra import dot, minus, normal_of, row_of
 from pcfix.lens.frames import (
     NOT_DISTORTED,
     NOTHING,
@@ -22,7 +23,6 @@ from pcfix.lens.frames import (
     no_frames,
 )
 from pcfix.model import (
-    NOMINAL_FOCAL_PX,
     Cameras,
     FloatArray,
     IntArray,
@@ -34,9 +34,12 @@ from pcfix.model import (
 )
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey
-from pcfix.refract.rays import pierce_mesh, pierce_raster
+from pcfix.refract.rays import pierce
 from pcfix.threads import one_caller
 from pcfix.water.surface import Field, SurfaceAbove, Tin, build_field, build_tin, locate
+
+NOMINAL_FOCAL_PX = 3700.0
+"""Of cameras without a lens: a survey drone's of 20 megapixels, 0.27 mrad a pixel."""
 
 TILE = 128
 """Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""
@@ -176,6 +179,27 @@ def views_in_frame(xyz: FloatArray, cameras: Cameras) -> Views:
     )
 
 
+def cameras_of_pairs(pairs: Views) -> Views:
+    """Return the cameras in each point's pairs, each once, in the order of the list."""
+    start = np.zeros(len(pairs.start), np.int64)
+    camera = np.asarray(pairs.camera, np.int64)
+    distinct = np.empty(len(camera), np.int64)
+    _distinct(np.asarray(pairs.start, np.int64), camera, start, distinct)
+    return Views(start, distinct[: start[-1]])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _distinct(start: IntArray, camera: IntArray, first: IntArray, distinct: IntArray) -> None:
+    owner = np.full(camera.max() + 1 if camera.size else 0, -1)
+    count = 0
+    for i in range(len(start) - 1):
+        for c in camera[start[i] : start[i + 1]]:
+            if owner[c] != i:
+                owner[c], distinct[count] = i, c
+                count += 1
+        first[i + 1] = count
+
+
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _make_room(points: Points, rig: Rig, frames: Frames, first: IntArray) -> None:
     """Set for each tile, one place on, how many entries it may get."""
@@ -279,10 +303,9 @@ def gather(tile: FloatArray, rows: IntArray, points: Points) -> tuple[FloatArray
             value = points.xyz[i, axis]
             tile[axis * TILE + j] = value
             low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
-        b, c = points.slope[i, 0], points.slope[i, 1]
-        up = 1.0 / np.sqrt(1.0 + b * b + c * c)
+        x, y, z = normal_of(points.slope[i, 0], points.slope[i, 1])
         tile[3 * TILE + j] = points.height[i]
-        tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j] = -b * up, -c * up, up
+        tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j] = x, y, z
     return low, high
 
 
@@ -324,29 +347,25 @@ def choose(
 
     On a mesh or raster the incidence angle is that where the ray pierces it.
     """
-    centres, least_cosine2, most = rig.centres, rule.least_cosine2, rule.most
-    chosen = np.empty(candidates.size, np.int64)
-    cosine2 = np.empty(candidates.size)
-    is_limited = least_cosine2 > 0.0 or most < candidates.size
+    chosen, cosine2 = np.empty(candidates.size, np.int64), np.empty(candidates.size)
+    is_limited = rule.least_cosine2 > 0.0 or rule.most < candidates.size
+    x, y, z = tile[j], tile[TILE + j], tile[2 * TILE + j]
+    upward = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
     k = 0
     for at in range(candidates.size):
         c = candidates[at]
-        px, py, pz = tile[j], tile[TILE + j], tile[2 * TILE + j]
-        ex, ey, ez = centres[c, 0] - px, centres[c, 1] - py, centres[c, 2] - pz
-        nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-        lowered = pz - rig.offset[c]
-        h = nz * (tile[3 * TILE + j] - lowered)
-        height = nx * ex + ny * ey + nz * ez
-        length2 = ex * ex + ey * ey + ez * ez
-        if not (height > h and holds(frames, c, ex, ey, ez)):
+        e, lowered = minus(row_of(rig.centres, c), (x, y, z)), (x, y, z - rig.offset[c])
+        h, height, length2 = (
+            upward[2] * (tile[3 * TILE + j] - lowered[2]),
+            dot(upward, e),
+            dot(e, e),
+        )
+        if not (height > h and holds(frames, c, e)):
             continue
         if h > 0.0 and is_limited and (tin is not None or field is not None):
-            if tin is not None:
-                _, nx, ny, nz = pierce_mesh(tin, px, py, lowered, ex, ey, ez, facet)
-            if field is not None:
-                _, nx, ny, nz = pierce_raster(field, px, py, lowered, ex, ey, ez, h, nx, ny, nz)
-            height = max(nx * ex + ny * ey + nz * ez, 0.0)
-        if height * height >= least_cosine2 * length2:
+            _, normal = pierce(tin, field, lowered, e, h, upward, facet)
+            height = max(dot(normal, e), 0.0)
+        if height * height >= rule.least_cosine2 * length2:
             chosen[k], cosine2[k] = at, height * height / length2
             k += 1
-    return chosen[: _keep_steepest(chosen, cosine2, k, most)]
+    return chosen[: _keep_steepest(chosen, cosine2, k, rule.most)]

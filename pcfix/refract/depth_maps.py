@@ -24,16 +24,17 @@ A level bed will do: a slope of it moves the Q_i and the directions a_ij nearly 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit, prange
 
+from pcfix.lens.algebra import Vector, beyond, dot, minus, row_of, scaled
 from pcfix.lens.frames import Frames, holds
 from pcfix.model import FloatArray, IntArray, Outcome
-from pcfix.refract.batch import Batch, Images, Intersection, as_made, as_now, images_of
+from pcfix.refract.batch import Batch, Chosen, Images, Intersection, as_made, as_now, images_of
 from pcfix.refract.matcher import Matcher
-from pcfix.refract.rays import light_path, refracted
+from pcfix.refract.rays import direction, light_path, refracted
 from pcfix.threads import one_caller
 
 MAX_LOOKS = 5
@@ -62,10 +63,6 @@ def invert_depth_maps(batch: Batch) -> Intersection:
         Its views are the images whose depth maps were fused, with their weights;
         `batch.survey.learned.matcher` says how they were matched.
 
-    Returns
-    -------
-    Intersection
-
     Notes
     -----
     The surface above each point is taken as a plane.
@@ -73,11 +70,8 @@ def invert_depth_maps(batch: Batch) -> Intersection:
     weights = batch.rays.weight
     result = np.zeros((len(batch.xyz), COLUMNS))
     with one_caller():
-        _invert(
-            *arrays_of(batch),
-            np.zeros(0) if weights is None else weights.astype(np.float64),
-            result,
-        )
+        given = np.zeros(0) if weights is None else weights.astype(np.float64)
+        _invert(*arrays_of(batch), given, result)
     return intersection_of(batch, result)
 
 
@@ -93,7 +87,7 @@ class Sight(NamedTuple):
         other cameras.
     above : array, shape (k,)
         Height of the water of each image over the point, along the normal, metres.
-    normal : array, shape (3,)
+    normal : Vector
         Of the water, upward.
     n : float
         Refractive index.
@@ -102,41 +96,30 @@ class Sight(NamedTuple):
     up: FloatArray
     made: FloatArray
     above: FloatArray
-    normal: FloatArray
+    normal: Vector
     n: float
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def sight_of(
-    point: FloatArray, made_point: FloatArray, centres: FloatArray, height: float,
-    normal: FloatArray, offset: FloatArray, images: Images, n: float,
-) -> Sight:  # fmt: skip
-    """Return what the images have of a point, shape (3,), with the water above it."""
-    up = centres - point
-    made = images.centres - made_point if len(images.centres) else up
-    above = normal[2] * (height - point[2] + offset)
-    return Sight(up, made, above, normal, n)
+def sight_of(points: Chosen, i: int, images: Images) -> Sight:
+    """Return what the images have of point i."""
+    point, normal = points.xyz[i], row_of(points.normals, i)
+    up = points.centres - point
+    made = images.centres - points.made_xyz[i] if len(images.centres) else up
+    above = normal[2] * (points.height[i] - point[2] + points.offset)
+    return Sight(up, made, above, normal, points.n)
 
 
-def arrays_of(batch: Batch) -> tuple[Any, ...]:
-    """Return what the kernels take of a batch."""
+Tables: TypeAlias = tuple[IntArray, IntArray, IntArray, FloatArray]
+
+
+def arrays_of(batch: Batch) -> tuple[Chosen, Images, Tables, Frames, float]:
+    """Return what the kernels take of a batch: points, images and the matcher in flat parts."""
     matcher = batch.survey.learned.matcher
     if matcher is None:
         raise ValueError("a model of the matcher is needed")
-    made_xyz = batch.xyz if batch.made_with is None else batch.made_with.xyz
-    return (
-        np.ascontiguousarray(batch.xyz),
-        np.ascontiguousarray(made_xyz),
-        np.ascontiguousarray(batch.surface.height_m),
-        batch.normals(),
-        np.ascontiguousarray(batch.survey.cameras.centres),
-        batch.survey.offset_m,
-        images_of(batch.made_with, batch.survey.cameras),
-        *matcher,
-        batch.rays.start,
-        np.asarray(batch.rays.camera, np.int64),
-        batch.survey.settings.refractive_index,
-    )
+    images = images_of(batch.made_with, batch.survey.cameras)
+    return batch.chosen(), images, matcher[:4], matcher.inner, matcher.tolerance_px2
 
 
 def intersection_of(batch: Batch, result: FloatArray) -> Intersection:
@@ -158,27 +141,25 @@ def intersection_of(batch: Batch, result: FloatArray) -> Intersection:
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _invert(
-    xyz: FloatArray, made_xyz: FloatArray, height: FloatArray, normals: FloatArray,
-    centres: FloatArray, offset: FloatArray, images: Images, matched: IntArray,
-    averaged: IntArray, fused: IntArray, focal_px: FloatArray, inner: Frames, tolerance: float,
-    start: IntArray, camera: IntArray, n: float,
+    points: Chosen, images: Images, tables: Tables, inner: Frames, tolerance: float,
     weight: FloatArray, result: FloatArray,
 ) -> None:  # fmt: skip
-    for block in prange((len(xyz) + _BLOCK - 1) // _BLOCK):
-        matcher = Matcher(matched, averaged, fused, focal_px, inner, tolerance)
-        place = np.full(len(centres), ABSENT)
-        found = np.empty(len(centres), np.int64)
-        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(xyz))):
-            sight = sight_of(xyz[i], made_xyz[i], centres, height[i], normals[i], offset, images, n)
-            listed = camera[start[i] : start[i + 1]]
+    start, k = points.start, len(points.centres)
+    for block in prange((len(points.xyz) + _BLOCK - 1) // _BLOCK):
+        matcher = Matcher(tables[0], tables[1], tables[2], tables[3], inner, tolerance)
+        place, found = np.full(k, ABSENT), np.empty(k, np.int64)
+        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(points.xyz))):
+            sight = sight_of(points, i, images)
+            listed = points.camera[start[i] : start[i + 1]]
             given = weight[start[i] : start[i + 1]] if weight.size else weight
             maps = found[: _with_neighbours(found, place, listed, sight.made, matcher)]
-            bed, t, slope = lines(maps, sight, images, matcher)
+            depths = lines(maps, sight, images, matcher)
             counts, step = np.zeros(maps.size), 0.0
             for _ in range(_ROUNDS):
-                _share(counts, place, listed, given, sight.made, t + slope * step, matcher)
-                step = balance(t, slope, counts)
-            settle_bed(result[i], maps, counts, t, slope, bed, sight, images, matcher)
+                now = depths.t + depths.slope * step
+                _share(counts, place, listed, given, sight.made, now, matcher)
+                step = balance(depths.t, depths.slope, counts)
+            settle_bed(result[i], maps, counts, depths, sight, images, matcher)
             place[maps] = ABSENT
             for c in listed:
                 for a in matcher.averaged[c]:
@@ -207,7 +188,7 @@ def _with_neighbours(
                 break
             if place[a] == ABSENT:
                 place[a] = _OUTSIDE
-                if holds(matcher.inner, a, made[a, 0], made[a, 1], made[a, 2]):
+                if holds(matcher.inner, a, row_of(made, a)):
                     place[a], found[count] = count, a
                     count += 1
     return count
@@ -244,20 +225,26 @@ def averages(own: int, a: int, now: FloatArray, place: IntArray) -> bool:
     return bool(abs(now[place[a]] - now[own]) < AVERAGED_WITHIN)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def lines(
-    maps: IntArray, sight: Sight, images: Images, matcher: Matcher
-) -> tuple[float, FloatArray, FloatArray]:
-    """Return how the depth of each map changes with the height of the bed, nearly in a line.
+class Lines(NamedTuple):
+    """How the depth of each map changes with the height of the bed, nearly in a line.
 
-    Returns
-    -------
+    Attributes
+    ----------
     bed : float
         A likely height of the bed, relative to the apparent point, metres.
     t, slope : array, shape (maps,)
         How far beyond the apparent point the map has that bed, relative to the distance from the
         camera, and the change of it with the height, 1/m. NaN where it has none.
     """
+
+    bed: float
+    t: FloatArray
+    slope: FloatArray
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def lines(maps: IntArray, sight: Sight, images: Images, matcher: Matcher) -> Lines:
+    """Return the lines of the depth maps of some images."""
     deep = -sight.above.mean() / sight.normal[2] * (sight.n - 1.0)
     bed, rise = 1.1 * deep, min(0.1 * deep, -LEAST_RISE_M)
     t, slope = np.empty(maps.size), np.empty(maps.size)
@@ -270,7 +257,7 @@ def lines(
         usual = 1.0 / (sight.n * sight.made[maps[q], 2])
         if slope[q] == slope[q] and not 0.5 < -slope[q] / usual < 2.0:
             slope[q] = -usual  # another pair of images was the best one there
-    return bed, t, slope
+    return Lines(bed, t, slope)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -285,15 +272,16 @@ def balance(t: FloatArray, slope: FloatArray, weight: FloatArray) -> float:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def settle_bed(
-    row: FloatArray, maps: IntArray, weight: FloatArray, t: FloatArray, slope: FloatArray,
-    bed: float, sight: Sight, images: Images, matcher: Matcher,
+    row: FloatArray, maps: IntArray, weight: FloatArray, depths: Lines, sight: Sight,
+    images: Images, matcher: Matcher,
 ) -> None:  # fmt: skip
     """Find the height of the bed at which the fused depths give the apparent point, and write it.
 
     From where the lines say, and looked at again until they need not be mended.
     """
     row[OUTCOME] = _NO_CAMERA if maps.size == 0 else _ONE_CAMERA
-    step = balance(t, slope, weight)
+    bed, slope = depths.bed, depths.slope
+    step = balance(depths.t, slope, weight)
     looks, work = np.empty((maps.size, 5)), np.empty((matcher.matched.shape[1], 3))
     for _ in range(MAX_LOOKS):
         if not np.isfinite(step):
@@ -331,79 +319,59 @@ def _look(
     Writes how far beyond P, relative to the distance from the camera, the place on the bed, and how
     that moves with the height.
     """
-    normal = sight.normal
-    ax, ay, az, ex, ey, ez, above = _ray(c, sight, images)
-    length2 = ex * ex + ey * ey + ez * ez
-    across = normal[0] * ex + normal[1] * ey + normal[2] * ez
-    wet = sight.above[c] > 0.0
-    f = above / across if wet else 0.0
-    bend = 1.0 / sight.n if wet else 1.0
-    dx, dy, dz = refracted(ex, ey, ez, length2, normal[0], normal[1], normal[2], across, bend)
-    ax, ay, az = ax + f * ex, ay + f * ey, az + f * ez
-    s = (bed - az) / dz
-    out[1], out[2] = ax + s * dx, ay + s * dy
-    out[3], out[4] = dx / dz, dy / dz
-    mx, my, mz = sight.made[c, 0], sight.made[c, 1], sight.made[c, 2]
-    length = np.sqrt(mx * mx + my * my + mz * mz)
-    t = _depth(
-        c, out[1], out[2], bed, -mx / length, -my / length, -mz / length, sight, images, matcher,
-        work,
-    )  # fmt: skip
-    out[0] = t / length
+    a, e, above = _ray(c, sight, images)
+    across, wet = dot(sight.normal, e), sight.above[c] > 0.0
+    f, bend = (above / across, 1.0 / sight.n) if wet else (0.0, 1.0)
+    d = refracted(e, dot(e, e), sight.normal, across, bend)
+    a = beyond(a, f, e)
+    s = (bed - a[2]) / d[2]
+    out[1], out[2] = a[0] + s * d[0], a[1] + s * d[1]
+    out[3], out[4] = d[0] / d[2], d[1] / d[2]
+    made = row_of(sight.made, c)
+    length = np.sqrt(dot(made, made))
+    u = -made[0] / length, -made[1] / length, -made[2] / length
+    out[0] = _depth(c, (out[1], out[2], bed), u, sight, images, matcher, work) / length
 
 
 @njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
-def _ray(
-    c: int, sight: Sight, images: Images
-) -> tuple[float, float, float, float, float, float, float]:
+def _ray(c: int, sight: Sight, images: Images) -> tuple[Vector, Vector, float]:
     """Return the ray on which image c shows the point.
 
     Where it passes the point, relative to it, the way from there to the projection centre, and how
     high the water is over there.
     """
-    up, made, normal = sight.up, sight.made, sight.normal
+    up = row_of(sight.up, c)
     if len(images.centres) == 0:
-        return 0.0, 0.0, 0.0, up[c, 0], up[c, 1], up[c, 2], sight.above[c]
-    dx, dy, dz = as_now(images, c, -made[c, 0], -made[c, 1], -made[c, 2])
-    along = (up[c, 0] * dx + up[c, 1] * dy + up[c, 2] * dz) / (dx * dx + dy * dy + dz * dz)
-    ex, ey, ez = along * dx, along * dy, along * dz
-    ax, ay, az = up[c, 0] - ex, up[c, 1] - ey, up[c, 2] - ez
-    above = sight.above[c] - (normal[0] * ax + normal[1] * ay + normal[2] * az)
-    return ax, ay, az, ex, ey, ez, above
+        return (0.0, 0.0, 0.0), up, sight.above[c]
+    d = as_now(images, c, scaled(-1.0, row_of(sight.made, c)))
+    e = scaled(dot(up, d) / dot(d, d), d)
+    a = minus(up, e)
+    return a, e, sight.above[c] - dot(sight.normal, a)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 def _depth(
-    c: int, qx: float, qy: float, qz: float, ux: float, uy: float, uz: float, sight: Sight,
-    images: Images, matcher: Matcher, work: FloatArray,
-) -> float:  # fmt: skip
+    c: int, q: Vector, u: Vector, sight: Sight, images: Images, matcher: Matcher, work: FloatArray
+) -> float:
     """Return how far beyond P, m along its ray u, the depth map of image c has the bed at Q.
 
     NaN where none of the images that it was matched with sees Q. The light goes as it does; where
     it seems to come from, and P and u, are as the matcher had them.
     """
     count = 0
-    nx, ny, nz = sight.normal[0], sight.normal[1], sight.normal[2]
     for j in matcher.matched[c]:
         if j < 0:
             break
-        ex, ey, ez = sight.up[j, 0], sight.up[j, 1], sight.up[j, 2]
-        k, _, _, _, sx, sy, sz = light_path(
-            qx, qy, qz, ex, ey, ez, nx, ny, nz, sight.above[j], sight.n
-        )
-        ax, ay, az = as_made(images, j, k * sx - nx, k * sy - ny, k * sz - nz)
-        if not (k == k and holds(matcher.inner, j, -ax, -ay, -az)):
+        path = light_path(q, row_of(sight.up, j), sight.normal, sight.above[j], sight.n)
+        a = as_made(images, j, direction(path, sight.normal))
+        if not (path[0] == path[0] and holds(matcher.inner, j, scaled(-1.0, a))):
             continue
-        size = 1.0 / np.sqrt(ax * ax + ay * ay + az * az)
-        ax, ay, az = ax * size, ay * size, az * size
-        ex, ey, ez = sight.made[j, 0], sight.made[j, 1], sight.made[j, 2]
-        along, turn = -(ex * ax + ey * ay + ez * az), ux * ax + uy * ay + uz * az
-        px, py, pz = -ex - along * ax, -ey - along * ay, -ez - along * az
-        gx, gy, gz = ux - turn * ax, uy - turn * ay, uz - turn * az
-        scale = matcher.focal_px[j] ** 2 / (ex * ex + ey * ey + ez * ez)
-        work[count, 0] = scale * (px * px + py * py + pz * pz)
-        work[count, 1] = scale * (px * gx + py * gy + pz * gz)
-        work[count, 2] = scale * (gx * gx + gy * gy + gz * gz)
+        a, e = scaled(1.0 / np.sqrt(dot(a, a)), a), row_of(sight.made, j)
+        p = minus(scaled(-1.0, e), scaled(-dot(e, a), a))
+        g = minus(u, scaled(dot(u, a), a))
+        scale = matcher.focal_px[j] ** 2 / dot(e, e)
+        work[count, 0], work[count, 1] = scale * dot(p, p), scale * dot(p, g)
+        work[count, 2] = scale * dot(g, g)
         count += 1
     if count == 0:
         return np.nan

@@ -19,10 +19,12 @@ from numba import njit, prange
 
 from pcfix.lens.frames import Frames
 from pcfix.model import FloatArray, IntArray
-from pcfix.refract.batch import Batch, Images, Intersection
+from pcfix.refract.batch import Batch, Chosen, Images, Intersection
 from pcfix.refract.depth_maps import (
     AMBIGUITY,
     COLUMNS,
+    Lines,
+    Tables,
     arrays_of,
     averages,
     balance,
@@ -50,10 +52,6 @@ def invert_fusion(batch: Batch) -> Intersection:
     batch : Batch
         Its views are all images that see each point. `batch.survey.learned` has the matcher and, if
         it was learned, the bed of the surroundings; without it the largest group made the point.
-
-    Returns
-    -------
-    Intersection
     """
     bed = batch.survey.learned.bed
     around = np.full(len(batch.xyz), np.nan) if bed is None else bed.height_at(batch.xyz[:, :2])
@@ -79,52 +77,47 @@ def likely_beds(batch: Batch) -> FloatArray:
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _likely(
-    xyz: FloatArray, made_xyz: FloatArray, height: FloatArray, normals: FloatArray,
-    centres: FloatArray, offset: FloatArray, images: Images, matched: IntArray,
-    averaged: IntArray, fused: IntArray, focal_px: FloatArray, inner: Frames, tolerance: float,
-    start: IntArray, camera: IntArray, n: float,
+    points: Chosen, images: Images, tables: Tables, inner: Frames, tolerance: float,
     likely: FloatArray,
 ) -> None:  # fmt: skip
-    for block in prange((len(xyz) + _BLOCK - 1) // _BLOCK):
-        matcher = Matcher(matched, averaged, fused, focal_px, inner, tolerance)
-        place = np.full(len(centres), -1)
-        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(xyz))):
-            maps = camera[start[i] : start[i + 1]]
-            sight = sight_of(xyz[i], made_xyz[i], centres, height[i], normals[i], offset, images, n)
-            bed, t, slope = lines(maps, sight, images, matcher)
+    for block in prange((len(points.xyz) + _BLOCK - 1) // _BLOCK):
+        matcher = Matcher(tables[0], tables[1], tables[2], tables[3], inner, tolerance)
+        place = np.full(len(points.centres), -1)
+        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(points.xyz))):
+            maps = points.camera[points.start[i] : points.start[i + 1]]
+            sight = sight_of(points, i, images)
+            depths = lines(maps, sight, images, matcher)
             weight = np.empty(maps.size)
             _set(place, maps)
             for seed in range(maps.size):
-                if slope[seed] == slope[seed]:
-                    rise, _ = _group(weight, seed, maps, place, t, slope, sight.made, matcher)
-                    likely[i, seed] = bed + rise
+                if depths.slope[seed] == depths.slope[seed]:
+                    rise, _ = _group(weight, seed, maps, place, depths, sight.made, matcher)
+                    likely[i, seed] = depths.bed + rise
             place[maps] = -1
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _invert(
-    xyz: FloatArray, made_xyz: FloatArray, height: FloatArray, normals: FloatArray,
-    centres: FloatArray, offset: FloatArray, images: Images, matched: IntArray,
-    averaged: IntArray, fused: IntArray, focal_px: FloatArray, inner: Frames, tolerance: float,
-    start: IntArray, camera: IntArray, n: float,
+    points: Chosen, images: Images, tables: Tables, inner: Frames, tolerance: float,
     around: FloatArray, result: FloatArray,
 ) -> None:  # fmt: skip
-    for block in prange((len(xyz) + _BLOCK - 1) // _BLOCK):
-        matcher = Matcher(matched, averaged, fused, focal_px, inner, tolerance)
-        place = np.full(len(centres), -1)
-        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(xyz))):
-            maps = camera[start[i] : start[i + 1]]
-            sight = sight_of(xyz[i], made_xyz[i], centres, height[i], normals[i], offset, images, n)
-            bed, t, slope = lines(maps, sight, images, matcher)
+    for block in prange((len(points.xyz) + _BLOCK - 1) // _BLOCK):
+        matcher = Matcher(tables[0], tables[1], tables[2], tables[3], inner, tolerance)
+        place = np.full(len(points.centres), -1)
+        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(points.xyz))):
+            maps = points.camera[points.start[i] : points.start[i + 1]]
+            sight = sight_of(points, i, images)
+            depths = lines(maps, sight, images, matcher)
             weight = np.zeros(maps.size)
             _set(place, maps)
+            wanted = around[i] - points.xyz[i, 2] - depths.bed
             seed, result[i, AMBIGUITY] = _best_seed(
-                weight, maps, place, t, slope, sight.made, matcher, around[i] - xyz[i, 2] - bed
+                weight, maps, place, depths, sight.made, matcher, wanted
             )
             if seed >= 0:
-                _group(weight, seed, maps, place, t, slope, sight.made, matcher)
+                _group(weight, seed, maps, place, depths, sight.made, matcher)
             place[maps] = -1
-            settle_bed(result[i], maps, weight, t, slope, bed, sight, images, matcher)
+            settle_bed(result[i], maps, weight, depths, sight, images, matcher)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -135,8 +128,8 @@ def _set(place: IntArray, maps: IntArray) -> None:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _best_seed(
-    weight: FloatArray, maps: IntArray, place: IntArray, t: FloatArray, slope: FloatArray,
-    made: FloatArray, matcher: Matcher, wanted: float,
+    weight: FloatArray, maps: IntArray, place: IntArray, depths: Lines, made: FloatArray,
+    matcher: Matcher, wanted: float,
 ) -> tuple[int, float]:  # fmt: skip
     """Return the seed whose group has the bed nearest to the wanted height, or the largest one.
 
@@ -145,9 +138,9 @@ def _best_seed(
     best, least = -1, np.inf
     total, first, second = 0.0, 0.0, 0.0
     for seed in range(maps.size):
-        if slope[seed] != slope[seed]:
+        if depths.slope[seed] != depths.slope[seed]:
             continue
-        rise, members = _group(weight, seed, maps, place, t, slope, made, matcher)
+        rise, members = _group(weight, seed, maps, place, depths, made, matcher)
         known = wanted == wanted
         misfit = abs(rise - wanted) if known else -float(members)
         if misfit < least:
@@ -163,13 +156,14 @@ def _best_seed(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _group(
-    weight: FloatArray, seed: int, maps: IntArray, place: IntArray, t: FloatArray,
-    slope: FloatArray, made: FloatArray, matcher: Matcher,
+    weight: FloatArray, seed: int, maps: IntArray, place: IntArray, depths: Lines,
+    made: FloatArray, matcher: Matcher,
 ) -> tuple[float, int]:  # fmt: skip
     """Return the height of the bed if the group of a seed made the point, and the group's size.
 
     Also sets what each depth map counts for in it.
     """
+    t, slope = depths.t, depths.slope
     rise, members = -t[seed] / slope[seed], 0
     now = np.empty(maps.size)
     for _ in range(MAX_ROUNDS):

@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from pcfix.lens.algebra import dot, minus, row_of, scaled
 from pcfix.lens.frames import (
     ALL,
     NOT_DISTORTED,
@@ -44,7 +45,7 @@ from pcfix.refract.choice import (
     rule_of,
     shapes_of,
 )
-from pcfix.refract.rays import line_terms, nearest_point, pierce_mesh, pierce_raster, refracted
+from pcfix.refract.rays import add_line, line_terms, nearest_point, pierce, refracted
 from pcfix.refract.sensitivity import SUMS, TILE_RUNS, Budget, add_below
 from pcfix.refract.uncertainty import (
     add_errors,
@@ -126,13 +127,11 @@ def _solve(row: FloatArray, k: float, sums: FloatArray) -> None:
     if k < 2.0:
         row[_OUTCOME] = _ONE_CAMERA if k == 1.0 else _NO_CAMERA
         return
-    solved, qx, qy, qz, miss, sigma_z = nearest_point(
-        k, sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7], sums[8]
-    )
+    solved, q, miss, sigma_z = nearest_point(k, sums)
     if not solved:
         row[_OUTCOME] = _PARALLEL
         return
-    row[0], row[1], row[2] = qx, qy, qz
+    row[0], row[1], row[2] = q
     row[_MISS], row[_SIGMA_Z] = miss, sigma_z
     row[_INCIDENCE] = np.degrees(np.arccos(np.sqrt(min(sums[10], 1.0))))
     row[_COUNT], row[_OUTCOME] = k, _CORRECTED
@@ -171,26 +170,26 @@ def _add_camera(
     `sums` and `tile` hold runs of `TILE` numbers in one array each: with one base address and
     fixed distances the compiler sees that the runs cannot overlap, and vectorises.
     """
-    cx, cy, cz, offset = rig.centres[c, 0], rig.centres[c, 1], rig.centres[c, 2], rig.offset[c]
+    centre, offset = row_of(rig.centres, c), rig.offset[c]
     least_cosine2, r = rule.least_cosine2, rule.bend
     rays = 0
     for j in range(marks.size):
         z = tile[2 * TILE + j]
-        ex, ey, ez = cx - tile[j], cy - tile[TILE + j], cz - z
-        nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-        height = nx * ex + ny * ey + nz * ez
-        h = nz * (tile[3 * TILE + j] - (z - offset))
-        length2 = ex * ex + ey * ey + ez * ez
+        e = minus(centre, (tile[j], tile[TILE + j], z))
+        normal = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+        height = dot(normal, e)
+        h = normal[2] * (tile[3 * TILE + j] - (z - offset))
+        length2 = dot(e, e)
         steep = (height > h) & (height * height >= least_cosine2 * length2)
-        held = marks[j] > 0.0 if g is None else in_frame(g, ex, ey, ez)
+        held = marks[j] > 0.0 if g is None else in_frame(g, e)
         use = held & steep
         # one division for two; a ray that is not used adds zeros
         q = 1.0 / (length2 * height)
         f = h * length2 * q if use and h > 0.0 else 0.0
         inv = height * q if use else 0.0
         bend = r if h > 0.0 else 1.0
-        dx, dy, dz = refracted(ex, ey, ez, length2, nx, ny, nz, height, bend)
-        xx, xy, xz, yy, yz, bx, by, bz, s = line_terms(f * ex, f * ey, f * ez, dx, dy, dz, inv)
+        d = refracted(e, length2, normal, height, bend)
+        xx, xy, xz, yy, yz, bx, by, bz, s = line_terms(scaled(f, e), d, inv)
         sums[j] += xx
         sums[TILE + j] += xy
         sums[2 * TILE + j] += xz
@@ -266,40 +265,34 @@ def _chosen(
             i = rows[j]
             facet = -1 if tin is None else locate(tin, tile[j], tile[TILE + j])
             cameras = camera[start[i] : start[i + 1]]
-            _intersect_one(result[i], cameras, tile, j, rig, rule.bend, used, tin, field, facet)
+            for c in cameras:
+                used[c] = True  # threads may write it at once: always the same value
+            _intersect_one(result[i], cameras, tile, j, rig, rule.bend, tin, field, facet)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _intersect_one(
     row: FloatArray, cameras: IntArray, tile: FloatArray, j: int, rig: Rig, r: float,
-    used: BoolArray, tin: Tin | None, field: Field | None, facet: int,
+    tin: Tin | None, field: Field | None, facet: int,
 ) -> None:  # fmt: skip
     """Intersect the rays of one point with its own cameras."""
-    px, py, pz = tile[j], tile[TILE + j], tile[2 * TILE + j]
-    ux, uy, uz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-    centres, sums, least = rig.centres, np.zeros(11), 1.0
+    x, y, z = tile[j], tile[TILE + j], tile[2 * TILE + j]
+    upward = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+    sums, least = np.zeros(11), 1.0
     for c in cameras:
-        used[c] = True
-        ex, ey, ez = centres[c, 0] - px, centres[c, 1] - py, centres[c, 2] - pz
-        length2 = ex * ex + ey * ey + ez * ez
-        lowered = pz - rig.offset[c]
-        h = uz * (tile[3 * TILE + j] - lowered)
-        f, bend, nx, ny, nz = 0.0, 1.0, ux, uy, uz
+        e = minus(row_of(rig.centres, c), (x, y, z))
+        length2, lowered = dot(e, e), (x, y, z - rig.offset[c])
+        h = upward[2] * (tile[3 * TILE + j] - lowered[2])
+        f, bend, normal = 0.0, 1.0, upward
         if h > 0.0:
             bend = r
-            if tin is not None:
-                f, nx, ny, nz = pierce_mesh(tin, px, py, lowered, ex, ey, ez, facet)
-            if field is not None:
-                f, nx, ny, nz = pierce_raster(field, px, py, lowered, ex, ey, ez, h, ux, uy, uz)
-        height = nx * ex + ny * ey + nz * ez
+            f, normal = pierce(tin, field, lowered, e, h, upward, facet)
+        height = dot(normal, e)
         q = 1.0 / (length2 * height)
         if h > 0.0 and tin is None and field is None:
-            f = h * length2 * q
+            f = h * length2 * q  # as in `_add_camera`
         inv = height * q
-        dx, dy, dz = refracted(ex, ey, ez, length2, nx, ny, nz, height, bend)
-        terms = line_terms(f * ex, f * ey, f * ez, dx, dy, dz, inv)
-        for i in range(9):
-            sums[i] += terms[i]
+        add_line(sums, scaled(f, e), refracted(e, length2, normal, height, bend), inv)
         least = min(least, height * height * inv)
     sums[10] = least
     _solve(row, float(cameras.size), sums)

@@ -14,9 +14,6 @@ These methods know level water only. Over a tilted surface or a mesh the depth i
 height of the water above the apparent point, along the vertical, and the surface is taken as level
 there. Each camera has its own water level where that moved; a camera whose water stood below the
 apparent point saw it through air, and its ray goes straight on.
-
-The arrays of rays are those of `pcfix.model.Views`: the rays of point i are the entries from
-``start[i]`` to ``start[i + 1]`` of ``camera``.
 """
 
 from __future__ import annotations
@@ -27,9 +24,10 @@ import numpy as np
 from numba import njit, prange
 
 from pcfix.errors import SettingError
+from pcfix.lens.algebra import dot, minus, row_of, scaled
 from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, Views
-from pcfix.refract.batch import Batch, Intersection
-from pcfix.refract.rays import line_terms, nearest_point, refracted
+from pcfix.refract.batch import Batch, Chosen, Intersection
+from pcfix.refract.rays import add_line, nearest_point, refracted
 from pcfix.threads import one_caller
 
 
@@ -44,27 +42,6 @@ def down(shift_m: FloatArray) -> FloatArray:
     return np.column_stack([none, none, -shift_m])
 
 
-def rays_of(
-    batch: Batch,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray, IntArray]:
-    """Return what the kernels need of a batch.
-
-    Returns
-    -------
-    xyz, depth, centres, offset, start, camera : array
-        Apparent points (m, 3) and their depth (m,), projection centres (k, 3) and the offsets of
-        their water levels (k,), metres; the list of rays.
-    """
-    return (
-        np.ascontiguousarray(batch.xyz),
-        np.ascontiguousarray(apparent_depth(batch)),
-        np.ascontiguousarray(batch.survey.cameras.centres),
-        np.ascontiguousarray(batch.survey.offset_m),
-        np.asarray(batch.rays.start, np.int64),
-        np.asarray(batch.rays.camera, np.int64),
-    )
-
-
 @njit(cache=True, error_model="numpy", nogil=True)
 def depth_ratio(tan2: float, n: float) -> float:
     """Return tan a / tan b of a ray with tan^2 a = `tan2`: what a depth grows by along it."""
@@ -72,34 +49,31 @@ def depth_ratio(tan2: float, n: float) -> float:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def plumb_line_crossings(
-    xyz: FloatArray, depth: FloatArray, centres: FloatArray, offset: FloatArray,
-    start: IntArray, camera: IntArray, n: float, by_cosine: bool, lowered: FloatArray,
-    miss: FloatArray,
-) -> None:  # fmt: skip
+def _plumb_line_crossings(points: Chosen, by_cosine: bool) -> tuple[FloatArray, FloatArray]:
     """Find where the bent rays of each point cross its plumb line, in the mean.
 
     Parameters
     ----------
-    xyz, depth, centres, offset, start, camera
-        Of `rays_of`.
-    n : float
-        Refractive index.
+    points : Chosen
     by_cosine : bool
         Weigh each ray with the cosine of its angle a in air, not with 1.
+
+    Returns
+    -------
     lowered, miss : array, shape (m,)
-        Filled in: how far below the apparent point the mean lies, and its root mean square
-        distance from the bent rays, metres; 0 where a point has no ray.
+        How far below the apparent point the mean lies, and its root mean square distance from the
+        bent rays, metres; 0 where a point has no ray.
 
     Notes
     -----
     A point h above the place where a ray crosses the plumb line is h sin b away from the ray.
     """
-    for i in range(len(xyz)):
-        rays = camera[start[i] : start[i + 1]]
+    lowered, miss = np.zeros(len(points.xyz)), np.zeros(len(points.xyz))
+    for i in range(len(points.xyz)):
+        rays = points.camera[points.start[i] : points.start[i + 1]]
         total, weights, squares = 0.0, 0.0, 0.0
         for c in rays:
-            below, cosine2 = _crossing(xyz[i], depth[i] + offset[c], centres[c], n)
+            below, cosine2 = _crossing(points, i, c)
             weight = np.sqrt(cosine2) if by_cosine else 1.0
             total += weight * below
             weights += weight
@@ -107,18 +81,20 @@ def plumb_line_crossings(
             continue
         lowered[i] = total / weights
         for c in rays:
-            below, cosine2 = _crossing(xyz[i], depth[i] + offset[c], centres[c], n)
-            squares += (lowered[i] - below) ** 2 * (1.0 - cosine2) / (n * n)
+            below, cosine2 = _crossing(points, i, c)
+            squares += (lowered[i] - below) ** 2 * (1.0 - cosine2) / (points.n * points.n)
         miss[i] = np.sqrt(squares / rays.size)
+    return lowered, miss
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _crossing(point: FloatArray, depth: float, centre: FloatArray, n: float) -> tuple[float, float]:
+def _crossing(points: Chosen, i: int, c: int) -> tuple[float, float]:
     """Return how far below the apparent point a bent ray crosses its plumb line; cos^2 a."""
-    ex, ey, ez = centre[0] - point[0], centre[1] - point[1], centre[2] - point[2]
+    ex, ey, ez = minus(row_of(points.centres, c), row_of(points.xyz, i))
     plan2 = ex * ex + ey * ey
     cosine2 = ez * ez / (plan2 + ez * ez)
-    return max(depth, 0.0) * (depth_ratio(plan2 / (ez * ez), n) - 1.0), cosine2
+    depth = points.height[i] - points.xyz[i, 2] + points.offset[c]
+    return max(depth, 0.0) * (depth_ratio(plan2 / (ez * ez), points.n) - 1.0), cosine2
 
 
 BASE_TO_HEIGHT = (0.3, 0.6)
@@ -150,40 +126,27 @@ def in_pairs(batch: Batch) -> Batch:
     start = np.concatenate([[0], np.cumsum(np.minimum(batch.counts, 2))]).astype(np.int64)
     camera = np.empty(start[-1], np.int64)
     with one_caller():
-        _choose_pairs(
-            np.ascontiguousarray(batch.xyz),
-            np.ascontiguousarray(batch.survey.cameras.centres),
-            np.asarray(batch.rays.start, np.int64),
-            np.asarray(batch.rays.camera, np.int64),
-            *BASE_TO_HEIGHT,
-            start,
-            camera,
-        )
+        _choose_pairs(batch.chosen(), start, camera)
     return replace(batch, views=Views(start, camera))
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def _choose_pairs(
-    xyz: FloatArray, centres: FloatArray, start: IntArray, camera: IntArray, least: float,
-    most: float, pair_start: IntArray, pair: IntArray,
-) -> None:  # fmt: skip
+def _choose_pairs(points: Chosen, pair_start: IntArray, pair: IntArray) -> None:
     """Fill in ``pair[pair_start[i] : pair_start[i + 1]]`` for every point."""
-    for i in prange(len(xyz)):
-        rays = camera[start[i] : start[i + 1]]
+    for i in prange(len(points.xyz)):
+        rays = points.camera[points.start[i] : points.start[i + 1]]
         place = pair_start[i]
         if rays.size == 1:
             pair[place] = rays[0]
         if rays.size > 1:
-            first, second = _best_pair(xyz[i], centres, rays, least, most)
+            first, second = _best_pair(points.xyz[i], points.centres, rays)
             pair[place], pair[place + 1] = rays[first], rays[second]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _best_pair(
-    point: FloatArray, centres: FloatArray, rays: IntArray, least: float, most: float
-) -> tuple[int, int]:
+def _best_pair(point: FloatArray, centres: FloatArray, rays: IntArray) -> tuple[int, int]:
     """Return the places of the best pair in the list of at least two rays; of equals the first."""
-    k = rays.size
+    k, (least, most) = rays.size, BASE_TO_HEIGHT
     u, v = np.empty(k), np.empty(k)
     for j in range(k):
         ez = centres[rays[j], 2] - point[2]
@@ -206,10 +169,6 @@ def _best_pair(
 def factor(batch: Batch) -> Intersection:
     """Multiply the apparent depth by `depth_factor`, else by the refractive index; only Z moves.
 
-    Parameters
-    ----------
-    batch : Batch
-
     Returns
     -------
     Intersection
@@ -229,10 +188,6 @@ def factor(batch: Batch) -> Intersection:
 
 def regression(batch: Batch) -> Intersection:
     """Apply the regression that was learned to the apparent depths; only Z moves.
-
-    Parameters
-    ----------
-    batch : Batch
 
     Returns
     -------
@@ -280,10 +235,6 @@ def without_rays(batch: Batch, lowered_m: FloatArray) -> Intersection:
 def dietrich(batch: Batch) -> Intersection:
     """Multiply the apparent depth by the mean of tan r / tan i over the cameras; only Z moves.
 
-    Parameters
-    ----------
-    batch : Batch
-
     Returns
     -------
     Intersection
@@ -307,19 +258,13 @@ def dietrich(batch: Batch) -> Intersection:
     shallow, by up to 1.5 % of the depth under nine nadir images (32 m apart, 80 m up) and by
     4 % for one camera overhead and one at 32 degrees.
     """
-    lowered, miss = np.zeros(len(batch.xyz)), np.zeros(len(batch.xyz))
-    n = batch.survey.settings.refractive_index
-    plumb_line_crossings(*rays_of(batch), n, False, lowered, miss)
+    lowered, miss = _plumb_line_crossings(batch.chosen(), False)
     outcome = np.where(batch.counts > 0, Outcome.CORRECTED, Outcome.NO_CAMERA).astype(np.uint8)
     return batch.result(down(lowered), outcome=outcome, ray_miss_m=miss)
 
 
 def murase(batch: Batch) -> Intersection:
     """Take the mean of the depths from two cameras, weighted by cosines; only Z moves.
-
-    Parameters
-    ----------
-    batch : Batch
 
     Returns
     -------
@@ -345,18 +290,12 @@ def murase(batch: Batch) -> Intersection:
     runs along the plumb line and says least of the depth, yet it counts most.
     """
     paired = in_pairs(batch)
-    lowered, miss = np.zeros(len(batch.xyz)), np.zeros(len(batch.xyz))
-    n = batch.survey.settings.refractive_index
-    plumb_line_crossings(*rays_of(paired), n, True, lowered, miss)
+    lowered, miss = _plumb_line_crossings(paired.chosen(), True)
     return paired.result(down(lowered), ray_miss_m=miss)
 
 
 def butler(batch: Batch) -> Intersection:
     """Intersect the bent rays of two cameras under level water; X, Y and Z move.
-
-    Parameters
-    ----------
-    batch : Batch
 
     Returns
     -------
@@ -379,37 +318,31 @@ def butler(batch: Batch) -> Intersection:
     of a pair pass each other, so that the apparent point lies on neither, and an error remains.
     """
     paired = in_pairs(batch)
-    found = np.zeros((len(batch.xyz), 4))
-    parallel = np.zeros(len(batch.xyz), np.bool_)
-    _meet(*rays_of(paired), 1.0 / batch.survey.settings.refractive_index, found, parallel)
+    found, parallel = _meet(paired.chosen())
     outcome = np.where(parallel, np.uint8(Outcome.PARALLEL_RAYS), paired.outcome())
     return paired.result(found[:, :3], outcome=outcome, ray_miss_m=found[:, 3])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _meet(
-    xyz: FloatArray, depth: FloatArray, centres: FloatArray, offset: FloatArray,
-    start: IntArray, camera: IntArray, r: float, found: FloatArray, parallel: BoolArray,
-) -> None:  # fmt: skip
-    """Fill in the shift of each point with two rays, its distance from them, and if they fail."""
-    for i in range(len(xyz)):
-        if start[i + 1] - start[i] < 2:
+def _meet(points: Chosen) -> tuple[FloatArray, BoolArray]:
+    """Return the shift of each point with two rays and its distance from them; where they fail."""
+    found, sums = np.zeros((len(points.xyz), 4)), np.empty(9)
+    parallel = np.zeros(len(points.xyz), np.bool_)
+    for i in range(len(points.xyz)):
+        if points.start[i + 1] - points.start[i] < 2:
             continue
-        xx = xy = xz = yy = yz = bx = by = bz = s = 0.0
-        for c in camera[start[i] : start[i + 1]]:
-            ex, ey = centres[c, 0] - xyz[i, 0], centres[c, 1] - xyz[i, 1]
-            ez = centres[c, 2] - xyz[i, 2]
-            length2 = ex * ex + ey * ey + ez * ez
-            share = max(depth[i] + offset[c], 0.0) / ez  # of the way up where the water is
-            dx, dy, dz = -ex, -ey, -ez
+        sums[:] = 0.0
+        for c in points.camera[points.start[i] : points.start[i + 1]]:
+            e = minus(row_of(points.centres, c), row_of(points.xyz, i))
+            length2, depth = dot(e, e), points.height[i] - points.xyz[i, 2] + points.offset[c]
+            share = max(depth, 0.0) / e[2]  # of the way up where the water is
+            d = scaled(-1.0, e)
             if share > 0.0:
-                dx, dy, dz = refracted(ex, ey, ez, length2, 0.0, 0.0, 1.0, ez, r)
-            terms = line_terms(share * ex, share * ey, share * ez, dx, dy, dz, 1.0 / length2)
-            xx, xy, xz, yy, yz = (
-                xx + terms[0], xy + terms[1], xz + terms[2], yy + terms[3], yz + terms[4]
-            )  # fmt: skip
-            bx, by, bz, s = bx + terms[5], by + terms[6], bz + terms[7], s + terms[8]
-        solved, qx, qy, qz, miss, _ = nearest_point(2.0, xx, xy, xz, yy, yz, bx, by, bz, s)
+                d = refracted(e, length2, (0.0, 0.0, 1.0), e[2], 1.0 / points.n)
+            add_line(sums, scaled(share, e), d, 1.0 / length2)
+        solved, q, miss, _ = nearest_point(2.0, sums)
         parallel[i] = not solved
         if solved:
-            found[i, 0], found[i, 1], found[i, 2], found[i, 3] = qx, qy, qz, miss
+            found[i, 0], found[i, 1], found[i, 2] = q
+            found[i, 3] = miss
+    return found, parallel

@@ -15,7 +15,7 @@ import numpy as np
 from pcfix.model import FloatArray, IntArray, Views, WaterMesh, WaterPlane, WaterRaster
 from pcfix.refract import literature
 from pcfix.refract.batch import Batch, Intersection, Survey
-from pcfix.refract.choice import chosen_views, spatial_order
+from pcfix.refract.choice import cameras_of_pairs, chosen_views, spatial_order
 from pcfix.refract.consistent import consistent
 from pcfix.refract.depth_maps import invert_depth_maps
 from pcfix.refract.fusion import invert_fusion
@@ -23,7 +23,7 @@ from pcfix.refract.intersect import intersect, intersect_in_frame
 from pcfix.refract.matcher import steepest_and_partners, without_border
 from pcfix.refract.occlusion import in_sight
 from pcfix.refract.shan import shan
-from pcfix.refract.stereo_pairs import cameras_of_pairs, invert_pairs
+from pcfix.refract.stereo_pairs import invert_pairs
 from pcfix.refract.uncertainty import with_uncertainty
 from pcfix.water.surface import SurfaceAbove
 

@@ -56,15 +56,23 @@ from typing import TypeAlias
 import numpy as np
 from numba import njit
 
+from pcfix.lens.algebra import (
+    Vector,
+    beyond,
+    cofactors,
+    dot,
+    minus,
+    normal_of,
+    product,
+    scaled,
+    vector,
+)
 from pcfix.model import FloatArray
 from pcfix.water.surface import Field, Tin, height_at, locate
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def refracted(
-    ex: float, ey: float, ez: float, length2: float,
-    nx: float, ny: float, nz: float, height: float, r: float,
-) -> tuple[float, float, float]:  # fmt: skip
+def refracted(e: Vector, length2: float, normal: Vector, height: float, r: float) -> Vector:
     """Return the refracted ray's direction (downward), with the length L of e.
 
     Snell's law in vector form, Skarlatos & Agrafiotis 2018, eq 10, multiplied by L: with the
@@ -75,11 +83,11 @@ def refracted(
 
     Parameters
     ----------
-    ex, ey, ez : float
+    e : Vector
         From the apparent point to the projection centre, metres.
     length2 : float
         L^2 = e.e
-    nx, ny, nz : float
+    normal : Vector
         Unit normal N of the surface, upward.
     height : float
         H = N.e
@@ -87,12 +95,12 @@ def refracted(
         1 / n
     """
     k = r * height - np.sqrt(length2 - r * r * (length2 - height * height))
-    return k * nx - r * ex, k * ny - r * ey, k * nz - r * ez
+    return minus(scaled(k, normal), scaled(r, e))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def line_terms(
-    ax: float, ay: float, az: float, dx: float, dy: float, dz: float, inv_length2: float
+    a: Vector, d: Vector, inv_length2: float
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
     """Return what one line adds to the normal equations of the nearest point.
 
@@ -107,13 +115,18 @@ def line_terms(
     bx, by, bz, s : float
         b (metres) and s (metres squared).
     """
-    tx, ty, tz = inv_length2 * dx, inv_length2 * dy, inv_length2 * dz
-    along = dx * ax + dy * ay + dz * az
-    return (
-        dx * tx, dx * ty, dx * tz, dy * ty, dy * tz,
-        ax - along * tx, ay - along * ty, az - along * tz,
-        ax * ax + ay * ay + az * az - along * along * inv_length2,
-    )  # fmt: skip
+    t, along = scaled(inv_length2, d), dot(d, a)
+    bx, by, bz = minus(a, scaled(along, t))
+    s = dot(a, a) - along * along * inv_length2
+    return d[0] * t[0], d[0] * t[1], d[0] * t[2], d[1] * t[1], d[1] * t[2], bx, by, bz, s
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def add_line(sums: FloatArray, a: Vector, d: Vector, inv_length2: float) -> None:
+    """Add the terms of one line to the first nine sums."""
+    terms = line_terms(a, d, inv_length2)
+    for i in range(9):
+        sums[i] += terms[i]
 
 
 MIN_DETERMINANT = 1e-6
@@ -122,17 +135,20 @@ below any usable base, and keeps rounding below 1e-9 m."""
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def nearest_point(
-    k: float, xx: float, xy: float, xz: float, yy: float, yz: float,
-    bx: float, by: float, bz: float, s: float,
-) -> tuple[bool, float, float, float, float, float]:  # fmt: skip
+def nearest_point(k: float, sums: FloatArray) -> tuple[bool, Vector, float, float]:
     """Solve M Q = b for the point nearest to k lines, all with equal weight.
+
+    Parameters
+    ----------
+    k : float
+    sums : array
+        The first nine are the sums of `line_terms`.
 
     Returns
     -------
     solved : bool
         False when the lines are too nearly parallel; then the rest is meaningless.
-    qx, qy, qz : float
+    q : Vector
         Q relative to the apparent point, metres.
     miss : float
         Root mean square distance of Q from the lines, metres.
@@ -140,18 +156,14 @@ def nearest_point(
         Standard error of Q_z from the scatter of the lines, metres: the a-posteriori variance
         s_min / (2k - 3) times (M^-1)_zz.
     """
-    m00, m11 = k - xx, k - yy
-    m22 = 2.0 * k - m00 - m11
-    m01, m02, m12 = -xy, -xz, -yz
-    c00, c01, c02 = m11 * m22 - m12 * m12, m02 * m12 - m01 * m22, m01 * m12 - m02 * m11
-    c11, c12, c22 = m00 * m22 - m02 * m02, m01 * m02 - m00 * m12, m00 * m11 - m01 * m01
-    det = m00 * c00 + m01 * c01 + m02 * c02
-    qx = (c00 * bx + c01 * by + c02 * bz) / det
-    qy = (c01 * bx + c11 * by + c12 * bz) / det
-    qz = (c02 * bx + c12 * by + c22 * bz) / det
-    rest = max(s - (bx * qx + by * qy + bz * qz), 0.0)
-    sigma_z = np.sqrt(rest / (2.0 * k - 3.0) * c22 / det)
-    return det >= MIN_DETERMINANT * k * k * k, qx, qy, qz, np.sqrt(rest / k), sigma_z
+    m00, m11 = k - sums[0], k - sums[3]
+    det, c = cofactors((m00, -sums[1], -sums[2], m11, -sums[4], 2.0 * k - m00 - m11))
+    b = sums[5], sums[6], sums[7]
+    x, y, z = product(c, b)
+    q = x / det, y / det, z / det
+    rest = max(sums[8] - dot(b, q), 0.0)
+    sigma_z = np.sqrt(rest / (2.0 * k - 3.0) * c[5] / det)
+    return det >= MIN_DETERMINANT * k * k * k, q, np.sqrt(rest / k), sigma_z
 
 
 PIERCING_STEPS = 16
@@ -162,84 +174,75 @@ allows (1e-12 m at 5000 m)."""
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def pierce_mesh(
-    tin: Tin, px: float, py: float, pz: float, ex: float, ey: float, ez: float, facet: int
-) -> tuple[float, float, float, float]:
+def pierce(
+    tin: Tin | None, field: Field | None, p: Vector, e: Vector, h: float, normal: Vector, facet: int
+) -> tuple[float, Vector]:
     """Return the fraction of e from P to the surface, and the unit normal there.
 
     Parameters
     ----------
-    tin : Tin
-    px, py, pz : float
-        Apparent point, world frame.
-    ex, ey, ez : float
+    tin, field
+        The mesh or raster; a plane where both are None.
+    p : Vector
+        Apparent point, world frame, under water.
+    e : Vector
         From it to the projection centre.
+    h, normal : float, Vector
+        Distance of the point from the tangent plane above it, and that plane's normal.
     facet : int
-        The facet above the point.
+        The facet above the point, on a mesh.
 
     Returns
     -------
-    f, nx, ny, nz : float
+    f, normal : float, Vector
         The piercing point is P + f e.
     """
-    f, nx, ny, nz = 0.0, 0.0, 0.0, 1.0
-    for _ in range(PIERCING_STEPS):
-        a, b, c = tin.planes[facet, 0], tin.planes[facet, 1], tin.planes[facet, 2]
-        above = a + b * (px - tin.origin_x) + c * (py - tin.origin_y) - pz
-        f = above / (ez - b * ex - c * ey)
-        nz = 1.0 / np.sqrt(1.0 + b * b + c * c)
-        nx, ny = -b * nz, -c * nz
-        following = locate(tin, px + f * ex, py + f * ey)
-        if following == facet or following < 0:
-            break
-        facet = following
-    return f, nx, ny, nz
+    if tin is not None:
+        return _pierce_mesh(tin, p, e, facet)
+    if field is not None:
+        return _pierce_raster(field, p, e, h, normal)
+    return h / dot(normal, e), normal
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def pierce_raster(
-    field: Field, px: float, py: float, pz: float, ex: float, ey: float, ez: float,
-    h: float, nx: float, ny: float, nz: float,
-) -> tuple[float, float, float, float]:  # fmt: skip
-    """Return the fraction of e from P to the surface, and the unit normal there.
+def _pierce_mesh(tin: Tin, p: Vector, e: Vector, facet: int) -> tuple[float, Vector]:
+    f, b, c = 0.0, 0.0, 0.0
+    for _ in range(PIERCING_STEPS):
+        a, b, c = tin.planes[facet, 0], tin.planes[facet, 1], tin.planes[facet, 2]
+        above = a + b * (p[0] - tin.origin_x) + c * (p[1] - tin.origin_y) - p[2]
+        f = above / (e[2] - b * e[0] - c * e[1])
+        following = locate(tin, p[0] + f * e[0], p[1] + f * e[1])
+        if following == facet or following < 0:
+            break
+        facet = following
+    return f, normal_of(b, c)
 
-    Parameters
-    ----------
-    field : Field
-    px, py, pz : float
-        Apparent point, world frame.
-    ex, ey, ez : float
-        From it to the projection centre.
-    h, nx, ny, nz : float
-        Distance of the point from the tangent plane above it, and that plane's normal.
 
-    Returns
-    -------
-    f, nx, ny, nz : float
-        The piercing point is P + f e.
-    """
+@njit(cache=True, error_model="numpy", nogil=True)
+def _pierce_raster(
+    field: Field, p: Vector, e: Vector, h: float, normal: Vector
+) -> tuple[float, Vector]:
     low, high = 0.0, 1.0
-    f = h / (nx * ex + ny * ey + nz * ez)
+    f = h / dot(normal, e)
     for _ in range(MAX_HALVINGS):
-        z, b, c = height_at(field, px + f * ex, py + f * ey)
-        gap = z - (pz + f * ez)
+        z, b, c = height_at(field, p[0] + f * e[0], p[1] + f * e[1])
+        gap = z - (p[2] + f * e[2])
         if np.isnan(gap):
             break
-        nz = 1.0 / np.sqrt(1.0 + b * b + c * c)
-        nx, ny = -b * nz, -c * nz
+        normal = normal_of(b, c)
         if abs(gap) <= CLOSE_M:
             break
         if gap > 0.0:
             low = f
         else:
             high = f
-        f += gap / (ez - b * ex - c * ey)
+        f += gap / (e[2] - b * e[0] - c * e[1])
         if not low < f < high:
             f = 0.5 * (low + high)
-    return f, nx, ny, nz
+    return f, normal
 
 
-Path: TypeAlias = tuple[float, float, float, float, float, float, float]
+Path: TypeAlias = tuple[float, float, float, float, Vector]
 """k, S, H, D and s."""
 
 NEWTON_STEPS = 40
@@ -248,19 +251,16 @@ CLOSE = 1e-8
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def light_path(
-    qx: float, qy: float, qz: float, ex: float, ey: float, ez: float,
-    nx: float, ny: float, nz: float, h: float, n: float,
-) -> Path:  # fmt: skip
+def light_path(q: Vector, e: Vector, normal: Vector, h: float, n: float) -> Path:
     """Return how light goes from Q to a camera through a plane.
 
     Parameters
     ----------
-    qx, qy, qz : float
+    q : Vector
         Q relative to the apparent point, metres.
-    ex, ey, ez : float
+    e : Vector
         From the apparent point to the projection centre, metres.
-    nx, ny, nz, h : float
+    normal, h : Vector, float
         The plane: unit normal, upward, and height over the apparent point along it, metres.
     n : float
         Refractive index.
@@ -270,16 +270,16 @@ def light_path(
     Path
         k NaN where the camera is not above the plane and the point.
     """
-    height = nx * ex + ny * ey + nz * ez - h
-    depth = h - (nx * qx + ny * qy + nz * qz)
+    height = dot(normal, e) - h
+    depth = h - dot(normal, q)
     all_down = height + depth
-    sx, sy, sz = qx - ex + all_down * nx, qy - ey + all_down * ny, qz - ez + all_down * nz
+    s = beyond(minus(q, e), all_down, normal)
     if not (height > 0.0 and all_down > 0.0):
-        return np.nan, 1.0, height, depth, sx, sy, sz
+        return np.nan, 1.0, height, depth, s
     if depth <= 0.0:
-        return 1.0 / all_down, 1.0, height, depth, sx, sy, sz
+        return 1.0 / all_down, 1.0, height, depth, s
     n2 = n * n
-    a = (n2 - 1.0) * (sx * sx + sy * sy + sz * sz)
+    a = (n2 - 1.0) * dot(s, s)
     k, root = 1.0 / (height + depth / n), n
     for _ in range(NEWTON_STEPS):
         root = np.sqrt(n2 + a * k * k)
@@ -288,13 +288,17 @@ def light_path(
         k += step
         if abs(step) <= CLOSE * k:
             break
-    return k, root, height, depth, sx, sy, sz
+    return k, root, height, depth, s
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def slope_of_path(path: Path, nx: float, ny: float, nz: float, n: float) -> tuple[
-    float, float, float
-]:  # fmt: skip
+def direction(path: Path, normal: Vector) -> Vector:
+    """Return w = k s - N, from the camera to where the light leaves the water."""
+    return minus(scaled(path[0], path[4]), normal)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def slope_of_path(path: Path, normal: Vector, n: float) -> Vector:
     """Return the gradient of k by Q, on one plane.
 
     Of G(k, D, s.s) = 0, implicitly, with grad D = -N and grad s.s = 2 s:
@@ -303,13 +307,12 @@ def slope_of_path(path: Path, nx: float, ny: float, nz: float, n: float) -> tupl
 
     and with it d w / d Q = k (I - N N') + s (grad k)'.
     """
-    k, root, height, depth, sx, sy, sz = path
+    k, root, height, depth, s = path
     n2 = n * n if depth > 0.0 else 1.0
     cube = root * root * root
     below = 1.0 / (height + depth * n2 / cube)
-    along = below * k / root
     aside = below * depth * k * k * k * (n2 - 1.0) / cube
-    return along * nx + aside * sx, along * ny + aside * sy, along * nz + aside * sz
+    return beyond(scaled(below * k / root, normal), aside, s)
 
 
 SETTLING_STEPS = 12
@@ -342,7 +345,7 @@ def plane_at(
 @njit(cache=True, error_model="numpy", nogil=True)
 def settle(
     plane: FloatArray, tin: Tin | None, field: Field | None, origin: FloatArray,
-    qx: float, qy: float, qz: float, ex: float, ey: float, ez: float, n: float,
+    q: Vector, e: Vector, n: float,
 ) -> None:  # fmt: skip
     """Bring the plane of a ray, (N, h), to where the light from Q leaves a mesh or raster.
 
@@ -352,40 +355,37 @@ def settle(
     on.
     """
     b, c = -plane[0] / plane[2], -plane[1] / plane[2]
-    b_before, c_before = b, c
+    before = b, c
     for _ in range(SETTLING_STEPS):
-        x, y, z_plane, depth = _way_out(plane, qx, qy, qz, ex, ey, ez, n)
+        (x, y, z_plane), depth = _way_out(plane, q, e, n)
         z, b_there, c_there = plane_at(tin, field, x, y, origin)
         change = abs(z - z_plane) + abs(depth) * (abs(b_there - b) + abs(c_there - c))
         if not change > CLOSE_M:
             return
-        _lay(plane, x, y, z, b_there, c_there)
-        b_before, c_before, b, c = b, c, b_there, c_there
-    _settle_on_crease(
-        plane, tin, field, origin, b_before, c_before, b, c, qx, qy, qz, ex, ey, ez, n
-    )
+        lay(plane, x, y, z, b_there, c_there)
+        before, b, c = (b, c), b_there, c_there
+    _settle_on_crease(plane, tin, field, origin, before, (b, c), q, e, n)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _settle_on_crease(
     plane: FloatArray, tin: Tin | None, field: Field | None, origin: FloatArray,
-    b1: float, c1: float, b2: float, c2: float,
-    qx: float, qy: float, qz: float, ex: float, ey: float, ez: float, n: float,
+    one: tuple[float, float], other: tuple[float, float], q: Vector, e: Vector, n: float,
 ) -> None:  # fmt: skip
     """Halve the share of the second slope until the light leaves on the crease itself.
 
     The first slope leads to the side that has the second, and the other way round; the two are
     taken anew as the crease comes nearer.
     """
-    low, high = 0.0, 1.0
+    (b1, c1), (b2, c2), low, high = one, other, 0.0, 1.0
     for _ in range(HALVINGS):
-        x, y, _, _ = _way_out(plane, qx, qy, qz, ex, ey, ez, n)
+        (x, y, _), _ = _way_out(plane, q, e, n)
         z, b, c = plane_at(tin, field, x, y, origin)
         if np.isnan(z):
             return
         share = 0.5 * (low + high)
-        _lay(plane, x, y, z, b1 + share * (b2 - b1), c1 + share * (c2 - c1))
-        x, y, _, _ = _way_out(plane, qx, qy, qz, ex, ey, ez, n)
+        lay(plane, x, y, z, b1 + share * (b2 - b1), c1 + share * (c2 - c1))
+        (x, y, _), _ = _way_out(plane, q, e, n)
         _, b, c = plane_at(tin, field, x, y, origin)
         if (b - b1) ** 2 + (c - c1) ** 2 > (b - b2) ** 2 + (c - c2) ** 2:
             low, b2, c2 = share, b, c
@@ -394,23 +394,15 @@ def _settle_on_crease(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _way_out(
-    plane: FloatArray, qx: float, qy: float, qz: float, ex: float, ey: float, ez: float, n: float
-) -> tuple[float, float, float, float]:
+def _way_out(plane: FloatArray, q: Vector, e: Vector, n: float) -> tuple[Vector, float]:
     """Return where light from Q leaves the water through a plane, and the depth of Q below it."""
-    nx, ny, nz = plane[0], plane[1], plane[2]
-    k, _, height, depth, sx, sy, sz = light_path(qx, qy, qz, ex, ey, ez, nx, ny, nz, plane[3], n)
-    return (
-        ex + height * (k * sx - nx),
-        ey + height * (k * sy - ny),
-        ez + height * (k * sz - nz),
-        depth,
-    )
+    normal = vector(plane)
+    path = light_path(q, e, normal, plane[3], n)
+    return beyond(e, path[2], direction(path, normal)), path[3]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _lay(plane: FloatArray, x: float, y: float, z: float, b: float, c: float) -> None:
-    """Lay the plane with the slopes b, c through a place."""
-    up = 1.0 / np.sqrt(1.0 + b * b + c * c)
-    plane[0], plane[1], plane[2] = -b * up, -c * up, up
-    plane[3] = up * (z - b * x - c * y)
+def lay(plane: FloatArray, x: float, y: float, z: float, b: float, c: float) -> None:
+    """Lay the plane (N, h) with the slopes b, c through a place."""
+    plane[0], plane[1], plane[2] = normal_of(b, c)
+    plane[3] = plane[2] * (z - b * x - c * y)

@@ -81,10 +81,6 @@ def fit_depths(apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:
     apparent_m, true_m : array, shape (m,)
         Metres, positive down.
 
-    Returns
-    -------
-    DepthRegression
-
     Raises
     ------
     GeometryError

@@ -48,18 +48,14 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numba import njit
 
+from pcfix.lens.algebra import Symmetric, Vector, beyond, dot, minus, plus, product, row_of, scaled
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.choice import TILE, Rig, Rule
 from pcfix.refract.rays import refracted
 
-Six: TypeAlias = tuple[float, float, float, float, float, float]
-"""A symmetric matrix: xx, xy, xz, yy, yz, zz."""
-Three: TypeAlias = tuple[float, float, float]
-Sight: TypeAlias = tuple[float, float, float, float, float, float]
+Sight: TypeAlias = tuple[Vector, float, float, float]
 """Projection centre, its level's offset, least squared cosine, 1 / n."""
-Seen: TypeAlias = tuple[
-    float, float, float, float, float, float, float, float, float, float, float, float
-]
+Seen: TypeAlias = tuple[float, Vector, Vector, float, float, float, float, float]
 
 
 class Budget(NamedTuple):
@@ -99,20 +95,15 @@ SUMS = 46
 def add_below(tile: FloatArray, shift: FloatArray, rows: IntArray) -> None:
     """Add to a tile how far below P the true point lies, along the normal of the surface."""
     for j in range(rows.size):
-        nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-        i = rows[j]
-        tile[BELOW * TILE + j] = -(nx * shift[i, 0] + ny * shift[i, 1] + nz * shift[i, 2])
+        normal = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+        tile[BELOW * TILE + j] = -dot(normal, row_of(shift, rows[j]))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _of_camera(rig: Rig, c: int, rule: Rule) -> tuple[Sight, Three, float]:
+def _of_camera(rig: Rig, c: int, rule: Rule) -> tuple[Sight, Vector, float]:
     """Return a camera as plain numbers, which stay in registers, for the loops over points."""
-    sight = (
-        rig.centres[c, 0], rig.centres[c, 1], rig.centres[c, 2], rig.offset[c],
-        rule.least_cosine2, rule.bend,
-    )  # fmt: skip
-    axis = (rig.axes[c, 0], rig.axes[c, 1], rig.axes[c, 2])
-    return sight, axis, rig.focal_px[c] * rig.focal_px[c]
+    sight = row_of(rig.centres, c), rig.offset[c], rule.least_cosine2, rule.bend
+    return sight, row_of(rig.axes, c), rig.focal_px[c] * rig.focal_px[c]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -121,19 +112,19 @@ def _seen(tile: FloatArray, j: int, mark: float, sight: Sight) -> Seen:
 
     A ray that is not used gets heights and lengths that do no harm.
     """
-    cx, cy, cz, offset, least_cosine2, r = sight
+    centre, offset, least_cosine2, r = sight
     z = tile[2 * TILE + j]
-    ex, ey, ez = cx - tile[j], cy - tile[TILE + j], cz - z
-    nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-    height = nx * ex + ny * ey + nz * ez
-    h = nz * (tile[3 * TILE + j] - (z - offset))
-    length2 = ex * ex + ey * ey + ez * ez
+    e = minus(centre, (tile[j], tile[TILE + j], z))
+    normal = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+    height = dot(normal, e)
+    h = normal[2] * (tile[3 * TILE + j] - (z - offset))
+    length2 = dot(e, e)
     use = (mark > 0.0) & (height > h) & (height * height >= least_cosine2 * length2)
     one = mark if use else 0.0
     height = height if use else 1.0
     length2 = length2 if use else 1.0
     bend = r if h > 0.0 else 1.0
-    return one, ex, ey, ez, nx, ny, nz, height, length2, h, h + tile[BELOW * TILE + j], bend
+    return one, e, normal, height, length2, h, h + tile[BELOW * TILE + j], bend
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -153,24 +144,20 @@ def _bent(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _weight(
-    one: float, ex: float, ey: float, ez: float, length2: float,
-    axis: tuple[float, float, float], square: float,
-) -> Six:  # fmt: skip
+def _weight(one: float, e: Vector, length2: float, axis: Vector, square: float) -> Symmetric:
     """Return J'J of a camera whose squared focal length (px) is `square`, at P.
 
     With the optical axis z and Z = -z.e it is (f / Z)^2 (I + x z' + z x'), x = e / Z +
     L^2 / (2 Z^2) z; without an axis (zeros), of angles, (f / L)^2 (I - e e' / L^2).
     """
-    zx, zy, zz = axis
-    flat = zx != 0.0 or zy != 0.0 or zz != 0.0
-    deep = -(zx * ex + zy * ey + zz * ez) if flat else length2
+    flat = axis[0] != 0.0 or axis[1] != 0.0 or axis[2] != 0.0
+    deep = -dot(axis, e) if flat else length2
     inv = 1.0 / deep if one > 0.0 else 0.0
     w = one * square * (inv * inv if flat else inv)
     a = inv if flat else -0.5 * inv
     b = 0.5 * length2 * inv * inv if flat else 0.0
-    zx, zy, zz = zx if flat else ex, zy if flat else ey, zz if flat else ez
-    x, y, z = w * (a * ex + b * zx), w * (a * ey + b * zy), w * (a * ez + b * zz)
+    zx, zy, zz = axis[0] if flat else e[0], axis[1] if flat else e[1], axis[2] if flat else e[2]
+    x, y, z = scaled(w, beyond(scaled(a, e), b, (zx, zy, zz)))
     return (
         w + 2.0 * x * zx, x * zy + zx * y, x * zz + zx * z,
         w + 2.0 * y * zy, y * zz + zy * z, w + 2.0 * z * zz,
@@ -178,24 +165,15 @@ def _weight(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _times(m: Six, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return a symmetric matrix times a vector."""
-    return (
-        m[0] * x + m[1] * y + m[2] * z,
-        m[1] * x + m[3] * y + m[4] * z,
-        m[2] * x + m[4] * y + m[5] * z,
-    )
+def _add_three(sums: FloatArray, at: int, c: float, a: Vector) -> None:
+    """Add c a."""
+    sums[at] += c * a[0]
+    sums[at + TILE] += c * a[1]
+    sums[at + 2 * TILE] += c * a[2]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _add_three(sums: FloatArray, at: int, c: float, x: float, y: float, z: float) -> None:
-    sums[at] += c * x
-    sums[at + TILE] += c * y
-    sums[at + 2 * TILE] += c * z
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _add_six(sums: FloatArray, at: int, m: Six) -> None:
+def _add_six(sums: FloatArray, at: int, m: Symmetric) -> None:
     sums[at] += m[0]
     sums[at + TILE] += m[1]
     sums[at + 2 * TILE] += m[2]
@@ -205,39 +183,32 @@ def _add_six(sums: FloatArray, at: int, m: Six) -> None:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _add_nine(
-    sums: FloatArray, at: int, c: float, m: Six, gx: float, gy: float, gz: float,
-    qx: float, qy: float, qz: float,
-) -> None:  # fmt: skip
+def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: Vector) -> None:
     """Add c m + g q'."""
-    sums[at] += c * m[0] + gx * qx
-    sums[at + TILE] += c * m[1] + gx * qy
-    sums[at + 2 * TILE] += c * m[2] + gx * qz
-    sums[at + 3 * TILE] += c * m[1] + gy * qx
-    sums[at + 4 * TILE] += c * m[3] + gy * qy
-    sums[at + 5 * TILE] += c * m[4] + gy * qz
-    sums[at + 6 * TILE] += c * m[2] + gz * qx
-    sums[at + 7 * TILE] += c * m[4] + gz * qy
-    sums[at + 8 * TILE] += c * m[5] + gz * qz
+    sums[at] += c * m[0] + g[0] * q[0]
+    sums[at + TILE] += c * m[1] + g[0] * q[1]
+    sums[at + 2 * TILE] += c * m[2] + g[0] * q[2]
+    sums[at + 3 * TILE] += c * m[1] + g[1] * q[0]
+    sums[at + 4 * TILE] += c * m[3] + g[1] * q[1]
+    sums[at + 5 * TILE] += c * m[4] + g[1] * q[2]
+    sums[at + 6 * TILE] += c * m[2] + g[2] * q[0]
+    sums[at + 7 * TILE] += c * m[4] + g[2] * q[1]
+    sums[at + 8 * TILE] += c * m[5] + g[2] * q[2]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _in_space(
-    one: float, ex: float, ey: float, ez: float, nx: float, ny: float, nz: float, height: float,
-    length2: float, bend: float, kappa: float, inv2: float,
-) -> tuple[Six, float, float, float]:  # fmt: skip
+    one: float, e: Vector, normal: Vector, height: float, length2: float, bend: float,
+    kappa: float, inv2: float,
+) -> tuple[Symmetric, Vector]:  # fmt: skip
     """Return t t' and E."""
-    dx, dy, dz = refracted(ex, ey, ez, length2, nx, ny, nz, height, bend)
+    dx, dy, dz = refracted(e, length2, normal, height, bend)
     one = one * inv2
     tx, ty, tz = one * dx, one * dy, one * dz
     along = kappa * kappa * one
     up = along * height + bend * kappa * (length2 - height * height) * one
-    return (
-        (dx * tx, dx * ty, dx * tz, dy * ty, dy * tz, dz * tz),
-        along * ex - up * nx,
-        along * ey - up * ny,
-        along * ez - up * nz,
-    )
+    tt = dx * tx, dx * ty, dx * tz, dy * ty, dy * tz, dz * tz
+    return tt, minus(scaled(along, e), scaled(up, normal))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -247,25 +218,23 @@ def add_in_space(
     """Add one camera's rays to the sums of a tile's points, as often as their marks say."""
     sight, view, square = _of_camera(rig, c, rule)
     for j in range(marks.size):
-        one, ex, ey, ez, nx, ny, nz, height, length2, h, y, bend = _seen(tile, j, marks[j], sight)
+        one, e, normal, height, length2, h, y, bend = _seen(tile, j, marks[j], sight)
         kappa, inv_h, inv2, lean, away, beta, by_n = _bent(height, length2, h, y, bend)
-        tt, gx, gy, gz = _in_space(
-            one, ex, ey, ez, nx, ny, nz, height, length2, bend, kappa, inv2
-        )  # fmt: skip
+        tt, g = _in_space(one, e, normal, height, length2, bend, kappa, inv2)
         # M D (p - (N.p) e / H), where M e = (1 - r H / kappa) E
         up = (away * (lean * height - 1.0) - beta * length2) * inv_h
         away *= one
         sums[RAYS * TILE + j] += one
-        _add_three(sums, BY_Q * TILE + j, 1.0, tt[0], tt[1], tt[2])
+        _add_three(sums, BY_Q * TILE + j, 1.0, tt[:3])
         sums[(BY_Q + 3) * TILE + j] += tt[3]
         sums[(BY_Q + 4) * TILE + j] += tt[4]
         m = (away - away * tt[0], -away * tt[1], -away * tt[2],
              away - away * tt[3], -away * tt[4], away - away * tt[5])  # fmt: skip
-        qx, qy, qz = up * nx + beta * ex, up * ny + beta * ey, up * nz + beta * ez
-        _add_nine(sums, BY_P * TILE + j, 1.0, m, gx, gy, gz, qx, qy, qz)
-        _add_three(sums, BY_LEVEL * TILE + j, inv_h - lean, gx, gy, gz)
-        _add_three(sums, BY_N * TILE + j, by_n, gx, gy, gz)
-        _add_six(sums, SIGHT * TILE + j, _weight(one, ex, ey, ez, length2, view, square))
+        q = plus(scaled(up, normal), scaled(beta, e))
+        _add_nine(sums, BY_P * TILE + j, 1.0, m, g, q)
+        _add_three(sums, BY_LEVEL * TILE + j, inv_h - lean, g)
+        _add_three(sums, BY_N * TILE + j, by_n, g)
+        _add_six(sums, SIGHT * TILE + j, _weight(one, e, length2, view, square))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -279,19 +248,19 @@ def add_in_images(
     """
     sight, view, square = _of_camera(rig, c, rule)
     for j in range(marks.size):
-        one, ex, ey, ez, nx, ny, nz, height, length2, h, y, bend = _seen(tile, j, marks[j], sight)
+        one, e, normal, height, length2, h, y, bend = _seen(tile, j, marks[j], sight)
         _, inv_h, _, lean, away, beta, by_n = _bent(height, length2, h, y, bend)
-        w = _weight(one, ex, ey, ez, length2, view, square)
-        gx, gy, gz = _times(w, nx, ny, nz)
+        w = _weight(one, e, length2, view, square)
+        g = product(w, normal)
         inner, outer = _inverse(height, length2, away, beta)
         v = height * beta * inner * outer
         u = lean * height * outer - inner - height * v
-        qx, qy, qz = u * nx + v * ex, u * ny + v * ey, u * nz + v * ez
+        q = plus(scaled(u, normal), scaled(v, e))
         sums[RAYS * TILE + j] += one
-        _add_nine(sums, BY_Q * TILE + j, inner, w, gx, gy, gz, qx, qy, qz)
+        _add_nine(sums, BY_Q * TILE + j, inner, w, g, q)
         scale = -height * outer
-        _add_three(sums, BY_LEVEL * TILE + j, scale * (inv_h - lean), gx, gy, gz)
-        _add_three(sums, BY_N * TILE + j, scale * by_n, gx, gy, gz)
+        _add_three(sums, BY_LEVEL * TILE + j, scale * (inv_h - lean), g)
+        _add_three(sums, BY_N * TILE + j, scale * by_n, g)
         _add_six(sums, SIGHT * TILE + j, w)
 
 
@@ -325,23 +294,19 @@ def add_tilt(
     """
     sight, view, square = _of_camera(rig, c, rule)
     for j in range(marks.size):
-        one, ex, ey, ez, nx, ny, nz, height, length2, h, y, bend = _seen(tile, j, marks[j], sight)
+        one, e, normal, height, length2, h, y, bend = _seen(tile, j, marks[j], sight)
         kappa, inv_h, inv2, lean, away, beta, _ = _bent(height, length2, h, y, bend)
         turn, along = _turned(height, inv_h, h, y, bend, 1.0 / kappa, lean)
         if in_images:
-            w = _weight(one, ex, ey, ez, length2, view, square)
-            gx, gy, gz = _times(w, nx, ny, nz)
+            w = _weight(one, e, length2, view, square)
+            g = product(w, normal)
             inner, outer = _inverse(height, length2, away, beta)
             along = (turn * beta * inner - along) * height * outer
             turn *= inner
         else:
-            tt, gx, gy, gz = _in_space(
-                one, ex, ey, ez, nx, ny, nz, height, length2, bend, kappa, inv2
-            )  # fmt: skip
+            tt, g = _in_space(one, e, normal, height, length2, bend, kappa, inv2)
             w = (one - tt[0], -tt[1], -tt[2], one - tt[3], -tt[4], one - tt[5])
-        _add_nine(
-            sums, BY_TILT * TILE + j, turn, w, gx, gy, gz, along * ex, along * ey, along * ez
-        )  # fmt: skip
+        _add_nine(sums, BY_TILT * TILE + j, turn, w, g, scaled(along, e))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -361,10 +326,10 @@ def add_noise(
     image_px, centre_m = budget.image_px, budget.centre_m
     attitude, waves = budget.attitude, budget.waves
     for j in range(marks.size):
-        one, ex, ey, ez, nx, ny, nz, height, length2, h, y, bend = _seen(tile, j, marks[j], sight)
+        one, e, normal, height, length2, h, y, bend = _seen(tile, j, marks[j], sight)
         kappa, _, _, lean, away, beta, _ = _bent(height, length2, h, y, bend)
-        w = _weight(one, ex, ey, ez, length2, view, square)
-        gx, gy, gz = _times(w, nx, ny, nz)
+        w = _weight(one, e, length2, view, square)
+        g = product(w, normal)
         inner, outer = _inverse(height, length2, away, beta)
         across = waves * y * (1.0 - height * lean)
         bow = bend * bend / (kappa * kappa)
@@ -376,18 +341,18 @@ def add_noise(
         by_normal = more * height * height - c_t * c_t
         ww = _squared(w)
         noise = (
-            image_px * image_px * w[0] + by_place * ww[0] + by_normal * gx * gx,
-            image_px * image_px * w[1] + by_place * ww[1] + by_normal * gx * gy,
-            image_px * image_px * w[2] + by_place * ww[2] + by_normal * gx * gz,
-            image_px * image_px * w[3] + by_place * ww[3] + by_normal * gy * gy,
-            image_px * image_px * w[4] + by_place * ww[4] + by_normal * gy * gz,
-            image_px * image_px * w[5] + by_place * ww[5] + by_normal * gz * gz,
+            image_px * image_px * w[0] + by_place * ww[0] + by_normal * g[0] * g[0],
+            image_px * image_px * w[1] + by_place * ww[1] + by_normal * g[0] * g[1],
+            image_px * image_px * w[2] + by_place * ww[2] + by_normal * g[0] * g[2],
+            image_px * image_px * w[3] + by_place * ww[3] + by_normal * g[1] * g[1],
+            image_px * image_px * w[4] + by_place * ww[4] + by_normal * g[1] * g[2],
+            image_px * image_px * w[5] + by_place * ww[5] + by_normal * g[2] * g[2],
         )
         _add_six(sums, NOISE * TILE + j, noise)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _squared(m: Six) -> Six:
+def _squared(m: Symmetric) -> Symmetric:
     """Return the square of a symmetric matrix."""
     xx, xy, xz, yy, yz, zz = m
     return (

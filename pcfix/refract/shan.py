@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from pcfix.model import BoolArray, FloatArray, IntArray, Outcome
-from pcfix.refract.batch import Batch, Intersection
-from pcfix.refract.literature import depth_ratio, rays_of
+from pcfix.model import BoolArray, FloatArray, Outcome
+from pcfix.refract.batch import Batch, Chosen, Intersection
+from pcfix.refract.literature import depth_ratio
 from pcfix.refract.rays import MIN_DETERMINANT
 from pcfix.threads import one_caller
 
@@ -18,10 +18,6 @@ MOST_ITERATIONS = 50
 
 def shan(batch: Batch) -> Intersection:
     """Intersect with the collinearity equations of the s-model; X, Y and Z move.
-
-    Parameters
-    ----------
-    batch : Batch
 
     Returns
     -------
@@ -61,32 +57,30 @@ def shan(batch: Batch) -> Intersection:
     found = np.zeros((len(batch.xyz), 4))
     failed = np.zeros(len(batch.xyz), np.bool_)
     with one_caller():
-        _solve_all(*rays_of(batch), batch.survey.settings.refractive_index, found, failed)
+        _solve_all(batch.chosen(), found, failed)
     outcome = np.where(failed, np.uint8(Outcome.PARALLEL_RAYS), batch.outcome())
     return batch.result(found[:, :3], outcome=outcome, ray_miss_m=found[:, 3])
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def _solve_all(
-    xyz: FloatArray, depth: FloatArray, centres: FloatArray, offset: FloatArray,
-    start: IntArray, camera: IntArray, n: float, found: FloatArray, failed: BoolArray,
-) -> None:  # fmt: skip
+def _solve_all(points: Chosen, found: FloatArray, failed: BoolArray) -> None:
     """Fill in shift and distance from the rays of each point with two rays or more."""
-    for i in prange(len(xyz)):
-        rays = camera[start[i] : start[i + 1]]
+    for i in prange(len(points.xyz)):
+        rays = points.camera[points.start[i] : points.start[i + 1]]
         if rays.size < 2:
             continue
         e = np.empty((rays.size, 3))
         d = np.empty(rays.size)
         for j in range(rays.size):
             for axis in range(3):
-                e[j, axis] = centres[rays[j], axis] - xyz[i, axis]
-            d[j] = max(depth[i] + offset[rays[j]], 0.0)
-        solved, x, y, sunk = _iterate(e, d, n)
+                e[j, axis] = points.centres[rays[j], axis] - points.xyz[i, axis]
+            depth = points.height[i] - points.xyz[i, 2]
+            d[j] = max(depth + points.offset[rays[j]], 0.0)
+        solved, x, y, sunk = _iterate(e, d, points.n)
         failed[i] = not solved
         if solved:
             found[i, 0], found[i, 1], found[i, 2] = x, y, -sunk
-            found[i, 3] = _miss(e, d, n, x, y, sunk)
+            found[i, 3] = _miss(e, d, points.n, x, y, sunk)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -25,20 +25,51 @@ above, and is taken back to half of such a step wherever it does not come nearer
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
 
-from pcfix.errors import PcfixWarning
-from pcfix.lens.formulas import CODES, KIND
-from pcfix.lens.imaging import image_and_gradients, lens_table
+from pcfix.lens.algebra import (
+    Vector,
+    beyond,
+    column_of,
+    cross,
+    dot,
+    minus,
+    plus,
+    row_of,
+    scaled,
+    solved,
+    times,
+    transposed_times,
+    vector,
+)
+from pcfix.lens.formulas import KIND, PERSPECTIVE
+from pcfix.lens.imaging import image_in_world
 from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, Views
-from pcfix.refract.batch import Batch, Images, Intersection, as_made, images_of
+from pcfix.refract.batch import (
+    Batch,
+    Chosen,
+    Images,
+    Intersection,
+    Optics,
+    as_made,
+    images_of,
+    optics_of,
+    warn_of_unsolved,
+)
+from pcfix.refract.choice import cameras_of_pairs
 from pcfix.refract.consistent import check_consistent
-from pcfix.refract.rays import MIN_DETERMINANT, light_path, line_terms, nearest_point, refracted
+from pcfix.refract.rays import (
+    MIN_DETERMINANT,
+    add_line,
+    direction,
+    light_path,
+    nearest_point,
+    refracted,
+)
 from pcfix.threads import one_caller
 
 MAX_STEPS = 40
@@ -46,7 +77,6 @@ CLOSE_M = 1e-6
 """How far from P the median may be; Q is then off by two or three times as much."""
 
 _BLOCK = 64
-_PERSPECTIVE = CODES["perspective"]
 _NO_CAMERA, _ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
 _PARALLEL, _CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
 
@@ -59,16 +89,11 @@ _ABOVE, _MADE, _BY_PLACE, _SQUARE, _RIGHT, _RAY_WIDTH = 3, 4, 7, 10, 16, 20
 
 
 class _Images(NamedTuple):
-    """Those of the matcher: rotations, shape (k, 3, 3), the lens of each as a row of `lenses`.
+    """Those of the matcher; `both` has them as they were and as they are now; n."""
 
-    `both` has them as they were and as they are now; n.
-    """
-
-    rotations: FloatArray
-    row: IntArray
-    lenses: FloatArray
+    optics: Optics
     both: Images
-    refractive_index: float
+    n: float
 
 
 def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
@@ -107,140 +132,86 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     check_consistent(batch.survey.cameras)
     if batch.rays.kind == "pairs":
         pairs, batch = batch.rays, replace(batch, views=cameras_of_pairs(batch.rays))
-    used = np.zeros(len(batch.rays.camera), np.bool_)
-    result = _inverted(batch, pairs, used)
-    outcome = result[:, _OUTCOME].astype(np.uint8)
-    moved = outcome == Outcome.CORRECTED
-    lost = int((moved & (result[:, _FOUND] == 0.0)).sum())
-    if lost:
-        warnings.warn(
-            f"stereo pairs: no solution for {lost:,} of {int(moved.sum()):,} points; they have that"
-            " of snell.",
-            PcfixWarning,
-            stacklevel=2,
-        )
-    count = np.concatenate([[0], np.cumsum(used)])
-    in_pairs = Views(count[batch.rays.start], np.asarray(batch.rays.camera)[used])
-    return replace(batch, views=in_pairs).result(
-        result[:, :3], outcome=outcome, ray_miss_m=result[:, _MISS]
-    )
-
-
-def cameras_of_pairs(pairs: Views) -> Views:
-    """Return the cameras in each point's pairs, each once, in the order of the list."""
-    start = np.zeros(len(pairs.start), np.int64)
-    camera = np.asarray(pairs.camera, np.int64)
-    distinct = np.empty(len(camera), np.int64)
-    _distinct(np.asarray(pairs.start, np.int64), camera, start, distinct)
-    return Views(start, distinct[: start[-1]])
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _distinct(start: IntArray, camera: IntArray, first: IntArray, distinct: IntArray) -> None:
-    owner = np.full(camera.max() + 1 if camera.size else 0, -1)
-    count = 0
-    for i in range(len(start) - 1):
-        for c in camera[start[i] : start[i + 1]]:
-            if owner[c] != i:
-                owner[c], distinct[count] = i, c
-                count += 1
-        first[i + 1] = count
-
-
-def _inverted(batch: Batch, pairs: Views | None, used: BoolArray) -> FloatArray:
-    """Return the rows of the kernel, one per point; mark the entries of the views in a pair."""
     cameras, matcher = batch.survey.cameras, batch.survey.learned.matcher
     if pairs is None and matcher is None:
         raise ValueError("pairs or a model of the matcher are needed")
-    made_xyz, made = batch.made_with or (batch.xyz, cameras)
-    row, table = lens_table(made.lenses or ())
-    rotations = np.ascontiguousarray(made.rotations, np.float64)
+    made = cameras if batch.made_with is None else batch.made_with.cameras
     listed = None if pairs is None else (pairs.start, np.asarray(pairs.camera, np.int64))
-    result = np.zeros((len(batch.xyz), _WIDTH))
+    matched = np.zeros((0, 0), np.int64) if matcher is None else matcher.matched
+    used, result = np.zeros(len(batch.rays.camera), np.bool_), np.zeros((len(batch), _WIDTH))
+    both = images_of(batch.made_with, cameras)
     with one_caller():
-        _invert(
-            np.ascontiguousarray(batch.xyz),
-            np.ascontiguousarray(made_xyz),
-            np.ascontiguousarray(batch.surface.height_m),
-            batch.normals(),
-            np.ascontiguousarray(cameras.centres),
-            np.ascontiguousarray(batch.survey.offset_m, np.float64),
-            rotations,
-            row,
-            table,
-            images_of(batch.made_with, cameras),
-            batch.survey.settings.refractive_index,
-            np.asarray(batch.rays.start, np.int64),
-            np.asarray(batch.rays.camera, np.int64),
-            listed,
-            np.zeros((0, 0), np.int64) if matcher is None else matcher.matched,
-            used,
-            result,
-        )
-    return result
+        _invert(batch.chosen(), optics_of(made), both, listed, matched, used, result)
+    outcome = result[:, _OUTCOME].astype(np.uint8)
+    moved = outcome == Outcome.CORRECTED
+    warn_of_unsolved("stereo pairs: no solution", result[moved, _FOUND] > 0.0)
+    count = np.concatenate([[0], np.cumsum(used)])
+    in_pairs = Views(count[batch.rays.start], np.asarray(batch.rays.camera)[used])
+    shift, miss = result[:, :3], result[:, _MISS]
+    return replace(batch, views=in_pairs).result(shift, outcome=outcome, ray_miss_m=miss)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _invert(
-    xyz: FloatArray, made_xyz: FloatArray, height: FloatArray, normals: FloatArray,
-    centres: FloatArray, offset: FloatArray, rotations: FloatArray, row: IntArray,
-    lenses: FloatArray, both: Images, n: float, start: IntArray, camera: IntArray,
-    listed: tuple[IntArray, IntArray] | None, matched: IntArray, used: BoolArray,
-    result: FloatArray,
+    points: Chosen, optics: Optics, both: Images, listed: tuple[IntArray, IntArray] | None,
+    matched: IntArray, used: BoolArray, result: FloatArray,
 ) -> None:  # fmt: skip
     """Correct every point on its own; a block of them shares the memory for rays and pairs."""
-    for block in prange((len(xyz) + _BLOCK - 1) // _BLOCK):
-        images = _Images(rotations, row, lenses, both, n)
-        first, last = block * _BLOCK, min((block + 1) * _BLOCK, len(xyz))
+    start = points.start
+    for block in prange((len(points.xyz) + _BLOCK - 1) // _BLOCK):
+        images = _Images(optics, both, points.n)
+        first, last = block * _BLOCK, min((block + 1) * _BLOCK, len(points.xyz))
         most, most_pairs = 0, 0
         for i in range(first, last):
-            mine = start[i + 1] - start[i]
-            most = max(most, mine)
-            room = mine * matched.shape[1]
+            count = start[i + 1] - start[i]
+            most = max(most, count)
+            room = count * matched.shape[1]
             if listed is not None:
                 room = (listed[0][i + 1] - listed[0][i]) // 2
             most_pairs = max(most_pairs, room)
-        rays, place = np.empty((most, _RAY_WIDTH)), np.full(len(centres), -1)
+        rays, place = np.empty((most, _RAY_WIDTH)), np.full(len(points.centres), -1)
         pairs, places = np.empty((most_pairs, 2), np.int64), np.empty((3, most_pairs))
         for i in range(first, last):
-            mine, flags = camera[start[i] : start[i + 1]], used[start[i] : start[i + 1]]
-            for j in range(mine.size):
-                place[mine[j]] = j
-                rays[j, :3] = centres[mine[j]] - xyz[i]
-                rays[j, _MADE:_BY_PLACE] = rays[j, :3]
-                if len(images.both.centres):
-                    rays[j, _MADE:_BY_PLACE] = images.both.centres[mine[j]] - made_xyz[i]
-                _scale(rays[j], images, mine[j])
-                rays[j, _ABOVE] = normals[i, 2] * (height[i] - xyz[i, 2] + offset[mine[j]])
+            cameras = points.camera[start[i] : start[i + 1]]
+            flags, normal = used[start[i] : start[i + 1]], row_of(points.normals, i)
+            for j in range(cameras.size):
+                place[cameras[j]] = j
+                _begin(rays[j], points, i, cameras[j], images)
             if listed is not None:
                 entries = listed[1][listed[0][i] : listed[0][i + 1]]
                 count = _listed_pairs(pairs, entries, place)
             else:
-                count = _matched_pairs(pairs, mine, matched, place)
-            for c in mine:
+                count = _matched_pairs(pairs, cameras, matched, place)
+            for c in cameras:
                 place[c] = -1
-            wide = _wide_pairs(pairs[:count], rays, normals[i])
+            wide = _wide_pairs(pairs[:count], rays, normal)
             if wide == 0:
-                few = _ONE_CAMERA if mine.size else _NO_CAMERA
+                few = _ONE_CAMERA if cameras.size else _NO_CAMERA
                 result[i, _OUTCOME] = _PARALLEL if count else few
                 continue
             for p in range(wide):
                 flags[pairs[p, 0]], flags[pairs[p, 1]] = True, True
-            _solve(result[i], rays, mine, flags, pairs[:wide], places[:, :wide], normals[i], images)
+            _solve(result[i], rays, cameras, flags, pairs[:wide], places[:, :wide], normal, images)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _scale(ray: FloatArray, images: _Images, c: int) -> None:
-    """Write how the distance that the scale of an image goes by changes, in terms of P's.
+def _begin(ray: FloatArray, points: Chosen, i: int, c: int, images: _Images) -> None:
+    """Fill in where a ray comes from, and how its scale changes with the place.
 
-    In perspective that is the distance along the axis, in other projections that from the centre.
+    The distance that the scale of an image goes by, in terms of P's, is in perspective that along
+    the axis, in other projections that from the centre.
     """
-    axis, made, ahead, size2 = images.rotations[c, 2], ray[_MADE:], 0.0, 0.0
-    for i in range(3):
-        ahead, size2 = ahead - axis[i] * made[i], size2 + made[i] * made[i]
-    flat = images.lenses[images.row[c], KIND] == _PERSPECTIVE and ahead > 0.0
-    for i in range(3):
-        ray[_BY_PLACE + i] = axis[i] / ahead if flat else -made[i] / size2
+    e = minus(row_of(points.centres, c), row_of(points.xyz, i))
+    ray[_ABOVE] = points.normals[i, 2] * (points.height[i] - points.xyz[i, 2] + points.offset[c])
+    made, optics = e, images.optics
+    if len(images.both.centres):
+        made = minus(row_of(images.both.centres, c), row_of(points.made_xyz, i))
+    axis, size2 = row_of(optics.rotations[c], 2), dot(made, made)
+    ahead = -dot(axis, made)
+    flat = optics.lenses[optics.row[c], KIND] == PERSPECTIVE and ahead > 0.0
+    for j in range(3):
+        ray[j], ray[_MADE + j] = e[j], made[j]
+        ray[_BY_PLACE + j] = axis[j] / ahead if flat else -made[j] / size2
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -256,15 +227,15 @@ def _listed_pairs(pairs: IntArray, entries: IntArray, place: IntArray) -> int:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _matched_pairs(pairs: IntArray, mine: IntArray, matched: IntArray, place: IntArray) -> int:
+def _matched_pairs(pairs: IntArray, cameras: IntArray, matched: IntArray, place: IntArray) -> int:
     """Write the pairs of cameras of which either was matched with the other; return how many."""
     count = 0
-    for a in range(mine.size):
-        for partner in matched[mine[a]]:
+    for a in range(cameras.size):
+        for partner in matched[cameras[a]]:
             if partner < 0:
                 break
             b = place[partner]
-            if b < 0 or (b < a and (matched[partner] == mine[a]).any()):
+            if b < 0 or (b < a and (matched[partner] == cameras[a]).any()):
                 continue
             pairs[count, 0], pairs[count, 1] = a, b
             count += 1
@@ -272,7 +243,7 @@ def _matched_pairs(pairs: IntArray, mine: IntArray, matched: IntArray, place: In
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _wide_pairs(pairs: IntArray, rays: FloatArray, normal: FloatArray) -> int:
+def _wide_pairs(pairs: IntArray, rays: FloatArray, normal: Vector) -> int:
     """Bring the pairs with a base to the front, as seen from P; return how many there are.
 
     The limit is that of `pcfix.refract.rays.nearest_point` for two rays. Cameras below the water
@@ -280,14 +251,13 @@ def _wide_pairs(pairs: IntArray, rays: FloatArray, normal: FloatArray) -> int:
     """
     count = 0
     for p in range(len(pairs)):
-        a, b = rays[pairs[p, 0]], rays[pairs[p, 1]]
-        ax, ay, az, bx, by, bz = a[0], a[1], a[2], b[0], b[1], b[2]
-        x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-        lengths2 = (ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz)
-        over_a = normal[0] * ax + normal[1] * ay + normal[2] * az
-        over_b = normal[0] * bx + normal[1] * by + normal[2] * bz
-        above = over_a > max(a[_ABOVE], 0.0) and over_b > max(b[_ABOVE], 0.0)
-        if above and x * x + y * y + z * z >= 4.0 * MIN_DETERMINANT * lengths2:
+        first, second = rays[pairs[p, 0]], rays[pairs[p, 1]]
+        a, b = vector(first), vector(second)
+        across = cross(a, b)
+        above = dot(normal, a) > max(first[_ABOVE], 0.0)
+        above = above and dot(normal, b) > max(second[_ABOVE], 0.0)
+        wide = dot(across, across) >= 4.0 * MIN_DETERMINANT * (dot(a, a) * dot(b, b))
+        if above and wide:
             pairs[count, 0], pairs[count, 1] = pairs[p, 0], pairs[p, 1]
             count += 1
     return count
@@ -295,183 +265,149 @@ def _wide_pairs(pairs: IntArray, rays: FloatArray, normal: FloatArray) -> int:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _solve(
-    out: FloatArray, rays: FloatArray, mine: IntArray, used: BoolArray, pairs: IntArray,
-    places: FloatArray, normal: FloatArray, images: _Images,
+    out: FloatArray, rays: FloatArray, cameras: IntArray, used: BoolArray, pairs: IntArray,
+    places: FloatArray, normal: Vector, images: _Images,
 ) -> None:  # fmt: skip
     """Solve one point and write its row."""
-    start = np.empty(3)
-    if not _snell(start, rays, used, normal, images.refractive_index):
+    fixed, q = _snell(rays, used, normal, images.n)
+    if not fixed:
         out[_OUTCOME] = _PARALLEL
         return
-    q = start.copy()
-    found = _search(q, rays, mine, used, pairs, places, normal, images)
-    out[:3] = q if found else start
-    out[_MISS] = _miss(out[:3], rays, used, normal, images.refractive_index)
+    found, q = _search(q, rays, cameras, used, pairs, places, normal, images)
+    out[0], out[1], out[2] = q
+    out[_MISS] = _miss(q, rays, used, normal, images.n)
     out[_OUTCOME], out[_FOUND] = _CORRECTED, 1.0 if found else 0.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _line(
-    ray: FloatArray, normal: FloatArray, n: float
-) -> tuple[float, float, float, float, float, float, float]:
-    """Return where the ray through P enters the water, its direction, length L, and L squared."""
-    ex, ey, ez = ray[0], ray[1], ray[2]
-    nx, ny, nz = normal[0], normal[1], normal[2]
-    length2 = ex * ex + ey * ey + ez * ez
-    across = nx * ex + ny * ey + nz * ez
-    wet = ray[_ABOVE] > 0.0
-    f, bend = (ray[_ABOVE] / across, 1.0 / n) if wet else (0.0, 1.0)
-    dx, dy, dz = refracted(ex, ey, ez, length2, nx, ny, nz, across, bend)
-    return f * ex, f * ey, f * ez, dx, dy, dz, length2
+def _line(ray: FloatArray, normal: Vector, n: float) -> tuple[Vector, Vector, float]:
+    """Return where the ray through P enters the water, its direction, and its length squared."""
+    e = vector(ray)
+    length2, across = dot(e, e), dot(normal, e)
+    f, bend = (ray[_ABOVE] / across, 1.0 / n) if ray[_ABOVE] > 0.0 else (0.0, 1.0)
+    return scaled(f, e), refracted(e, length2, normal, across, bend), length2
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _snell(
-    q: FloatArray, rays: FloatArray, used: BoolArray, normal: FloatArray, n: float
-) -> bool:  # fmt: skip
-    """Write the point nearest to the refracted rays; whether there is one."""
+def _snell(rays: FloatArray, used: BoolArray, normal: Vector, n: float) -> tuple[bool, Vector]:
+    """Return whether there is a point nearest to the refracted rays, and it."""
     k, sums = 0.0, np.zeros(9)
     for j in range(used.size):
         if used[j]:
-            x, y, z, dx, dy, dz, length2 = _line(rays[j], normal, n)
-            terms = line_terms(x, y, z, dx, dy, dz, 1.0 / length2)
+            a, d, length2 = _line(rays[j], normal, n)
+            add_line(sums, a, d, 1.0 / length2)
             k += 1.0
-            for i in range(9):
-                sums[i] += terms[i]
-    s = sums
-    solved, q[0], q[1], q[2], _, _ = nearest_point(
-        k, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8]
-    )
-    return solved
+    fixed, q, _, _ = nearest_point(k, sums)
+    return fixed, q
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _miss(
-    q: FloatArray, rays: FloatArray, used: BoolArray, normal: FloatArray, n: float
-) -> float:  # fmt: skip
+def _miss(q: Vector, rays: FloatArray, used: BoolArray, normal: Vector, n: float) -> float:
     """Return the rms distance of Q from the refracted rays through P."""
     k, total = 0.0, 0.0
     for j in range(used.size):
         if used[j]:
-            x, y, z, dx, dy, dz, length2 = _line(rays[j], normal, n)
-            x, y, z = q[0] - x, q[1] - y, q[2] - z
-            along = x * dx + y * dy + z * dz
-            total += max(x * x + y * y + z * z - along * along / length2, 0.0)
+            a, d, length2 = _line(rays[j], normal, n)
+            a = minus(q, a)
+            along = dot(a, d)
+            total += max(dot(a, a) - along * along / length2, 0.0)
             k += 1.0
     return np.sqrt(total / k)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _search(
-    q: FloatArray, rays: FloatArray, mine: IntArray, used: BoolArray, pairs: IntArray,
-    places: FloatArray, normal: FloatArray, images: _Images,
-) -> bool:  # fmt: skip
-    """Move Q to where the median F of the pairs' places is P, the origin; whether it was reached.
+    start: Vector, rays: FloatArray, cameras: IntArray, used: BoolArray, pairs: IntArray,
+    places: FloatArray, normal: Vector, images: _Images,
+) -> tuple[bool, Vector]:  # fmt: skip
+    """Return whether a Q was found where the median F of the pairs' places is P, and it.
 
     From the nearest Q so far goes a step s = -B F. Where F comes nearer, by y, the good Broyden
     update is B + (s - B y) s'B / (s'B y); where it does not, B starts anew, with half the step.
     """
-    best, share, step, change = np.inf, 1.0, np.empty(3), np.empty(3)
-    nearest, at_nearest, f, inverse = q.copy(), np.zeros(3), np.empty(3), np.empty((3, 3))
-    _begin(inverse, share, images.refractive_index)
+    q, nearest, at_nearest, best, share = start, start, (0.0, 0.0, 0.0), np.inf, 1.0
+    inverse = np.empty((3, 3))
+    _as_from_above(inverse, share, images.n)
     for _ in range(MAX_STEPS):
-        _median_of_pairs(f, q, rays, mine, used, pairs, places, normal, images)
-        size = np.sqrt(f[0] * f[0] + f[1] * f[1] + f[2] * f[2])
+        f = _median_of_pairs(q, rays, cameras, used, pairs, places, normal, images)
+        size = np.sqrt(dot(f, f))
         if size <= CLOSE_M:
-            return True
+            return True, q
         if size < best:
             if best < np.inf:
-                for i in range(3):
-                    step[i], change[i] = q[i] - nearest[i], f[i] - at_nearest[i]
-                _update(inverse, step, change)
-            best, nearest[:], at_nearest[:] = size, q, f
+                _update(inverse, minus(q, nearest), minus(f, at_nearest))
+            best, nearest, at_nearest = size, q, f
         elif best < np.inf:
             share *= 0.5
-            _begin(inverse, share, images.refractive_index)
+            _as_from_above(inverse, share, images.n)
         else:
-            return False
-        for i in range(3):
-            q[i] = nearest[i]
-            for j in range(3):
-                q[i] -= inverse[i, j] * at_nearest[j]
-    return False
+            return False, start
+        q = nearest
+        for j in range(3):
+            q = minus(q, scaled(at_nearest[j], column_of(inverse, j)))
+    return False, start
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _begin(inverse: FloatArray, share: float, n: float) -> None:
+def _as_from_above(inverse: FloatArray, share: float, n: float) -> None:
     """Set B to a share of what it is where all light comes from straight above."""
     inverse[:] = 0.0
     inverse[0, 0], inverse[1, 1], inverse[2, 2] = share, share, share * n
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _update(inverse: FloatArray, step: FloatArray, change: FloatArray) -> None:
+def _update(inverse: FloatArray, step: Vector, change: Vector) -> None:
     """Bring B to where it takes the last change of F for the last step (Broyden)."""
-    guess, left = np.zeros(3), np.zeros(3)
-    for i in range(3):
-        for j in range(3):
-            guess[i] += inverse[i, j] * change[j]
-            left[j] += step[i] * inverse[i, j]
-    scale = left[0] * change[0] + left[1] * change[1] + left[2] * change[2]
+    missing, left = minus(step, times(inverse, change)), transposed_times(inverse, step)
+    scale = dot(left, change)
     if scale == 0.0:
         return
     for i in range(3):
         for j in range(3):
-            inverse[i, j] += (step[i] - guess[i]) * left[j] / scale
+            inverse[i, j] += missing[i] * left[j] / scale
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _median_of_pairs(
-    f: FloatArray, q: FloatArray, rays: FloatArray, mine: IntArray, used: BoolArray,
-    pairs: IntArray, places: FloatArray, normal: FloatArray, images: _Images,
-) -> None:  # fmt: skip
-    """Write where the pairs would have placed Q; NaN where some camera has no image of it."""
+    q: Vector, rays: FloatArray, cameras: IntArray, used: BoolArray, pairs: IntArray,
+    places: FloatArray, normal: Vector, images: _Images,
+) -> Vector:  # fmt: skip
+    """Return where the pairs would have placed Q; NaN where some camera has no image of it."""
     for j in range(used.size):
         if used[j]:
-            _see(rays[j], q, mine[j], normal, images)
+            _see(rays[j], q, cameras[j], normal, images)
     for p in range(len(pairs)):
-        _meet(places[:, p], rays[pairs[p, 0]], rays[pairs[p, 1]])
-    for axis in range(3):
-        f[axis] = np.nan if np.isnan(places[axis]).any() else np.median(places[axis])
+        places[0, p], places[1, p], places[2, p] = _meet(rays[pairs[p, 0]], rays[pairs[p, 1]])
+    return _median(places[0]), _median(places[1]), _median(places[2])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _see(ray: FloatArray, q: FloatArray, c: int, normal: FloatArray, images: _Images) -> None:
+def _median(values: FloatArray) -> float:
+    return np.nan if np.isnan(values).any() else np.median(values)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _see(ray: FloatArray, q: Vector, c: int, normal: Vector, images: _Images) -> None:
     """Write what the image of Q says about places: G'G, G'G e and |G e|^2.
 
     w, as the matcher had it, is scaled to be as far away as P, so that G is that of there.
     """
-    ex, ey, ez = ray[0], ray[1], ray[2]
-    nx, ny, nz = normal[0], normal[1], normal[2]
-    k, _, _, _, sx, sy, sz = light_path(
-        q[0], q[1], q[2], ex, ey, ez, nx, ny, nz, ray[_ABOVE], images.refractive_index
-    )
-    wx, wy, wz = as_made(images.both, c, k * sx - nx, k * sy - ny, k * sz - nz)
-    ex, ey, ez = ray[_MADE], ray[_MADE + 1], ray[_MADE + 2]
-    at = _BY_PLACE
-    far = 1.0 / (wx * ray[at] + wy * ray[at + 1] + wz * ray[at + 2])
-    wx, wy, wz = far * wx, far * wy, far * wz
-    r, lens = images.rotations[c], images.lenses[images.row[c]]
-    _, _, (ux, uy, uz, vx, vy, vz) = image_and_gradients(
-        lens,
-        r[0, 0] * wx + r[0, 1] * wy + r[0, 2] * wz,
-        r[1, 0] * wx + r[1, 1] * wy + r[1, 2] * wz,
-        r[2, 0] * wx + r[2, 1] * wy + r[2, 2] * wz,
-    )
+    path = light_path(q, vector(ray), normal, ray[_ABOVE], images.n)
+    w = as_made(images.both, c, direction(path, normal))
+    w = scaled(1.0 / dot(w, vector(ray, _BY_PLACE)), w)
+    optics, e = images.optics, vector(ray, _MADE)
+    _, _, by_u, by_v = image_in_world(optics.lenses[optics.row[c]], optics.rotations[c], w)
     ray[_SQUARE:] = 0.0
-    for gx, gy, gz in ((ux, uy, uz), (vx, vy, vz)):
-        x = gx * r[0, 0] + gy * r[1, 0] + gz * r[2, 0]
-        y = gx * r[0, 1] + gy * r[1, 1] + gz * r[2, 1]
-        z = gx * r[0, 2] + gy * r[1, 2] + gz * r[2, 2]
-        off = x * ex + y * ey + z * ez
+    for g in (by_u, by_v):
+        (x, y, z), off = g, dot(g, e)
         terms = (x * x, x * y, x * z, y * y, y * z, z * z, off * x, off * y, off * z, off * off)
         for i in range(10):
             ray[_SQUARE + i] += terms[i]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _meet(place: FloatArray, a: FloatArray, b: FloatArray) -> None:
-    """Write where two straight rays have the least squared residuals in their images.
+def _meet(a: FloatArray, b: FloatArray) -> Vector:
+    """Return where two straight rays have the least squared residuals in their images.
 
     At X the residual of a camera is G (X - e) / t, t = 1 + g.X how far away X is in terms of P. The
     first round takes t as one. The second has it, and that it changes with X: at the least
@@ -480,16 +416,16 @@ def _meet(place: FloatArray, a: FloatArray, b: FloatArray) -> None:
 
     which tells in narrow pairs of rays that miss each other.
     """
-    _solve_two(place, a, b, 1.0, 1.0, 0.0, 0.0)
+    place = _solve_two(a, b, 1.0, 1.0, 0.0, 0.0)
     t, r2 = _residual(place, a)
     t_b, r2_b = _residual(place, b)
-    _solve_two(place, a, b, 1.0 / (t * t), 1.0 / (t_b * t_b), r2 / t**3, r2_b / t_b**3)
+    return _solve_two(a, b, 1.0 / (t * t), 1.0 / (t_b * t_b), r2 / t**3, r2_b / t_b**3)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _residual(place: FloatArray, ray: FloatArray) -> tuple[float, float]:
+def _residual(place: Vector, ray: FloatArray) -> tuple[float, float]:
     """Return t and r^2 of a place."""
-    x, y, z, s = place[0], place[1], place[2], ray[_SQUARE:]
+    (x, y, z), s = place, ray[_SQUARE:]
     t = 1.0 + x * ray[_BY_PLACE] + y * ray[_BY_PLACE + 1] + z * ray[_BY_PLACE + 2]
     twice = x * (s[1] * y + s[2] * z) + s[4] * y * z - (s[6] * x + s[7] * y + s[8] * z)
     return t, s[0] * x * x + s[3] * y * y + s[5] * z * z + 2.0 * twice + s[9]
@@ -497,21 +433,18 @@ def _residual(place: FloatArray, ray: FloatArray) -> tuple[float, float]:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _solve_two(
-    place: FloatArray, a: FloatArray, b: FloatArray, of_a: float, of_b: float,
-    g_a: float, g_b: float,
-) -> None:  # fmt: skip
-    """Solve the normal equations of two rays by cofactors."""
-    at = _SQUARE
-    xx, xy = of_a * a[at] + of_b * b[at], of_a * a[at + 1] + of_b * b[at + 1]
-    xz, yy = of_a * a[at + 2] + of_b * b[at + 2], of_a * a[at + 3] + of_b * b[at + 3]
-    yz, zz = of_a * a[at + 4] + of_b * b[at + 4], of_a * a[at + 5] + of_b * b[at + 5]
-    at, by = _RIGHT, _BY_PLACE
-    x = of_a * a[at] + of_b * b[at] + g_a * a[by] + g_b * b[by]
-    y = of_a * a[at + 1] + of_b * b[at + 1] + g_a * a[by + 1] + g_b * b[by + 1]
-    z = of_a * a[at + 2] + of_b * b[at + 2] + g_a * a[by + 2] + g_b * b[by + 2]
-    c00, c01, c02 = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
-    c11, c12, c22 = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
-    det = xx * c00 + xy * c01 + xz * c02
-    place[0] = (c00 * x + c01 * y + c02 * z) / det
-    place[1] = (c01 * x + c11 * y + c12 * z) / det
-    place[2] = (c02 * x + c12 * y + c22 * z) / det
+    a: FloatArray, b: FloatArray, of_a: float, of_b: float, g_a: float, g_b: float
+) -> Vector:
+    """Solve the normal equations of two rays."""
+    x, y, z = beyond(
+        beyond(_sum(a, b, of_a, of_b, _RIGHT), g_a, vector(a, _BY_PLACE)), g_b, vector(b, _BY_PLACE)
+    )
+    xx, xy, xz = _sum(a, b, of_a, of_b, _SQUARE)
+    yy, yz, zz = _sum(a, b, of_a, of_b, _SQUARE + 3)
+    return solved((xx, xy, xz, yy, yz, zz), (x, y, z))[1]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _sum(a: FloatArray, b: FloatArray, of_a: float, of_b: float, at: int) -> Vector:
+    """Return so many times three columns of one ray and of the other."""
+    return plus(scaled(of_a, vector(a, at)), scaled(of_b, vector(b, at)))

@@ -25,6 +25,7 @@ from typing import TypeAlias
 import numpy as np
 from numba import njit, prange
 
+from pcfix.lens.algebra import Symmetric, Vector
 from pcfix.model import FloatArray, IntArray, Outcome
 from pcfix.options.correct import LEVEL_M
 from pcfix.refract import sensitivity as s
@@ -33,7 +34,6 @@ from pcfix.refract.choice import TILE, Points, Rig, Rule, gather, points_of, rig
 from pcfix.refract.sensitivity import Budget
 from pcfix.threads import one_caller
 
-Three: TypeAlias = tuple[float, float, float]
 Four: TypeAlias = tuple[float, float, float, float]
 Nine: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
 """A matrix, row by row."""
@@ -280,7 +280,7 @@ def _dot(x: Four, y: Four) -> float:
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
 def _columns(
     by_delta: Nine, sums: FloatArray, tile: FloatArray, j: int, level_sigma: float, budget: Budget
-) -> tuple[Three, Three, Three, Three]:
+) -> tuple[Vector, Vector, Vector, Vector]:
     """Return how a point moves by one standard deviation of level, index and both tilts.
 
     A tilt also raises the water above the point, by its distance from the pivot.
@@ -304,12 +304,12 @@ def _columns(
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def _three(sums: FloatArray, at: int) -> Three:
+def _three(sums: FloatArray, at: int) -> Vector:
     return sums[at], sums[at + TILE], sums[at + 2 * TILE]
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def _six(sums: FloatArray, at: int) -> s.Six:
+def _six(sums: FloatArray, at: int) -> Symmetric:
     return (
         sums[at], sums[at + TILE], sums[at + 2 * TILE],
         sums[at + 3 * TILE], sums[at + 4 * TILE], sums[at + 5 * TILE],
@@ -326,22 +326,22 @@ def _nine(sums: FloatArray, at: int) -> Nine:
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def _full(m: s.Six) -> Nine:
+def _full(m: Symmetric) -> Nine:
     return m[0], m[1], m[2], m[1], m[3], m[4], m[2], m[4], m[5]
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def _scaled(c: float, x: Three) -> Three:
+def _scaled(c: float, x: Vector) -> Vector:
     return c * x[0], c * x[1], c * x[2]
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def _plus(x: Three, y: Three) -> Three:
+def _plus(x: Vector, y: Vector) -> Vector:
     return x[0] + y[0], x[1] + y[1], x[2] + y[2]
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def _times(m: Nine, x: Three) -> Three:
+def _times(m: Nine, x: Vector) -> Vector:
     """Return a matrix times a vector."""
     return (
         m[0] * x[0] + m[1] * x[1] + m[2] * x[2],

@@ -135,7 +135,7 @@ def test_tiles_are_never_judged_wrongly(name):
         inside[:8] = np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, low, high)
         for c, centre in enumerate(cameras.centres):
             e = centre - inside
-            held = [holds(frames, c, *row) for row in e]
+            held = [holds(frames, c, tuple(row)) for row in e]
             if not may_hold(frames.planes[c], centre, low, high):
                 assert not any(held)
                 continue
@@ -216,7 +216,7 @@ def test_lenses_may_differ_from_image_to_image(points):
         by_itself = frames_of(camera)
         for point in points[:100]:
             e = mixed.centres[c] - point
-            assert holds(frames, c, *e) == holds(by_itself, 0, *e)
+            assert holds(frames, c, tuple(e)) == holds(by_itself, 0, tuple(e))
 
 
 @pytest.mark.parametrize("radial", [(), (1e-300,)])

@@ -12,7 +12,7 @@ from pcfix.io.views import ViewMatch, read_views
 from pcfix.lens.frames import frames_of
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import Learned, images_of
+from pcfix.refract.batch import Chosen, Learned, images_of
 from pcfix.refract.depth_maps import _best_pairs, _depth, sight_of
 from pcfix.refract.matcher import WIDTH_M, Bed, Matcher, bed_of
 from pcfix.refract.methods import correct
@@ -108,8 +108,13 @@ def test_a_depth_is_that_of_a_slow_twin(c):
     normal = np.array([-plane[1], -plane[2], 1.0]) / np.sqrt(1 + plane[1] ** 2 + plane[2] ** 2)
     height = plane[0] + plane[1] * p[0] + plane[2] * p[1]
     images = images_of(None, CAMERAS)
-    sight = sight_of(p, p, CAMERAS.centres, height, normal, offset, images, N_WATER)
-    found = _depth(c, *(q - p), *u, sight, images, matcher(), np.empty((5, 3)))
+    nothing = np.zeros(0, np.int64)
+    points = Chosen(
+        p[None], p[None], np.array([height]), np.zeros((1, 2)), normal[None], CAMERAS.centres,
+        offset, nothing, nothing, N_WATER,
+    )  # fmt: skip
+    sight = sight_of(points, 0, images)
+    found = _depth(c, tuple(q - p), tuple(u), sight, images, matcher(), np.empty((5, 3)))
     # 0.3 to 1 m; scipy's least values are flat within 1e-6 m
     assert found == pytest.approx(slow_depth(costs, TOLERANCE), abs=5e-6)
 

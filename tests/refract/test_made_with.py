@@ -190,8 +190,8 @@ def test_directions_go_through_the_lenses_and_back():
     images = images_of(MadeWith(np.zeros((0, 3)), made), CAMERAS)
     for c in range(8):
         axis = CAMERAS.rotations[c][2] + [0.1, -0.05, 0.02]
-        there = as_made(images, c, *axis)
-        back = np.array(as_now(images, c, *there))
+        there = as_made(images, c, tuple(axis))
+        back = np.array(as_now(images, c, there))
         assert np.linalg.norm(there - axis / np.linalg.norm(axis)) > 1e-3
         # the distortion is undone to 1e-12
         assert back / np.linalg.norm(back) == pytest.approx(axis / np.linalg.norm(axis), abs=1e-10)

@@ -13,9 +13,10 @@ from pcfix.errors import PcfixWarning, SettingError
 from pcfix.model import Cameras, Lens, Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
+from pcfix.refract.choice import cameras_of_pairs
 from pcfix.refract.matcher import matcher_of
 from pcfix.refract.methods import correct
-from pcfix.refract.stereo_pairs import cameras_of_pairs, invert_pairs
+from pcfix.refract.stereo_pairs import invert_pairs
 from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of

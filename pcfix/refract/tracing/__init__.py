@@ -21,6 +21,7 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from pcfix.errors import SettingError
+from pcfix.lens.algebra import Vector, dot, minus, plus, row_of, scaled, vector
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 from pcfix.refract.tracing.tracers import (
@@ -211,56 +212,54 @@ def _trace(
         local[0] = plane[0] + plane[1] * p[0] + plane[2] * p[1] - p[2]
         local[1], local[2] = plane[1], plane[2]
         water = Water(local, tin, field, p)
-        ex, ey, ez = centres[i, 0] - p[0], centres[i, 1] - p[1], centres[i, 2] - p[2]
-        _path(result[i], water, ex, ey, ez, n, method, narrow)
+        e = minus(row_of(centres, i), vector(p))
+        _path(result[i], water, e, n, method, narrow)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _path(
-    out: FloatArray, water: Water, ex: float, ey: float, ez: float, n: float, method: int,
+    out: FloatArray, water: Water, e: Vector, n: float, method: int,
     narrow: bool,
 ) -> None:  # fmt: skip
     """Trace one pair and write its row."""
     out[:] = np.nan
     out[_STEPS], out[_STATE] = 0.0, _LOST
-    level, over = height_of(water, 0.0, 0.0)[0], height_of(water, ex, ey)[0]
-    if ez <= over or not abs(ex) + abs(ey) + abs(ez) < np.inf:
+    level, over = height_of(water, 0.0, 0.0)[0], height_of(water, e[0], e[1])[0]
+    if e[2] <= over or not abs(e[0]) + abs(e[1]) + abs(e[2]) < np.inf:
         return
     if not level > 0.0:
         out[:_STEPS], out[_STATE] = 0.0, _HIT
         return
-    if not ez > 0.0:
+    if not e[2] > 0.0:
         return
-    aim = min(level, HIGHEST_AIM * ez)
-    x, y, steps, found = _search(water, aim, ex, ey, ez, n, method)
+    aim = min(level, HIGHEST_AIM * e[2])
+    x, y, steps, found = _search(water, aim, e, n, method)
     if not found and narrow and method != _SCATTERSHOT:
         if np.isnan(height_of(water, x, y)[0]):
-            x, y = aim / ez * ex, aim / ez * ey
-        x, y, more, found = narrowed(water, ex, ey, ez, x, y, NEAR * level, n)
+            x, y = aim / e[2] * e[0], aim / e[2] * e[1]
+        x, y, more, found = narrowed(water, e, x, y, NEAR * level, n)
         steps += more
     out[_STEPS] = steps
     if found:
-        _write(out, water, ex, ey, ez, x, y, n)
+        _write(out, water, e, x, y, n)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _search(
-    water: Water, level: float, ex: float, ey: float, ez: float, n: float, method: int
+    water: Water, level: float, e: Vector, n: float, method: int
 ) -> tuple[float, float, int, bool]:
     """Return what the method finds."""
     if method == _KOTOWSKI:
-        return kotowski(water, level, ex, ey, ez, n)
+        return kotowski(water, level, e, n)
     if method == _AFRT:
-        return afrt(water, level, ex, ey, ez, n)
+        return afrt(water, level, e, n)
     if method == _MDFRT:
-        return mdfrt(water, level, ex, ey, ez, n)
-    return scattershot(water, level, ex, ey, ez, n)
+        return mdfrt(water, level, e, n)
+    return scattershot(water, level, e, n)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _write(
-    out: FloatArray, water: Water, ex: float, ey: float, ez: float, x: float, y: float, n: float
-) -> None:
+def _write(out: FloatArray, water: Water, e: Vector, x: float, y: float, n: float) -> None:
     """Fill in place and slope of the surface where the light leaves the water.
 
     Of a crease, where no facet's plane bends the light so, Snell's law gives the normal: it is
@@ -269,10 +268,11 @@ def _write(
     z, b, c = height_of(water, x, y)
     out[0], out[1], out[2], out[_SLOPE], out[_SLOPE + 1] = x, y, z, b, c
     out[_STATE] = _HIT
-    mx, my = miss_through(water, ex, ey, ez, x, y, n)
+    mx, my = miss_through(water, e, x, y, n)
     if mx * mx + my * my <= CREASE_M * CREASE_M:
         return
-    ux, uy, uz = x - ex, y - ey, z - ez
-    air, wet = 1.0 / np.sqrt(ux * ux + uy * uy + uz * uz), n / np.sqrt(x * x + y * y + z * z)
-    gx, gy, gz = air * ux + wet * x, air * uy + wet * y, air * uz + wet * z
+    a = x, y, z
+    u = minus(a, e)
+    air, wet = 1.0 / np.sqrt(dot(u, u)), n / np.sqrt(dot(a, a))
+    gx, gy, gz = plus(scaled(air, u), scaled(wet, a))
     out[_SLOPE], out[_SLOPE + 1], out[_STATE] = -gx / gz, -gy / gz, _CREASE

@@ -33,6 +33,7 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from pcfix.errors import SettingError
+from pcfix.lens.algebra import Vector, dot, minus, normal_of, row_of, vector
 from pcfix.model import FloatArray
 from pcfix.refract.rays import light_path
 from pcfix.refract.tracing import Tracing
@@ -45,18 +46,17 @@ DIRECTION, BY_POINT, BY_CENTRE, BY_LEVEL, BY_SLOPES, BY_INDEX = 0, 1, 4, 7, 8, 1
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def light_and_gradients(
-    qx: float, qy: float, qz: float, ex: float, ey: float, ez: float,
-    nx: float, ny: float, nz: float, h: float, n: float, out: FloatArray,
-) -> None:  # fmt: skip
+    q: Vector, e: Vector, normal: Vector, h: float, n: float, out: FloatArray
+) -> None:
     """Fill in the direction of the light from Q to a camera, and its derivatives.
 
     Parameters
     ----------
-    qx, qy, qz : float
+    q : Vector
         Q relative to the local origin, metres.
-    ex, ey, ez : float
+    e : Vector
         The projection centre relative to the local origin, metres.
-    nx, ny, nz, h : float
+    normal, h : Vector, float
         The plane N.x = h: unit normal, upward, and height over the local origin along it, metres.
     n : float
         Refractive index.
@@ -66,7 +66,7 @@ def light_and_gradients(
         8 and 9: by its slopes b and c (z = a + b x + c y about the local origin), 10: by n.
         11 is zero. All NaN where `light_path` finds no way.
     """
-    k, root, height, depth, sx, sy, sz = light_path(qx, qy, qz, ex, ey, ez, nx, ny, nz, h, n)
+    k, root, height, depth, s = light_path(q, e, normal, h, n)
     if np.isnan(k):
         out[:] = np.nan
         return
@@ -76,49 +76,46 @@ def light_and_gradients(
     along, aside = below * k / root, below * depth * k * k * k * (m * m - 1.0) / cube
     by_n = 0.0
     if depth > 0.0:
-        by_n = below * k * depth * n * (1.0 + k * k * (sx * sx + sy * sy + sz * sz)) / cube
-    _by_places(out, k, below * k, along, aside, sx, sy, sz, nx, ny, nz)
-    all_down = height + depth
+        by_n = below * k * depth * n * (1.0 + k * k * dot(s, s)) / cube
+    _by_places(out, k, below * k, along, aside, s, normal)
+    all_down, up = height + depth, normal[2]
     for axis in range(2):
-        _by_slope(
-            out, axis, k, 1.0 - k * all_down, nz, (sx, sy, sz), (nx, ny, nz),
-            nz * below * k * ((ex, ey)[axis] - (nx, ny)[axis] * height)
-            - nz * along * ((qx, qy)[axis] + (nx, ny)[axis] * depth)
-            - nz * aside * all_down * (sx, sy)[axis],
-        )  # fmt: skip
-    by_level = nz * (below * k - along)
-    for row, s in enumerate((sx, sy, sz)):
-        out[row, BY_LEVEL], out[row, BY_INDEX], out[row, 11] = s * by_level, s * by_n, 0.0
+        dk = (
+            up * below * k * (e[axis] - normal[axis] * height)
+            - up * along * (q[axis] + normal[axis] * depth)
+            - up * aside * all_down * s[axis]
+        )
+        _by_slope(out, axis, k, 1.0 - k * all_down, s, normal, dk)
+    by_level = up * (below * k - along)
+    for i in range(3):
+        out[i, BY_LEVEL], out[i, BY_INDEX], out[i, 11] = s[i] * by_level, s[i] * by_n, 0.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _by_places(
-    out: FloatArray, k: float, up: float, along: float, aside: float,
-    sx: float, sy: float, sz: float, nx: float, ny: float, nz: float,
-) -> None:  # fmt: skip
+    out: FloatArray, k: float, up: float, along: float, aside: float, s: Vector, normal: Vector
+) -> None:
     """Fill in w and its derivatives by Q and C.
 
     With dk / dQ = along N + aside s and dk / dC = -(up N + aside s).
     """
-    normal, sideways = (nx, ny, nz), (sx, sy, sz)
     for i in range(3):
-        out[i, DIRECTION] = k * sideways[i] - normal[i]
+        out[i, DIRECTION] = k * s[i] - normal[i]
         for j in range(3):
             flat = (k if i == j else 0.0) - k * normal[i] * normal[j]
-            aside_j = aside * sideways[j]
-            out[i, BY_POINT + j] = flat + sideways[i] * (along * normal[j] + aside_j)
-            out[i, BY_CENTRE + j] = -flat - sideways[i] * (up * normal[j] + aside_j)
+            aside_j = aside * s[j]
+            out[i, BY_POINT + j] = flat + s[i] * (along * normal[j] + aside_j)
+            out[i, BY_CENTRE + j] = -flat - s[i] * (up * normal[j] + aside_j)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _by_slope(
-    out: FloatArray, j: int, k: float, rest: float, u: float,
-    s: tuple[float, float, float], normal: tuple[float, float, float], dk: float,
-) -> None:  # fmt: skip
-    """Fill in dw by a slope: u (1 - k (H + D)) (e_j - N_j N) + k u s_j N + s dk."""
+    out: FloatArray, j: int, k: float, rest: float, s: Vector, normal: Vector, dk: float
+) -> None:
+    """Fill in dw by a slope: u (1 - k (H + D)) (e_j - N_j N) + k u s_j N + s dk, u = N_z."""
     for i in range(3):
         flat = (1.0 if i == j else 0.0) - normal[i] * normal[j]
-        out[i, BY_SLOPES + j] = u * (rest * flat + k * s[j] * normal[i]) + s[i] * dk
+        out[i, BY_SLOPES + j] = normal[2] * (rest * flat + k * s[j] * normal[i]) + s[i] * dk
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,14 +217,12 @@ def _differentiate(
         p, out = points[i], result[i]
         ax, ay, az = piercing[i, 0] - p[0], piercing[i, 1] - p[1], piercing[i, 2] - p[2]
         b, c = slope[i, 0], slope[i, 1]
-        up = 1.0 / np.sqrt(1.0 + b * b + c * c)
-        h = up * (az - b * ax - c * ay)
+        normal = normal_of(b, c)
+        h = normal[2] * (az - b * ax - c * ay)
         if ax == 0.0 and ay == 0.0 and az == 0.0:
             h = 0.0  # straight: of a point in the plane itself
-        light_and_gradients(
-            0.0, 0.0, 0.0, centres[i, 0] - p[0], centres[i, 1] - p[1], centres[i, 2] - p[2],
-            -b * up, -c * up, up, h, n, out,
-        )  # fmt: skip
+        e = minus(row_of(centres, i), vector(p))
+        light_and_gradients((0.0, 0.0, 0.0), e, normal, h, n, out)
         _of_unit_direction(out)
 
 

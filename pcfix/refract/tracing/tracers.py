@@ -16,6 +16,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numba import njit
 
+from pcfix.lens.algebra import Vector, dot, minus, normal_of
 from pcfix.model import FloatArray
 from pcfix.refract.rays import plane_at, refracted
 from pcfix.water.surface import Field, Tin
@@ -68,9 +69,7 @@ def _height_of(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def pierce(
-    water: Water, ex: float, ey: float, ez: float, dx: float, dy: float, dz: float
-) -> tuple[float, float]:
+def pierce(water: Water, e: Vector, d: Vector) -> tuple[float, float]:
     """Return the plan place where the ray from e along d pierces the surface.
 
     Newton's method on the tangent plane, from e + d on, inside the bracket in which the ray
@@ -79,34 +78,30 @@ def pierce(
     """
     low, high, f = 0.0, np.inf, 1.0
     for _ in range(PIERCING_STEPS):
-        x, y = ex + f * dx, ey + f * dy
+        x, y = e[0] + f * d[0], e[1] + f * d[1]
         z, b, c = height_of(water, x, y)
-        gap = z - (ez + f * dz)
+        gap = z - (e[2] + f * d[2])
         if not abs(gap) > 0.1 * CLOSE_M:
             break
         if gap > 0.0:
             high = f
         else:
             low = f
-        f += gap / (dz - b * dx - c * dy)
+        f += gap / (d[2] - b * d[0] - c * d[1])
         if not low < f < high:
             f = 2.0 * low if high == np.inf else 0.5 * (low + high)
     return (x, y) if abs(gap) <= CLOSE_M else (np.nan, np.nan)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def miss_through(
-    water: Water, ex: float, ey: float, ez: float, x: float, y: float, n: float
-) -> tuple[float, float]:
+def miss_through(water: Water, e: Vector, x: float, y: float, n: float) -> tuple[float, float]:
     """Return the miss of the ray that pierces the surface at the plan place x, y."""
     z, b, c = height_of(water, x, y)
-    nz = 1.0 / np.sqrt(1.0 + b * b + c * c)
-    nx, ny = -b * nz, -c * nz
-    ux, uy, uz = ex - x, ey - y, ez - z
-    facing = nx * ux + ny * uy + nz * uz
+    normal, u = normal_of(b, c), minus(e, (x, y, z))
+    facing = dot(normal, u)
     if not facing > 0.0:
         return np.nan, np.nan
-    tx, ty, tz = refracted(ux, uy, uz, ux * ux + uy * uy + uz * uz, nx, ny, nz, facing, 1.0 / n)
+    tx, ty, tz = refracted(u, dot(u, u), normal, facing, 1.0 / n)
     if not tz < 0.0:
         return np.nan, np.nan
     return x - tx * z / tz, y - ty * z / tz
@@ -114,22 +109,23 @@ def miss_through(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def shoot(
-    water: Water, level: float, ex: float, ey: float, ez: float, x: float, y: float, n: float
+    water: Water, level: float, e: Vector, x: float, y: float, n: float
 ) -> tuple[float, float, float, float]:
     """Return piercing place (x, y) and miss (x, y) of the ray aimed at x, y on a level."""
-    ax, ay = pierce(water, ex, ey, ez, x - ex, y - ey, level - ez)
-    mx, my = miss_through(water, ex, ey, ez, ax, ay, n)
+    ax, ay = pierce(water, e, minus((x, y, level), e))
+    mx, my = miss_through(water, e, ax, ay, n)
     return ax, ay, mx, my
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def travel(water: Water, ex: float, ey: float, ez: float, x: float, y: float, n: float) -> float:
+def travel(water: Water, e: Vector, x: float, y: float, n: float) -> float:
     """Return optical length (m) of the path through a plan place; infinite where there is none."""
     z, b, c = height_of(water, x, y)
-    ux, uy, uz = ex - x, ey - y, ez - z
-    if not uz - b * ux - c * uy > 0.0:
+    a = x, y, z
+    u = minus(e, a)
+    if not u[2] - b * u[0] - c * u[1] > 0.0:
         return np.inf
-    air, wet = np.sqrt(ux * ux + uy * uy + uz * uz), np.sqrt(x * x + y * y + z * z)
+    air, wet = np.sqrt(dot(u, u)), np.sqrt(dot(a, a))
     return float(air + n * wet)
 
 
@@ -138,7 +134,7 @@ HALVINGS = 24
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def kotowski(water: Water, level: float, ex: float, ey: float, ez: float, n: float) -> Found:
+def kotowski(water: Water, level: float, e: Vector, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, steps, found).
 
     The idea is that of Kotowski 1988, Phototriangulation in multi-media photogrammetry: ray tracing
@@ -159,18 +155,18 @@ def kotowski(water: Water, level: float, ex: float, ey: float, ez: float, n: flo
     A step that makes g grow is halved until it is short; from one patch of a broken surface to the
     next g may grow on the right way. So is one beyond the edge of the water.
     """
-    f = level / ez
-    x, y = f * ex, f * ey
-    gx, gy, hxx, hxy, hyy = _snell_at(water, ex, ey, ez, x, y, n)
+    f = level / e[2]
+    x, y = f * e[0], f * e[1]
+    gx, gy, hxx, hxy, hyy = _snell_at(water, e, x, y, n)
     if np.isnan(gx):
         x, y = 0.0, 0.0
-        gx, gy, hxx, hxy, hyy = _snell_at(water, ex, ey, ez, x, y, n)
+        gx, gy, hxx, hxy, hyy = _snell_at(water, e, x, y, n)
     for step in range(1, KOTOWSKI_STEPS + 1):
         det = hxx * hyy - hxy * hxy
         dx, dy = (hxy * gy - hyy * gx) / det, (hxy * gx - hxx * gy) / det
         before, size, share = gx * gx + gy * gy, np.sqrt(dx * dx + dy * dy), 1.0
         for _ in range(HALVINGS):
-            gx, gy, hxx, hxy, hyy = _snell_at(water, ex, ey, ez, x + share * dx, y + share * dy, n)
+            gx, gy, hxx, hxy, hyy = _snell_at(water, e, x + share * dx, y + share * dy, n)
             if gx * gx + gy * gy < before or (share * size < SHORT * level and not np.isnan(gx)):
                 break
             share *= 0.5
@@ -184,7 +180,7 @@ def kotowski(water: Water, level: float, ex: float, ey: float, ez: float, n: flo
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _snell_at(
-    water: Water, ex: float, ey: float, ez: float, x: float, y: float, n: float
+    water: Water, e: Vector, x: float, y: float, n: float
 ) -> tuple[float, float, float, float, float]:
     r"""Return g at a plan place, and its derivatives by x and y: xx, xy and yy.
 
@@ -192,7 +188,7 @@ def _snell_at(
     """
     z, b, c = height_of(water, x, y)
     twist = _twist_at(water.field, water.origin[0] + x, water.origin[1] + y)
-    ux, uy, uz = x - ex, y - ey, z - ez
+    ux, uy, uz = minus((x, y, z), e)
     air, wet = 1.0 / np.sqrt(ux * ux + uy * uy + uz * uz), 1.0 / np.sqrt(x * x + y * y + z * z)
     ux, uy, uz, vx, vy, vz = air * ux, air * uy, air * uz, -wet * x, -wet * y, -wet * z
     along_ux, along_uy = ux + b * uz, uy + c * uz
@@ -228,7 +224,7 @@ AFRT_STEPS = 60
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def afrt(water: Water, level: float, ex: float, ey: float, ez: float, n: float) -> Found:
+def afrt(water: Water, level: float, e: Vector, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, steps, found).
 
     The name is in Mulsow 2024, whose text could not be had; this is how it was read. The straight
@@ -243,13 +239,13 @@ def afrt(water: Water, level: float, ex: float, ey: float, ez: float, n: float) 
     B + t (s'B) / (s'(s - t)), with t = -B m of the new miss. A step is at most the depth or,
     where that is more, what the straight line goes sideways in the water.
     """
-    f = level / ez
+    f = level / e[2]
     px, py, sx, sy = 0.0, 0.0, 0.0, 0.0
     bxx, bxy, byx, byy = 1.0, 0.0, 0.0, 1.0
-    x, y = f * ex, f * ey
+    x, y = f * e[0], f * e[1]
     longest = max(level, np.sqrt(x * x + y * y))
     for step in range(1, AFRT_STEPS + 1):
-        ax, ay, mx, my = shoot(water, level, ex, ey, ez, px + f * (ex - px), py + f * (ey - py), n)
+        ax, ay, mx, my = shoot(water, level, e, px + f * (e[0] - px), py + f * (e[1] - py), n)
         if np.isnan(mx):
             return x, y, step, False
         x, y = ax, ay
@@ -277,7 +273,7 @@ NARROW_M = 1e-6
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def mdfrt(water: Water, level: float, ex: float, ey: float, ez: float, n: float) -> Found:
+def mdfrt(water: Water, level: float, e: Vector, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, steps, found).
 
     The name is in Mulsow 2024, whose text could not be had; this is how it was read. A ray and two
@@ -290,19 +286,19 @@ def mdfrt(water: Water, level: float, ex: float, ey: float, ez: float, n: float)
     A step that makes the miss grow is halved until it is short; so is one beyond the edge of the
     water.
     """
-    f = level / ez
-    x, y = f * ex, f * ey
-    ax, ay, mx, my = shoot(water, level, ex, ey, ez, x, y, n)
+    f = level / e[2]
+    x, y = f * e[0], f * e[1]
+    ax, ay, mx, my = shoot(water, level, e, x, y, n)
     if np.isnan(mx):
         x, y = 0.0, 0.0
-        ax, ay, mx, my = shoot(water, level, ex, ey, ez, x, y, n)
+        ax, ay, mx, my = shoot(water, level, e, x, y, n)
     for step in range(1, MDFRT_STEPS + 1):
         before = mx * mx + my * my
         if not before > CLOSE_M * CLOSE_M:
             return ax, ay, step, not np.isnan(mx)
         apart = min(max(0.01 * np.sqrt(before), NARROW_M), 0.05 * level)
-        _, _, xx, yx = shoot(water, level, ex, ey, ez, x + apart, y, n)
-        _, _, xy, yy = shoot(water, level, ex, ey, ez, x, y + apart, n)
+        _, _, xx, yx = shoot(water, level, e, x + apart, y, n)
+        _, _, xy, yy = shoot(water, level, e, x, y + apart, n)
         xx, yx, xy, yy = xx - mx, yx - my, xy - mx, yy - my
         det = (xx * yy - xy * yx) / apart
         dx, dy = (xy * my - yy * mx) / det, (yx * mx - xx * my) / det
@@ -310,7 +306,7 @@ def mdfrt(water: Water, level: float, ex: float, ey: float, ez: float, n: float)
         if not size < np.inf:
             return ax, ay, step, False
         for _ in range(HALVINGS):
-            there = shoot(water, level, ex, ey, ez, x + share * dx, y + share * dy, n)
+            there = shoot(water, level, e, x + share * dx, y + share * dy, n)
             less = there[2] * there[2] + there[3] * there[3] < before
             if less or (share * size < SHORT * level and not np.isnan(there[2])):
                 break
@@ -331,7 +327,7 @@ NEIGHBOUR_M = 1e-4
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def scattershot(water: Water, level: float, ex: float, ey: float, ez: float, n: float) -> Found:
+def scattershot(water: Water, level: float, e: Vector, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, shots, found).
 
     The name is in Mulsow 2024, whose text could not be had; this is how it was read. Rays to the
@@ -345,34 +341,30 @@ def scattershot(water: Water, level: float, ex: float, ey: float, ez: float, n: 
     On calm water that is between the plan place of the point and the straight line; the first
     shot covers these and as much as the point is deep all around.
     """
-    f = level / ez
-    middle_x, middle_y = 0.5 * f * ex, 0.5 * f * ey
+    f = level / e[2]
+    middle_x, middle_y = 0.5 * f * e[0], 0.5 * f * e[1]
     half = level + max(abs(middle_x), abs(middle_y))
     best, x, y = np.inf, middle_x, middle_y
     apart = 2.0 * half / (KNOTS - 1)
     for i in range(KNOTS):
         for j in range(KNOTS):
             knot_x, knot_y = middle_x - half + i * apart, middle_y - half + j * apart
-            length = travel(water, ex, ey, ez, knot_x, knot_y, n)
+            length = travel(water, e, knot_x, knot_y, n)
             if length < best:
                 best, x, y = length, knot_x, knot_y
-    x, y, shots, found = narrowed(water, ex, ey, ez, x, y, 2.0 * apart, n)
+    x, y, shots, found = narrowed(water, e, x, y, 2.0 * apart, n)
     return x, y, shots + 1, found
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def narrowed(
-    water: Water, ex: float, ey: float, ez: float, x: float, y: float, half: float, n: float
-) -> Found:
+def narrowed(water: Water, e: Vector, x: float, y: float, half: float, n: float) -> Found:
     """Return the nearest place of least optical length, from a place and half a grid's size on.
 
     Found is a path that hits the point, or one through a crease, known to about 1e-6 m along it:
     the shortest one although the rays beside it miss.
     """
-    x, y, first, _ = _draw_together(water, ex, ey, ez, x, y, half, BLUNT_M, n, False)
-    px, py, second, miss = _draw_together(
-        water, ex, ey, ez, x, y, NEIGHBOUR_M, 0.1 * CLOSE_M, n, True
-    )
+    x, y, first, _ = _draw_together(water, e, x, y, half, BLUNT_M, n, False)
+    px, py, second, miss = _draw_together(water, e, x, y, NEIGHBOUR_M, 0.1 * CLOSE_M, n, True)
     if miss <= CLOSE_M:
         return px, py, first + second, True
     return x, y, first + second, _inside(water, x, y)
@@ -380,22 +372,20 @@ def narrowed(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _draw_together(
-    water: Water, ex: float, ey: float, ez: float, x: float, y: float, half: float, end: float,
+    water: Water, e: Vector, x: float, y: float, half: float, end: float,
     n: float, by_miss: bool,
 ) -> tuple[float, float, int, float]:  # fmt: skip
     """Halve a grid of 5 x 5 about its best knot until it is small enough.
 
     While the best knot is on the rim the grid moves and keeps its size.
     """
-    best, shots = _badness(water, ex, ey, ez, x, y, n, by_miss), 0
+    best, shots = _badness(water, e, x, y, n, by_miss), 0
     while shots < SHOTS and half > end and not (by_miss and best <= CLOSE_M):
         shots += 1
         best_i, best_j = 0, 0
         for i in range(-2, 3):
             for j in range(-2, 3):
-                bad = _badness(
-                    water, ex, ey, ez, x + 0.5 * half * i, y + 0.5 * half * j, n, by_miss
-                )
+                bad = _badness(water, e, x + 0.5 * half * i, y + 0.5 * half * j, n, by_miss)
                 if bad < best:
                     best, best_i, best_j = bad, i, j
         x, y = x + 0.5 * half * best_i, y + 0.5 * half * best_j
@@ -405,14 +395,12 @@ def _draw_together(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _badness(
-    water: Water, ex: float, ey: float, ez: float, x: float, y: float, n: float, by_miss: bool
-) -> float:
+def _badness(water: Water, e: Vector, x: float, y: float, n: float, by_miss: bool) -> float:
     """Return the miss of a ray or the optical length of a path, metres; infinite without any."""
     if by_miss:
-        mx, my = miss_through(water, ex, ey, ez, x, y, n)
+        mx, my = miss_through(water, e, x, y, n)
         return np.inf if np.isnan(mx) else float(np.sqrt(mx * mx + my * my))
-    return travel(water, ex, ey, ez, x, y, n)
+    return travel(water, e, x, y, n)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

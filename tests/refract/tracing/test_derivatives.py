@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pcfix.refract.rays import light_path
+from pcfix.refract.rays import direction, light_path
 from pcfix.refract.tracing.gradients import COLUMNS, light_and_gradients
 from tests.utils.tracing_twin import through_plane
 
@@ -14,17 +14,17 @@ STEPS = np.array([3e-3] * 6 + [3e-3, 1e-4, 1e-4, 1e-3])
 below 1e-9 of a derivative."""
 
 
-def plane_of(a: float, b: float, c: float) -> tuple[float, float, float, float]:
+def plane_of(a: float, b: float, c: float) -> tuple[tuple[float, float, float], float]:
     up = 1.0 / np.sqrt(1.0 + b * b + c * c)
-    return -b * up, -c * up, up, a * up
+    return (-b * up, -c * up, up), a * up
 
 
 def truth(p: np.ndarray) -> np.ndarray:
     """Return w: the way to the piercing point, -1 long along the normal."""
     q, centre, (a, b, c), n = p[:3], p[3:6], p[6:9], p[9]
-    nx, ny, nz, h = plane_of(a, b, c)
+    normal, h = plane_of(a, b, c)
     way = through_plane(q, centre, (a, b, c), n) - centre
-    return way / (np.dot((nx, ny, nz), centre) - h)
+    return way / (np.dot(normal, centre) - h)
 
 
 def difference(p: np.ndarray, i: int) -> np.ndarray:
@@ -46,7 +46,8 @@ def scene(seed: int, z_low: float, z_high: float) -> np.ndarray:
 
 def filled(p: np.ndarray) -> np.ndarray:
     out = np.full((3, COLUMNS), -7.0)
-    light_and_gradients(*p[:6], *plane_of(*p[6:9]), p[9], out)
+    normal, h = plane_of(*p[6:9])
+    light_and_gradients(tuple(p[:3]), tuple(p[3:6]), normal, h, p[9], out)
     return out
 
 
@@ -84,12 +85,10 @@ def test_direction_is_continuous_at_the_water():
 
 def test_it_is_the_direction_of_light_path():
     p = scene(5, -9.0, -4.0)
-    nx, ny, nz, h = plane_of(*p[6:9])
-    k, _, _, _, sx, sy, sz = light_path(*p[:6], nx, ny, nz, h, p[9])
+    normal, h = plane_of(*p[6:9])
+    way = direction(light_path(tuple(p[:3]), tuple(p[3:6]), normal, h, p[9]), normal)
     # the same arithmetic
-    np.testing.assert_allclose(
-        filled(p)[:, 0], [k * sx - nx, k * sy - ny, k * sz - nz], rtol=0.0, atol=1e-15
-    )
+    np.testing.assert_allclose(filled(p)[:, 0], way, rtol=0.0, atol=1e-15)
 
 
 @pytest.mark.parametrize("camera_z", [-1.0, 0.0])

@@ -1,0 +1,140 @@
+"""Vectors and matrices of three for kernels: as tuples of numbers they stay in registers.
+
+Sums are taken from left to right, so that a result is the same to the bit wherever it is formed.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+from numba import njit
+
+from pcfix.model import FloatArray
+
+Vector: TypeAlias = tuple[float, float, float]
+Symmetric: TypeAlias = tuple[float, float, float, float, float, float]
+"""A symmetric matrix: xx, xy, xz, yy, yz, zz."""
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def dot(a: Vector, b: Vector) -> float:
+    """Return a.b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def cross(a: Vector, b: Vector) -> Vector:
+    """Return a x b."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def plus(a: Vector, b: Vector) -> Vector:
+    """Return a + b."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def minus(a: Vector, b: Vector) -> Vector:
+    """Return a - b."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def scaled(c: float, a: Vector) -> Vector:
+    """Return c a."""
+    return c * a[0], c * a[1], c * a[2]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def beyond(a: Vector, f: float, b: Vector) -> Vector:
+    """Return a + f b: so many times b on from a."""
+    return a[0] + f * b[0], a[1] + f * b[1], a[2] + f * b[2]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def unit(a: Vector) -> Vector:
+    """Return a vector of length 1; NaN for one without length."""
+    return scaled(1.0 / np.sqrt(dot(a, a)) if dot(a, a) > 0.0 else np.nan, a)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def vector(row: FloatArray, at: int = 0) -> Vector:
+    """Return three numbers of a row, from a place on."""
+    return row[at], row[at + 1], row[at + 2]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def row_of(rows: FloatArray, i: int) -> Vector:
+    """Return row i of an array, shape (n, 3)."""
+    return rows[i, 0], rows[i, 1], rows[i, 2]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def column_of(m: FloatArray, j: int) -> Vector:
+    """Return column j of an array, shape (3, n)."""
+    return m[0, j], m[1, j], m[2, j]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def times(m: FloatArray, a: Vector) -> Vector:
+    """Return m a: with the rotation of a camera, a vector of the world in its frame."""
+    return (
+        m[0, 0] * a[0] + m[0, 1] * a[1] + m[0, 2] * a[2],
+        m[1, 0] * a[0] + m[1, 1] * a[1] + m[1, 2] * a[2],
+        m[2, 0] * a[0] + m[2, 1] * a[1] + m[2, 2] * a[2],
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def transposed_times(m: FloatArray, a: Vector) -> Vector:
+    """Return m' a: with the rotation of a camera, what is in its frame in the world."""
+    return (
+        m[0, 0] * a[0] + m[1, 0] * a[1] + m[2, 0] * a[2],
+        m[0, 1] * a[0] + m[1, 1] * a[1] + m[2, 1] * a[2],
+        m[0, 2] * a[0] + m[1, 2] * a[1] + m[2, 2] * a[2],
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def normal_of(b: float, c: float) -> Vector:
+    """Return the unit normal, upward, of a plane with the slopes dz/dx = b and dz/dy = c."""
+    up = 1.0 / np.sqrt(1.0 + b * b + c * c)
+    return -b * up, -c * up, up
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def plus_square(m: Symmetric, a: Vector) -> Symmetric:
+    """Return m + a a'."""
+    x, y, z = a
+    return m[0] + x * x, m[1] + x * y, m[2] + x * z, m[3] + y * y, m[4] + y * z, m[5] + z * z
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def cofactors(m: Symmetric) -> tuple[float, Symmetric]:
+    """Return the determinant of a symmetric matrix and its cofactors: det times its inverse."""
+    xx, xy, xz, yy, yz, zz = m
+    c: Symmetric = (
+        yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy,
+        xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy,
+    )  # fmt: skip
+    return xx * c[0] + xy * c[1] + xz * c[2], c
+
+
+@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+def product(m: Symmetric, a: Vector) -> Vector:
+    """Return a symmetric matrix times a vector."""
+    return (
+        m[0] * a[0] + m[1] * a[1] + m[2] * a[2],
+        m[1] * a[0] + m[3] * a[1] + m[4] * a[2],
+        m[2] * a[0] + m[4] * a[1] + m[5] * a[2],
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def solved(m: Symmetric, a: Vector) -> tuple[float, Vector]:
+    """Return the determinant of a symmetric matrix, and its inverse times a vector."""
+    det, c = cofactors(m)
+    x, y, z = product(c, a)
+    return det, (x / det, y / det, z / det)
