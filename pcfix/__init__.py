@@ -28,7 +28,6 @@ if TYPE_CHECKING:
         Correction,
         Lens,
         Outcome,
-        Summary,
         Views,
         WaterDimension,
         WaterMesh,
@@ -37,6 +36,7 @@ if TYPE_CHECKING:
         WaterSurface,
     )
     from pcfix.options.correct import CorrectOptions as Options
+    from pcfix.refract.tally import Summary
     from pcfix.refract.tracing import trace
     from pcfix.simulate import simulate_scene
     from pcfix.water.index import refractive_index
@@ -53,9 +53,10 @@ _NAMES = {
     "pcfix.flow.restore": "restore_file",
     "pcfix.io.cameras": "read_cameras",
     "pcfix.io.water": "read_water",
-    "pcfix.model": "Cameras Correction Lens Outcome Summary Views WaterDimension WaterMesh"
+    "pcfix.model": "Cameras Correction Lens Outcome Views WaterDimension WaterMesh"
     " WaterPlane WaterRaster WaterSurface",
     "pcfix.options.correct": "Options",
+    "pcfix.refract.tally": "Summary",
     "pcfix.refract.tracing": "trace",
     "pcfix.simulate": "simulate_scene",
     "pcfix.water.index": "refractive_index",

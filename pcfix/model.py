@@ -6,10 +6,10 @@ The *camera frame* is OpenCV's: x right, y down, z forward; ``x_camera = R (x_wo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -22,19 +22,16 @@ BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
 UNCLASSIFIED, BATHYMETRIC_POINT, WATER_SURFACE = 1, 40, 41
 """Classes of LAS 1.4 and its topo-bathy lidar domain profile; 40 is a point on the bed."""
-
 NOISE_CLASSES = LOW_NOISE, HIGH_NOISE = 7, 18
 
 Projection = Literal[
     "perspective", "equidistant", "equisolid", "polynomial", "fov", "dual", "division", "eucm"
 ]
+ViewKind = Literal["tracks", "depth-maps", "pairs"]
 
-
-NOMINAL_FOCAL_PX = 3700.0
-"""Of cameras without a lens: a survey drone's of 20 megapixels, 0.27 mrad a pixel."""
 NOMINAL_WIDTH_PX = 5472.0
-"""Of lenses in millimetres whose pixel size is not known: the same camera's longer side, 13.2 mm of
-pixels of 2.4 um."""
+"""Of lenses in millimetres whose pixel size is not known: the longer side of a survey drone's
+camera of 20 megapixels, 13.2 mm of pixels of 2.4 um."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +69,7 @@ class Lens:
     Attributes
     ----------
     focal, width, height, principal_x, principal_y, b1, b2, b3 : float
-        All in one unit, pixels or millimetres.
+        All in `unit`, pixels or millimetres.
     projection : Projection
     shape : tuple of float
         The parameters of the projection, see the table.
@@ -94,7 +91,6 @@ class Lens:
     sensor : str
         What the source calls it.
     unit : {"px", "mm"}
-        Of the lengths.
     """
 
     focal: float
@@ -128,10 +124,8 @@ class Lens:
     @property
     def focal_px(self) -> float:
         """The focal length in pixels, nominal where nothing tells how large they are."""
-        if self.unit == "px":
-            return self.focal
-        if self.pixel_size_mm is not None:
-            return self.focal / self.pixel_size_mm
+        if self.unit == "px" or self.pixel_size_mm is not None:
+            return self.focal / self.pixel_size
         return self.focal / max(self.width, self.height) * NOMINAL_WIDTH_PX
 
 
@@ -298,8 +292,8 @@ class WaterRaster:
         shape = self.height_m.shape
         if len(shape) != 2 or min(shape) < 2:
             raise SettingError(f"A water raster needs two rows and columns at least, not {shape}.")
-        numbers = (self.left_m, self.top_m, *self.cell_m)
-        if not (np.isfinite(numbers).all() and min(self.cell_m) > 0.0):
+        place = (self.left_m, self.top_m, *self.cell_m)
+        if not (np.isfinite(place).all() and min(self.cell_m) > 0.0):
             raise SettingError(
                 f"Water raster {self.name}: the corner {self.left_m:g}, {self.top_m:g} must be"
                 f" finite and the cells {self.cell_m[0]:g} x {self.cell_m[1]:g} m positive."
@@ -316,9 +310,6 @@ class WaterRaster:
 
 
 WaterSurface: TypeAlias = WaterPlane | WaterDimension | WaterMesh | WaterRaster
-
-
-ViewKind = Literal["tracks", "depth-maps", "pairs"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -494,51 +485,3 @@ class Correction:
         """Points with a shift: the corrected ones, and land that adjusted cameras took along."""
         x, y, z = self.shift_m.T  # axis by axis: numpy is slow along the short one
         return np.asarray(self.corrected | (x != 0.0) | (y != 0.0) | (z != 0.0))
-
-
-@dataclass(frozen=True)
-class Summary:
-    """What a run over a file did, in numbers; `as_dict` is what ``--summary`` writes."""
-
-    input: str
-    output: str
-    pcfix: str
-    points: int
-    submerged: int
-    corrected: int
-    uncorrected: dict[str, int]
-    dropped: int
-    water_unknown: int
-    depth_m: dict[str, float]
-    shift_z_m: dict[str, float]
-    rays: int
-    cameras: int
-    cameras_used: int
-    cameras_unused: list[str]
-    water: str
-    settings: dict[str, Any]
-    seconds: float
-    views: dict[str, Any] | None = None
-    water_fit: dict[str, Any] | None = None
-    warnings: list[str] = field(default_factory=list)
-    labelling: dict[str, Any] | None = None
-    uncertainty: dict[str, Any] | None = None
-    carried: dict[str, Any] | None = None
-    absorbed: bool = False
-    """Whether it warned that the poses have absorbed the refraction; for later steps of a run."""
-
-    @property
-    def points_per_s(self) -> float:
-        """Points read per second, files included."""
-        return self.points / max(self.seconds, 1e-9)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON.
-
-        `labelling` is there where it had rules, `carried` where the cloud was taken from old
-        cameras to adjusted ones.
-        """
-        some = ("labelling", "carried")
-        values = {name: vars(self)[name] for name in vars(self) if name not in (*some, "absorbed")}
-        more = {name: getattr(self, name) for name in some if getattr(self, name) is not None}
-        return {**values, **more, "points_per_s": round(self.points_per_s)}

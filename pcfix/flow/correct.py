@@ -25,7 +25,6 @@ from pcfix.model import (
     Cameras,
     Correction,
     FloatArray,
-    Summary,
     Views,
     WaterSurface,
 )
@@ -34,6 +33,7 @@ from pcfix.options.declare import File, taken
 from pcfix.refract.batch import Batch, MadeWith, Survey
 from pcfix.refract.learning import learn_of_points
 from pcfix.refract.regression import DepthRegression
+from pcfix.refract.tally import Summary
 from pcfix.threads import threads
 from pcfix.water.checks import as_surface, check_above_water, checked_points
 from pcfix.water.index import with_index

@@ -16,9 +16,9 @@ from pcfix.flow.through_port import ThroughPort
 from pcfix.flow.through_water import ThroughWater
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.label.labelling import Labelling
-from pcfix.model import Correction, Outcome, Summary, WaterSurface
+from pcfix.model import Correction, Outcome, WaterSurface
 from pcfix.options.correct import CorrectOptions, LabelRules, ScienceOptions
-from pcfix.refract.tally import Tally
+from pcfix.refract.tally import Summary, Tally
 from pcfix.version import __version__
 from pcfix.water.index import with_index
 

@@ -12,7 +12,8 @@ from pcfix.grid.maps import Maps, MapsBuilder
 from pcfix.io.files import sha256, write_bytes, write_text
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates
-from pcfix.model import Cameras, FloatArray, Summary, WaterSurface
+from pcfix.model import Cameras, FloatArray, WaterSurface
+from pcfix.refract.tally import Summary
 from pcfix.report.page import Picture, Table, render
 from pcfix.report.run import Corrected, run_report
 

@@ -34,10 +34,10 @@ from pcfix.io.clouds import own_water
 from pcfix.io.files import file_state, files_in, read_json, write_text
 from pcfix.io.las.source import LasSource
 from pcfix.io.rasters import open_raster, preview, write_dod
-from pcfix.model import Summary
 from pcfix.options.correct import CorrectOptions
 from pcfix.options.declare import named, options_of
 from pcfix.options.survey import RunOptions
+from pcfix.refract.tally import Summary
 from pcfix.report.comparison import evaluation, in_a_sentence
 from pcfix.report.page import Picture, Table
 from pcfix.report.run import adjustment_sentence, adjustment_table, reason_sentence

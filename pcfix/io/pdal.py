@@ -21,7 +21,8 @@ from pcfix.io.las.columns import (
     rows_of,
     shift_steps,
 )
-from pcfix.model import BATHYMETRIC_POINT, Correction, FloatArray, Summary
+from pcfix.model import BATHYMETRIC_POINT, Correction, FloatArray
+from pcfix.refract.tally import Summary
 
 Dimensions: TypeAlias = "dict[str, npt.NDArray[Any]]"
 

@@ -5,6 +5,7 @@ Vertical uncertainty is in the terms of hydrographic surveys: TVU at 95 %, IHO S
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -192,3 +193,51 @@ class Tally:
 
 def _rounded(**values: float) -> dict[str, float]:
     return {name: round(float(value), 4) for name, value in values.items()}
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a run over a file did, in numbers; `as_dict` is what ``--summary`` writes."""
+
+    input: str
+    output: str
+    pcfix: str
+    points: int
+    submerged: int
+    corrected: int
+    uncorrected: dict[str, int]
+    dropped: int
+    water_unknown: int
+    depth_m: dict[str, float]
+    shift_z_m: dict[str, float]
+    rays: int
+    cameras: int
+    cameras_used: int
+    cameras_unused: list[str]
+    water: str
+    settings: dict[str, Any]
+    seconds: float
+    views: dict[str, Any] | None = None
+    water_fit: dict[str, Any] | None = None
+    warnings: list[str] = field(default_factory=list)
+    labelling: dict[str, Any] | None = None
+    uncertainty: dict[str, Any] | None = None
+    carried: dict[str, Any] | None = None
+    absorbed: bool = False
+    """Whether it warned that the poses have absorbed the refraction; for later steps of a run."""
+
+    @property
+    def points_per_s(self) -> float:
+        """Points read per second, files included."""
+        return self.points / max(self.seconds, 1e-9)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON.
+
+        `labelling` is there where it had rules, `carried` where the cloud was taken from old
+        cameras to adjusted ones.
+        """
+        some = ("labelling", "carried")
+        values = {name: vars(self)[name] for name in vars(self) if name not in (*some, "absorbed")}
+        more = {name: getattr(self, name) for name in some if getattr(self, name) is not None}
+        return {**values, **more, "points_per_s": round(self.points_per_s)}

@@ -49,8 +49,8 @@ class _Cells(NamedTuple):
     second: Heights
 
 
-class TopSurface:
-    """Gathers points, and makes their surface.
+class OccluderBuilder:
+    """Gathers the chunks of a cloud, of which noise does not count, and makes their surface.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class TopSurface:
         South-west and north-east corner of the cloud, metres, as far as they are known; the grid
         grows where points lie outside.
     points : int
-        How many there will be.
+        Of the whole cloud.
     """
 
     def __init__(self, low: FloatArray, high: FloatArray, points: int) -> None:
@@ -69,8 +69,18 @@ class TopSurface:
         if np.isfinite([low, high]).all() and (low <= high).all():
             self._reach(low, high)
 
-    def add(self, xyz: FloatArray) -> None:
-        """Add points, shape (n, 3), metres, world frame."""
+    def add(self, xyz: FloatArray, classes: npt.NDArray[np.uint8] | None = None) -> None:
+        """Add a chunk.
+
+        Parameters
+        ----------
+        xyz : array, shape (n, 3)
+            Apparent points, metres, world frame.
+        classes : array, shape (n,), optional
+            Low and high noise (7 and 18) hide nothing.
+        """
+        if classes is not None:
+            xyz = xyz[~np.isin(classes, NOISE_CLASSES)]
         if not len(xyz):
             return
         self._points += len(xyz)
@@ -86,7 +96,7 @@ class TopSurface:
         self._low, self._high = low, high
         self._cells = _over(low, high, self._most, self._cells)
 
-    def occluder(self) -> Occluder | None:
+    def build(self) -> Occluder | None:
         """Return the surface; None without points. The gathered points are used up."""
         cells, self._cells = self._cells, None
         if cells is None or not self._points:
@@ -230,7 +240,6 @@ def _wide_gaps(highest: Heights, second: Heights) -> tuple[Heights, npt.NDArray[
     return found, counts
 
 
-"""ASPRS classes of low and high noise, which hide nothing."""
 OBLIQUE_DEG = 15.0
 """An image whose axis is farther off the nadir is an oblique. The axes of stabilised nadir blocks
 stay within a few degrees; obliques are flown at 20 and more."""
@@ -249,36 +258,6 @@ def wants_occlusion(cameras: Cameras, settings: ScienceOptions) -> bool:
     # the third row of a rotation is the axis in the world frame; straight down it is (0, 0, -1)
     down = -cameras.rotations[:, 2, 2]
     return bool((down < np.cos(np.radians(OBLIQUE_DEG))).any())
-
-
-class OccluderBuilder:
-    """Gathers the chunks of a cloud, of which noise (classes 7 and 18) does not count.
-
-    Parameters
-    ----------
-    low_xy, high_xy : array, shape (2,)
-        South-west and north-east corner of the cloud, metres, as far as they are known.
-    points : int
-        Of the whole cloud.
-    """
-
-    def __init__(self, low_xy: FloatArray, high_xy: FloatArray, points: int) -> None:
-        self._surface = TopSurface(low_xy, high_xy, points)
-
-    def add(self, xyz: FloatArray, classes: npt.NDArray[np.uint8] | None = None) -> None:
-        """Add a chunk.
-
-        Parameters
-        ----------
-        xyz : array, shape (n, 3)
-            Apparent points, metres, world frame.
-        classes : array, shape (n,), optional
-        """
-        self._surface.add(xyz if classes is None else xyz[~np.isin(classes, NOISE_CLASSES)])
-
-    def build(self) -> Occluder | None:
-        """Return the surface; None where there was no point."""
-        return self._surface.occluder()
 
 
 def occluder_of(xyz: FloatArray, classes: npt.NDArray[np.uint8] | None = None) -> Occluder | None:

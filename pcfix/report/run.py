@@ -16,8 +16,8 @@ import numpy as np
 
 from pcfix.grid.maps import Maps
 from pcfix.grid.model import NO_LIGHT, hillshade
-from pcfix.model import BoolArray, Cameras, FloatArray, Summary, WaterPlane, WaterSurface
-from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
+from pcfix.model import BoolArray, Cameras, FloatArray, WaterPlane, WaterSurface
+from pcfix.refract.tally import COVERAGE_95, ORDERS, Summary, largest_tvu_m
 from pcfix.report.adjustment_text import WHERE, fixed, lens_label, listed, short
 from pcfix.report.page import (
     AFTER,

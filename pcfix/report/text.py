@@ -8,10 +8,9 @@ import numpy as np
 
 from pcfix.clean.points import CleanSummary
 from pcfix.grid.model import DsmSummary
-from pcfix.model import Summary
 from pcfix.options.correct import LEVEL_M
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
-from pcfix.refract.tally import ORDERS
+from pcfix.refract.tally import ORDERS, Summary
 
 if TYPE_CHECKING:
     from pcfix.label.labelling import LabelSummary
