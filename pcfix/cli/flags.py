@@ -18,7 +18,9 @@ from pcfix.options.shared import Panel
 FLAGS = Parameter(name="*")
 """Of a command's argument: each option of its class is a flag."""
 
-_GROUPS = {name: Group(name.value, sort_key=order) for order, name in enumerate(Panel)}
+_GROUPS: dict[str, Group] = {
+    name: Group(name.value, sort_key=order) for order, name in enumerate(Panel)
+}
 
 
 class UsageError(Exception):

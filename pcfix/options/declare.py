@@ -16,7 +16,6 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import Field, asdict, dataclass, field, fields
-from functools import cache
 from inspect import get_annotations
 from typing import (
     Any,
@@ -219,9 +218,17 @@ def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-@cache
+_KNOWN: dict[type, tuple[Option, ...]] = {}
+
+
 def options_of(kind: type) -> tuple[Option, ...]:
     """Return the options of a class, in the order of its help."""
+    if kind not in _KNOWN:
+        _KNOWN[kind] = _options_of(kind)
+    return _KNOWN[kind]
+
+
+def _options_of(kind: type) -> tuple[Option, ...]:
     homes = {name: base for base in reversed(kind.__mro__) for name in get_annotations(base)}
     return tuple(_option(one, homes[one.name]) for one in fields(kind) if "option" in one.metadata)
 

@@ -74,7 +74,8 @@ def draw_cloud(figure: Figure, plan: Axes, xyz: FloatArray, **look: Any) -> Floa
     """Draw points of a cloud in plan, coloured by their heights; return those that are shown."""
     shown = xyz[:: max(1, len(xyz) // MOST_POINTS)]
     if len(shown):
-        dots = plan.scatter(*shown[:, :2].T, c=shown[:, 2], s=2, cmap="cividis", **look)
+        x, y, z = shown.T
+        dots = plan.scatter(x, y, c=z, s=2, cmap="cividis", **look)
         figure.colorbar(dots, ax=plan, label="Height of the cloud (m)", shrink=0.8)
     return shown
 
