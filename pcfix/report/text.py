@@ -138,23 +138,9 @@ def _uncertainty(s: Summary) -> list[str]:
 
 
 def errors_of(s: Summary) -> str:
-    """Return the standard deviations that a run assumed, as ``image 0.5 px, level 0.020 m``."""
-    errors, level, source = s.settings, s.settings["sigma_level"], ""
-    if level is None:
-        level, source = LEVEL_M, " (assumed)"
-        fitted = None if s.water_fit is None else s.water_fit["sigma_level_m"]
-        if fitted is not None and np.isfinite(fitted):
-            level, source = fitted, " (fitted)"
-    parts = [f"image {errors['sigma_image']:g} px", f"level {level:.3f} m{source}"]
-    parts.append(f"index {errors['sigma_index']:g}")
-    more = (
-        ("tilt", "sigma_tilt", "deg"),
-        ("waves", "sigma_waves", "deg"),
-        ("camera positions", "sigma_centre", "m"),
-        ("attitude", "sigma_attitude", "deg"),
-    )
-    parts += [f"{name} {errors[key]:g} {unit}" for name, key, unit in more if errors[key] > 0.0]
-    return ", ".join(parts)
+    """Return the budget of a run in words."""
+    fitted = None if s.water_fit is None else s.water_fit["sigma_level_m"]
+    return budget_words(s.settings, fitted)
 
 
 def left_out_lines(labelling: dict[str, Any] | None) -> list[str]:
@@ -185,9 +171,45 @@ def share(part: int, whole: int) -> str:
     return f"{percent:.0f} %" if percent >= 10 or percent == 0 else f"{percent:.1f} %"
 
 
+def strictest_order(uncertainty: dict[str, Any]) -> str | None:
+    """Return the strictest order whose TVU 95 % of the points keep, if any."""
+    for order in ORDERS:
+        if uncertainty["s44"][order.name] >= 0.95:
+            return order.name
+    return None
+
+
+def budget_words(errors: dict[str, Any], level_from_fit: float | None = None) -> str:
+    """Return the standard deviations that were assumed, as ``image 0.5 px, level 0.020 m``.
+
+    Parameters
+    ----------
+    errors : dict
+        The settings of a summary, with the options ``sigma_...``.
+    level_from_fit : float, optional
+        Standard error of the level that a fit gave, where the user stated none.
+    """
+    level = errors["sigma_level"]
+    source = ""
+    if level is None:
+        level, source = LEVEL_M, " (assumed)"
+        if level_from_fit is not None and np.isfinite(level_from_fit):
+            level, source = level_from_fit, " (fitted)"
+    parts = [f"image {errors['sigma_image']:g} px", f"level {level:.3f} m{source}"]
+    parts.append(f"index {errors['sigma_index']:g}")
+    more = (
+        ("tilt", "sigma_tilt", "deg"),
+        ("waves", "sigma_waves", "deg"),
+        ("camera positions", "sigma_centre", "m"),
+        ("attitude", "sigma_attitude", "deg"),
+    )
+    parts += [f"{name} {errors[key]:g} {unit}" for name, key, unit in more if errors[key] > 0.0]
+    return ", ".join(parts)
+
+
 def tvu_sentence(uncertainty: dict[str, Any]) -> str:
-    """Return the strictest order of S-44 that 95 % of the points would keep, in words."""
-    order = next((one.name for one in ORDERS if uncertainty["s44"][one.name] >= 0.95), None)
+    """Return which order of S-44 the standard errors would allow, in words."""
+    order = strictest_order(uncertainty)
     if order is None:
         within = uncertainty["s44"][ORDERS[-1].name]
         return f"fewer than 95 % of the points keep any order of IHO S-44 ({within:.0%} order 2)"
