@@ -263,8 +263,8 @@ def _vertices(archive: ZipFile, name: str, needed: tuple[str, ...]) -> np.ndarra
 def _markers(frame: Document, block: Block) -> Seen:
     """Return the markers that were measured; they have no position."""
     row_of = {image.id: i for i, image in enumerate(block.images)}
-    point, camera, uv = [], [], []
-    count = 0
+    point: list[int] = []
+    camera, uv, count = [], [], 0
     for marker in frame.root.iterfind("markers//marker"):
         before = len(point)
         for mark in marker.iterfind("location"):

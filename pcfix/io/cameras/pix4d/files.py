@@ -166,10 +166,6 @@ Prior: TypeAlias = tuple[str, FloatArray, FloatArray]
 """The element that has the position of an image, that, and its standard deviations, metres."""
 
 
-Prior: TypeAlias = tuple[str, FloatArray, FloatArray]
-"""The element that has the position of an image, that, and its standard deviations, metres."""
-
-
 def _prior(path: Path, name: str, image: Element) -> Prior | None:
     """Return the position: `xyz` in the CRS of the images, or `gps` in WGS 84."""
     for kind, axes in (("xyz", ("x", "y", "z")), ("gps", ("lng", "lat", "alt"))):
