@@ -9,11 +9,19 @@ is by how much it stands higher than given, and b and c are unused.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens, WaterSurface
+from pcfix.model import (
+    BoolArray,
+    Cameras,
+    FloatArray,
+    IntArray,
+    Lens,
+    TiePoints,
+    WaterSurface,
+)
 from pcfix.port.shapes import Port
 
 if TYPE_CHECKING:
@@ -75,9 +83,11 @@ FOCAL, CX, CY, B1, B2, P1, P2, K1 = range(8)
 
 CODES = {"f": FOCAL, "cx": CX, "cy": CY, "b1": B1, "b2": B2, "p1": P1, "p2": P2}
 CODES |= {f"k{i + 1}": K1 + i for i in range(8)}
+NAMES = {code: name for name, code in CODES.items()}
 
-LEVEL, TILT_X, TILT_Y, INDEX = range(4)
 WATER_NAMES = ("level", "tilt_x", "tilt_y", "index")
+MOTIONS = ("shift x", "shift y", "shift z", "turn x", "turn y", "turn z", "scale")
+"""What a similarity does."""
 
 
 class Columns(NamedTuple):
@@ -108,6 +118,8 @@ class Loss(NamedTuple):
 
 SQUARES, HUBER, CAUCHY = range(3)
 """Kinds of `Loss`."""
+
+LEAST_SQUARES = Loss()
 
 
 class PointPriors(NamedTuple):
@@ -209,6 +221,23 @@ class Block:
         return np.asarray(np.isfinite(self.surveyed_sigma_m).any(axis=1))
 
 
+def plain_block(
+    cameras: Cameras,
+    ties: TiePoints,
+    water: WaterSurface | None = None,
+    refractive_index: float = 1.0,
+    wet: BoolArray | None = None,
+) -> Block:
+    """Return a block of tie points alone, all observations of 1 px; dry unless `wet` says where."""
+    k, m, o = len(cameras), len(ties.xyz), len(ties.views.camera)
+    nowhere, unknown = np.full((max(k, m), 3), np.nan), np.full((max(k, m), 3), np.inf)
+    return Block(
+        cameras, ties.xyz, ties.views.start, ties.views.camera, ties.image_xy, np.ones(o),
+        water, refractive_index, np.zeros(m, np.bool_) if wet is None else wet,
+        nowhere[:m], unknown[:m], nowhere[:k], unknown[:k],
+    )  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Unknowns:
     """What may move: zero fixes a number, infinity frees it, else it is a standard deviation.
@@ -250,17 +279,16 @@ def sensor_groups(lenses: tuple[Lens, ...]) -> tuple[IntArray, list[list[int]]]:
 
     Images with a calibration each of one sensor and frame share what is added to it.
     """
-    rows: dict[tuple[object, ...], list[int]] = {}
-    for i, lens in enumerate(lenses):
-        key = (lens.sensor, lens.width, lens.height, lens.projection, lens.inverse)
+    sensors = [(one.sensor, one.width, one.height, one.projection, one.inverse) for one in lenses]
+    distinct = len(set(lenses))
+    # several lenses of one sensor, each with images enough for its own
+    is_own = distinct > len(set(sensors)) and len(lenses) / distinct >= FEW_IMAGES
+    rows: dict[object, list[int]] = {}
+    for i, key in enumerate(lenses if is_own else sensors):
         rows.setdefault(key, []).append(i)
-    if _several_lenses(lenses, rows):
-        rows = {}
-        for i, lens in enumerate(lenses):
-            rows.setdefault((lens,), []).append(i)
     group = np.zeros(len(lenses), np.int64)
-    for number, mine in enumerate(rows.values()):
-        group[mine] = number
+    for number, members in enumerate(rows.values()):
+        group[members] = number
     return group, list(rows.values())
 
 
@@ -268,37 +296,33 @@ FEW_IMAGES = 5.0
 """Images a lens, in the mean, below which lenses of one sensor share what is added to them."""
 
 
-def _several_lenses(lenses: tuple[Lens, ...], rows: dict[tuple[object, ...], list[int]]) -> bool:
-    """Whether there are several lenses of one sensor, each with images enough for its own."""
-    distinct = len(set(lenses))
-    return distinct > len(rows) and len(lenses) / distinct >= FEW_IMAGES
-
-
 def usable_codes(lens: Lens, names: tuple[str, ...]) -> tuple[int, ...]:
     """Return the codes of those parameters that the formula of a lens has."""
     codes = tuple(CODES[name] for name in names)
-    if lens.in_turn:
-        return tuple(code for code in codes if code < CODES["p1"])
-    return codes
+    return tuple(code for code in codes if code < P1) if lens.in_turn else codes
+
+
+_FIELDS = {FOCAL: "focal", CX: "principal_x", CY: "principal_y", B1: "b1", B2: "b2"}
+
+
+def lens_parameter(lens: Lens, code: int) -> float:
+    """Return a parameter of a lens; zero of a polynomial that ends before it."""
+    if code in _FIELDS:
+        return float(getattr(lens, _FIELDS[code]))
+    values, place = (lens.radial, code - K1) if code >= K1 else (lens.tangential, code - P1)
+    return float(values[place]) if place < len(values) else 0.0
 
 
 def moved_lens(lens: Lens, codes: tuple[int, ...], by: FloatArray) -> Lens:
     """Return a lens with something added to some of its parameters."""
-    changes: dict[str, float | tuple[float, ...]] = {}
-    radial, tangential = list(lens.radial), list(lens.tangential)
-    plain = {
-        CODES["f"]: "focal", CODES["cx"]: "principal_x", CODES["cy"]: "principal_y",
-        CODES["b1"]: "b1", CODES["b2"]: "b2",
-    }  # fmt: skip
+    changes: dict[str, Any] = {"radial": lens.radial, "tangential": lens.tangential}
     for code, step in zip(codes, by.tolist(), strict=True):
-        if code in plain:
-            changes[plain[code]] = getattr(lens, plain[code]) + step
-        elif code >= CODES["k1"]:
-            place = code - CODES["k1"]
-            radial += [0.0] * (place + 1 - len(radial))
-            radial[place] += step
-        else:
-            place = code - CODES["p1"]
-            tangential += [0.0] * (2 - len(tangential))
-            tangential[place] += step
-    return replace(lens, **changes, radial=tuple(radial), tangential=tuple(tangential))  # type: ignore[arg-type]
+        value = lens_parameter(lens, code) + step
+        if code in _FIELDS:
+            changes[_FIELDS[code]] = value
+            continue
+        name, first, least = ("radial", K1, 0) if code >= K1 else ("tangential", P1, 2)
+        values = [*changes[name], *[0.0] * (max(code - first + 1, least) - len(changes[name]))]
+        values[code - first] = value
+        changes[name] = tuple(values)
+    return replace(lens, **changes)

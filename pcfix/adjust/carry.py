@@ -21,6 +21,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numba import njit, prange
 
+from pcfix.adjust.gather import some_cameras
 from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.lens.algebra import (
     dot,
@@ -45,7 +46,6 @@ from pcfix.model import (
     TiePoints,
     Views,
 )
-from pcfix.refract.batch import MadeWith
 from pcfix.refract.choice import spatial_order, views_in_frame
 from pcfix.threads import one_caller
 from pcfix.water.surface import SurfaceAbove, is_submerged
@@ -82,19 +82,20 @@ def carry(xyz: FloatArray, views: Views, old: Cameras, new: Cameras) -> Carried:
         Which cameras each point is carried by; weights do not count.
     old, new : Cameras
         The same images, in the same order, with angles and lenses.
-
-    Returns
-    -------
-    Carried
     """
-    shift = np.zeros((len(xyz), 3))
-    moved = np.zeros(len(xyz), np.bool_)
+    found = Carried(np.zeros((len(xyz), 3)), np.zeros(len(xyz), np.bool_))
+    start, camera = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
+    sides = (
+        _Side(
+            np.ascontiguousarray(cameras.centres),
+            np.ascontiguousarray(cameras.rotations, np.float64),
+            *lens_table(cameras.lenses or ()),
+        )
+        for cameras in (old, new)
+    )
     with one_caller():
-        _carry(
-            np.ascontiguousarray(xyz), np.asarray(views.start, np.int64),
-            np.asarray(views.camera, np.int64), _side_of(old), _side_of(new), shift, moved,
-        )  # fmt: skip
-    return Carried(shift, moved)
+        _carry(np.ascontiguousarray(xyz), start, camera, *sides, *found)
+    return found
 
 
 class _Side(NamedTuple):
@@ -104,13 +105,6 @@ class _Side(NamedTuple):
     rotations: FloatArray
     row: IntArray
     lenses: FloatArray
-
-
-def _side_of(cameras: Cameras) -> _Side:
-    return _Side(
-        np.ascontiguousarray(cameras.centres), np.ascontiguousarray(cameras.rotations, np.float64),
-        *lens_table(cameras.lenses or ()),
-    )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
@@ -183,10 +177,6 @@ class Pair:
     row: IntArray
     left_out: tuple[str, ...]
 
-    def renumbered(self, views: Views) -> Views:
-        """Return views of the old cameras as they were read as views of the rows here."""
-        return renumbered(views, self.row)[0]
-
 
 def pair_of(old: Cameras, new: Cameras, place: IntArray) -> Pair:
     """Return the pair of two models, given the row in the old one of each new image.
@@ -199,18 +189,9 @@ def pair_of(old: Cameras, new: Cameras, place: IntArray) -> Pair:
     row = np.full(len(old), -1)
     row[place] = np.arange(len(new))
     left_out = tuple(label for label, at in zip(old.labels, row, strict=True) if at < 0)
-    lenses: list[Lens] = []
-    for i, lens in zip(place, new.lenses or (), strict=True):
-        lenses.append(_in_unit_of(lens, (old.lenses or ())[i], old.labels[i]))
-    taken = replace(
-        old,
-        labels=tuple(old.labels[i] for i in place),
-        centres=old.centres[place],
-        rotations=None if old.rotations is None else old.rotations[place],
-        lenses=tuple(lenses),
-        gnss=None,
-    )
-    return Pair(taken, new, row, left_out)
+    old = some_cameras(old, place)
+    lenses = tuple(map(_in_unit_of, new.lenses or (), old.lenses or (), old.labels))
+    return Pair(replace(old, lenses=lenses), new, row, left_out)
 
 
 def _in_unit_of(new: Lens, old: Lens, label: str) -> Lens:
@@ -266,8 +247,12 @@ class Step(NamedTuple):
 
     def rule(self, label: Label | None) -> Label:
         """Return the rule that says what is submerged, by which no point is that stayed behind."""
-        below = _below if label is None else label
-        return lambda xyz, surface: below(xyz, surface) & self.carried
+
+        def submerged(xyz: FloatArray, surface: SurfaceAbove) -> BoolArray:
+            below = is_submerged(xyz[:, 2], surface) if label is None else label(xyz, surface)
+            return below & self.carried
+
+        return submerged
 
     def whole(self, correction: Correction) -> Correction:
         """Return the correction of `xyz` as one of the points as they were.
@@ -280,10 +265,6 @@ class Step(NamedTuple):
         stays = found.uncorrected
         shift = np.where(stays[:, None], 0.0, self.xyz - self.old_xyz + correction.shift_m)
         return replace(found, apparent_xyz=self.old_xyz, shift_m=shift)
-
-
-def _below(xyz: FloatArray, surface: SurfaceAbove) -> BoolArray:
-    return is_submerged(xyz[:, 2], surface)
 
 
 class Carrying:
@@ -315,27 +296,21 @@ class Carrying:
             If the two models do not lie in one place.
         """
         self._check(xyz)
-        views = None if listed is None else self.pair.renumbered(listed)
-        shift = np.zeros((len(xyz), 3))
-        carried = np.zeros(len(xyz), np.bool_)
+        old, new = self.pair.old, self.pair.new
+        shift, carried = np.zeros((len(xyz), 3)), np.zeros(len(xyz), np.bool_)
+        views = None if listed is None else renumbered(listed, self.pair.row)[0]
         if views is not None:
             # whatever the list means to the correction, these images saw the point
-            shift, carried = carry(xyz, replace(views, kind="tracks"), self.pair.old, self.pair.new)
+            shift, carried = carry(xyz, replace(views, kind="tracks"), old, new)
         for rows in _batches(xyz, np.flatnonzero(~carried)):
-            every = views_in_frame(xyz[rows], self.pair.old)
-            shift[rows], carried[rows] = carry(xyz[rows], every, self.pair.old, self.pair.new)
+            shift[rows], carried[rows] = carry(xyz[rows], views_in_frame(xyz[rows], old), old, new)
         return Step(xyz, xyz + shift, carried, views)
-
-    def made_with(self, xyz: FloatArray) -> MadeWith:
-        """Return what made points, as they were."""
-        return MadeWith(xyz, self.pair.old)
 
     def of_new_ties(self, ties: TiePoints) -> TiePoints:
         """Return tie points of the adjusted block, taken back to the old cameras."""
         known = np.flatnonzero(np.isfinite(ties.xyz).all(axis=1))
-        xyz = ties.xyz.copy()
-        some = ties.views.take(known)
-        xyz[known] += carry(xyz[known], some, self.pair.new, self.pair.old).shift_m
+        xyz, views = ties.xyz.copy(), ties.views.take(known)
+        xyz[known] += carry(xyz[known], views, self.pair.new, self.pair.old).shift_m
         return replace(ties, xyz=xyz)
 
     def _check(self, xyz: FloatArray) -> None:
@@ -396,24 +371,20 @@ class Carrying:
         """Return the figures in plain values, metres."""
         apart = np.linalg.norm(self.pair.new.centres - self.pair.old.centres, axis=1)
         mean = self._sum_m / max(self._points, 1)
+        shift = {
+            "mean_x": mean[0], "mean_y": mean[1], "mean_z": mean[2], "rms": np.sqrt(mean[3]),
+            "max": self._most_m,
+        }  # fmt: skip
+        centres = {"rms": np.sqrt((apart**2).mean()), "max": apart.max()}
         return {
             "points": self._points,
             "land": self._land,
             "not_carried": self._not_carried,
             "not_carried_reason": REASON,
-            "shift_m": {
-                "mean_x": _rounded(mean[0]),
-                "mean_y": _rounded(mean[1]),
-                "mean_z": _rounded(mean[2]),
-                "rms": _rounded(np.sqrt(mean[3])),
-                "max": _rounded(self._most_m),
-            },
+            "shift_m": {name: round(float(value), 4) for name, value in shift.items()},
             "cameras": len(apart),
             "cameras_left_out": list(self.pair.left_out),
-            "centres_m": {
-                "rms": _rounded(np.sqrt((apart**2).mean())),
-                "max": _rounded(apart.max()),
-            },
+            "centres_m": {name: round(float(value), 4) for name, value in centres.items()},
         }
 
     def provenance(self) -> dict[str, Any]:
@@ -430,7 +401,3 @@ def _batches(xyz: FloatArray, rows: IntArray) -> Iterator[IntArray]:
 
 def _metres(value: float) -> str:
     return f"{value:,.2f} m" if value < 100.0 else f"{value:,.0f} m"
-
-
-def _rounded(value: float) -> float:
-    return round(float(value), 4)

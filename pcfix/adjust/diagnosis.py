@@ -19,16 +19,14 @@ The first of them that can say something decides.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from pcfix.adjust.mend import Mended
+from pcfix.adjust.problem import Intersected, similarity_gradients
 from pcfix.model import BoolArray, FloatArray, IntArray
-
-if TYPE_CHECKING:
-    from pcfix.adjust.intersect import Intersected
-    from pcfix.adjust.mend import Mended
 
 LEAST_POINTS = 30
 """Tie points under water that a statement takes."""
@@ -134,9 +132,7 @@ class Diagnosis:
         }
 
 
-def tie_point_sign(
-    straight: Intersected, refracted: Intersected, depth_m: FloatArray, mended: Mended | None = None
-) -> Sign:
+def tie_point_sign(straight: Intersected, refracted: Intersected, depth_m: FloatArray) -> Sign:
     """Compare how tie points fit their images with and without refraction, poses as they are.
 
     Parameters
@@ -145,8 +141,6 @@ def tie_point_sign(
         The same m points from the same observations.
     depth_m : array, shape (m,)
         Of the straight intersection below the water; negative on land.
-    mended : Mended, optional
-        For the size of the error.
 
     Notes
     -----
@@ -175,13 +169,11 @@ def tie_point_sign(
     }  # fmt: skip
     if land.sum() < LEAST_POINTS:
         del figures["land_px"]
-    speaks = _side(share, sigma)
     plainly = (
         f"tie points under water have residuals of {figures['wet_refracted_px']:.2f} px with"
         f" refraction and of {figures['wet_straight_px']:.2f} px with straight rays"
     )
-    size = _size(speaks, mended)
-    return Sign("tie points", _tie_words(figures), figures, speaks, *size, plainly)
+    return Sign("tie points", _tie_words(figures), figures, _side(share, sigma), plainly=plainly)
 
 
 def _tie_words(f: dict[str, float]) -> str:
@@ -250,20 +242,19 @@ def _slope(found: Intersected, rows: BoolArray, depth_m: FloatArray) -> float:
     return float(np.polyfit(depth_m[rows], size, 1)[0]) if np.ptp(depth_m[rows]) > 0.0 else 0.0
 
 
-def _size(speaks: bool | None, mended: Mended | None) -> tuple[float | None, str]:
-    """Return the likely error and what it is an error of, where refraction was absorbed."""
-    if mended is None or not speaks:
-        return None, ""
+def sized(sign: Sign, mended: Mended) -> Sign:
+    """Return a sign with the likely error, and of what, where refraction was absorbed."""
+    if not sign.speaks:
+        return sign
     bed = float(np.sqrt(np.mean(mended.bed_m**2)))
     if not len(mended.land_m):
-        return bed, "rms, heights of the bed after its correction"
+        return replace(sign, size_m=bed, basis="rms, heights of the bed after its correction")
     land = float(np.sqrt(np.mean(mended.land_m**2)))
-    return land, f"rms, heights of the land; of the bed after its correction {bed:.2g} m"
+    basis = f"rms, heights of the land; of the bed after its correction {bed:.2g} m"
+    return replace(sign, size_m=land, basis=basis)
 
 
-def gnss_is_suspicious(
-    centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, similarity: FloatArray
-) -> bool:
+def gnss_is_suspicious(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray) -> bool:
     """Whether adjusted centres are so far from the GNSS, or in such a shape, that it is no chance.
 
     Parameters
@@ -273,25 +264,33 @@ def gnss_is_suspicious(
         Adjusted minus GNSS, NaN where there is none.
     sigma_m : array, shape (k, 3)
         Stated, NaN where not.
-    similarity : array, shape (k, 3, 7)
-        How the centres move with the block as a whole.
     """
     rows = np.isfinite(off_m)
-    y, base = off_m[rows], similarity[rows]
+    y, base = off_m[rows], _as_a_whole(centres)[rows]
     if len(y) < 3 * base.shape[1]:
         return False
-    left = y - base @ np.linalg.lstsq(base, y, rcond=None)[0]
+    left = _rest(y, base)
     sigma = sigma_m[rows]
     stated = np.isfinite(sigma)
     if stated.any() and np.sqrt(np.mean((left[stated] / sigma[stated]) ** 2)) > 1.5:
         return True
     bent = np.hstack([base, _bends(centres)[rows]])
-    rest = y - bent @ np.linalg.lstsq(bent, y, rcond=None)[0]
+    rest = _rest(y, bent)
     more, free = bent.shape[1] - base.shape[1], len(y) - bent.shape[1]
     if free < more:
         return False
     gain = ((left @ left) - (rest @ rest)) / more / max((rest @ rest) / free, 1e-300)
     return bool(gain > 3.0)  # F of 9 and some dozens: 1 %
+
+
+def _as_a_whole(centres: FloatArray) -> FloatArray:
+    """Return how centres move with shift, turn and scale of the block, shape (k, 3, 7)."""
+    return similarity_gradients(centres - centres.mean(axis=0))
+
+
+def _rest(y: FloatArray, columns: FloatArray) -> FloatArray:
+    """Return what is left of values after the best sum of columns."""
+    return np.asarray(y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0])
 
 
 def _bends(centres: FloatArray) -> FloatArray:
@@ -304,33 +303,31 @@ def _bends(centres: FloatArray) -> FloatArray:
     return found
 
 
-def gnss_sign(
-    off_m: FloatArray, sigma_m: FloatArray, similarity: FloatArray, mended: Mended,
-    predicted_m: FloatArray,
-) -> Sign:  # fmt: skip
-    """Look for the predicted pattern in adjusted minus GNSS positions.
+def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, mended: Mended) -> Sign:
+    """Look in adjusted minus GNSS positions for the pattern in which this water bends the block.
+
+    That is the centres as they are minus those that an adjustment with water finds without the
+    GNSS.
 
     Parameters
     ----------
-    off_m, sigma_m, similarity
+    centres, off_m, sigma_m
         As of `gnss_is_suspicious`.
     mended : Mended
-    predicted_m : array, shape (k, 3)
-        Centres as they are minus those that an adjustment with water finds without the GNSS.
 
     Notes
     -----
     off = b predicted + shift, turn and scale of the block + noise, by least squares. The noise is
     what is left, or what the GNSS states if that is more.
     """
+    centres, off_m = centres[mended.row], off_m[mended.row]
     rows = np.isfinite(off_m)
-    y, base, pattern = off_m[rows], similarity[rows], predicted_m[rows]
-    clear = pattern - base @ np.linalg.lstsq(base, pattern, rcond=None)[0]
+    y, base = off_m[rows], _as_a_whole(centres)[rows]
+    clear = _rest((centres - mended.cameras.centres)[rows], base)
     share = float(clear @ y) / max(float(clear @ clear), 1e-300)
-    columns = np.column_stack([base, clear])
-    left = y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0]
+    left = _rest(y, np.column_stack([base, clear]))
     noise = float(np.linalg.norm(left) / np.sqrt(max(len(y) - 8, 1)))
-    stated = sigma_m[rows]
+    stated = sigma_m[mended.row][rows]
     if np.isfinite(stated).any() and np.nanmedian(stated) < MOST_STATED_M:
         noise = max(noise, float(np.nanmedian(stated)))
     sigma = noise / max(float(np.linalg.norm(clear)), 1e-150)
@@ -347,27 +344,21 @@ def gnss_sign(
         " which this water bends the block"
     )
     speaks = None if share > MOST_SHARE else _side(share, sigma)
-    return Sign("GNSS", words, figures, speaks, *_size(speaks, mended), plainly)
+    return sized(Sign("GNSS", words, figures, speaks, plainly=plainly), mended)
 
 
 MOST_STATED_M = 0.5
 """A larger standard deviation is a default that software writes, as Metashape's 10 m."""
 
 
-def land_sign(higher_m: FloatArray, gsd_m: float, against: str, name: str = "land") -> Sign:
-    """Compare the cloud's land with a survey.
+def land_sign(higher_m: FloatArray, gsd_m: float, against: str) -> Sign:
+    """Compare the cloud's land with a survey: cloud minus survey in metres, shape (m,).
 
-    Parameters
-    ----------
-    higher_m : array, shape (m,)
-        Cloud minus survey, metres.
-    gsd_m : float
-    against : str
-        What was surveyed, in words.
+    `against` is what was surveyed, in words.
     """
     found = higher_m[np.isfinite(higher_m)]
     if len(found) < 3:
-        return Sign(name, f"only {len(found)} places of {against} on land", {}, None)
+        return Sign("land", f"only {len(found)} places of {against} on land", {}, None)
     bias = float(np.median(found))
     spread = 1.4826 * float(np.median(np.abs(found - bias)))
     limit = max(SIGMAS * 1.2533 * spread / np.sqrt(len(found)), LAND_GSD * gsd_m)
@@ -377,7 +368,7 @@ def land_sign(higher_m: FloatArray, gsd_m: float, against: str, name: str = "lan
     )
     figures = {"bias_m": bias, "spread_m": spread, "limit_m": limit, "places": float(len(found))}
     return Sign(
-        name, words, figures, True if abs(bias) > limit else None, abs(bias),
+        "land", words, figures, True if abs(bias) > limit else None, abs(bias),
         f"height of the land against {against}",
     )  # fmt: skip
 
@@ -397,14 +388,11 @@ def bed_sign(apparent_m: FloatArray, true_m: FloatArray, refractive_index: float
         f" error {sigma:.2f}, where refraction leaves {true_share:.2f} or less"
         f" ({deep.sum()} places, limit {limit:.2f})"
     )
-    speaks = None
-    if share - SIGMAS * sigma > limit:
-        speaks = True
-    elif share + SIGMAS * sigma < limit:
-        speaks = False
+    is_sure = abs(share - limit) > SIGMAS * sigma
     after = true_m[deep] - refractive_index * apparent_m[deep]
     return Sign(
-        "bed", words, {"share": share, "sigma_share": sigma, "limit": limit}, speaks,
+        "bed", words, {"share": share, "sigma_share": sigma, "limit": limit},
+        share > limit if is_sure else None,
         float(np.sqrt(np.mean(after**2))), "rms, measured depths against corrected ones",
     )  # fmt: skip
 

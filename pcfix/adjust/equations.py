@@ -12,14 +12,28 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
-from pcfix.adjust.block import SQUARES, Columns, Given, Loss, PointPriors, Seen, State, Surface
-from pcfix.adjust.normal import PARTS, Sums, linearise, most_seen, normal_equations, point_block
+from pcfix.adjust.block import (
+    LEAST_SQUARES,
+    Given,
+    Loss,
+    State,
+)
+from pcfix.adjust.normal import (
+    PARTS,
+    Sums,
+    add_point,
+    in_parts,
+    inverted,
+    linearise,
+    normal_equations,
+    part_of,
+    point_block,
+)
 from pcfix.adjust.observe import POINT, WIDTH, scratch
 from pcfix.adjust.problem import Problem, Solution, priors_at
 from pcfix.model import BoolArray, FloatArray, IntArray
-from pcfix.threads import one_caller
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -42,30 +56,20 @@ class Reduced(NamedTuple):
     active: IntArray
 
 
-def assemble(
-    sums: Sums, pairs: IntArray, damping: float, extra: FloatArray, extra_right: FloatArray,
-    moves: BoolArray,
-) -> Reduced:  # fmt: skip
-    """Put the blocks together.
+def reduced_at(
+    problem: Problem, found: Solution, loss: Loss = LEAST_SQUARES, damping: float = 0.0
+) -> Reduced:
+    """Return the normal equations at a solution, without the points, priors included.
 
-    Parameters
-    ----------
-    sums : Sums
-    pairs : array, shape (slots, 2)
-        Of `pcfix.adjust.normal.pair_slots`.
-    damping : float
-        Factor on the diagonal before the points were eliminated, priors included.
-    extra, extra_right : array, shape (u, u) or (u,), and (u,)
-        What priors add to the matrix or to its diagonal, and to the right side.
-    moves : array of bool, shape (u,)
-        Which unknowns move.
+    The damping is a factor on the diagonal before the points were eliminated.
     """
-    k, g = sums.border.shape[0], sums.border.shape[2]
-    size = 6 * k + g
+    k, g, pairs = len(found.state.centres), problem.columns.total, problem.slots[1]
+    size, active = 6 * k + g, np.flatnonzero(problem.moves)
+    sums = normal_equations(found.state, problem.given, loss, damping, problem.slots)
+    _, extra, extra_right = priors_at(problem, found)
     right = np.concatenate([sums.poses.ravel(), sums.shared]) + extra_right
     diagonal = np.concatenate([sums.diagonal.ravel(), sums.shared_diagonal])
     own = np.diag(extra) if extra.ndim == 2 else extra
-    active = np.flatnonzero(moves)
     if size <= DENSE_UP_TO:
         matrix = np.zeros((size, size))
         blocks = matrix[: 6 * k, : 6 * k].reshape(k, 6, k, 6)
@@ -113,9 +117,10 @@ def solver(reduced: Reduced) -> Callable[[FloatArray], FloatArray] | None:
     """Return a function that solves for a right side; None where the matrix is not definite."""
     if reduced.matrix.shape[0] == 0:
         return lambda right: right
-    scale = _scale(reduced.matrix.diagonal())
-    if scale is None:
+    diagonal = reduced.matrix.diagonal()
+    if not (diagonal > 0.0).all():
         return None
+    scale = 1.0 / np.sqrt(diagonal)
     solve = (
         _dense(reduced.matrix * scale * scale[:, None])
         if isinstance(reduced.matrix, np.ndarray)
@@ -151,13 +156,6 @@ def _factored(matrix: csc_array, scale: FloatArray) -> Callable[[FloatArray], Fl
     return lambda right: np.asarray(lu.solve(right))
 
 
-def _scale(diagonal: FloatArray) -> FloatArray | None:
-    """Return what makes the diagonal one; None where that cannot be."""
-    if not (diagonal > 0.0).all():
-        return None
-    return np.asarray(1.0 / np.sqrt(diagonal))
-
-
 FLAT = 1e-11
 """Of a point's normal matrix: determinant over product of the diagonal, below which it counts as
 singular; rays at less than about 1e-5 rad."""
@@ -166,11 +164,8 @@ singular; rays at less than about 1e-5 rad."""
 class Undamped(NamedTuple):
     """The equations, and what they were made of.
 
-    reduced : Reduced
-    problem : Problem
-        Observations of points that are not fixed have no weight.
-    is_fixed : array of bool, shape (m,)
-        Points that their observations, or their survey, fix.
+    problem : observations of points that are not fixed have no weight.
+    is_fixed : shape (m,), points that their observations, or their survey, fix.
     """
 
     reduced: Reduced
@@ -181,39 +176,25 @@ class Undamped(NamedTuple):
 def undamped(problem: Problem, found: Solution) -> Undamped:
     """Return the reduced normal equations at a solution."""
     is_fixed = np.zeros(len(found.state.xyz), np.bool_)
-    with one_caller():
-        _find_fixed(found.state, problem.given, is_fixed)
+    _find_fixed(found.state, problem.given, is_fixed)
     counts = np.repeat(is_fixed, np.diff(problem.seen.start))
     weight = np.where(counts, problem.seen.weight, 0.0)
     problem = replace(problem, seen=problem.seen._replace(weight=weight))
-    sums = normal_equations(found.state, problem.given, Loss(), 0.0, problem.slots)
-    extra = priors_at(problem, found)
-    reduced = assemble(sums, problem.slots[1], 0.0, extra.matrix, extra.right, problem.moves)
-    return Undamped(reduced, problem, is_fixed)
+    return Undamped(reduced_at(problem, found), problem, is_fixed)
 
 
 def point_covariances(equations: Undamped, found: Solution, inverse: FloatArray) -> FloatArray:
-    """Return the covariances of the points: V^-1 + V^-1 W' S^-1 W V^-1.
+    """Return the covariances of the points: V^-1 + V^-1 W' S^-1 W V^-1, shape (m, 6).
 
-    Parameters
-    ----------
-    equations : Undamped
-    found : Solution
-    inverse : array, shape (a, a)
-        S^-1, of the active unknowns.
-
-    Returns
-    -------
-    array, shape (m, 6)
-        xx, xy, xz, yy, yz, zz in square metres for observations of unit weight; NaN of points
-        that are not fixed.
+    They are xx, xy, xz, yy, yz, zz in square metres for observations of unit weight; NaN of points
+    that are not fixed. The inverse S^-1, shape (a, a), is of the active unknowns.
     """
     problem = equations.problem
     place = np.full(len(problem.moves), -1, np.int64)
     place[equations.reduced.active] = np.arange(len(equations.reduced.active))
     out = np.full((len(found.state.xyz), 6), np.nan)
-    with one_caller():
-        _point_covariances(found.state, *problem.given, equations.is_fixed, place, inverse, out)
+    given = problem.given
+    in_parts(_point_covariances, found.state, given, equations.is_fixed, place, inverse, out)
     return out
 
 
@@ -222,60 +203,46 @@ def _find_fixed(state: State, given: Given, is_fixed: BoolArray) -> None:
     """Find the points whose normal matrix V, priors included, is not singular."""
     room, seen = scratch(), given.seen
     own, shared, r = np.empty((2, WIDTH)), np.zeros((2, given.columns.total)), np.empty(2)
-    v = np.empty((3, 3))
+    v, rhs = np.empty((3, 3)), np.zeros(3)
     for p in range(len(state.xyz)):
         v[:] = 0.0
         for o in range(seen.start[p], seen.start[p + 1]):
-            if linearise(state, given, Loss(SQUARES, 1.0), p, o, room, own, shared, r):
-                b = own[:, POINT : POINT + 3]
-                for i in range(3):
-                    for j in range(3):
-                        v[i, j] += b[0, i] * b[0, j] + b[1, i] * b[1, j]
+            if linearise(state, given, LEAST_SQUARES, p, o, room, own, shared, r):
+                add_point(v, rhs, own, r)
         for i in range(3):
             v[i, i] += given.priors.weight[p, i]
-        det = (
-            v[0, 0] * (v[1, 1] * v[2, 2] - v[1, 2] * v[1, 2])
-            - v[0, 1] * (v[0, 1] * v[2, 2] - v[0, 2] * v[1, 2])
-            + v[0, 2] * (v[0, 1] * v[1, 2] - v[0, 2] * v[1, 1])
-        )
-        is_fixed[p] = det > FLAT * v[0, 0] * v[1, 1] * v[2, 2]
+        is_fixed[p] = inverted(v, FLAT)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def _point_covariances(
-    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
-    is_fixed: BoolArray, place: IntArray, inverse: FloatArray, out: FloatArray,
+    part: int, state: State, given: Given, is_fixed: BoolArray, place: IntArray,
+    inverse: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
-    for part in prange(PARTS):
-        given = Given(seen, surface, columns, priors)  # a loop takes flat tuples only
-        m, g, poses = len(state.xyz), columns.total, 6 * len(state.centres)
-        room = scratch()
-        most = most_seen(seen.start, part * m // PARTS, (part + 1) * m // PARTS)
-        own, shared, r = np.empty((2, WIDTH)), np.zeros((2, g)), np.empty(2)
-        v, nothing = np.empty((3, 3)), np.zeros(3)
-        w, at = np.empty((6 * most + g, 3)), np.empty(6 * most + g, np.int64)
-        for p in range(part * m // PARTS, (part + 1) * m // PARTS):
-            if not is_fixed[p]:
+    g, poses, seen = given.columns.total, 6 * len(state.centres), given.seen
+    first, last, most = part_of(part, PARTS, seen.start)
+    room, own, shared, r = scratch(), np.empty((2, WIDTH)), np.zeros((2, g)), np.empty(2)
+    v, rhs = np.empty((3, 3)), np.zeros(3)
+    w, at = np.empty((6 * most + g, 3)), np.empty(6 * most + g, np.int64)
+    for p in range(first, last):
+        if not is_fixed[p]:
+            continue
+        v[:], w[:g], at[:g], size = 0.0, 0.0, place[poses:], g
+        for o in range(seen.start[p], seen.start[p + 1]):
+            if not linearise(state, given, LEAST_SQUARES, p, o, room, own, shared, r):
                 continue
-            v[:], w[:g], size = 0.0, 0.0, g
-            for i in range(g):
-                at[i] = place[poses + i]
-            for o in range(seen.start[p], seen.start[p + 1]):
-                if not linearise(state, given, Loss(SQUARES, 1.0), p, o, room, own, shared, r):
-                    continue
-                for j in range(3):
-                    b0, b1 = own[0, POINT + j], own[1, POINT + j]
-                    for i in range(3):
-                        v[i, j] += own[0, POINT + i] * b0 + own[1, POINT + i] * b1
-                    for i in range(g):
-                        w[i, j] += shared[0, i] * b0 + shared[1, i] * b1
-                    for i in range(6):
-                        w[size + i, j] = own[0, i] * b0 + own[1, i] * b1
+            add_point(v, rhs, own, r)
+            for j in range(3):
+                b0, b1 = own[0, POINT + j], own[1, POINT + j]
+                for i in range(g):
+                    w[i, j] += shared[0, i] * b0 + shared[1, i] * b1
                 for i in range(6):
-                    at[size + i] = place[6 * seen.camera[o] + i]
-                size += 6
-            point_block(v, nothing, priors, state.xyz[p], p, 0.0)
-            _add_up(v, w[:size], at[:size], inverse, out[p])
+                    w[size + i, j] = own[0, i] * b0 + own[1, i] * b1
+            for i in range(6):
+                at[size + i] = place[6 * seen.camera[o] + i]
+            size += 6
+        point_block(v, rhs, given.priors, state.xyz[p], p, 0.0)
+        _add_up(v, w[:size], at[:size], inverse, out[p])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+from pcfix.adjust.block import plain_block
 from pcfix.adjust.diagnosis import (
     Diagnosis,
     Sign,
@@ -21,19 +22,17 @@ from pcfix.adjust.diagnosis import (
     gnss_is_suspicious,
     gnss_sign,
     land_sign,
+    sized,
     tie_point_sign,
 )
-from pcfix.adjust.gather import Datum
-from pcfix.adjust.intersect import intersect_fixed, plain_block
-from pcfix.adjust.mend import Mended, deeper, mended
-from pcfix.adjust.problem import similarity_gradients
+from pcfix.adjust.gather import Datum, deeper, no_datum, straight_images, taken
+from pcfix.adjust.mend import Mended, mended
+from pcfix.adjust.problem import intersect_fixed
 from pcfix.errors import GeometryError
-from pcfix.lens.imaging import project
 from pcfix.model import (
     Cameras,
     FloatArray,
     GroundControl,
-    IntArray,
     TiePoints,
     WaterDimension,
     WaterSurface,
@@ -93,15 +92,10 @@ class Evidence:
         In the cloud's CRS, with the GNSS positions to compare with.
     name : str
         Of their file, for messages.
-    water : WaterSurface
-    refractive_index : float
-    ties : TiePoints or None
     view : Cloud or None
         Of the cloud, for points that stand for tie points, and heights about surveyed places.
-    control : GroundControl or None
     calibrated : dict
         Focal length by width of the image, by the name of the sensor; "" is any.
-    reference : Reference or None
     gnss : Datum or None
         Positions of the GNSS in the frame of the cameras, NaN where there is none.
     in_passing : bool
@@ -121,13 +115,17 @@ class Evidence:
     in_passing: bool = False
 
     @property
+    def has_height(self) -> bool:
+        """Whether the water has a height anywhere, not only where the cloud has points."""
+        return not isinstance(self.water, WaterDimension)
+
+    @property
     def has_rays(self) -> bool:
         """Whether straight and refracted rays can be computed."""
         cameras = self.cameras
         if cameras.rotations is None or cameras.lenses is None:
             return False
-        pixels = all(lens.unit == "px" for lens in cameras.lenses)
-        return pixels and not isinstance(self.water, WaterDimension)
+        return self.has_height and all(lens.unit == "px" for lens in cameras.lenses)
 
 
 def diagnosed(evidence: Evidence) -> Diagnosis:
@@ -152,116 +150,50 @@ def diagnosed(evidence: Evidence) -> Diagnosis:
 
 def _signs_of_rays(evidence: Evidence) -> list[Sign]:
     """Look at tie points, and at the GNSS."""
-    signs: list[Sign] = []
-    apparent: FloatArray | None = None
-    ties = None if evidence.ties is None else _some_ties(evidence, evidence.ties)
-    if ties is not None:
-        signs.append(ties.sign)
-        apparent = ties.apparent
-    off = _gnss(evidence)
-    bent = ties is not None and bool(ties.sign.speaks)
-    asked = off.known and not evidence.in_passing
-    if not (bent or off.suspicious or asked):
-        return signs + ([off.calm] if off.calm is not None else [])
+    cameras, gnss = evidence.cameras, evidence.gnss or no_datum(len(evidence.cameras))
+    ties, apparent = (None, None) if evidence.ties is None else _sign_of_ties(evidence)
+    off = cameras.centres - gnss.xyz
+    known = int(np.isfinite(off).sum()) >= LEAST_COORDINATES
+    bent = ties is not None and bool(ties.speaks)
+    suspicious = gnss_is_suspicious(cameras.centres, off, gnss.sigma_m)
+    signs = [] if ties is None else [ties]
+    if not (bent or suspicious or (known and not evidence.in_passing)):
+        return [*signs, _without_pattern(off, ", without a pattern")] if known else signs
     try:
         mended = _mended(evidence, apparent)
     except GeometryError as error:
-        return [*signs, *off.unsure(str(error))]
-    if ties is not None and bent:
-        signs = [ties.with_size(mended)]
-    if off.known:
-        signs.append(off.sign(evidence.cameras, mended))
+        why = f"; what made their pattern is open ({error})"
+        return [*signs, _without_pattern(off, why)] if known else signs
+    signs = [sized(sign, mended) for sign in signs]
+    if known:
+        signs.append(gnss_sign(cameras.centres, off, gnss.sigma_m, mended))
     return signs
 
 
-class _Ties(NamedTuple):
-    """The sign of tie points, what made it, and where straight rays put them."""
-
-    sign: Sign
-    made_of: tuple[Any, Any, FloatArray]
-    apparent: FloatArray
-
-    def with_size(self, mended: Mended) -> Sign:
-        """Return the sign with the size of the error."""
-        return tie_point_sign(*self.made_of, mended)
+def _without_pattern(off_m: FloatArray, words: str) -> Sign:
+    rms = float(np.sqrt(np.nanmean(off_m**2)))
+    return Sign("GNSS", f"centres minus GNSS are {rms:.3f} m rms{words}", {"rms_m": rms}, None)
 
 
-def _some_ties(evidence: Evidence, ties: TiePoints) -> _Ties | None:
-    """Intersect some tie points straight and refracted."""
-    seen_by = np.diff(ties.views.start)
-    rows = np.flatnonzero((seen_by >= LEAST_TIE_VIEWS) & np.isfinite(ties.xyz).all(axis=1))
+def _sign_of_ties(evidence: Evidence) -> tuple[Sign | None, FloatArray | None]:
+    """Intersect some tie points straight and refracted; return where straight rays meet, too."""
+    ties, n = evidence.ties, evidence.refractive_index
+    if ties is None:
+        return None, None
+    counts = np.diff(ties.views.start)
+    rows = np.flatnonzero((counts >= LEAST_TIE_VIEWS) & np.isfinite(ties.xyz).all(axis=1))
     if not len(rows):
-        return None
-    rows = rows[:: max(1, len(rows) // TIE_POINTS)]
-    views = ties.views.take(rows)
-    first = np.repeat(ties.views.start[rows] - views.start[:-1], np.diff(views.start))
-    image_xy = ties.image_xy[first + np.arange(len(views.camera))]
-    dry = np.zeros(len(rows), np.bool_)
-    n = evidence.refractive_index
+        return None, None
     block = plain_block(
-        evidence.cameras, ties.xyz[rows], views.start, views.camera, image_xy, None, n, dry
+        evidence.cameras, taken(ties, rows[:: max(1, len(rows) // TIE_POINTS)]), None, n
     )
     straight = intersect_fixed(block)
     above = surface_above(evidence.water, straight.xyz)
-    depth = above.height_m - straight.xyz[:, 2]
     wet = is_submerged(straight.xyz[:, 2], above)
     begin = deeper(straight.xyz, above.height_m, wet, n)
     refracted = intersect_fixed(replace(block, xyz=begin, wet=wet, water=evidence.water))
-    fits = np.isfinite(straight.squares)
-    return _Ties(
-        tie_point_sign(straight, refracted, depth), (straight, refracted, depth),
-        straight.xyz[fits],
-    )  # fmt: skip
-
-
-class _Gnss(NamedTuple):
-    """Adjusted minus GNSS, its stated standard deviation, and whether that is worth a look."""
-
-    off_m: FloatArray
-    sigma_m: FloatArray
-    suspicious: bool
-
-    @property
-    def known(self) -> bool:
-        """Whether there are positions enough."""
-        return int(np.isfinite(self.off_m).sum()) >= LEAST_COORDINATES
-
-    @property
-    def calm(self) -> Sign | None:
-        """Say that nothing is to be seen, where there are positions."""
-        if not self.known:
-            return None
-        rms = float(np.sqrt(np.nanmean(self.off_m**2)))
-        words = f"centres minus GNSS are {rms:.3f} m rms, without a pattern"
-        return Sign("GNSS", words, {"rms_m": rms}, None)
-
-    def unsure(self, why: str) -> list[Sign]:
-        """Say that a pattern could not be compared with that of the water."""
-        if not self.known:
-            return []
-        rms = float(np.sqrt(np.nanmean(self.off_m**2)))
-        words = f"centres minus GNSS are {rms:.3f} m rms; what made their pattern is open ({why})"
-        return [Sign("GNSS", words, {"rms_m": rms}, None)]
-
-    def sign(self, cameras: Cameras, mended: Mended) -> Sign:
-        """Look for the pattern that the water would make."""
-        centres = cameras.centres[mended.row]
-        return gnss_sign(
-            self.off_m[mended.row], self.sigma_m[mended.row],
-            similarity_gradients(centres - centres.mean(axis=0)), mended,
-            centres - mended.cameras.centres,
-        )  # fmt: skip
-
-
-def _gnss(evidence: Evidence) -> _Gnss:
-    cameras, found = evidence.cameras, evidence.gnss
-    if found is None:
-        nothing = np.full((len(cameras), 3), np.nan)
-        return _Gnss(nothing, nothing, suspicious=False)
-    off = cameras.centres - found.xyz
-    by = similarity_gradients(cameras.centres - cameras.centres.mean(axis=0))
-    suspicious = gnss_is_suspicious(cameras.centres, off, found.sigma_m, by)
-    return _Gnss(off, found.sigma_m, suspicious)
+    sign = tie_point_sign(straight, refracted, above.height_m - straight.xyz[:, 2])
+    return sign, straight.xyz[np.isfinite(straight.squares)]
 
 
 def _mended(evidence: Evidence, apparent: FloatArray | None) -> Mended:
@@ -293,9 +225,8 @@ def sample_of(view: Cloud, wanted: int) -> FloatArray:
 def focal_of(evidence: Evidence) -> Sign | None:
     """Compare each sensor with its calibration."""
     known = evidence.calibrated or {}
-    lenses = evidence.cameras.lenses or ()
     by_sensor: dict[str, list[float]] = {}
-    for lens in lenses:
+    for lens in evidence.cameras.lenses or ():
         by_sensor.setdefault(lens.sensor, []).append(lens.focal / lens.width)
     pairs = [
         (float(np.mean(focal)), known.get(name, known.get("", np.nan)))
@@ -305,25 +236,20 @@ def focal_of(evidence: Evidence) -> Sign | None:
     if not pairs:
         return None
     centres = evidence.cameras.centres
-    level = surface_above(evidence.water, centres).height_m if has_height(evidence) else np.nan
+    level = surface_above(evidence.water, centres).height_m if evidence.has_height else np.nan
     height = float(np.nanmedian(centres[:, 2] - level)) if np.isfinite(level).any() else 0.0
     focal, calibrated = np.array(pairs).T
     return focal_sign(focal, calibrated, height)
 
 
-def has_height(evidence: Evidence) -> bool:
-    """Whether the water has a height anywhere, not only where the cloud has points."""
-    return not isinstance(evidence.water, WaterDimension)
-
-
 def _gsd_m(evidence: Evidence) -> float:
     """Return the size of a pixel at the water, roughly; zero where it cannot be known."""
     lenses, centres = evidence.cameras.lenses, evidence.cameras.centres
-    if lenses is None or not has_height(evidence):
+    if lenses is None or not evidence.has_height:
         return 0.0
     level = surface_above(evidence.water, centres).height_m
     above = centres[:, 2] - np.where(np.isfinite(level), level, np.nanmean(level))
-    focal = np.array([lens.focal if lens.unit == "px" else np.inf for lens in lenses])
+    focal = [lens.focal if lens.unit == "px" else np.inf for lens in lenses]
     return float(np.mean(above / focal))
 
 
@@ -331,24 +257,15 @@ def signs_of_control(evidence: Evidence, control: GroundControl) -> list[Sign]:
     """Compare control points on land with the cloud and in the images."""
     level = surface_above(evidence.water, control.xyz).height_m
     land = ~control.under_water & ~(control.xyz[:, 2] < level)
-    gsd, signs = _gsd_m(evidence), []
+    gsd, cameras, signs = _gsd_m(evidence), evidence.cameras, []
     if evidence.view is not None:
         higher = cloud_heights(evidence.view, control.xyz[land], gsd) - control.xyz[land, 2]
         signs.append(land_sign(higher, gsd, "the control points"))
-    if evidence.cameras.rotations is not None and evidence.cameras.lenses is not None:
+    if cameras.rotations is not None and cameras.lenses is not None:
         rows = np.flatnonzero(land[control.point])
-        signs.append(_control_sign(evidence, control, rows, gsd))
+        at = straight_images(control.xyz[control.point[rows]], control.camera[rows], cameras)
+        signs.append(control_sign(control.image_xy[rows] - at, control.sigma_px[rows], gsd))
     return signs
-
-
-def _control_sign(evidence: Evidence, control: GroundControl, rows: IntArray, gsd_m: float) -> Sign:
-    cameras, camera = evidence.cameras, control.camera[rows]
-    away = control.xyz[control.point[rows]] - cameras.centres[camera]
-    local = np.einsum("oij,oj->oi", np.asarray(cameras.rotations)[camera], away)
-    lenses = cameras.lenses or ()
-    at = [project(lenses[c], one[None])[0] for c, one in zip(camera, local, strict=True)]
-    off = control.image_xy[rows] - np.array(at).reshape(-1, 2)
-    return control_sign(off, control.sigma_px[rows], gsd_m)
 
 
 def cloud_heights(view: Cloud, xyz: FloatArray, gsd_m: float) -> FloatArray:
@@ -363,7 +280,7 @@ def cloud_heights(view: Cloud, xyz: FloatArray, gsd_m: float) -> FloatArray:
 
 def signs_of_reference(evidence: Evidence, reference: Reference) -> list[Sign]:
     """Compare land and bed of the cloud with a survey of both."""
-    if evidence.view is None or not has_height(evidence):
+    if evidence.view is None or not evidence.has_height:
         return []
     gsd = _gsd_m(evidence)
     if reference.sparse:

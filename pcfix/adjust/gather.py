@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.block import Block
+from pcfix.adjust.block import Block, plain_block
 from pcfix.errors import GeometryError, SettingError
 from pcfix.lens.imaging import project, unproject
 from pcfix.model import (
@@ -184,61 +184,50 @@ def block_of(material: Material, ties: TiePoints, sigma_px: float) -> Block:
 
     Raises
     ------
-    SettingError
-        If the water is a dimension of the cloud, which tie points do not have.
     GeometryError
         If a control point lies under water and the survey does not say so.
     """
-    water, control = material.water, material.control
-    check_surface(water)
-    m, inside = len(ties.xyz), material.inside
-    wet = None if inside is None else inside(ties.xyz[:, 0], ties.xyz[:, 1])
-    sigma = np.full(len(ties.views.camera), sigma_px)
-    xyz = true_start(ties.xyz, water, material.refractive_index, wet)
-    parts = [(xyz, ties.views.start, ties.views.camera, ties.image_xy, sigma)]
-    names: tuple[str, ...] = ()
-    is_check = np.zeros(0, np.bool_)
-    if control is not None:
-        _check_under_water(control, water, material.level_sigma_m)
-        names, is_check = control.names, control.is_check
-        parts.append(_control_part(control))
-    allowed = np.ones(m, np.bool_) if wet is None else wet
-    surveyed_xyz, surveyed_sigma = np.full((m, 3), np.nan), np.full((m, 3), np.inf)
-    if control is not None:
-        held = np.where(is_check[:, None], np.inf, control.sigma_m)
-        surveyed_xyz = np.vstack([surveyed_xyz, control.xyz])
-        surveyed_sigma = np.vstack([surveyed_sigma, held])
-        allowed = np.concatenate([allowed, control.under_water])
-    starts = [parts[0][1]] + [part[1][1:] + parts[0][1][-1] for part in parts[1:]]
-    return Block(
-        cameras=material.start,
-        xyz=np.vstack([part[0] for part in parts]),
-        start=np.concatenate(starts),
-        camera=np.concatenate([part[2] for part in parts]),
-        image_xy=np.vstack([part[3] for part in parts]),
-        sigma_px=np.concatenate([part[4] for part in parts]),
-        water=water,
-        refractive_index=material.refractive_index,
-        wet=allowed,
-        surveyed_xyz=surveyed_xyz,
-        surveyed_sigma_m=surveyed_sigma,
+    water, n, inside = material.water, material.refractive_index, material.inside
+    wet = np.ones(len(ties.xyz), np.bool_) if inside is None else inside(*ties.xyz[:, :2].T)
+    ties = replace(ties, xyz=true_start(ties.xyz, water, n, wet))
+    block = replace(
+        plain_block(material.start, ties, water, n, wet),
+        sigma_px=np.full(len(ties.views.camera), sigma_px),
         gnss_xyz=material.gnss.xyz,
         gnss_sigma_m=material.gnss.sigma_m,
         port=material.port,
-        control_names=names,
-        is_check=is_check,
+    )
+    control = material.control
+    if control is None:
+        return block
+    _check_under_water(control, water, material.level_sigma_m)
+    marks, sigma = marks_of(control)
+    held = np.where(control.is_check[:, None], np.inf, control.sigma_m)
+    return replace(
+        block,
+        xyz=np.vstack([block.xyz, control.xyz]),
+        start=np.concatenate([block.start, marks.views.start[1:] + block.start[-1]]),
+        camera=np.concatenate([block.camera, marks.views.camera]),
+        image_xy=np.vstack([block.image_xy, marks.image_xy]),
+        sigma_px=np.concatenate([block.sigma_px, sigma]),
+        wet=np.concatenate([block.wet, control.under_water]),
+        surveyed_xyz=np.vstack([block.surveyed_xyz, control.xyz]),
+        surveyed_sigma_m=np.vstack([block.surveyed_sigma_m, held]),
+        control_names=control.names,
+        is_check=control.is_check,
     )
 
 
-def _control_part(
-    control: GroundControl,
-) -> tuple[FloatArray, IntArray, IntArray, FloatArray, FloatArray]:
+def marks_of(control: GroundControl) -> tuple[TiePoints, FloatArray]:
+    """Return surveyed points with their marks as tie points, and the marks' standard deviations.
+
+    Those of check points are infinite.
+    """
     order = np.argsort(control.point, kind="stable")
     counts = np.bincount(control.point, minlength=len(control.names))
-    start = np.concatenate([[0], np.cumsum(counts)])
-    point = control.point[order]
-    sigma = np.where(control.is_check[point], np.inf, control.sigma_px[order])
-    return control.xyz, start, control.camera[order], control.image_xy[order], sigma
+    views = Views(np.concatenate([[0], np.cumsum(counts)]), control.camera[order])
+    sigma = np.where(control.is_check[control.point[order]], np.inf, control.sigma_px[order])
+    return TiePoints(control.xyz, views, control.image_xy[order]), sigma
 
 
 def _check_under_water(
@@ -260,34 +249,36 @@ def _check_under_water(
 
 
 def true_start(
-    xyz: FloatArray, water: WaterSurface | None, n: float, wet: BoolArray | None = None
+    xyz: FloatArray, water: WaterSurface | None, n: float, allowed: BoolArray | None = None
 ) -> FloatArray:
     """Return apparent points with their depths times n, where a true point may be looked for."""
     if water is None:
         return xyz.copy()
     level = surface_above(water, xyz).height_m
     below = level > xyz[:, 2]
-    if wet is not None:
-        below &= wet
-    moved = xyz.copy()
-    moved[below, 2] = level[below] - n * (level[below] - xyz[below, 2])
-    return moved
+    return deeper(xyz, level, below if allowed is None else below & allowed, n)
 
 
-def usable_ties(
-    ties: TiePoints, cameras: Cameras, most: int = TIE_POINTS, seed: int = 0
-) -> TiePoints:
+def deeper(
+    apparent: FloatArray, level_m: FloatArray, wet: BoolArray, refractive_index: float
+) -> FloatArray:
+    """Return about where apparent points are: straight down the depth grows by the index."""
+    true = apparent.copy()
+    true[wet, 2] = level_m[wet] - refractive_index * (level_m - apparent[:, 2])[wet]
+    return true
+
+
+def usable_ties(ties: TiePoints, cameras: Cameras, most: int = TIE_POINTS) -> TiePoints:
     """Return the tie points that can be adjusted.
 
     Those with a place in space, two images or more, and rays that meet at an angle; a random part
     of them where they are very many.
     """
-    counts = np.diff(ties.views.start)
-    good = np.isfinite(ties.xyz).all(axis=1) & (counts >= LEAST_VIEWS)
-    rows = np.flatnonzero(good)
+    seen = np.diff(ties.views.start) >= LEAST_VIEWS
+    rows = np.flatnonzero(np.isfinite(ties.xyz).all(axis=1) & seen)
     rows = rows[_ray_angle_deg(taken(ties, rows), cameras) >= LEAST_ANGLE_DEG]
     if len(rows) > most:
-        rows = np.sort(np.random.default_rng(seed).choice(rows, most, replace=False))
+        rows = np.sort(np.random.default_rng(0).choice(rows, most, replace=False))
     return taken(ties, rows)
 
 
@@ -341,14 +332,9 @@ def _ray_angle_deg(ties: TiePoints, cameras: Cameras) -> FloatArray:
 
 
 def ties_of_cloud(xyz: FloatArray, views: Views, cameras: Cameras) -> TiePoints:
-    """Return apparent points as tie points: where the cameras image them, straight.
+    """Return apparent points, shape (m, 3), as tie points: where cameras image them, straight.
 
-    Parameters
-    ----------
-    xyz : array, shape (m, 3)
-    views : Views
-        Which cameras made them, or hold them in frame.
-    cameras : Cameras
+    The views say which cameras made them, or hold them in frame.
     """
     if cameras.lenses is None or cameras.rotations is None:
         raise GeometryError("an adjustment needs cameras with angles and lenses.")
@@ -364,6 +350,16 @@ def ties_of_cloud(xyz: FloatArray, views: Views, cameras: Cameras) -> TiePoints:
     tracks = Views(start, np.asarray(views.camera)[seen])
     rows = np.flatnonzero(counts >= LEAST_VIEWS)
     return taken(TiePoints(xyz, tracks, image[seen]), rows)
+
+
+def straight_images(xyz: FloatArray, camera: IntArray, cameras: Cameras) -> FloatArray:
+    """Return where cameras image points by straight rays, a camera for each, shape (o, 2)."""
+    rotations, lenses = np.asarray(cameras.rotations), cameras.lenses or ()
+    local = np.einsum("oij,oj->oi", rotations[camera], xyz - cameras.centres[camera])
+    image_xy = np.empty((len(local), 2))
+    for c in np.unique(camera):
+        image_xy[camera == c] = project(lenses[c], local[camera == c])
+    return image_xy
 
 
 def well_seen(block: Block) -> IntArray:

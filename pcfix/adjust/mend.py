@@ -9,29 +9,31 @@ the one under which they fit best is taken.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
 
-from pcfix.adjust.block import Block, Unknowns
-from pcfix.adjust.gather import some_cameras
-from pcfix.adjust.intersect import intersect_fixed, plain_block
+from pcfix.adjust.block import Block, Unknowns, plain_block
+from pcfix.adjust.gather import deeper, some_cameras, straight_images
 from pcfix.adjust.normal import residuals
-from pcfix.adjust.problem import LogRow, Problem, Solution, gnss_weights, prepare, solved_cameras
+from pcfix.adjust.problem import (
+    Problem,
+    Progress,
+    Solution,
+    gnss_weights,
+    intersect_fixed,
+    prepare,
+    solved_cameras,
+)
 from pcfix.adjust.result import Adjusted, adjusted_of
 from pcfix.adjust.rounds import check_datum
 from pcfix.adjust.unaware import solve_unaware, straight_columns
 from pcfix.errors import GeometryError
-from pcfix.lens.imaging import project
-from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens, WaterSurface
+from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, WaterSurface
 from pcfix.refract.choice import views_in_frame
 from pcfix.water.surface import is_submerged, surface_above
-
-Progress = Callable[[LogRow], None]
-
 
 SIGMAS_PX = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 3.0, 5.0, 10.0)
 """How far the points of the cloud may be from images of tie points: tried in this order."""
@@ -50,7 +52,6 @@ class Trial(NamedTuple):
     """One choice and how GNSS and control points fit it."""
 
     name: str
-    block: Block
     problem: Problem
     found: Solution
     sigma_px: float
@@ -79,7 +80,7 @@ class Candidate(NamedTuple):
 def mend(
     candidates: list[Candidate],
     unknowns: Unknowns,
-    lens_sets: tuple[tuple[str, ...], ...],
+    lens_sets: list[tuple[str, ...]],
     progress: Progress | None = None,
 ) -> Adjusted:
     """Mend the poses of a block from the cloud that they made.
@@ -90,9 +91,8 @@ def mend(
         The same cloud with different guesses which images made each point.
     unknowns : Unknowns
         Its lens parameters are those of `lens_sets` that are chosen.
-    lens_sets : tuple of tuple of str
+    lens_sets : list of tuple of str
         Each has those before it and some more.
-    progress : callable, optional
 
     Raises
     ------
@@ -116,9 +116,9 @@ def mend(
         (_fitting(one, replace(unknowns, lens=lens_sets[0]), progress) for one in candidates),
         key=lambda trial: (trial.sigma_px, trial.misfit),
     )
-    chosen, notes = best, []
+    chosen = best
+    one = next(c for c in candidates if c.name == best.name)
     for names in lens_sets[1:]:
-        one = next(c for c in candidates if c.name == best.name)
         try:
             more = _trial(one, replace(unknowns, lens=names), best.sigma_px, progress)
         except GeometryError:
@@ -127,7 +127,7 @@ def mend(
         gain = (chosen.misfit - more.misfit) / max(chosen.mean, 1.0)
         if gain > chdtri(extra * len(chosen.problem.groups), SURE):
             chosen = more
-    notes.append(_what_counts(chosen, candidates, lens_sets))
+    notes = [_what_counts(chosen, lens_sets)]
     if chosen.sigma_px >= POOR_PX:
         notes.append(
             f"the points of the cloud fit GNSS and control points only if they count as"
@@ -141,19 +141,15 @@ def mend(
     return replace(found, sigma0=float(np.sqrt(chosen.mean)), redundancy=free)
 
 
-def _what_counts(
-    chosen: Trial, candidates: list[Candidate], lens_sets: tuple[tuple[str, ...], ...]
-) -> str:
-    free = chosen.problem.unknowns.lens
-    text = (
-        f"without tie points: {chosen.block.start[-1]:,} image places of points of the cloud"
+def _what_counts(chosen: Trial, lens_sets: list[tuple[str, ...]]) -> str:
+    block, free = chosen.problem.block, chosen.problem.unknowns.lens
+    left = dict.fromkeys(name for names in lens_sets for name in names if name not in free)
+    return (
+        f"without tie points: {block.start[-1]:,} image places of points of the cloud"
         f" ({chosen.name}), counting as {chosen.sigma_px:g} px"
+        f"; lens parameters free: {', '.join(free) or 'none'}"
+        + (f" (the block does not tell {', '.join(left)})." if left else ".")
     )
-    text += f"; lens parameters free: {', '.join(free) or 'none'}"
-    left = [name for names in lens_sets for name in names if name not in free]
-    if left:
-        text += f" (the block does not tell {', '.join(dict.fromkeys(left))})"
-    return text + "."
 
 
 def _observed(block: Block) -> int:
@@ -162,26 +158,23 @@ def _observed(block: Block) -> int:
 
 def _fitting(one: Candidate, unknowns: Unknowns, progress: Progress | None) -> Trial:
     """Return the trial in which the cloud counts most while GNSS and control points still fit."""
-    last: Trial | None = None
-    failed: GeometryError | None = None
+    trials: list[Trial] = []
     for sigma in SIGMAS_PX:
         try:
-            last = _trial(one, unknowns, sigma, progress)
-        except GeometryError as error:
-            failed = error
-            continue
-        if last.mean <= FITS:
-            return last
-    if last is None:
-        raise failed or GeometryError("the poses cannot be mended from the cloud.")
-    return last
+            trials.append(_trial(one, unknowns, sigma, progress))
+        except GeometryError:
+            if not trials and sigma == SIGMAS_PX[-1]:
+                raise
+        else:
+            if trials[-1].mean <= FITS:
+                break
+    return trials[-1]
 
 
 def _trial(one: Candidate, unknowns: Unknowns, sigma_px: float, progress: Progress | None) -> Trial:
-    block = one.block
-    m = len(block.xyz) - len(block.control_names)
-    sigma = np.where(block.owner < m, sigma_px, block.sigma_px)
-    block = replace(block, sigma_px=sigma)
+    m = len(one.block.xyz) - len(one.block.control_names)
+    sigma = np.where(one.block.owner < m, sigma_px, one.block.sigma_px)
+    block = replace(one.block, sigma_px=sigma)
     problem, start = prepare(block, unknowns)
     before, at_rest = prepare(replace(block, cameras=one.old), unknowns)
     tests = straight_columns(before, at_rest, one.apparent_xyz - before.origin)
@@ -193,7 +186,7 @@ def _trial(one: Candidate, unknowns: Unknowns, sigma_px: float, progress: Progre
     surveyed = problem.priors.weight > 0.0
     count = _observed(block) + 2 * int(marks.sum()) + int(surveyed.sum())
     count -= 3 * int(surveyed.any(axis=1).sum())
-    return Trial(one.name, block, problem, found, sigma_px, found.cost + in_images, count)
+    return Trial(one.name, problem, found, sigma_px, found.cost + in_images, count)
 
 
 SIGMA_PX = 0.25
@@ -220,40 +213,16 @@ class Mended(NamedTuple):
     bed_m: FloatArray
 
 
-def images_of(
-    xyz: FloatArray, cameras: Cameras, least: int = 2
-) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
-    """Return which points lie in frames, and where straight rays image them.
+def images_of(xyz: FloatArray, cameras: Cameras) -> TiePoints:
+    """Return those points, shape (m, 3), that lie in `LEAST_VIEWS` frames, and their images there.
 
-    Parameters
-    ----------
-    xyz : array, shape (m, 3)
-        Metres, world frame.
-    cameras : Cameras
-        With angles and lenses.
-    least : int
-        Frames that must hold a point.
-
-    Returns
-    -------
-    rows, start, camera, image_xy
-        Of the points; the other three as of `pcfix.adjust.block.Block`.
+    The images are those of straight rays.
     """
-    rotations = np.asarray(cameras.rotations)
     views = views_in_frame(xyz, cameras)
-    rows = np.flatnonzero(np.diff(views.start) >= least)
+    rows = np.flatnonzero(np.diff(views.start) >= LEAST_VIEWS)
     views = views.take(rows)
     owner = np.repeat(rows, np.diff(views.start))
-    local = xyz[owner] - cameras.centres[views.camera]
-    local = np.einsum("oij,oj->oi", rotations[views.camera], local)
-    image_xy = np.empty((len(owner), 2))
-    by_lens: dict[Lens, list[int]] = {}
-    for row, lens in enumerate(cameras.lenses or ()):
-        by_lens.setdefault(lens, []).append(row)
-    for lens, mine in by_lens.items():
-        of_lens = np.isin(views.camera, mine)
-        image_xy[of_lens] = project(lens, local[of_lens])
-    return rows, views.start, views.camera, image_xy
+    return TiePoints(xyz[rows], views, straight_images(xyz[owner], views.camera, cameras))
 
 
 def mended(
@@ -267,62 +236,32 @@ def mended(
     ----------
     xyz : array, shape (m, 3)
         Points of the apparent cloud, or tie points, spread over it; a thousand or two.
-    cameras : Cameras
-        With angles and lenses.
-    water : WaterPlane, WaterMesh or WaterRaster
-    refractive_index : float
 
     Raises
     ------
     GeometryError
         If the cloud does not determine the poses.
     """
-    row = _well_covered(xyz, cameras)
-    cameras = some_cameras(cameras, row)
-    block, apparent = _block_of(xyz, cameras, water, refractive_index)
-    problem, begin = prepare(block, Unknowns(lens=("f",)))
-    tests = straight_columns(problem, begin, apparent - problem.origin)
-    found = solve_unaware(problem, begin, tests, np.ones(len(apparent), np.bool_))
-    higher = found.state.xyz[:, 2] + problem.origin[2] - intersect_fixed(block).xyz[:, 2]
-    known, wet = np.isfinite(higher), block.wet
-    return Mended(solved_cameras(problem, found), row, higher[~wet & known], higher[wet & known])
-
-
-def _well_covered(xyz: FloatArray, cameras: Cameras) -> IntArray:
-    """Return the rows of the cameras that image enough points.
-
-    Raises
-    ------
-    GeometryError
-        If they are fewer than three.
-    """
-    _, _, camera, _ = images_of(xyz, cameras, LEAST_VIEWS)
-    row = np.flatnonzero(np.bincount(camera, minlength=len(cameras)) >= LEAST_POINTS)
+    counts = np.bincount(images_of(xyz, cameras).views.camera, minlength=len(cameras))
+    row = np.flatnonzero(counts >= LEAST_POINTS)
     if len(row) < LEAST_IMAGES:
         raise GeometryError(f"only {len(row)} images hold {LEAST_POINTS} points of the cloud.")
-    return row
-
-
-def _block_of(
-    xyz: FloatArray, cameras: Cameras, water: WaterSurface, refractive_index: float
-) -> tuple[Block, FloatArray]:
-    """Return the block that the points and their straight images make, and the points in it."""
-    rows, start, camera, image_xy = images_of(xyz, cameras, LEAST_VIEWS)
-    apparent = xyz[rows]
-    above = surface_above(water, apparent)
-    wet = is_submerged(apparent[:, 2], above)
+    cameras = some_cameras(cameras, row)
+    ties = images_of(xyz, cameras)
+    above = surface_above(water, ties.xyz)
+    wet = is_submerged(ties.xyz[:, 2], above)
     if not wet.any():
         raise GeometryError("no point of the cloud under water lies in three images.")
-    true = deeper(apparent, above.height_m, wet, refractive_index)
-    own = cameras.centres, np.full((len(cameras), 3), OWN_SIGMA_M)
-    block = plain_block(cameras, true, start, camera, image_xy, water, refractive_index, wet, own)
-    return replace(block, sigma_px=np.full(len(camera), SIGMA_PX)), apparent
-
-
-def deeper(
-    apparent: FloatArray, level_m: FloatArray, wet: BoolArray, refractive_index: float
-) -> FloatArray:
-    """Return about where apparent points are: straight down the depth grows by the index."""
-    true = apparent.copy()
-    true[wet, 2] = level_m[wet] - refractive_index * (level_m - apparent[:, 2])[wet]
-    return true
+    true = deeper(ties.xyz, above.height_m, wet, refractive_index)
+    block = replace(
+        plain_block(cameras, replace(ties, xyz=true), water, refractive_index, wet),
+        sigma_px=np.full(len(ties.image_xy), SIGMA_PX),
+        gnss_xyz=cameras.centres,
+        gnss_sigma_m=np.full((len(cameras), 3), OWN_SIGMA_M),
+    )
+    problem, begin = prepare(block, Unknowns(lens=("f",)))
+    tests = straight_columns(problem, begin, ties.xyz - problem.origin)
+    found = solve_unaware(problem, begin, tests, np.ones(len(wet), np.bool_))
+    higher = found.state.xyz[:, 2] + problem.origin[2] - intersect_fixed(block).xyz[:, 2]
+    known = np.isfinite(higher)
+    return Mended(solved_cameras(problem, found), row, higher[~wet & known], higher[wet & known])

@@ -16,15 +16,16 @@ number of threads.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import get_num_threads, njit
 
 from pcfix.adjust.block import (
     CAUCHY,
     HUBER,
-    Columns,
     Given,
     Loss,
     PointPriors,
@@ -78,8 +79,11 @@ def pair_slots(seen: Seen, cameras: int) -> tuple[IntArray, IntArray]:
     pairs : array, shape (slots, 2)
         i <= j.
     """
-    share = np.zeros((cameras, cameras), np.bool_)
-    _mark(share, seen.start, seen.camera)
+    from scipy.sparse import csr_array
+
+    images = np.ones(len(seen.camera)), seen.camera, seen.start
+    sees = csr_array(images, (len(seen.start) - 1, cameras))
+    share = (sees.T @ sees).toarray() > 0.0
     np.fill_diagonal(share, True)
     i, j = np.nonzero(np.triu(share))
     slot = np.full((cameras, cameras), -1)
@@ -87,38 +91,40 @@ def pair_slots(seen: Seen, cameras: int) -> tuple[IntArray, IntArray]:
     return slot, np.column_stack([i, j])
 
 
+def in_parts(kernel: Callable[..., None], *given: Any, parts: int = PARTS) -> None:
+    """Run a kernel for each part of the points, as many at a time as there are threads.
+
+    Threads of our own, as numba's loops take no tuples in tuples, which a mesh or raster is.
+    """
+    with one_caller():
+        count = min(parts, get_num_threads())
+    with ThreadPoolExecutor(count) as pool:
+        list(pool.map(lambda part: kernel(part, *given), range(parts)))
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
-def _mark(share: FloatArray, start: IntArray, camera: IntArray) -> None:
-    for p in range(len(start) - 1):
-        for a in range(start[p], start[p + 1]):
-            for b in range(start[p], start[p + 1]):
-                share[camera[a], camera[b]] = True
+def part_of(part: int, parts: int, start: IntArray) -> tuple[int, int, int]:
+    """Return the first point of a part, the next one's, and the most observations of a point."""
+    m, most = len(start) - 1, 1
+    first, last = part * m // parts, (part + 1) * m // parts
+    for p in range(first, last):
+        most = max(most, start[p + 1] - start[p])
+    return first, last, most
 
 
 def normal_equations(
     state: State, given: Given, loss: Loss, damping: float, slots: tuple[IntArray, IntArray]
 ) -> Sums:
-    """Return the reduced normal equations at a state.
+    """Return the reduced normal equations at a state, `slots` as of `pair_slots`.
 
-    Parameters
-    ----------
-    state : State
-    given : Given
-    loss : Loss
-    damping : float
-        Levenberg-Marquardt's factor on the diagonal of V; that of the poses is added later.
-    slots : tuple
-        Of `pair_slots`.
+    The damping is Levenberg-Marquardt's factor on the diagonal of V; that of the poses is added
+    later.
     """
     slot, pairs = slots
     k, g = len(state.centres), given.columns.total
-    sums = Sums(
-        np.zeros((PARTS, len(pairs), 6, 6)), np.zeros((PARTS, k, 6, g)), np.zeros((PARTS, g, g)),
-        np.zeros((PARTS, k, 6)), np.zeros((PARTS, g)),
-        np.zeros((PARTS, k, 6)), np.zeros((PARTS, g)),
-    )  # fmt: skip
-    with one_caller():
-        _sum_up(state, *given, loss, damping, slot, sums)
+    shapes = (len(pairs), 6, 6), (k, 6, g), (g, g), (k, 6), (g,), (k, 6), (g,)
+    sums = Sums(*(np.zeros((PARTS, *shape)) for shape in shapes))
+    in_parts(_sum_up, state, given, loss, damping, slot, sums)
     return Sums(*(part.sum(axis=0) for part in sums))
 
 
@@ -127,8 +133,7 @@ def point_steps(
 ) -> FloatArray:
     """Return the steps of the points, shape (m, 3), given those of all the rest, (6 k + g,)."""
     steps = np.zeros((len(state.xyz), 3))
-    with one_caller():
-        _point_steps(state, *given, loss, damping, moved, steps)
+    in_parts(_point_steps, state, given, loss, damping, moved, steps)
     return steps
 
 
@@ -138,8 +143,7 @@ def residuals(state: State, seen: Seen, surface: Surface) -> FloatArray:
     NaN where the camera does not image the point.
     """
     found = np.empty((len(seen.camera), 2))
-    with one_caller():
-        _residuals(state, seen, surface, found)
+    in_parts(_residuals, state, seen, surface, found)
     return found
 
 
@@ -165,14 +169,13 @@ def _influence(square: float, loss: Loss) -> float:
     return 1.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def _residuals(state: State, seen: Seen, surface: Surface, found: FloatArray) -> None:
-    for part in prange(PARTS):
-        m, room = len(state.xyz), scratch()
-        for p in range(part * m // PARTS, (part + 1) * m // PARTS):
-            for o in range(seen.start[p], seen.start[p + 1]):
-                u, v = image(state, seen, surface, p, seen.camera[o], room)
-                found[o, 0], found[o, 1] = seen.image_xy[o, 0] - u, seen.image_xy[o, 1] - v
+@njit(cache=True, error_model="numpy", nogil=True)
+def _residuals(part: int, state: State, seen: Seen, surface: Surface, found: FloatArray) -> None:
+    room, (first, last, _) = scratch(), part_of(part, PARTS, seen.start)
+    for p in range(first, last):
+        for o in range(seen.start[p], seen.start[p + 1]):
+            u, v = image(state, seen, surface, p, seen.camera[o], room)
+            found[o, 0], found[o, 1] = seen.image_xy[o, 0] - u, seen.image_xy[o, 1] - v
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -250,67 +253,61 @@ def point_block(
             rhs[i] += weight * (priors.xyz[p, i] - xyz[i])
     for i in range(3):
         v[i, i] += damping * v[i, i]
+    return inverted(v, 1e-14)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def inverted(v: FloatArray, least: float) -> bool:
+    """Replace a matrix of 3 x 3 by its inverse; whether it has one.
+
+    It has none where the determinant is less than this share of the product of the diagonal.
+    """
     a, b, c = v[0, 0], v[0, 1], v[0, 2]
-    d, e, f = v[1, 1], v[1, 2], v[2, 2]
-    det = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
-    if not det > 1e-14 * a * d * f:
+    d, e, f = v[1, 0], v[1, 1], v[1, 2]
+    g, h, i = v[2, 0], v[2, 1], v[2, 2]
+    det = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    if not abs(det) > least * abs(a * e * i):
         return False
-    v[0, 0], v[1, 1], v[2, 2] = (d * f - e * e) / det, (a * f - c * c) / det, (a * d - b * b) / det
-    v[0, 1] = v[1, 0] = (c * e - b * f) / det
-    v[0, 2] = v[2, 0] = (b * e - c * d) / det
-    v[1, 2] = v[2, 1] = (b * c - a * e) / det
+    v[0, 0], v[0, 1], v[0, 2] = (e * i - f * h) / det, (c * h - b * i) / det, (b * f - c * e) / det
+    v[1, 0], v[1, 1], v[1, 2] = (f * g - d * i) / det, (a * i - c * g) / det, (c * d - a * f) / det
+    v[2, 0], v[2, 1], v[2, 2] = (d * h - e * g) / det, (b * g - a * h) / det, (a * e - b * d) / det
     return True
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def most_seen(start: IntArray, first: int, last: int) -> int:
-    """Return the largest number of observations of one of the points."""
-    most = 1
-    for p in range(first, last):
-        most = max(most, start[p + 1] - start[p])
-    return most
-
-
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _sum_up(
-    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
-    loss: Loss, damping: float, slot: IntArray, sums: Sums,
-) -> None:  # fmt: skip
-    """Add up the equations of the points, each part of them in its row of the sums."""
-    blocks, border, corner, poses, shared_right, diagonal, shared_diagonal = sums
-    for part in prange(PARTS):
-        given = Given(seen, surface, columns, priors)  # a loop takes flat tuples only
-        m, g = len(state.xyz), columns.total
-        first, last = part * m // PARTS, (part + 1) * m // PARTS
-        start, most = seen.start, most_seen(seen.start, first, last)
-        of_part = Sums(
-            blocks[part], border[part], corner[part], poses[part], shared_right[part],
-            diagonal[part], shared_diagonal[part],
-        )  # fmt: skip
-        room = scratch()
-        own, shared = np.empty((most, 2, WIDTH)), np.zeros((most, 2, g))
-        r, who = np.empty((most, 2)), np.empty(most, np.int64)
-        v, rhs, w_g = np.empty((3, 3)), np.empty(3), np.empty((g, 3))
-        w = np.empty((most, 6, 3))
-        for p in range(first, last):
-            v[:], rhs[:], count = 0.0, 0.0, 0
-            for o in range(start[p], start[p + 1]):
-                if linearise(state, given, loss, p, o, room, own[count], shared[count], r[count]):
-                    who[count] = seen.camera[o]
-                    _add_point(v, rhs, own[count], r[count])
-                    count += 1
-            # a point that its rays do not fix says nothing of the cameras either
-            if count == 0 or not point_block(v, rhs, priors, state.xyz[p], p, damping):
-                continue
-            w_g[:] = 0.0
-            for a in range(count):
-                _add_pose(of_part, who[a], slot, w[a], own[a], shared[a], r[a])
-                _add_shared(of_part, w_g, own[a], shared[a], r[a])
-            _eliminate(of_part, slot, who[:count], w, w_g, v, rhs)
+    part: int, state: State, given: Given, loss: Loss, damping: float, slot: IntArray, sums: Sums
+) -> None:
+    """Add up the equations of the points of a part in its row of the sums."""
+    of_part = Sums(
+        sums.blocks[part], sums.border[part], sums.corner[part], sums.poses[part],
+        sums.shared[part], sums.diagonal[part], sums.shared_diagonal[part],
+    )  # fmt: skip
+    g, start, room = given.columns.total, given.seen.start, scratch()
+    first, last, most = part_of(part, PARTS, start)
+    own, shared = np.empty((most, 2, WIDTH)), np.zeros((most, 2, g))
+    r, who = np.empty((most, 2)), np.empty(most, np.int64)
+    v, rhs, w_g = np.empty((3, 3)), np.empty(3), np.empty((g, 3))
+    w = np.empty((most, 6, 3))
+    for p in range(first, last):
+        v[:], rhs[:], count = 0.0, 0.0, 0
+        for o in range(start[p], start[p + 1]):
+            if linearise(state, given, loss, p, o, room, own[count], shared[count], r[count]):
+                who[count] = given.seen.camera[o]
+                add_point(v, rhs, own[count], r[count])
+                count += 1
+        # a point that its rays do not fix says nothing of the cameras either
+        if count == 0 or not point_block(v, rhs, given.priors, state.xyz[p], p, damping):
+            continue
+        w_g[:] = 0.0
+        for a in range(count):
+            _add_pose(of_part, who[a], slot, w[a], own[a], shared[a], r[a])
+            _add_shared(of_part, w_g, own[a], shared[a], r[a])
+        _eliminate(of_part, slot, who[:count], w, w_g, v, rhs)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _add_point(v: FloatArray, rhs: FloatArray, own: FloatArray, r: FloatArray) -> None:
+def add_point(v: FloatArray, rhs: FloatArray, own: FloatArray, r: FloatArray) -> None:
     """Add B'B and B'r."""
     for i in range(3):
         for j in range(3):
@@ -358,8 +355,7 @@ def _eliminate(
     v: FloatArray, rhs: FloatArray,
 ) -> None:  # fmt: skip
     """Take a point out of the equations, with V inverted."""
-    blocks, border, corner, poses = sums.blocks, sums.border, sums.corner, sums.poses
-    shared_right = sums.shared
+    blocks, border, corner, poses, shared_right, _, _ = sums
     g, y = len(w_g), np.empty((6, 3))
     for a in range(who.size):
         c = who[a]
@@ -387,29 +383,33 @@ def _eliminate(
             corner[i, j] -= y0 * w_g[j, 0] + y1 * w_g[j, 1] + y2 * w_g[j, 2]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def _point_steps(
-    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
-    loss: Loss, damping: float, moved: FloatArray, steps: FloatArray,
+    part: int, state: State, given: Given, loss: Loss, damping: float,
+    moved: FloatArray, steps: FloatArray,
 ) -> None:  # fmt: skip
-    for part in prange(PARTS):
-        given = Given(seen, surface, columns, priors)  # a loop takes flat tuples only
-        m, g, first = len(state.xyz), columns.total, 6 * len(state.centres)
-        room = scratch()
-        own, shared, r = np.empty((2, WIDTH)), np.zeros((2, g)), np.empty(2)
-        v, rhs = np.empty((3, 3)), np.empty(3)
-        for p in range(part * m // PARTS, (part + 1) * m // PARTS):
-            v[:], rhs[:], count = 0.0, 0.0, 0
-            for o in range(seen.start[p], seen.start[p + 1]):
-                if not linearise(state, given, loss, p, o, room, own, shared, r):
-                    continue
-                for row in range(2):
-                    for i in range(6):
-                        r[row] -= own[row, i] * moved[6 * seen.camera[o] + i]
-                    for i in range(g):
-                        r[row] -= shared[row, i] * moved[first + i]
-                _add_point(v, rhs, own, r)
-                count += 1
-            if count and point_block(v, rhs, priors, state.xyz[p], p, damping):
-                for i in range(3):
-                    steps[p, i] = v[i, 0] * rhs[0] + v[i, 1] * rhs[1] + v[i, 2] * rhs[2]
+    g, seen, poses, room = given.columns.total, given.seen, 6 * len(state.centres), scratch()
+    own, shared, r = np.empty((2, WIDTH)), np.zeros((2, g)), np.empty(2)
+    v, rhs = np.empty((3, 3)), np.empty(3)
+    first, last, _ = part_of(part, PARTS, seen.start)
+    for p in range(first, last):
+        v[:], rhs[:], count = 0.0, 0.0, 0
+        for o in range(seen.start[p], seen.start[p + 1]):
+            if not linearise(state, given, loss, p, o, room, own, shared, r):
+                continue
+            for row in range(2):
+                for i in range(6):
+                    r[row] -= own[row, i] * moved[6 * seen.camera[o] + i]
+                for i in range(g):
+                    r[row] -= shared[row, i] * moved[poses + i]
+            add_point(v, rhs, own, r)
+            count += 1
+        if count and point_block(v, rhs, given.priors, state.xyz[p], p, damping):
+            solved(v, rhs, steps[p])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def solved(v: FloatArray, rhs: FloatArray, step: FloatArray) -> None:
+    """Fill in the step of a point, with V inverted."""
+    for i in range(3):
+        step[i] = v[i, 0] * rhs[0] + v[i, 1] * rhs[1] + v[i, 2] * rhs[2]

@@ -151,17 +151,10 @@ def image_and_all_gradients(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def lens_gradients(c: FloatArray, ahead: FloatArray, codes: FloatArray, out: FloatArray) -> None:
-    """Fill in how the image of a direction moves with parameters of the lens.
+    """Fill in how the image of a direction, camera frame, moves with parameters of the lens.
 
-    Parameters
-    ----------
-    c : array
-        Coefficients of the lens.
-    ahead : array, shape (3,)
-        The direction, camera frame.
-    codes : array of int, shape (p,)
-        See `pcfix.adjust.block`.
-    out : array, shape (2, p)
+    The coefficients c are those of the lens, the codes, shape (p,), of `pcfix.adjust.block`; `out`
+    has shape (2, p).
 
     Notes
     -----

@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.block import Unknowns
+from pcfix.adjust.block import MOTIONS, WATER_NAMES, Unknowns
 from pcfix.adjust.equations import Reduced, Undamped, point_covariances, solver, undamped
-from pcfix.adjust.problem import Problem, Solution, similarity_gradients
-from pcfix.adjust.solve import BED, LIMITS, MOTIONS, weakest, words_of
+from pcfix.adjust.problem import Problem, Solution, pose_gradients
+from pcfix.adjust.solve import BED, LIMITS, weakest, words_of
 from pcfix.errors import GeometryError
 from pcfix.model import FloatArray
 
@@ -41,13 +41,9 @@ BLOCK_MOTIONS = (
 class SharedUnknown(NamedTuple):
     """One of the unknowns that all points share.
 
-    name : str
-        See `pcfix.adjust.solve.Problem.names`. The level is that at the origin of the block,
-        below the middle of the projection centres.
-    added : float
-        To its start value.
-    sigma : float
-        Standard error, in its unit: pixels, metres, slopes without unit, radians.
+    name : see `Problem.names`; the level is that at the origin of the block, below the middle of
+    the projection centres. added : to its start value.
+    sigma : standard error, in its unit: pixels, metres, slopes without unit, radians.
     """
 
     name: str
@@ -127,8 +123,10 @@ def precision_of(problem: Problem, solution: Solution, sigma0: float = 1.0) -> P
     size, k = len(equations.reduced.active), len(solution.state.centres)
     asked = _asked(problem, solution)[equations.reduced.active]
     variance = sigma0 * sigma0
-    notes = _left_out(equations)
-    points = None
+    notes: list[str] = []
+    points: FloatArray | None = None
+    if loose := int((~equations.is_fixed).sum()):
+        notes.append(f"{loose:,} points that their images do not fix have no covariance.")
     if size <= DENSE_UP_TO:
         inverse = _inverse(equations, solution)
         of_asked = asked.T @ inverse @ asked
@@ -136,9 +134,9 @@ def precision_of(problem: Problem, solution: Solution, sigma0: float = 1.0) -> P
         points = variance * point_covariances(equations, solution, inverse)
     else:
         of_asked, poses = _by_parts(equations, solution, asked)
-        notes += (
+        notes.append(
             f"The covariances of the points were left out: {size:,} unknowns of poses, lens and"
-            f" water are more than {DENSE_UP_TO:,}.",
+            f" water are more than {DENSE_UP_TO:,}."
         )
     g = problem.columns.total
     correlation = _correlations(of_asked)
@@ -146,15 +144,8 @@ def precision_of(problem: Problem, solution: Solution, sigma0: float = 1.0) -> P
     rows = zip(problem.names, solution.shared.tolist(), sigma.tolist(), strict=True)
     return Precision(
         sigma0, variance * poses.reshape(k, 6, 6), tuple(SharedUnknown(*row) for row in rows),
-        correlation[:g, :g], correlation[:g, g:], points, notes,
+        correlation[:g, :g], correlation[:g, g:], points, tuple(notes),
     )  # fmt: skip
-
-
-def _left_out(equations: Undamped) -> tuple[str, ...]:
-    loose = int((~equations.is_fixed).sum())
-    if loose == 0:
-        return ()
-    return (f"{loose:,} points that their images do not fix have no covariance.",)
 
 
 def _asked(problem: Problem, solution: Solution) -> FloatArray:
@@ -168,12 +159,9 @@ def _asked(problem: Problem, solution: Solution) -> FloatArray:
         rows[5 : 6 * k : 6, g:] = fit.T
         return rows
     at = 6 * k + problem.columns.similarity
-    rows[at : at + 7, g:] = np.einsum("ak,kb->ba", fit, _centre_gradients(problem, solution)[:, 2])
+    upward = pose_gradients(solution.state, problem.columns.pivot)[:, 5]
+    rows[at : at + 7, g:] = np.einsum("ak,kb->ba", fit, upward)
     return rows
-
-
-def _centre_gradients(problem: Problem, solution: Solution) -> FloatArray:
-    return similarity_gradients(solution.state.centres - problem.pivot)
 
 
 def _inverse(equations: Undamped, solution: Solution) -> FloatArray:
@@ -229,7 +217,7 @@ def _pose_blocks(
     poses = np.zeros((k, 6, 6))
     if problem.columns.similarity >= 0:
         at = problem.columns.similarity
-        by = _pose_gradients(problem, solution)
+        by = pose_gradients(solution.state, problem.columns.pivot)
         return np.asarray(by @ inverse[at : at + 7, at : at + 7] @ by.transpose(0, 2, 1))
     place = np.full(len(problem.moves), -1)
     place[reduced.active] = np.arange(len(reduced.active))
@@ -237,14 +225,6 @@ def _pose_blocks(
     rows = first[first >= 0][:, None] + np.arange(6)
     poses[first >= 0] = inverse[rows[:, :, None], rows[:, None, :]]
     return poses
-
-
-def _pose_gradients(problem: Problem, solution: Solution) -> FloatArray:
-    """Return how each pose moves with a similarity, shape (k, 6, 7)."""
-    by = np.zeros((len(solution.state.centres), 6, 7))
-    by[:, :3, 3:6] = -solution.state.rotations
-    by[:, 3:] = _centre_gradients(problem, solution)
-    return by
 
 
 def _by_parts(
@@ -285,7 +265,7 @@ NO_NEWS = 0.9
 """Share of a given standard deviation above which the images told nothing beyond it."""
 
 
-def strong_correlations(precision: Precision, limit: float = STRONG) -> list[str]:
+def strong_correlations(precision: Precision) -> list[str]:
     """Return a sentence for each two unknowns that are hardly told apart, the strongest first.
 
     Pairs of k1, k2, ... are left out: they always are, and it harms nothing.
@@ -295,48 +275,38 @@ def strong_correlations(precision: Precision, limit: float = STRONG) -> list[str
     for i, name in enumerate(names):
         for j in range(i):
             r = float(precision.correlation[i, j])
-            if abs(r) > limit and not (_is_radial(name) and _is_radial(names[j])):
+            if abs(r) > STRONG and not (name[0] == names[j][0] == "k"):
                 found.append((r, _pair(names[j], name, r)))
         for words, r in zip(BLOCK_MOTIONS, precision.block_correlation[i].tolist(), strict=True):
             # where poses move together, their shift is a shared unknown of its own
-            if abs(r) > limit and not _moves_block(name):
+            if abs(r) > STRONG and name not in MOTIONS:
                 found.append((r, _with_block(name, words, r)))
     return [words for _, words in sorted(found, key=lambda row: -abs(row[0]))]
 
 
-def _is_radial(name: str) -> bool:
-    return name[0] == "k" and name[1:2].isdigit()
-
-
-def _moves_block(name: str) -> bool:
-    return name in MOTIONS or name == "scale"
-
-
 def _pair(a: str, b: str, r: float) -> str:
-    first, second = words_of(a), words_of(b)
-    if a in BED and b in BED:
-        return f"{first} and {second} move the bed alike: r = {r:.3f}; fix one of them."
-    if a in BED or b in BED:
+    beds, words = (a in BED) + (b in BED), f"{words_of(a)} and {words_of(b)}"
+    if beds == 2:
+        return f"{words} move the bed alike: r = {r:.3f}; fix one of them."
+    if beds == 1:
         return (
-            f"{first} and {second} are hardly told apart: r = {r:.3f}; fix one of them, or give"
-            " control points at several heights."
+            f"{words} are hardly told apart: r = {r:.3f}; fix one of them, or give control points"
+            " at several heights."
         )
-    return f"{first} and {second} do the same to the images: r = {r:.3f}; fix one of them."
+    return f"{words} do the same to the images: r = {r:.3f}; fix one of them."
 
 
 def _with_block(name: str, motion: str, r: float) -> str:
-    first = words_of(name)
-    if name in BED:
-        remedy = "fix it, or give control points on land or better GNSS positions"
-    else:
-        remedy = "fix it, or give control points at several heights or obliques"
-    return f"{first} and {motion} are hardly told apart: r = {r:.3f}; {remedy}."
+    remedy = "on land or better GNSS positions" if name in BED else "at several heights or obliques"
+    return (
+        f"{words_of(name)} and {motion} are hardly told apart: r = {r:.3f}; fix it, or give control"
+        f" points {remedy}."
+    )
 
 
 def undetermined(precision: Precision, unknowns: Unknowns) -> list[str]:
     """Return a sentence for each unknown whose standard error is too large to be of use."""
-    sigma = dict(zip(("level", "tilt_x", "tilt_y", "index"), unknowns.water_sigma, strict=True))
-    given = sigma | unknowns.lens_sigma
+    given = dict(zip(WATER_NAMES, unknowns.water_sigma, strict=True)) | unknowns.lens_sigma
     notes = []
     for row in precision.shared:
         limit, unit, _ = LIMITS.get(row.name, (math.inf, "", ""))

@@ -6,6 +6,7 @@ surveyed points, standard deviations of lens, water and index.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -13,6 +14,9 @@ import numpy as np
 
 from pcfix.adjust.block import (
     CODES,
+    LEAST_SQUARES,
+    MOTIONS,
+    NAMES,
     WATER_NAMES,
     Block,
     Columns,
@@ -27,7 +31,7 @@ from pcfix.adjust.block import (
     sensor_groups,
     usable_codes,
 )
-from pcfix.adjust.normal import cost_of, pair_slots, residuals
+from pcfix.adjust.normal import cost_of, pair_slots, point_steps, residuals
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import lens_table
 from pcfix.model import (
@@ -65,6 +69,10 @@ class LogRow(NamedTuple):
         )
 
 
+Progress = Callable[[LogRow], None]
+"""What is called after each step."""
+
+
 @dataclass(eq=False)
 class Problem:
     """A block with everything that stays as it is while it is solved."""
@@ -82,11 +90,6 @@ class Problem:
     moves: BoolArray
 
     @property
-    def pivot(self) -> FloatArray:
-        """About which a similarity turns and scales, block frame, shape (3,)."""
-        return self.columns.pivot
-
-    @property
     def given(self) -> Given:
         """What the kernels take of it."""
         return Given(self.seen, self.surface, self.columns, self.priors)
@@ -94,32 +97,22 @@ class Problem:
     @property
     def names(self) -> list[str]:
         """What each of the shared unknowns is."""
-        by_code = {code: name for name, code in CODES.items()}
         names = [
-            f"{by_code[code]}" if len(self.groups) == 1 else f"{by_code[code]} of sensor {i + 1}"
-            for i, mine in enumerate(self.codes)
-            for code in mine
+            NAMES[code] if len(self.groups) == 1 else f"{NAMES[code]} of sensor {i}"
+            for i, codes in enumerate(self.codes, start=1)
+            for code in codes
         ]
         names += [name for name, at in zip(WATER_NAMES, self.columns.water, strict=True) if at >= 0]
-        if self.columns.similarity >= 0:
-            names += ["shift x", "shift y", "shift z", "turn x", "turn y", "turn z", "scale"]
-        return names
+        return names + list(MOTIONS if self.columns.similarity >= 0 else ())
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
     """Where a problem came to rest.
 
-    Attributes
-    ----------
-    state : State
-        Relative to `Problem.origin`.
-    lenses : tuple of Lens, length k
-    shared : array, shape (g,)
-        What was added to the shared unknowns.
-    cost : float
-        Sum of weighted squares, priors included.
-    log : list of LogRow
+    state : relative to `Problem.origin`; lenses : k of them.
+    shared : shape (g,), what was added to the shared unknowns.
+    cost : sum of weighted squares, priors included.
     """
 
     state: State
@@ -146,7 +139,7 @@ def prepare(block: Block, unknowns: Unknowns) -> tuple[Problem, Solution]:
     plane = isinstance(block.water, WaterPlane) or block.water is None
     if unknowns.tilt_sigma and not plane:
         raise GeometryError("the tilt of the water can be free for a level or plane only.")
-    free = [bool(sigma) for sigma in unknowns.water_sigma]
+    free = [sigma != 0.0 for sigma in unknowns.water_sigma]
     centres = cameras.centres - origin
     columns = columns_of(codes, free, unknowns.poses == "similarity", centres.mean(axis=0))
     row, table = lens_table(cameras.lenses)
@@ -173,12 +166,11 @@ def prepare(block: Block, unknowns: Unknowns) -> tuple[Problem, Solution]:
 
 
 def _water_numbers(block: Block, origin: FloatArray) -> FloatArray:
-    n = block.refractive_index
-    match block.water:
-        case WaterPlane(a, b, c):
-            return np.array([a + (b * origin[0] + c * origin[1]) - origin[2], b, c, n])
-        case _:
-            return np.array([0.0, 0.0, 0.0, n])
+    water, n = block.water, block.refractive_index
+    if not isinstance(water, WaterPlane):
+        return np.array([0.0, 0.0, 0.0, n])
+    a, b, c = water.a, water.b, water.c
+    return np.array([a + (b * origin[0] + c * origin[1]) - origin[2], b, c, n])
 
 
 def water_of(problem: Problem, state: State) -> WaterSurface | None:
@@ -208,17 +200,14 @@ def _surface(block: Block, origin: FloatArray) -> Surface:
 
 
 def _point_priors(block: Block, origin: FloatArray) -> PointPriors:
-    known = np.isfinite(block.surveyed_sigma_m) & np.isfinite(block.surveyed_xyz)
-    weight = np.where(known, 1.0 / np.where(known, block.surveyed_sigma_m, 1.0) ** 2, 0.0)
-    return PointPriors(np.where(known, block.surveyed_xyz - origin, 0.0), weight)
+    weight = _weights(block.surveyed_xyz, block.surveyed_sigma_m)
+    return PointPriors(np.where(weight > 0.0, block.surveyed_xyz - origin, 0.0), weight)
 
 
 def _moves(block: Block, unknowns: Unknowns, columns: Columns) -> BoolArray:
-    k = len(block.cameras)
-    poses = np.full((k, 6), unknowns.poses == "free")
-    fixed = set(unknowns.fixed_images)
-    poses[[label in fixed for label in block.cameras.labels]] = False
-    return np.concatenate([poses.ravel(), np.ones(columns.total, bool)])
+    labels, fixed = block.cameras.labels, set(unknowns.fixed_images)
+    poses = [unknowns.poses == "free" and label not in fixed for label in labels]
+    return np.concatenate([np.repeat(poses, 6), np.ones(columns.total, bool)])
 
 
 class Priors(NamedTuple):
@@ -231,8 +220,13 @@ class Priors(NamedTuple):
 
 def gnss_weights(block: Block) -> FloatArray:
     """Return inverse variances of the GNSS positions, shape (k, 3); zero where there is none."""
-    known = np.isfinite(block.gnss_xyz) & np.isfinite(block.gnss_sigma_m)
-    return np.where(known, 1.0 / np.where(known, block.gnss_sigma_m, 1.0) ** 2, 0.0)
+    return _weights(block.gnss_xyz, block.gnss_sigma_m)
+
+
+def _weights(values: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Return inverse variances; zero where value or standard deviation is not known."""
+    known = np.isfinite(values) & np.isfinite(sigma)
+    return np.where(known, 1.0 / np.where(known, sigma, 1.0) ** 2, 0.0)
 
 
 def priors_at(problem: Problem, found: Solution) -> Priors:
@@ -241,12 +235,9 @@ def priors_at(problem: Problem, found: Solution) -> Priors:
     k, g = len(block.cameras), columns.total
     diagonal, right = np.zeros(6 * k + g), np.zeros(6 * k + g)
     weight = gnss_weights(block)
-    off = np.where(weight > 0.0, block.gnss_xyz - problem.origin, 0.0) - found.state.centres
-    off = np.where(weight > 0.0, off, 0.0)
+    off = np.where(weight > 0.0, block.gnss_xyz - problem.origin - found.state.centres, 0.0)
     cost = float((weight * off * off).sum())
-    sigma = _shared_sigma(problem)
-    held = np.isfinite(sigma)
-    tight = np.where(held, 1.0 / np.where(held, sigma, 1.0) ** 2, 0.0)
+    tight = _weights(found.shared, _shared_sigma(problem))
     cost += float((tight * found.shared**2).sum())
     diagonal[6 * k :] = tight
     right[6 * k :] = -tight * found.shared
@@ -258,7 +249,7 @@ def priors_at(problem: Problem, found: Solution) -> Priors:
             return _with_network(problem, found, Priors(cost, diagonal, right))
         return Priors(cost, diagonal, right)
     matrix = np.diag(diagonal)
-    by = similarity_gradients(found.state.centres - problem.pivot)
+    by = similarity_gradients(found.state.centres - columns.pivot)
     at = 6 * k + columns.similarity
     matrix[at:, at:] += np.einsum("kia,ki,kib->ab", by, weight, by)
     right[at:] += np.einsum("kia,ki->a", by, weight * off)
@@ -274,6 +265,14 @@ def similarity_gradients(d: FloatArray) -> FloatArray:
     by[:, 1, 3], by[:, 1, 5] = -z, x
     by[:, 2, 3], by[:, 2, 4] = y, -x
     by[:, :, 6] = d
+    return by
+
+
+def pose_gradients(state: State, pivot: FloatArray) -> FloatArray:
+    """Return how poses, turn and centre, move with the same, shape (k, 6, 7)."""
+    by = np.zeros((len(state.centres), 6, 7))
+    by[:, :3, 3:6] = -state.rotations
+    by[:, 3:] = similarity_gradients(state.centres - pivot)
     return by
 
 
@@ -301,14 +300,13 @@ def _undetermined(problem: Problem) -> list[int]:
 
     A water surface whose level or tilt does not move freely tells the height or tilt of the block.
     """
-    bends = problem.block.refractive_index != 1.0 or problem.unknowns.index_sigma > 0.0
+    unknowns = problem.unknowns
+    bends = problem.block.refractive_index != 1.0 or unknowns.index_sigma > 0.0
     if not (problem.surface.there and bends and problem.block.wet.any()):
         return list(range(7))
-    level, tilt = problem.unknowns.level_sigma_m, problem.unknowns.tilt_sigma
-    rows = [0, 1, 5, 6]
-    rows += [2] if np.isinf(level) else []
-    rows += [3, 4] if np.isinf(tilt) else []
-    return sorted(rows)
+    level = [2] if np.isinf(unknowns.level_sigma_m) else []
+    tilt = [3, 4] if np.isinf(unknowns.tilt_sigma) else []
+    return [0, 1, *level, *tilt, 5, 6]
 
 
 def _shared_sigma(problem: Problem) -> FloatArray:
@@ -321,19 +319,18 @@ def _shared_sigma(problem: Problem) -> FloatArray:
     return np.array([*lens, *water, *([np.inf] * rest)], np.float64)
 
 
-def weighted_squares(problem: Problem, found: Solution) -> FloatArray:
-    """Return the weighted square of each observation that counts; NaN where out of sight."""
-    r = residuals(found.state, problem.seen, problem.surface)
-    counts = problem.seen.weight > 0.0
-    return (r[counts] ** 2).sum(axis=1) * problem.seen.weight[counts] ** 2
-
-
 def cost_at(problem: Problem, found: Solution, loss: Loss) -> float:
     """Return what a solution costs: images, surveyed points and all priors."""
-    images = cost_of(weighted_squares(problem, found), loss)
+    counts = problem.seen.weight > 0.0
+    r = residuals(found.state, problem.seen, problem.surface)[counts]
+    images = cost_of((r**2).sum(axis=1) * problem.seen.weight[counts] ** 2, loss)
+    return images + survey_cost(problem, found) + priors_at(problem, found).cost
+
+
+def survey_cost(problem: Problem, found: Solution) -> float:
+    """Return the weighted squares by which surveyed points were moved."""
     priors = problem.priors
-    points = float((priors.weight * (priors.xyz - found.state.xyz) ** 2).sum())
-    return images + points + priors_at(problem, found).cost
+    return float((priors.weight * (priors.xyz - found.state.xyz) ** 2).sum())
 
 
 def counts_of(problem: Problem, found: Solution) -> tuple[int, float]:
@@ -352,3 +349,54 @@ def solved_cameras(problem: Problem, found: Solution) -> Cameras:
         rotations=found.state.rotations,
         lenses=found.lenses,
     )
+
+
+STEPS = 10
+CLOSE_M = 1e-4
+
+
+class Intersected(NamedTuple):
+    """Points and how well they fit their images.
+
+    xyz : shape (m, 3), metres, world frame.
+    residual_px : shape (o, 2), measured minus computed; NaN where the intersection failed.
+    start : shape (m + 1,), the residuals of point i are ``start[i]:start[i + 1]``.
+    """
+
+    xyz: FloatArray
+    residual_px: FloatArray
+    start: IntArray
+
+    @property
+    def redundancy(self) -> IntArray:
+        """Measured coordinates minus the three of the point, shape (m,)."""
+        return np.asarray(2 * np.diff(self.start) - 3)
+
+    def sums(self, values: FloatArray) -> FloatArray:
+        """Return sums over the observations of each point, shape (m,)."""
+        owner = np.repeat(np.arange(len(self.xyz)), np.diff(self.start))
+        return np.asarray(np.bincount(owner, values, len(self.xyz)), np.float64)
+
+    @property
+    def squares(self) -> FloatArray:
+        """Sum of squared residuals of each point, px2, shape (m,)."""
+        return self.sums((self.residual_px**2).sum(axis=1))
+
+
+def intersect_fixed(block: Block) -> Intersected:
+    """Return the points of a block by least squares, poses, lens and water as they are.
+
+    A point that takes more than `STEPS` steps of Gauss and Newton has failed.
+    """
+    problem, now = prepare(block, Unknowns(poses="fixed", lens=()))
+    nothing = np.zeros(len(problem.moves))
+    state, step = now.state, np.full((len(block.xyz), 3), np.inf)
+    for _ in range(STEPS):
+        step = point_steps(state, problem.given, LEAST_SQUARES, 0.0, nothing)
+        state = state._replace(xyz=state.xyz + step)
+        if np.nanmax(np.abs(step), initial=0.0) < CLOSE_M:
+            break
+    r = residuals(state, problem.seen, problem.surface)
+    settled = (np.abs(step) < CLOSE_M).all(axis=1)
+    r[~settled[block.owner]] = np.nan
+    return Intersected(state.xyz + problem.origin, r, np.asarray(block.start))

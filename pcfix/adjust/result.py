@@ -139,10 +139,8 @@ def adjusted_of(
     """Return what a solution says, with check points intersected."""
     block = problem.block
     state = now.state
-    xyz = state.xyz + problem.origin
-    xyz = with_checks(problem, now, xyz)
-    shown = state._replace(xyz=xyz - problem.origin)
-    r = residuals(shown, problem.seen, problem.surface)
+    xyz = with_checks(problem, now, state.xyz + problem.origin)
+    r = residuals(state._replace(xyz=xyz - problem.origin), problem.seen, problem.surface)
     water = water_of(problem, state)
     level = np.full(len(xyz), -np.inf) if water is None else surface_above(water, xyz).height_m
     cameras = solved_cameras(problem, now)
@@ -172,36 +170,30 @@ def adjusted_of(
 def with_checks(problem: Problem, now: Solution, xyz: FloatArray) -> FloatArray:
     """Return the points, those to check with intersected from the adjusted cameras."""
     block = problem.block
-    first = len(block.xyz) - len(block.control_names)
-    rows = first + np.flatnonzero(block.is_check)
+    rows = len(block.xyz) - len(block.control_names) + np.flatnonzero(block.is_check)
     rows = rows[np.diff(block.start)[rows] >= LEAST_VIEWS]
     if len(rows) == 0:
         return xyz
-    fixed = replace(problem.unknowns, poses="fixed", lens=(), level_sigma_m=0.0, tilt_sigma=0.0,
-                    index_sigma=0.0, free_network=False)  # fmt: skip
-    only = np.isin(block.owner, rows)
-    whole = replace(block, cameras=solved_cameras(problem, now), xyz=xyz,
-                    water=water_of(problem, now.state), refractive_index=float(now.state.water[3]),
-                    sigma_px=np.where(only, 1.0, np.inf))  # fmt: skip
-    part, start = prepare(whole, fixed)
-    found = solve(part, start)
+    whole = replace(
+        block, cameras=solved_cameras(problem, now), xyz=xyz, water=water_of(problem, now.state),
+        refractive_index=float(now.state.water[3]),
+        sigma_px=np.where(np.isin(block.owner, rows), 1.0, np.inf),
+    )  # fmt: skip
+    part, start = prepare(whole, Unknowns(poses="fixed", lens=()))
     moved = xyz.copy()
-    moved[rows] = found.state.xyz[rows] + part.origin
+    moved[rows] = solve(part, start).state.xyz[rows] + part.origin
     return moved
 
 
 def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlRow]:
     first = len(block.xyz) - len(block.control_names)
     rows = []
-    for i, name in enumerate(block.control_names):
-        p = first + i
-        mine = r[block.start[p] : block.start[p + 1]]
-        mine = mine[np.isfinite(mine).all(axis=1)]
-        check = bool(block.is_check[i])
-        known = block.surveyed_xyz[p]
-        if check and len(mine) < LEAST_VIEWS:
+    for p, (name, check) in enumerate(zip(block.control_names, block.is_check, strict=True), first):
+        marks = r[block.start[p] : block.start[p + 1]]
+        marks = marks[np.isfinite(marks).all(axis=1)]
+        if check and len(marks) < LEAST_VIEWS:
             continue
-        dx, dy, dz = (xyz[p] - known).tolist()
-        rms = float(np.sqrt((mine * mine).mean())) if len(mine) else float("nan")
-        rows.append(ControlRow(name, "check" if check else "control", dx, dy, dz, rms, len(mine)))
+        dx, dy, dz = (xyz[p] - block.surveyed_xyz[p]).tolist()
+        rms = float(np.sqrt((marks * marks).mean())) if len(marks) else float("nan")
+        rows.append(ControlRow(name, "check" if check else "control", dx, dy, dz, rms, len(marks)))
     return rows

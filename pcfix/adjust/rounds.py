@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from pcfix.adjust.block import CODES, K1, Block, Robust, Unknowns, usable_codes
+from pcfix.adjust.block import (
+    CX,
+    CY,
+    K1,
+    NAMES,
+    P1,
+    P2,
+    Block,
+    Robust,
+    Unknowns,
+    usable_codes,
+)
 from pcfix.adjust.gather import LEAST_VIEWS
 from pcfix.adjust.normal import residuals
 from pcfix.adjust.precision import Precision, precision_of
-from pcfix.adjust.problem import (
-    LogRow,
-    Problem,
-    Solution,
-    gnss_weights,
-    prepare,
-)
+from pcfix.adjust.problem import Problem, Progress, Solution, gnss_weights, prepare
 from pcfix.adjust.result import Adjusted, adjusted_of, sigma0_of
 from pcfix.adjust.solve import solve
 from pcfix.errors import GeometryError
 from pcfix.model import BoolArray, Lens
-
-Progress = Callable[[LogRow], None]
 
 ROUGHLY = 1e-4
 """Gain of a step, relative, below which the first, robust rounds end."""
@@ -42,75 +44,70 @@ WEAK_PX = 2.0
 it was; the focal length always moves."""
 
 
-@dataclass(frozen=True)
-class Rounds:
-    """How the rounds go.
-
-    Attributes
-    ----------
-    sigma_px : float or None
-        Of the tie points; None to estimate it.
-    outliers : bool
-        Whether to look for them.
-    drop_weak : bool
-        Whether lens parameters that the block does not determine are left as they were.
-    """
-
-    sigma_px: float | None = None
-    outliers: bool = True
-    drop_weak: bool = True
-
-
 def adjust_ties(
     block: Block,
     unknowns: Unknowns,
-    rounds: Rounds | None = None,
     progress: Progress | None = None,
+    *,
+    sigma_px: float | None = None,
+    outliers: bool = True,
+    drop_weak: bool = True,
 ) -> Adjusted:
     """Adjust a block of measured tie points.
 
     Parameters
     ----------
-    block : Block
-    unknowns : Unknowns
-    rounds : Rounds, optional
-    progress : callable, optional
-        Called with each `LogRow`.
+    sigma_px : float, optional
+        Of the tie points; it is estimated without.
+    outliers : bool
+        Whether to look for them.
+    drop_weak : bool
+        Whether lens parameters that the block does not determine are left as they were.
 
     Raises
     ------
     GeometryError
         If the block lacks a datum, does not converge, or its unknowns cannot be told apart.
     """
-    rounds = rounds or Rounds()
     check_datum(block, unknowns)
     problem, now = prepare(block, unknowns)
     _check_sight(problem, now)
-    problem, now = _cleaned(problem, now, rounds, progress)
-    now = solve(problem, now, "squares", number=LAST_ROUND, progress=progress)
-    precision = precision_of(problem, now, sigma0_of(problem, now))
-    weak = weak_lens_parameters(problem, precision) if rounds.drop_weak else []
+    problem, now = _cleaned(problem, now, sigma_px, outliers, progress)
+    now, precision = _settled(problem, now, LAST_ROUND, progress)
+    weak = weak_lens_parameters(problem, precision) if drop_weak else []
     notes = []
     if weak:
         notes.append(
             f"the block does not determine {', '.join(weak)} of the lens; left as they were."
         )
-        problem, start = _with_less_lens(problem, now, weak)
-        now = solve(problem, start, "squares", number=LAST_ROUND + 1, progress=progress)
-        precision = precision_of(problem, now, sigma0_of(problem, now))
+        kept = tuple(name for name in unknowns.lens if name not in weak)
+        seen, xyz = problem.seen, now.state.xyz
+        problem, start = prepare(block, replace(unknowns, lens=kept))
+        problem.seen = problem.seen._replace(weight=seen.weight)
+        start = replace(start, state=start.state._replace(xyz=xyz), log=now.log)
+        now, precision = _settled(problem, start, LAST_ROUND + 1, progress)
     return adjusted_of(problem, now, precision, notes, "tie points", "direct")
 
 
+def _settled(
+    problem: Problem, now: Solution, number: int, progress: Progress | None
+) -> tuple[Solution, Precision]:
+    """Return the least squares without outliers, and how well they are known."""
+    now = solve(problem, now, "squares", number=number, progress=progress)
+    return now, precision_of(problem, now, sigma0_of(problem, now))
+
+
 def _cleaned(
-    problem: Problem, now: Solution, rounds: Rounds, progress: Progress | None
-) -> tuple[Problem, Solution]:
+    problem: Problem, now: Solution, sigma_px: float | None, outliers: bool,
+    progress: Progress | None,
+) -> tuple[Problem, Solution]:  # fmt: skip
     """Return the problem with the noise of its tie points estimated and outliers left out."""
-    estimate = rounds.sigma_px is None
-    if rounds.outliers or estimate:
+    estimate = sigma_px is None
+    if outliers or estimate:
         now = solve(problem, now, "huber", number=1, progress=progress, close=ROUGHLY)
     if estimate:
         problem = with_sigma(problem, noise_px(problem, now))
-    if not rounds.outliers:
+    if not outliers:
         return problem, now
     for number in range(OUTLIER_ROUNDS):
         robust: Robust = "cauchy" if number == 0 else "squares"
@@ -124,24 +121,8 @@ def _cleaned(
     return problem, now
 
 
-def _with_less_lens(problem: Problem, now: Solution, weak: list[str]) -> tuple[Problem, Solution]:
-    """Return the problem with some lens parameters as they came, and where to start from."""
-    unknowns = problem.unknowns
-    kept = tuple(name for name in unknowns.lens if name not in weak)
-    fewer, start = prepare(problem.block, replace(unknowns, lens=kept))
-    fewer.seen = fewer.seen._replace(weight=problem.seen.weight)
-    return fewer, replace(start, state=start.state._replace(xyz=now.state.xyz), log=now.log)
-
-
 def check_datum(block: Block, unknowns: Unknowns, reason: str = "") -> None:
-    """Check that something says where the block is.
-
-    Parameters
-    ----------
-    block : Block
-    unknowns : Unknowns
-    reason : str
-        Why GNSS positions that there are do not count.
+    """Check that something says where the block is; `reason` is why GNSS positions do not count.
 
     Raises
     ------
@@ -151,7 +132,7 @@ def check_datum(block: Block, unknowns: Unknowns, reason: str = "") -> None:
     if unknowns.free_network or unknowns.poses == "fixed":
         return
     gnss = int((gnss_weights(block) > 0.0).all(axis=1).sum())
-    control = _control_in_images(block)
+    control = int((block.is_surveyed & (np.diff(block.start) >= LEAST_VIEWS)).sum())
     fixed = len(set(unknowns.fixed_images) & set(block.cameras.labels))
     if gnss + control >= 3 or fixed >= 2:
         return
@@ -162,11 +143,6 @@ def check_datum(block: Block, unknowns: Unknowns, reason: str = "") -> None:
         " Give --gnss or --gcps with three points at least, or --datum free to keep mean place,"
         " direction and scale of the old projection centres." + (f" {reason}" if reason else "")
     )
-
-
-def _control_in_images(block: Block) -> int:
-    counts = np.diff(block.start)
-    return int((block.is_surveyed & (counts >= LEAST_VIEWS)).sum())
 
 
 def noise_px(problem: Problem, now: Solution) -> float:
@@ -218,70 +194,60 @@ def without_outliers(problem: Problem, now: Solution) -> tuple[Problem, int]:
 
 def _check_sight(problem: Problem, start: Solution) -> None:
     """Refuse a start from which most tie points are not in front of their cameras."""
-    counts = np.isfinite(problem.block.sigma_px) & _of_ties(problem)
-    r = residuals(start.state, problem.seen, problem.surface)[counts]
-    ahead = int(np.isfinite(r).all(axis=1).sum())
-    if ahead < LEAST_SHARE * len(r):
-        raise GeometryError(
-            f"the adjustment does not converge: at the start, only {ahead:,} of {len(r):,}"
-            " observations are of points in front of their cameras; check that the poses and the"
-            " tie points are of one model, and the axes of the camera file."
-        )
+    r = residuals(start.state, problem.seen, problem.surface)
+    _check_most(
+        problem, np.asarray(np.isfinite(r).all(axis=1)), "at the start, only",
+        "are of points in front of their cameras; check that the poses and the tie points are of"
+        " one model, and the axes of the camera file.",
+    )  # fmt: skip
 
 
 def _check_share(problem: Problem) -> None:
     """Refuse a block of which more is left out than fits: it has come to rest at a wrong place."""
+    _check_most(
+        problem, problem.seen.weight > 0.0, "only",
+        "of tie points fit any poses near the given ones; check that the tie points and the poses"
+        " are of one model, and the water level, or align the images anew.",
+    )  # fmt: skip
+
+
+def _check_most(problem: Problem, good: BoolArray, only: str, what: str) -> None:
+    """Refuse a block where too few observations of tie points are good."""
     counts = np.isfinite(problem.block.sigma_px) & _of_ties(problem)
-    used = counts & (problem.seen.weight > 0.0)
-    if used.sum() >= LEAST_SHARE * counts.sum():
-        return
-    raise GeometryError(
-        f"the adjustment does not converge: only {int(used.sum()):,} of {int(counts.sum()):,}"
-        " observations of tie points fit any poses near the given ones; check that the tie points"
-        " and the poses are of one model, and the water level, or align the images anew."
-    )
+    n, most = int((counts & good).sum()), int(counts.sum())
+    if n < LEAST_SHARE * most:
+        raise GeometryError(
+            f"the adjustment does not converge: {only} {n:,} of {most:,} observations {what}"
+        )
 
 
 def weak_lens_parameters(problem: Problem, precision: Precision) -> list[str]:
     """Return which lens parameters, the focal length apart, the block hardly determines."""
-    weak = []
-    columns = problem.columns
-    lenses = problem.block.cameras.lenses or ()
-    for i, rows in enumerate(problem.groups):
-        for at in range(columns.lens[i], columns.lens[i + 1]):
-            code = int(columns.code[at])
-            name = next(name for name, value in CODES.items() if value == code)
-            effect = precision.shared[at].sigma * effect_at_corner(lenses[rows[0]], code)
-            if name != "f" and effect > WEAK_PX and name not in weak:
-                weak.append(name)
-    return weak
+    lenses, rows = problem.block.cameras.lenses or (), iter(precision.shared)
+    effects = [
+        (NAMES[code], next(rows).sigma * effect_at_corner(lenses[group[0]], code))
+        for group, codes in zip(problem.groups, problem.codes, strict=True)
+        for code in codes
+    ]
+    return list(dict.fromkeys(name for name, by in effects if name != "f" and by > WEAK_PX))
 
 
 def effect_at_corner(lens: Lens, code: int) -> float:
     """Return by how much the image moves at the corner of the frame with a lens parameter."""
     r = 0.5 * np.hypot(lens.width, lens.height) / lens.focal
-    if code in (CODES["cx"], CODES["cy"]):
+    if code in (CX, CY):
         return 1.0
     if code >= K1:
         return float(lens.focal * r ** (2 * (code - K1) + 3))
-    if code in (CODES["p1"], CODES["p2"]):
-        return float(3.0 * lens.focal * r * r)
-    return float(r)
+    return float(3.0 * lens.focal * r * r if code in (P1, P2) else r)
 
 
 def default_lens(lenses: tuple[Lens, ...]) -> tuple[str, ...]:
     """Return the parameters that may move where the user names none: those that the lenses have."""
     names = ["f", "cx", "cy"]
     for lens in lenses:
-        for i, value in enumerate(lens.radial[:4]):
-            if value and f"k{i + 1}" not in names:
-                names.append(f"k{i + 1}")
-        for i, value in enumerate(lens.tangential[:2]):
-            if value and f"p{i + 1}" not in names:
-                names.append(f"p{i + 1}")
-    known = {
-        name
-        for name, code in CODES.items()
-        if any(code in usable_codes(one, (name,)) for one in lenses)
-    }
-    return tuple(name for name in names if name in known)
+        names += [f"k{i}" for i, value in enumerate(lens.radial[:4], start=1) if value]
+        names += [f"p{i}" for i, value in enumerate(lens.tangential[:2], start=1) if value]
+    return tuple(
+        name for name in dict.fromkeys(names) if any(usable_codes(lens, (name,)) for lens in lenses)
+    )

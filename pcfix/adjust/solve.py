@@ -6,25 +6,33 @@ alike (Mulsow 2024): then they cannot all be free.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import CAUCHY, HUBER, SQUARES, Loss, Robust, State, moved_lens
-from pcfix.adjust.equations import assemble, solver, undamped
-from pcfix.adjust.normal import Sums, normal_equations, point_steps
+from pcfix.adjust.block import (
+    CAUCHY,
+    CODES,
+    HUBER,
+    SQUARES,
+    Loss,
+    Robust,
+    State,
+    moved_lens,
+)
+from pcfix.adjust.equations import reduced_at, solver, undamped
+from pcfix.adjust.normal import point_steps
 from pcfix.adjust.problem import (
     LogRow,
-    Priors,
     Problem,
+    Progress,
     Solution,
     cost_at,
     counts_of,
-    priors_at,
-    similarity_gradients,
+    pose_gradients,
 )
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import lens_table
@@ -35,6 +43,9 @@ if TYPE_CHECKING:
 
 
 LOSSES = {"squares": SQUARES, "huber": HUBER, "cauchy": CAUCHY}
+BEND = 2.0
+"""Where a robust loss begins to bend, in standard deviations."""
+
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e8
 MOST_STEPS = 60
 CLOSE = 1e-10
@@ -50,9 +61,8 @@ def solve(
     problem: Problem,
     start: Solution,
     robust: Robust = "squares",
-    scale: float = 2.0,
     number: int = 1,
-    progress: Callable[[LogRow], None] | None = None,
+    progress: Progress | None = None,
     close: float = CLOSE,
 ) -> Solution:
     """Minimise the weighted squares from a start.
@@ -60,8 +70,6 @@ def solve(
     Parameters
     ----------
     robust : {"squares", "huber", "cauchy"}
-    scale : float
-        Where the loss begins to bend, in standard deviations.
     number : int
         Of the round, for the log.
     close : float
@@ -72,7 +80,7 @@ def solve(
     GeometryError
         If the normal equations stay singular, or the cost is not finite.
     """
-    loss = Loss(LOSSES[robust], scale)
+    loss = Loss(LOSSES[robust], BEND)
     now = replace(start, cost=cost_at(problem, start, loss))
     if not np.isfinite(now.cost):
         raise GeometryError("the adjustment has no finite start: check the poses and the water.")
@@ -80,11 +88,7 @@ def solve(
     least_cost = EXACT * max(int((problem.seen.weight > 0.0).sum()), 1)
     log = list(start.log)
     for step in range(MOST_STEPS):
-        sums, extra = _equations(problem, now, loss, damping)
-        while True:
-            trial = _trial(problem, now, loss, damping, sums, extra)
-            if trial is not None and trial.cost <= now.cost:
-                break
+        while (trial := _trial(problem, now, loss, damping)) is None or not trial.cost <= now.cost:
             if trial is not None and trial.cost - now.cost < ROUNDING * max(now.cost, least_cost):
                 return replace(now, log=log)  # the cost is known no better than this
             damping, up = damping * up, 2.0 * up
@@ -94,7 +98,6 @@ def solve(
                         "the normal equations are singular: " + weakest(problem, now)
                     )
                 return replace(now, log=log)
-            sums, extra = _equations(problem, now, loss, damping)
         # exact data end at a cost of nothing, of which there is no share
         gain = (now.cost - trial.cost) / max(now.cost, least_cost)
         now, up = trial, 2.0
@@ -109,20 +112,13 @@ def solve(
     return replace(now, log=log)
 
 
-def _equations(problem: Problem, now: Solution, loss: Loss, damping: float) -> tuple[Sums, Priors]:
-    sums = normal_equations(now.state, problem.given, loss, damping, problem.slots)
-    return sums, priors_at(problem, now)
-
-
-def _trial(
-    problem: Problem, now: Solution, loss: Loss, damping: float, sums: Sums, extra: Priors
-) -> Solution | None:
+def _trial(problem: Problem, now: Solution, loss: Loss, damping: float) -> Solution | None:
     """Return the state one step on; None where the equations are singular."""
-    reduced = assemble(sums, problem.slots[1], damping, extra.matrix, extra.right, problem.moves)
+    reduced = reduced_at(problem, now, loss, damping)
     solve_for = solver(reduced)
     if solve_for is None:
         return None
-    step = np.zeros(len(extra.right))
+    step = np.zeros(len(problem.moves))
     step[reduced.active] = solve_for(reduced.right)
     if not np.isfinite(step).all():
         return None
@@ -142,8 +138,8 @@ def moved_by(
     if columns.similarity >= 0:
         t, phi, s = np.split(shared[columns.similarity :], [3, 6])
         turn = Rotation.from_rotvec(phi).as_matrix()
-        d = centres - problem.pivot
-        centres = problem.pivot + t + (1.0 + s[0]) * d @ turn.T
+        d = centres - problem.columns.pivot
+        centres = problem.columns.pivot + t + (1.0 + s[0]) * d @ turn.T
         rotations = rotations @ turn.T
     water = state.water.copy()
     free = columns.water >= 0
@@ -170,20 +166,16 @@ def moved_by(
 def _moved_lenses(
     problem: Problem, lenses: tuple[Lens, ...], shared: FloatArray
 ) -> tuple[Lens, ...] | None:
-    columns = problem.columns
-    if columns.lens[-1] == 0:
+    """Return the lenses with what was added to each group; None where one is no lens any more."""
+    if problem.columns.lens[-1] == 0:
         return lenses
-    made = list(lenses)
-    for number, rows in enumerate(problem.groups):
-        by = shared[columns.lens[number] : columns.lens[number + 1]]
-        known: dict[Lens, Lens] = {}
+    moved = list(lenses)
+    parts = np.split(shared, problem.columns.lens[1:])
+    for rows, codes, by in zip(problem.groups, problem.codes, parts, strict=False):
+        new = {lens: moved_lens(lens, codes, by) for lens in {lenses[i] for i in rows}}
         for i in rows:
-            if lenses[i] not in known:
-                known[lenses[i]] = moved_lens(lenses[i], problem.codes[number], by)
-            made[i] = known[lenses[i]]
-            if not made[i].focal > 0.0:
-                return None
-    return tuple(made)
+            moved[i] = new[lenses[i]]
+    return tuple(moved) if all(lens.focal > 0.0 for lens in moved) else None
 
 
 WEAK = 1e-11
@@ -204,9 +196,10 @@ _WORDS = {name: words for name, (_, _, words) in LIMITS.items()} | {
     "f": "the focal length", "cx": "the principal point's x", "cy": "the principal point's y",
     "b1": "the affinity b1", "b2": "the skew b2",
 }  # fmt: skip
-
-
-MOTIONS = {"shift x", "shift y", "shift z", "turn x", "turn y", "turn z"}
+_WORDS |= {name: f"the distortion {name}" for name in CODES if name[0] in "kp"}
+for _axis in "xyz":
+    _WORDS[f"shift {_axis}"] = f"the block's shift along {_axis}"
+    _WORDS[f"turn {_axis}"] = f"the block's turn about {_axis}"
 
 
 BED = {"level", "index", "tilt_x", "tilt_y"}
@@ -214,23 +207,8 @@ BED = {"level", "index", "tilt_x", "tilt_y"}
 
 def words_of(name: str) -> str:
     """Return what a surveyor calls a shared unknown."""
-    base, _, sensor = name.partition(" of sensor ")
-    words = _WORDS.get(base, base)
-    if base in MOTIONS:
-        words = (
-            f"the block's {base.replace('shift ', 'shift along ').replace('turn ', 'turn about ')}"
-        )
-    elif base[0] in "kp" and base[1:].isdigit():
-        words = f"the distortion {base}"
-    return f"{words} of sensor {sensor}" if sensor else words
-
-
-class _Motion(NamedTuple):
-    """A motion of everything together that images alone cannot see."""
-
-    words: str
-    pose: FloatArray
-    shared: dict[str, float]
+    base, of, sensor = name.partition(" of sensor ")
+    return _WORDS.get(base, base) + of + sensor
 
 
 def weakest(problem: Problem, solution: Solution) -> str:
@@ -250,14 +228,14 @@ def weakest(problem: Problem, solution: Solution) -> str:
     weak = values < max(WEAK, 10.0 * float(values[0]))
     free = vectors[:, weak]
     found, left = [], free
-    for motion in _motions(problem, solution):
-        v = _vector(problem, motion)[reduced.active] / scale
+    for words, step in _motions(problem, solution):
+        v = step[reduced.active] / scale
         length = float(np.linalg.norm(v))
         if length > 0.0 and float(np.linalg.norm(free.T @ v)) > 0.99 * length:
-            found.append(motion.words)
+            found.append(words)
             v = left @ (left.T @ v)
             left = _without(left, v)
-    parts = [_datum(found)] if found else []
+    parts = [_NO_DATUM.format(_listed(found))] if found else []
     parts += [_named(problem, left[:, i], reduced.active) for i in range(left.shape[1])]
     return "; ".join(parts) + "."
 
@@ -290,48 +268,34 @@ def _without(basis: FloatArray, v: FloatArray) -> FloatArray:
     return np.asarray(u[:, s > 0.5])
 
 
-def _motions(problem: Problem, solution: Solution) -> list[_Motion]:
-    """Return shift, turn and scale of everything, the water with it where it is free.
+def _motions(problem: Problem, solution: Solution) -> Iterator[tuple[str, FloatArray]]:
+    """Yield motions of everything that images alone cannot see, each as a step of all unknowns.
 
-    Turned and scaled about the place of the water at the block's origin, whose level stays. The
-    normal of z = a + b x + c y turns with the rest, and with it the slopes.
+    Shift, turn and scale, the water with it where it is free. Turned and scaled about the place of
+    the water at the block's origin, whose level stays. The normal of z = a + b x + c y turns with
+    the rest, and with it the slopes.
     """
-    state = solution.state
-    k = len(state.centres)
-    a, b, c, _ = state.water
-    about = np.array([0.0, 0.0, a]) if problem.surface.there else problem.pivot
-    by = np.zeros((k, 6, 7))
-    by[:, :3, 3:6] = -state.rotations
-    by[:, 3:] = similarity_gradients(state.centres - about)
-    water: tuple[tuple[str, dict[str, float]], ...] = (
-        ("along x", {"level": -b}), ("along y", {"level": -c}), ("in height", {"level": 1.0}),
-        ("about x", {"tilt_x": b * c, "tilt_y": 1.0 + c * c}),
-        ("about y", {"tilt_x": -1.0 - b * b, "tilt_y": -b * c}),
-        ("about the vertical", {"tilt_x": -c, "tilt_y": b}), ("", {}),
-    )  # fmt: skip
-    kinds = ("shift",) * 3 + ("turn",) * 3 + ("scale",)
-    return [
-        _Motion(f"{kind} {way}".strip(), by[:, :, i], shared)
-        for i, (kind, (way, shared)) in enumerate(zip(kinds, water, strict=True))
-    ]
+    a, b, c, _ = solution.state.water
+    pivot = np.array([0.0, 0.0, a]) if problem.surface.there else problem.columns.pivot
+    poses = pose_gradients(solution.state, pivot)
+    water: dict[str, dict[str, float]] = {
+        "shift along x": {"level": -b}, "shift along y": {"level": -c},
+        "shift in height": {"level": 1.0},
+        "turn about x": {"tilt_x": b * c, "tilt_y": 1.0 + c * c},
+        "turn about y": {"tilt_x": -1.0 - b * b, "tilt_y": -b * c},
+        "turn about the vertical": {"tilt_x": -c, "tilt_y": b}, "scale": {},
+    }  # fmt: skip
+    for i, (words, by_name) in enumerate(water.items()):
+        shared = [by_name.get(name, 0.0) for name in problem.names]
+        step = np.concatenate([poses[:, :, i].ravel(), shared])
+        step[~problem.moves] = 0.0
+        yield words, step
 
 
-def _vector(problem: Problem, motion: _Motion) -> FloatArray:
-    """Return a motion as a step of all unknowns."""
-    k, names = len(problem.block.cameras), problem.names
-    step = np.concatenate([motion.pose.ravel(), np.zeros(len(names))])
-    for name, by in motion.shared.items():
-        if name in names:
-            step[6 * k + names.index(name)] = by
-    step[: 6 * k][~problem.moves[: 6 * k]] = 0.0
-    return step
-
-
-def _datum(found: list[str]) -> str:
-    return (
-        f"nothing holds the {_listed(found)} of the block (no datum): give GNSS positions, three"
-        " control points, or fix images, or ask for a free network"
-    )
+_NO_DATUM = (
+    "nothing holds the {} of the block (no datum): give GNSS positions, three control points, or"
+    " fix images, or ask for a free network"
+)
 
 
 def _named(problem: Problem, v: FloatArray, active: IntArray) -> str:

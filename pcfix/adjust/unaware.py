@@ -23,28 +23,35 @@ the same way.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
-from pcfix.adjust.block import SQUARES, Columns, Given, Loss, PointPriors, Seen, State, Surface
-from pcfix.adjust.normal import PARTS, linearise, most_seen, point_block
-from pcfix.adjust.observe import (
-    POINT,
-    WATER,
-    WIDTH,
-    image_and_all_gradients,
-    lens_gradients,
-    scratch,
+from pcfix.adjust.block import LEAST_SQUARES, Given, State
+from pcfix.adjust.normal import (
+    PARTS,
+    in_parts,
+    inverted,
+    linearise,
+    part_of,
+    point_block,
+    solved,
 )
-from pcfix.adjust.problem import LogRow, Problem, Solution, counts_of, priors_at
+from pcfix.adjust.observe import POINT, WATER, WIDTH, scratch
+from pcfix.adjust.problem import (
+    LogRow,
+    Problem,
+    Progress,
+    Solution,
+    counts_of,
+    priors_at,
+    survey_cost,
+)
 from pcfix.adjust.solve import moved_by
 from pcfix.errors import GeometryError
 from pcfix.model import BoolArray, FloatArray, IntArray
-from pcfix.threads import one_caller
 
 MAX_STEPS = 25
 CLOSE_M = 1e-7
@@ -62,41 +69,43 @@ class _Rows(NamedTuple):
     rhs: FloatArray
 
 
-class Tests(NamedTuple):
-    """The columns that residuals are orthogonal to, one row per observation.
-
-    pose : shape (o, 2, 6); shared : shape (o, 2, g); point : shape (o, 2, 3).
-    """
-
-    pose: FloatArray
-    shared: FloatArray
-    point: FloatArray
-
-
-def straight_columns(problem: Problem, start: Solution, apparent_xyz: FloatArray) -> Tests:
+def straight_columns(problem: Problem, start: Solution, apparent_xyz: FloatArray) -> FloatArray:
     """Return the Jacobians of the straight collinearity at the old solution.
 
     Parameters
     ----------
     apparent_xyz : array, shape (m, 3)
         The points that the old adjustment saw, block frame.
+
+    Returns
+    -------
+    array, shape (o, 2, 9 + g)
+        By pose, point and what all share; the residuals are orthogonal to these columns.
     """
-    seen, columns = problem.seen, problem.columns
-    o, g = len(seen.camera), columns.total
-    found = Tests(np.zeros((o, 2, 6)), np.zeros((o, 2, g)), np.zeros((o, 2, 3)))
-    dry = problem.given._replace(seen=seen._replace(wet=np.zeros(len(seen.wet), np.bool_)))
+    seen, o = problem.seen, len(problem.seen.camera)
+    tests = np.zeros((o, 2, WATER + problem.columns.total))
+    dry = seen._replace(wet=np.zeros(len(seen.wet), np.bool_), weight=np.ones(o))
     state = start.state._replace(xyz=np.ascontiguousarray(apparent_xyz))
-    with one_caller():
-        _columns(state, *dry, found)
-    return found
+    _columns(state, problem.given._replace(seen=dry), tests)
+    return tests
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _columns(state: State, given: Given, tests: FloatArray) -> None:
+    room, own, r, start = scratch(), np.empty((2, WIDTH)), np.empty(2), given.seen.start
+    shared = np.zeros((2, given.columns.total))
+    for p in range(len(state.xyz)):
+        for o in range(start[p], start[p + 1]):
+            if linearise(state, given, LEAST_SQUARES, p, o, room, own, shared, r):
+                tests[o, :, :WATER], tests[o, :, WATER:] = own[:, :WATER], shared
 
 
 def solve_unaware(
     problem: Problem,
     start: Solution,
-    tests: Tests,
+    tests: FloatArray,
     is_tested: BoolArray,
-    progress: Callable[[LogRow], None] | None = None,
+    progress: Progress | None = None,
 ) -> Solution:
     """Find poses, lens and points at which the residuals are orthogonal to the old columns.
 
@@ -105,7 +114,8 @@ def solve_unaware(
     problem, start : Problem, Solution
         Of `pcfix.adjust.problem.prepare`; observations of the cloud are where the old cameras image
         the apparent points.
-    tests : Tests
+    tests : array, shape (o, 2, 9 + g)
+        Of `straight_columns`.
     is_tested : array of bool, shape (m,)
         Points of the cloud. The others, control points, are adjusted by least squares.
 
@@ -115,7 +125,7 @@ def solve_unaware(
         If the equations are singular or Newton's steps do not shrink.
     """
     now, log, before = start, list(start.log), np.inf
-    for number in range(MAX_STEPS):
+    for number in range(1, MAX_STEPS + 1):
         step, points = _newton(problem, now, tests, is_tested)
         moved = moved_by(problem, now, step, points)
         size = float(np.abs(points).max(initial=0.0)) if np.isfinite(points).all() else np.inf
@@ -125,12 +135,13 @@ def solve_unaware(
                 " tie points, GNSS positions of more images, or control points."
             )
         now = moved
-        row = LogRow(1, number + 1, _squares(problem, now), 0.0, *counts_of(problem, now))
+        cost = survey_cost(problem, now) + priors_at(problem, now).cost
+        row = LogRow(1, number, cost, 0.0, *counts_of(problem, now))
         log.append(row)
         if progress is not None:
             progress(row)
         if size < CLOSE_M:
-            return replace(now, cost=row.cost, log=log)
+            return replace(now, cost=cost, log=log)
         before = size
     raise GeometryError(
         f"the poses cannot be mended from the cloud: after {MAX_STEPS} steps points still move by"
@@ -138,24 +149,17 @@ def solve_unaware(
     )
 
 
-def _squares(problem: Problem, now: Solution) -> float:
-    """Return the weighted squares of what is not tested: GNSS, surveyed points, priors."""
-    priors = problem.priors
-    points = float((priors.weight * (priors.xyz - now.state.xyz) ** 2).sum())
-    return points + priors_at(problem, now).cost
-
-
 def _newton(
-    problem: Problem, now: Solution, tests: Tests, is_tested: BoolArray
+    problem: Problem, now: Solution, tests: FloatArray, is_tested: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the step of all that are not points, shape (6 k + g,), and that of the points."""
-    k, g = len(now.state.centres), problem.columns.total
-    size = 6 * k + g
+    from scipy.linalg import solve as solve_full
+
+    size = len(problem.moves)
     parts = PARTS if size <= 3000 else 2
     matrix, right = np.zeros((parts, size, size)), np.zeros((parts, size))
-    common = now.state, *problem.given, tests, is_tested
-    with one_caller():
-        _sum_tested(*common, matrix, right)
+    common = now.state, problem.given, tests, is_tested
+    in_parts(_sum_tested, *common, matrix, right, parts=parts)
     total, side = matrix.sum(axis=0), right.sum(axis=0)
     del matrix
     extra = priors_at(problem, now)
@@ -164,10 +168,8 @@ def _newton(
     step = np.zeros(size)
     active = np.flatnonzero(problem.moves)
     scale = 1.0 / np.sqrt(np.maximum(np.abs(total.diagonal()[active]), 1e-300))
+    part = total[np.ix_(active, active)] * scale * scale[:, None]
     try:
-        from scipy.linalg import solve as solve_full
-
-        part = total[np.ix_(active, active)] * scale * scale[:, None]
         step[active] = scale * solve_full(part, scale * side[active])
     except np.linalg.LinAlgError:
         raise GeometryError(
@@ -175,46 +177,8 @@ def _newton(
             " of three images or more, or three control points, are needed."
         ) from None
     points = np.zeros((len(now.state.xyz), 3))
-    with one_caller():
-        _tested_points(*common, step, points)
+    in_parts(_tested_points, *common, step, points)
     return step, points
-
-
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def _columns(
-    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors, found: Tests
-) -> None:
-    pose, shared, point = found
-    for part in prange(PARTS):
-        m = len(state.xyz)
-        room, own = scratch(), np.empty((2, WIDTH))
-        for p in range(part * m // PARTS, (part + 1) * m // PARTS):
-            for o in range(seen.start[p], seen.start[p + 1]):
-                c = seen.camera[o]
-                lens = state.lenses[seen.lens_row[c]]
-                image_and_all_gradients(state, seen, surface, p, c, room, own)
-                pose[o] = own[:, :POINT]
-                point[o] = own[:, POINT:WATER]
-                first, last = columns.lens[seen.group[c]], columns.lens[seen.group[c] + 1]
-                if last > first:
-                    lens_gradients(
-                        lens, room.ahead, columns.code[first:last], shared[o][:, first:last]
-                    )
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _inverted(v: FloatArray) -> bool:
-    """Replace a matrix of 3 x 3 by its inverse; whether it has one."""
-    a, b, c = v[0, 0], v[0, 1], v[0, 2]
-    d, e, f = v[1, 0], v[1, 1], v[1, 2]
-    g, h, i = v[2, 0], v[2, 1], v[2, 2]
-    det = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-    if not abs(det) > 1e-12 * abs(a * e * i):
-        return False
-    v[0, 0], v[0, 1], v[0, 2] = (e * i - f * h) / det, (c * h - b * i) / det, (b * f - c * e) / det
-    v[1, 0], v[1, 1], v[1, 2] = (f * g - d * i) / det, (a * i - c * g) / det, (c * d - a * f) / det
-    v[2, 0], v[2, 1], v[2, 2] = (d * h - e * g) / det, (b * g - a * h) / det, (a * e - b * d) / det
-    return True
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -226,7 +190,9 @@ def _rows(most: int, g: int) -> _Rows:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _gather(state: State, given: Given, tests: Tests, tested: bool, p: int, rows: _Rows) -> int:
+def _gather(
+    state: State, given: Given, tests: FloatArray, tested: bool, p: int, rows: _Rows
+) -> int:
     """Fill in the columns of a point's observations and V, inverted; how many count.
 
     Columns of `right` and `left`: pose, point, shared. The block V and its right side are B_l'B
@@ -237,15 +203,12 @@ def _gather(state: State, given: Given, tests: Tests, tested: bool, p: int, rows
     own, common = np.empty((2, WIDTH)), np.zeros((2, given.columns.total))
     v[:], rhs[:], count = 0.0, 0.0, 0
     for o in range(seen.start[p], seen.start[p + 1]):
-        if not linearise(state, given, Loss(SQUARES, 1.0), p, o, room, own, common, r[count]):
+        if not linearise(state, given, LEAST_SQUARES, p, o, room, own, common, r[count]):
             continue
         right[count, :, :WATER] = own[:, :WATER]
         right[count, :, WATER:] = common
         if tested:
-            w = seen.weight[o]
-            left[count, :, :POINT] = w * tests.pose[o]
-            left[count, :, POINT:WATER] = w * tests.point[o]
-            left[count, :, WATER:] = w * tests.shared[o]
+            left[count] = seen.weight[o] * tests[o]
         else:
             left[count] = right[count]
         for i in range(3):
@@ -258,55 +221,51 @@ def _gather(state: State, given: Given, tests: Tests, tested: bool, p: int, rows
     if count == 0:
         return 0
     if tested:
-        return count if _inverted(v) else 0
+        return count if inverted(v, 1e-12) else 0
     return count if point_block(v, rhs, given.priors, state.xyz[p], p, 0.0) else 0
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def _sum_tested(
-    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
-    tests: Tests, is_tested: BoolArray, matrix: FloatArray, side: FloatArray,
+    part: int, state: State, given: Given, tests: FloatArray, is_tested: BoolArray,
+    matrix: FloatArray, side: FloatArray,
 ) -> None:  # fmt: skip
-    parts = len(matrix)
-    for part in prange(parts):
-        given = Given(seen, surface, columns, priors)  # a loop takes flat tuples only
-        m, g, k = len(state.xyz), columns.total, len(state.centres)
-        first, last = part * m // parts, (part + 1) * m // parts
-        most = most_seen(seen.start, first, last)
-        rows = _rows(most, g)
-        right, left, r, who, v, rhs = rows
-        size = 6 * most + g
-        column = np.empty(size, np.int64)
-        w_right, w_left = np.empty((3, size)), np.empty((size, 3))
-        for p in range(first, last):
-            count = _gather(state, given, tests, is_tested[p], p, rows)
-            if count == 0:
-                continue
-            used = 6 * count + g
-            w_right[:, :used], w_left[:used] = 0.0, 0.0
-            for i in range(g):
-                column[6 * count + i] = 6 * k + i
-            for o in range(count):
-                for i in range(6):
-                    column[6 * o + i] = 6 * who[o] + i
-                _add_direct(matrix[part], side[part], right[o], left[o], r[o], 6 * who[o], 6 * k, g)
-                for a in range(2):
-                    for j in range(3):
-                        bl, br = left[o, a, POINT + j], right[o, a, POINT + j]
-                        for i in range(6):
-                            w_left[6 * o + i, j] += left[o, a, i] * br
-                            w_right[j, 6 * o + i] += bl * right[o, a, i]
-                        for i in range(g):
-                            w_left[6 * count + i, j] += left[o, a, WATER + i] * br
-                            w_right[j, 6 * count + i] += bl * right[o, a, WATER + i]
-            for i in range(used):
-                y0 = w_left[i, 0] * v[0, 0] + w_left[i, 1] * v[1, 0] + w_left[i, 2] * v[2, 0]
-                y1 = w_left[i, 0] * v[0, 1] + w_left[i, 1] * v[1, 1] + w_left[i, 2] * v[2, 1]
-                y2 = w_left[i, 0] * v[0, 2] + w_left[i, 1] * v[1, 2] + w_left[i, 2] * v[2, 2]
-                side[part, column[i]] -= y0 * rhs[0] + y1 * rhs[1] + y2 * rhs[2]
-                row = matrix[part, column[i]]
-                for j in range(used):
-                    row[column[j]] -= y0 * w_right[0, j] + y1 * w_right[1, j] + y2 * w_right[2, j]
+    g, k = given.columns.total, len(state.centres)
+    first, last, most = part_of(part, len(matrix), given.seen.start)
+    rows = _rows(most, g)
+    right, left, r, who, v, rhs = rows
+    size = 6 * most + g
+    column = np.empty(size, np.int64)
+    w_right, w_left = np.empty((3, size)), np.empty((size, 3))
+    for p in range(first, last):
+        count = _gather(state, given, tests, is_tested[p], p, rows)
+        if count == 0:
+            continue
+        used = 6 * count + g
+        w_right[:, :used], w_left[:used] = 0.0, 0.0
+        for i in range(g):
+            column[6 * count + i] = 6 * k + i
+        for o in range(count):
+            for i in range(6):
+                column[6 * o + i] = 6 * who[o] + i
+            _add_direct(matrix[part], side[part], right[o], left[o], r[o], 6 * who[o], 6 * k, g)
+            for a in range(2):
+                for j in range(3):
+                    bl, br = left[o, a, POINT + j], right[o, a, POINT + j]
+                    for i in range(6):
+                        w_left[6 * o + i, j] += left[o, a, i] * br
+                        w_right[j, 6 * o + i] += bl * right[o, a, i]
+                    for i in range(g):
+                        w_left[6 * count + i, j] += left[o, a, WATER + i] * br
+                        w_right[j, 6 * count + i] += bl * right[o, a, WATER + i]
+        for i in range(used):
+            y0 = w_left[i, 0] * v[0, 0] + w_left[i, 1] * v[1, 0] + w_left[i, 2] * v[2, 0]
+            y1 = w_left[i, 0] * v[0, 1] + w_left[i, 1] * v[1, 1] + w_left[i, 2] * v[2, 1]
+            y2 = w_left[i, 0] * v[0, 2] + w_left[i, 1] * v[1, 2] + w_left[i, 2] * v[2, 2]
+            side[part, column[i]] -= y0 * rhs[0] + y1 * rhs[1] + y2 * rhs[2]
+            row = matrix[part, column[i]]
+            for j in range(used):
+                row[column[j]] -= y0 * w_right[0, j] + y1 * w_right[1, j] + y2 * w_right[2, j]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -325,28 +284,25 @@ def _add_direct(
                 matrix[row, border + j] += value * right[a, WATER + j]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def _tested_points(
-    state: State, seen: Seen, surface: Surface, columns: Columns, priors: PointPriors,
-    tests: Tests, is_tested: BoolArray, moved: FloatArray, steps: FloatArray,
+    part: int, state: State, given: Given, tests: FloatArray, is_tested: BoolArray,
+    moved: FloatArray, steps: FloatArray,
 ) -> None:  # fmt: skip
-    for part in prange(PARTS):
-        given = Given(seen, surface, columns, priors)  # a loop takes flat tuples only
-        m, g, k = len(state.xyz), columns.total, len(state.centres)
-        first, last = part * m // PARTS, (part + 1) * m // PARTS
-        rows = _rows(most_seen(seen.start, first, last), g)
-        right, left, _, who, v, rhs = rows
-        for p in range(first, last):
-            count = _gather(state, given, tests, is_tested[p], p, rows)
-            for o in range(count):
-                for a in range(2):
-                    change = 0.0
-                    for i in range(6):
-                        change += right[o, a, i] * moved[6 * who[o] + i]
-                    for i in range(g):
-                        change += right[o, a, WATER + i] * moved[6 * k + i]
-                    for i in range(3):
-                        rhs[i] -= left[o, a, POINT + i] * change
-            if count:
+    g, k = given.columns.total, len(state.centres)
+    first, last, most = part_of(part, PARTS, given.seen.start)
+    rows = _rows(most, g)
+    right, left, _, who, v, rhs = rows
+    for p in range(first, last):
+        count = _gather(state, given, tests, is_tested[p], p, rows)
+        for o in range(count):
+            for a in range(2):
+                change = 0.0
+                for i in range(6):
+                    change += right[o, a, i] * moved[6 * who[o] + i]
+                for i in range(g):
+                    change += right[o, a, WATER + i] * moved[6 * k + i]
                 for i in range(3):
-                    steps[p, i] = v[i, 0] * rhs[0] + v[i, 1] * rhs[1] + v[i, 2] * rhs[2]
+                    rhs[i] -= left[o, a, POINT + i] * change
+        if count:
+            solved(v, rhs, steps[p])

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import CODES, K1, P1, WATER_NAMES, Unknowns, sensor_groups, usable_codes
+from pcfix.adjust.block import (
+    NAMES,
+    WATER_NAMES,
+    Unknowns,
+    lens_parameter,
+    sensor_groups,
+    usable_codes,
+)
+from pcfix.adjust.normal import residuals
+from pcfix.adjust.precision import Precision, strong_correlations, undetermined
+from pcfix.adjust.problem import intersect_fixed, prepare
+from pcfix.adjust.result import Adjusted, ControlRow
 from pcfix.model import BoolArray, FloatArray, Lens, WaterPlane
 from pcfix.water.surface import surface_above
-
-if TYPE_CHECKING:
-    from pcfix.adjust.precision import Precision
-    from pcfix.adjust.result import Adjusted, ControlRow
 
 Plain = dict[str, Any]
 
 MOST_DEPTH_BINS = 8
-_NAMES = {code: name for name, code in CODES.items()}
 
 
 class Before(NamedTuple):
@@ -38,13 +46,6 @@ def before_of(adjusted: Adjusted) -> Before:
     Control points are intersected as all others, so that what the survey says does not go into
     the residuals; observations that the adjustment left out stay out.
     """
-    from dataclasses import replace
-
-    from pcfix.adjust.block import Unknowns
-    from pcfix.adjust.intersect import intersect_fixed
-    from pcfix.adjust.normal import residuals
-    from pcfix.adjust.problem import prepare
-
     block = adjusted.block
     free = replace(
         block,
@@ -125,18 +126,25 @@ def adjustment_dict(adjusted: Adjusted, before: Before | None = None) -> Plain:
             `round`, `steps`, `cost`, `observations`, `rms_px` as each round ended.
         notes : list of str
     """
-    a, block = adjusted, adjusted.block
-    fixed = set(a.unknowns.fixed_images)
-    kept = len(block.cameras) if a.unknowns.poses == "fixed" else 0
+    a, block, u = adjusted, adjusted.block, adjusted.unknowns
+    kept = len(block.cameras) if u.poses == "fixed" else 0
+    known = a.precision
     return {
         "source": a.source,
         "engine": a.engine,
         "image_unit": _lenses(a)[0].unit,
         "images": len(block.cameras),
-        "images_fixed": kept or sum(label in fixed for label in block.cameras.labels),
-        "poses_are": a.unknowns.poses,
+        "images_fixed": kept or sum(label in u.fixed_images for label in block.cameras.labels),
+        "poses_are": u.poses,
         "port": block.port is not None,
-        "unknowns": _unknowns(a.unknowns),
+        "unknowns": {
+            "lens": list(u.lens),
+            "lens_sigma": {name: number(value) for name, value in u.lens_sigma.items()},
+            "level_sigma_m": number(u.level_sigma_m),
+            "tilt_sigma": number(u.tilt_sigma),
+            "index_sigma": number(u.index_sigma),
+            "free_network": u.free_network,
+        },
         "points": _points(a),
         "observations": _observations(a),
         "sigma0": number(a.sigma0),
@@ -149,14 +157,21 @@ def adjustment_dict(adjusted: Adjusted, before: Before | None = None) -> Plain:
         "lens": _lens(a),
         "water": _water(a),
         "poses": _poses(a),
-        "precision": None if a.precision is None else _precision(a.precision, a.unknowns),
+        "precision": None if known is None else _precision(known, u),
         "gnss": _gnss(a),
         "control": _surveyed([row for row in a.control if row.role == "control"]),
         "check": _surveyed([row for row in a.control if row.role == "check"]),
-        "rounds": _rounds(a),
-        "notes": list(
-            dict.fromkeys([*a.notes, *(a.precision.notes if a.precision is not None else ())])
-        ),
+        "rounds": [
+            {
+                "round": row.round,
+                "steps": row.step,
+                "cost": number(row.cost),
+                "observations": row.observations,
+                "rms_px": number(row.rms_px),
+            }
+            for row in {row.round: row for row in a.rounds}.values()
+        ],
+        "notes": list(dict.fromkeys([*a.notes, *(known.notes if known is not None else ())])),
     }
 
 
@@ -184,17 +199,6 @@ def _lenses(a: Adjusted) -> tuple[Lens, ...]:
     return a.block.cameras.lenses or ()
 
 
-def _unknowns(u: Unknowns) -> Plain:
-    return {
-        "lens": list(u.lens),
-        "lens_sigma": {name: number(value) for name, value in u.lens_sigma.items()},
-        "level_sigma_m": number(u.level_sigma_m),
-        "tilt_sigma": number(u.tilt_sigma),
-        "index_sigma": number(u.index_sigma),
-        "free_network": u.free_network,
-    }
-
-
 def carried_by(adjusted: Adjusted) -> BoolArray:
     """Return which points have observations that were used, shape (m,)."""
     a = adjusted
@@ -203,14 +207,12 @@ def carried_by(adjusted: Adjusted) -> BoolArray:
 
 def _is_check(a: Adjusted) -> BoolArray:
     """Return which points are check points, shape (m,); surveyed points are the last ones."""
-    held_out = np.zeros(len(a.xyz), np.bool_)
-    held_out[len(a.xyz) - len(a.block.is_check) :] = a.block.is_check
-    return held_out
+    ties = len(a.xyz) - len(a.block.is_check)
+    return np.concatenate([np.zeros(ties, np.bool_), a.block.is_check])
 
 
 def _points(a: Adjusted) -> Plain:
-    roles = [row.role for row in a.control]
-    carried = carried_by(a)
+    roles, carried = [row.role for row in a.control], carried_by(a)
     return {
         "all": int(carried.sum()),
         "land": int((carried & ~a.is_wet).sum()),
@@ -239,11 +241,19 @@ def _residuals(a: Adjusted, before: Before | None, points: BoolArray) -> Plain:
     sigma = None if a.precision is None else a.precision.point_sigma_m
     return {
         "points": int(points.sum()),
-        "observations": int(rows.sum()),
-        "rms_before_px": None if before is None else rms(before.residual_px[rows]),
+        **_fit(a, before, rows),
         "rms_px": number(a.rms_px(points)) if known else None,
         "rms_m": number(a.rms_m(points)) if known else None,
-        "sigma_xyz_m": None if sigma is None else _rms_columns(sigma[points]),
+        "sigma_xyz_m": None if sigma is None else _columns(rms, sigma[points]),
+    }
+
+
+def _fit(a: Adjusted, before: Before | None, rows: BoolArray) -> Plain:
+    """Return how many observations some rows are, and how they fit."""
+    return {
+        "observations": int(rows.sum()),
+        "rms_before_px": None if before is None else rms(before.residual_px[rows]),
+        "rms_px": rms(a.residual_px[rows]),
     }
 
 
@@ -253,13 +263,14 @@ def rms(values: FloatArray) -> float | None:
     return number(np.sqrt(np.mean(known * known))) if known.size else None
 
 
-def _rms_columns(values: FloatArray) -> list[float | None]:
-    return [rms(column) for column in values.T]
+def mean(values: FloatArray) -> float | None:
+    """Return the mean of those that are finite; None where none is."""
+    known = values[np.isfinite(values)]
+    return number(known.mean()) if known.size else None
 
 
-def _mean_columns(values: FloatArray) -> list[float | None]:
-    known = [column[np.isfinite(column)] for column in values.T]
-    return [number(column.mean()) if column.size else None for column in known]
+def _columns(of: Callable[[FloatArray], float | None], values: FloatArray) -> list[float | None]:
+    return [of(column) for column in values.T]
 
 
 def _depth_bins(a: Adjusted, before: Before | None) -> list[Plain]:
@@ -274,13 +285,7 @@ def _depth_bins(a: Adjusted, before: Before | None) -> list[Plain]:
     for i in range(int(deepest // step) + 1):
         rows = a.used & (of_point == i)[a.block.owner]
         if rows.any():
-            bins.append({
-                "from_m": i * step,
-                "to_m": (i + 1) * step,
-                "observations": int(rows.sum()),
-                "rms_before_px": None if before is None else rms(before.residual_px[rows]),
-                "rms_px": rms(a.residual_px[rows]),
-            })  # fmt: skip
+            bins.append({"from_m": i * step, "to_m": (i + 1) * step, **_fit(a, before, rows)})
     return bins
 
 
@@ -299,29 +304,17 @@ def _lens(a: Adjusted) -> list[Plain]:
     for place, mine in enumerate(groups, start=1):
         first, after = old[mine[0]], new[mine[0]]
         for code in usable_codes(first, a.unknowns.lens):
-            name = _NAMES[code]
-            unknown = name if len(groups) == 1 else f"{name} of sensor {place}"
+            unknown = NAMES[code] if len(groups) == 1 else f"{NAMES[code]} of sensor {place}"
             rows.append({
                 "sensor": first.sensor or f"sensor {place}",
                 "images": len(mine),
                 "lenses": len({old[i] for i in mine}),
-                "name": name,
-                "before": _parameter(first, code),
-                "after": _parameter(after, code),
+                "name": NAMES[code],
+                "before": lens_parameter(first, code),
+                "after": lens_parameter(after, code),
                 "sigma": _sigma(a, unknown),
             })  # fmt: skip
     return rows
-
-
-def _parameter(lens: Lens, code: int) -> float:
-    plain = {
-        "f": lens.focal, "cx": lens.principal_x, "cy": lens.principal_y,
-        "b1": lens.b1, "b2": lens.b2,
-    }  # fmt: skip
-    if _NAMES[code] in plain:
-        return float(plain[_NAMES[code]])
-    row, place = (lens.radial, code - K1) if code >= K1 else (lens.tangential, code - P1)
-    return float(row[place]) if place < len(row) else 0.0
 
 
 def _sigma(a: Adjusted, name: str) -> float | None:
@@ -359,7 +352,8 @@ def _water(a: Adjusted) -> Plain | None:
 def _poses(a: Adjusted) -> Plain:
     moved = a.cameras.centres - a.block.cameras.centres
     far = np.linalg.norm(moved, axis=1)
-    turned = _turned_deg(a)
+    old, new = np.asarray(a.block.cameras.rotations), np.asarray(a.cameras.rotations)
+    turned = np.degrees(Rotation.from_matrix(new @ old.transpose(0, 2, 1)).magnitude())
     return {
         "moved_mean_m": numbers(moved.mean(axis=0)),
         "moved_rms_m": number(np.sqrt(np.mean(far * far))),
@@ -370,16 +364,7 @@ def _poses(a: Adjusted) -> Plain:
     }
 
 
-def _turned_deg(a: Adjusted) -> FloatArray:
-    from scipy.spatial.transform import Rotation
-
-    old, new = np.asarray(a.block.cameras.rotations), np.asarray(a.cameras.rotations)
-    return np.asarray(np.degrees(Rotation.from_matrix(new @ old.transpose(0, 2, 1)).magnitude()))
-
-
 def _precision(p: Precision, unknowns: Unknowns) -> Plain:
-    from pcfix.adjust.precision import strong_correlations, undetermined
-
     centre, angle = p.centre_sigma_m, p.angle_sigma_deg
     moves = (centre > 0.0).any(axis=1) | (angle > 0.0).any(axis=1)
     found: Plain = {"images": int(moves.sum())}
@@ -405,8 +390,8 @@ def _gnss(a: Adjusted) -> Plain | None:
     worst = int(np.flatnonzero(known)[far.argmax()])
     return {
         "images": int(known.sum()),
-        "mean_m": _mean_columns(off),
-        "rms_m": _rms_columns(off),
+        "mean_m": _columns(mean, off),
+        "rms_m": _columns(rms, off),
         "largest_m": number(far.max()),
         "largest_image": a.cameras.labels[worst],
     }
@@ -418,8 +403,8 @@ def _surveyed(rows: Sequence[ControlRow]) -> Plain | None:
     off = np.array([[row.dx_m, row.dy_m, row.dz_m] for row in rows], np.float64)
     pixels = np.array([row.rms_px for row in rows], np.float64)
     return {
-        "rms_m": _rms_columns(off),
-        "mean_m": _mean_columns(off),
+        "rms_m": _columns(rms, off),
+        "mean_m": _columns(mean, off),
         "rms_px": rms(pixels),
         "points": [
             {
@@ -431,17 +416,3 @@ def _surveyed(rows: Sequence[ControlRow]) -> Plain | None:
             for row, xyz in zip(rows, off, strict=True)
         ],
     }
-
-
-def _rounds(a: Adjusted) -> list[Plain]:
-    last = {row.round: row for row in a.rounds}
-    return [
-        {
-            "round": row.round,
-            "steps": row.step,
-            "cost": number(row.cost),
-            "observations": row.observations,
-            "rms_px": number(row.rms_px),
-        }
-        for row in last.values()
-    ]

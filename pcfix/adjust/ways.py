@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from pcfix.adjust.block import CODES, Block, Unknowns
+from pcfix.adjust.block import CODES, Block, Unknowns, plain_block
 from pcfix.adjust.gather import (
     FIRST_SIGMA_PX,
     Material,
     block_of,
+    marks_of,
     restricted,
     some_cameras,
     ties_of_cloud,
     well_seen,
 )
-from pcfix.adjust.intersect import intersect_fixed, plain_block
 from pcfix.adjust.mend import Candidate, mend
 from pcfix.adjust.precision import strong_correlations, undetermined
-from pcfix.adjust.problem import LogRow
+from pcfix.adjust.problem import Progress, intersect_fixed
 from pcfix.adjust.result import Adjusted
-from pcfix.adjust.rounds import Rounds, adjust_ties, check_datum, default_lens
+from pcfix.adjust.rounds import adjust_ties, check_datum, default_lens
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import (
-    BoolArray,
     Cameras,
     FloatArray,
     GroundControl,
@@ -36,8 +34,6 @@ from pcfix.model import (
 )
 from pcfix.options.survey import AdjustRules
 from pcfix.water.surface import surface_above
-
-Progress = Callable[[LogRow], None]
 
 LEAST_TIES = 100
 SMALL_WATER = 10
@@ -87,6 +83,13 @@ def unknowns_of(rules: AdjustRules, lens: tuple[str, ...]) -> Unknowns:
     )
 
 
+def _lens_of(material: Material, rules: AdjustRules) -> tuple[str, ...]:
+    """Return the lens parameters that may move: those named, none of a calibration, or default."""
+    if rules.lens_unknowns is not None:
+        return rules.lens_unknowns
+    return () if material.calibrated is not None else default_lens(material.old.lenses or ())
+
+
 def by_ties(
     material: Material, ties: TiePoints, rules: AdjustRules, progress: Progress | None = None
 ) -> Adjusted:
@@ -98,16 +101,14 @@ def by_ties(
         If it cannot be adjusted: no datum, no water over it, images without points.
     """
     block = block_of(material, ties, rules.sigma_image or FIRST_SIGMA_PX)
-    lens = rules.lens_unknowns
-    if lens is None:
-        calibrated = material.calibrated is not None
-        lens = () if calibrated else default_lens(material.old.lenses or ())
-    unknowns = unknowns_of(rules, lens)
+    unknowns = unknowns_of(rules, _lens_of(material, rules))
     check_datum(block, unknowns, material.no_gnss)
     _check_wet(material.water, block.xyz[: len(ties.xyz)])
     kept, left_out = _kept(material.name, block)
-    rounds = Rounds(rules.sigma_image, rules.outliers, rules.lens_unknowns is None)
-    found = adjust_ties(restricted(block, kept), unknowns, rounds, progress)
+    found = adjust_ties(
+        restricted(block, kept), unknowns, progress, sigma_px=rules.sigma_image,
+        outliers=rules.outliers, drop_weak=rules.lens_unknowns is None,
+    )  # fmt: skip
     notes = [*left_out, *_check_dry(material.water, found), *found.notes]
     if found.precision is not None:
         notes += undetermined(found.precision, unknowns)
@@ -119,17 +120,9 @@ def by_cloud(
     material: Material, xyz: FloatArray, guesses: dict[str, Views], rules: AdjustRules,
     progress: Progress | None = None,
 ) -> Adjusted:  # fmt: skip
-    """Adjust a block by points of the cloud that it made.
+    """Adjust a block by points of the apparent cloud that it made, shape (m, 3).
 
-    Parameters
-    ----------
-    material : Material
-    xyz : array, shape (m, 3)
-        Points of the apparent cloud.
-    guesses : dict of str to Views
-        Which images made them, under the name of each guess.
-    rules : AdjustRules
-    progress : callable, optional
+    The guesses say which images made them, each under its name.
 
     Raises
     ------
@@ -144,13 +137,9 @@ def by_cloud(
             continue
         block = block_of(material, ties, FIRST_SIGMA_PX)
         check_datum(block, unknowns_of(rules, ()), material.no_gnss)
-        apparent = ties.xyz
-        if material.control is not None:
-            apparent = np.vstack([apparent, material.control.xyz])
-        if len(guesses) > 1:
-            kept = well_seen(block)
-        else:
-            kept, notes = _kept(material.name, block)
+        surveyed = [] if material.control is None else [material.control.xyz]
+        apparent = np.vstack([ties.xyz, *surveyed])
+        kept, notes = (well_seen(block), notes) if len(guesses) > 1 else _kept(material.name, block)
         if len(kept) < 2:
             continue
         old = some_cameras(material.old, kept)
@@ -161,13 +150,9 @@ def by_cloud(
             " --cloud'."
         )
     _check_wet(material.water, candidates[0].block.xyz)
-    if rules.lens_unknowns is not None:
-        sets: tuple[tuple[str, ...], ...] = (rules.lens_unknowns,)
-    elif material.calibrated is not None:
-        sets = ((),)
-    else:
-        default = default_lens(material.old.lenses or ())
-        sets = tuple(dict.fromkeys([("f",), ("f", "cx", "cy"), default]))
+    sets = [_lens_of(material, rules)]
+    if rules.lens_unknowns is None and material.calibrated is None:
+        sets = list(dict.fromkeys([("f",), ("f", "cx", "cy"), *sets]))
     found = mend(candidates, unknowns_of(rules, sets[0]), sets, progress)
     return replace(found, notes=[*notes, *_check_dry(material.water, found), *found.notes])
 
@@ -211,8 +196,8 @@ def _kept(name: str, block: Block) -> tuple[IntArray, list[str]]:
             f"{name}: {len(kept)} of {len(block.cameras)} images have observations enough"
             " for a pose; two at least are needed."
         )
-    lost = sorted(set(range(len(block.cameras))) - set(kept.tolist()))
-    if not lost:
+    lost = np.setdiff1d(np.arange(len(block.cameras)), kept)
+    if not len(lost):
         return kept, []
     return kept, [
         f"{len(lost)} of {len(block.cameras)} images have too few observations for a pose"
@@ -254,8 +239,6 @@ def check_marks(
 
     Parameters
     ----------
-    control : GroundControl
-    cameras : Cameras
     name : str
         Of the file.
     is_placed : bool
@@ -266,18 +249,15 @@ def check_marks(
     GeometryError
         Naming the point that is farthest off.
     """
-    order = np.argsort(control.point, kind="stable")
-    start = np.searchsorted(control.point[order], np.arange(len(control.names) + 1))
-    camera, marks = control.camera[order], control.image_xy[order]
-    wet = np.zeros(len(control.names), np.bool_)
-    found = intersect_fixed(plain_block(cameras, control.xyz, start, camera, marks, None, 1.0, wet))
-    met = np.isfinite(found.squares) & (np.diff(start) >= 2) & ~control.is_check
+    marks, _ = marks_of(control)
+    found = intersect_fixed(plain_block(cameras, marks))
+    met = np.isfinite(found.squares) & (np.diff(found.start) >= 2) & ~control.is_check
     if met.sum() < 3:
         return
     off = found.xyz - control.xyz
-    apart = np.linalg.norm(off - np.median(off[met], axis=0), axis=1)
-    height = float(np.median(cameras.centres[:, 2]) - np.median(control.xyz[:, 2]))
     middle = np.median(off[met], axis=0)
+    apart = np.linalg.norm(off - middle, axis=1)
+    height = float(np.median(cameras.centres[:, 2]) - np.median(control.xyz[:, 2]))
     if is_placed and np.abs(middle).max() > ELSEWHERE * height > 0.0:
         x, y, z = (-middle).tolist()
         raise GeometryError(
@@ -308,11 +288,8 @@ def check_control(found: Adjusted, name: str) -> None:
     block = found.block
     first = len(block.xyz) - len(block.control_names)
     rows = np.flatnonzero(block.is_surveyed[first:])
-    if len(rows) == 0:
-        return
-    px, sigmas = (
-        np.array(v) for v in zip(*(_off(found, first + int(i)) for i in rows), strict=True)
-    )
+    off = np.array([_off(found, first + int(i)) for i in rows])
+    px, sigmas = off.reshape(-1, 2).T
     gross = (px > GROSS_PX) & (sigmas > GROSS_SIGMAS)
     if not gross.any():
         return
@@ -328,22 +305,17 @@ def check_control(found: Adjusted, name: str) -> None:
 def _off(found: Adjusted, point: int) -> tuple[float, float]:
     """Return by how much a control point is off in the images, and in standard deviations."""
     block = found.block
-    mine = slice(block.start[point], block.start[point + 1])
-    sigma_px = block.sigma_px[mine]
-    seen = np.isfinite(found.residual_px[mine]).all(axis=1) & np.isfinite(sigma_px)
+    marks = slice(block.start[point], block.start[point + 1])
+    sigma_px, residual = block.sigma_px[marks], found.residual_px[marks]
+    seen = np.isfinite(residual).all(axis=1) & np.isfinite(sigma_px)
     if not seen.any():
         return 0.0, 0.0
-    marks = np.linalg.norm(found.residual_px[mine][seen], axis=1)
-    moved = found.xyz[point] - block.surveyed_xyz[point]
+    off = np.linalg.norm(residual[seen], axis=1)
     known = np.isfinite(block.surveyed_sigma_m[point])
-    place = np.where(known, moved, 0.0)
-    px = float(marks.max() + np.linalg.norm(place) * _px_per_metre(found, point, mine, seen))
-    of_place = np.abs(place[known] / block.surveyed_sigma_m[point][known]).max(initial=0.0)
-    return px, float(max((marks / sigma_px[seen]).max(), of_place))
-
-
-def _px_per_metre(found: Adjusted, point: int, mine: slice, seen: BoolArray) -> float:
-    camera = found.block.camera[mine][seen]
+    place = np.where(known, found.xyz[point] - block.surveyed_xyz[point], 0.0)
+    camera = block.camera[marks][seen]
     away = np.linalg.norm(found.cameras.centres[camera] - found.xyz[point], axis=1)
     focal = np.array([lens.focal for lens in found.cameras.lenses or ()])[camera]
-    return float(np.median(focal / away))
+    px = float(off.max() + np.linalg.norm(place) * float(np.median(focal / away)))
+    of_place = np.abs(place[known] / block.surveyed_sigma_m[point][known]).max(initial=0.0)
+    return px, float(max((off / sigma_px[seen]).max(), of_place))

@@ -112,7 +112,7 @@ class ThroughWater:
     def _makers(chunks: Callable[[], Iterable[Points]], carrying: Carrying) -> Iterator[MadeWith]:
         """Yield what made the points of the whole cloud."""
         for xyz, _, _ in chunks():
-            yield carrying.made_with(xyz)
+            yield MadeWith(xyz, carrying.pair.old)
 
     def _old_ties(self) -> TiePoints | None:
         """Return the tie points of the old model, else those of the adjusted one taken back."""
@@ -127,7 +127,7 @@ class ThroughWater:
         label: Label = partial(labelling.submerged, classes=classes)
         step, made_with = None, None
         if self.carrying is not None:
-            step, made_with = self.carrying.step(xyz, views), self.carrying.made_with(xyz)
+            step, made_with = self.carrying.step(xyz, views), MadeWith(xyz, self.carrying.pair.old)
             xyz, views, label = step.xyz, step.views, step.rule(label)
         above = surface_above(self.water, xyz, heights)
         batch = self._of_kind(Batch(xyz, above, self.survey, views, made_with))

@@ -16,9 +16,9 @@ from pcfix.adjust.diagnosis import (
     land_sign,
     tie_point_sign,
 )
-from pcfix.adjust.intersect import intersect_fixed
-from pcfix.adjust.mend import deeper, mended
-from pcfix.adjust.problem import similarity_gradients
+from pcfix.adjust.gather import deeper
+from pcfix.adjust.mend import mended
+from pcfix.adjust.problem import intersect_fixed
 from pcfix.model import WaterPlane
 from tests.utils.bent_blocks import GNSS_M, LEVEL_M, N, TrueBlock
 
@@ -37,13 +37,11 @@ def tie_sign(true, cameras, n=N):
 def gnss_signs(cameras, apparent):
     off = cameras.centres - cameras.gnss.xyz
     sigma = np.full(off.shape, GNSS_M)
-    by = similarity_gradients(cameras.centres - cameras.centres.mean(axis=0))
     found = mended(apparent, cameras, WATER, N)
     assert len(found.row) == len(cameras)
-    predicted = cameras.centres - found.cameras.centres
     return (
-        gnss_is_suspicious(cameras.centres, off, sigma, by),
-        gnss_sign(off, sigma, by, found, predicted),
+        gnss_is_suspicious(cameras.centres, off, sigma),
+        gnss_sign(cameras.centres, off, sigma, found),
         found,
     )
 

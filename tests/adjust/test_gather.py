@@ -12,6 +12,7 @@ from pcfix.adjust.gather import (
     Datum,
     Material,
     block_of,
+    check_surface,
     no_datum,
     restricted,
     taken,
@@ -172,7 +173,7 @@ def test_control_under_water_has_to_say_so():
 
 def test_water_that_only_the_cloud_knows_is_refused():
     with pytest.raises(SettingError, match="level, plane, raster, mesh or shoreline"):
-        gathered(water=WaterDimension("w"))
+        check_surface(WaterDimension("w"))
 
 
 def test_no_datum_is_no_position():

@@ -11,7 +11,7 @@ import pytest
 from pcfix.adjust.block import Unknowns
 from pcfix.adjust.gather import Datum, Material, block_of, no_datum
 from pcfix.adjust.problem import prepare
-from pcfix.adjust.rounds import Rounds, adjust_ties, check_datum, default_lens, noise_px
+from pcfix.adjust.rounds import adjust_ties, check_datum, default_lens, noise_px
 from pcfix.adjust.solve import solve
 from pcfix.errors import GeometryError
 from pcfix.threads import threads
@@ -92,14 +92,14 @@ def test_gross_errors_are_left_out_and_good_ones_are_not():
     apart = found.cameras.centres - clean.cameras.centres
     # with 5 % less to go by, they differ by a quarter of the standard error
     assert np.sqrt(np.mean((apart / clean.precision.centre_sigma_m) ** 2)) < 0.5
-    kept = adjust_ties(block(made, ties), FOCAL, Rounds(outliers=False))
+    kept = adjust_ties(block(made, ties), FOCAL, outliers=False)
     assert kept.used.all()
 
 
 def test_a_given_noise_is_not_estimated():
     made = scene()
     weighed = replace(block(made), sigma_px=np.full(len(made.views.camera), 0.25))
-    found = adjust_ties(weighed, FOCAL, Rounds(sigma_px=0.25, outliers=False))
+    found = adjust_ties(weighed, FOCAL, sigma_px=0.25, outliers=False)
     assert found.sigma0 == pytest.approx(2.0, rel=0.1)
 
 
@@ -179,7 +179,7 @@ def test_lens_parameters_that_the_block_does_not_tell_are_left():
     before, after = made.cameras.lenses[0], found.cameras.lenses[0]
     assert (after.principal_x, after.principal_y) == (before.principal_x, before.principal_y)
     assert after.focal != before.focal
-    named = adjust_ties(block(made), replace(FOCAL, lens=lens), Rounds(drop_weak=False))
+    named = adjust_ties(block(made), replace(FOCAL, lens=lens), drop_weak=False)
     assert named.unknowns.lens == lens
     assert not named.notes
 
@@ -194,7 +194,7 @@ def test_lens_parameters_that_may_move_are_those_of_the_lens():
 def test_it_is_the_least_squares_of_what_it_kept():
     made = scene()
     whole = simple_block(made)
-    found = adjust_ties(whole, FOCAL, Rounds(sigma_px=0.5, outliers=False))
+    found = adjust_ties(whole, FOCAL, sigma_px=0.5, outliers=False)
     problem, start = prepare(whole, FOCAL)
     once = solve(problem, start)
     # m: both stop where the cost no longer changes

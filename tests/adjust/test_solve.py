@@ -14,7 +14,7 @@ from pcfix.adjust.block import Unknowns
 from pcfix.adjust.precision import precision_of, undetermined
 from pcfix.adjust.problem import prepare, solved_cameras, water_of
 from pcfix.adjust.solve import solve
-from pcfix.model import WaterPlane
+from pcfix.model import WaterMesh, WaterPlane, WaterRaster
 from pcfix.threads import threads
 from tests.utils.adjust_twin import Twin
 from tests.utils.tie_blocks import block_of
@@ -208,6 +208,25 @@ def test_similarity_brings_a_displaced_block_home():
         block = block_of(made, exact=True, cameras=cameras, start_xyz=disturbed(made), **given)
         problem, found = adjusted(block, Unknowns(poses="similarity", lens=()))
         assert max(misses(made, problem, found)) < HOME_M
+
+
+@pytest.mark.parametrize("kind", ["raster", "mesh"])
+def test_a_surface_that_is_level_is_the_level(kind):
+    made = scene()
+    (x, y, _), level = np.round(made.cameras.centres.mean(axis=0)), made.water.a
+    corners = [[x + i, y + j, level] for i, j in ((-99, -99), (99, -99), (99, 99), (-99, 99))]
+    water = {
+        "raster": WaterRaster(np.full((40, 40), level), x - 100.0, y + 100.0, (5.0, 5.0)),
+        "mesh": WaterMesh(np.array(corners), np.array([[0, 1, 2], [0, 2, 3]])),
+    }[kind]
+    unknowns = Unknowns(lens=("f",), level_sigma_m=0.1)
+    _, found = adjusted(block_of(made, water=water), unknowns)
+    problem, wanted = adjusted(block_of(made), unknowns)
+    # m: the last steps of both
+    np.testing.assert_allclose(found.state.centres, wanted.state.centres, atol=1e-6)
+    np.testing.assert_allclose(found.state.xyz, wanted.state.xyz, atol=1e-6)
+    height = level + found.state.water[0]
+    assert abs(height - water_of(problem, wanted.state).a) < 1e-6
 
 
 def test_the_threads_do_not_change_a_bit():

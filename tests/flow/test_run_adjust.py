@@ -16,7 +16,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from pcfix.adjust.intersect import intersect_fixed, plain_block
+from pcfix.adjust.problem import intersect_fixed
 from pcfix.errors import GeometryError, PcfixWarning, SettingError
 from pcfix.flow.correct import correct_file
 from pcfix.flow.inputs import Inputs
@@ -73,10 +73,7 @@ def scene(tmp_path_factory):
 
 def _write(folder, name, block, cameras):
     """Write a model and the cloud that it makes."""
-    none = np.zeros(len(block.xyz), bool)
-    apparent = intersect_fixed(
-        plain_block(cameras, block.xyz, block.start, block.camera, block.image_xy, None, 1.0, none)
-    ).xyz
+    apparent = intersect_fixed(block.block(cameras, None)).xyz
     ties = TiePoints(apparent, Views(block.start, block.camera), block.image_xy)
     write_colmap(folder / name, replace(cameras, gnss=None), ties, offset_m=(0.0, 0.0, 0.0))
     (folder / name / "georeference.json").unlink(missing_ok=True)

@@ -8,11 +8,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import Unknowns
-from pcfix.adjust.intersect import plain_block
+from pcfix.adjust.block import Unknowns, plain_block
 from pcfix.adjust.problem import prepare, solved_cameras
 from pcfix.adjust.solve import solve
-from pcfix.model import Cameras, GnssPositions, Lens
+from pcfix.model import Cameras, GnssPositions, Lens, TiePoints, Views
 from pcfix.simulate.tracing import piercing_points
 
 HEIGHT_M, FOCAL_PX, SIZE = 75.0, 1500.0, (1600.0, 1200.0)
@@ -68,8 +67,8 @@ class TrueBlock:
 
     def block(self, cameras, water, wet=None):
         """Return what was measured as a block with given cameras."""
-        wet = np.zeros(len(self.xyz), bool) if wet is None else wet
-        return plain_block(cameras, self.xyz, self.start, self.camera, self.image_xy, water, N, wet)
+        ties = TiePoints(self.xyz, Views(self.start, self.camera), self.image_xy)
+        return plain_block(cameras, ties, water, N, wet)
 
     def adjusted(self, water=None, gnss_sigma_m=0.1):
         """Return the cameras after a bundle adjustment; without water, as usual software has it."""
