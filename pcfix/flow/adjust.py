@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Callable
 from dataclasses import replace
-from os import PathLike
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from pcfix.adjust.gather import LEAST_VIEWS
 from pcfix.adjust.gather import taken as taken_ties
-from pcfix.adjust.problem import LogRow
+from pcfix.adjust.problem import Progress
 from pcfix.adjust.result import Adjusted
 from pcfix.adjust.ways import unknowns_of
 from pcfix.errors import InputError, SettingError
@@ -30,8 +29,6 @@ from pcfix.model import Cameras, TiePoints, Views, WaterPlane
 from pcfix.options.declare import File, taken
 from pcfix.options.survey import AdjustOptions, AdjustRules
 
-AnyPath = str | PathLike[str]
-
 SUMMARY = "adjustment.json"
 
 
@@ -40,7 +37,7 @@ def adjust_cameras(
     out_dir: File | None = None,
     *,
     options: AdjustOptions | None = None,
-    progress: Callable[[LogRow], None] | None = None,
+    progress: Progress | None = None,
     **keywords: Any,
 ) -> Adjusted:
     """Adjust the poses of a block with the water in the light's way; ``pcfix adjust``.
@@ -69,6 +66,8 @@ def adjust_cameras(
         If an input cannot be read or does not fit, the block has no datum, or the unknowns cannot
         be told apart. Nothing is written then.
     """
+    if "free_network" in keywords:  # what was true or false is one of two words now
+        keywords["free_network"] = "free" if keywords["free_network"] else "observed"
     given = taken(AdjustOptions, options, keywords, "adjust_cameras")
     inputs = replace(given.part(Inputs), cameras=model)
     survey = Survey(given.gcps, given.gnss, given.lens, given.gcps_crs, given.gnss_crs)
@@ -81,8 +80,7 @@ def adjust_cameras(
 
 def adjust_into(
     folder: Path | None, inputs: Inputs, survey: Survey, rules: AdjustRules,
-    cloud: AnyPath | None = None, *, overwrite: bool = False,
-    progress: Callable[[LogRow], None] | None = None,
+    cloud: File | None = None, *, overwrite: bool = False, progress: Progress | None = None,
 ) -> Adjusted:  # fmt: skip
     """Adjust cameras with what was read of the options; see `adjust_cameras`."""
     unknowns_of(rules, ())
@@ -97,9 +95,9 @@ def adjust_into(
 def next_step(found: Adjusted, model: File, out_dir: File, options: AdjustOptions) -> str:
     """Return the command that takes the cloud over."""
     plane, offset = found.water, options.cameras_offset
-    level = (
-        f"{plane.a:.3f}" if isinstance(plane, WaterPlane) and plane.b == plane.c == 0.0 else "SPEC"
-    )
+    level = "SPEC"
+    if isinstance(plane, WaterPlane) and plane.b == plane.c == 0.0:
+        level = f"{plane.a:.3f}"
     return (
         f"pcfix correct {options.cloud or 'CLOUD'} OUTPUT --cameras {out_dir}/colmap"
         f" --adjusted-from {model} --water {level}"
@@ -156,18 +154,14 @@ def write_adjustment(folder: Path, found: Adjusted, model: str) -> None:
 
 def _write_models(folder: Path, found: Adjusted) -> None:
     """Write the model in each form that holds its lenses exactly."""
-    ties = adjusted_ties(found)
-    (folder / "opensfm").mkdir()
-    writers: dict[str, Callable[[], object]] = {
-        "colmap": lambda: write_colmap(
-            folder / "colmap", found.cameras, ties, crs=found.cameras.crs
-        ),
-        "opensfm": lambda: write_opensfm(
-            folder / "opensfm" / "reconstruction.json", found.cameras, ties
-        ),
-        "cameras.csv": lambda: write_table(folder, found.cameras),
+    ties, cameras, opensfm = adjusted_ties(found), found.cameras, folder / "opensfm"
+    writers = {
+        "colmap": partial(write_colmap, folder / "colmap", cameras, ties, crs=cameras.crs),
+        "opensfm": partial(write_opensfm, opensfm / "reconstruction.json", cameras, ties),
+        "cameras.csv": partial(write_table, folder, cameras),
     }
     failed = []
+    opensfm.mkdir()
     for name, write in writers.items():
         try:
             write()
@@ -175,8 +169,8 @@ def _write_models(folder: Path, found: Adjusted) -> None:
             failed.append(str(error).replace(f"{folder}/", ""))
             if name != "cameras.csv":  # a table is a convenience for blocks of one plain lens
                 found.notes.append(f"{name} is not written: {failed[-1]}")
-    if not any((folder / "opensfm").iterdir()):
-        (folder / "opensfm").rmdir()
+    if not any(opensfm.iterdir()):
+        opensfm.rmdir()
     if len(failed) == len(writers):
         raise InputError("no form of camera file holds these lenses: " + " ".join(failed))
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -19,7 +17,7 @@ from pcfix.adjust.gather import (
     usable_ties,
     with_places,
 )
-from pcfix.adjust.problem import LogRow
+from pcfix.adjust.problem import Progress
 from pcfix.adjust.result import Adjusted
 from pcfix.adjust.ways import (
     LEAST_TIES,
@@ -39,15 +37,14 @@ from pcfix.io.files import check_input
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.io.views import ViewList, ViewMatch
-from pcfix.model import Cameras, FloatArray, GroundControl, Lens, TiePoints, Views, WaterSurface
+from pcfix.model import Cameras, FloatArray, GroundControl, Lens, Views, WaterSurface
+from pcfix.options.declare import File
 from pcfix.options.survey import AdjustRules
 from pcfix.refract.choice import views_in_frame
 from pcfix.water.index import index_of
 
 if TYPE_CHECKING:
     from pyproj import CRS
-
-AnyPath = str | PathLike[str]
 
 CLOUD_POINTS = 6000
 """Points of the cloud that stand for tie points."""
@@ -56,11 +53,16 @@ CLOUD_POINTS = 6000
 class Survey(NamedTuple):
     """What was measured besides the images; see `pcfix.adjust_cameras`."""
 
-    gcps: AnyPath | GroundControl | None = None
-    gnss: AnyPath | None = None
-    lens: AnyPath | None = None
+    gcps: File | GroundControl | None = None
+    gnss: File | None = None
+    lens: File | None = None
     gcps_crs: str | None = None
     gnss_crs: str | None = None
+
+    @property
+    def gcps_name(self) -> str:
+        """Of the control points, for messages."""
+        return "gcps" if isinstance(self.gcps, GroundControl) else str(self.gcps)
 
 
 class Job(NamedTuple):
@@ -86,7 +88,8 @@ def read_job(inputs: Inputs, rules: AdjustRules, view: CloudView | None, survey:
     """
     name = str(inputs.cameras) if isinstance(inputs.cameras, str | Path) else "cameras"
     found = inputs.read()
-    crs = _own_crs(found) if view is None else view.crs
+    own = None if found.crs is None or is_topocentric(found.crs) else found.crs
+    crs = own if view is None else view.crs
     old, views = inputs.block(crs, found)
     if old.rotations is None or old.lenses is None:
         raise InputError(
@@ -100,25 +103,16 @@ def read_job(inputs: Inputs, rules: AdjustRules, view: CloudView | None, survey:
     gnss, no_gnss, notes = _datum(old, name, survey, rules.gnss_sigma)
     control = _control(old, water, survey, gnss)
     calibrated = None if survey.lens is None else _calibration(survey.lens, old)
-    inside = None
-    if inputs.water_mask is not None:
-        low, high = old.centres.min(axis=0), old.centres.max(axis=0)
-        if view is not None:
-            low, high = view.low, view.high
-        mask = mask_of(inputs.water_mask, crs or old.crs, low[:2], high[:2])
-        inside = None if mask is None else mask.inside
-    level_sigma_m = unknowns_of(rules, ()).level_sigma_m
+    low, high = old.centres.min(axis=0), old.centres.max(axis=0)
+    if view is not None:
+        low, high = view.low, view.high
+    mask = mask_of(inputs.water_mask, crs or old.crs, low[:2], high[:2])
+    inside = None if mask is None else mask.inside
     material = Material(
-        name, old, water, index, gnss, control, inputs.port, calibrated, inside, level_sigma_m,
-        no_gnss,
+        name, old, water, index, gnss, control, inputs.port, calibrated, inside,
+        unknowns_of(rules, ()).level_sigma_m, no_gnss,
     )  # fmt: skip
-    return Job(inputs, rules, view, crs, material, views, _control_name(survey), notes)
-
-
-def _own_crs(cameras: Cameras) -> str | None:
-    """Return the CRS in which a model without a cloud is adjusted: its own, where it is one."""
-    own = cameras.crs
-    return None if own is None or is_topocentric(own) else own
+    return Job(inputs, rules, view, crs, material, views, survey.gcps_name, notes)
 
 
 def _datum(
@@ -149,15 +143,11 @@ def _control(
         control = read_ground_control(control, old, crs=survey.gcps_crs)
     if water is not None:
         is_placed = bool(np.isfinite(gnss.xyz).any())
-        check_marks(control, old, _control_name(survey), is_placed=is_placed)
+        check_marks(control, old, survey.gcps_name, is_placed=is_placed)
     return control
 
 
-def _control_name(survey: Survey) -> str:
-    return "gcps" if isinstance(survey.gcps, GroundControl) else str(survey.gcps)
-
-
-def _calibration(path: AnyPath, cameras: Cameras) -> Lens:
+def _calibration(path: File, cameras: Cameras) -> Lens:
     """Return a calibration of images of this size."""
     one = read_sensor(check_input(path))
     for old in set(cameras.lenses or ()):
@@ -170,7 +160,7 @@ def _calibration(path: AnyPath, cameras: Cameras) -> Lens:
     return one
 
 
-def adjusted(job: Job, progress: Callable[[LogRow], None] | None = None) -> Adjusted:
+def adjusted(job: Job, progress: Progress | None = None) -> Adjusted:
     """Adjust by tie points where there are enough, else by the cloud.
 
     Raises
@@ -179,7 +169,11 @@ def adjusted(job: Job, progress: Callable[[LogRow], None] | None = None) -> Adju
         If there is neither, or the block cannot be adjusted.
     """
     material, rules = job.material, job.rules
-    ties = None if rules.ties == "cloud" else _tie_points(job)
+    ties = None
+    if rules.ties != "cloud":
+        ties = job.inputs.tie_points(job.crs, placed=False)
+    if ties is not None:
+        ties = usable_ties(with_places(ties, material.old), material.old)
     if ties is not None and len(ties.xyz) >= LEAST_TIES:
         found = by_ties(material, ties, rules, progress)
     elif rules.ties == "measured":
@@ -203,11 +197,6 @@ def adjusted(job: Job, progress: Callable[[LogRow], None] | None = None) -> Adju
     return replace(found, notes=[*job.notes, *found.notes])
 
 
-def _tie_points(job: Job) -> TiePoints | None:
-    found, old = job.inputs.tie_points(job.crs, placed=False), job.material.old
-    return None if found is None else usable_ties(with_places(found, old), old)
-
-
 def _sample(
     view: CloudView, views: ViewList | None, cameras: Cameras
 ) -> tuple[FloatArray, Views | None]:
@@ -215,17 +204,17 @@ def _sample(
     count = min(CLOUD_POINTS, view.points)
     rows = np.sort(np.random.default_rng(0).choice(view.points, count, replace=False))
     match = None if views is None else ViewMatch(views, cameras, points=view.points)
-    xyz, parts, first = [], [], 0
+    parts: list[Views] = []
+    xyz, first = [], 0
     for seen in view.chunks():
-        mine = rows[(rows >= first) & (rows < first + len(seen.xyz))] - first
-        xyz.append(seen.xyz[mine])
+        inside = rows[(rows >= first) & (rows < first + len(seen.xyz))] - first
+        xyz.append(seen.xyz[inside])
         if match is not None:
-            parts.append(match.for_chunk(seen.xyz, first).take(mine))
+            parts.append(match.for_chunk(seen.xyz, first).take(inside))
         first += len(seen.xyz)
     if match is None:
         return np.vstack(xyz), None
-    counts = np.concatenate([np.diff(part.start) for part in parts])
-    start = np.concatenate([[0], np.cumsum(counts)])
+    start = np.cumsum(np.concatenate([[0], *(np.diff(part.start) for part in parts)]))
     return np.vstack(xyz), Views(start, np.concatenate([part.camera for part in parts]))
 
 

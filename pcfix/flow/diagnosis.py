@@ -7,19 +7,19 @@ import warnings
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pcfix.adjust.diagnosis import Diagnosis
+from pcfix.adjust.evidence import Evidence, diagnosed
+from pcfix.adjust.gather import Datum
 from pcfix.errors import InputError, PcfixError, PcfixWarning
+from pcfix.flow.inputs import Inputs
+from pcfix.flow.surfaces import CloudView
+from pcfix.io.cameras.metashape.sensors import given_lenses
+from pcfix.io.cameras.table.sensor import read_sensor
 from pcfix.io.gnss_positions import gnss_in_frame_of
 from pcfix.model import Cameras, TiePoints, WaterSurface
-
-if TYPE_CHECKING:
-    from pcfix.adjust.evidence import Evidence
-    from pcfix.flow.inputs import Inputs
-    from pcfix.flow.surfaces import CloudView
-
-AnyPath = str | PathLike[str]
+from pcfix.options.declare import File
 
 QUICK_BYTES = 25_000_000
 """Of a model, in passing, where nobody asked: it takes no more than a second or two."""
@@ -33,9 +33,6 @@ def diagnose(evidence: Evidence) -> Diagnosis:
     PcfixError
         If the cloud cannot be read.
     """
-    from pcfix.adjust.evidence import diagnosed
-    from pcfix.adjust.gather import Datum
-
     if evidence.has_rays and evidence.cameras.gnss is not None:
         try:
             found = gnss_in_frame_of(evidence.cameras, evidence.name)
@@ -50,36 +47,19 @@ def diagnose_in_passing(
 ) -> str:
     """Warn, once, if what a correction is made with anyway says that the poses are bent.
 
-    Parameters
-    ----------
-    inputs : Inputs
-    cameras : Cameras
-        In the cloud's CRS.
-    water : WaterSurface
-    refractive_index : float
-    view : CloudView
-
-    Returns
-    -------
-    str
-        The warning; empty where there is nothing to say, or no way to know.
+    Returns the warning; empty where there is nothing to say, or no way to know. The cameras are in
+    the cloud's CRS.
     """
-    from pcfix.adjust.evidence import Evidence
-
-    if getattr(inputs, "adjusted_from", None) is not None:
+    if inputs.adjusted_from is not None:
         return ""
     path = None if isinstance(inputs.cameras, Cameras) else inputs.cameras
     evidence = Evidence(
-        cameras, str(path or "cameras"), water, refractive_index,
-        view=view, in_passing=True,
-    )  # fmt: skip
+        cameras, str(path or "cameras"), water, refractive_index, view=view, in_passing=True
+    )
     try:
         if path is not None and _size_of(Path(path)) <= QUICK_BYTES:
-            evidence = replace(
-                evidence,
-                ties=ties_of(inputs, view.crs) if evidence.has_rays else None,
-                calibrated=given_focal_lengths(path),
-            )
+            ties = ties_of(inputs, view.crs) if evidence.has_rays else None
+            evidence = replace(evidence, ties=ties, calibrated=given_focal_lengths(path))
         found = diagnose(evidence)
     except (PcfixError, OSError):  # a look in passing stops no correction
         return ""
@@ -104,7 +84,7 @@ def _size_of(path: Path) -> int:
     return path.stat().st_size
 
 
-def command_of(inputs: Inputs, cloud: str, **more: AnyPath | None) -> str:
+def command_of(inputs: Inputs, cloud: str, **more: File | None) -> str:
     """Return the command that mends the poses."""
     model = "MODEL" if isinstance(inputs.cameras, Cameras) else str(inputs.cameras)
     water = inputs.water if isinstance(inputs.water, str | PathLike | float | int) else "SPEC"
@@ -120,17 +100,13 @@ def command_of(inputs: Inputs, cloud: str, **more: AnyPath | None) -> str:
     return shlex.join(words)
 
 
-def given_focal_lengths(path: AnyPath) -> dict[str, float]:
+def given_focal_lengths(path: File) -> dict[str, float]:
     """Return focal length by width of the calibrations that a camera file was given."""
-    from pcfix.io.cameras.metashape.sensors import given_lenses
-
     found = given_lenses(Path(path))
     return {name: lens.focal / lens.width for name, lens in found.items()}
 
 
-def focal_length_of(path: AnyPath) -> dict[str, float]:
+def focal_length_of(path: File) -> dict[str, float]:
     """Return focal length by width of a calibration file, for any sensor."""
-    from pcfix.io.cameras.table import read_sensor
-
     lens = read_sensor(Path(path))
     return {"": lens.focal / lens.width}

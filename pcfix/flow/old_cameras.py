@@ -25,12 +25,7 @@ LOCAL = "local"
 
 
 def paired(old: Cameras, new: Cameras) -> Pair:
-    """Match the images of two models by their names.
-
-    Parameters
-    ----------
-    old, new : Cameras
-        In the cloud's CRS.
+    """Match the images of two models in the cloud's CRS by their names.
 
     Raises
     ------
@@ -91,11 +86,6 @@ class Blocks(NamedTuple):
 def read_blocks(inputs: Inputs, cloud_crs: str | CRS | None) -> Blocks:
     """Return cameras in the cloud's CRS, and the view list, confirmed by those that made the cloud.
 
-    Parameters
-    ----------
-    inputs : Inputs
-    cloud_crs : str, CRS or None
-
     Raises
     ------
     PcfixError
@@ -129,15 +119,13 @@ def told_apart(inputs: Inputs) -> tuple[Inputs, Inputs]:
     if inputs.cameras_crs is None and inputs.cameras_offset is None:
         return old, new
     read = old.read(), new.read()
-    tied = [
+    tied = tuple(
         isinstance(given.cameras, Cameras) or cameras.crs not in (None, LOCAL)
         for given, cameras in zip((old, new), read, strict=True)
-    ]
-    silent = [not one or all(tied) for one in tied]
-    old, new = (
-        one if is_silent else replace(one, cameras_crs=None, cameras_offset=None)
-        for one, is_silent in zip((old, new), silent, strict=True)
     )
+    if any(tied) and not all(tied):
+        plain = replace(old if tied[0] else new, cameras_crs=None, cameras_offset=None)
+        return (plain, new) if tied[0] else (old, plain)
     if inputs.cameras_offset is not None and not any(tied):
         moves = _who_moves(*read, np.array(inputs.cameras_offset))
         old, new = (
@@ -163,11 +151,7 @@ def _refuse_adjusted_tracks(inputs: Inputs) -> None:
 def _who_moves(old: Cameras, new: Cameras, offset_m: FloatArray) -> tuple[bool, bool]:
     """Return whether an offset is for the old centres and for the new ones, shapes (k, 3)."""
     apart = new.centres - old.centres[_rows(old.labels, new.labels)]
-    ways = {
-        (True, True): apart,
-        (True, False): apart - offset_m,
-        (False, True): apart + offset_m,
-    }
+    ways = {(True, True): apart, (True, False): apart - offset_m, (False, True): apart + offset_m}
     return min(ways, key=lambda way: float(np.median(np.linalg.norm(ways[way], axis=1))))
 
 
@@ -193,17 +177,15 @@ class ListedViews:
     def __init__(
         self, views: ViewList | None, cameras: Cameras, points: int, step_m: float
     ) -> None:
-        self.list, self._cameras, self._points, self._step_m = views, cameras, points, step_m
+        self.list = views
+        self._anew: Callable[[], ViewMatch | None] = lambda: (
+            None if views is None else ViewMatch(views, cameras, points=points, step_m=step_m)
+        )
         self.restart()
 
     def restart(self) -> None:
         """Go back to the first row of the cloud."""
         self._match = self._anew()
-
-    def _anew(self) -> ViewMatch | None:
-        if self.list is None:
-            return None
-        return ViewMatch(self.list, self._cameras, points=self._points, step_m=self._step_m)
 
     def all_anew(self) -> Callable[[FloatArray, int], Views | None]:
         """Return the views of the whole cloud from its first row on, apart from the count here."""

@@ -45,18 +45,17 @@ class Decision(NamedTuple):
 
 def outputs_of(folder: Path) -> list[Path]:
     """Return what an adjustment may leave in the folder of a run, its report first."""
-    at = folder / FOLDER
-    names = ("cameras.bin", "images.bin", "points3D.bin", "georeference.json")
-    more = [*(f"colmap/{name}" for name in names), "opensfm/reconstruction.json", "cameras.csv"]
-    return [at / "report.html", at / SUMMARY, *(at / name for name in more)]
+    colmap = [f"colmap/{name}.bin" for name in ("cameras", "images", "points3D")]
+    names = ["report.html", SUMMARY, *colmap, "colmap/georeference.json", *MODELS[1:]]
+    return [folder / FOLDER / name for name in names]
 
 
 @dataclass(frozen=True)
 class AdjustStep:
     """What a run is asked of its first step.
 
-    cloud, inputs, index : of the run. when : {"auto", "yes", "no"}. gcps, gnss, lens : files that
-    are of use to an adjustment only, See `pcfix.adjust_cameras`.
+    cloud, inputs, index : of the run. gcps, gnss, lens : files that are of use to an adjustment
+    only, see `pcfix.adjust_cameras`.
     """
 
     cloud: str
@@ -100,15 +99,7 @@ def adjust_first(
 ) -> dict[str, Any]:
     """Adjust the cameras of a run into its folder where that is asked for, or called for.
 
-    Parameters
-    ----------
-    step : AdjustStep
-    folder : Path
-        Of the run.
-    files : list of Path
-        Inputs of the run, which the adjustment must not replace.
-    jobs : int, optional
-        Threads.
+    The files are inputs of the run, which the adjustment must not replace.
 
     Returns
     -------
@@ -122,31 +113,23 @@ def adjust_first(
         If an adjustment was asked for, or files were given for it, and it cannot be done. Else
         the run goes on with the cameras as they are.
     """
-    decision, model = Decision(False, "", is_said=False), None
+    adjusts, why, is_said, model = False, "", False, None
     try:
-        decision = _decide(step)
-        if decision.adjust:
+        adjusts, why, is_said = _decide(step)
+        if adjusts:
             model = _adjust(step, folder / FOLDER, files, jobs)
     except PcfixError as error:
         if step.when == "yes" or step.survey:
             raise
         # what cannot be read stops the correction, with the same sentence
-        decision = Decision(False, str(error), is_said=decision.adjust)
-    return {
-        "adjusted": decision.adjust, "model": model, "why": decision.why,
-        "is_said": decision.is_said,
-    }  # fmt: skip
+        adjusts, why, is_said = False, str(error), adjusts
+    return {"adjusted": adjusts, "model": model, "why": why, "is_said": is_said}
 
 
 def is_worth_saying(step: dict[str, Any], absorbed: bool) -> bool:
     """Whether it matters that a run did not adjust: if asked, or if the poses turn out to be bent.
 
-    Parameters
-    ----------
-    step : dict
-        Of `adjust_first`.
-    absorbed : bool
-        Of the summary of the correction.
+    The step is what `adjust_first` returned; `absorbed` stands in the summary of the correction.
     """
     return step["is_said"] or bool(step["why"] and absorbed)
 
@@ -155,19 +138,19 @@ def _decide(step: AdjustStep) -> Decision:
     """Return whether to adjust: on request, or where the poses are bent and there is a datum."""
     if step.when == "yes":
         return Decision(True, "that was asked for")
-    given = bool(step.survey)
     if step.when == "no":
         return Decision(False, "", is_said=False)
+    inputs, is_said = step.inputs, bool(step.survey)
     if step.unfit:
-        return Decision(False, step.unfit, is_said=given)
-    inputs, view = step.inputs, view_of(check_input(step.cloud))
+        return Decision(False, step.unfit, is_said)
+    view = view_of(check_input(step.cloud))
     with warnings.catch_warnings():  # the correction shows them
         warnings.simplefilter("ignore", PcfixWarning)
         cameras = inputs.block(view.crs)[0]
         if step.gnss is not None:
             cameras = read_gnss(step.gnss, cameras)
-        if step.gnss is None and step.gcps is None and not _has_datum(cameras, str(inputs.cameras)):
-            return Decision(False, _NO_DATUM, is_said=given)
+        elif step.gcps is None and not _has_datum(cameras, str(inputs.cameras)):
+            return Decision(False, _NO_DATUM, is_said)
         water = inputs.surface(view).surface
         if isinstance(water, WaterDimension):
             return Decision(False, f"{water} is known at the points of the cloud alone")
@@ -216,36 +199,28 @@ def _diagnosed(
 def _verdict(found: Diagnosis) -> Decision:
     sign = found.decided_by
     if sign is None:
-        return Decision(
-            False,
+        why = (
             "nothing tells whether the poses have absorbed the refraction; --adjust yes does it"
-            " all the same",
+            " all the same"
         )
+        return Decision(False, why)
     if not sign.speaks:
         shown = sign.plainly if sign.name == "tie points" else sign.words
         return Decision(False, f"the poses have not absorbed the refraction: {shown}")
     return Decision(True, f"the poses had absorbed the refraction: {sign.plainly or sign.words}")
 
 
-def _adjust(step: AdjustStep, target: Path, files: list[Path], jobs: int | None) -> str:
+def _adjust(step: AdjustStep, target: Path, files: Sequence[Path], jobs: int | None) -> str:
     """Adjust, and return which of `MODELS` has the cameras."""
-    _check_apart(target, files)
-    survey = Survey(step.gcps, step.gnss, step.lens)
-    with threads(jobs):
-        adjust_into(
-            target, step.inputs, survey, AdjustRules(index=step.index), step.cloud, overwrite=True
-        )
-    return next(name for name in MODELS if (target / name).exists())
-
-
-def _check_apart(target: Path, inputs: Sequence[Path]) -> None:
-    """Refuse to replace a folder that inputs lie in."""
-    at = target.resolve()
-    for path in inputs:
-        if at in path.resolve().parents:
+    for path in files:
+        if target.resolve() in path.resolve().parents:
             raise SettingError(
                 f"{path}: lies in {target}, which the adjustment replaces; give another OUT_DIR."
             )
+    survey, rules = Survey(step.gcps, step.gnss, step.lens), AdjustRules(index=step.index)
+    with threads(jobs):
+        adjust_into(target, step.inputs, survey, rules, step.cloud, overwrite=True)
+    return next(name for name in MODELS if (target / name).exists())
 
 
 def figures_of(folder: Path) -> dict[str, Any]:

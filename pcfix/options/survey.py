@@ -179,6 +179,7 @@ class AdjustRules(IndexOptions):
     datum: Datum = option(
         "observed",
         "What says where the block is; free: mean place, direction and scale of the old poses.",
+        old=("free_network",),
     )
     ties: Ties = option(
         "auto", "Adjust measured tie points, or points of the cloud; auto: as there are."

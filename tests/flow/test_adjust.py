@@ -158,6 +158,12 @@ def test_a_free_network_keeps_place_and_scale(files):
     assert not np.isfinite(found.gnss_residual_m).any()
 
 
+def test_the_old_word_for_a_free_network_still_works(files):
+    with pytest.warns(PcfixWarning, match="free_network is called datum now"):
+        found = adjust(files, gnss=None, free_network=True, outliers=False, lens_unknowns=())
+    assert found.unknowns.free_network
+
+
 def test_level_and_index_are_found_or_doubted(files):
     found = adjust(
         files, water=files.water + 0.25, index=1.33, free=("level", "index"),
