@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pcfix.adjust.block import sensor_groups
-from pcfix.adjust.values import Before, carried_by, nice_step, rms
+from pcfix.adjust.result import Adjusted
+from pcfix.adjust.values import Before, Plain, carried_by, nice_step, rms
 from pcfix.model import BoolArray, FloatArray
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, label_plan, new_figure
 from pcfix.water.surface import surface_above
@@ -15,10 +16,6 @@ from pcfix.water.surface import surface_above
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from pcfix.adjust.result import Adjusted
-
-Plain = dict[str, Any]
 
 MOST_POINTS = 6000
 COLUMNS = 14
@@ -95,13 +92,11 @@ def _arrows(figure: Figure, axes: Axes, a: Adjusted, vectors: FloatArray, rows: 
 
 def _by_depth(d: Plain, before: Before | None) -> list[Picture]:
     """Return the residuals by depth, land first."""
-    bins = []
-    if d["residuals"]["land"]["observations"]:
-        bins.append(("land", d["residuals"]["land"]))
+    land = d["residuals"]["land"]
+    bins = [("land", land)] if land["observations"] else []
     bins += [(f"{b['from_m']:g} to {b['to_m']:g}", b) for b in d["depth_bins"]]
     if not bins:
         return []
-    unit = d["image_unit"]
     figure, axes = new_figure(8.0, 3.8)
     place = np.arange(len(bins))
     times = [("before", "rms_before_px", BEFORE)] if before is not None else []
@@ -115,18 +110,15 @@ def _by_depth(d: Plain, before: Before | None) -> list[Picture]:
         axes.bar_label(bars, labels, fontsize="small", padding=1)
     axes.set_xticks(place, [f"{name}\n{b['observations']:,}" for name, b in bins])
     axes.set_xlabel("Depth below the water (m), and how many observations")
-    axes.set_ylabel(f"Rms residual ({unit})")
+    axes.set_ylabel(f"Rms residual ({d['image_unit']})")
     axes.margins(y=0.12)
     axes.legend(loc="best")
     alt = (
         "Root mean square of the residuals in the images (of a coordinate), of points on land and"
         " by depth below the water."
-        + (
-            " Before: the poses and lens as they came, the points intersected with refraction."
-            if before is not None
-            else ""
-        )
     )
+    if before is not None:
+        alt += " Before: the poses and lens as they came, the points intersected with refraction."
     return [Picture("residuals_by_depth", "Residuals by depth", alt, figure)]
 
 
@@ -249,14 +241,11 @@ def _rounds(d: Plain, a: Adjusted) -> list[Picture]:
         return []
     figure, (upper, lower) = new_figure(8.0, 4.6, nrows=2, sharex=True)
     step = np.arange(1, len(a.rounds) + 1)
-    number = np.array([row.round for row in a.rounds])
-    for axes, values in (
-        (upper, np.array([row.cost for row in a.rounds])),
-        (lower, np.array([row.rms_px for row in a.rounds])),
-    ):
+    number, _, cost, _, _, rms_px = np.array(a.rounds).T
+    for axes, values in ((upper, cost), (lower, rms_px)):
         for one in np.unique(number):
-            some = number == one
-            axes.plot(step[some], values[some], "o-", color=AFTER, markersize=3)
+            mine = number == one
+            axes.plot(step[mine], values[mine], "o-", color=AFTER, markersize=3)
         # over several powers of ten, as poor starts have
         if values.min() > 0.0 and values.max() > 20.0 * values.min():
             axes.set_yscale("log")
@@ -266,7 +255,7 @@ def _rounds(d: Plain, a: Adjusted) -> list[Picture]:
         axes.grid(visible=True, axis="y", color="0.9", linewidth=0.6)
     for one in np.unique(number):
         upper.annotate(
-            f"round {one}", (step[number == one][0], 1.0), xycoords=("data", "axes fraction"),
+            f"round {one:g}", (step[number == one][0], 1.0), xycoords=("data", "axes fraction"),
             xytext=(2, 3), textcoords="offset points", fontsize="small",
         )  # fmt: skip
     upper.set_ylabel("Cost")

@@ -99,15 +99,12 @@ def rounds_words(d: Plain) -> str:
 
 
 def _residual_lines(d: Plain) -> list[str]:
-    unit = d["image_unit"]
+    unit, kinds = d["image_unit"], d["residuals"]
     head = f"{'residuals':<13}{'points':>9}{'observations':>14}"
     head += f"{f'before, {unit}':>12}{f'rms, {unit}':>9}{'rms, m':>9}"
-    has_sigma = any(d["residuals"][key]["sigma_xyz_m"] for key, _ in WHERE)
+    has_sigma = any(kinds[key]["sigma_xyz_m"] for key, _ in WHERE)
     lines = [head + ("   standard errors X, Y, Z, m" if has_sigma else "")]
-    for key, where in WHERE:
-        r = d["residuals"][key]
-        if not r["points"]:
-            continue
+    for r, where in ((kinds[key], where) for key, where in WHERE if kinds[key]["points"]):
         line = f"  {where:<11}{r['points']:>9,}{r['observations']:>14,}"
         line += f"{fixed(r['rms_before_px'], 3):>12}{fixed(r['rms_px'], 3):>9}"
         line += f"{fixed(r['rms_m'], 4):>9}"
@@ -117,10 +114,7 @@ def _residual_lines(d: Plain) -> list[str]:
 
 def found_rows(d: Plain) -> list[tuple[str, str]]:
     """Return what was found, as pairs of a label and words."""
-    many = len({row["sensor"] for row in d["lens"]}) > 1
-    rows = [(lens_label(row), _lens_words(row, d["image_unit"], many)) for row in d["lens"]]
-    if not rows:
-        rows.append(("lens", "fixed"))
+    rows = [(lens_label(row), _lens_words(row, d)) for row in d["lens"]] or [("lens", "fixed")]
     rows += _water_rows(d)
     rows += _pose_rows(d)
     if d["gnss"] is not None:
@@ -136,20 +130,33 @@ def lens_label(row: Plain) -> str:
     return str(_LENS.get(row["name"], row["name"]))
 
 
-def _lens_words(row: Plain, unit: str, many: bool) -> str:
-    of_sensor = f"; {row['sensor']}, {row['images']:,} images" if many else ""
-    unit = f" {unit}" if row["name"] in ("f", "cx", "cy", "b1", "b2") else ""
+def lens_unit(row: Plain, d: Plain) -> str:
+    """Return the unit of a parameter of a lens; empty where it has none."""
+    return str(d["image_unit"]) if row["name"] in ("f", "cx", "cy", "b1", "b2") else ""
+
+
+def has_many_sensors(d: Plain) -> bool:
+    """Whether parameters of several sensors were free."""
+    return len({row["sensor"] for row in d["lens"]}) > 1
+
+
+def before_after_change(row: Plain) -> tuple[str, str, str]:
+    """Return a value before and after, and the difference."""
     before, after, sigma = row["before"], row["after"], row["sigma"]
+    return short(before, sigma), short(after, sigma), short(after - before, sigma, "+")
+
+
+def _found(row: Plain, unit: str) -> str:
+    before, after, change = before_after_change(row)
+    sigma = row["sigma"]
+    error = "" if sigma is None else f", standard error {sigma:.2g}"
+    return f"{before} -> {after}{unit} ({change}{error})"
+
+
+def _lens_words(row: Plain, d: Plain) -> str:
+    sensor = f"; {row['sensor']}, {row['images']:,} images" if has_many_sensors(d) else ""
     several = f"; first of {row['lenses']} lenses" if row["lenses"] > 1 else ""
-    return (
-        f"{short(before, sigma)} -> {short(after, sigma)}{unit}"
-        f" ({short(after - before, sigma, '+')}{error(sigma)}){of_sensor}{several}"
-    )
-
-
-def error(sigma: float | None) -> str:
-    """Return a standard error in words; nothing where it is not known."""
-    return "" if sigma is None else f", standard error {sigma:.2g}"
+    return _found(row, f" {lens_unit(row, d)}".rstrip()) + sensor + several
 
 
 WATER_WORDS = {
@@ -167,12 +174,7 @@ def _water_rows(d: Plain) -> list[tuple[str, str]]:
         v = water.get(key)
         if v is None or (key.startswith("tilt") and not v["free"] and v["after"] == 0.0):
             continue
-        if not v["free"]:
-            rows.append((label, f"{v['after']:.6g}{unit}, fixed"))
-            continue
-        was, now = short(v["before"], v["sigma"]), short(v["after"], v["sigma"])
-        change = short(v["after"] - v["before"], v["sigma"], "+")
-        rows.append((label, f"{was} -> {now}{unit} ({change}{error(v['sigma'])})"))
+        rows.append((label, _found(v, unit) if v["free"] else f"{v['after']:.6g}{unit}, fixed"))
     return rows
 
 
@@ -180,25 +182,20 @@ def _pose_rows(d: Plain) -> list[tuple[str, str]]:
     poses, precision = d["poses"], d["precision"]
     if d["poses_are"] == "fixed":
         return []
-    rows = [
-        (
-            "poses",
-            f"centres moved {fixed(poses['moved_rms_m'], 3)} m (rms), mean east, north, up"
-            f" {listed(poses['moved_mean_m'], 3, '+')} m; largest"
-            f" {fixed(poses['moved_largest_m'], 3)} m ({poses['moved_largest_image']}); turned"
-            f" {fixed(poses['turned_rms_deg'], 4)} degrees (rms)",
-        )
-    ]
-    if precision is not None and precision["images"]:
-        rows.append(
-            (
-                "  precision",
-                f"standard errors of centres X, Y, Z: mean {listed(precision['centre_mean_m'], 4)}"
-                f" m, largest {listed(precision['centre_largest_m'], 4)} m; of angles: mean"
-                f" {listed(precision['angle_mean_deg'], 4)} degrees",
-            )
-        )
-    return rows
+    moved = (
+        f"centres moved {fixed(poses['moved_rms_m'], 3)} m (rms), mean east, north, up"
+        f" {listed(poses['moved_mean_m'], 3, '+')} m; largest"
+        f" {fixed(poses['moved_largest_m'], 3)} m ({poses['moved_largest_image']}); turned"
+        f" {fixed(poses['turned_rms_deg'], 4)} degrees (rms)"
+    )
+    if precision is None or not precision["images"]:
+        return [("poses", moved)]
+    errors = (
+        f"standard errors of centres X, Y, Z: mean {listed(precision['centre_mean_m'], 4)}"
+        f" m, largest {listed(precision['centre_largest_m'], 4)} m; of angles: mean"
+        f" {listed(precision['angle_mean_deg'], 4)} degrees"
+    )
+    return [("poses", moved), ("  precision", errors)]
 
 
 def _gnss_words(g: Plain) -> str:
@@ -220,8 +217,7 @@ def surveyed_words(one: Plain, unit: str) -> str:
 
 
 def _surveyed_lines(d: Plain) -> list[str]:
-    lines = []
-    unit = d["image_unit"]
+    lines, unit = [], d["image_unit"]
     for role in ("control", "check"):
         one = d[role]
         if one is None:

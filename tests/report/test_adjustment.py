@@ -18,11 +18,11 @@ from pcfix.model import Cameras, Lens, WaterPlane, WaterRaster
 from pcfix.report.adjustment import (
     Before,
     adjustment_dict,
-    adjustment_figures,
     adjustment_page,
     adjustment_text,
     before_of,
 )
+from pcfix.report.adjustment_figures import pictures_of
 from tests.utils.browser import needs_browser, open_page
 
 FOCAL, HEIGHT, LEVEL = 1000.0, 50.0, 0.5
@@ -215,8 +215,8 @@ def bare(adjusted):
 def test_page_is_whole_and_says_nothing_unknown(adjusted, kind):
     before = before_px(adjusted) if kind == "whole" else None
     it = adjusted if kind == "whole" else bare(adjusted)
-    pictures = adjustment_figures(it, before)
-    tree = Tree(adjustment_page(it, before, pictures=pictures))
+    pictures = pictures_of(adjustment_dict(it, before), it, before)
+    tree = Tree(adjustment_page(it, before))
     assert tree.open == []
     said = " ".join(tree.said)
     assert not re.search(r"\bnan\b|\bNone\b|\binf\b", said)
@@ -266,7 +266,7 @@ def test_similarity_tells_shift_turn_and_scale(adjusted):
     precision = replace(adjusted.precision, shared=shared, correlation=np.eye(3),
                         block_correlation=np.zeros((3, 3)))  # fmt: skip
     free = Unknowns(poses="similarity", level_sigma_m=0.1)
-    page = adjustment_page(replace(adjusted, precision=precision, unknowns=free), pictures=[])
+    page = adjustment_page(replace(adjusted, precision=precision, unknowns=free))
     row = re.search(r"<td>shift z</td>(.*?)</tr>", page)[1]
     assert re.findall(r"<td>(.*?)</td>", row) == ["", "", "+0.31", "0.02", "m"]
 
@@ -289,7 +289,7 @@ def test_before_intersects_what_the_images_show(adjusted):
 @needs_browser
 def test_page_opens_without_an_error(adjusted, tmp_path):
     page = tmp_path / "adjustment.html"
-    page.write_text(adjustment_page(adjusted, before_px(adjusted), pictures=[]))
+    page.write_text(adjustment_page(adjusted, before_px(adjusted)))
     opened = open_page(page, tmp_path / "profile")
     assert "Change in height" in opened.stdout
     assert not re.search(r"CONSOLE.*(Error|error)", opened.stderr)
