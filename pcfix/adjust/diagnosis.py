@@ -257,13 +257,7 @@ def sized(sign: Sign, mended: Mended) -> Sign:
 def gnss_is_suspicious(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray) -> bool:
     """Whether adjusted centres are so far from the GNSS, or in such a shape, that it is no chance.
 
-    Parameters
-    ----------
-    centres : array, shape (k, 3)
-    off_m : array, shape (k, 3)
-        Adjusted minus GNSS, NaN where there is none.
-    sigma_m : array, shape (k, 3)
-        Stated, NaN where not.
+    `off_m` is adjusted minus GNSS, NaN where there is none; `sigma_m` is stated, NaN where not.
     """
     rows = np.isfinite(off_m)
     y, base = off_m[rows], _as_a_whole(centres)[rows]
@@ -308,12 +302,6 @@ def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, mende
 
     That is the centres as they are minus those that an adjustment with water finds without the
     GNSS.
-
-    Parameters
-    ----------
-    centres, off_m, sigma_m
-        As of `gnss_is_suspicious`.
-    mended : Mended
 
     Notes
     -----

@@ -21,7 +21,7 @@ from pcfix.adjust.normal import residuals
 from pcfix.adjust.precision import Precision, strong_correlations, undetermined
 from pcfix.adjust.problem import intersect_fixed, prepare
 from pcfix.adjust.result import Adjusted, ControlRow
-from pcfix.model import BoolArray, FloatArray, Lens, WaterPlane
+from pcfix.model import BoolArray, FloatArray, WaterPlane
 from pcfix.water.surface import surface_above
 
 Plain = dict[str, Any]
@@ -128,11 +128,11 @@ def adjustment_dict(adjusted: Adjusted, before: Before | None = None) -> Plain:
     """
     a, block, u = adjusted, adjusted.block, adjusted.unknowns
     kept = len(block.cameras) if u.poses == "fixed" else 0
-    known = a.precision
+    known, lenses = a.precision, block.cameras.lenses or ()
     return {
         "source": a.source,
         "engine": a.engine,
-        "image_unit": _lenses(a)[0].unit,
+        "image_unit": lenses[0].unit,
         "images": len(block.cameras),
         "images_fixed": kept or sum(label in u.fixed_images for label in block.cameras.labels),
         "poses_are": u.poses,
@@ -193,10 +193,6 @@ def depth_of(adjusted: Adjusted) -> FloatArray | None:
     if adjusted.water is None:
         return None
     return np.asarray(surface_above(adjusted.water, adjusted.xyz).height_m - adjusted.xyz[:, 2])
-
-
-def _lenses(a: Adjusted) -> tuple[Lens, ...]:
-    return a.block.cameras.lenses or ()
 
 
 def carried_by(adjusted: Adjusted) -> BoolArray:
@@ -298,7 +294,7 @@ def nice_step(least: float) -> float:
 
 
 def _lens(a: Adjusted) -> list[Plain]:
-    old, new = _lenses(a), a.cameras.lenses or ()
+    old, new = a.block.cameras.lenses or (), a.cameras.lenses or ()
     _, groups = sensor_groups(old)
     rows = []
     for place, mine in enumerate(groups, start=1):

@@ -309,16 +309,8 @@ class Record:
     """What was asked for, from which files, and which steps are done.
 
     A step counts as done while the request and the input files are those of the record, every
-    step before it was found done, and its own files are as it left them.
-
-    Parameters
-    ----------
-    path : Path
-        Of the JSON file; it is written after each step.
-    request : dict
-        Plain values: everything that the results depend on.
-    inputs : sequence of Path
-        Files that they depend on.
+    step before it was found done, and its own files are as it left them. The JSON file at `path`
+    is written after each step; the request has everything that the results depend on.
     """
 
     def __init__(self, path: Path, request: dict[str, Any], inputs: Sequence[Path]) -> None:
@@ -346,15 +338,10 @@ class Record:
         return steps
 
     def step(self, name: str, outputs: Sequence[Path], work: Callable[[], Any]) -> tuple[Any, bool]:
-        """Do a step unless it is done; return its result, plain values, and whether it was done.
+        """Do a step unless it is done; return its result and whether it was done.
 
-        Parameters
-        ----------
-        name : str
-        outputs : sequence of Path
-            Every file that `work` leaves.
-        work : callable
-            Returns what later steps need, as JSON can hold it.
+        `outputs` are all files that `work` leaves; it returns what later steps need, as JSON can
+        hold it.
         """
         earlier = self._earlier.get(name)
         if earlier is not None and earlier["outputs"] == [file_state(p) for p in outputs]:

@@ -41,13 +41,10 @@ from pcfix.model import NOMINAL_WIDTH_PX, Cameras, FloatArray, IntArray, Lens, O
 from pcfix.options.correct import ScienceOptions
 from pcfix.port.light import coefficients, cosine_at_port, ray_through, through_port
 from pcfix.port.shapes import Port
-from pcfix.refract.batch import Intersection
+from pcfix.refract.batch import CORRECTED, NO_CAMERA, ONE_CAMERA, PARALLEL, Intersection
 from pcfix.refract.choice import ANY_NUMBER, NOMINAL_FOCAL_PX, TILE, near_cameras, spatial_order
 from pcfix.refract.rays import add_line, nearest_point
 from pcfix.threads import one_caller
-
-_NO_CAMERA, _ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
-_PARALLEL, _CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
 
 # Columns of the result after the shift.
 _MISS, _SIGMA_Z, _COSINE, _OUTCOME = 3, 4, 5, 6
@@ -302,11 +299,11 @@ def _intersect(
 def _solve(row: FloatArray, sums: FloatArray, k: int, cosine: float) -> None:
     """Solve one point and write its row; a point without a solution keeps a shift of zero."""
     if k < 2:
-        row[_OUTCOME] = _ONE_CAMERA if k == 1 else _NO_CAMERA
+        row[_OUTCOME] = ONE_CAMERA if k == 1 else NO_CAMERA
         return
     solved, q, miss, sigma_z = nearest_point(float(k), sums)
     if not solved:
-        row[_OUTCOME] = _PARALLEL
+        row[_OUTCOME] = PARALLEL
         return
     row[0], row[1], row[2] = q
-    row[_MISS], row[_SIGMA_Z], row[_COSINE], row[_OUTCOME] = miss, sigma_z, cosine, _CORRECTED
+    row[_MISS], row[_SIGMA_Z], row[_COSINE], row[_OUTCOME] = miss, sigma_z, cosine, CORRECTED

@@ -59,33 +59,16 @@ def consistent_through_port(
     settings: ScienceOptions,
     start: Intersection,
 ) -> Intersection:
-    """Move points so that straight rays to the true ones' images meet in the apparent ones.
+    """Return `start` with shifts after which straight rays to the images meet in the points.
 
-    Parameters
-    ----------
-    xyz : array, shape (m, 3)
-        Apparent points, metres, world frame.
-    views : Views
-        Their cameras.
-    cameras, port, settings
-        As of `pcfix.port.methods.intersect_through_port`.
-    start : Intersection
-        What `snell` makes of them, from where the search begins.
-
-    Returns
-    -------
-    Intersection
-        `start` with other shifts.
+    Apparent points xyz, shape (m, 3), metres, world frame; `start` is what `snell` makes of them,
+    from where the search begins; the rest as of `pcfix.port.methods.intersect_through_port`.
+    Points for which no true point is found keep the solution of `snell`, with a warning.
 
     Raises
     ------
     SettingError
         If the cameras have no angles or no lenses.
-
-    Warns
-    -----
-    PcfixWarning
-        Of points for which no true point was found; they get the solution of `snell`.
     """
     check_consistent(cameras)
     moved = np.flatnonzero(start.outcome == Outcome.CORRECTED)
@@ -101,16 +84,10 @@ def consistent_through_port(
 def port_covariances(
     true_xyz: FloatArray, views: Views, cameras: Cameras, port: Port, settings: ScienceOptions
 ) -> FloatArray:
-    """Return the covariance of points behind a port.
+    """Return the covariance of points behind a port, true_xyz, shape (m, 3), metres, world frame.
 
-    Parameters
-    ----------
-    true_xyz : array, shape (m, 3)
-        Metres, world frame.
-    views, cameras, port, settings
-        As of `consistent_through_port`; of the standard deviations those of the images, the
-        refractive index, the projection centres and the attitudes count. There is no surface to
-        err.
+    Of the standard deviations those of the images, the refractive index, the projection centres
+    and the attitudes count. There is no surface to err.
 
     Returns
     -------

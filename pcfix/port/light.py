@@ -34,14 +34,8 @@ def bent(s: Vector, normal: Vector, r: float) -> Vector:
     """Return the unit direction behind a face: Snell's law in vector form.
 
     Skarlatos & Agrafiotis 2018, eq 10, with the normal along the light instead of against it:
-    t = r s + (sqrt(1 - r^2 (1 - c^2)) - r c) N, c = N.s. NaN where all light is reflected.
-
-    Parameters
-    ----------
-    s, normal : Vector
-        Unit direction of the light; unit normal of the face, to the side it goes to.
-    r : float
-        Refractive index before the face by that behind it.
+    t = r s + (sqrt(1 - r^2 (1 - c^2)) - r c) N, c = N.s, with r the refractive index before the
+    face by that behind it. NaN where all light is reflected.
     """
     c = dot(normal, s)
     k = np.sqrt(1.0 - r * r * (1.0 - c * c)) - r * c

@@ -29,6 +29,10 @@ from pcfix.refract.occlusion import Occluder
 from pcfix.refract.regression import DepthRegression
 from pcfix.water.surface import SurfaceAbove
 
+NO_CAMERA, ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
+PARALLEL, CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
+"""Of `Outcome`, for kernels."""
+
 
 class Learned(NamedTuple):
     """What methods may need beyond the points themselves; None where it was not learned.

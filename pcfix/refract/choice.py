@@ -153,10 +153,11 @@ def chosen_views(batch: Batch) -> Views:
     with one_caller():
         if views is None:
             _make_room(points, rig, frames, first)
-            begin, entries = np.empty(len(batch), np.int64), None
+            begin, entries = np.empty(len(batch), np.int64), (first[:0], first[:0])
             place = np.empty(np.cumsum(first, out=first)[-1], np.int32)
         else:
-            begin, entries = np.array(views.start[:-1], np.int64), (views.start, views.camera)
+            entries = (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64))
+            begin = entries[0][:-1].copy()
             place = np.empty(len(views.camera), np.int32)
         _choose_all(
             points, rig, frames, rule_of(survey), *shapes_of(survey.water), entries, first,
@@ -212,14 +213,14 @@ def _make_room(points: Points, rig: Rig, frames: Frames, first: IntArray) -> Non
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _choose_all(
     points: Points, rig: Rig, frames: Frames, rule: Rule, tin: Tin | None, field: Field | None,
-    views: tuple[IntArray, IntArray] | None, first: IntArray,
+    views: tuple[IntArray, IntArray], first: IntArray,
     found: tuple[IntArray, IntArray, npt.NDArray[np.int32]],
 ) -> None:  # fmt: skip
     """Fill in where the entries of point i begin, how many they are (at i + 1), and the entries.
 
-    An entry is the number of a camera, or that of an entry of the views.
+    An entry is the number of a camera, or, where there are views, that of one of their entries.
     """
-    begin, count, place = found
+    (begin, count, place), listed = found, views[0].size > 0
     for t in prange(first.size - 1):
         rows = points.order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
@@ -230,14 +231,14 @@ def _choose_all(
             i = rows[j]
             facet = -1 if tin is None else locate(tin, tile[j], tile[TILE + j])
             candidates = near
-            if views is not None:
-                candidates = views[1][begin[i] : views[0][i + 1]].astype(np.int64)
+            if listed:
+                candidates = views[1][begin[i] : views[0][i + 1]]
             else:
                 begin[i] = free
             kept = choose(candidates, tile, j, rig, frames, rule, tin, field, facet)
             for k in range(kept.size):
                 at = kept[k]
-                place[begin[i] + k] = begin[i] + at if views is not None else candidates[at]
+                place[begin[i] + k] = begin[i] + at if listed else candidates[at]
             count[i + 1] = kept.size
             free += kept.size
 

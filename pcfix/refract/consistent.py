@@ -44,7 +44,18 @@ from pcfix.lens.algebra import (
 )
 from pcfix.lens.imaging import image_in_world, image_of
 from pcfix.model import Cameras, FloatArray, IntArray, Outcome
-from pcfix.refract.batch import Batch, Chosen, Intersection, Optics, optics_of, warn_of_unsolved
+from pcfix.refract.batch import (
+    CORRECTED,
+    NO_CAMERA,
+    ONE_CAMERA,
+    PARALLEL,
+    Batch,
+    Chosen,
+    Intersection,
+    Optics,
+    optics_of,
+    warn_of_unsolved,
+)
 from pcfix.refract.choice import shapes_of
 from pcfix.refract.rays import (
     Path,
@@ -65,8 +76,6 @@ CLOSE_M = 1e-7
 """What is left of the way to the solution, judged from the last two steps."""
 
 _BLOCK = 64
-_NO_CAMERA, _ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
-_PARALLEL, _CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
 
 # Columns of the result.
 _MISS, _SIGMA_Z, _COSINE2, _OUTCOME, _FOUND = 3, 4, 5, 6, 7
@@ -159,7 +168,7 @@ def _correct(
             cameras = points.camera[start[i] : start[i + 1]]
             out = result[i]
             if cameras.size == 0 or cameras.min() == cameras.max():
-                out[_OUTCOME] = _ONE_CAMERA if cameras.size else _NO_CAMERA
+                out[_OUTCOME] = ONE_CAMERA if cameras.size else NO_CAMERA
                 continue
             facet = -1 if tin is None else locate(tin, points.xyz[i, 0], points.xyz[i, 1])
             sums[:9], sums[9] = 0.0, 1.0
@@ -216,12 +225,12 @@ def _solve(
     k = float(cameras.size)
     solved, q, _, sigma_z = nearest_point(k, sums)
     if not solved:
-        out[_OUTCOME] = _PARALLEL
+        out[_OUTCOME] = PARALLEL
         return
     found, q = _search(q, rays, cameras, optics, n, tin, field)
     out[0], out[1], out[2] = q
     out[_MISS], out[_SIGMA_Z] = _miss(k, sums, q), sigma_z
-    out[_COSINE2], out[_OUTCOME], out[_FOUND] = sums[9], _CORRECTED, 1.0 if found else 0.0
+    out[_COSINE2], out[_OUTCOME], out[_FOUND] = sums[9], CORRECTED, 1.0 if found else 0.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

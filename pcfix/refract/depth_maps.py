@@ -31,8 +31,19 @@ from numba import njit, prange
 
 from pcfix.lens.algebra import Vector, beyond, dot, minus, row_of, scaled
 from pcfix.lens.frames import Frames, holds
-from pcfix.model import FloatArray, IntArray, Outcome
-from pcfix.refract.batch import Batch, Chosen, Images, Intersection, as_made, as_now, images_of
+from pcfix.model import FloatArray, IntArray
+from pcfix.refract.batch import (
+    CORRECTED,
+    NO_CAMERA,
+    ONE_CAMERA,
+    Batch,
+    Chosen,
+    Images,
+    Intersection,
+    as_made,
+    as_now,
+    images_of,
+)
 from pcfix.refract.matcher import Matcher
 from pcfix.refract.rays import direction, light_path, refracted
 from pcfix.threads import one_caller
@@ -47,8 +58,6 @@ AVERAGED_WITHIN = 0.012
 
 _ROUNDS = 4
 _BLOCK = 64
-_CORRECTED, _NO_CAMERA = int(Outcome.CORRECTED), int(Outcome.NO_CAMERA)
-_ONE_CAMERA = int(Outcome.ONE_CAMERA)
 _MISS, AMBIGUITY, OUTCOME, _COUNT = 3, 4, 5, 6
 COLUMNS = 7
 """Of what the kernels write: the shift, and these."""
@@ -132,7 +141,7 @@ def intersection_of(batch: Batch, result: FloatArray) -> Intersection:
         outcome=result[:, OUTCOME].astype(np.uint8),
         ray_miss_m=result[:, _MISS],
     )
-    moved = found.outcome == _CORRECTED
+    moved = found.outcome == CORRECTED
     return found._replace(
         sigma_z_m=np.where(moved, result[:, AMBIGUITY], 0.0),
         ray_count=np.where(moved, result[:, _COUNT], 0).astype(np.int32),
@@ -279,7 +288,7 @@ def settle_bed(
 
     From where the lines say, and looked at again until they need not be mended.
     """
-    row[OUTCOME] = _NO_CAMERA if maps.size == 0 else _ONE_CAMERA
+    row[OUTCOME] = NO_CAMERA if maps.size == 0 else ONE_CAMERA
     bed, slope = depths.bed, depths.slope
     step = balance(depths.t, slope, weight)
     looks, work = np.empty((maps.size, 5)), np.empty((matcher.matched.shape[1], 3))
@@ -306,7 +315,7 @@ def settle_bed(
         return
     row[0], row[1], row[2] = x / total, y / total, bed + step
     row[_MISS] = np.sqrt(max(squares / total - row[0] ** 2 - row[1] ** 2, 0.0))
-    row[OUTCOME], row[_COUNT] = _CORRECTED, count
+    row[OUTCOME], row[_COUNT] = CORRECTED, count
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -32,8 +32,8 @@ from pcfix.lens.frames import (
     may_hold,
     pyramid,
 )
-from pcfix.model import BoolArray, FloatArray, IntArray, Outcome
-from pcfix.refract.batch import Batch, Intersection
+from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.refract.batch import CORRECTED, NO_CAMERA, ONE_CAMERA, PARALLEL, Batch, Intersection
 from pcfix.refract.choice import (
     TILE,
     Points,
@@ -56,9 +56,6 @@ from pcfix.refract.uncertainty import (
 )
 from pcfix.threads import one_caller
 from pcfix.water.surface import Field, Tin, locate
-
-_NO_CAMERA, _ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
-_PARALLEL, _CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
 
 
 def intersect(batch: Batch) -> Intersection:
@@ -125,16 +122,16 @@ _MISS, _SIGMA_Z, _INCIDENCE, _COUNT, _OUTCOME = 3, 4, 5, 6, 7
 def _solve(row: FloatArray, k: float, sums: FloatArray) -> None:
     """Solve one point and write its row; a point without a solution keeps a shift of zero."""
     if k < 2.0:
-        row[_OUTCOME] = _ONE_CAMERA if k == 1.0 else _NO_CAMERA
+        row[_OUTCOME] = ONE_CAMERA if k == 1.0 else NO_CAMERA
         return
     solved, q, miss, sigma_z = nearest_point(k, sums)
     if not solved:
-        row[_OUTCOME] = _PARALLEL
+        row[_OUTCOME] = PARALLEL
         return
     row[0], row[1], row[2] = q
     row[_MISS], row[_SIGMA_Z] = miss, sigma_z
     row[_INCIDENCE] = np.degrees(np.arccos(np.sqrt(min(sums[10], 1.0))))
-    row[_COUNT], row[_OUTCOME] = k, _CORRECTED
+    row[_COUNT], row[_OUTCOME] = k, CORRECTED
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

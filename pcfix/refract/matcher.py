@@ -68,27 +68,15 @@ class Matcher(NamedTuple):
 
 
 def matcher_of(cameras: Cameras, places: FloatArray) -> Matcher:
-    """Return how images were likely matched.
+    """Return how images, with rotations and lenses, were likely matched.
 
-    Parameters
-    ----------
-    cameras : Cameras
-        With rotations and lenses.
-    places : array, shape (p, 3)
-        Some thousand places of the scene, as the software had them, metres, world frame.
+    The places, shape (p, 3), are some thousand of the scene, as the software had them, metres.
     """
     return _matcher(cameras, places, *_images(cameras, places), tracked=False)
 
 
 def matcher_of_ties(cameras: Cameras, ties: TiePoints) -> Matcher:
-    """Return how images were likely matched, by the images that saw each tie point.
-
-    Parameters
-    ----------
-    cameras : Cameras
-    ties : TiePoints
-        In the world frame.
-    """
+    """Return how images were likely matched, by those that saw each tie point, world frame."""
     rows = np.flatnonzero(np.isfinite(ties.xyz).all(axis=1))
     views = ties.views.take(rows)
     places = np.ascontiguousarray(ties.xyz[rows])

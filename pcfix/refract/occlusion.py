@@ -74,23 +74,10 @@ class Occluder(NamedTuple):
 
 
 def hidden(xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occluder) -> BoolArray:
-    """Return which cameras the cloud hides from the points.
+    """Return for each entry of ``views.camera`` whether the cloud hides the camera from its point.
 
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Apparent points, metres, world frame.
-    centres : array, shape (k, 3)
-        Projection centres, metres, world frame.
-    views : Views
-        The cameras of each point.
-    occluder : Occluder
-
-    Returns
-    -------
-    array of bool, shape (entries,)
-        One per entry of ``views.camera``. False for cameras not above their point, and for points
-        beside the grid.
+    Points, shape (n, 3), apparent, and projection centres, shape (k, 3), in metres, world frame.
+    No camera is hidden that is not above its point, nor from a point beside the grid.
 
     Notes
     -----
@@ -111,12 +98,7 @@ def in_sight(xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occlu
     """Return the views without the hidden cameras.
 
     A point that would keep fewer than two cameras keeps them all: it is in the cloud, so two saw
-    it, and it is the grid that does not show how.
-
-    Parameters
-    ----------
-    xyz, centres, views, occluder
-        As of `hidden`.
+    it, and it is the grid that does not show how. Parameters are those of `hidden`.
     """
     stays = ~hidden(xyz, centres, views, occluder)
     owner = np.repeat(np.arange(len(xyz)), np.diff(views.start))

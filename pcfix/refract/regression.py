@@ -139,14 +139,6 @@ def outliers(residual: FloatArray, leverage: FloatArray) -> IntArray:
 
     By externally studentised residuals, each with the standard error from the other values, and
     the limit of Student's distribution for the largest of all m (Bonferroni).
-
-    Parameters
-    ----------
-    residual, leverage : array, shape (m,)
-
-    Returns
-    -------
-    array of int, shape (outliers,)
     """
     from scipy.stats import t
 

@@ -50,6 +50,10 @@ from pcfix.lens.formulas import KIND, PERSPECTIVE
 from pcfix.lens.imaging import image_in_world
 from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, Views
 from pcfix.refract.batch import (
+    CORRECTED,
+    NO_CAMERA,
+    ONE_CAMERA,
+    PARALLEL,
     Batch,
     Chosen,
     Images,
@@ -77,8 +81,6 @@ CLOSE_M = 1e-6
 """How far from P the median may be; Q is then off by two or three times as much."""
 
 _BLOCK = 64
-_NO_CAMERA, _ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
-_PARALLEL, _CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
 
 # Columns of the result.
 _MISS, _OUTCOME, _FOUND, _WIDTH = 3, 4, 5, 6
@@ -186,8 +188,8 @@ def _invert(
                 place[c] = -1
             wide = _wide_pairs(pairs[:count], rays, normal)
             if wide == 0:
-                few = _ONE_CAMERA if cameras.size else _NO_CAMERA
-                result[i, _OUTCOME] = _PARALLEL if count else few
+                few = ONE_CAMERA if cameras.size else NO_CAMERA
+                result[i, _OUTCOME] = PARALLEL if count else few
                 continue
             for p in range(wide):
                 flags[pairs[p, 0]], flags[pairs[p, 1]] = True, True
@@ -271,12 +273,12 @@ def _solve(
     """Solve one point and write its row."""
     fixed, q = _snell(rays, used, normal, images.n)
     if not fixed:
-        out[_OUTCOME] = _PARALLEL
+        out[_OUTCOME] = PARALLEL
         return
     found, q = _search(q, rays, cameras, used, pairs, places, normal, images)
     out[0], out[1], out[2] = q
     out[_MISS] = _miss(q, rays, used, normal, images.n)
-    out[_OUTCOME], out[_FOUND] = _CORRECTED, 1.0 if found else 0.0
+    out[_OUTCOME], out[_FOUND] = CORRECTED, 1.0 if found else 0.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

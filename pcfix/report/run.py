@@ -71,15 +71,8 @@ def run_report(
 ) -> Report:
     """Return what the page of a run says.
 
-    Parameters
-    ----------
-    corrected : Corrected
-    files : Table
-        The files that went in.
-    more : pair of sequences
-        Pictures and tables of later steps.
-    verdict : str
-        A sentence that they come to.
+    `files` are those that went in; `more` are pictures and tables of later steps, and `verdict`
+    is a sentence that they come to.
     """
     s, maps = corrected.summary, corrected.maps
     settings = [[name.replace("_", " "), str(value)] for name, value in s.settings.items()]
@@ -269,13 +262,7 @@ def _uncertainty_picture(sample: FloatArray, s: Summary) -> list[Picture]:
 
 
 def tvu_figure(depth_m: FloatArray, sigma_z_m: FloatArray) -> Figure:
-    """Draw TVU at 95 % over depth, and the largest of the orders of IHO S-44 up to one above it.
-
-    Parameters
-    ----------
-    depth_m, sigma_z_m : array, shape (m,)
-        Depths and standard errors of Z of some points.
-    """
+    """Draw TVU at 95 % over depth, and the largest of the orders of IHO S-44 up to one above it."""
     figure, axes = new_figure()
     tvu = COVERAGE_95 * sigma_z_m
     deepest = float(max(depth_m.max(), 1e-3))
@@ -334,15 +321,7 @@ def adjustment_sentence(d: Plain) -> str:
 
 
 def adjustment_table(d: Plain, page: str) -> Table:
-    """Return what the adjustment changed, with a link to its own page.
-
-    Parameters
-    ----------
-    d : dict
-        Of `pcfix.adjust.values.adjustment_dict`.
-    page : str
-        Address of its report, relative to that of the run.
-    """
+    """Return what the adjustment changed, of `adjustment_dict`, with a link to its own page."""
     from markupsafe import Markup
 
     link = Markup('<a href="{0}">{0}</a>').format(page)

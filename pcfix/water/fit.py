@@ -129,9 +129,7 @@ class _Plan(NamedTuple):
 _UNKNOWNS: dict[Model, int] = {"level": 1, "along": 2, "plane": 3}
 
 
-def fit_water(
-    xyz: FloatArray, *, model: Model = "auto", max_tilt_percent: float = MAX_TILT_PERCENT
-) -> WaterFit:
+def fit_water(xyz: FloatArray, *, model: Model = "auto") -> WaterFit:
     """Fit the water surface to shoreline points, nearly half of which may be wrong.
 
     Parameters
@@ -142,8 +140,6 @@ def fit_water(
         ``along`` is tilted in the direction in which the points lie and level across it. ``auto``
         takes a tilt only where it is significant, and only along the points where these are
         nearly on one line, or lie along a river and show no tilt across it.
-    max_tilt_percent : float, default 5.0
-        A steeper surface is refused.
 
     Returns
     -------
@@ -156,7 +152,7 @@ def fit_water(
         If the model is unknown, or the shape of `xyz` is another.
     GeometryError
         If there are too few points for the model, they lie on one line, or the surface is steeper
-        than `max_tilt_percent`.
+        than `MAX_TILT_PERCENT`.
     """
     if model not in get_args(Model):
         raise SettingError(f"model '{model}' is not one of {', '.join(get_args(Model))}.")
@@ -176,11 +172,11 @@ def fit_water(
         sigma_m=found.sigma_m,
         notes=(*notes, *_doubts(found, len(points) - len(known))),
     )
-    if not fit.tilt_percent <= max_tilt_percent:
+    if not fit.tilt_percent <= MAX_TILT_PERCENT:
         raise GeometryError(
             f"The shoreline points tilt by {fit.tilt_percent:.1f} %, more than"
-            f" {max_tilt_percent:g} % (standard error {fit.sigma_tilt_percent:.1f} %); check their"
-            " heights and units, or allow it, or fit a level."
+            f" {MAX_TILT_PERCENT:g} % (standard error {fit.sigma_tilt_percent:.1f} %); check their"
+            " heights and units, or fit a level."
         )
     return fit
 

@@ -230,7 +230,7 @@ def flow_axis(xy: FloatArray) -> Axis:
     if len(xy) < FEWEST_ON_AXIS or not np.ptp(xy, axis=0).any():
         raise GeometryError(
             f"The axis of a river needs at least {FEWEST_ON_AXIS} shoreline points at different"
-            f" places, and there are {len(xy)}; fit a plane, or give the line along the river."
+            f" places, and there are {len(xy)}; fit a plane."
         )
     origin = xy.mean(axis=0)
     places = xy - origin
