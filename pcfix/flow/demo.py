@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from pcfix.flow.run import Request, run_all
 from pcfix.io.las.source import read_xyz
 from pcfix.io.scenes import write_scene
 from pcfix.model import FloatArray
+from pcfix.options.declare import File
 from pcfix.options.scenes import BlockKind
 from pcfix.simulate.scene import Scene, simulate_scene
 
@@ -21,7 +21,7 @@ REPORT = "run"
 
 
 def run_demo(
-    out_dir: str | os.PathLike[str],
+    out_dir: File,
     *,
     points: int = 50_000,
     overwrite: bool = False,

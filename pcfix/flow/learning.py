@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import repeat
@@ -16,6 +15,7 @@ from pcfix.io.tables import CheckDepths, read_check_depths
 from pcfix.label.labelling import Part
 from pcfix.model import NOISE_CLASSES, BoolArray, FloatArray, IntArray, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
+from pcfix.options.declare import File
 from pcfix.refract.batch import Batch, Learned, MadeWith, Survey, stacked
 from pcfix.refract.learning import check_method, wants_matcher, with_matcher
 from pcfix.refract.occlusion import Occluder
@@ -141,23 +141,12 @@ FEWEST_BED_POINTS, MOST_BED_POINTS = 250_000, 1_000_000
 
 
 def learn_regression(
-    path: str | os.PathLike[str], parts: Iterable[Part], settings: ScienceOptions
+    path: File, parts: Iterable[Part], settings: ScienceOptions
 ) -> DepthRegression:
     """Fit true depth = a + b * apparent depth to the check depths of a file.
 
-    Parameters
-    ----------
-    path : path
-        See `pcfix.io.tables.read_check_depths`.
-    parts : iterable of Part
-        The whole cloud as it came, each point with the water above it; gone through once, in
-        bounded memory. Points of noise (classes 7 and 18) do not count.
-    settings : ScienceOptions
-        For `least_r2`.
-
-    Returns
-    -------
-    DepthRegression
+    The parts are the whole cloud as it came, each point with the water above it; they are gone
+    through once, in bounded memory. Points of noise (classes 7 and 18) do not count.
 
     Raises
     ------

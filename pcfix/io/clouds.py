@@ -13,7 +13,7 @@ import numpy.typing as npt
 from pcfix.compare.match import Reference, SurveyCloud
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.crs import is_same, parts
-from pcfix.io.files import AnyPath, check_input
+from pcfix.io.files import check_input
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, stated_crs
 from pcfix.io.las.writing import own_settings
@@ -26,6 +26,7 @@ from pcfix.model import (
     WaterPlane,
     WaterSurface,
 )
+from pcfix.options.declare import File
 
 if TYPE_CHECKING:
     import laspy
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 
 def read_cloud(
-    path: AnyPath,
+    path: File,
     water: WaterSurface | None = None,
     skip_classes: Sequence[int] = NOISE_CLASSES,
 ) -> SurveyCloud:
@@ -119,7 +120,7 @@ WATER_CLASSES = (9, 41, 42, 45)
 KINDS = "a cloud (.las, .laz), check points (.csv, .txt) or a grid (.tif, .tiff)"
 
 
-def read_reference(path: AnyPath) -> Reference:
+def read_reference(path: File) -> Reference:
     """Read a reference; the end of its name says what it is.
 
     ``.las``, ``.laz``: all points but those withheld and those of noise or water; ``.csv``,

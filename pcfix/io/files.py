@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,14 +20,13 @@ import numpy.typing as npt
 from pcfix.errors import InputError, SettingError
 from pcfix.grid.lattice import Window
 from pcfix.model import FloatArray, IntArray
+from pcfix.options.declare import File
 
 if TYPE_CHECKING:
     from pcfix.clean.neighbours import Empty
 
-AnyPath: TypeAlias = str | os.PathLike[str]
 
-
-def check_input(path: AnyPath) -> Path:
+def check_input(path: File) -> Path:
     """Return the path of a file; one that does not exist is an `InputError`."""
     found = Path(path)
     if not found.is_file():
@@ -35,7 +34,7 @@ def check_input(path: AnyPath) -> Path:
     return found
 
 
-def files_in(path: AnyPath) -> list[Path]:
+def files_in(path: File) -> list[Path]:
     """Return a file, or the files directly in a folder, in the order of their names."""
     found = Path(path)
     if found.is_dir():
@@ -43,7 +42,7 @@ def files_in(path: AnyPath) -> list[Path]:
     return [check_input(found)]
 
 
-def check_output(path: AnyPath, *, overwrite: bool, inputs: Iterable[AnyPath] = ()) -> Path:
+def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:
     """Return the path of a file that may be written.
 
     A `SettingError` if it is one of the inputs, exists without `overwrite`, or has no folder.
@@ -99,14 +98,14 @@ def read_json(path: Path) -> Any:
     return json.loads(path.read_text("utf-8"))
 
 
-def write_bytes(path: AnyPath, data: bytes, *, overwrite: bool) -> None:
+def write_bytes(path: File, data: bytes, *, overwrite: bool) -> None:
     """Write a small file under the same rules."""
     target = check_output(path, overwrite=overwrite)
     with replaced_when_whole(target) as draft:
         draft.write_bytes(data)
 
 
-def write_text(path: AnyPath, text: str, *, overwrite: bool) -> None:
+def write_text(path: File, text: str, *, overwrite: bool) -> None:
     """Write a small text file under the same rules."""
     write_bytes(path, text.encode(), overwrite=overwrite)
 

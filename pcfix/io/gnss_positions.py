@@ -18,9 +18,10 @@ from pcfix.io.cameras.odm.project import read_images
 from pcfix.io.cameras.table import gnss_positions, open_table
 from pcfix.io.cameras.table.columns import Columns
 from pcfix.io.crs import METRES, is_topocentric, parse_crs
-from pcfix.io.files import AnyPath, check_input
+from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels, unnamed
 from pcfix.model import Cameras, FloatArray, GnssPositions
+from pcfix.options.declare import File
 
 SIGMAS = {
     "sigma_x": ("sx", "sxy", "sxyz", "sigma"),
@@ -45,7 +46,7 @@ class GnssInFrame(NamedTuple):
     reason: str = ""
 
 
-def read_gnss(path: AnyPath, cameras: Cameras, *, crs: str | None = None) -> Cameras:
+def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Cameras:
     """Return cameras with `gnss`: where the GNSS said that the images were taken.
 
     It is in its own CRS, NaN for images without a position and for standard deviations that are not

@@ -13,10 +13,11 @@ import numpy.typing as npt
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.control_marks import Marks, read_marks
 from pcfix.io.crs import is_topocentric
-from pcfix.io.files import AnyPath, check_input
+from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels, unnamed
 from pcfix.io.transformations import LOCAL, way_to_cloud
 from pcfix.model import Cameras, FloatArray, GroundControl, IntArray
+from pcfix.options.declare import File
 
 SIGMA_M, SIGMA_PX = 0.01, 0.5
 """Where the file states none."""
@@ -25,9 +26,7 @@ FARTHEST_M = 50e3
 _NAMED = 5
 
 
-def read_ground_control(
-    path: AnyPath, cameras: Cameras, *, crs: str | None = None
-) -> GroundControl:
+def read_ground_control(path: File, cameras: Cameras, *, crs: str | None = None) -> GroundControl:
     """Read surveyed points and where the images show them, in the CRS of the cameras.
 
     Stated standard deviations along x and y are taken over unturned, whatever the angle between the

@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from pcfix.errors import GeometryError, InputError, SettingError
 from pcfix.grid.lattice import Lattice, Window
-from pcfix.io.files import AnyPath, check_input, check_output, replaced_when_whole
+from pcfix.io.files import check_input, check_output, replaced_when_whole
 from pcfix.model import FloatArray
+from pcfix.options.declare import File
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -40,14 +41,14 @@ class Raster(NamedTuple):
     nodata: float | None
 
 
-def read_raster(path: AnyPath) -> Raster:
+def read_raster(path: File) -> Raster:
     """Return a whole raster of any format that GDAL reads; see `open_raster`."""
     with open_raster(path) as source:
         return Raster(source.read(), source.transform, source.crs, source.nodata)
 
 
 @contextmanager
-def open_raster(path: AnyPath) -> Iterator[DatasetReader]:
+def open_raster(path: File) -> Iterator[DatasetReader]:
     """Open a raster to read parts of it.
 
     An `InputError` if there is no such file, or it is none.
@@ -94,7 +95,7 @@ def _slices(window: Window) -> tuple[tuple[int, int], tuple[int, int]]:
     return (window.row, window.row_stop), (window.column, window.column_stop)
 
 
-def check_tif(path: AnyPath, *, overwrite: bool, inputs: Iterable[AnyPath] = ()) -> Path:
+def check_tif(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:
     """Return the path of a GeoTIFF that may be written, by its suffix and `check_output`."""
     target = check_output(path, overwrite=overwrite, inputs=inputs)
     if target.suffix.lower() not in _SUFFIXES:

@@ -12,9 +12,10 @@ import laspy
 import numpy as np
 from pyproj import CRS
 
-from pcfix.io.files import AnyPath, check_output, write_bytes
+from pcfix.io.files import check_output, write_bytes
 from pcfix.io.las.writing import LasSink
 from pcfix.model import BATHYMETRIC_POINT, Cameras, FloatArray, IntArray, Views
+from pcfix.options.declare import File
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ OTHERS = {
 _FINE_GSD_M = 0.005  # clouds of finer images get steps of 0.1 mm
 
 
-def write_scene(scene: Scene, out_dir: AnyPath, *, overwrite: bool) -> None:
+def write_scene(scene: Scene, out_dir: File, *, overwrite: bool) -> None:
     """Write `FILES`, and those of `OTHERS` that the scene has, into a folder, made if need be.
 
     A `SettingError` if one of them exists and `overwrite` is not set; then none is written.

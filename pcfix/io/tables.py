@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.io.files import AnyPath, check_input
+from pcfix.io.files import check_input
 from pcfix.model import FloatArray
+from pcfix.options.declare import File
 
 DEPTH_SPELLINGS = {
     "x": ("x", "easting", "east"),
@@ -167,7 +168,7 @@ class CheckDepths:
         return f"{self.name}: line {self.line[row]} ({self.xy[row, 0]:.2f}, {self.xy[row, 1]:.2f})"
 
 
-def read_check_depths(path: AnyPath) -> CheckDepths:
+def read_check_depths(path: File) -> CheckDepths:
     """Read check depths from a table with a header line.
 
     An `InputError` if there is no such file, a column is missing, not in metres or there twice, a

@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.io.files import AnyPath, check_input, read_json
+from pcfix.io.files import check_input, read_json
 from pcfix.io.labels import match_labels
 from pcfix.io.tables import read_table
 from pcfix.model import FloatArray
+from pcfix.options.declare import File
 
 IMAGES = (".jpg", ".jpeg", ".tif", ".tiff", ".png", ".webp", ".heic", ".dng")
 _EXIF_DATE = re.compile(r"^(\d{4}):(\d\d):(\d\d)\b")
@@ -37,7 +38,7 @@ class ImageTimes(NamedTuple):
     name: str
 
 
-def read_image_times(path: AnyPath, labels: Sequence[str]) -> ImageTimes:
+def read_image_times(path: File, labels: Sequence[str]) -> ImageTimes:
     """Find out when images were taken.
 
     An `InputError` if the time of an image is not there, or some have a zone and some not.
@@ -174,7 +175,7 @@ class TideTable(NamedTuple):
     name: str
 
 
-def read_tide(path: AnyPath) -> TideTable:
+def read_tide(path: File) -> TideTable:
     """Read a table with the columns ``time`` (ISO 8601) and ``level_m``.
 
     An `InputError` if a time or level is not one, times do not increase, or some have a zone and

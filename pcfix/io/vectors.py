@@ -16,10 +16,11 @@ import shapely
 
 from pcfix.errors import InputError, SettingError
 from pcfix.io.crs import parse_crs
-from pcfix.io.files import AnyPath, check_input
+from pcfix.io.files import check_input
 from pcfix.io.tables import Table, read_lines, split_header, table_below
 from pcfix.io.transformations import LOCAL, way_to_cloud
 from pcfix.model import FloatArray
+from pcfix.options.declare import File
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -82,12 +83,12 @@ class Vectors:
         return np.asarray(shapely.get_coordinates(self.geometries, include_z=True), np.float64)
 
 
-def is_vector_file(path: AnyPath) -> bool:
+def is_vector_file(path: File) -> bool:
     """Whether the name of a file, with or without a layer, is one that `read_vectors` reads."""
     return Path(_split_layer(path)[0]).suffix.lower() in (*GDAL_SUFFIXES, *TEXT_SUFFIXES)
 
 
-def read_vectors(path: AnyPath, *, crs: str | None = None) -> Vectors:
+def read_vectors(path: File, *, crs: str | None = None) -> Vectors:
     """Read one layer of a vector file, in its own CRS.
 
     Parameters
@@ -162,7 +163,7 @@ def _moved(geometries: npt.NDArray[Any], forward: Callable[[FloatArray], FloatAr
     return np.where(shapely.has_z(geometries), moved, shapely.force_2d(moved))
 
 
-def _split_layer(path: AnyPath) -> tuple[str, str | None]:
+def _split_layer(path: File) -> tuple[str, str | None]:
     """Return the file and the layer of ``file|layername=layer``, as QGIS writes it."""
     file, _, layer = str(path).partition(LAYER_MARK)
     return file, layer.removeprefix("layername=") or None
@@ -332,7 +333,7 @@ class WaterPolygons(NamedTuple):
 
 
 def read_shoreline(
-    path: AnyPath, cloud_crs: str | CRS | None = None, *, crs: str | None = None
+    path: File, cloud_crs: str | CRS | None = None, *, crs: str | None = None
 ) -> Shoreline:
     """Read shoreline points, from points, lines and rings of polygons, holes included.
 
@@ -387,7 +388,7 @@ def _vertices(geometries: npt.NDArray[Any]) -> FloatArray:
     return np.asarray(np.delete(xyz, again, axis=0), np.float64)
 
 
-def read_water_polygons(path: AnyPath, cloud_crs: str | CRS | None = None) -> WaterPolygons:
+def read_water_polygons(path: File, cloud_crs: str | CRS | None = None) -> WaterPolygons:
     """Read the polygons inside which points may be submerged, as one area.
 
     An `InputError` if there is no polygon with an area, or they cannot be read or brought to the

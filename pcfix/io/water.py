@@ -20,9 +20,10 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
-from pcfix.io.files import AnyPath, check_input
+from pcfix.io.files import check_input
 from pcfix.io.water_rasters import read_water_raster
 from pcfix.model import FloatArray, IntArray, WaterDimension, WaterMesh, WaterPlane, WaterSurface
+from pcfix.options.declare import File
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -43,7 +44,7 @@ LEAST_FACET_M2 = 1e-6
 
 
 def read_water(
-    spec: float | AnyPath,
+    spec: float | File,
     cloud_crs: str | CRS | None = None,
     bounds: tuple[float, float, float, float] | None = None,
 ) -> WaterSurface:

@@ -15,10 +15,10 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.crs import is_local, metres_up, parse_crs, parts
-from pcfix.io.files import AnyPath
 from pcfix.io.rasters import open_raster, place_of, read_masked
 from pcfix.io.transformations import Points, transformation_in_plan, way_to_cloud
 from pcfix.model import FloatArray, WaterRaster
+from pcfix.options.declare import File
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -43,7 +43,7 @@ _AT_ONCE = 1_000_000
 
 
 def read_water_raster(
-    path: AnyPath,
+    path: File,
     cloud_crs: str | CRS | None = None,
     bounds: Bounds | None = None,
 ) -> WaterRaster:

@@ -166,21 +166,23 @@ def port_views(
         In the order of the cameras, or of `views`.
     """
     limit = settings.max_angle
-    count = np.zeros(len(xyz) + 1, np.int64)
+    count, none = np.zeros(len(xyz) + 1, np.int64), np.zeros(0, np.int64)
     common = (
         spatial_order(xyz),
         np.ascontiguousarray(xyz),
         rig_of(cameras, port, settings),
         frames_of(cameras) if views is None else no_frames(len(cameras)),
-        None if views is None else (views.start, views.camera),
+        (none, none)
+        if views is None
+        else (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)),
         (
             0.0 if limit is None else float(np.cos(np.radians(limit))),
             settings.max_cameras or ANY_NUMBER,
         ),
-        None if shift_m is None else np.ascontiguousarray(shift_m),
+        np.zeros((0, 3)) if shift_m is None else np.ascontiguousarray(shift_m),
     )
     with one_caller():
-        _choose(*common, count, np.zeros(0, np.int64))
+        _choose(*common, count, none)
         start = np.cumsum(count)
         chosen = np.empty(start[-1], np.int64)
         _choose(*common, start, chosen)
@@ -200,24 +202,27 @@ def rotations_of(cameras: Cameras) -> FloatArray:
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _choose(
     order: IntArray, xyz: FloatArray, rig: Rig, frames: Frames,
-    views: tuple[IntArray, IntArray] | None, limits: tuple[float, int], shift: FloatArray | None,
+    views: tuple[IntArray, IntArray], limits: tuple[float, int], shift: FloatArray,
     start: IntArray, chosen: IntArray,
 ) -> None:  # fmt: skip
-    """Fill in the cameras of point i from ``start[i]``; without room count to ``start[i + 1]``."""
+    """Fill in the cameras of point i from ``start[i]``; without room count to ``start[i + 1]``.
+
+    Views and shifts are empty where there are none.
+    """
     for t in prange((len(xyz) + TILE - 1) // TILE):
         rows = order[t * TILE : (t + 1) * TILE]
         near = rows[:0]
-        if views is None:
+        if not views[0].size:
             low, high = _box(xyz, rows, shift)
             near = near_cameras(frames, rig.centres, low, high)
         for i in rows:
             candidates = near
-            if views is not None:
-                candidates = views[1][views[0][i] : views[0][i + 1]].astype(np.int64)
+            if views[0].size:
+                candidates = views[1][views[0][i] : views[0][i + 1]]
             place = row_of(xyz, i)
-            if shift is not None:
+            if shift.size:
                 place = plus(place, row_of(shift, i))
-            kept = _usable(candidates, place, rig, frames, limits, shift is not None)
+            kept = _usable(candidates, place, rig, frames, limits, shift.size > 0)
             if chosen.size:
                 chosen[start[i] : start[i] + kept.size] = kept
             else:
@@ -225,9 +230,7 @@ def _choose(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _box(
-    xyz: FloatArray, rows: IntArray, shift: FloatArray | None
-) -> tuple[FloatArray, FloatArray]:
+def _box(xyz: FloatArray, rows: IntArray, shift: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the corners of an upright box around points; with shifts, a wide one around both.
 
     A straight line to the true point leaves the frame where the bent light may still be in it, by
@@ -236,7 +239,7 @@ def _box(
     low, high, wide = xyz[rows[0]].copy(), xyz[rows[0]].copy(), 0.0
     for i in rows:
         for axis in range(3):
-            moved = 0.0 if shift is None else shift[i, axis]
+            moved = shift[i, axis] if shift.size else 0.0
             low[axis] = min(low[axis], xyz[i, axis] + min(moved, 0.0))
             high[axis] = max(high[axis], xyz[i, axis] + max(moved, 0.0))
             wide = max(wide, abs(moved))

@@ -138,7 +138,10 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     if pairs is None and matcher is None:
         raise ValueError("pairs or a model of the matcher are needed")
     made = cameras if batch.made_with is None else batch.made_with.cameras
-    listed = None if pairs is None else (pairs.start, np.asarray(pairs.camera, np.int64))
+    none = np.zeros(0, np.int64)
+    listed = (none, none)
+    if pairs is not None:
+        listed = np.asarray(pairs.start, np.int64), np.asarray(pairs.camera, np.int64)
     matched = np.zeros((0, 0), np.int64) if matcher is None else matcher.matched
     used, result = np.zeros(len(batch.rays.camera), np.bool_), np.zeros((len(batch), _WIDTH))
     both = images_of(batch.made_with, cameras)
@@ -155,10 +158,13 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _invert(
-    points: Chosen, optics: Optics, both: Images, listed: tuple[IntArray, IntArray] | None,
+    points: Chosen, optics: Optics, both: Images, listed: tuple[IntArray, IntArray],
     matched: IntArray, used: BoolArray, result: FloatArray,
 ) -> None:  # fmt: skip
-    """Correct every point on its own; a block of them shares the memory for rays and pairs."""
+    """Correct every point on its own; a block of them shares the memory for rays and pairs.
+
+    Without listed pairs, which are empty then, they are those of `matched`.
+    """
     start = points.start
     for block in prange((len(points.xyz) + _BLOCK - 1) // _BLOCK):
         images = _Images(optics, both, points.n)
@@ -168,7 +174,7 @@ def _invert(
             count = start[i + 1] - start[i]
             most = max(most, count)
             room = count * matched.shape[1]
-            if listed is not None:
+            if listed[0].size:
                 room = (listed[0][i + 1] - listed[0][i]) // 2
             most_pairs = max(most_pairs, room)
         rays, place = np.empty((most, _RAY_WIDTH)), np.full(len(points.centres), -1)
@@ -179,7 +185,7 @@ def _invert(
             for j in range(cameras.size):
                 place[cameras[j]] = j
                 _begin(rays[j], points, i, cameras[j], images)
-            if listed is not None:
+            if listed[0].size:
                 entries = listed[1][listed[0][i] : listed[0][i + 1]]
                 count = _listed_pairs(pairs, entries, place)
             else:

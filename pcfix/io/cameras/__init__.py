@@ -7,7 +7,6 @@ entry of `FORMATS`, from which its line in README.md of this folder follows.
 
 from __future__ import annotations
 
-import os
 import warnings
 from pathlib import Path
 
@@ -29,6 +28,7 @@ from pcfix.io.cameras import (
 from pcfix.io.cameras.formats import Angles, CameraFormat, Source, SparseReader
 from pcfix.io.files import check_input
 from pcfix.model import Cameras, TiePoints
+from pcfix.options.declare import File
 
 FORMATS = (
     CameraFormat(
@@ -68,8 +68,8 @@ table says least of all."""
 
 
 def read_cameras(
-    path: str | os.PathLike[str],
-    sensor: str | os.PathLike[str] | None = None,
+    path: File,
+    sensor: File | None = None,
     *,
     angles: Angles | None = None,
 ) -> Cameras:
@@ -127,7 +127,7 @@ def read_cameras(
     return cameras
 
 
-def read_tie_points(path: str | os.PathLike[str], cameras: Cameras) -> TiePoints:
+def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
     """Read the tie points of a sparse model, in the frame of the file.
 
     Parameters
@@ -153,7 +153,7 @@ def read_tie_points(path: str | os.PathLike[str], cameras: Cameras) -> TiePoints
 
 
 def _recognised(
-    path: str | os.PathLike[str], sensor: str | os.PathLike[str] | None, angles: Angles | None
+    path: File, sensor: File | None, angles: Angles | None
 ) -> tuple[Source, CameraFormat]:
     where = Path(path)
     source = Source(

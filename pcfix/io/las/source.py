@@ -22,8 +22,9 @@ from laspy.vlrs.vlrlist import VLRList
 
 from pcfix.errors import InputError
 from pcfix.io.crs import METRES
-from pcfix.io.files import AnyPath, check_input
+from pcfix.io.files import check_input
 from pcfix.model import FloatArray
+from pcfix.options.declare import File
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -153,7 +154,7 @@ class LasSource:
     what laspy would not.
     """
 
-    def __init__(self, path: AnyPath, jobs: int | None = None) -> None:
+    def __init__(self, path: File, jobs: int | None = None) -> None:
         """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable."""
         self.path = check_input(path)
         with las_errors(self.path):
@@ -232,7 +233,7 @@ def coordinates(points: laspy.ScaleAwarePointRecord) -> FloatArray:
     return xyz
 
 
-def centring_steps(path: AnyPath, jobs: int | None = None) -> tuple[int, ...]:
+def centring_steps(path: File, jobs: int | None = None) -> tuple[int, ...]:
     """Return by how many steps each integer axis must be moved to have its middle at zero."""
     with LasSource(path, jobs) as source:
         bounds = [
@@ -243,7 +244,7 @@ def centring_steps(path: AnyPath, jobs: int | None = None) -> tuple[int, ...]:
     return tuple((-(low + high) // 2).tolist())
 
 
-def read_xyz(path: AnyPath) -> FloatArray:
+def read_xyz(path: File) -> FloatArray:
     """Return all coordinates of a cloud that fits in memory, shape (n, 3), metres."""
     with LasSource(path) as source:
         return np.vstack([coordinates(points) for points in source.chunks()])

@@ -13,11 +13,12 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from pcfix.io.files import AnyPath, check_input
+from pcfix.io.files import check_input
 from pcfix.io.views.lists import ImageOrder, RawList, ViewList, read_list, tracks_as_list
 from pcfix.io.views.matching import ViewMatch, ViewReport, spacing_m
 from pcfix.io.views.orders import fitted, image_orders
 from pcfix.model import Cameras, FloatArray, TiePoints
+from pcfix.options.declare import File
 
 __all__ = ["ViewList", "ViewMatch", "ViewReport", "read_views", "track_views"]
 
@@ -29,9 +30,7 @@ point's images at any distance up to two spacings, so that a tie point speaks fo
 as a dense point does not."""
 
 
-def read_views(
-    path: AnyPath, cameras: Cameras, *, to_cloud: Transformation | None = None
-) -> ViewList:
+def read_views(path: File, cameras: Cameras, *, to_cloud: Transformation | None = None) -> ViewList:
     """Read the view list of a dense cloud.
 
     An `InputError` if the file is not a whole view list, names images that are not there, or its

@@ -8,7 +8,6 @@ points in the order of the tie points. Positions are written minus an offset, wh
 
 from __future__ import annotations
 
-import os
 import struct
 from pathlib import Path
 from typing import NamedTuple
@@ -21,6 +20,7 @@ from pcfix.io.cameras.colmap import FILE, place_text
 from pcfix.io.cameras.colmap.files import BY_NAME, MODELS, OBSERVATION, SHAPES, Camera, lens
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
+from pcfix.options.declare import File
 
 PREFERRED = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
@@ -55,7 +55,7 @@ class Block(NamedTuple):
 
 
 def write_colmap(
-    folder: str | os.PathLike[str],
+    folder: File,
     cameras: Cameras,
     tie_points: TiePoints | None = None,
     *,

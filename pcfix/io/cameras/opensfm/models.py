@@ -16,7 +16,6 @@ Cameras in no CRS keep their numbers, and no reference is written. The file of t
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Iterator
 from dataclasses import astuple, replace
@@ -42,6 +41,7 @@ from pcfix.io.crs import (
 )
 from pcfix.io.transformations import transformation_in_plan, transformation_in_space
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, Projection, TiePoints
+from pcfix.options.declare import File
 
 PANORAMAS = frozenset({"equirectangular", "spherical"})
 
@@ -115,7 +115,7 @@ FEATURE_SCALE = 0.001
 
 
 def write_opensfm(
-    path: str | os.PathLike[str],
+    path: File,
     cameras: Cameras,
     tie_points: TiePoints | None = None,
 ) -> None:

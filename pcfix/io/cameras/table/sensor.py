@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
 from pcfix.io.tables import Table, read_lines, read_table, split_header
 from pcfix.model import Cameras, Lens
+from pcfix.options.declare import File
 
 MILLIMETRES = ("focal", "sensor_x", "sensor_y")
 PIXELS = ("focal_px", "width_px", "height_px")
@@ -158,7 +158,7 @@ POSE = ("label", "x", "y", "z", "qw", "qx", "qy", "qz")
 OWN = ("f", "px", "py", *DISTORTION)
 
 
-def write_table(folder: str | os.PathLike[str], cameras: Cameras) -> None:
+def write_table(folder: File, cameras: Cameras) -> None:
     """Write ``cameras.csv`` and ``sensor.csv``.
 
     Parameters
