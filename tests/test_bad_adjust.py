@@ -16,6 +16,7 @@ from pcfix import cli
 from pcfix.io.cameras.colmap.writing import write_colmap
 from tests.test_bad_input import listing
 from tests.utils.adjust_files import EPSG, write_block, write_gcps, write_gnss
+from tests.utils.nightly import mostly_nightly
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -111,7 +112,7 @@ def drowned(tmp_path_factory: pytest.TempPathFactory) -> Files:
     return write_block(tmp_path_factory.mktemp("drowned"), points=900, bed="flat")
 
 
-@pytest.mark.parametrize("free", ["level", "level,tilt,index"])
+@pytest.mark.parametrize("free", mostly_nightly(["level", "level,tilt,index"], "level"))
 def test_a_block_all_under_water_with_the_water_free(refuse, folder, drowned, free):
     for name in ("model", "gnss.csv", "cloud.las"):
         here, there = folder / name, drowned.folder / name

@@ -26,6 +26,7 @@ from tests.utils.clouds import (
     random_cloud,
     write_cloud,
 )
+from tests.utils.nightly import mostly_nightly
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -558,7 +559,9 @@ PROCESSES = {
 }
 
 
-@pytest.mark.parametrize("case", PROCESSES)
+@pytest.mark.parametrize(
+    "case", mostly_nightly(PROCESSES, "missing input", "garbage mesh", "never corrected")
+)
 def test_a_process_refuses_tidily(folder: Path, case: str) -> None:
     arguments, word = PROCESSES[case]
     (folder / "text.las").write_text("x y z\n")
@@ -575,7 +578,7 @@ def test_a_process_refuses_tidily(folder: Path, case: str) -> None:
     assert listing(folder) == before
 
 
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize("suffix", mostly_nightly([".las", ".laz"], ".laz"))
 @pytest.mark.parametrize(("count", "limit"), [(300, 2000), (3000, 60_000)], ids=["end", "middle"])
 def test_a_full_disk_leaves_nothing_behind(
     folder: Path, count: int, limit: int, suffix: str

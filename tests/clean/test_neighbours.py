@@ -11,6 +11,7 @@ from pcfix.clean.points import Reason, clean_points
 from pcfix.io.water import load_open3d
 from pcfix.options.steps import CleanRules
 from tests.clean.scenes import spoilt_scene
+from tests.utils.nightly import mostly_nightly
 
 K = 12
 
@@ -55,7 +56,7 @@ def _quartiles(xyz: np.ndarray, tile_m: float) -> np.ndarray:
     return out
 
 
-@pytest.mark.parametrize("make", [_clustered, _lattice])
+@pytest.mark.parametrize("make", mostly_nightly([_clustered, _lattice], _clustered))
 def test_statistics_are_those_of_all_pairs_and_of_any_tiles(make) -> None:
     xyz = make()
     twin_mean = np.sort(_pairs(xyz, 3), axis=1)[:, :K].mean(axis=1)
@@ -101,7 +102,7 @@ def test_points_over_each_other_are_bounded(monkeypatch: pytest.MonkeyPatch) -> 
     assert (upper > lower).all()
 
 
-@pytest.mark.parametrize("tile_m", [8.0, 31.0, 400.0])
+@pytest.mark.parametrize("tile_m", mostly_nightly([8.0, 31.0, 400.0], 8.0))
 def test_reasons_do_not_depend_on_tiles(tile_m: float) -> None:
     s = spoilt_scene()
     settings = CleanRules(deviations=2.0, radius=1.0)
@@ -112,7 +113,7 @@ def test_reasons_do_not_depend_on_tiles(tile_m: float) -> None:
         assert (whole & reason).any()
 
 
-@pytest.mark.parametrize("deviations", [0.5, 2.0, 4.0])
+@pytest.mark.parametrize("deviations", mostly_nightly([0.5, 2.0, 4.0], 2.0))
 @pytest.mark.parametrize("k", [8, 20])
 def test_statistical_outliers_are_those_of_open3d(deviations: float, k: int) -> None:
     o3d, xyz = load_open3d(), spoilt_scene().xyz

@@ -15,6 +15,7 @@ from pcfix.refract.matcher import matcher_of
 from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
+from tests.utils.nightly import mostly_nightly
 from tests.utils.shared import needs
 
 RENDERED, rendered = needs("rendered_a")
@@ -38,7 +39,7 @@ BLOCKS = {
 }
 
 
-@pytest.mark.parametrize("block", BLOCKS)
+@pytest.mark.parametrize("block", mostly_nightly(BLOCKS, "obliques"))
 @pytest.mark.parametrize("cloud", ["tracks", "depth-maps"])
 def test_a_simulated_list_is_told(cloud, block):
     scene, rows = under_water(cloud, **BLOCKS[block])

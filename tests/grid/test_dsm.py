@@ -20,6 +20,7 @@ from pcfix.io.las import source
 from pcfix.io.rasters import read_raster
 from pcfix.report.text import dsm_text
 from tests.grid.clouds import EAST, NORTH, awkward, scattered, write
+from tests.utils.nightly import mostly_nightly
 from tests.utils.shared import ROOT
 
 SCENE = ROOT / "samples" / "scene"
@@ -45,8 +46,8 @@ SIZES = {
 
 
 @pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
-@pytest.mark.parametrize("fill", [None, 2.0])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("fill", mostly_nightly([None, 2.0], 2.0))
+@pytest.mark.parametrize("method", mostly_nightly(METHODS, "median", "idw", "tin"))
 def test_no_seams(awkward_cloud, tmp_path, monkeypatch, method, fill):
     """Chunks, squares of the store and windows of any size give the same raster, bit by bit."""
 

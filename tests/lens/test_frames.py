@@ -13,6 +13,7 @@ from pcfix.lens.frames import ALL, NOT_DISTORTED, NOTHING, frames_of, holds, jud
 from pcfix.lens.imaging import project
 from pcfix.refract.intersect import TILE
 from tests.refract.test_kernels import interpreted_environment, same
+from tests.utils.nightly import mostly_nightly
 from tests.utils.twins import image_slowly
 
 N = 5 * TILE + 17
@@ -87,7 +88,7 @@ def views_slowly(points, cameras):
     return pcfix.Views(start, np.array([c for r in rows for c in r], np.int64))
 
 
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("name", mostly_nightly(LENSES, "everything", "fisheye"))
 def test_slow_twin_agrees_point_by_point(name, points):
     cameras = block(LENSES[name])
     some = points if name != "inverse" else points[: 2 * TILE]  # its twin is very slow
@@ -124,7 +125,7 @@ def boxes(rng, count=400):
     return middle - half, middle + half
 
 
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("name", mostly_nightly(LENSES, "everything", "fisheye"))
 def test_tiles_are_never_judged_wrongly(name):
     rng = np.random.default_rng(5)
     cameras = block(LENSES[name], k=8, seed=3)

@@ -13,6 +13,7 @@ from pcfix.model import WaterPlane
 from pcfix.water.fit import fit_water, heights_from_cloud, is_near
 from pcfix.water.river import fit_river, flow_axis
 from pcfix.water.surface import surface_above
+from tests.utils.nightly import mostly_nightly
 
 UTM = np.array([512_345.0, 4_987_654.0])
 
@@ -42,7 +43,7 @@ def least_squares(points, places):
     return np.column_stack([np.ones(len(places)), places - middle]) @ beta
 
 
-@pytest.mark.parametrize("noise_m", [0.02, 0.03])
+@pytest.mark.parametrize("noise_m", mostly_nightly([0.02, 0.03], 0.02))
 def test_outliers_cost_nothing_against_least_squares_that_knows_them(noise_m):
     error, known, masks = [], [], 0
     for seed in range(60):
@@ -78,7 +79,7 @@ def test_standard_errors_are_what_the_errors_are():
     assert np.mean(levels) == pytest.approx(0.025 / math.sqrt(32), rel=0.1)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.4])
+@pytest.mark.parametrize("share", mostly_nightly([0.0, 0.3, 0.4], 0.4))
 def test_up_to_two_fifths_may_be_wrong(share):
     for seed in range(20):
         points, corners, true, _ = reach(seed, share=share, n=40)
@@ -267,7 +268,10 @@ def bounds_of(places, margin=10.0):
     return (*(places.min(axis=0) - margin), *(places.max(axis=0) + margin))
 
 
-@pytest.mark.parametrize(("n", "rms_m", "worst_m"), [(80, 0.05, 0.30), (300, 0.02, 0.15)])
+@pytest.mark.parametrize(
+    ("n", "rms_m", "worst_m"),
+    mostly_nightly([(80, 0.05, 0.30), (300, 0.02, 0.15)], (300, 0.02, 0.15)),
+)
 def test_a_winding_river_with_riffles_and_a_weir(n, rms_m, worst_m):
     """More than 10 m from the weir; the worst is at the ends of riffles, between points."""
     for seed in range(6):
