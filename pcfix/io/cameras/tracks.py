@@ -67,7 +67,7 @@ def point_list(path: Path, body: FloatArray, count: int, images: int, width: int
 
 def _starts(path: Path, body: FloatArray, count: int, width: int) -> tuple[IntArray, IntArray]:
     """Return where each point begins, and how many views it has."""
-    first, views = np.empty((2, count), np.int64)
+    found: list[tuple[int, int]] = []  # grows with the file, not with what that announces
     at = 0
     for i in range(count):
         n = float(body[at + _BEFORE_VIEWS - 1]) if at + _BEFORE_VIEWS <= len(body) else 0.5
@@ -75,8 +75,9 @@ def _starts(path: Path, body: FloatArray, count: int, width: int) -> tuple[IntAr
             raise InputError(
                 f"{path}: is cut off or damaged at point {i} of {count}; export it again."
             )
-        first[i], views[i] = at, int(n)
+        found.append((at, int(n)))
         at += _BEFORE_VIEWS + width * int(n)
+    first, views = np.array(found, np.int64).reshape(-1, 2).T
     return first, views
 
 
