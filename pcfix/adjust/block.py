@@ -145,12 +145,12 @@ def columns_of(
     pivot: FloatArray,
 ) -> Columns:
     """Return the columns of the free parameters of each group, the water's and a similarity's."""
-    lens = np.concatenate([[0], np.cumsum([len(mine) for mine in codes])]).astype(np.int64)
+    lens = np.concatenate([[0], np.cumsum([len(one) for one in codes])]).astype(np.int64)
     place = np.full(4, -1, np.int64)
     free = np.flatnonzero(water)
     place[free] = lens[-1] + np.arange(len(free))
     first = int(lens[-1]) + len(free)
-    flat = np.array([code for mine in codes for code in mine], np.int64)
+    flat = np.array([code for of_sensor in codes for code in of_sensor], np.int64)
     return Columns(lens, flat, place, first if similarity else -1, first + 7 * similarity, pivot)
 
 

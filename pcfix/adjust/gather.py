@@ -294,8 +294,8 @@ def with_places(ties: TiePoints, cameras: Cameras) -> TiePoints:
     owner = np.repeat(np.arange(len(lost)), np.diff(some.views.start))
     ray = np.full((len(owner), 3), np.nan)
     for c in np.unique(some.views.camera):
-        mine = some.views.camera == c
-        ray[mine] = unproject(cameras.lenses[c], some.image_xy[mine]) @ cameras.rotations[c]
+        entries = some.views.camera == c
+        ray[entries] = unproject(cameras.lenses[c], some.image_xy[entries]) @ cameras.rotations[c]
     across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
     middle = cameras.centres.mean(axis=0)
     centre = cameras.centres[some.views.camera] - middle
@@ -341,9 +341,9 @@ def ties_of_cloud(xyz: FloatArray, views: Views, cameras: Cameras) -> TiePoints:
     owner = np.repeat(np.arange(len(xyz)), np.diff(views.start))
     image = np.empty((len(owner), 2))
     for c in range(len(cameras)):
-        mine = views.camera == c
-        ahead = (xyz[owner[mine]] - cameras.centres[c]) @ cameras.rotations[c].T
-        image[mine] = project(cameras.lenses[c], ahead)
+        entries = views.camera == c
+        ahead = (xyz[owner[entries]] - cameras.centres[c]) @ cameras.rotations[c].T
+        image[entries] = project(cameras.lenses[c], ahead)
     seen = np.isfinite(image).all(axis=1)
     counts = np.bincount(owner[seen], minlength=len(xyz))
     start = np.concatenate([[0], np.cumsum(counts)])

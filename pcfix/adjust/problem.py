@@ -135,7 +135,7 @@ def prepare(block: Block, unknowns: Unknowns) -> tuple[Problem, Solution]:
         raise GeometryError("an adjustment needs cameras with angles and lenses.")
     origin = np.round(cameras.centres.mean(axis=0))
     group, groups = sensor_groups(cameras.lenses)
-    codes = [usable_codes(cameras.lenses[mine[0]], unknowns.lens) for mine in groups]
+    codes = [usable_codes(cameras.lenses[images[0]], unknowns.lens) for images in groups]
     plane = isinstance(block.water, WaterPlane) or block.water is None
     if unknowns.tilt_sigma and not plane:
         raise GeometryError("the tilt of the water can be free for a level or plane only.")

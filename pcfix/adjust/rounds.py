@@ -169,8 +169,8 @@ def _of_ties(problem: Problem) -> BoolArray:
 def with_sigma(problem: Problem, sigma_px: float) -> Problem:
     """Return the problem with another standard deviation of the tie points."""
     weight = problem.seen.weight.copy()
-    mine = _of_ties(problem) & (weight > 0.0)
-    weight[mine] = 1.0 / sigma_px
+    tie_rows = _of_ties(problem) & (weight > 0.0)
+    weight[tie_rows] = 1.0 / sigma_px
     return replace(problem, seen=problem.seen._replace(weight=weight))
 
 

@@ -297,14 +297,14 @@ def _lens(a: Adjusted) -> list[Plain]:
     old, new = a.block.cameras.lenses or (), a.cameras.lenses or ()
     _, groups = sensor_groups(old)
     rows = []
-    for place, mine in enumerate(groups, start=1):
-        first, after = old[mine[0]], new[mine[0]]
+    for place, images in enumerate(groups, start=1):
+        first, after = old[images[0]], new[images[0]]
         for code in usable_codes(first, a.unknowns.lens):
             unknown = NAMES[code] if len(groups) == 1 else f"{NAMES[code]} of sensor {place}"
             rows.append({
                 "sensor": first.sensor or f"sensor {place}",
-                "images": len(mine),
-                "lenses": len({old[i] for i in mine}),
+                "images": len(images),
+                "lenses": len({old[i] for i in images}),
                 "name": NAMES[code],
                 "before": lens_parameter(first, code),
                 "after": lens_parameter(after, code),

@@ -294,12 +294,12 @@ def _check_kinds(source: CRS, cloud: CRS, name: str) -> None:
 
 def _height_notes(source: CRS, cloud: CRS, name: str) -> tuple[str, ...]:
     """Return what is taken for granted about heights."""
-    own, theirs = heights_of(source), heights_of(cloud)
-    if own == "unstated" and theirs != "unstated":
+    own, of_cloud = heights_of(source), heights_of(cloud)
+    if own == "unstated" and of_cloud != "unstated":
         return (
             f"{name}: does not say what its heights are; taken to be the cloud's ({cloud.name}).",
         )
-    if own == "ellipsoidal" and theirs == "unstated":
+    if own == "ellipsoidal" and of_cloud == "unstated":
         return (
             f"{name}: has ellipsoidal heights ({source.name}), and the cloud's CRS ({cloud.name})"
             " does not say what its own are; taken to be the same.",

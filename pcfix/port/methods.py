@@ -28,8 +28,8 @@ def correct_through_port(
     """
     parts, order = [], spatial_order(xyz)
     for rows in batches(order):
-        mine = None if views is None else views.take(rows)
-        found, chosen = intersect_through_port(xyz[rows], cameras, port, settings, mine)
+        own_views = None if views is None else views.take(rows)
+        found, chosen = intersect_through_port(xyz[rows], cameras, port, settings, own_views)
         covariance = port_covariances(xyz[rows] + found.shift_m, chosen, cameras, port, settings)
         covariance[found.outcome != Outcome.CORRECTED] = 0.0
         sigma_z = np.sqrt(covariance[:, 5])

@@ -161,14 +161,14 @@ def _scores(
     k = len(centres)
     score = np.zeros((k, k))
     for i in prange(k):
-        mine = place[start[i] : start[i + 1]]
+        seen = place[start[i] : start[i + 1]]
         covered = np.zeros(CELLS * CELLS, np.bool_)
         for j in range(k):
             if j == i:
                 continue
             covered[:] = False
             total, angles, scales, common = 0.0, 0.0, 0.0, 0.0
-            for p in mine:
+            for p in seen:
                 if cell[j, p] < 0:
                     continue
                 covered[cell[i, p]] = True
@@ -231,9 +231,9 @@ def steepest_and_partners(
     np.maximum.at(best, owner, steep)
     reference = np.full(len(xyz), -1)
     reference[owner[steep == best[owner]]] = views.camera[steep == best[owner]]
-    mine = reference[owner]
-    partner = (matcher.matched[mine] == np.asarray(views.camera)[:, None]).any(axis=1)
-    kept = partner | (views.camera == mine)
+    seed = reference[owner]
+    partner = (matcher.matched[seed] == np.asarray(views.camera)[:, None]).any(axis=1)
+    kept = partner | (views.camera == seed)
     start = np.concatenate([[0], np.cumsum(np.bincount(owner[kept], minlength=len(xyz)))])
     return Views(start, np.asarray(views.camera)[kept])
 
@@ -360,20 +360,20 @@ def _vote(
             continue
         step = max(WIDTH_M / _STEPS, (high - low) / 2000.0)
         votes = np.zeros(int((high - low) / step) + 2)
-        mine = np.empty(votes.size)
+        vote = np.empty(votes.size)
         for i in rows:
-            mine[:] = 0.0
+            vote[:] = 0.0
             for h in range(likely.shape[1]):
                 if likely[i, h] == likely[i, h]:
-                    _add_vote(mine, (likely[i, h] + z[i] - low) / step)
-            votes += mine
+                    _add_vote(vote, (likely[i, h] + z[i] - low) / step)
+            votes += vote
         found[c] = low + np.argmax(votes) * step
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _add_vote(mine: FloatArray, at: float) -> None:
+def _add_vote(vote: FloatArray, at: float) -> None:
     """Vote once for every height at which a point can be, however many groups say so."""
     reach = int(3.0 * _STEPS)
-    for k in range(max(0, int(at) - reach), min(mine.size, int(at) + reach + 2)):
+    for k in range(max(0, int(at) - reach), min(vote.size, int(at) + reach + 2)):
         off = (k - at) / _STEPS
-        mine[k] = max(mine[k], np.exp(-0.5 * off * off))
+        vote[k] = max(vote[k], np.exp(-0.5 * off * off))

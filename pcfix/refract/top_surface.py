@@ -136,8 +136,8 @@ def _over(low: FloatArray, high: FloatArray, most: int, old: _Cells | None) -> _
     if old is not None:
         row, column = old.first_row - new.first_row, old.first_column - new.first_column
         rows, columns = old.highest.shape
-        for mine, theirs in zip(new[3:], old[3:], strict=True):
-            mine[row : row + rows, column : column + columns] = theirs
+        for target, source in zip(new[3:], old[3:], strict=True):
+            target[row : row + rows, column : column + columns] = source
     return new
 
 

@@ -244,8 +244,8 @@ def _rounds(d: Plain, a: Adjusted) -> list[Picture]:
     number, _, cost, _, _, rms_px = np.array(a.rounds).T
     for axes, values in ((upper, cost), (lower, rms_px)):
         for one in np.unique(number):
-            mine = number == one
-            axes.plot(step[mine], values[mine], "o-", color=AFTER, markersize=3)
+            of_round = number == one
+            axes.plot(step[of_round], values[of_round], "o-", color=AFTER, markersize=3)
         # over several powers of ten, as poor starts have
         if values.min() > 0.0 and values.max() > 20.0 * values.min():
             axes.set_yscale("log")

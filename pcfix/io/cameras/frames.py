@@ -174,20 +174,20 @@ def agree(frame: Frame, target: CRS, stated: Statement) -> bool:
 
 def height_notes(frame: Frame, target: CRS, stated: Statement, name: str) -> tuple[str, ...]:
     """Return what is guessed about heights."""
-    mine, cloud = heights_of(frame.crs), heights_of(target)
+    own, cloud = heights_of(frame.crs), heights_of(target)
     unit, size = plan_unit(frame.crs)
-    if mine == "unstated" and frame.crs.is_projected and size != 1.0:
+    if own == "unstated" and frame.crs.is_projected and size != 1.0:
         return (f"{name}: heights are taken to be in {unit}, as x and y are.",)
     if stated.trusted:
         return ()
-    if mine == "unstated" and cloud != "unstated":
+    if own == "unstated" and cloud != "unstated":
         return (
             f"{name}: does not say what its heights are; taken to be the cloud's ({target.name}).",
         )
     axes = [e.semi_major_metre for e in (frame.crs.ellipsoid, target.ellipsoid) if e is not None]
     other_datum = bool(axes) and max(axes) - min(axes) > 1.0
     is_guess = other_datum or (stated.project is None and not frame.topocentric)
-    if mine == "ellipsoidal" and cloud == "unstated" and is_guess:
+    if own == "ellipsoidal" and cloud == "unstated" and is_guess:
         return (
             f"{name}: the cloud's CRS ({target.name}) does not say what its heights are; taken to"
             f" be ellipsoidal, of {frame.crs.name}.",
