@@ -90,7 +90,7 @@ def test_the_picture_can_be_drawn():
     rng = np.random.default_rng(0)
     for points in (1, 500):
         depth, sigma = rng.uniform(0.0, 8.0, points), rng.uniform(0.01, 0.2, points)
-        assert png_of(tvu_figure(depth, sigma), 40).startswith(b"\x89PNG")
+        assert png_of(tvu_figure(depth, sigma)).startswith(b"\x89PNG")
 
 
 def test_a_run_says_what_it_assumed(tmp_path):

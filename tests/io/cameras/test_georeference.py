@@ -404,14 +404,14 @@ with rasterio.open(folder + "/es_ign_egm08-rednap.tif", "w", driver="GTiff", cou
     out.update_tags(TYPE="VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL", AREA_OR_POINT="Point")
     out.set_band_description(1, "geoid_undulation")
 pyproj.datadir.append_data_dir(folder)
-from pcfix.io.cameras.georeference import bring_to
+from pcfix.io.cameras.georeference import georeference
 from pcfix.model import Cameras
 ecef = [[float(w) for w in sys.argv[2:5]]]
 read = Cameras(("a",), np.array(ecef), np.eye(3)[None], crs="EPSG:4936",
                project_crs="EPSG:25830+5782")
 for cloud in ("EPSG:25830", "EPSG:25830+5782"):
-    found = bring_to(read, cloud)
-    flat = bring_to(read, cloud, cameras_crs="EPSG:25830")
+    found = georeference(read, cloud).cameras(read)
+    flat = georeference(read, cloud, cameras_crs="EPSG:25830").cameras(read)
     turn = flat.rotations[0] @ found.rotations[0].T
     turn_deg = np.degrees(np.linalg.norm(turn - turn.T) / np.sqrt(8))
     print(found.crs, *found.centres[0], turn_deg, found.notes)
