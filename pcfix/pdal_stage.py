@@ -114,8 +114,8 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
     from pcfix.flow.job import Job
     from pcfix.flow.runner import check_summary, write_summary
     from pcfix.io.las.columns import columns_for
+    from pcfix.kernels import threads
     from pcfix.options.correct import CorrectOptions
-    from pcfix.threads import threads
 
     started = time.perf_counter()
     options = _options(namespace, CorrectOptions, needed=("cameras", "water"))

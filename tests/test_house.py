@@ -20,7 +20,7 @@ HOUSE = Path(__file__).parents[1] / "pcfix"
 # lower floors and from its own room. "pcfix" is the front door, pcfix/__init__.py.
 FLOORS = (
     ("version", "errors"),
-    ("threads",),
+    ("kernels",),
     ("options",),
     ("model",),
     ("lens",),
@@ -230,3 +230,28 @@ def test_help_loads_nothing_heavy() -> None:
     )
     assert "Usage" in done.stdout
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+SCALARS = {
+    "float", "int", "bool", "None", "tuple", "Vector", "Symmetric", "Nine", "Path",
+    "Found", "Ray", "Gradients", "Jacobian", "Pyramid", "Seen", "Sight",
+}  # fmt: skip
+
+
+def test_lean_kernels_return_numbers() -> None:
+    """They do not count references to arrays: one that they hand out could be gone by then."""
+    found = []
+    for name, tree in trees().items():
+        for node in tree.body:
+            if not isinstance(node, ast.FunctionDef):
+                continue
+            by = {ast.unparse(decorator) for decorator in node.decorator_list}
+            assert "njit" not in " ".join(by), f"{name}.{node.name}: take pcfix.kernels"
+            returned = (
+                {n.id for n in ast.walk(node.returns) if isinstance(n, ast.Name)}
+                if (node.returns)
+                else set()
+            )
+            if by & {"lean", "inlined"} and not returned <= SCALARS:
+                found.append(f"{name}.{node.name}: {sorted(returned - SCALARS)}")
+    assert not found, "\n".join(found)

@@ -19,10 +19,10 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numba import njit, prange
 
 from pcfix.adjust.gather import some_cameras
 from pcfix.errors import GeometryError, PcfixWarning
+from pcfix.kernels import Span, in_tiles, kernel, lean, most_between
 from pcfix.lens.algebra import (
     dot,
     minus,
@@ -47,7 +47,6 @@ from pcfix.model import (
     Views,
 )
 from pcfix.refract.choice import spatial_order, views_in_frame
-from pcfix.threads import one_caller
 from pcfix.water.surface import SurfaceAbove, is_submerged
 
 Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
@@ -56,8 +55,6 @@ MAX_STEPS = 12
 CLOSE_M = 1e-6
 LEAST_CONDITION = 1e-6
 """Of the determinant of the normal matrix, against the product of its diagonal."""
-
-_BLOCK = 256
 
 
 class Carried(NamedTuple):
@@ -93,8 +90,7 @@ def carry(xyz: FloatArray, views: Views, old: Cameras, new: Cameras) -> Carried:
         )
         for cameras in (old, new)
     )
-    with one_caller():
-        _carry(np.ascontiguousarray(xyz), start, camera, *sides, *found)
+    in_tiles(_carry, len(xyz), np.ascontiguousarray(xyz), start, camera, *sides, *found)
     return found
 
 
@@ -107,31 +103,27 @@ class _Side(NamedTuple):
     lenses: FloatArray
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _carry(
-    xyz: FloatArray, start: IntArray, camera: IntArray, old: _Side, new: _Side,
+    span: Span, xyz: FloatArray, start: IntArray, camera: IntArray, old: _Side, new: _Side,
     shift: FloatArray, moved: BoolArray,
 ) -> None:  # fmt: skip
-    for block in prange((len(xyz) + _BLOCK - 1) // _BLOCK):
-        first, last = block * _BLOCK, min((block + 1) * _BLOCK, len(xyz))
-        most = 1
-        for i in range(first, last):
-            most = max(most, start[i + 1] - start[i])
-        image, who = np.empty((most, 2)), np.empty(most, np.int64)
-        for i in range(first, last):
-            count = 0
-            for j in range(start[i], start[i + 1]):
-                c = camera[j]
-                ahead = times(old.rotations[c], minus(row_of(xyz, i), row_of(old.centres, c)))
-                u, v = image_of(old.lenses[old.row[c]], *ahead)
-                if u == u and v == v:
-                    image[count, 0], image[count, 1], who[count] = u, v, c
-                    count += 1
-            if count >= 2:
-                moved[i] = _meet(shift[i], xyz[i], image[:count], who[:count], new)
+    most = most_between(span, start)
+    image, who = np.empty((most, 2)), np.empty(most, np.int64)
+    for i in range(*span):
+        count = 0
+        for j in range(start[i], start[i + 1]):
+            c = camera[j]
+            ahead = times(old.rotations[c], minus(row_of(xyz, i), row_of(old.centres, c)))
+            u, v = image_of(old.lenses[old.row[c]], *ahead)
+            if u == u and v == v:
+                image[count, 0], image[count, 1], who[count] = u, v, c
+                count += 1
+        if count >= 2:
+            moved[i] = _meet(shift[i], xyz[i], image[:count], who[:count], new)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _meet(shift: FloatArray, xyz: FloatArray, image: FloatArray, who: IntArray, new: _Side) -> bool:
     """Find the shift after which the cameras image the point nearest to the places; whether so."""
     moved, point = (0.0, 0.0, 0.0), vector(xyz)

@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from pcfix.adjust.block import (
     LEAST_SQUARES,
@@ -21,18 +20,18 @@ from pcfix.adjust.block import (
     State,
 )
 from pcfix.adjust.normal import (
-    PARTS,
     Sums,
+    Workspace,
     add_point,
     in_parts,
     inverted,
     linearise,
     normal_equations,
-    part_of,
     point_block,
 )
 from pcfix.adjust.observe import POINT, WIDTH, scratch
 from pcfix.adjust.problem import Problem, Solution, priors_at
+from pcfix.kernels import Span, kernel
 from pcfix.model import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -194,11 +193,14 @@ def point_covariances(equations: Undamped, found: Solution, inverse: FloatArray)
     place[equations.reduced.active] = np.arange(len(equations.reduced.active))
     out = np.full((len(found.state.xyz), 6), np.nan)
     given = problem.given
-    in_parts(_point_covariances, found.state, given, equations.is_fixed, place, inverse, out)
+    fixed = equations.is_fixed, place
+    in_parts(
+        _point_covariances, given.seen, given.columns.total, found.state, given, fixed, inverse, out
+    )
     return out
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _find_fixed(state: State, given: Given, is_fixed: BoolArray) -> None:
     """Find the points whose normal matrix V, priors included, is not singular."""
     room, seen = scratch(), given.seen
@@ -214,17 +216,16 @@ def _find_fixed(state: State, given: Given, is_fixed: BoolArray) -> None:
         is_fixed[p] = inverted(v, FLAT)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _point_covariances(
-    part: int, state: State, given: Given, is_fixed: BoolArray, place: IntArray,
-    inverse: FloatArray, out: FloatArray,
+    span: Span, part: int, state: State, given: Given, fixed: tuple[BoolArray, IntArray],
+    inverse: FloatArray, out: FloatArray, work: Workspace,
 ) -> None:  # fmt: skip
-    g, poses, seen = given.columns.total, 6 * len(state.centres), given.seen
-    first, last, most = part_of(part, PARTS, seen.start)
-    room, own, shared, r = scratch(), np.empty((2, WIDTH)), np.zeros((2, g)), np.empty(2)
-    v, rhs = np.empty((3, 3)), np.zeros(3)
+    g, poses, seen, most = given.columns.total, 6 * len(state.centres), given.seen, len(work.own)
+    room, own, shared, r = work.room, work.own[0], work.shared[0], work.r[0]
+    (is_fixed, place), v, rhs = fixed, work.v, work.rhs
     w, at = np.empty((6 * most + g, 3)), np.empty(6 * most + g, np.int64)
-    for p in range(first, last):
+    for p in range(*span):
         if not is_fixed[p]:
             continue
         v[:], w[:g], at[:g], size = 0.0, 0.0, place[poses:], g
@@ -245,7 +246,7 @@ def _point_covariances(
         _add_up(v, w[:size], at[:size], inverse, out[p])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _add_up(
     v: FloatArray, w: FloatArray, at: IntArray, inverse: FloatArray, out: FloatArray
 ) -> None:

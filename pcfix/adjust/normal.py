@@ -17,11 +17,9 @@ number of threads.
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import get_num_threads, njit
 
 from pcfix.adjust.block import (
     CAUCHY,
@@ -43,8 +41,8 @@ from pcfix.adjust.observe import (
     lens_gradients,
     scratch,
 )
+from pcfix.kernels import Span, in_tiles, lean
 from pcfix.model import FloatArray, IntArray
-from pcfix.threads import one_caller
 
 PARTS = 8
 LOST = 1e6
@@ -91,25 +89,51 @@ def pair_slots(seen: Seen, cameras: int) -> tuple[IntArray, IntArray]:
     return slot, np.column_stack([i, j])
 
 
-def in_parts(kernel: Callable[..., None], *given: Any, parts: int = PARTS) -> None:
+class Workspace(NamedTuple):
+    """Room for the observations of a point, at most `most`, and g unknowns that all share.
+
+    room : of `pcfix.adjust.observe`.
+    own, shared, r : shapes (most, 2, 13), (most, 2, g) and (most, 2), of `linearise`.
+    who : shape (most,), their cameras.
+    v, rhs : shapes (3, 3) and (3,), of the point.
+    w, w_g : shapes (most, 6, 3) and (g, 3).
+    y : shape (6, 3).
+    """
+
+    room: Scratch
+    own: FloatArray
+    shared: FloatArray
+    r: FloatArray
+    who: IntArray
+    v: FloatArray
+    rhs: FloatArray
+    w: FloatArray
+    w_g: FloatArray
+    y: FloatArray
+
+
+def workspace(seen: Seen, g: int) -> Workspace:
+    """Return new room."""
+    most = int(np.diff(seen.start).max(initial=1))
+    shapes = (most, 2, WIDTH), (most, 2, g), (most, 2)
+    own, shared, r = (np.zeros(shape) for shape in shapes)
+    v, rhs, w, w_g, y = (np.zeros(shape) for shape in ((3, 3), 3, (most, 6, 3), (g, 3), (6, 3)))
+    return Workspace(scratch(), own, shared, r, np.empty(most, np.int64), v, rhs, w, w_g, y)
+
+
+def in_parts(run: Callable[..., None], seen: Seen, g: int, *given: Any, parts: int = PARTS) -> None:
     """Run a kernel for each part of the points, as many at a time as there are threads.
 
-    Threads of our own, as numba's loops take no tuples in tuples, which a mesh or raster is.
+    Called is ``run((first, last), part, *given, workspace)`` with the points of the part.
     """
-    with one_caller():
-        count = min(parts, get_num_threads())
-    with ThreadPoolExecutor(count) as pool:
-        list(pool.map(lambda part: kernel(part, *given), range(parts)))
+    m = len(seen.start) - 1
 
+    def run_all(span: Span) -> None:
+        work = workspace(seen, g)
+        for part in range(*span):
+            run((part * m // parts, (part + 1) * m // parts), part, *given, work)
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def part_of(part: int, parts: int, start: IntArray) -> tuple[int, int, int]:
-    """Return the first point of a part, the next one's, and the most observations of a point."""
-    m, most = len(start) - 1, 1
-    first, last = part * m // parts, (part + 1) * m // parts
-    for p in range(first, last):
-        most = max(most, start[p + 1] - start[p])
-    return first, last, most
+    in_tiles(run_all, parts)
 
 
 def normal_equations(
@@ -124,7 +148,7 @@ def normal_equations(
     k, g = len(state.centres), given.columns.total
     shapes = (len(pairs), 6, 6), (k, 6, g), (g, g), (k, 6), (g,), (k, 6), (g,)
     sums = Sums(*(np.zeros((PARTS, *shape)) for shape in shapes))
-    in_parts(_sum_up, state, given, loss, damping, slot, sums)
+    in_parts(_sum_up, given.seen, g, state, given, (loss, damping), slot, sums)
     return Sums(*(part.sum(axis=0) for part in sums))
 
 
@@ -133,7 +157,8 @@ def point_steps(
 ) -> FloatArray:
     """Return the steps of the points, shape (m, 3), given those of all the rest, (6 k + g,)."""
     steps = np.zeros((len(state.xyz), 3))
-    in_parts(_point_steps, state, given, loss, damping, moved, steps)
+    seen, g = given.seen, given.columns.total
+    in_parts(_point_steps, seen, g, state, given, (loss, damping), moved, steps)
     return steps
 
 
@@ -143,7 +168,7 @@ def residuals(state: State, seen: Seen, surface: Surface) -> FloatArray:
     NaN where the camera does not image the point.
     """
     found = np.empty((len(seen.camera), 2))
-    in_parts(_residuals, state, seen, surface, found)
+    in_parts(_residuals, seen, 0, state, seen, surface, found)
     return found
 
 
@@ -159,7 +184,7 @@ def cost_of(squares: FloatArray, loss: Loss) -> float:
     return float(s.sum() + LOST * lost.sum())
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _influence(square: float, loss: Loss) -> float:
     """Return the derivative of the loss by the square: the weight of the observation."""
     if loss.kind == HUBER:
@@ -169,16 +194,18 @@ def _influence(square: float, loss: Loss) -> float:
     return 1.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _residuals(part: int, state: State, seen: Seen, surface: Surface, found: FloatArray) -> None:
-    room, (first, last, _) = scratch(), part_of(part, PARTS, seen.start)
-    for p in range(first, last):
+@lean
+def _residuals(
+    span: Span, part: int, state: State, seen: Seen, surface: Surface, found: FloatArray,
+    work: Workspace,
+) -> None:  # fmt: skip
+    for p in range(*span):
         for o in range(seen.start[p], seen.start[p + 1]):
-            u, v = image(state, seen, surface, p, seen.camera[o], room)
+            u, v = image(state, seen, surface, p, seen.camera[o], work.room)
             found[o, 0], found[o, 1] = seen.image_xy[o, 0] - u, seen.image_xy[o, 1] - v
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def linearise(
     state: State, given: Given, loss: Loss, p: int, o: int, room: Scratch,
     own: FloatArray, shared: FloatArray, r: FloatArray,
@@ -216,7 +243,7 @@ def linearise(
     return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _similarity_gradients(
     state: State, c: int, own: FloatArray, pivot: FloatArray, shared: FloatArray, at: int
 ) -> None:
@@ -241,7 +268,7 @@ def _similarity_gradients(
             own[row, i] = 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def point_block(
     v: FloatArray, rhs: FloatArray, priors: PointPriors, xyz: FloatArray, p: int, damping: float
 ) -> bool:
@@ -256,7 +283,7 @@ def point_block(
     return inverted(v, 1e-14)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def inverted(v: FloatArray, least: float) -> bool:
     """Replace a matrix of 3 x 3 by its inverse; whether it has one.
 
@@ -274,22 +301,19 @@ def inverted(v: FloatArray, least: float) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _sum_up(
-    part: int, state: State, given: Given, loss: Loss, damping: float, slot: IntArray, sums: Sums
-) -> None:
+    span: Span, part: int, state: State, given: Given, rule: tuple[Loss, float], slot: IntArray,
+    sums: Sums, work: Workspace,
+) -> None:  # fmt: skip
     """Add up the equations of the points of a part in its row of the sums."""
     of_part = Sums(
         sums.blocks[part], sums.border[part], sums.corner[part], sums.poses[part],
         sums.shared[part], sums.diagonal[part], sums.shared_diagonal[part],
     )  # fmt: skip
-    g, start, room = given.columns.total, given.seen.start, scratch()
-    first, last, most = part_of(part, PARTS, start)
-    own, shared = np.empty((most, 2, WIDTH)), np.zeros((most, 2, g))
-    r, who = np.empty((most, 2)), np.empty(most, np.int64)
-    v, rhs, w_g = np.empty((3, 3)), np.empty(3), np.empty((g, 3))
-    w = np.empty((most, 6, 3))
-    for p in range(first, last):
+    start, (loss, damping) = given.seen.start, rule
+    room, own, shared, r, who, v, rhs, w, w_g, _ = work
+    for p in range(*span):
         v[:], rhs[:], count = 0.0, 0.0, 0
         for o in range(start[p], start[p + 1]):
             if linearise(state, given, loss, p, o, room, own[count], shared[count], r[count]):
@@ -303,10 +327,10 @@ def _sum_up(
         for a in range(count):
             _add_pose(of_part, who[a], slot, w[a], own[a], shared[a], r[a])
             _add_shared(of_part, w_g, own[a], shared[a], r[a])
-        _eliminate(of_part, slot, who[:count], w, w_g, v, rhs)
+        _eliminate(of_part, slot, who[:count], work)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def add_point(v: FloatArray, rhs: FloatArray, own: FloatArray, r: FloatArray) -> None:
     """Add B'B and B'r."""
     for i in range(3):
@@ -315,7 +339,7 @@ def add_point(v: FloatArray, rhs: FloatArray, own: FloatArray, r: FloatArray) ->
         rhs[i] += own[0, POINT + i] * r[0] + own[1, POINT + i] * r[1]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _add_pose(
     sums: Sums, c: int, slot: IntArray, w: FloatArray,
     own: FloatArray, shared: FloatArray, r: FloatArray,
@@ -334,7 +358,7 @@ def _add_pose(
         right[i] += own[0, i] * r[0] + own[1, i] * r[1]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _add_shared(
     sums: Sums, w_g: FloatArray, own: FloatArray, shared: FloatArray, r: FloatArray
 ) -> None:
@@ -349,14 +373,12 @@ def _add_shared(
         right[i] += shared[0, i] * r[0] + shared[1, i] * r[1]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _eliminate(
-    sums: Sums, slot: IntArray, who: IntArray, w: FloatArray, w_g: FloatArray,
-    v: FloatArray, rhs: FloatArray,
-) -> None:  # fmt: skip
+@lean
+def _eliminate(sums: Sums, slot: IntArray, who: IntArray, work: Workspace) -> None:
     """Take a point out of the equations, with V inverted."""
     blocks, border, corner, poses, shared_right, _, _ = sums
-    g, y = len(w_g), np.empty((6, 3))
+    v, rhs, w, w_g, y = work.v, work.rhs, work.w, work.w_g, work.y
+    g = len(w_g)
     for a in range(who.size):
         c = who[a]
         for i in range(6):
@@ -383,19 +405,18 @@ def _eliminate(
             corner[i, j] -= y0 * w_g[j, 0] + y1 * w_g[j, 1] + y2 * w_g[j, 2]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _point_steps(
-    part: int, state: State, given: Given, loss: Loss, damping: float,
-    moved: FloatArray, steps: FloatArray,
+    span: Span, part: int, state: State, given: Given, rule: tuple[Loss, float],
+    moved: FloatArray, steps: FloatArray, work: Workspace,
 ) -> None:  # fmt: skip
-    g, seen, poses, room = given.columns.total, given.seen, 6 * len(state.centres), scratch()
-    own, shared, r = np.empty((2, WIDTH)), np.zeros((2, g)), np.empty(2)
-    v, rhs = np.empty((3, 3)), np.empty(3)
-    first, last, _ = part_of(part, PARTS, seen.start)
-    for p in range(first, last):
+    g, seen, poses = given.columns.total, given.seen, 6 * len(state.centres)
+    own, shared, r, v, rhs = work.own[0], work.shared[0], work.r[0], work.v, work.rhs
+    loss, damping = rule
+    for p in range(*span):
         v[:], rhs[:], count = 0.0, 0.0, 0
         for o in range(seen.start[p], seen.start[p + 1]):
-            if not linearise(state, given, loss, p, o, room, own, shared, r):
+            if not linearise(state, given, loss, p, o, work.room, own, shared, r):
                 continue
             for row in range(2):
                 for i in range(6):
@@ -408,7 +429,7 @@ def _point_steps(
             solved(v, rhs, steps[p])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def solved(v: FloatArray, rhs: FloatArray, step: FloatArray) -> None:
     """Fill in the step of a point, with V inverted."""
     for i in range(3):

@@ -12,9 +12,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from pcfix.adjust.block import B1, B2, CX, CY, FOCAL, K1, P1, Seen, State, Surface
+from pcfix.kernels import kernel, lean
 from pcfix.lens import formulas as places
 from pcfix.lens.algebra import (
     column_of,
@@ -28,7 +28,7 @@ from pcfix.lens.algebra import (
 )
 from pcfix.lens.formulas import distorted, jacobian, undistorted
 from pcfix.lens.imaging import image_and_gradients, image_of, in_plane
-from pcfix.model import FloatArray
+from pcfix.model import FloatArray, IntArray
 from pcfix.port.light import through_port
 from pcfix.refract.rays import direction, lay, light_path, plane_at, settle
 from pcfix.refract.tracing.gradients import light_and_gradients
@@ -42,17 +42,21 @@ class Scratch(NamedTuple):
 
     light, plane : shapes (3, 12) and (4,), the light with its derivatives and where it is bent.
     ahead : shape (3,), filled with the direction that the lens images, camera frame.
+    bent : shape (3, 5), that direction behind a port, with its derivatives.
+    origin : shape (3,), the block's origin, from the level of the water.
     """
 
     light: FloatArray
     plane: FloatArray
     ahead: FloatArray
+    bent: FloatArray
+    origin: FloatArray
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def scratch() -> Scratch:
     """Return new room."""
-    return Scratch(np.empty((3, 12)), np.empty(4), np.empty(3))
+    return Scratch(np.empty((3, 12)), np.empty(4), np.empty(3), np.empty((3, 5)), np.empty(3))
 
 
 _CENTRE_X, _CENTRE_Y, _INVERSE = places.CENTRE_X, places.CENTRE_Y, places.INVERSE
@@ -62,16 +66,17 @@ _TANGENTIAL, _IN_TURN = places.TANGENTIAL, places.IN_TURN
 _PRINCIPAL_X, _PRINCIPAL_Y = places.PRINCIPAL_X, places.PRINCIPAL_Y
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def water_plane(
-    plane: FloatArray, water: FloatArray, surface: Surface, q: FloatArray, centre: FloatArray
+    room: Scratch, water: FloatArray, surface: Surface, q: FloatArray, centre: FloatArray
 ) -> bool:
-    """Set the plane (N, h) at which light from Q to C leaves the water; whether Q is below it."""
+    """Set the room's plane (N, h), where light from Q to C leaves the water; is Q below it."""
+    plane, origin = room.plane, room.origin
     if surface.field is None and surface.tin is None:
         plane[0], plane[1], plane[2] = normal_of(water[1], water[2])
         plane[3] = plane[2] * water[0]
         return bool(water[0] + water[1] * q[0] + water[2] * q[1] > q[2])
-    origin = surface.origin.copy()
+    origin[0], origin[1], origin[2] = vector(surface.origin)
     origin[2] -= water[0]
     z, b, c = plane_at(surface.tin, surface.field, q[0], q[1], origin)
     if not z > q[2]:
@@ -81,7 +86,7 @@ def water_plane(
     return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def image(
     state: State, seen: Seen, surface: Surface, p: int, c: int, room: Scratch
 ) -> tuple[float, float]:
@@ -91,7 +96,7 @@ def image(
     w = minus(vector(q), vector(centre))
     refracted = surface.port.size == 0 and seen.wet[p] and surface.there
     if refracted:
-        refracted = water_plane(plane, water, surface, q, centre)
+        refracted = water_plane(room, water, surface, q, centre)
     if refracted:
         normal = vector(plane)
         path = light_path(vector(q), vector(centre), normal, plane[3], water[3])
@@ -103,7 +108,7 @@ def image(
     return image_of(state.lenses[seen.lens_row[c]], *x)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def image_and_all_gradients(
     state: State, seen: Seen, surface: Surface, p: int, c: int, room: Scratch, out: FloatArray
 ) -> tuple[float, float]:
@@ -115,7 +120,7 @@ def image_and_all_gradients(
     light, plane, ahead = room.light, room.plane, room.ahead
     refracted = surface.port.size == 0 and seen.wet[p] and surface.there
     if refracted:
-        refracted = water_plane(plane, water, surface, q, centre)
+        refracted = water_plane(room, water, surface, q, centre)
     if refracted:
         light_and_gradients(vector(q), vector(centre), vector(plane), plane[3], water[3], light)
     else:
@@ -125,18 +130,16 @@ def image_and_all_gradients(
             light[i, 1 + i], light[i, 4 + i] = 1.0, -1.0
     x = times(r, column_of(light, 0))
     ahead[0], ahead[1], ahead[2] = x
-    by_n_port = np.zeros(3)
+    bent = room.bent
     if surface.port.size:
-        bent = np.empty((3, 5))
         through_port(surface.port, water[3], *x, bent)
-        ahead[:] = bent[:, 0]
-        by_n_port[:] = bent[:, 4]
+        ahead[0], ahead[1], ahead[2] = column_of(bent, 0)
     u, v, both = image_and_gradients(state.lenses[seen.lens_row[c]], ahead[0], ahead[1], ahead[2])
     for row in range(2):
         g = both[3 * row], both[3 * row + 1], both[3 * row + 2]
         along_n = 0.0
         if surface.port.size:
-            along_n = dot(g, vector(by_n_port))
+            along_n = dot(g, column_of(bent, 4))
             g = dot(g, column_of(bent, 1)), dot(g, column_of(bent, 2)), dot(g, column_of(bent, 3))
         out[row, 0], out[row, 1], out[row, 2] = cross(x, g)
         w = transposed_times(r, g)
@@ -149,8 +152,8 @@ def image_and_all_gradients(
     return u, v
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def lens_gradients(c: FloatArray, ahead: FloatArray, codes: FloatArray, out: FloatArray) -> None:
+@lean
+def lens_gradients(c: FloatArray, ahead: FloatArray, codes: IntArray, out: FloatArray) -> None:
     """Fill in how the image of a direction, camera frame, moves with parameters of the lens.
 
     The coefficients c are those of the lens, the codes, shape (p,), of `pcfix.adjust.block`; `out`
@@ -192,7 +195,7 @@ def lens_gradients(c: FloatArray, ahead: FloatArray, codes: FloatArray, out: Flo
             out[0, i], out[1, i] = fx * bx + b2 * by, fy * by + b3 * bx
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _brown_gradient(c: FloatArray, x: float, y: float, code: int) -> tuple[float, float]:
     """Return the derivative of Brown's formula at a place by one of its parameters."""
     r2 = x * x + y * y

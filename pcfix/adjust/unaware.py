@@ -27,15 +27,14 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from pcfix.adjust.block import LEAST_SQUARES, Given, State
 from pcfix.adjust.normal import (
     PARTS,
+    Workspace,
     in_parts,
     inverted,
     linearise,
-    part_of,
     point_block,
     solved,
 )
@@ -51,6 +50,7 @@ from pcfix.adjust.problem import (
 )
 from pcfix.adjust.solve import moved_by
 from pcfix.errors import GeometryError
+from pcfix.kernels import Span, kernel, lean
 from pcfix.model import BoolArray, FloatArray, IntArray
 
 MAX_STEPS = 25
@@ -90,7 +90,7 @@ def straight_columns(problem: Problem, start: Solution, apparent_xyz: FloatArray
     return tests
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _columns(state: State, given: Given, tests: FloatArray) -> None:
     room, own, r, start = scratch(), np.empty((2, WIDTH)), np.empty(2), given.seen.start
     shared = np.zeros((2, given.columns.total))
@@ -159,7 +159,8 @@ def _newton(
     parts = PARTS if size <= 3000 else 2
     matrix, right = np.zeros((parts, size, size)), np.zeros((parts, size))
     common = now.state, problem.given, tests, is_tested
-    in_parts(_sum_tested, *common, matrix, right, parts=parts)
+    seen, g = problem.given.seen, problem.given.columns.total
+    in_parts(_sum_tested, seen, g, *common, matrix, right, parts=parts)
     total, side = matrix.sum(axis=0), right.sum(axis=0)
     del matrix
     extra = priors_at(problem, now)
@@ -177,11 +178,11 @@ def _newton(
             " of three images or more, or three control points, are needed."
         ) from None
     points = np.zeros((len(now.state.xyz), 3))
-    in_parts(_tested_points, *common, step, points)
+    in_parts(_tested_points, seen, g, *common, step, points)
     return step, points
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _rows(most: int, g: int) -> _Rows:
     """Return room for so many observations."""
     right, left = np.empty((most, 2, WATER + g)), np.empty((most, 2, WATER + g))
@@ -189,21 +190,21 @@ def _rows(most: int, g: int) -> _Rows:
     return _Rows(right, left, r, who, np.empty((3, 3)), np.empty(3))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _gather(
-    state: State, given: Given, tests: FloatArray, tested: bool, p: int, rows: _Rows
-) -> int:
+    state: State, given: Given, tests: FloatArray, tested: bool, p: int, rows: _Rows,
+    work: Workspace,
+) -> int:  # fmt: skip
     """Fill in the columns of a point's observations and V, inverted; how many count.
 
     Columns of `right` and `left`: pose, point, shared. The block V and its right side are B_l'B
     and B_l'r.
     """
     right, left, r, who, v, rhs = rows
-    seen, room = given.seen, scratch()
-    own, common = np.empty((2, WIDTH)), np.zeros((2, given.columns.total))
+    seen, own, common = given.seen, work.own[0], work.shared[0]
     v[:], rhs[:], count = 0.0, 0.0, 0
     for o in range(seen.start[p], seen.start[p + 1]):
-        if not linearise(state, given, LEAST_SQUARES, p, o, room, own, common, r[count]):
+        if not linearise(state, given, LEAST_SQUARES, p, o, work.room, own, common, r[count]):
             continue
         right[count, :, :WATER] = own[:, :WATER]
         right[count, :, WATER:] = common
@@ -225,20 +226,19 @@ def _gather(
     return count if point_block(v, rhs, given.priors, state.xyz[p], p, 0.0) else 0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _sum_tested(
-    part: int, state: State, given: Given, tests: FloatArray, is_tested: BoolArray,
-    matrix: FloatArray, side: FloatArray,
+    span: Span, part: int, state: State, given: Given, tests: FloatArray, is_tested: BoolArray,
+    matrix: FloatArray, side: FloatArray, work: Workspace,
 ) -> None:  # fmt: skip
-    g, k = given.columns.total, len(state.centres)
-    first, last, most = part_of(part, len(matrix), given.seen.start)
+    g, k, most = given.columns.total, len(state.centres), len(work.own)
     rows = _rows(most, g)
     right, left, r, who, v, rhs = rows
     size = 6 * most + g
     column = np.empty(size, np.int64)
     w_right, w_left = np.empty((3, size)), np.empty((size, 3))
-    for p in range(first, last):
-        count = _gather(state, given, tests, is_tested[p], p, rows)
+    for p in range(*span):
+        count = _gather(state, given, tests, is_tested[p], p, rows, work)
         if count == 0:
             continue
         used = 6 * count + g
@@ -268,7 +268,7 @@ def _sum_tested(
                 row[column[j]] -= y0 * w_right[0, j] + y1 * w_right[1, j] + y2 * w_right[2, j]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _add_direct(
     matrix: FloatArray, side: FloatArray, right: FloatArray, left: FloatArray, r: FloatArray,
     at: int, border: int, g: int,
@@ -284,17 +284,16 @@ def _add_direct(
                 matrix[row, border + j] += value * right[a, WATER + j]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _tested_points(
-    part: int, state: State, given: Given, tests: FloatArray, is_tested: BoolArray,
-    moved: FloatArray, steps: FloatArray,
+    span: Span, part: int, state: State, given: Given, tests: FloatArray, is_tested: BoolArray,
+    moved: FloatArray, steps: FloatArray, work: Workspace,
 ) -> None:  # fmt: skip
     g, k = given.columns.total, len(state.centres)
-    first, last, most = part_of(part, PARTS, given.seen.start)
-    rows = _rows(most, g)
+    rows = _rows(len(work.own), g)
     right, left, _, who, v, rhs = rows
-    for p in range(first, last):
-        count = _gather(state, given, tests, is_tested[p], p, rows)
+    for p in range(*span):
+        count = _gather(state, given, tests, is_tested[p], p, rows, work)
         for o in range(count):
             for a in range(2):
                 change = 0.0

@@ -24,9 +24,9 @@ from pcfix.clean.neighbours import (
     used_rows,
 )
 from pcfix.errors import InputError, SettingError
+from pcfix.kernels import threads
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import LEAST_NEIGHBOURS, CleanRules
-from pcfix.threads import threads
 from pcfix.water.checks import as_surface, checked_points
 from pcfix.water.surface import is_submerged, surface_above
 

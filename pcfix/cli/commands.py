@@ -102,8 +102,8 @@ def adjust(
     if (options.water is None) == (options.port is None):
         raise UsageError("give --water, or --port for images taken under water")
     from pcfix.flow.adjust import next_step
+    from pcfix.kernels import threads
     from pcfix.report.adjustment import adjustment_text, before_of
-    from pcfix.threads import threads
 
     with threads(jobs), status_line("Adjusting", quiet) as progress:
         found = pcfix.adjust_cameras(model, out, options=options, progress=progress)

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 
+from pcfix.kernels import Span, in_tiles, kernel, lean
 from pcfix.model import FloatArray, IntArray
 
 POINTS_PER_CELL = 3.0
@@ -45,7 +45,8 @@ def build_cells(points: FloatArray) -> Cells:
     side = max(side * np.sqrt(taken * POINTS_PER_CELL / len(points)), _side(extent, MAX_CELLS))
     columns, rows = (int(n) + 1 for n in extent / side)
     start, order = sorted_by_cell(cell_of(points, low, side, columns, rows), columns * rows)
-    arranged = _gathered(points, order)
+    arranged = np.empty((len(order), 3))
+    in_tiles(_gather, len(order), points, order, arranged)
     return Cells(low, side, columns, rows, start, arranged, _z_range(start, arranged))
 
 
@@ -55,7 +56,7 @@ def _side(extent: FloatArray, cells: float) -> float:
     return max(float(np.sqrt(area / cells)), length / cells, length * 1e-6, 1e-9)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def cell_of(
     points: FloatArray, low: FloatArray, side_m: float, columns: int, rows: int
 ) -> IntArray:
@@ -68,7 +69,7 @@ def cell_of(
     return cell
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sorted_by_cell(cell: IntArray, count: int) -> tuple[IntArray, IntArray]:
     """Return where each cell starts, and the rows in the order of their cells."""
     start = np.zeros(count + 1, np.int64)
@@ -84,17 +85,15 @@ def sorted_by_cell(cell: IntArray, count: int) -> tuple[IntArray, IntArray]:
     return start, order
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def _gathered(points: FloatArray, order: IntArray) -> FloatArray:
-    """Return ``points[order]``, with all cores: the jumps through memory are what takes time."""
-    arranged = np.empty((len(order), 3))
-    for i in prange(len(order)):
+@lean
+def _gather(span: Span, points: FloatArray, order: IntArray, arranged: FloatArray) -> None:
+    """Set ``points[order]``, with all cores: the jumps through memory are what takes time."""
+    for i in range(*span):
         for axis in range(3):
             arranged[i, axis] = points[order[i], axis]
-    return arranged
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _z_range(start: IntArray, points: FloatArray) -> FloatArray:
     """Return lowest and highest Z of each cell; of an empty one, infinitely far apart."""
     z_range = np.empty((len(start) - 1, 2))
@@ -106,13 +105,13 @@ def _z_range(start: IntArray, points: FloatArray) -> FloatArray:
     return z_range
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _gap(x: float, cell: int, side_m: float) -> float:
     """Return how far x lies outside the cell, along one axis."""
     return max(cell * side_m - x, x - (cell + 1) * side_m, 0.0)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _best_in_cell(
     grid: Cells, column: int, row: int, x: float, y: float, z: float, best: float
 ) -> float:
@@ -130,7 +129,7 @@ def _best_in_cell(
     return best
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _nearest_one(grid: Cells, place: FloatArray) -> float:
     """Return the distance to the nearest point; NaN where it is too many rings away."""
     x, y, z = place[0] - grid.low[0], place[1] - grid.low[1], place[2]
@@ -163,19 +162,17 @@ def _nearest_one(grid: Cells, place: FloatArray) -> float:
     return float(np.nan)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@lean
 def nearest_distances(
-    grid: Cells, places: FloatArray, order: IntArray
-) -> FloatArray:  # pragma: no cover - compiled
-    """Return the distance of each place (n, 3) to its nearest point.
+    span: Span, grid: Cells, places: FloatArray, order: IntArray, distance: FloatArray
+) -> None:  # pragma: no cover - compiled
+    """Set the distance of each place (n, 3) to its nearest point.
 
     NaN where that is more than `MAX_RINGS` cells away. Places are visited in the given order,
     which changes the time and nothing else.
     """
-    distance = np.empty(len(places))
-    for k in prange(len(order)):
+    for k in range(*span):
         distance[order[k]] = _nearest_one(grid, places[order[k]])
-    return distance
 
 
 CHUNK_POINTS = 200_000
@@ -256,7 +253,8 @@ def cloud_to_cloud(xyz: FloatArray, reference: FloatArray) -> FloatArray:
     places, grid = xyz - origin, build_cells(reference - origin)
     cell = cell_of(places, grid.low, grid.side_m, grid.columns, grid.rows)
     _, order = sorted_by_cell(cell, grid.columns * grid.rows)
-    distance = nearest_distances(grid, places, order)
+    distance = np.empty(len(places))
+    in_tiles(nearest_distances, len(order), grid, places, order, distance)
     far = np.isnan(distance)
     if far.any():
         distance[far], _ = Neighbours(grid.points).nearest(places[far])

@@ -24,11 +24,11 @@ from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import cleaning_vlr, noted_header
+from pcfix.kernels import threads
 from pcfix.model import LOW_NOISE, NOISE_CLASSES
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CleanOptions, CleanRules
-from pcfix.threads import threads
 from pcfix.version import __version__
 from pcfix.water.checks import check_submerged
 from pcfix.water.surface import is_submerged, surface_above

@@ -20,6 +20,7 @@ from pcfix.flow.through_water import Label, correct_checked
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps
 from pcfix.io.las.writing import corrected_header
+from pcfix.kernels import threads
 from pcfix.model import (
     BATHYMETRIC_POINT,
     Cameras,
@@ -34,7 +35,6 @@ from pcfix.refract.batch import Batch, MadeWith, Survey
 from pcfix.refract.learning import learn_of_points
 from pcfix.refract.regression import DepthRegression
 from pcfix.refract.tally import Summary
-from pcfix.threads import threads
 from pcfix.water.checks import as_surface, check_above_water, checked_points
 from pcfix.water.index import with_index
 from pcfix.water.surface import is_submerged, surface_above

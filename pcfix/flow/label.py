@@ -26,12 +26,12 @@ from pcfix.flow.surfaces import (
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import labelling_vlr, noted_header
+from pcfix.kernels import threads
 from pcfix.label.areas import WaterMask
 from pcfix.label.labelling import Labelling, LabelSummary, Part, sets_class
 from pcfix.model import WaterPlane, WaterSurface
 from pcfix.options.correct import LabelOptions, LabelRules, StageLabelOptions
 from pcfix.options.declare import File, taken
-from pcfix.threads import threads
 from pcfix.version import __version__
 from pcfix.water.checks import as_surface, check_submerged, check_tilt, checked_points
 from pcfix.water.surface import surface_above

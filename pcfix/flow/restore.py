@@ -12,10 +12,10 @@ from pcfix.flow.runner import Chunk, Header, Step, file_task
 from pcfix.io.las.columns import SHIFTS, columns_for, is_corrected, is_marked_uncorrected, shifted
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import read_settings, restored_header
+from pcfix.kernels import threads
 from pcfix.options.correct import Dimensions
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import JobOptions
-from pcfix.threads import threads
 
 
 def restore_file(

@@ -21,10 +21,10 @@ from pcfix.flow.surfaces import CloudView, view_of
 from pcfix.io.files import check_input, read_json
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
+from pcfix.kernels import threads
 from pcfix.model import Cameras, WaterDimension, WaterSurface
 from pcfix.options.declare import File
 from pcfix.options.survey import AdjustRules, AdjustWhen
-from pcfix.threads import threads
 from pcfix.water.index import index_of
 
 FOLDER = "adjusted"

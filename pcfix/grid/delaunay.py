@@ -12,10 +12,10 @@ a little, always the same way for the same point.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from scipy.spatial import Delaunay, QhullError
 
 from pcfix.grid.lattice import Window
+from pcfix.kernels import kernel, lean
 from pcfix.model import BoolArray, FloatArray, IntArray
 
 MOVED = 1e-4
@@ -94,7 +94,7 @@ def _triangles(position: FloatArray) -> IntArray:
     return corners[np.lexsort(corners.T[::-1])]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _draw(
     position: FloatArray,
     moved: FloatArray,
@@ -129,7 +129,7 @@ def _draw(
                     out[row, column] = z[i] + s * (z[j] - z[i]) + u * (z[k] - z[i])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _shares(
     a: FloatArray, b: FloatArray, c: FloatArray, x: float, y: float
 ) -> tuple[float, float]:  # pragma: no cover - compiled
@@ -140,7 +140,7 @@ def _shares(
     return (px * cy - py * cx) / area, (bx * py - by * px) / area
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _square_radius(
     a: FloatArray, b: FloatArray, c: FloatArray
 ) -> float:  # pragma: no cover - compiled

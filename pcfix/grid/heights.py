@@ -6,10 +6,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from pcfix.grid.delaunay import triangulated
 from pcfix.grid.lattice import Lattice, Window
+from pcfix.kernels import kernel
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.steps import DsmMethod
 
@@ -184,7 +184,7 @@ def inverse_distance(block: Block) -> FloatArray:
     return np.asarray(_weighted(block.position[order], block.z[order], start, *block.window))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _weighted(
     position: FloatArray,
     z: FloatArray,

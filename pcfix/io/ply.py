@@ -14,9 +14,9 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from pcfix.errors import InputError
+from pcfix.kernels import lean
 from pcfix.model import FloatArray, IntArray
 
 _TYPES = {
@@ -210,7 +210,7 @@ def _text_numbers(path: Path, start: int) -> FloatArray:
         ) from error
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _length(units: npt.NDArray[Any], at: int, size: int, big: bool) -> int:
     """Return a list's count from its bytes, or from its one number where the file is text."""
     count = 0
@@ -219,7 +219,7 @@ def _length(units: npt.NDArray[Any], at: int, size: int, big: bool) -> int:
     return count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def list_starts(
     units: npt.NDArray[Any], item: IntArray, prefix: IntArray, big: bool, which: IntArray,
     start: IntArray,
@@ -250,7 +250,7 @@ def list_starts(
     return at
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def copy_field(
     units: npt.NDArray[Any], item: IntArray, prefix: IntArray, big: bool, field: int,
     part: tuple[int, int], records: int, out: npt.NDArray[Any],

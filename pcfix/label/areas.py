@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
 
+from pcfix.kernels import Span, in_tiles, lean
 from pcfix.model import BoolArray, FloatArray, IntArray
 
 States = npt.NDArray[np.uint8]
@@ -80,7 +80,7 @@ class WaterMask:
         import shapely
 
         states = np.empty(x.size, np.uint8)
-        _look_up(self._cells, np.asarray(self.bounds), x, y, states)
+        in_tiles(_look_up, x.size, self._cells, np.asarray(self.bounds), x, y, states)
         asked = np.flatnonzero(states == CROSSED)
         states[asked] = shapely.intersects_xy(self.area, x[asked], y[asked])
         return states.astype(np.bool_)
@@ -109,13 +109,13 @@ def _cells_over(area: Any, corner: FloatArray, side_m: float) -> _Cells:
     return _Cells(west, south, side_m / 2**HALVINGS, states)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@lean
 def _look_up(
-    cells: _Cells, bounds: FloatArray, x: FloatArray, y: FloatArray, states: States
+    span: Span, cells: _Cells, bounds: FloatArray, x: FloatArray, y: FloatArray, states: States
 ) -> None:  # pragma: no cover - compiled
     """Write the state of each position; those off the cells but within the bounds are unsure."""
     rows, columns = cells.states.shape
-    for i in prange(x.size):
+    for i in range(*span):
         column = np.floor((x[i] - cells.west) / cells.cell_m)
         row = np.floor((y[i] - cells.south) / cells.cell_m)
         within = bounds[0] <= x[i] <= bounds[2] and bounds[1] <= y[i] <= bounds[3]
@@ -298,7 +298,7 @@ def _pools(
     return Pools(number, area, stays)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _add(
     lattice: Lattice,
     flags: Flags,

@@ -15,9 +15,9 @@ from __future__ import annotations
 from typing import TypeAlias, get_args
 
 import numpy as np
-from numba import njit
 from numpy.polynomial import Polynomial
 
+from pcfix.kernels import inlined, lean
 from pcfix.model import FloatArray, Lens, Projection
 
 KIND, LARGEST_ANGLE, LARGEST_RADIUS = range(3)
@@ -94,12 +94,12 @@ def first_root(polynomial: Polynomial) -> float:
     return 1.0 / float(real.max()) if real.size else np.inf
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+@inlined
 def _shape(c: FloatArray, i: int) -> float:
     return c[int(c[SHAPE]) + i]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+@inlined
 def radius(c: FloatArray, theta: float) -> float:
     """Return the distance from the centre of the plane of a direction at an angle."""
     kind, s0, s1 = int(c[KIND]), _shape(c, 0), _shape(c, 1)
@@ -125,7 +125,7 @@ def radius(c: FloatArray, theta: float) -> float:
     return np.tan(theta)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def angle(c: FloatArray, rho: float) -> float:
     """Return the angle from the axis of a place in the plane; undoes `radius`."""
     if not rho <= c[LARGEST_RADIUS]:
@@ -149,7 +149,7 @@ def angle(c: FloatArray, rho: float) -> float:
     return np.arctan(rho)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+@inlined
 def _polynomial(c: FloatArray, theta: float) -> tuple[float, float]:
     """Return Pix4D's polynomial and its slope."""
     q = theta / RIGHT_ANGLE
@@ -160,7 +160,7 @@ def _polynomial(c: FloatArray, theta: float) -> tuple[float, float]:
     return value, slope / RIGHT_ANGLE
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+@inlined
 def _dual(share: float, theta: float) -> tuple[float, float]:
     """Return the mean of perspective and equidistant, and its slope."""
     if share == 0.0:
@@ -169,7 +169,7 @@ def _dual(share: float, theta: float) -> tuple[float, float]:
     return share * tangent + (1.0 - share) * theta, 1.0 + share * tangent * tangent
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _search(c: FloatArray, rho: float) -> float:
     """Solve radius(theta) = rho by Newton's steps, halving the bracket where they leave it."""
     low, high = 0.0, c[LARGEST_ANGLE]
@@ -197,7 +197,7 @@ def _search(c: FloatArray, rho: float) -> float:
 Jacobian: TypeAlias = tuple[float, float, float, float]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+@inlined
 def _radial(c: FloatArray, r2: float) -> tuple[float, float]:
     """Return r' / r and its derivative by r^2."""
     k, d = int(c[RADIALS]), int(c[DENOMINATORS])
@@ -219,7 +219,7 @@ def _radial(c: FloatArray, r2: float) -> tuple[float, float]:
     return g, (slope - g * below_slope) / below
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+@inlined
 def _sideways(c: FloatArray, x: float, y: float) -> tuple[float, float]:
     """Return the tangential and thin prism terms."""
     p1, p2, p3, p4 = c[TANGENTIAL], c[TANGENTIAL + 1], c[TANGENTIAL + 2], c[TANGENTIAL + 3]
@@ -231,7 +231,7 @@ def _sideways(c: FloatArray, x: float, y: float) -> tuple[float, float]:
     return tx + (s1 + s2 * r2) * r2, ty + (s3 + s4 * r2) * r2
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+@inlined
 def distorted(c: FloatArray, x: float, y: float) -> tuple[float, float]:
     """Return Brown's formula at a place; NaN outside the disc where it is one to one."""
     r2 = x * x + y * y
@@ -246,7 +246,7 @@ def distorted(c: FloatArray, x: float, y: float) -> tuple[float, float]:
     return fx + tx, fy + ty
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _sideways_jacobian(c: FloatArray, x: float, y: float) -> Jacobian:
     p1, p2, p3, p4 = c[TANGENTIAL], c[TANGENTIAL + 1], c[TANGENTIAL + 2], c[TANGENTIAL + 3]
     s1, s2, s3, s4 = c[THIN_PRISM], c[THIN_PRISM + 1], c[THIN_PRISM + 2], c[THIN_PRISM + 3]
@@ -264,7 +264,7 @@ def _sideways_jacobian(c: FloatArray, x: float, y: float) -> Jacobian:
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def jacobian(c: FloatArray, x: float, y: float) -> Jacobian:
     """Return d x'/d x, d x'/d y, d y'/d x, d y'/d y of `distorted`."""
     g, slope = _radial(c, x * x + y * y)
@@ -278,7 +278,7 @@ def jacobian(c: FloatArray, x: float, y: float) -> Jacobian:
     return a * xx + b * xy, a * xy + b * yy, d * xx + e * xy, d * xy + e * yy
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _start(c: FloatArray, rho: float) -> float:
     """Return the radius that the radial terms alone bring to `rho`, or one near the fold."""
     low, high = 0.0, min(c[DISC], 1e6)
@@ -299,7 +299,7 @@ def _start(c: FloatArray, rho: float) -> float:
     return r
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def undistorted(c: FloatArray, u: float, v: float) -> tuple[float, float]:
     """Return the place in the disc that `distorted` brings to (u, v), NaN where there is none.
 
@@ -354,7 +354,7 @@ def _radial_fold(lens: Lens) -> float:
 _DIRECTIONS, _RADII_PER_DECADE = 72, 40
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _bends(c: FloatArray, r: float) -> bool:
     """Whether the symmetric part of the Jacobian is anywhere not positive definite on a circle."""
     for i in range(_DIRECTIONS):
@@ -365,7 +365,7 @@ def _bends(c: FloatArray, r: float) -> bool:
     return False
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _first_bend(c: FloatArray, fold: float) -> float:
     """Return the smallest radius that bends, found on a fine series and then halved to it."""
     low = 0.0

@@ -20,8 +20,8 @@ from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numba import njit, prange
 
+from pcfix.kernels import Span, in_tiles, inlined, lean
 from pcfix.lens.algebra import Vector, dot, minus, row_of, scaled, times
 from pcfix.lens.formulas import (
     B2,
@@ -43,7 +43,6 @@ from pcfix.lens.formulas import (
 )
 from pcfix.lens.imaging import coefficients, image_of, lens_table, project, unproject
 from pcfix.model import Cameras, FloatArray, IntArray, Lens
-from pcfix.threads import one_caller
 
 
 class FrameShape(NamedTuple):
@@ -234,7 +233,7 @@ def frames_of(cameras: Cameras) -> Frames:
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def pyramid(g: FloatArray) -> Pyramid:
     """Return the planes of one camera, shape (4, 3), as twelve numbers.
 
@@ -243,7 +242,7 @@ def pyramid(g: FloatArray) -> Pyramid:
     return row_of(g, 0), row_of(g, 1), row_of(g, 2), row_of(g, 3)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def in_frame(g: Pyramid, e: Vector) -> bool:
     """Whether the point at C - e is on the inner side of all four planes."""
     return (
@@ -254,20 +253,20 @@ def in_frame(g: Pyramid, e: Vector) -> bool:
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+@inlined
 def _image(lens: FloatArray, r: FloatArray, e: Vector) -> tuple[float, float]:
     """Return where a lens with rotation r images the point at C - e."""
     return image_of(lens, *scaled(-1.0, times(r, e)))
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+@inlined
 def _images(lens: FloatArray, r: FloatArray, e: Vector) -> bool:
     """Whether that place is in the frame."""
     u, v = _image(lens, r, e)
     return (u >= 0.0) & (u <= lens[WIDTH]) & (v >= 0.0) & (v <= lens[HEIGHT])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def holds(frames: Frames, c: int, e: Vector) -> bool:
     """Whether the frame of camera c holds the point at C - e, distortion included."""
     if not in_frame(pyramid(frames.planes[c]), e):
@@ -276,7 +275,7 @@ def holds(frames: Frames, c: int, e: Vector) -> bool:
     return row == NOT_DISTORTED or _images(frames.lenses[row], frames.rotations[c], e)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def mark_pyramid(
     marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, centre: FloatArray, g: Pyramid
 ) -> None:
@@ -286,7 +285,7 @@ def mark_pyramid(
         marks[j] = 1.0 if in_frame(g, (cx - x[j], cy - y[j], cz - z[j])) else 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def mark(
     marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray,
     centre: FloatArray, frames: Frames, c: int,
@@ -302,7 +301,7 @@ def mark(
     return _mark_any(marks, x, y, z, centre, around, frames.rotations[c], lens)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _mark_any(
     marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, centre: FloatArray,
     around: Pyramid, r: FloatArray, lens: FloatArray,
@@ -317,7 +316,7 @@ def _mark_any(
     return count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _mark_plain(
     marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, centre: FloatArray,
     r: FloatArray, c: FloatArray,
@@ -350,7 +349,7 @@ def _mark_plain(
     return count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def may_hold(g: FloatArray, centre: FloatArray, low: FloatArray, high: FloatArray) -> bool:
     """Whether a pyramid can hold any point of an upright box; never wrongly False."""
     for p in range(4):
@@ -363,7 +362,7 @@ def may_hold(g: FloatArray, centre: FloatArray, low: FloatArray, high: FloatArra
     return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def judge(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: FloatArray) -> int:
     """Return whether the distorted frame of camera c holds all or nothing of an upright box.
 
@@ -409,17 +408,19 @@ def cameras_in_sight(xyz: FloatArray, cameras: Cameras) -> IntArray:
     -------
     array of int, shape (n,)
     """
-    with one_caller():
-        return _count(np.ascontiguousarray(xyz), cameras.centres, frames_of(cameras))
-
-
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def _count(xyz: FloatArray, centres: FloatArray, frames: Frames) -> IntArray:
     counts = np.zeros(len(xyz), np.int64)
-    for i in prange(len(xyz)):
+    xyz = np.ascontiguousarray(xyz)
+    in_tiles(_count, len(xyz), xyz, cameras.centres, frames_of(cameras), counts)
+    return counts
+
+
+@lean
+def _count(
+    span: Span, xyz: FloatArray, centres: FloatArray, frames: Frames, counts: IntArray
+) -> None:
+    for i in range(*span):
         for c in range(len(centres)):
             counts[i] += holds(frames, c, minus(row_of(centres, c), row_of(xyz, i)))
-    return counts
 
 
 def footprint(cameras: Cameras, row: int, height_m: float) -> FloatArray:

@@ -22,9 +22,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 
 from pcfix.errors import SettingError
+from pcfix.kernels import Span, in_tiles, kernel, lean
 from pcfix.lens.algebra import (
     Vector,
     column_of,
@@ -44,7 +44,6 @@ from pcfix.port.shapes import Port
 from pcfix.refract.batch import CORRECTED, NO_CAMERA, ONE_CAMERA, PARALLEL, Intersection
 from pcfix.refract.choice import ANY_NUMBER, NOMINAL_FOCAL_PX, TILE, near_cameras, spatial_order
 from pcfix.refract.rays import add_line, nearest_point
-from pcfix.threads import one_caller
 
 # Columns of the result after the shift.
 _MISS, _SIGMA_Z, _COSINE, _OUTCOME = 3, 4, 5, 6
@@ -116,15 +115,16 @@ def intersect_rays(
         One row per point. A ray that does not meet the port does not count.
     """
     result = np.zeros((len(near), 7))
-    with one_caller():
-        _intersect(
-            np.ascontiguousarray(near, np.float64),
-            np.ascontiguousarray(directions, np.float64),
-            np.ascontiguousarray(views.start, np.int64),
-            np.ascontiguousarray(views.camera, np.int64),
-            rig_of(cameras, port, settings),
-            result,
-        )
+    in_tiles(
+        _intersect,
+        len(near),
+        np.ascontiguousarray(near, np.float64),
+        np.ascontiguousarray(directions, np.float64),
+        np.ascontiguousarray(views.start, np.int64),
+        np.ascontiguousarray(views.camera, np.int64),
+        rig_of(cameras, port, settings),
+        result,
+    )
     outcome = result[:, _OUTCOME].astype(np.uint8)
     moved = outcome == Outcome.CORRECTED
     counts = np.diff(views.start)
@@ -181,11 +181,11 @@ def port_views(
         ),
         np.zeros((0, 3)) if shift_m is None else np.ascontiguousarray(shift_m),
     )
-    with one_caller():
-        _choose(*common, count, none)
-        start = np.cumsum(count)
-        chosen = np.empty(start[-1], np.int64)
-        _choose(*common, start, chosen)
+    tiles = (len(xyz) + TILE - 1) // TILE
+    in_tiles(_choose, tiles, *common, (count, none))
+    start = np.cumsum(count)
+    chosen = np.empty(start[-1], np.int64)
+    in_tiles(_choose, tiles, *common, (start, chosen))
     return Views(start, chosen)
 
 
@@ -199,17 +199,18 @@ def rotations_of(cameras: Cameras) -> FloatArray:
     return np.asarray(cameras.rotations, np.float64)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _choose(
-    order: IntArray, xyz: FloatArray, rig: Rig, frames: Frames,
+    span: Span, order: IntArray, xyz: FloatArray, rig: Rig, frames: Frames,
     views: tuple[IntArray, IntArray], limits: tuple[float, int], shift: FloatArray,
-    start: IntArray, chosen: IntArray,
+    found: tuple[IntArray, IntArray],
 ) -> None:  # fmt: skip
     """Fill in the cameras of point i from ``start[i]``; without room count to ``start[i + 1]``.
 
     Views and shifts are empty where there are none.
     """
-    for t in prange((len(xyz) + TILE - 1) // TILE):
+    start, chosen = found
+    for t in range(*span):
         rows = order[t * TILE : (t + 1) * TILE]
         near = rows[:0]
         if not views[0].size:
@@ -229,7 +230,7 @@ def _choose(
                 start[i + 1] = kept.size
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _box(xyz: FloatArray, rows: IntArray, shift: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the corners of an upright box around points; with shifts, a wide one around both.
 
@@ -246,7 +247,7 @@ def _box(xyz: FloatArray, rows: IntArray, shift: FloatArray) -> tuple[FloatArray
     return low - wide, high + wide
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _usable(
     candidates: IntArray, point: Vector, rig: Rig, frames: Frames, limits: tuple[float, int],
     through: bool,
@@ -277,13 +278,13 @@ def _usable(
     return kept[ranked]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _intersect(
-    near: FloatArray, directions: FloatArray, start: IntArray, camera: IntArray, rig: Rig,
-    result: FloatArray,
+    span: Span, near: FloatArray, directions: FloatArray, start: IntArray, camera: IntArray,
+    rig: Rig, result: FloatArray,
 ) -> None:  # fmt: skip
     """Intersect the rays of each point, with the place near it as the origin."""
-    for i in prange(len(near)):
+    for i in range(*span):
         sums, least, k = np.zeros(9), 1.0, 0
         for o in range(start[i], start[i + 1]):
             r, d = rig.rotations[camera[o]], row_of(directions, o)
@@ -298,7 +299,7 @@ def _intersect(
         _solve(result[i], sums, k, least)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _solve(row: FloatArray, sums: FloatArray, k: int, cosine: float) -> None:
     """Solve one point and write its row; a point without a solution keeps a shift of zero."""
     if k < 2:

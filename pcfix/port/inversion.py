@@ -23,8 +23,8 @@ and a column for the refractive index, whose error all rays have in common.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
+from pcfix.kernels import Span, in_tiles, kernel, lean
 from pcfix.lens.algebra import (
     Vector,
     cross,
@@ -44,7 +44,6 @@ from pcfix.port.light import through_port
 from pcfix.port.shapes import Port
 from pcfix.refract.batch import Intersection, warn_of_unsolved
 from pcfix.refract.consistent import check_consistent
-from pcfix.threads import one_caller
 
 MAX_STEPS = 30
 CLOSE_M = 1e-7
@@ -73,10 +72,9 @@ def consistent_through_port(
     check_consistent(cameras)
     moved = np.flatnonzero(start.outcome == Outcome.CORRECTED)
     shift, found = start.shift_m.copy(), np.zeros(len(moved), np.bool_)
-    with one_caller():
-        rows = _rows(views)
-        rig = rig_of(cameras, port, settings)
-        _search_all(moved, np.ascontiguousarray(xyz), *rows, rig, shift, found)
+    rows, rig = _rows(views), rig_of(cameras, port, settings)
+    of_points = np.ascontiguousarray(xyz), *rows
+    in_tiles(_search_all, len(moved), moved, *of_points, rig, shift, found)
     warn_of_unsolved("method consistent found no solution behind the port", found)
     return start._replace(shift_m=shift)
 
@@ -96,15 +94,16 @@ def port_covariances(
         meet. Cameras without a lens stand in with that of a survey drone.
     """
     result = np.zeros((len(true_xyz), 6))
-    with one_caller():
-        _covariances(
-            np.ascontiguousarray(true_xyz),
-            *_rows(views),
-            rig_of(cameras, port, settings),
-            settings.sigma_image * np.array([lens.pixel_size for lens in lenses_of(cameras)]),
-            (settings.sigma_index, settings.sigma_centre, np.radians(settings.sigma_attitude)),
-            result,
-        )
+    in_tiles(
+        _covariances,
+        len(true_xyz),
+        np.ascontiguousarray(true_xyz),
+        *_rows(views),
+        rig_of(cameras, port, settings),
+        settings.sigma_image * np.array([lens.pixel_size for lens in lenses_of(cameras)]),
+        (settings.sigma_index, settings.sigma_centre, np.radians(settings.sigma_attitude)),
+        result,
+    )
     return result
 
 
@@ -113,7 +112,7 @@ def _rows(views: Views) -> tuple[IntArray, IntArray]:
     return start, np.ascontiguousarray(views.camera, np.int64)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _image_through(a: Vector, rig: Rig, c: int, out: FloatArray, image: FloatArray) -> None:
     """Fill in where a camera images what lies at C + a through the port.
 
@@ -132,18 +131,18 @@ def _image_through(a: Vector, rig: Rig, c: int, out: FloatArray, image: FloatArr
         image[axis, 1], image[axis, 2], image[axis, 3] = x, y, z
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _search_all(
-    moved: IntArray, xyz: FloatArray, start: IntArray, camera: IntArray, rig: Rig,
+    span: Span, moved: IntArray, xyz: FloatArray, start: IntArray, camera: IntArray, rig: Rig,
     shift: FloatArray, found: BoolArray,
 ) -> None:  # fmt: skip
     """Search each point; one that is not found keeps its shift."""
-    for m in prange(moved.size):
+    for m in range(*span):
         i = moved[m]
         found[m] = _search(shift[i], row_of(xyz, i), camera[start[i] : start[i + 1]], rig)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _search(shift: FloatArray, point: Vector, cameras: IntArray, rig: Rig) -> bool:
     """Move a point to where g is zero; whether it was reached."""
     q = shift.copy()
@@ -170,16 +169,16 @@ def _search(shift: FloatArray, point: Vector, cameras: IntArray, rig: Rig) -> bo
     return False
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _covariances(
-    xyz: FloatArray, start: IntArray, camera: IntArray, rig: Rig, sigma_image: FloatArray,
-    sigmas: tuple[float, float, float], result: FloatArray,
+    span: Span, xyz: FloatArray, start: IntArray, camera: IntArray, rig: Rig,
+    sigma_image: FloatArray, sigmas: tuple[float, float, float], result: FloatArray,
 ) -> None:  # fmt: skip
     """Sum up H, the noise and the column of n over the rays of each point, and solve.
 
     Standard deviations of the image for each camera; of index, projection centre and attitude.
     """
-    for i in prange(len(xyz)):
+    for i in range(*span):
         cameras = camera[start[i] : start[i + 1]]
         out, image, w = np.empty((3, 5)), np.empty((2, 8)), np.empty((2, 2))
         h, noise, by_n = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
@@ -209,7 +208,7 @@ def _covariances(
                 at += 1
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _image_noise(
     w: FloatArray, image: FloatArray, seen: Vector, sigma_image: float, sigma_centre: float,
     sigma_attitude: float,

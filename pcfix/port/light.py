@@ -19,8 +19,8 @@ from __future__ import annotations
 from typing import TypeAlias
 
 import numpy as np
-from numba import njit
 
+from pcfix.kernels import lean
 from pcfix.lens.algebra import Vector, beyond, dot, minus, plus, scaled, unit
 from pcfix.model import FloatArray
 from pcfix.port.shapes import DomePort, FlatPort, Port
@@ -29,7 +29,7 @@ Ray: TypeAlias = tuple[float, float, float, float, float, float]
 """A place and a unit direction."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def bent(s: Vector, normal: Vector, r: float) -> Vector:
     """Return the unit direction behind a face: Snell's law in vector form.
 
@@ -47,7 +47,7 @@ FLAT_CLOSE = 1e-8
 """Of a step, relative; as each step squares the error, the next would be below rounding."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def through_flat(
     normal: Vector, distance: float, thickness: float, glass: float, n: float,
     point: Vector, out: FloatArray,
@@ -91,7 +91,7 @@ def through_flat(
             out[i, 1 + j] = k * across + aside[i] * gradient
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _slope(
     distance: float, thickness: float, depth: float, aside2: float, glass: float, n: float
 ) -> float:
@@ -112,7 +112,7 @@ def _slope(
     return np.nan
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def ray_through_flat(
     normal: Vector, distance: float, thickness: float, glass: float, n: float, direction: Vector
 ) -> Ray:
@@ -135,7 +135,7 @@ SERIES_UP_TO = 0.01
 """Beyond, the closed form of the derivative loses two digits at most."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def turn(y: float, u: float) -> tuple[float, float, float]:
     """Return asin(y sqrt(u)) / sqrt(u), which is a series in u, and its derivatives by y and u."""
     z = y * y * u
@@ -151,7 +151,7 @@ def turn(y: float, u: float) -> tuple[float, float, float]:
     return y * s, 1.0 / root, y * y * y * by_z
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _miss(
     q: float, v: float, u: float, far: float, a: float, b: float, glass: float, n: float
 ) -> tuple[float, float, float, float, float, float]:
@@ -179,7 +179,7 @@ def _miss(
     return total, left_q - by_p * p_q, -by_p * p_v, by_u - by_p * p_u, by_far, by_n
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _place(v: float, u: float, far: float, a: float, b: float, glass: float, n: float) -> float:
     """Solve for q: Newton's method, and halving where it would leave the bracket."""
     # where the straight line from o to X meets the inner sphere
@@ -203,7 +203,7 @@ def _place(v: float, u: float, far: float, a: float, b: float, glass: float, n: 
     return q
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def through_dome(
     centre: Vector, a: float, thickness: float, glass: float, n: float,
     point: Vector, out: FloatArray,
@@ -265,7 +265,7 @@ def through_dome(
             out[i, 1 + j] = e[i] * lean_j + lean * turned / far + a * o[i] * q_j
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def ray_through_dome(
     centre: Vector, a: float, thickness: float, glass: float, n: float, direction: Vector
 ) -> Ray:
@@ -278,7 +278,7 @@ def ray_through_dome(
     return plus(outer, centre) + t
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _meet(start: Vector, s: Vector, radius: float) -> Vector:
     """Return where a ray that starts inside a sphere about the origin, or on it, leaves it."""
     along = dot(start, s)
@@ -286,7 +286,7 @@ def _meet(start: Vector, s: Vector, radius: float) -> Vector:
     return beyond(start, f, s)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def cosine_at_dome(centre: Vector, a: float, direction: Vector) -> float:
     """Return the cosine of the angle at which a ray from the projection centre meets a dome."""
     o, s = scaled(-1.0, centre), unit(direction)
@@ -310,7 +310,7 @@ def coefficients(port: Port) -> FloatArray:
     return np.array(c, np.float64)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def through_port(port: FloatArray, n: float, x: float, y: float, z: float, out: FloatArray) -> None:
     """Find in which direction the light of a point comes to the projection centre.
 
@@ -335,7 +335,7 @@ def through_port(port: FloatArray, n: float, x: float, y: float, z: float, out: 
         through_dome(where, size, thickness, glass, n, (x, y, z), out)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def ray_through(port: FloatArray, n: float, dx: float, dy: float, dz: float) -> Ray:
     """Return how a ray from the projection centre goes on in the water.
 
@@ -359,7 +359,7 @@ def ray_through(port: FloatArray, n: float, dx: float, dy: float, dz: float) -> 
     return ray_through_dome(where, size, thickness, glass, n, (dx, dy, dz))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def cosine_at_port(port: FloatArray, dx: float, dy: float, dz: float) -> float:
     """Return the cosine of the angle of incidence in air at the inner face.
 

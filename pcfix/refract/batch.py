@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from pcfix.errors import PcfixWarning
+from pcfix.kernels import inlined, lean
 from pcfix.lens.algebra import Vector, times, transposed_times
 from pcfix.lens.imaging import direction_of, image_of, lens_table
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Outcome, Views, WaterSurface
@@ -280,8 +280,6 @@ def warn_of_unsolved(beginning: str, found: BoolArray) -> None:
 class Chosen(NamedTuple):
     """Points, the water above them and the cameras chosen for each, for kernels; see `Batch`.
 
-    Flat, as kernels that run in parallel have no place for tuples within tuples.
-
     Attributes
     ----------
     xyz, made_xyz : array, shape (m, 3)
@@ -384,7 +382,7 @@ def _are_equal(made: Cameras, now: Cameras) -> bool:
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+@inlined
 def as_made(images: Images, c: int, a: Vector) -> Vector:
     """Return where the matcher had what camera c sees in a direction, both in the world frame.
 
@@ -398,7 +396,7 @@ def as_made(images: Images, c: int, a: Vector) -> Vector:
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def as_now(images: Images, c: int, a: Vector) -> Vector:
     """Return in which direction camera c sees what the matcher had in a direction."""
     return _through(
@@ -407,7 +405,7 @@ def as_now(images: Images, c: int, a: Vector) -> Vector:
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _through(
     r: FloatArray, lens: FloatArray, to_r: FloatArray, to_lens: FloatArray, a: Vector
 ) -> Vector:

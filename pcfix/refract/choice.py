@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
 
+from pcfix.kernels import Span, in_tiles, kernel, lean
 from pcfix.lens.algebra import dot, minus, normal_of, row_of
 from pcfix.lens.frames import (
     NOT_DISTORTED,
@@ -35,7 +35,6 @@ from pcfix.model import (
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.rays import pierce
-from pcfix.threads import one_caller
 from pcfix.water.surface import Field, SurfaceAbove, Tin, build_field, build_tin, locate
 
 NOMINAL_FOCAL_PX = 3700.0
@@ -52,8 +51,7 @@ ANY_NUMBER = 2**31
 class Points(NamedTuple):
     """Points and the water above them, for kernels; see `Batch`.
 
-    `order` brings neighbours together. Kernels that run in parallel take flat tuples of arrays
-    like this one; numba has no place for tuples within tuples there.
+    `order` brings neighbours together.
     """
 
     order: IntArray
@@ -148,23 +146,23 @@ def chosen_views(batch: Batch) -> Views:
     frames = no_frames(len(survey.cameras))
     if views is None:
         frames = frames_of(survey.cameras)
-    tiles = (len(batch) + TILE - 1) // TILE
+    tiles = tiles_of(batch)
     first, count = np.zeros(tiles + 1, np.int64), np.zeros(len(batch) + 1, np.int64)
-    with one_caller():
-        if views is None:
-            _make_room(points, rig, frames, first)
-            begin, entries = np.empty(len(batch), np.int64), (first[:0], first[:0])
-            place = np.empty(np.cumsum(first, out=first)[-1], np.int32)
-        else:
-            entries = (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64))
-            begin = entries[0][:-1].copy()
-            place = np.empty(len(views.camera), np.int32)
-        _choose_all(
-            points, rig, frames, rule_of(survey), *shapes_of(survey.water), entries, first,
-            (begin, count, place),
-        )  # fmt: skip
-        start = np.cumsum(count)
-        chosen = _gathered(begin, start, place)
+    if views is None:
+        in_tiles(_make_room, tiles, points, rig, frames, first)
+        begin, entries = np.empty(len(batch), np.int64), (first[:0], first[:0])
+        place = np.empty(np.cumsum(first, out=first)[-1], np.int32)
+    else:
+        entries = (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64))
+        begin = entries[0][:-1].copy()
+        place = np.empty(len(views.camera), np.int32)
+    in_tiles(
+        _choose_all, tiles, points, rig, frames, rule_of(survey), *shapes_of(survey.water),
+        entries, (first, begin, count, place),
+    )  # fmt: skip
+    start = np.cumsum(count)
+    chosen = np.empty(start[-1], np.int64)
+    in_tiles(_gather_chosen, len(begin), begin, start, place, chosen)
     if views is None:
         return Views(start, chosen)
     weight = None if views.weight is None else views.weight[chosen]
@@ -189,7 +187,7 @@ def cameras_of_pairs(pairs: Views) -> Views:
     return Views(start, distinct[: start[-1]])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _distinct(start: IntArray, camera: IntArray, first: IntArray, distinct: IntArray) -> None:
     owner = np.full(camera.max() + 1 if camera.size else 0, -1)
     count = 0
@@ -201,27 +199,32 @@ def _distinct(start: IntArray, camera: IntArray, first: IntArray, distinct: IntA
         first[i + 1] = count
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def _make_room(points: Points, rig: Rig, frames: Frames, first: IntArray) -> None:
+def tiles_of(batch: Batch) -> int:
+    """Return how many tiles of neighbours the points of a batch fill."""
+    return (len(batch) + TILE - 1) // TILE
+
+
+@kernel
+def _make_room(span: Span, points: Points, rig: Rig, frames: Frames, first: IntArray) -> None:
     """Set for each tile, one place on, how many entries it may get."""
-    for t in prange(first.size - 1):
+    for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
         low, high = gather(np.empty(7 * TILE), rows, points)
         first[t + 1] = rows.size * near_cameras(frames, rig.centres, low, high).size
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _choose_all(
-    points: Points, rig: Rig, frames: Frames, rule: Rule, tin: Tin | None, field: Field | None,
-    views: tuple[IntArray, IntArray], first: IntArray,
-    found: tuple[IntArray, IntArray, npt.NDArray[np.int32]],
+    span: Span, points: Points, rig: Rig, frames: Frames, rule: Rule, tin: Tin | None,
+    field: Field | None, views: tuple[IntArray, IntArray],
+    found: tuple[IntArray, IntArray, IntArray, npt.NDArray[np.int32]],
 ) -> None:  # fmt: skip
     """Fill in where the entries of point i begin, how many they are (at i + 1), and the entries.
 
     An entry is the number of a camera, or, where there are views, that of one of their entries.
     """
-    (begin, count, place), listed = found, views[0].size > 0
-    for t in prange(first.size - 1):
+    (first, begin, count, place), listed = found, views[0].size > 0
+    for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
         low, high = gather(tile, rows, points)
@@ -243,14 +246,14 @@ def _choose_all(
             free += kept.size
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def _gathered(begin: IntArray, start: IntArray, place: npt.NDArray[np.int32]) -> IntArray:
-    """Return the entries of all points one after the other."""
-    chosen = np.empty(start[-1], np.int64)
-    for i in prange(begin.size):
+@lean
+def _gather_chosen(
+    span: Span, begin: IntArray, start: IntArray, place: npt.NDArray[np.int32], chosen: IntArray
+) -> None:
+    """Set the entries of all points one after the other."""
+    for i in range(*span):
         for k in range(start[i + 1] - start[i]):
             chosen[start[i] + k] = place[begin[i] + k]
-    return chosen
 
 
 def spatial_order(xyz: FloatArray) -> IntArray:
@@ -268,7 +271,7 @@ def spatial_order(xyz: FloatArray) -> IntArray:
     return _cell_order(xyz, x.min(), y.min(), 1.0 / cell_m, columns, rows)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _cell_order(
     xyz: FloatArray, x0: float, y0: float, cells_per_m: float, columns: int, rows: int
 ) -> IntArray:
@@ -294,7 +297,7 @@ MAX_ANGLE_WITHOUT_FRAMES_DEG = 80.0
 block in another CRS is told apart."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def gather(tile: FloatArray, rows: IntArray, points: Points) -> tuple[FloatArray, FloatArray]:
     """Bring a tile together: runs of x, y, z, surface height and unit normal; return its box."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -310,7 +313,7 @@ def gather(tile: FloatArray, rows: IntArray, points: Points) -> tuple[FloatArray
     return low, high
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _keep_steepest(chosen: IntArray, cosine2: FloatArray, k: int, most: int) -> int:
     """Bring the `most` steepest of k cameras to the front, in the order of the cameras."""
     if k <= most:
@@ -322,7 +325,7 @@ def _keep_steepest(chosen: IntArray, cosine2: FloatArray, k: int, most: int) -> 
     return most
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def near_cameras(
     frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray
 ) -> IntArray:
@@ -339,7 +342,7 @@ def near_cameras(
     return near[:count]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def choose(
     candidates: IntArray, tile: FloatArray, j: int, rig: Rig, frames: Frames, rule: Rule,
     tin: Tin | None, field: Field | None, facet: int,

@@ -26,9 +26,9 @@ digits, and two or three do; Broyden's update of the inverse mends what is missi
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
 from pcfix.errors import SettingError
+from pcfix.kernels import Span, in_tiles, kernel, lean, most_between
 from pcfix.lens.algebra import (
     Vector,
     beyond,
@@ -68,14 +68,12 @@ from pcfix.refract.rays import (
     settle,
     slope_of_path,
 )
-from pcfix.threads import one_caller
 from pcfix.water.surface import Field, Tin, locate
 
 MAX_STEPS = 30
 CLOSE_M = 1e-7
 """What is left of the way to the solution, judged from the last two steps."""
 
-_BLOCK = 64
 
 # Columns of the result.
 _MISS, _SIGMA_Z, _COSINE2, _OUTCOME, _FOUND = 3, 4, 5, 6, 7
@@ -135,8 +133,8 @@ def consistent(batch: Batch) -> Intersection:
     """
     check_consistent(batch.survey.cameras)
     survey, result = batch.survey, np.zeros((len(batch), 8))
-    with one_caller():
-        _correct(batch.chosen(), optics_of(survey.cameras), *shapes_of(survey.water), result)
+    optics, shapes = optics_of(survey.cameras), shapes_of(survey.water)
+    in_tiles(_correct, len(batch), batch.chosen(), optics, *shapes, result)
     outcome = result[:, _OUTCOME].astype(np.uint8)
     moved = outcome == Outcome.CORRECTED
     warn_of_unsolved("method consistent found no solution", result[moved, _FOUND] > 0.0)
@@ -152,33 +150,30 @@ def consistent(batch: Batch) -> Intersection:
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _correct(
-    points: Chosen, optics: Optics, tin: Tin | None, field: Field | None, result: FloatArray
-) -> None:
-    """Correct every point on its own; a block of them shares the memory for their rays."""
+    span: Span, points: Chosen, optics: Optics, tin: Tin | None, field: Field | None,
+    result: FloatArray,
+) -> None:  # fmt: skip
+    """Correct every point on its own."""
     start = points.start
-    for block in prange((len(points.xyz) + _BLOCK - 1) // _BLOCK):
-        first, last = block * _BLOCK, min((block + 1) * _BLOCK, len(points.xyz))
-        most = 0
-        for i in range(first, last):
-            most = max(most, start[i + 1] - start[i])
-        rays, sums = np.empty((most, _WIDTH)), np.empty(10)
-        for i in range(first, last):
-            cameras = points.camera[start[i] : start[i + 1]]
-            out = result[i]
-            if cameras.size == 0 or cameras.min() == cameras.max():
-                out[_OUTCOME] = ONE_CAMERA if cameras.size else NO_CAMERA
-                continue
-            facet = -1 if tin is None else locate(tin, points.xyz[i, 0], points.xyz[i, 1])
-            sums[:9], sums[9] = 0.0, 1.0
-            for j in range(cameras.size):
-                _begin(rays[j], sums, points, i, cameras[j], tin, field, facet)
-                _add_image(rays[j], optics, cameras[j])
-            _solve(out, rays, sums, cameras, optics, points.n, tin, field)
+    rays, sums = np.empty((most_between(span, start), _WIDTH)), np.empty(10)
+    g, inverse = np.empty(3), np.empty((3, 3))
+    for i in range(*span):
+        cameras = points.camera[start[i] : start[i + 1]]
+        out = result[i]
+        if cameras.size == 0 or cameras.min() == cameras.max():
+            out[_OUTCOME] = ONE_CAMERA if cameras.size else NO_CAMERA
+            continue
+        facet = -1 if tin is None else locate(tin, points.xyz[i, 0], points.xyz[i, 1])
+        sums[:9], sums[9] = 0.0, 1.0
+        for j in range(cameras.size):
+            _begin(rays[j], sums, points, i, cameras[j], tin, field, facet)
+            _add_image(rays[j], optics, cameras[j])
+        _solve(out, rays, (sums, g, inverse), cameras, optics, points.n, tin, field)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _begin(
     ray: FloatArray, sums: FloatArray, points: Chosen, i: int, c: int,
     tin: Tin | None, field: Field | None, facet: int,
@@ -206,7 +201,7 @@ def _begin(
     ray[_ORIGIN], ray[_ORIGIN + 1], ray[_ORIGIN + 2] = lowered
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _add_image(ray: FloatArray, optics: Optics, c: int) -> None:
     """Fill in where the camera images P, and how that moves with P in the world frame."""
     lens, down = optics.lenses[optics.row[c]], scaled(-1.0, vector(ray))
@@ -216,24 +211,24 @@ def _add_image(ray: FloatArray, optics: Optics, c: int) -> None:
     ray[_IMAGE], ray[_IMAGE + 1] = u, v
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _solve(
-    out: FloatArray, rays: FloatArray, sums: FloatArray, cameras: IntArray, optics: Optics,
-    n: float, tin: Tin | None, field: Field | None,
+    out: FloatArray, rays: FloatArray, room: tuple[FloatArray, FloatArray, FloatArray],
+    cameras: IntArray, optics: Optics, n: float, tin: Tin | None, field: Field | None,
 ) -> None:  # fmt: skip
-    """Solve one point and write its row."""
-    k = float(cameras.size)
+    """Solve one point and write its row; the room is its sums, and that of the search."""
+    (sums, g, inverse), k = room, float(cameras.size)
     solved, q, _, sigma_z = nearest_point(k, sums)
     if not solved:
         out[_OUTCOME] = PARALLEL
         return
-    found, q = _search(q, rays, cameras, optics, n, tin, field)
+    found, q = _search(q, (g, inverse), rays, cameras, optics, n, tin, field)
     out[0], out[1], out[2] = q
     out[_MISS], out[_SIGMA_Z] = _miss(k, sums, q), sigma_z
     out[_COSINE2], out[_OUTCOME], out[_FOUND] = sums[9], CORRECTED, 1.0 if found else 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _miss(k: float, s: FloatArray, q: Vector) -> float:
     """Return the rms distance of Q from the lines of the sums, Q'MQ - 2 b'Q + s over k."""
     x, y, z = q
@@ -244,10 +239,10 @@ def _miss(k: float, s: FloatArray, q: Vector) -> float:
     return np.sqrt(max(rest, 0.0) / k)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _search(
-    start: Vector, rays: FloatArray, cameras: IntArray, optics: Optics, n: float,
-    tin: Tin | None, field: Field | None,
+    start: Vector, room: tuple[FloatArray, FloatArray], rays: FloatArray, cameras: IntArray,
+    optics: Optics, n: float, tin: Tin | None, field: Field | None,
 ) -> tuple[bool, Vector]:  # fmt: skip
     """Return whether a Q was found where g is zero, and it, else the start.
 
@@ -255,7 +250,8 @@ def _search(
     B + t (s'B) / (s'(s - t)), with t = -B g of the new g.
     """
     q, s, before = start, (0.0, 0.0, 0.0), 0.0
-    g, inverse = np.empty(3), np.zeros((3, 3))
+    g, inverse = room
+    inverse[:] = 0.0
     for step in range(MAX_STEPS):
         _gradient(g, inverse[: 0 if step else 3], q, rays, cameras, optics, n, tin, field)
         if step == 0 and not _inverted(inverse):
@@ -277,7 +273,7 @@ def _search(
     return False, start
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _gradient(
     g: FloatArray, slope: FloatArray, q: Vector, rays: FloatArray, cameras: IntArray,
     optics: Optics, n: float, tin: Tin | None, field: Field | None,
@@ -300,7 +296,7 @@ def _gradient(
             _add_slope(slope, ray, path, slope_of_path(path, normal, n))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _add_slope(slope: FloatArray, ray: FloatArray, path: Path, by_q: Vector) -> None:
     """Add (N.e) J'J d w / d Q, with d w / d Q = k (I - N N') + s (grad k)'."""
     k, s, normal = path[0], path[4], vector(ray, _PLANE)
@@ -315,7 +311,7 @@ def _add_slope(slope: FloatArray, ray: FloatArray, path: Path, by_q: Vector) -> 
                 slope[i, axis] += j[i] * d[axis]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _inverted(m: FloatArray) -> bool:
     """Replace a matrix of 3 x 3 by its inverse; whether it has one."""
     a, b, c = m[0, 0], m[0, 1], m[0, 2]

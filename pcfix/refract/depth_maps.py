@@ -24,13 +24,13 @@ A level bed will do: a slope of it moves the Q_i and the directions a_ij nearly 
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 
+from pcfix.kernels import Span, in_tiles, inlined, kernel, lean
 from pcfix.lens.algebra import Vector, beyond, dot, minus, row_of, scaled
-from pcfix.lens.frames import Frames, holds
+from pcfix.lens.frames import holds
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import (
     CORRECTED,
@@ -46,7 +46,6 @@ from pcfix.refract.batch import (
 )
 from pcfix.refract.matcher import Matcher
 from pcfix.refract.rays import direction, light_path, refracted
-from pcfix.threads import one_caller
 
 MAX_LOOKS = 5
 CLOSE_M = 0.002
@@ -57,7 +56,6 @@ AVERAGED_WITHIN = 0.012
 """Depths of neighbouring maps that differ by less, relative, are averaged before the fusion."""
 
 _ROUNDS = 4
-_BLOCK = 64
 _MISS, AMBIGUITY, OUTCOME, _COUNT = 3, 4, 5, 6
 COLUMNS = 7
 """Of what the kernels write: the shift, and these."""
@@ -78,9 +76,8 @@ def invert_depth_maps(batch: Batch) -> Intersection:
     """
     weights = batch.rays.weight
     result = np.zeros((len(batch.xyz), COLUMNS))
-    with one_caller():
-        given = np.zeros(0) if weights is None else weights.astype(np.float64)
-        _invert(*arrays_of(batch), given, result)
+    given = np.zeros(0) if weights is None else weights.astype(np.float64)
+    in_tiles(_invert, len(batch), *arrays_of(batch), given, result)
     return intersection_of(batch, result)
 
 
@@ -109,26 +106,61 @@ class Sight(NamedTuple):
     n: float
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def sight_of(points: Chosen, i: int, images: Images) -> Sight:
-    """Return what the images have of point i."""
-    point, normal = points.xyz[i], row_of(points.normals, i)
-    up = points.centres - point
-    made = images.centres - points.made_xyz[i] if len(images.centres) else up
-    above = normal[2] * (points.height[i] - point[2] + points.offset)
-    return Sight(up, made, above, normal, points.n)
+class Room(NamedTuple):
+    """Room for one point and the k images, so that no kernel makes arrays.
+
+    up, made : shape (k, 3); above : shape (k,), of `Sight`.
+    t, slope : shape (k,), of `Lines`.
+    weight, now : shape (k,), what each map counts for, and its depth as it is now.
+    looks : shape (k, 5), of `_look`.
+    pairs : shape (partners, 3), of `_depth`.
+    place, found : shape (k,), where each image is among those found, and these.
+    """
+
+    up: FloatArray
+    made: FloatArray
+    above: FloatArray
+    t: FloatArray
+    slope: FloatArray
+    weight: FloatArray
+    now: FloatArray
+    looks: FloatArray
+    pairs: FloatArray
+    place: IntArray
+    found: IntArray
 
 
-Tables: TypeAlias = tuple[IntArray, IntArray, IntArray, FloatArray]
+@kernel
+def room_for(k: int, partners: int) -> Room:
+    """Return new room, in which no image has a place."""
+    return Room(
+        np.empty((k, 3)), np.empty((k, 3)), np.empty(k), np.empty(k), np.empty(k), np.empty(k),
+        np.empty(k), np.empty((k, 5)), np.empty((partners, 3)), np.full(k, ABSENT),
+        np.empty(k, np.int64),
+    )  # fmt: skip
 
 
-def arrays_of(batch: Batch) -> tuple[Chosen, Images, Tables, Frames, float]:
-    """Return what the kernels take of a batch: points, images and the matcher in flat parts."""
+@lean
+def look_at(room: Room, points: Chosen, i: int, images: Images) -> None:
+    """Fill in what the images have of point i: `up`, `made` and `above`."""
+    apart = len(images.centres) > 0
+    for c in range(len(points.centres)):
+        for axis in range(3):
+            up = points.centres[c, axis] - points.xyz[i, axis]
+            room.up[c, axis] = room.made[c, axis] = up
+            if apart:
+                room.made[c, axis] = images.centres[c, axis] - points.made_xyz[i, axis]
+        above = points.height[i] - points.xyz[i, 2] + points.offset[c]
+        room.above[c] = points.normals[i, 2] * above
+
+
+def arrays_of(batch: Batch) -> tuple[Chosen, Images, Matcher]:
+    """Return what the kernels take of a batch: points, images and the matcher."""
     matcher = batch.survey.learned.matcher
     if matcher is None:
         raise ValueError("a model of the matcher is needed")
     images = images_of(batch.made_with, batch.survey.cameras)
-    return batch.chosen(), images, matcher[:4], matcher.inner, matcher.tolerance_px2
+    return batch.chosen(), images, matcher
 
 
 def intersection_of(batch: Batch, result: FloatArray) -> Intersection:
@@ -148,38 +180,48 @@ def intersection_of(batch: Batch, result: FloatArray) -> Intersection:
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _invert(
-    points: Chosen, images: Images, tables: Tables, inner: Frames, tolerance: float,
-    weight: FloatArray, result: FloatArray,
+    span: Span, points: Chosen, images: Images, matcher: Matcher, weight: FloatArray,
+    result: FloatArray,
 ) -> None:  # fmt: skip
-    start, k = points.start, len(points.centres)
-    for block in prange((len(points.xyz) + _BLOCK - 1) // _BLOCK):
-        matcher = Matcher(tables[0], tables[1], tables[2], tables[3], inner, tolerance)
-        place, found = np.full(k, ABSENT), np.empty(k, np.int64)
-        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(points.xyz))):
-            sight = sight_of(points, i, images)
-            listed = points.camera[start[i] : start[i + 1]]
-            given = weight[start[i] : start[i + 1]] if weight.size else weight
-            maps = found[: _with_neighbours(found, place, listed, sight.made, matcher)]
-            depths = lines(maps, sight, images, matcher)
-            counts, step = np.zeros(maps.size), 0.0
-            for _ in range(_ROUNDS):
-                now = depths.t + depths.slope * step
-                _share(counts, place, listed, given, sight.made, now, matcher)
-                step = balance(depths.t, depths.slope, counts)
-            settle_bed(result[i], maps, counts, depths, sight, images, matcher)
-            place[maps] = ABSENT
-            for c in listed:
-                for a in matcher.averaged[c]:
-                    if a >= 0:
-                        place[a] = ABSENT
+    room = room_for(len(points.centres), matcher.matched.shape[1])
+    for i in range(*span):
+        first, last = points.start[i], points.start[i + 1]
+        given = weight[first:last] if weight.size else weight
+        _invert_one(result[i], points, i, points.camera[first:last], given, images, matcher, room)
+
+
+@lean
+def _invert_one(
+    row: FloatArray, points: Chosen, i: int, listed: IntArray, given: FloatArray, images: Images,
+    matcher: Matcher, room: Room,
+) -> None:  # fmt: skip
+    look_at(room, points, i, images)
+    made, normal = room.made, row_of(points.normals, i)
+    sight = Sight(room.up, made, room.above, normal, points.n)
+    maps = room.found[: _with_neighbours(room.found, room.place, listed, made, matcher)]
+    t, slope = room.t[: maps.size], room.slope[: maps.size]
+    depths = Lines(find_lines(t, slope, maps, sight, images, matcher, room), t, slope)
+    counts, now, step = room.weight[: maps.size], room.now, 0.0
+    for _ in range(_ROUNDS):
+        for q in range(maps.size):
+            now[q] = t[q] + slope[q] * step
+        _share(counts, room.place, listed, given, made, now, matcher)
+        step = balance(t, slope, counts)
+    settle_bed(row, maps, counts, depths, sight, images, matcher, room)
+    for q in maps:
+        room.place[q] = ABSENT
+    for c in listed:
+        for a in matcher.averaged[c]:
+            if a >= 0:
+                room.place[a] = ABSENT
 
 
 ABSENT, _OUTSIDE = -1, -2
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _with_neighbours(
     found: IntArray, place: IntArray, listed: IntArray, made: FloatArray, matcher: Matcher
 ) -> int:
@@ -203,7 +245,7 @@ def _with_neighbours(
     return count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _share(
     counts: FloatArray, place: IntArray, listed: IntArray, given: FloatArray, made: FloatArray,
     now: FloatArray, matcher: Matcher,
@@ -216,7 +258,7 @@ def _share(
     counts[:] = 0.0
     for k in range(listed.size):
         c = listed[k]
-        w = given[k] if given.size else 1.0 / (made[c] * made[c]).sum()
+        w = given[k] if given.size else 1.0 / dot(row_of(made, c), row_of(made, c))
         own, members = place[c], 1.0
         for a in matcher.averaged[c]:
             members += averages(own, a, now, place)
@@ -226,7 +268,7 @@ def _share(
                 counts[place[a]] += w / members
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def averages(own: int, a: int, now: FloatArray, place: IntArray) -> bool:
     """Whether a depth is averaged with that of image a: both show the place, nearly alike."""
     if a < 0 or place[a] < 0:
@@ -251,25 +293,30 @@ class Lines(NamedTuple):
     slope: FloatArray
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def lines(maps: IntArray, sight: Sight, images: Images, matcher: Matcher) -> Lines:
-    """Return the lines of the depth maps of some images."""
-    deep = -sight.above.mean() / sight.normal[2] * (sight.n - 1.0)
+@lean
+def find_lines(
+    t: FloatArray, slope: FloatArray, maps: IntArray, sight: Sight, images: Images,
+    matcher: Matcher, room: Room,
+) -> float:  # fmt: skip
+    """Fill in the lines of the depth maps of some images, and return their likely bed."""
+    deep = 0.0
+    for c in range(sight.above.size):
+        deep += sight.above[c]
+    deep = -(deep / sight.above.size) / sight.normal[2] * (sight.n - 1.0)
     bed, rise = 1.1 * deep, min(0.1 * deep, -LEAST_RISE_M)
-    t, slope = np.empty(maps.size), np.empty(maps.size)
-    out, work = np.empty(5), np.empty((matcher.matched.shape[1], 3))
+    out = room.looks[0]
     for q in range(maps.size):
-        _look(out, maps[q], bed, sight, images, matcher, work)
+        _look(out, maps[q], bed, sight, images, matcher, room.pairs)
         t[q] = out[0]
-        _look(out, maps[q], bed + rise, sight, images, matcher, work)
+        _look(out, maps[q], bed + rise, sight, images, matcher, room.pairs)
         slope[q] = (out[0] - t[q]) / rise
         usual = 1.0 / (sight.n * sight.made[maps[q], 2])
         if slope[q] == slope[q] and not 0.5 < -slope[q] / usual < 2.0:
             slope[q] = -usual  # another pair of images was the best one there
-    return Lines(bed, t, slope)
+    return bed
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def balance(t: FloatArray, slope: FloatArray, weight: FloatArray) -> float:
     """Return how far up the bed must go so that the weighted mean of the depths is zero."""
     total, change = 0.0, 0.0
@@ -279,10 +326,10 @@ def balance(t: FloatArray, slope: FloatArray, weight: FloatArray) -> float:
     return -total / change
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def settle_bed(
     row: FloatArray, maps: IntArray, weight: FloatArray, depths: Lines, sight: Sight,
-    images: Images, matcher: Matcher,
+    images: Images, matcher: Matcher, room: Room,
 ) -> None:  # fmt: skip
     """Find the height of the bed at which the fused depths give the apparent point, and write it.
 
@@ -291,14 +338,14 @@ def settle_bed(
     row[OUTCOME] = NO_CAMERA if maps.size == 0 else ONE_CAMERA
     bed, slope = depths.bed, depths.slope
     step = balance(depths.t, slope, weight)
-    looks, work = np.empty((maps.size, 5)), np.empty((matcher.matched.shape[1], 3))
+    looks = room.looks[: maps.size]
     for _ in range(MAX_LOOKS):
         if not np.isfinite(step):
             return
         bed += step
         for q in range(maps.size):
             if weight[q] > 0.0:
-                _look(looks[q], maps[q], bed, sight, images, matcher, work)
+                _look(looks[q], maps[q], bed, sight, images, matcher, room.pairs)
             else:
                 looks[q, 0] = 0.0
         step = balance(looks[:, 0], slope, weight)
@@ -318,7 +365,7 @@ def settle_bed(
     row[OUTCOME], row[_COUNT] = CORRECTED, count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _look(
     out: FloatArray, c: int, bed: float, sight: Sight, images: Images, matcher: Matcher,
     work: FloatArray,
@@ -342,7 +389,7 @@ def _look(
     out[0] = _depth(c, (out[1], out[2], bed), u, sight, images, matcher, work) / length
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+@inlined
 def _ray(c: int, sight: Sight, images: Images) -> tuple[Vector, Vector, float]:
     """Return the ray on which image c shows the point.
 
@@ -358,7 +405,7 @@ def _ray(c: int, sight: Sight, images: Images) -> tuple[Vector, Vector, float]:
     return a, e, sight.above[c] - dot(sight.normal, a)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+@inlined
 def _depth(
     c: int, q: Vector, u: Vector, sight: Sight, images: Images, matcher: Matcher, work: FloatArray
 ) -> float:
@@ -389,7 +436,7 @@ def _depth(
     return _best_pairs(work[:count], matcher.tolerance_px2)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _best_pairs(work: FloatArray, tolerance: float) -> float:
     """Return the depth at which two images agree best: a mean over the pairs, the best most.
 

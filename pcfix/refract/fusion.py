@@ -15,33 +15,34 @@ height that most points around can have come from, the bed of the surroundings
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
-from pcfix.lens.frames import Frames
+from pcfix.kernels import Span, in_tiles, kernel, lean
+from pcfix.lens.algebra import row_of
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Batch, Chosen, Images, Intersection
 from pcfix.refract.depth_maps import (
+    ABSENT,
     AMBIGUITY,
     COLUMNS,
     Lines,
-    Tables,
+    Room,
+    Sight,
     arrays_of,
     averages,
     balance,
+    find_lines,
     intersection_of,
-    lines,
+    look_at,
+    room_for,
     settle_bed,
-    sight_of,
 )
 from pcfix.refract.matcher import WIDTH_M, Matcher
-from pcfix.threads import one_caller
 
 AGREE = 0.01
 """Depths that differ by less, relative, are fused."""
 
 MAX_ROUNDS = 6
 CLOSE_M = 2e-3
-_BLOCK = 64
 
 
 def invert_fusion(batch: Batch) -> Intersection:
@@ -56,8 +57,7 @@ def invert_fusion(batch: Batch) -> Intersection:
     bed = batch.survey.learned.bed
     around = np.full(len(batch.xyz), np.nan) if bed is None else bed.height_at(batch.xyz[:, :2])
     result = np.zeros((len(batch.xyz), COLUMNS))
-    with one_caller():
-        _invert(*arrays_of(batch), around, result)
+    in_tiles(_invert, len(batch), *arrays_of(batch), around, result)
     return intersection_of(batch, result)
 
 
@@ -70,67 +70,84 @@ def likely_beds(batch: Batch) -> FloatArray:
         Relative to each apparent point, metres; NaN where there is none.
     """
     likely = np.full((len(batch.xyz), max(1, batch.counts.max(initial=0))), np.nan, np.float32)
-    with one_caller():
-        _likely(*arrays_of(batch), likely)
+    in_tiles(_likely, len(batch), *arrays_of(batch), likely)
     return likely
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _likely(
-    points: Chosen, images: Images, tables: Tables, inner: Frames, tolerance: float,
-    likely: FloatArray,
+    span: Span, points: Chosen, images: Images, matcher: Matcher, likely: FloatArray
+) -> None:
+    room = room_for(len(points.centres), matcher.matched.shape[1])
+    for i in range(*span):
+        maps = points.camera[points.start[i] : points.start[i + 1]]
+        _likely_of(likely[i], points, i, maps, images, matcher, room)
+
+
+@lean
+def _likely_of(
+    likely: FloatArray, points: Chosen, i: int, maps: IntArray, images: Images, matcher: Matcher,
+    room: Room,
 ) -> None:  # fmt: skip
-    for block in prange((len(points.xyz) + _BLOCK - 1) // _BLOCK):
-        matcher = Matcher(tables[0], tables[1], tables[2], tables[3], inner, tolerance)
-        place = np.full(len(points.centres), -1)
-        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(points.xyz))):
-            maps = points.camera[points.start[i] : points.start[i + 1]]
-            sight = sight_of(points, i, images)
-            depths = lines(maps, sight, images, matcher)
-            weight = np.empty(maps.size)
-            _set(place, maps)
-            for seed in range(maps.size):
-                if depths.slope[seed] == depths.slope[seed]:
-                    rise, _ = _group(weight, seed, maps, place, depths, sight.made, matcher)
-                    likely[i, seed] = depths.bed + rise
-            place[maps] = -1
+    look_at(room, points, i, images)
+    sight = Sight(room.up, room.made, room.above, row_of(points.normals, i), points.n)
+    t, slope = room.t[: maps.size], room.slope[: maps.size]
+    depths = Lines(find_lines(t, slope, maps, sight, images, matcher, room), t, slope)
+    _set(room.place, maps)
+    for seed in range(maps.size):
+        if depths.slope[seed] == depths.slope[seed]:
+            rise, _ = _group(seed, maps, depths, sight.made, matcher, room)
+            likely[seed] = depths.bed + rise
+    _unset(room.place, maps)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _invert(
-    points: Chosen, images: Images, tables: Tables, inner: Frames, tolerance: float,
-    around: FloatArray, result: FloatArray,
+    span: Span, points: Chosen, images: Images, matcher: Matcher, around: FloatArray,
+    result: FloatArray,
 ) -> None:  # fmt: skip
-    for block in prange((len(points.xyz) + _BLOCK - 1) // _BLOCK):
-        matcher = Matcher(tables[0], tables[1], tables[2], tables[3], inner, tolerance)
-        place = np.full(len(points.centres), -1)
-        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(points.xyz))):
-            maps = points.camera[points.start[i] : points.start[i + 1]]
-            sight = sight_of(points, i, images)
-            depths = lines(maps, sight, images, matcher)
-            weight = np.zeros(maps.size)
-            _set(place, maps)
-            wanted = around[i] - points.xyz[i, 2] - depths.bed
-            seed, result[i, AMBIGUITY] = _best_seed(
-                weight, maps, place, depths, sight.made, matcher, wanted
-            )
-            if seed >= 0:
-                _group(weight, seed, maps, place, depths, sight.made, matcher)
-            place[maps] = -1
-            settle_bed(result[i], maps, weight, depths, sight, images, matcher)
+    room = room_for(len(points.centres), matcher.matched.shape[1])
+    for i in range(*span):
+        maps = points.camera[points.start[i] : points.start[i + 1]]
+        _invert_one(result[i], points, i, maps, around[i], images, matcher, room)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
+def _invert_one(
+    row: FloatArray, points: Chosen, i: int, maps: IntArray, around: float, images: Images,
+    matcher: Matcher, room: Room,
+) -> None:  # fmt: skip
+    look_at(room, points, i, images)
+    sight = Sight(room.up, room.made, room.above, row_of(points.normals, i), points.n)
+    t, slope = room.t[: maps.size], room.slope[: maps.size]
+    depths = Lines(find_lines(t, slope, maps, sight, images, matcher, room), t, slope)
+    _set(room.place, maps)
+    wanted = around - points.xyz[i, 2] - depths.bed
+    weight = room.weight[: maps.size]
+    weight[:] = 0.0
+    seed, row[AMBIGUITY] = _best_seed(maps, depths, sight.made, matcher, wanted, room)
+    if seed >= 0:
+        _group(seed, maps, depths, sight.made, matcher, room)
+    _unset(room.place, maps)
+    settle_bed(row, maps, weight, depths, sight, images, matcher, room)
+
+
+@lean
 def _set(place: IntArray, maps: IntArray) -> None:
     for q in range(maps.size):
         place[maps[q]] = q
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
+def _unset(place: IntArray, maps: IntArray) -> None:
+    for c in maps:
+        place[c] = ABSENT
+
+
+@lean
 def _best_seed(
-    weight: FloatArray, maps: IntArray, place: IntArray, depths: Lines, made: FloatArray,
-    matcher: Matcher, wanted: float,
-) -> tuple[int, float]:  # fmt: skip
+    maps: IntArray, depths: Lines, made: FloatArray, matcher: Matcher, wanted: float, room: Room
+) -> tuple[int, float]:
     """Return the seed whose group has the bed nearest to the wanted height, or the largest one.
 
     And how far apart (m, standard deviation) the beds are of the groups that it can have been.
@@ -140,7 +157,7 @@ def _best_seed(
     for seed in range(maps.size):
         if depths.slope[seed] != depths.slope[seed]:
             continue
-        rise, members = _group(weight, seed, maps, place, depths, made, matcher)
+        rise, members = _group(seed, maps, depths, made, matcher, room)
         known = wanted == wanted
         misfit = abs(rise - wanted) if known else -float(members)
         if misfit < least:
@@ -154,18 +171,17 @@ def _best_seed(
     return best, np.sqrt(max(second / total - mean * mean, 0.0))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _group(
-    weight: FloatArray, seed: int, maps: IntArray, place: IntArray, depths: Lines,
-    made: FloatArray, matcher: Matcher,
-) -> tuple[float, int]:  # fmt: skip
+    seed: int, maps: IntArray, depths: Lines, made: FloatArray, matcher: Matcher, room: Room
+) -> tuple[float, int]:
     """Return the height of the bed if the group of a seed made the point, and the group's size.
 
-    Also sets what each depth map counts for in it.
+    Also sets, in the room, what each depth map counts for in it.
     """
     t, slope = depths.t, depths.slope
     rise, members = -t[seed] / slope[seed], 0
-    now = np.empty(maps.size)
+    weight, now, place = room.weight[: maps.size], room.now[: maps.size], room.place
     for _ in range(MAX_ROUNDS):
         for q in range(maps.size):
             now[q] = t[q] + slope[q] * rise
@@ -182,7 +198,7 @@ def _group(
     return rise, members
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _averaged(
     camera: int, q: int, now: FloatArray, place: IntArray, matcher: Matcher
 ) -> tuple[float, float]:
@@ -194,7 +210,7 @@ def _averaged(
     return total / count, count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _fuse(
     weight: FloatArray, q: int, maps: IntArray, now: FloatArray, middle: float, place: IntArray,
     made: FloatArray, matcher: Matcher,

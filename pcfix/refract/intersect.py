@@ -14,8 +14,8 @@ water lay below the apparent point saw it through air; its ray goes straight on.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
+from pcfix.kernels import Span, in_tiles, kernel, lean
 from pcfix.lens.algebra import dot, minus, row_of, scaled
 from pcfix.lens.frames import (
     ALL,
@@ -44,6 +44,7 @@ from pcfix.refract.choice import (
     rig_of,
     rule_of,
     shapes_of,
+    tiles_of,
 )
 from pcfix.refract.rays import add_line, line_terms, nearest_point, pierce, refracted
 from pcfix.refract.sensitivity import SUMS, TILE_RUNS, Budget, add_below
@@ -54,7 +55,6 @@ from pcfix.refract.uncertainty import (
     level_sigma_of,
     with_errors,
 )
-from pcfix.threads import one_caller
 from pcfix.water.surface import Field, Tin, locate
 
 
@@ -72,11 +72,11 @@ def intersect(batch: Batch) -> Intersection:
     """
     survey, views = batch.survey, batch.rays
     result, used = np.zeros((len(batch), 8)), np.zeros(len(survey.cameras), np.bool_)
-    with one_caller():
-        _chosen(
-            points_of(batch), rig_of(survey), rule_of(survey), *shapes_of(survey.water),
-            (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)), result, used,
-        )  # fmt: skip
+    in_tiles(
+        _chosen, tiles_of(batch), points_of(batch), rig_of(survey), rule_of(survey),
+        *shapes_of(survey.water),
+        (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)), result, used,
+    )  # fmt: skip
     return _as_intersection(result, used)
 
 
@@ -93,11 +93,10 @@ def intersect_in_frame(batch: Batch) -> Intersection:
     survey = batch.survey
     result, used = np.zeros((len(batch), 8)), np.zeros(len(survey.cameras), np.bool_)
     covariance = np.zeros((len(batch) if survey.settings.dimensions == "all" else 0, 6))
-    with one_caller():
-        _all_in_frame(
-            points_of(batch), rig_of(survey), frames_of(survey.cameras), rule_of(survey),
-            budget_of(survey), level_sigma_of(batch), result, used, covariance,
-        )  # fmt: skip
+    in_tiles(
+        _all_in_frame, tiles_of(batch), points_of(batch), rig_of(survey), frames_of(survey.cameras),
+        rule_of(survey), budget_of(survey), level_sigma_of(batch), (result, used, covariance),
+    )  # fmt: skip
     found = _as_intersection(result, used)
     return with_errors(found, covariance if len(covariance) == len(batch) else None, survey)
 
@@ -118,7 +117,7 @@ def _as_intersection(result: FloatArray, used: BoolArray) -> Intersection:
 _MISS, _SIGMA_Z, _INCIDENCE, _COUNT, _OUTCOME = 3, 4, 5, 6, 7
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _solve(row: FloatArray, k: float, sums: FloatArray) -> None:
     """Solve one point and write its row; a point without a solution keeps a shift of zero."""
     if k < 2.0:
@@ -134,7 +133,7 @@ def _solve(row: FloatArray, k: float, sums: FloatArray) -> None:
     row[_COUNT], row[_OUTCOME] = k, CORRECTED
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _mark_camera(
     marks: FloatArray, tile: FloatArray, frames: Frames, c: int, centre: FloatArray,
     low: FloatArray, high: FloatArray,
@@ -156,7 +155,7 @@ def _mark_camera(
     return bool(mark(marks, x, y, z, centre, frames, c) > 0)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _add_camera(
     sums: FloatArray, tile: FloatArray, marks: FloatArray, g: Pyramid | None, rig: Rig, c: int,
     rule: Rule,
@@ -203,14 +202,15 @@ def _add_camera(
     return rays
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _all_in_frame(
-    points: Points, rig: Rig, frames: Frames, rule: Rule, budget: Budget, level_sigma: FloatArray,
-    result: FloatArray, used: BoolArray, covariance: FloatArray,
+    span: Span, points: Points, rig: Rig, frames: Frames, rule: Rule, budget: Budget,
+    level_sigma: FloatArray, found: tuple[FloatArray, BoolArray, FloatArray],
 ) -> None:  # fmt: skip
     """Every camera whose frame holds the point; the surface above it is a plane."""
     centres = rig.centres
-    for t in prange((points.order.size + TILE - 1) // TILE):
+    result, used, covariance = found
+    for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
         tile, sums = np.empty(TILE_RUNS * TILE), np.zeros(11 * TILE)
         low, high = gather(tile, rows, points)
@@ -247,14 +247,14 @@ def _all_in_frame(
             finish_tile(covariance, rows, errors, tile, level_sigma, budget)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _chosen(
-    points: Points, rig: Rig, rule: Rule, tin: Tin | None, field: Field | None,
+    span: Span, points: Points, rig: Rig, rule: Rule, tin: Tin | None, field: Field | None,
     views: tuple[IntArray, IntArray], result: FloatArray, used: BoolArray,
 ) -> None:  # fmt: skip
     """Chosen cameras per point, and rays that may bend at a mesh or raster."""
     start, camera = views
-    for t in prange((points.order.size + TILE - 1) // TILE):
+    for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
         gather(tile, rows, points)
@@ -267,7 +267,7 @@ def _chosen(
             _intersect_one(result[i], cameras, tile, j, rig, rule.bend, tin, field, facet)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _intersect_one(
     row: FloatArray, cameras: IntArray, tile: FloatArray, j: int, rig: Rig, r: float,
     tin: Tin | None, field: Field | None, facet: int,

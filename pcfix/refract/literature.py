@@ -21,14 +21,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numba import njit, prange
 
 from pcfix.errors import SettingError
+from pcfix.kernels import Span, in_tiles, kernel, lean
 from pcfix.lens.algebra import dot, minus, row_of, scaled
 from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, Views
 from pcfix.refract.batch import Batch, Chosen, Intersection
 from pcfix.refract.rays import add_line, nearest_point, refracted
-from pcfix.threads import one_caller
 
 
 def apparent_depth(batch: Batch) -> FloatArray:
@@ -42,13 +41,13 @@ def down(shift_m: FloatArray) -> FloatArray:
     return np.column_stack([none, none, -shift_m])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def depth_ratio(tan2: float, n: float) -> float:
     """Return tan a / tan b of a ray with tan^2 a = `tan2`: what a depth grows by along it."""
     return np.sqrt(n * n + (n * n - 1.0) * tan2)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _plumb_line_crossings(points: Chosen, by_cosine: bool) -> tuple[FloatArray, FloatArray]:
     """Find where the bent rays of each point cross its plumb line, in the mean.
 
@@ -87,7 +86,7 @@ def _plumb_line_crossings(points: Chosen, by_cosine: bool) -> tuple[FloatArray, 
     return lowered, miss
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _crossing(points: Chosen, i: int, c: int) -> tuple[float, float]:
     """Return how far below the apparent point a bent ray crosses its plumb line; cos^2 a."""
     ex, ey, ez = minus(row_of(points.centres, c), row_of(points.xyz, i))
@@ -125,15 +124,14 @@ def in_pairs(batch: Batch) -> Batch:
     """
     start = np.concatenate([[0], np.cumsum(np.minimum(batch.counts, 2))]).astype(np.int64)
     camera = np.empty(start[-1], np.int64)
-    with one_caller():
-        _choose_pairs(batch.chosen(), start, camera)
+    in_tiles(_choose_pairs, len(batch), batch.chosen(), start, camera)
     return replace(batch, views=Views(start, camera))
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def _choose_pairs(points: Chosen, pair_start: IntArray, pair: IntArray) -> None:
+@kernel
+def _choose_pairs(span: Span, points: Chosen, pair_start: IntArray, pair: IntArray) -> None:
     """Fill in ``pair[pair_start[i] : pair_start[i + 1]]`` for every point."""
-    for i in prange(len(points.xyz)):
+    for i in range(*span):
         rays = points.camera[points.start[i] : points.start[i + 1]]
         place = pair_start[i]
         if rays.size == 1:
@@ -143,7 +141,7 @@ def _choose_pairs(points: Chosen, pair_start: IntArray, pair: IntArray) -> None:
             pair[place], pair[place + 1] = rays[first], rays[second]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _best_pair(point: FloatArray, centres: FloatArray, rays: IntArray) -> tuple[int, int]:
     """Return the places of the best pair in the list of at least two rays; of equals the first."""
     k, (least, most) = rays.size, BASE_TO_HEIGHT
@@ -323,7 +321,7 @@ def butler(batch: Batch) -> Intersection:
     return paired.result(found[:, :3], outcome=outcome, ray_miss_m=found[:, 3])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _meet(points: Chosen) -> tuple[FloatArray, BoolArray]:
     """Return the shift of each point with two rays and its distance from them; where they fail."""
     found, sums = np.zeros((len(points.xyz), 4)), np.empty(9)

@@ -14,12 +14,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 
+from pcfix.kernels import Span, in_tiles, kernel, lean
 from pcfix.lens.frames import Frames, frames_of
 from pcfix.lens.imaging import project
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints, Views
-from pcfix.threads import one_caller
 
 MATCHED, AVERAGED, NEIGHBOURS = 5, 8, 12
 BEST_ANGLE_DEG, NARROW_DEG, WIDE_DEG = 12.0, 4.56, 8.4
@@ -98,8 +97,9 @@ def _matcher(
     seen = cell >= 0
     start = np.concatenate([[0], np.cumsum(seen.sum(axis=1))])
     place = np.nonzero(seen)[1]
-    with one_caller():
-        score = _scores(places, cameras.centres, cell, depth, start, place, tracked)
+    score = np.zeros((len(cameras), len(cameras)))
+    seen_in = cell, depth, start, place
+    in_tiles(_scores, len(cameras), places, cameras.centres, seen_in, tracked, score)
     most = min(NEIGHBOURS, len(cameras))
     best = np.argsort(-score, axis=1, kind="stable")[:, :most]
     best = np.where(np.take_along_axis(score, best, axis=1) > 0.0, best, -1)
@@ -152,15 +152,14 @@ def _images(cameras: Cameras, places: FloatArray) -> tuple[IntArray, FloatArray]
     return cell, depth
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _scores(
-    places: FloatArray, centres: FloatArray, cell: IntArray, depth: FloatArray,
-    start: IntArray, place: IntArray, tracked: bool,
-) -> FloatArray:  # fmt: skip
-    """Return how good a partner each image j is for the reference i, shape (k, k)."""
-    k = len(centres)
-    score = np.zeros((k, k))
-    for i in prange(k):
+    span: Span, places: FloatArray, centres: FloatArray,
+    seen_in: tuple[IntArray, FloatArray, IntArray, IntArray], tracked: bool, score: FloatArray,
+) -> None:  # fmt: skip
+    """Set how good a partner each image j is for the reference i, shape (k, k)."""
+    k, (cell, depth, start, place) = len(centres), seen_in
+    for i in range(*span):
         seen = place[start[i] : start[i + 1]]
         covered = np.zeros(CELLS * CELLS, np.bool_)
         for j in range(k):
@@ -185,10 +184,9 @@ def _scores(
                 continue
             if SCALE_RANGE[0] <= scales / common <= SCALE_RANGE[1]:
                 score[i, j] = total * area
-    return score
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _angle_deg(one: FloatArray, other: FloatArray, place: FloatArray) -> float:
     """Return the angle between the rays from a place to two centres."""
     a, b = one - place, other - place
@@ -196,14 +194,14 @@ def _angle_deg(one: FloatArray, other: FloatArray, place: FloatArray) -> float:
     return float(np.degrees(np.arccos(min(1.0, cosine))))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _angle_weight(angle_deg: float) -> float:
     wide = NARROW_DEG if angle_deg < BEST_ANGLE_DEG else WIDE_DEG
     off = (angle_deg - BEST_ANGLE_DEG) / wide
     return max(np.exp(-0.5 * off * off), LEAST_ANGLE_WEIGHT)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _scale_weight(scale: float) -> float:
     if scale > FINER:
         return (FINER / scale) ** 2
@@ -296,15 +294,14 @@ def bed_of(xyz: FloatArray, likely_m: FloatArray) -> Bed:
     filled, counts = np.unique(key, return_counts=True)
     start = np.concatenate([[0], np.cumsum(counts)])
     found = np.empty(len(filled))
-    with one_caller():
-        _vote(order, start, np.ascontiguousarray(xyz[:, 2]), likely_m, found)
+    in_tiles(_vote, len(found), order, start, np.ascontiguousarray(xyz[:, 2]), likely_m, found)
     height = np.full(rows * columns, np.nan)
     height[filled] = found
     grid = _without_outliers(height.reshape(rows, columns))
     return Bed(grid, float(low[0]), float(low[1]), cell)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _without_outliers(height: FloatArray) -> FloatArray:
     """Return heights in which a cell far off the median of its 5 x 5 surroundings is that median.
 
@@ -342,12 +339,13 @@ def _cell_m(xy: FloatArray, low: FloatArray, high: FloatArray) -> float:
     return side
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _vote(
-    order: IntArray, start: IntArray, z: FloatArray, likely: FloatArray, found: FloatArray
-) -> None:
+    span: Span, order: IntArray, start: IntArray, z: FloatArray, likely: FloatArray,
+    found: FloatArray,
+) -> None:  # fmt: skip
     """Find in each cell the height with the most votes; a point votes for all its likely beds."""
-    for c in prange(start.size - 1):
+    for c in range(*span):
         rows = order[start[c] : start[c + 1]]
         low, high = np.inf, -np.inf
         for i in rows:
@@ -370,7 +368,7 @@ def _vote(
         found[c] = low + np.argmax(votes) * step
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _add_vote(vote: FloatArray, at: float) -> None:
     """Vote once for every height at which a point can be, however many groups say so."""
     reach = int(3.0 * _STEPS)

@@ -23,10 +23,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
 
+from pcfix.kernels import Span, in_tiles, lean
 from pcfix.model import BoolArray, FloatArray, IntArray, Views
-from pcfix.threads import one_caller
 
 Heights = npt.NDArray[np.float32]
 
@@ -86,11 +85,10 @@ def hidden(xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occlude
     so that on an even slope, which the ray climbs away from, no cell stands above it.
     """
     found = np.zeros(len(views.camera), np.bool_)
-    with one_caller():
-        _hidden(
-            np.ascontiguousarray(xyz), np.ascontiguousarray(centres),
-            views.start, views.camera, occluder, found,
-        )  # fmt: skip
+    in_tiles(
+        _hidden, len(xyz), np.ascontiguousarray(xyz), np.ascontiguousarray(centres),
+        views.start, views.camera, occluder, found,
+    )  # fmt: skip
     return found
 
 
@@ -109,13 +107,13 @@ def in_sight(xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occlu
     return Views(start, views.camera[stays], weight, views.kind)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@lean
 def _hidden(
-    xyz: FloatArray, centres: FloatArray, start: IntArray, camera: IntArray, o: Occluder,
-    found: BoolArray,
+    span: Span, xyz: FloatArray, centres: FloatArray, start: IntArray, camera: IntArray,
+    o: Occluder, found: BoolArray,
 ) -> None:  # fmt: skip
     """Test every ray; distances in plan are in cells from here on."""
-    for i in prange(len(xyz)):
+    for i in range(*span):
         u, v, z = (xyz[i, 0] - o.left_m) / o.cell_m, (xyz[i, 1] - o.bottom_m) / o.cell_m, xyz[i, 2]
         if not _inside(o.height, u, v):
             continue
@@ -139,12 +137,12 @@ def _hidden(
             found[entry] = pierces or _meets(o, u, v, z + slack, du, dv, rise, run, first)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _inside(height: Heights, u: float, v: float) -> bool:
     return 0.0 <= u < height.shape[1] and 0.0 <= v < height.shape[0]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _is_roofed(height: Heights, row: int, column: int, z: float) -> bool:
     """Whether all cells as near as is not tested stand above z."""
     if not height[row, column] > z:
@@ -159,7 +157,7 @@ def _is_roofed(height: Heights, row: int, column: int, z: float) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _to_edge(x: float, dx: float, side: int) -> float:
     """Return how far the ray goes until it leaves its block along one axis."""
     if dx == 0.0:
@@ -168,7 +166,7 @@ def _to_edge(x: float, dx: float, side: int) -> float:
     return (edge - x) / dx
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _meets(
     o: Occluder, u: float, v: float, z: float, du: float, dv: float, rise: float, run: float,
     first: float,
@@ -192,7 +190,7 @@ def _meets(
     return False
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _through_roof(
     o: Occluder, u: float, v: float, z: float, du: float, dv: float, rise: float, run: float,
     slack: float,

@@ -46,8 +46,8 @@ from __future__ import annotations
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numba import njit
 
+from pcfix.kernels import lean
 from pcfix.lens.algebra import Symmetric, Vector, beyond, dot, minus, plus, product, row_of, scaled
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.choice import TILE, Rig, Rule
@@ -91,7 +91,7 @@ NOISE = 40  # six
 SUMS = 46
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def add_below(tile: FloatArray, shift: FloatArray, rows: IntArray) -> None:
     """Add to a tile how far below P the true point lies, along the normal of the surface."""
     for j in range(rows.size):
@@ -99,14 +99,14 @@ def add_below(tile: FloatArray, shift: FloatArray, rows: IntArray) -> None:
         tile[BELOW * TILE + j] = -dot(normal, row_of(shift, rows[j]))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _of_camera(rig: Rig, c: int, rule: Rule) -> tuple[Sight, Vector, float]:
     """Return a camera as plain numbers, which stay in registers, for the loops over points."""
     sight = row_of(rig.centres, c), rig.offset[c], rule.least_cosine2, rule.bend
     return sight, row_of(rig.axes, c), rig.focal_px[c] * rig.focal_px[c]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _seen(tile: FloatArray, j: int, mark: float, sight: Sight) -> Seen:
     """Return how often a ray counts; e, N, H, L^2, h, y and r where the light bends.
 
@@ -127,7 +127,7 @@ def _seen(tile: FloatArray, j: int, mark: float, sight: Sight) -> Seen:
     return one, e, normal, height, length2, h, h + tile[BELOW * TILE + j], bend
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _bent(
     height: float, length2: float, h: float, y: float, bend: float
 ) -> tuple[float, float, float, float, float, float, float]:
@@ -143,7 +143,7 @@ def _bent(
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _weight(one: float, e: Vector, length2: float, axis: Vector, square: float) -> Symmetric:
     """Return J'J of a camera whose squared focal length (px) is `square`, at P.
 
@@ -164,7 +164,7 @@ def _weight(one: float, e: Vector, length2: float, axis: Vector, square: float) 
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _add_three(sums: FloatArray, at: int, c: float, a: Vector) -> None:
     """Add c a."""
     sums[at] += c * a[0]
@@ -172,7 +172,7 @@ def _add_three(sums: FloatArray, at: int, c: float, a: Vector) -> None:
     sums[at + 2 * TILE] += c * a[2]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _add_six(sums: FloatArray, at: int, m: Symmetric) -> None:
     sums[at] += m[0]
     sums[at + TILE] += m[1]
@@ -182,7 +182,7 @@ def _add_six(sums: FloatArray, at: int, m: Symmetric) -> None:
     sums[at + 5 * TILE] += m[5]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: Vector) -> None:
     """Add c m + g q'."""
     sums[at] += c * m[0] + g[0] * q[0]
@@ -196,7 +196,7 @@ def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: V
     sums[at + 8 * TILE] += c * m[5] + g[2] * q[2]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _in_space(
     one: float, e: Vector, normal: Vector, height: float, length2: float, bend: float,
     kappa: float, inv2: float,
@@ -211,7 +211,7 @@ def _in_space(
     return tt, minus(scaled(along, e), scaled(up, normal))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def add_in_space(
     sums: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule
 ) -> None:
@@ -237,7 +237,7 @@ def add_in_space(
         _add_six(sums, SIGHT * TILE + j, _weight(one, e, length2, view, square))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def add_in_images(
     sums: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule
 ) -> None:
@@ -264,7 +264,7 @@ def add_in_images(
         _add_six(sums, SIGHT * TILE + j, w)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _inverse(height: float, length2: float, away: float, beta: float) -> tuple[float, float]:
     """Return what D^-1 does to p across d, and along it."""
     outer = away + beta * (length2 - height * height)
@@ -272,7 +272,7 @@ def _inverse(height: float, length2: float, away: float, beta: float) -> tuple[f
     return share * outer, share * away
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _turned(
     height: float, inv_h: float, h: float, y: float, bend: float, inv_k: float, lean: float
 ) -> tuple[float, float]:
@@ -282,7 +282,7 @@ def _turned(
     return -y * (1.0 - height * lean), along
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def add_tilt(
     sums: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule,
     in_images: bool,
@@ -309,7 +309,7 @@ def add_tilt(
         _add_nine(sums, BY_TILT * TILE + j, turn, w, g, scaled(along, e))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def add_noise(
     sums: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule,
     budget: Budget,
@@ -351,7 +351,7 @@ def add_noise(
         _add_six(sums, NOISE * TILE + j, noise)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _squared(m: Symmetric) -> Symmetric:
     """Return the square of a symmetric matrix."""
     xx, xy, xz, yy, yz, zz = m

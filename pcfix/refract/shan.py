@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
+from pcfix.kernels import Span, in_tiles, kernel, lean
 from pcfix.model import BoolArray, FloatArray, Outcome
 from pcfix.refract.batch import Batch, Chosen, Intersection
 from pcfix.refract.literature import depth_ratio
 from pcfix.refract.rays import MIN_DETERMINANT
-from pcfix.threads import one_caller
 
 TOLERANCE = 1e-9
 """Of tan a between two iterations; the depth then changes by less than 1e-9 of itself."""
@@ -56,16 +55,15 @@ def shan(batch: Batch) -> Intersection:
     """
     found = np.zeros((len(batch.xyz), 4))
     failed = np.zeros(len(batch.xyz), np.bool_)
-    with one_caller():
-        _solve_all(batch.chosen(), found, failed)
+    in_tiles(_solve_all, len(batch), batch.chosen(), found, failed)
     outcome = np.where(failed, np.uint8(Outcome.PARALLEL_RAYS), batch.outcome())
     return batch.result(found[:, :3], outcome=outcome, ray_miss_m=found[:, 3])
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def _solve_all(points: Chosen, found: FloatArray, failed: BoolArray) -> None:
+@kernel
+def _solve_all(span: Span, points: Chosen, found: FloatArray, failed: BoolArray) -> None:
     """Fill in shift and distance from the rays of each point with two rays or more."""
-    for i in prange(len(points.xyz)):
+    for i in range(*span):
         rays = points.camera[points.start[i] : points.start[i + 1]]
         if rays.size < 2:
             continue
@@ -83,7 +81,7 @@ def _solve_all(points: Chosen, found: FloatArray, failed: BoolArray) -> None:
             found[i, 3] = _miss(e, d, points.n, x, y, sunk)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _iterate(e: FloatArray, d: FloatArray, n: float) -> tuple[bool, float, float, float]:
     """Solve for one point; e (k, 3) leads from it to the cameras, d (k,) is its depth for each.
 
@@ -112,7 +110,7 @@ def _iterate(e: FloatArray, d: FloatArray, n: float) -> tuple[bool, float, float
     return True, x, y, sunk
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _intersected(e: FloatArray, d: FloatArray, s: FloatArray) -> tuple[bool, float, float, float]:
     """Solve the collinearity equations with s known.
 
@@ -147,7 +145,7 @@ def _intersected(e: FloatArray, d: FloatArray, s: FloatArray) -> tuple[bool, flo
     return True, mean_r[0] + sunk * mean_v[0], mean_r[1] + sunk * mean_v[1], sunk
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _miss(e: FloatArray, d: FloatArray, n: float, x: float, y: float, sunk: float) -> float:
     """Return the root mean square distance of the point found from the bent rays themselves."""
     squares = 0.0

@@ -29,8 +29,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 
+from pcfix.kernels import Span, in_tiles, kernel, lean, most_between
 from pcfix.lens.algebra import (
     Vector,
     beyond,
@@ -74,13 +74,11 @@ from pcfix.refract.rays import (
     nearest_point,
     refracted,
 )
-from pcfix.threads import one_caller
 
 MAX_STEPS = 40
 CLOSE_M = 1e-6
 """How far from P the median may be; Q is then off by two or three times as much."""
 
-_BLOCK = 64
 
 # Columns of the result.
 _MISS, _OUTCOME, _FOUND, _WIDTH = 3, 4, 5, 6
@@ -145,8 +143,8 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     matched = np.zeros((0, 0), np.int64) if matcher is None else matcher.matched
     used, result = np.zeros(len(batch.rays.camera), np.bool_), np.zeros((len(batch), _WIDTH))
     both = images_of(batch.made_with, cameras)
-    with one_caller():
-        _invert(batch.chosen(), optics_of(made), both, listed, matched, used, result)
+    optics = optics_of(made)
+    in_tiles(_invert, len(batch), batch.chosen(), optics, both, listed, matched, used, result)
     outcome = result[:, _OUTCOME].astype(np.uint8)
     moved = outcome == Outcome.CORRECTED
     warn_of_unsolved("stereo pairs: no solution", result[moved, _FOUND] > 0.0)
@@ -156,53 +154,48 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     return replace(batch, views=in_pairs).result(shift, outcome=outcome, ray_miss_m=miss)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _invert(
-    points: Chosen, optics: Optics, both: Images, listed: tuple[IntArray, IntArray],
+    span: Span, points: Chosen, optics: Optics, both: Images, listed: tuple[IntArray, IntArray],
     matched: IntArray, used: BoolArray, result: FloatArray,
 ) -> None:  # fmt: skip
-    """Correct every point on its own; a block of them shares the memory for rays and pairs.
+    """Correct every point on its own.
 
     Without listed pairs, which are empty then, they are those of `matched`.
     """
-    start = points.start
-    for block in prange((len(points.xyz) + _BLOCK - 1) // _BLOCK):
-        images = _Images(optics, both, points.n)
-        first, last = block * _BLOCK, min((block + 1) * _BLOCK, len(points.xyz))
-        most, most_pairs = 0, 0
-        for i in range(first, last):
-            count = start[i + 1] - start[i]
-            most = max(most, count)
-            room = count * matched.shape[1]
-            if listed[0].size:
-                room = (listed[0][i + 1] - listed[0][i]) // 2
-            most_pairs = max(most_pairs, room)
-        rays, place = np.empty((most, _RAY_WIDTH)), np.full(len(points.centres), -1)
-        pairs, places = np.empty((most_pairs, 2), np.int64), np.empty((3, most_pairs))
-        for i in range(first, last):
-            cameras = points.camera[start[i] : start[i + 1]]
-            flags, normal = used[start[i] : start[i + 1]], row_of(points.normals, i)
-            for j in range(cameras.size):
-                place[cameras[j]] = j
-                _begin(rays[j], points, i, cameras[j], images)
-            if listed[0].size:
-                entries = listed[1][listed[0][i] : listed[0][i + 1]]
-                count = _listed_pairs(pairs, entries, place)
-            else:
-                count = _matched_pairs(pairs, cameras, matched, place)
-            for c in cameras:
-                place[c] = -1
-            wide = _wide_pairs(pairs[:count], rays, normal)
-            if wide == 0:
-                few = ONE_CAMERA if cameras.size else NO_CAMERA
-                result[i, _OUTCOME] = PARALLEL if count else few
-                continue
-            for p in range(wide):
-                flags[pairs[p, 0]], flags[pairs[p, 1]] = True, True
-            _solve(result[i], rays, cameras, flags, pairs[:wide], places[:, :wide], normal, images)
+    start, images = points.start, _Images(optics, both, points.n)
+    most = most_between(span, start)
+    most_pairs = most * matched.shape[1]
+    if listed[0].size:
+        most_pairs = most_between(span, listed[0]) // 2
+    rays, place = np.empty((most, _RAY_WIDTH)), np.full(len(points.centres), -1)
+    pairs, places = np.empty((most_pairs, 2), np.int64), np.empty((3, most_pairs))
+    room = np.empty(9), np.empty((3, 3))
+    for i in range(*span):
+        cameras = points.camera[start[i] : start[i + 1]]
+        flags, normal = used[start[i] : start[i + 1]], row_of(points.normals, i)
+        for j in range(cameras.size):
+            place[cameras[j]] = j
+            _begin(rays[j], points, i, cameras[j], images)
+        if listed[0].size:
+            entries = listed[1][listed[0][i] : listed[0][i + 1]]
+            count = _listed_pairs(pairs, entries, place)
+        else:
+            count = _matched_pairs(pairs, cameras, matched, place)
+        for c in cameras:
+            place[c] = -1
+        wide = _wide_pairs(pairs[:count], rays, normal)
+        if wide == 0:
+            few = ONE_CAMERA if cameras.size else NO_CAMERA
+            result[i, _OUTCOME] = PARALLEL if count else few
+            continue
+        for p in range(wide):
+            flags[pairs[p, 0]], flags[pairs[p, 1]] = True, True
+        of_pairs = pairs[:wide], places[:, :wide]
+        _solve(result[i], rays, cameras, flags, of_pairs, normal, images, room)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _begin(ray: FloatArray, points: Chosen, i: int, c: int, images: _Images) -> None:
     """Fill in where a ray comes from, and how its scale changes with the place.
 
@@ -222,7 +215,7 @@ def _begin(ray: FloatArray, points: Chosen, i: int, c: int, images: _Images) -> 
         ray[_BY_PLACE + j] = axis[j] / ahead if flat else -made[j] / size2
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _listed_pairs(pairs: IntArray, entries: IntArray, place: IntArray) -> int:
     """Write the pairs of a list whose cameras both have a place; return how many."""
     count = 0
@@ -234,7 +227,7 @@ def _listed_pairs(pairs: IntArray, entries: IntArray, place: IntArray) -> int:
     return count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _matched_pairs(pairs: IntArray, cameras: IntArray, matched: IntArray, place: IntArray) -> int:
     """Write the pairs of cameras of which either was matched with the other; return how many."""
     count = 0
@@ -243,14 +236,22 @@ def _matched_pairs(pairs: IntArray, cameras: IntArray, matched: IntArray, place:
             if partner < 0:
                 break
             b = place[partner]
-            if b < 0 or (b < a and (matched[partner] == cameras[a]).any()):
+            if b < 0 or (b < a and _contains(matched[partner], cameras[a])):
                 continue
             pairs[count, 0], pairs[count, 1] = a, b
             count += 1
     return count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
+def _contains(row: IntArray, value: int) -> bool:
+    found = False
+    for one in row:
+        found = found or one == value
+    return found
+
+
+@lean
 def _wide_pairs(pairs: IntArray, rays: FloatArray, normal: Vector) -> int:
     """Bring the pairs with a base to the front, as seen from P; return how many there are.
 
@@ -271,23 +272,25 @@ def _wide_pairs(pairs: IntArray, rays: FloatArray, normal: Vector) -> int:
     return count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _solve(
-    out: FloatArray, rays: FloatArray, cameras: IntArray, used: BoolArray, pairs: IntArray,
-    places: FloatArray, normal: Vector, images: _Images,
+    out: FloatArray, rays: FloatArray, cameras: IntArray, used: BoolArray,
+    pairs: tuple[IntArray, FloatArray], normal: Vector, images: _Images,
+    room: tuple[FloatArray, FloatArray],
 ) -> None:  # fmt: skip
-    """Solve one point and write its row."""
-    fixed, q = _snell(rays, used, normal, images.n)
+    """Solve one point and write its row; the pairs come with room for their places."""
+    sums, inverse = room
+    fixed, q = _snell(sums, rays, used, normal, images.n)
     if not fixed:
         out[_OUTCOME] = PARALLEL
         return
-    found, q = _search(q, rays, cameras, used, pairs, places, normal, images)
+    found, q = _search(q, inverse, rays, cameras, used, pairs, normal, images)
     out[0], out[1], out[2] = q
     out[_MISS] = _miss(q, rays, used, normal, images.n)
     out[_OUTCOME], out[_FOUND] = CORRECTED, 1.0 if found else 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _line(ray: FloatArray, normal: Vector, n: float) -> tuple[Vector, Vector, float]:
     """Return where the ray through P enters the water, its direction, and its length squared."""
     e = vector(ray)
@@ -296,10 +299,13 @@ def _line(ray: FloatArray, normal: Vector, n: float) -> tuple[Vector, Vector, fl
     return scaled(f, e), refracted(e, length2, normal, across, bend), length2
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _snell(rays: FloatArray, used: BoolArray, normal: Vector, n: float) -> tuple[bool, Vector]:
+@lean
+def _snell(
+    sums: FloatArray, rays: FloatArray, used: BoolArray, normal: Vector, n: float
+) -> tuple[bool, Vector]:
     """Return whether there is a point nearest to the refracted rays, and it."""
-    k, sums = 0.0, np.zeros(9)
+    k = 0.0
+    sums[:] = 0.0
     for j in range(used.size):
         if used[j]:
             a, d, length2 = _line(rays[j], normal, n)
@@ -309,7 +315,7 @@ def _snell(rays: FloatArray, used: BoolArray, normal: Vector, n: float) -> tuple
     return fixed, q
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _miss(q: Vector, rays: FloatArray, used: BoolArray, normal: Vector, n: float) -> float:
     """Return the rms distance of Q from the refracted rays through P."""
     k, total = 0.0, 0.0
@@ -323,10 +329,10 @@ def _miss(q: Vector, rays: FloatArray, used: BoolArray, normal: Vector, n: float
     return np.sqrt(total / k)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _search(
-    start: Vector, rays: FloatArray, cameras: IntArray, used: BoolArray, pairs: IntArray,
-    places: FloatArray, normal: Vector, images: _Images,
+    start: Vector, inverse: FloatArray, rays: FloatArray, cameras: IntArray, used: BoolArray,
+    pairs: tuple[IntArray, FloatArray], normal: Vector, images: _Images,
 ) -> tuple[bool, Vector]:  # fmt: skip
     """Return whether a Q was found where the median F of the pairs' places is P, and it.
 
@@ -334,10 +340,9 @@ def _search(
     update is B + (s - B y) s'B / (s'B y); where it does not, B starts anew, with half the step.
     """
     q, nearest, at_nearest, best, share = start, start, (0.0, 0.0, 0.0), np.inf, 1.0
-    inverse = np.empty((3, 3))
     _as_from_above(inverse, share, images.n)
     for _ in range(MAX_STEPS):
-        f = _median_of_pairs(q, rays, cameras, used, pairs, places, normal, images)
+        f = _median_of_pairs(q, rays, cameras, used, pairs, normal, images)
         size = np.sqrt(dot(f, f))
         if size <= CLOSE_M:
             return True, q
@@ -356,14 +361,14 @@ def _search(
     return False, start
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _as_from_above(inverse: FloatArray, share: float, n: float) -> None:
     """Set B to a share of what it is where all light comes from straight above."""
     inverse[:] = 0.0
     inverse[0, 0], inverse[1, 1], inverse[2, 2] = share, share, share * n
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _update(inverse: FloatArray, step: Vector, change: Vector) -> None:
     """Bring B to where it takes the last change of F for the last step (Broyden)."""
     missing, left = minus(step, times(inverse, change)), transposed_times(inverse, step)
@@ -375,12 +380,13 @@ def _update(inverse: FloatArray, step: Vector, change: Vector) -> None:
             inverse[i, j] += missing[i] * left[j] / scale
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _median_of_pairs(
-    q: Vector, rays: FloatArray, cameras: IntArray, used: BoolArray, pairs: IntArray,
-    places: FloatArray, normal: Vector, images: _Images,
+    q: Vector, rays: FloatArray, cameras: IntArray, used: BoolArray,
+    of_pairs: tuple[IntArray, FloatArray], normal: Vector, images: _Images,
 ) -> Vector:  # fmt: skip
     """Return where the pairs would have placed Q; NaN where some camera has no image of it."""
+    pairs, places = of_pairs
     for j in range(used.size):
         if used[j]:
             _see(rays[j], q, cameras[j], normal, images)
@@ -389,12 +395,22 @@ def _median_of_pairs(
     return _median(places[0]), _median(places[1]), _median(places[2])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _median(values: FloatArray) -> float:
-    return np.nan if np.isnan(values).any() else np.median(values)
+    """Return the median, NaN where one is; the values are sorted."""
+    for i in range(values.size):
+        value, place = values[i], i
+        if value != value:
+            return np.nan
+        while place > 0 and values[place - 1] > value:
+            values[place] = values[place - 1]
+            place -= 1
+        values[place] = value
+    half = values.size // 2
+    return values[half] if values.size % 2 else 0.5 * (values[half - 1] + values[half])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _see(ray: FloatArray, q: Vector, c: int, normal: Vector, images: _Images) -> None:
     """Write what the image of Q says about places: G'G, G'G e and |G e|^2.
 
@@ -413,7 +429,7 @@ def _see(ray: FloatArray, q: Vector, c: int, normal: Vector, images: _Images) ->
             ray[_SQUARE + i] += terms[i]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _meet(a: FloatArray, b: FloatArray) -> Vector:
     """Return where two straight rays have the least squared residuals in their images.
 
@@ -430,7 +446,7 @@ def _meet(a: FloatArray, b: FloatArray) -> Vector:
     return _solve_two(a, b, 1.0 / (t * t), 1.0 / (t_b * t_b), r2 / t**3, r2_b / t_b**3)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _residual(place: Vector, ray: FloatArray) -> tuple[float, float]:
     """Return t and r^2 of a place."""
     (x, y, z), s = place, ray[_SQUARE:]
@@ -439,7 +455,7 @@ def _residual(place: Vector, ray: FloatArray) -> tuple[float, float]:
     return t, s[0] * x * x + s[3] * y * y + s[5] * z * z + 2.0 * twice + s[9]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _solve_two(
     a: FloatArray, b: FloatArray, of_a: float, of_b: float, g_a: float, g_b: float
 ) -> Vector:
@@ -452,7 +468,7 @@ def _solve_two(
     return solved((xx, xy, xz, yy, yz, zz), (x, y, z))[1]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _sum(a: FloatArray, b: FloatArray, of_a: float, of_b: float, at: int) -> Vector:
     """Return so many times three columns of one ray and of the other."""
     return plus(scaled(of_a, vector(a, at)), scaled(of_b, vector(b, at)))

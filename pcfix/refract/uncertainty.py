@@ -23,16 +23,25 @@ import math
 from typing import TypeAlias
 
 import numpy as np
-from numba import njit, prange
 
+from pcfix.kernels import Span, in_tiles, inlined, kernel, lean
 from pcfix.lens.algebra import Symmetric, Vector
 from pcfix.model import FloatArray, IntArray, Outcome
 from pcfix.options.correct import LEVEL_M
 from pcfix.refract import sensitivity as s
 from pcfix.refract.batch import Batch, Intersection, Survey
-from pcfix.refract.choice import TILE, Points, Rig, Rule, gather, points_of, rig_of, rule_of
+from pcfix.refract.choice import (
+    TILE,
+    Points,
+    Rig,
+    Rule,
+    gather,
+    points_of,
+    rig_of,
+    rule_of,
+    tiles_of,
+)
 from pcfix.refract.sensitivity import Budget
-from pcfix.threads import one_caller
 
 Four: TypeAlias = tuple[float, float, float, float]
 Nine: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
@@ -74,12 +83,11 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
     survey, views, result = batch.survey, batch.rays, np.zeros((len(batch), 6))
     # the rays are chosen: a mesh may have let through one that its plane above the point would not
     every_ray = rule_of(survey)._replace(least_cosine2=0.0)
-    with one_caller():
-        _of_lists(
-            points_of(batch), np.ascontiguousarray(shift_m), rig_of(survey),
-            (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)),
-            every_ray, budget_of(survey), level_sigma_of(batch), result,
-        )  # fmt: skip
+    in_tiles(
+        _of_lists, tiles_of(batch), points_of(batch), np.ascontiguousarray(shift_m), rig_of(survey),
+        (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)),
+        every_ray, budget_of(survey), level_sigma_of(batch), result,
+    )  # fmt: skip
     return result
 
 
@@ -136,14 +144,14 @@ def budget_of(survey: Survey) -> Budget:
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _of_lists(
-    points: Points, shift: FloatArray, rig: Rig, views: tuple[IntArray, IntArray], rule: Rule,
-    budget: Budget, level_sigma: FloatArray, result: FloatArray,
+    span: Span, points: Points, shift: FloatArray, rig: Rig, views: tuple[IntArray, IntArray],
+    rule: Rule, budget: Budget, level_sigma: FloatArray, result: FloatArray,
 ) -> None:  # fmt: skip
     """Take the cameras of lists; those of a tile come one after the other, as by their frames."""
     start, camera = views
-    for t in prange((points.order.size + TILE - 1) // TILE):
+    for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
         tile, sums = np.empty(s.TILE_RUNS * TILE), np.zeros(s.SUMS * TILE)
         gather(tile, rows, points)
@@ -160,7 +168,7 @@ def _of_lists(
         finish_tile(result, rows, sums, tile, level_sigma, budget)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _named(start: IntArray, camera: IntArray, rows: IntArray, k: int) -> IntArray:
     """Return the cameras that the lists of some points name, in their order."""
     named = np.zeros(k, np.bool_)
@@ -170,7 +178,7 @@ def _named(start: IntArray, camera: IntArray, rows: IntArray, k: int) -> IntArra
     return np.flatnonzero(named)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def add_errors(
     sums: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule,
     budget: Budget,
@@ -186,7 +194,7 @@ def add_errors(
         s.add_noise(sums, tile, marks, rig, c, rule, budget)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _per_image(budget: Budget) -> bool:
     """Whether rays differ by more than the noise of image coordinates."""
     return max(budget.waves, max(budget.centre_m, budget.attitude)) > 0.0
@@ -196,7 +204,7 @@ def _per_image(budget: Budget) -> bool:
 # is not vectorised, and takes five times as long.
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def finish_tile(
     result: FloatArray, rows: IntArray, sums: FloatArray, tile: FloatArray,
     level_sigma: FloatArray, budget: Budget,
@@ -219,7 +227,7 @@ def finish_tile(
             result[rows[j], at] = out[at * TILE + j]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _solved_in_images(sums: FloatArray, j: int) -> tuple[bool, Nine]:
     """Return whether the rays fix a point, and the inverse of sum S T.
 
@@ -231,7 +239,7 @@ def _solved_in_images(sums: FloatArray, j: int) -> tuple[bool, Nine]:
     return (sums[j] >= 2.0) & (det >= MIN_DETERMINANT * half * half * half), inverse
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _solved_in_space(sums: FloatArray, j: int) -> tuple[bool, Nine, Nine]:
     """Return whether the rays fix a point, and by what it moves.
 
@@ -248,7 +256,7 @@ def _solved_in_space(sums: FloatArray, j: int) -> tuple[bool, Nine, Nine]:
     return solved, by_delta, _product(by_p, by_sight)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _write(
     out: FloatArray, j: int, solved: bool, by_delta: Nine, by_noise: Nine, sums: FloatArray,
     tile: FloatArray, level_sigma: float, budget: Budget,
@@ -272,12 +280,12 @@ def _write(
     out[5 * TILE + j] = noise[8] + _dot(z, z) if solved else 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _dot(x: Four, y: Four) -> float:
     return x[0] * y[0] + x[1] * y[1] + x[2] * y[2] + x[3] * y[3]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _columns(
     by_delta: Nine, sums: FloatArray, tile: FloatArray, j: int, level_sigma: float, budget: Budget
 ) -> tuple[Vector, Vector, Vector, Vector]:
@@ -303,12 +311,12 @@ def _columns(
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _three(sums: FloatArray, at: int) -> Vector:
     return sums[at], sums[at + TILE], sums[at + 2 * TILE]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _six(sums: FloatArray, at: int) -> Symmetric:
     return (
         sums[at], sums[at + TILE], sums[at + 2 * TILE],
@@ -316,7 +324,7 @@ def _six(sums: FloatArray, at: int) -> Symmetric:
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _nine(sums: FloatArray, at: int) -> Nine:
     return (
         sums[at], sums[at + TILE], sums[at + 2 * TILE],
@@ -325,22 +333,22 @@ def _nine(sums: FloatArray, at: int) -> Nine:
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _full(m: Symmetric) -> Nine:
     return m[0], m[1], m[2], m[1], m[3], m[4], m[2], m[4], m[5]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _scaled(c: float, x: Vector) -> Vector:
     return c * x[0], c * x[1], c * x[2]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _plus(x: Vector, y: Vector) -> Vector:
     return x[0] + y[0], x[1] + y[1], x[2] + y[2]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _times(m: Nine, x: Vector) -> Vector:
     """Return a matrix times a vector."""
     return (
@@ -350,7 +358,7 @@ def _times(m: Nine, x: Vector) -> Vector:
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _product(a: Nine, b: Nine) -> Nine:
     """Return a matrix times a matrix."""
     x, y, z = (
@@ -359,7 +367,7 @@ def _product(a: Nine, b: Nine) -> Nine:
     return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _inverted(m: Nine) -> tuple[float, Nine]:
     """Return the determinant of a matrix and its inverse, which without one is meaningless."""
     a, b, c, d, e, f, g, h, i = m

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
 
 from pcfix.errors import GeometryError, SettingError
+from pcfix.kernels import Span, in_tiles, kernel, lean
 from pcfix.model import (
     BoolArray,
     FloatArray,
@@ -115,7 +115,8 @@ def surface_above(
 
 def _mesh_above(mesh: WaterMesh, xyz: FloatArray) -> SurfaceAbove:
     tin = build_tin(mesh)
-    facet = facets_above(tin, np.ascontiguousarray(xyz[:, 0]), np.ascontiguousarray(xyz[:, 1]))
+    facet, (x, y) = np.empty(len(xyz), np.int64), np.ascontiguousarray(xyz[:, :2].T)
+    in_tiles(_set_facets, len(xyz), tin, x, y, facet)
     plane = tin.planes[facet]
     height = (
         plane[:, 0]
@@ -158,7 +159,7 @@ def build_field(raster: WaterRaster) -> Field:
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def height_at(field: Field, x: float, y: float) -> tuple[float, float, float]:
     """Return height, dz/dx and dz/dy at a plan position (world frame); NaN where not known.
 
@@ -179,15 +180,19 @@ def height_at(field: Field, x: float, y: float) -> tuple[float, float, float]:
     return height, (east + t * twist) / field.cell_x, -(south + s * twist) / field.cell_y
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def heights_above(
-    field: Field, x: FloatArray, y: FloatArray
-) -> tuple[FloatArray, FloatArray]:  # pragma: no cover - compiled
+def heights_above(field: Field, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return `height_at` for n positions: heights, shape (n,), and slopes, shape (n, 2)."""
     height, slope = np.empty(x.size), np.empty((x.size, 2))
-    for i in prange(x.size):
-        height[i], slope[i, 0], slope[i, 1] = height_at(field, x[i], y[i])
+    in_tiles(_set_heights, x.size, field, x, y, height, slope)
     return height, slope
+
+
+@lean
+def _set_heights(
+    span: Span, field: Field, x: FloatArray, y: FloatArray, height: FloatArray, slope: FloatArray
+) -> None:  # pragma: no cover - compiled
+    for i in range(*span):
+        height[i], slope[i, 0], slope[i, 1] = height_at(field, x[i], y[i])
 
 
 EDGE_TOLERANCE = 1e-9  # of a barycentric coordinate: a point on an edge belongs to both sides
@@ -252,7 +257,7 @@ def _index_cells(corners: FloatArray) -> tuple[float, int, int, IntArray, IntArr
     return cell, columns, rows, start.astype(np.int64), facet[order].astype(np.int64)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def locate(tin: Tin, x: float, y: float) -> int:
     """Return the facet above the plan position (world frame), or -1 outside the mesh."""
     u, v = x - tin.origin_x, y - tin.origin_y
@@ -267,7 +272,7 @@ def locate(tin: Tin, x: float, y: float) -> int:
     return -1
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _inside(corners: FloatArray, u: float, v: float) -> bool:
     """Whether a plan position lies in a triangle, edges included."""
     ax, ay = corners[1, 0] - corners[0, 0], corners[1, 1] - corners[0, 1]
@@ -279,15 +284,13 @@ def _inside(corners: FloatArray, u: float, v: float) -> bool:
     return bool(s >= -EDGE_TOLERANCE and t >= -EDGE_TOLERANCE and s + t <= 1.0 + EDGE_TOLERANCE)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def facets_above(
-    tin: Tin, x: FloatArray, y: FloatArray
-) -> npt.NDArray[np.int64]:  # pragma: no cover - compiled
-    """Return `locate` for n positions."""
-    facet = np.empty(x.size, np.int64)
-    for i in prange(x.size):
+@lean
+def _set_facets(
+    span: Span, tin: Tin, x: FloatArray, y: FloatArray, facet: npt.NDArray[np.int64]
+) -> None:  # pragma: no cover - compiled
+    """Set `locate` for n positions."""
+    for i in range(*span):
         facet[i] = locate(tin, x[i], y[i])
-    return facet
 
 
 APART_M = 0.01
@@ -305,7 +308,7 @@ def in_two_sheets(tin: Tin) -> tuple[BoolArray, FloatArray]:
     return double, area_m2
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _meet_others(tin: Tin, centres: FloatArray) -> BoolArray:  # pragma: no cover - compiled
     """Return which facets' centres lie in another facet of another height."""
     double = np.zeros(len(centres), np.bool_)

@@ -14,7 +14,7 @@ from pcfix.adjust.precision import precision_of, strong_correlations, undetermin
 from pcfix.adjust.problem import prepare
 from pcfix.adjust.solve import solve
 from pcfix.errors import GeometryError
-from pcfix.threads import threads
+from pcfix.kernels import threads
 from tests.utils.adjust_twin import Twin
 from tests.utils.tie_blocks import block_of, clear_of_the_waterline
 from tests.utils.tie_points import simulate_tie_points

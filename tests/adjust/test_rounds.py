@@ -14,7 +14,7 @@ from pcfix.adjust.problem import prepare
 from pcfix.adjust.rounds import adjust_ties, check_datum, default_lens, noise_px
 from pcfix.adjust.solve import solve
 from pcfix.errors import GeometryError
-from pcfix.threads import threads
+from pcfix.kernels import threads
 from tests.utils.tie_blocks import block_of as simple_block
 from tests.utils.tie_points import simulate_tie_points
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
-import numba
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -14,8 +13,8 @@ from pcfix.adjust.block import Unknowns
 from pcfix.adjust.precision import precision_of, undetermined
 from pcfix.adjust.problem import prepare, solved_cameras, water_of
 from pcfix.adjust.solve import solve
+from pcfix.kernels import threads
 from pcfix.model import WaterMesh, WaterPlane, WaterRaster
-from pcfix.threads import threads
 from tests.utils.adjust_twin import Twin
 from tests.utils.tie_blocks import block_of
 from tests.utils.tie_points import simulate_tie_points
@@ -232,15 +231,12 @@ def test_a_surface_that_is_level_is_the_level(kind):
 def test_the_threads_do_not_change_a_bit():
     made = scene()
     unknowns = Unknowns(lens=("f",), level_sigma_m=FREE, index_sigma=FREE)
-    block, before, states = block_of(made, control=True), numba.get_num_threads(), []
-    try:
-        for count in (1, min(2, numba.config.NUMBA_NUM_THREADS)):
-            numba.set_num_threads(count)
+    block, states = block_of(made, control=True), []
+    for count in (1, 3):
+        with threads(count):
             problem, found = adjusted(block, unknowns)
             points = precision_of(problem, found).point_covariance_m2
             states.append((*found.state, found.shared, points))
-    finally:
-        numba.set_num_threads(before)
     for one, two in zip(*states, strict=True):
         np.testing.assert_array_equal(one, two)
 

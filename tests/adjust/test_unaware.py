@@ -15,8 +15,8 @@ from pcfix.adjust.problem import prepare, solved_cameras
 from pcfix.adjust.rounds import adjust_ties
 from pcfix.adjust.solve import solve
 from pcfix.errors import GeometryError
+from pcfix.kernels import threads
 from pcfix.simulate.tracing import piercing_points, project
-from pcfix.threads import threads
 from tests.utils.tie_points import simulate_tie_points
 from tests.utils.unaware_blocks import unaware
 

@@ -12,8 +12,8 @@ import pytest
 import pcfix
 from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.adjust import adjust_cameras, next_step
+from pcfix.kernels import threads
 from pcfix.options.survey import AdjustOptions
-from pcfix.threads import threads
 from tests.utils.adjust_files import IMAGE_PX, write_block, write_gnss
 from tests.utils.program import run_pcfix
 

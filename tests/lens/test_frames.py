@@ -3,12 +3,12 @@
 import subprocess
 import sys
 
-import numba
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import pcfix
+from pcfix.kernels import threads
 from pcfix.lens.frames import ALL, NOT_DISTORTED, NOTHING, frames_of, holds, judge, may_hold
 from pcfix.lens.imaging import project
 from pcfix.refract.intersect import TILE
@@ -112,10 +112,9 @@ def test_nothing_depends_on_tiles_order_or_threads(name, points):
     for i in range(0, N, 97):
         alone = pcfix.correct_points(points[i : i + 1], cameras, 0.0)
         assert np.array_equal(alone.xyz[0], whole.xyz[i])
-    numba.set_num_threads(1)
-    one_thread = pcfix.correct_points(points, cameras, 0.0)
-    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
-    same(whole, one_thread)
+    for count in (1, 3):
+        with threads(count):
+            same(whole, pcfix.correct_points(points, cameras, 0.0))
 
 
 def boxes(rng, count=400):

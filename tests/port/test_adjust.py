@@ -10,9 +10,9 @@ import pytest
 import pcfix
 from pcfix.flow.adjust import adjust_cameras
 from pcfix.io.cameras.colmap.writing import write_colmap
+from pcfix.kernels import threads
 from pcfix.model import TiePoints
 from pcfix.port.shapes import DomePort, FlatPort
-from pcfix.threads import threads
 from tests.utils.adjust_files import EPSG, write_gnss
 from tests.utils.port_scenes import simulate_port
 from tests.utils.program import run_pcfix

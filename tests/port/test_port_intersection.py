@@ -2,13 +2,13 @@
 
 import dataclasses
 
-import numba
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from pcfix import Cameras
 from pcfix.errors import SettingError
+from pcfix.kernels import threads
 from pcfix.lens.imaging import unproject
 from pcfix.model import Outcome
 from pcfix.options.correct import BudgetOptions, ScienceOptions
@@ -220,13 +220,10 @@ def test_bits_do_not_depend_on_threads_or_neighbours(noisy):
         return found.shift_m, found.covariance_m2
 
     rows = np.arange(len(noisy.apparent))
-    many = run(rows)
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
+    with threads(3):
+        many = run(rows)
+    with threads(1):
         one = run(rows[::-3])
-    finally:
-        numba.set_num_threads(before)
     for a, b in zip(many, one, strict=True):
         assert a[::-3].tobytes() == b.tobytes()
 

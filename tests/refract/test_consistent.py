@@ -7,12 +7,12 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from pcfix.errors import PcfixWarning, SettingError
+from pcfix.kernels import threads
 from pcfix.lens.imaging import coefficients, image_and_gradients
 from pcfix.model import Cameras, Lens, Outcome, Views, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.correct import ScienceOptions
@@ -357,11 +357,9 @@ def test_bits_do_not_depend_on_neighbours_or_threads(many):
     for row in (0, 77, 399):
         alone = np.array([row])
         same(whole, run(points[alone], cameras, water, views.take(alone)), alone)
-    numba.set_num_threads(1)
-    try:
-        same(whole, run(points, cameras, water, views))
-    finally:
-        numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    for count in (1, 3):
+        with threads(count):
+            same(whole, run(points, cameras, water, views))
 
 
 def eight_under_waves():

@@ -3,17 +3,17 @@
 from dataclasses import replace
 from functools import lru_cache
 
-import numba
 import numpy as np
 import pytest
 
 import pcfix
 from pcfix.io.views import ViewMatch, read_views
+from pcfix.kernels import threads
 from pcfix.lens.frames import frames_of
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Chosen, Learned, images_of
-from pcfix.refract.depth_maps import _best_pairs, _depth, sight_of
+from pcfix.refract.depth_maps import Sight, _best_pairs, _depth, look_at, room_for
 from pcfix.refract.matcher import WIDTH_M, Bed, Matcher, bed_of
 from pcfix.refract.methods import correct
 from pcfix.simulate.scene import simulate_scene
@@ -114,8 +114,10 @@ def test_a_depth_is_that_of_a_slow_twin(c):
         p[None], p[None], np.array([height]), np.zeros((1, 2)), normal[None], CAMERAS.centres,
         offset, nothing, nothing, N_WATER,
     )  # fmt: skip
-    sight = sight_of(points, 0, images)
-    found = _depth(c, tuple(q - p), tuple(u), sight, images, matcher(), np.empty((5, 3)))
+    room = room_for(len(CAMERAS), 5)
+    look_at(room, points, 0, images)
+    sight = Sight(room.up, room.made, room.above, tuple(normal), N_WATER)
+    found = _depth(c, tuple(q - p), tuple(u), sight, images, matcher(), room.pairs)
     # 0.3 to 1 m; scipy's least values are flat within 1e-6 m
     assert found == pytest.approx(slow_depth(costs, TOLERANCE), abs=5e-6)
 
@@ -249,14 +251,11 @@ def test_threads_do_not_change_a_bit():
         matcher=matcher(fused=FUSED, averaged=FUSED[:, :8].copy()),
         bed=Bed(np.full((1, 1), -5.0), -20.0, -20.0, 50.0),
     )
-    before, found = numba.get_num_threads(), []
-    try:
-        for threads in (1, before):
-            numba.set_num_threads(threads)
+    found = []
+    for count in (1, 3):
+        with threads(count):
             found += [run(xyz, WaterPlane(0.3), listed([MIXED] * 300), learned).shift_m]
             found += [run(xyz, WaterPlane(0.3), None, learned).shift_m]
-    finally:
-        numba.set_num_threads(before)
     assert np.array_equal(found[0], found[2]) and np.array_equal(found[1], found[3])
 
 

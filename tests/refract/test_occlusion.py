@@ -1,13 +1,13 @@
 """Which cameras a cloud hides from its own points: shadows known from plane geometry."""
 
 import laspy
-import numba
 import numpy as np
 import pytest
 
 import pcfix
 from pcfix import Cameras, Lens
 from pcfix.io.views import ViewMatch, read_views
+from pcfix.kernels import threads
 from pcfix.model import Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
@@ -241,12 +241,9 @@ def test_result_does_not_depend_on_threads_or_company(walled):
     bed, _, occluder = walled
     xyz, centres = bed[:5_000] + UTM, ring(50.0) + UTM
     whole = hidden_of(xyz, centres, occluder)
-    before = numba.get_num_threads()
-    try:
-        numba.set_num_threads(1)
-        assert (hidden_of(xyz, centres, occluder) == whole).all()
-    finally:
-        numba.set_num_threads(before)
+    for count in (1, 3):
+        with threads(count):
+            assert (hidden_of(xyz, centres, occluder) == whole).all()
     parts = [hidden_of(part, centres, occluder) for part in np.array_split(xyz, 7)]
     assert (np.concatenate(parts) == whole).all() and whole.any()
 

@@ -3,13 +3,13 @@
 from dataclasses import replace
 from functools import lru_cache
 
-import numba
 import numpy as np
 import pytest
 from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 from pcfix.errors import PcfixWarning, SettingError
+from pcfix.kernels import threads
 from pcfix.model import Cameras, Lens, Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
@@ -290,11 +290,8 @@ def test_cameras_of_pairs():
 def test_the_number_of_threads_does_not_matter():
     scene = scene_of("obliques", 0.5)
     rows = under_water(scene)
-    before, shifts = numba.get_num_threads(), []
-    try:
-        for threads in (1, numba.config.NUMBA_NUM_THREADS):
-            numba.set_num_threads(threads)
+    shifts = []
+    for count in (1, 3):
+        with threads(count):
             shifts.append(corrected(scene, rows, pairs_in(scene, rows)).shift_m)
-    finally:
-        numba.set_num_threads(before)
     assert (shifts[0] == shifts[1]).all()

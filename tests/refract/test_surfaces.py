@@ -2,7 +2,6 @@
 
 import math
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
 import pcfix
+from pcfix.kernels import threads
 from pcfix.model import WaterRaster
 from pcfix.simulate.block import fly_block
 from pcfix.simulate.settings import SceneSettings
@@ -194,13 +194,12 @@ def test_a_cliff_in_the_raster_gives_finite_coordinates():
     assert np.isfinite(result.ray_miss_m).all()
 
 
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="needs two threads")
 def test_neither_threads_nor_company_change_the_bits():
     water, points = raster(waves), bed(700)
-    whole = pcfix.correct_points(points, cameras(), water)
-    numba.set_num_threads(1)
-    one = pcfix.correct_points(points, cameras(), water)
-    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    with threads(3):
+        whole = pcfix.correct_points(points, cameras(), water)
+    with threads(1):
+        one = pcfix.correct_points(points, cameras(), water)
     assert np.array_equal(whole.xyz, one.xyz)
     for i in range(0, 700, 77):
         alone = pcfix.correct_points(points[i : i + 1], cameras(), water)

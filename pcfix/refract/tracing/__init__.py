@@ -18,9 +18,9 @@ from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
 
 from pcfix.errors import SettingError
+from pcfix.kernels import Span, in_tiles, kernel, lean
 from pcfix.lens.algebra import Vector, dot, minus, plus, row_of, scaled, vector
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
@@ -34,7 +34,6 @@ from pcfix.refract.tracing.tracers import (
     narrowed,
     scattershot,
 )
-from pcfix.threads import one_caller
 from pcfix.water.surface import Field, Tin, build_field, build_tin
 
 Surface: TypeAlias = WaterPlane | WaterRaster | WaterMesh
@@ -140,8 +139,8 @@ def trace(
     code, n = _checked(refractive_index, method)
     plane, tin, field = _as_kernels_take(surfaces)
     result = np.empty((len(xyz), _WIDTH))
-    with one_caller():
-        _trace(xyz, seen_from, plane, tin, field, n, code, narrow, result)
+    how = n, code, narrow
+    in_tiles(_trace, len(xyz), xyz, seen_from, plane, tin, field, how, result)
     piercing = xyz + result[:, :_SLOPE]
     way = (xyz - seen_from) + result[:, :_SLOPE]
     return Tracing(
@@ -200,13 +199,14 @@ def _as_kernels_take(
     raise SettingError(f"Light is traced through a plane, raster or mesh, not {surface}.")
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _trace(
-    points: FloatArray, centres: FloatArray, plane: FloatArray, tin: Tin | None,
-    field: Field | None, n: float, method: int, narrow: bool, result: FloatArray,
+    span: Span, points: FloatArray, centres: FloatArray, plane: FloatArray, tin: Tin | None,
+    field: Field | None, how: tuple[float, int, bool], result: FloatArray,
 ) -> None:  # fmt: skip
     """Trace every pair on its own, in coordinates about the object point."""
-    for i in prange(len(points)):
+    n, method, narrow = how
+    for i in range(*span):
         p = points[i]
         local = np.empty(3)
         local[0] = plane[0] + plane[1] * p[0] + plane[2] * p[1] - p[2]
@@ -216,7 +216,7 @@ def _trace(
         _path(result[i], water, e, n, method, narrow)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _path(
     out: FloatArray, water: Water, e: Vector, n: float, method: int,
     narrow: bool,
@@ -244,7 +244,7 @@ def _path(
         _write(out, water, e, x, y, n)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _search(
     water: Water, level: float, e: Vector, n: float, method: int
 ) -> tuple[float, float, int, bool]:
@@ -258,7 +258,7 @@ def _search(
     return scattershot(water, level, e, n)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _write(out: FloatArray, water: Water, e: Vector, x: float, y: float, n: float) -> None:
     """Fill in place and slope of the surface where the light leaves the water.
 

@@ -30,21 +30,20 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
 
 from pcfix.errors import SettingError
+from pcfix.kernels import Span, in_tiles, lean
 from pcfix.lens.algebra import Vector, dot, minus, normal_of, row_of, vector
 from pcfix.model import FloatArray
 from pcfix.refract.rays import light_path
 from pcfix.refract.tracing import Tracing
-from pcfix.threads import one_caller
 
 COLUMNS = 12
 DIRECTION, BY_POINT, BY_CENTRE, BY_LEVEL, BY_SLOPES, BY_INDEX = 0, 1, 4, 7, 8, 10
 """First columns of what `light_and_gradients` fills in."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def light_and_gradients(
     q: Vector, e: Vector, normal: Vector, h: float, n: float, out: FloatArray
 ) -> None:
@@ -91,7 +90,7 @@ def light_and_gradients(
         out[i, BY_LEVEL], out[i, BY_INDEX], out[i, 11] = s[i] * by_level, s[i] * by_n, 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _by_places(
     out: FloatArray, k: float, up: float, along: float, aside: float, s: Vector, normal: Vector
 ) -> None:
@@ -108,7 +107,7 @@ def _by_places(
             out[i, BY_CENTRE + j] = -flat - s[i] * (up * normal[j] + aside_j)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _by_slope(
     out: FloatArray, j: int, k: float, rest: float, s: Vector, normal: Vector, dk: float
 ) -> None:
@@ -188,10 +187,10 @@ def gradients(
             f" those of a tracing of {shape[0]} paths."
         ) from None
     result = np.empty((len(xyz), 3, COLUMNS))
-    with one_caller():
-        _differentiate(
-            xyz, seen_from, tracing.piercing_xyz, tracing.slope, float(refractive_index), result
-        )
+    in_tiles(
+        _differentiate, len(xyz), xyz, seen_from, tracing.piercing_xyz, tracing.slope,
+        float(refractive_index), result,
+    )  # fmt: skip
     by_slopes = result[:, :, BY_SLOPES:BY_INDEX].copy()
     from_pivot = xyz[:, :2] - np.asarray(pivot, float)
     by_slopes += from_pivot[:, None, :] * result[:, :, BY_LEVEL, None]
@@ -204,16 +203,16 @@ def gradients(
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@lean
 def _differentiate(
-    points: FloatArray, centres: FloatArray, piercing: FloatArray, slope: FloatArray, n: float,
-    result: FloatArray,
+    span: Span, points: FloatArray, centres: FloatArray, piercing: FloatArray, slope: FloatArray,
+    n: float, result: FloatArray,
 ) -> None:  # fmt: skip
     """Fill in the columns of `light_and_gradients`, made those of the unit direction.
 
     In coordinates about the point. Of d = w / |w| any derivative is (I - d d') w' / |w|.
     """
-    for i in prange(len(points)):
+    for i in range(*span):
         p, out = points[i], result[i]
         ax, ay, az = piercing[i, 0] - p[0], piercing[i, 1] - p[1], piercing[i, 2] - p[2]
         b, c = slope[i, 0], slope[i, 1]
@@ -226,7 +225,7 @@ def _differentiate(
         _of_unit_direction(out)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _of_unit_direction(out: FloatArray) -> None:
     """Scale the direction to one, and its derivatives with it."""
     w = out[:, DIRECTION]

@@ -14,8 +14,8 @@ from __future__ import annotations
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numba import njit
 
+from pcfix.kernels import lean
 from pcfix.lens.algebra import Vector, dot, minus, normal_of
 from pcfix.model import FloatArray
 from pcfix.refract.rays import plane_at, refracted
@@ -52,13 +52,13 @@ class Water(NamedTuple):
     origin: FloatArray
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def height_of(water: Water, x: float, y: float) -> tuple[float, float, float]:
     """Return height over the point, dz/dx and dz/dy of the water at a plan place; NaN if none."""
     return _height_of(water.plane, water.tin, water.field, water.origin, x, y)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _height_of(
     plane: FloatArray, tin: Tin | None, field: Field | None, origin: FloatArray, x: float, y: float
 ) -> tuple[float, float, float]:
@@ -68,7 +68,7 @@ def _height_of(
     return plane_at(tin, field, x, y, origin)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def pierce(water: Water, e: Vector, d: Vector) -> tuple[float, float]:
     """Return the plan place where the ray from e along d pierces the surface.
 
@@ -93,7 +93,7 @@ def pierce(water: Water, e: Vector, d: Vector) -> tuple[float, float]:
     return (x, y) if abs(gap) <= CLOSE_M else (np.nan, np.nan)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def miss_through(water: Water, e: Vector, x: float, y: float, n: float) -> tuple[float, float]:
     """Return the miss of the ray that pierces the surface at the plan place x, y."""
     z, b, c = height_of(water, x, y)
@@ -107,7 +107,7 @@ def miss_through(water: Water, e: Vector, x: float, y: float, n: float) -> tuple
     return x - tx * z / tz, y - ty * z / tz
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def shoot(
     water: Water, level: float, e: Vector, x: float, y: float, n: float
 ) -> tuple[float, float, float, float]:
@@ -117,7 +117,7 @@ def shoot(
     return ax, ay, mx, my
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def travel(water: Water, e: Vector, x: float, y: float, n: float) -> float:
     """Return optical length (m) of the path through a plan place; infinite where there is none."""
     z, b, c = height_of(water, x, y)
@@ -133,7 +133,7 @@ KOTOWSKI_STEPS = 40
 HALVINGS = 24
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def kotowski(water: Water, level: float, e: Vector, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, steps, found).
 
@@ -178,7 +178,7 @@ def kotowski(water: Water, level: float, e: Vector, n: float) -> Found:
     return x, y, KOTOWSKI_STEPS, False
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _snell_at(
     water: Water, e: Vector, x: float, y: float, n: float
 ) -> tuple[float, float, float, float, float]:
@@ -204,7 +204,7 @@ def _snell_at(
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _twist_at(field: Field | None, x: float, y: float) -> float:
     """Return the second derivative z_xy of a raster's patch at a place (world frame), 1 / m."""
     if field is not None:
@@ -223,7 +223,7 @@ def _twist_at(field: Field | None, x: float, y: float) -> float:
 AFRT_STEPS = 60
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def afrt(water: Water, level: float, e: Vector, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, steps, found).
 
@@ -272,7 +272,7 @@ NARROW_M = 1e-6
 """The least distance of the aims: below, rounding would outdo what is left out."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def mdfrt(water: Water, level: float, e: Vector, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, steps, found).
 
@@ -326,7 +326,7 @@ BLUNT_M = 1e-7
 NEIGHBOUR_M = 1e-4
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def scattershot(water: Water, level: float, e: Vector, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, shots, found).
 
@@ -356,7 +356,7 @@ def scattershot(water: Water, level: float, e: Vector, n: float) -> Found:
     return x, y, shots + 1, found
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def narrowed(water: Water, e: Vector, x: float, y: float, half: float, n: float) -> Found:
     """Return the nearest place of least optical length, from a place and half a grid's size on.
 
@@ -370,7 +370,7 @@ def narrowed(water: Water, e: Vector, x: float, y: float, half: float, n: float)
     return x, y, first + second, _inside(water, x, y)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _draw_together(
     water: Water, e: Vector, x: float, y: float, half: float, end: float,
     n: float, by_miss: bool,
@@ -394,7 +394,7 @@ def _draw_together(
     return x, y, shots, best
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _badness(water: Water, e: Vector, x: float, y: float, n: float, by_miss: bool) -> float:
     """Return the miss of a ray or the optical length of a path, metres; infinite without any."""
     if by_miss:
@@ -403,7 +403,7 @@ def _badness(water: Water, e: Vector, x: float, y: float, n: float, by_miss: boo
     return travel(water, e, x, y, n)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@lean
 def _inside(water: Water, x: float, y: float) -> bool:
     """Whether there is water on all sides: at an edge the shortest path means nothing."""
     for i in (-1.0, 1.0):

@@ -2,7 +2,6 @@
 
 import math
 
-import numba
 import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
@@ -10,6 +9,7 @@ from scipy.optimize import minimize_scalar
 
 import pcfix
 from pcfix.errors import SettingError
+from pcfix.kernels import threads
 from pcfix.model import WaterDimension, WaterMesh, WaterPlane, WaterRaster
 from pcfix.refract.tracing import METHODS, trace
 from tests.utils.tracing_twin import direction, through_plane, through_surface
@@ -266,13 +266,10 @@ def test_a_camera_lower_than_the_water_over_the_point_sees_it_through_a_tilted_p
 def test_any_number_of_threads_gives_the_same_bits(method):
     points, centres = pairs(200, steepest_deg=45.0)
     water = raster(waves(4.0))
-    many = trace(centres, points, water, refractive_index=INDEX, method=method)
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
+    with threads(3):
+        many = trace(centres, points, water, refractive_index=INDEX, method=method)
+    with threads(1):
         one = trace(centres, points, water, refractive_index=INDEX, method=method)
-    finally:
-        numba.set_num_threads(before)
     np.testing.assert_array_equal(many.piercing_xyz, one.piercing_xyz)
     np.testing.assert_array_equal(many.iterations, one.iterations)
 
