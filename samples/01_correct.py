@@ -9,11 +9,7 @@ import pcfix
 
 scene = Path(__file__).parent / "scene"
 summary = pcfix.correct_file(
-    scene / "cloud.laz",
-    "corrected.laz",
-    cameras=scene / "cameras.csv",
-    water=0.37,
-    overwrite=True,
+    scene / "cloud.laz", "corrected.laz", cameras=scene / "cameras.csv", water=0.37, overwrite=True
 )
 print(f"{summary.corrected:,} of {summary.points:,} points lay under water and were moved")
 print(f"deepest point {summary.depth_m['max']:.2f} m, mean shift {summary.shift_z_m['mean']:.2f} m")

@@ -616,9 +616,7 @@ def test_a_full_disk_leaves_nothing_behind(
     ids=" ".join,
 )
 def test_wrong_usage_is_exit_code_2(
-    folder: Path,
-    run: Callable[..., subprocess.CompletedProcess[str]],
-    arguments: list[str],
+    folder: Path, run: Callable[..., subprocess.CompletedProcess[str]], arguments: list[str]
 ) -> None:
     before = listing(folder)
     done = run(*arguments)

@@ -13,15 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from pcfix.model import (
-    BoolArray,
-    Cameras,
-    FloatArray,
-    IntArray,
-    Lens,
-    TiePoints,
-    WaterSurface,
-)
+from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens, TiePoints, WaterSurface
 from pcfix.port.shapes import Port
 
 if TYPE_CHECKING:
@@ -139,10 +131,7 @@ class Given(NamedTuple):
 
 
 def columns_of(
-    codes: list[tuple[int, ...]],
-    water: list[bool],
-    similarity: bool,
-    pivot: FloatArray,
+    codes: list[tuple[int, ...]], water: list[bool], similarity: bool, pivot: FloatArray
 ) -> Columns:
     """Return the columns of the free parameters of each group, the water's and a similarity's."""
     lens = np.concatenate([[0], np.cumsum([len(one) for one in codes])]).astype(np.int64)

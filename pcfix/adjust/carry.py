@@ -23,17 +23,7 @@ import numpy as np
 from pcfix.adjust.gather import some_cameras
 from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.kernels import Span, in_tiles, kernel, lean, most_between
-from pcfix.lens.algebra import (
-    dot,
-    minus,
-    plus,
-    plus_square,
-    row_of,
-    scaled,
-    solved,
-    times,
-    vector,
-)
+from pcfix.lens.algebra import dot, minus, plus, plus_square, row_of, scaled, solved, times, vector
 from pcfix.lens.imaging import image_in_world, image_of, lens_table
 from pcfix.model import (
     BoolArray,

@@ -13,18 +13,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.block import (
-    LEAST_SQUARES,
-    Given,
-    Loss,
-    State,
-)
+from pcfix.adjust.block import LEAST_SQUARES, Given, Loss, State
 from pcfix.adjust.normal import (
     Sums,
     Workspace,
     add_point,
     in_parts,
-    inverted,
     linearise,
     normal_equations,
     point_block,
@@ -32,6 +26,7 @@ from pcfix.adjust.normal import (
 from pcfix.adjust.observe import POINT, WIDTH, scratch
 from pcfix.adjust.problem import Problem, Solution, priors_at
 from pcfix.kernels import Span, kernel
+from pcfix.lens.algebra import inverted
 from pcfix.model import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:

@@ -29,14 +29,7 @@ from pcfix.adjust.gather import Datum, deeper, no_datum, straight_images, taken
 from pcfix.adjust.mend import Mended, mended
 from pcfix.adjust.problem import intersect_fixed
 from pcfix.errors import GeometryError
-from pcfix.model import (
-    Cameras,
-    FloatArray,
-    GroundControl,
-    TiePoints,
-    WaterDimension,
-    WaterSurface,
-)
+from pcfix.model import Cameras, FloatArray, GroundControl, TiePoints, WaterDimension, WaterSurface
 from pcfix.water.fit import heights_from_cloud, is_near
 from pcfix.water.surface import is_submerged, surface_above
 

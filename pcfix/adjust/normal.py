@@ -21,16 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.block import (
-    CAUCHY,
-    HUBER,
-    Given,
-    Loss,
-    PointPriors,
-    Seen,
-    State,
-    Surface,
-)
+from pcfix.adjust.block import CAUCHY, HUBER, Given, Loss, PointPriors, Seen, State, Surface
 from pcfix.adjust.observe import (
     POINT,
     WATER,
@@ -42,6 +33,7 @@ from pcfix.adjust.observe import (
     scratch,
 )
 from pcfix.kernels import Span, in_tiles, lean
+from pcfix.lens.algebra import inverted
 from pcfix.model import FloatArray, IntArray
 
 PARTS = 8
@@ -281,24 +273,6 @@ def point_block(
     for i in range(3):
         v[i, i] += damping * v[i, i]
     return inverted(v, 1e-14)
-
-
-@lean
-def inverted(v: FloatArray, least: float) -> bool:
-    """Replace a matrix of 3 x 3 by its inverse; whether it has one.
-
-    It has none where the determinant is less than this share of the product of the diagonal.
-    """
-    a, b, c = v[0, 0], v[0, 1], v[0, 2]
-    d, e, f = v[1, 0], v[1, 1], v[1, 2]
-    g, h, i = v[2, 0], v[2, 1], v[2, 2]
-    det = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-    if not abs(det) > least * abs(a * e * i):
-        return False
-    v[0, 0], v[0, 1], v[0, 2] = (e * i - f * h) / det, (c * h - b * i) / det, (b * f - c * e) / det
-    v[1, 0], v[1, 1], v[1, 2] = (f * g - d * i) / det, (a * i - c * g) / det, (c * d - a * f) / det
-    v[2, 0], v[2, 1], v[2, 2] = (d * h - e * g) / det, (b * g - a * h) / det, (a * e - b * d) / det
-    return True
 
 
 @lean

@@ -6,18 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pcfix.adjust.block import (
-    CX,
-    CY,
-    K1,
-    NAMES,
-    P1,
-    P2,
-    Block,
-    Robust,
-    Unknowns,
-    usable_codes,
-)
+from pcfix.adjust.block import CX, CY, K1, NAMES, P1, P2, Block, Robust, Unknowns, usable_codes
 from pcfix.adjust.gather import LEAST_VIEWS
 from pcfix.adjust.normal import residuals
 from pcfix.adjust.precision import Precision, precision_of

@@ -13,16 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import (
-    CAUCHY,
-    CODES,
-    HUBER,
-    SQUARES,
-    Loss,
-    Robust,
-    State,
-    moved_lens,
-)
+from pcfix.adjust.block import CAUCHY, CODES, HUBER, SQUARES, Loss, Robust, State, moved_lens
 from pcfix.adjust.equations import reduced_at, solver, undamped
 from pcfix.adjust.normal import point_steps
 from pcfix.adjust.problem import (

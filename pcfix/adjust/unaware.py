@@ -29,15 +29,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.adjust.block import LEAST_SQUARES, Given, State
-from pcfix.adjust.normal import (
-    PARTS,
-    Workspace,
-    in_parts,
-    inverted,
-    linearise,
-    point_block,
-    solved,
-)
+from pcfix.adjust.normal import PARTS, Workspace, in_parts, linearise, point_block, solved
 from pcfix.adjust.observe import POINT, WATER, WIDTH, scratch
 from pcfix.adjust.problem import (
     LogRow,
@@ -51,6 +43,7 @@ from pcfix.adjust.problem import (
 from pcfix.adjust.solve import moved_by
 from pcfix.errors import GeometryError
 from pcfix.kernels import Span, kernel, lean
+from pcfix.lens.algebra import inverted
 from pcfix.model import BoolArray, FloatArray, IntArray
 
 MAX_STEPS = 25

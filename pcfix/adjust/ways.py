@@ -23,15 +23,7 @@ from pcfix.adjust.problem import Progress, intersect_fixed
 from pcfix.adjust.result import Adjusted
 from pcfix.adjust.rounds import adjust_ties, check_datum, default_lens
 from pcfix.errors import GeometryError, SettingError
-from pcfix.model import (
-    Cameras,
-    FloatArray,
-    GroundControl,
-    IntArray,
-    TiePoints,
-    Views,
-    WaterSurface,
-)
+from pcfix.model import Cameras, FloatArray, GroundControl, IntArray, TiePoints, Views, WaterSurface
 from pcfix.options.survey import AdjustRules
 from pcfix.water.surface import surface_above
 

@@ -144,9 +144,7 @@ def _only_wet_places(found: Match) -> Match:
             f"{found.reference.name}: no check point is under water; compare without --submerged."
         )
     return replace(
-        found,
-        places=found.places[wet],
-        not_submerged=found.not_submerged + int((~wet).sum()),
+        found, places=found.places[wet], not_submerged=found.not_submerged + int((~wet).sum())
     )
 
 

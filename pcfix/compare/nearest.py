@@ -165,7 +165,7 @@ def _nearest_one(grid: Cells, place: FloatArray) -> float:
 @lean
 def nearest_distances(
     span: Span, grid: Cells, places: FloatArray, order: IntArray, distance: FloatArray
-) -> None:  # pragma: no cover - compiled
+) -> None:
     """Set the distance of each place (n, 3) to its nearest point.
 
     NaN where that is more than `MAX_RINGS` cells away. Places are visited in the given order,

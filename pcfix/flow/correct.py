@@ -21,14 +21,7 @@ from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps
 from pcfix.io.las.writing import corrected_header
 from pcfix.kernels import threads
-from pcfix.model import (
-    BATHYMETRIC_POINT,
-    Cameras,
-    Correction,
-    FloatArray,
-    Views,
-    WaterSurface,
-)
+from pcfix.model import BATHYMETRIC_POINT, Cameras, Correction, FloatArray, Views, WaterSurface
 from pcfix.options.correct import CorrectOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import File, taken
 from pcfix.refract.batch import Batch, MadeWith, Survey

@@ -104,7 +104,7 @@ def _draw(
     row_first: int,
     column_first: int,
     out: FloatArray,
-) -> None:  # pragma: no cover - compiled
+) -> None:
     """Write the height of each centre; of two triangles that share it the first one counts.
 
     The moved positions say which triangle a centre is in, the true ones how high it lies.
@@ -130,9 +130,7 @@ def _draw(
 
 
 @lean
-def _shares(
-    a: FloatArray, b: FloatArray, c: FloatArray, x: float, y: float
-) -> tuple[float, float]:  # pragma: no cover - compiled
+def _shares(a: FloatArray, b: FloatArray, c: FloatArray, x: float, y: float) -> tuple[float, float]:
     """Return the barycentric coordinates of a place that belong to the corners b and c."""
     bx, by, cx, cy = b[0] - a[0], b[1] - a[1], c[0] - a[0], c[1] - a[1]
     px, py = x - a[0], y - a[1]
@@ -141,9 +139,7 @@ def _shares(
 
 
 @lean
-def _square_radius(
-    a: FloatArray, b: FloatArray, c: FloatArray
-) -> float:  # pragma: no cover - compiled
+def _square_radius(a: FloatArray, b: FloatArray, c: FloatArray) -> float:
     """Return the square of the radius of the circle through three points, a b c / 4 area."""
     bx, by, cx, cy = b[0] - a[0], b[1] - a[1], c[0] - a[0], c[1] - a[1]
     ab, ac = bx * bx + by * by, cx * cx + cy * cy

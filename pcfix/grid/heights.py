@@ -193,7 +193,7 @@ def _weighted(
     row_stop: int,
     column_first: int,
     column_stop: int,
-) -> FloatArray:  # pragma: no cover - compiled
+) -> FloatArray:
     """Return the weighted means; `start` indexes the points of cells with a margin of one."""
     height, width = row_stop - row_first, column_stop - column_first
     out = np.full((height, width), np.nan)

@@ -19,13 +19,7 @@ from pcfix.io.las.source import LasSource, coordinates, stated_crs
 from pcfix.io.las.writing import own_settings
 from pcfix.io.rasters import place_of, read_masked
 from pcfix.io.tables import read_table
-from pcfix.model import (
-    BATHYMETRIC_POINT,
-    NOISE_CLASSES,
-    WaterDimension,
-    WaterPlane,
-    WaterSurface,
-)
+from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, WaterDimension, WaterPlane, WaterSurface
 from pcfix.options.declare import File
 
 if TYPE_CHECKING:
@@ -34,9 +28,7 @@ if TYPE_CHECKING:
 
 
 def read_cloud(
-    path: File,
-    water: WaterSurface | None = None,
-    skip_classes: Sequence[int] = NOISE_CLASSES,
+    path: File, water: WaterSurface | None = None, skip_classes: Sequence[int] = NOISE_CLASSES
 ) -> SurveyCloud:
     """Read the points that count of a LAS or LAZ cloud that fits in memory.
 

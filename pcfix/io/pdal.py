@@ -13,14 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import SettingError
-from pcfix.io.las.columns import (
-    Column,
-    changed_rows,
-    column_scale,
-    in_steps,
-    rows_of,
-    shift_steps,
-)
+from pcfix.io.las.columns import Column, changed_rows, column_scale, in_steps, rows_of, shift_steps
 from pcfix.model import BATHYMETRIC_POINT, Correction, FloatArray
 from pcfix.refract.tally import Summary
 

@@ -43,9 +43,7 @@ _AT_ONCE = 1_000_000
 
 
 def read_water_raster(
-    path: File,
-    cloud_crs: str | CRS | None = None,
-    bounds: Bounds | None = None,
+    path: File, cloud_crs: str | CRS | None = None, bounds: Bounds | None = None
 ) -> WaterRaster:
     """Read the heights of the water, in the cloud's CRS and metres; warn of what is taken on trust.
 
@@ -205,11 +203,7 @@ def check_size(cells: int, name: str) -> None:
 
 
 def sampled(
-    part: Part,
-    to_cloud: Points,
-    from_cloud: Points,
-    bounds: Bounds | None,
-    names: tuple[str, str],
+    part: Part, to_cloud: Points, from_cloud: Points, bounds: Bounds | None, names: tuple[str, str]
 ) -> WaterRaster:
     """Sample on a grid in the cloud's CRS with square cells as fine as the raster's finest.
 

@@ -112,7 +112,7 @@ def _cells_over(area: Any, corner: FloatArray, side_m: float) -> _Cells:
 @lean
 def _look_up(
     span: Span, cells: _Cells, bounds: FloatArray, x: FloatArray, y: FloatArray, states: States
-) -> None:  # pragma: no cover - compiled
+) -> None:
     """Write the state of each position; those off the cells but within the bounds are unsure."""
     rows, columns = cells.states.shape
     for i in range(*span):
@@ -308,7 +308,7 @@ def _add(
     y: FloatArray,
     height_m: FloatArray,
     counts: BoolArray,
-) -> int:  # pragma: no cover - compiled
+) -> int:
     """Mark the cells of points and add their votes; return how many are below or undecided."""
     water = 0
     for i in range(x.size):

@@ -138,3 +138,21 @@ def solved(m: Symmetric, a: Vector) -> tuple[float, Vector]:
     det, c = cofactors(m)
     x, y, z = product(c, a)
     return det, (x / det, y / det, z / det)
+
+
+@lean
+def inverted(m: FloatArray, least: float) -> bool:
+    """Replace a matrix by its inverse; whether it has one.
+
+    It has none where the determinant is less than this share of the product of the diagonal.
+    """
+    a, b, c = m[0, 0], m[0, 1], m[0, 2]
+    d, e, f = m[1, 0], m[1, 1], m[1, 2]
+    g, h, i = m[2, 0], m[2, 1], m[2, 2]
+    det = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    if not abs(det) > least * abs(a * e * i):
+        return False
+    m[0, 0], m[0, 1], m[0, 2] = (e * i - f * h) / det, (c * h - b * i) / det, (b * f - c * e) / det
+    m[1, 0], m[1, 1], m[1, 2] = (f * g - d * i) / det, (a * i - c * g) / det, (c * d - a * f) / det
+    m[2, 0], m[2, 1], m[2, 2] = (d * h - e * g) / det, (b * g - a * h) / det, (a * e - b * d) / det
+    return True

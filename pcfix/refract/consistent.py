@@ -33,6 +33,7 @@ from pcfix.lens.algebra import (
     Vector,
     beyond,
     dot,
+    inverted,
     minus,
     normal_of,
     plus,
@@ -254,7 +255,7 @@ def _search(
     inverse[:] = 0.0
     for step in range(MAX_STEPS):
         _gradient(g, inverse[: 0 if step else 3], q, rays, cameras, optics, n, tin, field)
-        if step == 0 and not _inverted(inverse):
+        if step == 0 and not inverted(inverse, 0.0):
             return False, start
         t = scaled(-1.0, times(inverse, vector(g)))
         if step > 0:
@@ -309,18 +310,3 @@ def _add_slope(slope: FloatArray, ray: FloatArray, path: Path, by_q: Vector) -> 
         for i in range(3):
             for axis in range(3):
                 slope[i, axis] += j[i] * d[axis]
-
-
-@lean
-def _inverted(m: FloatArray) -> bool:
-    """Replace a matrix of 3 x 3 by its inverse; whether it has one."""
-    a, b, c = m[0, 0], m[0, 1], m[0, 2]
-    d, e, f = m[1, 0], m[1, 1], m[1, 2]
-    g, h, i = m[2, 0], m[2, 1], m[2, 2]
-    det = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-    if not (det != 0.0 and abs(det) < np.inf):
-        return False
-    m[0, 0], m[0, 1], m[0, 2] = (e * i - f * h) / det, (c * h - b * i) / det, (b * f - c * e) / det
-    m[1, 0], m[1, 1], m[1, 2] = (f * g - d * i) / det, (a * i - c * g) / det, (c * d - a * f) / det
-    m[2, 0], m[2, 1], m[2, 2] = (d * h - e * g) / det, (b * g - a * h) / det, (a * e - b * d) / det
-    return True

@@ -169,9 +169,7 @@ def intersection_of(batch: Batch, result: FloatArray) -> Intersection:
     The rays are those of the depth maps that count, averaged ones included.
     """
     found = batch.result(
-        result[:, :3],
-        outcome=result[:, OUTCOME].astype(np.uint8),
-        ray_miss_m=result[:, _MISS],
+        result[:, :3], outcome=result[:, OUTCOME].astype(np.uint8), ray_miss_m=result[:, _MISS]
     )
     moved = found.outcome == CORRECTED
     return found._replace(

@@ -7,14 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pcfix.adjust.result import Adjusted
-from pcfix.adjust.values import (
-    Before,
-    Plain,
-    adjustment_dict,
-    before_of,
-    carried_by,
-    depth_of,
-)
+from pcfix.adjust.values import Before, Plain, adjustment_dict, before_of, carried_by, depth_of
 from pcfix.grid.maps import Maps, MapsBuilder
 from pcfix.model import FloatArray
 from pcfix.report.adjustment_figures import pictures_of
@@ -38,13 +31,7 @@ from pcfix.report.adjustment_text import (
 )
 from pcfix.report.page import Layer, Report, Table, render
 
-__all__ = [
-    "Before",
-    "adjustment_dict",
-    "adjustment_page",
-    "adjustment_text",
-    "before_of",
-]
+__all__ = ["Before", "adjustment_dict", "adjustment_page", "adjustment_text", "before_of"]
 
 
 def adjustment_text(adjusted: Adjusted, before: Before | None = None) -> str:

@@ -245,11 +245,7 @@ def _witnesses(near: Looked, gain: dict[Cue, Gain], evidence: dict[str, float]) 
 
 
 def _refuse_poor(
-    height: str,
-    evidence: dict[str, float],
-    sigma_m: float,
-    speaking: list[str],
-    lift: float | None,
+    height: str, evidence: dict[str, float], sigma_m: float, speaking: list[str], lift: float | None
 ) -> float:
     """Return the evidence that is needed, or refuse.
 

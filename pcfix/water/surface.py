@@ -190,7 +190,7 @@ def heights_above(field: Field, x: FloatArray, y: FloatArray) -> tuple[FloatArra
 @lean
 def _set_heights(
     span: Span, field: Field, x: FloatArray, y: FloatArray, height: FloatArray, slope: FloatArray
-) -> None:  # pragma: no cover - compiled
+) -> None:
     for i in range(*span):
         height[i], slope[i, 0], slope[i, 1] = height_at(field, x[i], y[i])
 
@@ -287,7 +287,7 @@ def _inside(corners: FloatArray, u: float, v: float) -> bool:
 @lean
 def _set_facets(
     span: Span, tin: Tin, x: FloatArray, y: FloatArray, facet: npt.NDArray[np.int64]
-) -> None:  # pragma: no cover - compiled
+) -> None:
     """Set `locate` for n positions."""
     for i in range(*span):
         facet[i] = locate(tin, x[i], y[i])
@@ -309,7 +309,7 @@ def in_two_sheets(tin: Tin) -> tuple[BoolArray, FloatArray]:
 
 
 @kernel
-def _meet_others(tin: Tin, centres: FloatArray) -> BoolArray:  # pragma: no cover - compiled
+def _meet_others(tin: Tin, centres: FloatArray) -> BoolArray:
     """Return which facets' centres lie in another facet of another height."""
     double = np.zeros(len(centres), np.bool_)
     for f in range(len(centres)):

@@ -68,9 +68,7 @@ def disturbed(made, seed=3, by_m=0.3):
 
 
 @pytest.mark.parametrize(
-    "settings",
-    [{}, {"tilt_percent": 2.0}, OBLIQUE],
-    ids=["nadir", "tilted water", "obliques"],
+    "settings", [{}, {"tilt_percent": 2.0}, OBLIQUE], ids=["nadir", "tilted water", "obliques"]
 )
 def test_comes_home_with_gnss(settings):
     made = scene(**settings)

@@ -25,7 +25,7 @@ def main():
         make(laz, arguments.points, arguments.cameras)
     cloud = uncompressed(laz)
     options = [
-        *("--cameras", camera_table(laz), "--sensor", folder / "sensor.csv", "--water", "0.37"),
+        *("--cameras", camera_table(laz), "--sensor", folder / "sensor.csv", "--water", "0.37")
     ]
     outputs = [folder / f"{name}.las" for name in ("corrected", "stage", "copied")]
     pcfix = [sys.executable, "-m", "pcfix"]

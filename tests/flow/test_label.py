@@ -259,10 +259,7 @@ def test_mask_that_crosses_itself_is_mended_and_said_so(tmp_path):
     ("area", "sentence"),
     [
         (shapely.Point(EAST_M, NORTH_M), r"mask.wkt: holds no polygon \(Point\); a mask needs"),
-        (
-            shapely.box(10, 20, 30, 40),
-            r"mask.wkt: the mask holds none of the \d+ points",
-        ),
+        (shapely.box(10, 20, 30, 40), r"mask.wkt: the mask holds none of the \d+ points"),
     ],
 )
 def test_masks_that_cannot_be_used(tmp_path, area, sentence):

@@ -148,11 +148,7 @@ def test_sparse_water_hangs_together():
 
 @pytest.mark.parametrize(
     "choices",
-    [
-        {"dead_band": 0.1},
-        {"connected": True},
-        {"dead_band": 0.08, "connected": True, "band": 0.02},
-    ],
+    [{"dead_band": 0.1}, {"connected": True}, {"dead_band": 0.08, "connected": True, "band": 0.02}],
 )
 def test_parts_order_and_corners_leave_no_trace(choices):
     *_, xyz = beach(20_000)

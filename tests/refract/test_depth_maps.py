@@ -19,14 +19,7 @@ from pcfix.refract.methods import correct
 from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
-from tests.utils.depth_map_twin import (
-    LENS,
-    costs_of,
-    fused_slowly,
-    looking,
-    on_bed,
-    slow_depth,
-)
+from tests.utils.depth_map_twin import LENS, costs_of, fused_slowly, looking, on_bed, slow_depth
 from tests.utils.nightly import mostly_nightly
 from tests.utils.shared import needs
 
@@ -304,8 +297,7 @@ def test_known_maps_of_a_block_are_undone(name, most):
 
 
 @pytest.mark.parametrize(
-    ("name", "most"),
-    mostly_nightly([("nadir", 3.0), ("half oblique", 9.0)], ("half oblique", 9.0)),
+    ("name", "most"), mostly_nightly([("nadir", 3.0), ("half oblique", 9.0)], ("half oblique", 9.0))
 )
 def test_maps_are_found_where_no_list_tells_them(name, most, monkeypatch):
     error = errors_gsd(name, method="consistent", camera_set="mvs")

@@ -127,10 +127,9 @@ def test_a_block_that_is_only_elsewhere_makes_the_same_cloud(kind):
         CAMERAS, centres=elsewhere(CAMERAS.centres), rotations=CAMERAS.rotations @ turned.T
     )
     xyz = some_points()
-    views = {
-        "list": listed([MIXED] * 60),
-        "pairs": listed([(0, 2, 4, 5, 2, 7)] * 60, "pairs"),
-    }.get(kind)
+    views = {"list": listed([MIXED] * 60), "pairs": listed([(0, 2, 4, 5, 2, 7)] * 60, "pairs")}.get(
+        kind
+    )
     matching = "pairs" if kind == "pairs of the matcher" else "depth-maps"
     bed = Bed(np.full((1, 1), -5.0), -20.0, -20.0, 50.0)
     one = run(xyz, views, Learned(matcher=matcher(CAMERAS, True), bed=bed), None, matching)
@@ -148,10 +147,9 @@ def test_a_block_that_is_only_elsewhere_makes_the_same_cloud(kind):
 @pytest.mark.parametrize("kind", ["list", "no list", "pairs"])
 def test_the_same_cameras_change_no_bit(kind):
     xyz = some_points()
-    views = {
-        "list": listed([MIXED] * 60),
-        "pairs": listed([(0, 2, 4, 5, 2, 7)] * 60, "pairs"),
-    }.get(kind)
+    views = {"list": listed([MIXED] * 60), "pairs": listed([(0, 2, 4, 5, 2, 7)] * 60, "pairs")}.get(
+        kind
+    )
     learned = Learned(matcher=matcher(CAMERAS, True))
     same = Cameras(CAMERAS.labels, CAMERAS.centres.copy(), CAMERAS.rotations.copy(), CAMERAS.lenses)
     one, other = run(xyz, views, learned, None), run(xyz, views, learned, MadeWith(xyz, same))

@@ -68,10 +68,7 @@ table says least of all."""
 
 
 def read_cameras(
-    path: File,
-    sensor: File | None = None,
-    *,
-    angles: Angles | None = None,
+    path: File, sensor: File | None = None, *, angles: Angles | None = None
 ) -> Cameras:
     """Read the exterior (and interior) orientation of a block of images.
 

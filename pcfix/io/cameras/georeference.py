@@ -204,12 +204,7 @@ def _from_earth(
 
 
 def _into(
-    cloud: CRS,
-    frame: Frame,
-    stated: Statement,
-    cameras: Cameras,
-    offset: FloatArray,
-    name: str,
+    cloud: CRS, frame: Frame, stated: Statement, cameras: Cameras, offset: FloatArray, name: str
 ) -> Georeference:
     """Return the way from a frame tied to the earth into a CRS."""
     check_projected_metres(cloud, "the cloud")

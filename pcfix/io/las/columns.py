@@ -238,9 +238,7 @@ def _bytes(array: Records) -> Records:
 
 
 def shifted(
-    points: laspy.ScaleAwarePointRecord,
-    header: laspy.LasHeader,
-    steps: npt.NDArray[np.int64],
+    points: laspy.ScaleAwarePointRecord, header: laspy.LasHeader, steps: npt.NDArray[np.int64]
 ) -> laspy.ScaleAwarePointRecord:
     """Return points in the header's format, moved by whole steps of its scale, shape (n, 3).
 

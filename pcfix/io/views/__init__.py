@@ -52,11 +52,7 @@ def read_views(path: File, cameras: Cameras, *, to_cloud: Transformation | None 
 
 
 def track_views(
-    path: Path,
-    tie_points: TiePoints,
-    cameras: Cameras,
-    *,
-    to_cloud: Transformation | None = None,
+    path: Path, tie_points: TiePoints, cameras: Cameras, *, to_cloud: Transformation | None = None
 ) -> ViewList:
     """Take the tracks of a sparse model, read from `path`, as a view list; see `read_views`.
 

@@ -320,10 +320,7 @@ def test_archive(tmp_path):
     ("text", "message"),
     [
         (simple(photo())[:-200], "damaged or cut off"),
-        (
-            simple(photo()).replace("?>", '?><!DOCTYPE a [<!ENTITY b "c">]>', 1),
-            "declares entities",
-        ),
+        (simple(photo()).replace("?>", '?><!DOCTYPE a [<!ENTITY b "c">]>', 1), "declares entities"),
         (simple(), "no photo has a pose"),
         (simple(photo(centre=("x", 2, 3))), "image p0.jpg, Center: 'x' is not a number"),
         (simple(photo(rotation=matrix(2 * TURN))), "image p0.jpg: the rotation matrix is not"),
@@ -378,10 +375,7 @@ def test_bad_input(tmp_path, text, message):
     [
         ("", "has no tie points"),
         ("<TiePoints><Path>gone.xml</Path></TiePoints>", "gone.xml, which is not beside it"),
-        (
-            f"<TiePoints>{TIE.replace('>10<', '>ten<')}</TiePoints>",
-            "x of a tie point: .*'ten'",
-        ),
+        (f"<TiePoints>{TIE.replace('>10<', '>ten<')}</TiePoints>", "x of a tie point: .*'ten'"),
         (f"<TiePoints>{TIE.replace('<y>20</y>', '')}</TiePoints>", "photo 1: a measurement"),
     ],
 )

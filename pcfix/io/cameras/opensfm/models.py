@@ -114,11 +114,7 @@ FEATURE_SCALE = 0.001
 """Of a feature, in units of the larger side; OpenSfM wants some number."""
 
 
-def write_opensfm(
-    path: File,
-    cameras: Cameras,
-    tie_points: TiePoints | None = None,
-) -> None:
+def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = None) -> None:
     """Write a block as an OpenSfM reconstruction.
 
     Parameters
