@@ -27,7 +27,7 @@ NOISE_CLASSES = LOW_NOISE, HIGH_NOISE = 7, 18
 Projection = Literal[
     "perspective", "equidistant", "equisolid", "polynomial", "fov", "dual", "division", "eucm"
 ]
-ViewKind = Literal["tracks", "depth-maps", "pairs"]
+ViewKind = Literal["tracks", "depth-maps", "pairs", "pair-images"]
 
 NOMINAL_WIDTH_PX = 5472.0
 """Of lenses in millimetres whose pixel size is not known: the longer side of a survey drone's
@@ -321,7 +321,8 @@ class Views:
 
     As `tracks` they are the images whose rays were intersected; as `depth-maps` those whose depth
     maps, each matched with other images, were averaged; as `pairs` the entries 2i and 2i + 1 of a
-    point are the two images of its stereo pair i, of whose places the point is the median.
+    point are the two images of its stereo pair i, of whose places the point is the median; as
+    `pair-images` they are the images of such pairs, any two that were matched.
     """
 
     start: IntArray

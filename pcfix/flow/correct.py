@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -127,9 +126,7 @@ def correct_points(
         points, views, label = step.xyz, step.views, step.rule(label)
     above = surface_above(surface, points, dimension)
     batch = Batch(points, above, Survey(surface, cameras, settings, offset), views, made_with)
-    learned = learn_of_points(batch, regression)
-    batch = replace(batch, survey=replace(batch.survey, learned=learned))
-    found = correct_checked(batch, label)
+    found = correct_checked(learn_of_points(batch, regression), label)
     return found if step is None else step.whole(found)
 
 

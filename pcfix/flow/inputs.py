@@ -17,7 +17,7 @@ from pcfix.io.cameras.georeference import Georeference, georeference
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.io.views import ViewList
 from pcfix.label.areas import WaterMask
-from pcfix.model import Cameras, FloatArray, TiePoints
+from pcfix.model import Cameras, FloatArray, TiePoints, ViewKind
 from pcfix.options.declare import File, options_of
 from pcfix.options.shared import InputOptions
 from pcfix.port.shapes import port_of
@@ -138,7 +138,10 @@ class Inputs(InputOptions):
 
     def _of_kind(self, views: ViewList) -> ViewList:
         """Return a view list as what the user says that it is."""
-        return views if self.views_are == "auto" else replace(views, kind=self.views_are)
+        kind: ViewKind = views.kind
+        if self.views_are != "auto":
+            kind = "pair-images" if self.views_are == "pairs" else self.views_are
+        return replace(views, kind=kind)
 
     def tie_points(self, cloud_crs: str | CRS | None, *, placed: bool = True) -> TiePoints | None:
         """Return the tie points of the camera file in the cloud's CRS, where it has any.

@@ -17,7 +17,8 @@ from pcfix.model import NOISE_CLASSES, BoolArray, FloatArray, IntArray, TiePoint
 from pcfix.options.correct import ScienceOptions
 from pcfix.options.declare import File
 from pcfix.refract.batch import Batch, Learned, MadeWith, Survey, stacked
-from pcfix.refract.learning import check_method, wants_matcher, with_matcher
+from pcfix.refract.hypotheses import Verdict
+from pcfix.refract.learning import check_method, resolved, wants_matcher, with_matcher
 from pcfix.refract.occlusion import Occluder
 from pcfix.refract.regression import (
     LEAST_COUNT,
@@ -62,9 +63,11 @@ class Learning:
         ties: Callable[[], TiePoints | None] | None = None,
     ) -> None:
         self._ties = ties or (lambda: inputs.tie_points(view.crs))
-        self.survey, self._inputs, self._view, self._views = survey, inputs, view, views
+        self._inputs, self._view, self._views = inputs, view, views
         self.notes: list[str] = []
-        settings = survey.settings
+        self.verdict: Verdict | None = None
+        settings = resolved(survey.settings, survey.cameras, views)
+        self.survey = replace(survey, settings=settings)
         check_method(settings, survey.cameras)
         if (settings.method == "regression") != (inputs.check_depths is not None):
             raise SettingError(
@@ -76,13 +79,17 @@ class Learning:
         self,
         chunks: Callable[[], Iterable[Points]],
         makers: Callable[[], Iterable[MadeWith]] | None = None,
-    ) -> Learned:
-        """Return what is learned of the whole cloud, whose chunks may be asked for again.
+    ) -> Survey:
+        """Return the survey with what is learned of the whole cloud; its chunks may be asked again.
 
         And, chunk by chunk, what made the points, where that are not these cameras.
         """
         learned = Learned(regression=self._regression(chunks), occluder=self._occluder(chunks))
-        return self._with_matcher(learned, chunks, makers)
+        self.survey = replace(self.survey, learned=learned)
+        if wants_matcher(self.survey.settings, self._views):
+            sample = self._sample(chunks, makers)
+            self.survey, self.verdict = with_matcher(sample, self._view.points, self._ties())
+        return self.survey
 
     def _regression(self, chunks: Callable[[], Iterable[Points]]) -> DepthRegression | None:
         path = self._inputs.check_depths
@@ -107,20 +114,16 @@ class Learning:
             builder.add(xyz, classes)
         return builder.build()
 
-    def _with_matcher(
+    def _sample(
         self,
-        learned: Learned,
         chunks: Callable[[], Iterable[Points]],
         makers: Callable[[], Iterable[MadeWith]] | None,
-    ) -> Learned:
-        """Add the model of the matcher, by the tie points where the camera file has some."""
-        if not wants_matcher(self.survey.settings, self._views):
-            return learned
+    ) -> Batch:
+        """Return points of the whole cloud, evenly spread over its order, and without noise."""
         area_m2 = np.prod(np.maximum(np.subtract(self._view.high, self._view.low)[:2], 1.0))
         wanted = np.clip(BED_POINTS_A_M2 * float(area_m2), FEWEST_BED_POINTS, MOST_BED_POINTS)
         step = max(1, self._view.points // int(wanted))
-        survey = replace(self.survey, learned=learned)
-        taken: list[Batch] = []
+        survey, taken = self.survey, list[Batch]()
         done = 0
         of_chunks = repeat(None) if makers is None else makers()
         for (xyz, heights, classes), made_with in zip(chunks(), of_chunks, strict=False):
@@ -132,7 +135,7 @@ class Learning:
             of_rows = None if made_with is None else made_with.take(rows)
             taken.append(Batch(xyz[rows], above, survey, made_with=of_rows))
             done += len(xyz)
-        return with_matcher(stacked(taken), self._views, self._ties())
+        return stacked(taken)
 
 
 BED_POINTS_A_M2 = 5.0

@@ -8,7 +8,7 @@ submerged point, 1 mm.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,9 @@ class ThroughPort:
                 "port: it is fixed to the camera, and these cameras have no angles; give a camera"
                 " file that has them."
             )
+        if options.method == "auto":
+            known = self._cameras.lenses is not None
+            self._options = replace(options, method="consistent" if known else "snell")
         self.water = WaterPlane(np.inf)
         self.settings = {"port": asdict(self._port)}
         self.restart()
@@ -65,7 +68,7 @@ class ThroughPort:
         for name, is_given in given.items():
             if is_given:
                 raise SettingError(f"{name} is of no use with a port; leave it out.")
-        if options.method not in ("snell", "consistent"):
+        if options.method not in ("auto", "snell", "consistent"):
             raise SettingError(
                 f"method {options.method} is about a water surface; with a port give snell or"
                 " consistent."

@@ -29,6 +29,7 @@ from pcfix.model import (
 )
 from pcfix.options.correct import CorrectOptions
 from pcfix.refract.batch import Batch, Intersection, MadeWith, Survey
+from pcfix.refract.hypotheses import Verdict
 from pcfix.refract.learning import kind_of_views
 from pcfix.refract.methods import correct, shift_of_land
 from pcfix.refract.tally import Tally
@@ -66,14 +67,15 @@ class ThroughWater:
         self.level_offset_m = inputs.level_offset_m(self._cameras)
         check_above_water(self._cameras, self.water, self.level_offset_m)
         check_tilt(self.water)
+        self._listed = None if blocks.views is None else blocks.views.kind
         self._learning = Learning(
             Survey(self.water, self._cameras, options, self.level_offset_m), inputs, view,
-            None if blocks.views is None else blocks.views.kind,
+            self._listed,
             None if blocks.pair is None else self._old_ties,
         )  # fmt: skip
         self.survey = self._learning.survey
         self._kind: ViewKind | None = None
-        self._kind_notes: list[str] = []
+        self.verdict: Verdict | None = None
         self._bent = ""
         self.restart()
 
@@ -95,8 +97,8 @@ class ThroughWater:
             labelling.look_around(
                 lambda: parts_of(around(), self.water), self._view.low, self._view.high
             )
-        learned = self._learning.of_cloud(around, makers)
-        self.survey = replace(self.survey, learned=learned)
+        self.survey = self._learning.of_cloud(around, makers)
+        self.verdict = self._learning.verdict
 
     @staticmethod
     def _carried(
@@ -146,9 +148,9 @@ class ThroughWater:
             return batch
         if self._kind is None:
             rows = np.flatnonzero(is_submerged(batch.xyz[:, 2], batch.surface))
-            found = kind_of_views(batch.take(rows))
-            self._kind = batch.views.kind if found is None else found.kind
-            self._kind_notes = [] if found is None else [str(found)]
+            self.verdict = kind_of_views(batch.take(rows))
+            told = None if self.verdict is None else self.verdict.chosen.kind
+            self._kind = told or batch.views.kind
         return replace(batch, views=replace(batch.views, kind=self._kind))
 
     def _level_sigma_m(self, xy: FloatArray) -> FloatArray | None:
@@ -161,11 +163,35 @@ class ThroughWater:
         sigma = getattr(found, "sigma_level_m", None)
         return None if sigma is None else np.full(len(xy), float(sigma))
 
+    @property
+    def made(self) -> dict[str, Any] | None:
+        """What the cloud was taken for, and why, where the options leave it open."""
+        settings, verdict, views = self.survey.settings, self.verdict, self._listed
+        if verdict is not None:
+            because = str(verdict)
+        elif self._options.method != "auto":
+            return None
+        elif settings.method == "snell":
+            because = "The cameras have no lenses or no angles: corrected by snell."
+        elif views is not None:
+            because = f"The list is one of {views}: corrected as such."
+        else:
+            because = "Too few points to tell how the cloud was made: taken for intersected rays."
+        return {
+            "method": settings.method,
+            "camera_set": settings.camera_set,
+            "matcher": settings.matcher,
+            "views_are": self._kind or views,
+            "because": because,
+            **({} if verdict is None else verdict.as_dict()),
+        }
+
     def provenance(self) -> dict[str, Any]:
         """Return what a file shall say of the water."""
         plane = list(astuple(self.water)) if isinstance(self.water, WaterPlane) else None
         carried = {} if self.carrying is None else self.carrying.provenance()
-        return {"water": str(self.water), "water_plane": plane, **carried}
+        made = {} if self.made is None else {"made": self.made}
+        return {"water": str(self.water), "water_plane": plane, **made, **carried}
 
     def check_carried(self, name: str) -> None:
         """Refuse a cloud that could not be taken to the adjusted cameras."""
@@ -204,7 +230,7 @@ class ThroughWater:
         bent = [self._bent] if self._bent else []
         return [
             *self._learning.notes,
-            *self._kind_notes,
+            *([self.made["because"]] if self.made else []),
             *self.found.notes,
             *self._meeting.notes,
             *bent,
@@ -222,6 +248,7 @@ class ThroughWater:
             "water_fit": self.found.as_dict(),
             "uncertainty": tally.uncertainty(),
             "carried": None if self.carrying is None else self.carrying.as_dict(),
+            "made": self.made,
             "absorbed": bool(self._bent),
         }
 

@@ -22,7 +22,7 @@ from pcfix.options.shared import (
 Uncorrected = Literal["withhold", "keep", "drop"]
 Dimensions = Literal["all", "minimal", "none"]
 Method = Literal[
-    "snell", "consistent", "shan", "butler", "murase", "dietrich", "factor", "regression"
+    "auto", "snell", "consistent", "shan", "butler", "murase", "dietrich", "factor", "regression"
 ]
 CameraSet = Literal["auto", "mvs", "all"]
 Occlusion = Literal["auto", "on", "off"]
@@ -41,7 +41,11 @@ class MethodOptions(IndexOptions):
     panel = Panel.METHOD
     old_units = True
 
-    method: Method = option("snell", "How the true point follows from the apparent one.")
+    method: Method = option(
+        "auto",
+        "How the true point follows from the apparent one; auto: consistent, as the cloud itself"
+        " tells that it was made, or snell where the cameras have no lenses or angles.",
+    )
     camera_set: CameraSet = option(
         "auto",
         "Without --views: every camera whose frame holds the point, or a model of dense matching;"
@@ -91,7 +95,7 @@ class MethodOptions(IndexOptions):
     @property
     def models_matcher(self) -> bool:
         """Whether a model of dense matching stands in for a list of views."""
-        automatic = self.camera_set == "auto" and self.method == "consistent"
+        automatic = self.camera_set == "auto" and self.method in ("auto", "consistent")
         return automatic or self.camera_set == "mvs"
 
 

@@ -18,7 +18,7 @@ from pcfix.options.declare import (
     within,
 )
 
-ViewsAre = Literal["auto", "tracks", "depth-maps"]
+ViewsAre = Literal["auto", "tracks", "depth-maps", "pairs"]
 Angles = Literal["omega-phi-kappa", "yaw-pitch-roll", "aircraft"]
 WaterModel = Literal["auto", "level", "plane", "along", "river"]
 
@@ -213,8 +213,8 @@ class ViewOptions(OptionSet):
     )
     views_are: ViewsAre = option(
         "auto",
-        "Whether --views lists the images whose rays were intersected, or whose depth maps were"
-        " averaged.",
+        "Whether --views lists the images whose rays were intersected, whose depth maps were"
+        " averaged, or of whose stereo pairs the median was taken; auto: told by the cloud.",
     )
 
 

@@ -44,7 +44,11 @@ METHODS: dict[str, Method] = {
 }
 """What each name of `pcfix.options.Method` stands for: a new one is a function and an entry."""
 
-_OF_MATCHERS: dict[str, Method] = {"depth-maps": invert_depth_maps, "pairs": invert_pairs}
+_OF_MATCHERS: dict[str, Method] = {
+    "depth-maps": invert_depth_maps,
+    "pairs": invert_pairs,
+    "pair-images": invert_pairs,
+}
 """What `consistent` is for the kinds of dense clouds."""
 
 

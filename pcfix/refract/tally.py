@@ -223,6 +223,8 @@ class Summary:
     labelling: dict[str, Any] | None = None
     uncertainty: dict[str, Any] | None = None
     carried: dict[str, Any] | None = None
+    made: dict[str, Any] | None = None
+    """What the cloud was taken for, and why, where the options leave it open."""
     absorbed: bool = False
     """Whether it warned that the poses have absorbed the refraction; for later steps of a run."""
 

@@ -123,7 +123,7 @@ def _floor(scene: Any, measured: np.ndarray, seed: int) -> np.ndarray:
     rng = np.random.default_rng([seed, 99])
     rows = np.flatnonzero(measured)
     rows = np.sort(rng.choice(rows, min(FLOOR_POINTS, len(rows)), replace=False))
-    noise_px = scene.settings["image_noise_px"]
+    noise_px = scene.settings["image_noise"]
     truth = scene.true_xyz[rows]
     again = triangulated_again(
         truth, scene.views.take(rows), scene.true_cameras, scene.water,

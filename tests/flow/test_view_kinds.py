@@ -1,4 +1,4 @@
-"""Which kind of list it is, told by how smooth the bed comes out."""
+"""Which kind of list it is, told by the steps between neighbours."""
 
 from dataclasses import replace
 
@@ -10,7 +10,8 @@ from pcfix.io.views import ViewMatch, read_views
 from pcfix.model import Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
-from pcfix.refract.learning import PATCHES, kind_of_views
+from pcfix.refract.hypotheses import FEWEST_POINTS
+from pcfix.refract.learning import kind_of_views
 from pcfix.refract.matcher import matcher_of
 from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
@@ -43,31 +44,25 @@ BLOCKS = {
 @pytest.mark.parametrize("cloud", ["tracks", "depth-maps"])
 def test_a_simulated_list_is_told(cloud, block):
     scene, rows = under_water(cloud, **BLOCKS[block])
-    views = scene.views.take(rows)
+    views = replace(scene.views.take(rows), kind="depth-maps")
     found = kind_of(scene.xyz[rows], scene.cameras, scene.water, views)
-    assert found.kind == cloud
-    right, wrong = found.tracks_m, found.depth_maps_m
-    if cloud == "depth-maps":
-        right, wrong = wrong, right
-    assert right < wrong
-    assert f"{100 * right:.1f} cm" in str(found) and "--views-are" in str(found)
-    # what the list was taken for before does not matter
-    other = replace(views, kind="depth-maps")
-    assert kind_of(scene.xyz[rows], scene.cameras, scene.water, other) == found
+    assert found.chosen.kind == cloud and found.is_sure
+    assert found.share < 0.3 < 0.7 < found.runner_up_share
+    assert found.runner_up.words in str(found) and "not sure" not in str(found)
 
 
 def test_too_few_points_tell_nothing():
     scene, rows = under_water("tracks", 800, bed="flat")
-    rows = rows[: PATCHES - 1]
-    views = scene.views.take(rows)
+    rows = rows[: FEWEST_POINTS - 1]
+    views = replace(scene.views.take(rows), kind="depth-maps")
     assert kind_of(scene.xyz[rows], scene.cameras, scene.water, views) is None
 
 
 def test_points_of_one_image_do_not_count():
     scene, rows = under_water("tracks", 800, bed="flat")
     first = scene.views.camera[scene.views.start[rows]]
-    views = Views(np.arange(len(rows) + 1), first)
-    assert len(rows) > PATCHES
+    views = Views(np.arange(len(rows) + 1), first, None, "depth-maps")
+    assert len(rows) > FEWEST_POINTS
     assert kind_of(scene.xyz[rows], scene.cameras, scene.water, views) is None
 
 
@@ -81,4 +76,4 @@ def test_the_list_of_a_real_dense_cloud_is_one_of_depth_maps():
     match = ViewMatch(read_views(RENDERED / "dense.vis", cameras), cameras, points=len(xyz))
     rows = np.flatnonzero(xyz[:, 2] < 0.37)[::5]
     views = match.for_chunk(xyz, 0).take(rows)
-    assert kind_of(xyz[rows], cameras, WaterPlane(0.37), views).kind == "depth-maps"
+    assert kind_of(xyz[rows], cameras, WaterPlane(0.37), views).chosen.kind == "depth-maps"

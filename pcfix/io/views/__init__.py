@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from pcfix.io.files import check_input
 from pcfix.io.views.lists import ImageOrder, RawList, ViewList, read_list, tracks_as_list
 from pcfix.io.views.matching import ViewMatch, ViewReport, spacing_m
 from pcfix.io.views.orders import fitted, image_orders
-from pcfix.model import Cameras, FloatArray, TiePoints
+from pcfix.model import Cameras, FloatArray, TiePoints, ViewKind
 from pcfix.options.declare import File
 
 __all__ = ["ViewList", "ViewMatch", "ViewReport", "read_views", "track_views"]
@@ -66,7 +66,7 @@ def track_views(
 def _fitted(
     raw: RawList,
     orders: tuple[ImageOrder, ...],
-    kind: Literal["tracks", "depth-maps"],
+    kind: ViewKind,
     cameras: Cameras,
     to_cloud: Transformation | None,
 ) -> ViewList:

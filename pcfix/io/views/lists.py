@@ -19,14 +19,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError
 from pcfix.io.ply import Vertices, copy_field, list_starts, read_header
-from pcfix.model import FloatArray, IntArray, TiePoints
+from pcfix.model import FloatArray, IntArray, TiePoints, ViewKind
 
 _HEAD = 8
 _IMAGES, _WEIGHTS = "view_indices", "view_weights"
@@ -78,7 +78,7 @@ class ViewList:
     share_seen: float | None
     spacing_m: float | None  # between neighbouring points, where there are positions
     default_spacings: float
-    kind: Literal["tracks", "depth-maps"]  # see `pcfix.model.Views`
+    kind: ViewKind  # see `pcfix.model.Views`
 
     def __len__(self) -> int:
         return len(self.raw)

@@ -1,0 +1,96 @@
+"""How a cloud was made is told by the steps between neighbours, and `auto` corrects it so."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pcfix
+from pcfix.model import Cameras, WaterPlane
+from pcfix.options.correct import ScienceOptions
+from pcfix.refract.batch import Batch, Survey
+from pcfix.refract.hypotheses import FEWEST_POINTS, IN_FRAME, hypotheses_of
+from pcfix.refract.learning import with_matcher
+from pcfix.simulate.scene import simulate_scene
+from pcfix.water.surface import surface_above
+from tests.utils.nightly import mostly_nightly
+from tests.utils.shared import needs
+
+RENDERED, rendered = needs("rendered_a")
+AUTO = ScienceOptions(method="auto", index=1.34)
+
+
+def told(xyz, cameras, water, settings=AUTO):
+    batch = Batch(xyz, surface_above(water, xyz), Survey(water, cameras, settings))
+    survey, verdict = with_matcher(batch, len(xyz))
+    return survey.settings, verdict
+
+
+# two of them have the same bed and block: what differs is the software
+CLOUDS = {
+    "tracks": {"cloud": "tracks"},
+    "depth-maps": {"cloud": "depth-maps"},
+    "river of tracks": {"cloud": "tracks", "bed": "river"},
+    "pairs": {"cloud": "pairs"},
+}
+
+
+@pytest.mark.parametrize("name", mostly_nightly(CLOUDS, "tracks", "depth-maps"))
+def test_a_simulated_cloud_is_told(name):
+    scene = simulate_scene(12_000, seed=1, lidar_per_m2=0.0, **CLOUDS[name])
+    settings, verdict = told(scene.apparent_xyz, scene.cameras, scene.water)
+    kind = {"river of tracks": "tracks"}.get(name, name)
+    place = ["tracks", "depth-maps", "pairs"].index(kind)
+    assert verdict.chosen is IN_FRAME[place]
+    assert settings.method == "consistent"
+    assert verdict.share < verdict.runner_up_share
+    assert verdict.is_sure or name == "pairs"
+    assert verdict.runner_up.words in str(verdict)
+
+
+def test_auto_is_the_correction_that_was_told():
+    scene = simulate_scene(12_000, seed=1, lidar_per_m2=0.0)
+    points, given = scene.apparent_xyz, (scene.cameras, scene.water)
+    found = pcfix.correct_points(points, *given, method="auto")
+    same = pcfix.correct_points(points, *given, method="consistent", camera_set="all")
+    np.testing.assert_array_equal(found.xyz, same.xyz)
+    listed = pcfix.correct_points(points, *given, method="auto", views=scene.views)
+    same = pcfix.correct_points(points, *given, method="consistent", views=scene.views)
+    np.testing.assert_array_equal(listed.xyz, same.xyz)
+
+
+def test_without_lenses_it_is_snell():
+    scene = simulate_scene(2_000, seed=1, lidar_per_m2=0.0)
+    bare = Cameras(scene.cameras.labels, scene.cameras.centres)
+    points = scene.apparent_xyz
+    found = pcfix.correct_points(points, bare, scene.water, method="auto")
+    same = pcfix.correct_points(points, bare, scene.water, method="snell")
+    np.testing.assert_array_equal(found.xyz, same.xyz)
+
+
+def test_few_points_tell_nothing():
+    scene = simulate_scene(FEWEST_POINTS - 1, seed=1, lidar_per_m2=0.0)
+    settings, verdict = told(scene.apparent_xyz, scene.cameras, scene.water)
+    assert verdict is None
+    assert (settings.method, settings.camera_set) == ("consistent", "all")
+
+
+def test_a_camera_set_limits_what_is_asked():
+    scene = simulate_scene(500, seed=1, lidar_per_m2=0.0)
+    batch = Batch(
+        scene.apparent_xyz,
+        surface_above(scene.water, scene.apparent_xyz),
+        Survey(scene.water, scene.cameras, replace(AUTO, camera_set="mvs")),
+    )
+    assert hypotheses_of(batch) == IN_FRAME[1:]
+
+
+@rendered
+def test_a_real_dense_cloud_is_of_depth_maps():
+    import laspy
+
+    local = pcfix.read_cameras(RENDERED / "colmap")
+    cameras = replace(local, centres=local.centres + np.loadtxt(RENDERED / "offset.txt"))
+    xyz = np.ascontiguousarray(laspy.read(RENDERED / "cloud.las").xyz)
+    _, verdict = told(xyz[::4], cameras, WaterPlane(0.37))
+    assert verdict.chosen is IN_FRAME[1] and verdict.is_sure
