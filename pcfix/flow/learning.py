@@ -18,7 +18,7 @@ from pcfix.options.correct import ScienceOptions
 from pcfix.options.declare import File
 from pcfix.refract.batch import Batch, Learned, MadeWith, Survey, stacked
 from pcfix.refract.hypotheses import Verdict
-from pcfix.refract.learning import check_method, resolved, wants_matcher, with_matcher
+from pcfix.refract.learning import check_method, learn_of_sample, resolved, wants_sample
 from pcfix.refract.occlusion import Occluder
 from pcfix.refract.regression import (
     LEAST_COUNT,
@@ -86,9 +86,9 @@ class Learning:
         """
         learned = Learned(regression=self._regression(chunks), occluder=self._occluder(chunks))
         self.survey = replace(self.survey, learned=learned)
-        if wants_matcher(self.survey.settings, self._views):
+        if wants_sample(self.survey.settings, self._views):
             sample = self._sample(chunks, makers)
-            self.survey, self.verdict = with_matcher(sample, self._view.points, self._ties())
+            self.survey, self.verdict = learn_of_sample(sample, self._view.points, self._ties())
         return self.survey
 
     def _regression(self, chunks: Callable[[], Iterable[Points]]) -> DepthRegression | None:

@@ -149,9 +149,12 @@ class ThroughWater:
         if self._kind is None:
             rows = np.flatnonzero(is_submerged(batch.xyz[:, 2], batch.surface))
             self.verdict = kind_of_views(batch.take(rows))
-            told = None if self.verdict is None else self.verdict.chosen.kind
-            self._kind = told or batch.views.kind
-        return replace(batch, views=replace(batch.views, kind=self._kind))
+            self._kind = batch.views.kind
+            if self.verdict is not None:
+                self._kind = self.verdict.chosen.kind or self._kind
+                learned = self.survey.learned._replace(doubt=self.verdict.doubt)
+                self.survey = replace(self.survey, learned=learned)
+        return replace(batch, survey=self.survey, views=replace(batch.views, kind=self._kind))
 
     def _level_sigma_m(self, xy: FloatArray) -> FloatArray | None:
         """Return the standard error of the water's height at places, where its fit says one."""
@@ -210,7 +213,7 @@ class ThroughWater:
         middle = (tally.low + tally.high) / 2.0
         distance = float(np.hypot(*(self._cameras.centres - middle)[:, :2].T).min())
         away = f"{distance / 1000.0:,.1f} km" if distance >= 10_000.0 else f"{distance:,.1f} m"
-        limit = self._options.max_angle
+        limit = self.survey.settings.limit_deg
         return (
             "no camera has a submerged point in sight"
             + (f" within {limit:g} degrees" if limit else "")

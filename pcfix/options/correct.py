@@ -34,6 +34,15 @@ LEVEL_M = 0.02
 _SIGMA = not_negative("give a standard deviation")
 
 
+def _angle_limit(name: str, text: str) -> float | str | None:
+    if text in ("auto", "none"):
+        return text if text == "auto" else None
+    try:
+        return float(text)
+    except ValueError:
+        raise SettingError(f"{name} '{text}' is neither degrees nor none or auto.") from None
+
+
 @dataclass(frozen=True, kw_only=True)
 class MethodOptions(IndexOptions):
     """Which rays count, and how the true point follows from the apparent one."""
@@ -56,12 +65,15 @@ class MethodOptions(IndexOptions):
         "What that model makes a point of: fused depth maps (OpenMVS, COLMAP), or the median of"
         " stereo pairs (MicMac, SURE).",
     )
-    max_angle: float | None = option(
-        None,
-        "Use rays up to this incidence angle in air, from the surface normal.",
+    max_angle: float | str | None = option(
+        "auto",
+        "Use rays up to this incidence angle in air, from the surface normal, or none: all; auto:"
+        " with a method that weighs all rays alike, as the cloud tells which rays made it.",
         unit="deg",
         rule=within(0.0, 90.0, "give degrees from the surface normal", above=True),
-        default_is="no limit; 80 without angles",
+        parse=_angle_limit,
+        metavar="DEG",
+        default_is="auto; 80 without angles",
     )
     max_cameras: int | None = option(
         None,
@@ -91,6 +103,11 @@ class MethodOptions(IndexOptions):
         super().check()
         if self.depth_factor is not None and self.method != "factor":
             raise SettingError("depth-factor is of no use without --method factor; give both.")
+
+    @property
+    def limit_deg(self) -> float | None:
+        """The largest incidence angle; None where there is none, or it is still open."""
+        return None if self.max_angle in (None, "auto") else float(self.max_angle)
 
     @property
     def models_matcher(self) -> bool:

@@ -165,7 +165,7 @@ def port_views(
     Views
         In the order of the cameras, or of `views`.
     """
-    limit = settings.max_angle
+    limit = settings.limit_deg
     count, none = np.zeros(len(xyz) + 1, np.int64), np.zeros(0, np.int64)
     common = (
         spatial_order(xyz),

@@ -47,12 +47,30 @@ class Learned(NamedTuple):
         Which images were matched with which.
     bed : Bed or None
         What fused points of one place have in common.
+    doubt : Doubt or None
+        Of how the cloud was made.
     """
 
     regression: DepthRegression | None = None
     occluder: Occluder | None = None
     matcher: Matcher | None = None
     bed: Bed | None = None
+    doubt: Doubt | None = None
+
+
+class Doubt(NamedTuple):
+    """What the standard error of Z has beyond the error budget, as the cloud itself tells it.
+
+    Attributes
+    ----------
+    scatter_m : float
+        Of neighbours about a smooth bed, beyond what the budget explains: mismatches.
+    per_depth : float
+        Standard deviation, relative to the depth, by what is not known of how the cloud was made.
+    """
+
+    scatter_m: float
+    per_depth: float
 
 
 class MadeWith(NamedTuple):

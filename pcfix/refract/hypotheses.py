@@ -18,14 +18,15 @@ larger; that part of d is taken out first, as it tells nothing.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pcfix.model import FloatArray, IntArray, Outcome, ViewKind
-from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import Batch, Learned
+from pcfix.options.correct import Dimensions, ScienceOptions
+from pcfix.refract.batch import Batch, Doubt, Learned
 from pcfix.refract.fusion import likely_beds
 from pcfix.refract.matcher import bed_of
 from pcfix.refract.methods import correct, with_rays
@@ -75,8 +76,21 @@ LISTED = (
     Hypothesis(_MAPS, {"method": "consistent"}, "depth-maps"),
     Hypothesis(_PAIRS, {"method": "consistent"}, "pair-images"),
 )
-BARE = Hypothesis("intersected rays", {"method": "snell", "camera_set": "all"})
+BARE = Hypothesis(_TRACKS, {"method": "snell", "camera_set": "all"})
 """Without lenses or angles no other method is possible."""
+
+LIMITS = (
+    Hypothesis("all rays", {"max_angle": None}),
+    *(
+        Hypothesis(f"rays within {limit:g} degrees of the surface normal", {"max_angle": limit})
+        for limit in (60.0, 50.0, 40.0, 35.0)
+    ),
+)
+"""Which rays made the points; a method that weighs all alike is spoilt by others."""
+
+ALIKE = ("snell", "shan", "butler", "murase", "dietrich")
+COVERED = 0.95
+"""Of the points that most hypotheses correct, what a hypothesis must correct to be one."""
 
 
 class Verdict(NamedTuple):
@@ -93,6 +107,9 @@ class Verdict(NamedTuple):
         By how much the runner-up would have the bed deeper, on the average of the patches.
     patches : int
         How many told it; 0 if they told nothing.
+    doubt : Doubt
+        What it leaves open: of the difference to each other hypothesis that share which is left in
+        the bed, the largest of them; and the scatter of neighbours.
     """
 
     chosen: Hypothesis
@@ -102,6 +119,7 @@ class Verdict(NamedTuple):
     sigma: float
     deeper_m: float
     patches: int
+    doubt: Doubt
 
     @property
     def is_sure(self) -> bool:
@@ -119,6 +137,8 @@ class Verdict(NamedTuple):
             "sigma": round(self.sigma, 3),
             "runner_up_deeper_m": round(self.deeper_m, 4),
             "patches": self.patches,
+            "scatter_m": round(self.doubt.scatter_m, 4),
+            "doubt_per_depth": round(self.doubt.per_depth, 4),
         }
 
     def __str__(self) -> str:
@@ -178,13 +198,18 @@ def weigh(batch: Batch, hypotheses: tuple[Hypothesis, ...], step: float) -> Verd
     if batch.views is None:
         part = replace(part, survey=replace(part.survey, learned=_with_bed(part, hypotheses)))
     z = np.array([_heights(part, hypothesis) for hypothesis in hypotheses])
+    covered = np.isfinite(z).sum(axis=1)
+    kept = np.flatnonzero(covered >= COVERED * covered.max())
+    if len(kept) < 2:
+        return None
+    z, hypotheses = z[kept], tuple(hypotheses[i] for i in kept)
     patches = place[np.isfinite(z[:, place]).all(axis=(0, 2))]
     enough = len(patches) >= LEAST_PATCHES
     share, sigma = _shares(part, patches, z) if enough else np.full((2, *z.shape[:1] * 2), 0.5)
     np.fill_diagonal(share, -np.inf)
     best = int(np.argmin(share.max(axis=1)))
     other = int(np.argmax(share[best]))
-    told = 0.5 - share[best, other] > SURE * sigma[best, other]
+    told = 0.5 - share[best, other] > sigma[best, other]
     if not told and batch.views is None:
         # dense clouds are not of tracks, sparse ones are
         doubtful = best if _is_dense(part, place, step * thinned) else other
@@ -195,7 +220,31 @@ def weigh(batch: Batch, hypotheses: tuple[Hypothesis, ...], step: float) -> Verd
     return Verdict(
         hypotheses[best], hypotheses[other], float(share[best, other]), float(share[other, best]),
         float(sigma[best, other]), deeper_m, len(patches) if enough else 0,
+        _doubt(part, both, z, best, (share[best], sigma[best]), hypotheses[best]),
     )  # fmt: skip
+
+
+def _doubt(
+    part: Batch, place: IntArray, z: FloatArray, best: int, shares: tuple[FloatArray, FloatArray],
+    chosen: Hypothesis,
+) -> Doubt:  # fmt: skip
+    """Return what the choice leaves open."""
+    share, sigma = shares
+    depth = part.surface.height_m[place] - z[best][place]
+    others = [i for i in range(len(z)) if i != best]
+    left = [
+        min(max(share[i], 0.0) + sigma[i], 1.0)
+        * float(np.sqrt(np.nanmean((z[best] - z[i])[place] ** 2)))
+        for i in others
+    ]
+    rest = _rest(_smooth(part.xyz[place]), z[best][place])
+    free = PATCH_POINTS - _TERMS
+    scatter2 = float(np.nanmedian((rest**2).sum(axis=1) / free))
+    budget = correct(_as(part, chosen, "all"))
+    explained2 = float(np.median(budget.sigma_z_m) ** 2)
+    return Doubt(
+        math.sqrt(max(scatter2 - explained2, 0.0)), max(left) / max(float(np.nanmean(depth)), 1e-3)
+    )
 
 
 def _patches(batch: Batch) -> tuple[IntArray, IntArray, int]:
@@ -240,10 +289,10 @@ def _with_bed(part: Batch, hypotheses: tuple[Hypothesis, ...]) -> Learned:
     return learned
 
 
-def _as(part: Batch, hypothesis: Hypothesis) -> Batch:
+def _as(part: Batch, hypothesis: Hypothesis, dimensions: Dimensions = "none") -> Batch:
     """Return the points as those of a hypothesis."""
     survey = part.survey
-    settings = replace(hypothesis.settings(survey.settings), dimensions="none")
+    settings = replace(hypothesis.settings(survey.settings), dimensions=dimensions)
     learned = survey.learned
     if hypothesis.changes.get("camera_set") == "all":
         learned = learned._replace(matcher=None)
@@ -294,6 +343,9 @@ def _smooth(patch: FloatArray) -> FloatArray:
     x, y = np.moveaxis(across / (np.abs(across).max(axis=(1, 2), keepdims=True) + 1e-9), -1, 0)
     columns = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
     return np.asarray(np.linalg.qr(columns)[0])
+
+
+_TERMS = 6
 
 
 def _rest(smooth: FloatArray, z: FloatArray) -> FloatArray:

@@ -13,7 +13,16 @@ from pcfix.refract.batch import Batch, Learned, Survey
 from pcfix.refract.choice import spatial_order
 from pcfix.refract.consistent import check_consistent
 from pcfix.refract.fusion import likely_beds
-from pcfix.refract.hypotheses import BARE, IN_FRAME, Verdict, hypotheses_of, weigh
+from pcfix.refract.hypotheses import (
+    ALIKE,
+    BARE,
+    IN_FRAME,
+    LIMITS,
+    Hypothesis,
+    Verdict,
+    hypotheses_of,
+    weigh,
+)
 from pcfix.refract.matcher import Bed, bed_of, matcher_of, matcher_of_ties, places_for
 from pcfix.refract.methods import batches, with_rays
 from pcfix.refract.regression import DepthRegression
@@ -39,6 +48,16 @@ def resolved(settings: ScienceOptions, cameras: Cameras, views: ViewKind | None)
     if cameras.lenses is None or cameras.rotations is None:
         return BARE.settings(settings)
     return settings if views is None else replace(settings, method="consistent")
+
+
+def wants_sample(settings: ScienceOptions, views: ViewKind | None) -> bool:
+    """Return whether points of the whole cloud tell something of the correction."""
+    return wants_matcher(settings, views) or _wants_limit(settings, views)
+
+
+def _wants_limit(settings: ScienceOptions, views: ViewKind | None) -> bool:
+    """Whether the largest incidence angle is to be told by the cloud."""
+    return views is None and settings.max_angle == "auto" and settings.method in ALIKE
 
 
 def wants_matcher(settings: ScienceOptions, views: ViewKind | None) -> bool:
@@ -67,16 +86,16 @@ def learn_of_points(batch: Batch, regression: DepthRegression | None) -> Batch:
         occluder = occluder_of(batch.xyz) if wants_occlusion(cameras, settings) else None
     learned = Learned(regression=regression, occluder=occluder)
     batch = replace(batch, survey=replace(batch.survey, settings=settings, learned=learned))
-    if not wants_matcher(settings, kind):
+    if not wants_sample(settings, kind):
         return batch
-    survey, _ = with_matcher(batch, len(batch))
+    survey, _ = learn_of_sample(batch, len(batch))
     return replace(batch, survey=survey)
 
 
-def with_matcher(
+def learn_of_sample(
     batch: Batch, points: int, ties: TiePoints | None = None
 ) -> tuple[Survey, Verdict | None]:
-    """Learn how the images were matched; without a list what ``auto`` stands for, and the bed.
+    """Learn what ``auto`` stands for, how the images were matched, and the bed, as needed.
 
     Parameters
     ----------
@@ -94,6 +113,30 @@ def with_matcher(
     verdict : Verdict or None
         Why; None where nothing was to be told, or could be.
     """
+    kind = None if batch.views is None else batch.views.kind
+    survey, verdict = batch.survey, None
+    if wants_matcher(survey.settings, kind):
+        survey, verdict = _with_matcher(batch, points, ties)
+    if _wants_limit(survey.settings, kind):
+        rows = np.flatnonzero(is_submerged(batch.xyz[:, 2], batch.surface))
+        sample = replace(batch.take(rows), survey=survey)
+        verdict = weigh(sample, LIMITS, points / max(len(batch), 1))
+        survey = as_told(survey, verdict, LIMITS[0])
+    return survey, verdict
+
+
+def as_told(survey: Survey, verdict: Verdict | None, else_as: Hypothesis) -> Survey:
+    """Return a survey with the options, and the doubt, of what the cloud was taken for."""
+    if verdict is None:
+        return replace(survey, settings=else_as.settings(survey.settings))
+    learned = survey.learned._replace(doubt=verdict.doubt)
+    return replace(survey, settings=verdict.chosen.settings(survey.settings), learned=learned)
+
+
+def _with_matcher(
+    batch: Batch, points: int, ties: TiePoints | None
+) -> tuple[Survey, Verdict | None]:
+    """Learn how the images were matched; without a list what ``auto`` stands for, and the bed."""
     survey, verdict = batch.survey, None
     places, matched = batch.made_with or (batch.xyz, survey.cameras)
     if ties is not None:
@@ -108,8 +151,7 @@ def with_matcher(
     sample = replace(batch.take(rows), survey=survey)
     if survey.settings.method == "auto":
         verdict = weigh(sample, hypotheses_of(sample), points / max(len(batch), 1))
-        chosen = IN_FRAME[0] if verdict is None else verdict.chosen
-        survey = replace(survey, settings=chosen.settings(survey.settings))
+        survey = as_told(survey, verdict, IN_FRAME[0])
         sample = replace(sample, survey=survey)
     settings = survey.settings
     if not settings.models_matcher:

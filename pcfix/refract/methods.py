@@ -24,7 +24,7 @@ from pcfix.refract.matcher import steepest_and_partners, without_border
 from pcfix.refract.occlusion import in_sight
 from pcfix.refract.shan import shan
 from pcfix.refract.stereo_pairs import invert_pairs
-from pcfix.refract.uncertainty import with_uncertainty
+from pcfix.refract.uncertainty import with_doubt, with_uncertainty
 from pcfix.water.surface import SurfaceAbove
 
 Method: TypeAlias = Callable[[Batch], Intersection]
@@ -65,7 +65,7 @@ def correct(batch: Batch) -> Intersection:
     if views is not None and views.kind == "pairs":
         pairs, batch = views, replace(batch, views=cameras_of_pairs(views))
     if method is intersect and _takes_all_in_frame(batch):
-        return intersect_in_frame(batch)
+        return with_doubt(intersect_in_frame(batch), batch)
     order = spatial_order(batch.xyz)
     parts = []
     for rows in batches(order):
@@ -76,7 +76,7 @@ def correct(batch: Batch) -> Intersection:
             found = method(part)
         known = with_uncertainty(found, part)
         parts.append(_with_ambiguity(known, found) if method is invert_fusion else known)
-    return joined(parts, order, len(survey.cameras))
+    return with_doubt(joined(parts, order, len(survey.cameras)), batch)
 
 
 def _takes_all_in_frame(batch: Batch) -> bool:

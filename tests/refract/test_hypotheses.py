@@ -10,7 +10,7 @@ from pcfix.model import Cameras, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.hypotheses import FEWEST_POINTS, IN_FRAME, hypotheses_of
-from pcfix.refract.learning import with_matcher
+from pcfix.refract.learning import learn_of_sample
 from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
 from tests.utils.nightly import mostly_nightly
@@ -22,7 +22,7 @@ AUTO = ScienceOptions(method="auto", index=1.34)
 
 def told(xyz, cameras, water, settings=AUTO):
     batch = Batch(xyz, surface_above(water, xyz), Survey(water, cameras, settings))
-    survey, verdict = with_matcher(batch, len(xyz))
+    survey, verdict = learn_of_sample(batch, len(xyz))
     return survey.settings, verdict
 
 
