@@ -607,7 +607,7 @@ def test_a_full_disk_leaves_nothing_behind(
         ["correct", "cloud.las", "out.las", "--water", "3"],
         ["correct", "cloud.las", "out.las", "--cameras", "cameras.csv"],
         job("--deeper"),
-        job("--max-angle", "wet"),
+        job("--max-cameras", "few"),
         job("--uncorrected", "burn"),
         job("--dimensions", "some"),
         ["restore", "cloud.las"],
@@ -633,7 +633,7 @@ KEYS = {
     "input", "output", "pcfix", "points", "submerged", "corrected", "uncorrected", "dropped",
     "water_unknown", "depth_m", "shift_z_m", "rays", "cameras", "cameras_used", "cameras_unused",
     "water", "settings", "seconds", "views", "water_fit", "warnings", "points_per_s",
-    "uncertainty",
+    "uncertainty", "made",
 }  # fmt: skip
 
 

@@ -38,9 +38,9 @@ def test_every_option_says_what_it_is(kind):
     [
         ({"max_angel": 30}, "correct_file: there is no option 'max_angel'; did you mean max_angle"),
         ({"max_angle": 95}, "max-angle 95 is outside 0 to 90: give degrees from the surface"),
-        ({"max_angle": "wide"}, "max-angle 'wide' must be a number"),
+        ({"max_angle": "wide"}, "max-angle 'wide' is neither degrees nor none or auto"),
         ({"max_cameras": 2.5}, "max-cameras 2.5 must be a whole number"),
-        ({"method": "snel"}, "method 'snel' is not one of snell, consistent"),
+        ({"method": "snel"}, "method 'snel' is not one of auto, snell, consistent"),
         ({"index": 1.7}, "refractive index 1.7 is outside 1.0 to 1.5"),
         ({"depth_factor": 1.4}, "depth-factor is of no use without --method factor"),
         ({"least_pool": 3.0}, "least-pool is of no use without connected"),

@@ -122,6 +122,7 @@ class Learning:
         """Return points of the whole cloud, evenly spread over its order, and without noise."""
         area_m2 = np.prod(np.maximum(np.subtract(self._view.high, self._view.low)[:2], 1.0))
         wanted = np.clip(BED_POINTS_A_M2 * float(area_m2), FEWEST_BED_POINTS, MOST_BED_POINTS)
+        wanted = wanted if np.isfinite(wanted) else MOST_BED_POINTS  # bounds that are none
         step = max(1, self._view.points // int(wanted))
         survey, taken = self.survey, list[Batch]()
         done = 0

@@ -233,7 +233,7 @@ class ThroughWater:
         bent = [self._bent] if self._bent else []
         return [
             *self._learning.notes,
-            *([self.made["because"]] if self.made else []),
+            *([str(self.verdict)] if self.verdict is not None and not self.verdict.is_sure else []),
             *self.found.notes,
             *self._meeting.notes,
             *bent,

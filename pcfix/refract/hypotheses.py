@@ -200,7 +200,7 @@ def weigh(batch: Batch, hypotheses: tuple[Hypothesis, ...], step: float) -> Verd
     z = np.array([_heights(part, hypothesis) for hypothesis in hypotheses])
     covered = np.isfinite(z).sum(axis=1)
     kept = np.flatnonzero(covered >= COVERED * covered.max())
-    if len(kept) < 2:
+    if len(kept) < 2 or not covered.max():
         return None
     z, hypotheses = z[kept], tuple(hypotheses[i] for i in kept)
     patches = place[np.isfinite(z[:, place]).all(axis=(0, 2))]

@@ -43,6 +43,8 @@ def summary_text(summary: Summary) -> str:
             f"shift in Z   mean {shift['mean']:.3f} m, 5 % {shift['p5']:.3f} m,"
             f" 95 % {shift['p95']:.3f} m"
         )
+    if s.made:
+        lines.append(f"method       {s.made['method']}. {s.made['because']}")
     unused = len(s.cameras_unused)
     names = ", ".join(s.cameras_unused[:5]) + (", ..." if unused > 5 else "")
     lines += [

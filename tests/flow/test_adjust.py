@@ -60,11 +60,14 @@ def heights_rms_m(files, cloud):
     return [float(np.sqrt(np.mean((z - truth)[rows] ** 2))) for rows in (wet, ~wet)]
 
 
+SNELL = {"method": "snell", "max_angle": None}
+
+
 def home(files, new, **more):
     out = files.folder / "home.las"
     pcfix.correct_file(
         files.folder / "cloud.las", out, cameras=new, adjusted_from=files.folder / "model",
-        water=files.water, overwrite=True, **more,
+        water=files.water, overwrite=True, **{**SNELL, **more},
     )  # fmt: skip
     return heights_rms_m(files, out)
 

@@ -86,9 +86,12 @@ def test_wrong_angles_are_noticed(tmp_path):
     assert report.tilt_deg[0] > 50.0
 
 
+SNELL = {"water": 0.37, "method": "snell", "max_angle": None}
+
+
 def corrected(tmp_path, name, **options):
     path = tmp_path / name
-    summary = pcfix.correct_file(CLOUD, path, **{"water": 0.37, "sensor": SENSOR, **options})
+    summary = pcfix.correct_file(CLOUD, path, **{**SNELL, "sensor": SENSOR, **options})
     return laspy.read(path), summary
 
 
@@ -170,7 +173,7 @@ def test_views_of_a_real_cloud_change_the_rays(tmp_path):
     offset = [float(word) for word in (RENDERED / "offset.txt").read_text().splitlines()[1].split()]
     with pytest.warns(pcfix.PcfixWarning, match="dense.ply: has 83,334 points"):
         summary = pcfix.correct_file(
-        RENDERED / "cloud.las", tmp_path / "c.las", cameras=RENDERED / "colmap", water=0.37,
+        RENDERED / "cloud.las", tmp_path / "c.las", cameras=RENDERED / "colmap", **SNELL,
         cameras_offset=tuple(offset), views=RENDERED / "dense.vis",
     )  # fmt: skip
     assert summary.corrected == summary.submerged

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import laspy
 import numpy as np
@@ -56,9 +57,13 @@ def cloud(tmp_path):
     return write_cloud(tmp_path / "cloud.las", 7)
 
 
+SNELL = {"method": "snell", "max_angle": None}
+snell = partial(pcfix.correct_points, **SNELL)
+
+
 def correct(cloud, **more):
     output = cloud.with_name("out.las")
-    told = pcfix.correct_file(cloud, output, water=WATER_M, overwrite=True, **more)
+    told = pcfix.correct_file(cloud, output, water=WATER_M, overwrite=True, **SNELL, **more)
     return told, laspy.read(cloud), laspy.read(output)
 
 
@@ -83,7 +88,7 @@ def test_land_and_bed_follow_the_cameras(cloud, old):
     new = adjusted(old)
     told, before, after = correct(cloud, cameras=new, adjusted_from=old)
     came = np.array(before.xyz)
-    expected = pcfix.correct_points(similar(came), new, WATER_M)
+    expected = snell(similar(came), new, WATER_M)
     stuck = np.array(after.RayCount) == 0
     land = expected.outcome == Outcome.LAND
     # what is under water is decided where the points are taken to
@@ -110,7 +115,7 @@ def test_land_and_bed_follow_the_cameras(cloud, old):
 
 def test_points_that_no_two_old_cameras_see_stay_and_are_withheld(cloud, old):
     told, before, after = correct(cloud, cameras=adjusted(old), adjusted_from=old)
-    result = pcfix.correct_points(before.xyz, adjusted(old), WATER_M, adjusted_from=old)
+    result = snell(before.xyz, adjusted(old), WATER_M, adjusted_from=old)
     behind = result.outcome == Outcome.NOT_CARRIED
     assert told.carried["not_carried"] == behind.sum() > 10
     assert not shift_of(after)[behind].any()
@@ -153,17 +158,26 @@ def test_the_doors_agree(cloud, old, tmp_path):
     }
     _, before, after = correct(cloud, **paths)
     words = [f"--{key.replace('_', '-')}={value}" for key, value in paths.items()]
+    words += ["--method=snell", "--max-angle=none"]
     done = run_pcfix("correct", cloud, tmp_path / "cli.las", "--water", WATER_M, "-q", *words)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "cli.las").read_bytes() == (tmp_path / "out.las").read_bytes()
-    outs, _ = run("correct", arrays_of(before), metadata_of(before.header), water=WATER_M, **paths)
+    outs, _ = run(
+        "correct",
+        arrays_of(before),
+        metadata_of(before.header),
+        water=WATER_M,
+        method="snell",
+        max_angle="none",
+        **paths,
+    )
     for axis in "XYZ":
         scale, offset = (getattr(after.header, f"{axis.lower()}_{w}") for w in ("scale", "offset"))
         assert np.array_equal(np.rint((outs[axis] - offset) / scale), after[axis])
         assert np.array_equal(outs[f"Shift{axis}"], np.array(after[f"Shift{axis}"], np.float32))
     assert np.array_equal(outs["Classification"], np.array(after.classification))
     assert np.array_equal(outs["ClassFlags"] & 4 != 0, np.array(after.withheld) != 0)
-    result = pcfix.correct_points(
+    result = snell(
         before.xyz, pcfix.read_cameras(paths["cameras"]), WATER_M,
         adjusted_from=pcfix.read_cameras(paths["adjusted_from"]),
     )  # fmt: skip
@@ -199,7 +213,7 @@ def test_views_count_the_old_cameras(old):
     )
     place = np.argsort(order)
     theirs = Views(views.start, place[views.camera])
-    found = pcfix.correct_points(xyz, new, WATER_M, adjusted_from=shuffled, views=theirs)
+    found = snell(xyz, new, WATER_M, adjusted_from=shuffled, views=theirs)
     corrected = straight.corrected
     assert np.array_equal(found.corrected, corrected)
     assert corrected.sum() > 150
@@ -210,7 +224,7 @@ def test_views_count_the_old_cameras(old):
         new, labels=new.labels[1:], centres=new.centres[1:], rotations=new.rotations[1:],
         lenses=new.lenses[1:],
     )  # fmt: skip
-    found = pcfix.correct_points(xyz, fewer, WATER_M, adjusted_from=shuffled, views=theirs)
+    found = snell(xyz, fewer, WATER_M, adjusted_from=shuffled, views=theirs)
     has = (listed == 0).any(axis=1) & found.corrected & corrected
     assert np.array_equal(found.ray_count[has], straight.ray_count[has] - 1)
 

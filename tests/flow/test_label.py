@@ -177,7 +177,9 @@ def test_correct_through_every_door(tmp_path, mask, choices):
 
 def test_without_choices_a_correction_says_nothing_of_them(tmp_path):
     path = write_cloud(tmp_path / "in.las", 7)
-    result = pcfix.correct_file(path, tmp_path / "out.las", cameras=block(), water=WATER_M)
+    result = pcfix.correct_file(
+        path, tmp_path / "out.las", cameras=block(), water=WATER_M, method="snell", max_angle=None
+    )
     assert result.labelling is None
     (vlr,) = [v for v in laspy.read(tmp_path / "out.las").vlrs if v.user_id == "pcfix"]
     assert set(json.loads(vlr.record_data)) == {

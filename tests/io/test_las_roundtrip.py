@@ -65,7 +65,7 @@ class Trip(NamedTuple):
 
 
 def correct(source: Path, output: Path, **choices: object) -> pcfix.Summary:
-    arguments = {"cameras": block(), "water": WATER_M, **choices}
+    arguments = {"cameras": block(), "water": WATER_M, "method": "snell", **choices}
     return pcfix.correct_file(source, output, **arguments)
 
 

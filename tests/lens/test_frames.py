@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from pcfix.refract.intersect import TILE
 from tests.refract.test_kernels import interpreted_environment, same
 from tests.utils.nightly import mostly_nightly
 from tests.utils.twins import image_slowly
+
+snell = partial(pcfix.correct_points, method="snell", max_angle=None)
 
 N = 5 * TILE + 17
 SIZE = (4000.0, 3000.0, 2010.0, 1490.0)
@@ -93,28 +96,26 @@ def test_slow_twin_agrees_point_by_point(name, points):
     cameras = block(LENSES[name])
     some = points if name != "inverse" else points[: 2 * TILE]  # its twin is very slow
     views = views_slowly(some, cameras)
-    result = pcfix.correct_points(some, cameras, 0.0)
+    result = snell(some, cameras, 0.0)
     seen = np.diff(views.start)
     assert 0 <= seen.min() < seen.max() <= len(cameras)  # the scene tests something
     assert np.array_equal(result.ray_count, np.where(seen >= 2, seen, 0))
-    same(result, pcfix.correct_points(some, cameras, 0.0, views=views))
+    same(result, snell(some, cameras, 0.0, views=views))
 
 
 @pytest.mark.parametrize("name", LENSES)
 def test_nothing_depends_on_tiles_order_or_threads(name, points):
     cameras = block(LENSES[name])
-    whole = pcfix.correct_points(points, cameras, 0.0)
-    same(whole, pcfix.correct_points(points, cameras, 0.0, max_cameras=len(cameras)))
+    whole = snell(points, cameras, 0.0)
+    same(whole, snell(points, cameras, 0.0, max_cameras=len(cameras)))
     shuffled = np.random.default_rng(1).permutation(N)
-    assert np.array_equal(
-        whole.xyz[shuffled], pcfix.correct_points(points[shuffled], cameras, 0.0).xyz
-    )
+    assert np.array_equal(whole.xyz[shuffled], snell(points[shuffled], cameras, 0.0).xyz)
     for i in range(0, N, 97):
-        alone = pcfix.correct_points(points[i : i + 1], cameras, 0.0)
+        alone = snell(points[i : i + 1], cameras, 0.0)
         assert np.array_equal(alone.xyz[0], whole.xyz[i])
     for count in (1, 3):
         with threads(count):
-            same(whole, pcfix.correct_points(points, cameras, 0.0))
+            same(whole, snell(points, cameras, 0.0))
 
 
 def boxes(rng, count=400):
@@ -194,10 +195,10 @@ def test_paths_of_straight_and_distorted_lenses_agree_to_the_bit(points):
     general = pcfix.Lens(3000.0, *SIZE, b1=4.0, b2=1.0, b3=-2.0, denominator=(1e-300,))
     rows = [frames_of(block(lens)).row[0] for lens in (straight, bent, general)]
     assert rows == [NOT_DISTORTED, 0, 0]
-    one = pcfix.correct_points(points, block(straight), 0.0)
+    one = snell(points, block(straight), 0.0)
     assert one.ray_count.max() > 4
-    same(one, pcfix.correct_points(points, block(bent), 0.0))
-    same(one, pcfix.correct_points(points, block(general), 0.0))
+    same(one, snell(points, block(bent), 0.0))
+    same(one, snell(points, block(general), 0.0))
 
 
 def test_lenses_may_differ_from_image_to_image(points):
@@ -225,7 +226,7 @@ def test_a_point_on_the_border_is_inside(radial, x, inside):
     lens = pcfix.Lens(1024.0, 1024.0, 512.0, 512.0, 256.0, radial=radial)
     looking_down = np.diag([1.0, -1.0, -1.0])
     cameras = pcfix.Cameras(("a",), np.array([[0.0, 0, 60]]), looking_down[None], (lens,))
-    result = pcfix.correct_points([[x, 0.0, -4.0]], cameras, 0.0)  # X / Z = 0.5: u = 1024
+    result = snell([[x, 0.0, -4.0]], cameras, 0.0)  # X / Z = 0.5: u = 1024
     expected = pcfix.Outcome.ONE_CAMERA if inside else pcfix.Outcome.NO_CAMERA
     assert result.outcome.tolist() == [expected]
 
@@ -233,19 +234,19 @@ def test_a_point_on_the_border_is_inside(radial, x, inside):
 def test_without_a_lens_a_frame_is_everything_in_front():
     east = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # looks along x, horizontally
     cameras = pcfix.Cameras(("a", "b"), np.array([[0.0, -9, 20], [0, 9, 20]]), np.stack([east] * 2))
-    result = pcfix.correct_points([[30.0, 0, -2], [-30.0, 0, -2]], cameras, 0.0)
+    result = snell([[30.0, 0, -2], [-30.0, 0, -2]], cameras, 0.0)
     assert result.ray_count.tolist() == [2, 0]
     assert result.outcome.tolist() == [pcfix.Outcome.CORRECTED, pcfix.Outcome.NO_CAMERA]
-    far = pcfix.correct_points([[3000.0, 0, -2]], cameras, 0.0)  # flatter than 80 degrees
+    far = snell([[3000.0, 0, -2]], cameras, 0.0)  # flatter than 80 degrees
     assert far.outcome.tolist() == [pcfix.Outcome.NO_CAMERA]
 
 
 def test_views_ignore_frames():
     cameras = block(LENSES["barrel"], k=2)
     away = np.array([[3000.0, 2500.0, -2.0]])
-    assert pcfix.correct_points(away, cameras, 0.0).outcome[0] == pcfix.Outcome.NO_CAMERA
+    assert snell(away, cameras, 0.0).outcome[0] == pcfix.Outcome.NO_CAMERA
     views = pcfix.Views(np.array([0, 2]), np.array([0, 1]))
-    assert pcfix.correct_points(away, cameras, 0.0, views=views).ray_count[0] == 2
+    assert snell(away, cameras, 0.0, views=views).ray_count[0] == 2
 
 
 def test_compiled_and_interpreted_agree(tmp_path, points):
@@ -254,7 +255,8 @@ def test_compiled_and_interpreted_agree(tmp_path, points):
 import numpy as np, pcfix
 from tests.lens.test_frames import LENSES, block
 xyz = np.load({str(tmp_path / "xyz.npy")!r})
-found = {{n: pcfix.correct_points(xyz, block(LENSES[n], k=6), 0.0).xyz for n in {names}}}
+found = {{n: pcfix.correct_points(xyz, block(LENSES[n], k=6), 0.0, method="snell",
+         max_angle=None).xyz for n in {names}}}
 np.savez({str(tmp_path / "out.npz")!r}, **found)
 """
     some = points[np.abs(points[:, :2] - 50).max(axis=1) < 50][:40]
@@ -264,7 +266,7 @@ np.savez({str(tmp_path / "out.npz")!r}, **found)
     )
     slow = np.load(tmp_path / "out.npz")
     for name in names:
-        fast = pcfix.correct_points(some, block(LENSES[name], k=6), 0.0)
+        fast = snell(some, block(LENSES[name], k=6), 0.0)
         assert fast.corrected.any()
         # the compiler may round a product and a sum at once: allow the last bits
         assert slow[name] == pytest.approx(fast.xyz, abs=1e-11)

@@ -61,7 +61,9 @@ def test_a_file_is_what_the_arrays_are(scene, cloud, tmp_path):
 
 
 def test_forward_intersection_says_what_it_leaves_out(scene, cloud, tmp_path):
-    told = pcfix.correct_file(cloud, tmp_path / "out.las", cameras=scene.cameras, port=scene.port)
+    told = pcfix.correct_file(
+        cloud, tmp_path / "out.las", cameras=scene.cameras, port=scene.port, method="snell"
+    )
     (note,) = [line for line in told.warnings if "miss each other" in line]
     assert "--method consistent" in note
 

@@ -313,7 +313,7 @@ def test_cliff_spoils_the_bed_below_it_unless_its_shadow_is_known():
     def rms_m(views=None, occluder=None, **words):
         result = correct(
             batch_of(
-                apparent, flat, water, cameras, ScienceOptions(**words), views,
+                apparent, flat, water, cameras, ScienceOptions(method="snell", **words), views,
                 learned=Learned(occluder=occluder),
             )
         )  # fmt: skip

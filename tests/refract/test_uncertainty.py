@@ -280,7 +280,7 @@ def test_level_is_the_users_else_the_fits_else_a_default():
 def test_points_without_a_solution_have_none():
     bed, cameras, _ = scene(0.0, points=3)
     bed[1] = [500.0, 500.0, -3.0]  # out of every frame
-    found = correct(batch_of(bed, flat(3), LEVEL, cameras, ScienceOptions()))
+    found = correct(batch_of(bed, flat(3), LEVEL, cameras, ScienceOptions(method="snell")))
     assert (found.covariance_m2[1] == 0.0).all() and found.sigma_z_m[1] == 0.0
     assert (found.sigma_z_m[[0, 2]] > 0.0).all()
     assert covariances(bed[:0], bed[:0], flat(0), cameras, ScienceOptions()).shape == (0, 6)
@@ -288,7 +288,9 @@ def test_points_without_a_solution_have_none():
 
 def test_it_is_skipped_where_nobody_reads_it():
     bed, cameras, _ = scene(0.0, points=3)
-    found = correct(batch_of(bed, flat(3), LEVEL, cameras, ScienceOptions(dimensions="minimal")))
+    found = correct(
+        batch_of(bed, flat(3), LEVEL, cameras, ScienceOptions(method="snell", dimensions="minimal"))
+    )
     assert found.covariance_m2 is None and (found.sigma_z_m == 0.0).all()
 
 

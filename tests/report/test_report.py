@@ -26,7 +26,9 @@ def report(tmp_path_factory):
     """Return the folder of a report on the sample scene, and the summary."""
     folder = tmp_path_factory.mktemp("report")
     cloud, cameras = SCENE / "cloud.laz", SCENE / "cameras.csv"
-    summary = pcfix.correct_file(cloud, folder / "corrected.laz", cameras=cameras, water=0.37)
+    summary = pcfix.correct_file(
+        cloud, folder / "corrected.laz", cameras=cameras, water=0.37, method="snell", max_angle=None
+    )
     write_report(
         folder / "corrected.laz", folder, summary=summary,
         cameras=pcfix.read_cameras(cameras), water=pcfix.read_water(0.37), inputs=[cloud, cameras],
