@@ -26,12 +26,15 @@ import numpy as np
 
 from pcfix.model import FloatArray, IntArray, Outcome, ViewKind
 from pcfix.options.correct import Dimensions, ScienceOptions
-from pcfix.refract.batch import Batch, Doubt, Learned
+from pcfix.refract.batch import Batch, Doubt
 from pcfix.refract.fusion import likely_beds
 from pcfix.refract.matcher import bed_of
 from pcfix.refract.methods import correct, with_rays
 
 PATCHES, PATCH_POINTS, FEWEST_POINTS = 500, 16, 400
+FEWEST_WITHOUT_LIST = 2000
+"""Fewer are tie points, and their patches overlap."""
+
 PATCH_WIDTH = 0.04
 """Of a patch, in flying heights: wide enough for borders of images to cross many of them."""
 
@@ -195,9 +198,8 @@ def weigh(batch: Batch, hypotheses: tuple[Hypothesis, ...], step: float) -> Verd
         return None
     part = batch.take(rows)
     part = replace(part, survey=replace(part.survey, level_offset_m=None), level_sigma_m=None)
-    if batch.views is None:
-        part = replace(part, survey=replace(part.survey, learned=_with_bed(part, hypotheses)))
-    z = np.array([_heights(part, hypothesis) for hypothesis in hypotheses])
+    around = _around(replace(batch, survey=part.survey), rows)
+    z = np.array([_heights(part, around, hypothesis) for hypothesis in hypotheses])
     covered = np.isfinite(z).sum(axis=1)
     kept = np.flatnonzero(covered >= COVERED * covered.max())
     if len(kept) < 2 or not covered.max():
@@ -257,7 +259,7 @@ def _patches(batch: Batch) -> tuple[IntArray, IntArray, int]:
     usable = np.arange(len(batch))
     if batch.views is not None:
         usable = np.flatnonzero(np.diff(batch.views.start) >= 2)
-    if len(usable) < FEWEST_POINTS:
+    if len(usable) < (FEWEST_POINTS if batch.views is not None else FEWEST_WITHOUT_LIST):
         return usable[:0], usable[:0], 1
     width_m = PATCH_WIDTH * float(_flying_height_m(batch))
     # so dense that a patch is as wide as the images' borders are far apart
@@ -273,20 +275,21 @@ def _patches(batch: Batch) -> tuple[IntArray, IntArray, int]:
     return rows, place.reshape(patch.shape), step
 
 
+def _around(batch: Batch, rows: IntArray) -> Batch:
+    """Return other points around some, as near as there are."""
+    from scipy.spatial import cKDTree
+
+    others = np.setdiff1d(np.arange(len(batch)), rows, assume_unique=True)
+    if batch.views is not None or len(others) < PATCH_POINTS:
+        return batch.take(rows)
+    tree = cKDTree(batch.xyz[others, :2], balanced_tree=False, compact_nodes=False)
+    near = tree.query(batch.xyz[rows[::4], :2], k=PATCH_POINTS)[1]
+    return batch.take(others[np.unique(near)])
+
+
 def _flying_height_m(batch: Batch) -> float:
     """Return the height of the cameras above the water, in the median."""
     return float(np.median(batch.survey.cameras.centres[:, 2]) - batch.surface.height_m.mean())
-
-
-def _with_bed(part: Batch, hypotheses: tuple[Hypothesis, ...]) -> Learned:
-    """Return what was learned, with the bed of the patches if fused depth maps may be theirs."""
-    learned = part.survey.learned
-    for one in hypotheses:
-        if one.changes.get("matcher") == "depth-maps":
-            likely = likely_beds(with_rays(_as(part, one)))
-            if np.isfinite(likely).any():
-                return learned._replace(bed=bed_of(part.xyz, likely))
-    return learned
 
 
 def _as(part: Batch, hypothesis: Hypothesis, dimensions: Dimensions = "none") -> Batch:
@@ -302,9 +305,20 @@ def _as(part: Batch, hypothesis: Hypothesis, dimensions: Dimensions = "none") ->
     return replace(part, views=views, survey=replace(survey, settings=settings, learned=learned))
 
 
-def _heights(part: Batch, hypothesis: Hypothesis) -> FloatArray:
+def _heights(part: Batch, around: Batch, hypothesis: Hypothesis) -> FloatArray:
     """Return the heights under a hypothesis, NaN where a point is not corrected."""
-    found = correct(_as(part, hypothesis))
+    part = _as(part, hypothesis)
+    if part.views is not None or hypothesis.changes.get("matcher") != "depth-maps":
+        return _corrected_z(part)
+    # the bed tells which images made a point: that of others, or its own noise would seem right
+    likely = likely_beds(with_rays(_as(around, hypothesis)))
+    bed = bed_of(around.xyz, likely) if np.isfinite(likely).any() else None
+    learned = part.survey.learned._replace(bed=bed)
+    return _corrected_z(replace(part, survey=replace(part.survey, learned=learned)))
+
+
+def _corrected_z(part: Batch) -> FloatArray:
+    found = correct(part)
     z = part.xyz[:, 2] + found.shift_m[:, 2]
     return np.where(found.outcome == Outcome.CORRECTED, z, np.nan)
 

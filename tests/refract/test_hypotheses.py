@@ -9,7 +9,7 @@ import pcfix
 from pcfix.model import Cameras, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey
-from pcfix.refract.hypotheses import FEWEST_POINTS, IN_FRAME, hypotheses_of
+from pcfix.refract.hypotheses import FEWEST_WITHOUT_LIST, IN_FRAME, hypotheses_of
 from pcfix.refract.learning import learn_of_sample
 from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
@@ -69,7 +69,7 @@ def test_without_lenses_it_is_snell():
 
 
 def test_few_points_tell_nothing():
-    scene = simulate_scene(FEWEST_POINTS - 1, seed=1, lidar_per_m2=0.0)
+    scene = simulate_scene(FEWEST_WITHOUT_LIST - 1, seed=1, lidar_per_m2=0.0)
     settings, verdict = told(scene.apparent_xyz, scene.cameras, scene.water)
     assert verdict is None
     assert (settings.method, settings.camera_set) == ("consistent", "all")

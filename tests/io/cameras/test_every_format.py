@@ -59,7 +59,7 @@ def corrected(cloud, out, options):
     """Return coordinates and ray counts of a corrected file, and what was warned of."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", pcfix.PcfixWarning)
-        pcfix.correct_file(cloud, out, method="snell", max_angle=None, **options)
+        pcfix.correct_file(cloud, out, **{"method": "snell", "max_angle": None, **options})
     las = laspy.read(out)
     said = [str(w.message) for w in caught if issubclass(w.category, pcfix.PcfixWarning)]
     return np.asarray(las.xyz), np.asarray(las.RayCount), said
