@@ -188,7 +188,7 @@ def correct_one(
 ) -> None:  # fmt: skip
     """Correct one point with some cameras and write its row."""
     rays, sums, g, inverse = room
-    if cameras.size == 0 or cameras.min() == cameras.max():
+    if _are_one(cameras):
         out[OUTCOME] = ONE_CAMERA if cameras.size else NO_CAMERA
         return
     facet = -1 if tin is None else locate(tin, points.xyz[i, 0], points.xyz[i, 1])
@@ -197,6 +197,15 @@ def correct_one(
         begin(rays[j], sums, points, i, cameras[j], tin, field, facet)
         add_image(rays[j], optics, cameras[j])
     _solve(out, rays, (sums, g, inverse), cameras, optics, points.n, tin, field)
+
+
+@lean
+def _are_one(cameras: IntArray) -> bool:
+    """Whether there is one camera at most, perhaps several times."""
+    one = True
+    for c in cameras:
+        one = one and c == cameras[0]
+    return one
 
 
 @lean

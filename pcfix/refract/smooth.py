@@ -18,9 +18,16 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from pcfix.kernels import Span, in_tiles, kernel, lean
-from pcfix.lens.algebra import Vector, dot, minus, normal_of, plus, row_of, scaled, times, vector
+from pcfix.lens.algebra import Vector, dot, normal_of, plus, row_of, scaled, times, vector
 from pcfix.model import FloatArray, IntArray
-from pcfix.refract.batch import CORRECTED, Batch, Chosen, Intersection, Optics, optics_of
+from pcfix.refract.batch import (
+    CORRECTED,
+    Batch,
+    Chosen,
+    Intersection,
+    Optics,
+    optics_of,
+)
 from pcfix.refract.choice import rig_of
 from pcfix.refract.consistent import (
     COLUMNS,
@@ -72,10 +79,10 @@ _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 _NODES = np.vstack([np.array(list(product(_FOUR, _FOUR, _THREE))), _CORNERS])
 _INSIDE, _AT_CORNERS = len(_NODES) - len(_CORNERS), len(_CORNERS)
 _BASIS = _basis_of(_NODES)
-_FIT_CUBIC = np.linalg.pinv(_BASIS[:_INSIDE])
-_FIT_QUADRATIC = np.linalg.pinv(_BASIS[:_INSIDE, :_QUADRATIC])
+_FIT_CUBIC: FloatArray = np.linalg.pinv(_BASIS[:_INSIDE])
+_FIT_QUADRATIC: FloatArray = np.linalg.pinv(_BASIS[:_INSIDE, :_QUADRATIC])
 _SOME = np.concatenate([np.arange(0, _INSIDE, 5), np.arange(_INSIDE, len(_NODES))])
-_FIT_SOME = np.linalg.pinv(_BASIS[_SOME, :_QUADRATIC])
+_FIT_SOME: FloatArray = np.linalg.pinv(_BASIS[_SOME, :_QUADRATIC])
 
 # What a camera adds: g, cubic; its derivative, quadratic; and how much the polynomials of g lack at
 # each corner.
@@ -132,7 +139,10 @@ def consistent_in_cells(batch: Batch) -> Intersection:
 
 
 def _cells(batch: Batch) -> tuple[IntArray, IntArray]:
-    """Return the order of the points cell by cell, and the first of each cell."""
+    """Return the order of the points cell by cell, and the first of each cell.
+
+    Those of a cell with the same cameras come one after the other.
+    """
     if not len(batch):
         return np.zeros(0, np.int64), np.zeros(1, np.int64)
     height = np.median(batch.survey.cameras.centres[:, 2]) - np.median(batch.surface.height_m)
@@ -141,7 +151,9 @@ def _cells(batch: Batch) -> tuple[IntArray, IntArray]:
     cell = np.floor(batch.xyz[:, :2] / size).astype(np.int64)
     cell -= cell.min(axis=0)
     key = cell[:, 1] * (cell[:, 0].max() + 1) + cell[:, 0]
-    order = np.argsort(key, kind="stable")
+    names = np.random.default_rng(0).integers(2**40, size=len(batch.survey.cameras))
+    sums = np.concatenate([[0], np.cumsum(names[batch.rays.camera])])
+    order = np.lexsort((np.diff(sums[batch.rays.start]), key))
     new = np.flatnonzero(np.diff(key[order])) + 1
     return order, np.concatenate([[0], new, [len(order)]])
 
@@ -161,14 +173,30 @@ def _correct_cells(
             np.empty(_WIDTH), np.empty(_VALUES), np.empty(_CUBIC), np.empty(10),
             np.empty(RAY_WIDTH), np.empty((3, 3)),
         )  # fmt: skip
-        few = rows.size < LEAST_POINTS or seen.max() == 0
+        known, few = False, rows.size < LEAST_POINTS or seen.max() == 0
         cell = _empty_cell() if few else _cell_of(rows, seen, points, optics, room)
-        for i in rows:
-            cameras, out = points.camera[points.start[i] : points.start[i + 1]], result[i]
-            if few or not _predict(out, i, cameras, points, cell, pixel, work):
+        for at in range(rows.size):
+            i, last = rows[at], rows[max(at - 1, 0)]
+            cameras, out = _cameras_of(points, i), result[i]
+            if not few and (at == 0 or not _are_same(cameras, _cameras_of(points, last))):
+                known = _add_up(work[0], cameras, cell)
+            if few or not (known and _predict(out, i, cameras, points, cell, pixel, work)):
                 if cameras.size > len(room[0]):
                     room = room_for(cameras.size)
                 correct_one(out, points, i, cameras, optics, None, None, room)
+
+
+@kernel
+def _cameras_of(points: Chosen, i: int) -> IntArray:
+    return points.camera[points.start[i] : points.start[i + 1]]
+
+
+@lean
+def _are_same(a: IntArray, b: IntArray) -> bool:
+    same = a.size == b.size
+    for j in range(min(a.size, b.size)):
+        same = same and a[j] == b[j]
+    return same
 
 
 @kernel
@@ -176,7 +204,7 @@ def _counts(rows: IntArray, points: Chosen) -> IntArray:
     """Return how many of some points each camera sees."""
     seen = np.zeros(len(points.centres), np.int64)
     for i in rows:
-        for c in points.camera[points.start[i] : points.start[i + 1]]:
+        for c in _cameras_of(points, i):
             seen[c] += 1
     return seen
 
@@ -188,9 +216,7 @@ def _empty_cell() -> _Cell:
 
 
 @kernel
-def _cell_of(
-    rows: IntArray, seen: IntArray, points: Chosen, optics: Optics, room: Room
-) -> _Cell:
+def _cell_of(rows: IntArray, seen: IntArray, points: Chosen, optics: Optics, room: Room) -> _Cell:
     """Fit the polynomials of a cell."""
     named = np.flatnonzero(seen)
     box, water = _box_of(rows, points)
@@ -299,9 +325,9 @@ def _predict(
     out: FloatArray, i: int, cameras: IntArray, points: Chosen, cell: _Cell, pixel: FloatArray,
     room: _Work,
 ) -> bool:  # fmt: skip
-    """Write the row of a point by the polynomials; False where they do not serve."""
+    """Write the row of a point by the terms of its cameras; False where they do not serve."""
     terms, values, basis, lines, ray, inverse = room
-    if not (_is_under(points, i, cell) and _add_up(terms, cameras, cell)):
+    if not _is_under(points, i, cell):
         return False
     _set_basis(basis, points, i, cell)
     _evaluate(values, terms, basis)
