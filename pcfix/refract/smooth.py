@@ -53,8 +53,8 @@ TOLERANCE_PX = 0.02
 """What may be lacking, in ground pixels: of the polynomials, and of the one Newton step."""
 
 CELLS_A_HEIGHT = 8.0
-LEAST_POINTS = 60
-"""A cell costs as much as this many points."""
+LEAST_POINTS = 150
+"""Of a cell that a camera gives rays to, on average: its polynomials cost as much as those rays."""
 
 LEAST_LENGTH_M = 1e-3
 SAME_PLANE = 1e-6
@@ -70,6 +70,10 @@ def _basis_of(x: FloatArray) -> FloatArray:
     )  # fmt: skip
 
 
+def _fit_at(basis: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.pinv(basis), np.float64)
+
+
 _QUADRATIC, _CUBIC = 10, 19
 """Terms of polynomials; the cubic one has no power of three of the height, that spreads least."""
 
@@ -79,10 +83,10 @@ _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 _NODES = np.vstack([np.array(list(product(_FOUR, _FOUR, _THREE))), _CORNERS])
 _INSIDE, _AT_CORNERS = len(_NODES) - len(_CORNERS), len(_CORNERS)
 _BASIS = _basis_of(_NODES)
-_FIT_CUBIC: FloatArray = np.linalg.pinv(_BASIS[:_INSIDE])
-_FIT_QUADRATIC: FloatArray = np.linalg.pinv(_BASIS[:_INSIDE, :_QUADRATIC])
+_FIT_CUBIC = _fit_at(_BASIS[:_INSIDE])
+_FIT_QUADRATIC = _fit_at(_BASIS[:_INSIDE, :_QUADRATIC])
 _SOME = np.concatenate([np.arange(0, _INSIDE, 5), np.arange(_INSIDE, len(_NODES))])
-_FIT_SOME: FloatArray = np.linalg.pinv(_BASIS[_SOME, :_QUADRATIC])
+_FIT_SOME = _fit_at(_BASIS[_SOME, :_QUADRATIC])
 
 # What a camera adds: g, cubic; its derivative, quadratic; and how much the polynomials of g lack at
 # each corner.
@@ -173,7 +177,7 @@ def _correct_cells(
             np.empty(_WIDTH), np.empty(_VALUES), np.empty(_CUBIC), np.empty(10),
             np.empty(RAY_WIDTH), np.empty((3, 3)),
         )  # fmt: skip
-        known, few = False, rows.size < LEAST_POINTS or seen.max() == 0
+        known, few = False, seen.sum() <= LEAST_POINTS * np.count_nonzero(seen)
         cell = _empty_cell() if few else _cell_of(rows, seen, points, optics, room)
         for at in range(rows.size):
             i, last = rows[at], rows[max(at - 1, 0)]
