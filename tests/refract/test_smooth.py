@@ -69,14 +69,15 @@ def test_so_are_points_with_lists_of_their_own():
     listed = np.concatenate([rng.choice(len(cameras), k, replace=False) for k in count])
     quick, alone = both(xyz, cameras, views=Views(start, listed))
     apart_px = assert_as_alone(quick, alone)
-    assert np.mean(apart_px > 0.0) > 0.5
+    assert np.mean(apart_px > 0.0) > 0.2  # cameras from all sides: the one step is often too long
     assert len(np.unique(quick.outcome)) == 3
 
 
 def test_so_they_are_where_the_water_fell_during_the_flight():
     rng = np.random.default_rng(3)
     xyz, cameras = bed(rng, 1.0), nadir_block(rng)
-    assert_as_alone(*both(xyz, cameras, offset=rng.uniform(-0.5, 0.0, len(cameras))))
+    apart_px = assert_as_alone(*both(xyz, cameras, offset=rng.uniform(-0.5, 0.0, len(cameras))))
+    assert np.mean(apart_px > 0.0) > 0.1  # not where a ray stays dry beside those that do not
 
 
 def test_threads_do_not_matter_and_parts_hardly():
