@@ -86,6 +86,11 @@ class MethodOptions(IndexOptions):
         "Leave out cameras to which the cloud itself hides the point; auto: where there are"
         " obliques.",
     )
+    exact: bool = option(
+        False,
+        "Solve every point by itself; else --method consistent has that within 0.05 ground pixels,"
+        " from solutions nearby where these are enough.",
+    )
     depth_factor: float | None = option(
         None,
         "With --method factor: true by apparent depth.",

@@ -25,6 +25,8 @@ digits, and two or three do; Broyden's update of the inverse mends what is missi
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
 
 from pcfix.errors import SettingError
@@ -77,10 +79,11 @@ CLOSE_M = 1e-7
 
 
 # Columns of the result.
-_MISS, _SIGMA_Z, _COSINE2, _OUTCOME, _FOUND = 3, 4, 5, 6, 7
+MISS, SIGMA_Z, COSINE2, OUTCOME, FOUND = 3, 4, 5, 6, 7
+COLUMNS = 8
 
 # Columns of a ray: e, its plane (N, h), the gradients of its image by P, that image, its origin.
-_PLANE, _GRADIENTS, _IMAGE, _ORIGIN, _WIDTH = 3, 7, 13, 15, 18
+_PLANE, _GRADIENTS, _IMAGE, _ORIGIN, RAY_WIDTH = 3, 7, 13, 15, 18
 
 
 def check_consistent(cameras: Cameras) -> None:
@@ -133,19 +136,24 @@ def consistent(batch: Batch) -> Intersection:
         happens under waves that focus the light.
     """
     check_consistent(batch.survey.cameras)
-    survey, result = batch.survey, np.zeros((len(batch), 8))
+    survey, result = batch.survey, np.zeros((len(batch), COLUMNS))
     optics, shapes = optics_of(survey.cameras), shapes_of(survey.water)
     in_tiles(_correct, len(batch), batch.chosen(), optics, *shapes, result)
-    outcome = result[:, _OUTCOME].astype(np.uint8)
+    return intersection_of(batch, result)
+
+
+def intersection_of(batch: Batch, result: FloatArray) -> Intersection:
+    """Return the rows that kernels wrote as a result, and warn of points without a solution."""
+    outcome = result[:, OUTCOME].astype(np.uint8)
     moved = outcome == Outcome.CORRECTED
-    warn_of_unsolved("method consistent found no solution", result[moved, _FOUND] > 0.0)
-    angle = np.degrees(np.arccos(np.sqrt(np.minimum(result[:, _COSINE2], 1.0))))
+    warn_of_unsolved("method consistent found no solution", result[moved, FOUND] > 0.0)
+    angle = np.degrees(np.arccos(np.sqrt(np.minimum(result[:, COSINE2], 1.0))))
     return Intersection(
         shift_m=result[:, :3],
         outcome=outcome,
         ray_count=np.where(moved, batch.counts, 0).astype(np.int32),
-        ray_miss_m=result[:, _MISS],
-        sigma_z_m=result[:, _SIGMA_Z],
+        ray_miss_m=result[:, MISS],
+        sigma_z_m=result[:, SIGMA_Z],
         incidence_deg=np.where(moved, angle, 0.0),
         camera_used=batch.camera_used(moved),
     )
@@ -158,24 +166,51 @@ def _correct(
 ) -> None:  # fmt: skip
     """Correct every point on its own."""
     start = points.start
-    rays, sums = np.empty((most_between(span, start), _WIDTH)), np.empty(10)
-    g, inverse = np.empty(3), np.empty((3, 3))
+    room = room_for(most_between(span, start))
     for i in range(*span):
         cameras = points.camera[start[i] : start[i + 1]]
-        out = result[i]
-        if cameras.size == 0 or cameras.min() == cameras.max():
-            out[_OUTCOME] = ONE_CAMERA if cameras.size else NO_CAMERA
-            continue
-        facet = -1 if tin is None else locate(tin, points.xyz[i, 0], points.xyz[i, 1])
-        sums[:9], sums[9] = 0.0, 1.0
-        for j in range(cameras.size):
-            _begin(rays[j], sums, points, i, cameras[j], tin, field, facet)
-            _add_image(rays[j], optics, cameras[j])
-        _solve(out, rays, (sums, g, inverse), cameras, optics, points.n, tin, field)
+        correct_one(result[i], points, i, cameras, optics, tin, field, room)
+
+
+Room: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Of one point: its rays, their sums, g and the inverse of its derivative."""
+
+
+@kernel
+def room_for(rays: int) -> Room:
+    """Return room for a point with at most so many rays."""
+    return np.empty((rays, RAY_WIDTH)), np.empty(10), np.empty(3), np.empty((3, 3))
 
 
 @lean
-def _begin(
+def correct_one(
+    out: FloatArray, points: Chosen, i: int, cameras: IntArray, optics: Optics,
+    tin: Tin | None, field: Field | None, room: Room,
+) -> None:  # fmt: skip
+    """Correct one point with some cameras and write its row."""
+    rays, sums, g, inverse = room
+    if _are_one(cameras):
+        out[OUTCOME] = ONE_CAMERA if cameras.size else NO_CAMERA
+        return
+    facet = -1 if tin is None else locate(tin, points.xyz[i, 0], points.xyz[i, 1])
+    sums[:9], sums[9] = 0.0, 1.0
+    for j in range(cameras.size):
+        begin(rays[j], sums, points, i, cameras[j], tin, field, facet)
+        add_image(rays[j], optics, cameras[j])
+    _solve(out, rays, (sums, g, inverse), cameras, optics, points.n, tin, field)
+
+
+@lean
+def _are_one(cameras: IntArray) -> bool:
+    """Whether there is one camera at most, perhaps several times."""
+    one = True
+    for c in cameras:
+        one = one and c == cameras[0]
+    return one
+
+
+@lean
+def begin(
     ray: FloatArray, sums: FloatArray, points: Chosen, i: int, c: int,
     tin: Tin | None, field: Field | None, facet: int,
 ) -> None:  # fmt: skip
@@ -203,7 +238,7 @@ def _begin(
 
 
 @lean
-def _add_image(ray: FloatArray, optics: Optics, c: int) -> None:
+def add_image(ray: FloatArray, optics: Optics, c: int) -> None:
     """Fill in where the camera images P, and how that moves with P in the world frame."""
     lens, down = optics.lenses[optics.row[c]], scaled(-1.0, vector(ray))
     u, v, by_u, by_v = image_in_world(lens, optics.rotations[c], down)
@@ -221,16 +256,16 @@ def _solve(
     (sums, g, inverse), k = room, float(cameras.size)
     solved, q, _, sigma_z = nearest_point(k, sums)
     if not solved:
-        out[_OUTCOME] = PARALLEL
+        out[OUTCOME] = PARALLEL
         return
     found, q = _search(q, (g, inverse), rays, cameras, optics, n, tin, field)
     out[0], out[1], out[2] = q
-    out[_MISS], out[_SIGMA_Z] = _miss(k, sums, q), sigma_z
-    out[_COSINE2], out[_OUTCOME], out[_FOUND] = sums[9], CORRECTED, 1.0 if found else 0.0
+    out[MISS], out[SIGMA_Z] = miss(k, sums, q), sigma_z
+    out[COSINE2], out[OUTCOME], out[FOUND] = sums[9], CORRECTED, 1.0 if found else 0.0
 
 
 @lean
-def _miss(k: float, s: FloatArray, q: Vector) -> float:
+def miss(k: float, s: FloatArray, q: Vector) -> float:
     """Return the rms distance of Q from the lines of the sums, Q'MQ - 2 b'Q + s over k."""
     x, y, z = q
     along = s[0] * x * x + s[3] * y * y + (k - s[0] - s[3]) * z * z
@@ -282,19 +317,27 @@ def _gradient(
     """Sum up g(Q), and d g / d Q where it has rows."""
     g[:] = 0.0
     for j in range(cameras.size):
-        ray, c = rays[j], cameras[j]
-        e, plane = vector(ray), ray[_PLANE:_GRADIENTS]
-        if tin is not None or field is not None:
-            settle(plane, tin, field, ray[_ORIGIN:], q, e, n)
-        normal = vector(plane)
-        path = light_path(q, e, normal, plane[3], n)
-        w = times(optics.rotations[c], direction(path, normal))
-        u, v = image_of(optics.lenses[optics.row[c]], *w)
-        du, dv = u - ray[_IMAGE], v - ray[_IMAGE + 1]
-        for i in range(3):
-            g[i] += ray[_GRADIENTS + i] * du + ray[_GRADIENTS + 3 + i] * dv
-        if len(slope):
-            _add_slope(slope, ray, path, slope_of_path(path, normal, n))
+        add_residual(g, slope, q, rays[j], cameras[j], optics, n, tin, field)
+
+
+@lean
+def add_residual(
+    g: FloatArray, slope: FloatArray, q: Vector, ray: FloatArray, c: int, optics: Optics, n: float,
+    tin: Tin | None, field: Field | None,
+) -> None:  # fmt: skip
+    """Add what one ray says to g(Q), and to d g / d Q where it has rows."""
+    e, plane = vector(ray), ray[_PLANE:_GRADIENTS]
+    if tin is not None or field is not None:
+        settle(plane, tin, field, ray[_ORIGIN:], q, e, n)
+    normal = vector(plane)
+    path = light_path(q, e, normal, plane[3], n)
+    w = times(optics.rotations[c], direction(path, normal))
+    u, v = image_of(optics.lenses[optics.row[c]], *w)
+    du, dv = u - ray[_IMAGE], v - ray[_IMAGE + 1]
+    for i in range(3):
+        g[i] += ray[_GRADIENTS + i] * du + ray[_GRADIENTS + 3 + i] * dv
+    if len(slope):
+        _add_slope(slope, ray, path, slope_of_path(path, normal, n))
 
 
 @lean

@@ -23,6 +23,7 @@ from pcfix.refract.intersect import intersect, intersect_in_frame
 from pcfix.refract.matcher import steepest_and_partners, without_border
 from pcfix.refract.occlusion import in_sight
 from pcfix.refract.shan import shan
+from pcfix.refract.smooth import consistent_in_cells
 from pcfix.refract.stereo_pairs import invert_pairs
 from pcfix.refract.uncertainty import with_doubt, with_uncertainty
 from pcfix.water.surface import SurfaceAbove
@@ -87,8 +88,13 @@ def _takes_all_in_frame(batch: Batch) -> bool:
         and survey.settings.max_cameras is None
         and survey.learned.occluder is None
         and survey.learned.matcher is None
-        and not isinstance(survey.water, WaterMesh | WaterRaster)
+        and not _is_bent(survey)
     )
+
+
+def _is_bent(survey: Survey) -> bool:
+    """Whether rays of one point may pierce the water under different slopes."""
+    return isinstance(survey.water, WaterMesh | WaterRaster)
 
 
 def shift_of_land(batch: Batch) -> FloatArray:
@@ -135,6 +141,8 @@ def _method(batch: Batch) -> Method:
         return invert_fusion
     if settings.method == "consistent" and kind in _OF_MATCHERS:
         return _OF_MATCHERS[kind]
+    if settings.method == "consistent" and not (settings.exact or _is_bent(batch.survey)):
+        return consistent_in_cells
     return METHODS[settings.method]
 
 
