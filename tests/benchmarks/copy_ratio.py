@@ -1,8 +1,9 @@
 """How much longer a correction takes than a plain copy of the same file.
 
 Simulates a cloud once (kept in a folder for the next run), then times, in one run and by turns,
-``pcfix correct`` and a plain laspy read-and-write, each as a process of its own. Prints the
-ratio, the peak memory, and the speed of the kernel in point-camera pairs per second.
+``pcfix correct``, the same with ``--method snell --max-angle none``, and a plain laspy
+read-and-write, each as a process of its own. Prints the ratios, the peak memory, and the speed of
+the kernel of ``snell`` in point-camera pairs per second.
 
     python tests/benchmarks/copy_ratio.py [--points 5000000] [--cameras 200] [--folder DIR]
 """
@@ -36,14 +37,14 @@ def main():
     scene = camera_table(cloud)
     copied, corrected = folder / "copy.laz", folder / "corrected.laz"
     words = ["--cameras", scene, "--sensor", folder / "sensor.csv", "--water", "0.37"]
-    commands = {
-        "plain copy": [sys.executable, "-c", COPY, cloud, copied],
-        "pcfix correct": [
+    commands = {"plain copy": [sys.executable, "-c", COPY, cloud, copied]}
+    options = {"snell": ["--method", "snell", "--max-angle", "none"], "pcfix correct": []}
+    for name, more in options.items():
+        commands[name] = [
             *(sys.executable, "-m", "pcfix", "correct", cloud, corrected),
-            *(*words, "--overwrite", "--quiet"),
-        ],
-    }
-    run(commands["pcfix correct"])  # compile the kernels
+            *(*words, *more, "--overwrite", "--quiet"),
+        ]
+        run(commands[name])  # compile the kernels
     seconds, peak = {name: [] for name in commands}, dict.fromkeys(commands, 0.0)
     for _ in range(arguments.runs):
         for name, command in commands.items():
@@ -56,9 +57,10 @@ def main():
             f"{name:<14} {middle:7.2f} s median, {least:6.2f} s least,"
             f" {arguments.points / middle / 1e6:5.2f} M points/s, peak {peak[name]:5.0f} MB"
         )
-    pairs = zip(seconds["pcfix correct"], seconds["plain copy"], strict=True)
-    ratio = statistics.median(one / other for one, other in pairs)
-    print(f"ratio          {ratio:7.2f} (correct / copy, median of {arguments.runs} pairs of runs)")
+    for one, other in (("snell", "plain copy"), ("pcfix correct", "snell")):
+        pairs = zip(seconds[one], seconds[other], strict=True)
+        ratio = statistics.median(a / b for a, b in pairs)
+        print(f"ratio {ratio:7.2f} ({one} / {other}, median of {arguments.runs} pairs of runs)")
     sizes = [p.stat().st_size / arguments.points for p in (cloud, corrected)]
     print(f"file           {sizes[0]:.2f} -> {sizes[1]:.2f} bytes a point")
     kernel(cloud, scene, folder / "sensor.csv")
@@ -112,7 +114,7 @@ def kernel(cloud, cameras, sensor):
     xyz = xyz[xyz[:, 2] < 0.37][:1_000_000]
     block, water = pcfix.read_cameras(cameras, sensor), pcfix.WaterPlane(0.37)
     surface = SurfaceAbove(np.full(len(xyz), 0.37), np.zeros((len(xyz), 2)))
-    survey = Survey(water, block, ScienceOptions(dimensions="minimal"))
+    survey = Survey(water, block, ScienceOptions(method="snell", dimensions="minimal"))
     best, found = np.inf, None
     for _ in range(15):
         started = time.perf_counter()

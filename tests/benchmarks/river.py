@@ -48,7 +48,7 @@ def main():
     mesh = pcfix.read_water(folder / "water_surface.obj")
     for limit in (None, 35.0):
         name = "all" if limit is None else f"{limit:g} degrees"
-        options = {"refractive_index": PEER_INDEX, "max_angle_deg": limit}
+        options = {"index": PEER_INDEX, "method": "snell", "max_angle": limit}
         dietrich, count = dietrich_mean(xyz, surface, cameras, limit)
         show(f"Dietrich, cameras of pcfix, {name}", dietrich[use] / apparent[use], count[use])
         ours = pcfix.correct_points(xyz, cameras, surface, **options)
