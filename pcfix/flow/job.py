@@ -132,6 +132,7 @@ class Job:
             water_unknown=tally.water_unknown,
             shift_z_m=tally.shift_z_m(),
             rays=tally.rays,
+            incidence_deg=round(tally.incidence_deg, 2),
             cameras=len(self.cameras),
             cameras_used=len(self.cameras) - len(unused),
             cameras_unused=unused,

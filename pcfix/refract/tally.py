@@ -130,7 +130,7 @@ class Tally:
         self.camera_used: BoolArray = np.zeros(cameras, dtype=np.bool_)
         self.low: FloatArray = np.full(3, np.inf)
         self.high: FloatArray = np.full(3, -np.inf)
-        self.lowest_water_m = np.inf
+        self.lowest_water_m, self.incidence_deg = np.inf, 0.0
         self._depth_low_m, self._depth_high_m, self._depth_sum_m = np.inf, -np.inf, 0.0
         self._shift = _Histogram(-100.0, 100.0)
         self._uncertainty = UncertaintyTally()
@@ -150,6 +150,7 @@ class Tally:
         self.lowest_water_m = min(self.lowest_water_m, correction.lowest_water_m)
         moved = correction.corrected
         if moved.any():
+            self.incidence_deg = max(self.incidence_deg, float(correction.incidence_deg.max()))
             depth = correction.depth_m[moved]
             self._depth_low_m = min(self._depth_low_m, float(depth.min()))
             self._depth_high_m = max(self._depth_high_m, float(depth.max()))
@@ -211,6 +212,8 @@ class Summary:
     depth_m: dict[str, float]
     shift_z_m: dict[str, float]
     rays: int
+    incidence_deg: float
+    """The largest in air of a ray that was used."""
     cameras: int
     cameras_used: int
     cameras_unused: list[str]

@@ -32,7 +32,7 @@ from pcfix.report.page import (
     new_figure,
     new_map,
 )
-from pcfix.report.text import errors_of, share, tvu_sentence
+from pcfix.report.text import errors_of, order_sentence, share
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def _facts(s: Summary) -> Table:
     if s.uncertainty is not None:
         tvu = s.uncertainty["tvu_95_m"]
         rows.append(["Uncertainty", f"TVU at 95 % {tvu['mean']:.3f} m on average, formal;"
-                     f" {tvu_sentence(s.uncertainty)}"])  # fmt: skip
+                     f" {order_sentence(s)}"])  # fmt: skip
     return Table("In short", [], rows)
 
 

@@ -50,7 +50,8 @@ def summary_text(summary: Summary) -> str:
     lines += [
         f"cameras      {s.cameras_used} of {s.cameras} used"
         + (f"; {unused} see no corrected point: {names}" if unused else ""),
-        f"rays         {s.rays:,} ({s.rays / max(s.corrected, 1):.1f} a point)",
+        f"rays         {s.rays:,} ({s.rays / max(s.corrected, 1):.1f} a point, incidence up to"
+        f" {s.incidence_deg:.0f} degrees)",
         f"water        {s.water}, refractive index {s.settings['index']:.6g}",
         *_index(s),
         *_water_fit(s),
@@ -133,7 +134,7 @@ def _uncertainty(s: Summary) -> list[str]:
     return [
         f"uncertainty  standard error of Z mean {sigma['mean']:.3f} m, 95 % of the points below"
         f" {sigma['p95']:.3f} m; TVU at 95 % mean {tvu['mean']:.3f} m",
-        f"  IHO S-44   {tvu_sentence(found)}",
+        f"  IHO S-44   {order_sentence(s)}",
         f"  formal     it assumes {errors_of(s)} (standard deviations)",
         "             and no mismatches; S-44 asks for more than the TVU",
     ]
@@ -207,6 +208,18 @@ def budget_words(errors: dict[str, Any], level_from_fit: float | None = None) ->
     )
     parts += [f"{name} {errors[key]:g} {unit}" for name, key, unit in more if errors[key] > 0.0]
     return ", ".join(parts)
+
+
+def order_sentence(s: Summary) -> str:
+    """Return which order of S-44 the standard errors allow, if the bed is not off as a whole.
+
+    It may be where nothing tells that the cloud was made as the method takes it.
+    """
+    made = s.made or {}
+    measured = s.settings["method"] == "regression"
+    if s.uncertainty is None or not (measured or made.get("sure") or made.get("views_are")):
+        return "no order is claimed: nothing tells that the cloud was made as the method takes it"
+    return tvu_sentence(s.uncertainty)
 
 
 def tvu_sentence(uncertainty: dict[str, Any]) -> str:
