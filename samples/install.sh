@@ -46,4 +46,11 @@ if [ ${#missing[@]} -gt 0 ]; then system_packages "${missing[@]}"; fi
 if [ ! -x "$folder/bin/python" ]; then "$python" -m venv "$folder"; fi
 "$folder/bin/python" -m pip install --quiet --upgrade pip
 "$folder/bin/python" -m pip install --quiet --editable ".$extras"
+if [ -z "$extras" ]; then
+    echo "compiling the kernels, so that the first correction need not wait for it ..."
+    warm=$(mktemp -d)
+    "$folder/bin/pcfix" correct samples/scene/cloud.laz "$warm/out.laz" \
+        --cameras samples/scene/cameras.csv --water 0.37 --quiet
+    rm -r "$warm"
+fi
 echo "pcfix $("$folder/bin/python" -c 'import pcfix; print(pcfix.__version__)') is in $folder"

@@ -103,6 +103,8 @@ def progress_bar(title: str, quiet: bool) -> Iterator[Callable[[int, int], None]
         progress.TimeRemainingColumn(),
     )
     with progress.Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        if not any((Path(__file__).parents[1] / "refract").glob("__pycache__/*.nbi")):
+            title = f"Compiling, once after an installation; then {title.lower()}"
         task = bar.add_task(title, total=None, rate="")
         started = time.perf_counter()
 

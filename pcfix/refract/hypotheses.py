@@ -35,8 +35,10 @@ PATCHES, PATCH_POINTS, FEWEST_POINTS = 500, 16, 400
 FEWEST_WITHOUT_LIST = 2000
 """Fewer are tie points, and their patches overlap."""
 
+WIDEST_PATCH = 0.055
 PATCH_WIDTH = 0.04
-"""Of a patch, in flying heights: wide enough for borders of images to cross many of them."""
+"""Of a patch, in flying heights: wide enough for borders of images to cross many of them. Where the
+points are so sparse that patches are wider than the widest, relief drowns the steps of images."""
 
 LEAST_PATCHES = 100
 """Patches with all their points corrected under each hypothesis, below which nothing is told."""
@@ -271,6 +273,10 @@ def _patches(batch: Batch) -> tuple[IntArray, IntArray, int]:
     seeds = np.unique(np.linspace(0, len(xy) - 1, PATCHES).astype(int))
     tree = cKDTree(xy, balanced_tree=False, compact_nodes=False)
     patch = usable[tree.query(xy[seeds], k=PATCH_POINTS)[1]]
+    across = np.ptp(batch.xyz[patch, :2], axis=1).prod(axis=1)
+    sparse = math.sqrt(np.median(across)) * PATCH_WIDTH > WIDEST_PATCH * width_m
+    if batch.views is None and sparse:
+        return usable[:0], usable[:0], 1
     rows, place = np.unique(patch, return_inverse=True)
     return rows, place.reshape(patch.shape), step
 

@@ -181,8 +181,14 @@ MISTAKES = {
     "an option that is none": ({**GOOD, "watre": 1}, "no option 'watre'"),
     "no cameras": ({"water": 1.0}, "'cameras' is needed"),
     "no water": ({"cameras": "cameras.csv"}, "'water' is needed"),
-    "a word for a number": ({**GOOD, "max_angle": "wet"}, 'max_angle must be a number, not "wet"'),
-    "true for a number": ({**GOOD, "max_angle": True}, "max_angle must be a number, not true"),
+    "a word for a number": (
+        {**GOOD, "max_cameras": "few"},
+        'max_cameras must be a whole number, not "few"',
+    ),
+    "true for a number": (
+        {**GOOD, "max_angle": True},
+        "max_angle must be a number or a text, not true",
+    ),
     "a list": ({**GOOD, "cameras": ["a"]}, 'cameras must be a text, not ["a"]'),
     "half a camera": ({**GOOD, "max_cameras": 2.5}, "max_cameras must be a whole number"),
     "an index": ({**GOOD, "index": 1.6}, "refractive index 1.6 is outside 1.0 to 1.5"),
