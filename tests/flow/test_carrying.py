@@ -28,6 +28,7 @@ from tests.utils.clouds import (
     read_raw,
     write_cloud,
 )
+from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
 
@@ -324,7 +325,7 @@ def test_a_run_keeps_it(tmp_path):
 
 @free
 @true
-@pytest.mark.parametrize("views", [None, "dense.vis"])
+@pytest.mark.parametrize("views", mostly_nightly([None, "dense.vis"], "dense.vis"))
 def test_a_block_that_had_swallowed_the_water(tmp_path, views):
     """With true poses; before, land lies 19 GSD (of 5 cm) too low and the bed is 27 off."""
     told = pcfix.correct_file(
