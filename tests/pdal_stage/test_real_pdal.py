@@ -206,15 +206,12 @@ def options_of(recipe: str, folder: Path, **more: object) -> list[str]:
     return [*words, f"--writers.las.filename={folder / 'out.las'}"]
 
 
-def corrected_scene(folder: Path) -> Path:
+def corrected_scene(folder: Path, method: str = "snell") -> Path:
+    limit = None if method == "snell" else "auto"
     pcfix.correct_file(
-        SCENE / "cloud.laz",
-        folder / "cli.las",
-        cameras=SCENE / "cameras.csv",
-        water=0.37,
-        method="snell",
-        max_angle=None,
-    )
+        SCENE / "cloud.laz", folder / "cli.las", cameras=SCENE / "cameras.csv", water=0.37,
+        method=method, max_angle=limit,
+    )  # fmt: skip
     return folder / "cli.las"
 
 
@@ -237,7 +234,7 @@ def test_correct_recipe_as_it_stands(tmp_path: Path) -> None:
     out = f"--writers.las.filename={tmp_path / 'out.las'}"
     done = pdal("pipeline", "pipelines/correct.json", out, folder=ROOT)
     assert (done.returncode, done.stderr) == (0, "")
-    assert_same(corrected_scene(tmp_path), tmp_path / "out.las")
+    assert_same(corrected_scene(tmp_path, "auto"), tmp_path / "out.las")
 
 
 @needs_pdal
