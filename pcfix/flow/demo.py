@@ -51,13 +51,13 @@ def _table(scene: Scene, folder: Path, overwrite: bool) -> str:
     times_n = scene.apparent_xyz.copy()
     depth = scene.water_level_m - times_n[below, 2]
     times_n[below, 2] = scene.water_level_m - scene.refractive_index * depth
-    by_snell = correct_points(
+    by_default = correct_points(
         scene.apparent_xyz, scene.cameras, scene.water, index=scene.refractive_index
     )
     rows = [
         ("as it came", scene.apparent_xyz),
         (f"depth times {scene.refractive_index:g}", times_n),
-        ("snell, every camera", by_snell.xyz),
+        ("without any option", by_default.xyz),
         ("consistent, own cameras", _corrected(scene, folder, overwrite)),
     ]
     head = f"error of {deep.sum():,} bed points"
