@@ -124,7 +124,7 @@ def test_demo_prints_errors_before_and_after(tmp_path):
     assert done.returncode == 0, done.stderr
     rows = {}
     for line in done.stdout.splitlines():
-        for name in ("as it came", "depth times 1.34", "snell", "consistent"):
+        for name in ("as it came", "depth times 1.34", "without any option", "consistent"):
             if line.startswith(name):
                 rows.setdefault(name, []).append(float(line[30:].split()[6]))
     before, factor, snell, consistent = (np.array(r) for r in rows.values())
