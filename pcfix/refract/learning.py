@@ -13,16 +13,7 @@ from pcfix.refract.batch import Batch, Learned, Survey
 from pcfix.refract.choice import spatial_order
 from pcfix.refract.consistent import check_consistent
 from pcfix.refract.fusion import likely_beds
-from pcfix.refract.hypotheses import (
-    ALIKE,
-    BARE,
-    IN_FRAME,
-    LIMITS,
-    Hypothesis,
-    Verdict,
-    hypotheses_of,
-    weigh,
-)
+from pcfix.refract.hypotheses import ALIKE, BARE, LIMITS, Hypothesis, Verdict, hypotheses_of, weigh
 from pcfix.refract.matcher import Bed, bed_of, matcher_of, matcher_of_ties, places_for
 from pcfix.refract.methods import batches, with_rays
 from pcfix.refract.regression import DepthRegression
@@ -150,8 +141,9 @@ def _with_matcher(
     rows = np.flatnonzero(is_submerged(batch.xyz[:, 2], batch.surface))
     sample = replace(batch.take(rows), survey=survey)
     if survey.settings.method == "auto":
-        verdict = weigh(sample, hypotheses_of(sample), points / max(len(batch), 1))
-        survey = as_told(survey, verdict, IN_FRAME[0])
+        hypotheses = hypotheses_of(sample)
+        verdict = weigh(sample, hypotheses, points / max(len(batch), 1))
+        survey = as_told(survey, verdict, hypotheses[0])
         sample = replace(sample, survey=survey)
     settings = survey.settings
     if not settings.models_matcher:

@@ -217,7 +217,8 @@ def order_sentence(s: Summary) -> str:
     """
     made = s.made or {}
     measured = s.settings["method"] == "regression"
-    if s.uncertainty is None or not (measured or made.get("sure") or made.get("views_are")):
+    told = made.get("method") == "consistent" and made.get("sure", bool(made.get("views_are")))
+    if s.uncertainty is None or not (measured or told):
         return "no order is claimed: nothing tells that the cloud was made as the method takes it"
     return tvu_sentence(s.uncertainty)
 

@@ -83,6 +83,10 @@ def test_a_camera_set_limits_what_is_asked():
         Survey(scene.water, scene.cameras, replace(AUTO, camera_set="mvs")),
     )
     assert hypotheses_of(batch) == IN_FRAME[1:]
+    settings, verdict = told(
+        scene.apparent_xyz, scene.cameras, scene.water, replace(AUTO, camera_set="mvs")
+    )
+    assert verdict is None and (settings.camera_set, settings.matcher) == ("mvs", "depth-maps")
 
 
 @rendered
