@@ -33,6 +33,12 @@ inlined: Callable[[_Function], _Function] = njit(
 )
 """Compile a small lean kernel into those that call it."""
 
+summed: Callable[[_Function], _Function] = njit(
+    cache=True, error_model="numpy", nogil=True, forceinline=True, _nrt=False,
+    fastmath={"reassoc", "contract"},
+)  # fmt: skip
+"""Compile a small lean kernel of long sums into those that call it; their order is left open."""
+
 Span: TypeAlias = tuple[int, int]
 """The first of the rows of a tile, and the one after its last."""
 

@@ -140,7 +140,7 @@ class Learning:
 
 
 BED_POINTS_A_M2 = 5.0
-FEWEST_BED_POINTS, MOST_BED_POINTS = 250_000, 1_000_000
+FEWEST_BED_POINTS, MOST_BED_POINTS = 125_000, 1_000_000
 """Of the cloud, evenly spread over its order, tell the bed of the surroundings."""
 
 

@@ -28,139 +28,136 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, inlined, kernel, lean
-from pcfix.lens.algebra import Vector, beyond, dot, minus, row_of, scaled
+from pcfix.kernels import inlined, kernel, lean
+from pcfix.lens.algebra import Vector, beyond, dot, minus, plus, row_of, scaled, unit
 from pcfix.lens.frames import holds
-from pcfix.model import FloatArray, IntArray
+from pcfix.model import FloatArray, IntArray, WaterMesh, WaterRaster
 from pcfix.refract.batch import (
     CORRECTED,
     NO_CAMERA,
     ONE_CAMERA,
     Batch,
     Chosen,
-    Images,
     Intersection,
     as_made,
     as_now,
-    images_of,
 )
-from pcfix.refract.matcher import Matcher
+from pcfix.refract.cells import CUBIC
+from pcfix.refract.map_table import USUAL, Block, Table, has_terms, meet, read_table
+from pcfix.refract.matcher import MATCHED
 from pcfix.refract.rays import direction, light_path, refracted
 
 MAX_LOOKS = 5
 CLOSE_M = 0.002
 """Between two looks; what is left is mended in a straight line."""
 
-LEAST_RISE_M = 0.005
+NEAR_PX = 2.0
+"""Beside a table, which has how the depths change with the bed, in pixels on the ground."""
+
+LIKELY, LEAST_DEPTH_M = 1.1, 0.005
+RISE, STEEP = 0.1, 0.3
+LEAST_CHANGE, MOST_CHANGE = 0.35, 1.5
+"""Between these is how much the apparent depth grows with that of the bed along a ray."""
+
+NOTHING = 20.0
+"""exp(-this) is not worth the time that it takes."""
+
 AVERAGED_WITHIN = 0.012
 """Depths of neighbouring maps that differ by less, relative, are averaged before the fusion."""
 
-_ROUNDS = 4
 _MISS, AMBIGUITY, OUTCOME, _COUNT = 3, 4, 5, 6
 COLUMNS = 7
 """Of what the kernels write: the shift, and these."""
 
 
-def invert_depth_maps(batch: Batch) -> Intersection:
-    """Return the true points from which dense matching would have made the apparent ones.
-
-    Parameters
-    ----------
-    batch : Batch
-        Its views are the images whose depth maps were fused, with their weights;
-        `batch.survey.learned.matcher` says how they were matched.
-
-    Notes
-    -----
-    The surface above each point is taken as a plane.
-    """
-    weights = batch.rays.weight
-    result = np.zeros((len(batch.xyz), COLUMNS))
-    given = np.zeros(0) if weights is None else weights.astype(np.float64)
-    in_tiles(_invert, len(batch), *arrays_of(batch), given, result)
-    return intersection_of(batch, result)
-
-
 class Sight(NamedTuple):
-    """What the k images have of one apparent point, for kernels.
+    """One apparent point, for kernels.
 
     Attributes
     ----------
-    up : array, shape (k, 3)
-        From the point to the projection centres, metres, world frame.
-    made : array, shape (k, 3)
-        The same as the matcher had them, and the point; `up` itself where it is not corrected with
-        other cameras.
-    above : array, shape (k,)
-        Height of the water of each image over the point, along the normal, metres.
+    now, made : Vector
+        Where it is, and where the matcher had it, world frame.
+    above : float
+        Height of the water over it, along the normal, metres.
     normal : Vector
         Of the water, upward.
-    n : float
-        Refractive index.
     """
 
-    up: FloatArray
-    made: FloatArray
-    above: FloatArray
+    now: Vector
+    made: Vector
+    above: float
     normal: Vector
-    n: float
 
 
 class Room(NamedTuple):
     """Room for one point and the k images, so that no kernel makes arrays.
 
-    up, made : shape (k, 3); above : shape (k,), of `Sight`.
     t, slope : shape (k,), of `Lines`.
-    weight, now : shape (k,), what each map counts for, and its depth as it is now.
-    looks : shape (k, 5), of `_look`.
-    pairs : shape (partners, 3), of `_depth`.
+    weight, own, now : shape (k,), what each map counts for, all in all and by itself, and its depth
+    as it is now.
+    looks : shape (k, 6), of `_look`.
+    partners : shape (partners, 3), of `_compare`.
+    pairs : shape (pairs of partners, 2), of `best_pairs`.
+    powers : of the polynomials of a cell.
     place, found : shape (k,), where each image is among those found, and these.
     """
 
-    up: FloatArray
-    made: FloatArray
-    above: FloatArray
     t: FloatArray
     slope: FloatArray
     weight: FloatArray
+    own: FloatArray
     now: FloatArray
     looks: FloatArray
+    partners: FloatArray
     pairs: FloatArray
+    powers: FloatArray
     place: IntArray
     found: IntArray
 
 
 @kernel
-def room_for(k: int, partners: int) -> Room:
+def room_for(k: int) -> Room:
     """Return new room, in which no image has a place."""
     return Room(
-        np.empty((k, 3)), np.empty((k, 3)), np.empty(k), np.empty(k), np.empty(k), np.empty(k),
-        np.empty(k), np.empty((k, 5)), np.empty((partners, 3)), np.full(k, ABSENT),
-        np.empty(k, np.int64),
+        np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty((k, 6)),
+        np.empty((MATCHED, 3)), np.empty((MATCHED * MATCHED, 2)), np.empty(CUBIC),
+        np.full(k, ABSENT), np.empty(k, np.int64),
     )  # fmt: skip
 
 
 @lean
-def look_at(room: Room, points: Chosen, i: int, images: Images) -> None:
-    """Fill in what the images have of point i: `up`, `made` and `above`."""
-    apart = len(images.centres) > 0
-    for c in range(len(points.centres)):
-        for axis in range(3):
-            up = points.centres[c, axis] - points.xyz[i, axis]
-            room.up[c, axis] = room.made[c, axis] = up
-            if apart:
-                room.made[c, axis] = images.centres[c, axis] - points.made_xyz[i, axis]
-        above = points.height[i] - points.xyz[i, 2] + points.offset[c]
-        room.above[c] = points.normals[i, 2] * above
+def sight_of(points: Chosen, i: int) -> Sight:
+    """Return point i."""
+    normal = row_of(points.normals, i)
+    above = normal[2] * (points.height[i] - points.xyz[i, 2])
+    return Sight(row_of(points.xyz, i), row_of(points.made_xyz, i), above, normal)
 
 
-def arrays_of(batch: Batch) -> tuple[Chosen, Images, Matcher]:
-    """Return what the kernels take of a batch: points, images and the matcher."""
-    matcher = batch.survey.learned.matcher
-    if matcher is None:
-        raise ValueError("a model of the matcher is needed")
-    images = images_of(batch.made_with, batch.survey.cameras)
-    return batch.chosen(), images, matcher
+@inlined
+def _up(sight: Sight, points: Chosen, c: int) -> Vector:
+    """Return the way from the point to the projection centre."""
+    return minus(row_of(points.centres, c), sight.now)
+
+
+@inlined
+def made_up(sight: Sight, block: Block, c: int) -> Vector:
+    """Return the way from the point to the projection centre as the matcher had both."""
+    if len(block.images.centres) == 0:
+        return _up(sight, block.points, c)
+    return minus(row_of(block.images.centres, c), sight.made)
+
+
+@inlined
+def _above(sight: Sight, points: Chosen, c: int) -> float:
+    """Return how high the water of an image is over the point."""
+    return sight.above + sight.normal[2] * points.offset[c]
+
+
+def is_quick(batch: Batch) -> bool:
+    """Whether polynomials may stand for what each point would have to be asked."""
+    survey = batch.survey
+    bent = isinstance(survey.water, WaterMesh | WaterRaster)
+    return not (survey.settings.exact or bent)
 
 
 def intersection_of(batch: Batch, result: FloatArray) -> Intersection:
@@ -178,100 +175,7 @@ def intersection_of(batch: Batch, result: FloatArray) -> Intersection:
     )
 
 
-@kernel
-def _invert(
-    span: Span, points: Chosen, images: Images, matcher: Matcher, weight: FloatArray,
-    result: FloatArray,
-) -> None:  # fmt: skip
-    room = room_for(len(points.centres), matcher.matched.shape[1])
-    for i in range(*span):
-        first, last = points.start[i], points.start[i + 1]
-        given = weight[first:last] if weight.size else weight
-        _invert_one(result[i], points, i, points.camera[first:last], given, images, matcher, room)
-
-
-@lean
-def _invert_one(
-    row: FloatArray, points: Chosen, i: int, listed: IntArray, given: FloatArray, images: Images,
-    matcher: Matcher, room: Room,
-) -> None:  # fmt: skip
-    look_at(room, points, i, images)
-    made, normal = room.made, row_of(points.normals, i)
-    sight = Sight(room.up, made, room.above, normal, points.n)
-    maps = room.found[: _with_neighbours(room.found, room.place, listed, made, matcher)]
-    t, slope = room.t[: maps.size], room.slope[: maps.size]
-    depths = Lines(find_lines(t, slope, maps, sight, images, matcher, room), t, slope)
-    counts, now, step = room.weight[: maps.size], room.now, 0.0
-    for _ in range(_ROUNDS):
-        for q in range(maps.size):
-            now[q] = t[q] + slope[q] * step
-        _share(counts, room.place, listed, given, made, now, matcher)
-        step = balance(t, slope, counts)
-    settle_bed(row, maps, counts, depths, sight, images, matcher, room)
-    for q in maps:
-        room.place[q] = ABSENT
-    for c in listed:
-        for a in matcher.averaged[c]:
-            if a >= 0:
-                room.place[a] = ABSENT
-
-
-ABSENT, _OUTSIDE = -1, -2
-
-
-@lean
-def _with_neighbours(
-    found: IntArray, place: IntArray, listed: IntArray, made: FloatArray, matcher: Matcher
-) -> int:
-    """Gather the listed images and those in frame that their depths were averaged with.
-
-    Returns how many they are. `place` says where each image is among them.
-    """
-    count = 0
-    for c in listed:
-        if place[c] < 0:
-            place[c], found[count] = count, c
-            count += 1
-        for a in matcher.averaged[c]:
-            if a < 0:
-                break
-            if place[a] == ABSENT:
-                place[a] = _OUTSIDE
-                if holds(matcher.inner, a, row_of(made, a)):
-                    place[a], found[count] = count, a
-                    count += 1
-    return count
-
-
-@lean
-def _share(
-    counts: FloatArray, place: IntArray, listed: IntArray, given: FloatArray, made: FloatArray,
-    now: FloatArray, matcher: Matcher,
-) -> None:  # fmt: skip
-    """Set what each depth map counts for in the point, with their depths as they are now.
-
-    A fused map counts by its weight, that of the matcher or one by its squared distance, and
-    shares it evenly with the maps it was averaged with before.
-    """
-    counts[:] = 0.0
-    for k in range(listed.size):
-        c = listed[k]
-        w = given[k] if given.size else 1.0 / dot(row_of(made, c), row_of(made, c))
-        own, members = place[c], 1.0
-        for a in matcher.averaged[c]:
-            members += averages(own, a, now, place)
-        counts[own] += w / members
-        for a in matcher.averaged[c]:
-            if averages(own, a, now, place):
-                counts[place[a]] += w / members
-
-
-@lean
-def averages(own: int, a: int, now: FloatArray, place: IntArray) -> bool:
-    """Whether a depth is averaged with that of image a: both show the place, nearly alike."""
-    if a < 0 or place[a] < 0:
-        return False
-    return bool(abs(now[place[a]] - now[own]) < AVERAGED_WITHIN)
+ABSENT = -1
 
 
 class Lines(NamedTuple):
@@ -280,7 +184,7 @@ class Lines(NamedTuple):
     Attributes
     ----------
     bed : float
-        A likely height of the bed, relative to the apparent point, metres.
+        A height of the bed, relative to the apparent point, metres.
     t, slope : array, shape (maps,)
         How far beyond the apparent point the map has that bed, relative to the distance from the
         camera, and the change of it with the height, 1/m. NaN where it has none.
@@ -292,26 +196,53 @@ class Lines(NamedTuple):
 
 
 @lean
-def find_lines(
-    t: FloatArray, slope: FloatArray, maps: IntArray, sight: Sight, images: Images,
-    matcher: Matcher, room: Room,
-) -> float:  # fmt: skip
-    """Fill in the lines of the depth maps of some images, and return their likely bed."""
-    deep = 0.0
-    for c in range(sight.above.size):
-        deep += sight.above[c]
-    deep = -(deep / sight.above.size) / sight.normal[2] * (sight.n - 1.0)
-    bed, rise = 1.1 * deep, min(0.1 * deep, -LEAST_RISE_M)
-    out = room.looks[0]
+def look(
+    maps: IntArray, weight: FloatArray, bed: float, sight: Sight, block: Block, table: Table,
+    room: Room,
+) -> None:  # fmt: skip
+    """Look at a bed with the depth maps of those images that have a weight; see `_look`."""
     for q in range(maps.size):
-        _look(out, maps[q], bed, sight, images, matcher, room.pairs)
-        t[q] = out[0]
-        _look(out, maps[q], bed + rise, sight, images, matcher, room.pairs)
-        slope[q] = (out[0] - t[q]) / rise
-        usual = 1.0 / (sight.n * sight.made[maps[q], 2])
-        if slope[q] == slope[q] and not 0.5 < -slope[q] / usual < 2.0:
-            slope[q] = -usual  # another pair of images was the best one there
-    return bed
+        if weight[q] > 0.0:
+            _look(room.looks[q], maps[q], bed, sight, block, table, room)
+
+
+@lean
+def find_lines(
+    lines: Lines, maps: IntArray, sight: Sight, block: Block, table: Table, room: Room
+) -> None:
+    """Fill in the lines of the depth maps of some images.
+
+    How a depth changes with the bed is known from a second look; in a cell with polynomials the
+    first of its points has that for all.
+    """
+    again, rise = room.now[: maps.size], min(RISE * lines.bed, -LEAST_DEPTH_M)
+    for q in range(maps.size):
+        fitted = has_terms(table, maps[q])
+        again[q] = 1.0 if not fitted or table.steep[maps[q]] == 0.0 else 0.0
+    look(maps, again, lines.bed + rise, sight, block, table, room)
+    for q in range(maps.size):
+        lines.slope[q] = room.looks[q, 0]
+    room.weight[: maps.size] = 1.0
+    look(maps, room.weight, lines.bed, sight, block, table, room)
+    for q in range(maps.size):
+        usual, lines.t[q] = room.looks[q, 5], room.looks[q, 0]
+        if again[q] > 0.0:
+            steep = (lines.slope[q] - lines.t[q]) / (rise * usual)
+            steep = steep if abs(steep - 1.0) < STEEP else 1.0  # other images are the best there
+            room.looks[q, 5] *= steep
+            if has_terms(table, maps[q]):
+                table.steep[maps[q]] = steep
+        lines.slope[q] = room.looks[q, 5]
+
+
+@lean
+def likely_bed(sight: Sight, block: Block) -> float:
+    """Return a likely height of the bed, relative to the apparent point."""
+    points, above = block.points, 0.0
+    for c in range(len(points.offset)):
+        above += points.offset[c]
+    above = sight.above + sight.normal[2] * above / len(points.offset)
+    return -LIKELY * max(above, LEAST_DEPTH_M) / sight.normal[2] * (points.n - 1.0)
 
 
 @lean
@@ -327,31 +258,30 @@ def balance(t: FloatArray, slope: FloatArray, weight: FloatArray) -> float:
 @lean
 def settle_bed(
     row: FloatArray, maps: IntArray, weight: FloatArray, depths: Lines, sight: Sight,
-    images: Images, matcher: Matcher, room: Room,
+    block: Block, table: Table, room: Room,
 ) -> None:  # fmt: skip
     """Find the height of the bed at which the fused depths give the apparent point, and write it.
 
-    From where the lines say, and looked at again until they need not be mended.
+    From where the lines, which were looked at last, say, and looked at again until they need not be
+    mended.
     """
     row[OUTCOME] = NO_CAMERA if maps.size == 0 else ONE_CAMERA
-    bed, slope = depths.bed, depths.slope
-    step = balance(depths.t, slope, weight)
-    looks = room.looks[: maps.size]
+    bed, looks, near = depths.bed, room.looks[: maps.size], CLOSE_M
+    step = balance(depths.t, depths.slope, weight)
+    if table.place.size and maps.size:
+        c = maps[0]
+        near = max(near, NEAR_PX * _length(sight, block, c) / block.matcher.focal_px[c])
     for _ in range(MAX_LOOKS):
         if not np.isfinite(step):
             return
-        bed += step
-        for q in range(maps.size):
-            if weight[q] > 0.0:
-                _look(looks[q], maps[q], bed, sight, images, matcher, room.pairs)
-            else:
-                looks[q, 0] = 0.0
-        step = balance(looks[:, 0], slope, weight)
-        if abs(step) < CLOSE_M:
+        if abs(step) <= near:
             break
+        bed += step
+        look(maps, weight, bed, sight, block, table, room)
+        step = balance(looks[:, 0], looks[:, 5], weight)
     total, x, y, squares, count = 0.0, 0.0, 0.0, 0.0, 0.0
     for q in range(maps.size):
-        if weight[q] > 0.0 and slope[q] == slope[q]:
+        if weight[q] > 0.0 and looks[q, 5] == looks[q, 5]:
             w, px = weight[q], looks[q, 1] + step * looks[q, 3]
             py = looks[q, 2] + step * looks[q, 4]
             total, x, y = total + w, x + w * px, y + w * py
@@ -363,92 +293,117 @@ def settle_bed(
     row[OUTCOME], row[_COUNT] = CORRECTED, count
 
 
-@lean
+@inlined
 def _look(
-    out: FloatArray, c: int, bed: float, sight: Sight, images: Images, matcher: Matcher,
-    work: FloatArray,
-) -> None:  # fmt: skip
+    out: FloatArray, c: int, bed: float, sight: Sight, block: Block, table: Table, room: Room
+) -> None:
     """Say where the depth map of image c has a bed at a height relative to the apparent point.
 
-    Writes how far beyond P, relative to the distance from the camera, the place on the bed, and how
-    that moves with the height.
+    Writes how far beyond P, relative to the distance from the camera, the place on the bed, how
+    that moves with the height, and how the first does, nearly. NaN where none of the images that
+    it was matched with sees the bed there.
     """
-    a, e, above = _ray(c, sight, images)
-    across, wet = dot(sight.normal, e), sight.above[c] > 0.0
-    f, bend = (above / across, 1.0 / sight.n) if wet else (0.0, 1.0)
-    d = refracted(e, dot(e, e), sight.normal, across, bend)
-    a = beyond(a, f, e)
-    s = (bed - a[2]) / d[2]
-    out[1], out[2] = a[0] + s * d[0], a[1] + s * d[1]
-    out[3], out[4] = d[0] / d[2], d[1] / d[2]
-    made = row_of(sight.made, c)
-    length = np.sqrt(dot(made, made))
-    u = -made[0] / length, -made[1] / length, -made[2] / length
-    out[0] = _depth(c, (out[1], out[2], bed), u, sight, images, matcher, work) / length
+    n, normal = block.points.n, sight.normal
+    a, e, above = _ray(c, sight, block)
+    across, length2 = dot(normal, e), dot(e, e)
+    per_across, length = 1.0 / across, np.sqrt(length2)
+    f, bend = (above * per_across, 1.0 / n) if above > 0.0 else (0.0, 1.0)
+    d = refracted(e, length2, normal, across, bend)
+    a, down = beyond(a, f, e), 1.0 / d[2]
+    s = (bed - a[2]) * down
+    q = a[0] + s * d[0], a[1] + s * d[1], bed
+    out[1], out[2] = q[0], q[1]
+    out[3], out[4] = d[0] * down, d[1] * down
+    depth, under, count = dot(normal, minus(a, q)), f * length, -1
+    away, per_depth = length, length * per_across
+    if len(block.images.centres):
+        length = _length(sight, block, c)
+    if has_terms(table, c):
+        usual = away - under + USUAL * depth * per_depth - length
+        count = read_table(room.partners, room.powers, table, c, plus(sight.now, q), usual, block)
+    if count < 0:
+        count = _compare(room.partners, c, q, length, sight, block)
+    t = best_pairs(room.partners[:count], room.pairs, block.matcher.tolerance_px2)
+    out[0] = t / length
+    change = (t + under) / depth if depth > LEAST_DEPTH_M else per_depth / n
+    change = min(max(change, LEAST_CHANGE * per_depth), MOST_CHANGE * per_depth)
+    steep = 1.0
+    if table.place.size and table.steep[c] != 0.0:
+        steep = table.steep[c]
+    out[5] = -steep * change / length if t == t else np.nan
 
 
 @inlined
-def _ray(c: int, sight: Sight, images: Images) -> tuple[Vector, Vector, float]:
+def _length(sight: Sight, block: Block, c: int) -> float:
+    """Return how far the point is from the projection centre, as the matcher had both, metres."""
+    made = made_up(sight, block, c)
+    return np.sqrt(dot(made, made))
+
+
+@inlined
+def _ray(c: int, sight: Sight, block: Block) -> tuple[Vector, Vector, float]:
     """Return the ray on which image c shows the point.
 
     Where it passes the point, relative to it, the way from there to the projection centre, and how
     high the water is over there.
     """
-    up = row_of(sight.up, c)
-    if len(images.centres) == 0:
-        return (0.0, 0.0, 0.0), up, sight.above[c]
-    d = as_now(images, c, scaled(-1.0, row_of(sight.made, c)))
+    up, above = _up(sight, block.points, c), _above(sight, block.points, c)
+    if len(block.images.centres) == 0:
+        return (0.0, 0.0, 0.0), up, above
+    d = as_now(block.images, c, scaled(-1.0, made_up(sight, block, c)))
     e = scaled(dot(up, d) / dot(d, d), d)
     a = minus(up, e)
-    return a, e, sight.above[c] - dot(sight.normal, a)
-
-
-@inlined
-def _depth(
-    c: int, q: Vector, u: Vector, sight: Sight, images: Images, matcher: Matcher, work: FloatArray
-) -> float:
-    """Return how far beyond P, m along its ray u, the depth map of image c has the bed at Q.
-
-    NaN where none of the images that it was matched with sees Q. The light goes as it does; where
-    it seems to come from, and P and u, are as the matcher had them.
-    """
-    count = 0
-    for j in matcher.matched[c]:
-        if j < 0:
-            break
-        path = light_path(q, row_of(sight.up, j), sight.normal, sight.above[j], sight.n)
-        a = as_made(images, j, direction(path, sight.normal))
-        if not (path[0] == path[0] and holds(matcher.inner, j, scaled(-1.0, a))):
-            continue
-        a, e = scaled(1.0 / np.sqrt(dot(a, a)), a), row_of(sight.made, j)
-        p = minus(scaled(-1.0, e), scaled(-dot(e, a), a))
-        g = minus(u, scaled(dot(u, a), a))
-        scale = matcher.focal_px[j] ** 2 / dot(e, e)
-        work[count, 0], work[count, 1] = scale * dot(p, p), scale * dot(p, g)
-        work[count, 2] = scale * dot(g, g)
-        count += 1
-    if count == 0:
-        return np.nan
-    if count == 1:
-        return -work[0, 1] / work[0, 2]
-    return _best_pairs(work[:count], matcher.tolerance_px2)
+    return a, e, above - dot(sight.normal, a)
 
 
 @lean
-def _best_pairs(work: FloatArray, tolerance: float) -> float:
+def _compare(
+    partners: FloatArray, c: int, q: Vector, length: float, sight: Sight, block: Block
+) -> int:
+    """Write what the images that image c was matched with say of a bed at Q; return how many do.
+
+    How far beyond P, m along its ray, each has it, its squared residual, px^2, and half of how that
+    curves, px^2/m^2. The light goes as it does; where it seems to come from, and P and its ray, are
+    as the matcher had them.
+    """
+    points, matcher, made = block.points, block.matcher, made_up(sight, block, c)
+    u, count = scaled(-1.0 / length, made), 0
+    for j in matcher.matched[c]:
+        if j < 0:
+            break
+        up, above = _up(sight, points, j), _above(sight, points, j)
+        path = light_path(q, up, sight.normal, above, points.n)
+        a = as_made(block.images, j, direction(path, sight.normal))
+        if not (path[0] == path[0] and holds(matcher.inner, j, scaled(-1.0, a))):
+            continue
+        base = minus(made, made_up(sight, block, j))
+        away, miss, partners[count, 2] = meet(u, unit(a), base, matcher.focal_px[j])
+        partners[count, 0], partners[count, 1] = away - length, miss * miss
+        count += 1
+    return count
+
+
+@lean
+def best_pairs(partners: FloatArray, pairs: FloatArray, tolerance: float) -> float:
     """Return the depth at which two images agree best: a mean over the pairs, the best most.
 
-    Rows of `work`: the squared residual at t = 0, half its derivative, its curvature.
+    See `_compare`; NaN without a partner, and that of a single one where it has its least. `pairs`
+    is room for the squared residuals of two images at the depth that they have together, and it.
     """
-    least, total, sum_t = np.inf, 0.0, 0.0
-    for p in range(len(work)):
-        for q in range(p + 1, len(work)):
-            half, curved = work[p, 1] + work[q, 1], work[p, 2] + work[q, 2]
-            cost = work[p, 0] + work[q, 0] - half * half / curved
-            if cost < least:
-                shrink = np.exp((cost - least) / tolerance) if total > 0.0 else 0.0
-                total, sum_t, least = total * shrink, sum_t * shrink, cost
-            w = np.exp((least - cost) / tolerance)
-            total += w
-            sum_t -= w * half / curved
+    count, least = 0, np.inf
+    if len(partners) < 2:
+        return partners[0, 0] if len(partners) else np.nan
+    for p in range(len(partners)):
+        for q in range(p + 1, len(partners)):
+            a, b = partners[p, 2], partners[q, 2]
+            off, share = partners[q, 0] - partners[p, 0], b / (a + b)
+            cost = partners[p, 1] + partners[q, 1] + a * share * off * off
+            pairs[count, 0], pairs[count, 1] = cost, partners[p, 0] + share * off
+            least, count = min(least, cost), count + 1
+    total, sum_t = 0.0, 0.0
+    for p in range(count):
+        worse = (pairs[p, 0] - least) / tolerance
+        if worse < NOTHING:
+            w = np.exp(-worse)
+            total, sum_t = total + w, sum_t + w * pairs[p, 1]
     return sum_t / total

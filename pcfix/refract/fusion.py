@@ -14,35 +14,42 @@ height that most points around can have come from, the bed of the surroundings
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import numpy as np
 
 from pcfix.kernels import Span, in_tiles, kernel, lean
-from pcfix.lens.algebra import row_of
+from pcfix.lens.algebra import dot
 from pcfix.model import FloatArray, IntArray
-from pcfix.refract.batch import Batch, Chosen, Images, Intersection
+from pcfix.refract.batch import Batch, Intersection
+from pcfix.refract.cells import are_same, cameras_of, cells_of, counts_of
 from pcfix.refract.depth_maps import (
     ABSENT,
     AMBIGUITY,
+    AVERAGED_WITHIN,
     COLUMNS,
     Lines,
     Room,
     Sight,
-    arrays_of,
-    averages,
-    balance,
     find_lines,
     intersection_of,
-    look_at,
+    is_quick,
+    likely_bed,
+    made_up,
     room_for,
     settle_bed,
+    sight_of,
 )
+from pcfix.refract.map_table import LEAST_POINTS, Block, Table, block_of, no_table, reads, table_of
 from pcfix.refract.matcher import WIDTH_M, Matcher
 
 AGREE = 0.01
 """Depths that differ by less, relative, are fused."""
 
-MAX_ROUNDS = 6
-CLOSE_M = 2e-3
+SHALLOW, DEEP = 0.3, 3.5
+"""Where the bed of the surroundings is looked for at first, in likely heights: outliers have it
+elsewhere."""
 
 
 def invert_fusion(batch: Batch) -> Intersection:
@@ -57,7 +64,7 @@ def invert_fusion(batch: Batch) -> Intersection:
     bed = batch.survey.learned.bed
     around = np.full(len(batch.xyz), np.nan) if bed is None else bed.height_at(batch.xyz[:, :2])
     result = np.zeros((len(batch.xyz), COLUMNS))
-    in_tiles(_invert, len(batch), *arrays_of(batch), around, result)
+    _in_cells(batch, _invert, around, result)
     return intersection_of(batch, result)
 
 
@@ -70,159 +77,245 @@ def likely_beds(batch: Batch) -> FloatArray:
         Relative to each apparent point, metres; NaN where there is none.
     """
     likely = np.full((len(batch.xyz), max(1, batch.counts.max(initial=0))), np.nan, np.float32)
-    in_tiles(_likely, len(batch), *arrays_of(batch), likely)
+    _in_cells(batch, _likely, likely)
     return likely
+
+
+def _in_cells(batch: Batch, run: Callable[..., None], *given: FloatArray) -> None:
+    order, first = cells_of(batch)
+    in_tiles(run, len(first) - 1, (order, first), block_of(batch), is_quick(batch), *given)
+
+
+class Groups(NamedTuple):
+    """Which of a point's depth maps were averaged and fused with which, for kernels.
+
+    Attributes
+    ----------
+    averaged, fused : array, shape (k, 9) and (k, 13)
+        For each map itself and the others, by their places among those of the point; -1 after the
+        last.
+    place : array, shape (k,)
+        Of each image among those of the point, or -1.
+    share : array, shape (k,)
+        What each map counts for.
+    depth, change : array, shape (k,)
+        Of each map as it is averaged, relative, and how that changes with the height of the bed.
+    rise, size : array, shape (k,)
+        How far up the bed is if the group of each seed made the point, metres, and how many maps
+        are in it.
+    """
+
+    averaged: IntArray
+    fused: IntArray
+    place: IntArray
+    share: FloatArray
+    depth: FloatArray
+    change: FloatArray
+    rise: FloatArray
+    size: FloatArray
+
+
+@kernel
+def _no_groups(block: Block) -> Groups:
+    k, matcher = len(block.points.centres), block.matcher
+    return Groups(
+        np.full((k, matcher.averaged.shape[1] + 1), ABSENT),
+        np.full((k, matcher.fused.shape[1] + 1), ABSENT),
+        np.full(k, ABSENT), np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(k),
+    )  # fmt: skip
+
+
+@lean
+def _group(groups: Groups, maps: IntArray, matcher: Matcher) -> None:
+    """Find the places of the depth maps of a point."""
+    groups.place[:] = ABSENT
+    for q in range(maps.size):
+        groups.place[maps[q]] = q
+    for q in range(maps.size):
+        _place(groups.averaged[q], q, matcher.averaged[maps[q]], groups.place)
+        _place(groups.fused[q], q, matcher.fused[maps[q]], groups.place)
+
+
+@lean
+def _place(members: IntArray, q: int, others: IntArray, place: IntArray) -> None:
+    """Write a place and those of other images that have one."""
+    members[0], count = q, 1
+    for c in others:
+        if c >= 0 and place[c] >= 0:
+            members[count], count = place[c], count + 1
+    members[count:] = ABSENT
 
 
 @kernel
 def _likely(
-    span: Span, points: Chosen, images: Images, matcher: Matcher, likely: FloatArray
+    span: Span, cells: tuple[IntArray, IntArray], block: Block, quick: bool, likely: FloatArray
 ) -> None:
-    room = room_for(len(points.centres), matcher.matched.shape[1])
-    for i in range(*span):
-        maps = points.camera[points.start[i] : points.start[i + 1]]
-        _likely_of(likely[i], points, i, maps, images, matcher, room)
+    points, (order, first) = block.points, cells
+    room, none, groups = room_for(len(points.centres)), no_table(), _no_groups(block)
+    for cell in range(*span):
+        rows = order[first[cell] : first[cell + 1]]
+        fitted = none
+        if quick and rows.size >= LEAST_POINTS:
+            fitted = table_of(rows, counts_of(rows, points) > 0, block)
+        for at in range(rows.size):
+            i, maps = rows[at], cameras_of(points, rows[at])
+            if at == 0 or not are_same(maps, cameras_of(points, rows[at - 1])):
+                _group(groups, maps, block.matcher)
+            table = fitted if reads(fitted, points, i) else none
+            _likely_of(likely[i], i, maps, groups, block, table, room)
 
 
 @lean
 def _likely_of(
-    likely: FloatArray, points: Chosen, i: int, maps: IntArray, images: Images, matcher: Matcher,
+    likely: FloatArray, i: int, maps: IntArray, groups: Groups, block: Block, table: Table,
     room: Room,
 ) -> None:  # fmt: skip
-    look_at(room, points, i, images)
-    sight = Sight(room.up, room.made, room.above, row_of(points.normals, i), points.n)
+    sight = sight_of(block.points, i)
     t, slope = room.t[: maps.size], room.slope[: maps.size]
-    depths = Lines(find_lines(t, slope, maps, sight, images, matcher, room), t, slope)
-    _set(room.place, maps)
+    depths = Lines(likely_bed(sight, block), t, slope)
+    find_lines(depths, maps, sight, block, table, room)
+    _set_shares(groups.share, maps, sight, block)
+    _set_rises(groups, depths)
     for seed in range(maps.size):
         if depths.slope[seed] == depths.slope[seed]:
-            rise, _ = _group(seed, maps, depths, sight.made, matcher, room)
-            likely[seed] = depths.bed + rise
-    _unset(room.place, maps)
+            likely[seed] = depths.bed + groups.rise[seed]
 
 
 @kernel
 def _invert(
-    span: Span, points: Chosen, images: Images, matcher: Matcher, around: FloatArray,
+    span: Span, cells: tuple[IntArray, IntArray], block: Block, quick: bool, around: FloatArray,
     result: FloatArray,
 ) -> None:  # fmt: skip
-    room = room_for(len(points.centres), matcher.matched.shape[1])
-    for i in range(*span):
-        maps = points.camera[points.start[i] : points.start[i + 1]]
-        _invert_one(result[i], points, i, maps, around[i], images, matcher, room)
+    points, (order, first) = block.points, cells
+    room, none, groups = room_for(len(points.centres)), no_table(), _no_groups(block)
+    for cell in range(*span):
+        rows = order[first[cell] : first[cell + 1]]
+        fitted = none
+        if quick and rows.size >= LEAST_POINTS:
+            fitted = table_of(rows, counts_of(rows, points) > 0, block)
+        for at in range(rows.size):
+            i, maps = rows[at], cameras_of(points, rows[at])
+            if at == 0 or not are_same(maps, cameras_of(points, rows[at - 1])):
+                _group(groups, maps, block.matcher)
+            table = fitted if reads(fitted, points, i) else none
+            _invert_one(result[i], i, maps, around[i], groups, block, table, room)
 
 
 @lean
 def _invert_one(
-    row: FloatArray, points: Chosen, i: int, maps: IntArray, around: float, images: Images,
-    matcher: Matcher, room: Room,
+    row: FloatArray, i: int, maps: IntArray, around: float, groups: Groups, block: Block,
+    table: Table, room: Room,
 ) -> None:  # fmt: skip
-    look_at(room, points, i, images)
-    sight = Sight(room.up, room.made, room.above, row_of(points.normals, i), points.n)
-    t, slope = room.t[: maps.size], room.slope[: maps.size]
-    depths = Lines(find_lines(t, slope, maps, sight, images, matcher, room), t, slope)
-    _set(room.place, maps)
-    wanted = around - points.xyz[i, 2] - depths.bed
+    sight = sight_of(block.points, i)
+    wanted, bed = around - sight.now[2], likely_bed(sight, block)
+    if wanted == wanted:
+        bed = max(min(wanted, SHALLOW * bed), DEEP * bed)
+    depths = Lines(bed, room.t[: maps.size], room.slope[: maps.size])
+    find_lines(depths, maps, sight, block, table, room)
+    _set_shares(groups.share, maps, sight, block)
+    seed, rise, row[AMBIGUITY] = _best_seed(groups, depths, wanted - bed)
     weight = room.weight[: maps.size]
     weight[:] = 0.0
-    seed, row[AMBIGUITY] = _best_seed(maps, depths, sight.made, matcher, wanted, room)
     if seed >= 0:
-        _group(seed, maps, depths, sight.made, matcher, room)
-    _unset(room.place, maps)
-    settle_bed(row, maps, weight, depths, sight, images, matcher, room)
+        _weigh(weight, seed, rise, groups, depths)
+    settle_bed(row, maps, weight, depths, sight, block, table, room)
 
 
 @lean
-def _set(place: IntArray, maps: IntArray) -> None:
+def _set_shares(share: FloatArray, maps: IntArray, sight: Sight, block: Block) -> None:
     for q in range(maps.size):
-        place[maps[q]] = q
+        made = made_up(sight, block, maps[q])
+        share[q] = 1.0 / dot(made, made)
 
 
 @lean
-def _unset(place: IntArray, maps: IntArray) -> None:
-    for c in maps:
-        place[c] = ABSENT
-
-
-@lean
-def _best_seed(
-    maps: IntArray, depths: Lines, made: FloatArray, matcher: Matcher, wanted: float, room: Room
-) -> tuple[int, float]:
+def _best_seed(groups: Groups, depths: Lines, wanted: float) -> tuple[int, float, float]:
     """Return the seed whose group has the bed nearest to the wanted height, or the largest one.
 
-    And how far apart (m, standard deviation) the beds are of the groups that it can have been.
+    And that bed, and how far apart (m, standard deviation) the beds are of the groups that it can
+    have been.
     """
-    best, least = -1, np.inf
+    best, at_best, least, known = -1, 0.0, np.inf, wanted == wanted
     total, first, second = 0.0, 0.0, 0.0
-    for seed in range(maps.size):
+    _set_rises(groups, depths)
+    for seed in range(depths.t.size):
         if depths.slope[seed] != depths.slope[seed]:
             continue
-        rise, members = _group(seed, maps, depths, made, matcher, room)
-        known = wanted == wanted
-        misfit = abs(rise - wanted) if known else -float(members)
+        rise = groups.rise[seed]
+        misfit = abs(rise - wanted) if known else -groups.size[seed]
         if misfit < least:
-            best, least = seed, misfit
+            best, at_best, least = seed, rise, misfit
         likely = np.exp(-0.5 * (misfit / WIDTH_M) ** 2) if known else 1.0
         total += likely
         first, second = first + likely * rise, second + likely * rise * rise
     if not total > 0.0:
-        return best, abs(least) if best >= 0 else 0.0
+        return best, at_best, abs(least) if best >= 0 else 0.0
     mean = first / total
-    return best, np.sqrt(max(second / total - mean * mean, 0.0))
+    return best, at_best, np.sqrt(max(second / total - mean * mean, 0.0))
 
 
 @lean
-def _group(
-    seed: int, maps: IntArray, depths: Lines, made: FloatArray, matcher: Matcher, room: Room
-) -> tuple[float, int]:
-    """Return the height of the bed if the group of a seed made the point, and the group's size.
+def _set_rises(groups: Groups, depths: Lines) -> None:
+    """Find how far up the bed is if the group of each seed made the point, and its size.
 
-    Also sets, in the room, what each depth map counts for in it.
+    Which maps agree is asked for the bed that the lines are of, and again for that of each group.
+    """
+    k = depths.t.size
+    _average(groups, depths, 0.0)
+    for seed in range(k):
+        groups.rise[seed], groups.size[seed] = _fuse(seed, groups)
+    for seed in range(k):
+        _average(groups, depths, groups.rise[seed])
+        step, groups.size[seed] = _fuse(seed, groups)
+        groups.rise[seed] += step
+
+
+@lean
+def _average(groups: Groups, depths: Lines, rise: float) -> None:
+    """Average each depth with those of the maps around that agree, for a bed so much higher."""
+    t, slope = depths.t, depths.slope
+    for q in range(t.size):
+        own, total, change, count = t[q] + slope[q] * rise, 0.0, 0.0, 0.0
+        for a in groups.averaged[q]:
+            if a < 0:
+                break
+            other = t[a] + slope[a] * rise
+            if abs(other - own) < AVERAGED_WITHIN:
+                total, change, count = total + other, change + slope[a], count + 1.0
+        each = 1.0 / count
+        groups.depth[q], groups.change[q] = total * each, change * each
+
+
+@lean
+def _fuse(seed: int, groups: Groups) -> tuple[float, float]:
+    """Return how far up the bed must go for the group of a seed, and how many maps it has."""
+    total, change, members = 0.0, 0.0, 0.0
+    for q in groups.fused[seed]:
+        if q < 0:
+            break
+        if abs(groups.depth[q] - groups.depth[seed]) < AGREE:
+            total += groups.share[q] * groups.depth[q]
+            change += groups.share[q] * groups.change[q]
+            members += 1.0
+    return -total / change, members
+
+
+@lean
+def _weigh(weight: FloatArray, seed: int, rise: float, groups: Groups, depths: Lines) -> None:
+    """Write what each depth map counts for in the group of a seed.
+
+    The weight of one that agrees goes evenly to the maps it was averaged with.
     """
     t, slope = depths.t, depths.slope
-    rise, members = -t[seed] / slope[seed], 0
-    weight, now, place = room.weight[: maps.size], room.now[: maps.size], room.place
-    for _ in range(MAX_ROUNDS):
-        for q in range(maps.size):
-            now[q] = t[q] + slope[q] * rise
-        weight[:] = 0.0
-        middle, _ = _averaged(maps[seed], seed, now, place, matcher)
-        members = _fuse(weight, seed, maps, now, middle, place, made, matcher)
-        for c in matcher.fused[maps[seed]]:
-            if c >= 0 and place[c] >= 0:
-                members += _fuse(weight, place[c], maps, now, middle, place, made, matcher)
-        step = balance(now, slope, weight)
-        rise += step
-        if not abs(step) > CLOSE_M:
+    _average(groups, depths, rise)
+    for q in groups.fused[seed]:
+        if q < 0:
             break
-    return rise, members
-
-
-@lean
-def _averaged(
-    camera: int, q: int, now: FloatArray, place: IntArray, matcher: Matcher
-) -> tuple[float, float]:
-    """Return a depth after averaging with the maps around that agree, and their number."""
-    total, count = now[q], 1.0
-    for a in matcher.averaged[camera]:
-        if averages(q, a, now, place):
-            total, count = total + now[place[a]], count + 1.0
-    return total / count, count
-
-
-@lean
-def _fuse(
-    weight: FloatArray, q: int, maps: IntArray, now: FloatArray, middle: float, place: IntArray,
-    made: FloatArray, matcher: Matcher,
-) -> int:  # fmt: skip
-    """Fuse one depth map if it agrees: its weight goes evenly to the maps it was averaged with."""
-    camera = maps[q]
-    depth, count = _averaged(camera, q, now, place, matcher)
-    if not abs(depth - middle) < AGREE:
-        return 0
-    each = 1.0 / ((made[camera, 0] ** 2 + made[camera, 1] ** 2 + made[camera, 2] ** 2) * count)
-    weight[q] += each
-    for a in matcher.averaged[camera]:
-        if averages(q, a, now, place):
-            weight[place[a]] += each
-    return 1
+        if not abs(groups.depth[q] - groups.depth[seed]) < AGREE:
+            continue
+        own, count = t[q] + slope[q] * rise, 0.0
+        for a in groups.averaged[q]:
+            count += a >= 0 and abs(t[a] + slope[a] * rise - own) < AVERAGED_WITHIN
+        for a in groups.averaged[q]:
+            if a >= 0 and abs(t[a] + slope[a] * rise - own) < AVERAGED_WITHIN:
+                weight[a] += groups.share[q] / count

@@ -319,6 +319,8 @@ def _heights(part: Batch, around: Batch, hypothesis: Hypothesis) -> FloatArray:
     # the bed tells which images made a point: that of others, or its own noise would seem right
     likely = likely_beds(with_rays(_as(around, hypothesis)))
     bed = bed_of(around.xyz, likely) if np.isfinite(likely).any() else None
+    # in steps, as a smooth bed would make smooth whatever is chosen by it
+    bed = None if bed is None else bed._replace(between=False)
     learned = part.survey.learned._replace(bed=bed)
     return _corrected_z(replace(part, survey=replace(part.survey, learned=learned)))
 

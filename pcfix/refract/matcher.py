@@ -257,20 +257,40 @@ class Bed(NamedTuple):
     height_m : array, shape (rows, columns)
         World frame; the first row is the southern one.
     left_m, bottom_m, cell_m : float
+    between : bool
+        Whether heights go from cell to cell in straight lines, or in steps.
     """
 
     height_m: FloatArray
     left_m: float
     bottom_m: float
     cell_m: float
+    between: bool = True
 
     def height_at(self, xy: FloatArray) -> FloatArray:
-        """Return the height of the cell of each place, shape (n,)."""
+        """Return the height at each place, shape (n,).
+
+        NaN where the cell has none; cells beside it without one do not count.
+        """
+        x, y = (xy[:, 0] - self.left_m) / self.cell_m, (xy[:, 1] - self.bottom_m) / self.cell_m
+        own = self._at(np.floor(y).astype(int), np.floor(x).astype(int))
+        if not self.between:
+            return own
+        total, weights = np.zeros(len(xy)), np.zeros(len(xy))
+        for up, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            row, column = np.floor(y - 0.5).astype(int) + up, np.floor(x - 0.5).astype(int) + right
+            height = self._at(row, column)
+            weight = (1.0 - np.abs(y - row - 0.5)) * (1.0 - np.abs(x - column - 0.5))
+            weight = np.where(np.isfinite(height), weight, 0.0)
+            total, weights = total + weight * np.nan_to_num(height), weights + weight
+        known = np.isfinite(own) & (weights > 0.0)
+        return np.where(known, total / np.where(known, weights, 1.0), np.nan)
+
+    def _at(self, row: IntArray, column: IntArray) -> FloatArray:
+        """Return the heights of cells, NaN beside the grid."""
         rows, columns = self.height_m.shape
-        column = np.floor((xy[:, 0] - self.left_m) / self.cell_m).astype(int)
-        row = np.floor((xy[:, 1] - self.bottom_m) / self.cell_m).astype(int)
         inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-        height = np.full(len(xy), np.nan)
+        height = np.full(len(row), np.nan)
         height[inside] = self.height_m[row[inside], column[inside]]
         return height
 

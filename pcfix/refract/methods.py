@@ -17,9 +17,9 @@ from pcfix.refract import literature
 from pcfix.refract.batch import Batch, Intersection, Survey
 from pcfix.refract.choice import cameras_of_pairs, chosen_views, spatial_order
 from pcfix.refract.consistent import consistent
-from pcfix.refract.depth_maps import invert_depth_maps
 from pcfix.refract.fusion import invert_fusion
 from pcfix.refract.intersect import intersect, intersect_in_frame
+from pcfix.refract.listed_maps import invert_depth_maps
 from pcfix.refract.matcher import steepest_and_partners, without_border
 from pcfix.refract.occlusion import in_sight
 from pcfix.refract.shan import shan

@@ -12,15 +12,49 @@ the point's ground pixel, the point is solved as by `consistent`.
 
 from __future__ import annotations
 
-from itertools import product
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from pcfix.kernels import Span, in_tiles, kernel, lean
-from pcfix.lens.algebra import Vector, dot, inverted, normal_of, plus, row_of, scaled, times, vector
+from pcfix.lens.algebra import (
+    Vector,
+    beyond,
+    dot,
+    inverted,
+    normal_of,
+    plus,
+    row_of,
+    scaled,
+    times,
+    vector,
+)
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import CORRECTED, Batch, Chosen, Intersection, Optics, optics_of
+from pcfix.refract.cells import (
+    AT_CORNERS,
+    BASIS,
+    CUBIC,
+    FIT_CUBIC,
+    FIT_QUADRATIC,
+    FIT_SOME,
+    INSIDE,
+    NODES,
+    QUADRATIC,
+    SOME,
+    Box,
+    are_same,
+    box_of,
+    cameras_of,
+    cells_of,
+    counts_of,
+    fit,
+    in_box,
+    is_under,
+    no_box,
+    set_powers,
+    water_at,
+)
 from pcfix.refract.choice import rig_of
 from pcfix.refract.consistent import (
     COLUMNS,
@@ -44,48 +78,15 @@ from pcfix.refract.rays import nearest_point
 TOLERANCE_PX = 0.02
 """What may be lacking, in ground pixels: of the polynomials, and of the one Newton step."""
 
-CELLS_A_HEIGHT = 8.0
 LEAST_POINTS = 150
 """Of a cell that a camera gives rays to, on average: its polynomials cost as much as those rays."""
-
-LEAST_LENGTH_M = 1e-3
-SAME_PLANE = 1e-6
-"""Metres of height, and of slope."""
-
-
-def _basis_of(x: FloatArray) -> FloatArray:
-    u, v, w = x.T
-    uu, uv, vv, ww = u * u, u * v, v * v, w * w
-    return np.column_stack(
-        [np.ones(len(x)), u, v, w, uu, uv, u * w, vv, v * w, ww,
-         uu * u, uu * v, uu * w, uv * v, uv * w, u * ww, vv * v, vv * w, v * ww]
-    )  # fmt: skip
-
-
-def _fit_at(basis: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.pinv(basis), np.float64)
-
-
-_QUADRATIC, _CUBIC = 10, 19
-"""Terms of polynomials; the cubic one has no power of three of the height, that spreads least."""
-
-# Polynomials through these nodes are off most at the corners, where it is asked how much.
-_FOUR, _THREE = np.cos(np.pi / 8.0 * np.arange(1, 8, 2)), np.sqrt(0.75) * np.arange(-1.0, 2.0)
-_CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
-_NODES = np.vstack([np.array(list(product(_FOUR, _FOUR, _THREE))), _CORNERS])
-_INSIDE, _AT_CORNERS = len(_NODES) - len(_CORNERS), len(_CORNERS)
-_BASIS = _basis_of(_NODES)
-_FIT_CUBIC = _fit_at(_BASIS[:_INSIDE])
-_FIT_QUADRATIC = _fit_at(_BASIS[:_INSIDE, :_QUADRATIC])
-_SOME = np.concatenate([np.arange(0, _INSIDE, 5), np.arange(_INSIDE, len(_NODES))])
-_FIT_SOME = _fit_at(_BASIS[_SOME, :_QUADRATIC])
 
 # What a camera adds: g, cubic; its derivative, quadratic; and how much the polynomials of g lack at
 # each corner.
 _SLOPE, _VALUES = 3, 12
-_REST = _SLOPE * _CUBIC
-_LACK = _REST + (_VALUES - _SLOPE) * _QUADRATIC
-_WIDTH = _LACK + 3 * _AT_CORNERS
+_REST, _REST_VALUES = _SLOPE * CUBIC, _VALUES - _SLOPE
+_LACK = _REST + _REST_VALUES * QUADRATIC
+_WIDTH = _LACK + 3 * AT_CORNERS
 
 
 class _Cell(NamedTuple):
@@ -93,11 +94,8 @@ class _Cell(NamedTuple):
 
     Attributes
     ----------
-    box : array, shape (2, 3)
-        Middle and half the size of the cell in x, y and the height over the water, metres.
-    water : array, shape (3,)
-        Height of the water over the middle, and its slope.
-    middle : array, shape (3, 10)
+    box : Box
+    middle : array, shape (10, 3)
         Q0, relative to the apparent point.
     place : array, shape (k,)
         The row of each camera in `terms`, or -1.
@@ -105,8 +103,7 @@ class _Cell(NamedTuple):
         What each of them adds.
     """
 
-    box: FloatArray
-    water: FloatArray
+    box: Box
     middle: FloatArray
     place: IntArray
     terms: FloatArray
@@ -126,32 +123,12 @@ def consistent_in_cells(batch: Batch) -> Intersection:
     cameras = batch.survey.cameras
     check_consistent(cameras)
     result, points = np.zeros((len(batch), COLUMNS)), batch.chosen()
-    order, first = _cells(batch)
+    order, first = cells_of(batch)
     in_tiles(
         _correct_cells, len(first) - 1, (order, first), points, optics_of(cameras),
         1.0 / rig_of(batch.survey).focal_px, result,
     )  # fmt: skip
     return intersection_of(batch, result)
-
-
-def _cells(batch: Batch) -> tuple[IntArray, IntArray]:
-    """Return the order of the points cell by cell, and the first of each cell.
-
-    Those of a cell with the same cameras come one after the other.
-    """
-    if not len(batch):
-        return np.zeros(0, np.int64), np.zeros(1, np.int64)
-    height = np.median(batch.survey.cameras.centres[:, 2]) - np.median(batch.surface.height_m)
-    # a power of two, so that other chunks have the same cells
-    size = 2.0 ** np.rint(np.log2(max(height, LEAST_LENGTH_M) / CELLS_A_HEIGHT))
-    cell = np.floor(batch.xyz[:, :2] / size).astype(np.int64)
-    cell -= cell.min(axis=0)
-    key = cell[:, 1] * (cell[:, 0].max() + 1) + cell[:, 0]
-    names = np.random.default_rng(0).integers(2**40, size=len(batch.survey.cameras))
-    sums = np.concatenate([[0], np.cumsum(names[batch.rays.camera])])
-    order = np.lexsort((np.diff(sums[batch.rays.start]), key))
-    new = np.flatnonzero(np.diff(key[order])) + 1
-    return order, np.concatenate([[0], new, [len(order)]])
 
 
 @kernel
@@ -163,18 +140,18 @@ def _correct_cells(
     order, first = cells
     for t in range(*span):
         rows = order[first[t] : first[t + 1]]
-        seen = _counts(rows, points)
+        seen = counts_of(rows, points)
         room = room_for(len(points.centres))
         work = (
-            np.empty(_WIDTH), np.empty(_VALUES), np.empty(_CUBIC), np.empty(10),
+            np.empty(_WIDTH), np.empty(_VALUES), np.empty(CUBIC), np.empty(10),
             np.empty(RAY_WIDTH), np.empty((3, 3)),
         )  # fmt: skip
         known, few = False, seen.sum() <= LEAST_POINTS * np.count_nonzero(seen)
         cell = _empty_cell() if few else _cell_of(rows, seen, points, optics, room)
         for at in range(rows.size):
             i, last = rows[at], rows[max(at - 1, 0)]
-            cameras, out = _cameras_of(points, i), result[i]
-            if not few and (at == 0 or not _are_same(cameras, _cameras_of(points, last))):
+            cameras, out = cameras_of(points, i), result[i]
+            if not few and (at == 0 or not are_same(cameras, cameras_of(points, last))):
                 known = _add_up(work[0], cameras, cell)
             if few or not (known and _predict(out, i, cameras, points, cell, pixel, work)):
                 if cameras.size > len(room[0]):
@@ -183,121 +160,61 @@ def _correct_cells(
 
 
 @kernel
-def _cameras_of(points: Chosen, i: int) -> IntArray:
-    return points.camera[points.start[i] : points.start[i + 1]]
-
-
-@lean
-def _are_same(a: IntArray, b: IntArray) -> bool:
-    same = a.size == b.size
-    for j in range(min(a.size, b.size)):
-        same = same and a[j] == b[j]
-    return same
-
-
-@kernel
-def _counts(rows: IntArray, points: Chosen) -> IntArray:
-    """Return how many of some points each camera sees."""
-    seen = np.zeros(len(points.centres), np.int64)
-    for i in rows:
-        for c in _cameras_of(points, i):
-            seen[c] += 1
-    return seen
-
-
-@kernel
 def _empty_cell() -> _Cell:
-    none, no_row = np.empty((0, 0)), np.empty(0, np.int64)
-    return _Cell(none, none[0:0].ravel(), none, no_row, none)
+    none = np.empty((0, 0))
+    return _Cell(no_box(), none, np.empty(0, np.int64), none)
 
 
 @kernel
 def _cell_of(rows: IntArray, seen: IntArray, points: Chosen, optics: Optics, room: Room) -> _Cell:
     """Fit the polynomials of a cell."""
     named = np.flatnonzero(seen)
-    box, water = _box_of(rows, points)
-    nodes = _nodes_of(box, water, points)
-    shift = np.zeros((len(_SOME), COLUMNS))
+    box = box_of(rows, points)
+    nodes = _nodes_of(box, points)
+    shift = np.zeros((len(SOME), COLUMNS))
     common = np.flatnonzero(2 * seen >= seen.max())
-    for k in range(len(_SOME)):
-        correct_one(shift[k], nodes, _SOME[k], common, optics, None, None, room)
-    middle = np.ascontiguousarray((_FIT_SOME @ shift[:, :3].copy()).T)
+    for k in range(len(SOME)):
+        correct_one(shift[k], nodes, SOME[k], common, optics, None, None, room)
+    middle = FIT_SOME @ shift[:, :3].copy()
     place = np.full(len(points.centres), -1)
-    terms, values = np.empty((named.size, _WIDTH)), np.empty((_VALUES, len(_NODES)))
+    terms, values = np.empty((named.size, _WIDTH)), np.empty((len(NODES), _VALUES))
     for at in range(named.size):
-        for k in range(len(_NODES)):
-            q = _place(middle, _BASIS[k])
-            _look(values[:, k], q, nodes, k, named[at], optics, room)
+        for k in range(len(NODES)):
+            q = _place(middle, BASIS[k])
+            _look(values[k], q, nodes, k, named[at], optics, room)
         _fit(terms[at], values)
         if np.isfinite(terms[at]).all():
             place[named[at]] = at
-    return _Cell(box, water, middle, place, terms)
+    return _Cell(box, middle, place, terms)
 
 
 @lean
 def _fit(terms: FloatArray, values: FloatArray) -> None:
-    """Write the polynomials through the values, shape (12, nodes), of one camera."""
-    _fit_some(terms, _FIT_CUBIC, values[:_SLOPE])
-    _fit_some(terms[_REST:], _FIT_QUADRATIC, values[_SLOPE:])
-    for k in range(_AT_CORNERS):
-        for i in range(3):
-            there = _value(terms[_CUBIC * i : _CUBIC * (i + 1)], _BASIS[_INSIDE + k])
-            terms[_LACK + 3 * k + i] = there - values[i, _INSIDE + k]
-
-
-@lean
-def _fit_some(terms: FloatArray, fit: FloatArray, values: FloatArray) -> None:
-    for f in range(len(values)):
-        for j in range(len(fit)):
-            total = 0.0
-            for k in range(_INSIDE):
-                total += fit[j, k] * values[f, k]
-            terms[f * len(fit) + j] = total
+    """Write the polynomials through the values, shape (nodes, 12), of one camera."""
+    fit(terms, FIT_CUBIC, values[:, :_SLOPE])
+    fit(terms[_REST:], FIT_QUADRATIC, values[:, _SLOPE:])
+    for k in range(AT_CORNERS):
+        for i in range(_SLOPE):
+            lack = -values[INSIDE + k, i]
+            for j in range(CUBIC):
+                lack += BASIS[INSIDE + k, j] * terms[_SLOPE * j + i]
+            terms[_LACK + _SLOPE * k + i] = lack
 
 
 @kernel
-def _box_of(rows: IntArray, points: Chosen) -> tuple[FloatArray, FloatArray]:
-    """Return the box of some points and the water over its middle, that of the first of them."""
-    i, low, high = rows[0], np.full(3, np.inf), np.full(3, -np.inf)
-    b, c = points.slope[i]
-    a = points.height[i] - b * points.xyz[i, 0] - c * points.xyz[i, 1]
-    for j in rows:
-        x, y, z = row_of(points.xyz, j)
-        at = x, y, z - (a + b * x + c * y)
-        for axis in range(3):
-            low[axis], high[axis] = min(low[axis], at[axis]), max(high[axis], at[axis])
-    box = np.empty((2, 3))
-    box[0], box[1] = 0.5 * (low + high), np.maximum(0.5 * (high - low), LEAST_LENGTH_M)
-    return box, np.array([a + b * box[0, 0] + c * box[0, 1], b, c])
-
-
-@kernel
-def _nodes_of(box: FloatArray, water: FloatArray, points: Chosen) -> Chosen:
+def _nodes_of(box: Box, points: Chosen) -> Chosen:
     """Return the nodes of a box as points."""
-    xyz, height = box[0] + box[1] * _NODES, np.empty(len(_NODES))
-    slope, normals = np.empty((len(_NODES), 2)), np.empty((len(_NODES), 3))
-    for k in range(len(_NODES)):
-        slope[k] = water[1:]
-        height[k] = _water_at(water, box, xyz[k, 0], xyz[k, 1])
+    xyz, height = box.middle + box.half * NODES, np.empty(len(NODES))
+    slope, normals = np.empty((len(NODES), 2)), np.empty((len(NODES), 3))
+    for k in range(len(NODES)):
+        slope[k] = box.water[1:]
+        height[k] = water_at(box, xyz[k, 0], xyz[k, 1])
         xyz[k, 2] += height[k]
-        normals[k, 0], normals[k, 1], normals[k, 2] = normal_of(water[1], water[2])
+        normals[k, 0], normals[k, 1], normals[k, 2] = normal_of(box.water[1], box.water[2])
     return Chosen(
         xyz, xyz, height, slope, normals, points.centres, points.offset, points.start,
         points.camera, points.n,
     )  # fmt: skip
-
-
-@lean
-def _water_at(water: FloatArray, box: FloatArray, x: float, y: float) -> float:
-    return water[0] + water[1] * (x - box[0, 0]) + water[2] * (y - box[0, 1])
-
-
-@lean
-def _value(a: FloatArray, b: FloatArray) -> float:
-    total = 0.0
-    for i in range(a.size):
-        total += a[i] * b[i]
-    return total
 
 
 @lean
@@ -323,9 +240,9 @@ def _predict(
 ) -> bool:  # fmt: skip
     """Write the row of a point by the terms of its cameras; False where they do not serve."""
     terms, values, basis, lines, ray, inverse = room
-    if not _is_under(points, i, cell):
+    if not is_under(points, i, cell.box):
         return False
-    _set_basis(basis, points, i, cell)
+    set_powers(basis, in_box(cell.box, row_of(points.xyz, i)))
     _evaluate(values, terms, basis)
     for j in range(9):
         inverse[j // 3, j % 3] = values[_SLOPE + j]
@@ -345,24 +262,22 @@ def _predict(
 @lean
 def _evaluate(values: FloatArray, sums: FloatArray, basis: FloatArray) -> None:
     """Write what the polynomials of `sums` are at a point."""
-    for f in range(_SLOPE):
-        values[f] = _value(sums[_CUBIC * f : _CUBIC * (f + 1)], basis)
-    for f in range(_VALUES - _SLOPE):
-        values[_SLOPE + f] = _value(sums[_REST + _QUADRATIC * f :][:_QUADRATIC], basis)
+    values[:] = 0.0
+    for j in range(CUBIC):
+        for f in range(_SLOPE):
+            values[f] += basis[j] * sums[_SLOPE * j + f]
+    for j in range(QUADRATIC):
+        for f in range(_REST_VALUES):
+            values[_SLOPE + f] += basis[j] * sums[_REST + _REST_VALUES * j + f]
 
 
 @lean
 def _place(middle: FloatArray, basis: FloatArray) -> Vector:
     """Return Q0 relative to the apparent point."""
-    return _value(middle[0], basis), _value(middle[1], basis), _value(middle[2], basis)
-
-
-@lean
-def _is_under(points: Chosen, i: int, cell: _Cell) -> bool:
-    """Whether the water over a point is the plane of the cell."""
-    off = points.height[i] - _water_at(cell.water, cell.box, points.xyz[i, 0], points.xyz[i, 1])
-    b, c = points.slope[i, 0] - cell.water[1], points.slope[i, 1] - cell.water[2]
-    return bool(max(abs(off), max(abs(b), abs(c))) <= SAME_PLANE)
+    x, y, z = 0.0, 0.0, 0.0
+    for j in range(QUADRATIC):
+        x, y, z = beyond((x, y, z), basis[j], row_of(middle, j))
+    return x, y, z
 
 
 @lean
@@ -376,22 +291,6 @@ def _add_up(sums: FloatArray, cameras: IntArray, cell: _Cell) -> bool:
         for i in range(_WIDTH):
             sums[i] += cell.terms[at, i]
     return True
-
-
-@lean
-def _set_basis(basis: FloatArray, points: Chosen, i: int, cell: _Cell) -> None:
-    """Write the powers of where a point lies in the cell."""
-    x, y, z = row_of(points.xyz, i)
-    middle, half = row_of(cell.box, 0), row_of(cell.box, 1)
-    u, v = (x - middle[0]) / half[0], (y - middle[1]) / half[1]
-    w = (z - _water_at(cell.water, cell.box, x, y) - middle[2]) / half[2]
-    uu, uv, vv, ww = u * u, u * v, v * v, w * w
-    powers = (
-        1.0, u, v, w, uu, uv, u * w, vv, v * w, ww,
-        uu * u, uu * v, uu * w, uv * v, uv * w, u * ww, vv * v, vv * w, v * ww,
-    )  # fmt: skip
-    for j in range(_CUBIC):
-        basis[j] = powers[j]
 
 
 @lean
@@ -417,7 +316,7 @@ def _lines(
 def _lack2(sums: FloatArray, inverse: FloatArray) -> float:
     """Return how far off (squared, m) the polynomials put the point at the worst corner."""
     most = 0.0
-    for corner in range(_AT_CORNERS):
+    for corner in range(AT_CORNERS):
         off = times(inverse, vector(sums, _LACK + 3 * corner))
         most = max(most, dot(off, off))
     return most

@@ -62,7 +62,7 @@ def on_bed(centre, towards, plane, bed, n):
 def costs_of(p, u, q, cameras, partners, planes, n, metric, made=None):
     """Return for each partner its squared residual, px^2, as a function of the way t beyond p.
 
-    In pixels, or as angles times the focal length as seen from the distance of p.
+    In pixels, or as angles times the focal length as seen from where it is least.
     """
     made = made or cameras
 
@@ -72,8 +72,13 @@ def costs_of(p, u, q, cameras, partners, planes, n, metric, made=None):
         if metric == "pixels":
             return lambda t: float(((pixel(made, j, p + t * u) - there) ** 2).sum())
         ray = way_of(made, j, there)
-        scale = focal**2 / ((p - centre) ** 2).sum()
-        return lambda t: float(scale * (np.cross(p + t * u - centre, ray) ** 2).sum())
+
+        def miss2(t):
+            return float((np.cross(p + t * u - centre, ray) ** 2).sum())
+
+        least = minimize_scalar(miss2, bracket=(-0.5, 0.5), options={"xtol": 1e-11}).x
+        scale = (focal / ((p + least * u - centre) @ ray)) ** 2
+        return lambda t: scale * miss2(t)
 
     return [one(j) for j in partners]
 

@@ -1,0 +1,188 @@
+"""Cells of neighbouring points, in which what is smooth becomes polynomials.
+
+Each has a box: in x and y, and in the height over the water, that is a plane above the cell. Its
+coordinates go from -1 to 1.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from pcfix.kernels import inlined, kernel, lean
+from pcfix.lens.algebra import Vector, row_of
+from pcfix.model import FloatArray, IntArray
+from pcfix.refract.batch import Batch, Chosen
+
+CELLS_A_HEIGHT = 8.0
+LEAST_LENGTH_M = 1e-3
+SAME_PLANE = 1e-6
+"""Metres of height, and of slope."""
+
+
+class Box(NamedTuple):
+    """The box of a cell, for kernels.
+
+    Attributes
+    ----------
+    middle, half : array, shape (3,)
+        In x, y and the height over the water, metres.
+    scale : array, shape (3,)
+        One by `half`.
+    water : array, shape (3,)
+        Height of the water over the middle, world frame, and its slope.
+    """
+
+    middle: FloatArray
+    half: FloatArray
+    scale: FloatArray
+    water: FloatArray
+
+
+def _basis_of(x: FloatArray) -> FloatArray:
+    u, v, w = x.T
+    uu, uv, vv, ww = u * u, u * v, v * v, w * w
+    return np.column_stack(
+        [np.ones(len(x)), u, v, w, uu, uv, u * w, vv, v * w, ww,
+         uu * u, uu * v, uu * w, uv * v, uv * w, u * ww, vv * v, vv * w, v * ww]
+    )  # fmt: skip
+
+
+def _fit_at(basis: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.pinv(basis), np.float64)
+
+
+QUADRATIC, CUBIC = 10, 19
+"""Terms of polynomials; the cubic one has no power of three of the height, that spreads least."""
+
+# Polynomials through these nodes are off most at the corners, where it is asked how much.
+_FOUR, _THREE = np.cos(np.pi / 8.0 * np.arange(1, 8, 2)), np.sqrt(0.75) * np.arange(-1.0, 2.0)
+_CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
+NODES = np.vstack([np.array(list(product(_FOUR, _FOUR, _THREE))), _CORNERS])
+INSIDE, AT_CORNERS = len(NODES) - len(_CORNERS), len(_CORNERS)
+BASIS = _basis_of(NODES)
+FIT_CUBIC = _fit_at(BASIS[:INSIDE])
+FIT_QUADRATIC = _fit_at(BASIS[:INSIDE, :QUADRATIC])
+SOME = np.concatenate([np.arange(0, INSIDE, 5), np.arange(INSIDE, len(NODES))])
+FIT_SOME = _fit_at(BASIS[SOME, :QUADRATIC])
+
+
+def cells_of(batch: Batch) -> tuple[IntArray, IntArray]:
+    """Return the order of the points cell by cell, and the first of each cell.
+
+    Those of a cell with the same cameras come one after the other.
+    """
+    if not len(batch):
+        return np.zeros(0, np.int64), np.zeros(1, np.int64)
+    height = np.median(batch.survey.cameras.centres[:, 2]) - np.median(batch.surface.height_m)
+    # a power of two, so that other chunks have the same cells
+    size = 2.0 ** np.rint(np.log2(max(height, LEAST_LENGTH_M) / CELLS_A_HEIGHT))
+    cell = np.floor(batch.xyz[:, :2] / size).astype(np.int64)
+    cell -= cell.min(axis=0)
+    key = cell[:, 1] * (cell[:, 0].max() + 1) + cell[:, 0]
+    names = np.random.default_rng(0).integers(2**40, size=len(batch.survey.cameras))
+    sums = np.concatenate([[0], np.cumsum(names[batch.rays.camera])])
+    order = np.lexsort((np.diff(sums[batch.rays.start]), key))
+    new = np.flatnonzero(np.diff(key[order])) + 1
+    return order, np.concatenate([[0], new, [len(order)]])
+
+
+@kernel
+def cameras_of(points: Chosen, i: int) -> IntArray:
+    """Return the cameras of a point."""
+    return points.camera[points.start[i] : points.start[i + 1]]
+
+
+@lean
+def are_same(a: IntArray, b: IntArray) -> bool:
+    """Whether two lists of cameras are one."""
+    same = a.size == b.size
+    for j in range(min(a.size, b.size)):
+        same = same and a[j] == b[j]
+    return same
+
+
+@kernel
+def counts_of(rows: IntArray, points: Chosen) -> IntArray:
+    """Return how many of some points each camera sees."""
+    seen = np.zeros(len(points.centres), np.int64)
+    for i in rows:
+        for c in cameras_of(points, i):
+            seen[c] += 1
+    return seen
+
+
+@kernel
+def no_box() -> Box:
+    """Return a box that nothing is in."""
+    return Box(np.zeros(3), np.ones(3), np.ones(3), np.zeros(3))
+
+
+@kernel
+def box_of(rows: IntArray, points: Chosen) -> Box:
+    """Return the box of some points; the water is that of the first of them."""
+    i, low, high = rows[0], np.full(3, np.inf), np.full(3, -np.inf)
+    b, c = points.slope[i, 0], points.slope[i, 1]
+    a = points.height[i] - b * points.xyz[i, 0] - c * points.xyz[i, 1]
+    for j in rows:
+        x, y, z = row_of(points.xyz, j)
+        at = x, y, z - (a + b * x + c * y)
+        for axis in range(3):
+            low[axis], high[axis] = min(low[axis], at[axis]), max(high[axis], at[axis])
+    middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), LEAST_LENGTH_M)
+    return Box(middle, half, 1.0 / half, np.array([a + b * middle[0] + c * middle[1], b, c]))
+
+
+@inlined
+def water_at(box: Box, x: float, y: float) -> float:
+    """Return the height of the water at a place."""
+    return box.water[0] + box.water[1] * (x - box.middle[0]) + box.water[2] * (y - box.middle[1])
+
+
+@lean
+def is_under(points: Chosen, i: int, box: Box) -> bool:
+    """Whether the water over a point is the plane of the cell."""
+    off = points.height[i] - water_at(box, points.xyz[i, 0], points.xyz[i, 1])
+    b, c = points.slope[i, 0] - box.water[1], points.slope[i, 1] - box.water[2]
+    return bool(max(abs(off), max(abs(b), abs(c))) <= SAME_PLANE)
+
+
+@inlined
+def in_box(box: Box, place: Vector) -> Vector:
+    """Return the coordinates of a place of the world."""
+    x, y, z = place
+    return (
+        (x - box.middle[0]) * box.scale[0],
+        (y - box.middle[1]) * box.scale[1],
+        (z - water_at(box, x, y) - box.middle[2]) * box.scale[2],
+    )
+
+
+@inlined
+def set_powers(basis: FloatArray, at: Vector) -> None:
+    """Write the powers of coordinates, one for each term."""
+    u, v, w = at
+    uu, uv, vv, ww = u * u, u * v, v * v, w * w
+    powers = (
+        1.0, u, v, w, uu, uv, u * w, vv, v * w, ww,
+        uu * u, uu * v, uu * w, uv * v, uv * w, u * ww, vv * v, vv * w, v * ww,
+    )  # fmt: skip
+    for j in range(CUBIC):
+        basis[j] = powers[j]
+
+
+@lean
+def fit(terms: FloatArray, by: FloatArray, values: FloatArray) -> None:
+    """Write the polynomials through values at the nodes, shape (nodes, values).
+
+    Term by term: those of all values for the first power, and so on.
+    """
+    many = values.shape[1]
+    for j in range(len(by)):
+        for f in range(many):
+            terms[j * many + f] = 0.0
+        for k in range(INSIDE):
+            for f in range(many):
+                terms[j * many + f] += by[j, k] * values[k, f]
