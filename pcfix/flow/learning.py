@@ -18,7 +18,14 @@ from pcfix.options.correct import ScienceOptions
 from pcfix.options.declare import File
 from pcfix.refract.batch import Batch, Learned, MadeWith, Survey, stacked
 from pcfix.refract.hypotheses import Verdict
-from pcfix.refract.learning import check_method, learn_of_sample, resolved, wants_sample
+from pcfix.refract.learning import (
+    FLAT_DEG,
+    check_method,
+    learn_of_sample,
+    resolved,
+    seen_flat,
+    wants_sample,
+)
 from pcfix.refract.occlusion import Occluder
 from pcfix.refract.regression import (
     LEAST_COUNT,
@@ -29,7 +36,7 @@ from pcfix.refract.regression import (
     fit_depths,
 )
 from pcfix.refract.top_surface import OccluderBuilder, wants_occlusion
-from pcfix.water.surface import SurfaceAbove, surface_above
+from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
 
 class Learning:
@@ -89,7 +96,25 @@ class Learning:
         if wants_sample(self.survey.settings, self._views):
             sample = self._sample(chunks, makers)
             self.survey, self.verdict = learn_of_sample(sample, self._view.points, self._ties())
+            self._note_flat(sample)
         return self.survey
+
+    def _note_flat(self, sample: Batch) -> None:
+        """Say how many points are seen by flat obliques alone, and where."""
+        if self._views is not None:
+            return  # the list says which images saw them
+        wet = sample.take(np.flatnonzero(is_submerged(sample.xyz[:, 2], sample.surface)))
+        wet = replace(wet, survey=self.survey)
+        flat = seen_flat(wet) if len(wet) else np.zeros(0, np.bool_)
+        if flat.sum() <= FLAT_SHARE * len(flat):
+            return
+        low, high = np.percentile(wet.xyz[flat, :2], (2.0, 98.0), axis=0)
+        self.notes.append(
+            f"About {100.0 * flat.mean():.0f} % of the submerged points are seen by flat obliques"
+            f" alone, every ray beyond {FLAT_DEG:g} degrees: nearly all of them between"
+            f" {low[0]:.0f}, {low[1]:.0f} and {high[0]:.0f}, {high[1]:.0f}. Their depths are the"
+            " least certain: trust them less than SigmaZ says, or fly steeper there."
+        )
 
     def _regression(self, chunks: Callable[[], Iterable[Points]]) -> DepthRegression | None:
         path = self._inputs.check_depths
@@ -138,6 +163,9 @@ class Learning:
             done += len(xyz)
         return stacked(taken)
 
+
+FLAT_SHARE = 0.01
+"""Of the submerged points, from which flat obliques alone are worth a word."""
 
 BED_POINTS_A_M2 = 5.0
 FEWEST_BED_POINTS, MOST_BED_POINTS = 125_000, 1_000_000

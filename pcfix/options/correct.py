@@ -89,7 +89,7 @@ class MethodOptions(IndexOptions):
     exact: bool = option(
         False,
         "Solve every point by itself; else --method consistent has that within 0.05 ground pixels,"
-        " from solutions nearby where these are enough.",
+        " but where a choice of images is all but open, from polynomials where these are enough.",
     )
     depth_factor: float | None = option(
         None,

@@ -214,13 +214,21 @@ class Batch:
 
     def incidence_deg(self) -> FloatArray:
         """Return the largest incidence angle in air of each point's rays, shape (m,)."""
-        owner = self.owner
-        to_camera = self.survey.cameras.centres[self.rays.camera] - self.xyz[owner]
-        across = np.einsum("ij,ij->i", self.normals()[owner], to_camera)
-        cosine = across / np.linalg.norm(to_camera, axis=1)
         least = np.ones(len(self.xyz))
-        np.minimum.at(least, owner, cosine)
+        np.minimum.at(least, self.owner, self._cosines())
         return np.degrees(np.arccos(np.clip(least, 0.0, 1.0)))
+
+    def steepest_deg(self) -> FloatArray:
+        """Return the smallest one; 90 where there is no ray."""
+        most = np.zeros(len(self.xyz))
+        np.maximum.at(most, self.owner, self._cosines())
+        return np.degrees(np.arccos(np.clip(most, 0.0, 1.0)))
+
+    def _cosines(self) -> FloatArray:
+        """Return the cosine of the incidence angle of each ray."""
+        to_camera = self.survey.cameras.centres[self.rays.camera] - self.xyz[self.owner]
+        across = np.einsum("ij,ij->i", self.normals()[self.owner], to_camera)
+        return np.asarray(across / np.linalg.norm(to_camera, axis=1))
 
     def camera_used(self, moved: BoolArray) -> BoolArray:
         """Return which cameras give a ray to a point that is moved, shape (k,)."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.model import Cameras, TiePoints, ViewKind
+from pcfix.model import BoolArray, Cameras, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Learned, Survey
 from pcfix.refract.choice import spatial_order
@@ -167,6 +167,16 @@ def _learn_bed(batch: Batch) -> Bed | None:
         table[done : done + len(part), : part.shape[1]] = part
         done += len(part)
     return bed_of(batch.xyz[order], table) if np.isfinite(table).any() else None
+
+
+FLAT_DEG = 35.0
+"""Rays beyond this are those by which methods differ most; see `hypotheses.LIMITS`."""
+
+
+def seen_flat(batch: Batch) -> BoolArray:
+    """Return which points have rays, and those beyond `FLAT_DEG` from the normal alone."""
+    with_views = with_rays(batch)
+    return (with_views.counts > 0) & (with_views.steepest_deg() > FLAT_DEG)
 
 
 def kind_of_views(batch: Batch) -> Verdict | None:

@@ -33,7 +33,10 @@ from pcfix.refract.depth_maps import (
 )
 from pcfix.refract.map_table import LEAST_POINTS, Block, Table, block_of, no_table, reads, table_of
 
-_ROUNDS = 4
+_ROUNDS, _BEDS = 4, 3
+FAR = 0.1
+"""Of the way to the bed: farther off, it is asked anew which depths were averaged."""
+
 LEAST_LIKELY, MOST_LIKELY = 0.7, 2.0
 _OUTSIDE = -2
 
@@ -105,14 +108,19 @@ def _invert_one(
         made = made_up(sight, block, listed[k])
         own[k] = given[k] if given.size else 1.0 / dot(made, made)
     likely, step = likely_bed(sight, block), 0.0
-    depths = Lines(likely * table.likely[0], t, slope)
-    find_lines(depths, maps, sight, block, table, room)
-    for _ in range(_ROUNDS):
-        for q in range(maps.size):
-            room.now[q] = depths.t[q] + depths.slope[q] * step
-        _share(counts, listed, own, room.now, averaged, room.place)
-        step = balance(depths.t, depths.slope, counts)
-    settle_bed(row, maps, counts, depths, sight, block, table, room)
+    bed = likely * table.likely[0]
+    for _ in range(_BEDS):
+        bed += step
+        find_lines(Lines(bed, t, slope), maps, sight, block, table, room)
+        step = 0.0
+        for _ in range(_ROUNDS):
+            for q in range(maps.size):
+                room.now[q] = t[q] + slope[q] * step
+            _share(counts, listed, own, room.now, averaged, room.place)
+            step = balance(t, slope, counts)
+        if not abs(step) > FAR * abs(bed):
+            break
+    settle_bed(row, maps, counts, Lines(bed, t, slope), sight, block, table, room)
     if table.place.size:
         table.likely[0] = min(max(row[2] / likely, LEAST_LIKELY), MOST_LIKELY)
     for q in maps:

@@ -64,6 +64,7 @@ from pcfix.refract.batch import (
     optics_of,
     warn_of_unsolved,
 )
+from pcfix.refract.cells import are_same, cameras_of, cells_of
 from pcfix.refract.choice import cameras_of_pairs
 from pcfix.refract.consistent import check_consistent
 from pcfix.refract.rays import (
@@ -76,6 +77,9 @@ from pcfix.refract.rays import (
 )
 
 MAX_STEPS = 40
+ALIKE = 0.5
+"""Depths between which the start from the point before is not far off."""
+
 CLOSE_M = 1e-6
 """How far from P the median may be; Q is then off by two or three times as much."""
 
@@ -144,7 +148,11 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     used, result = np.zeros(len(batch.rays.camera), np.bool_), np.zeros((len(batch), _WIDTH))
     both = images_of(batch.made_with, cameras)
     optics = optics_of(made)
-    in_tiles(_invert, len(batch), batch.chosen(), optics, both, listed, matched, used, result)
+    order, first = cells_of(batch)
+    in_tiles(
+        _invert, len(first) - 1, (order, first), batch.chosen(), optics, both, (*listed, matched),
+        used, result,
+    )  # fmt: skip
     outcome = result[:, _OUTCOME].astype(np.uint8)
     moved = outcome == Outcome.CORRECTED
     warn_of_unsolved("stereo pairs: no solution", result[moved, _FOUND] > 0.0)
@@ -156,43 +164,62 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
 
 @kernel
 def _invert(
-    span: Span, points: Chosen, optics: Optics, both: Images, listed: tuple[IntArray, IntArray],
-    matched: IntArray, used: BoolArray, result: FloatArray,
+    span: Span, cells: tuple[IntArray, IntArray], points: Chosen, optics: Optics, both: Images,
+    listed: tuple[IntArray, IntArray, IntArray], used: BoolArray, result: FloatArray,
 ) -> None:  # fmt: skip
-    """Correct every point on its own.
+    """Correct the points of each cell.
 
-    Without listed pairs, which are empty then, they are those of `matched`.
+    Without listed pairs, which are empty then, they are those of the images that were matched. A
+    point starts from the one before it, if that has the same cameras.
     """
-    start, images = points.start, _Images(optics, both, points.n)
-    most = most_between(span, start)
+    order, first = cells
+    start, images, matched = points.start, _Images(optics, both, points.n), listed[2]
+    most = most_between((0, len(start) - 1), start)
     most_pairs = most * matched.shape[1]
     if listed[0].size:
-        most_pairs = most_between(span, listed[0]) // 2
+        most_pairs = most_between((0, len(start) - 1), listed[0]) // 2
     rays, place = np.empty((most, _RAY_WIDTH)), np.full(len(points.centres), -1)
     pairs, places = np.empty((most_pairs, 2), np.int64), np.empty((3, most_pairs))
-    room = np.empty(9), np.empty((3, 3))
-    for i in range(*span):
-        cameras = points.camera[start[i] : start[i + 1]]
-        flags, normal = used[start[i] : start[i + 1]], row_of(points.normals, i)
-        for j in range(cameras.size):
-            place[cameras[j]] = j
-            _begin(rays[j], points, i, cameras[j], images)
-        if listed[0].size:
-            entries = listed[1][listed[0][i] : listed[0][i + 1]]
-            count = _listed_pairs(pairs, entries, place)
-        else:
-            count = _matched_pairs(pairs, cameras, matched, place)
-        for c in cameras:
-            place[c] = -1
-        wide = _wide_pairs(pairs[:count], rays, normal)
-        if wide == 0:
-            few = ONE_CAMERA if cameras.size else NO_CAMERA
-            result[i, _OUTCOME] = PARALLEL if count else few
-            continue
-        for p in range(wide):
-            flags[pairs[p, 0]], flags[pairs[p, 1]] = True, True
-        of_pairs = pairs[:wide], places[:, :wide]
-        _solve(result[i], rays, cameras, flags, of_pairs, normal, images, room)
+    room, before = (np.empty(9), np.empty((3, 3))), -1
+    for t in range(*span):
+        before = -1
+        for i in order[first[t] : first[t + 1]]:
+            cameras = points.camera[start[i] : start[i + 1]]
+            flags, normal = used[start[i] : start[i + 1]], row_of(points.normals, i)
+            for j in range(cameras.size):
+                place[cameras[j]] = j
+                _begin(rays[j], points, i, cameras[j], images)
+            if listed[0].size:
+                entries = listed[1][listed[0][i] : listed[0][i + 1]]
+                count = _listed_pairs(pairs, entries, place)
+            else:
+                count = _matched_pairs(pairs, cameras, matched, place)
+            for c in cameras:
+                place[c] = -1
+            wide = _wide_pairs(pairs[:count], rays, normal)
+            if wide == 0:
+                few = ONE_CAMERA if cameras.size else NO_CAMERA
+                result[i, _OUTCOME] = PARALLEL if count else few
+                continue
+            for p in range(wide):
+                flags[pairs[p, 0]], flags[pairs[p, 1]] = True, True
+            near = result[i, :3]
+            near[:] = np.nan
+            if before >= 0 and are_same(cameras, cameras_of(points, before)):
+                _start(near, points, i, before, result[before])
+            of_pairs = pairs[:wide], places[:, :wide]
+            _solve(result[i], rays, cameras, flags, of_pairs, normal, images, room)
+            before = i if result[i, _FOUND] > 0.0 else -1
+
+
+@lean
+def _start(near: FloatArray, points: Chosen, i: int, before: int, found: FloatArray) -> None:
+    """Write where the true point lies if it is as far off by its depth as that of another one."""
+    depth = points.height[i] - points.xyz[i, 2]
+    there = points.height[before] - points.xyz[before, 2]
+    if there > 0.0 and ALIKE * there < depth < there / ALIKE:
+        for axis in range(3):
+            near[axis] = found[axis] * (depth / there)
 
 
 @lean
@@ -278,13 +305,23 @@ def _solve(
     pairs: tuple[IntArray, FloatArray], normal: Vector, images: _Images,
     room: tuple[FloatArray, FloatArray],
 ) -> None:  # fmt: skip
-    """Solve one point and write its row; the pairs come with room for their places."""
+    """Solve one point and write its row; the pairs come with room for their places.
+
+    The row has a start already, or NaN.
+    """
     sums, inverse = room
     fixed, q = _snell(sums, rays, used, normal, images.n)
     if not fixed:
-        out[_OUTCOME] = PARALLEL
+        out[:3], out[_OUTCOME] = 0.0, PARALLEL
         return
-    found, q = _search(q, inverse, rays, cameras, used, pairs, normal, images)
+    found, near = False, vector(out)
+    if near[0] == near[0]:  # B is still that of the point before
+        found, near = _search(near, inverse, rays, cameras, used, pairs, normal, images)
+    if found:
+        q = near
+    else:
+        _as_from_above(inverse, 1.0, images.n)
+        found, q = _search(q, inverse, rays, cameras, used, pairs, normal, images)
     out[0], out[1], out[2] = q
     out[_MISS] = _miss(q, rays, used, normal, images.n)
     out[_OUTCOME], out[_FOUND] = CORRECTED, 1.0 if found else 0.0
@@ -336,11 +373,11 @@ def _search(
 ) -> tuple[bool, Vector]:  # fmt: skip
     """Return whether a Q was found where the median F of the pairs' places is P, and it.
 
-    From the nearest Q so far goes a step s = -B F. Where F comes nearer, by y, the good Broyden
-    update is B + (s - B y) s'B / (s'B y); where it does not, B starts anew, with half the step.
+    From the nearest Q so far goes a step s = -B F, at first with the B that is there. Where F
+    comes nearer, by y, the good Broyden update is B + (s - B y) s'B / (s'B y); where it does not,
+    B starts anew, with half the step.
     """
     q, nearest, at_nearest, best, share = start, start, (0.0, 0.0, 0.0), np.inf, 1.0
-    _as_from_above(inverse, share, images.n)
     for _ in range(MAX_STEPS):
         f = _median_of_pairs(q, rays, cameras, used, pairs, normal, images)
         size = np.sqrt(dot(f, f))
