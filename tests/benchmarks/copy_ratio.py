@@ -5,7 +5,8 @@ Simulates a cloud once (kept in a folder for the next run), then times, in one r
 read-and-write, each as a process of its own. Prints the ratios, the peak memory, and the speed of
 the kernel of ``snell`` in point-camera pairs per second.
 
-    python tests/benchmarks/copy_ratio.py [--points 5000000] [--cameras 200] [--folder DIR]
+    python tests/benchmarks/copy_ratio.py [--points 5000000] [--cameras 200] [--cloud depth-maps]
+        [--folder DIR]
 """
 
 import argparse
@@ -31,9 +32,10 @@ def main():
     arguments = parsed(__doc__)
     folder = arguments.folder
     folder.mkdir(parents=True, exist_ok=True)
-    cloud = folder / f"cloud_{arguments.points}_{arguments.cameras}.laz"
+    kind = f"{arguments.cloud}_{arguments.points}_{arguments.cameras}"
+    cloud = folder / f"cloud_{kind}.laz"
     if not cloud.exists():
-        make(cloud, arguments.points, arguments.cameras)
+        make(cloud, arguments)
     scene = camera_table(cloud)
     copied, corrected = folder / "copy.laz", folder / "corrected.laz"
     words = ["--cameras", scene, "--sensor", folder / "sensor.csv", "--water", "0.37"]
@@ -71,15 +73,18 @@ def parsed(about):
     parser.add_argument("--points", type=int, default=5_000_000)
     parser.add_argument("--cameras", type=int, default=200)
     parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--cloud", choices=["tracks", "depth-maps", "pairs"], default="tracks")
     parser.add_argument(
         "--folder", type=Path, default=Path(tempfile.gettempdir()) / "pcfix-benchmark"
     )
     return parser.parse_args()
 
 
-def make(cloud, points, cameras):
+def make(cloud, arguments):
     """Simulate in a process of its own: what this one holds would count as its children's."""
-    folder, words = cloud.parent, ["--points", points, "--cameras", cameras, "--overwrite"]
+    folder, words = cloud.parent, ["--overwrite"]
+    for name in ("points", "cameras", "cloud"):
+        words += [f"--{name}", getattr(arguments, name)]
     run([sys.executable, "-m", "pcfix", "simulate", folder, *words])
     (folder / "cloud.laz").rename(cloud)
     (folder / "cameras.csv").rename(camera_table(cloud))
