@@ -13,8 +13,8 @@ import numpy as np
 
 from pcfix.kernels import inlined, kernel, lean
 from pcfix.lens.algebra import Vector, row_of
-from pcfix.model import FloatArray, IntArray
-from pcfix.refract.batch import Batch, Chosen
+from pcfix.model import FloatArray, IntArray, WaterMesh, WaterRaster
+from pcfix.refract.batch import Batch, Chosen, Survey
 
 CELLS_A_HEIGHT = 8.0
 LEAST_LENGTH_M = 1e-3
@@ -67,6 +67,16 @@ FIT_CUBIC = _fit_at(BASIS[:INSIDE])
 FIT_QUADRATIC = _fit_at(BASIS[:INSIDE, :QUADRATIC])
 SOME = np.concatenate([np.arange(0, INSIDE, 5), np.arange(INSIDE, len(NODES))])
 FIT_SOME = _fit_at(BASIS[SOME, :QUADRATIC])
+
+
+def is_bent(survey: Survey) -> bool:
+    """Whether rays of one point may pierce the water under different slopes."""
+    return isinstance(survey.water, WaterMesh | WaterRaster)
+
+
+def is_quick(batch: Batch) -> bool:
+    """Whether polynomials may stand for what each point would have to be asked."""
+    return not (batch.survey.settings.exact or is_bent(batch.survey))
 
 
 def cells_of(batch: Batch) -> tuple[IntArray, IntArray]:

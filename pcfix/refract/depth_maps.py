@@ -31,7 +31,7 @@ import numpy as np
 from pcfix.kernels import inlined, kernel, lean
 from pcfix.lens.algebra import Vector, beyond, dot, minus, plus, row_of, scaled, unit
 from pcfix.lens.frames import holds
-from pcfix.model import FloatArray, IntArray, WaterMesh, WaterRaster
+from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import (
     CORRECTED,
     NO_CAMERA,
@@ -55,7 +55,12 @@ NEAR_PX = 2.0
 """Beside a table, which has how the depths change with the bed, in pixels on the ground."""
 
 LIKELY, LEAST_DEPTH_M = 1.1, 0.005
+"""Below the apparent point, in terms of what the index alone would have; depths near nothing."""
+
 RISE, STEEP = 0.1, 0.3
+"""How far away from a bed, relative, the second look goes; by how much more or less than usual a
+depth may change on the way there, before it is taken to be of other images."""
+
 LEAST_CHANGE, MOST_CHANGE = 0.35, 1.5
 """Between these is how much the apparent depth grows with that of the bed along a ray."""
 
@@ -151,13 +156,6 @@ def made_up(sight: Sight, block: Block, c: int) -> Vector:
 def _above(sight: Sight, points: Chosen, c: int) -> float:
     """Return how high the water of an image is over the point."""
     return sight.above + sight.normal[2] * points.offset[c]
-
-
-def is_quick(batch: Batch) -> bool:
-    """Whether polynomials may stand for what each point would have to be asked."""
-    survey = batch.survey
-    bent = isinstance(survey.water, WaterMesh | WaterRaster)
-    return not (survey.settings.exact or bent)
 
 
 def intersection_of(batch: Batch, result: FloatArray) -> Intersection:

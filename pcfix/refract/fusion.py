@@ -23,7 +23,7 @@ from pcfix.kernels import Span, in_tiles, kernel, lean
 from pcfix.lens.algebra import dot
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Batch, Intersection
-from pcfix.refract.cells import are_same, cameras_of, cells_of, counts_of
+from pcfix.refract.cells import are_same, cameras_of, cells_of, counts_of, is_quick
 from pcfix.refract.depth_maps import (
     ABSENT,
     AMBIGUITY,
@@ -34,7 +34,6 @@ from pcfix.refract.depth_maps import (
     Sight,
     find_lines,
     intersection_of,
-    is_quick,
     likely_bed,
     made_up,
     room_for,

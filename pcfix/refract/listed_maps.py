@@ -13,7 +13,7 @@ from pcfix.lens.algebra import dot
 from pcfix.lens.frames import holds
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.refract.batch import Batch, Intersection
-from pcfix.refract.cells import cells_of, counts_of
+from pcfix.refract.cells import cells_of, counts_of, is_quick
 from pcfix.refract.depth_maps import (
     ABSENT,
     AVERAGED_WITHIN,
@@ -24,7 +24,6 @@ from pcfix.refract.depth_maps import (
     balance,
     find_lines,
     intersection_of,
-    is_quick,
     likely_bed,
     made_up,
     room_for,

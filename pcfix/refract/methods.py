@@ -12,9 +12,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from pcfix.model import FloatArray, IntArray, Views, WaterMesh, WaterPlane, WaterRaster
+from pcfix.model import FloatArray, IntArray, Views, WaterPlane
 from pcfix.refract import literature
 from pcfix.refract.batch import Batch, Intersection, Survey
+from pcfix.refract.cells import is_bent, is_quick
 from pcfix.refract.choice import cameras_of_pairs, chosen_views, spatial_order
 from pcfix.refract.consistent import consistent
 from pcfix.refract.fusion import invert_fusion
@@ -88,13 +89,8 @@ def _takes_all_in_frame(batch: Batch) -> bool:
         and survey.settings.max_cameras is None
         and survey.learned.occluder is None
         and survey.learned.matcher is None
-        and not _is_bent(survey)
+        and not is_bent(survey)
     )
-
-
-def _is_bent(survey: Survey) -> bool:
-    """Whether rays of one point may pierce the water under different slopes."""
-    return isinstance(survey.water, WaterMesh | WaterRaster)
 
 
 def shift_of_land(batch: Batch) -> FloatArray:
@@ -141,7 +137,7 @@ def _method(batch: Batch) -> Method:
         return invert_fusion
     if settings.method == "consistent" and kind in _OF_MATCHERS:
         return _OF_MATCHERS[kind]
-    if settings.method == "consistent" and not (settings.exact or _is_bent(batch.survey)):
+    if settings.method == "consistent" and is_quick(batch):
         return consistent_in_cells
     return METHODS[settings.method]
 
