@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from itertools import repeat
 
 import numpy as np
 
-from pcfix.errors import GeometryError, SettingError
+from pcfix.errors import GeometryError, PcfixWarning, SettingError
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.surfaces import CloudView, Points, parts_of
 from pcfix.io.tables import CheckDepths, read_check_depths
@@ -17,7 +19,7 @@ from pcfix.model import NOISE_CLASSES, BoolArray, FloatArray, IntArray, TiePoint
 from pcfix.options.correct import ScienceOptions
 from pcfix.options.declare import File
 from pcfix.refract.batch import Batch, Learned, MadeWith, Survey, stacked
-from pcfix.refract.hypotheses import Verdict
+from pcfix.refract.hypotheses import Verdict, hint_of
 from pcfix.refract.learning import (
     FLAT_DEG,
     check_method,
@@ -69,10 +71,10 @@ class Learning:
         views: ViewKind | None,
         ties: Callable[[], TiePoints | None] | None = None,
     ) -> None:
-        self._ties = ties or (lambda: inputs.tie_points(view.crs))
+        self._ties = ties or partial(_ties_of, inputs, view)
         self._inputs, self._view, self._views = inputs, view, views
         self.notes: list[str] = []
-        self.verdict: Verdict | None = None
+        self.verdicts: tuple[Verdict, ...] = ()
         settings = resolved(survey.settings, survey.cameras, views)
         self.survey = replace(survey, settings=settings)
         check_method(settings, survey.cameras)
@@ -93,9 +95,12 @@ class Learning:
         """
         learned = Learned(regression=self._regression(chunks), occluder=self._occluder(chunks))
         self.survey = replace(self.survey, learned=learned)
-        if wants_sample(self.survey.settings, self._views):
+        if wants_sample(self.survey.settings, self.survey.cameras, self._views):
             sample = self._sample(chunks, makers)
-            self.survey, self.verdict = learn_of_sample(sample, self._view.points, self._ties())
+            hint = hint_of((self._view.software, self.survey.cameras.source))
+            self.survey, self.verdicts = learn_of_sample(
+                sample, self._view.points, self._ties(), hint
+            )
             self._note_flat(sample)
         return self.survey
 
@@ -162,6 +167,13 @@ class Learning:
             taken.append(Batch(xyz[rows], above, survey, made_with=of_rows))
             done += len(xyz)
         return stacked(taken)
+
+
+def _ties_of(inputs: Inputs, view: CloudView) -> TiePoints | None:
+    """Return the tie points of the camera file; what it warns of was said with its cameras."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PcfixWarning)
+        return inputs.tie_points(view.crs)
 
 
 FLAT_SHARE = 0.01

@@ -59,6 +59,8 @@ class CloudView:
     points : int
     chunks : callable
         Returns the points, `Seen` after `Seen`.
+    software : str
+        What the file says that it was made with.
     """
 
     name: str
@@ -67,6 +69,7 @@ class CloudView:
     high: FloatArray
     points: int
     chunks: Callable[[], Iterator[Seen]]
+    software: str = ""
 
 
 def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -81,6 +84,7 @@ def view_of(path: Path, jobs: int | None = None) -> CloudView:
     with LasSource(path, jobs) as source:
         crs, points = metric_crs(source), len(source)
         low, high = np.array(source.header.mins[:2]), np.array(source.header.maxs[:2])
+        software = str(source.header.generating_software or "")
 
     def chunks() -> Iterator[Seen]:
         with LasSource(path, jobs) as source:
@@ -92,7 +96,7 @@ def view_of(path: Path, jobs: int | None = None) -> CloudView:
                 classes, returns = chunk["classification"], chunk["number_of_returns"]
                 yield Seen(coordinates(chunk), rgb, np.asarray(classes), np.asarray(returns))
 
-    return CloudView(str(path), crs, low, high, points, chunks)
+    return CloudView(str(path), crs, low, high, points, chunks, software)
 
 
 def file_points(

@@ -30,7 +30,7 @@ from pcfix.model import (
 from pcfix.options.correct import CorrectOptions
 from pcfix.refract.batch import Batch, Intersection, MadeWith, Survey
 from pcfix.refract.hypotheses import Verdict
-from pcfix.refract.learning import kind_of_views
+from pcfix.refract.learning import as_told, weigh_lists
 from pcfix.refract.methods import correct, shift_of_land
 from pcfix.refract.tally import Tally
 from pcfix.water.checks import WaterMeeting, check_above_water, check_tilt, refuse_under_water
@@ -75,7 +75,7 @@ class ThroughWater:
         )  # fmt: skip
         self.survey = self._learning.survey
         self._kind: ViewKind | None = None
-        self.verdict: Verdict | None = None
+        self.verdicts: tuple[Verdict, ...] = ()
         self._bent = ""
         self.restart()
 
@@ -98,7 +98,7 @@ class ThroughWater:
                 lambda: parts_of(around(), self.water), self._view.low, self._view.high
             )
         self.survey = self._learning.of_cloud(around, makers)
-        self.verdict = self._learning.verdict
+        self.verdicts = self._learning.verdicts
 
     @staticmethod
     def _carried(
@@ -142,18 +142,17 @@ class ThroughWater:
 
     def _of_kind(self, batch: Batch) -> Batch:
         """Return a chunk with its views as what they are; the first one tells what they list."""
-        if batch.views is None or self.survey.learned.matcher is None:
-            return batch
-        if self._inputs.views_are != "auto":
+        if batch.views is None:
             return batch
         if self._kind is None:
-            rows = np.flatnonzero(is_submerged(batch.xyz[:, 2], batch.surface))
-            self.verdict = kind_of_views(batch.take(rows))
             self._kind = batch.views.kind
-            if self.verdict is not None:
-                self._kind = self.verdict.chosen.kind or self._kind
-                learned = self.survey.learned._replace(doubt=self.verdict.doubt)
-                self.survey = replace(self.survey, learned=learned)
+            is_open = self._inputs.views_are == "auto" and self._kind == "depth-maps"
+            rows = np.flatnonzero(is_submerged(batch.xyz[:, 2], batch.surface))
+            verdict = weigh_lists(batch.take(rows), is_open=is_open)
+            if verdict is not None:
+                self.verdicts = (verdict,)
+                self._kind = verdict.chosen.kind or self._kind
+                self.survey = as_told(self.survey, verdict)
         return replace(batch, survey=self.survey, views=replace(batch.views, kind=self._kind))
 
     def _level_sigma_m(self, xy: FloatArray) -> FloatArray | None:
@@ -169,9 +168,9 @@ class ThroughWater:
     @property
     def made(self) -> dict[str, Any] | None:
         """What the cloud was taken for, and why, where the options leave it open."""
-        settings, verdict, views = self.survey.settings, self.verdict, self._listed
-        if verdict is not None:
-            because = str(verdict)
+        settings, views = self.survey.settings, self._listed
+        if self.verdicts:
+            because = " ".join(str(one) for one in self.verdicts)
         elif self._options.method != "auto":
             return None
         elif settings.method == "snell":
@@ -186,7 +185,7 @@ class ThroughWater:
             "matcher": settings.matcher,
             "views_are": self._kind or views,
             "because": because,
-            **({} if verdict is None else verdict.as_dict()),
+            **(self.verdicts[-1].as_dict() if self.verdicts else {}),
         }
 
     def provenance(self) -> dict[str, Any]:
@@ -233,7 +232,7 @@ class ThroughWater:
         bent = [self._bent] if self._bent else []
         return [
             *self._learning.notes,
-            *([str(self.verdict)] if self.verdict is not None and not self.verdict.is_sure else []),
+            *(note for one in self.verdicts for note in one.warnings()),
             *self.found.notes,
             *self._meeting.notes,
             *bent,

@@ -67,10 +67,13 @@ class Doubt(NamedTuple):
         Of neighbours about a smooth bed, beyond what the budget explains: mismatches.
     per_depth : float
         Standard deviation, relative to the depth, by what is not known of how the cloud was made.
+    formal_m : float
+        What the budget itself comes to, in the median, metres.
     """
 
     scatter_m: float
     per_depth: float
+    formal_m: float = 0.0
 
 
 class MadeWith(NamedTuple):

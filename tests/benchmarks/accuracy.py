@@ -2,11 +2,11 @@
 
     python tests/benchmarks/accuracy.py
 
-Simulated scenes (`accuracy_scenes.SETTINGS`) and, where the folder ``rendered_a`` of the shared
-test data is (environment variable PCFIX_SHARED), the cloud that COLMAP and OpenMVS made of
-rendered images. All numbers are over the same points of a scene, those under more than 0.2 m of
-water, in ground sampling distances; XY bias is the length of the mean error in plan. Points that
-a method left uncorrected are not in its row; "done" is the share of the others.
+Simulated scenes (`accuracy_scenes.SETTINGS`) and, of the shared test data (environment variable
+PCFIX_SHARED), the clouds that COLMAP and OpenMVS made of rendered images (``rendered_a``, ``_c``).
+All numbers are over the same points of a scene, those under more than 0.2 m of water, in ground
+sampling distances; XY bias is the length of the mean error in plan. Points that a method left
+uncorrected are not in its row; "done" is the share of the others.
 
 Cameras: "views" are those that made the point, as the software's list has them; "pairs" the
 stereo pairs, which for all but `consistent` are the same cameras; "mvs" a model of dense matching,

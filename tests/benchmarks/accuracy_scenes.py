@@ -1,4 +1,4 @@
-"""The scenes of `accuracy.py`: simulated blocks, and a rendered one that real software matched."""
+"""The scenes of `accuracy.py`: simulated blocks, and rendered ones that real software matched."""
 
 from __future__ import annotations
 
@@ -29,8 +29,9 @@ SETTINGS = {
     "depth-maps": {**SHORE, "cloud": "depth-maps"},
 }
 """Names of `pcfix.simulate.settings.SceneSettings`; the rest is its default."""
-REAL = "rendered"
-NAMES = (*SETTINGS, REAL)
+REAL = ("rendered_a", "rendered_c")
+"""Clouds that COLMAP and OpenMVS made of rendered images, of the shared test data."""
+NAMES = (*SETTINGS, *REAL)
 BY_FRAME = {"mvs": {"camera_set": "mvs"}, "all": {"camera_set": "all"}}
 """What can be known without a list."""
 
@@ -76,7 +77,7 @@ class Case:
 
 def make(name: str, points: int, seed: int) -> Case | None:
     """Return the scene of a name; None where its data are not there."""
-    return rendered(points) if name == REAL else simulated(name, points, seed)
+    return rendered(name, points) if name in REAL else simulated(name, points, seed)
 
 
 def simulated(name: str, points: int, seed: int) -> Case:
@@ -132,9 +133,9 @@ def _floor(scene: Any, measured: np.ndarray, seed: int) -> np.ndarray:
     return again - truth
 
 
-def rendered(points: int) -> Case | None:
+def rendered(name: str, points: int) -> Case | None:
     """Return the cloud that OpenMVS made of rendered images, about so many points of it."""
-    folder, _ = needs("rendered_a")
+    folder, _ = needs(name)
     if not folder.exists():
         return None
     xyz, views, cameras = _rendered_cloud(folder, points)
@@ -147,7 +148,7 @@ def rendered(points: int) -> Case | None:
         return np.column_stack([unknown, unknown, found[:, 2] - height(found)])
 
     return Case(
-        name=REAL,
+        name=name,
         words=f"{len(xyz):,} points, {len(cameras)} rendered images, COLMAP and OpenMVS",
         xyz=xyz,
         cameras=cameras,

@@ -10,9 +10,9 @@ from pcfix.io.views import ViewMatch, read_views
 from pcfix.model import Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
-from pcfix.refract.hypotheses import FEWEST_POINTS
-from pcfix.refract.learning import kind_of_views
+from pcfix.refract.learning import weigh_lists
 from pcfix.refract.matcher import matcher_of
+from pcfix.refract.patches import FEWEST_POINTS
 from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
@@ -26,7 +26,8 @@ def kind_of(xyz, cameras, water, views, n=1.34):
     settings = ScienceOptions(method="consistent", index=n, dimensions="none")
     learned = Learned(matcher=matcher_of(cameras, xyz))
     above = surface_above(water, xyz)
-    return kind_of_views(batch_of(xyz, above, water, cameras, settings, views, learned=learned))
+    batch = batch_of(xyz, above, water, cameras, settings, views, learned=learned)
+    return weigh_lists(batch, is_open=True)
 
 
 def under_water(cloud, points=1200, **settings):

@@ -9,8 +9,9 @@ import pcfix
 from pcfix.model import Cameras, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey
-from pcfix.refract.hypotheses import FEWEST_WITHOUT_LIST, IN_FRAME, hypotheses_of
+from pcfix.refract.hypotheses import IN_FRAME, hypotheses_of
 from pcfix.refract.learning import learn_of_sample
+from pcfix.refract.patches import FEWEST_WITHOUT_LIST
 from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
 from tests.utils.nightly import mostly_nightly
@@ -22,8 +23,8 @@ AUTO = ScienceOptions(method="auto", index=1.34)
 
 def told(xyz, cameras, water, settings=AUTO):
     batch = Batch(xyz, surface_above(water, xyz), Survey(water, cameras, settings))
-    survey, verdict = learn_of_sample(batch, len(xyz))
-    return survey.settings, verdict
+    survey, verdicts = learn_of_sample(batch, len(xyz))
+    return survey.settings, verdicts[0] if verdicts else None
 
 
 # two of them have the same bed and block: what differs is the software

@@ -1,0 +1,200 @@
+"""Patches of neighbours, and what is left of the steps between them in a bed.
+
+The same apparent points are corrected as different software would have made them. Where the images
+that see a point change, two such corrections differ by a step. Of the right one the bed has no step
+there; of the wrong one it has just the step by which the two differ.
+
+So from patches of neighbours, with r_a and r_b what is left of the heights of either correction
+after a smooth surface (a quadratic one) is taken out, and d = r_a - r_b, comes the share of d that
+is in r_a,
+
+    beta = sum(w r_a d) / sum(w d d),
+
+near 0 if a is right and near 1 if b is. The weights are one over the square of the scatter of the
+apparent patch. Noise of the points is in r_a and r_b by the factors by which either makes depths
+larger; that part of d is taken out first, as it tells nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.refract.batch import Batch
+
+PATCHES, PATCH_POINTS, FEWEST_POINTS = 500, 16, 400
+FEWEST_WITHOUT_LIST = 2000
+"""Fewer are tie points, and their patches overlap."""
+
+WIDEST_PATCH = 0.055
+PATCH_WIDTH = 0.04
+"""Of a patch, in flying heights: wide enough for borders of images to cross many of them. Where the
+points are so sparse that patches are wider than the widest, relief drowns the steps of images."""
+
+DENSE_GSD = 8.0
+"""Points of dense matching are nearer to each other than this, those of tracks are not."""
+
+GRID_SHARE = 0.9
+"""Of neighbours that lie whole steps of a grid apart, from which a cloud is a grid."""
+
+SMOOTH_GSD = 0.02
+"""Scatter of neighbours below which a cloud was made smooth: image noise leaves ten times that."""
+
+_TERMS = 6
+
+
+class Patches(NamedTuple):
+    """Groups of neighbours among points of a cloud.
+
+    Attributes
+    ----------
+    rows : array, shape (m,)
+        The points that are of a patch, rows of a batch.
+    place : array, shape (p, 16)
+        Rows of `rows`, patch by patch.
+    step : int
+        Every so many points of the batch were taken.
+    """
+
+    rows: IntArray
+    place: IntArray
+    step: int
+
+
+def patches_of(batch: Batch) -> Patches | None:
+    """Return patches of neighbours; None where there are too few points, or too sparse ones."""
+    from scipy.spatial import cKDTree
+
+    usable, fewest = np.arange(len(batch)), FEWEST_WITHOUT_LIST
+    if batch.views is not None:
+        usable, fewest = np.flatnonzero(np.diff(batch.views.start) >= 2), FEWEST_POINTS
+    if len(usable) < fewest:
+        return None
+    width_m = PATCH_WIDTH * flying_height_m(batch)
+    # so dense that a patch is as wide as the images' borders are far apart
+    extent = np.maximum(np.ptp(batch.xyz[usable, :2], axis=0), width_m)
+    wanted = max(FEWEST_POINTS, PATCH_POINTS * float(extent.prod()) / width_m**2)
+    step = max(1, int(len(usable) / wanted))
+    usable = usable[::step]
+    xy = batch.xyz[usable, :2]
+    seeds = np.unique(np.linspace(0, len(xy) - 1, PATCHES).astype(int))
+    tree = cKDTree(xy, balanced_tree=False, compact_nodes=False)
+    patch = usable[tree.query(xy[seeds], k=PATCH_POINTS)[1]]
+    across = np.ptp(batch.xyz[patch, :2], axis=1).prod(axis=1)
+    is_wide = math.sqrt(np.median(across)) * PATCH_WIDTH > WIDEST_PATCH * width_m
+    if batch.views is None and is_wide:
+        return None
+    rows, place = np.unique(patch, return_inverse=True)
+    return Patches(rows, place.reshape(patch.shape), step)
+
+
+def others_around(batch: Batch, rows: IntArray) -> Batch:
+    """Return other points around some, as near as there are."""
+    from scipy.spatial import cKDTree
+
+    others = np.setdiff1d(np.arange(len(batch)), rows, assume_unique=True)
+    if batch.views is not None or len(others) < PATCH_POINTS:
+        return batch.take(rows)
+    tree = cKDTree(batch.xyz[others, :2], balanced_tree=False, compact_nodes=False)
+    near = tree.query(batch.xyz[rows[::4], :2], k=PATCH_POINTS)[1]
+    return batch.take(others[np.unique(near)])
+
+
+def flying_height_m(batch: Batch) -> float:
+    """Return the height of the cameras above the water, in the median."""
+    return float(np.median(batch.survey.cameras.centres[:, 2]) - batch.surface.height_m.mean())
+
+
+def gsd_m(batch: Batch) -> float:
+    """Return the ground size of a pixel straight below, metres."""
+    lenses = batch.survey.cameras.lenses or ()
+    return flying_height_m(batch) / float(np.median([lens.focal_px for lens in lenses]))
+
+
+def shares(part: Batch, place: IntArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return beta of each way a against each b, and its standard error, shapes (h, h).
+
+    Parameters
+    ----------
+    part : Batch
+        The m points of the patches.
+    place : array, shape (p, 16)
+    z : array, shape (h, m)
+        Heights as each way corrects them, metres.
+    """
+    h = len(z)
+    beta, sigma = np.full((2, h, h), np.nan)
+    smooth = _smooth(part.xyz[place])
+    level, apparent = part.surface.height_m[place], part.xyz[place, 2]
+    noise = _rest(smooth, apparent)
+    spread = np.sqrt((noise**2).mean(axis=1))
+    weight = 1.0 / np.maximum(spread, max(float(np.median(spread)), 1e-6)) ** 2
+    depth = np.maximum((level - apparent).mean(axis=1), 1e-6)
+    rest = [_rest(smooth, one[place]) for one in z]
+    gain = [(level - one[place]).mean(axis=1) / depth for one in z]
+    for a in range(h):
+        for b in range(h):
+            if a == b:
+                continue
+            d = rest[a] - rest[b] - (gain[a] - gain[b])[:, None] * noise
+            inner, square = weight * (rest[a] * d).sum(axis=1), weight * (d * d).sum(axis=1)
+            total = max(float(square.sum()), 1e-12)
+            beta[a, b] = inner.sum() / total
+            sigma[a, b] = np.sqrt(((inner - beta[a, b] * square) ** 2).sum()) / total
+    return beta, sigma
+
+
+def scatter_m(part: Batch, place: IntArray, z: FloatArray) -> float:
+    """Return the scatter of neighbours about a smooth surface, standard deviation, metres."""
+    rest = _rest(_smooth(part.xyz[place]), z[place])
+    return math.sqrt(float(np.nanmedian((rest**2).sum(axis=1) / (PATCH_POINTS - _TERMS))))
+
+
+def _smooth(patch: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of quadratic surfaces over patches, (p, k, 3), as (p, k, 6)."""
+    across = patch[..., :2] - patch[..., :2].mean(axis=1, keepdims=True)
+    x, y = np.moveaxis(across / (np.abs(across).max(axis=(1, 2), keepdims=True) + 1e-9), -1, 0)
+    columns = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    return np.asarray(np.linalg.qr(columns)[0])
+
+
+def _rest(smooth: FloatArray, z: FloatArray) -> FloatArray:
+    """Return what is left of heights, (p, k), without the nearest smooth surface."""
+    return z - np.einsum("pki,pi->pk", smooth, np.einsum("pki,pk->pi", smooth, z))
+
+
+def is_dense(part: Batch, place: IntArray, step: float) -> bool:
+    """Whether neighbouring points of the cloud are as near to each other as dense matching is.
+
+    `step` says how many points of the cloud there are for each of these.
+    """
+    extent = np.ptp(part.xyz[place, :2], axis=1).prod(axis=1)
+    spacing_m = math.sqrt(float(np.median(extent)) / PATCH_POINTS / step)
+    return spacing_m < DENSE_GSD * gsd_m(part)
+
+
+def grid_m(xyz: FloatArray) -> float | None:
+    """Return the step of the grid that points, shape (m, 3), lie on; None if they lie on none.
+
+    Where coordinates are rounded as coarsely as the points are dense, that is no grid.
+    """
+    steps = []
+    for axis in (0, 1):
+        values = np.unique(np.round(xyz[:, axis], 4))
+        if len(values) < 10 or len(values) > len(xyz) / 4:
+            return None
+        gap = np.diff(values)
+        step = float(np.median(gap))
+        whole = np.abs(gap / step - np.rint(gap / step)) < 0.02
+        if not whole.mean() > GRID_SHARE:
+            return None
+        steps.append(step)
+    return float(np.mean(steps))
+
+
+def is_smooth(part: Batch, place: IntArray) -> BoolArray | bool:
+    """Whether neighbours scatter less than images can tell: of a mesh, or filtered."""
+    return scatter_m(part, place, part.xyz[:, 2]) < SMOOTH_GSD * gsd_m(part)
