@@ -214,7 +214,8 @@ def _chunks(ins: Dimensions, water: WaterSurface, flags: Flags) -> Iterator[tupl
     for rows in _slices(len(ins["X"])):
         xyz = checked_points(np.column_stack([ins[axis][rows] for axis in "XYZ"]))
         heights = dimension(ins, water.name)[rows] if isinstance(water, WaterDimension) else None
-        yield rows, (xyz, heights, flags.classes[rows])
+        sources = ins["PointSourceId"][rows] if "PointSourceId" in ins else None
+        yield rows, Points(xyz, heights, flags.classes[rows], sources)
 
 
 def _view(ins: Dimensions, metadata: dict[str, Any] | None, flags: Flags) -> CloudView:

@@ -202,7 +202,7 @@ def _sample(
     """Return points evenly spread over the file, and their water heights where there are any."""
     every = max(1, view.points // most)
     parts, heights = [], []
-    for xyz, height, _ in file_points(Path(view.name), water):
+    for xyz, height, *_ in file_points(Path(view.name), water):
         parts.append(xyz[::every])
         if height is not None:
             heights.append(height[::every])

@@ -132,7 +132,7 @@ class Cleaning(Step):
 
     def _read(self, points: Chunk, source: LasSource, rows: slice, names: set[str]) -> None:
         """Read coordinates and masks, and flag weak intersections on the way."""
-        cloud, (xyz, heights, classes) = self.cloud, points_of(points, source, self._water)
+        cloud, (xyz, heights, classes, _) = self.cloud, points_of(points, source, self._water)
         withheld = np.asarray(points["withheld"]).astype(np.bool_)
         used = ~(withheld | np.isin(classes, NOISE_CLASSES))
         rays, miss, incidence = (

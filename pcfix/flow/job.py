@@ -75,7 +75,7 @@ class Job:
 
     def correct(self, points: Points) -> Correction:
         """Correct one chunk."""
-        views = self.views.of(points[0], self.tally.points)
+        views = self.views.of(points.xyz, self.tally.points)
         correction = self.medium.correct(points, views, self.labelling)
         self.tally.add(correction.apparent_xyz, correction)
         return correction

@@ -18,15 +18,19 @@ from pcfix.label.labelling import Part
 from pcfix.model import NOISE_CLASSES, BoolArray, FloatArray, IntArray, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
 from pcfix.options.declare import File
-from pcfix.refract.batch import Batch, Learned, MadeWith, Survey, stacked
+from pcfix.refract.batch import UNLISTED, Batch, Learned, MadeWith, Survey, stacked
 from pcfix.refract.hypotheses import Verdict, hint_of
 from pcfix.refract.learning import (
+    CORRECTED_RATIO,
     FLAT_DEG,
     check_method,
+    depth_ratio,
     learn_of_sample,
+    learn_of_unlisted,
     resolved,
     seen_flat,
     wants_sample,
+    with_matcher,
 )
 from pcfix.refract.occlusion import Occluder
 from pcfix.refract.regression import (
@@ -75,6 +79,8 @@ class Learning:
         self._inputs, self._view, self._views = inputs, view, views
         self.notes: list[str] = []
         self.verdicts: tuple[Verdict, ...] = ()
+        self.of_unlisted: tuple[Verdict, ...] = ()
+        self._given = survey.settings
         settings = resolved(survey.settings, survey.cameras, views)
         self.survey = replace(survey, settings=settings)
         check_method(settings, survey.cameras)
@@ -88,26 +94,46 @@ class Learning:
         self,
         chunks: Callable[[], Iterable[Points]],
         makers: Callable[[], Iterable[MadeWith]] | None = None,
+        *,
+        all_listed: bool = True,
     ) -> Survey:
         """Return the survey with what is learned of the whole cloud; its chunks may be asked again.
 
-        And, chunk by chunk, what made the points, where that are not these cameras.
+        And, chunk by chunk, what made the points, where that are not these cameras. Where not
+        all points are listed, the others are corrected as without a list.
         """
         learned = Learned(regression=self._regression(chunks), occluder=self._occluder(chunks))
         self.survey = replace(self.survey, learned=learned)
-        if wants_sample(self.survey.settings, self.survey.cameras, self._views):
-            sample = self._sample(chunks, makers)
-            hint = hint_of((self._view.software, self.survey.cameras.source))
-            self.survey, self.verdicts = learn_of_sample(
-                sample, self._view.points, self._ties(), hint
-            )
+        settings, cameras = self.survey.settings, self.survey.cameras
+        some_listed = self._views is not None and not all_listed
+        if not (some_listed or wants_sample(settings, cameras, self._views)):
+            return self.survey
+        sample, ties = self._sample(chunks, makers), self._ties()
+        self._note_corrected(sample, ties)
+        points, hint = self._view.points, hint_of((self._view.software, cameras.source))
+        if self._views is None:
+            self.survey, self.verdicts = learn_of_sample(sample, points, ties, hint)
             self._note_flat(sample)
+            return self.survey
+        self.survey = with_matcher(sample, ties)
+        if some_listed:
+            bare = replace(sample, survey=replace(sample.survey, settings=self._given))
+            unlisted, self.of_unlisted = learn_of_unlisted(bare, points, ties, hint)
+            self.survey = replace(self.survey, parts={UNLISTED: unlisted})
         return self.survey
+
+    def _note_corrected(self, sample: Batch, ties: TiePoints | None) -> None:
+        """Say so where the cloud is deeper than tie points of the same cameras."""
+        wet = sample.take(np.flatnonzero(is_submerged(sample.xyz[:, 2], sample.surface)))
+        ratio = None if ties is None else depth_ratio(wet, ties)
+        if ratio is not None and ratio > CORRECTED_RATIO:
+            self.notes.append(
+                f"The cloud lies {ratio:.2f} times as deep as the tie points of its cameras: it"
+                " looks as if it had been corrected before; give the cloud as the matcher wrote it."
+            )
 
     def _note_flat(self, sample: Batch) -> None:
         """Say how many points are seen by flat obliques alone, and where."""
-        if self._views is not None:
-            return  # the list says which images saw them
         wet = sample.take(np.flatnonzero(is_submerged(sample.xyz[:, 2], sample.surface)))
         wet = replace(wet, survey=self.survey)
         flat = seen_flat(wet) if len(wet) else np.zeros(0, np.bool_)
@@ -120,6 +146,13 @@ class Learning:
             f" {low[0]:.0f}, {low[1]:.0f} and {high[0]:.0f}, {high[1]:.0f}. Their depths are the"
             " least certain; images from above would tell more of them."
         )
+
+    def of_unlisted_notes(self) -> list[str]:
+        """Return what is said of points in no list."""
+        if UNLISTED not in self.survey.parts:
+            return []
+        so = " ".join(str(one) for one in self.of_unlisted)
+        return [f"The list is of a part of the cloud: the rest is corrected as without one. {so}"]
 
     def _regression(self, chunks: Callable[[], Iterable[Points]]) -> DepthRegression | None:
         path = self._inputs.check_depths
@@ -140,8 +173,8 @@ class Learning:
         if listed or not wants_occlusion(self.survey.cameras, self.survey.settings):
             return None  # listed cameras did see their points
         builder = OccluderBuilder(self._view.low, self._view.high, self._view.points)
-        for xyz, _, classes in chunks():
-            builder.add(xyz, classes)
+        for points in chunks():
+            builder.add(points.xyz, points.classes)
         return builder.build()
 
     def _sample(
@@ -157,14 +190,15 @@ class Learning:
         survey, taken = self.survey, list[Batch]()
         done = 0
         of_chunks = repeat(None) if makers is None else makers()
-        for (xyz, heights, classes), made_with in zip(chunks(), of_chunks, strict=False):
+        for (xyz, heights, classes, sources), made_with in zip(chunks(), of_chunks, strict=False):
             rows = np.arange(-done % step, len(xyz), step)
             rows = rows[~np.isin(classes[rows], NOISE_CLASSES)]
             above = surface_above(
                 survey.water, xyz[rows], None if heights is None else heights[rows]
             )
             of_rows = None if made_with is None else made_with.take(rows)
-            taken.append(Batch(xyz[rows], above, survey, made_with=of_rows))
+            source = None if sources is None else sources[rows]
+            taken.append(Batch(xyz[rows], above, survey, made_with=of_rows, source=source))
             done += len(xyz)
         return stacked(taken)
 

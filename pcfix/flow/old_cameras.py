@@ -177,7 +177,7 @@ class ListedViews:
     def __init__(
         self, views: ViewList | None, cameras: Cameras, points: int, step_m: float
     ) -> None:
-        self.list = views
+        self.list, self._points = views, points
         self._anew: Callable[[], ViewMatch | None] = lambda: (
             None if views is None else ViewMatch(views, cameras, points=points, step_m=step_m)
         )
@@ -195,6 +195,13 @@ class ListedViews:
     def of(self, xyz: FloatArray, row: int) -> Views | None:
         """Return the views of a chunk, shape (n, 3), that begins at a row."""
         return None if self._match is None else self._match.for_chunk(xyz, row)
+
+    @property
+    def are_all(self) -> bool:
+        """Whether every point of the cloud can have a list."""
+        return self.list is None or (
+            len(self.list) >= self._points and bool((np.diff(self.list.raw.start) > 0).all())
+        )
 
     @property
     def report(self) -> ViewReport | None:

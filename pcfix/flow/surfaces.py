@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,7 @@ from pcfix.flow.runner import Chunk
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.water import read_water
 from pcfix.label.labelling import Part
-from pcfix.model import FloatArray, WaterDimension, WaterSurface
+from pcfix.model import FloatArray, IntArray, WaterDimension, WaterSurface
 from pcfix.options.declare import File
 from pcfix.options.shared import WaterOptions
 from pcfix.water.fit import WaterFit
@@ -27,7 +27,27 @@ from pcfix.water.surface import FoundSurface, surface_above
 if TYPE_CHECKING:
     from pyproj import CRS
 
-Points: TypeAlias = tuple[FloatArray, FloatArray | None, npt.NDArray[np.uint8]]
+
+class Points(NamedTuple):
+    """Points of a chunk.
+
+    Attributes
+    ----------
+    xyz : array, shape (n, 3)
+        World frame, metres.
+    heights : array, shape (n,), or None
+        Of the water above each, where a dimension has it.
+    classes : array of uint8, shape (n,)
+    sources : array of int, shape (n,), or None
+        The point source of each, where the cloud has it: which of several clouds it came from.
+    """
+
+    xyz: FloatArray
+    heights: FloatArray | None
+    classes: npt.NDArray[np.uint8]
+    sources: IntArray | None = None
+
+
 """Some points: coordinates (n, 3), water heights where those are a dimension, classes."""
 
 SAMPLE_POINTS = 2_000_000
@@ -113,13 +133,14 @@ def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Po
     heights = None
     if isinstance(water, WaterDimension):
         heights = source.dimension(chunk, water.name)
-    return coordinates(chunk), heights, np.asarray(chunk["classification"])
+    classes = np.asarray(chunk["classification"])
+    return Points(coordinates(chunk), heights, classes, np.asarray(chunk["point_source_id"]))
 
 
 def parts_of(chunks: Iterable[Points], water: WaterSurface) -> Iterable[Part]:
     """Return chunks with the water above them."""
     return (
-        Part(xyz, surface_above(water, xyz, heights), classes) for xyz, heights, classes in chunks
+        Part(one.xyz, surface_above(water, one.xyz, one.heights), one.classes) for one in chunks
     )
 
 

@@ -85,7 +85,7 @@ class ThroughPort:
 
     def correct(self, points: Points, views: Views | None, labelling: Labelling) -> Correction:
         """Correct one chunk; see `pcfix.flow.job.Job.correct`."""
-        xyz, _, classes = points
+        xyz, classes = points.xyz, points.classes
         n = len(xyz)
         above = SurfaceAbove(np.full(n, np.inf), np.zeros((n, 2)))
         rows = np.flatnonzero(labelling.submerged(xyz, above, classes))

@@ -97,7 +97,7 @@ class ThroughWater:
             labelling.look_around(
                 lambda: parts_of(around(), self.water), self._view.low, self._view.high
             )
-        self.survey = self._learning.of_cloud(around, makers)
+        self.survey = self._learning.of_cloud(around, makers, all_listed=views.are_all)
         self.verdicts = self._learning.verdicts
 
     @staticmethod
@@ -106,15 +106,16 @@ class ThroughWater:
     ) -> Iterator[Points]:
         """Yield the whole cloud as it lies with the adjusted cameras."""
         listed, row = views.all_anew(), 0
-        for xyz, heights, classes in chunks():
-            yield carrying.step(xyz, listed(xyz, row)).xyz, heights, classes
+        for points in chunks():
+            xyz = points.xyz
+            yield points._replace(xyz=carrying.step(xyz, listed(xyz, row)).xyz)
             row += len(xyz)
 
     @staticmethod
     def _makers(chunks: Callable[[], Iterable[Points]], carrying: Carrying) -> Iterator[MadeWith]:
         """Yield what made the points of the whole cloud."""
-        for xyz, _, _ in chunks():
-            yield MadeWith(xyz, carrying.pair.old)
+        for points in chunks():
+            yield MadeWith(points.xyz, carrying.pair.old)
 
     def _old_ties(self) -> TiePoints | None:
         """Return the tie points of the old model, else those of the adjusted one taken back."""
@@ -125,14 +126,15 @@ class ThroughWater:
 
     def correct(self, points: Points, views: Views | None, labelling: Labelling) -> Correction:
         """Correct one chunk; see `pcfix.flow.job.Job.correct`."""
-        xyz, heights, classes = points
+        xyz, classes = points.xyz, points.classes
         label: Label = partial(labelling.submerged, classes=classes)
         step, made_with = None, None
         if self.carrying is not None:
             step, made_with = self.carrying.step(xyz, views), MadeWith(xyz, self.carrying.pair.old)
             xyz, views, label = step.xyz, step.views, step.rule(label)
-        above = surface_above(self.water, xyz, heights)
-        batch = self._of_kind(Batch(xyz, above, self.survey, views, made_with))
+        above = surface_above(self.water, xyz, points.heights)
+        batch = Batch(xyz, above, self.survey, views, made_with, source=points.sources)
+        batch = self._of_kind(batch)
         correction = correct_checked(batch, label, self._level_sigma_m)
         if self.carrying is not None and step is not None:
             correction = step.whole(correction)
@@ -233,6 +235,7 @@ class ThroughWater:
         return [
             *self._learning.notes,
             *(note for one in self.verdicts for note in one.warnings()),
+            *self._learning.of_unlisted_notes(),
             *self.found.notes,
             *self._meeting.notes,
             *bent,

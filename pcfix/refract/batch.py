@@ -12,6 +12,7 @@ one geometry is a direction in the other, through the lens of either (`MadeWith`
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -32,6 +33,10 @@ from pcfix.water.surface import SurfaceAbove
 NO_CAMERA, ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
 PARALLEL, CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
 """Of `Outcome`, for kernels."""
+
+
+UNLISTED, MAIN = -1, -2
+"""Points in no list, and those of no source of their own; see `Survey.parts`."""
 
 
 class Learned(NamedTuple):
@@ -109,6 +114,9 @@ class Survey:
     level_offset_m : array, shape (k,), or None
         How much higher the water stood when each camera took its image. None: nowhere.
     learned : Learned
+    parts : mapping
+        Surveys of points that were made in another way than most: by their source, and of those in
+        no list, where there is one, by `UNLISTED`.
     """
 
     water: WaterSurface
@@ -116,6 +124,7 @@ class Survey:
     settings: ScienceOptions
     level_offset_m: FloatArray | None = None
     learned: Learned = field(default_factory=Learned)
+    parts: Mapping[int, Survey] = field(default_factory=dict)
 
     @property
     def offset_m(self) -> FloatArray:
@@ -145,6 +154,8 @@ class Batch:
         learned is one of those cameras then.
     level_sigma_m : array, shape (m,), or None
         Standard deviation of the height of the surface above each point, as its fit has it.
+    source : array of int, shape (m,), or None
+        Which of several clouds each point came from.
     """
 
     xyz: FloatArray
@@ -153,6 +164,7 @@ class Batch:
     views: Views | None = None
     made_with: MadeWith | None = None
     level_sigma_m: FloatArray | None = None
+    source: IntArray | None = None
 
     def take(self, rows: IntArray) -> Batch:
         """Return some of the points, in the order of `rows`."""
@@ -164,10 +176,29 @@ class Batch:
             views=None if self.views is None else self.views.take(rows),
             made_with=None if self.made_with is None else self.made_with.take(rows),
             level_sigma_m=None if sigma is None else sigma[rows],
+            source=None if self.source is None else self.source[rows],
         )
 
     def __len__(self) -> int:
         return len(self.xyz)
+
+    def parts(self) -> list[tuple[IntArray, Batch]]:
+        """Return the rows that were made in one way, and the batch of them, way by way."""
+        surveys = self.survey.parts
+        if not surveys:
+            return [(np.arange(len(self)), self)]
+        key = np.full(len(self), MAIN) if self.source is None else self.source.astype(np.int64)
+        key[~np.isin(key, list(surveys))] = MAIN
+        if self.views is not None and UNLISTED in surveys:
+            key[np.diff(self.views.start) == 0] = UNLISTED
+        parts = []
+        for one in np.unique(key):
+            rows = np.flatnonzero(key == one)
+            part = self.take(rows)
+            if one != MAIN:
+                part = replace(part, survey=surveys[int(one)])
+            parts.append((rows, replace(part, views=None) if one == UNLISTED else part))
+        return parts or [(np.arange(0), self)]
 
     @property
     def rays(self) -> Views:
@@ -267,6 +298,7 @@ class Batch:
 def stacked(batches: list[Batch]) -> Batch:
     """Return batches of one survey, without views, as one; at least one of them."""
     made = [batch.made_with for batch in batches if batch.made_with is not None]
+    source = [batch.source for batch in batches if batch.source is not None]
     return replace(
         batches[0],
         xyz=np.vstack([batch.xyz for batch in batches]),
@@ -275,6 +307,7 @@ def stacked(batches: list[Batch]) -> Batch:
             np.vstack([batch.surface.slope for batch in batches]),
         ),
         made_with=MadeWith(np.vstack([one.xyz for one in made]), made[0].cameras) if made else None,
+        source=np.concatenate(source) if source else None,
     )
 
 

@@ -5,6 +5,7 @@ Which of them it was, the cloud itself tells: see `pcfix.refract.weighing`.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -85,7 +86,7 @@ class Hint(NamedTuple):
 def hint_of(names: tuple[str, ...]) -> Hint | None:
     """Return what the names of software say, the first that says something."""
     for name in names:
-        for word in name.lower().replace("(", " ").replace("/", " ").split():
+        for word in re.findall(r"[a-z]+", name.lower()):
             if word in SOFTWARE:
                 return Hint(SOFTWARE[word], name.strip())
     return None
@@ -113,6 +114,8 @@ class Verdict(NamedTuple):
         What else decided than the steps, in words; empty where they did.
     is_told : bool
         Whether the user said what to do, so that nothing was decided.
+    of : str
+        Which points it is of; empty for all.
     remarks : tuple of str
         What makes the evidence weak, a sentence each.
     """
@@ -128,6 +131,7 @@ class Verdict(NamedTuple):
     by: str = ""
     is_told: bool = False
     remarks: tuple[str, ...] = ()
+    of: str = ""
 
     @property
     def is_sure(self) -> bool:
@@ -167,21 +171,22 @@ class Verdict(NamedTuple):
             f"; taken for {self.runner_up.words}, the bed would be {abs(self.deeper_m):.3f} m"
             f" {way} on average"
         )
-        told = f"Told {self.chosen.words}" if self.is_told else ""
+        whole = self.of[:1].upper() + self.of[1:] or "The cloud"
+        taken = f"{'Told' if self.is_told else f'{whole} is taken for'} {self.chosen.words}"
         if not self.patches:
             by = "" if self.is_told else f", by {self.by or 'its density'} alone"
-            return f"{told or f'The cloud is taken for {self.chosen.words}'}{by}{other}."
+            return f"{taken}{by}{other}."
         steps = (
             f"of the steps between neighbours by which {self.runner_up.words} would be corrected"
             f" differently, {_percent(self.share)} are left in its bed, else"
             f" {_percent(self.runner_up_share)} ({self.patches} patches)"
         )
         if self.is_told:
-            fit = "; the cloud fits the other better" if self.is_against else ""
-            return f"{told}: {steps}{fit}{other}."
+            fit = f"; the cloud fits {self.runner_up.words} better" if self.is_against else ""
+            return f"{taken}: {steps}{fit}{other}."
         doubt = "" if self.is_sure else ", which is not sure"
         by = f" (by {self.by})" if self.by else ""
-        return f"The cloud is taken for {self.chosen.words}{doubt}{by}: {steps}{other}."
+        return f"{taken}{doubt}{by}: {steps}{other}."
 
 
 def _percent(share: float) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from pcfix.errors import SettingError
 from pcfix.model import BoolArray, Cameras, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import Batch, Learned, Survey
+from pcfix.refract.batch import UNLISTED, Batch, Learned, Survey
 from pcfix.refract.choice import spatial_order
 from pcfix.refract.consistent import check_consistent
 from pcfix.refract.fusion import likely_beds
@@ -26,6 +26,7 @@ from pcfix.refract.hypotheses import (
 )
 from pcfix.refract.matcher import Bed, bed_of, matcher_of, matcher_of_ties, places_for
 from pcfix.refract.methods import batches, with_rays
+from pcfix.refract.patches import FEWEST_WITHOUT_LIST
 from pcfix.refract.regression import DepthRegression
 from pcfix.refract.top_surface import occluder_of, wants_occlusion
 from pcfix.refract.weighing import weigh
@@ -87,7 +88,8 @@ def learn_of_points(batch: Batch, regression: DepthRegression | None) -> Batch:
     """
     cameras, views = batch.survey.cameras, batch.views
     kind = None if views is None else views.kind
-    settings = resolved(batch.survey.settings, cameras, kind)
+    given = batch.survey.settings
+    settings = resolved(given, cameras, kind)
     check_method(settings, cameras)
     if settings.method == "regression" and regression is None:
         raise SettingError("method regression needs a regression; fit one of check depths first.")
@@ -99,6 +101,10 @@ def learn_of_points(batch: Batch, regression: DepthRegression | None) -> Batch:
     if not wants_sample(settings, cameras, kind):
         return batch
     survey, _ = learn_of_sample(batch, len(batch))
+    if views is not None and (np.diff(views.start) == 0).any():
+        as_given = replace(batch.survey, settings=given)
+        unlisted, _ = learn_of_unlisted(replace(batch, survey=as_given), len(batch))
+        survey = replace(survey, parts={UNLISTED: unlisted})
     return replace(batch, survey=survey)
 
 
@@ -125,10 +131,14 @@ def learn_of_sample(
     verdicts : tuple of Verdict
         Why, as far as something was to be told, and could be.
     """
+    if batch.views is None and batch.survey.settings.method == "auto":
+        found = _learn_of_sources(batch, points, ties, hint)
+        if found is not None:
+            return found
     survey, step = batch.survey, points / max(len(batch), 1)
     kind = None if batch.views is None else batch.views.kind
     if wants_matcher(survey.settings, survey.cameras, kind):
-        survey = _with_matcher(batch, ties)
+        survey = with_matcher(batch, ties)
     rows = np.flatnonzero(is_submerged(batch.xyz[:, 2], batch.surface))
     sample = replace(batch.take(rows), survey=survey)
     if batch.views is not None:
@@ -141,6 +151,46 @@ def learn_of_sample(
     elif settings.method == "consistent" and settings.matcher == "depth-maps" and len(rows):
         learned = learned._replace(bed=_learn_bed(replace(sample, survey=survey)))
     return replace(survey, learned=learned), verdicts
+
+
+MOST_SOURCES = 8
+"""More point sources than these are strips or images, and not clouds that were merged."""
+
+
+def _learn_of_sources(
+    batch: Batch, points: int, ties: TiePoints | None, hint: Hint | None
+) -> tuple[Survey, tuple[Verdict, ...]] | None:
+    """Learn of each source by itself; None where all of them were made in one way."""
+    if batch.source is None:
+        return None
+    submerged = is_submerged(batch.xyz[:, 2], batch.surface)
+    source, count = np.unique(batch.source[submerged], return_counts=True)
+    large = source[count >= FEWEST_WITHOUT_LIST][np.argsort(count[count >= FEWEST_WITHOUT_LIST])]
+    if not 2 <= len(large) <= MOST_SOURCES:
+        return None
+    surveys, verdicts = dict[int, Survey](), list[Verdict]()
+    for one in large.tolist():
+        part = replace(batch.take(np.flatnonzero(batch.source == one)), source=None)
+        surveys[one], told = learn_of_sample(part, points * len(part) // len(batch), ties, hint)
+        of = f"point source {one} ({100.0 * len(part) / len(batch):.0f} % of the points)"
+        verdicts += [verdict._replace(of=of) for verdict in told]
+    if len({verdict.chosen.words for verdict in verdicts if verdict.is_sure}) < 2:
+        return None
+    most = int(large[-1])
+    others = {one: survey for one, survey in surveys.items() if one != most}
+    return replace(surveys[most], parts=others), tuple(verdicts)
+
+
+def learn_of_unlisted(
+    batch: Batch, points: int, ties: TiePoints | None = None, hint: Hint | None = None
+) -> tuple[Survey, tuple[Verdict, ...]]:
+    """Learn of points as without their list, for those that are in none; see `learn_of_sample`.
+
+    `batch.survey.settings` are those that were given, ``auto`` included.
+    """
+    settings = resolved(batch.survey.settings, batch.survey.cameras, None)
+    bare = replace(batch, views=None, survey=replace(batch.survey, settings=settings))
+    return learn_of_sample(bare, points, ties, hint)
 
 
 def _weighed(sample: Batch, step: float, hint: Hint | None) -> tuple[Survey, tuple[Verdict, ...]]:
@@ -173,7 +223,7 @@ def as_told(survey: Survey, verdict: Verdict | None, else_as: Hypothesis | None 
     return replace(survey, settings=verdict.chosen.settings(survey.settings), learned=learned)
 
 
-def _with_matcher(batch: Batch, ties: TiePoints | None) -> Survey:
+def with_matcher(batch: Batch, ties: TiePoints | None) -> Survey:
     """Return the survey with how the images were matched."""
     survey = batch.survey
     places, matched = batch.made_with or (batch.xyz, survey.cameras)
@@ -199,6 +249,32 @@ def _learn_bed(batch: Batch) -> Bed | None:
         table[done : done + len(part), : part.shape[1]] = part
         done += len(part)
     return bed_of(batch.xyz[order], table) if np.isfinite(table).any() else None
+
+
+LEAST_TIES, LEAST_DEPTH_M = 50, 0.3
+CORRECTED_RATIO = 1.2
+"""Depth of a cloud by that of its tie points, beyond which it was likely corrected before: as it
+came it is near 1, corrected 1.34 and more."""
+
+
+def depth_ratio(batch: Batch, ties: TiePoints) -> float | None:
+    """Return how much deeper submerged points, shape (m, 3), lie than tie points of their block.
+
+    The median over the tie points of the ratio to the nearest point's depth; None for few of them.
+    """
+    from scipy.spatial import cKDTree
+
+    xyz = ties.xyz[np.isfinite(ties.xyz).all(axis=1)]
+    if len(batch) < LEAST_TIES or len(xyz) < LEAST_TIES:
+        return None
+    near_m = 3.0 * float(np.sqrt(np.ptp(batch.xyz[:, :2], axis=0).prod() / len(batch)))
+    apart_m, near = cKDTree(batch.xyz[:, :2]).query(xyz[:, :2])
+    found = np.asarray(apart_m) < near_m
+    row = np.asarray(near)[found]
+    level = batch.surface.height_m[row]
+    depth, tie_depth = level - batch.xyz[row, 2], level - xyz[found, 2]
+    deep = tie_depth > LEAST_DEPTH_M
+    return float(np.median(depth[deep] / tie_depth[deep])) if deep.sum() >= LEAST_TIES else None
 
 
 FLAT_DEG = 35.0

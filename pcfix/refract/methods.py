@@ -62,6 +62,15 @@ def correct(batch: Batch) -> Intersection:
     Intersection
         One row per point of the batch, in its order.
     """
+    parts = batch.parts()
+    found = [_corrected(part) for _, part in parts]
+    if len(found) == 1:
+        return found[0]
+    return joined(found, np.concatenate([rows for rows, _ in parts]), len(batch.survey.cameras))
+
+
+def _corrected(batch: Batch) -> Intersection:
+    """Correct points that were made in one way."""
     survey, views, pairs = batch.survey, batch.views, None
     method = _method(batch)
     if views is not None and views.kind == "pairs":
@@ -114,6 +123,7 @@ def shift_of_land(batch: Batch) -> FloatArray:
         settings=replace(survey.settings, index=1.0, dimensions="none"),
         level_offset_m=None,
         learned=survey.learned._replace(bed=None),
+        parts={},
     )
     at_themselves = SurfaceAbove(xyz[:, 2].copy(), np.zeros((len(xyz), 2)))
     return correct(replace(batch, surface=at_themselves, survey=dry)).shift_m

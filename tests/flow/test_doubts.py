@@ -1,0 +1,222 @@
+"""What SigmaZ has of methods that were told, and of clouds that tell little, odd or twice."""
+
+from dataclasses import replace
+
+import laspy
+import numpy as np
+import pytest
+
+import pcfix
+from pcfix.model import Outcome, TiePoints, Views
+from pcfix.options.correct import ScienceOptions
+from pcfix.refract.batch import Batch, Survey
+from pcfix.refract.hypotheses import IN_FRAME, hint_of
+from pcfix.refract.learning import CORRECTED_RATIO, depth_ratio, learn_of_sample
+from pcfix.refract.patches import grid_m
+from pcfix.simulate.scene import simulate_scene
+from pcfix.water.surface import surface_above
+from tests.io.test_views import write_ply, write_vis
+
+BLOCK = {"seed": 1, "lidar_per_m2": 0.0}
+OBLIQUE = {**BLOCK, "bed": "shore", "obliques_deg": 35.0, "detection": 0.5}
+
+
+def scene_of(cloud="tracks", points=12_000, **settings):
+    return simulate_scene(points, cloud=cloud, **{**BLOCK, **settings})
+
+
+def wet(scene):
+    """Return points that were made, and are under water before and after."""
+    made = np.diff(scene.views.start) > 1
+    deep = scene.depth_m(scene.true_xyz) > 0.2
+    return made & deep & (scene.depth_m(scene.apparent_xyz) > 0.0)
+
+
+def covered(scene, found):
+    rows = np.flatnonzero(wet(scene) & found.corrected)
+    error = found.xyz[rows, 2] - scene.true_xyz[rows, 2]
+    return float(np.mean(np.abs(error) <= 1.96 * found.sigma_z_m[rows]))
+
+
+@pytest.mark.parametrize(
+    ("cloud", "told"),
+    [
+        ("tracks", {"method": "snell", "max_angle": None}),
+        ("tracks", {"method": "murase", "max_angle": None}),
+        ("tracks", {"method": "consistent", "camera_set": "mvs"}),
+        ("depth-maps", {"method": "snell", "max_angle": None}),
+        ("depth-maps", {"method": "consistent", "camera_set": "all"}),
+    ],
+    ids=str,
+)
+def test_a_method_that_is_off_says_so(cloud, told):
+    settings = OBLIQUE if cloud == "tracks" else BLOCK
+    scene = scene_of(cloud, **settings)
+    points = (scene.apparent_xyz, scene.cameras, scene.water)
+    assert covered(scene, pcfix.correct_points(*points, **told)) >= 0.90
+
+
+def test_a_list_of_another_kind_than_told_says_so():
+    scene = scene_of("pairs")
+    as_tracks = replace(scene.views, kind="tracks")
+    found = pcfix.correct_points(scene.apparent_xyz, scene.cameras, scene.water, views=as_tracks)
+    assert covered(scene, found) >= 0.90
+
+
+def half(views):
+    """Return a list without its first half, and those points."""
+    counts = np.diff(views.start)
+    first = np.arange(len(counts)) < len(counts) // 2
+    kept = np.repeat(~first, counts)
+    start = np.concatenate([[0], np.cumsum(np.where(first, 0, counts))])
+    return Views(start, views.camera[kept], None, views.kind), first
+
+
+def test_points_in_no_list_are_corrected_as_without_one():
+    scene = scene_of()
+    views, first = half(scene.views)
+    given = (scene.apparent_xyz, scene.cameras, scene.water)
+    found = pcfix.correct_points(*given, views=views)
+    alone, listed = pcfix.correct_points(*given), pcfix.correct_points(*given, views=scene.views)
+    np.testing.assert_array_equal(found.xyz[first], alone.xyz[first])
+    made = ~first & (np.diff(scene.views.start) > 1)
+    np.testing.assert_allclose(found.xyz[made], listed.xyz[made], atol=0.05 * scene.gsd_m)
+    seen = first & alone.corrected
+    assert seen.any() and (found.outcome[seen] == Outcome.CORRECTED).all()
+
+
+def as_file(path, xyz, sources, gsd_m=0.001):
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = np.full(3, gsd_m), np.floor(xyz.min(axis=0))
+    cloud = laspy.LasData(header)
+    cloud.xyz = xyz
+    cloud.point_source_id = np.broadcast_to(sources, len(xyz))
+    cloud.write(path)
+    return path
+
+
+def test_clouds_that_were_merged_are_told_apart(tmp_path):
+    clouds = [scene_of(cloud) for cloud in ("tracks", "depth-maps")]
+    assert np.array_equal(clouds[0].cameras.centres, clouds[1].cameras.centres)
+    xyz = np.vstack([scene.apparent_xyz for scene in clouds])
+    sources = np.repeat([7, 9], [len(scene.apparent_xyz) for scene in clouds])
+    order = np.random.default_rng(1).permutation(len(xyz))
+    path = as_file(tmp_path / "both.las", xyz[order], sources[order])
+    given = {"cameras": clouds[0].cameras, "water": clouds[0].water}
+    summary = pcfix.correct_file(path, tmp_path / "out.las", **given)
+    assert "Point source 7" in summary.made["because"]
+    assert "Point source 9" in summary.made["because"]
+    out = np.empty_like(xyz)
+    out[order] = laspy.read(tmp_path / "out.las").xyz
+    for source, scene, told in zip((7, 9), clouds, IN_FRAME[:2], strict=True):
+        rows = wet(scene)
+        error = (out[sources == source] - scene.true_xyz)[rows, 2]
+        best = pcfix.correct_points(
+            scene.apparent_xyz, scene.cameras, scene.water, **told.changes
+        )  # fmt: skip
+        least = (best.xyz - scene.true_xyz)[rows, 2]
+        assert np.sqrt(np.mean(error**2)) < 1.1 * np.sqrt(np.mean(least**2))
+
+
+def test_sources_of_one_software_are_one_cloud(tmp_path):
+    scene = scene_of()
+    sources = np.arange(len(scene.apparent_xyz)) % 3
+    given = {"cameras": scene.cameras, "water": scene.water}
+    paths = [tmp_path / name for name in ("some.las", "one.las")]
+    for path, source in zip(paths, (sources, np.zeros_like(sources)), strict=True):
+        as_file(path, scene.apparent_xyz, source)
+        pcfix.correct_file(path, path.with_suffix(".out.las"), **given)
+    some, one = (laspy.read(path.with_suffix(".out.las")) for path in paths)
+    np.testing.assert_array_equal(some.xyz, one.xyz)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("Agisoft Metashape 2.1.0", "fused depth maps"),
+        ("PDAL 2.8 (OpenMVS)", "fused depth maps"),
+        ("MicMac", "stereo pairs"),
+    ],
+)
+def test_software_says_what_it_makes(name, words):
+    assert hint_of(("LAStools", name)).words == words
+    assert hint_of(("LAStools", "Pix4D")) is None
+
+
+def gridded(scene, step_m):
+    """Return one point in each cell of a grid, at the cell's middle."""
+    xyz = scene.apparent_xyz.copy()
+    xyz[:, :2] = np.floor(xyz[:, :2] / step_m) * step_m + step_m / 2.0
+    return xyz[np.unique(xyz[:, :2], axis=0, return_index=True)[1]]
+
+
+def told(xyz, scene):
+    above = surface_above(scene.water, xyz)
+    batch = Batch(xyz, above, Survey(scene.water, scene.cameras, ScienceOptions()))
+    return learn_of_sample(batch, len(xyz))[1]
+
+
+def test_a_grid_is_said():
+    scene = scene_of()
+    assert grid_m(scene.apparent_xyz) is None
+    assert grid_m(np.round(scene.apparent_xyz, 3)) is None
+    xyz = gridded(scene, 0.5)
+    assert grid_m(xyz) == pytest.approx(0.5, abs=1e-3)
+    (verdict,) = told(xyz, scene)
+    assert "grid of 0.5 m" in " ".join(verdict.warnings())
+
+
+def test_a_smooth_cloud_is_said():
+    scene = scene_of(bed="flat")
+    assert not any("mesh" in note for note in told(scene.apparent_xyz, scene)[0].warnings())
+    xyz = scene.apparent_xyz.copy()
+    xyz[:, 2] = np.median(xyz[:, 2]) + 0.01 * (xyz[:, 0] - xyz[:, 0].mean())
+    (verdict,) = told(xyz, scene)
+    assert "mesh" in " ".join(verdict.warnings())
+
+
+def test_a_cloud_that_was_corrected_is_deeper_than_its_tie_points():
+    scene = scene_of()
+    above = surface_above(scene.water, scene.apparent_xyz)
+    rows = np.flatnonzero(wet(scene))
+    survey = Survey(scene.water, scene.cameras, ScienceOptions())
+    views = scene.views.take(rows[::20])
+    ties = TiePoints(scene.apparent_xyz[rows[::20]], views, np.zeros((len(views.camera), 2)))
+    came = Batch(scene.apparent_xyz, above, survey).take(rows)
+    done = replace(came, xyz=scene.true_xyz[rows])
+    assert depth_ratio(came, ties) == pytest.approx(1.0, abs=0.05)
+    assert depth_ratio(done, ties) > CORRECTED_RATIO + 0.1
+
+
+def test_without_standard_errors_nothing_is_compared(tmp_path):
+    scene = scene_of()
+    path = as_file(tmp_path / "cloud.las", scene.apparent_xyz, 0)
+    given = {"cameras": scene.cameras, "water": scene.water, "method": "snell", "max_angle": None}
+    made, out = {}, {}
+    for dimensions in ("all", "minimal"):
+        target = tmp_path / f"{dimensions}.las"
+        made[dimensions] = pcfix.correct_file(path, target, dimensions=dimensions, **given).made
+        out[dimensions] = laspy.read(target).xyz
+    assert made["all"]["patches"] > 0 and made["minimal"] is None
+    np.testing.assert_array_equal(out["all"], out["minimal"])
+
+
+@pytest.mark.filterwarnings("ignore:.*are not in the list")
+def test_a_list_of_half_the_cloud(tmp_path):
+    scene = scene_of(points=6000)
+    rows = np.arange(0, len(scene.apparent_xyz), 2)
+    images = [
+        scene.views.camera[scene.views.start[i] : scene.views.start[i + 1]].tolist() for i in rows
+    ]
+    write_vis(tmp_path / "fused.ply.vis", images)
+    write_ply(tmp_path / "fused.ply", scene.apparent_xyz[rows], position="double")
+    path = as_file(tmp_path / "cloud.las", scene.apparent_xyz, 0)
+    given = {"cameras": scene.cameras, "water": scene.water, "exact": True}
+    out = {}
+    for name, views in (("half", tmp_path / "fused.ply.vis"), ("none", None)):
+        summary = pcfix.correct_file(path, tmp_path / f"{name}.las", views=views, **given)
+        out[name] = laspy.read(tmp_path / f"{name}.las")
+        assert summary.corrected > 0.95 * summary.submerged
+        assert ("corrected as without one" in " ".join(summary.warnings)) == (name == "half")
+    unlisted = np.setdiff1d(np.arange(len(scene.apparent_xyz)), rows)
+    np.testing.assert_array_equal(out["half"].xyz[unlisted], out["none"].xyz[unlisted])
