@@ -102,7 +102,8 @@ class Learning:
         And, chunk by chunk, what made the points, where that are not these cameras. Where not
         all points are listed, the others are corrected as without a list.
         """
-        learned = Learned(regression=self._regression(chunks), occluder=self._occluder(chunks))
+        occluder = self._occluder(chunks, listed=self._views is not None)
+        learned = Learned(regression=self._regression(chunks), occluder=occluder)
         self.survey = replace(self.survey, learned=learned)
         settings, cameras = self.survey.settings, self.survey.cameras
         some_listed = self._views is not None and not all_listed
@@ -117,8 +118,11 @@ class Learning:
             return self.survey
         self.survey = with_matcher(sample, ties)
         if some_listed:
-            bare = replace(sample, survey=replace(sample.survey, settings=self._given))
-            unlisted, self.of_unlisted = learn_of_unlisted(bare, points, ties, hint)
+            learned = learned._replace(occluder=self._occluder(chunks, listed=False))
+            bare = replace(self.survey, settings=self._given, learned=learned)
+            unlisted, self.of_unlisted = learn_of_unlisted(
+                replace(sample, survey=bare), points, ties, hint
+            )
             self.survey = replace(self.survey, parts={UNLISTED: unlisted})
         return self.survey
 
@@ -168,8 +172,8 @@ class Learning:
         ]
         return found
 
-    def _occluder(self, chunks: Callable[[], Iterable[Points]]) -> Occluder | None:
-        listed = self._views is not None and self.survey.settings.occlusion == "auto"
+    def _occluder(self, chunks: Callable[[], Iterable[Points]], *, listed: bool) -> Occluder | None:
+        listed = listed and self.survey.settings.occlusion == "auto"
         if listed or not wants_occlusion(self.survey.cameras, self.survey.settings):
             return None  # listed cameras did see their points
         builder = OccluderBuilder(self._view.low, self._view.high, self._view.points)

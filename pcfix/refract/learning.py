@@ -93,16 +93,17 @@ def learn_of_points(batch: Batch, regression: DepthRegression | None) -> Batch:
     check_method(settings, cameras)
     if settings.method == "regression" and regression is None:
         raise SettingError("method regression needs a regression; fit one of check depths first.")
-    occluder = None
-    if settings.occlusion == "on" or (settings.occlusion == "auto" and views is None):
-        occluder = occluder_of(batch.xyz) if wants_occlusion(cameras, settings) else None
+    hides = wants_occlusion(cameras, settings)
+    listed = settings.occlusion == "auto" and views is not None
+    occluder = occluder_of(batch.xyz) if hides and not listed else None
     learned = Learned(regression=regression, occluder=occluder)
     batch = replace(batch, survey=replace(batch.survey, settings=settings, learned=learned))
     if not wants_sample(settings, cameras, kind):
         return batch
     survey, _ = learn_of_sample(batch, len(batch))
     if views is not None and (np.diff(views.start) == 0).any():
-        as_given = replace(batch.survey, settings=given)
+        hidden = occluder_of(batch.xyz) if hides else None
+        as_given = replace(batch.survey, settings=given, learned=Learned(occluder=hidden))
         unlisted, _ = learn_of_unlisted(replace(batch, survey=as_given), len(batch))
         survey = replace(survey, parts={UNLISTED: unlisted})
     return replace(batch, survey=survey)
