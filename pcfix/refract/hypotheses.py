@@ -70,6 +70,17 @@ SOFTWARE = {
 """Of what dense clouds are made, by a word in the name of the software; Pix4D does not say."""
 
 
+FITS = 0.3
+"""Share of the steps in the bed of the right way, at most; of stereo pairs it may be more. With
+cameras that were moved, and of smoothed clouds, the best way has 0.35 to 0.48; with a wrong level no
+more than with the right one."""
+
+CAUSES = (
+    "Where no way fits, the cameras may be of another block or moved against the cloud, the poses"
+    " may have absorbed the refraction (see pcfix cameras), or the cloud was filtered or meshed."
+)
+
+
 class Hint(NamedTuple):
     """What files say of how a dense cloud was made.
 
@@ -147,7 +158,10 @@ class Verdict(NamedTuple):
         """Return what the user must know of it, a sentence each."""
         apart = self.is_against and abs(self.deeper_m) > self.doubt.formal_m
         unsure = apart if self.is_told else not self.is_sure
-        return (*self.remarks, *((str(self),) if unsure else ()))
+        said = (str(self),) if unsure else ()
+        if not self.is_told and self.patches and self.share > FITS:
+            said = (f"{self} {CAUSES}",)
+        return (*self.remarks, *said)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
