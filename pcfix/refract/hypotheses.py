@@ -72,8 +72,8 @@ SOFTWARE = {
 
 FITS = 0.3
 """Share of the steps in the bed of the right way, at most; of stereo pairs it may be more. With
-cameras that were moved, and of smoothed clouds, the best way has 0.35 to 0.48; with a wrong level no
-more than with the right one."""
+cameras that were moved, and of smoothed clouds, the best way has 0.35 to 0.48; of a wrong level the
+steps say nothing."""
 
 CAUSES = (
     "Where no way fits, the cameras may be of another block or moved against the cloud, the poses"
