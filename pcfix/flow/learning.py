@@ -138,8 +138,8 @@ class Learning:
 
     def _note_flat(self, sample: Batch) -> None:
         """Say how many points are seen by flat obliques alone, and where."""
-        wet = sample.take(np.flatnonzero(is_submerged(sample.xyz[:, 2], sample.surface)))
-        wet = replace(wet, survey=self.survey)
+        rows = np.flatnonzero(is_submerged(sample.xyz[:, 2], sample.surface))
+        wet = replace(sample.take(rows[:: 1 + len(rows) // FLAT_SAMPLE]), survey=self.survey)
         flat = seen_flat(wet) if len(wet) else np.zeros(0, np.bool_)
         if flat.sum() <= FLAT_SHARE * len(flat):
             return
@@ -214,8 +214,8 @@ def _ties_of(inputs: Inputs, view: CloudView) -> TiePoints | None:
         return inputs.tie_points(view.crs)
 
 
-FLAT_SHARE = 0.01
-"""Of the submerged points, from which flat obliques alone are worth a word."""
+FLAT_SHARE, FLAT_SAMPLE = 0.01, 20_000
+"""Of the submerged points, from which flat obliques alone are worth a word; of so many at most."""
 
 BED_POINTS_A_M2 = 5.0
 FEWEST_BED_POINTS, MOST_BED_POINTS = 125_000, 1_000_000

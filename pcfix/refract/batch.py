@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import PcfixWarning
-from pcfix.kernels import inlined, lean
+from pcfix.kernels import Span, in_tiles, inlined, lean
 from pcfix.lens.algebra import Vector, times, transposed_times
 from pcfix.lens.imaging import direction_of, image_of, lens_table
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Outcome, Views, WaterSurface
@@ -248,21 +248,24 @@ class Batch:
 
     def incidence_deg(self) -> FloatArray:
         """Return the largest incidence angle in air of each point's rays, shape (m,)."""
-        least = np.ones(len(self.xyz))
-        np.minimum.at(least, self.owner, self._cosines())
-        return np.degrees(np.arccos(np.clip(least, 0.0, 1.0)))
+        return self._angles_deg()[:, 1]
 
     def steepest_deg(self) -> FloatArray:
         """Return the smallest one; 90 where there is no ray."""
-        most = np.zeros(len(self.xyz))
-        np.maximum.at(most, self.owner, self._cosines())
-        return np.degrees(np.arccos(np.clip(most, 0.0, 1.0)))
+        return self._angles_deg()[:, 0]
 
-    def _cosines(self) -> FloatArray:
-        """Return the cosine of the incidence angle of each ray."""
-        to_camera = self.survey.cameras.centres[self.rays.camera] - self.xyz[self.owner]
-        across = np.einsum("ij,ij->i", self.normals()[self.owner], to_camera)
-        return np.asarray(across / np.linalg.norm(to_camera, axis=1))
+    def _angles_deg(self) -> FloatArray:
+        """Return the smallest and the largest incidence angle of each point's rays, shape (m, 2).
+
+        90 and 0 where there is no ray.
+        """
+        cosine, views = np.empty((len(self), 2)), self.rays
+        in_tiles(
+            _incidence, len(self), np.ascontiguousarray(self.xyz), self.normals(),
+            np.ascontiguousarray(self.survey.cameras.centres),
+            np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64), cosine,
+        )  # fmt: skip
+        return np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0)))
 
     def camera_used(self, moved: BoolArray) -> BoolArray:
         """Return which cameras give a ray to a point that is moved, shape (k,)."""
@@ -309,6 +312,24 @@ def stacked(batches: list[Batch]) -> Batch:
         made_with=MadeWith(np.vstack([one.xyz for one in made]), made[0].cameras) if made else None,
         source=np.concatenate(source) if source else None,
     )
+
+
+@lean
+def _incidence(
+    span: Span, xyz: FloatArray, normals: FloatArray, centres: FloatArray, start: IntArray,
+    camera: IntArray, cosine: FloatArray,
+) -> None:  # fmt: skip
+    """Write the largest and the smallest cosine of the incidence angles of each point's rays."""
+    for i in range(*span):
+        most, least = 0.0, 1.0
+        for at in range(start[i], start[i + 1]):
+            c, across, square = camera[at], 0.0, 0.0
+            for k in range(3):
+                way = centres[c, k] - xyz[i, k]
+                across, square = across + normals[i, k] * way, square + way * way
+            along = across / np.sqrt(square)
+            most, least = max(most, along), min(least, along)
+        cosine[i, 0], cosine[i, 1] = most, least
 
 
 class Intersection(NamedTuple):
