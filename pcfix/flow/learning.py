@@ -18,11 +18,10 @@ from pcfix.label.labelling import Part
 from pcfix.model import NOISE_CLASSES, BoolArray, FloatArray, IntArray, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
 from pcfix.options.declare import File
-from pcfix.refract.batch import UNLISTED, Batch, Learned, MadeWith, Survey, stacked
+from pcfix.refract.batch import FLAT_DEG, UNLISTED, Batch, Learned, MadeWith, Survey, stacked
 from pcfix.refract.hypotheses import Verdict, hint_of
 from pcfix.refract.learning import (
     CORRECTED_RATIO,
-    FLAT_DEG,
     check_method,
     depth_ratio,
     learn_of_sample,

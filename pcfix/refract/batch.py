@@ -34,6 +34,9 @@ NO_CAMERA, ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
 PARALLEL, CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
 """Of `Outcome`, for kernels."""
 
+FLAT_DEG = 35.0
+"""Rays beyond this are those by which methods differ most; see `hypotheses.LIMITS`."""
+
 
 UNLISTED, MAIN = -1, -2
 """Points in no list, and those of no source of their own; see `Survey.parts`."""
@@ -257,6 +260,10 @@ class Batch:
         most = np.zeros(len(self.xyz))
         np.maximum.at(most, self.owner, self._cosines())
         return np.degrees(np.arccos(np.clip(most, 0.0, 1.0)))
+
+    def seen_flat(self) -> BoolArray:
+        """Return which points have rays, and those beyond `FLAT_DEG` from the normal alone."""
+        return np.asarray((self.counts > 0) & (self.steepest_deg() > FLAT_DEG))
 
     def _cosines(self) -> FloatArray:
         """Return the cosine of the incidence angle of each ray."""
