@@ -125,7 +125,7 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
             f' use withhold or keep, add "{OUTCOME}=uint8" to add_dimension, and let'
             f' filters.range keep "{OUTCOME}[0:1]".'
         )
-    columns = columns_for(options.dimensions)
+    columns = columns_for(options.dimensions, options.unsure)
     check_dimensions(ins, columns)
     metadata = namespace.get("metadata")
     scales = scales_of(metadata)

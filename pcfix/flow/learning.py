@@ -147,7 +147,8 @@ class Learning:
             f"About {100.0 * flat.mean():.0f} % of the submerged points are seen by flat obliques"
             f" alone, every ray beyond {FLAT_DEG:g} degrees: nearly all of them between"
             f" {low[0]:.0f}, {low[1]:.0f} and {high[0]:.0f}, {high[1]:.0f}. Their depths are the"
-            " least certain; images from above would tell more of them."
+            " least certain; images from above would tell more of them"
+            + (", --unsure withhold flags them." if self.survey.settings.unsure == "keep" else ".")
         )
 
     def of_unlisted_notes(self) -> list[str]:

@@ -321,8 +321,8 @@ def stacked(batches: list[Batch]) -> Batch:
 class Intersection(NamedTuple):
     """The result for m submerged points; see `pcfix.Correction` for the meaning of each.
 
-    The methods themselves leave `sigma_z_m` and `covariance_m2` open, but for some that know a
-    scatter; `pcfix.refract.methods.correct` fills both.
+    The methods themselves leave `sigma_z_m`, `covariance_m2` and `unsure` open, but for some that
+    know a scatter; `pcfix.refract.methods.correct` fills them.
     """
 
     shift_m: FloatArray
@@ -333,6 +333,7 @@ class Intersection(NamedTuple):
     incidence_deg: FloatArray
     camera_used: BoolArray
     covariance_m2: FloatArray | None = None
+    unsure: BoolArray | None = None
 
 
 def warn_of_unsolved(beginning: str, found: BoolArray) -> None:

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from pcfix.model import FloatArray, IntArray, Views, WaterPlane
+from pcfix.model import FloatArray, IntArray, Outcome, Views, WaterPlane
 from pcfix.refract import literature
 from pcfix.refract.batch import Batch, Intersection, Survey
 from pcfix.refract.cells import is_bent, is_quick
@@ -86,16 +86,21 @@ def _corrected(batch: Batch) -> Intersection:
         else:
             found = method(part)
         known = with_uncertainty(found, part)
-        parts.append(_with_ambiguity(known, found) if method is invert_fusion else known)
+        known = _with_ambiguity(known, found) if method is invert_fusion else known
+        parts.append(_with_unsure(known, part, batch.views))
     return with_doubt(joined(parts, order, len(survey.cameras)), batch)
 
 
 def _takes_all_in_frame(batch: Batch) -> bool:
-    """Whether every camera whose frame holds the point counts, under water that is a plane."""
+    """Whether every camera whose frame holds the point counts, under water that is a plane.
+
+    And nobody asks which these are, as the kernel for this makes no lists.
+    """
     survey = batch.survey
     return (
         batch.views is None
         and survey.settings.max_cameras is None
+        and survey.settings.unsure == "keep"
         and survey.learned.occluder is None
         and survey.learned.matcher is None
         and not is_bent(survey)
@@ -120,7 +125,7 @@ def shift_of_land(batch: Batch) -> FloatArray:
     dry = replace(
         survey,
         water=WaterPlane(0.0),
-        settings=replace(survey.settings, index=1.0, dimensions="none"),
+        settings=replace(survey.settings, index=1.0, dimensions="none", unsure="keep"),
         level_offset_m=None,
         learned=survey.learned._replace(bed=None),
         parts={},
@@ -136,6 +141,14 @@ def _with_ambiguity(known: Intersection, found: Intersection) -> Intersection:
     covariance = known.covariance_m2.copy()
     covariance[:, 5] += found.sigma_z_m**2
     return known._replace(covariance_m2=covariance, sigma_z_m=np.sqrt(covariance[:, 5]))
+
+
+def _with_unsure(found: Intersection, part: Batch, listed: Views | None) -> Intersection:
+    """Add, where it is asked for, which points are corrected by flat obliques alone."""
+    if part.survey.settings.unsure == "keep":
+        return found
+    unsure = (found.outcome == Outcome.CORRECTED) & part.seen_flat() & (listed is None)
+    return found._replace(unsure=unsure)
 
 
 def _method(batch: Batch) -> Method:
@@ -196,7 +209,7 @@ def joined(parts: list[Intersection], order: IntArray, k: int) -> Intersection:
     """Return the results of batches as one, back in the order of the points."""
 
     def back(name: str) -> Any:
-        if parts[0].covariance_m2 is None and name == "covariance_m2":
+        if getattr(parts[0], name) is None:
             return None
         values = np.concatenate([getattr(part, name) for part in parts])
         full = np.empty_like(values)
