@@ -209,6 +209,7 @@ def _slices(n: int) -> Iterator[slice]:
 
 def _chunks(ins: Dimensions, water: WaterSurface, flags: Flags) -> Iterator[tuple[slice, Points]]:
     """Yield the rows of each chunk, and its coordinates, heights of the water and classes."""
+    from pcfix.flow.surfaces import Points
     from pcfix.water.checks import checked_points
 
     for rows in _slices(len(ins["X"])):
