@@ -10,6 +10,8 @@ import pytest
 
 import pcfix
 from pcfix.io.las.columns import COLUMNS
+from pcfix.io.scenes import colmap_vis
+from pcfix.model import Views
 from pcfix.options.correct import CorrectOptions
 from pcfix.options.survey import RunOptions
 from pcfix.refract.matcher import without_border
@@ -72,6 +74,17 @@ def test_with_a_list_nothing_is_unsure(folder, needed, tmp_path):
         needed, folder / "cloud.las", tmp_path / "out.las", views=folder / "fused.ply.vis"
     )
     assert told.corrected and told.unsure == 0
+
+
+def test_of_a_list_of_some_points_the_others_may_be_unsure(folder, needed, tmp_path):
+    views, listed = half_oblique().views, np.arange(3000) % 2 == 0
+    start = np.concatenate([[0], np.cumsum(np.where(listed, np.diff(views.start), 0))])
+    camera = views.camera[np.repeat(listed, np.diff(views.start))]
+    (tmp_path / "fused.ply.vis").write_bytes(colmap_vis(Views(start, camera)))
+    for name, more in (("all", {}), ("some", {"views": tmp_path / "fused.ply.vis"})):
+        corrected(needed, folder / "cloud.las", tmp_path / f"{name}.las", **more)
+    whole, some = (laspy.read(tmp_path / name) for name in ("all.las", "some.las"))
+    np.testing.assert_array_equal(some.Unsure, np.where(listed, 0, whole.Unsure))
 
 
 def test_a_file_has_them_withheld_and_marked(folder, needed, tmp_path):
