@@ -444,6 +444,9 @@ class Correction:
     covariance_m2 : array, shape (n, 6), or None
         The same for all coordinates: xx, xy, xz, yy, yz, zz; see `pcfix.refract.uncertainty`.
         None where it was not asked for.
+    unsure : array of bool, shape (n,), or None
+        Corrected points that flat obliques alone see, and no list says which images made them;
+        see `pcfix.refract.batch.Batch.seen_flat`. None where the option `unsure` does not ask.
     """
 
     apparent_xyz: FloatArray
@@ -458,6 +461,7 @@ class Correction:
     water_known: BoolArray
     lowest_water_m: float
     covariance_m2: FloatArray | None = None
+    unsure: BoolArray | None = None
 
     @cached_property
     def xyz(self) -> FloatArray:

@@ -125,7 +125,7 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
             f' use withhold or keep, add "{OUTCOME}=uint8" to add_dimension, and let'
             f' filters.range keep "{OUTCOME}[0:1]".'
         )
-    columns = columns_for(options.dimensions)
+    columns = columns_for(options.dimensions, options.unsure)
     check_dimensions(ins, columns)
     metadata = namespace.get("metadata")
     scales = scales_of(metadata)
@@ -209,6 +209,7 @@ def _slices(n: int) -> Iterator[slice]:
 
 def _chunks(ins: Dimensions, water: WaterSurface, flags: Flags) -> Iterator[tuple[slice, Points]]:
     """Yield the rows of each chunk, and its coordinates, heights of the water and classes."""
+    from pcfix.flow.surfaces import Points
     from pcfix.water.checks import checked_points
 
     for rows in _slices(len(ins["X"])):

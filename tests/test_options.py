@@ -94,3 +94,9 @@ def test_a_stage_gets_every_digit():
         "cameras_offset": "319900.125,4650123.4567,0", "respect_classes": "2,5",
     }  # fmt: skip
     assert CorrectOptions(**given.plain()) == given
+
+
+def test_a_stage_is_told_that_there_is_no_limit():
+    given = CorrectOptions(max_angle=None)
+    assert given.plain() == {"max_angle": "none"}
+    assert CorrectOptions(**given.plain()) == given

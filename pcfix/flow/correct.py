@@ -59,9 +59,9 @@ def correct_points(
         each point, NaN where it is not known.
     options : RefractionOptions, optional
         Or its attributes as keywords, as of ``pcfix correct``: index, method, max_angle (degrees
-        from the surface normal), max_cameras, camera_set, matcher, depth_factor, sigma_image and
-        the other standard errors; occlusion is off unless asked for, as these points may not be
-        the whole cloud.
+        from the surface normal), max_cameras, camera_set, matcher, depth_factor, unsure (with
+        ``"withhold"`` the result says which are), sigma_image and the other standard errors;
+        occlusion is off unless asked for, as these points may not be the whole cloud.
     views : Views, optional
         Which cameras made each point, rows of `adjusted_from` where that is given, else of
         `cameras`. Default: as the option `camera_set` says.
@@ -214,7 +214,7 @@ class Correcting(Step):
 
     def __init__(self, job: Job) -> None:
         self.job = job
-        self._columns = columns.columns_for(job.options.dimensions)
+        self._columns = columns.columns_for(job.options.dimensions, job.options.unsure)
         self.wide = False
         self.steps: tuple[int, ...] = (0, 0, 0)
 
@@ -231,11 +231,12 @@ class Correcting(Step):
         new = columns.shifted(points, header, moved + np.array(self.steps))
         withheld = np.asarray(new["withheld"]).astype(bool)
         withhold = self.job.options.uncorrected == "withhold"
+        correction = columns.unsure_anew(correction, withheld)
         changed = columns.changed_rows(correction, withheld, withhold=withhold)
         columns.fill(new, self._columns, correction, moved, changed)
         new.array["classification"][correction.corrected] = BATHYMETRIC_POINT
-        if withhold:
-            new["withheld"][:] = (withheld | correction.uncorrected).astype(np.uint8)
+        flagged = withheld | columns.to_withhold(correction, withhold=withhold)
+        new["withheld"][:] = flagged.astype(np.uint8)
         return new[~correction.uncorrected] if self.job.options.uncorrected == "drop" else new
 
     def finish(self) -> None:

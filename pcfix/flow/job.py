@@ -130,6 +130,7 @@ class Job:
             uncorrected=uncorrected,
             dropped=stuck if self.options.uncorrected == "drop" else 0,
             water_unknown=tally.water_unknown,
+            unsure=tally.unsure if self.options.unsure == "withhold" else None,
             shift_z_m=tally.shift_z_m(),
             rays=tally.rays,
             incidence_deg=round(tally.incidence_deg, 2),

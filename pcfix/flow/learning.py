@@ -18,11 +18,10 @@ from pcfix.label.labelling import Part
 from pcfix.model import NOISE_CLASSES, BoolArray, FloatArray, IntArray, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
 from pcfix.options.declare import File
-from pcfix.refract.batch import UNLISTED, Batch, Learned, MadeWith, Survey, stacked
+from pcfix.refract.batch import FLAT_DEG, UNLISTED, Batch, Learned, MadeWith, Survey, stacked
 from pcfix.refract.hypotheses import Verdict, hint_of
 from pcfix.refract.learning import (
     CORRECTED_RATIO,
-    FLAT_DEG,
     check_method,
     depth_ratio,
     learn_of_sample,
@@ -148,7 +147,8 @@ class Learning:
             f"About {100.0 * flat.mean():.0f} % of the submerged points are seen by flat obliques"
             f" alone, every ray beyond {FLAT_DEG:g} degrees: nearly all of them between"
             f" {low[0]:.0f}, {low[1]:.0f} and {high[0]:.0f}, {high[1]:.0f}. Their depths are the"
-            " least certain; images from above would tell more of them."
+            " least certain; images from above would tell more of them"
+            + (", --unsure withhold flags them." if self.survey.settings.unsure == "keep" else ".")
         )
 
     def of_unlisted_notes(self) -> list[str]:

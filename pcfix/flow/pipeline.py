@@ -42,7 +42,7 @@ def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str
             f"{input}: has waveforms (point format {point_format.id}), which PDAL does not write;"
             " use 'pcfix correct'."
         )
-    columns = columns_for(options.dimensions)
+    columns = columns_for(options.dimensions, options.unsure)
     drop = options.uncorrected == "drop"
     given = {
         "cameras": None,

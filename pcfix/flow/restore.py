@@ -9,11 +9,17 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.flow.runner import Chunk, Header, Step, file_task
-from pcfix.io.las.columns import SHIFTS, columns_for, is_corrected, is_marked_uncorrected, shifted
+from pcfix.io.las.columns import (
+    SHIFTS,
+    UNSURE,
+    columns_for,
+    is_corrected,
+    is_marked_uncorrected,
+    shifted,
+)
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import read_settings, restored_header
 from pcfix.kernels import threads
-from pcfix.options.correct import Dimensions
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import JobOptions
 
@@ -61,12 +67,13 @@ class Restoring(Step):
     """The step that takes points back."""
 
     def __init__(self) -> None:
-        self.points, self._offset = 0, np.zeros(3, np.int64)
+        self.points, self._offset, self._has_unsure = 0, np.zeros(3, np.int64), False
 
     def header(self, source: LasSource) -> Header:
         """Return the header as it was before the correction."""
         content = read_settings(source.vlrs, source.path)
-        names = _ours(source, content["settings"]["dimensions"])
+        names = _ours(source, content["settings"])
+        self._has_unsure = UNSURE.name in names
         self.identity = content["before"]["identity"].encode("latin-1")
         self._offset = np.array(content["before"]["steps"])
         return restored_header(source, content["before"], names)
@@ -76,15 +83,20 @@ class Restoring(Step):
         self.points += len(points)
         moved = is_corrected(points)
         points.array["classification"][moved] = points.array["SourceClass"][moved]
+        ours = is_marked_uncorrected(points)
+        if self._has_unsure:
+            ours |= points.array[UNSURE.name] > 0
         withheld = np.asarray(points["withheld"]).astype(bool)
-        points["withheld"][:] = (withheld & ~is_marked_uncorrected(points)).astype(np.uint8)
+        points["withheld"][:] = (withheld & ~ours).astype(np.uint8)
         shift = np.column_stack([points.array[name] for name in SHIFTS]).astype(np.int64)
         return shifted(points, header, -shift - self._offset)
 
 
-def _ours(source: LasSource, dimensions: Dimensions) -> set[str]:
+def _ours(source: LasSource, settings: dict[str, Any]) -> set[str]:
     """Return the dimensions that pcfix added, once all that undo its work are there."""
-    names = {column.name for column in columns_for(dimensions)}
+    dimensions = settings["dimensions"]
+    unsure = settings.get("unsure", "keep")  # files of old have none
+    names = {column.name for column in columns_for(dimensions, unsure)}
     if not names.issuperset(SHIFTS):
         raise InputError(
             f"{source.path}: was written with --dimensions {dimensions}, which keeps no way back;"

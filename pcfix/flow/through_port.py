@@ -64,6 +64,7 @@ class ThroughPort:
             "camera-set mvs": options.camera_set == "mvs",
             "occlusion on": options.occlusion == "on",
             "adjusted-from": options.adjusted_from is not None,
+            "unsure withhold": options.unsure == "withhold",
         }
         for name, is_given in given.items():
             if is_given:

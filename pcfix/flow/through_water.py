@@ -300,6 +300,7 @@ def correct_checked(
 
 _PER_POINT = (
     "shift_m", "outcome", "ray_count", "ray_miss_m", "incidence_deg", "sigma_z_m", "covariance_m2",
+    "unsure",
 )  # fmt: skip
 
 

@@ -13,7 +13,16 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import SettingError
-from pcfix.io.las.columns import Column, changed_rows, column_scale, in_steps, rows_of, shift_steps
+from pcfix.io.las.columns import (
+    Column,
+    changed_rows,
+    column_scale,
+    in_steps,
+    rows_of,
+    shift_steps,
+    to_withhold,
+    unsure_anew,
+)
 from pcfix.model import BATHYMETRIC_POINT, Correction, FloatArray
 from pcfix.refract.tally import Summary
 
@@ -82,7 +91,9 @@ class Results:
         for i, axis in enumerate("XYZ"):
             # land keeps its bits, negative zero included
             out[axis][rows][correction.moved] += moved[correction.moved, i] * scales[i]
-        changed = changed_rows(correction, self._flags.withheld[rows], withhold=withhold)
+        withheld = self._flags.withheld[rows]
+        correction = unsure_anew(correction, withheld)
+        changed = changed_rows(correction, withheld, withhold=withhold)
         for column in self._columns:
             filled = rows_of(column, correction, changed)
             values = in_steps(column, correction, moved, classes, filled)
@@ -90,8 +101,7 @@ class Results:
         out["Classification"][rows][correction.corrected] = BATHYMETRIC_POINT
         if OUTCOME in out:
             out[OUTCOME][rows] = correction.outcome
-        if withhold:
-            self._flags.withheld[rows] |= correction.uncorrected
+        self._flags.withheld[rows] |= to_withhold(correction, withhold=withhold)
 
     @property
     def dimensions(self) -> Dimensions:

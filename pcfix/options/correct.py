@@ -20,6 +20,7 @@ from pcfix.options.shared import (
 )
 
 Uncorrected = Literal["withhold", "keep", "drop"]
+Unsure = Literal["keep", "withhold"]
 Dimensions = Literal["all", "minimal", "none"]
 Method = Literal[
     "auto", "snell", "consistent", "shan", "butler", "murase", "dietrich", "factor", "regression"
@@ -151,7 +152,20 @@ class BudgetOptions(OptionSet):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefractionOptions(BudgetOptions, MethodOptions):
+class UnsureOption(OptionSet):
+    """What becomes of points that were corrected by flat rays alone."""
+
+    panel = Panel.OUTPUT
+
+    unsure: Unsure = option(
+        "keep",
+        "Corrected points that only flat obliques see, every ray beyond 35 degrees, where no list"
+        " says which images made them: as others, or flagged withheld.",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefractionOptions(BudgetOptions, MethodOptions, UnsureOption):
     """What the correction of points goes by; `pcfix.correct_points` takes these."""
 
 

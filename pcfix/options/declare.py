@@ -206,7 +206,9 @@ class OptionSet:
 
 
 def _worded(one: Option, value: Any) -> Any:
-    """Return numbers and words as text with commas between, where text is parsed."""
+    """Return numbers and words as text with commas between, where text is parsed, and no limit."""
+    if value is None:
+        return "none"  # null would be the default
     if isinstance(value, tuple) and one.parse is not None:
         return ",".join(f"{v:.15g}" if isinstance(v, float) else str(v) for v in value)
     return _plain(value)

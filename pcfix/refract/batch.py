@@ -34,6 +34,9 @@ NO_CAMERA, ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
 PARALLEL, CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
 """Of `Outcome`, for kernels."""
 
+FLAT_DEG = 35.0
+"""Rays beyond this are those by which methods differ most; see `hypotheses.LIMITS`."""
+
 
 UNLISTED, MAIN = -1, -2
 """Points in no list, and those of no source of their own; see `Survey.parts`."""
@@ -254,6 +257,10 @@ class Batch:
         """Return the smallest one; 90 where there is no ray."""
         return self._angles_deg()[:, 0]
 
+    def seen_flat(self) -> BoolArray:
+        """Return which points have rays, and those beyond `FLAT_DEG` from the normal alone."""
+        return np.asarray((self.counts > 0) & (self.steepest_deg() > FLAT_DEG))
+
     def _angles_deg(self) -> FloatArray:
         """Return the smallest and the largest incidence angle of each point's rays, shape (m, 2).
 
@@ -335,8 +342,8 @@ def _incidence(
 class Intersection(NamedTuple):
     """The result for m submerged points; see `pcfix.Correction` for the meaning of each.
 
-    The methods themselves leave `sigma_z_m` and `covariance_m2` open, but for some that know a
-    scatter; `pcfix.refract.methods.correct` fills both.
+    The methods themselves leave `sigma_z_m`, `covariance_m2` and `unsure` open, but for some that
+    know a scatter; `pcfix.refract.methods.correct` fills them.
     """
 
     shift_m: FloatArray
@@ -347,6 +354,7 @@ class Intersection(NamedTuple):
     incidence_deg: FloatArray
     camera_used: BoolArray
     covariance_m2: FloatArray | None = None
+    unsure: BoolArray | None = None
 
 
 def warn_of_unsolved(beginning: str, found: BoolArray) -> None:

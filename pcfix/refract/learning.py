@@ -278,14 +278,9 @@ def depth_ratio(batch: Batch, ties: TiePoints) -> float | None:
     return float(np.median(depth[deep] / tie_depth[deep])) if deep.sum() >= LEAST_TIES else None
 
 
-FLAT_DEG = 35.0
-"""Rays beyond this are those by which methods differ most; see `hypotheses.LIMITS`."""
-
-
 def seen_flat(batch: Batch) -> BoolArray:
-    """Return which points have rays, and those beyond `FLAT_DEG` from the normal alone."""
-    with_views = with_rays(batch)
-    return (with_views.counts > 0) & (with_views.steepest_deg() > FLAT_DEG)
+    """Return which points are seen by flat obliques alone; see `Batch.seen_flat`."""
+    return with_rays(batch).seen_flat()
 
 
 def weigh_lists(batch: Batch, *, is_open: bool) -> Verdict | None:

@@ -86,17 +86,22 @@ def _corrected(batch: Batch) -> Intersection:
         else:
             found = method(part)
         known = with_uncertainty(found, part)
-        of_maps = method in (invert_fusion, invert_depth_maps)
-        parts.append(_with_model_error(known, found, part) if of_maps else known)
+        if method in (invert_fusion, invert_depth_maps):
+            known = _with_model_error(known, found, part)
+        parts.append(_with_unsure(known, part, batch.views))
     return with_doubt(joined(parts, order, len(survey.cameras)), batch)
 
 
 def _takes_all_in_frame(batch: Batch) -> bool:
-    """Whether every camera whose frame holds the point counts, under water that is a plane."""
+    """Whether every camera whose frame holds the point counts, under water that is a plane.
+
+    And nobody asks which these are, as the kernel for this makes no lists.
+    """
     survey = batch.survey
     return (
         batch.views is None
         and survey.settings.max_cameras is None
+        and survey.settings.unsure == "keep"
         and survey.learned.occluder is None
         and survey.learned.matcher is None
         and not is_bent(survey)
@@ -121,7 +126,7 @@ def shift_of_land(batch: Batch) -> FloatArray:
     dry = replace(
         survey,
         water=WaterPlane(0.0),
-        settings=replace(survey.settings, index=1.0, dimensions="none"),
+        settings=replace(survey.settings, index=1.0, dimensions="none", unsure="keep"),
         level_offset_m=None,
         learned=survey.learned._replace(bed=None),
         parts={},
@@ -145,6 +150,14 @@ def _with_model_error(known: Intersection, found: Intersection, batch: Batch) ->
     covariance = known.covariance_m2.copy()
     covariance[:, 5] += np.where(moved, found.sigma_z_m**2 + (MODEL_GSD * gsd_m) ** 2, 0.0)
     return known._replace(covariance_m2=covariance, sigma_z_m=np.sqrt(covariance[:, 5]))
+
+
+def _with_unsure(found: Intersection, part: Batch, listed: Views | None) -> Intersection:
+    """Add, where it is asked for, which points are corrected by flat obliques alone."""
+    if part.survey.settings.unsure == "keep":
+        return found
+    unsure = (found.outcome == Outcome.CORRECTED) & part.seen_flat() & (listed is None)
+    return found._replace(unsure=unsure)
 
 
 def _method(batch: Batch) -> Method:
@@ -205,7 +218,7 @@ def joined(parts: list[Intersection], order: IntArray, k: int) -> Intersection:
     """Return the results of batches as one, back in the order of the points."""
 
     def back(name: str) -> Any:
-        if parts[0].covariance_m2 is None and name == "covariance_m2":
+        if getattr(parts[0], name) is None:
             return None
         values = np.concatenate([getattr(part, name) for part in parts])
         full = np.empty_like(values)

@@ -124,7 +124,7 @@ class Tally:
 
     def __init__(self, cameras: int) -> None:
         self.points = 0
-        self.water_unknown = 0
+        self.water_unknown = self.unsure = 0
         self.rays = 0
         self.outcomes = np.zeros(len(Outcome), dtype=np.int64)
         self.camera_used: BoolArray = np.zeros(cameras, dtype=np.bool_)
@@ -140,6 +140,7 @@ class Tally:
         self.points += len(apparent)
         self.water_unknown += int((~correction.water_known).sum())
         self.rays += int(correction.ray_count.sum())
+        self.unsure += 0 if correction.unsure is None else int(correction.unsure.sum())
         self.outcomes += np.bincount(correction.outcome, minlength=len(Outcome))
         self.camera_used |= correction.camera_used
         submerged = apparent[correction.submerged]
@@ -230,6 +231,8 @@ class Summary:
     """What the cloud was taken for, and why, where the options leave it open."""
     absorbed: bool = False
     """Whether it warned that the poses have absorbed the refraction; for later steps of a run."""
+    unsure: int | None = None
+    """Corrected points that flat obliques alone see; None where these are not withheld."""
 
     @property
     def points_per_s(self) -> float:
@@ -240,9 +243,9 @@ class Summary:
         """Return plain values, ready for JSON.
 
         `labelling` is there where it had rules, `carried` where the cloud was taken from old
-        cameras to adjusted ones.
+        cameras to adjusted ones, `unsure` where such points are withheld.
         """
-        some = ("labelling", "carried")
+        some = ("labelling", "carried", "unsure")
         values = {name: vars(self)[name] for name in vars(self) if name not in (*some, "absorbed")}
         more = {name: getattr(self, name) for name in some if getattr(self, name) is not None}
         return {**values, **more, "points_per_s": round(self.points_per_s)}

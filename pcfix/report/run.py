@@ -131,6 +131,9 @@ def _facts(s: Summary) -> Table:
         ["Cameras", f"{s.cameras_used} of {s.cameras} see corrected points;"
          f" {s.rays / max(s.corrected, 1):.1f} rays a point"],
     ]  # fmt: skip
+    if s.unsure is not None:
+        rows.append(["Unsure", f"{s.unsure:,} ({share(s.unsure, s.corrected)} of the corrected) are"
+                     " seen by flat obliques alone, and withheld"])  # fmt: skip
     if s.uncertainty is not None:
         tvu = s.uncertainty["tvu_95_m"]
         rows.append(["Uncertainty", f"TVU at 95 % {tvu['mean']:.3f} m on average, formal;"

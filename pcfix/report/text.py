@@ -31,6 +31,11 @@ def summary_text(summary: Summary) -> str:
     for reason, count in s.uncorrected.items():
         if count:
             lines.append(f"  not        {count:,}: {reason} ({_FATE[s.settings['uncorrected']]})")
+    if s.unsure is not None:
+        lines.append(
+            f"unsure       {s.unsure:,} ({share(s.unsure, s.corrected)} of the corrected): seen by"
+            " flat obliques alone, withheld"
+        )
     lines += _no_surface(s)
     if s.depth_m:
         depth = s.depth_m

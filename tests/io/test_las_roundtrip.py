@@ -15,7 +15,7 @@ from laspy.vlrs.vlrlist import VLRList
 
 import pcfix
 from pcfix import PcfixError
-from pcfix.io.las.columns import COLUMNS, UPGRADE
+from pcfix.io.las.columns import COLUMNS, UNSURE, UPGRADE
 from tests.utils.clouds import (
     CAMERA_HEIGHT_M,
     EAST_M,
@@ -652,7 +652,7 @@ def test_the_documentation_has_the_table_of_dimensions() -> None:
     units = {0.0: "file's scale", 0.001: "1 mm", 0.0001: "0.1 mm", 0.1: "0.1°", 1.0: ""}
     head = "| extra dimension | type | unit | |\n|---|---|---|---|\n"
     rows = []
-    for c in COLUMNS:
+    for c in (*COLUMNS, UNSURE):
         kind = c.narrow if c.narrow == c.wide else f"{c.narrow} ({c.wide})"
         rows.append(re.escape(f"| `{c.name}` | {kind} | {units[c.scale]} |".replace("  ", " ")))
     table = re.compile(re.escape(head) + "".join(f"{row} .+ \\|\n" for row in rows) + "\n")

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.io.las.columns import COLUMNS
+from pcfix.io.las.columns import COLUMNS, UNSURE
 from pcfix.io.pdal import add_dimension
 from pcfix.pdal_stage import stages
 from tests.utils.clouds import WATER_M, block, cameras_csv, framed_block, random_cloud, write_cloud
+from tests.utils.half_oblique import write_half_oblique
 
 DTYPES = {"float": "f4", "uint16": "u2", "uint8": "u1"}
 
@@ -126,6 +127,20 @@ def test_withheld_is_honoured_wherever_pdal_keeps_it(tmp_path, keeps, uncorrecte
     else:
         np.testing.assert_array_equal(outs["ClassFlags"] & 4 != 0, expected)
         np.testing.assert_array_equal(outs["ClassFlags"] & ~np.uint8(4), others)
+
+
+def test_unsure_points_are_withheld_as_in_files(tmp_path):
+    more = {"method": "snell", "max_angle": "none", "occlusion": "off", "unsure": "withhold"}
+    more |= write_half_oblique(tmp_path)
+    before = laspy.read(tmp_path / "cloud.las")
+    ins = arrays_of(before, add_dimension((*COLUMNS, UNSURE)))
+    outs, report = run("correct", ins, metadata_of(before.header), **more)
+    pcfix.correct_file(tmp_path / "cloud.las", tmp_path / "out.las", **more)
+    las = laspy.read(tmp_path / "out.las")
+    np.testing.assert_array_equal(outs["Unsure"], las.Unsure)
+    np.testing.assert_array_equal(outs["ClassFlags"] >> 2 & 1, las.withheld)
+    (told,) = (node["value"] for node in report["children"] if node["name"] == "unsure")
+    assert told > np.array(las.Unsure).sum() > 0  # some came withheld
 
 
 def test_classes_packed_with_flags_are_taken_apart(cloud, tmp_path):

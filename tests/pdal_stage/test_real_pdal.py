@@ -13,6 +13,7 @@ import pcfix
 from pcfix.io.las.columns import COLUMNS
 from pcfix.io.pdal import CLASS_FLAGS, STAGE_SOURCE, add_dimension
 from tests.utils.clouds import WATER_M, block, cameras_csv, framed_block, random_cloud, write_cloud
+from tests.utils.half_oblique import write_half_oblique
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
 from tests.utils.real_pdal import ROOT, needs_pdal, pdal, python
@@ -124,6 +125,21 @@ def test_any_call_has_its_pipeline(tmp_path: Path, more: dict[str, Any]) -> None
     assert list(stage.point_format.extra_dimension_names) == list(
         cli.point_format.extra_dimension_names
     )
+
+
+@needs_pdal
+def test_unsure_points_have_their_pipeline(tmp_path: Path) -> None:
+    more = {"method": "snell", "max_angle": "none", "occlusion": "off", "unsure": "withhold"}
+    more |= write_half_oblique(tmp_path)
+    words = [word for name, one in more.items() for word in ("--" + name.replace("_", "-"), one)]
+    job = pipeline_of(tmp_path, "cloud.las", "stage.las", *words)
+    done = run_pipeline("program", job, tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    pcfix.correct_file(tmp_path / "cloud.las", tmp_path / "cli.las", **more)
+    assert_same(tmp_path / "cli.las", tmp_path / "stage.las")
+    cli, stage = laspy.read(tmp_path / "cli.las"), laspy.read(tmp_path / "stage.las")
+    np.testing.assert_array_equal(stage.Unsure, cli.Unsure)
+    assert np.array(cli.Unsure).sum() > 0
 
 
 @needs_pdal

@@ -84,6 +84,7 @@ def test_restored_to_the_bit(scene, cloud, tmp_path):
         ({"port": "flat"}, "distance is missing"),
         ({"port": SPEC, "method": "murase"}, "method murase is about a water surface"),
         ({"port": SPEC, "camera_set": "mvs"}, "camera-set mvs is of no use with a port"),
+        ({"port": SPEC, "unsure": "withhold"}, "unsure withhold is of no use with a port"),
         ({"port": SPEC, "connected": True}, "connected is of no use with a port"),
         ({"port": SPEC, "tide": "tide.csv"}, "tide is of no use with a port"),
     ],

@@ -9,8 +9,8 @@ import pytest
 from pcfix.kernels import threads
 from pcfix.model import WaterPlane
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import Batch, Survey
-from pcfix.refract.learning import FLAT_DEG, learn_of_sample, seen_flat
+from pcfix.refract.batch import FLAT_DEG, Batch, Survey
+from pcfix.refract.learning import learn_of_sample, seen_flat
 from pcfix.refract.methods import correct
 from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import is_submerged, surface_above

@@ -2,13 +2,13 @@
 
 The extra dimensions are integers with a scale, so that LAZ packs them well. Each has a narrow type,
 which nearly every cloud fits, and a wide one; a cloud with a value outside the narrow range is
-written again with the wide types. `COLUMNS` is all that is said of them: files and PDAL's stage
-take name, type and unit from it, and a test holds the documentation to it.
+written again with the wide types. `COLUMNS` and `UNSURE` are all that is said of them: files and
+PDAL's stage take name, type and unit from them, and a test holds the documentation to them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from pcfix.errors import InputError
 from pcfix.model import BoolArray, Correction, FloatArray
-from pcfix.options.correct import Dimensions
+from pcfix.options.correct import Dimensions, Unsure
 
 if TYPE_CHECKING:
     import laspy
@@ -87,16 +87,18 @@ COLUMNS = (
     Column("RayCount", "ray_count", "uint16", "uint16", 1.0, "rays intersected", saturates=True),
     Column("SourceClass", "", "uint8", "uint8", 1.0, "class before the correction"),
 )
+UNSURE = Column("Unsure", "unsure", "uint8", "uint8", 1.0, "withheld: only flat rays see it")
+"""Written where such points are withheld."""
 SHIFTS = ("ShiftX", "ShiftY", "ShiftZ")
 MINIMAL = ("ShiftZ", "RayCount")
 
 
-def columns_for(dimensions: Dimensions) -> tuple[Column, ...]:
-    """Return the columns that ``--dimensions`` asks for."""
-    if dimensions == "all":
-        return COLUMNS
-    names = MINIMAL if dimensions == "minimal" else ()
-    return tuple(column for column in COLUMNS if column.name in names)
+def columns_for(dimensions: Dimensions, unsure: Unsure) -> tuple[Column, ...]:
+    """Return the columns that ``--dimensions`` and ``--unsure`` ask for."""
+    if dimensions == "none":
+        return ()
+    some = tuple(c for c in COLUMNS if dimensions == "all" or c.name in MINIMAL)
+    return (*some, UNSURE) if unsure == "withhold" else some
 
 
 def column_scale(column: Column, scales: FloatArray) -> float:
@@ -173,6 +175,22 @@ def changed_rows(correction: Correction, withheld: BoolArray, *, withhold: bool)
     """
     marked = correction.uncorrected if withhold else correction.submerged
     return correction.corrected | (marked & ~withheld)
+
+
+def unsure_anew(correction: Correction, withheld: BoolArray) -> Correction:
+    """Return a correction in which no point that came withheld is unsure.
+
+    So `restore` can tell these from the unsure ones, which are withheld by pcfix.
+    """
+    if correction.unsure is None:
+        return correction
+    return replace(correction, unsure=correction.unsure & ~withheld)
+
+
+def to_withhold(correction: Correction, *, withhold: bool) -> BoolArray:
+    """Return the rows to be flagged: the unsure, and the uncorrected where these are withheld."""
+    rows = correction.uncorrected if withhold else np.zeros(len(correction.outcome), np.bool_)
+    return rows if correction.unsure is None else rows | correction.unsure
 
 
 def is_corrected(points: laspy.ScaleAwarePointRecord) -> BoolArray:
