@@ -68,12 +68,17 @@ def threads(jobs: int | None) -> Iterator[None]:
         _most_threads = before
 
 
+def cores() -> int:
+    """Return on how many threads kernels run."""
+    return _most_threads or 1
+
+
 def in_tiles(run: Callable[..., Any], rows: int, *given: Any) -> None:
     """Call ``run((first, last), *given)`` for all rows, a tile of them at a time in each thread.
 
     No row may depend on another one: which share a tile depends on the number of threads.
     """
-    count = min(_most_threads or 1, rows)
+    count = min(cores(), rows)
     if count < 2:
         if rows:
             run((0, rows), *given)

@@ -23,6 +23,8 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompileResult
 from numba.core.registry import CPUDispatcher
 
+from pcfix.ahead import wait_for
+
 Decorator: TypeAlias = Callable[[Any], Any]
 
 TRIED = ("0.68",)
@@ -33,9 +35,17 @@ _are_linked = numba.__version__.rpartition(".")[0] in TRIED and not config.DISAB
 
 def kernel(**options: Any) -> Decorator:
     """Return a decorator for functions that Python calls, with options of numba's ``njit``."""
-    if _are_linked:
-        options["pipeline_class"] = _KernelCompiler
-    return njit(cache=True, **options)
+    if not _are_linked:
+        return njit(cache=True, **options)
+
+    def compiled(function: Any) -> _Kernel:
+        found = _Kernel(
+            function, targetoptions={"nopython": True, **options}, pipeline_class=_KernelCompiler
+        )
+        found.enable_caching()
+        return found
+
+    return compiled
 
 
 def part(**options: Any) -> Decorator:
@@ -116,6 +126,13 @@ class _PartCompiler(_KernelCompiler):
         self.state.flags.no_cpython_wrapper = True
         self.state.flags.no_compile = True
         return super().define_pipelines()
+
+
+class _Kernel(CPUDispatcher):
+    def compile(self, signature: Any) -> Any:
+        """Compile a kernel or load it, unless another process is compiling it."""
+        wait_for(f"{self.py_func.__module__}.{self.py_func.__qualname__}")
+        return super().compile(signature)
 
 
 class _Part(CPUDispatcher):

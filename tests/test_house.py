@@ -19,7 +19,8 @@ HOUSE = Path(__file__).parents[1] / "pcfix"
 # The floors, from the ground up. What shares a floor stands side by side; a file may import from
 # lower floors and from its own room. "pcfix" is the front door, pcfix/__init__.py.
 FLOORS = (
-    ("version", "errors", "parts"),
+    ("version", "errors", "ahead"),
+    ("parts",),
     ("kernels",),
     ("options",),
     ("model",),
@@ -45,7 +46,10 @@ TWINS = {"simulate": {"label", "refract", "port", "adjust", "clean", "grid", "co
 FILE_LIBRARIES = {"laspy", "rasterio", "pyproj", "fiona", "pyogrio", "PIL"}
 OPENING = {"read_text", "read_bytes", "write_text", "write_bytes"}
 # Files and libraries of files outside io/, with the reason.
-OUTSIDE_IO = {"pcfix.flow.adjust": "its results are a folder that is replaced as a whole"}
+OUTSIDE_IO = {
+    "pcfix.flow.adjust": "its results are a folder that is replaced as a whole",
+    "pcfix.ahead": "what its second process says goes nowhere",
+}
 
 MOST_PARAMETERS = 9
 
