@@ -10,34 +10,40 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from pcfix import parts
 from pcfix.errors import SettingError
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
-kernel: Callable[[_Function], _Function] = njit(cache=True, error_model="numpy", nogil=True)
-"""Compile a kernel."""
+kernel: Callable[[_Function], _Function] = parts.kernel(error_model="numpy", nogil=True)
+"""Compile a kernel: Python calls it."""
 
-lean: Callable[[_Function], _Function] = njit(
-    cache=True, error_model="numpy", nogil=True, _nrt=False
+part: Callable[[_Function], _Function] = parts.part(error_model="numpy", nogil=True)
+"""Compile a part of kernels: only they call it, and other parts."""
+
+lean_kernel: Callable[[_Function], _Function] = parts.kernel(
+    error_model="numpy", nogil=True, _nrt=False
 )
-"""Compile a kernel that makes no array and calls none that does.
+"""Compile a kernel that makes no array and calls nothing that does.
 
 References to arrays are not counted in it. Counting takes two locked operations for each array of
 each argument, which was two thirds of the time of kernels that are handed tuples of arrays.
 """
 
-inlined: Callable[[_Function], _Function] = njit(
-    cache=True, error_model="numpy", nogil=True, forceinline=True, _nrt=False
-)
-"""Compile a small lean kernel into those that call it."""
+lean: Callable[[_Function], _Function] = parts.part(error_model="numpy", nogil=True, _nrt=False)
+"""Compile a part that makes no array and calls none that does; see `lean_kernel`."""
 
-summed: Callable[[_Function], _Function] = njit(
-    cache=True, error_model="numpy", nogil=True, forceinline=True, _nrt=False,
+inlined: Callable[[_Function], _Function] = parts.part(
+    error_model="numpy", nogil=True, forceinline=True, _nrt=False
+)
+"""Compile a small lean part into those that call it."""
+
+summed: Callable[[_Function], _Function] = parts.part(
+    error_model="numpy", nogil=True, forceinline=True, _nrt=False,
     fastmath={"reassoc", "contract"},
 )  # fmt: skip
-"""Compile a small lean kernel of long sums into those that call it; their order is left open."""
+"""Compile a small lean part of long sums into those that call it; their order is left open."""
 
 Span: TypeAlias = tuple[int, int]
 """The first of the rows of a tile, and the one after its last."""
@@ -62,12 +68,17 @@ def threads(jobs: int | None) -> Iterator[None]:
         _most_threads = before
 
 
+def cores() -> int:
+    """Return on how many threads kernels run."""
+    return _most_threads or 1
+
+
 def in_tiles(run: Callable[..., Any], rows: int, *given: Any) -> None:
     """Call ``run((first, last), *given)`` for all rows, a tile of them at a time in each thread.
 
     No row may depend on another one: which share a tile depends on the number of threads.
     """
-    count = min(_most_threads or 1, rows)
+    count = min(cores(), rows)
     if count < 2:
         if rows:
             run((0, rows), *given)

@@ -19,7 +19,8 @@ HOUSE = Path(__file__).parents[1] / "pcfix"
 # The floors, from the ground up. What shares a floor stands side by side; a file may import from
 # lower floors and from its own room. "pcfix" is the front door, pcfix/__init__.py.
 FLOORS = (
-    ("version", "errors"),
+    ("version", "errors", "ahead"),
+    ("parts",),
     ("kernels",),
     ("options",),
     ("model",),
@@ -45,7 +46,10 @@ TWINS = {"simulate": {"label", "refract", "port", "adjust", "clean", "grid", "co
 FILE_LIBRARIES = {"laspy", "rasterio", "pyproj", "fiona", "pyogrio", "PIL"}
 OPENING = {"read_text", "read_bytes", "write_text", "write_bytes"}
 # Files and libraries of files outside io/, with the reason.
-OUTSIDE_IO = {"pcfix.flow.adjust": "its results are a folder that is replaced as a whole"}
+OUTSIDE_IO = {
+    "pcfix.flow.adjust": "its results are a folder that is replaced as a whole",
+    "pcfix.ahead": "what its second process says goes nowhere",
+}
 
 MOST_PARAMETERS = 9
 
@@ -238,6 +242,54 @@ SCALARS = {
 }  # fmt: skip
 
 
+PARTS = {"part", "lean", "inlined", "summed"}
+COMPILED = PARTS | {"kernel", "lean_kernel"}
+
+
+def compiled_by(node: ast.AST) -> str:
+    """Return which decorator of `pcfix.kernels` compiles a function, or nothing."""
+    found = getattr(node, "decorator_list", [])
+    return next((d for d in map(ast.unparse, found) if d in COMPILED), "")
+
+
+def run_by_python(node: ast.AST) -> Iterator[str]:
+    """Yield the names of the file that Python reads, and not from within a compiled function."""
+    if compiled_by(node):
+        return
+    own = set()
+    if isinstance(node, ast.FunctionDef | ast.Lambda):
+        own = {n.arg for n in ast.walk(node) if isinstance(n, ast.arg)}
+        own |= {
+            n.id for n in ast.walk(node) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)
+        }
+    if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
+        yield node.id
+    for child in ast.iter_child_nodes(node):
+        yield from (name for name in run_by_python(child) if name not in own)
+
+
+def test_only_kernels_call_parts() -> None:
+    """Python could, but would wait each time: they are not kept."""
+    parts = {
+        f"{name}.{node.name}"
+        for name, tree in trees().items()
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef) and compiled_by(node) in PARTS
+    }
+    found = []
+    for name, tree in trees().items():
+        known = {one.rpartition(".")[2]: one for one in parts if one.rpartition(".")[0] == name}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom):
+                full = {
+                    alias.asname or alias.name: f"{node.module}.{alias.name}"
+                    for alias in node.names
+                }
+                known |= {short: one for short, one in full.items() if one in parts}
+        found += [f"{name}: {known[one]}" for one in set(run_by_python(tree)) & known.keys()]
+    assert not found, "\n".join(found)
+
+
 def test_lean_kernels_return_numbers() -> None:
     """They do not count references to arrays: one that they hand out could be gone by then."""
     found = []
@@ -252,6 +304,6 @@ def test_lean_kernels_return_numbers() -> None:
                 if (node.returns)
                 else set()
             )
-            if by & {"lean", "inlined"} and not returned <= SCALARS:
+            if by & {"lean", "lean_kernel", "inlined", "summed"} and not returned <= SCALARS:
                 found.append(f"{name}.{node.name}: {sorted(returned - SCALARS)}")
     assert not found, "\n".join(found)

@@ -25,7 +25,7 @@ from pcfix.adjust.normal import (
 )
 from pcfix.adjust.observe import POINT, WIDTH, scratch
 from pcfix.adjust.problem import Problem, Solution, priors_at
-from pcfix.kernels import Span, kernel
+from pcfix.kernels import Span, kernel, part
 from pcfix.lens.algebra import inverted
 from pcfix.model import BoolArray, FloatArray, IntArray
 
@@ -241,7 +241,7 @@ def _point_covariances(
         _add_up(v, w[:size], at[:size], inverse, out[p])
 
 
-@kernel
+@part
 def _add_up(
     v: FloatArray, w: FloatArray, at: IntArray, inverse: FloatArray, out: FloatArray
 ) -> None:

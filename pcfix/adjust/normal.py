@@ -32,7 +32,7 @@ from pcfix.adjust.observe import (
     lens_gradients,
     scratch,
 )
-from pcfix.kernels import Span, in_tiles, lean
+from pcfix.kernels import Span, in_tiles, lean, lean_kernel
 from pcfix.lens.algebra import inverted
 from pcfix.model import FloatArray, IntArray
 
@@ -186,7 +186,7 @@ def _influence(square: float, loss: Loss) -> float:
     return 1.0
 
 
-@lean
+@lean_kernel
 def _residuals(
     span: Span, part: int, state: State, seen: Seen, surface: Surface, found: FloatArray,
     work: Workspace,
@@ -275,7 +275,7 @@ def point_block(
     return inverted(v, 1e-14)
 
 
-@lean
+@lean_kernel
 def _sum_up(
     span: Span, part: int, state: State, given: Given, rule: tuple[Loss, float], slot: IntArray,
     sums: Sums, work: Workspace,
@@ -379,7 +379,7 @@ def _eliminate(sums: Sums, slot: IntArray, who: IntArray, work: Workspace) -> No
             corner[i, j] -= y0 * w_g[j, 0] + y1 * w_g[j, 1] + y2 * w_g[j, 2]
 
 
-@lean
+@lean_kernel
 def _point_steps(
     span: Span, part: int, state: State, given: Given, rule: tuple[Loss, float],
     moved: FloatArray, steps: FloatArray, work: Workspace,

@@ -42,7 +42,7 @@ from pcfix.adjust.problem import (
 )
 from pcfix.adjust.solve import moved_by
 from pcfix.errors import GeometryError
-from pcfix.kernels import Span, kernel, lean
+from pcfix.kernels import Span, kernel, lean, part
 from pcfix.lens.algebra import inverted
 from pcfix.model import BoolArray, FloatArray, IntArray
 
@@ -175,7 +175,7 @@ def _newton(
     return step, points
 
 
-@kernel
+@part
 def _rows(most: int, g: int) -> _Rows:
     """Return room for so many observations."""
     right, left = np.empty((most, 2, WATER + g)), np.empty((most, 2, WATER + g))
@@ -183,7 +183,7 @@ def _rows(most: int, g: int) -> _Rows:
     return _Rows(right, left, r, who, np.empty((3, 3)), np.empty(3))
 
 
-@kernel
+@part
 def _gather(
     state: State, given: Given, tests: FloatArray, tested: bool, p: int, rows: _Rows,
     work: Workspace,

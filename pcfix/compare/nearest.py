@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, kernel, lean
+from pcfix.kernels import Span, in_tiles, kernel, lean, lean_kernel
 from pcfix.model import FloatArray, IntArray
 
 POINTS_PER_CELL = 3.0
@@ -85,7 +85,7 @@ def sorted_by_cell(cell: IntArray, count: int) -> tuple[IntArray, IntArray]:
     return start, order
 
 
-@lean
+@lean_kernel
 def _gather(span: Span, points: FloatArray, order: IntArray, arranged: FloatArray) -> None:
     """Set ``points[order]``, with all cores: the jumps through memory are what takes time."""
     for i in range(*span):
@@ -162,7 +162,7 @@ def _nearest_one(grid: Cells, place: FloatArray) -> float:
     return float(np.nan)
 
 
-@lean
+@lean_kernel
 def nearest_distances(
     span: Span, grid: Cells, places: FloatArray, order: IntArray, distance: FloatArray
 ) -> None:

@@ -193,7 +193,7 @@ def correct_file(
     given = taken(CorrectOptions, options, keywords, "correct_file")
     task = file_task(input, output, given, reads=paths_in(given), progress=progress)
     step = Correcting(job_for(task.source, given))
-    with threads(given.jobs):
+    with threads(given.jobs), step.job.compiling():
         step.job.look_around(lambda: file_points(task.source, step.job.water, given.jobs))
         _run_until_it_fits(task, step)
     result = step.job.summary(str(task.source), str(task.target), task.seconds)

@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from pcfix.adjust.carry import Carrying
+from pcfix.ahead import Rehearsal
 from pcfix.flow.diagnosis import diagnose_in_passing
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.learning import Learning
@@ -32,6 +33,7 @@ from pcfix.refract.batch import Batch, Intersection, MadeWith, Survey
 from pcfix.refract.hypotheses import Verdict
 from pcfix.refract.learning import as_told, weigh_lists
 from pcfix.refract.methods import correct, shift_of_land
+from pcfix.refract.rehearsal import rehearsals
 from pcfix.refract.tally import Tally
 from pcfix.water.checks import WaterMeeting, check_above_water, check_tilt, refuse_under_water
 from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
@@ -84,6 +86,10 @@ class ThroughWater:
         self._meeting = WaterMeeting(self.water)
         if self.carrying is not None:
             self.carrying.restart()
+
+    def rehearsals(self) -> tuple[Rehearsal, ...]:
+        """Return what compiles the kernels that ``auto`` needs."""
+        return rehearsals(self.survey) if self.survey.settings.method == "auto" else ()
 
     def look_around(
         self, chunks: Callable[[], Iterable[Points]], labelling: Labelling, views: ListedViews

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError
-from pcfix.kernels import lean
+from pcfix.kernels import lean, lean_kernel
 from pcfix.model import FloatArray, IntArray
 
 _TYPES = {
@@ -219,7 +219,7 @@ def _length(units: npt.NDArray[Any], at: int, size: int, big: bool) -> int:
     return count
 
 
-@lean
+@lean_kernel
 def list_starts(
     units: npt.NDArray[Any], item: IntArray, prefix: IntArray, big: bool, which: IntArray,
     start: IntArray,
@@ -250,7 +250,7 @@ def list_starts(
     return at
 
 
-@lean
+@lean_kernel
 def copy_field(
     units: npt.NDArray[Any], item: IntArray, prefix: IntArray, big: bool, field: int,
     part: tuple[int, int], records: int, out: npt.NDArray[Any],

@@ -17,7 +17,7 @@ from typing import TypeAlias, get_args
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from pcfix.kernels import inlined, lean
+from pcfix.kernels import inlined, lean, lean_kernel
 from pcfix.model import FloatArray, Lens, Projection
 
 KIND, LARGEST_ANGLE, LARGEST_RADIUS = range(3)
@@ -72,8 +72,13 @@ def largest_angle(lens: Lens) -> float:
 
 def largest_radius(c: FloatArray) -> float:
     """Return the distance from the centre of the largest angle; may be infinite."""
-    rho = float(radius(c, c[LARGEST_ANGLE]))
+    rho = float(_largest_radius(c))
     return rho if rho >= 0.0 else np.inf  # a tangent or a quotient beyond its pole by rounding
+
+
+@lean_kernel
+def _largest_radius(c: FloatArray) -> float:
+    return radius(c, c[LARGEST_ANGLE])
 
 
 def _end_of_polynomial(shape: tuple[float, ...]) -> float:
@@ -125,7 +130,7 @@ def radius(c: FloatArray, theta: float) -> float:
     return np.tan(theta)
 
 
-@lean
+@lean_kernel
 def angle(c: FloatArray, rho: float) -> float:
     """Return the angle from the axis of a place in the plane; undoes `radius`."""
     if not rho <= c[LARGEST_RADIUS]:
@@ -365,7 +370,7 @@ def _bends(c: FloatArray, r: float) -> bool:
     return False
 
 
-@lean
+@lean_kernel
 def _first_bend(c: FloatArray, fold: float) -> float:
     """Return the smallest radius that bends, found on a fine series and then halved to it."""
     low = 0.0

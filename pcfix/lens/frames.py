@@ -21,7 +21,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, inlined, lean
+from pcfix.kernels import Span, in_tiles, inlined, lean, lean_kernel
 from pcfix.lens.algebra import Vector, dot, minus, row_of, scaled, times
 from pcfix.lens.formulas import (
     B2,
@@ -414,7 +414,7 @@ def cameras_in_sight(xyz: FloatArray, cameras: Cameras) -> IntArray:
     return counts
 
 
-@lean
+@lean_kernel
 def _count(
     span: Span, xyz: FloatArray, centres: FloatArray, frames: Frames, counts: IntArray
 ) -> None:

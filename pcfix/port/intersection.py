@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.kernels import Span, in_tiles, kernel, lean
+from pcfix.kernels import Span, in_tiles, kernel, lean, part
 from pcfix.lens.algebra import (
     Vector,
     column_of,
@@ -230,7 +230,7 @@ def _choose(
                 start[i + 1] = kept.size
 
 
-@kernel
+@part
 def _box(xyz: FloatArray, rows: IntArray, shift: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the corners of an upright box around points; with shifts, a wide one around both.
 
@@ -247,7 +247,7 @@ def _box(xyz: FloatArray, rows: IntArray, shift: FloatArray) -> tuple[FloatArray
     return low - wide, high + wide
 
 
-@kernel
+@part
 def _usable(
     candidates: IntArray, point: Vector, rig: Rig, frames: Frames, limits: tuple[float, int],
     through: bool,

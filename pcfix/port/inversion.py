@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, kernel, lean
+from pcfix.kernels import Span, in_tiles, kernel, lean, part
 from pcfix.lens.algebra import (
     Vector,
     cross,
@@ -142,7 +142,7 @@ def _search_all(
         found[m] = _search(shift[i], row_of(xyz, i), camera[start[i] : start[i + 1]], rig)
 
 
-@kernel
+@part
 def _search(shift: FloatArray, point: Vector, cameras: IntArray, rig: Rig) -> bool:
     """Move a point to where g is zero; whether it was reached."""
     q = shift.copy()

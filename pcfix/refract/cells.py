@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import inlined, kernel, lean
+from pcfix.kernels import inlined, lean, part
 from pcfix.lens.algebra import Vector, row_of
 from pcfix.model import FloatArray, IntArray, WaterMesh, WaterRaster
 from pcfix.refract.batch import Batch, Chosen, Survey
@@ -99,7 +99,7 @@ def cells_of(batch: Batch) -> tuple[IntArray, IntArray]:
     return order, np.concatenate([[0], new, [len(order)]])
 
 
-@kernel
+@part
 def cameras_of(points: Chosen, i: int) -> IntArray:
     """Return the cameras of a point."""
     return points.camera[points.start[i] : points.start[i + 1]]
@@ -114,7 +114,7 @@ def are_same(a: IntArray, b: IntArray) -> bool:
     return same
 
 
-@kernel
+@part
 def counts_of(rows: IntArray, points: Chosen) -> IntArray:
     """Return how many of some points each camera sees."""
     seen = np.zeros(len(points.centres), np.int64)
@@ -124,13 +124,13 @@ def counts_of(rows: IntArray, points: Chosen) -> IntArray:
     return seen
 
 
-@kernel
+@part
 def no_box() -> Box:
     """Return a box that nothing is in."""
     return Box(np.zeros(3), np.ones(3), np.ones(3), np.zeros(3))
 
 
-@kernel
+@part
 def box_of(rows: IntArray, points: Chosen) -> Box:
     """Return the box of some points; the water is that of the first of them."""
     i, low, high = rows[0], np.full(3, np.inf), np.full(3, -np.inf)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.kernels import Span, in_tiles, kernel, lean
+from pcfix.kernels import Span, in_tiles, kernel, lean_kernel, part
 from pcfix.lens.algebra import dot, minus, normal_of, row_of
 from pcfix.lens.frames import (
     NOT_DISTORTED,
@@ -246,7 +246,7 @@ def _choose_all(
             free += kept.size
 
 
-@lean
+@lean_kernel
 def _gather_chosen(
     span: Span, begin: IntArray, start: IntArray, place: npt.NDArray[np.int32], chosen: IntArray
 ) -> None:
@@ -297,7 +297,7 @@ MAX_ANGLE_WITHOUT_FRAMES_DEG = 80.0
 block in another CRS is told apart."""
 
 
-@kernel
+@part
 def gather(tile: FloatArray, rows: IntArray, points: Points) -> tuple[FloatArray, FloatArray]:
     """Bring a tile together: runs of x, y, z, surface height and unit normal; return its box."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -313,7 +313,7 @@ def gather(tile: FloatArray, rows: IntArray, points: Points) -> tuple[FloatArray
     return low, high
 
 
-@kernel
+@part
 def _keep_steepest(chosen: IntArray, cosine2: FloatArray, k: int, most: int) -> int:
     """Bring the `most` steepest of k cameras to the front, in the order of the cameras."""
     if k <= most:
@@ -325,7 +325,7 @@ def _keep_steepest(chosen: IntArray, cosine2: FloatArray, k: int, most: int) -> 
     return most
 
 
-@kernel
+@part
 def near_cameras(
     frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray
 ) -> IntArray:
@@ -342,7 +342,7 @@ def near_cameras(
     return near[:count]
 
 
-@kernel
+@part
 def choose(
     candidates: IntArray, tile: FloatArray, j: int, rig: Rig, frames: Frames, rule: Rule,
     tin: Tin | None, field: Field | None, facet: int,

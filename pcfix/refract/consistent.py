@@ -30,7 +30,7 @@ from typing import TypeAlias
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.kernels import Span, in_tiles, kernel, lean, most_between
+from pcfix.kernels import Span, in_tiles, kernel, lean, most_between, part
 from pcfix.lens.algebra import (
     Vector,
     beyond,
@@ -176,7 +176,7 @@ Room: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 """Of one point: its rays, their sums, g and the inverse of its derivative."""
 
 
-@kernel
+@part
 def room_for(rays: int) -> Room:
     """Return room for a point with at most so many rays."""
     return np.empty((rays, RAY_WIDTH)), np.empty(10), np.empty(3), np.empty((3, 3))

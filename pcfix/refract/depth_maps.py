@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import inlined, kernel, lean
+from pcfix.kernels import inlined, lean, part
 from pcfix.lens.algebra import Vector, beyond, dot, minus, plus, row_of, scaled, unit
 from pcfix.lens.frames import holds
 from pcfix.model import FloatArray, IntArray
@@ -120,7 +120,7 @@ class Room(NamedTuple):
     found: IntArray
 
 
-@kernel
+@part
 def room_for(k: int) -> Room:
     """Return new room, in which no image has a place."""
     return Room(

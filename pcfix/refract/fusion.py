@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, kernel, lean
+from pcfix.kernels import Span, in_tiles, kernel, lean, part
 from pcfix.lens.algebra import dot
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Batch, Intersection
@@ -114,7 +114,7 @@ class Groups(NamedTuple):
     size: FloatArray
 
 
-@kernel
+@part
 def _no_groups(block: Block) -> Groups:
     k, matcher = len(block.points.centres), block.matcher
     return Groups(

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, kernel, lean
+from pcfix.kernels import Span, in_tiles, kernel, lean, part
 from pcfix.lens.algebra import dot, minus, row_of, scaled
 from pcfix.lens.frames import (
     ALL,
@@ -267,7 +267,7 @@ def _chosen(
             _intersect_one(result[i], cameras, tile, j, rig, rule.bend, tin, field, facet)
 
 
-@kernel
+@part
 def _intersect_one(
     row: FloatArray, cameras: IntArray, tile: FloatArray, j: int, rig: Rig, r: float,
     tin: Tin | None, field: Field | None, facet: int,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, kernel, lean
+from pcfix.kernels import Span, in_tiles, kernel, lean, part
 from pcfix.lens.algebra import dot
 from pcfix.lens.frames import holds
 from pcfix.model import BoolArray, FloatArray, IntArray
@@ -82,7 +82,7 @@ def _invert(
             _invert_one(result[i], i, points.camera[begin:end], given, block, table, room)
 
 
-@kernel
+@part
 def _may_count(rows: IntArray, block: Block) -> BoolArray:
     """Return which images, or their neighbours, are listed for some points."""
     listed = counts_of(rows, block.points) > 0

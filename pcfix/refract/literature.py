@@ -23,7 +23,7 @@ from dataclasses import replace
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.kernels import Span, in_tiles, kernel, lean
+from pcfix.kernels import Span, in_tiles, kernel, lean, part
 from pcfix.lens.algebra import dot, minus, row_of, scaled
 from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, Views
 from pcfix.refract.batch import Batch, Chosen, Intersection
@@ -141,7 +141,7 @@ def _choose_pairs(span: Span, points: Chosen, pair_start: IntArray, pair: IntArr
             pair[place], pair[place + 1] = rays[first], rays[second]
 
 
-@kernel
+@part
 def _best_pair(point: FloatArray, centres: FloatArray, rays: IntArray) -> tuple[int, int]:
     """Return the places of the best pair in the list of at least two rays; of equals the first."""
     k, (least, most) = rays.size, BASE_TO_HEIGHT

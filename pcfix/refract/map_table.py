@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import inlined, kernel, lean, summed
+from pcfix.kernels import inlined, lean, part, summed
 from pcfix.lens.algebra import Vector, cross, dot, minus, normal_of, row_of, scaled, unit
 from pcfix.lens.frames import holds
 from pcfix.model import BoolArray, FloatArray, IntArray
@@ -100,7 +100,7 @@ def block_of(batch: Batch) -> Block:
     return Block(batch.chosen(), images_of(batch.made_with, batch.survey.cameras), matcher)
 
 
-@kernel
+@part
 def no_table() -> Table:
     """Return a table without polynomials."""
     none = np.empty((0, 0))
@@ -110,7 +110,7 @@ def no_table() -> Table:
     )  # fmt: skip
 
 
-@kernel
+@part
 def table_of(rows: IntArray, seeing: BoolArray, block: Block) -> Table:
     """Fit the polynomials of some points, for the images that may see them."""
     matched, first = block.matcher.matched, np.flatnonzero(seeing)
@@ -135,7 +135,7 @@ def table_of(rows: IntArray, seeing: BoolArray, block: Block) -> Table:
     return Table(box, place, terms, in_frame, ways, np.zeros(seeing.size), np.ones(1))
 
 
-@kernel
+@part
 def _bed_under(box: Box) -> Box:
     """Return the box in which the bed of the points of a box lies."""
     deep, shallow = box.half[2] - box.middle[2], -box.half[2] - box.middle[2]

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, kernel, lean
+from pcfix.kernels import Span, in_tiles, kernel, lean, part
 from pcfix.lens.frames import Frames, frames_of
 from pcfix.lens.imaging import project
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints, Views
@@ -186,7 +186,7 @@ def _scores(
                 score[i, j] = total * area
 
 
-@kernel
+@part
 def _angle_deg(one: FloatArray, other: FloatArray, place: FloatArray) -> float:
     """Return the angle between the rays from a place to two centres."""
     a, b = one - place, other - place

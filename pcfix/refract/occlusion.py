@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.kernels import Span, in_tiles, lean
+from pcfix.kernels import Span, in_tiles, lean, lean_kernel
 from pcfix.model import BoolArray, FloatArray, IntArray, Views
 
 Heights = npt.NDArray[np.float32]
@@ -107,7 +107,7 @@ def in_sight(xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occlu
     return Views(start, views.camera[stays], weight, views.kind)
 
 
-@lean
+@lean_kernel
 def _hidden(
     span: Span, xyz: FloatArray, centres: FloatArray, start: IntArray, camera: IntArray,
     o: Occluder, found: BoolArray,

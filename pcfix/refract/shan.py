@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, kernel, lean
+from pcfix.kernels import Span, in_tiles, kernel, lean, part
 from pcfix.model import BoolArray, FloatArray, Outcome
 from pcfix.refract.batch import Batch, Chosen, Intersection
 from pcfix.refract.literature import depth_ratio
@@ -81,7 +81,7 @@ def _solve_all(span: Span, points: Chosen, found: FloatArray, failed: BoolArray)
             found[i, 3] = _miss(e, d, points.n, x, y, sunk)
 
 
-@kernel
+@part
 def _iterate(e: FloatArray, d: FloatArray, n: float) -> tuple[bool, float, float, float]:
     """Solve for one point; e (k, 3) leads from it to the cameras, d (k,) is its depth for each.
 
@@ -110,7 +110,7 @@ def _iterate(e: FloatArray, d: FloatArray, n: float) -> tuple[bool, float, float
     return True, x, y, sunk
 
 
-@kernel
+@part
 def _intersected(e: FloatArray, d: FloatArray, s: FloatArray) -> tuple[bool, float, float, float]:
     """Solve the collinearity equations with s known.
 

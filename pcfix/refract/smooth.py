@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, kernel, lean
+from pcfix.kernels import Span, in_tiles, kernel, lean, part
 from pcfix.lens.algebra import (
     Vector,
     beyond,
@@ -159,13 +159,13 @@ def _correct_cells(
                 correct_one(out, points, i, cameras, optics, None, None, room)
 
 
-@kernel
+@part
 def _empty_cell() -> _Cell:
     none = np.empty((0, 0))
     return _Cell(no_box(), none, np.empty(0, np.int64), none)
 
 
-@kernel
+@part
 def _cell_of(rows: IntArray, seen: IntArray, points: Chosen, optics: Optics, room: Room) -> _Cell:
     """Fit the polynomials of a cell."""
     named = np.flatnonzero(seen)
@@ -201,7 +201,7 @@ def _fit(terms: FloatArray, values: FloatArray) -> None:
             terms[_LACK + _SLOPE * k + i] = lack
 
 
-@kernel
+@part
 def _nodes_of(box: Box, points: Chosen) -> Chosen:
     """Return the nodes of a box as points."""
     xyz, height = box.middle + box.half * NODES, np.empty(len(NODES))

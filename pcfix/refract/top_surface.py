@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.kernels import kernel, lean
+from pcfix.kernels import kernel, lean_kernel
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.occlusion import BLOCK, LARGE_BLOCK, MARGIN_BLOCK, Occluder
@@ -166,7 +166,7 @@ def _quads(cells: Heights, pad: tuple[tuple[int, int], ...]) -> list[Any]:
     return [full[::2, ::2], full[::2, 1::2], full[1::2, ::2], full[1::2, 1::2]]
 
 
-@lean
+@lean_kernel
 def _add(cells: _Cells, xyz: FloatArray) -> None:
     for i in range(len(xyz)):
         c = int(np.floor(xyz[i, 0] / cells.side_m)) - cells.first_column

@@ -24,7 +24,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, inlined, kernel, lean
+from pcfix.kernels import Span, in_tiles, inlined, kernel, lean, part
 from pcfix.lens.algebra import Symmetric, Vector
 from pcfix.model import FloatArray, IntArray, Outcome
 from pcfix.options.correct import LEVEL_M
@@ -180,7 +180,7 @@ def _of_lists(
         finish_tile(result, rows, sums, tile, level_sigma, budget)
 
 
-@kernel
+@part
 def _named(start: IntArray, camera: IntArray, rows: IntArray, k: int) -> IntArray:
     """Return the cameras that the lists of some points name, in their order."""
     named = np.zeros(k, np.bool_)
@@ -216,7 +216,7 @@ def _per_image(budget: Budget) -> bool:
 # is not vectorised, and takes five times as long.
 
 
-@kernel
+@part
 def finish_tile(
     result: FloatArray, rows: IntArray, sums: FloatArray, tile: FloatArray,
     level_sigma: FloatArray, budget: Budget,

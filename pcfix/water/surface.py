@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import GeometryError, SettingError
-from pcfix.kernels import Span, in_tiles, kernel, lean
+from pcfix.kernels import Span, in_tiles, kernel, lean, lean_kernel
 from pcfix.model import (
     BoolArray,
     FloatArray,
@@ -187,7 +187,7 @@ def heights_above(field: Field, x: FloatArray, y: FloatArray) -> tuple[FloatArra
     return height, slope
 
 
-@lean
+@lean_kernel
 def _set_heights(
     span: Span, field: Field, x: FloatArray, y: FloatArray, height: FloatArray, slope: FloatArray
 ) -> None:
@@ -284,7 +284,7 @@ def _inside(corners: FloatArray, u: float, v: float) -> bool:
     return bool(s >= -EDGE_TOLERANCE and t >= -EDGE_TOLERANCE and s + t <= 1.0 + EDGE_TOLERANCE)
 
 
-@lean
+@lean_kernel
 def _set_facets(
     span: Span, tin: Tin, x: FloatArray, y: FloatArray, facet: npt.NDArray[np.int64]
 ) -> None:

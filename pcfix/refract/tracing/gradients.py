@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import SettingError
-from pcfix.kernels import Span, in_tiles, lean
+from pcfix.kernels import Span, in_tiles, lean, lean_kernel
 from pcfix.lens.algebra import Vector, dot, minus, normal_of, row_of, vector
 from pcfix.model import FloatArray
 from pcfix.refract.rays import light_path
@@ -203,7 +203,7 @@ def gradients(
     )
 
 
-@lean
+@lean_kernel
 def _differentiate(
     span: Span, points: FloatArray, centres: FloatArray, piercing: FloatArray, slope: FloatArray,
     n: float, result: FloatArray,

@@ -1,0 +1,54 @@
+"""How kernels are compiled changes nothing of the results."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numba
+
+from pcfix.parts import TRIED
+
+if TYPE_CHECKING:
+    from pytest import TempPathFactory
+
+CORRECT = """
+import sys
+import numba
+if sys.argv[1] == "apart":
+    numba.__version__ = "0.0.0"
+import numpy as np, pcfix, pcfix.parts
+assert (sys.argv[1] == "linked") == pcfix.parts._are_linked
+across, along = np.meshgrid(np.linspace(-40, 40, 3), np.linspace(-40, 40, 3))
+centres = np.column_stack([across.ravel(), along.ravel(), np.full(9, 100.0)])
+lens = pcfix.Lens(3000.0, 4000.0, 3000.0, 2010.0, 1490.0)
+cameras = pcfix.Cameras(
+    tuple("abcdefghi"), centres, np.tile(np.diag([1.0, -1.0, -1.0]), (9, 1, 1)), (lens,) * 9
+)
+places = np.random.default_rng(5).uniform([-30, -30, -6], [30, 30, -1], (500, 3))
+found = pcfix.correct_points(places, cameras, 0.0, method="snell", max_angle=None)
+sys.stdout.buffer.write(np.column_stack([found.xyz, found.sigma_z_m]).tobytes())
+"""
+
+
+def corrected(way: str, cache: Path) -> bytes:
+    done = subprocess.run(
+        [sys.executable, "-c", CORRECT, way],
+        capture_output=True,
+        check=True,
+        env=os.environ | {"NUMBA_CACHE_DIR": str(cache)},
+    )
+    return done.stdout
+
+
+def test_this_numba_was_tried() -> None:
+    assert numba.__version__.rpartition(".")[0] in TRIED
+
+
+def test_parts_give_what_kernels_give(tmp_path_factory: TempPathFactory) -> None:
+    linked = corrected("linked", tmp_path_factory.mktemp("linked"))
+    assert len(linked) == 500 * 4 * 8
+    assert linked == corrected("apart", tmp_path_factory.mktemp("apart"))
