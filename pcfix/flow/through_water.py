@@ -235,21 +235,20 @@ class ThroughWater:
             self._inputs, self._cameras, self.water, self._options.refractive_index, self._view
         )
 
+    def _told(self) -> list[str]:
+        """Return what the cloud told beside the sentence on how it was made."""
+        verdicts = dict.fromkeys(note for one in self.verdicts for note in one.warnings())
+        return [*self._learning.notes, *verdicts, *self._learning.of_unlisted_notes()]
+
     def notes(self, tally: Tally) -> list[str]:
         """Return what was done on the user's behalf."""
         bent = [self._bent] if self._bent else []
-        return [
-            *self._learning.notes,
-            *(note for one in self.verdicts for note in one.warnings()),
-            *self._learning.of_unlisted_notes(),
-            *self.found.notes,
-            *self._meeting.notes,
-            *bent,
-        ]
+        return [*self._told(), *self.found.notes, *self._meeting.notes, *bent]
 
     def figures(self, tally: Tally) -> dict[str, Any]:
         """Return what the summary says of depths and water."""
-        moved, water = self.level_offset_m, str(self.water)
+        moved, water, made = self.level_offset_m, str(self.water), self.made
+        notes = [] if made is None else [s for s in self._told() if s not in made["because"]]
         if moved is not None:
             times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
             water = f"{water}, {times}"
@@ -259,7 +258,7 @@ class ThroughWater:
             "water_fit": self.found.as_dict(),
             "uncertainty": tally.uncertainty(),
             "carried": None if self.carrying is None else self.carrying.as_dict(),
-            "made": self.made,
+            "made": None if made is None else {**made, "notes": notes},
             "absorbed": bool(self._bent),
         }
 

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import PcfixWarning
-from pcfix.kernels import Span, in_tiles, inlined, lean
+from pcfix.kernels import Span, in_tiles, inlined, lean, lean_kernel
 from pcfix.lens.algebra import Vector, times, transposed_times
 from pcfix.lens.imaging import direction_of, image_of, lens_table
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Outcome, Views, WaterSurface
@@ -321,7 +321,7 @@ def stacked(batches: list[Batch]) -> Batch:
     )
 
 
-@lean
+@lean_kernel
 def _incidence(
     span: Span, xyz: FloatArray, normals: FloatArray, centres: FloatArray, start: IntArray,
     camera: IntArray, cosine: FloatArray,

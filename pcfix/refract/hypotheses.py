@@ -158,10 +158,10 @@ class Verdict(NamedTuple):
         """Return what the user must know of it, a sentence each."""
         apart = self.is_against and abs(self.deeper_m) > self.doubt.formal_m
         unsure = apart if self.is_told else not self.is_sure
-        said = (str(self),) if unsure else ()
-        if not self.is_told and self.patches and self.share > FITS:
-            said = (f"{self} {CAUSES}",)
-        return (*self.remarks, *said)
+        is_way = "method" in self.chosen.changes and not self.is_told
+        none_fits = is_way and self.patches > 0 and self.share > FITS
+        said = ((str(self), unsure), (CAUSES, none_fits))
+        return (*self.remarks, *(sentence for sentence, holds in said if holds))
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""

@@ -50,6 +50,7 @@ def summary_text(summary: Summary) -> str:
         )
     if s.made:
         lines.append(f"method       {s.made['method']}. {s.made['because']}")
+        lines += [f"  note       {note}" for note in s.made.get("notes", ())]
     unused = len(s.cameras_unused)
     names = ", ".join(s.cameras_unused[:5]) + (", ..." if unused > 5 else "")
     lines += [

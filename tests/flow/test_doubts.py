@@ -169,11 +169,11 @@ def test_a_grid_is_said():
 
 def test_a_smooth_cloud_is_said():
     scene = scene_of(bed="flat")
-    assert not any("mesh" in note for note in told(scene.apparent_xyz, scene)[0].warnings())
+    assert not any("of a mesh" in note for note in told(scene.apparent_xyz, scene)[0].warnings())
     xyz = scene.apparent_xyz.copy()
     xyz[:, 2] = np.median(xyz[:, 2]) + 0.01 * (xyz[:, 0] - xyz[:, 0].mean())
     (verdict,) = told(xyz, scene)
-    assert "mesh" in " ".join(verdict.warnings())
+    assert "of a mesh" in " ".join(verdict.warnings())
 
 
 def test_a_cloud_that_was_corrected_is_deeper_than_its_tie_points():
