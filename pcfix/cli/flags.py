@@ -86,6 +86,9 @@ Quiet = Annotated[
 ]
 
 
+COMPILING = "kernels are compiled first, once after an installation: about a minute"
+
+
 @contextmanager
 def progress_bar(title: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
     """Show a bar with points/s and the time left on a terminal; nothing when piped."""
@@ -103,14 +106,16 @@ def progress_bar(title: str, quiet: bool) -> Iterator[Callable[[int, int], None]
         progress.TimeRemainingColumn(),
     )
     with progress.Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        if not any((Path(__file__).parents[1] / "refract").glob("__pycache__/*.nbi")):
-            title = f"Compiling, once after an installation; then {title.lower()}"
-        task = bar.add_task(title, total=None, rate="")
+        kept = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[1] / "refract")
+        first = "" if any(kept.glob("**/*.nbi")) else f" ({COMPILING})"
+        task = bar.add_task(title + first, total=None, rate="")
         started = time.perf_counter()
 
         def update(done: int, total: int) -> None:
             rate = done / (time.perf_counter() - started)
-            bar.update(task, completed=done, total=total, rate=f"{rate:,.0f} points/s")
+            bar.update(
+                task, description=title, completed=done, total=total, rate=f"{rate:,.0f} points/s"
+            )
 
         yield update
 
