@@ -172,7 +172,8 @@ def _doubt(part: Batch, beds: _Beds, way: int, among: list[int]) -> Doubt:
     """Return what a way leaves open, told or decided, among ways that may be right.
 
     That is of the one that fits best, for each other one, the share of the difference to it that
-    is left in the bed; of a way that fits less well, the difference to the best besides.
+    is left in the bed; of a way that fits less well, the difference to the best besides. Of what is
+    no way to make a cloud, but a formula, all of it: a bed can be smooth and too shallow.
     """
     depth = np.maximum(part.surface.height_m - beds.z[way], 1e-3)[beds.place]
     deep = depth > LEAST_DEPTH_M
@@ -180,12 +181,12 @@ def _doubt(part: Batch, beds: _Beds, way: int, among: list[int]) -> Doubt:
     def left(a: int, b: int, most: float) -> float:
         apart = np.abs((beds.z[a] - beds.z[b])[beds.place]) / depth
         share = min(max(float(beds.share[a, b]), 0.0) + float(beds.sigma[a, b]), 1.0)
-        return (share if share < most else 1.0) * _spread(apart[deep])
+        return (share if share <= most else 1.0) * _spread(apart[deep])
 
     best, _ = beds.rank(among)
     open_m = max((left(best, i, 1.0) for i in among if i != best), default=0.0)
     if way != best:
-        open_m = math.hypot(open_m, left(way, best, 0.5))
+        open_m = math.hypot(open_m, left(way, best, 0.5 if way in among else 0.0))
     scatter = scatter_m(part, beds.place, beds.z[way])
     budget = correct(_as(part, beds.ways[way], "all"))
     formal = float(np.median(budget.sigma_z_m))

@@ -18,7 +18,9 @@ within 1.96 SigmaZ.
 noise of the same size, of 1000 points. Of depth maps the list has no partner images, and each is
 matched anew, so that there it is a scale rather than a limit.
 
-``--sensitivity`` prints how wrong inputs come through instead, beside the predicted budget.
+``--reliability PNG`` draws, of each scene, the share of the points whose error is within so many
+standard errors beside the share that a Gaussian has there. ``--sensitivity`` prints how wrong
+inputs come through instead, beside the predicted budget.
 """
 
 from __future__ import annotations
@@ -41,6 +43,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from pcfix.flow.learning import learn_regression
 from pcfix.label.labelling import Part
 from pcfix.water.surface import surface_above
+from tests.benchmarks.accuracy_reliability import BOUNDS, draw
 from tests.benchmarks.accuracy_scenes import NAMES, Case, make
 from tests.benchmarks.accuracy_sensitivity import COLUMNS as SENSITIVITY_COLUMNS
 from tests.benchmarks.accuracy_sensitivity import sensitivity
@@ -74,6 +77,8 @@ def rows_of(case: Case, runs: int, seed: int) -> list[dict[str, Any]]:
     learned = regression_of(case, seed)
     rows.append(row_of(case, "regression", None, {"regression": learned}, runs))
     rows.append(row_of(case, "auto", "auto", {}, runs))
+    if "views" in case.knowledge:
+        rows.append(row_of(case, "auto", "views", case.knowledge["views"], runs))
     rows.append(row_of(case, "snell", "auto", {}, runs))
     rows += [
         row_of(case, method, name, {**options, "max_angle": None}, runs)
@@ -97,11 +102,13 @@ def row_of(
     rows = np.flatnonzero(case.measured & found.corrected)
     error = case.error(found.xyz[rows], rows)
     rays = float(found.ray_count[rows].mean()) if cameras else None
+    within = np.abs(error[:, 2]) / found.sigma_z_m[rows]
     return {
         **row,
         "rays": rays,
         **errors(case, error),
-        "covered": float(np.mean(np.abs(error[:, 2]) <= 1.96 * found.sigma_z_m[rows])),
+        "covered": float(np.mean(within <= 1.96)),
+        "within": [float(np.mean(within <= bound)) for bound in BOUNDS],
         "done": len(rows) / int(case.measured.sum()),
         "points_per_s": int(found.submerged.sum()) / seconds,
     }
@@ -176,6 +183,7 @@ def main() -> None:
     ask.add_argument("--scenes", nargs="+", choices=NAMES, default=list(NAMES))
     ask.add_argument("--runs", type=int, default=1, help="the speed is the median of so many")
     ask.add_argument("--seed", type=int, default=1)
+    ask.add_argument("--reliability", type=Path, metavar="PNG", help="draw it there")
     ask.add_argument("--sensitivity", action="store_true", help="print the other table")
     ask.add_argument("--markdown", action="store_true")
     ask.add_argument("--json", type=Path, help="write the rows there as well")
@@ -185,6 +193,8 @@ def main() -> None:
         print(table(rows, SENSITIVITY_COLUMNS, markdown=given.markdown))
     else:
         rows = accuracy(given)
+        if given.reliability:
+            draw(rows, given.reliability)
     if given.json:
         asked = {"points": given.points, "seed": given.seed, "runs": given.runs}
         given.json.write_text(json.dumps({"pcfix": pcfix.__version__, **asked, "rows": rows}))
