@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import laspy
@@ -101,6 +102,15 @@ def test_bar_on_a_terminal(scene, tmp_path):
         parent, child = pty.openpty()
     except OSError as error:
         pytest.skip(f"this machine lends no terminal: {error}")
+    seen = []
+
+    def read():
+        with contextlib.suppress(OSError):  # the end of a terminal is an error
+            while part := os.read(parent, 4096):
+                seen.append(part.decode(errors="replace"))
+
+    reader = threading.Thread(target=read)  # meanwhile: a terminal that nobody reads is soon full
+    reader.start()
     words = ("--cameras", scene / "cameras.csv", "--water", "0.37", "--quiet")
     for quiet in (words, words[:-1]):
         done = subprocess.run(
@@ -111,12 +121,9 @@ def test_bar_on_a_terminal(scene, tmp_path):
         )  # fmt: skip
         assert (done.stdout == b"") == ("--quiet" in quiet)
     os.close(child)
-    seen = ""
-    with contextlib.suppress(OSError):  # the end of a terminal is an error
-        while part := os.read(parent, 4096):
-            seen += part.decode(errors="replace")
-    assert "Correcting" in seen
-    assert "points/s" in seen
+    reader.join()
+    assert "Correcting" in "".join(seen)
+    assert "points/s" in "".join(seen)
 
 
 def test_demo_prints_errors_before_and_after(tmp_path):
