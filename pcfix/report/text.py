@@ -15,6 +15,8 @@ from pcfix.refract.tally import ORDERS, Summary
 if TYPE_CHECKING:
     from pcfix.label.labelling import LabelSummary
 
+FEWEST = 59
+"""Differences of which all keep an order before 95 % of all are likely to: 0.95^59 is 0.05."""
 BED_PER_LEVEL = 0.44
 """How far a bed moves with the level, measured over whole blocks; straight down it is n - 1."""
 
@@ -239,6 +241,22 @@ def tvu_sentence(uncertainty: dict[str, Any]) -> str:
     number = "order" if order[0].isdigit() else ""
     name = f"{number} {order}".strip() + ("" if number else " Order")
     return f"{100.0 * within:.4g} % of the points are within the TVU of IHO S-44 {name}"
+
+
+def uncertainty_sentence(s: Summary, measured: dict[str, Any] | None = None) -> str:
+    """Return TVU and order of S-44 of a run: as `measured` against a reference, else as predicted.
+
+    `measured` is `Comparison.tvu` in plain values. Empty where neither is known.
+    """
+    mean = "" if s.uncertainty is None else f"{s.uncertainty['tvu_95_m']['mean']:.3f} m on average"
+    if measured is None:
+        return f"TVU at 95 % {mean}, formal; {order_sentence(s)}" if mean else ""
+    few = f"fewer than {FEWEST} points claim no order of IHO S-44"
+    return (
+        f"TVU at 95 %{f' predicted {mean},' if mean else ''} measured"
+        f" {measured['tvu_95_m']:.3f} m at {measured['count']:,} points of the bed;"
+        f" {few if measured['count'] < FEWEST else tvu_sentence(measured)}"
+    )
 
 
 def labelling_text(summary: LabelSummary) -> str:
