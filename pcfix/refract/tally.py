@@ -193,9 +193,17 @@ class Tally:
         p5, p95 = (self._shift.percentile_m(percent) for percent in (5, 95))
         return _rounded(mean=self._shift.mean_m(), p5=p5, p95=p95)
 
-    def uncertainty(self) -> dict[str, Any] | None:
-        """Return standard error of Z, TVU and orders; see `UncertaintyTally.as_dict`."""
-        return self._uncertainty.as_dict()
+    def uncertainty(self, made: dict[str, Any] | None = None) -> dict[str, Any] | None:
+        """Return standard error of Z, TVU and orders; see `UncertaintyTally.as_dict`.
+
+        `of_cloud` is there where what the cloud was `made` of tells it: the scatter beyond the
+        error budget, and the standard deviation relative to the depth, that the cloud itself adds.
+        """
+        found = self._uncertainty.as_dict()
+        if found is not None and made is not None and "scatter_m" in made:
+            doubt = {"scatter_m": made["scatter_m"], "per_depth": made["doubt_per_depth"]}
+            found["of_cloud"] = doubt
+        return found
 
 
 def _rounded(**values: float) -> dict[str, float]:

@@ -33,7 +33,7 @@ from pcfix.report.page import (
     new_figure,
     new_map,
 )
-from pcfix.report.text import errors_of, share, uncertainty_sentence
+from pcfix.report.text import errors_of, of_cloud, share, uncertainty_sentence
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
@@ -157,6 +157,8 @@ def _facts(s: Summary, measured: Plain | None) -> Table:
     if s.unsure is not None:
         rows.append(["Unsure", f"{s.unsure:,} ({share(s.unsure, s.corrected)} of the corrected) are"
                      " seen by flat obliques alone, and withheld"])  # fmt: skip
+    if s.made is not None:
+        rows.insert(2, ["Method", f"{s.made['method']}. {s.made['because']}"])
     if uncertainty := uncertainty_sentence(s, measured):
         rows.append(["Uncertainty", uncertainty])
     return Table("In short", [], rows)
@@ -279,7 +281,7 @@ def _uncertainty_picture(sample: FloatArray, s: Summary, later: Later) -> list[P
     text = (
         "Total vertical uncertainty at 95 % (1.96 standard errors of Z) over depth, and the"
         f" largest that the orders of IHO S-44 allow. It is formal: it assumes {errors_of(s)}"
-        f" (standard deviations), and no mismatches."
+        f" (standard deviations), and {of_cloud(s)}."
         + (" Dots: within which 95 % of the differences to the reference lie." if bins else "")
         + " S-44 asks for more than the TVU: position, features and coverage."
     )

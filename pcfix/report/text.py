@@ -140,11 +140,11 @@ def _uncertainty(s: Summary) -> list[str]:
         return []
     sigma, tvu = found["sigma_z_m"], found["tvu_95_m"]
     return [
-        f"uncertainty  standard error of Z mean {sigma['mean']:.3f} m, 95 % of the points below"
-        f" {sigma['p95']:.3f} m; TVU at 95 % mean {tvu['mean']:.3f} m",
+        f"uncertainty  predicted standard error of Z mean {sigma['mean']:.3f} m, 95 % of the points"
+        f" below {sigma['p95']:.3f} m; TVU at 95 % mean {tvu['mean']:.3f} m",
         f"  IHO S-44   {order_sentence(s)}",
-        f"  formal     it assumes {errors_of(s)} (standard deviations)",
-        "             and no mismatches; S-44 asks for more than the TVU",
+        f"  formal     it assumes {errors_of(s)} (standard deviations),",
+        f"             and {of_cloud(s)}; S-44 asks for more than the TVU",
     ]
 
 
@@ -152,6 +152,17 @@ def errors_of(s: Summary) -> str:
     """Return the budget of a run in words."""
     fitted = None if s.water_fit is None else s.water_fit["sigma_level_m"]
     return budget_words(s.settings, fitted)
+
+
+def of_cloud(s: Summary) -> str:
+    """Return what the standard errors have beyond the budget, in words."""
+    found = (s.uncertainty or {}).get("of_cloud")
+    if found is None:
+        return "no mismatches"
+    return (
+        f"has from the cloud itself {found['scatter_m']:.3f} m of scatter and"
+        f" {100.0 * found['per_depth']:.1f} % of the depth"
+    )
 
 
 def left_out_lines(labelling: dict[str, Any] | None) -> list[str]:

@@ -109,6 +109,7 @@ def test_measured_uncertainty_is_said_where_there_is_a_reference(finished):
     assert said.endswith("IHO S-44 Exclusive Order")
     assert said in text
     assert f"<td>{100.0 * measured['s44']['Exclusive']:.4g} %</td>" in text
+    assert f"<td>consistent. {steps['correct']['made']['because']}</td>" in text
 
 
 def test_a_formal_order_that_the_reference_forbids_is_not_claimed(tmp_path):

@@ -13,7 +13,7 @@ import pytest
 import pcfix
 from pcfix.compare.statistics import binned, tvu_of
 from pcfix.options.correct import BudgetOptions
-from pcfix.refract.tally import ORDERS, UncertaintyTally, largest_tvu_m
+from pcfix.refract.tally import ORDERS, Tally, UncertaintyTally, largest_tvu_m
 from pcfix.report.page import png_of
 from pcfix.report.run import tvu_figure
 from pcfix.report.text import (
@@ -132,6 +132,18 @@ def test_what_was_measured_is_said_instead_of_what_was_predicted(summary):
     assert f"fewer than {FEWEST} points claim no order" in uncertainty_sentence(summary, few)
 
 
+def test_what_the_cloud_adds_is_said(summary):
+    made = summary.made
+    doubt = {"scatter_m": made["scatter_m"], "per_depth": made["doubt_per_depth"]}
+    assert summary.uncertainty["of_cloud"] == doubt
+    percent = 100.0 * doubt["per_depth"]
+    assert percent > 0.0
+    text = summary_text(summary)
+    assert f"m of scatter and {percent:.1f} % of the depth; S-44 asks" in text
+    assert "no mismatches" not in text
+    assert Tally(1).uncertainty(made) is None
+
+
 def test_a_run_says_what_it_assumed(tmp_path):
     scene = Path(__file__).parents[2] / "samples" / "scene"
     cloud, cameras = scene / "cloud.laz", scene / "cameras.csv"
@@ -143,5 +155,6 @@ def test_a_run_says_what_it_assumed(tmp_path):
     moved = np.asarray(written["RayCount"]) > 0
     tally.add(np.asarray(written["SigmaZ"])[moved], np.asarray(written["WaterDepth"])[moved])
     text = summary_text(replace(summary, uncertainty=tally.as_dict()))
+    assert "predicted standard error of Z" in text and "and no mismatches" in text
     assert "TVU at 95 %" in text and "it assumes image 0.5 px, level 0.020 m (assumed)" in text
     assert "uncertainty" not in summary_text(replace(summary, uncertainty=None))
