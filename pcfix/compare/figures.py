@@ -147,6 +147,13 @@ def bins_table(bins: Iterable[Bin]) -> str:
     return "\n".join(lines) + "\n"
 
 
+CORRECTED_BEFORE = (
+    "As it came, the cloud has the depths of the reference: it was likely corrected before."
+)
+AS_DEEP, TOO_DEEP = 0.10, 0.15
+"""Of the depth: a cloud that came so near to the reference, and is deeper by that much now, was
+corrected twice; as refraction leaves it, it lacks a quarter.
+"""
 MIN_REACH_M, REACH_FACTOR = 1.0, 1.5
 """M3C2 looks along the normal beyond nearly all differences: 1.5 times their 99th percentile."""
 
@@ -249,6 +256,9 @@ def _by_depth(match: Match, pairs: AfterBefore[Pairs] | None, notes: list[str]) 
         depth_before = ((surface if over is None else over) - before.reference_m)[wet]
         error_before = before.error_m[wet]
         fits = replace(fits, before=fit_line(depth_before, depth_before - error_before))
+        now, came = _ratio(depth, error), _ratio(depth_before, error_before)
+        if abs(came - 1.0) <= AS_DEEP and now > 1.0 + TOO_DEEP:
+            notes.append(CORRECTED_BEFORE)
     bins = binned(depth, error, error_before, match.settings.bin_width)
     found = _OfDepth(fits, bins, tvu=tvu_of(error, depth))
     if len(match.dry_xy) == 0:
@@ -257,6 +267,12 @@ def _by_depth(match: Match, pairs: AfterBefore[Pairs] | None, notes: list[str]) 
     shore = distance_from_shore(after.xy[wet], match.dry_xy)
     width = match.settings.shore_bin_width
     return replace(found, shore_bins=binned(shore, error, error_before, width))
+
+
+def _ratio(depth_m: FloatArray, error_m: FloatArray) -> float:
+    """Return the median of depth over reference depth, where that is one; NaN if nowhere."""
+    some = depth_m > 0.0
+    return float(np.median(1.0 - error_m[some] / depth_m[some])) if some.any() else math.nan
 
 
 def _m3c2(match: Match, pairs: AfterBefore[Pairs] | None) -> AfterBefore[M3c2] | None:
