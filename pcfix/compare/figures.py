@@ -19,10 +19,12 @@ from pcfix.compare.statistics import (
     Bin,
     Distribution,
     Line,
+    Tvu,
     binned,
     distance_from_shore,
     distribution_of,
     fit_line,
+    tvu_of,
 )
 from pcfix.compare.vertical import Pairs, pairs_at_cloud, pairs_at_reference
 from pcfix.errors import GeometryError
@@ -73,6 +75,8 @@ class Comparison:
         Depth against reference depth; None where the water surface is not known.
     depth_bins, shore_bins : tuple of Bin
         Submerged places by reference depth, and by distance in plan from the nearest dry point.
+    tvu : Tvu or None
+        Of all submerged places.
     m3c2 : AfterBefore of M3c2, or None
     sections : tuple of Section
     settings : CompareRules
@@ -90,6 +94,7 @@ class Comparison:
     depth: AfterBefore[Line | None] | None
     depth_bins: tuple[Bin, ...]
     shore_bins: tuple[Bin, ...]
+    tvu: Tvu | None
     m3c2: AfterBefore[M3c2] | None
     sections: tuple[Section, ...]
     settings: CompareRules
@@ -142,6 +147,13 @@ def bins_table(bins: Iterable[Bin]) -> str:
     return "\n".join(lines) + "\n"
 
 
+CORRECTED_BEFORE = (
+    "As it came, the cloud has the depths of the reference: it was likely corrected before."
+)
+AS_DEEP, TOO_DEEP = 0.10, 0.15
+"""Of the depth: a cloud that came so near to the reference, and is deeper by that much now, was
+corrected twice; as refraction leaves it, it lacks a quarter.
+"""
 MIN_REACH_M, REACH_FACTOR = 1.0, 1.5
 """M3C2 looks along the normal beyond nearly all differences: 1.5 times their 99th percentile."""
 
@@ -158,7 +170,7 @@ def figures_of(match: Match, lines: Sequence[SectionLine], started: float) -> Co
     if match.settings.vertical:
         _check_enough(match)
         pairs = _both(partial(_pairs, match), *clouds)
-    fits, depth_bins, shore_bins = _by_depth(match, pairs, notes)
+    of_depth = _by_depth(match, pairs, notes)
     return Comparison(
         cloud=match.whole.name,
         reference=match.reference.name,
@@ -168,9 +180,10 @@ def figures_of(match: Match, lines: Sequence[SectionLine], started: float) -> Co
         vertical=None
         if pairs is None
         else _both(lambda p: distribution_of(p.error_m), pairs.after, pairs.before),
-        depth=fits,
-        depth_bins=depth_bins,
-        shore_bins=shore_bins,
+        depth=of_depth.fits,
+        depth_bins=of_depth.depth_bins,
+        shore_bins=of_depth.shore_bins,
+        tvu=of_depth.tvu,
         m3c2=_m3c2(match, pairs),
         sections=_sections(match, lines),
         settings=match.settings,
@@ -210,11 +223,19 @@ def _c2c(match: Match, xyz: FloatArray) -> FloatArray:
     return cloud_to_cloud(xyz, match.reference.xyz)
 
 
-def _by_depth(
-    match: Match, pairs: AfterBefore[Pairs] | None, notes: list[str]
-) -> tuple[AfterBefore[Line | None] | None, tuple[Bin, ...], tuple[Bin, ...]]:
-    """Return the fits and tables of the submerged places, as far as the water is known."""
-    nothing = None, (), ()
+@dataclass(frozen=True)
+class _OfDepth:
+    """What is said of the submerged places; see `Comparison`."""
+
+    fits: AfterBefore[Line | None] | None = None
+    depth_bins: tuple[Bin, ...] = ()
+    shore_bins: tuple[Bin, ...] = ()
+    tvu: Tvu | None = None
+
+
+def _by_depth(match: Match, pairs: AfterBefore[Pairs] | None, notes: list[str]) -> _OfDepth:
+    """Return fits, tables and TVU of the submerged places, as far as the water is known."""
+    nothing = _OfDepth()
     if pairs is None:
         return nothing
     after, before = pairs.after, pairs.before
@@ -235,12 +256,23 @@ def _by_depth(
         depth_before = ((surface if over is None else over) - before.reference_m)[wet]
         error_before = before.error_m[wet]
         fits = replace(fits, before=fit_line(depth_before, depth_before - error_before))
+        now, came = _ratio(depth, error), _ratio(depth_before, error_before)
+        if abs(came - 1.0) <= AS_DEEP and now > 1.0 + TOO_DEEP:
+            notes.append(CORRECTED_BEFORE)
     bins = binned(depth, error, error_before, match.settings.bin_width)
+    found = _OfDepth(fits, bins, tvu=tvu_of(error, depth))
     if len(match.dry_xy) == 0:
         notes.append("the cloud has no dry point, so nothing is said of the distance from shore")
-        return fits, bins, ()
+        return found
     shore = distance_from_shore(after.xy[wet], match.dry_xy)
-    return fits, bins, binned(shore, error, error_before, match.settings.shore_bin_width)
+    width = match.settings.shore_bin_width
+    return replace(found, shore_bins=binned(shore, error, error_before, width))
+
+
+def _ratio(depth_m: FloatArray, error_m: FloatArray) -> float:
+    """Return the median of depth over reference depth, where that is one; NaN if nowhere."""
+    some = depth_m > 0.0
+    return float(np.median(1.0 - error_m[some] / depth_m[some])) if some.any() else math.nan
 
 
 def _m3c2(match: Match, pairs: AfterBefore[Pairs] | None) -> AfterBefore[M3c2] | None:

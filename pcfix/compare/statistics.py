@@ -9,6 +9,7 @@ import numpy as np
 from pcfix.compare.nearest import Neighbours
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import FloatArray
+from pcfix.refract.tally import share_of_orders, within_orders
 
 PERCENTILES = (5, 25, 50, 75, 95)
 NMAD_FACTOR = 1.4826
@@ -55,7 +56,8 @@ class Statistics:
     """A sample of distances or errors, metres.
 
     For signed errors the mean is the bias. The standard deviation is that of the sample itself
-    (divided by n), so that rmse^2 = mean^2 + sd^2.
+    (divided by n), so that rmse^2 = mean^2 + sd^2; 95 % of the sample are no larger than
+    `within_95_m`, whatever their sign.
     """
 
     count: int
@@ -66,6 +68,7 @@ class Statistics:
     median_m: float
     min_m: float
     max_m: float
+    within_95_m: float
     percentiles_m: dict[str, float]
 
 
@@ -93,6 +96,7 @@ def statistics_of(values: FloatArray) -> Statistics:
         median_m=median,
         min_m=float(marks[-2]),
         max_m=float(marks[-1]),
+        within_95_m=float(np.percentile(np.abs(values), 95)),
         percentiles_m={
             f"p{name}": float(mark) for name, mark in zip(PERCENTILES, marks, strict=False)
         },
@@ -165,6 +169,32 @@ class Bin:
     to_m: float
     after: Statistics
     before: Statistics | None
+
+
+@dataclass(frozen=True, slots=True)
+class Tvu:
+    """Total vertical uncertainty at 95 % as it was measured, in the terms of IHO S-44.
+
+    Attributes
+    ----------
+    count : int
+        Differences that it is of.
+    tvu_95_m : float
+        That 95 % of them do not exceed.
+    s44 : dict
+        The share of them, 0 to 1, within the TVU of each order at the depth of the reference.
+    """
+
+    count: int
+    tvu_95_m: float
+    s44: dict[str, float]
+
+
+def tvu_of(error_m: FloatArray, depth_m: FloatArray) -> Tvu:
+    """Return the vertical uncertainty that errors at reference depths, shape (n,), m, come to."""
+    size = np.abs(error_m)
+    shares = share_of_orders(within_orders(size, depth_m), len(size))
+    return Tvu(len(size), float(np.percentile(size, 95)), shares)
 
 
 def fit_line(reference_depth_m: FloatArray, depth_m: FloatArray) -> Line | None:

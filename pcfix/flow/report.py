@@ -14,8 +14,8 @@ from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates
 from pcfix.model import Cameras, FloatArray, WaterSurface
 from pcfix.refract.tally import Summary
-from pcfix.report.page import Picture, Table, render
-from pcfix.report.run import Corrected, run_report
+from pcfix.report.page import Table, render
+from pcfix.report.run import NOTHING_LATER, Corrected, Later, run_report
 
 NEEDED = (*SHIFTS, "WaterDepth", "RayCount")
 SIGMA_Z = "SigmaZ"
@@ -31,8 +31,7 @@ def write_report(
     cameras: Cameras,
     water: WaterSurface,
     inputs: Sequence[Path],
-    more: tuple[Sequence[Picture], Sequence[Table]] = ((), ()),
-    verdict: str = "",
+    later: Later = NOTHING_LATER,
     overwrite: bool = False,
 ) -> Path:
     """Write ``report.html`` and ``figures/*.png`` about a corrected cloud.
@@ -49,10 +48,8 @@ def write_report(
         What it was given.
     inputs : sequence of Path
         Files whose size and checksum the page lists.
-    more : pair of sequences
-        Pictures and tables of later steps.
-    verdict : str
-        A sentence that they come to.
+    later : Later
+        What other steps of a run add.
     overwrite : bool
         Replace a report that is there.
 
@@ -69,7 +66,7 @@ def write_report(
     maps, sample = _read(corrected)
     rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in inputs]
     files = Table("Input files", ["file", "bytes", "SHA-256"], rows)
-    report = run_report(Corrected(summary, cameras, water, maps, sample), files, more, verdict)
+    report = run_report(Corrected(summary, cameras, water, maps, sample), files, later)
     figures = out_dir / "figures"
     figures.mkdir(exist_ok=True)
     for picture in report.pictures:

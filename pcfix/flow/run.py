@@ -40,7 +40,8 @@ from pcfix.options.survey import RunOptions
 from pcfix.refract.tally import Summary
 from pcfix.report.comparison import evaluation, in_a_sentence
 from pcfix.report.page import Picture, Table
-from pcfix.report.run import adjustment_sentence, adjustment_table, reason_sentence
+from pcfix.report.run import Later, adjustment_sentence, adjustment_table, reason_sentence
+from pcfix.report.text import uncertainty_sentence
 from pcfix.water.index import with_index
 
 RECORD = "run.json"
@@ -273,7 +274,9 @@ def _rasters(request: Request) -> list[str]:
     return [DOD] if suffix in (".tif", ".tiff") else []
 
 
-def _report(request: Request, files: Files, inputs: list[Path], done: dict[str, Any]) -> str:
+def _report(
+    request: Request, files: Files, inputs: list[Path], done: dict[str, Any]
+) -> dict[str, str]:
     pictures: list[Picture] = []
     tables: list[Table] = []
     first, compared = done["adjust"], done["compare"]
@@ -291,18 +294,19 @@ def _report(request: Request, files: Files, inputs: list[Path], done: dict[str, 
             water = own_water(source)
         view = view_of(files.corrected)
         cameras = read_blocks(inputs_again, view.crs).cameras
+    summary = Summary(**done["correct"])
+    later = Later(pictures, tables, verdict, {} if compared is None else compared["figures"])
     page = write_report(
         files.corrected,
         files.folder,
-        summary=Summary(**done["correct"]),
+        summary=summary,
         cameras=cameras,
         water=water or inputs_again.surface(view).surface,
         inputs=inputs,
-        more=(pictures, tables),
-        verdict=verdict,
+        later=later,
         overwrite=True,
     )
-    return str(page)
+    return {"page": str(page), "uncertainty": uncertainty_sentence(summary, later.tvu)}
 
 
 class Record:

@@ -256,7 +256,7 @@ class ThroughWater:
             "depth_m": tally.depth_m(),
             "water": water,
             "water_fit": self.found.as_dict(),
-            "uncertainty": tally.uncertainty(),
+            "uncertainty": tally.uncertainty(self.made),
             "carried": None if self.carrying is None else self.carrying.as_dict(),
             "made": None if made is None else {**made, "notes": notes},
             "absorbed": bool(self._bent),

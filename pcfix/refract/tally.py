@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.model import BoolArray, Correction, FloatArray, Outcome
+from pcfix.model import BoolArray, Correction, FloatArray, IntArray, Outcome
 
 COVERAGE_95 = 1.96
 """Standard errors of a Gaussian quantity within which 95 % lie, as S-44 takes it in one dimension.
@@ -55,6 +55,16 @@ def largest_tvu_m(order: Order, depth_m: FloatArray) -> FloatArray:
     return np.asarray(np.hypot(order.a_m, order.b * depth_m))
 
 
+def within_orders(tvu_m: FloatArray, depth_m: FloatArray) -> IntArray:
+    """Return how many vertical uncertainties at 95 % each of the `ORDERS` allows at their depth."""
+    return np.array([(tvu_m <= largest_tvu_m(order, depth_m)).sum() for order in ORDERS], np.int64)
+
+
+def share_of_orders(within: IntArray, count: int) -> dict[str, float]:
+    """Return these as a share, 0 to 1, by the name of the order."""
+    return {o.name: round(int(n) / count, 6) for o, n in zip(ORDERS, within, strict=True)}
+
+
 class _Histogram:
     """Sum and percentiles, to a millimetre, of values that are added array by array.
 
@@ -95,9 +105,7 @@ class UncertaintyTally:
             return
         self._sigma.add(sigma_z_m)
         self._most_m = max(self._most_m, float(sigma_z_m.max()))
-        tvu_m = COVERAGE_95 * sigma_z_m
-        for i, order in enumerate(ORDERS):
-            self._within[i] += int((tvu_m <= largest_tvu_m(order, depth_m)).sum())
+        self._within += within_orders(COVERAGE_95 * sigma_z_m, depth_m)
 
     def as_dict(self) -> dict[str, Any] | None:
         """Return the figures as plain values; None where no point has a standard error.
@@ -112,10 +120,7 @@ class UncertaintyTally:
         return {
             "sigma_z_m": _rounded(**sigma),
             "tvu_95_m": _rounded(**{name: COVERAGE_95 * value for name, value in sigma.items()}),
-            "s44": {
-                order.name: round(int(within) / self._sigma.count, 6)
-                for order, within in zip(ORDERS, self._within, strict=True)
-            },
+            "s44": share_of_orders(self._within, self._sigma.count),
         }
 
 
@@ -188,9 +193,17 @@ class Tally:
         p5, p95 = (self._shift.percentile_m(percent) for percent in (5, 95))
         return _rounded(mean=self._shift.mean_m(), p5=p5, p95=p95)
 
-    def uncertainty(self) -> dict[str, Any] | None:
-        """Return standard error of Z, TVU and orders; see `UncertaintyTally.as_dict`."""
-        return self._uncertainty.as_dict()
+    def uncertainty(self, made: dict[str, Any] | None = None) -> dict[str, Any] | None:
+        """Return standard error of Z, TVU and orders; see `UncertaintyTally.as_dict`.
+
+        `of_cloud` is there where what the cloud was `made` of tells it: the scatter beyond the
+        error budget, and the standard deviation relative to the depth, that the cloud itself adds.
+        """
+        found = self._uncertainty.as_dict()
+        if found is not None and made is not None and "scatter_m" in made:
+            doubt = {"scatter_m": made["scatter_m"], "per_depth": made["doubt_per_depth"]}
+            found["of_cloud"] = doubt
+        return found
 
 
 def _rounded(**values: float) -> dict[str, float]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.compare.figures import CORRECTED_BEFORE
 from pcfix.model import FloatArray
 from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, Picture, Table, new_figure, new_map
 from pcfix.report.text import share
@@ -153,10 +154,12 @@ def in_a_sentence(compared: Plain) -> str:
         return ""
     before, after = (pair[when]["statistics"] for when, _, _ in _TIMES)
     name = compared["reference"].rsplit("/", 1)[-1]
+    way = "fell" if after["rmse_m"] <= before["rmse_m"] else "grew"
+    twice = f" {CORRECTED_BEFORE}" if CORRECTED_BEFORE in compared["notes"] else ""
     return (
-        f" Against {name} the vertical error fell from {before['rmse_m']:.3f} to"
+        f" Against {name} the vertical error {way} from {before['rmse_m']:.3f} to"
         f" {after['rmse_m']:.3f} m (RMSE of {after['count']:,} points); what is left has a bias of"
-        f" {after['mean_m']:+.3f} m."
+        f" {after['mean_m']:+.3f} m.{twice}"
     )
 
 

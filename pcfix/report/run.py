@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +22,7 @@ from pcfix.report.adjustment_text import WHERE, fixed, lens_label, listed, short
 from pcfix.report.page import (
     AFTER,
     BEFORE,
+    REFERENCE,
     WATER,
     Layer,
     Picture,
@@ -32,7 +33,7 @@ from pcfix.report.page import (
     new_figure,
     new_map,
 )
-from pcfix.report.text import errors_of, order_sentence, share
+from pcfix.report.text import errors_of, of_cloud, share, uncertainty_sentence
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
@@ -63,25 +64,43 @@ class Corrected:
     sample: FloatArray
 
 
-def run_report(
-    corrected: Corrected,
-    files: Table,
-    more: tuple[Sequence[Picture], Sequence[Table]] = ((), ()),
-    verdict: str = "",
-) -> Report:
-    """Return what the page of a run says.
+@dataclass(frozen=True)
+class Later:
+    """What other steps of a run add to its page.
 
-    `files` are those that went in; `more` are pictures and tables of later steps, and `verdict`
-    is a sentence that they come to.
+    Attributes
+    ----------
+    pictures, tables : sequence
+    verdict : str
+        A sentence that they come to.
+    compared : dict
+        `Comparison.as_dict`; what it measured replaces what was predicted.
     """
+
+    pictures: Sequence[Picture] = ()
+    tables: Sequence[Table] = ()
+    verdict: str = ""
+    compared: Plain = field(default_factory=dict)
+
+    @property
+    def tvu(self) -> Plain | None:
+        """That of the bed as it was measured, where it was."""
+        return self.compared.get("tvu")
+
+
+NOTHING_LATER = Later()
+
+
+def run_report(corrected: Corrected, files: Table, later: Later = NOTHING_LATER) -> Report:
+    """Return what the page of a run says; `files` are those that went in."""
     s, maps = corrected.summary, corrected.maps
     settings = [[name.replace("_", " "), str(value)] for name, value in s.settings.items()]
     versions = [["pcfix", __version__], ["Python", platform.python_version()]]
     versions += [[name, version(name)] for name in ("numpy", "scipy", "numba", "laspy", "lazrs")]
     return Report(
         title=f"Refraction correction of {Path(s.input).name}",
-        lead=_lead(s) + verdict,
-        facts=_facts(s),
+        lead=_lead(s) + later.verdict,
+        facts=_facts(s, later.tvu),
         warnings=_warnings(s),
         maps=maps,
         layers=[
@@ -91,8 +110,12 @@ def run_report(
             Layer("Shift in plan", "m", maps.shift_xy_m),
             Layer("Rays", "", maps.rays),
         ],
-        pictures=[*_pictures(corrected), *_uncertainty_picture(corrected.sample, s), *more[0]],
-        tables=[*_orders(s), *more[1]],
+        pictures=[
+            *_pictures(corrected),
+            *_uncertainty_picture(corrected.sample, s, later),
+            *later.pictures,
+        ],
+        tables=[*_orders(s, later.tvu), *later.tables],
         provenance=[
             Table("ScienceOptions", ["setting", "value"], settings),
             files,
@@ -117,7 +140,7 @@ def _lead(s: Summary) -> str:
     )
 
 
-def _facts(s: Summary) -> Table:
+def _facts(s: Summary, measured: Plain | None) -> Table:
     shift, depth = s.shift_z_m, s.depth_m
     rows = [
         ["Cloud", Path(s.input).name],
@@ -134,10 +157,10 @@ def _facts(s: Summary) -> Table:
     if s.unsure is not None:
         rows.append(["Unsure", f"{s.unsure:,} ({share(s.unsure, s.corrected)} of the corrected) are"
                      " seen by flat obliques alone, and withheld"])  # fmt: skip
-    if s.uncertainty is not None:
-        tvu = s.uncertainty["tvu_95_m"]
-        rows.append(["Uncertainty", f"TVU at 95 % {tvu['mean']:.3f} m on average, formal;"
-                     f" {order_sentence(s)}"])  # fmt: skip
+    if s.made is not None:
+        rows.insert(2, ["Method", f"{s.made['method']}. {s.made['because']}"])
+    if uncertainty := uncertainty_sentence(s, measured):
+        rows.append(["Uncertainty", uncertainty])
     return Table("In short", [], rows)
 
 
@@ -249,23 +272,30 @@ def cameras_figure(
     return figure
 
 
-def _uncertainty_picture(sample: FloatArray, s: Summary) -> list[Picture]:
+def _uncertainty_picture(sample: FloatArray, s: Summary, later: Later) -> list[Picture]:
     """Return TVU over depth, where the cloud has standard errors."""
     known = sample[:, 4] > 0.0
     if s.uncertainty is None or not known.any():
         return []
+    bins = later.compared["depth_bins"] if later.tvu else []
     text = (
         "Total vertical uncertainty at 95 % (1.96 standard errors of Z) over depth, and the"
         f" largest that the orders of IHO S-44 allow. It is formal: it assumes {errors_of(s)}"
-        " (standard deviations), and no mismatches. S-44 asks for more than the TVU: position,"
-        " features and coverage."
+        f" (standard deviations), and {of_cloud(s)}."
+        + (" Dots: within which 95 % of the differences to the reference lie." if bins else "")
+        + " S-44 asks for more than the TVU: position, features and coverage."
     )
-    figure = tvu_figure(sample[known, 3], sample[known, 4])
+    figure = tvu_figure(sample[known, 3], sample[known, 4], bins)
     return [Picture("uncertainty", "Vertical uncertainty", text, figure)]
 
 
-def tvu_figure(depth_m: FloatArray, sigma_z_m: FloatArray) -> Figure:
-    """Draw TVU at 95 % over depth, and the largest of the orders of IHO S-44 up to one above it."""
+def tvu_figure(
+    depth_m: FloatArray, sigma_z_m: FloatArray, measured: Sequence[Plain] = ()
+) -> Figure:
+    """Draw TVU at 95 % over depth, and the largest of the orders of IHO S-44 up to one above it.
+
+    `measured` are the `Comparison.depth_bins` of a reference, in plain values.
+    """
     figure, axes = new_figure()
     tvu = COVERAGE_95 * sigma_z_m
     deepest = float(max(depth_m.max(), 1e-3))
@@ -275,32 +305,37 @@ def tvu_figure(depth_m: FloatArray, sigma_z_m: FloatArray) -> Figure:
     low, middle, high = np.array([np.percentile(tvu[slot == i], [5, 50, 95]) for i in filled]).T
     centres = 0.5 * (edges[:-1] + edges[1:])[filled]
     axes.fill_between(
-        centres, low, high, color=WATER, alpha=0.6, linewidth=0.0, label="90 % of the points"
+        centres, low, high, color=WATER, alpha=0.6, linewidth=0.0, label="predicted, 90 %"
     )
-    axes.plot(centres, middle, color=AFTER, label="median")
+    axes.plot(centres, middle, color=AFTER, label="predicted, median")
+    within = [one["after"]["within_95_m"] for one in measured]
+    if measured:
+        at = [0.5 * (one["from_m"] + one["to_m"]) for one in measured]
+        axes.plot(at, within, "o", color=REFERENCE, label="measured")
     depths = np.linspace(0.0, deepest, 100)
     for order, style in zip(ORDERS, ("-", "--", "-.", ":"), strict=True):
         largest = largest_tvu_m(order, depths)
         name = order.name if order.name[0].isalpha() else f"order {order.name}"
         axes.plot(depths, largest, style, color=BEFORE, label=f"IHO S-44 {name}")
-        if largest[0] > high.max():
+        if largest[0] > max(high.max(), *within, 0.0):
             break  # the laxer ones would only press the points down
     axes.set(xlim=(0.0, deepest), ylim=(0.0, None), xlabel="Depth (m)", ylabel="TVU at 95 % (m)")
     axes.legend(loc="best")
     return figure
 
 
-def _orders(s: Summary) -> list[Table]:
+def _orders(s: Summary, measured: Plain | None) -> list[Table]:
     """Return the share of the points within each order of IHO S-44."""
-    if s.uncertainty is None:
-        return []
-    shares = s.uncertainty["s44"]
+    both = {"predicted TVU at 95 %": s.uncertainty, "measured difference": measured}
+    known = {name: found["s44"] for name, found in both.items() if found is not None}
     rows = [
-        [order.name, f"{order.a_m:g} m", f"{order.b:g}", f"{100.0 * shares[order.name]:.4g} %"]
+        [order.name, f"{order.a_m:g} m", f"{order.b:g}"]
+        + [f"{100.0 * shares[order.name]:.4g} %" for shares in known.values()]
         for order in ORDERS
     ]
-    header = ["order", "a", "b", "points with TVU at 95 % within sqrt(a^2 + (b depth)^2)"]
-    return [Table("Orders of IHO S-44, vertical, formal", header, rows)]
+    limit = "within sqrt(a^2 + (b depth)^2)"
+    header = ["order", "a", "b", *(f"points with {name} {limit}" for name in known)]
+    return [Table("Orders of IHO S-44, vertical", header, rows)] if known else []
 
 
 def adjustment_sentence(d: Plain) -> str:

@@ -15,6 +15,8 @@ from pcfix.refract.tally import ORDERS, Summary
 if TYPE_CHECKING:
     from pcfix.label.labelling import LabelSummary
 
+FEWEST = 59
+"""Differences of which all keep an order before 95 % of all are likely to: 0.95^59 is 0.05."""
 BED_PER_LEVEL = 0.44
 """How far a bed moves with the level, measured over whole blocks; straight down it is n - 1."""
 
@@ -138,11 +140,11 @@ def _uncertainty(s: Summary) -> list[str]:
         return []
     sigma, tvu = found["sigma_z_m"], found["tvu_95_m"]
     return [
-        f"uncertainty  standard error of Z mean {sigma['mean']:.3f} m, 95 % of the points below"
-        f" {sigma['p95']:.3f} m; TVU at 95 % mean {tvu['mean']:.3f} m",
+        f"uncertainty  predicted standard error of Z mean {sigma['mean']:.3f} m, 95 % of the points"
+        f" below {sigma['p95']:.3f} m; TVU at 95 % mean {tvu['mean']:.3f} m",
         f"  IHO S-44   {order_sentence(s)}",
-        f"  formal     it assumes {errors_of(s)} (standard deviations)",
-        "             and no mismatches; S-44 asks for more than the TVU",
+        f"  formal     it assumes {errors_of(s)} (standard deviations),",
+        f"             and {of_cloud(s)}; S-44 asks for more than the TVU",
     ]
 
 
@@ -150,6 +152,17 @@ def errors_of(s: Summary) -> str:
     """Return the budget of a run in words."""
     fitted = None if s.water_fit is None else s.water_fit["sigma_level_m"]
     return budget_words(s.settings, fitted)
+
+
+def of_cloud(s: Summary) -> str:
+    """Return what the standard errors have beyond the budget, in words."""
+    found = (s.uncertainty or {}).get("of_cloud")
+    if found is None:
+        return "no mismatches"
+    return (
+        f"has from the cloud itself {found['scatter_m']:.3f} m of scatter and"
+        f" {100.0 * found['per_depth']:.1f} % of the depth"
+    )
 
 
 def left_out_lines(labelling: dict[str, Any] | None) -> list[str]:
@@ -239,6 +252,22 @@ def tvu_sentence(uncertainty: dict[str, Any]) -> str:
     number = "order" if order[0].isdigit() else ""
     name = f"{number} {order}".strip() + ("" if number else " Order")
     return f"{100.0 * within:.4g} % of the points are within the TVU of IHO S-44 {name}"
+
+
+def uncertainty_sentence(s: Summary, measured: dict[str, Any] | None = None) -> str:
+    """Return TVU and order of S-44 of a run: as `measured` against a reference, else as predicted.
+
+    `measured` is `Comparison.tvu` in plain values. Empty where neither is known.
+    """
+    mean = "" if s.uncertainty is None else f"{s.uncertainty['tvu_95_m']['mean']:.3f} m on average"
+    if measured is None:
+        return f"TVU at 95 % {mean}, formal; {order_sentence(s)}" if mean else ""
+    few = f"fewer than {FEWEST} points claim no order of IHO S-44"
+    return (
+        f"TVU at 95 %{f' predicted {mean},' if mean else ''} measured"
+        f" {measured['tvu_95_m']:.3f} m at {measured['count']:,} points of the bed;"
+        f" {few if measured['count'] < FEWEST else tvu_sentence(measured)}"
+    )
 
 
 def labelling_text(summary: LabelSummary) -> str:

@@ -129,6 +129,7 @@ def test_statistics_are_those_of_plain_formulas():
     assert found.median_m == plain[500]
     assert found.nmad_m == 1.4826 * sorted(abs(v - plain[500]) for v in plain)[500]
     assert (found.min_m, found.max_m) == (plain[0], plain[-1])
+    assert found.within_95_m == pytest.approx(sorted(abs(v) for v in plain)[950])
     # 5 % of 1000 steps between 1001 sorted values: the 50th from below
     assert found.percentiles_m["p5"] == pytest.approx(plain[50])
     assert found.percentiles_m["p95"] == pytest.approx(plain[950])

@@ -15,7 +15,9 @@ from pyproj import CRS
 
 import pcfix
 from pcfix.compare import m3c2
+from pcfix.compare.figures import CORRECTED_BEFORE
 from pcfix.flow.compare import compare_clouds
+from pcfix.report.comparison import in_a_sentence
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT
 
@@ -342,6 +344,20 @@ def test_bad_input_is_one_clear_sentence(tmp_path):
     refused(setting, "max-gap -1", cloud, cloud, max_gap=-1.0)
     refused(setting, "section '1,2' is not", cloud, cloud, section=["1,2"])
     refused(setting, "does not exist", cloud, cloud, out_dir=tmp_path / "no" / "where")
+
+
+@pytest.mark.parametrize(("came", "twice"), [(1.0, True), (0.92, True), (0.75, False)])
+def test_a_cloud_that_came_as_deep_as_the_reference_was_corrected_before(tmp_path, came, twice):
+    true = plane(500, 24, noise_m=0.0)
+    depth, up = -true[:, 2], np.array([0.0, 0.0, 1.0])
+    shift = {"ShiftX": 0.0 * depth, "ShiftY": 0.0 * depth, "ShiftZ": -0.34 * came * depth}
+    xyz = true + up * (depth * (1.0 - 1.34 * came))[:, np.newaxis]
+    cloud = write_las(tmp_path / "cloud.las", xyz, 40, WaterDepth=-xyz[:, 2], **shift)
+    found = compare_clouds(cloud, write_las(tmp_path / "lidar.las", true))
+    assert (CORRECTED_BEFORE in found.notes) == twice
+    said = in_a_sentence(found.as_dict())
+    assert (CORRECTED_BEFORE in said) == ("error grew" in said) == twice
+    assert found.tvu.count == 500
 
 
 def test_equal_clouds_differ_by_nothing(tmp_path):

@@ -15,6 +15,8 @@ import rasterio
 
 import pcfix
 from pcfix.flow.run import Request, request_of, run_all
+from pcfix.refract.tally import Summary
+from pcfix.report.text import order_sentence
 from tests.utils.program import run_pcfix
 
 SCENE = Path(__file__).parents[2] / "samples" / "scene"
@@ -91,6 +93,38 @@ def test_report_holds_the_comparison(finished):
     assert len(list((finished[0] / "figures").glob("*.png"))) == text.count("<img ")
 
 
+def steps_and_page(folder):
+    steps = json.loads((folder / "run.json").read_text())["steps"]
+    return {name: step["result"] for name, step in steps.items()}, (folder / "report.html")
+
+
+def test_measured_uncertainty_is_said_where_there_is_a_reference(finished):
+    steps, page = steps_and_page(finished[0])
+    measured, text = steps["compare"]["figures"]["tvu"], page.read_text()
+    # the noise of cloud and reference is 4 cm at most, of which 95 % lie within 1.96
+    assert 0.04 < measured["tvu_95_m"] < 1.96 * 0.04
+    assert 0.95 < measured["s44"]["Exclusive"] < 1.0 == measured["s44"]["1a/1b"]
+    said = steps["report"]["uncertainty"]
+    assert f"measured {measured['tvu_95_m']:.3f} m at {measured['count']:,} points" in said
+    assert said.endswith("IHO S-44 Exclusive Order")
+    assert said in text
+    assert f"<td>{100.0 * measured['s44']['Exclusive']:.4g} %</td>" in text
+    assert f"<td>consistent. {steps['correct']['made']['because']}</td>" in text
+
+
+def test_a_formal_order_that_the_reference_forbids_is_not_claimed(tmp_path):
+    wrong = ["--water", "0.87", "--sigma-image", "0.01"]  # half a metre too high, and too proud
+    done = run(tmp_path, *WORDS, *wrong)
+    assert done.returncode == 0, done.stderr
+    steps, page = steps_and_page(tmp_path / "out")
+    formal = order_sentence(Summary(**steps["correct"]))
+    assert formal.endswith("Exclusive Order")
+    said, text = steps["report"]["uncertainty"], page.read_text()
+    assert said.endswith("IHO S-44 order 1a/1b")  # the bed is off by nearly half of the level
+    assert said in text
+    assert formal not in text and "Exclusive Order" not in text
+
+
 @pytest.mark.skipif(importlib.util.find_spec("py4dgeo") is None, reason="needs the extra m3c2")
 def test_m3c2_is_in_the_report_when_asked_for(copied):
     done = run(copied, *WORDS, "--m3c2", "--overwrite")
@@ -152,7 +186,10 @@ def test_without_a_reference_there_is_a_report_all_the_same(tmp_path):
         input=str(SCENE / "cloud.laz"), cameras=str(SCENE / "cameras.csv"), water="0.37"
     )
     page = run_all(request, tmp_path / "out")
-    assert "Cross-section" not in page.read_text()
+    text = page.read_text()
+    assert "Cross-section" not in text
+    assert "on average, formal; 100 % of the points are within" in text
+    assert "measured" not in text
     assert not (tmp_path / "out" / "compare").exists()
 
 

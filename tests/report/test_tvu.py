@@ -11,11 +11,19 @@ import numpy as np
 import pytest
 
 import pcfix
+from pcfix.compare.statistics import binned, tvu_of
 from pcfix.options.correct import BudgetOptions
-from pcfix.refract.tally import ORDERS, UncertaintyTally, largest_tvu_m
+from pcfix.refract.tally import ORDERS, Tally, UncertaintyTally, largest_tvu_m
 from pcfix.report.page import png_of
 from pcfix.report.run import tvu_figure
-from pcfix.report.text import budget_words, strictest_order, summary_text, tvu_sentence
+from pcfix.report.text import (
+    FEWEST,
+    budget_words,
+    strictest_order,
+    summary_text,
+    tvu_sentence,
+    uncertainty_sentence,
+)
 
 # Edition 6, table 1: the largest TVU at the surface and at 40 m, m, by hand
 BY_HAND = {
@@ -91,6 +99,49 @@ def test_the_picture_can_be_drawn():
     for points in (1, 500):
         depth, sigma = rng.uniform(0.0, 8.0, points), rng.uniform(0.01, 0.2, points)
         assert png_of(tvu_figure(depth, sigma)).startswith(b"\x89PNG")
+    bins = [asdict(one) for one in binned(depth, rng.normal(0.0, 0.1, 500), None, 1.0)]
+    assert png_of(tvu_figure(depth, sigma, bins)).startswith(b"\x89PNG")
+
+
+def test_measured_tvu_is_that_of_differences_of_either_sign():
+    # 21 from 0 to 0.20 m at the surface, of which 16 are within 0.15 m, and 0.20 m at 20 m
+    error, depth = np.append(np.arange(21) * 0.01, -0.2), np.append(np.zeros(21), 20.0)
+    found = tvu_of(error, depth)
+    assert found.s44 == {"Exclusive": round(17 / 22, 6), "Special": 1.0, "1a/1b": 1.0, "2": 1.0}
+    assert found.tvu_95_m == pytest.approx(0.2 - 0.05 * 0.01)  # 95 % of 21 steps: 19.95 of them
+    assert found.count == 22
+
+
+@pytest.fixture(scope="module")
+def summary(tmp_path_factory):
+    scene = Path(__file__).parents[2] / "samples" / "scene"
+    out = tmp_path_factory.mktemp("tvu") / "c.laz"
+    return pcfix.correct_file(scene / "cloud.laz", out, cameras=scene / "cameras.csv", water=0.37)
+
+
+def test_what_was_measured_is_said_instead_of_what_was_predicted(summary):
+    predicted = uncertainty_sentence(summary)
+    assert "formal" in predicted and "Exclusive Order" in predicted
+    far = asdict(tvu_of(np.full(100, 0.3), np.full(100, 2.0)))
+    said = uncertainty_sentence(summary, far)
+    mean = summary.uncertainty["tvu_95_m"]["mean"]
+    assert f"predicted {mean:.3f} m on average, measured 0.300 m at 100 points" in said
+    assert "order 1a/1b" in said and "Exclusive" not in said
+    assert "predicted" not in uncertainty_sentence(replace(summary, uncertainty=None), far)
+    few = asdict(tvu_of(np.full(FEWEST - 1, 0.01), np.full(FEWEST - 1, 2.0)))
+    assert f"fewer than {FEWEST} points claim no order" in uncertainty_sentence(summary, few)
+
+
+def test_what_the_cloud_adds_is_said(summary):
+    made = summary.made
+    doubt = {"scatter_m": made["scatter_m"], "per_depth": made["doubt_per_depth"]}
+    assert summary.uncertainty["of_cloud"] == doubt
+    percent = 100.0 * doubt["per_depth"]
+    assert percent > 0.0
+    text = summary_text(summary)
+    assert f"m of scatter and {percent:.1f} % of the depth; S-44 asks" in text
+    assert "no mismatches" not in text
+    assert Tally(1).uncertainty(made) is None
 
 
 def test_a_run_says_what_it_assumed(tmp_path):
@@ -104,5 +155,6 @@ def test_a_run_says_what_it_assumed(tmp_path):
     moved = np.asarray(written["RayCount"]) > 0
     tally.add(np.asarray(written["SigmaZ"])[moved], np.asarray(written["WaterDepth"])[moved])
     text = summary_text(replace(summary, uncertainty=tally.as_dict()))
+    assert "predicted standard error of Z" in text and "and no mismatches" in text
     assert "TVU at 95 %" in text and "it assumes image 0.5 px, level 0.020 m (assumed)" in text
     assert "uncertainty" not in summary_text(replace(summary, uncertainty=None))
