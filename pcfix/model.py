@@ -432,9 +432,9 @@ class Correction:
     incidence_deg : array, shape (n,)
         The largest incidence angle in air among the rays used.
     sigma_z_m : array, shape (n,)
-        Formal standard error of Z: what the options ``sigma_...`` come to by the law of
-        propagation. It is as good as the budget, and knows nothing of mismatches, of rays that
-        did not make the point, or of what a method leaves out.
+        Standard error of Z: what the options ``sigma_...`` come to by the law of propagation, and
+        what the cloud itself tells, where it has enough points: mismatches, and by how much other
+        ways to make such a cloud would have the bed elsewhere (see `pcfix.refract.weighing`).
     camera_used : array of bool, shape (k,)
         Which cameras gave at least one ray.
     water_known : array of bool, shape (n,)

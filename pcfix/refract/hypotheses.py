@@ -159,7 +159,7 @@ class Verdict(NamedTuple):
         apart = self.is_against and abs(self.deeper_m) > self.doubt.formal_m
         unsure = apart if self.is_told else not self.is_sure
         is_way = "method" in self.chosen.changes and not self.is_told
-        none_fits = is_way and self.patches > 0 and self.share > FITS
+        none_fits = is_way and self.patches > 0 and not self.is_sure and self.share > FITS
         said = ((str(self), unsure), (CAUSES, none_fits))
         return (*self.remarks, *(sentence for sentence, holds in said if holds))
 
