@@ -15,7 +15,7 @@ from pcfix.refract.choice import TILE, spatial_order
 snell = partial(pcfix.correct_points, method="snell", max_angle=None)
 
 RNG = np.random.default_rng(7)
-N = 5 * TILE + 17
+N = 2 * TILE + 17  # fewer than tell how a list was made, which SigmaZ would have
 
 
 def lens():
