@@ -217,9 +217,9 @@ def hypotheses_of(batch: Batch) -> tuple[Hypothesis, ...]:
         return tuple(
             one for one in IN_FRAME if not auto or given in ("auto", one.changes["camera_set"])
         )
-    if batch.survey.learned.matcher is not None and views.kind != "pairs":
-        return LISTED
-    return (LISTED[0]._replace(kind=views.kind),)
+    if views.kind == "pairs":
+        return (LISTED[2]._replace(kind="pairs"), LISTED[0])
+    return LISTED if batch.survey.learned.matcher is not None else LISTED[:1]
 
 
 def told_by(batch: Batch) -> Hypothesis:
@@ -227,15 +227,10 @@ def told_by(batch: Batch) -> Hypothesis:
     settings, views = batch.survey.settings, batch.views
     changes: dict[str, Any] = {"method": settings.method, "max_angle": settings.max_angle}
     if views is None:
-        modelled = settings.models_matcher
-        changes["camera_set"] = "mvs" if modelled else "all"
-        if modelled:
-            changes["matcher"] = settings.matcher
-    if settings.method != "consistent":
-        return Hypothesis(f"{settings.method}", changes, None if views is None else views.kind)
-    for one in IN_FRAME if views is None else LISTED:
-        told = changes if views is None else {"method": settings.method}
-        same = all(told.get(name) == value for name, value in one.changes.items())
-        if same and (views is None or one.kind == views.kind):
+        changes["camera_set"] = "mvs" if settings.models_matcher else "all"
+        changes["matcher"] = settings.matcher
+    kind = None if views is None else views.kind
+    for one in hypotheses_of(batch) if views is not None else IN_FRAME:
+        if one.kind == kind and all(changes[name] == one.changes[name] for name in one.changes):
             return one
-    return Hypothesis(_TRACKS, changes, None if views is None else views.kind)
+    return Hypothesis(settings.method, changes, kind)

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Batch
 
 PATCHES, PATCH_POINTS, FEWEST_POINTS = 500, 16, 400
@@ -195,6 +195,6 @@ def grid_m(xyz: FloatArray) -> float | None:
     return float(np.mean(steps))
 
 
-def is_smooth(part: Batch, place: IntArray) -> BoolArray | bool:
+def is_smooth(part: Batch, place: IntArray) -> bool:
     """Whether neighbours scatter less than images can tell: of a mesh, or filtered."""
     return scatter_m(part, place, part.xyz[:, 2]) < SMOOTH_GSD * gsd_m(part)
