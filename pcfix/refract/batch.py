@@ -57,6 +57,8 @@ class Learned(NamedTuple):
         What fused points of one place have in common.
     doubt : Doubt or None
         Of how the cloud was made.
+    land : Survey or None
+        What land is corrected with that was carried to adjusted cameras, if not with the same.
     """
 
     regression: DepthRegression | None = None
@@ -64,6 +66,7 @@ class Learned(NamedTuple):
     matcher: Matcher | None = None
     bed: Bed | None = None
     doubt: Doubt | None = None
+    land: Survey | None = None
 
 
 class Doubt(NamedTuple):

@@ -25,7 +25,7 @@ from pcfix.refract.hypotheses import (
     told_by,
 )
 from pcfix.refract.matcher import Bed, bed_of, matcher_of, matcher_of_ties, places_for
-from pcfix.refract.methods import batches, with_rays
+from pcfix.refract.methods import batches, on_land, with_rays
 from pcfix.refract.patches import FEWEST_WITHOUT_LIST
 from pcfix.refract.regression import DepthRegression
 from pcfix.refract.top_surface import occluder_of, wants_occlusion
@@ -146,7 +146,9 @@ def learn_of_sample(
         verdict = weigh_lists(sample, is_open=False)
         return as_told(survey, verdict), () if verdict is None else (verdict,)
     survey, verdicts = _weighed(sample, step, hint)
-    settings, learned = survey.settings, survey.learned
+    settings, learned = survey.settings, survey.learned._replace(land=None)
+    if batch.made_with is not None:
+        learned = learned._replace(land=_land_of(survey, verdicts))
     if not settings.models_matcher:
         learned = learned._replace(matcher=None)
     elif settings.method == "consistent" and settings.matcher == "depth-maps" and len(rows):
@@ -250,6 +252,20 @@ def _learn_bed(batch: Batch) -> Bed | None:
         table[done : done + len(part), : part.shape[1]] = part
         done += len(part)
     return bed_of(batch.xyz[order], table) if np.isfinite(table).any() else None
+
+
+def _land_of(survey: Survey, verdicts: tuple[Verdict, ...]) -> Survey:
+    """Return what land is corrected with that was carried to adjusted cameras.
+
+    It goes by how the cloud was made, also where a formula corrects the bed.
+    """
+    for verdict in verdicts:
+        if verdict.is_told and verdict.is_against:
+            survey = replace(survey, settings=verdict.runner_up.settings(survey.settings))
+    dry = on_land(survey)
+    if survey.settings.models_matcher:
+        return dry
+    return replace(dry, learned=dry.learned._replace(matcher=None))
 
 
 LEAST_TIES, LEAST_DEPTH_M = 50, 0.3

@@ -117,13 +117,22 @@ def shift_of_land(batch: Batch) -> FloatArray:
     Returns
     -------
     array, shape (m, 3)
-        Metres; zero for other methods than those that go by `made_with`.
+        Metres; zero for clouds that no dense matcher made.
     """
-    xyz, survey = batch.xyz, batch.survey
+    batch = replace(batch, survey=batch.survey.learned.land or on_land(batch.survey))
     if _method(batch) not in (invert_fusion, *_OF_MATCHERS.values()):
-        return np.zeros((len(xyz), 3))
-    # the bed of the surroundings tells nothing of land: the largest group made the point
-    dry = replace(
+        return np.zeros((len(batch), 3))
+    at_themselves = SurfaceAbove(batch.xyz[:, 2].copy(), np.zeros((len(batch), 2)))
+    return correct(replace(batch, surface=at_themselves)).shift_m
+
+
+def on_land(survey: Survey) -> Survey:
+    """Return what points are corrected with where there is no water.
+
+    The bed of the surroundings tells nothing there: groups of images are centimetres apart on land,
+    so that the largest made the point.
+    """
+    return replace(
         survey,
         water=WaterPlane(0.0),
         settings=replace(survey.settings, index=1.0, dimensions="none", unsure="keep"),
@@ -131,8 +140,6 @@ def shift_of_land(batch: Batch) -> FloatArray:
         learned=survey.learned._replace(bed=None),
         parts={},
     )
-    at_themselves = SurfaceAbove(xyz[:, 2].copy(), np.zeros((len(xyz), 2)))
-    return correct(replace(batch, surface=at_themselves, survey=dry)).shift_m
 
 
 MODEL_GSD = 0.8

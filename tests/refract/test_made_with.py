@@ -11,7 +11,7 @@ from pcfix.model import Cameras, Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned, MadeWith, as_made, as_now, images_of
 from pcfix.refract.matcher import Bed, Matcher
-from pcfix.refract.methods import correct, shift_of_land
+from pcfix.refract.methods import correct, on_land, shift_of_land
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
 from tests.utils.depth_map_twin import LENS, fused_slowly, looking
@@ -180,6 +180,12 @@ def test_land_comes_home(with_list):
         assert np.isfinite(shift).all() and np.abs(shift).max() > 0.1
     tracks = replace(listed([MIXED]), kind="tracks")
     assert not shift_of_land(replace(batch, views=tracks)).any()
+    # a formula for the bed leaves land to how the cloud was made
+    formula = replace(batch.survey, settings=replace(settings, method="snell", camera_set="all"))
+    assert not shift_of_land(replace(batch, survey=formula, views=None)).any()
+    land = formula.learned._replace(land=on_land(batch.survey))
+    told = replace(batch, survey=replace(formula, learned=land))
+    assert np.array_equal(shift_of_land(told), shift)
 
 
 def test_directions_go_through_the_lenses_and_back():
