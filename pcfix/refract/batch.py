@@ -27,6 +27,7 @@ from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Outcome, Views
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.matcher import Bed, Matcher
 from pcfix.refract.occlusion import Occluder
+from pcfix.refract.pose_errors import PoseErrors
 from pcfix.refract.regression import DepthRegression
 from pcfix.water.surface import SurfaceAbove
 
@@ -57,6 +58,8 @@ class Learned(NamedTuple):
         What fused points of one place have in common.
     doubt : Doubt or None
         Of how the cloud was made.
+    poses : PoseErrors or None
+        What the errors of adjusted poses come to.
     """
 
     regression: DepthRegression | None = None
@@ -64,6 +67,7 @@ class Learned(NamedTuple):
     matcher: Matcher | None = None
     bed: Bed | None = None
     doubt: Doubt | None = None
+    poses: PoseErrors | None = None
 
 
 class Doubt(NamedTuple):
