@@ -17,8 +17,8 @@ from pcfix.adjust.problem import Problem, Solution
 from pcfix.adjust.solve import moved_by
 from pcfix.model import Cameras, FloatArray, IntArray, WaterPlane, WaterSurface
 
-MEMBERS = 64
-"""A standard deviation is told by so many to a tenth of itself."""
+MEMBERS, AXES = 32, 16
+"""Chance leaves an eighth of a standard deviation open with so many, but along the axes nothing."""
 
 TINY = 1e-10
 """Added to the diagonal of correlations, which rounding may leave indefinite."""
@@ -105,16 +105,27 @@ class Members:
 
 
 def drawn(covariance: FloatArray, count: int = MEMBERS) -> FloatArray:
-    """Return draws of a covariance, shape (a, a), as rows; always the same."""
-    from scipy.linalg import cholesky
+    """Return draws of a covariance, shape (a, a), as rows; always the same.
 
-    sigma = np.sqrt(covariance.diagonal())
+    Along the largest axes of its correlations, on which most unknowns go together, they scatter
+    by the very variance; on all others as chance has it.
+    """
+    from scipy.linalg import cholesky
+    from scipy.sparse.linalg import eigsh
+
+    sigma, rng = np.sqrt(covariance.diagonal()), np.random.default_rng(0)
     correlation = np.array(covariance / sigma, order="F")
     correlation /= sigma[:, None]
     correlation[np.diag_indices(len(sigma))] += TINY
+    few = min(AXES, count, len(sigma) - 1)
+    found = eigsh(correlation, few, v0=np.ones(len(sigma))) if few > 0 else None
     factor = cholesky(correlation, lower=True, overwrite_a=True)
-    noise = np.random.default_rng(0).standard_normal((count, len(sigma)))
-    return np.asarray(noise @ factor.T * sigma)
+    draws = rng.standard_normal((count, len(sigma))) @ factor.T
+    if found is not None:
+        values, axes = found
+        even = np.linalg.qr(draws @ axes)[0] * np.sqrt(count * values)
+        draws += (even - draws @ axes) @ axes.T
+    return np.asarray(draws * sigma)
 
 
 def members_of(problem: Problem, found: Solution, active: IntArray, steps: FloatArray) -> Members:

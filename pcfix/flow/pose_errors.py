@@ -27,7 +27,7 @@ from pcfix.refract.pose_errors import PoseErrors, pose_errors_of
 from pcfix.water.surface import is_submerged, surface_above
 
 SAMPLE_POINTS, BED_POINTS = 20_000, 1000
-"""Of the cloud, and of those under water, with which the errors are found."""
+"""Of the cloud, and at most about so many of those under water: the errors are smooth."""
 
 
 class Adjustment(NamedTuple):

@@ -8,7 +8,7 @@ import numpy as np
 
 from pcfix.model import FloatArray
 
-POINTS_A_CELL = 12
+POINTS_A_CELL, FEWEST = 12, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ def pose_errors_of(xy: FloatArray, variance_m2: FloatArray) -> PoseErrors:
     """Return the errors over a bed from variances at n places of it, shapes (n, 2) and (n,).
 
     A cell has the median of its points: a few of them jump, as a camera comes into their reach or
-    leaves it. One without points has that of the nearest which has some.
+    leaves it. One of too few points has that of the nearest which has enough.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -54,10 +54,11 @@ def pose_errors_of(xy: FloatArray, variance_m2: FloatArray) -> PoseErrors:
     place = np.minimum(((xy - low) / cell_m).astype(int), shape - 1)
     cell = place[:, 0] * shape[1] + place[:, 1]
     order = np.argsort(cell, kind="stable")
-    cells, first = np.unique(cell[order], return_index=True)
+    cells, first, counts = np.unique(cell[order], return_index=True, return_counts=True)
+    medians = np.array([np.median(part) for part in np.split(variance_m2[order], first[1:])])
+    enough = counts >= min(FEWEST, counts.max())
     variance = np.full(shape.prod(), np.nan)
-    parts = np.split(variance_m2[order], first[1:])
-    variance[cells] = [np.median(part) for part in parts]
+    variance[cells[enough]] = medians[enough]
     variance = variance.reshape(shape)
     nearest = distance_transform_edt(
         np.isnan(variance), return_distances=False, return_indices=True

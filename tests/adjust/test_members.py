@@ -65,7 +65,7 @@ def test_they_scatter_as_the_adjustment_says():
     members = precision.members
     squares = np.einsum("mki,kij->mkj", members.shift_m, found.state.rotations) ** 2
     wanted = precision.centre_sigma_m
-    # 64 draws tell a standard deviation to a tenth
+    # 32 draws tell a standard deviation to an eighth
     np.testing.assert_allclose(np.sqrt(squares.mean(axis=0)), wanted, rtol=0.4)
     assert np.sqrt(squares.mean() / (wanted**2).mean()) == pytest.approx(1.0, abs=0.1)
     f = np.sqrt((members.lens[:, 0, 0] ** 2).mean())
