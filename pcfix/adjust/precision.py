@@ -142,7 +142,7 @@ def precision_of(problem: Problem, solution: Solution, sigma0: float = 1.0) -> P
     else:
         of_asked, poses = _by_parts(equations, solution, asked)
         notes.append(
-            f"The covariances of the points, and the ensemble, were left out: {size:,} unknowns of"
+            f"The covariances of the points were left out, and the ensemble: {size:,} unknowns of"
             f" poses, lens and water are more than {DENSE_UP_TO:,}."
         )
     g = problem.columns.total
