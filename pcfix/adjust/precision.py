@@ -16,6 +16,7 @@ import numpy as np
 
 from pcfix.adjust.block import MOTIONS, WATER_NAMES, Unknowns
 from pcfix.adjust.equations import Reduced, Undamped, point_covariances, solver, undamped
+from pcfix.adjust.members import Members, drawn, members_of
 from pcfix.adjust.problem import Problem, Solution, pose_gradients
 from pcfix.adjust.solve import BED, LIMITS, weakest, words_of
 from pcfix.errors import GeometryError
@@ -72,6 +73,8 @@ class Precision:
         None where there are too many unknowns.
     notes : tuple of str
         What was left out.
+    members : Members or None
+        Drawn from the joint covariance of poses, lens and water; None as for the points.
     """
 
     sigma0: float
@@ -81,6 +84,7 @@ class Precision:
     block_correlation: FloatArray
     point_covariance_m2: FloatArray | None
     notes: tuple[str, ...] = ()
+    members: Members | None = None
 
     @property
     def centre_sigma_m(self) -> FloatArray:
@@ -125,6 +129,7 @@ def precision_of(problem: Problem, solution: Solution, sigma0: float = 1.0) -> P
     variance = sigma0 * sigma0
     notes: list[str] = []
     points: FloatArray | None = None
+    members: Members | None = None
     if loose := int((~equations.is_fixed).sum()):
         notes.append(f"{loose:,} points that their images do not fix have no covariance.")
     if size <= DENSE_UP_TO:
@@ -132,11 +137,13 @@ def precision_of(problem: Problem, solution: Solution, sigma0: float = 1.0) -> P
         of_asked = asked.T @ inverse @ asked
         poses = _pose_blocks(problem, solution, equations.reduced, inverse)
         points = variance * point_covariances(equations, solution, inverse)
+        active = equations.reduced.active
+        members = members_of(problem, solution, active, sigma0 * drawn(inverse))
     else:
         of_asked, poses = _by_parts(equations, solution, asked)
         notes.append(
-            f"The covariances of the points were left out: {size:,} unknowns of poses, lens and"
-            f" water are more than {DENSE_UP_TO:,}."
+            f"The covariances of the points were left out, and the ensemble: {size:,} unknowns of"
+            f" poses, lens and water are more than {DENSE_UP_TO:,}."
         )
     g = problem.columns.total
     correlation = _correlations(of_asked)
@@ -144,7 +151,7 @@ def precision_of(problem: Problem, solution: Solution, sigma0: float = 1.0) -> P
     rows = zip(problem.names, solution.shared.tolist(), sigma.tolist(), strict=True)
     return Precision(
         sigma0, variance * poses.reshape(k, 6, 6), tuple(SharedUnknown(*row) for row in rows),
-        correlation[:g, :g], correlation[:g, g:], points, tuple(notes),
+        correlation[:g, :g], correlation[:g, g:], points, tuple(notes), members,
     )  # fmt: skip
 
 

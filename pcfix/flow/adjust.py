@@ -25,6 +25,7 @@ from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.io.cameras.opensfm.models import write_opensfm
 from pcfix.io.cameras.table.sensor import write_table
 from pcfix.io.files import check_input
+from pcfix.io.members import write_members
 from pcfix.model import Cameras, TiePoints, Views, WaterPlane
 from pcfix.options.declare import File, taken
 from pcfix.options.survey import AdjustOptions, AdjustRules
@@ -48,7 +49,8 @@ def adjust_cameras(
         See `pcfix.read_cameras`; with tie points, or together with the cloud that it made.
     out_dir : path, optional
         A new folder: the adjusted model as ``colmap/`` and ``opensfm/``, where one lens will do
-        as ``cameras.csv``, ``adjustment.json`` and ``report.html``. Nothing is written without.
+        as ``cameras.csv``, ``ensemble.npz`` (see `pcfix.adjust.members`), ``adjustment.json`` and
+        ``report.html``. Nothing is written without.
     options : AdjustOptions, optional
         Or its attributes as keywords, as of ``pcfix adjust``: water (or port), cloud (apparent;
         some of its points stand for tie points where there are none), gcps, gnss, lens (held
@@ -138,6 +140,8 @@ def write_adjustment(folder: Path, found: Adjusted, model: str) -> None:
     draft = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=parent))
     try:
         _write_models(draft, found)
+        if found.precision is not None and found.precision.members is not None:
+            write_members(draft, found.precision.members)
         summary = {"model": model, **adjustment_dict(found, before)}
         text = json.dumps(summary, indent=2, allow_nan=False)
         (draft / SUMMARY).write_text(text + "\n", "utf-8")

@@ -21,6 +21,7 @@ from pcfix.flow.surfaces import CloudView, view_of
 from pcfix.io.files import check_input, read_json
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
+from pcfix.io.members import FILE as MEMBERS
 from pcfix.kernels import threads
 from pcfix.model import Cameras, WaterDimension, WaterSurface
 from pcfix.options.declare import File
@@ -46,7 +47,7 @@ class Decision(NamedTuple):
 def outputs_of(folder: Path) -> list[Path]:
     """Return what an adjustment may leave in the folder of a run, its report first."""
     colmap = [f"colmap/{name}.bin" for name in ("cameras", "images", "points3D")]
-    names = ["report.html", SUMMARY, *colmap, "colmap/georeference.json", *MODELS[1:]]
+    names = ["report.html", SUMMARY, MEMBERS, *colmap, "colmap/georeference.json", *MODELS[1:]]
     return [folder / FOLDER / name for name in names]
 
 

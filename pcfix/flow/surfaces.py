@@ -47,6 +47,12 @@ class Points(NamedTuple):
     classes: npt.NDArray[np.uint8]
     sources: IntArray | None = None
 
+    def take(self, rows: IntArray) -> Points:
+        """Return some of the points."""
+        heights = None if self.heights is None else self.heights[rows]
+        sources = None if self.sources is None else self.sources[rows]
+        return Points(self.xyz[rows], heights, self.classes[rows], sources)
+
 
 """Some points: coordinates (n, 3), water heights where those are a dimension, classes."""
 

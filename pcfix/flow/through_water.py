@@ -15,6 +15,7 @@ from pcfix.flow.diagnosis import diagnose_in_passing
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.learning import Learning
 from pcfix.flow.old_cameras import Blocks, ListedViews, old_tie_points
+from pcfix.flow.pose_errors import SAMPLE_POINTS, adjustment_of, pose_errors, sample_of, with_poses
 from pcfix.flow.surfaces import CloudView, Points, parts_of
 from pcfix.label.labelling import Labelling
 from pcfix.model import (
@@ -79,6 +80,9 @@ class ThroughWater:
         self._kind: ViewKind | None = None
         self.verdicts: tuple[Verdict, ...] = ()
         self._bent = ""
+        self._adjustment, self._no_poses = None, ""
+        if options.dimensions == "all" and self.survey.settings.method != "regression":
+            self._adjustment, self._no_poses = adjustment_of(inputs.cameras, self._cameras)
         self.restart()
 
     def restart(self) -> None:
@@ -105,6 +109,16 @@ class ThroughWater:
             )
         self.survey = self._learning.of_cloud(around, makers, all_listed=views.are_all)
         self.verdicts = self._learning.verdicts
+        self._learn_poses(chunks, views)
+
+    def _learn_poses(self, chunks: Callable[[], Iterable[Points]], views: ListedViews) -> None:
+        """Find what the errors of the adjustment come to in the heights of the bed."""
+        if self._adjustment is None:
+            return
+        sample = sample_of(chunks(), views, 1 + self._view.points // SAMPLE_POINTS)
+        pair = None if self.carrying is None else self.carrying.pair
+        poses = pose_errors(sample, self.survey, self._adjustment, pair)
+        self.survey = with_poses(self.survey, poses)
 
     @staticmethod
     def _carried(
@@ -242,12 +256,15 @@ class ThroughWater:
 
     def notes(self, tally: Tally) -> list[str]:
         """Return what was done on the user's behalf."""
-        bent = [self._bent] if self._bent else []
-        return [*self._told(), *self.found.notes, *self._meeting.notes, *bent]
+        said = [one for one in (self._bent, self._no_poses) if one]
+        return [*self._told(), *self.found.notes, *self._meeting.notes, *said]
 
     def figures(self, tally: Tally) -> dict[str, Any]:
         """Return what the summary says of depths and water."""
         moved, water, made = self.level_offset_m, str(self.water), self.made
+        uncertainty, poses = tally.uncertainty(self.made), self.survey.learned.poses
+        if uncertainty is not None and poses is not None:
+            uncertainty["poses_m"] = round(poses.middle_m, 4)
         notes = [] if made is None else [s for s in self._told() if s not in made["because"]]
         if moved is not None:
             times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
@@ -256,7 +273,7 @@ class ThroughWater:
             "depth_m": tally.depth_m(),
             "water": water,
             "water_fit": self.found.as_dict(),
-            "uncertainty": tally.uncertainty(self.made),
+            "uncertainty": uncertainty,
             "carried": None if self.carrying is None else self.carrying.as_dict(),
             "made": None if made is None else {**made, "notes": notes},
             "absorbed": bool(self._bent),

@@ -27,6 +27,7 @@ from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Outcome, Views
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.matcher import Bed, Matcher
 from pcfix.refract.occlusion import Occluder
+from pcfix.refract.pose_errors import PoseErrors
 from pcfix.refract.regression import DepthRegression
 from pcfix.water.surface import SurfaceAbove
 
@@ -59,6 +60,8 @@ class Learned(NamedTuple):
         Of how the cloud was made.
     land : Survey or None
         What land is corrected with that was carried to adjusted cameras, if not with the same.
+    poses : PoseErrors or None
+        What the errors of adjusted poses come to.
     """
 
     regression: DepthRegression | None = None
@@ -67,6 +70,7 @@ class Learned(NamedTuple):
     bed: Bed | None = None
     doubt: Doubt | None = None
     land: Survey | None = None
+    poses: PoseErrors | None = None
 
 
 class Doubt(NamedTuple):

@@ -116,14 +116,17 @@ def with_errors(found: Intersection, covariance: FloatArray | None, survey: Surv
 
 
 def with_doubt(found: Intersection, batch: Batch) -> Intersection:
-    """Return a result whose standard errors of Z have what the cloud itself tells of them."""
-    doubt = batch.survey.learned.doubt
-    if doubt is None or found.covariance_m2 is None:
+    """Return a result whose standard errors of Z have what cloud and poses tell of them."""
+    doubt, poses = batch.survey.learned.doubt, batch.survey.learned.poses
+    if (doubt is None and poses is None) or found.covariance_m2 is None:
         return found
     moved = found.outcome == Outcome.CORRECTED
-    depth = batch.surface.height_m - (batch.xyz[:, 2] + found.shift_m[:, 2])
     covariance = found.covariance_m2.copy()
-    covariance[moved, _ZZ] += doubt.scatter_m**2 + (doubt.per_depth * depth[moved]) ** 2
+    if doubt is not None:
+        depth = batch.surface.height_m - (batch.xyz[:, 2] + found.shift_m[:, 2])
+        covariance[moved, _ZZ] += doubt.scatter_m**2 + (doubt.per_depth * depth[moved]) ** 2
+    if poses is not None:
+        covariance[moved, _ZZ] += poses.at(batch.xyz[moved, :2]) ** 2
     return found._replace(sigma_z_m=np.sqrt(covariance[:, _ZZ]), covariance_m2=covariance)
 
 

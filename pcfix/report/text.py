@@ -156,12 +156,14 @@ def errors_of(s: Summary) -> str:
 
 def of_cloud(s: Summary) -> str:
     """Return what the standard errors have beyond the budget, in words."""
-    found = (s.uncertainty or {}).get("of_cloud")
+    known = s.uncertainty or {}
+    found, poses_m = known.get("of_cloud"), known.get("poses_m")
+    poses = "" if poses_m is None else f"; poses as adjusted: {poses_m:.3f} m"
     if found is None:
-        return "no mismatches"
+        return f"no mismatches{poses}"
     return (
         f"has from the cloud itself {found['scatter_m']:.3f} m of scatter and"
-        f" {100.0 * found['per_depth']:.1f} % of the depth"
+        f" {100.0 * found['per_depth']:.1f} % of the depth{poses}"
     )
 
 

@@ -1,0 +1,277 @@
+"""What the errors of an adjustment add to SigmaZ: a slow twin, repeats, and the doors."""
+
+from dataclasses import fields, replace
+
+import laspy
+import numpy as np
+import pytest
+from scipy.optimize import fsolve
+from scipy.spatial.transform import Rotation
+
+import pcfix
+from pcfix.adjust.block import Unknowns
+from pcfix.adjust.carry import Pair
+from pcfix.adjust.members import Members
+from pcfix.adjust.precision import precision_of
+from pcfix.adjust.problem import prepare, solved_cameras
+from pcfix.adjust.solve import solve
+from pcfix.flow.pose_errors import Adjustment, Sample, pose_errors, variances, with_poses
+from pcfix.flow.surfaces import Points
+from pcfix.io.members import FILE, find_members, write_members
+from pcfix.kernels import threads
+from pcfix.model import Cameras, Lens, Views, WaterPlane
+from pcfix.options.correct import ScienceOptions
+from pcfix.refract.batch import Batch, Survey
+from pcfix.refract.methods import correct
+from pcfix.refract.pose_errors import pose_errors_of
+from pcfix.report.text import summary_text
+from pcfix.simulate.tracing import piercing_points, project, triangulate
+from pcfix.water.surface import surface_above
+from tests.utils.clouds import WATER_M, cameras_csv, framed_block, write_cloud
+from tests.utils.tie_blocks import block_of, some_ties
+from tests.utils.tie_points import simulate_tie_points
+from tests.utils.unaware_blocks import parted
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """Blocks so small spend more on waking a second thread than it does."""
+    with threads(1):
+        yield
+
+
+LENS = Lens(1500.0, 1600.0, 1200.0, 800.0, 600.0)
+EXACT = ScienceOptions(
+    method="consistent", camera_set="all", max_angle=None, sigma_image=0.0, sigma_level=0.0,
+    sigma_index=0.0,
+)  # fmt: skip
+
+
+def three_cameras():
+    centres = np.array([[-18.0, -3.0, 62.0], [2.0, 9.0, 60.0], [17.0, -6.0, 61.0]])
+    tilts = Rotation.from_rotvec([[0.02, 0.15, 0.3], [-0.1, 0.03, 0.1], [0.05, -0.2, -0.2]])
+    return Cameras(
+        ("a", "b", "c"), centres, tilts.as_matrix() @ np.diag([1.0, -1.0, -1.0]), (LENS,) * 3
+    )
+
+
+UNKNOWNS = 21
+"""Turn and centre of each camera, focal length, level and index."""
+N, LEVEL_M = 1.34, 0.2
+
+
+class SlowTwin:
+    """Points from their places in three images, cameras and water given as one vector."""
+
+    def __init__(self, cameras, image):
+        self.cameras, self.image = cameras, image
+        self.camera, self.start = np.arange(len(image)) % 3, np.arange(0, len(image) + 1, 3)
+
+    def straight(self, image, cameras, near):
+        return triangulate(image, cameras, self.camera, self.start, cameras.lenses[0], near)
+
+    def true(self, x, near):
+        """Return the points whose bent images meet, straight, where the measured ones do."""
+        poses, (focal, level, n) = x[:18].reshape(3, 6), x[18:]
+        turned = Rotation.from_rotvec(poses[:, :3]).as_matrix() @ self.cameras.rotations
+        cameras = replace(
+            self.cameras, centres=self.cameras.centres + poses[:, 3:], rotations=turned,
+            lenses=(replace(LENS, focal=LENS.focal + focal),) * 3,
+        )  # fmt: skip
+        met = self.straight(self.image, cameras, near)
+
+        def miss(flat):
+            xyz = np.repeat(flat.reshape(-1, 3), 3, axis=0)
+            bent = piercing_points(xyz, cameras.centres[self.camera], LEVEL_M + level, N + n)
+            image, _ = project(bent, cameras, self.camera, cameras.lenses[0])
+            return (self.straight(image, cameras, met) - met).ravel()
+
+        return fsolve(miss, near.ravel(), xtol=1e-10).reshape(-1, 3)
+
+
+def members_with(covariance, cameras):
+    """Return members whose mean square is a covariance of the unknowns of the twin, exactly."""
+    steps = np.sqrt(UNKNOWNS) * np.linalg.cholesky(covariance).T
+    poses, lens = steps[:, :18].reshape(-1, 3, 6), np.repeat(steps[:, None, 18:19], 3, axis=1)
+    nothing = np.zeros(UNKNOWNS)
+    return Members(
+        cameras.labels, cameras.centres, np.full(3, LENS.focal), poses[:, :, :3],
+        np.einsum("kij,mkj->mki", cameras.rotations, poses[:, :, 3:]), ("f",), lens,
+        np.column_stack([steps[:, 19], nothing, nothing, steps[:, 20]]),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("moved", [False, True], ids=["adjusted before", "adjusted since"])
+def test_variances_are_those_of_a_slow_twin(moved):
+    rng = np.random.default_rng(5)
+    new = three_cameras()
+    turn = Rotation.from_rotvec(rng.normal(0.0, 2e-3, (3, 3))).as_matrix()
+    old = replace(
+        new, centres=new.centres + rng.normal(0.0, 0.1, (3, 3)), rotations=turn @ new.rotations
+    )
+    old = old if moved else new
+    xyz = np.column_stack([rng.uniform(-6.0, 6.0, (4, 2)), [-1.0, -2.5, -4.0, -6.0]])
+    sigma = np.array([1e-4, 1e-4, 1e-4, 0.02, 0.02, 0.03] * 3 + [0.5, 0.01, 0.001])
+    mix = rng.normal(size=(UNKNOWNS, 2 * UNKNOWNS))
+    correlation = np.corrcoef(mix)
+    covariance = correlation * sigma * sigma[:, None]
+
+    image, _ = project(np.repeat(xyz, 3, axis=0), old, np.arange(12) % 3, LENS)
+    twin, zero = SlowTwin(new, image), np.zeros(UNKNOWNS)
+    near = twin.true(zero, xyz)
+    by = np.array(
+        [(twin.true(step, near) - twin.true(-step, near))[:, 2] / 2.0 for step in np.diag(sigma)]
+    )
+    wanted = np.einsum("an,ab,bn->n", by, correlation, by)
+
+    members = members_with(covariance, new)
+    views = Views(np.arange(0, 13, 3), np.arange(12) % 3)
+    sample = Sample(Points(xyz, None, np.zeros(4, np.uint8)), views)
+    survey = Survey(WaterPlane(LEVEL_M), new, replace(EXACT, index=N))
+    found = variances(
+        sample, survey, Adjustment(members, np.arange(3)), Pair(old, new, np.arange(3), ())
+    )
+    assert np.sqrt(wanted).min() > 0.05
+    # the twin is of first order, the members are not
+    np.testing.assert_allclose(np.sqrt(found), np.sqrt(wanted), rtol=0.01)
+
+
+REPEATS = 40
+"""Most of an error is common to a bed, so that it lies within its bounds whole, or not at all."""
+
+
+def test_the_bed_lies_within_its_bounds():
+    """A block adjusted again and again with noise of its own, and the cloud that it makes."""
+    scene, others = parted(
+        simulate_tie_points(400, area_m=(50, 40), greatest_depth_m=5, image_noise=0.3), 250
+    )
+    others = some_ties(others, np.flatnonzero(others.is_wet))
+    truth, views, rng = others.truth, others.views, np.random.default_rng(8)
+    settings = replace(EXACT, sigma_image=0.3, index=scene.refractive_index)
+    known, bare, poses = [], [], None
+    for _ in range(REPEATS):
+        problem, start = prepare(block_of(scene.measured(rng)), Unknowns(lens=("f",)))
+        found = solve(problem, start)
+        cameras, image = solved_cameras(problem, found), others.measured(rng).ties.image_xy
+        lens = cameras.lenses[0]
+        xyz = triangulate(image, cameras, views.camera, views.start, lens, truth)
+        survey = Survey(scene.water, cameras, settings)
+        if poses is None:  # the covariance hardly changes
+            members = precision_of(problem, found).members
+            sample = Sample(Points(xyz, None, np.zeros(len(xyz), np.uint8)), views)
+            poses = pose_errors(sample, survey, Adjustment(members, np.arange(len(cameras))), None)
+        for one, into in ((with_poses(survey, poses), known), (survey, bare)):
+            result = correct(Batch(xyz, surface_above(scene.water, xyz), one, views))
+            into.append((xyz[:, 2] + result.shift_m[:, 2] - truth[:, 2]) / result.sigma_z_m)
+    known, bare = np.abs(known), np.abs(bare)
+    assert 0.90 <= np.mean(known < 1.96) <= 0.98
+    assert np.sqrt(np.mean(known**2)) == pytest.approx(1.0, abs=0.2)
+    assert np.mean(bare < 1.96) < 0.5
+
+
+def test_a_grid_holds_a_smooth_field_and_no_jumps():
+    rng = np.random.default_rng(2)
+    xy = rng.uniform((5e5, 4e6), (5e5 + 200.0, 4e6 + 80.0), (1000, 2))
+    hole = np.abs(xy - [5e5 + 100.0, 4e6 + 40.0]).max(axis=1) < 15.0
+
+    def sigma(places):
+        return 0.02 + 1e-4 * (places[:, 0] - 5e5) + 1e-4 * (places[:, 1] - 4e6)
+
+    variance = sigma(xy) ** 2
+    variance[rng.random(len(xy)) < 0.1] = 4.0
+    found = pose_errors_of(xy[~hole], variance[~hole])
+    inside = rng.uniform((5e5 + 8.0, 4e6 + 8.0), (5e5 + 192.0, 4e6 + 72.0), (50, 2))
+    np.testing.assert_allclose(found.at(inside), sigma(inside), rtol=0.15)
+    assert found.middle_m == pytest.approx(0.034, abs=0.002)
+    one = pose_errors_of(xy[:1], variance[:1])
+    assert one.at(xy[:3]) == pytest.approx(np.sqrt(variance[0]))
+
+
+def members_of(cameras, sigma_m):
+    """Return members in which the block stands higher or lower as a whole."""
+    up = np.array([-1.0, 1.0])[:, None, None] * np.array([0.0, 0.0, sigma_m])
+    nothing = np.zeros((2, len(cameras), 3))
+    return Members(
+        cameras.labels, cameras.centres, np.array([lens.focal for lens in cameras.lenses]),
+        nothing, nothing + up @ cameras.rotations[0].T, (), nothing[:, :, :0], np.zeros((2, 4)),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def files(tmp_path):
+    (tmp_path / "out").mkdir()
+    cameras = framed_block()
+    path = cameras_csv(tmp_path / "out" / "cameras.csv", cameras, angles=True)
+    (tmp_path / "out" / "sensor.csv").write_text("focal,sensor_x,sensor_y\n24,24,9.6\n")
+    return write_cloud(tmp_path / "cloud.las", 7), path
+
+
+def corrected(files, **more):
+    cloud, cameras = files
+    out = cloud.with_name("c.las")
+    given = {"method": "snell", "max_angle": None, **more}
+    told = pcfix.correct_file(
+        cloud, out, cameras=cameras, water=WATER_M, overwrite=True, sigma_level=0.0, **given
+    )
+    return told, laspy.read(out)
+
+
+def test_a_file_finds_the_ensemble_beside_its_cameras(files):
+    before, bare = corrected(files)
+    assert "poses_m" not in before.uncertainty
+    write_members(files[1].parent, members_of(pcfix.read_cameras(files[1]), 0.1))
+    told, las = corrected(files)
+    moved = np.array(bare.SigmaZ) > 0.0
+    # a block that stands higher by 0.1 m over fixed water has its bed higher by about that
+    assert told.uncertainty["poses_m"] == pytest.approx(0.1, rel=0.5)
+    more = np.sqrt(np.array(las.SigmaZ)[moved] ** 2 - np.array(bare.SigmaZ)[moved] ** 2)
+    assert np.median(more) == pytest.approx(told.uncertainty["poses_m"], rel=0.1)
+    assert not np.array(las.SigmaZ)[~moved].any()
+    np.testing.assert_array_equal(las.xyz, bare.xyz)
+    assert f"poses as adjusted: {told.uncertainty['poses_m']:.3f} m" in summary_text(told)
+    since, _ = corrected(files, adjusted_from=files[1])
+    assert since.uncertainty["poses_m"] == pytest.approx(told.uncertainty["poses_m"], rel=0.01)
+
+
+def test_the_stage_of_pdal_finds_it_too(files):
+    from tests.pdal_stage.test_arrays import arrays_of, metadata_of, run
+
+    write_members(files[1].parent, members_of(pcfix.read_cameras(files[1]), 0.1))
+    _, las = corrected(files)
+    before = laspy.read(files[0])
+    outs, _ = run(
+        "correct", arrays_of(before), metadata_of(before.header), cameras=str(files[1]),
+        water=WATER_M, method="snell", max_angle="none", sigma_level=0.0,
+    )  # fmt: skip
+    np.testing.assert_array_equal(outs["SigmaZ"], np.array(las.SigmaZ).astype(np.float32))
+
+
+def test_an_ensemble_of_other_cameras_is_left_aside_and_said(files):
+    _, bare = corrected(files)
+    cameras = pcfix.read_cameras(files[1])
+    centres = cameras.centres.copy()
+    centres[0, 0] += 0.5
+    where = files[1].parent
+    write_members(where, members_of(replace(cameras, centres=centres), 0.1))
+    told, las = corrected(files)
+    assert any("ensemble.npz: is of other cameras" in note for note in told.warnings)
+    np.testing.assert_array_equal(las.SigmaZ, bare.SigmaZ)
+    (where / FILE).write_bytes(b"nothing of use")
+    told, las = corrected(files)
+    assert any("is no ensemble of an adjustment" in note for note in told.warnings)
+    np.testing.assert_array_equal(las.SigmaZ, bare.SigmaZ)
+    told, _ = corrected(files, dimensions="minimal")  # then nobody asks for it
+    assert not any("ensemble" in note for note in told.warnings)
+
+
+def test_what_is_written_is_read(tmp_path):
+    cameras = framed_block()
+    written = members_of(cameras, 0.1)
+    write_members(tmp_path, written)
+    (tmp_path / "opensfm").mkdir()
+    for beside in (tmp_path, tmp_path / "colmap", tmp_path / "opensfm" / "reconstruction.json"):
+        where, read = find_members(beside)
+        assert where == (tmp_path / FILE).resolve()
+        for one in fields(Members):
+            np.testing.assert_array_equal(getattr(read, one.name), getattr(written, one.name))
+    assert find_members(tmp_path.parent / "elsewhere") is None
