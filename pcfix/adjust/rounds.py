@@ -6,15 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from pcfix.adjust.block import CX, CY, K1, NAMES, P1, P2, Block, Robust, Unknowns, usable_codes
+from pcfix.adjust.block import Block, Robust, Unknowns
 from pcfix.adjust.gather import LEAST_VIEWS
+from pcfix.adjust.lens_choice import missing_lens_parameters, weak_lens_parameters
 from pcfix.adjust.normal import residuals
 from pcfix.adjust.precision import Precision, precision_of
 from pcfix.adjust.problem import Problem, Progress, Solution, gnss_weights, prepare
 from pcfix.adjust.result import Adjusted, adjusted_of, sigma0_of
 from pcfix.adjust.solve import solve
 from pcfix.errors import GeometryError
-from pcfix.model import BoolArray, Lens
+from pcfix.model import BoolArray
 
 ROUGHLY = 1e-4
 """Gain of a step, relative, below which the first, robust rounds end."""
@@ -28,9 +29,6 @@ LEAST_SHARE = 0.5
 MAD_TO_SIGMA = 1.4826
 OUTLIER_ROUNDS = 3
 LAST_ROUND = 2 + OUTLIER_ROUNDS
-WEAK_PX = 2.0
-"""Standard error of the image at the corner of the frame above which a lens parameter is left as
-it was; the focal length always moves."""
 
 
 def adjust_ties(
@@ -40,7 +38,7 @@ def adjust_ties(
     *,
     sigma_px: float | None = None,
     outliers: bool = True,
-    drop_weak: bool = True,
+    choose_lens: bool = True,
 ) -> Adjusted:
     """Adjust a block of measured tie points.
 
@@ -50,8 +48,9 @@ def adjust_ties(
         Of the tie points; it is estimated without.
     outliers : bool
         Whether to look for them.
-    drop_weak : bool
-        Whether lens parameters that the block does not determine are left as they were.
+    choose_lens : bool
+        Whether lens parameters that the block does not determine are left as they were, and those
+        that lower the residuals are freed; else those of the unknowns move and no others.
 
     Raises
     ------
@@ -63,19 +62,45 @@ def adjust_ties(
     _check_sight(problem, now)
     problem, now = _cleaned(problem, now, sigma_px, outliers, progress)
     now, precision = _settled(problem, now, LAST_ROUND, progress)
-    weak = weak_lens_parameters(problem, precision) if drop_weak else []
-    notes = []
+    notes: list[str] = []
+    if choose_lens:
+        weak = weak_lens_parameters(problem, precision)
+        kept = [name for name in unknowns.lens if name not in weak]
+        more = missing_lens_parameters(problem, now, sigma0_of(problem, now))
+        notes = _lens_notes([*kept, *more], weak, more)
+        if weak or more:
+            problem, now = _with_lens(problem, now, (*kept, *more), outliers, progress)
+            now, precision = _settled(problem, now, LAST_ROUND + 2, progress)
+    return adjusted_of(problem, now, precision, notes, "tie points", "direct")
+
+
+def _with_lens(
+    problem: Problem, now: Solution, lens: tuple[str, ...], outliers: bool,
+    progress: Progress | None,
+) -> tuple[Problem, Solution]:  # fmt: skip
+    """Return the problem with other lens parameters, all observations judged anew by them."""
+    wide, start = prepare(problem.block, replace(problem.unknowns, lens=lens))
+    wide.seen = problem.seen
+    state = start.state._replace(xyz=now.state.xyz)
+    start = replace(start, state=state, log=now.log)
+    start = solve(wide, start, "squares", number=LAST_ROUND + 1, progress=progress, close=ROUGHLY)
+    if not outliers:
+        return wide, start
+    used = problem.seen.weight[_of_ties(problem)].max(initial=0.0)
+    ties = _of_ties(problem) & np.isfinite(problem.block.sigma_px)
+    wide.seen = wide.seen._replace(weight=np.where(ties, used, wide.seen.weight))
+    return without_outliers(wide, start)[0], start
+
+
+def _lens_notes(free: list[str], weak: list[str], more: list[str]) -> list[str]:
+    """Say which lens parameters move, and what the tests came to."""
+    tests = f" (tests of the residuals: {', '.join(more)} too)" if more else ""
+    notes = [f"lens parameters free: {', '.join(free)}{tests}."]
     if weak:
         notes.append(
             f"the block does not determine {', '.join(weak)} of the lens; left as they were."
         )
-        kept = tuple(name for name in unknowns.lens if name not in weak)
-        seen, xyz = problem.seen, now.state.xyz
-        problem, start = prepare(block, replace(unknowns, lens=kept))
-        problem.seen = problem.seen._replace(weight=seen.weight)
-        start = replace(start, state=start.state._replace(xyz=xyz), log=now.log)
-        now, precision = _settled(problem, start, LAST_ROUND + 1, progress)
-    return adjusted_of(problem, now, precision, notes, "tie points", "direct")
+    return notes
 
 
 def _settled(
@@ -208,35 +233,3 @@ def _check_most(problem: Problem, good: BoolArray, only: str, what: str) -> None
         raise GeometryError(
             f"the adjustment does not converge: {only} {n:,} of {most:,} observations {what}"
         )
-
-
-def weak_lens_parameters(problem: Problem, precision: Precision) -> list[str]:
-    """Return which lens parameters, the focal length apart, the block hardly determines."""
-    lenses, rows = problem.block.cameras.lenses or (), iter(precision.shared)
-    effects = [
-        (NAMES[code], next(rows).sigma * effect_at_corner(lenses[group[0]], code))
-        for group, codes in zip(problem.groups, problem.codes, strict=True)
-        for code in codes
-    ]
-    return list(dict.fromkeys(name for name, by in effects if name != "f" and by > WEAK_PX))
-
-
-def effect_at_corner(lens: Lens, code: int) -> float:
-    """Return by how much the image moves at the corner of the frame with a lens parameter."""
-    r = 0.5 * np.hypot(lens.width, lens.height) / lens.focal
-    if code in (CX, CY):
-        return 1.0
-    if code >= K1:
-        return float(lens.focal * r ** (2 * (code - K1) + 3))
-    return float(3.0 * lens.focal * r * r if code in (P1, P2) else r)
-
-
-def default_lens(lenses: tuple[Lens, ...]) -> tuple[str, ...]:
-    """Return the parameters that may move where the user names none: those that the lenses have."""
-    names = ["f", "cx", "cy"]
-    for lens in lenses:
-        names += [f"k{i}" for i, value in enumerate(lens.radial[:4], start=1) if value]
-        names += [f"p{i}" for i, value in enumerate(lens.tangential[:2], start=1) if value]
-    return tuple(
-        name for name in dict.fromkeys(names) if any(usable_codes(lens, (name,)) for lens in lenses)
-    )

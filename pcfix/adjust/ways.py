@@ -17,11 +17,12 @@ from pcfix.adjust.gather import (
     ties_of_cloud,
     well_seen,
 )
+from pcfix.adjust.lens_choice import default_lens
 from pcfix.adjust.mend import Candidate, mend
 from pcfix.adjust.precision import strong_correlations, undetermined
 from pcfix.adjust.problem import Progress, intersect_fixed
 from pcfix.adjust.result import Adjusted
-from pcfix.adjust.rounds import adjust_ties, check_datum, default_lens
+from pcfix.adjust.rounds import adjust_ties, check_datum
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import Cameras, FloatArray, GroundControl, IntArray, TiePoints, Views, WaterSurface
 from pcfix.options.survey import AdjustRules
@@ -99,7 +100,8 @@ def by_ties(
     kept, left_out = _kept(material.name, block)
     found = adjust_ties(
         restricted(block, kept), unknowns, progress, sigma_px=rules.sigma_image,
-        outliers=rules.outliers, drop_weak=rules.lens_unknowns is None,
+        outliers=rules.outliers,
+        choose_lens=rules.lens_unknowns is None and material.calibrated is None,
     )  # fmt: skip
     notes = [*left_out, *_check_dry(material.water, found), *found.notes]
     if found.precision is not None:

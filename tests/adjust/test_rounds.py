@@ -10,8 +10,9 @@ import pytest
 
 from pcfix.adjust.block import Unknowns
 from pcfix.adjust.gather import Datum, Material, block_of, no_datum
+from pcfix.adjust.lens_choice import default_lens
 from pcfix.adjust.problem import prepare
-from pcfix.adjust.rounds import adjust_ties, check_datum, default_lens, noise_px
+from pcfix.adjust.rounds import adjust_ties, check_datum, noise_px
 from pcfix.adjust.solve import solve
 from pcfix.errors import GeometryError
 from pcfix.kernels import threads
@@ -179,7 +180,7 @@ def test_lens_parameters_that_the_block_does_not_tell_are_left():
     before, after = made.cameras.lenses[0], found.cameras.lenses[0]
     assert (after.principal_x, after.principal_y) == (before.principal_x, before.principal_y)
     assert after.focal != before.focal
-    named = adjust_ties(block(made), replace(FOCAL, lens=lens), drop_weak=False)
+    named = adjust_ties(block(made), replace(FOCAL, lens=lens), choose_lens=False)
     assert named.unknowns.lens == lens
     assert not named.notes
 
