@@ -22,6 +22,7 @@ from pcfix.model import (
     Correction,
     FloatArray,
     IntArray,
+    Outcome,
     TiePoints,
     ViewKind,
     Views,
@@ -217,10 +218,16 @@ class ThroughWater:
 
     def out_of_sight(self, tally: Tally) -> str:
         """Return what to say where no camera has a submerged point in sight."""
+        limit = self.survey.settings.limit_deg
+        if tally.outcomes[Outcome.FLAT_RAYS]:
+            return (
+                f"no submerged point has two rays within {limit or 90.0:g} degrees of the surface"
+                f" normal, {tally.outcomes[Outcome.FLAT_RAYS]:,} have them beyond; give a larger"
+                " --max-angle, or none."
+            )
         middle = (tally.low + tally.high) / 2.0
         distance = float(np.hypot(*(self._cameras.centres - middle)[:, :2].T).min())
         away = f"{distance / 1000.0:,.1f} km" if distance >= 10_000.0 else f"{distance:,.1f} m"
-        limit = self.survey.settings.limit_deg
         return (
             "no camera has a submerged point in sight"
             + (f" within {limit:g} degrees" if limit else "")
@@ -248,7 +255,7 @@ class ThroughWater:
     def figures(self, tally: Tally) -> dict[str, Any]:
         """Return what the summary says of depths and water."""
         moved, water, made = self.level_offset_m, str(self.water), self.made
-        notes = [] if made is None else [s for s in self._told() if s not in made["because"]]
+        notes = [s for s in self._told() if made is None or s not in made["because"]]
         if moved is not None:
             times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
             water = f"{water}, {times}"
@@ -259,6 +266,7 @@ class ThroughWater:
             "uncertainty": tally.uncertainty(self.made),
             "carried": None if self.carrying is None else self.carrying.as_dict(),
             "made": None if made is None else {**made, "notes": notes},
+            "told": notes,
             "absorbed": bool(self._bent),
         }
 
@@ -285,11 +293,16 @@ def correct_checked(
     wet = batch.take(rows)
     if level_sigma_m is not None:
         wet = replace(wet, level_sigma_m=level_sigma_m(wet.xyz[:, :2]))
-    above, found = wet.surface, correct(wet)
-    shift_x, shift_y, shift_z = found.shift_m.T
-    rise = above.slope[:, 0] * shift_x + above.slope[:, 1] * shift_y
+    found = correct(wet)
+    below = _below_m(wet, found)
+    if batch.made_with is not None:
+        # their own images put them lower than all images together, by which they were carried
+        bed = (below >= 0.0) | (found.outcome != Outcome.CORRECTED)
+        submerged = submerged.copy()
+        submerged[rows[~bed]] = False
+        rows, found, below = rows[bed], found.take(bed), below[bed]
     depth = np.zeros(len(xyz))
-    depth[rows] = above.height_m + rise - (xyz[rows, 2] + shift_z)
+    depth[rows] = below
     values = spread_over(found, rows, len(xyz))
     values["shift_m"] = values["shift_m"] + _land_shift(batch, submerged)
     known = np.isfinite(surface.height_m)
@@ -301,6 +314,13 @@ def correct_checked(
         camera_used=found.camera_used,
         **values,
     )
+
+
+def _below_m(wet: Batch, found: Intersection) -> FloatArray:
+    """Return how deep points lie after their correction, shape (m,); above the water negative."""
+    shift_x, shift_y, shift_z = found.shift_m.T
+    rise = wet.surface.slope[:, 0] * shift_x + wet.surface.slope[:, 1] * shift_y
+    return np.asarray(wet.surface.height_m + rise - (wet.xyz[:, 2] + shift_z))
 
 
 _PER_POINT = (
