@@ -406,6 +406,8 @@ class Outcome(IntEnum):
     PARALLEL_RAYS = 4
     NOT_CARRIED = 5
     """Under water or not, it could not be taken from the old cameras to adjusted ones."""
+    FLAT_RAYS = 6
+    """Two cameras or more see it, but fewer than two within the largest angle."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -107,8 +107,11 @@ class Diagnosis:
                 return float(known[name].size_m or 0.0), known[name].basis
         return None
 
-    def sentence(self, command: str) -> str:
-        """Return a plain warning with what mends it; empty where the poses seem right."""
+    def sentence(self, command: str, because: str = "") -> str:
+        """Return a plain warning with what mends it; empty where the poses seem right.
+
+        `because` says why the command has what was not given.
+        """
         if not self.absorbed or self.decided_by is None:
             return ""
         size = self.size
@@ -116,7 +119,7 @@ class Diagnosis:
         why = self.decided_by.plainly or self.decided_by.words
         return (
             f"The poses have absorbed the refraction: {why}.{error} Correcting the cloud alone"
-            f" makes it worse; mend the poses first: {command}"
+            f" makes it worse; mend the poses first{because}: {command}"
         )
 
     def as_dict(self) -> dict[str, Any]:

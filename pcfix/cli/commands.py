@@ -101,14 +101,15 @@ def adjust(
     """Adjust poses, lens and points with the light bent at the water."""
     if (options.water is None) == (options.port is None):
         raise UsageError("give --water, or --port for images taken under water")
-    from pcfix.flow.adjust import next_step
+    from pcfix.flow.next_steps import correct_words
     from pcfix.kernels import threads
     from pcfix.report.adjustment import adjustment_text, before_of
 
     with threads(jobs), status_line("Adjusting", quiet) as progress:
         found = pcfix.adjust_cameras(model, out, options=options, progress=progress)
     say(adjustment_text(found, before_of(found)), quiet)
-    say(f"Next: {next_step(found, model, out, options)}", quiet)
+    cloud = "" if options.cloud else " (CLOUD.laz is the cloud that the old cameras made)"
+    say(f"Next{cloud}: {correct_words(found, model, out, options)}", quiet)
 
 
 def label(

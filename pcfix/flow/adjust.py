@@ -26,7 +26,7 @@ from pcfix.io.cameras.opensfm.models import write_opensfm
 from pcfix.io.cameras.table.sensor import write_table
 from pcfix.io.files import check_input
 from pcfix.io.members import write_members
-from pcfix.model import Cameras, TiePoints, Views, WaterPlane
+from pcfix.model import Cameras, TiePoints, Views
 from pcfix.options.declare import File, taken
 from pcfix.options.survey import AdjustOptions, AdjustRules
 
@@ -92,19 +92,6 @@ def adjust_into(
     if target is not None:
         write_adjustment(target, found, str(inputs.cameras))
     return found
-
-
-def next_step(found: Adjusted, model: File, out_dir: File, options: AdjustOptions) -> str:
-    """Return the command that takes the cloud over."""
-    plane, offset = found.water, options.cameras_offset
-    level = "SPEC"
-    if isinstance(plane, WaterPlane) and plane.b == plane.c == 0.0:
-        level = f"{plane.a:.3f}"
-    return (
-        f"pcfix correct {options.cloud or 'CLOUD'} OUTPUT --cameras {out_dir}/colmap"
-        f" --adjusted-from {model} --water {level}"
-        + ("" if offset is None else f" --cameras-offset {','.join(f'{v:.15g}' for v in offset)}")
-    )
 
 
 def checked_folder(folder: Path, overwrite: bool, inputs: list[Any]) -> Path:

@@ -32,7 +32,7 @@ from pcfix.errors import GeometryError, InputError, SettingError
 from pcfix.flow.inputs import Inputs, mask_of
 from pcfix.flow.surfaces import CloudView
 from pcfix.io.cameras.table.sensor import read_sensor
-from pcfix.io.crs import is_topocentric
+from pcfix.io.crs import is_topocentric, parse_crs
 from pcfix.io.files import check_input
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
@@ -88,8 +88,7 @@ def read_job(inputs: Inputs, rules: AdjustRules, view: CloudView | None, survey:
     """
     name = str(inputs.cameras) if isinstance(inputs.cameras, str | Path) else "cameras"
     found = inputs.read()
-    own = None if found.crs is None or is_topocentric(found.crs) else found.crs
-    crs = own if view is None else view.crs
+    crs = _map_of(found.crs) if view is None else view.crs
     old, views = inputs.block(crs, found)
     if old.rotations is None or old.lenses is None:
         raise InputError(
@@ -113,6 +112,13 @@ def read_job(inputs: Inputs, rules: AdjustRules, view: CloudView | None, survey:
         unknowns_of(rules, ()).level_sigma_m, no_gnss,
     )  # fmt: skip
     return Job(inputs, rules, view, crs, material, views, survey.gcps_name, notes)
+
+
+def _map_of(crs: str | None) -> str | None:
+    """Return the CRS of cameras where a cloud could be in it: one on a map."""
+    if crs is None or is_topocentric(crs) or not parse_crs(crs, "cameras").is_projected:
+        return None
+    return crs
 
 
 def _datum(

@@ -11,8 +11,9 @@ import numpy as np
 from pcfix.adjust.diagnosis import Diagnosis
 from pcfix.adjust.evidence import Evidence
 from pcfix.errors import InputError, SettingError
-from pcfix.flow.diagnosis import command_of, diagnose, focal_length_of, given_focal_lengths, ties_of
+from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, has_datum, ties_of
 from pcfix.flow.inputs import Inputs
+from pcfix.flow.next_steps import adjust_words
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import CloudView, file_points, find_surface, view_of
 from pcfix.io.cameras.georeference import adjusted_minus_gnss
@@ -81,11 +82,11 @@ def check_cameras(
         cameras, problem = _without_cloud(inputs, read)
     if given.gnss is not None:
         cameras = read_gnss(given.gnss, cameras)
-    diagnosis, remedy = None, ""
+    diagnosis, remedy = None, ("", "")
     if view is not None and surface is not None:
         diagnosis = _diagnosis(given, inputs, cameras, view, surface)
-        surveys = {name: getattr(given, name) for name in ("gnss", "gcps", "lens")}
-        remedy = command_of(inputs, view.name, **surveys)
+        surveys = {name: getattr(given, name) for name in ("gnss", "gcps", "lens", "index")}
+        remedy = adjust_words(inputs, view.name, has_datum=has_datum(cameras, str(path)), **surveys)
     level = None
     if surface is not None and not (isinstance(surface, WaterDimension) and heights is None):
         at = cameras.centres if heights is None else xyz

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-import shlex
 import warnings
 from dataclasses import replace
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from pcfix.adjust.diagnosis import Diagnosis
+import numpy as np
+
+from pcfix.adjust.diagnosis import MOST_STATED_M, Diagnosis
 from pcfix.adjust.evidence import Evidence, diagnosed
 from pcfix.adjust.gather import Datum
 from pcfix.errors import InputError, PcfixError, PcfixWarning
 from pcfix.flow.inputs import Inputs
+from pcfix.flow.next_steps import adjust_words
 from pcfix.flow.surfaces import CloudView
 from pcfix.io.cameras.metashape.sensors import given_lenses
 from pcfix.io.cameras.table.sensor import read_sensor
 from pcfix.io.gnss_positions import gnss_in_frame_of
 from pcfix.model import Cameras, TiePoints, WaterSurface
 from pcfix.options.declare import File
+from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
+
+LEAST_POSITIONS = 3
+"""Of the GNSS, that say where a block is, how it is turned, and its scale."""
 
 QUICK_BYTES = 25_000_000
 """Of a model, in passing, where nobody asked: it takes no more than a second or two."""
@@ -63,7 +68,11 @@ def diagnose_in_passing(
         found = diagnose(evidence)
     except (PcfixError, OSError):  # a look in passing stops no correction
         return ""
-    sentence = found.sentence(command_of(inputs, view.name))
+    name = str(path or "cameras")
+    index = None if refractive_index == DEFAULT_REFRACTIVE_INDEX else refractive_index
+    holds = has_datum(cameras, name)
+    command, because = adjust_words(inputs, view.name, has_datum=holds, index=index)
+    sentence = found.sentence(command, because)
     if sentence:
         warnings.warn(sentence, PcfixWarning, stacklevel=3)
     return sentence
@@ -84,20 +93,21 @@ def _size_of(path: Path) -> int:
     return path.stat().st_size
 
 
-def command_of(inputs: Inputs, cloud: str, **more: File | None) -> str:
-    """Return the command that mends the poses."""
-    model = "MODEL" if isinstance(inputs.cameras, Cameras) else str(inputs.cameras)
-    water = inputs.water if isinstance(inputs.water, str | PathLike | float | int) else "SPEC"
-    words = ["pcfix", "adjust", model, "OUT", "--water", f"{water}", "--cloud", cloud]
-    given: dict[str, Any] = {
-        "sensor": inputs.sensor, "cameras-crs": inputs.cameras_crs, "angles": inputs.angles, **more
-    }  # fmt: skip
-    if inputs.cameras_offset is not None:
-        given["cameras-offset"] = ",".join(f"{value:.12g}" for value in inputs.cameras_offset)
-    for name, value in given.items():
-        if value is not None:
-            words += [f"--{name}", str(value)]
-    return shlex.join(words)
+def has_datum(cameras: Cameras, name: str) -> bool:
+    """Whether the camera file has positions of the GNSS good enough to hold a block."""
+    if cameras.gnss is None:
+        return False
+    try:
+        found = gnss_in_frame_of(cameras, name)
+    except InputError:
+        return False
+    known = np.isfinite(found.xyz).all(axis=1)
+    if known.sum() < LEAST_POSITIONS:
+        return False
+    off = (cameras.centres - found.xyz)[known]
+    spread = 1.4826 * np.median(np.abs(off - np.median(off, axis=0)))
+    stated = found.sigma_m[known]
+    return bool(np.median(np.where(np.isfinite(stated), stated, spread)) <= MOST_STATED_M)
 
 
 def given_focal_lengths(path: File) -> dict[str, float]:

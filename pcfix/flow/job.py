@@ -115,8 +115,10 @@ class Job:
         self.medium.check_carried(self.name)
         self.labelling.check(self.name)
         self.medium.check_meeting(self.name, tally)
-        if tally.outcomes[Outcome.NO_CAMERA] == tally.submerged:
-            found = likely_mistake(self.cameras.centres, tally.low, tally.high, self._view.crs)
+        flat = int(tally.outcomes[Outcome.FLAT_RAYS])
+        if tally.outcomes[Outcome.NO_CAMERA] + flat == tally.submerged:
+            block = self.cameras.centres, tally.low, tally.high, self._view.crs
+            found = None if flat else likely_mistake(*block)
             mistake = f" {found}" if found else ""
             raise GeometryError(f"{self.name}: {self.medium.out_of_sight(tally)}{mistake}")
         self.medium.look_back()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pcfix.adjust.carry import Pair, pair_of, renumbered
-from pcfix.errors import GeometryError, PcfixWarning, SettingError
+from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
 from pcfix.io.labels import match_labels
 from pcfix.io.views import ViewList, ViewMatch, ViewReport
 from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, Views
@@ -95,9 +95,26 @@ def read_blocks(inputs: Inputs, cloud_crs: str | CRS | None) -> Blocks:
         cameras, views = inputs.block(cloud_crs)
         return Blocks(cameras, views, cameras, None)
     old, new = told_apart(inputs)
-    listed, views = old.block(cloud_crs)
     cameras, _ = new.block(cloud_crs)
+    try:
+        listed, views = old.block(cloud_crs)
+    except InputError:
+        _refuse_apart(replace(old, views=None).block(cloud_crs)[0], cameras)
+        raise
+    _refuse_apart(listed, cameras)
     return Blocks(cameras, views, listed, paired(listed, cameras))
+
+
+def _refuse_apart(old: Cameras, new: Cameras) -> None:
+    """Refuse two models that are apart, before the list of the cloud is blamed."""
+    place = _rows(old.labels, new.labels)
+    apart = float(np.median(np.linalg.norm(new.centres - old.centres[place], axis=1)))
+    if apart > np.ptp(np.vstack([old.centres[place], new.centres]), axis=0).max() / 2.0:
+        raise GeometryError(
+            f"adjusted-from: its cameras stand {apart:,.0f} m from where the adjusted ones do;"
+            " give the offset of the one that is shifted to the origin: --cameras-offset"
+            " counts for the file that does not say where it lies."
+        )
 
 
 def told_apart(inputs: Inputs) -> tuple[Inputs, Inputs]:

@@ -8,18 +8,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
-import numpy as np
-
 from pcfix.adjust.diagnosis import MOST_STATED_M, Diagnosis
 from pcfix.adjust.evidence import Evidence
 from pcfix.errors import PcfixError, PcfixWarning, SettingError
 from pcfix.flow.adjust import SUMMARY, adjust_into
 from pcfix.flow.adjust_job import Survey
-from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, ties_of
+from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, has_datum, ties_of
 from pcfix.flow.inputs import Inputs
+from pcfix.flow.next_steps import MODELS
 from pcfix.flow.surfaces import CloudView, view_of
 from pcfix.io.files import check_input, read_json
-from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
+from pcfix.io.gnss_positions import read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.io.members import FILE as MEMBERS
 from pcfix.kernels import threads
@@ -29,11 +28,6 @@ from pcfix.options.survey import AdjustRules, AdjustWhen
 from pcfix.water.index import index_of
 
 FOLDER = "adjusted"
-MODELS = ("colmap", "opensfm/reconstruction.json", "cameras.csv")
-"""What an adjustment leaves, in the order in which a run takes it."""
-
-LEAST_POSITIONS = 3
-"""Of the GNSS, that say where a block is, how it is turned, and its scale."""
 
 
 class Decision(NamedTuple):
@@ -150,7 +144,7 @@ def _decide(step: AdjustStep) -> Decision:
         cameras = inputs.block(view.crs)[0]
         if step.gnss is not None:
             cameras = read_gnss(step.gnss, cameras)
-        elif step.gcps is None and not _has_datum(cameras, str(inputs.cameras)):
+        elif step.gcps is None and not has_datum(cameras, str(inputs.cameras)):
             return Decision(False, _NO_DATUM, is_said)
         water = inputs.surface(view).surface
         if isinstance(water, WaterDimension):
@@ -162,20 +156,6 @@ _NO_DATUM = (
     "nothing says where the block is: no --gcps, no --gnss, and no positions of the GNSS to"
     f" {MOST_STATED_M:g} m in the camera file"
 )
-
-
-def _has_datum(cameras: Cameras, name: str) -> bool:
-    """Whether the camera file has positions of the GNSS good enough to hold a block."""
-    if cameras.gnss is None:
-        return False
-    found = gnss_in_frame_of(cameras, name)
-    known = np.isfinite(found.xyz).all(axis=1)
-    if known.sum() < LEAST_POSITIONS:
-        return False
-    off = (cameras.centres - found.xyz)[known]
-    spread = 1.4826 * np.median(np.abs(off - np.median(off, axis=0)))
-    stated = found.sigma_m[known]
-    return bool(np.median(np.where(np.isfinite(stated), stated, spread)) <= MOST_STATED_M)
 
 
 def _diagnosed(

@@ -144,4 +144,5 @@ class ThroughPort:
             "water": f"all around, seen through a {self._port}",
             "water_fit": None,
             "uncertainty": None,
+            "told": self.notes(tally),
         }

@@ -23,6 +23,7 @@ from pcfix.model import (
     Correction,
     FloatArray,
     IntArray,
+    Outcome,
     TiePoints,
     ViewKind,
     Views,
@@ -231,10 +232,16 @@ class ThroughWater:
 
     def out_of_sight(self, tally: Tally) -> str:
         """Return what to say where no camera has a submerged point in sight."""
+        limit = self.survey.settings.limit_deg
+        if tally.outcomes[Outcome.FLAT_RAYS]:
+            return (
+                f"no submerged point has two rays within {limit or 90.0:g} degrees of the surface"
+                f" normal, {tally.outcomes[Outcome.FLAT_RAYS]:,} have them beyond; give a larger"
+                " --max-angle, or none."
+            )
         middle = (tally.low + tally.high) / 2.0
         distance = float(np.hypot(*(self._cameras.centres - middle)[:, :2].T).min())
         away = f"{distance / 1000.0:,.1f} km" if distance >= 10_000.0 else f"{distance:,.1f} m"
-        limit = self.survey.settings.limit_deg
         return (
             "no camera has a submerged point in sight"
             + (f" within {limit:g} degrees" if limit else "")
@@ -265,7 +272,7 @@ class ThroughWater:
         uncertainty, poses = tally.uncertainty(self.made), self.survey.learned.poses
         if uncertainty is not None and poses is not None:
             uncertainty["poses_m"] = round(poses.middle_m, 4)
-        notes = [] if made is None else [s for s in self._told() if s not in made["because"]]
+        notes = [s for s in self._told() if made is None or s not in made["because"]]
         if moved is not None:
             times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
             water = f"{water}, {times}"
@@ -275,7 +282,8 @@ class ThroughWater:
             "water_fit": self.found.as_dict(),
             "uncertainty": uncertainty,
             "carried": None if self.carrying is None else self.carrying.as_dict(),
-            "made": None if made is None else {**made, "notes": notes},
+            "made": made,
+            "told": notes,
             "absorbed": bool(self._bent),
         }
 
@@ -302,11 +310,16 @@ def correct_checked(
     wet = batch.take(rows)
     if level_sigma_m is not None:
         wet = replace(wet, level_sigma_m=level_sigma_m(wet.xyz[:, :2]))
-    above, found = wet.surface, correct(wet)
-    shift_x, shift_y, shift_z = found.shift_m.T
-    rise = above.slope[:, 0] * shift_x + above.slope[:, 1] * shift_y
+    found = correct(wet)
+    below = _below_m(wet, found)
+    if batch.made_with is not None:
+        # their own images put them lower than all images together, by which they were carried
+        bed = (below >= 0.0) | (found.outcome != Outcome.CORRECTED)
+        submerged = submerged.copy()
+        submerged[rows[~bed]] = False
+        rows, found, below = rows[bed], found.take(bed), below[bed]
     depth = np.zeros(len(xyz))
-    depth[rows] = above.height_m + rise - (xyz[rows, 2] + shift_z)
+    depth[rows] = below
     values = spread_over(found, rows, len(xyz))
     values["shift_m"] = values["shift_m"] + _land_shift(batch, submerged)
     known = np.isfinite(surface.height_m)
@@ -318,6 +331,13 @@ def correct_checked(
         camera_used=found.camera_used,
         **values,
     )
+
+
+def _below_m(wet: Batch, found: Intersection) -> FloatArray:
+    """Return how deep points lie after their correction, shape (m,); above the water negative."""
+    shift_x, shift_y, shift_z = found.shift_m.T
+    rise = wet.surface.slope[:, 0] * shift_x + wet.surface.slope[:, 1] * shift_y
+    return np.asarray(wet.surface.height_m + rise - (wet.xyz[:, 2] + shift_z))
 
 
 _PER_POINT = (

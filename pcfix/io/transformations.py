@@ -274,9 +274,9 @@ def _without_cloud_crs(source: CRS, name: str) -> tuple[str, ...]:
     if not source.is_projected or plan_unit(source)[1] != 1.0:
         unit = f"the unit {plan_unit(source)[0]}" if source.is_projected else "degrees"
         raise InputError(
-            f"{name}: is in {unit} ({source.name}) and the cloud names no CRS; set the cloud's CRS."
+            f"{name}: is in {unit} ({source.name}) and no cloud names a CRS; set the cloud's CRS."
         )
-    return (f"{name}: the cloud names no CRS; taken to be in {source.name} too.",)
+    return (f"{name}: no cloud names a CRS; taken to be in {source.name} too.",)
 
 
 def _check_kinds(source: CRS, cloud: CRS, name: str) -> None:

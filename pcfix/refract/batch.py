@@ -363,6 +363,12 @@ class Intersection(NamedTuple):
     covariance_m2: FloatArray | None = None
     unsure: BoolArray | None = None
 
+    def take(self, rows: IntArray | BoolArray) -> Intersection:
+        """Return the results of some points."""
+        known = {name: value for name, value in self._asdict().items() if value is not None}
+        known.pop("camera_used")
+        return self._replace(**{name: value[rows] for name, value in known.items()})
+
 
 def warn_of_unsolved(beginning: str, found: BoolArray) -> None:
     """Warn of the points that are moved without a solution; `found` has one entry for each."""

@@ -63,10 +63,23 @@ def correct(batch: Batch) -> Intersection:
         One row per point of the batch, in its order.
     """
     parts = batch.parts()
-    found = [_corrected(part) for _, part in parts]
+    found = [_named_by_limit(_corrected(part), part) for _, part in parts]
     if len(found) == 1:
         return found[0]
     return joined(found, np.concatenate([rows for rows, _ in parts]), len(batch.survey.cameras))
+
+
+def _named_by_limit(found: Intersection, batch: Batch) -> Intersection:
+    """Tell apart, of points with fewer than two rays, those that lack them by the largest angle."""
+    survey = batch.survey
+    few = np.flatnonzero(np.isin(found.outcome, (Outcome.NO_CAMERA, Outcome.ONE_CAMERA)))
+    if survey.settings.limit_deg is None or not len(few):
+        return found
+    free = replace(survey, settings=replace(survey.settings, max_angle=None))
+    flat = few[with_rays(replace(batch.take(few), survey=free)).counts >= 2]
+    outcome = found.outcome.copy()
+    outcome[flat] = Outcome.FLAT_RAYS
+    return found._replace(outcome=outcome)
 
 
 def _corrected(batch: Batch) -> Intersection:

@@ -18,6 +18,7 @@ COVERAGE_95 = 1.96
 REASONS = {
     Outcome.NO_CAMERA: "no camera has it in its frame, or in its list of views",
     Outcome.ONE_CAMERA: "one usable ray only",
+    Outcome.FLAT_RAYS: "fewer than two rays within the largest angle (--max-angle)",
     Outcome.PARALLEL_RAYS: "rays nearly parallel",
 }
 _BIN_M = 0.001
@@ -242,6 +243,8 @@ class Summary:
     carried: dict[str, Any] | None = None
     made: dict[str, Any] | None = None
     """What the cloud was taken for, and why, where the options leave it open."""
+    told: list[str] = field(default_factory=list)
+    """What the cloud told beside that; `warnings` has it too."""
     absorbed: bool = False
     """Whether it warned that the poses have absorbed the refraction; for later steps of a run."""
     unsure: int | None = None
@@ -258,7 +261,7 @@ class Summary:
         `labelling` is there where it had rules, `carried` where the cloud was taken from old
         cameras to adjusted ones, `unsure` where such points are withheld.
         """
-        some = ("labelling", "carried", "unsure")
-        values = {name: vars(self)[name] for name in vars(self) if name not in (*some, "absorbed")}
+        some, own = ("labelling", "carried", "unsure"), ("absorbed", "told")
+        values = {name: vars(self)[name] for name in vars(self) if name not in (*some, *own)}
         more = {name: getattr(self, name) for name in some if getattr(self, name) is not None}
         return {**values, **more, "points_per_s": round(self.points_per_s)}

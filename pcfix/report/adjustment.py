@@ -16,6 +16,7 @@ from pcfix.report.adjustment_text import (
     WHERE,
     all_notes,
     before_after_change,
+    engine_words,
     fixed,
     found_rows,
     has_many_sensors,
@@ -95,7 +96,7 @@ def _facts(d: Plain) -> Table:
         [
             "Sigma0",
             f"{fixed(d['sigma0'], 3)} (1 where the given standard deviations are right),"
-            f" redundancy {d['redundancy']:,}; {rounds_words(d)}, engine {d['engine']}",
+            f" redundancy {d['redundancy']:,}; {rounds_words(d)}{engine_words(d)}",
         ],
     ]
     if d["water"] is not None and not d["water"]["surface"].startswith("level"):

@@ -22,7 +22,7 @@ def summary_lines(d: Plain) -> list[str]:
         f"points       {points_words(d)}",
         f"observations {observations_words(d)}",
         f"sigma0       {fixed(d['sigma0'], 3)}, redundancy {d['redundancy']:,};"
-        f" {rounds_words(d)} ({d['engine']})",
+        f" {rounds_words(d)}{engine_words(d)}",
         *_residual_lines(d),
         *(f"{label:<12} {words}" for label, words in found_rows(d)),
         *_surveyed_lines(d),
@@ -90,6 +90,13 @@ def observations_words(d: Plain) -> str:
         f" ({share(n['left_out'], n['used'] + n['left_out'])}); {kinds[d['source']]}"
         + (f"; {n['out_of_sight']:,} out of sight" if n["out_of_sight"] else "")
     )
+
+
+def engine_words(d: Plain) -> str:
+    """Return how the poses were found, where no tie points tell."""
+    if d["engine"] != "unaware":
+        return ""
+    return "; the poses are those that an adjustment without water turns into the old ones"
 
 
 def rounds_words(d: Plain) -> str:

@@ -103,8 +103,8 @@ class CamerasReport:
         Why `cameras` are not in a map and so have no heights; empty where they are.
     diagnosis : Diagnosis or None
         Whether the poses have absorbed the refraction; None without a cloud or water.
-    remedy : str
-        The command that mends them.
+    remedy : tuple of 2 str
+        The command that mends them, and why it has what was not given.
     """
 
     path: str
@@ -119,7 +119,7 @@ class CamerasReport:
     level_m: float | None
     problem: str = ""
     diagnosis: Diagnosis | None = None
-    remedy: str = ""
+    remedy: tuple[str, str] = ("", "")
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
@@ -173,6 +173,7 @@ def cameras_text(report: CamerasReport) -> str:
         lines.append(f"tilt         median {median:.1f}, largest {largest:.1f} degrees")
     if r.gnss is not None:
         lines += _gnss(r.gnss)
+    lines += [f"note         {note}" for note in cameras.notes]
     return "\n".join([*lines, *_fit(r), *_refraction(r)])
 
 
@@ -229,7 +230,7 @@ def _refraction(report: CamerasReport) -> list[str]:
     lines = ["", "Have the poses absorbed the refraction?"]
     lines += [f"{sign.name:<14} {says[sign.speaks] + ':':<13} {sign.words}" for sign in found.signs]
     if found.absorbed:
-        return [*lines, f"{'verdict':<14} {found.sentence(report.remedy)}"]
+        return [*lines, f"{'verdict':<14} {found.sentence(*report.remedy)}"]
     if found.absorbed is False and found.decided_by is not None:
         return [*lines, f"{'verdict':<14} no, by {found.decided_by.name}"]
     needs = "tie points, GNSS positions, control points or a reference would tell"

@@ -52,7 +52,9 @@ def summary_text(summary: Summary) -> str:
         )
     if s.made:
         lines.append(f"method       {s.made['method']}. {s.made['because']}")
-        lines += [f"  note       {note}" for note in s.made.get("notes", ())]
+    elif s.told:
+        lines.append(f"method       {s.settings['method']}")
+    lines += [f"  note       {note}" for note in s.told]
     unused = len(s.cameras_unused)
     names = ", ".join(s.cameras_unused[:5]) + (", ..." if unused > 5 else "")
     lines += [
@@ -190,8 +192,10 @@ def left_out_lines(labelling: dict[str, Any] | None) -> list[str]:
 
 
 def share(part: int, whole: int) -> str:
-    """Return a percentage, with a digit more where it is small."""
+    """Return a percentage, with a digit more where it is small; 100 % only where it is all."""
     percent = 100.0 * part / max(whole, 1)
+    if percent >= 99.5 and part < whole:
+        return f"all but {whole - part:,}"
     return f"{percent:.0f} %" if percent >= 10 or percent == 0 else f"{percent:.1f} %"
 
 

@@ -11,7 +11,8 @@ import pytest
 
 import pcfix
 from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
-from pcfix.flow.adjust import adjust_cameras, next_step
+from pcfix.flow.adjust import adjust_cameras
+from pcfix.flow.next_steps import correct_words
 from pcfix.kernels import threads
 from pcfix.options.survey import AdjustOptions
 from tests.utils.adjust_files import IMAGE_PX, write_block, write_gnss
@@ -235,9 +236,9 @@ def test_the_summary_tells_it_in_plain_values(files, written):
 def test_the_next_step_does_what_it_says(files, written):
     out, found = written
     options = AdjustOptions(cloud=files.folder / "cloud.las")
-    words = next_step(found, files.folder / "model", out, options)
+    words = correct_words(found, files.folder / "model", out, options)
     target = files.folder / "next.las"
-    arguments = words.replace("OUTPUT", str(target)).split()[1:]
+    arguments = words.replace("corrected.laz", str(target)).split()[1:]
     done = run_pcfix(*arguments, "-q")
     assert done.returncode == 0, done.stderr
     assert max(heights_rms_m(files, target)) < 0.02

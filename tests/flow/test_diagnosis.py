@@ -8,8 +8,8 @@ import pytest
 import pcfix
 from pcfix.errors import PcfixWarning, SettingError
 from pcfix.flow.checks import check_cameras
-from pcfix.flow.diagnosis import command_of
 from pcfix.flow.inputs import Inputs
+from pcfix.flow.next_steps import adjust_words
 from pcfix.report.cameras import cameras_text
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
@@ -120,13 +120,18 @@ def test_evidence_needs_cloud_and_water():
 
 def test_the_command_names_what_was_given():
     inputs = Inputs(
-        cameras="my model", water=0.5, cameras_offset=(1.0, 2.0, 3.0), cameras_crs="EPSG:25830"
+        cameras="my model", water=0.5, cameras_offset=(1.0, 2.0, 3.0), cameras_crs="EPSG:25830",
+        views="dense.vis", views_are="depth-maps",
+    )  # fmt: skip
+    head = "pcfix adjust 'my model' OUT --water 0.5 --cloud cloud.laz"
+    tail = (
+        "--cameras-crs EPSG:25830 --cameras-offset 1,2,3 --views dense.vis --views-are depth-maps"
     )
-    command = command_of(inputs, "cloud.laz", gnss="gnss.csv", gcps=None)
-    assert command == (
-        "pcfix adjust 'my model' OUT --water 0.5 --cloud cloud.laz --cameras-crs EPSG:25830"
-        " --gnss gnss.csv --cameras-offset 1,2,3"
-    )
+    command, because = adjust_words(inputs, "cloud.laz", has_datum=False, gnss="gnss.csv")
+    assert (command, because) == (f"{head} {tail} --gnss gnss.csv", "")
+    command, because = adjust_words(inputs, "cloud.laz", has_datum=False)
+    assert command == f"{head} {tail} --gnss GNSS.csv"
+    assert "nothing given says where the block is" in because
 
 
 @bent

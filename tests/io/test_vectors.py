@@ -218,7 +218,7 @@ def test_no_crs_is_the_clouds(tmp_path, heights):
 
 def test_a_cloud_without_crs_takes_metres_alone(tmp_path):
     metres = read_vectors(write_text(tmp_path / "a.csv", "x,y", "1,2"), crs=UTM30)
-    assert "the cloud names no CRS" in in_cloud_crs(metres, None, heights=True).notes[0]
+    assert "no cloud names a CRS" in in_cloud_crs(metres, None, heights=True).notes[0]
     for crs, unit in (("EPSG:4326", "degrees"), ("EPSG:2992", "the unit foot")):
         found = read_vectors(tmp_path / "a.csv", crs=crs)
         with pytest.raises(InputError, match=f"is in {unit} .* set the cloud's CRS"):

@@ -236,7 +236,7 @@ def test_a_vertical_crs_in_feet_is_converted(tmp_path):
     heights = tilted(*cells(from_origin(LEFT, TOP, 2.0, 2.0)))
     path = write(tmp_path / "w.tif", heights * 3937.0 / 1200.0, crs="EPSG:26910+6360")
     expect_plane(pcfix.read_water(path, "EPSG:26910+5703"))
-    with pytest.warns(pcfix.PcfixWarning, match="the cloud names no CRS; taken to be in NAD83"):
+    with pytest.warns(pcfix.PcfixWarning, match="no cloud names a CRS; taken to be in NAD83"):
         expect_plane(pcfix.read_water(path))
 
 
@@ -244,7 +244,7 @@ def test_a_crs_in_feet_says_what_heights_are(tmp_path):
     path = write(tmp_path / "w.tif", np.full((5, 5), 10.0), crs="EPSG:2225")
     with (
         pytest.warns(pcfix.PcfixWarning, match=r"taken to be in that of its CRS \(0.3048 m\)"),
-        pytest.raises(pcfix.InputError, match="the cloud names no CRS"),
+        pytest.raises(pcfix.InputError, match="no cloud names a CRS"),
     ):
         pcfix.read_water(path, "EPSG:26910")
         pcfix.read_water(path)

@@ -127,7 +127,7 @@ def test_text_says_what_was_calculated_by_hand(adjusted):
     assert land[2:6] == ["8", "23", "1.200", "0.300"]
     assert wet[2:6] == ["16", "47", "2.400", "0.400"]
     assert "70 used, 2 left out (2.8 %)" in text
-    assert "sigma0       1.234, redundancy 60; 2 rounds, 3 steps (direct)" in text
+    assert "sigma0       1.234, redundancy 60; 2 rounds, 3 steps" in text
     assert "focal length 1000.00 -> 1002.00 px (+2.00, standard error 0.25)" in text
     assert "water level  0.500 -> 0.520 m (+0.020, standard error 0.004)" in text
     assert "index        1.34, fixed" in text

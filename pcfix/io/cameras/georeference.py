@@ -193,13 +193,13 @@ def _from_earth(
     elif frame.direct or stated.project is None or not stated.project.is_projected:
         kind = "degrees" if frame.direct else "geocentric coordinates"
         raise InputError(
-            f"{name}: is in {kind} ({frame.crs.name}) and the cloud names no CRS; set the cloud's"
-            " CRS."
+            f"{name}: is in {kind} ({frame.crs.name}) and no cloud names a CRS; give"
+            " the cloud, or set its CRS."
         )
     else:
         words = stated.project.name
         found = _into(stated.project, frame, stated, cameras, offset, name)
-    note = f"{name}: the cloud names no CRS; taken to be in {words} as the cameras are."
+    note = f"{name}: no cloud names a CRS; taken to be in {words} as the cameras are."
     return replace(found, notes=(note, *found.notes))
 
 

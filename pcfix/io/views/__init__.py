@@ -13,6 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from pcfix.errors import InputError
 from pcfix.io.files import check_input
 from pcfix.io.views.lists import ImageOrder, RawList, ViewList, read_list, tracks_as_list
 from pcfix.io.views.matching import ViewMatch, ViewReport, spacing_m
@@ -77,4 +78,14 @@ def _fitted(
         raw = replace(raw, xyz=np.ascontiguousarray(to_cloud(raw.xyz), np.float64))
     xyz = np.asarray(raw.xyz)
     views = ViewList(raw, orders, None, spacing_m(xyz), _SPACINGS[kind], kind)
-    return fitted(views, cameras, xyz, np.arange(len(views)))
+    try:
+        return fitted(views, cameras, xyz, np.arange(len(views)))
+    except InputError:
+        if not raw.is_beside:
+            raise
+    note = (
+        f"{raw.path}: the PLY file beside it is in another frame than the cameras, as a local one"
+        " is; its positions are not used, and the list goes by the rows of the cloud."
+    )
+    raw = replace(raw, xyz=None, notes=(*raw.notes, note))
+    return ViewList(raw, orders, None, None, _SPACINGS[kind], kind)

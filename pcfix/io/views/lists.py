@@ -28,6 +28,7 @@ from pcfix.errors import InputError
 from pcfix.io.ply import Vertices, copy_field, list_starts, read_header
 from pcfix.model import FloatArray, IntArray, TiePoints, ViewKind
 
+COLMAP_LIST = "COLMAP view list"
 _HEAD = 8
 _IMAGES, _WEIGHTS = "view_indices", "view_weights"
 _OTHERS = {
@@ -54,6 +55,11 @@ class RawList:
 
     def __len__(self) -> int:
         return len(self.start) - 1
+
+    @property
+    def is_beside(self) -> bool:
+        """Whether its positions, if any, are of another file, so that it can do without."""
+        return self.what == COLMAP_LIST
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +127,7 @@ def _colmap(path: Path) -> RawList:
     image = number.view(np.int32)
     if image.size and image.min() < 0:
         _complain(path, f"a point names image {int(image.min()) % 2**32}")
-    return RawList(path, "COLMAP view list", start[0], image, None, *_beside(path, count))
+    return RawList(path, COLMAP_LIST, start[0], image, None, *_beside(path, count))
 
 
 def _complain(path: Path, what: str) -> NoReturn:

@@ -61,8 +61,9 @@ class ViewMatch:
             raise InputError(
                 f"{raw.path}: has the lists of {len(views):,} points, the cloud has"
                 f" {'an unknown number' if points is None else f'{points:,}'}, and without"
-                " positions they cannot be told apart; put the PLY file that was written with the"
-                " list beside it, or give the cloud as it was when the list was written."
+                " positions in the frame of the cameras they cannot be told apart; put the PLY file"
+                " that was written with the list beside it, or give the cloud as it was when the"
+                " list was written."
             )
         self._note_order()
 

@@ -521,7 +521,7 @@ def test_without_the_clouds_crs():
     found = bring_to(cameras(ecef, "EPSG:4936", project_crs=UTM30), None, name="a.xml")
     assert (found.crs, found.centres[0, 2]) == (UTM30, pytest.approx(142.48))
     assert found.notes == (
-        "a.xml: the cloud names no CRS; taken to be in ETRS89 / UTM zone 30N as the cameras are.",
+        "a.xml: no cloud names a CRS; taken to be in ETRS89 / UTM zone 30N as the cameras are.",
     )
     for at, crs in ((VALENCIA, UTM30), ([1.0, 2, 3], "ENU:39,0,5"), ([6.0, 4, 2], "EPSG:2992")):
         found = bring_to(cameras(at, crs), None)
@@ -543,7 +543,7 @@ def test_without_the_clouds_crs():
     ],
 )
 def test_without_the_clouds_crs_no_map_is_chosen(at, crs, more):
-    with pytest.raises(InputError, match=r"a.xml: is in .* names no CRS; set the cloud's CRS"):
+    with pytest.raises(InputError, match=r"a.xml: is in .* no cloud names a CRS; give"):
         bring_to(cameras(at, crs, **more), None, name="a.xml")
 
 

@@ -1,0 +1,121 @@
+"""What a user is told: lines that work as printed, right reasons, poses that are doubted."""
+
+import json
+import shlex
+import shutil
+import warnings
+
+import laspy
+import numpy as np
+
+import pcfix
+from pcfix.model import Cameras, Lens, Outcome
+from pcfix.report.text import share
+from tests.utils.program import run_pcfix
+from tests.utils.shared import ROOT, needs
+
+SCENE = ROOT / "samples" / "scene"
+BENT, bent = needs("rendered_c_free")
+OFFSET_M = (318700.0, 3851200.0, 0.0)
+LEVEL_M = 0.37
+
+
+def run_line(line, **instead):
+    """Run a printed command with what it has in capitals, or is not to be overwritten, replaced."""
+    words = shlex.split(line)
+    assert words[0] == "pcfix"
+    done = run_pcfix(*(str(instead.get(word, word)) for word in words[1:]))
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@bent
+def test_each_line_leads_to_the_next(tmp_path):
+    """From the warning by `pcfix adjust` to the corrected cloud, as printed."""
+    cloud, model, listed = BENT / "cloud.las", BENT / "sparse", BENT / "dense.vis"
+    done = run_pcfix(
+        "correct", cloud, tmp_path / "bent.laz", "--cameras", model, "--water", LEVEL_M,
+        "--cameras-offset", ",".join(map(str, OFFSET_M)), "--views", listed,
+    )  # fmt: skip
+    assert "GNSS.csv stands for the positions of the images" in done.stderr
+    line = done.stderr.split("instead): ")[1].splitlines()[0]
+    assert f"--views {listed}" in line
+    out = run_line(line, **{"GNSS.csv": BENT / "gnss.csv", "OUT": tmp_path / "adjusted"})
+    assert "(direct)" not in out
+    line = out.split("Next: ")[1].splitlines()[0]
+    assert f"--views {listed}" in line
+    assert "--cameras-offset 318700,3851200,0" in line
+    out = run_line(line, **{"corrected.laz": tmp_path / "mended.laz"})
+    shallowest = float(out.split("depth        ")[1].split(" to ")[0])
+    assert shallowest >= 0.0
+    # without the offset it is the offset that is missing, not the list that is wrong
+    words = [word for word in shlex.split(line)[1:] if word != "--cameras-offset"]
+    words.remove("318700,3851200,0")
+    words[2] = str(tmp_path / "none.laz")
+    done = run_pcfix(*words)
+    assert done.returncode == 1
+    assert "adjusted-from: its cameras stand" in done.stderr
+    assert "--cameras-offset" in done.stderr
+
+
+@bent
+def test_a_local_ply_beside_the_list_is_left_out(tmp_path):
+    """As of a dense workspace, shifted to the origin, where the cameras are on the map."""
+    shutil.copy(BENT / "dense.vis", tmp_path)
+    las = laspy.read(BENT / "cloud.las")
+    local = (np.asarray(las.xyz) - OFFSET_M).astype("<f4")
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(local)}\n{axes}end_header\n"
+    (tmp_path / "dense.ply").write_bytes(head.encode() + local.tobytes())
+    done = run_pcfix(
+        "correct", BENT / "cloud.las", tmp_path / "out.laz", "--cameras", BENT / "cameras.xml",
+        "--water", LEVEL_M, "--views", tmp_path / "dense.vis", "--summary", tmp_path / "it.json",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "the PLY file beside it is in another frame" in done.stderr
+    found = json.loads((tmp_path / "it.json").read_text())["views"]
+    assert found["share_seen"] > 0.95
+    assert found["by_row"] == len(local)
+
+
+@bent
+def test_without_a_cloud_none_is_spoken_of(tmp_path):
+    done = run_pcfix("adjust", BENT / "cameras.xml", tmp_path / "out", "--water", "0.37")
+    assert done.returncode == 1
+    assert "the cloud names no CRS" not in done.stderr
+    assert "reproject the cloud" not in done.stderr
+    assert "give --cloud" in done.stderr
+
+
+def test_all_is_said_of_all_only():
+    assert share(100_000, 100_000) == "100 %"
+    assert share(99_897, 100_000) == "all but 103"
+    assert share(99_000, 100_000) == "99 %"
+    assert share(0, 0) == "0 %"
+
+
+def nadir():
+    """Two cameras 100 m up, 60 m apart, of a wide lens."""
+    lens = Lens(500.0, 1000.0, 1000.0, 500.0, 500.0)
+    centres = np.array([[-30.0, 0.0, 100.0], [30.0, 0.0, 100.0]])
+    return Cameras(("a", "b"), centres, np.tile(np.diag([1.0, -1.0, -1.0]), (2, 1, 1)), (lens,) * 2)
+
+
+def test_rays_beyond_the_limit_have_a_reason_of_their_own():
+    """Straight below one of two cameras, between them, and out of all frames."""
+    xyz = [[30.0, 0.0, -2.0], [0.0, 0.0, -2.0], [0.0, 500.0, -2.0]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = pcfix.correct_points(xyz, nadir(), 0.0, method="snell", max_angle=20.0)
+    assert found.outcome.tolist() == [Outcome.FLAT_RAYS, Outcome.CORRECTED, Outcome.NO_CAMERA]
+
+
+def test_a_limit_that_leaves_no_ray_is_named(tmp_path):
+    done = run_pcfix(
+        "correct", SCENE / "cloud.laz", tmp_path / "out.laz", "--cameras",
+        SCENE / "cameras.csv", "--water", "0.37", "--method", "snell", "--max-angle", "0.01",
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "within 0.01 degrees of the surface normal" in done.stderr
+    assert "give a larger --max-angle" in done.stderr
+    assert "same CRS" not in done.stderr
