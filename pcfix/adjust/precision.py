@@ -2,7 +2,8 @@
 
 The inverse of the reduced normal matrix S is the covariance of poses and shared unknowns for
 observations of unit weight, as the points were eliminated and not left out (Triggs et al. 2000,
-section 6). All is scaled by the a-posteriori variance of unit weight. The datum is that of the
+section 6). All is scaled by the a-posteriori variance of unit weight, and by what groups of
+observations disagree beyond it. The datum is that of the
 priors; in a free network that of the start values.
 """
 
@@ -59,7 +60,7 @@ class Precision:
     Attributes
     ----------
     sigma0 : float
-        By whose square the covariances are scaled.
+        By whose square the covariances are scaled, apart from the factors of `precision_of`.
     pose_covariance : array, shape (k, 6, 6)
         Of the small turn of each camera about the axes of its own frame (radians), and of its
         centre in the world frame (metres). Zero where a pose is fixed.
@@ -107,7 +108,9 @@ class Precision:
         return next((row.sigma for row in self.shared if row.name == name), None)
 
 
-def precision_of(problem: Problem, solution: Solution, sigma0: float = 1.0) -> Precision:
+def precision_of(
+    problem: Problem, solution: Solution, sigma0: float = 1.0, factor: FloatArray | None = None
+) -> Precision:
     """Return covariances and correlations at a solution.
 
     Parameters
@@ -117,6 +120,9 @@ def precision_of(problem: Problem, solution: Solution, sigma0: float = 1.0) -> P
     solution : Solution
     sigma0 : float
         A-posteriori standard deviation of unit weight; 1 for what the given ones say.
+    factor : array, shape (6 + g,), optional
+        By which standard errors grow besides: of the angles and centres of all poses, and of the
+        shared unknowns; see `pcfix.adjust.disagreement`.
 
     Raises
     ------
@@ -125,7 +131,10 @@ def precision_of(problem: Problem, solution: Solution, sigma0: float = 1.0) -> P
     """
     equations = undamped(problem, solution)
     size, k = len(equations.reduced.active), len(solution.state.centres)
-    asked = _asked(problem, solution)[equations.reduced.active]
+    g = problem.columns.total
+    times = np.ones(6 + g) if factor is None else factor
+    each = np.concatenate([np.tile(times[:6], k), times[6:]])[equations.reduced.active]
+    asked = _asked(problem, solution)[equations.reduced.active] * each[:, None]
     variance = sigma0 * sigma0
     notes: list[str] = []
     points: FloatArray | None = None
@@ -135,17 +144,19 @@ def precision_of(problem: Problem, solution: Solution, sigma0: float = 1.0) -> P
     if size <= DENSE_UP_TO:
         inverse = _inverse(equations, solution)
         of_asked = asked.T @ inverse @ asked
+        inverse *= each
+        inverse *= each[:, None]
         poses = _pose_blocks(problem, solution, equations.reduced, inverse)
         points = variance * point_covariances(equations, solution, inverse)
         active = equations.reduced.active
         members = members_of(problem, solution, active, sigma0 * drawn(inverse))
     else:
         of_asked, poses = _by_parts(equations, solution, asked)
+        poses *= times[:6] * times[:6, None]
         notes.append(
             f"The covariances of the points were left out, and the ensemble: {size:,} unknowns of"
             f" poses, lens and water are more than {DENSE_UP_TO:,}."
         )
-    g = problem.columns.total
     correlation = _correlations(of_asked)
     sigma = np.sqrt(np.diag(of_asked)[:g]) * sigma0
     rows = zip(problem.names, solution.shared.tolist(), sigma.tolist(), strict=True)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from pcfix.adjust.block import Block, Robust, Unknowns
+from pcfix.adjust.disagreement import common_errors, disagreement_of
 from pcfix.adjust.gather import LEAST_VIEWS
 from pcfix.adjust.lens_choice import missing_lens_parameters, weak_lens_parameters
 from pcfix.adjust.normal import residuals
@@ -28,6 +29,9 @@ LEAST_SHARE = 0.5
 
 MAD_TO_SIGMA = 1.4826
 OUTLIER_ROUNDS = 3
+MANY_OUT = 0.05
+"""Share of outliers that deserves a word."""
+
 LAST_ROUND = 2 + OUTLIER_ROUNDS
 
 
@@ -61,7 +65,8 @@ def adjust_ties(
     problem, now = prepare(block, unknowns)
     _check_sight(problem, now)
     problem, now = _cleaned(problem, now, sigma_px, outliers, progress)
-    now, precision = _settled(problem, now, LAST_ROUND, progress)
+    estimate, clean = sigma_px is None, problem
+    problem, now, precision = _settled(clean, now, LAST_ROUND, estimate, progress)
     notes: list[str] = []
     if choose_lens:
         weak = weak_lens_parameters(problem, precision)
@@ -69,9 +74,27 @@ def adjust_ties(
         more = missing_lens_parameters(problem, now, sigma0_of(problem, now))
         notes = _lens_notes([*kept, *more], weak, more)
         if weak or more:
-            problem, now = _with_lens(problem, now, (*kept, *more), outliers, progress)
-            now, precision = _settled(problem, now, LAST_ROUND + 2, progress)
+            clean, now = _with_lens(clean, now, (*kept, *more), outliers, progress)
+            problem, now, precision = _settled(clean, now, LAST_ROUND + 2, estimate, progress)
+    shared_errors = disagreement_of(problem, now, precision)
+    factor = shared_errors.factor * common_errors(problem, precision)
+    precision = precision_of(problem, now, precision.sigma0, factor)
+    notes += [*shared_errors.notes, *_left_out(problem)]
     return adjusted_of(problem, now, precision, notes, "tie points", "direct")
+
+
+def _left_out(problem: Problem) -> list[str]:
+    """Say what it may mean where many observations are left out."""
+    counted = np.isfinite(problem.block.sigma_px) & _of_ties(problem)
+    share = 1.0 - (problem.seen.weight > 0.0)[counted].mean()
+    if share < MANY_OUT:
+        return []
+    return [
+        f"{100.0 * share:.0f} % of the observations of tie points are left out, being off by more"
+        f" than {OUTLIER_SIGMAS:g} standard deviations: wrong matches, waves, what moved between"
+        " the images, or a lens or water surface of another shape than assumed. If it is not the"
+        " matching, standard errors are too small."
+    ]
 
 
 def _with_lens(
@@ -104,11 +127,17 @@ def _lens_notes(free: list[str], weak: list[str], more: list[str]) -> list[str]:
 
 
 def _settled(
-    problem: Problem, now: Solution, number: int, progress: Progress | None
-) -> tuple[Solution, Precision]:
-    """Return the least squares without outliers, and how well they are known."""
+    problem: Problem, now: Solution, number: int, estimate: bool, progress: Progress | None
+) -> tuple[Problem, Solution, Precision]:
+    """Return the least squares without outliers, and how well they are known.
+
+    The estimate of the noise is now that of all residuals, long tails included, so that GNSS and
+    control points, whose standard deviations are given, count as they should beside the images.
+    """
+    if estimate:
+        problem = with_sigma(problem, noise_px(problem, now, robust=False))
     now = solve(problem, now, "squares", number=number, progress=progress)
-    return now, precision_of(problem, now, sigma0_of(problem, now))
+    return problem, now, precision_of(problem, now, sigma0_of(problem, now))
 
 
 def _cleaned(
@@ -159,11 +188,11 @@ def check_datum(block: Block, unknowns: Unknowns, reason: str = "") -> None:
     )
 
 
-def noise_px(problem: Problem, now: Solution) -> float:
+def noise_px(problem: Problem, now: Solution, *, robust: bool = True) -> float:
     """Return the standard deviation of the tie points' image places, from their residuals.
 
-    The median is not moved by outliers; what the points themselves take up is put back by the
-    share of the redundancy.
+    The median is not moved by outliers, the mean square (not robust) has all that count; what the
+    points themselves take up is put back by the share of the redundancy.
     """
     ties, used = _of_ties(problem), problem.seen.weight > 0.0
     rows = ties & used
@@ -171,7 +200,8 @@ def noise_px(problem: Problem, now: Solution) -> float:
     r = r[np.isfinite(r).all(axis=1)]
     points = len(np.unique(problem.block.owner[rows]))
     share = max(1.0 - 3.0 * points / max(2.0 * len(r), 1.0), 0.05)
-    return float(max(MAD_TO_SIGMA * np.median(np.abs(r)) / np.sqrt(share), 1e-6))
+    typical = MAD_TO_SIGMA * np.median(np.abs(r)) if robust else np.sqrt(np.mean(r * r))
+    return float(max(typical / np.sqrt(share), 1e-6))
 
 
 def _of_ties(problem: Problem) -> BoolArray:

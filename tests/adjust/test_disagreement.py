@@ -1,0 +1,86 @@
+"""Standard errors hold where observations share errors, and are no larger where they do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pcfix.adjust.block import Unknowns
+from pcfix.adjust.disagreement import disagreement_of
+from pcfix.adjust.precision import precision_of
+from pcfix.adjust.problem import prepare
+from pcfix.adjust.result import sigma0_of
+from pcfix.adjust.solve import solve
+from pcfix.kernels import threads
+from tests.utils.tie_blocks import block_of
+from tests.utils.tie_points import simulate_tie_points
+
+NOISE_PX = 0.2
+DRAWS = 2
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """So small a block spends more on waking a second thread than it does."""
+    with threads(1):
+        yield
+
+
+@cache
+def scene():
+    return simulate_tie_points(
+        400, area_m=(40, 35), greatest_depth_m=5, obliques_deg=30, oblique_directions=4,
+        image_noise=NOISE_PX, seed=5,
+    )  # fmt: skip
+
+
+def with_errors(rng, kind):
+    """Return a block with fresh noise, and with errors of the same size that many share."""
+    block = block_of(scene().measured(rng), sigma_px=NOISE_PX)
+    if kind == "none":
+        return block
+    place = np.floor(block.xyz[block.owner, :2] / 10.0).astype(int)
+    _, tile = np.unique(
+        np.column_stack([place, block.camera]), axis=0, return_inverse=True
+    )  # what a patch of the bed looks like from one image
+    error = rng.normal(0.0, 1.5 * NOISE_PX, (tile.max() + 1, 2))
+    return replace(block, image_xy=block.image_xy + error[tile.ravel()])
+
+
+def draws(kind):
+    """Return errors over standard errors of each kind of unknown, formal ones and larger ones."""
+    rng, made, both = np.random.default_rng(8), scene(), []
+    for _ in range(DRAWS):
+        problem, start = prepare(with_errors(rng, kind), Unknowns(lens=("f",)))
+        found = solve(problem, start)
+        formal = precision_of(problem, found, sigma0_of(problem, found))
+        by = disagreement_of(problem, found, formal)
+        off = found.state.centres + problem.origin - made.true_cameras.centres
+        turn = found.state.rotations @ made.true_cameras.rotations.transpose(0, 2, 1)
+        angles = np.degrees(Rotation.from_matrix(turn).as_rotvec())
+        rows = []
+        for precision in (formal, precision_of(problem, found, formal.sigma0, by.factor)):
+            z = np.hstack([angles / precision.angle_sigma_deg, off / precision.centre_sigma_m])
+            rows.append(np.sqrt([(z[:, :3] ** 2).mean(), (z[:, 3:] ** 2).mean()]))
+        both.append(rows)
+    return np.sqrt((np.array(both) ** 2).mean(axis=0))
+
+
+def test_what_shares_nothing_is_left():
+    formal, larger = draws("none")
+    assert (formal > 0.7).all() and (formal < 1.4).all()
+    assert (larger > 0.85 * formal).all()
+
+
+def test_errors_that_neighbours_share():
+    """Of patches of 10 m as one image shows them; over 12 draws it is 2.4 and 2.8, then 1 and 1.1.
+
+    Two draws of some thirty images that hang together leave a third of it to chance.
+    """
+    formal, larger = draws("shared")
+    assert (formal > 1.7).all()
+    assert (larger > 0.7).all() and (larger < 1.4).all()
