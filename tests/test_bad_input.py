@@ -633,7 +633,7 @@ KEYS = {
     "input", "output", "pcfix", "points", "submerged", "corrected", "uncorrected", "dropped",
     "water_unknown", "depth_m", "shift_z_m", "rays", "cameras", "cameras_used", "cameras_unused",
     "water", "settings", "seconds", "views", "water_fit", "warnings", "points_per_s",
-    "uncertainty", "made", "incidence_deg",
+    "uncertainty", "made", "poses", "incidence_deg",
 }  # fmt: skip
 
 

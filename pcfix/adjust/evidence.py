@@ -91,6 +91,8 @@ class Evidence:
         Focal length by width of the image, by the name of the sensor; "" is any.
     gnss : Datum or None
         Positions of the GNSS in the frame of the cameras, NaN where there is none.
+    neighbours : Sign or None
+        What the points of the cloud say of each other; see `pcfix.adjust.diagnosis`.
     in_passing : bool
         Whether nobody asked, so that it must not take long.
     """
@@ -105,6 +107,7 @@ class Evidence:
     calibrated: dict[str, float] | None = None
     reference: Reference | None = None
     gnss: Datum | None = None
+    neighbours: Sign | None = None
     in_passing: bool = False
 
     @property
@@ -121,6 +124,27 @@ class Evidence:
         return self.has_height and all(lens.unit == "px" for lens in cameras.lenses)
 
 
+EXPORTS = {
+    "metashape": "give the project (.psx) or its BlocksExchange export with tie points",
+    "photoscan": "give the project (.psz) or its BlocksExchange export with tie points",
+    "pix4d": "give the params folder with its tp_ file",
+    "opendronemap": "give the project's opensfm folder with tracks.csv",
+    "opensfm": "keep tracks.csv beside the reconstruction",
+    "colmap": "keep points3D beside the images",
+    "blocksexchange": "export it with tie points",
+    "bundler": "export the .out file with its points",
+}
+"""What a user has to give for tie points, by a word in the source of the cameras."""
+
+
+def export_of(cameras: Cameras) -> str:
+    """Return what a user has to give so that poses can be checked."""
+    source = cameras.source.lower()
+    other = "give a model with tie points (COLMAP's, Bundler's .out)"
+    found = next((words for name, words in EXPORTS.items() if name in source), other)
+    return f"{found}, or try 'pcfix cameras --gnss'"
+
+
 def diagnosed(evidence: Evidence) -> Diagnosis:
     """Look for every sign that the evidence allows.
 
@@ -129,7 +153,7 @@ def diagnosed(evidence: Evidence) -> Diagnosis:
     PcfixError
         If the cloud cannot be read.
     """
-    signs: list[Sign] = []
+    signs = [] if evidence.neighbours is None else [evidence.neighbours]
     if evidence.has_rays:
         signs += _signs_of_rays(evidence)
     if evidence.calibrated and (found := focal_of(evidence)) is not None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.diagnosis import MOST_STATED_M, Diagnosis
-from pcfix.adjust.evidence import Evidence, diagnosed
+from pcfix.adjust.diagnosis import MOST_STATED_M, Diagnosis, neighbours_sign
+from pcfix.adjust.evidence import Evidence, diagnosed, export_of
 from pcfix.adjust.gather import Datum
 from pcfix.errors import InputError, PcfixError, PcfixWarning
 from pcfix.flow.inputs import Inputs
@@ -19,9 +19,10 @@ from pcfix.flow.surfaces import CloudView
 from pcfix.io.cameras.metashape.sensors import given_lenses
 from pcfix.io.cameras.table.sensor import read_sensor
 from pcfix.io.gnss_positions import gnss_in_frame_of
-from pcfix.model import Cameras, TiePoints, WaterSurface
+from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
+from pcfix.refract.hypotheses import Verdict
 
 LEAST_POSITIONS = 3
 """Of the GNSS, that say where a block is, how it is turned, and its scale."""
@@ -47,35 +48,74 @@ def diagnose(evidence: Evidence) -> Diagnosis:
     return diagnosed(evidence)
 
 
-def diagnose_in_passing(
-    inputs: Inputs, cameras: Cameras, water: WaterSurface, refractive_index: float, view: CloudView
-) -> str:
-    """Warn, once, if what a correction is made with anyway says that the poses are bent.
+class Poses(NamedTuple):
+    """What is known of the poses of a correction.
 
-    Returns the warning; empty where there is nothing to say, or no way to know. The cameras are in
-    the cloud's CRS.
+    absorbed : whether they have absorbed the refraction, None where nothing tells; words : that as
+    a line of a summary; warning : empty where there is nothing to mend; signs : each in plain
+    values.
+    """
+
+    absorbed: bool | None
+    words: str
+    warning: str = ""
+    signs: tuple[dict[str, Any], ...] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return {"absorbed": self.absorbed, "words": self.words, "signs": list(self.signs)}
+
+
+ADJUSTED = Poses(False, "adjusted with the light bent at the water (--adjusted-from)")
+
+
+def diagnose_in_passing(
+    inputs: Inputs, evidence: Evidence, view: CloudView, verdicts: tuple[Verdict, ...] = ()
+) -> Poses:
+    """Say what a correction is made with anyway tells of its poses; warn once if they are bent.
+
+    The cameras of the evidence are in the cloud's CRS; the verdicts are what the cloud was taken
+    for.
     """
     if inputs.adjusted_from is not None:
-        return ""
+        return ADJUSTED
     path = None if isinstance(inputs.cameras, Cameras) else inputs.cameras
-    evidence = Evidence(
-        cameras, str(path or "cameras"), water, refractive_index, view=view, in_passing=True
-    )
+    told = [(one.straight, one.is_fused) for one in verdicts if one.straight is not None]
+    sign = neighbours_sign(*told[-1][0], is_fused=told[-1][1]) if told else None
+    evidence, why = replace(evidence, view=view, neighbours=sign, in_passing=True), ""
     try:
-        if path is not None and _size_of(Path(path)) <= QUICK_BYTES:
+        if path is not None and _size_of(Path(path)) > QUICK_BYTES:
+            why = f"a file of more than {QUICK_BYTES / 1e6:g} MB is looked at by 'pcfix cameras'"
+        elif path is not None:
             ties = ties_of(inputs, view.crs) if evidence.has_rays else None
             evidence = replace(evidence, ties=ties, calibrated=given_focal_lengths(path))
         found = diagnose(evidence)
-    except (PcfixError, OSError):  # a look in passing stops no correction
-        return ""
-    name = str(path or "cameras")
-    index = None if refractive_index == DEFAULT_REFRACTIVE_INDEX else refractive_index
-    holds = has_datum(cameras, name)
-    command, because = adjust_words(inputs, view.name, has_datum=holds, index=index)
+    except (PcfixError, OSError) as error:  # a look in passing stops no correction
+        return Poses(None, f"not checked for absorbed refraction: {error}")
+    n = evidence.refractive_index
+    command, because = adjust_words(
+        inputs, view.name, has_datum=has_datum(evidence.cameras, evidence.name),
+        index=None if n == DEFAULT_REFRACTIVE_INDEX else n,
+    )  # fmt: skip
     sentence = found.sentence(command, because)
     if sentence:
         warnings.warn(sentence, PcfixWarning, stacklevel=3)
-    return sentence
+    signs = tuple(found.as_dict()["signs"])
+    return Poses(found.absorbed, _in_short(found, evidence.cameras, why), sentence, signs)
+
+
+def _in_short(found: Diagnosis, cameras: Cameras, why: str) -> str:
+    """Return the line of a summary; `why` says why a file was not looked at."""
+    if found.decided_by is not None:
+        name = found.decided_by.name
+        if found.absorbed:
+            return f"absorbed the refraction, by {name}; see the warning"
+        return f"did not absorb the refraction, by {name}"
+    open_ones = [sign.name for sign in found.signs if sign.name in ("tie points", "GNSS")]
+    if not why and open_ones:
+        why = f"{' and '.join(open_ones)} of the file tell too little (see 'pcfix cameras')"
+    none = "the file has neither tie points nor GNSS; "
+    return f"not checked for absorbed refraction: {why or none + export_of(cameras)}"
 
 
 def ties_of(inputs: Inputs, crs: Any) -> TiePoints | None:

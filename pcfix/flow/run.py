@@ -181,7 +181,8 @@ def run_all(
     _say_adjusted(first, out_dir, was_done, say)
     request = request.with_adjusted(out_dir, first)
     corrected = step("correct", [files.corrected], lambda: _correct(request, files, jobs, progress))
-    if not first["is_said"] and is_worth_saying(first, corrected.get("absorbed", False)):
+    corrected = _with_checked(corrected, first)
+    if not first["is_said"] and is_worth_saying(first, _is_bent(corrected)):
         first = {**first, "is_said": True}
         _say_adjusted(first, out_dir, was_done, say)
     # the surface of a dimension is still in the cloud, and what was corrected is known anyway
@@ -215,6 +216,20 @@ def _correct(
     options = replace(request, overwrite=True, jobs=jobs).part(CorrectOptions)
     summary = correct_file(request.input, files.corrected, options=options, progress=progress)
     return vars(summary)
+
+
+def _with_checked(corrected: dict[str, Any], first: dict[str, Any]) -> dict[str, Any]:
+    """Return the correction with what the first step found of its poses, by surveys it has not."""
+    poses = corrected["poses"]
+    if not first.get("is_fine") or poses is None or poses["absorbed"] is not None:
+        return corrected
+    words = "did not absorb the refraction, as the first step found"
+    return {**corrected, "poses": {**poses, "absorbed": False, "words": words}}
+
+
+def _is_bent(corrected: dict[str, Any]) -> bool:
+    """Whether the correction found that the poses have absorbed the refraction."""
+    return bool((corrected["poses"] or {}).get("absorbed"))
 
 
 def _grid(request: Request, files: Files) -> dict[str, Any]:

@@ -31,11 +31,12 @@ FOLDER = "adjusted"
 
 
 class Decision(NamedTuple):
-    """Whether a run adjusts, why, and whether that is worth a line."""
+    """Whether a run adjusts, why, whether that is worth a line, and whether the poses are right."""
 
     adjust: bool
     why: str
     is_said: bool = True
+    is_fine: bool = False
 
 
 def outputs_of(folder: Path) -> list[Path]:
@@ -100,7 +101,7 @@ def adjust_first(
     -------
     dict
         `adjusted`, a bool; `model`, what of the folder of the adjustment has the cameras; `why`;
-        `is_said`, whether that is worth a line.
+        `is_said`, whether that is worth a line; `is_fine`, whether the poses are known to be right.
 
     Raises
     ------
@@ -108,9 +109,9 @@ def adjust_first(
         If an adjustment was asked for, or files were given for it, and it cannot be done. Else
         the run goes on with the cameras as they are.
     """
-    adjusts, why, is_said, model = False, "", False, None
+    adjusts, why, is_said, is_fine, model = False, "", False, False, None
     try:
-        adjusts, why, is_said = _decide(step)
+        adjusts, why, is_said, is_fine = _decide(step)
         if adjusts:
             model = _adjust(step, folder / FOLDER, files, jobs)
     except PcfixError as error:
@@ -118,7 +119,7 @@ def adjust_first(
             raise
         # what cannot be read stops the correction, with the same sentence
         adjusts, why, is_said = False, str(error), adjusts
-    return {"adjusted": adjusts, "model": model, "why": why, "is_said": is_said}
+    return {"adjusted": adjusts, "model": model, "why": why, "is_said": is_said, "is_fine": is_fine}
 
 
 def is_worth_saying(step: dict[str, Any], absorbed: bool) -> bool:
@@ -187,7 +188,8 @@ def _verdict(found: Diagnosis) -> Decision:
         return Decision(False, why)
     if not sign.speaks:
         shown = sign.plainly if sign.name == "tie points" else sign.words
-        return Decision(False, f"the poses have not absorbed the refraction: {shown}")
+        why = f"the poses have not absorbed the refraction: {shown}"
+        return Decision(False, why, is_fine=True)
     return Decision(True, f"the poses had absorbed the refraction: {sign.plainly or sign.words}")
 
 

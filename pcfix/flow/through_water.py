@@ -10,8 +10,9 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from pcfix.adjust.carry import Carrying
+from pcfix.adjust.evidence import Evidence
 from pcfix.ahead import Rehearsal
-from pcfix.flow.diagnosis import diagnose_in_passing
+from pcfix.flow.diagnosis import Poses, diagnose_in_passing
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.learning import Learning
 from pcfix.flow.old_cameras import Blocks, ListedViews, old_tie_points
@@ -20,6 +21,7 @@ from pcfix.flow.surfaces import CloudView, Points, parts_of
 from pcfix.label.labelling import Labelling
 from pcfix.model import (
     BoolArray,
+    Cameras,
     Correction,
     FloatArray,
     IntArray,
@@ -80,7 +82,7 @@ class ThroughWater:
         self.survey = self._learning.survey
         self._kind: ViewKind | None = None
         self.verdicts: tuple[Verdict, ...] = ()
-        self._bent = ""
+        self._poses: Poses | None = None
         self._adjustment, self._no_poses = None, ""
         if options.dimensions == "all" and self.survey.settings.method != "regression":
             self._adjustment, self._no_poses = adjustment_of(inputs.cameras, self._cameras)
@@ -252,9 +254,10 @@ class ThroughWater:
 
     def look_back(self) -> None:
         """Warn if what the correction was made with says that the poses are bent."""
-        self._bent = diagnose_in_passing(
-            self._inputs, self._cameras, self.water, self._options.refractive_index, self._view
-        )
+        given = self._inputs.cameras
+        name = "cameras" if isinstance(given, Cameras) else str(given)
+        evidence = Evidence(self._cameras, name, self.water, self._options.refractive_index)
+        self._poses = diagnose_in_passing(self._inputs, evidence, self._view, self.verdicts)
 
     def _told(self) -> list[str]:
         """Return what the cloud told beside the sentence on how it was made."""
@@ -263,7 +266,8 @@ class ThroughWater:
 
     def notes(self, tally: Tally) -> list[str]:
         """Return what was done on the user's behalf."""
-        said = [one for one in (self._bent, self._no_poses) if one]
+        bent = self._poses.warning if self._poses else ""
+        said = [one for one in (bent, self._no_poses) if one]
         return [*self._told(), *self.found.notes, *self._meeting.notes, *said]
 
     def figures(self, tally: Tally) -> dict[str, Any]:
@@ -284,7 +288,7 @@ class ThroughWater:
             "carried": None if self.carrying is None else self.carrying.as_dict(),
             "made": made,
             "told": notes,
-            "absorbed": bool(self._bent),
+            "poses": None if self._poses is None else self._poses.as_dict(),
         }
 
 

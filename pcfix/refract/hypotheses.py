@@ -125,6 +125,9 @@ class Verdict(NamedTuple):
         What else decided than the steps, in words; empty where they did.
     is_told : bool
         Whether the user said what to do, so that nothing was decided.
+    straight : tuple of 2 float, or None
+        Of the steps by which the chosen way differs from straight rays, what is left in its bed,
+        near 1 where the poses have absorbed the refraction; and its standard error.
     of : str
         Which points it is of; empty for all.
     remarks : tuple of str
@@ -143,6 +146,12 @@ class Verdict(NamedTuple):
     is_told: bool = False
     remarks: tuple[str, ...] = ()
     of: str = ""
+    straight: tuple[float, float] | None = None
+
+    @property
+    def is_fused(self) -> bool:
+        """Whether the cloud was taken for fused depth maps, whose model is the closest."""
+        return self.chosen.words == _MAPS
 
     @property
     def is_sure(self) -> bool:

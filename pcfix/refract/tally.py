@@ -245,10 +245,34 @@ class Summary:
     """What the cloud was taken for, and why, where the options leave it open."""
     told: list[str] = field(default_factory=list)
     """What the cloud told beside that; `warnings` has it too."""
-    absorbed: bool = False
-    """Whether it warned that the poses have absorbed the refraction; for later steps of a run."""
+    poses: dict[str, Any] | None = None
+    """Whether they have absorbed the refraction, in a line and sign by sign, where that was asked.
+    """
     unsure: int | None = None
     """Corrected points that flat obliques alone see; None where these are not withheld."""
+
+    @property
+    def absorbed(self) -> bool | None:
+        """Whether the poses have absorbed the refraction; None where nothing tells."""
+        return None if self.poses is None else self.poses["absorbed"]
+
+    @property
+    def why_no_order(self) -> str:
+        """Why no order of S-44 is claimed: the bed may be off as a whole; empty where one is.
+
+        It may be where nothing tells that the cloud was made as the method takes it, or that its
+        poses have not absorbed the refraction.
+        """
+        made = self.made or {}
+        if self.settings["method"] == "regression":  # measured depths hold the bed
+            return ""
+        if made.get("method") != "consistent" or not made.get("sure", bool(made.get("views_are"))):
+            return "nothing tells that the cloud was made as the method takes it"
+        return {
+            True: "the poses absorbed the refraction",
+            None: "the poses were not checked for absorbed refraction",
+            False: "",
+        }[self.absorbed]
 
     @property
     def points_per_s(self) -> float:
@@ -258,10 +282,14 @@ class Summary:
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON.
 
-        `labelling` is there where it had rules, `carried` where the cloud was taken from old
-        cameras to adjusted ones, `unsure` where such points are withheld.
+        `labelling` is there where it had rules, `poses` where the light bends at a surface,
+        `carried` where the cloud was taken from old cameras to adjusted ones, `unsure` where such
+        points are withheld. Where no order of S-44 is claimed it is said why.
         """
-        some, own = ("labelling", "carried", "unsure"), ("absorbed", "told")
+        some, own = ("labelling", "carried", "unsure", "poses"), ("told",)
         values = {name: vars(self)[name] for name in vars(self) if name not in (*some, *own)}
         more = {name: getattr(self, name) for name in some if getattr(self, name) is not None}
+        if self.uncertainty is not None and self.why_no_order:
+            no_order = {"s44": None, "why_no_order": self.why_no_order}
+            more["uncertainty"] = {**self.uncertainty, **no_order}
         return {**values, **more, "points_per_s": round(self.points_per_s)}

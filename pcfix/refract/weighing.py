@@ -99,7 +99,19 @@ def weigh(
         beds.ways[best], beds.ways[other], float(beds.share[best, other]),
         float(beds.share[other, best]), float(beds.sigma[best, other]), deeper_m, beds.patches,
         _doubt(part, beds, best, among), by, told is not None, remarks,
+        straight=None if remarks else _straight(part, beds, best),
     )  # fmt: skip
+
+
+def _straight(part: Batch, beds: _Beds, way: int) -> tuple[float, float] | None:
+    """Return the share of the steps of straight rays' bed in that of a way, and its error.
+
+    None where too few points tell, or where they were made with other poses.
+    """
+    if not beds.patches or part.made_with is not None:
+        return None
+    share, sigma = shares(part, beds.place, np.array([beds.z[way], part.xyz[:, 2]]))
+    return float(share[0, 1]), float(sigma[0, 1])
 
 
 def _beds(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.adjust.diagnosis import Diagnosis
+from pcfix.adjust.evidence import export_of
 from pcfix.lens.frames import footprint
 from pcfix.model import Cameras, FloatArray
 from pcfix.report.page import AFTER, WATER, draw_cloud, label_plan, label_side, new_figure
@@ -233,7 +234,7 @@ def _refraction(report: CamerasReport) -> list[str]:
         return [*lines, f"{'verdict':<14} {found.sentence(*report.remedy)}"]
     if found.absorbed is False and found.decided_by is not None:
         return [*lines, f"{'verdict':<14} no, by {found.decided_by.name}"]
-    needs = "tie points, GNSS positions, control points or a reference would tell"
+    needs = f"control points (--gcps) or a reference would tell, else {export_of(report.cameras)}"
     return [*lines, f"{'verdict':<14} not known; {needs}"]
 
 

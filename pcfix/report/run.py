@@ -161,6 +161,8 @@ def _facts(s: Summary, measured: Plain | None) -> Table:
         rows.insert(2, ["Method", f"{s.made['method']}. {s.made['because']}"])
     if uncertainty := uncertainty_sentence(s, measured):
         rows.append(["Uncertainty", uncertainty])
+    if s.poses is not None:
+        rows.append(["Poses", s.poses["words"]])
     return Table("In short", [], rows)
 
 
@@ -326,7 +328,8 @@ def tvu_figure(
 
 def _orders(s: Summary, measured: Plain | None) -> list[Table]:
     """Return the share of the points within each order of IHO S-44."""
-    both = {"predicted TVU at 95 %": s.uncertainty, "measured difference": measured}
+    predicted = None if s.why_no_order else s.uncertainty
+    both = {"predicted TVU at 95 %": predicted, "measured difference": measured}
     known = {name: found["s44"] for name, found in both.items() if found is not None}
     rows = [
         [order.name, f"{order.a_m:g} m", f"{order.b:g}"]

@@ -65,6 +65,7 @@ def summary_text(summary: Summary) -> str:
         f"water        {s.water}, refractive index {s.settings['index']:.6g}",
         *_index(s),
         *_water_fit(s),
+        *([] if s.poses is None else [f"poses        {s.poses['words']}"]),
         *_uncertainty(s),
     ]
     return "\n".join([*lines, *left_out_lines(s.labelling)])
@@ -236,15 +237,9 @@ def budget_words(errors: dict[str, Any], level_from_fit: float | None = None) ->
 
 
 def order_sentence(s: Summary) -> str:
-    """Return which order of S-44 the standard errors allow, if the bed is not off as a whole.
-
-    It may be where nothing tells that the cloud was made as the method takes it.
-    """
-    made = s.made or {}
-    measured = s.settings["method"] == "regression"
-    told = made.get("method") == "consistent" and made.get("sure", bool(made.get("views_are")))
-    if s.uncertainty is None or not (measured or told):
-        return "no order is claimed: nothing tells that the cloud was made as the method takes it"
+    """Return which order of S-44 the standard errors allow, or why none is claimed."""
+    if s.uncertainty is None or s.why_no_order:
+        return f"no order is claimed: {s.why_no_order}"
     return tvu_sentence(s.uncertainty)
 
 

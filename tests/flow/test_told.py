@@ -7,8 +7,11 @@ import warnings
 
 import laspy
 import numpy as np
+import pytest
 
 import pcfix
+from pcfix.adjust.diagnosis import diagnosis_of, focal_sign, neighbours_sign
+from pcfix.adjust.evidence import EXPORTS, export_of
 from pcfix.model import Cameras, Lens, Outcome
 from pcfix.report.text import share
 from tests.utils.program import run_pcfix
@@ -16,6 +19,7 @@ from tests.utils.shared import ROOT, needs
 
 SCENE = ROOT / "samples" / "scene"
 BENT, bent = needs("rendered_c_free")
+TRUE, rendered = needs("rendered_a")
 OFFSET_M = (318700.0, 3851200.0, 0.0)
 LEVEL_M = 0.37
 
@@ -119,3 +123,78 @@ def test_a_limit_that_leaves_no_ray_is_named(tmp_path):
     assert "within 0.01 degrees of the surface normal" in done.stderr
     assert "give a larger --max-angle" in done.stderr
     assert "same CRS" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("share", "sigma", "is_fused", "absorbed"),
+    [
+        (0.02, 0.03, True, False),
+        (0.25, 0.02, True, False),
+        (0.86, 0.02, True, True),
+        (0.86, 0.02, False, None),  # what is left may be that of a wrong guess at the rays
+        (0.25, 0.02, False, False),
+        (0.6, 0.05, True, None),
+    ],
+)
+def test_neighbours_tell_of_the_poses(share, sigma, is_fused, absorbed):
+    assert neighbours_sign(share, sigma, is_fused=is_fused).speaks is absorbed
+
+
+def test_neighbours_are_heard_before_a_calibration():
+    off = focal_sign(np.array([1.01]), np.array([1.0]), 80.0)
+    found = diagnosis_of([off, neighbours_sign(0.1, 0.01, is_fused=True)])
+    assert found.absorbed is False
+    bent = diagnosis_of([neighbours_sign(0.9, 0.01, is_fused=True)])
+    assert bent.sentence("pcfix adjust").startswith("The poses seem to have absorbed")
+
+
+def told_of(folder, cameras, tmp_path, *more):
+    """Return stdout and stderr of a correction, and its summary."""
+    done = run_pcfix(
+        "correct", folder / "cloud.las", tmp_path / "out.laz", "--cameras", folder / cameras,
+        "--water", LEVEL_M, "--summary", tmp_path / "summary.json", *more,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done, json.loads((tmp_path / "summary.json").read_text())
+
+
+@bent
+@pytest.mark.parametrize("listed", [False, True])
+def test_bent_poses_without_ties_or_gnss_are_noticed(tmp_path, listed):
+    done, found = told_of(
+        BENT, "cameras.xml", tmp_path, *(["--views", BENT / "dense.vis"] if listed else [])
+    )
+    assert "The poses seem to have absorbed the refraction" in done.stderr
+    assert "--gnss GNSS.csv" in done.stderr
+    assert "poses        absorbed the refraction, by neighbours; see the warning" in done.stdout
+    assert "no order is claimed" in done.stdout
+    assert found["poses"]["absorbed"] is True
+    assert found["uncertainty"]["s44"] is None
+    assert found["uncertainty"]["why_no_order"]
+
+
+@rendered
+def test_true_poses_are_said_to_be_right(tmp_path):
+    done, found = told_of(TRUE, "cameras.xml", tmp_path)
+    assert "absorbed" not in done.stderr
+    assert "poses        did not absorb the refraction, by neighbours" in done.stdout
+    assert found["poses"]["absorbed"] is False
+
+
+def test_where_nothing_was_checked_that_is_said(tmp_path):
+    done = run_pcfix(
+        "correct", SCENE / "cloud.laz", tmp_path / "out.laz", "--cameras", SCENE / "cameras.csv",
+        "--water", "0.37",
+    )  # fmt: skip
+    shown = (ROOT / "README.md").read_text("utf-8")
+    for head in ("poses", "  IHO S-44"):
+        line = next(line for line in done.stdout.splitlines() if line.startswith(head))
+        assert line in shown
+    assert "not checked" in done.stdout
+
+
+def test_each_package_has_its_export():
+    for name, words in EXPORTS.items():
+        cameras = Cameras(("a",), np.zeros((1, 3)), source=f"{name.capitalize()} 2.1")
+        assert words in export_of(cameras)
+    assert "model with tie points" in export_of(Cameras(("a",), np.zeros((1, 3))))

@@ -120,7 +120,8 @@ def summary(tmp_path_factory):
 
 
 def test_what_was_measured_is_said_instead_of_what_was_predicted(summary):
-    predicted = uncertainty_sentence(summary)
+    assert "no order is claimed: the poses were not checked" in uncertainty_sentence(summary)
+    predicted = uncertainty_sentence(replace(summary, poses={"absorbed": False}))
     assert "formal" in predicted and "Exclusive Order" in predicted
     far = asdict(tvu_of(np.full(100, 0.3), np.full(100, 2.0)))
     said = uncertainty_sentence(summary, far)
