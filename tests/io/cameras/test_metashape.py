@@ -570,6 +570,15 @@ def test_what_a_lens_here_has_not_is_told(tmp_path):
     assert "rolling shutter" in cameras.notes[1]
 
 
+@pytest.mark.parametrize(("value", "notes"), [("true", 1), ("false", 0)])
+def test_flags_of_a_rolling_shutter_say_nothing_of_one_that_is_off(tmp_path, value, notes):
+    inner = calibration("<f>9</f>")
+    for name, text in (("rolling_shutter", value), ("rolling_shutter_flags", "63")):
+        inner += f'<property name="{name}" value="{text}"/>'
+    cameras = read_chunk(tmp_path, sensors=sensor(inner))
+    assert len([n for n in cameras.notes if "0.15 m at 5 m/s" in n]) == notes
+
+
 @pytest.mark.parametrize("kind", ["spherical", "cylindrical", "rpc"])
 def test_images_without_a_central_projection_are_left_out(tmp_path, kind):
     cameras = read_chunk(
