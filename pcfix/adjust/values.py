@@ -388,6 +388,7 @@ def _gnss(a: Adjusted) -> Plain | None:
         "images": int(known.sum()),
         "mean_m": _columns(mean, off),
         "rms_m": _columns(rms, off),
+        "rms_before_m": _columns(rms, (a.block.cameras.centres - a.block.gnss_xyz)[known]),
         "largest_m": number(far.max()),
         "largest_image": a.cameras.labels[worst],
     }

@@ -19,16 +19,18 @@ from pcfix.compare.statistics import (
     Bin,
     Distribution,
     Line,
+    Statistics,
     Tvu,
     binned,
     distance_from_shore,
     distribution_of,
     fit_line,
+    statistics_of,
     tvu_of,
 )
 from pcfix.compare.vertical import Pairs, pairs_at_cloud, pairs_at_reference
 from pcfix.errors import GeometryError
-from pcfix.model import FloatArray
+from pcfix.model import BoolArray, FloatArray
 from pcfix.options.steps import CompareRules
 
 Given = TypeVar("Given")
@@ -71,6 +73,8 @@ class Comparison:
         To the nearest point, without sign.
     vertical : AfterBefore of Distribution, or None
         Signed, along the vertical.
+    bed, land : AfterBefore of Statistics, or None
+        The same of what lies under water and of what does not.
     depth : AfterBefore of Line, or None
         Depth against reference depth; None where the water surface is not known.
     depth_bins, shore_bins : tuple of Bin
@@ -91,6 +95,8 @@ class Comparison:
     counts: Counts
     c2c: AfterBefore[Distribution]
     vertical: AfterBefore[Distribution] | None
+    bed: AfterBefore[Statistics] | None
+    land: AfterBefore[Statistics] | None
     depth: AfterBefore[Line | None] | None
     depth_bins: tuple[Bin, ...]
     shore_bins: tuple[Bin, ...]
@@ -180,6 +186,8 @@ def figures_of(match: Match, lines: Sequence[SectionLine], started: float) -> Co
         vertical=None
         if pairs is None
         else _both(lambda p: distribution_of(p.error_m), pairs.after, pairs.before),
+        bed=of_depth.bed,
+        land=of_depth.land,
         depth=of_depth.fits,
         depth_bins=of_depth.depth_bins,
         shore_bins=of_depth.shore_bins,
@@ -225,12 +233,14 @@ def _c2c(match: Match, xyz: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _OfDepth:
-    """What is said of the submerged places; see `Comparison`."""
+    """What is said of the submerged places, and of the others; see `Comparison`."""
 
     fits: AfterBefore[Line | None] | None = None
     depth_bins: tuple[Bin, ...] = ()
     shore_bins: tuple[Bin, ...] = ()
     tvu: Tvu | None = None
+    bed: AfterBefore[Statistics] | None = None
+    land: AfterBefore[Statistics] | None = None
 
 
 def _by_depth(match: Match, pairs: AfterBefore[Pairs] | None, notes: list[str]) -> _OfDepth:
@@ -260,13 +270,21 @@ def _by_depth(match: Match, pairs: AfterBefore[Pairs] | None, notes: list[str]) 
         if abs(came - 1.0) <= AS_DEEP and now > 1.0 + TOO_DEEP:
             notes.append(CORRECTED_BEFORE)
     bins = binned(depth, error, error_before, match.settings.bin_width)
-    found = _OfDepth(fits, bins, tvu=tvu_of(error, depth))
+    bed, land = _errors_of(pairs, wet), _errors_of(pairs, ~wet)
+    found = _OfDepth(fits, bins, tvu=tvu_of(error, depth), bed=bed, land=land)
     if len(match.dry_xy) == 0:
         notes.append("the cloud has no dry point, so nothing is said of the distance from shore")
         return found
     shore = distance_from_shore(after.xy[wet], match.dry_xy)
     width = match.settings.shore_bin_width
     return replace(found, shore_bins=binned(shore, error, error_before, width))
+
+
+def _errors_of(pairs: AfterBefore[Pairs], rows: BoolArray) -> AfterBefore[Statistics] | None:
+    """Return what the vertical errors of some places are; None without any."""
+    if not rows.any():
+        return None
+    return _both(lambda p: statistics_of(p.error_m[rows]), pairs.after, pairs.before)
 
 
 def _ratio(depth_m: FloatArray, error_m: FloatArray) -> float:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.compare.figures import CORRECTED_BEFORE
+from pcfix.compare.statistics import Statistics
 from pcfix.model import FloatArray
 from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, Picture, Table, new_figure, new_map
 from pcfix.report.text import share
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from pcfix.compare.figures import Comparison
-    from pcfix.compare.statistics import Bin, Statistics
+    from pcfix.compare.m3c2 import M3c2
+    from pcfix.compare.statistics import Bin, Distribution
 
 Plain = dict[str, Any]
 _TIMES = (("before", "as it came", BEFORE), ("after", "corrected", AFTER))
@@ -70,16 +72,20 @@ def comparison_text(comparison: Comparison) -> str:
 
 def _rows(c: Comparison) -> list[str]:
     rows = []
-    for title, pair in (("dZ", c.vertical), ("C2C", c.c2c), ("M3C2", c.m3c2)):
+    kinds = (
+        ("dZ", c.vertical), ("dZ bed", c.bed), ("dZ land", c.land), ("C2C", c.c2c), ("M3C2", c.m3c2)
+    )  # fmt: skip
+    for title, pair in kinds:
         if pair is not None and pair.before is not None:
-            rows.append(_row(f"{title} before", pair.before.statistics))
+            rows.append(_row(f"{title} before", pair.before))
             title += " after"
         if pair is not None:
-            rows.append(_row(title, pair.after.statistics))
+            rows.append(_row(title, pair.after))
     return rows
 
 
-def _row(title: str, s: Statistics) -> str:
+def _row(title: str, of: Statistics | Distribution | M3c2) -> str:
+    s = of if isinstance(of, Statistics) else of.statistics
     marks = s.percentiles_m
     values = (s.mean_m, s.sd_m, s.rmse_m, s.nmad_m, s.median_m, marks["p5"], marks["p95"])
     return f"{title:<20}" + "".join(f"{value:9.3f}" for value in values)
@@ -158,8 +164,18 @@ def in_a_sentence(compared: Plain) -> str:
     twice = f" {CORRECTED_BEFORE}" if CORRECTED_BEFORE in compared["notes"] else ""
     return (
         f" Against {name} the vertical error {way} from {before['rmse_m']:.3f} to"
-        f" {after['rmse_m']:.3f} m (RMSE of {after['count']:,} points); what is left has a bias of"
-        f" {after['mean_m']:+.3f} m.{twice}"
+        f" {after['rmse_m']:.3f} m (RMSE of {after['count']:,} points{_apart(compared)}); what is"
+        f" left has a bias of {after['mean_m']:+.3f} m.{twice}"
+    )
+
+
+def _apart(compared: Plain) -> str:
+    """Return how bed and land changed, where there are both."""
+    parts = [(name, compared.get(name)) for name in ("bed", "land")]
+    return "".join(
+        f"; {name} {pair['before']['rmse_m']:.3f} to {pair['after']['rmse_m']:.3f} m"
+        for name, pair in parts
+        if pair is not None and all(pair for _, pair in parts)
     )
 
 
@@ -267,11 +283,15 @@ def _section(section: Plain) -> Figure:
 def _statistics(compared: Plain) -> Table:
     header = ["", "points", "mean", "sd", "RMSE", "NMAD", "median", "95 %"]
     rows = []
-    kinds = (("vertical", "Vertical error"), ("m3c2", "M3C2 distance"), ("c2c", "C2C distance"))
+    kinds = (
+        ("vertical", "Vertical error"), ("bed", "Bed, vertical error"),
+        ("land", "Land, vertical error"), ("m3c2", "M3C2 distance"), ("c2c", "C2C distance"),
+    )  # fmt: skip
     for key, kind in kinds:
         for when, name, _ in _TIMES:
-            if compared[key] is not None and compared[key][when] is not None:
-                s = compared[key][when]["statistics"]
+            # comparisons from before there were bed and land do without
+            if (pair := compared.get(key)) is not None and pair[when] is not None:
+                s = pair[when].get("statistics", pair[when])
                 names = ("mean_m", "sd_m", "rmse_m", "nmad_m", "median_m")
                 figures = [f"{s[n]:.3f}" for n in names] + [f"{s['percentiles_m']['p95']:.3f}"]
                 rows.append([f"{kind}, {name}", f"{s['count']:,}", *figures])

@@ -117,7 +117,7 @@ def run_report(corrected: Corrected, files: Table, later: Later = NOTHING_LATER)
         ],
         tables=[*_orders(s, later.tvu), *later.tables],
         provenance=[
-            Table("ScienceOptions", ["setting", "value"], settings),
+            Table("Settings", ["setting", "value"], settings),
             files,
             Table("Software", ["name", "version"], versions),
         ],
@@ -194,8 +194,9 @@ def _pictures(corrected: Corrected) -> list[Picture]:
         ),
         Picture(
             "shift", "Shift in Z",
-            f"Map of how far the bed moved down; mean {shift['mean']:.2f} m, growing with depth"
-            " and towards flat rays.",
+            f"Map of how far the bed moved down; mean {shift['mean']:.2f} m,"
+            + (" growing with depth and towards flat rays." if s.carried is None else " with what"
+               " the adjustment changed."),
             map_figure(maps, maps.shift_z_m, "True minus apparent Z (m)", "magma"),
         ),
         Picture(
@@ -403,8 +404,8 @@ def _residuals(d: Plain) -> Iterator[list[str]]:
 def _poses(d: Plain) -> Iterator[list[str]]:
     yield ["Projection centres moved (rms)", "", f"{fixed(d['poses']['moved_rms_m'], 3)} m"]
     if d["gnss"] is not None:
-        rms = listed(d["gnss"]["rms_m"])
-        yield ["Centres minus GNSS, east, north, up (rms)", "", f"{rms} m"]
+        before, after = (listed(d["gnss"].get(key)) for key in ("rms_before_m", "rms_m"))
+        yield ["Centres minus GNSS, east, north, up (rms)", f"{before} m", f"{after} m"]
 
 
 def _surveyed(d: Plain) -> Iterator[list[str]]:
