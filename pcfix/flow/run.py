@@ -38,6 +38,7 @@ from pcfix.options.correct import CorrectOptions
 from pcfix.options.declare import named, options_of
 from pcfix.options.survey import RunOptions
 from pcfix.refract.tally import Summary
+from pcfix.report.adjustment_text import all_notes
 from pcfix.report.comparison import evaluation, in_a_sentence
 from pcfix.report.page import Picture, Table
 from pcfix.report.run import Later, adjustment_sentence, adjustment_table, reason_sentence
@@ -205,7 +206,9 @@ def _say_adjusted(
     """Say what came of the adjustment; nothing where there was no question of one."""
     if first["adjusted"]:
         say(f"{'adjust':<9} {'done before' if was_done else 'done'}: {outputs_of(out_dir)[0]}")
-        say(f"{'':<9} {adjustment_sentence(figures_of(out_dir))}")
+        figures = figures_of(out_dir)
+        for line in (adjustment_sentence(figures), *all_notes(figures)):
+            say(f"{'':<9} {line}")
     elif first["is_said"]:
         say(f"{'adjust':<9} not done: {first['why']}")
 

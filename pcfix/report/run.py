@@ -18,7 +18,7 @@ from pcfix.grid.maps import Maps
 from pcfix.grid.model import NO_LIGHT, hillshade
 from pcfix.model import BoolArray, Cameras, FloatArray, WaterPlane, WaterSurface
 from pcfix.refract.tally import COVERAGE_95, ORDERS, Summary, largest_tvu_m
-from pcfix.report.adjustment_text import WHERE, fixed, lens_label, listed, short
+from pcfix.report.adjustment_text import WHERE, all_notes, fixed, lens_label, listed, short
 from pcfix.report.page import (
     AFTER,
     BEFORE,
@@ -367,7 +367,8 @@ def adjustment_table(d: Plain, page: str) -> Table:
     from markupsafe import Markup
 
     link = Markup('<a href="{0}">{0}</a>').format(page)
-    rows = [*_lens(d), *_residuals(d), *_poses(d), *_surveyed(d), ["All of it", "", link]]
+    rows = [*_lens(d), *_residuals(d), *_poses(d), *_surveyed(d)]
+    rows += [*(["Note", "", note] for note in all_notes(d)), ["All of it", "", link]]
     return Table("Refractive bundle adjustment", ["", "before", "after"], rows)
 
 

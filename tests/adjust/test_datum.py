@@ -24,10 +24,9 @@ def adjust(files, tmp_path):
 
     def call(up_m=0.0, rows=slice(None), model="model", **more):
         gnss, labels = files.scene.cameras.gnss, np.array(files.scene.cameras.labels)
+        xyz = gnss.xyz + np.array([0.0, 0.0, up_m])
         path = tmp_path / "gnss.csv"
-        write_gnss(
-            path, labels[rows], (gnss.xyz + np.array([0, 0, up_m]))[rows], gnss.sigma_m[rows]
-        )
+        write_gnss(path, labels[rows], xyz[rows], gnss.sigma_m[rows])
         return adjust_cameras(files.folder / model, water=files.water, gnss=path, **more)
 
     return call

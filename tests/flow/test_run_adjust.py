@@ -21,9 +21,10 @@ from pcfix.errors import GeometryError, PcfixWarning, SettingError
 from pcfix.flow.correct import correct_file
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.run import Request, request_of, run_all
-from pcfix.flow.run_adjust import adjust_first
+from pcfix.flow.run_adjust import adjust_first, figures_of
 from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.model import TiePoints, Views
+from pcfix.report.run import adjustment_table
 from tests.utils.bent_blocks import GNSS_M, LEVEL_M, TrueBlock
 from tests.utils.program import run_pcfix
 
@@ -34,7 +35,7 @@ def first_step(request, folder):
 
 ORIGIN_M = (319900.0, 3842700.0, 0.0)
 GSD_M = 0.05
-STEPS = ["adjust", "correct", "clean", "dsm", "report"]
+STEPS = ["adjust", "correct", "clean", "dsm", "compare", "report"]
 pytestmark = pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
 
 
@@ -54,6 +55,9 @@ class Scene(NamedTuple):
     def gnss(self):
         return str(self.folder / "gnss.csv")
 
+    def whole(self):
+        return self.request(adjust="yes", gnss=self.gnss, reference=str(self.folder / "truth.las"))
+
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
@@ -61,6 +65,7 @@ def scene(tmp_path_factory):
     block = TrueBlock(4)
     for name, cameras in (("bent", block.adjusted()), ("true", block.cameras)):
         _write(folder, name, block, cameras)
+    _write_las(folder / "truth.las", block.xyz + ORIGIN_M)
     rows = [
         f"{label},{x:.4f},{y:.4f},{z:.4f},{GNSS_M},{GNSS_M},{GNSS_M}"
         for label, (x, y, z) in zip(
@@ -77,11 +82,15 @@ def _write(folder, name, block, cameras):
     ties = TiePoints(apparent, Views(block.start, block.camera), block.image_xy)
     write_colmap(folder / name, replace(cameras, gnss=None), ties, offset_m=(0.0, 0.0, 0.0))
     (folder / name / "georeference.json").unlink(missing_ok=True)
+    _write_las(folder / f"{name}.las", apparent + ORIGIN_M)
+
+
+def _write_las(path, xyz):
     las = laspy.create(point_format=6, file_version="1.4")
     las.header.add_crs(pyproj.CRS("EPSG:32636"))
     las.header.scales, las.header.offsets = [1e-4] * 3, ORIGIN_M
-    las.xyz = apparent + ORIGIN_M
-    las.write(folder / f"{name}.las")
+    las.xyz = xyz
+    las.write(path)
 
 
 def errors_gsd(path, truth):
@@ -94,7 +103,7 @@ def errors_gsd(path, truth):
 @pytest.fixture(scope="module")
 def finished(scene, tmp_path_factory):
     folder, said = tmp_path_factory.mktemp("run") / "out", []
-    run_all(scene.request(adjust="yes", gnss=scene.gnss), folder, say=said.append)
+    run_all(scene.whole(), folder, say=said.append)
     return folder, said
 
 
@@ -132,12 +141,36 @@ def test_report_tells_of_the_adjustment(finished):
     assert '<a href="adjusted/report.html">' in page
     summary = json.loads((folder / "adjusted" / "adjustment.json").read_text())
     assert f"{summary['poses']['moved_rms_m']:.3f} m</td>" in page
+    assert summary["gnss"]["rms_before_m"][2] > summary["gnss"]["rms_m"][2]
+
+
+def test_report_has_bed_and_land_before_and_after(finished):
+    folder, _ = finished
+    page = (folder / "report.html").read_text()
+    found = json.loads((folder / "compare" / "compare.json").read_text())
+    for name in ("bed", "land"):
+        before, after = (found[name][when]["rmse_m"] for when in ("before", "after"))
+        assert before > 1.5 * after  # planes through the few points of this scene blur both
+        assert f"{name} {before:.3f} to {after:.3f} m" in page
+        for when in ("as it came", "corrected"):
+            assert f"{name.capitalize()}, vertical error, {when}" in page
+    counts = [found[name]["after"]["count"] for name in ("bed", "land")]
+    assert sum(counts) == found["counts"]["compared"]
+
+
+def test_notes_of_the_adjustment_are_said_and_stand_in_the_report(scene, finished, monkeypatch):
+    figures = figures_of(finished[0]) | {"notes": ["the GNSS positions lie 0.3 m above"]}
+    assert ["Note", "", "The GNSS positions lie 0.3 m above"] in adjustment_table(figures, "p").rows
+    monkeypatch.setattr("pcfix.flow.run.figures_of", lambda _: figures)
+    said = []
+    run_all(scene.whole(), finished[0], say=said.append)
+    assert any(line.strip() == "The GNSS positions lie 0.3 m above" for line in said)
 
 
 def test_a_finished_adjustment_is_not_done_again(scene, finished):
     folder, _ = finished
     said = []
-    run_all(scene.request(adjust="yes", gnss=scene.gnss), folder, say=said.append)
+    run_all(scene.whole(), folder, say=said.append)
     assert sum("done before" in line for line in said) == len(STEPS)
 
 
@@ -148,7 +181,7 @@ def test_a_lost_model_is_made_again(scene, finished, tmp_path, monkeypatch):
     (tmp_path / "out" / "adjusted" / "colmap" / "images.bin").unlink()
     monkeypatch.setattr("pcfix.flow.run_adjust._adjust", _stop)
     with pytest.raises(KeyboardInterrupt):
-        run_all(scene.request(adjust="yes", gnss=scene.gnss), tmp_path / "out")
+        run_all(scene.whole(), tmp_path / "out")
 
 
 def _stop(*_):
@@ -246,7 +279,7 @@ def test_yes_without_a_datum_stops(scene, tmp_path):
 def test_inputs_are_not_replaced(scene, finished, tmp_path):
     shutil.copytree(finished[0] / "adjusted", tmp_path / "out" / "adjusted")
     request = replace(
-        scene.request(adjust="yes", gnss=scene.gnss),
+        scene.whole(),
         cameras=str(tmp_path / "out" / "adjusted" / "colmap"), cameras_offset=None,
     )  # fmt: skip
     with pytest.raises(SettingError, match="give another OUT_DIR"):
