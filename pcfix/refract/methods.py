@@ -76,7 +76,10 @@ def _named_by_limit(found: Intersection, batch: Batch) -> Intersection:
     if survey.settings.limit_deg is None or not len(few):
         return found
     free = replace(survey, settings=replace(survey.settings, max_angle=None))
-    flat = few[with_rays(replace(batch.take(few), survey=free)).counts >= 2]
+    part = replace(batch.take(few), survey=free)
+    if part.views is not None and part.views.kind == "pairs":
+        part = replace(part, views=cameras_of_pairs(part.views))
+    flat = few[with_rays(part).counts >= 2]
     outcome = found.outcome.copy()
     outcome[flat] = Outcome.FLAT_RAYS
     return found._replace(outcome=outcome)

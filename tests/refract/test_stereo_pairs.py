@@ -241,7 +241,7 @@ def test_what_becomes_of_points_without_pairs():
         "CORRECTED",
         "NO_CAMERA",
         "ONE_CAMERA",
-        "ONE_CAMERA",
+        "FLAT_RAYS",
         "PARALLEL_RAYS",
         "CORRECTED",
     ]
