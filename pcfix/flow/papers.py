@@ -55,7 +55,7 @@ def write_refraction_effect(out_dir: File, options: SimulateOptions) -> str:
     """
     camera, overlap = _camera(options), options.effect_overlap or OVERLAP
     apparent_depths_m = options.effect_depths or APPARENT_DEPTHS_M
-    index, seed = index_of(options.index)[0], options.seed
+    index, seed = index_of(options.index, options.index_formula)[0], options.seed
     heights = {
         one: options.effect_heights or FLYING_HEIGHTS_M.get(one, (50.0, 100.0, 200.0))
         for one in ([camera] if camera else FLYING_HEIGHTS_M)
