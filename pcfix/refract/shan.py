@@ -27,7 +27,8 @@ def shan(batch: Batch) -> Intersection:
     Notes
     -----
     Shan (1994), "Relief reconstruction using two-media photogrammetry", as Skarlatos & Agrafiotis
-    (2018, JMSE 6(3) 77, section 2.1.1, eqs 1-7) give it. The image of the true point (X, Y) at
+    (2018, JMSE 6(3), 77, section 2.1.1, eqs 1-7) give it; their eq 2 lacks the root that eqs 1 and
+    7 have. The image of the true point (X, Y) at
     the depth D is that of a point seen through air on the same vertical at the depth D / s, with
 
         s = tan a / tan b = sqrt(n^2 + (n^2 - 1) tan^2 a)        (eq 7)
@@ -45,8 +46,7 @@ def shan(batch: Batch) -> Intersection:
       divided so that it says X or Y in metres. Two rays alone are overdetermined too (4 by 3).
     - The equations are horizontal distances at the true depth, not distances from the rays as in
       eq 11 (method snell); the two agree where the rays truly meet.
-    - tan a is taken from the point at the depth D / s, which lies on the image ray where the
-      equations hold; the text leaves that open.
+    - tan a is that of eq 6, from the point at the depth D / s, with the s of the turn before.
     - All rays vertical leave the depth open: the equations are singular.
 
     Exact where the straight rays meet in the apparent point: two cameras at the same incidence,
