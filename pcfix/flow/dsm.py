@@ -27,6 +27,7 @@ from pcfix.grid.model import NO_LIGHT, DsmSummary, Tally, hillshade
 from pcfix.io import rasters
 from pcfix.io.files import Bins, replaced_when_whole
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
+from pcfix.io.las.writing import is_ours
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, BoolArray, FloatArray, IntArray
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import DsmOptions, DsmRules, SurfaceChoice
@@ -136,12 +137,14 @@ class _Run:
         """Write the raster, and its hillshade if a path is given."""
         with LasSource(self.task.source) as source:
             self.crs, self.points = metric_crs(source), len(source)
+            corrected = any(is_ours(vlr) for vlr in source.vlrs)
             self.sorted = SortedPoints(
                 source, self.settings, folder, lambda done, total: self.report(0.5 * done / total)
             )
         self.near, self.lattice = self.sorted.near, self.sorted.lattice
         plain = folder / "dsm.tif" if self.cog else draft
-        tags = {"PCFIX": json.dumps({"pcfix": __version__, **asdict(self.settings)})}
+        made = {"pcfix": __version__, "corrected": corrected, **asdict(self.settings)}
+        tags = {"PCFIX": json.dumps(made)}
         bands = WITH_SIGMA if self.sorted.has_sigma else BANDS
         with rasters.new_raster(plain, self.lattice, self.crs, bands, tags=tags) as dsm:
             if self.settings.fill is None or self.settings.method == "tin":

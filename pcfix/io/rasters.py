@@ -84,6 +84,26 @@ def read_masked(raster: Any, **how: Any) -> FloatArray:
     return np.asarray(raster.read(1, masked=True, **how).astype(np.float64).filled(np.nan))
 
 
+def filled_heights(source: DatasetReader, *, fill: bool) -> FloatArray:
+    """Return the first band, NaN where it has no value; its holes interpolated from around them.
+
+    Raises
+    ------
+    InputError
+        If it has no heights at all.
+    """
+    from rasterio.fill import fillnodata
+
+    height = read_masked(source)
+    known = np.isfinite(height)
+    if not known.any():
+        raise InputError(f"{source.name}: has no heights in its first band; give a DSM.")
+    if not fill or known.all():
+        return height
+    reach = float(max(height.shape))
+    return np.asarray(fillnodata(np.where(known, height, 0.0), known, max_search_distance=reach))
+
+
 def write_part(target: DatasetWriter, values: npt.NDArray[Any], window: Window, band: int) -> None:
     """Write part of a band, shape (rows, columns); NaN becomes the raster's nodata."""
     if np.issubdtype(values.dtype, np.floating):
