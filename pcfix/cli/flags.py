@@ -68,6 +68,7 @@ def _parameter(one: Option) -> Parameter:
         negative_none="no-" if one.name in ("below", "floating") else (),
         negative_iterable=(),
         allow_repeating=True,  # the last one counts
+        allow_leading_hyphen=one.metavar in ("X,Y,Z", "X,Y,X,Y", "LOW,HIGH"),  # below zero
         show=not one.hidden,
         show_default=(lambda value: default) if default else False,
     )
