@@ -38,8 +38,8 @@ HEIGHTS_M = (50.0, 100.0, 200.0)
 """Above the water, of a camera of one's own."""
 PUBLISHED = (
     "published (Skarlatos & Agrafiotis 2018) for the SwingletCAM from 100 m, 80 %, 15 m: centre"
-    " -5.15 m, corner -8.23 m; at any height, with any lens, 1/3 of the true depth at most or half"
-    " the apparent one"
+    " -5.15 m, corner -8.23 m; the largest error at any height, with any lens: 1/3 of the true"
+    " depth or half the apparent one"
 )
 
 
