@@ -98,7 +98,7 @@ def read_job(inputs: Inputs, rules: AdjustRules, view: CloudView | None, survey:
     water = None if inputs.water is None else inputs.surface(view).surface
     check_surface(water)
     check_images(name, old, water, rules.fixed_images)
-    index = index_of(rules.index)[0]
+    index = index_of(rules.index, rules.index_formula)[0]
     gnss, no_gnss, notes = _datum(old, name, survey, rules.gnss_sigma)
     control = _control(old, water, survey, gnss)
     calibrated = None if survey.lens is None else _calibration(survey.lens, old)

@@ -181,7 +181,8 @@ def _diagnosis(
         check_same_crs(view.name, crs, reference.name, reference.crs)
     return diagnose(
         Evidence(
-            cameras, path, surface, index_of(given.index)[0], view=view, reference=reference,
+            cameras, path, surface, index_of(given.index, given.index_formula)[0],
+            view=view, reference=reference,
             control=None if gcps is None else read_ground_control(gcps, cameras),
             calibrated=given_focal_lengths(path) if lens is None else focal_length_of(lens),
             ties=ties_of(inputs, view.crs),

@@ -1,7 +1,7 @@
 """Work out the effect of refraction and the tables of papers, and write them into a folder.
 
-What ``pcfix simulate --refraction-effect`` runs. One table is that of Hsu & Wang, remade on the
-simulated flume: error by depth, method by method.
+What ``pcfix simulate --refraction-effect`` runs. One table is that of Hsu & Wang's experiment,
+simulated: error by depth, method by method.
 """
 
 from __future__ import annotations
@@ -17,8 +17,14 @@ from pcfix.options.declare import File
 from pcfix.options.scenes import SimulateOptions
 from pcfix.report import papers
 from pcfix.report.page import png_of
-from pcfix.simulate.flume import Flume, simulate_flume
-from pcfix.simulate.hsu_wang import DepthBins, depth_bins
+from pcfix.simulate.hsu_wang import (
+    METHODS,
+    WATER_LEVEL_M,
+    Bowl,
+    DepthBins,
+    depth_bins,
+    simulate_bowl,
+)
 from pcfix.simulate.refraction_effect import (
     APPARENT_DEPTHS_M,
     FLYING_HEIGHTS_M,
@@ -60,7 +66,7 @@ def write_refraction_effect(out_dir: File, options: SimulateOptions) -> str:
         none is written.
     """
     camera, apparent_depths_m = _camera(options), options.effect_depths or APPARENT_DEPTHS_M
-    index, seed = index_of(options.index)[0], options.seed
+    index, seed = index_of(options.index, options.index_formula)[0], options.seed
     effect_index = PAPER_INDEX if camera is None and options.index is None else index
     flights = {
         one: {
@@ -78,13 +84,13 @@ def write_refraction_effect(out_dir: File, options: SimulateOptions) -> str:
     found = effects(pairs, apparent_depths_m, effect_index)
     deepest = max(apparent_depths_m)
     shan = {pair: shan_iterations(pair, deepest, effect_index) for pair in pairs}
-    bins = flume_bins(simulate_flume(refractive_index=index, seed=seed))
+    bins = bowl_bins(simulate_bowl(refractive_index=index, seed=seed))
     settings = {
         "made_by": f"pcfix {__version__}",
         "cameras": [asdict(one) | flight for one, flight in flights.items()],
         "apparent_depths_m": apparent_depths_m,
         "refractive_index": effect_index,
-        "refractive_index_flume": index,
+        "refractive_index_bowl": index,
         "seed": seed,
     }
     files = _pictures(found, bins, deepest) | {
@@ -92,7 +98,7 @@ def write_refraction_effect(out_dir: File, options: SimulateOptions) -> str:
         "shan_iterations.csv": papers.csv_text(
             [row for pair, table in shan.items() for row in papers.shan_rows(pair, table)]
         ).encode(),
-        "flume_depth_bins.csv": papers.csv_text(papers.depth_bins_rows(bins)).encode(),
+        "bowl_depth_bins.csv": papers.csv_text(papers.depth_bins_rows(bins)).encode(),
         "refraction_effect.json": json_text(settings).encode(),
     }
     _write(Path(out_dir), files, options.overwrite)
@@ -126,7 +132,7 @@ def _pictures(found: list[Effect], bins: DepthBins, deepest: float) -> dict[str,
         figures[f"{name}.png"] = papers.error_map_figure(deep)
         figures[f"{name}_bed.png"] = papers.bed_figure(deep)
         figures[f"{name}_stack.png"] = papers.stack_figure(own)
-    figures["flume_depth_bins.png"] = papers.depth_bins_figure(bins)
+    figures["bowl_depth_bins.png"] = papers.depth_bins_figure(bins)
     return {name: png_of(figure) for name, figure in figures.items()}
 
 
@@ -138,10 +144,13 @@ def _write(folder: Path, files: dict[str, bytes], overwrite: bool) -> None:
         write_bytes(folder / name, data, overwrite=overwrite)
 
 
-def flume_bins(flume: Flume) -> DepthBins:
-    """Correct the flume's cloud by every method and return the errors by depth."""
-    corrected = correct_points(
-        flume.apparent_xyz, flume.cameras, flume.water_level_m, index=flume.refractive_index,
-        views=flume.views,
-    )  # fmt: skip
-    return depth_bins(flume, flume.water_level_m - corrected.xyz[:, 2])
+def bowl_bins(bowl: Bowl) -> DepthBins:
+    """Correct the bowl's cloud by every method and return the errors by depth."""
+    corrected = {
+        name: correct_points(
+            bowl.apparent_xyz, bowl.cameras, WATER_LEVEL_M, index=bowl.refractive_index,
+            views=bowl.views, method=method,
+        ).xyz
+        for name, method in METHODS.items() if method
+    }  # fmt: skip
+    return depth_bins(bowl, corrected)

@@ -62,13 +62,13 @@ class Request(RunOptions):
     def check(self) -> None:
         """Check what options say together."""
         super().check()
-        with_index(self.part(RunOptions))
         self.adjust_step()
 
     def adjust_step(self) -> AdjustStep:
         """Return what the first step is asked for."""
+        index = with_index(self.part(RunOptions)).refractive_index
         return AdjustStep(
-            self.input, self.part(Inputs), self.index, self.adjust, self.gcps, self.gnss, self.lens
+            self.input, self.part(Inputs), index, self.adjust, self.gcps, self.gnss, self.lens
         )
 
     def with_adjusted(self, folder: Path, step: dict[str, Any]) -> Request:

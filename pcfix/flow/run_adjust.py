@@ -25,7 +25,6 @@ from pcfix.kernels import threads
 from pcfix.model import Cameras, WaterDimension, WaterSurface
 from pcfix.options.declare import File
 from pcfix.options.survey import AdjustRules, AdjustWhen
-from pcfix.water.index import index_of
 
 FOLDER = "adjusted"
 
@@ -56,7 +55,7 @@ class AdjustStep:
 
     cloud: str
     inputs: Inputs
-    index: float | str | None
+    index: float
     when: AdjustWhen = "auto"
     gcps: File | None = None
     gnss: File | None = None
@@ -168,7 +167,7 @@ def _diagnosed(
     """
     lens, model = step.lens, str(step.inputs.cameras)
     evidence = Evidence(
-        cameras, model, water, index_of(step.index)[0], view=view,
+        cameras, model, water, step.index, view=view,
         control=None if step.gcps is None else read_ground_control(step.gcps, cameras),
         calibrated=given_focal_lengths(model) if lens is None else focal_length_of(lens),
         in_passing=not step.survey,

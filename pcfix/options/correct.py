@@ -79,7 +79,7 @@ class MethodOptions(IndexOptions):
     max_cameras: int | None = option(
         None,
         "Use so many rays a point at most, the steepest.",
-        rule=at_least(2, "an intersection needs two rays"),
+        rule=at_least(1, "give one ray or more"),
         default_is="no limit",
     )
     occlusion: Occlusion = option(
@@ -109,6 +109,11 @@ class MethodOptions(IndexOptions):
         super().check()
         if self.depth_factor is not None and self.method != "factor":
             raise SettingError("depth-factor is of no use without --method factor; give both.")
+        if self.max_cameras == 1 and self.method not in ("butler", "dietrich"):
+            raise SettingError(
+                "max-cameras 1 is less than 2: an intersection needs two rays; one is enough for"
+                " --method butler and dietrich alone."
+            )
 
     @property
     def limit_deg(self) -> float | None:

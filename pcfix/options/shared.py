@@ -20,6 +20,7 @@ from pcfix.options.declare import (
 
 ViewsAre = Literal["auto", "tracks", "depth-maps", "pairs"]
 Angles = Literal["omega-phi-kappa", "yaw-pitch-roll", "aircraft"]
+IndexFormula = Literal["skarlatos", "quan-fry"]
 WaterModel = Literal["auto", "level", "plane", "along", "river"]
 
 DEFAULT_REFRACTIVE_INDEX = 1.34
@@ -94,6 +95,11 @@ class IndexOptions(OptionSet):
         default_is=f"{DEFAULT_REFRACTIVE_INDEX:g}",
         metavar="N",
         old=("refractive_index",),
+    )
+    index_formula: IndexFormula = option(
+        "skarlatos",
+        "How the index follows from salinity, temperature and wavelength: Skarlatos & Agrafiotis"
+        " 2018, eq 13, or Quan & Fry 1995.",
     )
 
     @property

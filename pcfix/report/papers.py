@@ -1,4 +1,4 @@
-"""Papers, remade: the effect of refraction on a pair of vertical images, Shan's iteration, a flume.
+"""Papers, remade: the effect of refraction on a pair of vertical images, Shan's iteration, a bowl.
 
 Each as text, as rows for a CSV file, and as pictures.
 """
@@ -8,13 +8,14 @@ from __future__ import annotations
 import csv
 import io
 import math
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pcfix.model import FloatArray
 from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, new_figure
-from pcfix.simulate.hsu_wang import METHODS, DepthBins
+from pcfix.simulate.hsu_wang import EDGES_M, METHODS, PRINTED_RMSE_MM, DepthBins
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -292,25 +293,34 @@ def shan_rows(pair: StereoPair, table: list[Iteration]) -> list[dict[str, Any]]:
 
 
 def depth_bins_text(bins: DepthBins) -> str:
-    """Return the RMSE of the heights by depth, a column per method."""
+    """Return the RMSE of the heights by depth, a column per method, and what the paper prints."""
     lines = [
-        "RMSE of heights on the simulated flume, mm, by true depth; III: D ="
-        f" {1000 * bins.offset_m:+.1f} mm {bins.slope:+.3f} d, r2 {bins.r2:.4f}",
-        f"{'depth, m':<10}{'points':>7}" + "".join(f"{name:>13}" for name in METHODS),
+        "RMSE of heights in the simulated bowl of Hsu & Wang, mm, by true depth; III: D ="
+        f" {1000 * bins.offset_m:+.2f} mm {bins.slope:+.3f} d, r2 {bins.r2:.4f}",
+        f"{'depth, mm':<11}{'points':>7}" + "".join(f"{name:>13}" for name in METHODS),
     ]
-    for name, points, row in zip(_bin_names(bins), _counts(bins), bins.rmse_m, strict=True):
-        lines.append(f"{name:<10}{points:>7}" + "".join(f"{1e3 * v:>13.2f}" for v in row))
+    for name, points, row in zip(_bin_names(), bins.points, bins.rmse_m, strict=True):
+        lines.append(f"{name:<11}{points:>7}" + "".join(f"{1e3 * v:>13.3f}" for v in row))
+    lines.append(
+        "as printed; refraction does not explain it, as the uncorrected error falls with depth"
+    )
+    for name, row in zip(_bin_names(), zip(*PRINTED_RMSE_MM.values(), strict=True), strict=True):
+        lines.append(f"{name:<18}" + "".join(f"{v:>13.3f}" for v in row))
     return "\n".join(lines)
 
 
 def depth_bins_rows(bins: DepthBins) -> list[dict[str, Any]]:
     """Return RMSE and mean error of each bin and method as rows."""
     return [
-        {"depth_m": name, "points": points}
+        {"depth_mm": name, "points": points}
         | {f"rmse_{m}_mm": round(1e3 * v, 3) for m, v in zip(METHODS, rmse, strict=True)}
         | {f"mean_{m}_mm": round(1e3 * v, 3) for m, v in zip(METHODS, mean, strict=True)}
         for name, points, rmse, mean in zip(
-            _bin_names(bins), _counts(bins), bins.rmse_m.tolist(), bins.mean_m.tolist(), strict=True
+            _bin_names(),
+            bins.points.tolist(),
+            bins.rmse_m.tolist(),
+            bins.mean_m.tolist(),
+            strict=True,
         )
     ]
 
@@ -318,23 +328,19 @@ def depth_bins_rows(bins: DepthBins) -> list[dict[str, Any]]:
 def depth_bins_figure(bins: DepthBins) -> Figure:
     """Draw the RMSE of each bin, a bar per method, on a logarithmic scale."""
     figure, axes = new_figure(8.5, 4.8)
-    places, width = np.arange(len(bins.points)), 0.8 / len(METHODS)
+    places, width = np.arange(len(EDGES_M) - 1), 0.8 / len(METHODS)
     for i, method in enumerate(METHODS):
         left = places + (i - (len(METHODS) - 1) / 2.0) * width
         axes.bar(left, 1e3 * bins.rmse_m[:-1, i], width, color=_COLOURS[method], label=method)
     axes.set_yscale("log")
-    axes.set_xticks(places, _bin_names(bins)[:-1])
-    axes.set(xlabel="True depth (m)", ylabel="RMSE of heights (mm)")
+    axes.set_xticks(places, _bin_names()[:-1])
+    axes.set(xlabel="True depth (mm)", ylabel="RMSE of heights (mm)")
     axes.grid(axis="y", color="0.9")
     axes.set_axisbelow(True)
     figure.legend(loc="outside upper center", ncols=len(METHODS))
     return figure
 
 
-def _bin_names(bins: DepthBins) -> list[str]:
-    pairs = zip(bins.edges_m[:-1], bins.edges_m[1:], strict=True)
-    return [*(f"{low:.1f}-{high:.1f}" for low, high in pairs), "all"]
-
-
-def _counts(bins: DepthBins) -> list[int]:
-    return [*bins.points.tolist(), int(bins.points.sum())]
+def _bin_names() -> list[str]:
+    edges = 1e3 * EDGES_M
+    return [*(f"{low:.0f}-{high:.0f}" for low, high in pairwise(edges)), "overall"]

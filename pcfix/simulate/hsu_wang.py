@@ -1,21 +1,30 @@
-"""The error by depth of Hsu & Wang, remade on the simulated flume, method by method.
+"""The experiment of Hsu & Wang, simulated: a bowl in a box of water under a hand-held camera.
 
-The paper was not at hand; the methods are read as follows, depths from the water surface, D true
-and d apparent.
+Their section 2: a box of 20 x 30 x 40 cm, in it a bowl of sand 15 cm wide and 3 cm high, a Nikon
+D200 with a lens of 60 mm (3872 x 2592 pixels of 6.1 um, points measured to 0.2 px), 24 images taken
+almost vertically, a surface model every 0.5 mm, 16 depths measured with a probe. What they do not
+give is chosen: the camera 1 m above the water, six by four images, tilts of a degree, the rim of
+the bowl 1 mm under water, and the probe good for 0.1 mm.
 
-=========== =====================================================================================
-uncorrected D = d
-I           D = n d
-II          Snell's law along the line of sight of each camera that made the point, at the place of
-            the apparent point; the mean of their depths (Dietrich 2017): D = d tan r / tan i,
-            sin r = n sin i, r from the vertical
-III         D = a + b d, fitted by least squares to check points of known depth, which are then
-            left out of the table
+=========== ===================================================================================
+uncorrected the cloud as it came
+I           `pcfix.refract.literature.butler`, their eq 1: the mean over a point's images
+II          `pcfix.refract.literature.murase`, their eqs 2 to 4: the X-parallax of its stereo pairs
+III         D = a + b d, fitted by least squares to the probe's depths
 pcfix       `pcfix.correct_points` with the cameras that made each point
-=========== =====================================================================================
+=========== ===================================================================================
 
-Methods I to III change the height only. The error is that of the height of each point against its
-own true position, not against the bed below or above it.
+The error is that of the surface model (eq 5): the height of each point against the bed above or
+below its place in plan.
+
+The table that they print (`PRINTED_RMSE_MM`) cannot come from refraction, and nothing here is set
+to reach it. A bed that looks d deep is d (n - 1), a third of d, too high where rays are steep:
+that grows with the depth, from 3 mm at 10-15 mm to 7 mm at 25-30 mm, but the printed error of the
+uncorrected model falls from 8.3 to 5.9 mm. Their line, h = 0.9895 h_A - 8.3428 mm with heights from
+an origin 190 mm off and an r2 of 0.79, says the same: next to no scale, which refraction is, and a
+shift of 6 to 8 mm, which refraction is not. A shift between the two surface models, or another
+water level, would explain both, and would make methods I and II miss by what is left of it. So
+would noise of millimetres, where 0.2 px in 24 images comes to 0.08 mm.
 """
 
 from __future__ import annotations
@@ -24,13 +33,106 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pcfix.model import BoolArray, FloatArray, IntArray
-from pcfix.simulate.flume import Flume
+from pcfix.errors import SettingError
+from pcfix.lens.rotations import from_yaw_pitch_roll
+from pcfix.model import Cameras, FloatArray, IntArray, Lens, Views
+from pcfix.options.correct import ScienceOptions
+from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
+from pcfix.simulate.sight import starts_of
+from pcfix.simulate.tracing import piercing_points, project, triangulate
 
-METHODS = ("uncorrected", "I", "II", "III", "pcfix")
-BIN_M = 0.1
-CHECKS_PER_BIN = 10
-CHECK_SD_M = 0.002  # of a depth read from a point gauge
+BOWL_WIDTH_M, BOWL_HEIGHT_M, RIM_DEPTH_M, SPACING_M = 0.15, 0.03, 0.001, 5e-4
+WATER_LEVEL_M, CAMERA_HEIGHT_M, TILT_SD_DEG = 0.2, 1.0, 1.0
+COLUMNS_X_M, ROWS_Y_M = np.linspace(-0.1, 0.1, 6), np.linspace(-0.045, 0.045, 4)
+LENS = Lens(60.0 / 6.1e-3, 3872, 2592, 1936.0, 1296.0)
+IMAGE_NOISE_PX = 0.2
+GSD_M = CAMERA_HEIGHT_M / LENS.focal
+PROBES, PROBE_SD_M = 16, 1e-4
+
+METHODS = {"uncorrected": "", "I": "butler", "II": "murase", "III": "", "pcfix": "auto"}
+"""The columns of the table, and by which method of pcfix."""
+EDGES_M = np.arange(0.010, 0.031, 0.005)
+PRINTED_RMSE_MM = {
+    "uncorrected": (8.32, 8.1221, 7.2805, 5.8844, 8.145),
+    "I": (7.5109, 5.2108, 3.0802, 3.2645, 6.9539),
+    "II": (6.1878, 4.2094, 2.3091, 2.569, 5.7084),
+    "III": (2.0803, 1.9761, 1.1521, 1.3702, 2.0063),
+}
+"""Their Fig 11: 10-15, 15-20, 20-25, 25-30 mm, and overall."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bowl:
+    """What `simulate_bowl` made; metres.
+
+    Attributes
+    ----------
+    apparent_xyz, true_xyz : array, shape (n, 3)
+        The points as SfM software would place them, and the truth, row by row; all submerged.
+    cameras : Cameras
+    views : Views
+        The cameras that made each point.
+    refractive_index : float
+    """
+
+    apparent_xyz: FloatArray
+    true_xyz: FloatArray
+    cameras: Cameras
+    views: Views
+    refractive_index: float
+
+
+def simulate_bowl(
+    spacing_m: float = SPACING_M,
+    *,
+    refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
+    image_noise_px: float = IMAGE_NOISE_PX,
+    seed: int = 1,
+) -> Bowl:
+    """Make the bowl and the cloud of its surface.
+
+    Every point is traced through the water into every image that shows it, gets noise there, and
+    is triangulated with straight rays from all of them.
+
+    Raises
+    ------
+    SettingError
+        If an argument is outside its rule.
+    """
+    ScienceOptions(index=refractive_index)
+    if not 0.0 < spacing_m < BOWL_WIDTH_M / 4.0:
+        raise SettingError(f"spacing {spacing_m:g} m is not between 0 and a quarter of the bowl.")
+    if image_noise_px < 0.0:
+        raise SettingError(f"image noise {image_noise_px:g} px is negative.")
+    rng = np.random.default_rng(seed)
+    side = np.arange(-BOWL_WIDTH_M / 2.0, BOWL_WIDTH_M / 2.0, spacing_m) + spacing_m / 2.0
+    plan = np.array([axis.ravel() for axis in np.meshgrid(side, side)]).T
+    plan = plan[np.hypot(*plan.T) < BOWL_WIDTH_M / 2.0]
+    bed, cameras = np.column_stack([plan, bed_height_m(plan)]), _cameras(rng)
+    point, camera = (pairs.ravel() for pairs in np.indices((len(bed), len(cameras))))
+    surface = piercing_points(bed[point], cameras.centres[camera], WATER_LEVEL_M, refractive_index)
+    pixels, _ = project(surface, cameras, camera, LENS)
+    inside = ((pixels >= 0.0) & (pixels < [LENS.width, LENS.height])).all(axis=1)
+    point, camera, pixels = point[inside], camera[inside], pixels[inside]
+    pixels = pixels + rng.normal(0.0, image_noise_px, pixels.shape)
+    start = starts_of(point, len(bed))
+    apparent = triangulate(pixels, cameras, camera, start, LENS, bed)
+    return Bowl(apparent, bed, cameras, Views(start, camera), refractive_index)
+
+
+def bed_height_m(xy: FloatArray) -> FloatArray:
+    """Return the height of the bowl at places, shape (n, 2): a paraboloid, lowest in the middle."""
+    share = (xy**2).sum(axis=1) / (BOWL_WIDTH_M / 2.0) ** 2
+    return np.asarray(WATER_LEVEL_M - RIM_DEPTH_M - BOWL_HEIGHT_M * (1.0 - share))
+
+
+def _cameras(rng: np.random.Generator) -> Cameras:
+    """Return the 24 images; the whole bowl is in nearly all of them."""
+    x, y = (side.ravel() for side in np.meshgrid(COLUMNS_X_M, ROWS_Y_M))
+    centres = np.column_stack([x, y, np.full(len(x), WATER_LEVEL_M + CAMERA_HEIGHT_M)])
+    tilt = rng.normal(0.0, TILT_SD_DEG, (len(x), 3))
+    labels = tuple(f"D{i + 1:02d}" for i in range(len(x)))
+    return Cameras(labels, centres, from_yaw_pitch_roll(*tilt.T), (LENS,) * len(x))
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,16 +141,14 @@ class DepthBins:
 
     Attributes
     ----------
-    edges_m : array, shape (b + 1,)
-    points : array, shape (b,)
-        Points of each bin; the check points are not among them.
+    points : array, shape (b + 1,)
+        Points of each bin of `EDGES_M`, and of the whole bowl.
     rmse_m, mean_m : array, shape (b + 1, len(METHODS))
         Of the heights; the last row is for all points.
     offset_m, slope, r2 : float
-        The regression of method III, and its coefficient of determination.
+        The line of method III, and its coefficient of determination.
     """
 
-    edges_m: FloatArray
     points: IntArray
     rmse_m: FloatArray
     mean_m: FloatArray
@@ -57,62 +157,45 @@ class DepthBins:
     r2: float
 
 
-def depth_bins(flume: Flume, corrected_depth_m: FloatArray, seed: int = 1) -> DepthBins:
-    """Return the errors of every method by depth, with those of pcfix's own depths, shape (n,)."""
-    bins = int(np.ceil(flume.true_depth_m.max() / BIN_M - 1e-9))
-    edges = BIN_M * np.arange(bins + 1)
-    which = np.clip(np.digitize(flume.true_depth_m, edges) - 1, 0, bins - 1)
-    rng = np.random.default_rng(seed)
-    check = _check_points(which, rng)
-    slope, offset, r2 = _regression(flume, check, rng)
-    estimates = [
-        flume.apparent_depth_m,
-        flume.refractive_index * flume.apparent_depth_m,
-        mean_of_cameras(flume),
-        offset + slope * flume.apparent_depth_m,
-        corrected_depth_m,
-    ]
-    errors = flume.true_depth_m[:, None] - np.column_stack(estimates)
-    groups = [(which == i) & ~check for i in range(bins)]
-    rows = [errors[group] for group in [*groups, ~check]]
+def depth_bins(bowl: Bowl, corrected: dict[str, FloatArray], seed: int = 1) -> DepthBins:
+    """Return the errors of every method by depth.
+
+    Parameters
+    ----------
+    bowl : Bowl
+    corrected : dict of str to array, shape (n, 3)
+        The cloud as the methods of `METHODS` with a name of pcfix correct it.
+    seed : int
+        Of the probe's errors.
+    """
+    apparent, true_m = bowl.apparent_xyz, WATER_LEVEL_M - bowl.true_xyz[:, 2]
+    offset, slope, r2 = probe_line(WATER_LEVEL_M - apparent[:, 2], true_m, seed)
+    by_line = apparent.copy()
+    by_line[:, 2] = WATER_LEVEL_M - offset - slope * (WATER_LEVEL_M - apparent[:, 2])
+    clouds = {"uncorrected": apparent, "III": by_line} | corrected
+    errors = np.array(
+        [clouds[name][:, 2] - bed_height_m(clouds[name][:, :2]) for name in METHODS]
+    ).T
+    which = np.digitize(true_m, EDGES_M) - 1
+    groups = [errors[which == i] for i in range(len(EDGES_M) - 1)] + [errors]
     return DepthBins(
-        edges_m=np.asarray(edges, dtype=np.float64),
-        points=np.array([group.sum() for group in groups]),
-        rmse_m=np.array([np.sqrt((row**2).mean(axis=0)) for row in rows]),
-        mean_m=np.array([row.mean(axis=0) for row in rows]),
+        points=np.array([len(group) for group in groups]),
+        rmse_m=np.array([np.sqrt((group**2).mean(axis=0)) for group in groups]),
+        mean_m=np.array([group.mean(axis=0) for group in groups]),
         offset_m=offset,
         slope=slope,
         r2=r2,
     )
 
 
-def _check_points(which: IntArray, rng: np.random.Generator) -> BoolArray:
-    """Choose the same number of points from every bin."""
-    check = np.zeros(len(which), dtype=bool)
-    for i in range(int(which.max()) + 1):
-        own = np.flatnonzero(which == i)
-        check[rng.choice(own, min(CHECKS_PER_BIN, len(own) // 2), replace=False)] = True
-    return check
-
-
-def _regression(
-    flume: Flume, check: BoolArray, rng: np.random.Generator
+def probe_line(
+    apparent_m: FloatArray, true_m: FloatArray, seed: int = 1
 ) -> tuple[float, float, float]:
-    """Return slope, offset and r^2 of the measured depth of the check points on the apparent."""
-    apparent = flume.apparent_depth_m[check]
-    measured = flume.true_depth_m[check] + rng.normal(0.0, CHECK_SD_M, len(apparent))
-    slope, offset = np.polyfit(apparent, measured, 1)
-    return float(slope), float(offset), float(np.corrcoef(apparent, measured)[0, 1] ** 2)
+    """Return offset, slope and r2 of true on apparent depth, from the probe's 16 places."""
+    from scipy.stats import linregress
 
-
-def mean_of_cameras(flume: Flume) -> FloatArray:
-    """Return the depth by method II, shape (n,)."""
-    counts = np.diff(flume.views.start)
-    owner = np.repeat(np.arange(len(counts)), counts)
-    sight = flume.cameras.centres[flume.views.camera] - flume.apparent_xyz[owner]
-    r = np.arctan2(np.hypot(sight[:, 0], sight[:, 1]), sight[:, 2])
-    i = np.arcsin(np.sin(r) / flume.refractive_index)
-    ratio = np.divide(
-        np.tan(r), np.tan(i), out=np.full(len(r), flume.refractive_index), where=i > 0
-    )
-    return np.asarray(flume.apparent_depth_m * np.bincount(owner, ratio) / counts)
+    rng = np.random.default_rng(seed)
+    # evenly through the depths, so that the line is held at both ends
+    places = np.argsort(true_m)[np.linspace(0, len(true_m) - 1, PROBES).astype(int)]
+    line = linregress(apparent_m[places], true_m[places] + rng.normal(0.0, PROBE_SD_M, PROBES))
+    return float(line.intercept), float(line.slope), float(line.rvalue**2)

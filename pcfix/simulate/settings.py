@@ -31,7 +31,7 @@ class SceneSettings(SceneOptions):
     def check(self) -> None:
         """Check what options say together."""
         super().check()
-        object.__setattr__(self, "index", index_of(self.index)[0])
+        object.__setattr__(self, "index", index_of(self.index, self.index_formula)[0])
         pitch = [mm / px for mm, px in zip(self.sensor_mm, self.sensor_px, strict=True)]
         if not 0.98 < pitch[0] / pitch[1] < 1.02:
             raise SettingError(

@@ -49,7 +49,7 @@ from tests.benchmarks.accuracy_sensitivity import COLUMNS as SENSITIVITY_COLUMNS
 from tests.benchmarks.accuracy_sensitivity import sensitivity
 from tests.benchmarks.accuracy_tables import table
 
-METHODS = ("butler", "murase", "dietrich", "shan", "snell", "consistent")
+METHODS = ("butler", "murase", "shan", "snell", "consistent")
 CHECK_DEPTHS, CHECK_NOISE_M = 50, 0.03
 WARM_POINTS = 1000
 COLUMNS = [

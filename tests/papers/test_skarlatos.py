@@ -20,6 +20,7 @@ from pcfix.simulate.refraction_effect import (
     effects,
     shan_iterations,
 )
+from tests.papers.test_equations import pierced, refracted
 
 PAIR = StereoPair(SWINGLETCAM, 100.0)
 
@@ -40,14 +41,10 @@ def true_depth(apparent, centres, index):
     system, right, up = np.zeros((6, 5)), np.zeros(6), np.array([0.0, 0.0, 1.0])
     for i, centre in enumerate(centres):
         ray = (apparent - centre) / np.linalg.norm(apparent - centre)
-        surface = centre - ray * centre[2] / ray[2]  # eq 8 with Z_A1 = 0, vertical images
-        across = np.cross(up, ray)
-        root = math.sqrt(1.0 - across @ across / index**2)
-        bent = np.cross(up, np.cross(-up, ray)) / index - up * root  # eq 10
-        assert math.hypot(*bent[:2]) * index == pytest.approx(math.hypot(*ray[:2]))  # eq 9
-        system[3 * i : 3 * i + 3, :3], system[3 * i : 3 * i + 3, 3 + i] = np.eye(3), -bent
-        right[3 * i : 3 * i + 3] = surface
-    return -np.linalg.lstsq(system, right)[0][2]  # eq 11
+        rows = slice(3 * i, 3 * i + 3)
+        system[rows, :3], system[rows, 3 + i] = np.eye(3), -refracted(ray, up, 1.0, index)
+        right[rows] = pierced(apparent, centre)
+    return -np.linalg.lstsq(system, right, rcond=None)[0][2]
 
 
 def test_geometry_of_the_swinglet_pair():

@@ -1,9 +1,12 @@
 """The refractive index against measurements that its formula was not fitted to."""
 
+import numpy as np
 import pytest
 
 import pcfix
 from pcfix.water.index import index_of, refractive_index
+
+FORMULAS = ("skarlatos", "quan-fry")
 
 
 def iapws_1997(temperature_c, wavelength_um, density_kg_m3):
@@ -23,16 +26,47 @@ AIR = 1.000274
 """Index of air at 15 degrees and sea level; it varies by 2e-5 with the weather."""
 
 
+PURE = [(0.0, 999.84), (10.0, 999.70), (20.0, 998.21), (30.0, 995.65)]
+
+
 @pytest.mark.parametrize("wavelength_um", [0.42, 0.5, 0.5893, 0.68])
-@pytest.mark.parametrize(
-    ("temperature_c", "density"), [(0.0, 999.84), (10.0, 999.70), (20.0, 998.21), (30.0, 995.65)]
-)
+@pytest.mark.parametrize(("temperature_c", "density"), PURE)
 def test_pure_water_is_that_of_the_iapws(temperature_c, density, wavelength_um):
     vacuum = iapws_1997(temperature_c, wavelength_um, density)
-    found = refractive_index(0.0, temperature_c, wavelength_um)
+    found = refractive_index(0.0, temperature_c, wavelength_um, "quan-fry")
     # the fit's own scatter is 1.5e-5; IAPWS and the weather of the air add as much. 1e-4 would
     # move a bed 15 m deep by 1 mm
     assert found == pytest.approx(vacuum / AIR, abs=1e-4)
+
+
+@pytest.mark.parametrize("wavelength_um", [0.42, 0.5, 0.5893, 0.65])
+@pytest.mark.parametrize(("temperature_c", "density"), PURE)
+def test_eq_13_is_that_of_the_iapws_but_for_red(temperature_c, density, wavelength_um):
+    vacuum = iapws_1997(temperature_c, wavelength_um, density)
+    found = refractive_index(0.0, temperature_c, wavelength_um)
+    # three powers of the wavelength are fewer than dispersion has: 4 mm in 15 m at the red end
+    assert found == pytest.approx(vacuum / AIR, abs=3e-4)
+
+
+def test_eq_13_as_it_is_printed():
+    assert refractive_index(0.0, 20.0, 0.589) == pytest.approx(1.33301, abs=5e-6)
+    s, t, um = 35.0, 15.0, 0.53
+    printed = (
+        1.447824 + 3.0110e-4 * s - 1.8029e-5 * t - 1.6916e-6 * t**2 - 4.89040e-1 * um
+        + 7.28364e-1 * um**2 - 3.83745e-1 * um**3
+        - s * (7.9362e-7 * t - 8.0597e-9 * t**2)
+        - s * (4.249e-4 * um - 5.847e-4 * um**2 + 2.812e-4 * um**3)
+    )  # fmt: skip
+    assert refractive_index(s, t, um) == pytest.approx(printed, abs=1e-14)
+
+
+def test_the_formulas_differ_by_no_more_than_is_said():
+    grid = np.meshgrid(np.linspace(0, 40, 9), np.linspace(0, 30, 16), np.linspace(0.4, 0.7, 31))
+    apart = [
+        abs(refractive_index(*at) - refractive_index(*at, "quan-fry"))
+        for at in zip(*(axis.ravel() for axis in grid), strict=True)
+    ]
+    assert 4.4e-4 < max(apart) < 4.6e-4
 
 
 def test_the_reference_of_this_test_gives_the_values_of_its_release():
@@ -49,19 +83,23 @@ def test_the_reference_of_this_test_gives_the_values_of_its_release():
         (0.0, -1.97812e-6, 1.03223e-7, -8.58125e-6, -1.54834e-4, 1.38919),
     ],
 )
-def test_sea_and_fresh_water_of_parrish_2020(salinity, a, b, c, d, e, wavelength_nm, temperature_c):
+@pytest.mark.parametrize("formula", FORMULAS)
+def test_sea_and_fresh_water_of_parrish_2020(
+    formula, salinity, a, b, c, d, e, wavelength_nm, temperature_c
+):
     # a surface through the tables of Mobley 2010, with an RMSE of 2e-4 of its own: three times
     # that is allowed, 9 mm in 15 m of water
     published = a * temperature_c**2 + b * wavelength_nm**2 + c * temperature_c
     published += d * wavelength_nm + e
-    found = refractive_index(salinity, temperature_c, wavelength_nm / 1000.0)
+    found = refractive_index(salinity, temperature_c, wavelength_nm / 1000.0, formula)
     assert found == pytest.approx(published, abs=6e-4)
 
 
-def test_index_falls_with_temperature_and_wavelength_and_grows_with_salt():
-    assert refractive_index(35, 10, 0.5) > refractive_index(35, 25, 0.5)
-    assert refractive_index(35, 10, 0.45) > refractive_index(35, 10, 0.65)
-    assert refractive_index(35, 10, 0.5) > refractive_index(10, 10, 0.5)
+@pytest.mark.parametrize("by", FORMULAS)
+def test_index_falls_with_temperature_and_wavelength_and_grows_with_salt(by):
+    assert refractive_index(35, 10, 0.5, by) > refractive_index(35, 25, 0.5, by)
+    assert refractive_index(35, 10, 0.45, by) > refractive_index(35, 10, 0.65, by)
+    assert refractive_index(35, 10, 0.5, by) > refractive_index(10, 10, 0.5, by)
 
 
 def test_waters_by_name():
@@ -71,6 +109,9 @@ def test_waters_by_name():
     assert index_of(1.337) == (1.337, "")
     assert index_of("sea") == (index_of("35,15,0.53")[0], "sea: 35 PSU, 15 C, 0.53 um")
     assert index_of("20,4")[0] == refractive_index(20.0, 4.0)
+    number, origin = index_of("20,4,0.6", "quan-fry")
+    assert number == refractive_index(20.0, 4.0, 0.6, "quan-fry")
+    assert origin == "20 PSU, 4 C, 0.6 um, by quan-fry"
 
 
 @pytest.mark.parametrize(
@@ -80,6 +121,7 @@ def test_waters_by_name():
         ({"temperature_c": 293.0}, "temperature 293 .* degrees Celsius"),
         ({"wavelength_um": 550.0}, "wavelength 550 .* micrometres"),
         ({"salinity": float("nan")}, "salinity nan"),
+        ({"formula": "cauchy"}, "formula 'cauchy' is none of skarlatos, quan-fry"),
     ],
 )
 def test_values_outside_the_fit_are_refused(words, message):
