@@ -320,7 +320,7 @@ class SimulateOptions(OverwriteOption, EffectOptions, SceneOptions):
         False,
         "No scene, but how far refraction puts points wrong in a pair of vertical images"
         " (Skarlatos & Agrafiotis 2018, Figures 4 to 6): surfaces, maps, tables. Of the paper's"
-        " cameras with --index 1.3405 if none is given.",
+        " cameras with n = 1.3405, which fits its figures, if no --index is given.",
     )
 
     def check(self) -> None:

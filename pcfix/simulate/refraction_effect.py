@@ -15,7 +15,8 @@ centre. The reading that gives both (-8.232 m and -5.147 m):
 - The base is the free part of the short side at the water: 21.6 m. The model is the overlap of the
   two footprints there, and its apparent bed is level: x and y of a corner are 43.2 m and 72 m from
   the centre, and z is -15 m there.
-- n = 1.3405. It is not printed; from 1.3404 to 1.3406 both numbers come out.
+- n = 1.3405. It is not printed but fitted to the two: they come out from 1.3404 to 1.3406. So that
+  they agree says that one n explains both, not that it was the authors'.
 - The true point is that of eqs 8 to 11: the least squares of eq 11 for two rays are the midpoint of
   the shortest line between them.
 - The error is the apparent depth minus the true depth, so a minus says: too shallow.
@@ -52,6 +53,7 @@ NODES = 61
 OVERLAP = 0.8
 APPARENT_DEPTHS_M = tuple(float(depth) for depth in range(16))
 PAPER_INDEX = 1.3405
+"""Not printed: fitted to the two errors that are."""
 
 
 @dataclass(frozen=True)
