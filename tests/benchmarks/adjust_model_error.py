@@ -49,7 +49,9 @@ def main():
 
 
 def show(words, squares, beds):
-    figures = " ".join(f"{value:6.2f}" for value in np.sqrt(np.nanmean(squares, axis=0)))
+    known = np.isfinite(squares).sum(axis=0)  # cx and cy are held where the block does not tell
+    means = np.nansum(squares, axis=0) / np.where(known, known, np.nan)
+    figures = " ".join(f"{value:6.2f}" for value in np.sqrt(means))
     before, after = np.sqrt(np.mean(np.square(beds), axis=0))
     print(f"{words:<12} {figures}  {before:6.2f} -> {after:.2f}", flush=True)
 
