@@ -120,6 +120,7 @@ class Files:
         self.dsm, self.dsm_bed = folder / "dsm.tif", folder / "dsm_bed.tif"
         self.hillshade = folder / "hillshade.tif"
         self.compare, self.report = folder / "compare", folder / "report.html"
+        self.regression = folder / "regression.json"
 
 
 def run_all(
@@ -183,7 +184,8 @@ def run_all(
     )
     _say_adjusted(first, out_dir, was_done, say)
     request = request.with_adjusted(out_dir, first)
-    corrected = step("correct", [files.corrected], lambda: _correct(request, files, jobs, progress))
+    clouds = [files.corrected] + ([] if request.check_depths is None else [files.regression])
+    corrected = step("correct", clouds, lambda: _correct(request, files, jobs, progress))
     corrected = _with_checked(corrected, first)
     if not first["is_said"] and is_worth_saying(first, _is_bent(corrected)):
         first = {**first, "is_said": True}
@@ -219,6 +221,8 @@ def _correct(
     request: Request, files: Files, jobs: int | None, progress: Callable[[int, int], None] | None
 ) -> dict[str, Any]:
     options = replace(request, overwrite=True, jobs=jobs).part(CorrectOptions)
+    if request.check_depths is not None:
+        options = replace(options, save_regression=files.regression)
     summary = correct_file(request.input, files.corrected, options=options, progress=progress)
     return vars(summary)
 
