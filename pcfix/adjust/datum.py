@@ -90,7 +90,7 @@ def datum_notes(found: Adjusted) -> list[str]:
     if not known.any() or found.unknowns.poses != "free" or found.unknowns.free_network:
         return []
     stated = float(np.median(found.block.gnss_sigma_m[known]))
-    offset = None if found.precision is None else offset_of(found)
+    offset = None if found.source == "cloud" else offset_of(found)
     return _weakness(found, stated) + ([] if offset is None else _beside(found, offset, stated))
 
 
@@ -99,7 +99,7 @@ def _weakness(found: Adjusted, stated_m: float) -> list[str]:
     control = sum(row.role == "control" for row in found.control)
     what = f"{len(places)} GNSS positions and {control} control points hold the block"
     remedy = "give positions of more images, spread over the block, or control points."
-    if found.precision is None:
+    if found.precision is None or found.source == "cloud":
         few = len(places) + control < FEW
         return [f"only {what} and say how much the cloud counts: {remedy}"] if few else []
     sigma = found.precision.centre_sigma_m.max(axis=1)

@@ -149,8 +149,8 @@ def by_cloud(
     if rules.lens_unknowns is None and material.calibrated is None:
         sets = list(dict.fromkeys([("f",), ("f", "cx", "cy"), *sets]))
     found = mend(candidates, unknowns_of(rules, sets[0]), sets, progress)
-    notes += [*_check_dry(material.water, found), *found.notes, *datum_notes(found)]
-    return replace(found, notes=notes)
+    notes += [*_check_dry(material.water, found), *found.notes]
+    return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])
 
 
 def _check_wet(water: WaterSurface | None, xyz: FloatArray) -> None:

@@ -32,11 +32,13 @@ def test_a_principal_point_that_was_bent_goes_back(strip):
     assert not any("does not determine" in note for note in found.notes)
 
 
-def test_centres_are_true_within_their_standard_errors(strip):
+def test_positions_are_not_said_to_lie_off_for_a_lens_that_was_held(strip):
+    """They lie right; with the principal point held they seemed 2 m below the centres."""
     found, true = strip
+    assert not any("the projection centres" in note for note in found.notes)
     off = (found.cameras.centres - true.centres) / found.precision.centre_sigma_m
-    # of 42 normalised errors, neighbours alike; with the principal point held it is 2.4
-    assert np.sqrt((off**2).mean()) < 1.5
+    # rms of 42 normalised errors: 1 with a standard deviation of a tenth, more as neighbours agree
+    assert np.sqrt((off**2).mean()) < 1.3
 
 
 def test_the_tilt_across_the_strip_is_said_to_be_unknown(strip):
