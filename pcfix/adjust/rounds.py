@@ -70,7 +70,7 @@ def adjust_ties(
     problem, now, precision = _settled(clean, now, LAST_ROUND, estimate, progress)
     notes: list[str] = []
     if choose_lens:
-        weak = weak_lens_parameters(problem, precision)
+        weak = weak_lens_parameters(problem, now, precision)
         kept = [name for name in unknowns.lens if name not in weak]
         more = missing_lens_parameters(problem, now, sigma0_of(problem, now))
         notes = _lens_notes([*kept, *more], weak, more)
