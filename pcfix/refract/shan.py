@@ -33,13 +33,14 @@ def shan(batch: Batch) -> Intersection:
 
         s = tan a / tan b = sqrt(n^2 + (n^2 - 1) tan^2 a)        (eq 7)
 
-    so that the collinearity equations hold with D / s for the depth (eq 6). Every image has its
+    so that the collinearity equations hold with D / s for the depth (eq 3). Every image has its
     own s; two images give four equations for X, Y, D and two s. With s known they are linear.
     The iteration starts with s = 1, takes tan a from the point found, and with the s of eq 7
     solves again, until no tan a changes by more than `TOLERANCE`.
 
-    How this differs, or fills a gap:
+    How this differs:
 
+    - The paper's first tan a is eq 6 with Z = 0; s = 1 is nearer, and saves an iteration.
     - The image ray is the line from the projection centre to the apparent point, as a cloud has
       no image coordinates. So the start, s = 1, is the apparent point itself.
     - Any number of rays: the equations of all are solved together in least squares, each one

@@ -74,6 +74,7 @@ def rows_of(case: Case, runs: int, seed: int) -> list[dict[str, Any]]:
     if case.floor is not None:
         rows.append({"method": "floor", **errors(case, case.floor)})
     rows.append(row_of(case, "factor", None, {}, runs))
+    rows.append(row_of(case, "factor", "auto", {"depth_factor": "auto"}, runs))
     learned = regression_of(case, seed)
     rows.append(row_of(case, "regression", None, {"regression": learned}, runs))
     rows.append(row_of(case, "auto", "auto", {}, runs))
