@@ -13,6 +13,7 @@ import pcfix
 from pcfix.cli.flags import FLAGS, Quiet, UsageError, check_needed, progress_bar, say, status_line
 from pcfix.options.correct import CorrectOptions, LabelOptions
 from pcfix.options.declare import options_of
+from pcfix.options.photos import PhotosOptions
 from pcfix.options.scenes import DemoOptions, SimulateOptions
 from pcfix.options.shared import JobOptions
 from pcfix.options.steps import CleanOptions, CompareOptions, DsmOptions
@@ -180,6 +181,23 @@ def compare(
     say(comparison_text(result), quiet)
 
 
+def photos(
+    images: Annotated[Path, Parameter(help="Folder of photographs.")],
+    out: Annotated[Path, Parameter(help="Folder for those without water.")],
+    /,
+    *,
+    options: Annotated[PhotosOptions, FLAGS] = PhotosOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Resample photographs to those that would have been taken without water."""
+    check_needed(options)
+    from pcfix.report.photos import photos_text
+
+    with progress_bar("Mapping photographs", quiet, unit="photographs") as progress:
+        result = pcfix.map_photos(images, out, options=options, progress=progress)
+    say(photos_text(result), quiet)
+
+
 def cameras(
     path: Annotated[Path, Parameter(help="File or folder of camera poses.")],
     /,
@@ -266,6 +284,7 @@ EXAMPLES: tuple[tuple[Callable[..., None], str], ...] = (
     (clean, "pcfix clean corrected.laz cleaned.laz"),
     (dsm, "pcfix dsm cleaned.laz bed.tif --resolution 0.5 --surface bed"),
     (compare, "pcfix compare cleaned.laz lidar.laz --submerged"),
+    (photos, "pcfix photos images dry --cameras cameras.xml --dsm bed.tif --water 0.37"),
     (cameras, "pcfix cameras cameras.xml --cloud cloud.laz --water 0.37 --plot block.png"),
     (water, "pcfix water shore.csv --cloud cloud.laz --plot water.png"),
     (restore, "pcfix restore corrected.laz cloud.laz"),

@@ -92,8 +92,10 @@ COMPILING = "kernels are compiled first, once after an installation: about a min
 
 
 @contextmanager
-def progress_bar(title: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """Show a bar with points/s and the time left on a terminal; nothing when piped."""
+def progress_bar(
+    title: str, quiet: bool, unit: str = "points"
+) -> Iterator[Callable[[int, int], None] | None]:
+    """Show a bar with units/s and the time left on a terminal; nothing when piped."""
     if quiet or not sys.stderr.isatty():
         yield None
         return
@@ -115,9 +117,8 @@ def progress_bar(title: str, quiet: bool) -> Iterator[Callable[[int, int], None]
 
         def update(done: int, total: int) -> None:
             rate = done / (time.perf_counter() - started)
-            bar.update(
-                task, description=title, completed=done, total=total, rate=f"{rate:,.0f} points/s"
-            )
+            text = f"{rate:,.0f} {unit}/s" if rate > 10.0 else f"{60.0 * rate:.0f} {unit}/min"
+            bar.update(task, description=title, completed=done, total=total, rate=text)
 
         yield update
 

@@ -22,14 +22,16 @@ from pcfix.io.files import file_state, read_json, write_text
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
 from pcfix.io.rasters import filled_heights, open_raster
 from pcfix.kernels import cores, threads
-from pcfix.model import Cameras, FloatArray, Lens, WaterDimension
+from pcfix.model import Cameras, FloatArray, Lens, WaterDimension, WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import PhotosOptions
 from pcfix.photos.ground import Ground, ground_of
 from pcfix.photos.mapping import Photo, Scene, exact, paper
+from pcfix.photos.model import PhotosSummary
 from pcfix.photos.resample import resample
 from pcfix.version import __version__
 from pcfix.water.index import index_of
+from pcfix.water.surface import surface_above
 
 RECORD = "pcfix-photos.json"
 LEAST_STEP_PX = 4
@@ -38,38 +40,6 @@ MOST_BLACK = 0.2
 """Of a photograph; more is worth a warning."""
 LENS_TOLERANCE = 0.005
 """Of the shape of a frame in millimetres against that of the photograph."""
-
-
-@dataclass(frozen=True)
-class PhotosSummary:
-    """What `map_photos` did.
-
-    Attributes
-    ----------
-    images, done_before : int
-        Photographs written, and those of them that an earlier call had written.
-    megapixels, seconds : float
-    largest_shift_px : float
-    black_share : float
-        Of all pixels: those over no ground, hidden, or from outside the photograph.
-    mapping, dsm, water : str
-    refractive_index : float
-    spacing_px : int
-    notes : tuple of str
-    """
-
-    images: int
-    done_before: int
-    megapixels: float
-    seconds: float
-    largest_shift_px: float
-    black_share: float
-    mapping: str
-    dsm: str
-    water: str
-    refractive_index: float
-    spacing_px: int
-    notes: tuple[str, ...]
 
 
 def map_photos(
@@ -174,6 +144,7 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> Block:
         raise SettingError(
             "water dim:NAME belongs to a cloud; give a level, plane, mesh or raster."
         )
+    check_above(cameras.centres[theirs], surface, str(given.cameras))
     ground = ground_of(heights, *origin)
     index = index_of(given.index, given.index_formula)[0]
     rotations: Any = cameras.rotations
@@ -186,6 +157,16 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> Block:
     gsd = _ground_pixel_m(photos, ground)
     step = given.spacing or max(LEAST_STEP_PX, int(np.ceil(ground.cell_m / gsd)))
     return Block(tuple(mine), photos, Scene(ground, surface, index), step, (*notes, *more))
+
+
+def check_above(centres: FloatArray, water: WaterSurface, name: str) -> None:
+    """Refuse cameras that do not stand above the water, where that is known."""
+    under = surface_above(water, centres).height_m >= centres[:, 2]
+    if under.any():
+        raise GeometryError(
+            f"{name}: {int(under.sum())} of {len(centres)} cameras do not stand above the water,"
+            f" the lowest at {centres[:, 2].min():.1f} m; check the CRS and vertical datum of both."
+        )
 
 
 def _heights(

@@ -38,10 +38,17 @@ def photographs_in(folder: Path) -> list[Path]:
 
 def size_of(path: Path) -> tuple[int, int]:
     """Return columns and rows of a photograph, from its header."""
-    import rasterio
+    with _readable(path):
+        if path.suffix.lower() in TIFF:
+            import tifffile
 
-    with _readable(path), rasterio.Env(CPL_DEBUG=False), rasterio.open(path) as image:
-        return int(image.width), int(image.height)
+            with tifffile.TiffFile(path) as file:
+                page: Any = file.pages[0]
+                return int(page.imagewidth), int(page.imagelength)
+        from PIL import Image
+
+        with Image.open(path) as image:
+            return image.size
 
 
 def read_photograph(path: Path) -> Pixels:

@@ -1,0 +1,186 @@
+"""``pcfix photos`` over files: names, metadata, bits of land, resuming, bad input."""
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2", reason="photographs need the extra 'photos'")
+
+import rasterio
+from PIL import Image
+from rasterio.transform import from_origin
+
+import pcfix
+from pcfix.io.photographs import read_photograph
+from tests.photos.test_mapping import GSD_M, LENS, LEVEL_M, photo, relief
+from tests.utils.program import run_pcfix
+from tests.utils.renderer import Texture, rendered
+
+CORNER = np.array([500_000.0, 4_000_000.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory):
+    """Return a folder: images, a camera table, a sensor, and a DSM of the true bed."""
+    folder = tmp_path_factory.mktemp("photos")
+    (folder / "images").mkdir()
+    rows = ["label,x,y,z,yaw,pitch,roll"]
+    for number, x in enumerate((-8.0, 8.0)):
+        grey, _ = rendered(photo(x), relief(), Texture(5 * GSD_M, 1.5), LEVEL_M)
+        colour = np.dstack([grey, grey[:, ::-1], 255 - grey])
+        exif = Image.Exif()
+        exif[0x010F] = "pcfix"  # maker
+        Image.fromarray(colour).save(
+            folder / "images" / f"IMG_{number}.JPG", quality=92, exif=exif, dpi=(72, 72)
+        )
+        place = CORNER + photo(x).centre
+        rows.append(f"IMG_{number},{place[0]},{place[1]},{place[2]},35,4,3")
+    (folder / "cameras.csv").write_text("\n".join(rows) + "\n")
+    mm = 6e-3  # of a pixel
+    (folder / "sensor.csv").write_text(
+        "focal,sensor_x,sensor_y\n" + f"{600 * mm},{480 * mm},{360 * mm}\n"
+    )
+    ground = relief()
+    with rasterio.open(
+        folder / "bed.tif", "w", driver="GTiff", width=450, height=450, count=1, dtype="float64",
+        crs="EPSG:32633", nodata=-9999.0,
+        transform=from_origin(CORNER[0] - 45.0, CORNER[1] + 45.0, 0.2, 0.2),
+    ) as raster:  # fmt: skip
+        raster.write(ground.height_m, 1)
+    return folder
+
+
+def words(project, *more, out="out"):
+    return [
+        "photos", str(project / "images"), str(project / out), "--cameras",
+        str(project / "cameras.csv"), "--dsm", str(project / "bed.tif"), "--water", str(LEVEL_M),
+        *more,
+    ]  # fmt: skip
+
+
+def test_the_command(project):
+    done = run_pcfix(*words(project, "--summary", str(project / "said.json")))
+    assert done.returncode == 0, done.stderr
+    assert "does not say that it is of a cloud that pcfix corrected" in done.stderr
+    assert "photographs  2 written" in done.stdout
+    said = json.loads((project / "said.json").read_text())
+    assert said["images"] == 2
+    assert 5.0 < said["largest_shift_px"] < 60.0
+    for number in range(2):
+        name = f"IMG_{number}.JPG"
+        old, new = (Image.open(project / at / name) for at in ("images", "out"))
+        assert old.size == new.size
+        assert new.getexif()[0x010F] == "pcfix"
+        assert new.info["dpi"] == old.info["dpi"]
+        assert new.quantization == old.quantization
+        changed = (np.asarray(old) != np.asarray(new)).any(axis=2).mean()
+        assert changed > 0.6  # two thirds and all of them are over water
+
+
+def test_land_is_unchanged_to_the_bit(project):
+    if not (project / "out").exists():
+        run_pcfix(*words(project))
+    _, place = rendered(photo(-8.0), relief(), Texture(1.0, 2.0))
+    land = place[..., 2] > LEVEL_M + 0.3
+    # 8 x 8 of luminance, 16 x 16 of colour, and one pixel more by which decoders smooth colour
+    import cv2
+
+    inland = cv2.erode(land.astype(np.uint8), np.ones((49, 49))) > 0
+    assert inland.mean() > 0.05
+    before, after = (read_photograph(project / at / "IMG_0.JPG") for at in ("images", "out"))
+    assert (before == after)[inland].all()
+
+
+def test_an_interrupted_call_goes_on(project):
+    run_pcfix(*words(project, out="again"))
+    (project / "again" / "IMG_1.JPG").unlink()
+    kept = (project / "again" / "IMG_0.JPG").stat().st_mtime_ns
+    done = run_pcfix(*words(project, out="again"))
+    assert "1 written" in done.stdout
+    assert "1 were there from before" in done.stdout
+    assert (project / "again" / "IMG_0.JPG").stat().st_mtime_ns == kept
+    other = run_pcfix(*words(project, "--index", "1.33", out="again"))
+    assert other.returncode == 1
+    assert "was not written by an equal call" in other.stderr
+
+
+@pytest.mark.parametrize(
+    ("suffix", "dtype"), [("tif", np.uint16), ("png", np.uint16), ("tif", np.uint8)]
+)
+def test_other_formats_keep_their_bits(project, tmp_path, suffix, dtype):
+    import cv2
+    import tifffile
+
+    folder = tmp_path / "images"
+    folder.mkdir()
+    grey, _ = rendered(photo(-8.0), relief(), Texture(5 * GSD_M, 1.5), LEVEL_M)
+    scale = 257 if dtype == np.uint16 else 1
+    bands = np.dstack([grey] * (5 if suffix == "tif" else 3)).astype(dtype) * dtype(scale)
+    path = folder / f"IMG_0.{suffix}"
+    if suffix == "tif":
+        tifffile.imwrite(
+            path,
+            bands,
+            photometric="minisblack",
+            planarconfig="contig",
+            extratags=[(271, 2, 6, "maker", True)],
+        )
+    else:
+        cv2.imwrite(str(path), bands)
+    with pytest.warns(pcfix.PcfixWarning, match="does not say"):
+        pcfix.map_photos(
+            folder, tmp_path / "out", cameras=project / "cameras.csv", dsm=project / "bed.tif",
+            water=LEVEL_M,
+        )  # fmt: skip
+    before, after = read_photograph(path), read_photograph(tmp_path / "out" / path.name)
+    assert after.shape == before.shape
+    assert after.dtype == dtype
+    same = (before == after).all(axis=2)
+    assert 0.05 < same.mean() < 0.8
+    assert (after[..., 0] == after[..., 2]).all()
+    if suffix == "tif":
+        with tifffile.TiffFile(tmp_path / "out" / path.name) as file:
+            assert file.pages[0].tags["Make"].value == "maker"
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        (("--resolution", "1"), "resolution is of a cloud that is gridded"),
+        (("--spacing", "0"), "spacing 0"),
+        (("--water", "dim:Level"), "dim:NAME belongs to a cloud"),
+        (("--water", "200"), "cameras"),
+    ],
+)
+def test_bad_input_gets_a_sentence(project, more, sentence):
+    done = run_pcfix(*words(project, *more, out="bad"))
+    assert done.returncode == 1
+    assert sentence in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_photographs_of_another_size(project, tmp_path):
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", (480, 400)).save(tmp_path / "images" / "IMG_0.JPG")
+    done = run_pcfix(
+        "photos", str(tmp_path / "images"), str(tmp_path / "out"), "--cameras",
+        str(project / "cameras.csv"), "--dsm", str(project / "bed.tif"), "--water", "0.3",
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "has 480 x 400 pixels" in done.stderr
+
+
+def test_photographs_that_no_camera_knows(project, tmp_path):
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", (480, 360)).save(tmp_path / "images" / "DJI_7.JPG")
+    done = run_pcfix(
+        "photos", str(tmp_path / "images"), str(tmp_path / "out"), "--cameras",
+        str(project / "cameras.csv"), "--dsm", str(project / "bed.tif"), "--water", "0.3",
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "knows none of the photographs (DJI_7.JPG ... against IMG_0 ...)" in done.stderr
+
+
+def test_the_lens_of_the_table_is_that_of_the_renderer():
+    assert (LENS.width, LENS.height) == (480, 360)
