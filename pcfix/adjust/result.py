@@ -76,7 +76,7 @@ class Adjusted:
     used : array of bool, shape (o,)
         Observations that were not left out as outliers.
     is_wet : array of bool, shape (m,)
-        Points that lie below the water.
+        Points that lie below the water; before a port all.
     sigma0 : float
         A-posteriori standard deviation of unit weight.
     redundancy : int
@@ -167,7 +167,8 @@ def adjusted_of(
     xyz = with_checks(problem, now, state.xyz + problem.origin)
     r = residuals(state._replace(xyz=xyz - problem.origin), problem.seen, problem.surface)
     water = water_of(problem, state)
-    level = np.full(len(xyz), -np.inf) if water is None else surface_above(water, xyz).height_m
+    none = -np.inf if block.port is None else np.inf  # before a port all is under water
+    level = np.full(len(xyz), none) if water is None else surface_above(water, xyz).height_m
     cameras = solved_cameras(problem, now)
     off = cameras.centres - block.gnss_xyz
     return Adjusted(

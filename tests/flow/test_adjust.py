@@ -226,6 +226,8 @@ def test_a_shape_and_waterline_points_go_from_file_to_file(files, tmp_path):
     for where in ("land", "water"):
         fit = told["residuals"][where]
         assert np.hypot(*fit["rms_xy_px"]) == pytest.approx(np.sqrt(2.0) * fit["rms_px"])
+    words = correct_words(found, "model", tmp_path / "out", AdjustOptions(water=files.water))
+    assert f"--water {tmp_path / 'out' / 'water.tif'}" in words
     bed, _ = home(files, tmp_path / "out" / "colmap", water=tmp_path / "out" / "water.tif")
     assert bed < 0.02
     level = told["water"]["level"]

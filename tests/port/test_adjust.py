@@ -14,9 +14,11 @@ from pcfix.adjust.problem import port_of, prepare
 from pcfix.adjust.solve import solve
 from pcfix.errors import SettingError
 from pcfix.flow.adjust import adjust_cameras
+from pcfix.flow.next_steps import correct_words
 from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.kernels import threads
 from pcfix.model import TiePoints
+from pcfix.options.survey import AdjustOptions
 from pcfix.port.light import coefficients
 from pcfix.port.shapes import DomePort, FlatPort
 from pcfix.port.shapes import port_of as port_of_text
@@ -127,6 +129,9 @@ def test_noisy_images_tell_the_port_within_its_standard_error(tmp_path, port, fr
         assert abs(row["after"] - value) < 3.5 * row["sigma"]
         assert abs(row["before"] - value) > 0.0 or value == 0.0
     assert f"--port {told['port']}" in adjustment_text(found)
+    options = AdjustOptions(port=port, free=(free,))
+    words = correct_words(found, "model", tmp_path / "out", options)
+    assert words.endswith(f"--port {told['port']}")
 
 
 def test_a_port_has_its_own_unknowns(tmp_path):
