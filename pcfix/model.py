@@ -194,10 +194,10 @@ class Cameras:
     def __post_init__(self) -> None:
         """Check that the arrays belong together."""
         k = len(self.labels)
-        if k == 0 or self.centres.shape != (k, 3):
+        if self.centres.shape != (k, 3):
             raise SettingError(
-                f"Cameras need one label per centre and at least one: {k} labels,"
-                f" centres of shape {self.centres.shape}."
+                f"Cameras need one label per centre: {k} labels, centres of shape"
+                f" {self.centres.shape}."
             )
         if not np.isfinite(self.centres).all():
             bad = self.labels[int(np.argmin(np.isfinite(self.centres).all(axis=1)))]
@@ -211,6 +211,10 @@ class Cameras:
 
     def __len__(self) -> int:
         return len(self.labels)
+
+
+NO_CAMERAS = Cameras((), np.zeros((0, 3)))
+"""Of a correction that looks at none; see `MethodOptions.check_no_cameras`."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -118,7 +118,9 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
     from pcfix.options.correct import CorrectOptions
 
     started = time.perf_counter()
-    options = _options(namespace, CorrectOptions, needed=("cameras", "water"))
+    options = _options(namespace, CorrectOptions, needed=("water",))
+    if options.cameras is None and options.needs_cameras:
+        raise _missing("cameras")
     if options.uncorrected == "drop":
         raise SettingError(
             "uncorrected 'drop': a stage of PDAL cannot set dimensions and drop points at once;"
@@ -141,6 +143,7 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
     job.check_fit()
     outs.update(results.dimensions)
     summary = job.summary(NAME, NAME, time.perf_counter() - started)
+    job.save_regression()
     write_summary(options, summary.as_dict())
     namespace["out_metadata"] = metadata_of(summary)
 
@@ -179,8 +182,12 @@ def _options(namespace: dict[str, Any], kind: type[Set], needed: tuple[str, ...]
     }
     for name in needed:
         if name not in values:
-            raise SettingError(f"pdalargs: the option '{name}' is needed.")
+            raise _missing(name)
     return kind(**values)
+
+
+def _missing(name: str) -> SettingError:
+    return SettingError(f"pdalargs: the option '{name}' is needed.")
 
 
 def _converted(one: Option, value: Any) -> Any:

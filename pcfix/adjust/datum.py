@@ -33,6 +33,9 @@ there is none; then so many positions and control points are few."""
 IN_LINE = 0.1
 """Spread of positions across over that along, below which they lie in a line."""
 
+BED_GSD = 1.5
+"""Standard error of the bed's heights, in ground pixels, from which it deserves a word."""
+
 SIDES = (("to the right of", "to the left of"), ("ahead of", "behind"), ("above", "below"))
 """Seen from the projection centres, the upper edge of the image ahead."""
 
@@ -88,28 +91,68 @@ def datum_notes(found: Adjusted) -> list[str]:
     if not known.any() or found.unknowns.poses != "free" or found.unknowns.free_network:
         return []
     stated = float(np.median(found.block.gnss_sigma_m[known]))
-    offset = None if found.precision is None else offset_of(found)
+    offset = None if found.source == "cloud" else offset_of(found)
     return _weakness(found, stated) + ([] if offset is None else _beside(found, offset, stated))
 
 
 def _weakness(found: Adjusted, stated_m: float) -> list[str]:
-    places = found.block.gnss_xyz[np.isfinite(found.gnss_residual_m[:, :2]).all(axis=1)]
+    places, way = _line(found)
     control = sum(row.role == "control" for row in found.control)
     what = f"{len(places)} GNSS positions and {control} control points hold the block"
     remedy = "give positions of more images, spread over the block, or control points."
-    if found.precision is None:
+    if found.precision is None or found.source == "cloud":
         few = len(places) + control < FEW
         return [f"only {what} and say how much the cloud counts: {remedy}"] if few else []
     sigma = found.precision.centre_sigma_m.max(axis=1)
     if sigma.max() <= WEAK * stated_m:
         return []
-    spread = np.linalg.svd(places[:, :2] - places[:, :2].mean(axis=0), compute_uv=False)
-    line = ", the positions in a line" if spread[-1] < IN_LINE * spread[0] else ""
+    line = "" if way is None else ", the positions in a line"
     return [
         f"{what} weakly{line}: the standard error of its centres grows to {sigma.max():.2f} m"
         f" ({found.cameras.labels[int(sigma.argmax())]}), that of a position is {stated_m:.2f} m;"
         f" {remedy}"
     ]
+
+
+def _line(found: Adjusted) -> tuple[FloatArray, FloatArray | None]:
+    """Return the GNSS positions that count, and the direction of the line in which they lie."""
+    places = found.block.gnss_xyz[np.isfinite(found.gnss_residual_m[:, :2]).all(axis=1)]
+    if len(places) < 2:
+        return places, None
+    off = places[:, :2] - places[:, :2].mean(axis=0)
+    _, spread, ways = np.linalg.svd(off, full_matrices=False)
+    return places, np.append(ways[0], 0.0) if spread[1] < IN_LINE * spread[0] else None
+
+
+def bed_notes(found: Adjusted) -> list[str]:
+    """Return a sentence if the heights of the bed are known poorly: how, and what it comes from."""
+    precision, used = found.precision, np.zeros(len(found.xyz), np.bool_)
+    used[found.block.owner[found.used]] = True
+    bed = found.is_wet & used
+    if precision is None or precision.point_sigma_m is None or not bed.any():
+        return []
+    sigma_m = float(np.nanmedian(precision.point_sigma_m[bed, 2]))
+    focal = float(np.median([lens.focal for lens in found.cameras.lenses or ()]))
+    away_m = float(np.median(found.cameras.centres[:, 2]) - np.median(found.xyz[bed, 2]))
+    gsd = sigma_m / (away_m / focal)
+    if gsd < BED_GSD:
+        return []
+    why, (places, way) = "", _line(found)
+    of_focal = precision.sigma_of("f")
+    if way is not None and not any(row.role == "control" for row in found.control):
+        about = np.asarray(found.cameras.rotations) @ way
+        turn = np.einsum("ki,kij,kj->k", about, precision.pose_covariance[:, :3, :3], about)
+        tilt = np.degrees(np.sqrt(np.median(turn)))
+        why = (
+            f" The {len(places)} GNSS positions lie in a line, so the tilt across it is known to"
+            f" {tilt:.2f} degrees only: give control points beside it, or fly a second strip."
+        )
+    elif of_focal is not None and of_focal / focal * away_m > 0.5 * sigma_m:
+        why = (
+            f" Most of it is the focal length (standard error {of_focal:.2g}): give a calibrated"
+            " lens, or control points."
+        )
+    return [f"the heights of the bed are known to {sigma_m:.2f} m ({gsd:.1f} ground pixels).{why}"]
 
 
 def _beside(found: Adjusted, offset: Offset, stated_m: float) -> list[str]:

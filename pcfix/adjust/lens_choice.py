@@ -29,7 +29,11 @@ SURE = 1e-3
 
 WEAK_PX = 2.0
 """Standard error of the image at the corner of the frame above which a lens parameter is left as
-it was; the focal length always moves."""
+it was, if the residuals let it; the focal length always moves."""
+
+BENT = 0.05
+"""Probability at which weak parameters go as far for nothing. An unaware adjustment bends them too:
+one that is held there bends the block instead, and no standard error knows of it."""
 
 TRIED = ("b1", "k1", "k2", "k3", "p1", "p2")
 """What a lens may lack. The skew b2 is none of these: sensors have none, nor do COLMAP's lenses."""
@@ -47,15 +51,24 @@ def default_lens(lenses: tuple[Lens, ...]) -> tuple[str, ...]:
     )
 
 
-def weak_lens_parameters(problem: Problem, precision: Precision) -> list[str]:
-    """Return which lens parameters, the focal length apart, the block hardly determines."""
-    rows = iter(precision.shared)
+def weak_lens_parameters(problem: Problem, found: Solution, precision: Precision) -> list[str]:
+    """Return which lens parameters, the focal length apart, stay: the block hardly determines them.
+
+    None does where all of these went further together than chance takes them.
+    """
+    names = [NAMES[code] for codes in problem.codes for code in codes]
     effects = [
-        (NAMES[code], next(rows).sigma * effect_at_corner(_first_lens(problem, group), code))
+        effect_at_corner(_first_lens(problem, group), code)
         for group, codes in enumerate(problem.codes)
         for code in codes
     ]
-    return list(dict.fromkeys(name for name, by in effects if name != "f" and by > WEAK_PX))
+    sigma = np.array([row.sigma for row in precision.shared[: len(names)]])
+    by_px = zip(names, sigma * effects, strict=True)
+    weak = list(dict.fromkeys(name for name, by in by_px if name != "f" and by > WEAK_PX))
+    rows = np.flatnonzero(np.isin(names, weak))
+    went = found.shared[rows] / sigma[rows]
+    squares = went @ np.linalg.pinv(precision.correlation[np.ix_(rows, rows)]) @ went
+    return [] if squares > chdtri(max(len(rows), 1), BENT) else weak
 
 
 def effect_at_corner(lens: Lens, code: int) -> float:

@@ -18,6 +18,7 @@ from scipy.special import chdtri
 from pcfix.adjust.block import Block, Unknowns, plain_block
 from pcfix.adjust.gather import deeper, some_cameras, straight_images
 from pcfix.adjust.normal import residuals
+from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import (
     Problem,
     Progress,
@@ -140,10 +141,15 @@ def mend(
             " length may be off by more than all figures here say; give tie points, control points"
             " or a calibrated lens."
         )
-    found = adjusted_of(chosen.problem, chosen.found, None, notes, "cloud", "unaware")
     # the points of the cloud say nothing of noise: GNSS and control points are all there is
-    free = max(chosen.observations - 7, 1)
-    return replace(found, sigma0=float(np.sqrt(chosen.mean)), redundancy=free)
+    free, sigma0 = max(chosen.observations - 7, 1), float(np.sqrt(chosen.mean))
+    try:  # about as well as by tie points that are as good as the points of the cloud count
+        known = precision_of(chosen.problem, chosen.found, max(sigma0, 1.0))
+    except GeometryError as error:
+        known = None
+        notes.append(f"how well the poses are known is not: {error} SigmaZ goes without.")
+    found = adjusted_of(chosen.problem, chosen.found, known, notes, "cloud", "unaware")
+    return replace(found, sigma0=sigma0, redundancy=free)
 
 
 def _what_counts(chosen: Trial, lens_sets: list[tuple[str, ...]]) -> str:

@@ -13,6 +13,7 @@ from pcfix.adjust.lens_choice import missing_lens_parameters, weak_lens_paramete
 from pcfix.adjust.normal import residuals
 from pcfix.adjust.precision import Precision, precision_of
 from pcfix.adjust.problem import Problem, Progress, Solution, gnss_weights, prepare
+from pcfix.adjust.quality import weighed
 from pcfix.adjust.result import Adjusted, adjusted_of, sigma0_of
 from pcfix.adjust.solve import solve
 from pcfix.errors import GeometryError
@@ -69,7 +70,7 @@ def adjust_ties(
     problem, now, precision = _settled(clean, now, LAST_ROUND, estimate, progress)
     notes: list[str] = []
     if choose_lens:
-        weak = weak_lens_parameters(problem, precision)
+        weak = weak_lens_parameters(problem, now, precision)
         kept = [name for name in unknowns.lens if name not in weak]
         more = missing_lens_parameters(problem, now, sigma0_of(problem, now))
         notes = _lens_notes([*kept, *more], weak, more)
@@ -79,7 +80,8 @@ def adjust_ties(
     shared_errors = disagreement_of(problem, now, precision)
     factor = shared_errors.factor * common_errors(problem, precision)
     precision = precision_of(problem, now, precision.sigma0, factor)
-    notes += [*shared_errors.notes, *_left_out(problem)]
+    quality = weighed(clean, now, _of_ties(clean))[1] if estimate else []
+    notes += [*quality, *shared_errors.notes, *_left_out(problem)]
     return adjusted_of(problem, now, precision, notes, "tie points", "direct")
 
 
@@ -136,6 +138,7 @@ def _settled(
     """
     if estimate:
         problem = with_sigma(problem, noise_px(problem, now, robust=False))
+        problem = weighed(problem, now, _of_ties(problem))[0]
     now = solve(problem, now, "squares", number=number, progress=progress)
     return problem, now, precision_of(problem, now, sigma0_of(problem, now))
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from pcfix.adjust.block import CODES, Block, Unknowns, plain_block
-from pcfix.adjust.datum import datum_notes
+from pcfix.adjust.datum import bed_notes, datum_notes
 from pcfix.adjust.gather import (
     FIRST_SIGMA_PX,
     Material,
@@ -114,7 +114,7 @@ def by_ties(
         if found.origin is not None:
             wet = found.is_wet & np.isfinite(found.xyz).all(axis=1)
             notes += shape_doubts(found.precision, (found.xyz - found.origin)[wet, :2])
-    return replace(found, notes=[*notes, *datum_notes(found)])
+    return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])
 
 
 def by_cloud(
@@ -155,8 +155,8 @@ def by_cloud(
     if rules.lens_unknowns is None and material.calibrated is None:
         sets = list(dict.fromkeys([("f",), ("f", "cx", "cy"), *sets]))
     found = mend(candidates, unknowns_of(rules, sets[0]), sets, progress)
-    notes += [*_check_dry(material.water, found), *found.notes, *datum_notes(found)]
-    return replace(found, notes=notes)
+    notes += [*_check_dry(material.water, found), *found.notes]
+    return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])
 
 
 def _check_wet(water: WaterSurface | None, xyz: FloatArray) -> None:

@@ -45,8 +45,9 @@ def run(
             raise UsageError("with --config give OUT_DIR alone")
         request = request_of(config)
     else:
-        if None in (input, out_dir, options.cameras, options.water):
-            raise UsageError("INPUT, OUT_DIR, --cameras and --water are needed")
+        if None in (input, out_dir):
+            raise UsageError("INPUT and OUT_DIR are needed")
+        check_needed(options)
         values = {one.name: getattr(options, one.name) for one in options_of(RunOptions)}
         request, folder = Request(input=str(input), **values), out_dir
     with progress_bar("Correcting", quiet) as progress:

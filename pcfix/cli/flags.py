@@ -43,6 +43,7 @@ def check_needed(options: OptionSet, *, water: bool = True) -> None:
     """Refuse a command without the options that it needs; `water` tells whether that is one."""
     for one in options_of(type(options)):
         wanted = one.needed and (water or one.name != "water")
+        wanted = wanted and (one.name != "cameras" or getattr(options, "needs_cameras", True))
         if wanted and getattr(options, one.name) is None:
             raise UsageError(f"{one.flag} is needed")
 
@@ -59,15 +60,16 @@ def _type(one: Option) -> Any:
 
 
 def _parameter(one: Option) -> Parameter:
-    default = one.default_text
+    default = "" if one.needed else one.default_text
     has_opposite = one.type is bool and (one.default or one.name == "connected")
     return Parameter(
-        help=f"{one.help_text}{' (needed)' if one.needed else ''}",
+        help=f"{one.help_text}{f' ({one.needed_text})' if one.needed else ''}",
         group=_GROUPS[one.panel],
         negative_bool="no-" if has_opposite else (),
         negative_none="no-" if one.name in ("below", "floating") else (),
         negative_iterable=(),
         allow_repeating=True,  # the last one counts
+        allow_leading_hyphen=one.metavar in ("X,Y,Z", "X,Y,X,Y", "LOW,HIGH"),  # below zero
         show=not one.hidden,
         show_default=(lambda value: default) if default else False,
     )

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 
+from pcfix.compare.c2c import AfterBefore, Further, both, c2c_of, far_of, further_of, sparse_notes
 from pcfix.compare.m3c2 import M3c2, m3c2_distances
 from pcfix.compare.match import Match
-from pcfix.compare.nearest import cloud_to_cloud
 from pcfix.compare.sections import Section, SectionLine, lines_downslope, section_along
 from pcfix.compare.statistics import (
     Bin,
@@ -33,9 +33,6 @@ from pcfix.errors import GeometryError
 from pcfix.model import BoolArray, FloatArray
 from pcfix.options.steps import CompareRules
 
-Given = TypeVar("Given")
-Figure = TypeVar("Figure")
-
 
 @dataclass(frozen=True, slots=True)
 class Counts:
@@ -49,14 +46,7 @@ class Counts:
     not_submerged: int
     compared: int
     by_nearest: int
-
-
-@dataclass(frozen=True, slots=True)
-class AfterBefore(Generic[Figure]):
-    """A figure after the correction and, where the cloud says where its points were, before."""
-
-    after: Figure
-    before: Figure | None
+    reference_compared: int  # with C2C from the reference
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,8 +59,13 @@ class Comparison:
     measured_at : {"cloud", "reference"}
         Whether each point of the cloud was compared, or each check point.
     counts : Counts
-    c2c : AfterBefore of Distribution
-        To the nearest point, without sign.
+    c2c : AfterBefore of Distribution, or None
+        From each point of the cloud to the nearest of the reference, without sign; from each check
+        point to the nearest of the cloud. None with ``direction="from-reference"``.
+    c2c_from_reference : AfterBefore of Distribution, or None
+        From each point of the reference to the nearest of the cloud, where that was asked for.
+    also : tuple of Further
+        C2C of the further clouds.
     vertical : AfterBefore of Distribution, or None
         Signed, along the vertical.
     bed, land : AfterBefore of Statistics, or None
@@ -93,7 +88,9 @@ class Comparison:
     reference: str
     measured_at: Literal["cloud", "reference"]
     counts: Counts
-    c2c: AfterBefore[Distribution]
+    c2c: AfterBefore[Distribution] | None
+    c2c_from_reference: AfterBefore[Distribution] | None
+    also: tuple[Further, ...]
     vertical: AfterBefore[Distribution] | None
     bed: AfterBefore[Statistics] | None
     land: AfterBefore[Statistics] | None
@@ -164,28 +161,33 @@ MIN_REACH_M, REACH_FACTOR = 1.0, 1.5
 """M3C2 looks along the normal beyond nearly all differences: 1.5 times their 99th percentile."""
 
 
-def figures_of(match: Match, lines: Sequence[SectionLine], started: float) -> Comparison:
+def figures_of(
+    match: Match, lines: Sequence[SectionLine], started: float, others: Mapping[str, Match]
+) -> Comparison:
     """Return all figures that the settings ask for.
 
     The cross-sections along `lines` come beside the automatic ones; the comparison `started` at a
-    time of `time.perf_counter`. A `GeometryError` if there are too few points for planes, or M3C2
-    finds nothing.
+    time of `time.perf_counter`; `others` are further clouds by name. A `GeometryError` if there are
+    too few points for planes, or M3C2 finds nothing.
     """
-    notes, clouds = _notes(match), (match.cloud.xyz, match.apparent)
+    notes, c2c = _notes(match), c2c_of(match)
+    notes += sparse_notes(match, c2c)
     pairs = None
     if match.settings.vertical:
         _check_enough(match)
-        pairs = _both(partial(_pairs, match), *clouds)
+        pairs = both(partial(_pairs, match), match.cloud.xyz, match.cloud.apparent)
     of_depth = _by_depth(match, pairs, notes)
     return Comparison(
         cloud=match.whole.name,
         reference=match.reference.name,
         measured_at="reference" if match.reference.sparse else "cloud",
         counts=_counts(match, pairs),
-        c2c=_both(lambda xyz: distribution_of(_c2c(match, xyz)), *clouds),
+        c2c=c2c.to_reference,
+        c2c_from_reference=c2c.from_reference,
+        also=further_of(others),
         vertical=None
         if pairs is None
-        else _both(lambda p: distribution_of(p.error_m), pairs.after, pairs.before),
+        else both(lambda p: distribution_of(p.error_m), pairs.after, pairs.before),
         bed=of_depth.bed,
         land=of_depth.land,
         depth=of_depth.fits,
@@ -193,17 +195,11 @@ def figures_of(match: Match, lines: Sequence[SectionLine], started: float) -> Co
         shore_bins=of_depth.shore_bins,
         tvu=of_depth.tvu,
         m3c2=_m3c2(match, pairs),
-        sections=_sections(match, lines),
+        sections=_sections(match, lines, others),
         settings=match.settings,
         notes=tuple(notes),
         seconds=round(time.perf_counter() - started, 3),
     )
-
-
-def _both(
-    figure: Callable[[Given], Figure], after: Given, before: Given | None
-) -> AfterBefore[Figure]:
-    return AfterBefore(figure(after), None if before is None else figure(before))
 
 
 def _check_enough(match: Match) -> None:
@@ -223,12 +219,6 @@ def _pairs(match: Match, xyz: FloatArray) -> Pairs:
     if match.reference.sparse:
         return pairs_at_reference(xyz, match.places, k)
     return pairs_at_cloud(xyz, match.reference.xyz, k)
-
-
-def _c2c(match: Match, xyz: FloatArray) -> FloatArray:
-    if match.reference.sparse:
-        return cloud_to_cloud(match.places, xyz)
-    return cloud_to_cloud(xyz, match.reference.xyz)
 
 
 @dataclass(frozen=True)
@@ -284,7 +274,7 @@ def _errors_of(pairs: AfterBefore[Pairs], rows: BoolArray) -> AfterBefore[Statis
     """Return what the vertical errors of some places are; None without any."""
     if not rows.any():
         return None
-    return _both(lambda p: statistics_of(p.error_m[rows]), pairs.after, pairs.before)
+    return both(lambda p: statistics_of(p.error_m[rows]), pairs.after, pairs.before)
 
 
 def _ratio(depth_m: FloatArray, error_m: FloatArray) -> float:
@@ -297,24 +287,27 @@ def _m3c2(match: Match, pairs: AfterBefore[Pairs] | None) -> AfterBefore[M3c2] |
     if not match.settings.m3c2:
         return None
     if pairs is None:
-        far = _c2c(match, match.cloud.xyz)
+        far = far_of(match, match.cloud.xyz)
     else:
         far = np.abs((pairs.before or pairs.after).error_m)
     reach = max(MIN_REACH_M, REACH_FACTOR * float(np.percentile(far, 99)))
-    target = match.reference.xyz
-    return _both(lambda xyz: m3c2_distances(xyz, target, reach), match.cloud.xyz, match.apparent)
+    cloud, target = match.cloud, match.reference.xyz
+    return both(lambda xyz: m3c2_distances(xyz, target, reach), cloud.xyz, cloud.apparent)
 
 
-def _sections(match: Match, lines: Sequence[SectionLine]) -> tuple[Section, ...]:
+def _sections(
+    match: Match, lines: Sequence[SectionLine], others: Mapping[str, Match]
+) -> tuple[Section, ...]:
     """Return the cross-sections that were asked for."""
     if match.settings.sections:
         bed = match.cloud.xyz[match.wet] if match.wet.any() else match.cloud.xyz
         lines = [*lines, *lines_downslope(bed, match.settings.sections)]
     layers = {
         "water": match.water_points,
-        "apparent": match.apparent,
+        "apparent": match.cloud.apparent,
         "corrected": match.cloud.xyz,
         "reference": match.reference.xyz,
+        **{name: other.cloud.xyz for name, other in others.items()},
     }
     known = {name: xyz for name, xyz in layers.items() if xyz is not None and len(xyz)}
     return tuple(section_along(line, known, match.settings.corridor) for line in lines)
@@ -331,6 +324,7 @@ def _counts(match: Match, pairs: AfterBefore[Pairs] | None) -> Counts:
         not_submerged=match.not_submerged,
         compared=len(match.places) if reference.sparse else len(match.cloud),
         by_nearest=0 if pairs is None else int(pairs.after.by_nearest.sum()),
+        reference_compared=len(match.places) if match.settings.from_reference else 0,
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pcfix.compare.nearest import Neighbours, mean_spacing_m
-from pcfix.errors import GeometryError, InputError
+from pcfix.errors import GeometryError, InputError, SettingError
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import CompareRules
 
@@ -33,6 +33,11 @@ class SurveyCloud:
     def __len__(self) -> int:
         return len(self.xyz)
 
+    @cached_property
+    def apparent(self) -> FloatArray | None:
+        """Where the points were before the correction, shape (n, 3), metres."""
+        return None if self.shift_m is None else self.xyz - self.shift_m
+
     def take(self, rows: BoolArray) -> SurveyCloud:
         """Return the cloud with these rows alone."""
         return replace(
@@ -53,6 +58,7 @@ class Reference:
     crs: Any  # pyproj.CRS or None
     left_out: int = 0  # points withheld, of noise, or of water; cells without data
     sparse: bool = False  # whether these are single check points, not a sampled surface
+    raster: bool = False  # whether these are the centres of cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,14 +71,10 @@ class Match:
     dry_xy: FloatArray  # (d, 2), where the whole cloud is above the water, metres
     reference: Reference
     places: FloatArray  # (p, 3), points of the reference that the cloud reaches, metres
-    outside: int  # points that were not chosen, as the next
+    asked: SurveyCloud  # of the cloud, the points that may be the nearest to one of these
+    outside: int  # points that were not chosen, as the next; check points where that is what counts
     not_submerged: int
     settings: CompareRules
-
-    @cached_property
-    def apparent(self) -> FloatArray | None:
-        """Where the points were before the correction, shape (n, 3), metres."""
-        return None if self.cloud.shift_m is None else self.cloud.xyz - self.cloud.shift_m
 
     @cached_property
     def water_points(self) -> FloatArray:
@@ -100,8 +102,9 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
 
     Where the user has `given` the water surface it counts, else what the cloud says, its classes
     too. A `PcfixError` if nothing is under water where that was asked for, or the two do not
-    overlap.
+    overlap, or C2C is wanted in a direction that the reference does not have.
     """
+    _check_direction(target, settings)
     below = whole.xyz[:, 2] < whole.water_m
     wet = below if given else whole.bathymetric | below
     chosen = wet if settings.submerged else np.ones(len(whole), np.bool_)
@@ -111,30 +114,49 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
             " --water, or compare without --submerged."
         )
     not_submerged = int(len(whole) - chosen.sum())
+    places, near = target.xyz, chosen
+    if target.sparse or settings.from_reference:
+        gap = _gap(whole.xyz, settings)
+        places = places[near_in_plan(places[:, :2], whole.xyz[chosen, :2], gap)]
     if target.sparse:
-        held = near_in_plan(target.xyz[:, :2], whole.xyz[chosen, :2], _gap(whole.xyz, settings))
-        near, places = chosen, target.xyz[held]
-        outside = int((~held).sum())
+        outside = len(target.xyz) - len(places)
     else:
-        near = chosen & near_in_plan(
-            whole.xyz[:, :2], target.xyz[:, :2], _gap(target.xyz, settings)
-        )
-        places, outside = target.xyz, int(chosen.sum() - near.sum())
+        gap = _gap(target.xyz, settings)
+        near = chosen & near_in_plan(whole.xyz[:, :2], target.xyz[:, :2], gap)
+        outside = int(chosen.sum() - near.sum())
     if not (near.any() and len(places)):
         raise GeometryError(
             f"{whole.name} and {target.name} do not overlap in plan: the points to compare lie in"
             f" {_bounds(whole.xyz[chosen])}, the reference in {_bounds(target.xyz)}; check the"
             " CRS of both."
         )
+    cloud = whole.take(near)
+    asked = whole.take(chosen) if settings.from_reference and not target.sparse else cloud
     found = Match(
-        whole, whole.take(near), wet[near], whole.xyz[~wet, :2], target, places, outside,
+        whole, cloud, wet[near], whole.xyz[~wet, :2], target, places, asked, outside,
         not_submerged, settings,
     )  # fmt: skip
-    return _only_wet_places(found) if target.sparse and settings.submerged else found
+    by_place = target.sparse or settings.from_reference
+    return _only_wet_places(found) if by_place and settings.submerged else found
+
+
+def _check_direction(target: Reference, settings: CompareRules) -> None:
+    """Refuse C2C that a reference is not made for."""
+    if target.raster and settings.from_reference:
+        raise SettingError(
+            f"{target.name}: is a raster, whose cells are no measured points, and --direction"
+            f" {settings.direction} starts at those of the reference; give the reference as points"
+            " (.las, .laz), or leave --direction out."
+        )
+    if target.sparse and settings.direction not in (None, "from-reference"):
+        raise SettingError(
+            f"{target.name}: holds check points, too far apart to be the nearest ones of a cloud;"
+            f" give --direction from-reference instead of {settings.direction}, or leave it out."
+        )
 
 
 def _only_wet_places(found: Match) -> Match:
-    """Leave out check points above the water, where the water is known."""
+    """Leave out points of the reference above the water, where the water is known."""
     surface = found.water_at(found.places[:, :2])
     if surface is None:
         return found
@@ -142,10 +164,12 @@ def _only_wet_places(found: Match) -> Match:
     if not wet.any():
         raise GeometryError(
             f"{found.reference.name}: no check point is under water; compare without --submerged."
+            if found.reference.sparse
+            else f"{found.reference.name}: no point near the cloud is under water; compare without"
+            " --submerged."
         )
-    return replace(
-        found, places=found.places[wet], not_submerged=found.not_submerged + int((~wet).sum())
-    )
+    dry = int((~wet).sum()) if found.reference.sparse else 0
+    return replace(found, places=found.places[wet], not_submerged=found.not_submerged + dry)
 
 
 def _gap(xyz: FloatArray, settings: CompareRules) -> float:

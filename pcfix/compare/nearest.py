@@ -8,6 +8,7 @@ close together, and gives up where a neighbour is many rings away.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -36,6 +37,16 @@ class Cells(NamedTuple):
 
 def build_cells(points: FloatArray) -> Cells:
     """Sort points (m, 3), metres, into cells."""
+    low, extent, side = _lattice(points)
+    columns, rows = (int(n) + 1 for n in extent / side)
+    start, order = sorted_by_cell(cell_of(points, low, side, columns, rows), columns * rows)
+    arranged = np.empty((len(order), 3))
+    in_tiles(_gather, len(order), points, order, arranged)
+    return Cells(low, side, columns, rows, start, arranged, _z_range(start, arranged))
+
+
+def _lattice(points: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return the corner and the extent of points, and the side of their cells."""
     low = np.array([points[:, 0].min(), points[:, 1].min()])
     extent = np.array([points[:, 0].max(), points[:, 1].max()]) - low
     side = _side(extent, len(points) / POINTS_PER_CELL)
@@ -43,11 +54,12 @@ def build_cells(points: FloatArray) -> Cells:
     taken = np.count_nonzero(np.bincount(cell_of(points, low, side, columns, rows)))
     # a cloud that fills little of its bounding box gets smaller cells
     side = max(side * np.sqrt(taken * POINTS_PER_CELL / len(points)), _side(extent, MAX_CELLS))
-    columns, rows = (int(n) + 1 for n in extent / side)
-    start, order = sorted_by_cell(cell_of(points, low, side, columns, rows), columns * rows)
-    arranged = np.empty((len(order), 3))
-    in_tiles(_gather, len(order), points, order, arranged)
-    return Cells(low, side, columns, rows, start, arranged, _z_range(start, arranged))
+    return low, extent, float(side)
+
+
+def spacing_m(points: FloatArray) -> float:
+    """Return the side of the square that each point (n, 3) has, where there are points, metres."""
+    return _lattice(points)[2] / math.sqrt(POINTS_PER_CELL)
 
 
 def _side(extent: FloatArray, cells: float) -> float:

@@ -57,8 +57,8 @@ class Section:
     distance_m : array, shape (s,)
         Stations, from the start of the line.
     heights_m : dict of array, shape (s,)
-        World Z of ``water``, ``apparent``, ``corrected`` and ``reference``, as far as known; NaN
-        where the corridor is empty.
+        World Z of ``water``, ``apparent``, ``corrected`` and ``reference``, as far as known, and of
+        further clouds by name; NaN where the corridor is empty.
     """
 
     line: SectionLine

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -73,12 +75,22 @@ class Statistics:
 
 
 @dataclass(frozen=True, slots=True)
+class Share:
+    """The share of a sample, 0 to 1, from one value up to, and without, another."""
+
+    low_m: float
+    high_m: float
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
 class Distribution:
     """Statistics of a sample with its histogram and the fitted normal distribution."""
 
     statistics: Statistics
     histogram: Histogram
     normal: Normal
+    shares: tuple[Share, ...] = ()
 
 
 def statistics_of(values: FloatArray) -> Statistics:
@@ -107,6 +119,23 @@ def distribution_of(values: FloatArray) -> Distribution:
     """Return statistics, histogram and fitted normal distribution of a sample, shape (n,), m."""
     statistics, histogram = statistics_of(values), histogram_of(values)
     return Distribution(statistics, histogram, normal_of(statistics, histogram))
+
+
+def distances_of(
+    values: FloatArray, classes: int | None, bands: Iterable[tuple[float, float]]
+) -> Distribution:
+    """Return the same of distances, with the histogram that CloudCompare draws, and shares.
+
+    The histogram has all values, shape (n,), metres; without a number of classes it has the square
+    root of n, rounded up. A band is from its lower bound up to, and without, its upper one, m.
+    """
+    plain = distribution_of(values)
+    counts, edges = np.histogram(values, classes or math.ceil(math.sqrt(len(values))))
+    shares = [
+        Share(low, high, float(np.mean((values >= low) & (values < high)))) for low, high in bands
+    ]
+    histogram = Histogram(edges.tolist(), counts.tolist(), 0, 0)
+    return replace(plain, histogram=histogram, shares=tuple(shares))
 
 
 def histogram_of(values: FloatArray) -> Histogram:

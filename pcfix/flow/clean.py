@@ -23,7 +23,7 @@ from pcfix.flow.surfaces import find_surface, points_of, view_of
 from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
-from pcfix.io.las.writing import cleaning_vlr, noted_header
+from pcfix.io.las.writing import cleaning_vlr, noted_header, own_settings
 from pcfix.kernels import threads
 from pcfix.model import LOW_NOISE, NOISE_CLASSES
 from pcfix.options.declare import File, taken
@@ -105,8 +105,9 @@ class Cleaning(Step):
 
     def find(self, tile_m: float | None, empty: Empty) -> None:
         """Read the cloud and run the tests, with arrays on disk for what is large."""
-        jobs, rules = self._task.jobs, self._rules
+        jobs = self._task.jobs
         with LasSource(self._task.source, jobs) as source:
+            self._rules = rules = self._rules_of(source)
             names = set(source.header.point_format.dimension_names)
             n = len(source)
             used, submerged, reasons = (np.zeros(n, kind) for kind in (bool, bool, np.uint8))
@@ -121,8 +122,19 @@ class Cleaning(Step):
             submerged[:] = False
         resources = Resources(tile_m, empty, jobs, self._count)
         self._distance_m = flag_neighbours(str(source.path), self.cloud, rules, resources)
-        self._not_run = self._tests_not_run(names)
+        self._not_run += self._tests_not_run(names)
         self.cloud = self.cloud._replace(xyz=np.zeros((0, 3)))  # gives the disk back
+
+    def _rules_of(self, source: LasSource) -> CleanRules:
+        """Return the rules without those about rays, where a cloud was corrected without any."""
+        try:
+            ours = own_settings(source.vlrs) or {}
+        except ValueError:  # whoever needs it says so
+            ours = {}
+        if ours.get("cameras") != 0 or not self._rules.weak:
+            return self._rules
+        self._not_run = ["few rays, ray miss, incidence: the cloud was corrected without cameras"]
+        return replace(self._rules, weak=False)
 
     def _count(self, points: int) -> None:
         """Report so many more points of a pass."""

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pcfix.compare.figures import Comparison, bins_table, figures_of
 from pcfix.compare.m3c2 import load_py4dgeo
-from pcfix.compare.match import match
+from pcfix.compare.match import Match, match
 from pcfix.compare.sections import parse_line
 from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_summary
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference
-from pcfix.io.files import check_input, check_output, write_text
+from pcfix.io.files import check_input, check_output, write_bytes, write_text
+from pcfix.model import WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CompareOptions, CompareRules
@@ -39,7 +43,8 @@ def compare_clouds(
         Or its attributes as keywords, as of ``pcfix compare``: out_dir (a folder for
         ``compare.json``, ``depth_bins.csv``, ``shore_bins.csv`` and ``section_*.csv``, made where
         its parent exists), submerged, water, m3c2, section (texts ``x1,y1,x2,y2`` or
-        `pcfix.compare.sections.SectionLine`) and others.
+        `pcfix.compare.sections.SectionLine`), direction, share (texts or pairs), also (texts, pairs
+        or a dict of paths by name) and others.
 
     Returns
     -------
@@ -53,7 +58,7 @@ def compare_clouds(
     started = time.perf_counter()
     given = taken(CompareOptions, options, keywords, "compare_clouds")
     lines = [parse_line(line) if isinstance(line, str) else line for line in given.section]
-    _check_outputs(given, [cloud, reference])
+    _check_outputs(given, [cloud, reference, *(path for _, path in given.also)])
     if given.m3c2:
         load_py4dgeo()
     water = None
@@ -65,9 +70,24 @@ def compare_clouds(
     target, whole = read_reference(reference), read_cloud(cloud, water)
     check_same_crs(whole.name, whole.crs, target.name, target.crs)
     matched = match(whole, target, given.part(CompareRules), given=water is not None)
-    result = figures_of(matched, lines, started)
+    others = {name: _further(path, water, matched) for name, path in given.also}
+    result = figures_of(matched, lines, started, others)
     _write(result, given)
     return result
+
+
+def _further(path: File, water: WaterSurface | None, first: Match) -> Match:
+    """Choose the points of a further cloud, and ask it at the same places as the first.
+
+    What it does not know of the water, the first does.
+    """
+    cloud, target = read_cloud(path, water), first.reference
+    check_same_crs(cloud.name, cloud.crs, target.name, target.crs)
+    over = first.water_at(cloud.xyz[:, :2]) if first.settings.submerged else None
+    if over is not None:
+        cloud = replace(cloud, water_m=np.where(np.isnan(cloud.water_m), over, cloud.water_m))
+    found = match(cloud, target, first.settings, given=water is not None)
+    return replace(found, places=first.places)
 
 
 def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:
@@ -82,6 +102,8 @@ def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:
         if folder.is_dir():
             for path in [*(folder / name for name in names), *folder.glob("section_*.csv")]:
                 check_output(path, overwrite=given.overwrite, inputs=inputs)
+    if given.plot is not None:
+        check_output(given.plot, overwrite=given.overwrite, inputs=inputs)
     check_summary(given, inputs)
 
 
@@ -98,4 +120,10 @@ def _write(result: Comparison, given: CompareOptions) -> None:
         for path in folder.glob("section_*.csv"):  # of an earlier comparison with more of them
             if path.name not in files:
                 path.unlink()
+    if given.plot is not None:
+        from pcfix.report.c2c import c2c_figure
+        from pcfix.report.page import png_of
+
+        picture = png_of(c2c_figure(result.as_dict()))
+        write_bytes(given.plot, picture, overwrite=given.overwrite)
     write_summary(given, result.as_dict())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.adjust.carry import Carrying
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.inputs import paths_in
 from pcfix.flow.job import Job
 from pcfix.flow.old_cameras import paired
@@ -19,13 +20,22 @@ from pcfix.flow.through_water import Label, correct_checked
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps
 from pcfix.io.las.writing import corrected_header
+from pcfix.io.regressions import read_regression
 from pcfix.kernels import threads
-from pcfix.model import BATHYMETRIC_POINT, Cameras, Correction, FloatArray, Views, WaterSurface
+from pcfix.model import (
+    BATHYMETRIC_POINT,
+    NO_CAMERAS,
+    Cameras,
+    Correction,
+    FloatArray,
+    Views,
+    WaterSurface,
+)
 from pcfix.options.correct import CorrectOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import File, taken
 from pcfix.refract.batch import Batch, MadeWith, Survey
 from pcfix.refract.learning import learn_of_points
-from pcfix.refract.regression import DepthRegression
+from pcfix.refract.regression import BeyondRange, DepthRegression
 from pcfix.refract.tally import Summary
 from pcfix.water.checks import as_surface, check_above_water, checked_points
 from pcfix.water.index import with_index
@@ -34,7 +44,7 @@ from pcfix.water.surface import is_submerged, surface_above
 
 def correct_points(
     xyz: npt.ArrayLike,
-    cameras: Cameras,
+    cameras: Cameras | None,
     water: WaterSurface | float | npt.ArrayLike,
     *,
     options: RefractionOptions | None = None,
@@ -42,7 +52,7 @@ def correct_points(
     may_be_submerged: npt.ArrayLike | None = None,
     level_offset_m: npt.ArrayLike | None = None,
     adjusted_from: Cameras | None = None,
-    regression: DepthRegression | None = None,
+    regression: DepthRegression | File | None = None,
     **keywords: Any,
 ) -> Correction:
     """Correct apparent points for refraction at the water surface.
@@ -52,8 +62,9 @@ def correct_points(
     xyz : array, shape (n, 3)
         Points as the SfM software placed them, metres, world frame. Those below the water
         surface are moved, the others come back bit for bit.
-    cameras : Cameras
-        Poses in the same frame; see `pcfix.read_cameras`.
+    cameras : Cameras or None
+        Poses in the same frame; see `pcfix.read_cameras`. The methods factor and regression do
+        without: then no point has rays, an incidence or, with factor, a standard error.
     water : WaterSurface, float, or array of shape (n,)
         The water surface (see `pcfix.read_water`), its level in metres, or its height above
         each point, NaN where it is not known.
@@ -76,8 +87,8 @@ def correct_points(
         Those that the points were made with, in the same frame, where `cameras` are the same
         images (matched by their labels) adjusted since. All points, land too, are first taken
         from those to these; see `pcfix.adjust.carry`.
-    regression : DepthRegression, optional
-        With the method regression; see `pcfix.refract.regression`.
+    regression : DepthRegression or path, optional
+        With the method regression: see `pcfix.refract.regression`, or the file of a line.
 
     Returns
     -------
@@ -111,6 +122,14 @@ def correct_points(
     """
     given = taken(RefractionOptions, options, keywords, "correct_points", occlusion="off")
     settings = with_index(given.part(ScienceOptions))
+    if not cameras:
+        given.check_no_cameras()
+        if not (views is None and level_offset_m is None and adjusted_from is None):
+            raise SettingError(
+                "views, level_offset_m and adjusted_from are about cameras, and there are none:"
+                " leave them out, or give cameras too."
+            )
+    cameras = cameras or NO_CAMERAS
     points = checked_points(xyz)
     surface, dimension = as_surface(water, len(points))
     offset = None if level_offset_m is None else _offsets(level_offset_m, len(cameras))
@@ -126,7 +145,15 @@ def correct_points(
         points, views, label = step.xyz, step.views, step.rule(label)
     above = surface_above(surface, points, dimension)
     batch = Batch(points, above, Survey(surface, cameras, settings, offset), views, made_with)
-    found = correct_checked(learn_of_points(batch, regression), label)
+    line = regression
+    if line is not None and not isinstance(line, DepthRegression):
+        line = read_regression(line)
+    found = correct_checked(learn_of_points(batch, line), label)
+    if line is not None and line is not regression:
+        beyond = BeyondRange(line)
+        beyond.add((above.height_m - points[:, 2])[found.submerged])
+        for note in (*line.notes, *beyond.notes()):
+            warnings.warn(note, PcfixWarning, stacklevel=2)
     return found if step is None else step.whole(found)
 
 
@@ -196,6 +223,7 @@ def correct_file(
     with threads(given.jobs), step.job.compiling():
         step.job.look_around(lambda: file_points(task.source, step.job.water, given.jobs))
         _run_until_it_fits(task, step)
+    step.job.save_regression()
     result = step.job.summary(str(task.source), str(task.target), task.seconds)
     task.tell(result.as_dict())
     return result

@@ -17,6 +17,7 @@ from pcfix.flow.surfaces import CloudView, Points
 from pcfix.flow.through_port import ThroughPort
 from pcfix.flow.through_water import ThroughWater
 from pcfix.io.cameras.mistakes import likely_mistake
+from pcfix.io.regressions import write_regression
 from pcfix.kernels import cores
 from pcfix.label.labelling import Labelling
 from pcfix.model import Correction, Outcome, WaterSurface
@@ -122,6 +123,12 @@ class Job:
             mistake = f" {found}" if found else ""
             raise GeometryError(f"{self.name}: {self.medium.out_of_sight(tally)}{mistake}")
         self.medium.look_back()
+
+    def save_regression(self) -> None:
+        """Write the line that was fitted, where a file was named for it."""
+        path, line = self.options.save_regression, self.medium.regression
+        if path is not None and line is not None:
+            write_regression(path, line, overwrite=self.options.overwrite)
 
     def summary(self, input: str, output: str, seconds: float) -> Summary:
         """Return the numbers of all chunks."""

@@ -7,12 +7,14 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from itertools import repeat
+from pathlib import Path
 
 import numpy as np
 
 from pcfix.errors import GeometryError, PcfixWarning, SettingError
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.surfaces import CloudView, Points, parts_of
+from pcfix.io.regressions import read_regression
 from pcfix.io.tables import CheckDepths, read_check_depths
 from pcfix.label.labelling import Part
 from pcfix.model import NOISE_CLASSES, BoolArray, FloatArray, IntArray, TiePoints, ViewKind
@@ -29,6 +31,7 @@ from pcfix.refract.learning import (
     resolved,
     seen_flat,
     wants_sample,
+    with_factor,
     with_matcher,
 )
 from pcfix.refract.occlusion import Occluder
@@ -83,11 +86,7 @@ class Learning:
         settings = resolved(survey.settings, survey.cameras, views)
         self.survey = replace(survey, settings=settings)
         check_method(settings, survey.cameras)
-        if (settings.method == "regression") != (inputs.check_depths is not None):
-            raise SettingError(
-                "method regression needs check-depths, a CSV of measured depths, and check-depths"
-                " are of no use without it; give both, or neither."
-            )
+        _check_regression(settings.method, inputs)
 
     def of_cloud(
         self,
@@ -109,6 +108,11 @@ class Learning:
         if not (some_listed or wants_sample(settings, cameras, self._views)):
             return self.survey
         sample, ties = self._sample(chunks, makers), self._ties()
+        sample, factor = with_factor(sample)
+        if factor is not None:
+            self.notes.append(str(factor))
+            self.survey = sample.survey
+            self._given = replace(self._given, depth_factor=factor.factor)
         self._note_corrected(sample, ties)
         points, hint = self._view.points, hint_of((self._view.software, cameras.source))
         if self._views is None:
@@ -159,15 +163,24 @@ class Learning:
         return [f"The list is of a part of the cloud: the rest is corrected as without one. {so}"]
 
     def _regression(self, chunks: Callable[[], Iterable[Points]]) -> DepthRegression | None:
-        path = self._inputs.check_depths
-        if path is None:
+        path, water, where = self._inputs.check_depths, self.survey.water, ""
+        if self._inputs.regression is not None:
+            found = read_regression(self._inputs.regression)
+            where = (
+                f" It is that of {self._inputs.regression}"
+                + (f", fitted to {found.source}" if found.source else "")
+                + "; that it holds for this cloud too is not checked."
+            )
+        elif path is not None:
+            found = learn_regression(path, parts_of(chunks(), water), self.survey.settings)
+            source = f"{Path(path).name} on {Path(self._view.name).name}, water {water}"
+            found = replace(found, source=source)
+        else:
             return None
-        parts = parts_of(chunks(), self.survey.water)
-        found = learn_regression(path, parts, self.survey.settings)
         again = "" if found.cv_rmse_m is None else f", cross-validated {found.cv_rmse_m:.3f} m"
         self.notes += [
             f"Regression: {found}; standard errors {found.intercept_se_m:.3f} m and"
-            f" {found.slope_se:.3f}, RMSE {found.rmse_m:.3f} m{again}.",
+            f" {found.slope_se:.3f}, RMSE {found.rmse_m:.3f} m{again}.{where}",
             *found.notes,
         ]
         return found
@@ -205,6 +218,21 @@ class Learning:
             taken.append(Batch(xyz[rows], above, survey, made_with=of_rows, source=source))
             done += len(xyz)
         return stacked(taken)
+
+
+def _check_regression(method: str, inputs: Inputs) -> None:
+    """Refuse check depths, or a line, without the method; the method without either; both."""
+    given = [n for n in ("check_depths", "regression") if getattr(inputs, n) is not None]
+    if len(given) == 2:
+        raise SettingError(
+            "check-depths and regression exclude each other: a line is fitted, or taken from a"
+            " file; give one of the two."
+        )
+    if (method == "regression") != bool(given):
+        raise SettingError(
+            "method regression needs check-depths, a CSV of measured depths, or regression, the"
+            " line of another cloud, and these are of no use without it; give both, or neither."
+        )
 
 
 def _ties_of(inputs: Inputs, view: CloudView) -> TiePoints | None:

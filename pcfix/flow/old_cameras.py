@@ -14,7 +14,7 @@ from pcfix.adjust.carry import Pair, pair_of, renumbered
 from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
 from pcfix.io.labels import match_labels
 from pcfix.io.views import ViewList, ViewMatch, ViewReport
-from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, Views
+from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints, Views
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -73,8 +73,9 @@ def _rows(old: tuple[str, ...], new: tuple[str, ...]) -> IntArray:
 class Blocks(NamedTuple):
     """What a correction has of cameras.
 
-    cameras : the ones to correct with; views : the list of the cloud, where there is one; listed :
-    the cameras that it counts, which made the cloud; pair : where the two are not the same.
+    cameras : the ones to correct with, `NO_CAMERAS` where none are given; views : the list of the
+    cloud, where there is one; listed : the cameras that it counts, which made the cloud; pair :
+    where the two are not the same.
     """
 
     cameras: Cameras
@@ -91,6 +92,8 @@ def read_blocks(inputs: Inputs, cloud_crs: str | CRS | None) -> Blocks:
     PcfixError
         If a file cannot be read or does not fit, or the two models are not of one block.
     """
+    if not inputs.cameras:
+        return Blocks(NO_CAMERAS, None, NO_CAMERAS, None)
     if inputs.adjusted_from is None:
         cameras, views = inputs.block(cloud_crs)
         return Blocks(cameras, views, cameras, None)

@@ -29,17 +29,23 @@ from pcfix.simulate.refraction_effect import (
     APPARENT_DEPTHS_M,
     FLYING_HEIGHTS_M,
     OVERLAP,
+    OVERLAPS,
+    PAPER_INDEX,
     AerialCamera,
     Effect,
+    StereoPair,
     effects,
     shan_iterations,
 )
 from pcfix.version import __version__
 from pcfix.water.index import index_of
 
+HEIGHTS_M = (50.0, 100.0, 200.0)
+"""Above the water, of a camera of one's own."""
 PUBLISHED = (
     "published (Skarlatos & Agrafiotis 2018) for the SwingletCAM from 100 m, 80 %, 15 m: centre"
-    " -5.15 m, corner -8.23 m"
+    " -5.15 m, corner -8.23 m; the largest error at any height, with any lens: 1/3 of the true"
+    " depth or half the apparent one"
 )
 
 
@@ -59,24 +65,32 @@ def write_refraction_effect(out_dir: File, options: SimulateOptions) -> str:
         If an argument is outside its rule, or a file exists and `overwrite` is not set; then
         none is written.
     """
-    camera, overlap = _camera(options), options.effect_overlap or OVERLAP
-    apparent_depths_m = options.effect_depths or APPARENT_DEPTHS_M
+    camera, apparent_depths_m = _camera(options), options.effect_depths or APPARENT_DEPTHS_M
     index, seed = index_of(options.index, options.index_formula)[0], options.seed
-    heights = {
-        one: options.effect_heights or FLYING_HEIGHTS_M.get(one, (50.0, 100.0, 200.0))
+    effect_index = PAPER_INDEX if camera is None and options.index is None else index
+    flights = {
+        one: {
+            "flying_heights_m": options.effect_heights or FLYING_HEIGHTS_M.get(one, HEIGHTS_M),
+            "overlaps": options.effect_overlap or OVERLAPS.get(one, (OVERLAP,)),
+        }
         for one in ([camera] if camera else FLYING_HEIGHTS_M)
     }
-    found = effects(heights, apparent_depths_m, overlap=overlap, refractive_index=index)
-    deepest = max(one.apparent_depth_m for one in found)
-    pairs = dict.fromkeys(one.pair for one in found)
-    shan = {pair: shan_iterations(pair, deepest, index) for pair in pairs}
+    pairs = [
+        StereoPair(one, height, overlap)
+        for one, flight in flights.items()
+        for overlap in flight["overlaps"]
+        for height in flight["flying_heights_m"]
+    ]
+    found = effects(pairs, apparent_depths_m, effect_index)
+    deepest = max(apparent_depths_m)
+    shan = {pair: shan_iterations(pair, deepest, effect_index) for pair in pairs}
     bins = bowl_bins(simulate_bowl(refractive_index=index, seed=seed))
     settings = {
         "made_by": f"pcfix {__version__}",
-        "cameras": [asdict(one) | {"flying_heights_m": h} for one, h in heights.items()],
-        "overlap": overlap,
+        "cameras": [asdict(one) | flight for one, flight in flights.items()],
         "apparent_depths_m": apparent_depths_m,
-        "refractive_index": index,
+        "refractive_index": effect_index,
+        "refractive_index_bowl": index,
         "seed": seed,
     }
     files = _pictures(found, bins, deepest) | {
@@ -88,8 +102,7 @@ def write_refraction_effect(out_dir: File, options: SimulateOptions) -> str:
         "refraction_effect.json": json_text(settings).encode(),
     }
     _write(Path(out_dir), files, options.overwrite)
-    pair, table = list(shan.items())[len(next(iter(heights.values()))) // 2]
-    shan_lines = papers.shan_text(pair, table, max(apparent_depths_m))
+    shan_lines = papers.shan_text(pairs[0], shan[pairs[0]], deepest)
     parts = [papers.effect_text(found), shan_lines, papers.depth_bins_text(bins)]
     if camera is None:
         parts[0] += f"\n{PUBLISHED}"
@@ -113,8 +126,12 @@ def _camera(options: SimulateOptions) -> AerialCamera | None:
 def _pictures(found: list[Effect], bins: DepthBins, deepest: float) -> dict[str, bytes]:
     figures = {"refraction_effect_depth.png": papers.depth_figure(found)}
     for camera in dict.fromkeys(one.pair.camera for one in found):
-        own = [f for f in found if f.pair.camera == camera and f.apparent_depth_m == deepest]
-        figures[f"refraction_effect_{camera.name.lower()}.png"] = papers.error_map_figure(own)
+        own = [one for one in found if one.pair.camera == camera]
+        deep = [one for one in own if one.apparent_depth_m == deepest]
+        name = f"refraction_effect_{camera.name.lower()}"
+        figures[f"{name}.png"] = papers.error_map_figure(deep)
+        figures[f"{name}_bed.png"] = papers.bed_figure(deep)
+        figures[f"{name}_stack.png"] = papers.stack_figure(own)
     figures["bowl_depth_bins.png"] = papers.depth_bins_figure(bins)
     return {name: png_of(figure) for name, figure in figures.items()}
 

@@ -44,10 +44,10 @@ def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str
         )
     columns = columns_for(options.dimensions, options.unsure)
     drop = options.uncorrected == "drop"
-    given = {
-        "cameras": None,
-        "water": None,
-        **options.plain(),
+    plain = options.plain()
+    given: dict[str, Any] = {
+        **{name: plain[name] for name in ("cameras", "water") if name in plain},  # come first
+        **plain,
         "uncorrected": "keep" if drop else options.uncorrected,
         "dimensions": options.dimensions,
     }

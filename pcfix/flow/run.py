@@ -31,11 +31,12 @@ from pcfix.flow.run_adjust import (
 from pcfix.flow.runner import json_text
 from pcfix.flow.surfaces import view_of
 from pcfix.io.clouds import own_water
-from pcfix.io.files import file_state, files_in, read_json, write_text
+from pcfix.io.files import check_input, file_state, files_in, read_json, write_text
 from pcfix.io.las.source import LasSource
 from pcfix.io.rasters import open_raster, preview, write_dod
 from pcfix.options.correct import CorrectOptions
 from pcfix.options.declare import named, options_of
+from pcfix.options.steps import DistanceOptions
 from pcfix.options.survey import RunOptions
 from pcfix.refract.tally import Summary
 from pcfix.report.adjustment_text import all_notes
@@ -92,6 +93,7 @@ class Request(RunOptions):
         names = [self.input, *paths_in(self, but=("water",)), self.reference]
         names += [self.gcps, self.gnss, self.lens]
         found = [path for name in names if name is not None for path in files_in(name)]
+        found += [check_input(path) for _, path in self.also]
         return [*found, Path(self.water)] if Path(self.water).is_file() else found
 
 
@@ -118,6 +120,7 @@ class Files:
         self.dsm, self.dsm_bed = folder / "dsm.tif", folder / "dsm_bed.tif"
         self.hillshade = folder / "hillshade.tif"
         self.compare, self.report = folder / "compare", folder / "report.html"
+        self.regression = folder / "regression.json"
 
 
 def run_all(
@@ -181,7 +184,8 @@ def run_all(
     )
     _say_adjusted(first, out_dir, was_done, say)
     request = request.with_adjusted(out_dir, first)
-    corrected = step("correct", [files.corrected], lambda: _correct(request, files, jobs, progress))
+    clouds = [files.corrected] + ([] if request.check_depths is None else [files.regression])
+    corrected = step("correct", clouds, lambda: _correct(request, files, jobs, progress))
     corrected = _with_checked(corrected, first)
     if not first["is_said"] and is_worth_saying(first, _is_bent(corrected)):
         first = {**first, "is_said": True}
@@ -217,6 +221,8 @@ def _correct(
     request: Request, files: Files, jobs: int | None, progress: Callable[[int, int], None] | None
 ) -> dict[str, Any]:
     options = replace(request, overwrite=True, jobs=jobs).part(CorrectOptions)
+    if request.check_depths is not None:
+        options = replace(options, save_regression=files.regression)
     summary = correct_file(request.input, files.corrected, options=options, progress=progress)
     return vars(summary)
 
@@ -257,10 +263,10 @@ def _resolution_m(path: Path) -> float:
 
 def _compare(request: Request, files: Files) -> dict[str, Any]:
     reference = Path(str(request.reference))
+    asked = {one.name: getattr(request, one.name) for one in options_of(DistanceOptions)}
     result = compare_clouds(
-        files.cleaned, reference, out_dir=files.compare, sections=SECTIONS, m3c2=request.m3c2,
-        overwrite=True,
-    )  # fmt: skip
+        files.cleaned, reference, out_dir=files.compare, sections=SECTIONS, overwrite=True, **asked
+    )
     if _rasters(request):
         heights = reference
         if reference.suffix.lower() in CLOUDS:

@@ -71,6 +71,10 @@ class AdjustStep:
                 f"{self.survey[0]} is of use to an adjustment only; leave it out, or let --adjust"
                 " be auto or yes."
             )
+        if self.when == "yes" and self.inputs.cameras is None:
+            raise SettingError(
+                "adjust yes: there are no cameras to adjust; give them, or leave it."
+            )
         if self.when == "yes" and self.unfit:
             raise SettingError(f"adjust yes: {self.unfit}; leave one of the two out.")
 
@@ -82,6 +86,8 @@ class AdjustStep:
     @property
     def unfit(self) -> str:
         """Why an adjustment does not go with the other options; empty where it does."""
+        if self.inputs.cameras is None:
+            return "there are no cameras to adjust"
         if self.inputs.adjusted_from is not None:
             return "with adjusted-from the cameras are adjusted already"
         if self.inputs.tide is not None:

@@ -93,10 +93,12 @@ def json_text(content: dict[str, Any]) -> str:
 
 
 def check_summary(options: Any, inputs: Iterable[File] = ()) -> None:
-    """Refuse a summary that could not be written, before anything is computed."""
-    summary = getattr(options, "summary", None)
-    if summary is not None:
-        check_output(summary, overwrite=options.overwrite, inputs=inputs)
+    """Refuse a summary, or a line, that could not be written, before anything is computed."""
+    known = list(inputs)
+    for name in ("summary", "save_regression"):
+        path = getattr(options, name, None)
+        if path is not None:
+            known.append(check_output(path, overwrite=options.overwrite, inputs=known))
 
 
 def write_summary(options: Any, summary: dict[str, Any]) -> None:

@@ -49,7 +49,7 @@ class ThroughPort:
             known = self._cameras.lenses is not None
             self._options = replace(options, method="consistent" if known else "snell")
         self.water = WaterPlane(np.inf)
-        self.settings = {"port": asdict(self._port)}
+        self.settings, self.regression = {"port": asdict(self._port)}, None
         self.restart()
 
     @staticmethod
@@ -59,6 +59,7 @@ class ThroughPort:
             "tide": options.tide is not None,
             "image-times": options.image_times is not None,
             "check-depths": options.check_depths is not None,
+            "regression": options.regression is not None,
             "water-crs": options.water_crs is not None,
             "water-model": options.water_model != "auto",
             "connected": options.connected,

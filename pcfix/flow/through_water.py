@@ -37,6 +37,7 @@ from pcfix.refract.batch import Batch, Intersection, MadeWith, Survey
 from pcfix.refract.hypotheses import Verdict
 from pcfix.refract.learning import as_told, weigh_lists
 from pcfix.refract.methods import correct, shift_of_land
+from pcfix.refract.regression import LEAST_BEYOND, BeyondRange, DepthRegression
 from pcfix.refract.rehearsal import rehearsals
 from pcfix.refract.tally import Tally
 from pcfix.water.checks import WaterMeeting, check_above_water, check_tilt, refuse_under_water
@@ -59,12 +60,14 @@ class ThroughWater:
 
     @staticmethod
     def check(options: CorrectOptions) -> None:
-        """Refuse options that are of no use here; there are none."""
+        """Refuse what needs cameras, where there are none."""
+        if not options.cameras:
+            options.check_no_cameras()
 
     def __init__(
         self, options: CorrectOptions, inputs: Inputs, blocks: Blocks, view: CloudView
     ) -> None:
-        self.settings = {}
+        self.settings = {} if inputs.regression is None else {"regression": str(inputs.regression)}
         self._options, self._inputs, self._view = options, inputs, view
         self._cameras = blocks.cameras
         self.carrying = None if blocks.pair is None else Carrying(blocks.pair)
@@ -84,13 +87,15 @@ class ThroughWater:
         self.verdicts: tuple[Verdict, ...] = ()
         self._poses: Poses | None = None
         self._adjustment, self._no_poses = None, ""
-        if options.dimensions == "all" and self.survey.settings.method != "regression":
+        told = options.dimensions == "all" and self.survey.settings.method != "regression"
+        if told and len(self._cameras):
             self._adjustment, self._no_poses = adjustment_of(inputs.cameras, self._cameras)
         self.restart()
 
     def restart(self) -> None:
         """Forget the chunks so far."""
         self._meeting = WaterMeeting(self.water)
+        self._beyond: BeyondRange | None = None
         if self.carrying is not None:
             self.carrying.restart()
 
@@ -111,6 +116,8 @@ class ThroughWater:
                 lambda: parts_of(around(), self.water), self._view.low, self._view.high
             )
         self.survey = self._learning.of_cloud(around, makers, all_listed=views.are_all)
+        if self._options.depth_factor == "auto":
+            self.settings["depth_factor"] = self.survey.settings.depth_factor
         self.verdicts = self._learning.verdicts
         self._learn_poses(chunks, views)
 
@@ -159,11 +166,20 @@ class ThroughWater:
         batch = Batch(xyz, above, self.survey, views, made_with, source=points.sources)
         batch = self._of_kind(batch)
         correction = correct_checked(batch, label, self._level_sigma_m)
+        if self.regression is not None:
+            least = LEAST_BEYOND if self._inputs.regression is None else 0.0
+            self._beyond = self._beyond or BeyondRange(self.regression, least)
+            self._beyond.add((above.height_m - xyz[:, 2])[correction.submerged])
         if self.carrying is not None and step is not None:
             correction = step.whole(correction)
             self.carrying.add(step, correction)
         self._meeting.add(xyz, correction)
         return correction
+
+    @property
+    def regression(self) -> DepthRegression | None:
+        """The line of the method regression."""
+        return self.survey.learned.regression
 
     def _of_kind(self, batch: Batch) -> Batch:
         """Return a chunk with its views as what they are; the first one tells what they list."""
@@ -218,7 +234,9 @@ class ThroughWater:
         plane = list(astuple(self.water)) if isinstance(self.water, WaterPlane) else None
         carried = {} if self.carrying is None else self.carrying.provenance()
         made = {} if self.made is None else {"made": self.made}
-        return {"water": str(self.water), "water_plane": plane, **made, **carried}
+        return {
+            "water": str(self.water), "water_plane": plane, **self.settings, **made, **carried
+        }  # fmt: skip
 
     def check_carried(self, name: str) -> None:
         """Refuse a cloud that could not be taken to the adjusted cameras."""
@@ -254,6 +272,9 @@ class ThroughWater:
 
     def look_back(self) -> None:
         """Warn if what the correction was made with says that the poses are bent."""
+        if not len(self._cameras):
+            self._poses = Poses(None, "not applicable: no cameras were given")
+            return
         given = self._inputs.cameras
         name = "cameras" if isinstance(given, Cameras) else str(given)
         evidence = Evidence(self._cameras, name, self.water, self._options.refractive_index)
@@ -262,7 +283,8 @@ class ThroughWater:
     def _told(self) -> list[str]:
         """Return what the cloud told beside the sentence on how it was made."""
         verdicts = dict.fromkeys(note for one in self.verdicts for note in one.warnings())
-        return [*self._learning.notes, *verdicts, *self._learning.of_unlisted_notes()]
+        beyond = [] if self._beyond is None else self._beyond.notes()
+        return [*self._learning.notes, *beyond, *verdicts, *self._learning.of_unlisted_notes()]
 
     def notes(self, tally: Tally) -> list[str]:
         """Return what was done on the user's behalf."""

@@ -154,7 +154,7 @@ def _read_grid(path: Path) -> Reference:
     x, y = place_of(transform, column + 0.5, row + 0.5)
     xyz = np.column_stack([x, y, height[row, column]])
     crs = CRS.from_wkt(wkt) if wkt else None
-    return Reference(str(path), xyz, crs, height.size - len(xyz))
+    return Reference(str(path), xyz, crs, height.size - len(xyz), raster=True)
 
 
 def check_same_crs(cloud: str, crs: CRS | None, reference: str, other: CRS | None) -> None:

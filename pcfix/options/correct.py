@@ -6,7 +6,15 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pcfix.errors import SettingError
-from pcfix.options.declare import OptionSet, at_least, not_negative, option, within
+from pcfix.options.declare import (
+    File,
+    OptionSet,
+    at_least,
+    not_negative,
+    option,
+    options_of,
+    within,
+)
 from pcfix.options.shared import (
     IndexOptions,
     InputOptions,
@@ -29,10 +37,25 @@ CameraSet = Literal["auto", "mvs", "all"]
 Occlusion = Literal["auto", "on", "off"]
 MatcherKind = Literal["depth-maps", "pairs"]
 
+WITHOUT_CAMERAS = ("factor", "regression")
+"""Methods that look at the apparent depth alone."""
+_ABOUT_CAMERAS = (
+    "sensor", "angles", "cameras_crs", "cameras_offset", "views", "views_are", "adjusted_from",
+    "tide", "image_times", "camera_set", "matcher", "max_angle", "max_cameras", "occlusion",
+    "unsure",
+)  # fmt: skip
+
 LEVEL_M = 0.02
 """Standard deviation of a water level that nothing else is known of."""
 
 _SIGMA = not_negative("give a standard deviation")
+
+
+def _factor(name: str, text: str) -> float | str:
+    try:
+        return "auto" if text == "auto" else float(text)
+    except ValueError:
+        raise SettingError(f"{name} '{text}' is neither true by apparent depth nor auto.") from None
 
 
 def _angle_limit(name: str, text: str) -> float | str | None:
@@ -92,10 +115,13 @@ class MethodOptions(IndexOptions):
         "Solve every point by itself; else --method consistent has that within 0.05 ground pixels,"
         " but where a choice of images is all but open, from polynomials where these are enough.",
     )
-    depth_factor: float | None = option(
+    depth_factor: float | str | None = option(
         None,
-        "With --method factor: true by apparent depth.",
+        "With --method factor: true by apparent depth; auto: as stereo pairs with the flying"
+        " height, focal length and base of the cameras have it on average.",
         rule=within(1.0, 3.0, "give true by apparent depth"),
+        parse=_factor,
+        metavar="N",
         default_is="the refractive index",
     )
     least_r2: float = option(
@@ -114,6 +140,36 @@ class MethodOptions(IndexOptions):
                 "max-cameras 1 is less than 2: an intersection needs two rays; one is enough for"
                 " --method butler and dietrich alone."
             )
+
+    @property
+    def needs_cameras(self) -> bool:
+        """Whether the correction looks at cameras."""
+        return self.method not in WITHOUT_CAMERAS or self.depth_factor == "auto"
+
+    def check_no_cameras(self) -> None:
+        """Refuse what cannot be done, or says nothing, where there are no cameras.
+
+        Raises
+        ------
+        SettingError
+            With the first option that is about cameras.
+        """
+        if self.depth_factor == "auto":
+            raise SettingError(
+                "cameras are missing: depth-factor auto goes by their height, focal length and"
+                " base; give them, or a number."
+            )
+        if self.needs_cameras:
+            raise SettingError(
+                f"cameras are missing: method {self.method} goes along their rays; give the poses"
+                f" of the images, or a method that needs none: {' or '.join(WITHOUT_CAMERAS)}."
+            )
+        for one in options_of(type(self)):
+            if one.name in _ABOUT_CAMERAS and getattr(self, one.name) not in (one.default, "off"):
+                raise SettingError(
+                    f"{one.flag[2:]} is about cameras, and there are none: leave it out, or give"
+                    " cameras too."
+                )
 
     @property
     def limit_deg(self) -> float | None:
@@ -194,6 +250,20 @@ class ScienceOptions(RefractionOptions, ResultOptions):
 @dataclass(frozen=True, kw_only=True)
 class CorrectOptions(JobOptions, SummaryOption, ScienceOptions, SubmergedOptions, InputOptions):
     """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
+
+    panel = Panel.OUTPUT
+
+    save_regression: File | None = option(
+        None, "Write the line fitted to --check-depths there, as JSON."
+    )
+
+    def check(self) -> None:
+        """Check what options say together."""
+        super().check()
+        if self.save_regression is not None and self.check_depths is None:
+            raise SettingError(
+                "save-regression is of no use without check-depths; give both, or neither."
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -52,7 +52,7 @@ class Option(NamedTuple):
     default_is : str
         The default in words, where it is not the value.
     needed : bool
-        Whether the command line and PDAL ask for it.
+        Whether the command line and PDAL ask for it; `default_is` says where not.
     parse : callable or None
         From the text of the command line or of JSON to the value.
     metavar : str
@@ -109,6 +109,11 @@ class Option(NamedTuple):
         if isinstance(self.default, tuple):
             return " ".join(f"{value:g}" for value in self.default)
         return f"{self.default:g}" if isinstance(self.default, float) else str(self.default)
+
+    @property
+    def needed_text(self) -> str:
+        """Whether it is needed, and where not."""
+        return ", ".join(filter(None, ["needed" if self.needed else "", self.default_text]))
 
     @property
     def placeholder(self) -> str:
@@ -252,9 +257,8 @@ def table_of(kind: type) -> str:
         if one.hidden:
             continue
         value = "\\|".join(one.choices) or one.metavar or one.placeholder
-        default = "needed" if one.needed else one.default_text
         flag = f"{one.flag} {value}".strip()
-        rows.append(f"| `{flag}` | {one.help_text} | {default} |")
+        rows.append(f"| `{flag}` | {one.help_text} | {one.needed_text} |")
     return "\n".join(rows)
 
 

@@ -15,6 +15,7 @@ BedKind = Literal["shore", "flat", "slope", "steps", "river"]
 CloudKind = Literal["tracks", "pairs", "depth-maps"]
 
 
+_MOST_DEPTHS = 100
 _UNITS = {"m": " m", "mm": " mm", "deg": " deg", "percent": " %"}
 
 
@@ -220,14 +221,39 @@ class SceneOptions(SceneCloudOptions, SceneWaterOptions, CameraOptions, FlightOp
     """What a simulated scene can be asked for."""
 
 
-def _effect_numbers(option: str, text: str) -> tuple[float, ...]:
+def _effect_numbers(option: str, text: str, most: int = 6) -> tuple[float, ...]:
     try:
         found = tuple(dict.fromkeys(float(word) for word in text.split(",")))
     except ValueError:
         raise SettingError(f"--{option} {text} is not a list of numbers, as 50,100.") from None
-    if len(found) > 6:
-        raise SettingError(f"--{option} {text} has {len(found)} numbers; give 6 at most.")
+    if len(found) > most:
+        raise SettingError(f"--{option} {text} has {len(found)} numbers; give {most} at most.")
     return found
+
+
+def _effect_depths(option: str, text: str) -> tuple[float, ...]:
+    """Return the depths of a list, or of FROM:TO:STEP with TO where a step ends there."""
+    if ":" not in text:
+        return _effect_numbers(option, text, _MOST_DEPTHS)
+    try:
+        first, last, step = (float(word) for word in text.split(":"))
+    except ValueError:
+        first = last = step = math.nan
+    if not (-math.inf < first <= last < math.inf and 0.0 < step < math.inf):
+        raise SettingError(
+            f"--{option} {text} is not FROM:TO:STEP upwards with a step above 0, as 0:15:1."
+        )
+    count = (last - first) / step + 1.0 + 1e-9
+    if count >= _MOST_DEPTHS + 1:
+        raise SettingError(
+            f"--{option} {text} has {count:.0f} depths; give {_MOST_DEPTHS} at most."
+        )
+    return tuple(round(first + i * step, 9) for i in range(int(count)))
+
+
+_SEVERAL = rule(
+    lambda value: isinstance(value, tuple), "{option} {value} is no list: give it as ({value},)."
+)
 
 
 def _frame(option: str, text: str) -> tuple[int, int]:
@@ -258,21 +284,28 @@ class EffectOptions(OptionSet):
         metavar="WIDTHxHEIGHT",
     )
     effect_pixel_um: float | None = option(None, "Its pixel size.")
-    effect_overlap: float | None = option(
-        None, "Overlap of the two images, 0 to 1.", default_is="0.8"
+    effect_overlap: tuple[float, ...] | None = option(
+        None,
+        "Overlaps of the two images, 0 to 1.",
+        rule=_SEVERAL,
+        parse=_effect_numbers,
+        default_is="0.8; UltraCamX 0.6,0.8",
+        metavar="N,N",
     )
     effect_heights: tuple[float, ...] | None = option(
         None,
         "Above the water, metres.",
+        rule=_SEVERAL,
         parse=_effect_numbers,
-        default_is="50,100,200; UltraCam 500,1000,3000",
+        default_is="100,200; UltraCamX 1000,3000; your own 50,100,200",
         metavar="M,M",
     )
     effect_depths: tuple[float, ...] | None = option(
         None,
-        "Depths that the cloud shows, metres; maps are drawn of the largest.",
-        parse=_effect_numbers,
-        default_is="1,2,5,10,15",
+        "Depths that the cloud shows, metres: a list, or FROM:TO:STEP; maps are of the largest.",
+        rule=_SEVERAL,
+        parse=_effect_depths,
+        default_is="0:15:1",
         metavar="M,M",
     )
 
@@ -286,7 +319,8 @@ class SimulateOptions(OverwriteOption, EffectOptions, SceneOptions):
     refraction_effect: bool = option(
         False,
         "No scene, but how far refraction puts points wrong in a pair of vertical images"
-        " (Skarlatos & Agrafiotis 2018, Figures 4 to 6): maps, tables.",
+        " (Skarlatos & Agrafiotis 2018, Figures 4 to 6): surfaces, maps, tables. Of the paper's"
+        " cameras with n = 1.3405, which fits its figures, if no --index is given.",
     )
 
     def check(self) -> None:

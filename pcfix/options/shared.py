@@ -295,6 +295,7 @@ class CamerasOptions(OptionSet):
         " VisualSFM, BlocksExchange, RealityCapture, or a CSV table.",
         metavar="PATH",
         needed=True,
+        default_is="but with --method factor or regression",
     )
 
 
@@ -331,6 +332,9 @@ class HistoryOptions(OptionSet):
     )
     check_depths: File | None = option(
         None, "With --method regression: CSV x,y,depth of measured depths, m."
+    )
+    regression: File | None = option(
+        None, "Instead of --check-depths: the line that --save-regression wrote of another cloud."
     )
 
 

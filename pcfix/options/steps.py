@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -18,6 +22,7 @@ LEAST_PLANE_POINTS, PLANE_POINTS = 6, 8
 
 DsmMethod = Literal["mean", "median", "min", "max", "idw", "tin"]
 SurfaceChoice = Literal["all", "bed"]
+Direction = Literal["to-reference", "from-reference", "both"]
 
 METRES = positive("{option} {value:g} is not positive; give metres.")
 
@@ -213,20 +218,99 @@ class DsmOptions(OverwriteOption, SummaryOption, DsmRules):
     cog: bool = option(False, "Write cloud optimised GeoTIFF.")
 
 
+LAYERS = ("water", "apparent", "corrected", "reference")
+"""Lines of a cross-section; a further cloud goes by another name."""
+_NAME = re.compile(r"[\w .+-]*\w[\w .+-]*")
+
+
 @dataclass(frozen=True, kw_only=True)
-class M3c2Option(OptionSet):
-    """Whether M3C2 is wanted."""
+class DistanceOptions(OptionSet):
+    """What a comparison, or that of a run, measures besides the vertical error.
+
+    `share` and `also` are told by texts, and hold pairs: of bounds in metres, and of a name and a
+    path; `also` may be a dict too.
+    """
 
     panel = Panel.FIGURES
 
     m3c2: bool = option(False, "Compare by M3C2 too, with py4dgeo: the extra m3c2.")
+    direction: Direction | None = option(
+        None,
+        "Of C2C: from each point of the cloud to the nearest of the reference, from each of the"
+        " reference to the nearest of the cloud, or both.",
+        default_is="to-reference; from each check point",
+    )
+    classes: int | None = option(
+        None,
+        "Of the C2C histograms.",
+        rule=must_be(2, 100_000, "the square root of the number of points is usual", whole=True),
+        default_is="square root of the number of distances",
+    )
+    share: tuple[Any, ...] = option(
+        (),
+        "Say which share of the C2C distances is from LOW up to HIGH metres; may be repeated.",
+        metavar="LOW,HIGH",
+    )
+    also: tuple[Any, ...] = option(
+        (),
+        "A further cloud, in the C2C table and the cross-sections; may be repeated.",
+        metavar="NAME=CLOUD",
+    )
+
+    def check(self) -> None:
+        """Take texts apart."""
+        super().check()
+        object.__setattr__(self, "share", tuple(map(_band, _several(self.share))))
+        object.__setattr__(self, "also", tuple(_named_clouds(self.also)))
+
+    @property
+    def from_reference(self) -> bool:
+        """Whether C2C is wanted from each point of the reference."""
+        return self.direction in ("from-reference", "both")
+
+
+def _several(value: Any) -> tuple[Any, ...]:
+    """Return the one text that a stage of PDAL may give as one of several."""
+    return (value,) if isinstance(value, str) else tuple(value)
+
+
+def _band(given: Any) -> tuple[float, float]:
+    """Return the bounds of a share."""
+    low = high = math.nan
+    with suppress(ValueError, TypeError):
+        low, high = (float(v) for v in (given.split(",") if isinstance(given, str) else given))
+    if not 0.0 <= low < high < math.inf:
+        text = given if isinstance(given, str) else ",".join(map(str, given))
+        raise SettingError(
+            f"share '{text}' must be two distances LOW,HIGH in metres, not negative and the lower"
+            " one first, as 0.6,1.0."
+        )
+    return low, high
+
+
+def _named_clouds(given: Any) -> Iterator[tuple[str, str]]:
+    """Yield name and path of each further cloud."""
+    known = set(LAYERS)
+    for one in given.items() if isinstance(given, Mapping) else _several(given):
+        name, mark, path = one.partition("=") if isinstance(one, str) else (one[0], "=", one[1])
+        text = f"{name}{mark}{path}"
+        if not (_NAME.fullmatch(name) and os.fspath(path)):
+            raise SettingError(
+                f"also '{text}' must be NAME=CLOUD, a name of letters, digits, spaces and . + - _,"
+                " and a LAS or LAZ file, as iteration1=iteration1.laz."
+            )
+        if name in known:
+            taken = "a line of each cross-section" if name in LAYERS else "another cloud"
+            raise SettingError(f"also '{text}': {name} is the name of {taken}; give another one.")
+        known.add(name)
+        yield name, os.fspath(path)
 
 
 _BIN_WIDTH = positive("bin width {value:g} is not positive; give metres, such as 1.")
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareRules(M3c2Option):
+class CompareRules(DistanceOptions):
     """What is measured of two clouds."""
 
     panel = Panel.FIGURES
@@ -281,3 +365,4 @@ class CompareOptions(OverwriteOption, SummaryOption, CompareRules):
         metavar="X,Y,X,Y",
         old=("section_lines",),
     )
+    plot: File | None = option(None, "PNG of the C2C histograms, each with its Gauss curve.")

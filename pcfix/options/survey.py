@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from pcfix.errors import PcfixWarning, SettingError
 from pcfix.options.correct import RefractionOptions
-from pcfix.options.declare import File, OptionSet, one_or_more, option, positive
+from pcfix.options.declare import File, OptionSet, one_or_more, option, options_of, positive
 from pcfix.options.shared import (
     CameraFileOptions,
     IndexOptions,
@@ -23,7 +23,7 @@ from pcfix.options.shared import (
     ViewOptions,
     WaterOptions,
 )
-from pcfix.options.steps import METRES, M3c2Option
+from pcfix.options.steps import METRES, DistanceOptions
 
 Poses = Literal["free", "fixed", "similarity"]
 Datum = Literal["observed", "free"]
@@ -88,7 +88,7 @@ class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(
-    JobOptions, M3c2Option, SurveyedOptions, RefractionOptions, SubmergedOptions, SurveyOptions
+    JobOptions, DistanceOptions, SurveyedOptions, RefractionOptions, SubmergedOptions, SurveyOptions
 ):
     """The options of ``pcfix run``: everything that its results depend on is in ``run.json``."""
 
@@ -110,8 +110,11 @@ class RunOptions(
     def check(self) -> None:
         """Check what options say together."""
         super().check()
-        if self.m3c2 and self.reference is None:
-            raise SettingError("m3c2 compares with a reference; give --reference too.")
+        for one in options_of(DistanceOptions):
+            if self.reference is None and getattr(self, one.name) != one.default:
+                raise SettingError(
+                    f"{one.flag[2:]} is for a comparison with a reference; give --reference too."
+                )
 
 
 _SIGMA = positive("the standard deviation {value:g} must be positive.")

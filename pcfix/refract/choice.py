@@ -142,6 +142,8 @@ def chosen_views(batch: Batch) -> Views:
         In the order of the cameras, or of the list; its weights are kept.
     """
     survey, views = batch.survey, batch.views
+    if not len(survey.cameras):
+        return Views(np.zeros(len(batch) + 1, np.int64), np.zeros(0, np.int64))
     points, rig = points_of(batch), rig_of(survey)
     frames = no_frames(len(survey.cameras))
     if views is None:

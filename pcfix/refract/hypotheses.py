@@ -34,7 +34,9 @@ class Hypothesis(NamedTuple):
 
     def settings(self, given: ScienceOptions) -> ScienceOptions:
         """Return the options by which such a cloud is corrected."""
-        return replace(given, **self.changes)
+        of_factor = self.changes.get("method", given.method) == "factor"
+        gone: dict[str, Any] = {} if of_factor else {"depth_factor": None}
+        return replace(given, **gone, **self.changes)
 
 
 _TRACKS, _MAPS, _PAIRS = "intersected rays", "fused depth maps", "stereo pairs"

@@ -98,7 +98,7 @@ def intersect_in_frame(batch: Batch) -> Intersection:
         rule_of(survey), budget_of(survey), level_sigma_of(batch), (result, used, covariance),
     )  # fmt: skip
     found = _as_intersection(result, used)
-    return with_errors(found, covariance if len(covariance) == len(batch) else None, survey)
+    return with_errors(found, covariance if len(covariance) == len(batch) else None)
 
 
 def _as_intersection(result: FloatArray, used: BoolArray) -> Intersection:

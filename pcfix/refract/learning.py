@@ -28,6 +28,7 @@ from pcfix.refract.matcher import Bed, bed_of, matcher_of, matcher_of_ties, plac
 from pcfix.refract.methods import batches, on_land, with_rays
 from pcfix.refract.patches import FEWEST_WITHOUT_LIST
 from pcfix.refract.regression import DepthRegression
+from pcfix.refract.stereo_factor import StereoFactor, check_stereo, stereo_factor
 from pcfix.refract.top_surface import occluder_of, wants_occlusion
 from pcfix.refract.weighing import weigh
 from pcfix.water.surface import is_submerged
@@ -42,6 +43,8 @@ def check_method(settings: ScienceOptions, cameras: Cameras) -> None:
         )
     if settings.method == "consistent":
         check_consistent(cameras)
+    if settings.depth_factor == "auto":
+        check_stereo(cameras)
 
 
 def resolved(settings: ScienceOptions, cameras: Cameras, views: ViewKind | None) -> ScienceOptions:
@@ -55,7 +58,22 @@ def resolved(settings: ScienceOptions, cameras: Cameras, views: ViewKind | None)
 
 def wants_sample(settings: ScienceOptions, cameras: Cameras, views: ViewKind | None) -> bool:
     """Return whether points of the whole cloud tell something of the correction."""
-    return wants_matcher(settings, cameras, views) or _wants_limit(settings, views)
+    known = settings.depth_factor != "auto"
+    return wants_matcher(settings, cameras, views) or _wants_limit(settings, views) or not known
+
+
+def with_factor(batch: Batch) -> tuple[Batch, StereoFactor | None]:
+    """Return a batch with a number for the factor of depths, and whence, where that is auto."""
+    survey = batch.survey
+    if survey.settings.depth_factor != "auto":
+        return batch, None
+    known = batch.surface.height_m[np.isfinite(batch.surface.height_m)]
+    found = None
+    if len(known):  # else no point lies below the water, which is said elsewhere
+        n = survey.settings.refractive_index
+        found = stereo_factor(survey.cameras, float(np.median(known)), n)
+    settings = replace(survey.settings, depth_factor=None if found is None else found.factor)
+    return replace(batch, survey=replace(survey, settings=settings)), found
 
 
 def _wants_limit(settings: ScienceOptions, views: ViewKind | None) -> bool:
@@ -88,9 +106,10 @@ def learn_of_points(batch: Batch, regression: DepthRegression | None) -> Batch:
     """
     cameras, views = batch.survey.cameras, batch.views
     kind = None if views is None else views.kind
+    check_method(resolved(batch.survey.settings, cameras, kind), cameras)
+    batch, _ = with_factor(batch)
     given = batch.survey.settings
     settings = resolved(given, cameras, kind)
-    check_method(settings, cameras)
     if settings.method == "regression" and regression is None:
         raise SettingError("method regression needs a regression; fit one of check depths first.")
     hides = wants_occlusion(cameras, settings)

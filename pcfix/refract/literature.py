@@ -100,10 +100,12 @@ def factor(batch: Batch) -> Intersection:
     With n it is the limit for cameras straight above, long in use for rivers (Westaway et al.
     2001, Woodget et al. 2015). Away from there the true depth is larger, at the angle a in air by
     (n^2 - 1) tan^2 a / (2 n^2) of it: 1.6 % at 15 degrees, 3.3 % at 21 degrees. A factor of one's
-    own can take that in.
+    own can take that in, or that of stereo pairs, `pcfix.refract.stereo_factor`, for which
+    `depth_factor` auto stands until the cloud is looked at.
     """
-    ratio = batch.survey.settings.depth_factor
-    ratio = batch.survey.settings.refractive_index if ratio is None else ratio
+    settings = batch.survey.settings
+    given = settings.depth_factor
+    ratio = settings.refractive_index if given is None else float(given)
     return without_rays(batch, (ratio - 1.0) * apparent_depth(batch))
 
 
@@ -123,8 +125,11 @@ def regression(batch: Batch) -> Intersection:
 
     Notes
     -----
-    Method III of Hsu & Wang: a line fitted to check depths. With a negative intercept the line
-    takes very shallow points above the water; they go to its surface.
+    Method III of Hsu & Wang ("the empirical relation between the true depth and apparent depth
+    from a limited depth measurement"), option 1 of Mulsow (2024): a line fitted to check depths.
+    With a negative intercept it takes very shallow points above the water; they go to its surface.
+    Their own line, of values that are negative as the origin is at 190 mm, has the slope 0.9895;
+    here depths count from the water.
     """
     learned = batch.survey.learned.regression
     if learned is None:

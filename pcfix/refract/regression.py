@@ -39,6 +39,10 @@ class DepthRegression:
         Check depths that were fitted.
     shallowest_m, deepest_m : float
         Of their apparent depths; the line is extrapolated beyond.
+    covariance_m : float
+        Of intercept and slope.
+    source : str
+        What the line was fitted to, in words.
     outliers : tuple of int
         Which of them, from 0, lie too far off the line to be of one set with the rest.
     notes : tuple of str
@@ -55,12 +59,31 @@ class DepthRegression:
     count: int
     shallowest_m: float
     deepest_m: float
+    covariance_m: float = 0.0
+    source: str = ""
     outliers: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
 
     def depth_m(self, apparent_m: FloatArray) -> FloatArray:
         """Return the true depths of apparent ones; never above the water, where a line may lead."""
         return np.asarray(np.maximum(self.intercept_m + self.slope * apparent_m, 0.0))
+
+    def sigma_m(self, apparent_m: FloatArray) -> FloatArray:
+        """Return the standard errors of true depths, metres, shape (m,), from apparent ones.
+
+        That of predicting check depths left out of the fit (of its residuals, where none can be):
+        it holds whatever the poses and the water were. Beyond the fitted depths grows what
+        the standard errors of the line add.
+        """
+        inside = self.rmse_m if self.cv_rmse_m is None else self.cv_rmse_m
+        nearest = np.clip(apparent_m, self.shallowest_m, self.deepest_m)
+        more = self._variance_m2(apparent_m) - self._variance_m2(nearest)
+        return np.asarray(np.sqrt(inside**2 + np.maximum(more, 0.0)))
+
+    def _variance_m2(self, apparent_m: FloatArray) -> FloatArray:
+        """Return the variance of the line itself at apparent depths."""
+        ends = self.intercept_se_m**2 + (self.slope_se * apparent_m) ** 2
+        return np.asarray(ends + 2.0 * self.covariance_m * apparent_m)
 
     def as_dict(self) -> dict[str, Any]:
         """Return it in plain values."""
@@ -118,8 +141,9 @@ def fit_depths(apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:
         count=len(x),
         shallowest_m=float(x.min()),
         deepest_m=float(x.max()),
+        covariance_m=float(-x.mean() * line.stderr**2),
         outliers=tuple(int(i) for i in outliers(residual, leverage)),
-        notes=_notes(len(x), float(line.slope)),
+        notes=notes_of(len(x), float(line.slope)),
     )
 
 
@@ -153,7 +177,8 @@ def outliers(residual: FloatArray, leverage: FloatArray) -> IntArray:
     return np.flatnonzero(far & (leverage < 1.0 - 1e-9))
 
 
-def _notes(count: int, slope: float) -> tuple[str, ...]:
+def notes_of(count: int, slope: float) -> tuple[str, ...]:
+    """Return what a user should know of a line of so many check depths."""
     notes = []
     if count < FEW:
         notes.append(
@@ -166,6 +191,46 @@ def _notes(count: int, slope: float) -> tuple[str, ...]:
             " the water's height and the check depths."
         )
     return tuple(notes)
+
+
+LEAST_BEYOND = 0.05
+"""Share of the points beyond the depths of a line from which its own cloud is worth a note."""
+
+
+class BeyondRange:
+    """Counts apparent depths beyond those that a line was fitted on.
+
+    Parameters
+    ----------
+    line : DepthRegression
+    least : float
+        The share of the points above which it is noted.
+    """
+
+    def __init__(self, line: DepthRegression, least: float = 0.0) -> None:
+        self._least = least
+        self._line, self._count, self._shallower, self._deeper = line, 0, 0, 0
+        self._deepest_m = 0.0
+
+    def add(self, apparent_m: FloatArray) -> None:
+        """Add submerged points, shape (m,)."""
+        self._count += len(apparent_m)
+        self._shallower += int((apparent_m < self._line.shallowest_m).sum())
+        self._deeper += int((apparent_m > self._line.deepest_m).sum())
+        self._deepest_m = max(self._deepest_m, float(apparent_m.max(initial=0.0)))
+
+    def notes(self) -> list[str]:
+        """Return a sentence on them, if there are any."""
+        if self._shallower + self._deeper <= self._least * self._count:
+            return []
+        of = 100.0 / self._count
+        return [
+            f"{of * (self._shallower + self._deeper):.1f} % of the submerged points lie beyond the"
+            f" apparent depths of {self._line.shallowest_m:.2f} to {self._line.deepest_m:.2f} m"
+            f" that the line was fitted on ({of * self._shallower:.1f} % shallower,"
+            f" {of * self._deeper:.1f} % deeper, down to {self._deepest_m:.2f} m): it is"
+            " extrapolated there, and SigmaZ grows."
+        ]
 
 
 NEIGHBOURS, LEAST_NEIGHBOURS = 16, 3

@@ -27,26 +27,27 @@ def shan(batch: Batch) -> Intersection:
     Notes
     -----
     Shan (1994), "Relief reconstruction using two-media photogrammetry", as Skarlatos & Agrafiotis
-    (2018, JMSE 6(3) 77, section 2.1.1, eqs 1-7) give it. The image of the true point (X, Y) at
+    (2018, JMSE 6(3), 77, section 2.1.1, eqs 1-7) give it; their eq 2 lacks the root that eqs 1 and
+    7 have. The image of the true point (X, Y) at
     the depth D is that of a point seen through air on the same vertical at the depth D / s, with
 
         s = tan a / tan b = sqrt(n^2 + (n^2 - 1) tan^2 a)        (eq 7)
 
-    so that the collinearity equations hold with D / s for the depth (eq 6). Every image has its
+    so that the collinearity equations hold with D / s for the depth (eq 3). Every image has its
     own s; two images give four equations for X, Y, D and two s. With s known they are linear.
     The iteration starts with s = 1, takes tan a from the point found, and with the s of eq 7
     solves again, until no tan a changes by more than `TOLERANCE`.
 
-    How this differs, or fills a gap:
+    How this differs:
 
+    - The paper's first tan a is eq 6 with Z = 0; s = 1 is nearer, and saves an iteration.
     - The image ray is the line from the projection centre to the apparent point, as a cloud has
       no image coordinates. So the start, s = 1, is the apparent point itself.
     - Any number of rays: the equations of all are solved together in least squares, each one
       divided so that it says X or Y in metres. Two rays alone are overdetermined too (4 by 3).
     - The equations are horizontal distances at the true depth, not distances from the rays as in
       eq 11 (method snell); the two agree where the rays truly meet.
-    - tan a is taken from the point at the depth D / s, which lies on the image ray where the
-      equations hold; the text leaves that open.
+    - tan a is that of eq 6, from the point at the depth D / s, with the s of the turn before.
     - All rays vertical leave the depth open: the equations are singular.
 
     Exact where the straight rays meet in the apparent point: two cameras at the same incidence,

@@ -265,7 +265,7 @@ class Summary:
         """
         made = self.made or {}
         if self.settings["method"] == "regression":  # measured depths hold the bed
-            return ""
+            return "the line is of another cloud" if "regression" in self.settings else ""
         if made.get("method") != "consistent" or not made.get("sure", bool(made.get("views_are"))):
             return "nothing tells that the cloud was made as the method takes it"
         return {

@@ -81,6 +81,8 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
     models), which gets that of one adjustment of all its images.
     """
     survey, views, result = batch.survey, batch.rays, np.zeros((len(batch), 6))
+    if not len(survey.cameras):
+        return result
     # the rays are chosen: a mesh may have let through one that its plane above the point would not
     every_ray = rule_of(survey)._replace(least_cosine2=0.0)
     in_tiles(
@@ -93,25 +95,22 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
 
 def with_uncertainty(found: Intersection, batch: Batch) -> Intersection:
     """Return a result with its covariances and standard errors of Z, where they are asked for."""
-    wanted = batch.survey.settings.dimensions == "all"
-    return with_errors(found, covariances(batch, found.shift_m) if wanted else None, batch.survey)
+    survey = batch.survey
+    if survey.settings.dimensions != "all":
+        return with_errors(found, None)
+    covariance, line = covariances(batch, found.shift_m), survey.learned.regression
+    if survey.settings.method == "regression" and line is not None:
+        covariance[:, [_XZ, _YZ]] = 0.0
+        covariance[:, _ZZ] = line.sigma_m(batch.surface.height_m - batch.xyz[:, 2]) ** 2
+    return with_errors(found, covariance)
 
 
-def with_errors(found: Intersection, covariance: FloatArray | None, survey: Survey) -> Intersection:
-    """Return a result with covariances, which it may change, and what follows from them.
-
-    The standard error of a regression is that with which it predicts check depths left out of it
-    (of its residuals, where none can be): it holds whatever the poses and the water were.
-    """
+def with_errors(found: Intersection, covariance: FloatArray | None) -> Intersection:
+    """Return a result with covariances, which it may change, and what follows from them."""
     if covariance is None:
         return found._replace(sigma_z_m=np.zeros(len(found.outcome)))
     moved = found.outcome == Outcome.CORRECTED
     covariance[~moved] = 0.0
-    line = survey.learned.regression
-    if survey.settings.method == "regression" and line is not None:
-        sigma = line.rmse_m if line.cv_rmse_m is None else line.cv_rmse_m
-        covariance[:, [_XZ, _YZ]] = 0.0
-        covariance[moved, _ZZ] = sigma**2
     return found._replace(sigma_z_m=np.sqrt(covariance[:, _ZZ]), covariance_m2=covariance)
 
 

@@ -11,8 +11,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.compare.figures import CORRECTED_BEFORE
-from pcfix.compare.statistics import Statistics
 from pcfix.model import FloatArray
+from pcfix.options.steps import LAYERS
+from pcfix.report.c2c import (
+    TIMES,
+    Plain,
+    bell,
+    c2c_figure,
+    c2c_lines,
+    c2c_rows,
+    c2c_table,
+    further_colour,
+)
 from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, Picture, Table, new_figure, new_map
 from pcfix.report.text import share
 
@@ -20,12 +30,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from pcfix.compare.figures import Comparison
-    from pcfix.compare.m3c2 import M3c2
-    from pcfix.compare.statistics import Bin, Distribution
+    from pcfix.compare.statistics import Bin
 
-Plain = dict[str, Any]
-_TIMES = (("before", "as it came", BEFORE), ("after", "corrected", AFTER))
-HEAD = f"{'m':<20}{'mean':>9}{'sd':>9}{'rmse':>9}{'nmad':>9}{'median':>9}{'5 %':>9}{'95 %':>9}"
+_HEAD = ("mean", "sd", "rmse", "nmad", "median", "5 %", "95 %", "max")
 
 
 def comparison_text(comparison: Comparison) -> str:
@@ -45,7 +52,17 @@ def comparison_text(comparison: Comparison) -> str:
     lines += [f"  not        {count:,}: {reason}" for reason, count in left.items() if count]
     if n.by_nearest:
         lines.append(f"  no plane   {n.by_nearest:,}: the nearest point's height was taken")
-    lines += ["", HEAD, *_rows(c), *_normal(c)]
+    if n.reference_compared:
+        whole = n.reference - n.reference_left_out
+        lines.append(
+            f"  C2C from   {n.reference_compared:,} points of the reference"
+            f" ({share(n.reference_compared, whole)}): those about the cloud"
+            f"{' and under water' if c.settings.submerged else ''}"
+        )
+    plain = c.as_dict()
+    distances = [(f"C2C {way}, {name}", of["statistics"]) for way, name, _, of in c2c_rows(plain)]
+    for table in ([*_table(_signed(plain)), *_normal(c)], _table(distances) + c2c_lines(plain)):
+        lines += ["", *table] if table else []
     if c.depth is not None:
         lines += [
             "",
@@ -70,34 +87,44 @@ def comparison_text(comparison: Comparison) -> str:
     return "\n".join([*lines, *(f"note: {note}" for note in c.notes)])
 
 
-def _rows(c: Comparison) -> list[str]:
+def _signed(plain: Plain) -> list[tuple[str, Plain]]:
+    """Return the statistics of all that has a sign, by title."""
     rows = []
-    kinds = (
-        ("dZ", c.vertical), ("dZ bed", c.bed), ("dZ land", c.land), ("C2C", c.c2c), ("M3C2", c.m3c2)
-    )  # fmt: skip
-    for title, pair in kinds:
-        if pair is not None and pair.before is not None:
-            rows.append(_row(f"{title} before", pair.before))
+    kinds = (("dZ", "vertical"), ("dZ bed", "bed"), ("dZ land", "land"), ("M3C2", "m3c2"))
+    for title, key in kinds:
+        pair = plain[key] or {"before": None, "after": None}
+        if pair["before"] is not None:
+            rows.append((f"{title} before", pair["before"].get("statistics", pair["before"])))
             title += " after"
-        if pair is not None:
-            rows.append(_row(title, pair.after))
+        if pair["after"] is not None:
+            rows.append((title, pair["after"].get("statistics", pair["after"])))
     return rows
 
 
-def _row(title: str, of: Statistics | Distribution | M3c2) -> str:
-    s = of if isinstance(of, Statistics) else of.statistics
-    marks = s.percentiles_m
-    values = (s.mean_m, s.sd_m, s.rmse_m, s.nmad_m, s.median_m, marks["p5"], marks["p95"])
-    return f"{title:<20}" + "".join(f"{value:9.3f}" for value in values)
+def _table(rows: list[tuple[str, Plain]]) -> list[str]:
+    """Return lines of statistics under a header; none where there are none."""
+    if not rows:
+        return []
+    width = max(20, *(len(title) + 1 for title, _ in rows))
+    head = f"{'m':<{width}}" + "".join(f"{name:>9}" for name in _HEAD)
+    return [head, *(f"{title:<{width}}{_figures(of)}" for title, of in rows)]
+
+
+def _figures(s: Plain) -> str:
+    names = ("mean_m", "sd_m", "rmse_m", "nmad_m", "median_m")
+    marks = s["percentiles_m"]
+    values = (*(s[name] for name in names), marks["p5"], marks["p95"], s["max_m"])
+    return "".join(f"{value:9.3f}" for value in values)
 
 
 def _normal(c: Comparison) -> list[str]:
-    normal = (c.vertical or c.c2c).after.normal
-    name = "dZ" if c.vertical else "C2C"
+    if c.vertical is None:
+        return []
+    normal = c.vertical.after.normal
     if normal.histogram_mu_m is None:
-        return [f"note: {name}: {normal.note}"]
+        return [f"note: dZ: {normal.note}"]
     return [
-        f"normal fit to the histogram of {name}: mu {normal.histogram_mu_m:.3f},"
+        f"normal fit to the histogram of dZ: mu {normal.histogram_mu_m:.3f},"
         f" sigma {normal.histogram_sigma_m:.3f}"
     ]
 
@@ -138,7 +165,7 @@ def evaluation(
     pictures = [*_histograms(compared), *_by_depth(compared), *_sections(sections)]
     if dod is not None:
         pictures.insert(2, _difference(*dod))
-    return pictures, [_statistics(compared), *_bins(compared)]
+    return pictures, [_statistics(compared), c2c_table(compared), *_bins(compared)]
 
 
 def _difference(values: FloatArray, extent_m: tuple[float, float, float, float]) -> Picture:
@@ -158,7 +185,7 @@ def in_a_sentence(compared: Plain) -> str:
     pair = compared["vertical"]
     if pair is None or pair["before"] is None:
         return ""
-    before, after = (pair[when]["statistics"] for when, _, _ in _TIMES)
+    before, after = (pair[when]["statistics"] for when, _, _ in TIMES)
     name = compared["reference"].rsplit("/", 1)[-1]
     way = "fell" if after["rmse_m"] <= before["rmse_m"] else "grew"
     twice = f" {CORRECTED_BEFORE}" if CORRECTED_BEFORE in compared["notes"] else ""
@@ -180,28 +207,30 @@ def _apart(compared: Plain) -> str:
 
 
 def _histograms(compared: Plain) -> list[Picture]:
-    kinds = (
-        ("vertical", "Vertical error", "Cloud minus reference, Z (m)"),
-        ("c2c", "Distance to the reference (C2C)", "Distance to the nearest point (m)"),
-    )
     pictures = []
-    for key, title, label in kinds:
-        if compared[key] is not None:
-            bells = " with fitted Gaussians" if key == "vertical" else ""
-            moments = " ".join(
-                f"{name.capitalize()}: mean {s['mean_m']:.3f} m, standard deviation"
-                f" {s['sd_m']:.3f} m."
-                for when, name, _ in _TIMES
-                if compared[key][when] is not None and (s := compared[key][when]["statistics"])
-            )
-            alt = f"{title}: histograms{bells}. {moments}"
-            figure = _histogram(compared[key], label, bell=key == "vertical")
-            pictures.append(Picture(f"histogram_{key}", title, alt, figure))
-    return pictures
+    if compared["vertical"] is not None:
+        rows = [(name, compared["vertical"][when]) for when, name, _ in TIMES]
+        alt = f"Vertical error: histograms with fitted Gaussians. {_moments(rows)}"
+        figure = _histogram(compared["vertical"], "Cloud minus reference, Z (m)")
+        pictures.append(Picture("histogram_vertical", "Vertical error", alt, figure))
+    rows = [(f"{way}, {name}", of) for way, name, _, of in c2c_rows(compared)]
+    title = "Distance to the nearest point (C2C)"
+    alt = f"{title}: histograms with fitted Gaussians. {_moments(rows)}"
+    alt += "".join(f" {n[:1].upper()}{n[1:]}." for n in compared["notes"] if "C2C" in n)
+    return [*pictures, Picture("histogram_c2c", title, alt, c2c_figure(compared))]
 
 
-def _histogram(pair: Plain, label: str, *, bell: bool) -> Figure:
-    known = [(when, name, colour) for when, name, colour in _TIMES if pair[when] is not None]
+def _moments(rows: list[tuple[str, Plain | None]]) -> str:
+    return " ".join(
+        f"{name[:1].upper() + name[1:]}: mean {of['statistics']['mean_m']:.3f} m, standard"
+        f" deviation {of['statistics']['sd_m']:.3f} m."
+        for name, of in rows
+        if of is not None
+    )
+
+
+def _histogram(pair: Plain, label: str) -> Figure:
+    known = [(when, name, colour) for when, name, colour in TIMES if pair[when] is not None]
     figure, panels = new_figure(8.0, 2.4 * len(known) + 0.4, nrows=len(known), squeeze=False)
     for axes, (when, name, colour) in zip(panels[:, 0], known, strict=True):
         s, h = pair[when]["statistics"], pair[when]["histogram"]
@@ -209,10 +238,9 @@ def _histogram(pair: Plain, label: str, *, bell: bool) -> Figure:
         density = counts / (s["count"] * np.diff(edges))
         text = f"{name}: mean {s['mean_m']:.3f}, sd {s['sd_m']:.3f} m"
         axes.stairs(density, edges, fill=True, color=colour, alpha=0.55, label=text)
-        if bell and s["sd_m"] > 0.0:
+        if s["sd_m"] > 0.0:
             x = np.linspace(edges[0], edges[-1], 200)
-            y = np.exp(-0.5 * ((x - s["mean_m"]) / s["sd_m"]) ** 2)
-            axes.plot(x, y / (s["sd_m"] * np.sqrt(2.0 * np.pi)), color=colour)
+            axes.plot(x, bell(x, s["mean_m"], s["sd_m"]), color=colour)
         axes.set_ylabel("Density")
         axes.legend(loc="upper right")
     panels[-1, 0].set_xlabel(label)
@@ -239,7 +267,7 @@ def _by_depth(compared: Plain) -> list[Picture]:
 def _errors(bins: list[Plain], label: str) -> Figure:
     figure, axes = new_figure()
     axes.axhline(0.0, color="0.5", linewidth=0.8)
-    for when, name, colour in _TIMES:
+    for when, name, colour in TIMES:
         known = [b for b in bins if b[when] is not None]
         if known:
             middle = [(b["from_m"] + b["to_m"]) / 2.0 for b in known]
@@ -255,11 +283,15 @@ def _sections(sections: list[Plain]) -> list[Picture]:
         Picture(
             f"section_{number}", f"Cross-section {number}",
             f"Heights along a line of {section['distance_m'][-1]:.0f} m: water surface, the cloud"
-            " as it came, corrected, and the reference.",
+            f" as it came, corrected, the reference{''.join(f', {n}' for n in _further(section))}.",
             _section(section),
         )
         for number, section in enumerate(sections, start=1)
     ]  # fmt: skip
+
+
+def _further(section: Plain) -> list[str]:
+    return [name for name in section["heights_m"] if name not in LAYERS]
 
 
 def _section(section: Plain) -> Figure:
@@ -271,6 +303,8 @@ def _section(section: Plain) -> Figure:
         "corrected": {"color": AFTER},
     }
     names = {"apparent": "as it came"}
+    for number, name in enumerate(_further(section)):
+        looks[name] = {"color": further_colour(number), "linewidth": 1.0}
     for key, look in looks.items():
         if key in section["heights_m"]:
             heights = np.array(section["heights_m"][key], float)
@@ -281,22 +315,30 @@ def _section(section: Plain) -> Figure:
 
 
 def _statistics(compared: Plain) -> Table:
-    header = ["", "points", "mean", "sd", "RMSE", "NMAD", "median", "95 %"]
+    header = ["", "points", "mean", "sd", "RMSE", "NMAD", "median", "95 %", "max"]
     rows = []
     kinds = (
         ("vertical", "Vertical error"), ("bed", "Bed, vertical error"),
-        ("land", "Land, vertical error"), ("m3c2", "M3C2 distance"), ("c2c", "C2C distance"),
+        ("land", "Land, vertical error"), ("m3c2", "M3C2 distance"),
     )  # fmt: skip
     for key, kind in kinds:
-        for when, name, _ in _TIMES:
+        for when, name, _ in TIMES:
             # comparisons from before there were bed and land do without
             if (pair := compared.get(key)) is not None and pair[when] is not None:
                 s = pair[when].get("statistics", pair[when])
-                names = ("mean_m", "sd_m", "rmse_m", "nmad_m", "median_m")
-                figures = [f"{s[n]:.3f}" for n in names] + [f"{s['percentiles_m']['p95']:.3f}"]
-                rows.append([f"{kind}, {name}", f"{s['count']:,}", *figures])
+                rows.append([f"{kind}, {name}", *_cells(s)])
+    rows += [
+        [f"C2C {way}, {name}", *_cells(of["statistics"])] for way, name, _, of in c2c_rows(compared)
+    ]
     title = f"Against {compared['reference'].rsplit('/', 1)[-1]} (m)"
     return Table(title, header, rows)
+
+
+def _cells(s: Plain) -> list[str]:
+    """Return the cells of a sample under the header of `_statistics`."""
+    values = [s[n] for n in ("mean_m", "sd_m", "rmse_m", "nmad_m", "median_m")]
+    values += [s["percentiles_m"]["p95"], s["max_m"]]
+    return [f"{s['count']:,}", *(f"{value:.3f}" for value in values)]
 
 
 def _bins(compared: Plain) -> list[Table]:
@@ -304,7 +346,7 @@ def _bins(compared: Plain) -> list[Table]:
     if compared["depth"] is not None:
         rows = [
             [name, f"{fit['slope']:.4f}", f"{fit['intercept_m']:.3f}", f"{fit['r2']:.4f}"]
-            for when, name, _ in _TIMES
+            for when, name, _ in TIMES
             if (fit := compared["depth"][when]) is not None
         ]
         header = ["", "slope", "intercept (m)", "r²"]
@@ -318,7 +360,7 @@ def _bins(compared: Plain) -> list[Table]:
             [f"{b['from_m']:g} to {b['to_m']:g}", f"{b['after']['count']:,}"]
             + [
                 "" if b[when] is None else f"{b[when][key]:.3f}"
-                for when, _, _ in _TIMES
+                for when, _, _ in TIMES
                 for key in ("mean_m", "rmse_m", "nmad_m")
             ]
             for b in compared["depth_bins"]

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.model import FloatArray
 from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, new_figure
 from pcfix.simulate.hsu_wang import EDGES_M, METHODS, PRINTED_RMSE_MM, DepthBins
 
@@ -35,39 +37,43 @@ _COLOURS = {
 
 
 def effect_text(effects: list[Effect]) -> str:
-    """Return the errors at the largest depth, a line per camera and flying height."""
+    """Return the errors at the largest depth, a line per camera, overlap and flying height."""
     deepest = max(one.apparent_depth_m for one in effects)
-    index, overlap = effects[0].refractive_index, effects[0].pair.overlap
+    heads = "base", "centre", "corner", "mean", "/ true", "/ apparent"
     lines = [
-        f"apparent minus true depth of a bed that looks {deepest:g} m deep; overlap"
-        f" {100.0 * overlap:g} %, refractive index {index:g}",
-        f"{'camera':<14}{'flying height':>15}{'base':>11}{'centre':>11}{'corner':>11}{'mean':>11}",
+        f"apparent minus true depth of a bed that looks {deepest:g} m deep, refractive index"
+        f" {effects[0].refractive_index:g}; the corner's as a share of the two depths too",
+        f"{'camera':<12}{'overlap':>9}{'flying height':>15}"
+        + "".join(f"{head:>11}" for head in heads),
     ]
     for one in effects:
         if one.apparent_depth_m == deepest:
-            pair = one.pair
+            pair, corner = one.pair, -one.corner_m
             lines.append(
-                f"{pair.camera.name:<14}{pair.flying_height_m:>13g} m{pair.base_m:>9.2f} m"
-                f"{one.centre_m:>9.3f} m{one.corner_m:>9.3f} m{one.mean_m:>9.3f} m"
+                f"{pair.camera.name:<12}{100.0 * pair.overlap:>7g} %{pair.flying_height_m:>13g} m"
+                f"{pair.base_m:>9.2f} m{one.centre_m:>9.3f} m{one.corner_m:>9.3f} m"
+                f"{one.mean_m:>9.3f} m{corner / (corner + deepest):>11.3f}{corner / deepest:>11.3f}"
             )
     return "\n".join(lines)
 
 
 def effect_rows(effects: list[Effect]) -> list[dict[str, Any]]:
-    """Return a row of `COLUMNS` per camera, flying height and depth."""
+    """Return a row of `COLUMNS` per pair and depth; a depth of 0 has no factors."""
     rows = []
     for one in effects:
         pair, depth = one.pair, one.apparent_depth_m
         centre, corner = depth - one.centre_m, depth - one.corner_m
         metres = (
-            one.centre_m, one.corner_m, one.mean_m, centre, corner, centre / depth, corner / depth,
+            one.centre_m, one.corner_m, one.mean_m, centre, corner,
+            *((centre / depth, corner / depth) if depth else (math.nan, math.nan)),
             float(one.shift_m.max()),
         )  # fmt: skip
         facts = (
             pair.camera.name, pair.camera.focal_mm, pair.flying_height_m, pair.overlap,
             round(pair.base_m, 4), one.refractive_index, depth,
         )  # fmt: skip
-        rows.append(dict(zip(COLUMNS, [*facts, *(round(m, 5) for m in metres)], strict=True)))
+        numbers = ("" if math.isnan(m) else round(m, 5) + 0.0 for m in metres)
+        rows.append(dict(zip(COLUMNS, [*facts, *numbers], strict=True)))
     return rows
 
 
@@ -81,23 +87,101 @@ def csv_text(rows: list[dict[str, Any]]) -> str:
 
 
 def error_map_figure(effects: list[Effect]) -> Figure:
-    """Draw the error over the model of one camera at one depth, a map per flying height."""
+    """Draw the error over the model of one camera at one depth, a map per pair."""
     low = min(float(one.error_m.min()) for one in effects)
     high = max(float(one.error_m.max()) for one in effects)
     levels = _levels(low, high)
-    figure, panels = new_figure(1.6 + 2.9 * len(effects), 5.4, ncols=len(effects), squeeze=False)
-    for axes, one in zip(panels[0], effects, strict=True):
+    figure, panels = _panels(effects, 2.9, 4.6)
+    for axes, (one,) in panels:
         filled = axes.contourf(one.x_m, one.y_m, one.error_m, levels, cmap="viridis")
         _draw_contours(axes, one, levels)
         _mark_places(axes, one)
-    figure.colorbar(filled, ax=panels[0], label="Apparent minus true depth (m)", shrink=0.9)
-    first = effects[0]
-    figure.suptitle(
-        f"{first.pair.camera.name}, {first.pair.camera.focal_mm:g} mm, overlap"
-        f" {100.0 * first.pair.overlap:g} %:\nbed that looks {first.apparent_depth_m:g} m deep,"
-        f" n = {first.refractive_index:g}"
+        axes.set_aspect("equal")
+    figure.colorbar(
+        filled, ax=[axes for axes, _ in panels], label="Apparent minus true depth (m)", shrink=0.9
     )
     return figure
+
+
+def bed_figure(effects: list[Effect]) -> Figure:
+    """Draw the apparent bed of one depth, the true one and their difference, after Fig 4.
+
+    The true bed and the difference stand where the apparent one does in plan.
+    """
+    figure, panels = _panels(effects, 4.2, 4.2, subplot_kw={"projection": "3d"})
+    surfaces = {"True bed": "tab:blue", "Apparent bed": "tab:green", "Difference": "tab:red"}
+    for axes, (one,) in panels:
+        bed = np.full_like(one.error_m, -one.apparent_depth_m)
+        for z, (name, colour) in zip(
+            (bed + one.error_m, bed, one.error_m), surfaces.items(), strict=True
+        ):
+            _draw_surface(axes, one, z, color=colour, label=name)
+        _label_surfaces(axes, one, "Height (m)")
+    figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
+
+
+def stack_figure(effects: list[Effect]) -> Figure:
+    """Draw the error at every depth as a surface, a stack per pair, after Figs 5 and 6."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    depths = [one.apparent_depth_m for one in effects]
+    colours = ScalarMappable(Normalize(min(depths), max(depths)), "viridis_r")
+    shades = dict(zip(depths, colours.to_rgba(np.array(depths)), strict=True))
+    figure, panels = _panels(effects, 4.2, 4.2, subplot_kw={"projection": "3d"})
+    for axes, stack in panels:
+        for one in stack:
+            _draw_surface(axes, one, one.error_m, color=shades[one.apparent_depth_m])
+        axes.set_zlim(min(-0.01, *(float(one.error_m.min()) for one in effects)), 0.0)
+        _label_surfaces(axes, stack[0], "Apparent minus true depth (m)")
+    figure.colorbar(
+        colours, ax=[axes for axes, _ in panels], label="Apparent depth (m)", shrink=0.6, pad=0.08
+    )
+    return figure
+
+
+def _draw_surface(axes: Any, one: Effect, z: FloatArray, **style: Any) -> None:
+    axes.plot_surface(
+        *np.meshgrid(one.x_m, one.y_m), z, rcount=12, ccount=12, linewidth=0.3,
+        edgecolor=(0.0, 0.0, 0.0, 0.25), shade=False, **style,
+    )  # fmt: skip
+
+
+def _label_surfaces(axes: Any, one: Effect, height: str) -> None:
+    """Give a panel of surfaces the model's shape in plan, few ticks, and room for its labels."""
+    sides = np.array(one.pair.model_m)
+    axes.set_box_aspect((*(sides / sides.max()), 0.7), zoom=0.8)
+    axes.set_xlabel("Along (m)")
+    axes.set_ylabel("Across (m)", labelpad=8.0)
+    axes.set_zlabel(height, labelpad=6.0)
+    axes.locator_params(nbins=4)
+
+
+def _panels(
+    effects: list[Effect], width_in: float, height_in: float, **grid: Any
+) -> tuple[Figure, list[tuple[Any, list[Effect]]]]:
+    """Return a panel for each pair with what belongs there; rows are overlaps, columns heights."""
+    pairs, first = list(dict.fromkeys(one.pair for one in effects)), effects[0]
+    rows, columns = len({p.overlap for p in pairs}), len({p.flying_height_m for p in pairs})
+    figure, panels = new_figure(
+        1.6 + width_in * columns, 0.8 + height_in * rows, nrows=rows, ncols=columns,
+        squeeze=False, **grid,
+    )  # fmt: skip
+    for axes, pair in zip(panels.flat, pairs, strict=True):
+        axes.set_title(
+            f"{pair.flying_height_m:g} m, overlap {100.0 * pair.overlap:g} %", fontsize=10
+        )
+        axes.set(xlabel="Along the flight (m)", ylabel="Across the flight (m)")
+    deepest = max(one.apparent_depth_m for one in effects)
+    least = min(one.apparent_depth_m for one in effects)
+    looks = f"{deepest:g}" if least == deepest else f"{least:g} to {deepest:g}"
+    figure.suptitle(
+        f"{first.pair.camera.name}, {first.pair.camera.focal_mm:g} mm:\nbed that looks {looks} m"
+        f" deep, n = {first.refractive_index:g}"
+    )
+    own = [[one for one in effects if one.pair == pair] for pair in pairs]
+    return figure, list(zip(panels.flat, own, strict=True))
 
 
 def _draw_contours(axes: Axes, one: Effect, levels: Any) -> None:
@@ -134,8 +218,6 @@ def _mark_places(axes: Axes, one: Effect) -> None:
         f"{one.corner_m:.2f} m", (one.x_m[-1], one.y_m[-1]), xytext=(-3, -3),
         textcoords="offset points", ha="right", va="top", fontsize=9, bbox=box, zorder=20,
     )  # fmt: skip
-    axes.set_title(f"{one.pair.flying_height_m:g} m above the water", fontsize=10)
-    axes.set(aspect="equal", xlabel="Along the flight (m)", ylabel="Across the flight (m)")
 
 
 def depth_figure(effects: list[Effect]) -> Figure:
@@ -163,20 +245,22 @@ def depth_figure(effects: list[Effect]) -> Figure:
 
 def _draw_camera(panels: Any, camera: AerialCamera, effects: list[Effect], colour: str) -> None:
     own = [one for one in effects if one.pair.camera == camera]
-    heights = list(dict.fromkeys(one.pair.flying_height_m for one in own))
-    for i, height in enumerate(heights):
-        line = [one for one in own if one.pair.flying_height_m == height]
+    for i, pair in enumerate(dict.fromkeys(one.pair for one in own)):
+        line = sorted(
+            (one for one in own if one.pair == pair), key=lambda one: one.apparent_depth_m
+        )
         depth = np.array([one.apparent_depth_m for one in line])
-        order = np.argsort(depth)
+        wet = depth > 0.0
         for place, mark in (("centre", "o"), ("corner", "s")):
             error = np.array([getattr(one, f"{place}_m") for one in line])
             style = {
                 "linestyle": LINES[i % len(LINES)], "marker": mark, "color": colour,
                 "markersize": 4, "markerfacecolor": "white" if place == "centre" else colour,
-                "label": f"{camera.name} {height:g} m, {place}",
+                "label": f"{camera.name} {pair.flying_height_m:g} m, {100.0 * pair.overlap:g} %,"
+                f" {place}",
             }  # fmt: skip
-            panels[0].plot(depth[order], error[order], **style)
-            panels[1].plot(depth[order], 1.0 - error[order] / depth[order], **style)
+            panels[0].plot(depth, error, **style)
+            panels[1].plot(depth[wet], 1.0 - error[wet] / depth[wet], **style)
 
 
 def shan_text(pair: StereoPair, table: list[Iteration], depth_m: float) -> str:
@@ -198,6 +282,7 @@ def shan_rows(pair: StereoPair, table: list[Iteration]) -> list[dict[str, Any]]:
         {
             "camera": pair.camera.name,
             "flying_height_m": pair.flying_height_m,
+            "overlap": pair.overlap,
             "iteration": one.number,
             "mean_residual_m": float(f"{one.mean_m:.4g}"),
             "max_residual_m": float(f"{one.max_m:.4g}"),

@@ -33,7 +33,7 @@ from pcfix.report.page import (
     new_figure,
     new_map,
 )
-from pcfix.report.text import errors_of, of_cloud, share, uncertainty_sentence
+from pcfix.report.text import formal_words, share, uncertainty_sentence
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
@@ -152,7 +152,7 @@ def _facts(s: Summary, measured: Plain | None) -> Table:
         ["Shift in Z", f"mean {shift['mean']:.3f} m; 90 % of the points lie between"
          f" {shift['p5']:.3f} and {shift['p95']:.3f} m"],
         ["Cameras", f"{s.cameras_used} of {s.cameras} see corrected points;"
-         f" {s.rays / max(s.corrected, 1):.1f} rays a point"],
+         f" {s.rays / max(s.corrected, 1):.1f} rays a point" if s.cameras else "none"],
     ]  # fmt: skip
     if s.unsure is not None:
         rows.append(["Unsure", f"{s.unsure:,} ({share(s.unsure, s.corrected)} of the corrected) are"
@@ -206,12 +206,12 @@ def _pictures(corrected: Corrected) -> list[Picture]:
             "Histogram of the shift in Z of the corrected points.",
             histogram_figure(corrected.sample[:, 2], "shift in Z", "True minus apparent Z (m)"),
         ),
-        Picture(
+        *([] if not s.cameras else [Picture(
             "cameras", "Cameras",
             f"Projection centres over the cloud, in plan and seen from the south;"
             f" {s.cameras_used} of {s.cameras} see corrected points.",
             cameras_figure(maps, cameras.centres, used, level),
-        ),
+        )]),
     ]  # fmt: skip
 
 
@@ -283,8 +283,7 @@ def _uncertainty_picture(sample: FloatArray, s: Summary, later: Later) -> list[P
     bins = later.compared["depth_bins"] if later.tvu else []
     text = (
         "Total vertical uncertainty at 95 % (1.96 standard errors of Z) over depth, and the"
-        f" largest that the orders of IHO S-44 allow. It is formal: it assumes {errors_of(s)}"
-        f" (standard deviations), and {of_cloud(s)}."
+        f" largest that the orders of IHO S-44 allow. It is formal: {formal_words(s)}."
         + (" Dots: within which 95 % of the differences to the reference lie." if bins else "")
         + " S-44 asks for more than the TVU: position, features and coverage."
     )

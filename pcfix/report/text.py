@@ -15,6 +15,7 @@ from pcfix.refract.tally import ORDERS, Summary
 if TYPE_CHECKING:
     from pcfix.label.labelling import LabelSummary
 
+BELOW = "\n" + 13 * " "
 FEWEST = 59
 """Differences of which all keep an order before 95 % of all are likely to: 0.95^59 is 0.05."""
 BED_PER_LEVEL = 0.44
@@ -55,13 +56,8 @@ def summary_text(summary: Summary) -> str:
     elif s.told:
         lines.append(f"method       {s.settings['method']}")
     lines += [f"  note       {note}" for note in s.told]
-    unused = len(s.cameras_unused)
-    names = ", ".join(s.cameras_unused[:5]) + (", ..." if unused > 5 else "")
     lines += [
-        f"cameras      {s.cameras_used} of {s.cameras} used"
-        + (f"; {unused} see no corrected point: {names}" if unused else ""),
-        f"rays         {s.rays:,} ({s.rays / max(s.corrected, 1):.1f} a point, incidence up to"
-        f" {s.incidence_deg:.0f} degrees)",
+        *_cameras(s),
         f"water        {s.water}, refractive index {s.settings['index']:.6g}",
         *_index(s),
         *_water_fit(s),
@@ -69,6 +65,22 @@ def summary_text(summary: Summary) -> str:
         *_uncertainty(s),
     ]
     return "\n".join([*lines, *left_out_lines(s.labelling)])
+
+
+def _cameras(s: Summary) -> list[str]:
+    if not s.cameras:
+        return [
+            "cameras      none: a corrected point has a ray count of 1 and an incidence of 0, and"
+            " which images made it, or were hidden, is not known"
+        ]
+    unused = len(s.cameras_unused)
+    names = ", ".join(s.cameras_unused[:5]) + (", ..." if unused > 5 else "")
+    return [
+        f"cameras      {s.cameras_used} of {s.cameras} used"
+        + (f"; {unused} see no corrected point: {names}" if unused else ""),
+        f"rays         {s.rays:,} ({s.rays / max(s.corrected, 1):.1f} a point, incidence up to"
+        f" {s.incidence_deg:.0f} degrees)",
+    ]
 
 
 def _head(s: Summary | LabelSummary | CleanSummary) -> list[str]:
@@ -139,6 +151,8 @@ def _water_fit(s: Summary) -> list[str]:
 def _uncertainty(s: Summary) -> list[str]:
     """Say how good the heights are, if the budget is right and nothing else is wrong."""
     found = s.uncertainty
+    if found is None and s.settings["dimensions"] == "all" and not s.cameras:
+        return ["uncertainty  not known: no rays to propagate errors along; SigmaZ is 0"]
     if found is None:
         return []
     sigma, tvu = found["sigma_z_m"], found["tvu_95_m"]
@@ -146,15 +160,17 @@ def _uncertainty(s: Summary) -> list[str]:
         f"uncertainty  predicted standard error of Z mean {sigma['mean']:.3f} m, 95 % of the points"
         f" below {sigma['p95']:.3f} m; TVU at 95 % mean {tvu['mean']:.3f} m",
         f"  IHO S-44   {order_sentence(s)}",
-        f"  formal     it assumes {errors_of(s)} (standard deviations),",
-        f"             and {of_cloud(s)}; S-44 asks for more than the TVU",
+        f"  formal     {formal_words(s, BELOW)}; S-44 asks for more than the TVU",
     ]
 
 
-def errors_of(s: Summary) -> str:
-    """Return the budget of a run in words."""
+def formal_words(s: Summary, apart: str = " ") -> str:
+    """Return what the standard errors of a run rest on; `apart` stands between its two parts."""
+    if s.settings["method"] == "regression":
+        return "it is how far the line misses check depths that it was not fitted to"
     fitted = None if s.water_fit is None else s.water_fit["sigma_level_m"]
-    return budget_words(s.settings, fitted)
+    errors = budget_words(s.settings, fitted)
+    return f"it assumes {errors} (standard deviations),{apart}and {of_cloud(s)}"
 
 
 def of_cloud(s: Summary) -> str:

@@ -7,33 +7,32 @@ with the correction; that the two agree is for a test to say.
 
 What the paper gives to check against is one pair of numbers: with the SwingletCAM from 100 m, 80 %
 overlap and an apparent depth of 15 m, -8.23 m in the corners of the model and -5.15 m in its
-centre. The reading that is used here:
+centre. The reading that gives both (-8.232 m and -5.147 m):
 
-- The flying height is above the water. The base is the free part of the short side of the
-  footprint *at the water surface* (144.19 m x 108.14 m): 21.63 m.
-- The model is the overlap of the two footprints, taken at the water surface too, and its apparent
-  bed is level: x and y of a corner are 43.26 m and 72.09 m from the centre, and z is -15 m there.
-- n = 1.34; the true point is the midpoint of the shortest line between the two bent rays.
+- The flying height is above the water, where the footprint is that which is printed, 144 m x 108 m,
+  pixels of 0.036 m. The lens and the 1.55 um printed make it 144.19 m x 108.14 m, which gives both
+  numbers for no index; so the pixel is taken as 1.548 um, which rounds to that.
+- The base is the free part of the short side at the water: 21.6 m. The model is the overlap of the
+  two footprints there, and its apparent bed is level: x and y of a corner are 43.2 m and 72 m from
+  the centre, and z is -15 m there.
+- n = 1.3405. It is not printed but fitted to the two: they come out from 1.3404 to 1.3406. So that
+  they agree says that one n explains both, not that it was the authors'.
+- The true point is that of eqs 8 to 11: the least squares of eq 11 for two rays are the midpoint of
+  the shortest line between them.
 - The error is the apparent depth minus the true depth, so a minus says: too shallow.
 
-It gives -8.228 m and -5.139 m (with the base rounded to 21.6 m, -8.229 m and -5.139 m): the corner
-as published, the centre 1 cm off. Following the ray of the corner pixel down to the apparent bed
-instead gives -9.17 m in the corner. Taking the base from the footprint at the apparent bed gives
--5.15 m in the centre, but -8.13 m in the corner. No reading was found that gives both published
-numbers.
-
 How fast the iteration of Shan (1994), "Relief reconstruction using two-media photogrammetry", finds
-the depth is reckoned as the same paper gives it (section 2.1.1): the true point A and its image do
+the depth is reckoned as the same paper gives it (eqs 1 to 7): the true point A and its image do
 not fit the collinearity equations, but the point on the vertical through A does that lies 1/s as
 deep, where
 
-    s = tan a / tan b = sqrt(n^2 + (n^2 - 1) tan^2 a),
+    s = tan a / tan b = sqrt(n^2 + (n^2 - 1) tan^2 a),    tan a = R / (Z_o - Z / s),
 
-a the angle in air, b that in water. Each image has its own s, so a pair gives 4 equations for X,
-Y, depth and two s; with s known they are linear. The iteration starts with s = 1, the point that
-software makes that knows nothing of water, takes tan a from the point found, and solves again,
-until tan a no longer changes. The paper leaves open which point tan a is taken from; here it is the
-one at the depth divided by s, which lies on the image ray.
+a the angle in air, b that in water, R the distance in plan. Each image has its own s, so a pair
+gives the 4 equations of eq 3 for X, Y, depth and two s; with s known they are linear. The iteration
+starts with s = 1, the point that software makes that knows nothing of water, takes tan a from the
+point found, and solves again, until tan a no longer changes. (Where that departs from the print:
+`pcfix.refract.shan`.)
 """
 
 from __future__ import annotations
@@ -52,7 +51,9 @@ from pcfix.simulate.tracing import piercing_points
 NODES = 61
 """Nodes of a model along its flight and across it; odd, so that the centre is one."""
 OVERLAP = 0.8
-APPARENT_DEPTHS_M = (1.0, 2.0, 5.0, 10.0, 15.0)
+APPARENT_DEPTHS_M = tuple(float(depth) for depth in range(16))
+PAPER_INDEX = 1.3405
+"""Not printed: fitted to the two errors that are."""
 
 
 @dataclass(frozen=True)
@@ -82,13 +83,16 @@ class AerialCamera:
         return self.rows * scale, self.columns * scale
 
 
-SWINGLETCAM = AerialCamera("SwingletCAM", 4.3, 4000, 3000, 1.55)
+SWINGLETCAM = AerialCamera("SwingletCAM", 4.3, 4000, 3000, 1.548)
 ULTRACAM = AerialCamera("UltraCamX", 100.5, 14430, 9420, 7.2)
-"""The paper's second camera is an UltraCam of 100.5 mm. The frame is that of the UltraCamX, which
-has this focal length: 103.9 mm x 67.8 mm; the UltraCam Eagle's of 100.5 mm is within 0.3 %."""
+"""Of the paper's second camera only the 100.5 mm are printed; the frame is the UltraCamX's."""
 
-FLYING_HEIGHTS_M = {SWINGLETCAM: (50.0, 100.0, 200.0), ULTRACAM: (500.0, 1000.0, 3000.0)}
-"""Above the water. Only the 100 m are known to be the paper's; the others are usual ones."""
+FLYING_HEIGHTS_M: dict[AerialCamera, tuple[float, ...]] = {
+    SWINGLETCAM: (100.0, 200.0),
+    ULTRACAM: (1000.0, 3000.0),
+}
+OVERLAPS: dict[AerialCamera, tuple[float, ...]] = {SWINGLETCAM: (0.8,), ULTRACAM: (0.6, 0.8)}
+"""Of Figures 5 and 6; heights above the water."""
 
 
 @dataclass(frozen=True)
@@ -174,21 +178,34 @@ def effect(
     Raises
     ------
     SettingError
-        If the depth is not above 0, or the refractive index is outside its rule.
+        If the depth is not above 0 and finite, or the refractive index is outside its rule.
     """
-    ScienceOptions(index=refractive_index)
-    if not (np.isfinite(apparent_depth_m) and apparent_depth_m > 0.0):
-        raise SettingError(f"apparent depth {apparent_depth_m:g} m is not above 0.")
+    _check_depths((apparent_depth_m,))
+    return _over_model(pair, apparent_depth_m, refractive_index, nodes)
+
+
+def _check_depths(apparent_depths_m: tuple[float, ...]) -> None:
+    """Refuse depths that are none, and the water's surface alone."""
+    wrong = [depth for depth in apparent_depths_m if not 0.0 <= depth < np.inf]
+    if wrong or not any(apparent_depths_m):
+        raise SettingError(
+            f"apparent depth {[*wrong, 0.0][0]:g} m is not finite and above 0: give metres under"
+            " the water, and 0 only beside others."
+        )
+
+
+def _over_model(pair: StereoPair, apparent_depth_m: float, index: float, nodes: int) -> Effect:
+    ScienceOptions(index=index)
     along, across = pair.model_m
     x = np.linspace(-along / 2.0, along / 2.0, nodes | 1)
     y = np.linspace(-across / 2.0, across / 2.0, nodes | 1)
     plan = np.stack(np.meshgrid(x, y), axis=-1)
     apparent = np.dstack([plan, np.full(plan.shape[:2], -apparent_depth_m)])
-    true = true_points(apparent, pair.centres, refractive_index)
+    true = true_points(apparent, pair.centres, index)
     return Effect(
         pair=pair,
         apparent_depth_m=apparent_depth_m,
-        refractive_index=refractive_index,
+        refractive_index=index,
         x_m=x,
         y_m=y,
         error_m=apparent_depth_m + true[..., 2],
@@ -224,17 +241,21 @@ def _in_water(apparent: FloatArray, centre: FloatArray, n: float) -> tuple[Float
 
 
 def effects(
-    heights_m: dict[AerialCamera, tuple[float, ...]],
+    pairs: list[StereoPair],
     apparent_depths_m: tuple[float, ...],
-    *,
-    overlap: float = OVERLAP,
     refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
 ) -> list[Effect]:
-    """Return the effect of every camera, flying height above the water and apparent depth."""
+    """Return the effect of every pair and apparent depth; 0 among several is the water's surface.
+
+    Raises
+    ------
+    SettingError
+        As `effect`.
+    """
+    _check_depths(apparent_depths_m)
     return [
-        effect(StereoPair(camera, height, overlap), depth, refractive_index)
-        for camera, heights in heights_m.items()
-        for height in heights
+        _over_model(pair, depth, refractive_index, NODES)
+        for pair in pairs
         for depth in apparent_depths_m
     ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -201,3 +202,21 @@ def test_it_is_the_least_squares_of_what_it_kept():
     # m: both stop where the cost no longer changes
     centres = found.cameras.centres - problem.origin
     np.testing.assert_allclose(centres, once.state.centres, atol=1e-6)
+
+
+def test_sides_of_the_water_that_differ_count_by_their_own_noise():
+    """Noise of 0.3 px and of 0.9 px under water, each found to a tenth; a given one is kept."""
+    made = scene(0.3)
+    wet = np.repeat(made.is_wet, np.diff(made.views.start))
+    more = np.random.default_rng(5).normal(0.0, np.sqrt(0.9**2 - 0.3**2), (len(wet), 2))
+    ties = replace(made.ties, image_xy=made.ties.image_xy + np.where(wet[:, None], more, 0.0))
+    found = adjust_ties(block(made, ties), FOCAL)
+    (note,) = [words for words in found.notes if "the noise of tie points differs" in words]
+    land, under = re.match(
+        r".*: ([\d.]+) px on land and ([\d.]+) px under water; each", note
+    ).groups()
+    assert float(land) == pytest.approx(0.3, rel=0.1)
+    assert float(under) == pytest.approx(0.9, rel=0.1)
+    equal = adjust_ties(block(made, ties), FOCAL, sigma_px=0.7)
+    assert not any("differs" in words for words in equal.notes)
+    assert not any("differs" in words for words in adjust_ties(block(made), FOCAL).notes)

@@ -49,7 +49,7 @@ from tests.benchmarks.accuracy_sensitivity import COLUMNS as SENSITIVITY_COLUMNS
 from tests.benchmarks.accuracy_sensitivity import sensitivity
 from tests.benchmarks.accuracy_tables import table
 
-METHODS = ("butler", "murase", "dietrich", "shan", "snell", "consistent")
+METHODS = ("butler", "murase", "shan", "snell", "consistent")
 CHECK_DEPTHS, CHECK_NOISE_M = 50, 0.03
 WARM_POINTS = 1000
 COLUMNS = [
@@ -74,6 +74,7 @@ def rows_of(case: Case, runs: int, seed: int) -> list[dict[str, Any]]:
     if case.floor is not None:
         rows.append({"method": "floor", **errors(case, case.floor)})
     rows.append(row_of(case, "factor", None, {}, runs))
+    rows.append(row_of(case, "factor", "auto", {"depth_factor": "auto"}, runs))
     learned = regression_of(case, seed)
     rows.append(row_of(case, "regression", None, {"regression": learned}, runs))
     rows.append(row_of(case, "auto", "auto", {}, runs))

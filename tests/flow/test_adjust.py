@@ -127,6 +127,12 @@ def test_the_cloud_stands_in_for_tie_points(files):
     # m: 1200 points stand for the 400 of the old adjustment, which held noise of their own
     assert centre_rms_m(files, found.cameras) < 0.04
     assert any(note.startswith("without tie points") for note in found.notes)
+    # rms of 45 normalised errors, neighbours alike; SigmaZ takes them from the members
+    off = (
+        found.cameras.centres - files.scene.true_cameras.centres
+    ) / found.precision.centre_sigma_m
+    assert 0.3 < np.sqrt((off**2).mean()) < 2.0
+    assert len(found.precision.members) > 0
     bed, land = home(files, found.cameras)
     assert bed < 0.03
     assert land < 0.02

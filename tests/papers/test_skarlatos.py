@@ -7,34 +7,103 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.report.papers import shan_rows, shan_text
+from pcfix.report.papers import effect_rows, shan_rows, shan_text
 from pcfix.simulate.refraction_effect import (
+    FLYING_HEIGHTS_M,
+    OVERLAPS,
+    PAPER_INDEX,
     SWINGLETCAM,
     ULTRACAM,
+    AerialCamera,
     StereoPair,
     effect,
+    effects,
     shan_iterations,
 )
+from tests.papers.test_equations import pierced, refracted
 
 PAIR = StereoPair(SWINGLETCAM, 100.0)
 
 
+PAIRS = [
+    StereoPair(camera, height, overlap)
+    for camera in (SWINGLETCAM, ULTRACAM)
+    for overlap in OVERLAPS[camera]
+    for height in FLYING_HEIGHTS_M[camera]
+]
+each_pair = pytest.mark.parametrize(
+    "pair", PAIRS, ids=lambda p: f"{p.flying_height_m:g}-{p.overlap}"
+)
+
+
+def true_depth(apparent, centres, index):
+    """Return the depth of eqs 8, 10 and 11 as printed, by numpy alone."""
+    system, right, up = np.zeros((6, 5)), np.zeros(6), np.array([0.0, 0.0, 1.0])
+    for i, centre in enumerate(centres):
+        ray = (apparent - centre) / np.linalg.norm(apparent - centre)
+        rows = slice(3 * i, 3 * i + 3)
+        system[rows, :3], system[rows, 3 + i] = np.eye(3), -refracted(ray, up, 1.0, index)
+        right[rows] = pierced(apparent, centre)
+    return -np.linalg.lstsq(system, right, rcond=None)[0][2]
+
+
 def test_geometry_of_the_swinglet_pair():
     along, across = SWINGLETCAM.footprint_m(100.0)
-    # m, the footprints and the base as their two decimals say
-    assert (across, along) == pytest.approx((144.19, 108.14), abs=0.005)
-    assert PAIR.base_m == pytest.approx(21.63, abs=0.005)
+    assert (across, along) == pytest.approx((144.0, 108.0), abs=1e-9)  # m, as printed
+    assert across / SWINGLETCAM.columns == pytest.approx(0.036, abs=1e-9)  # m of ground a pixel
+    assert round(SWINGLETCAM.pixel_um, 2) == 1.55  # um, as printed
+    assert PAIR.base_m == pytest.approx(21.6, abs=1e-9)
 
 
-def test_published_error_in_the_corners():
-    # m, to the last digit published
-    assert effect(PAIR, 15.0).corner_m == pytest.approx(-8.23, abs=0.005)
+def test_published_errors_of_corner_and_centre():
+    """Section 2.1.5: -8.23 and -5.15 m, to the last digit published; -15 m is truly -23.23 m."""
+    found = effect(PAIR, 15.0, PAPER_INDEX)
+    assert found.corner_m == pytest.approx(-8.23, abs=0.005)
+    assert found.centre_m == pytest.approx(-5.15, abs=0.005)
+    assert found.corner_m - 15.0 == pytest.approx(-23.23, abs=0.005)
 
 
-def test_published_error_in_the_centre():
-    # m; the paper has -5.15, which this reading of its geometry misses by 1.1 cm, 0.2 %: see
-    # the docstring of pcfix.simulate.refraction_effect
-    assert effect(PAIR, 15.0).centre_m == pytest.approx(-5.15, abs=0.012)
+@pytest.mark.parametrize(("index", "pixel_um"), [(1.34, 1.548), (1.341, 1.548), (1.3405, 1.55)])
+def test_other_readings_miss_a_published_error(index, pixel_um):
+    pair = StereoPair(AerialCamera("other", 4.3, 4000, 3000, pixel_um), 100.0)
+    found = effect(pair, 15.0, index)
+    assert abs(found.corner_m + 8.23) > 0.005 or abs(found.centre_m + 5.15) > 0.005
+
+
+@each_pair
+@pytest.mark.parametrize("depth_m", [1.0, 8.0, 15.0])
+def test_models_of_figures_5_and_6_are_those_of_the_equations(pair, depth_m):
+    found = effect(pair, depth_m, PAPER_INDEX, nodes=5)
+    for i, y in enumerate(found.y_m):
+        for j, x in enumerate(found.x_m):
+            true = true_depth(np.array([x, y, -depth_m]), pair.centres, PAPER_INDEX)
+            # m; least squares of 6 by 5 with sums of 3000 m
+            assert found.error_m[i, j] == pytest.approx(depth_m - true, abs=1e-7)
+
+
+@each_pair
+def test_the_largest_error_is_about_a_third_of_the_true_depth(pair):
+    """Section 2.1.5: 1/3 of the real depth or half the apparent one, at any height and lens.
+
+    It holds as a round number: 0.31 to 0.37 and 0.45 to 0.57 in the models of Figures 5 and 6.
+    """
+    corner = -effect(pair, 15.0, PAPER_INDEX).corner_m
+    assert corner / (15.0 + corner) == pytest.approx(1.0 / 3.0, abs=0.033)
+    assert corner / 15.0 == pytest.approx(0.5, abs=0.076)
+
+
+def test_a_long_lens_has_less_than_that():
+    """Where all rays are steep the error is n - 1 of the apparent depth, so not at any lens."""
+    narrow = StereoPair(AerialCamera("long", 1000.0, 4000, 3000, 1.55), 1000.0)
+    assert -effect(narrow, 15.0, PAPER_INDEX).corner_m / 15.0 == pytest.approx(0.3405, abs=1e-4)
+
+
+def test_depth_zero_is_the_surface_of_the_water():
+    zero, deep = effects([PAIR], (0.0, 15.0), PAPER_INDEX)
+    assert np.abs(zero.error_m).max() < 1e-12  # m, rounding of sums of 100 m
+    rows = effect_rows([zero, deep])
+    assert rows[0]["factor_centre"] == rows[0]["factor_corner"] == ""
+    assert rows[1]["factor_corner"] == pytest.approx(23.23 / 15.0, abs=0.005 / 15.0)
 
 
 def test_the_ultracam_has_the_smaller_error():

@@ -9,6 +9,7 @@ import pytest
 
 import pcfix
 from pcfix.errors import SettingError
+from pcfix.options.scenes import SimulateOptions
 from pcfix.simulate.refraction_effect import (
     SWINGLETCAM,
     ULTRACAM,
@@ -87,7 +88,7 @@ def test_the_map_is_symmetric_and_worst_in_the_corners():
 
 
 def test_deeper_and_wider_is_worse():
-    by_depth = [one.centre_m for one in effects({SWINGLETCAM: (100.0,)}, (1.0, 2.0, 5.0, 15.0))]
+    by_depth = [one.centre_m for one in effects([PAIR], (1.0, 2.0, 5.0, 15.0))]
     assert by_depth == sorted(by_depth, reverse=True)
     wide, narrow = (effect(StereoPair(c, 1000.0), 10.0) for c in (SWINGLETCAM, ULTRACAM))
     assert wide.corner_m < narrow.corner_m
@@ -102,12 +103,21 @@ def test_deeper_and_wider_is_worse():
         (lambda: AerialCamera("x", 0.0, 4000, 3000, 1.5), "focal length 0"),
         (lambda: effect(PAIR, 0.0), "apparent depth 0 m"),
         (lambda: effect(PAIR, math.nan), "apparent depth nan m"),
+        (lambda: effects([PAIR], (0.0,)), "apparent depth 0 m is not finite and above 0"),
+        (lambda: effects([PAIR], (0.0, -1.0)), "apparent depth -1 m"),
+        (lambda: effects([PAIR], (0.0, 0.0)), "apparent depth 0 m"),
+        (lambda: SimulateOptions(refraction_effect=True, effect_overlap=0.8), r"as \(0.8,\)"),
+        (lambda: effects([PAIR], (1.0, math.inf)), "apparent depth inf m"),
         (lambda: effect(PAIR, 5.0, 1.7), "1.7"),
     ],
 )
 def test_mistakes_are_told(made, what):
     with pytest.raises(SettingError, match=what):
         made()
+
+
+FIGURES = "", "_bed", "_stack"
+"""Maps, Fig 4, and Figs 5 and 6."""
 
 
 def run(*words):
@@ -117,14 +127,17 @@ def run(*words):
 def test_command_writes_tables_and_pictures(tmp_path):
     done = run(tmp_path / "out", "--refraction-effect")
     assert done.returncode == 0, done.stderr
-    assert "-8.228 m" in done.stdout and "published" in done.stdout
+    assert "-8.232 m" in done.stdout and "-5.147 m" in done.stdout and "published" in done.stdout
     rows = list(csv.DictReader((tmp_path / "out" / "refraction_effect.csv").open()))
-    assert len(rows) == 2 * 3 * 5
+    assert len(rows) == (2 + 2 * 2) * 16
     chosen = [r for r in rows if (r["flying_height_m"], r["apparent_depth_m"]) == ("100.0", "15.0")]
-    assert float(chosen[0]["error_corner_m"]) == pytest.approx(-8.2277, abs=1e-4)  # m, as written
+    assert float(chosen[0]["error_corner_m"]) == pytest.approx(-8.2322, abs=1e-4)  # m, as written
+    assert (rows[0]["error_corner_m"], rows[0]["factor_corner"]) == ("0.0", "")  # at depth 0
     settings = json.loads((tmp_path / "out" / "refraction_effect.json").read_text())
-    assert settings["overlap"] == 0.8
-    for name in ("swingletcam", "ultracamx", "depth"):
+    assert [one["overlaps"] for one in settings["cameras"]] == [[0.8], [0.6, 0.8]]
+    assert settings["refractive_index"] == 1.3405
+    drawn = [f"{name}{kind}" for name in ("swingletcam", "ultracamx") for kind in FIGURES]
+    for name in (*drawn, "depth"):
         picture = (tmp_path / "out" / f"refraction_effect_{name}.png").read_bytes()
         assert picture.startswith(b"\x89PNG")
     again = run(tmp_path / "out", "--refraction-effect")
@@ -134,7 +147,7 @@ def test_command_writes_tables_and_pictures(tmp_path):
 def test_command_takes_a_camera_of_ones_own(tmp_path):
     """With no refraction at all, so that the maps have to draw a level error too."""
     camera = "--effect-focal-mm 8.8 --effect-frame-px 5472x3648 --effect-pixel-um 2.41"
-    pair = "--effect-overlap 0.6 --effect-heights 30 --effect-depths 1,4 --index 1 --quiet"
+    pair = "--effect-overlap 0.6 --effect-heights 30 --effect-depths 1:5:3 --index 1 --quiet"
     done = run(tmp_path / "own", "--refraction-effect", *camera.split(), *pair.split())
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     rows = list(csv.DictReader((tmp_path / "own" / "refraction_effect.csv").open()))
@@ -142,7 +155,8 @@ def test_command_takes_a_camera_of_ones_own(tmp_path):
     base = 0.4 * 3648 * 2.41e-6 * 30.0 / 8.8e-3
     assert float(rows[0]["base_m"]) == pytest.approx(base, abs=1e-4)  # m, as written
     assert float(rows[1]["error_corner_m"]) == pytest.approx(0.0, abs=1e-5)
-    assert (tmp_path / "own" / "refraction_effect_camera.png").stat().st_size > 5000
+    for kind in FIGURES:
+        assert (tmp_path / "own" / f"refraction_effect_camera{kind}.png").stat().st_size > 5000
 
 
 @pytest.mark.parametrize(
@@ -153,6 +167,21 @@ def test_command_takes_a_camera_of_ones_own(tmp_path):
         (["--refraction-effect", "--effect-heights", "high"], "not a list of numbers"),
         (["--refraction-effect", "--effect-heights", "1,2,3,4,5,6,7"], "6 at most"),
         (["--refraction-effect", "--effect-depths", "-2"], "apparent depth -2 m"),
+        (
+            ["--refraction-effect", "--effect-depths", "0"],
+            "apparent depth 0 m is not finite and above 0",
+        ),
+        (
+            ["--refraction-effect", "--effect-depths", "0:0:1"],
+            "apparent depth 0 m is not finite and above 0",
+        ),
+        (["--refraction-effect", "--effect-depths", "0:15:-1"], "with a step above 0, as 0:15:1"),
+        (["--refraction-effect", "--effect-depths", "15:0:1"], "upwards"),
+        (["--refraction-effect", "--effect-depths", "0:15"], "not FROM:TO:STEP"),
+        (["--refraction-effect", "--effect-depths", "0:deep:1"], "0:deep:1 is not FROM:TO:STEP"),
+        (["--refraction-effect", "--effect-depths", "0:15:0.01"], "1501 depths; give 100"),
+        (["--refraction-effect", "--effect-depths", "shallow"], "not a list of numbers"),
+        (["--refraction-effect", "--effect-overlap", "much"], "not a list of numbers"),
         (
             [
                 "--refraction-effect",

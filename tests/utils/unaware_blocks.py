@@ -21,6 +21,7 @@ from tests.utils.adjust_twin import Twin
 from tests.utils.tie_blocks import block_of, some_ties
 
 if TYPE_CHECKING:
+    from pcfix.adjust.block import Robust
     from pcfix.model import Cameras, FloatArray
     from tests.utils.tie_points import TieScene
 
@@ -52,12 +53,12 @@ class Unaware:
         return jacobian.T @ r, np.linalg.norm(jacobian, axis=0) * np.linalg.norm(r)
 
 
-def unaware(scene: TieScene, *, exact: bool = False) -> Unaware:
+def unaware(scene: TieScene, *, exact: bool = False, robust: Robust = "squares") -> Unaware:
     """Adjust a scene with straight rays."""
     block = block_of(scene, exact=exact, gnss=False)
     dry = replace(block, water=None, wet=np.zeros(len(block.xyz), bool))
     problem, start = prepare(dry, Unknowns(lens=("f",), free_network=True))
-    found = solve(problem, start)
+    found = solve(problem, start, robust)
     cameras, xyz = solved_cameras(problem, found), found.state.xyz + problem.origin
     target = scene.true_cameras.centres if exact else scene.cameras.gnss.xyz
     scale, turn, shift = similarity(cameras.centres, target)

@@ -119,6 +119,8 @@ def read_cameras(
     """
     source, form = _recognised(path, sensor, angles)
     cameras = form.reader.read(source)
+    if not len(cameras):
+        raise InputError(f"{path}: has no image with a pose.")
     for note in cameras.notes:
         warnings.warn(note, PcfixWarning, stacklevel=2)
     return cameras

@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from pcfix.kernels import lean
-from pcfix.lens.algebra import Vector, dot, minus, normal_of
+from pcfix.lens.algebra import Vector, cross, dot, minus, normal_of, scaled
 from pcfix.model import FloatArray
 from pcfix.refract.rays import plane_at, refracted
 from pcfix.water.surface import Field, Tin
@@ -94,17 +94,29 @@ def pierce(water: Water, e: Vector, d: Vector) -> tuple[float, float]:
 
 
 @lean
+def bent(water: Water, e: Vector, x: float, y: float, n: float) -> tuple[Vector, Vector]:
+    """Return piercing point and refracted ray of the ray through a plan place of the surface.
+
+    The ray, not of unit length and NaN where it does not go down, is that of Mulsow 2024 after
+    Glassner 1989, which is eq 10 of Skarlatos & Agrafiotis 2018. The n_t that is printed with it,
+    n_t / n_(t+1), is the inverse of that which the formula takes.
+    """
+    z, b, c = height_of(water, x, y)
+    a = x, y, z
+    normal, u = normal_of(b, c), minus(e, a)
+    facing = dot(normal, u)
+    if facing > 0.0:
+        t = refracted(u, dot(u, u), normal, facing, 1.0 / n)
+        if t[2] < 0.0:
+            return a, t
+    return a, (np.nan, np.nan, np.nan)
+
+
+@lean
 def miss_through(water: Water, e: Vector, x: float, y: float, n: float) -> tuple[float, float]:
     """Return the miss of the ray that pierces the surface at the plan place x, y."""
-    z, b, c = height_of(water, x, y)
-    normal, u = normal_of(b, c), minus(e, (x, y, z))
-    facing = dot(normal, u)
-    if not facing > 0.0:
-        return np.nan, np.nan
-    tx, ty, tz = refracted(u, dot(u, u), normal, facing, 1.0 / n)
-    if not tz < 0.0:
-        return np.nan, np.nan
-    return x - tx * z / tz, y - ty * z / tz
+    a, t = bent(water, e, x, y, n)
+    return x - t[0] * a[2] / t[2], y - t[1] * a[2] / t[2]
 
 
 @lean
@@ -137,11 +149,9 @@ HALVINGS = 24
 def kotowski(water: Water, level: float, e: Vector, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, steps, found).
 
-    The idea is that of Kotowski 1988, Phototriangulation in multi-media photogrammetry: ray tracing
-    through refracting surfaces of any form inside the bundle, which Mulsow 2010, A flexible
-    multi-media bundle approach, takes up. Only the openings of both could be had; that the piercing
-    point is iterated from the straight line by Newton's method is how they were read, and the
-    equations are our own.
+    Kotowski 1987 is, after Mulsow 2024, the first universal model: the collinearity equations of
+    the piercing point, of which every point is iterated. How is not told there; here it is by
+    Newton's method from the straight line, with equations of our own.
 
     With the unit vectors u from the camera to A and v from A to the point, Snell's law says that u
     - n v stands upright on the surface, hence on its tangents (1, 0, b) and (0, 1, c):
@@ -227,7 +237,7 @@ AFRT_STEPS = 60
 def afrt(water: Water, level: float, e: Vector, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, steps, found).
 
-    The name is in Mulsow 2024, whose text could not be had; this is how it was read. The straight
+    Mulsow 2024 has the name alone; this is how it is read. The straight
     ray to an apparent point P, at the height of the object point, is traced forward through the
     water and comes out beside the object point; P is moved by as much the other way, the ray is
     traced again, and so on. It starts with P in the object point. On calm water, from a height H
@@ -273,49 +283,65 @@ NARROW_M = 1e-6
 
 
 @lean
+def _distance(
+    water: Water, level: float, e: Vector, x: float, y: float, n: float
+) -> tuple[float, float, Vector, Vector]:
+    """Return piercing place (x, y), distance d and direction t of the ray aimed at x, y.
+
+    d leads from the refracted ray at right angles to the object point P:
+
+        d = P - A - (t.(P - A) / t.t) t
+
+    Mulsow 2024 prints P_0 for the first P, and the last term with A - P but the same sign.
+    """
+    ax, ay = pierce(water, e, minus((x, y, level), e))
+    a, t = bent(water, e, ax, ay, n)
+    return ax, ay, minus(scaled(dot(t, a) / dot(t, t), t), a), t
+
+
+@lean
 def mdfrt(water: Water, level: float, e: Vector, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, steps, found).
 
-    The name is in Mulsow 2024, whose text could not be had; this is how it was read. A ray and two
-    beside it are traced forward through the water. Where the three come down to the height of the
-    object point gives the mapping from direction to place, linearised; it is solved for the
-    direction that hits the point, the rays are traced about that one and nearer to each other, and
-    so on. It starts with the straight line. That is Newton's method with differences instead of
-    derivatives: three rays a step, few steps.
+    Minimum distance forward ray tracing of Mulsow 2024: rays are traced forward, and the direction
+    at the camera, that of the straight line at first, is changed until the distance d of the
+    refracted ray from the object point is 0. How it is changed is not told there: here a ray and
+    two beside it make d linear in the two coordinates of the aim, and of the three equations the
+    two across the ray are solved. That is Newton's method with differences instead of derivatives:
+    three rays a step, few steps.
 
-    A step that makes the miss grow is halved until it is short; so is one beyond the edge of the
-    water.
+    A step that makes the distance grow is halved until it is short; so is one beyond the edge of
+    the water.
     """
     f = level / e[2]
     x, y = f * e[0], f * e[1]
-    ax, ay, mx, my = shoot(water, level, e, x, y, n)
-    if np.isnan(mx):
+    ax, ay, d, t = _distance(water, level, e, x, y, n)
+    if np.isnan(d[0]):
         x, y = 0.0, 0.0
-        ax, ay, mx, my = shoot(water, level, e, x, y, n)
+        ax, ay, d, t = _distance(water, level, e, x, y, n)
     for step in range(1, MDFRT_STEPS + 1):
-        before = mx * mx + my * my
+        before = dot(d, d)
         if not before > CLOSE_M * CLOSE_M:
-            return ax, ay, step, not np.isnan(mx)
+            return ax, ay, step, not np.isnan(before)
         apart = min(max(0.01 * np.sqrt(before), NARROW_M), 0.05 * level)
-        _, _, xx, yx = shoot(water, level, e, x + apart, y, n)
-        _, _, xy, yy = shoot(water, level, e, x, y + apart, n)
-        xx, yx, xy, yy = xx - mx, yx - my, xy - mx, yy - my
-        det = (xx * yy - xy * yx) / apart
-        dx, dy = (xy * my - yy * mx) / det, (yx * mx - xx * my) / det
+        by_x = minus(_distance(water, level, e, x + apart, y, n)[2], d)
+        by_y = minus(_distance(water, level, e, x, y + apart, n)[2], d)
+        det = dot(t, cross(by_x, by_y)) / apart
+        dx, dy = dot(t, cross(by_y, d)) / det, dot(t, cross(d, by_x)) / det
         size, share = np.sqrt(dx * dx + dy * dy), 1.0
         if not size < np.inf:
             return ax, ay, step, False
         for _ in range(HALVINGS):
-            there = shoot(water, level, e, x + share * dx, y + share * dy, n)
-            less = there[2] * there[2] + there[3] * there[3] < before
-            if less or (share * size < SHORT * level and not np.isnan(there[2])):
+            there = _distance(water, level, e, x + share * dx, y + share * dy, n)
+            after = dot(there[2], there[2])
+            if after < before or (share * size < SHORT * level and not np.isnan(after)):
                 break
             share *= 0.5
-        if np.isnan(there[2]):
+        if np.isnan(after):
             return ax, ay, step, False
         x, y = x + share * dx, y + share * dy
-        ax, ay, mx, my = there
-    return ax, ay, MDFRT_STEPS, mx * mx + my * my <= CLOSE_M * CLOSE_M
+        ax, ay, d, t = there
+    return ax, ay, MDFRT_STEPS, dot(d, d) <= CLOSE_M * CLOSE_M
 
 
 KNOTS = 21
@@ -330,7 +356,7 @@ NEIGHBOUR_M = 1e-4
 def scattershot(water: Water, level: float, e: Vector, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, shots, found).
 
-    The name is in Mulsow 2024, whose text could not be had; this is how it was read. Rays to the
+    Mulsow 2024 has the name alone ("brute force"); this is how it is read. Rays to the
     knots of a grid on the surface are followed to the object point; the grid is drawn together
     about the best one again and again. No start value, no derivative, no law of refraction even:
     the best one is that of the least optical length (Fermat). So where a broken surface sends light

@@ -1,0 +1,294 @@
+"""C2C either way, of several clouds, against SciPy's tree and NumPy asked directly."""
+
+import csv
+import json
+import math
+
+import laspy
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+import pcfix
+from pcfix.compare.nearest import spacing_m
+from pcfix.compare.statistics import distances_of
+from pcfix.flow.compare import compare_clouds
+from pcfix.report.c2c import c2c_figure, c2c_lines, gauss
+from pcfix.report.comparison import comparison_text, evaluation
+from tests.compare.test_files import LIDAR, SCENE, lifted, plane, refused, write_las
+from tests.utils.program import run_pcfix
+
+WHOLE = {"max_gap": 1000.0}  # no point is too far outside the other cloud
+BANDS = [(0.6, 1.0), (3.0, 6.0)]
+"""Those of which Skarlatos & Agrafiotis 2018 give the share, at Amathounta and at Agia Napa."""
+
+
+def words(*names):
+    return {"cameras": SCENE / "cameras.csv", "water": 0.37, **dict(names)}
+
+
+@pytest.fixture(scope="module")
+def corrected(tmp_path_factory):
+    path = tmp_path_factory.mktemp("c2c") / "corrected.laz"
+    pcfix.correct_file(SCENE / "cloud.laz", path, **words())
+    return path
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory):
+    path = tmp_path_factory.mktemp("c2c") / "other.laz"
+    pcfix.correct_file(SCENE / "cloud.laz", path, **words(("method", "dietrich")))
+    return path
+
+
+@pytest.fixture(scope="module")
+def both(corrected, other):
+    given = {"direction": "both", "share": BANDS, "also": {"Dietrich": other}}
+    return compare_clouds(corrected, LIDAR, sections=1, **given, **WHOLE)
+
+
+def places(path):
+    return np.asarray(laspy.read(path).xyz)
+
+
+def far(compared, reference):
+    return cKDTree(reference).query(compared)[0]
+
+
+def agrees(found, expected):
+    """Check a distribution against distances that SciPy found; coordinates of 5e6 m, float64."""
+    s, count = found.statistics, len(expected)
+    assert s.count == count
+    values = (s.mean_m, s.sd_m, s.max_m, s.median_m, found.normal.mu_m, found.normal.sigma_m)
+    own = (expected.mean(), expected.std(), expected.max(), np.median(expected))
+    np.testing.assert_allclose(values, (*own, *own[:2]), rtol=0, atol=1e-8)
+    classes = math.ceil(math.sqrt(count))
+    assert len(found.histogram.counts) == classes
+    counts, edges = np.histogram(expected, classes)
+    np.testing.assert_allclose(found.histogram.edges_m, edges, rtol=0, atol=1e-8)
+    # a distance on an edge falls to either side of it
+    assert np.abs(np.cumsum(found.histogram.counts) - np.cumsum(counts)).max() <= 2
+    for share, (low, high) in zip(found.shares, BANDS, strict=True):
+        inside = np.count_nonzero((expected >= low) & (expected < high))
+        assert share.share == pytest.approx(inside / count, abs=1.5 / count)
+
+
+def test_either_way_before_and_after_is_what_scipy_finds(both, corrected):
+    las, lidar = laspy.read(corrected), places(LIDAR)
+    now = np.asarray(las.xyz)
+    came = now - np.column_stack([las["ShiftX"], las["ShiftY"], las["ShiftZ"]])
+    agrees(both.c2c.after, far(now, lidar))
+    agrees(both.c2c.before, far(came, lidar))
+    agrees(both.c2c_from_reference.after, far(lidar, now))
+    agrees(both.c2c_from_reference.before, far(lidar, came))
+    assert both.counts.reference_compared == len(lidar)
+
+
+def test_a_further_cloud_is_in_the_table_and_the_sections(both, other):
+    (one,) = both.also
+    assert (one.name, one.cloud) == ("Dietrich", str(other))
+    agrees(one.c2c, far(places(other), places(LIDAR)))
+    agrees(one.c2c_from_reference, far(places(LIDAR), places(other)))
+    (section,) = both.sections
+    assert list(section.heights_m)[-2:] == ["reference", "Dietrich"]
+    alone = compare_clouds(other, LIDAR, section=[section.line]).sections[0]
+    np.testing.assert_array_equal(section.heights_m["Dietrich"], alone.heights_m["corrected"])
+
+
+def test_each_direction_alone_is_that_of_both(both, corrected):
+    back = compare_clouds(corrected, LIDAR, direction="from-reference", share="0.6,1.0", **WHOLE)
+    assert back.c2c is None
+    assert back.c2c_from_reference.after.statistics == both.c2c_from_reference.after.statistics
+    assert back.c2c_from_reference.after.shares == both.c2c_from_reference.after.shares[:1]
+    there = compare_clouds(corrected, LIDAR, direction="to-reference", **WHOLE)
+    assert there.c2c_from_reference is None
+    assert there.c2c == compare_clouds(corrected, LIDAR, **WHOLE).c2c
+    assert there.vertical == back.vertical == both.vertical
+
+
+def test_under_water_alone_both_clouds_are_cut(corrected):
+    lidar, las = places(LIDAR), laspy.read(corrected)
+    given = {"submerged": True, "direction": "from-reference", "water": 0.37}
+    found = compare_clouds(corrected, LIDAR, also={"raw": SCENE / "cloud.laz"}, **given, **WHOLE)
+    wet = lidar[lidar[:, 2] < 0.37]
+    assert 0 < found.counts.reference_compared == len(wet) < len(lidar)
+    bed = np.asarray(las.xyz)[np.asarray(las.z) < 0.37]
+    expected = far(wet, bed)
+    after = found.c2c_from_reference.after.statistics
+    assert after.mean_m == pytest.approx(expected.mean(), abs=1e-8)
+    # the raw cloud is what the corrected one came as, but for rounding to the file's scale
+    before = found.c2c_from_reference.before.statistics
+    assert found.also[0].c2c_from_reference.statistics.mean_m == pytest.approx(
+        before.mean_m, abs=0.001
+    )
+    # S: refraction left 0.4 and 2.2 m; here a bed of twelve metres
+    assert before.mean_m > 1.5 > 0.5 > after.mean_m
+
+
+def test_a_cloud_that_knows_no_water_takes_that_of_the_first(corrected):
+    given = {"submerged": True, "also": {"raw": SCENE / "cloud.laz"}}
+    found = compare_clouds(corrected, LIDAR, **given)
+    raw, before = found.also[0].c2c.statistics, found.c2c.before.statistics
+    # points within a millimetre of the surface may be dry here and wet there
+    assert raw.count == pytest.approx(before.count, abs=20)
+    assert raw.mean_m == pytest.approx(before.mean_m, abs=0.003)
+
+
+@pytest.mark.parametrize(("count", "classes"), [(1_288_760, 1136), (2209, 47), (2210, 48), (1, 1)])
+def test_as_many_classes_as_cloudcompare_has(count, classes):
+    """1136 are those of Figure 18 of Skarlatos & Agrafiotis 2018, with so many points of LiDAR."""
+    values = np.abs(np.random.default_rng(40).normal(0.5, 0.3, count))
+    found = distances_of(values, None, [])
+    assert len(found.histogram.counts) == classes
+    assert sum(found.histogram.counts) == count
+    assert found.histogram.edges_m[-1] >= found.statistics.max_m
+    assert len(distances_of(values, 20, []).histogram.counts) == 20
+
+
+def test_further_clouds_are_asked_at_the_same_places(tmp_path):
+    """So that their figures can be laid side by side: all of Figure 18 has 1136 classes."""
+    reference = write_las(tmp_path / "ref.las", plane(2000, 55))
+    cloud = write_las(tmp_path / "cloud.las", plane(9000, 56, side_m=50.0))
+    small = plane(4000, 57, side_m=20.0)
+    also = {"small": write_las(tmp_path / "small.las", small)}
+    found = compare_clouds(cloud, reference, direction="from-reference", also=also)
+    there = places(reference)
+    beside = there[(there[:, :2] <= places(cloud)[:, :2].max(axis=0) + 1.0).all(axis=1)]
+    count = found.c2c_from_reference.after.statistics.count
+    assert found.also[0].c2c_from_reference.statistics.count == count
+    assert len(beside) <= count < len(there)
+    assert found.also[0].c2c_from_reference.statistics.max_m > 30.0
+
+
+def test_bands_that_touch_count_each_distance_once():
+    values = np.array([0.0, 0.5, 0.5, 1.0, 2.0])
+    shares = distances_of(values, None, [(0.0, 0.5), (0.5, 1.0), (1.0, 3.0)]).shares
+    assert [one.share for one in shares] == [0.2, 0.4, 0.4]
+
+
+def test_gauss_is_written_as_cloudcompare_writes_it(both):
+    values = np.concatenate([np.full(500, 1.0), np.full(500, 3.0)])
+    plain = compare_clouds(LIDAR, LIDAR, c2c_only=True).as_dict()
+    plain["c2c"]["after"]["normal"] = {"mu_m": 2.234814, "sigma_m": 1.441840}
+    plain["c2c"]["after"]["histogram"]["counts"] = [1] * 1136
+    said = "Gauss: mean = 2.234814 / std.dev. = 1.441840 [1136 classes]"  # of Figure 18a
+    assert c2c_lines(plain) == [f"C2C to reference, as it is: {said}"]
+    assert gauss(json.loads(json.dumps(plain))["c2c"]["after"]) == said
+    of = distances_of(values, None, []).normal
+    assert (of.mu_m, of.sigma_m) == (2.0, 1.0)  # divided by n, as CloudCompare does
+    text, normal = comparison_text(both), both.c2c.before.normal
+    assert f"C2C to reference, as it came: Gauss: mean = {normal.mu_m:.6f} / std.dev. = " in text
+    back = both.also[0].c2c_from_reference
+    share, count = back.shares[0].share, back.statistics.count
+    assert f"  of {count:,} points {100 * share:.1f} % are 0.6 to 1 m away" in text
+
+
+def test_the_curve_on_the_histogram_is_that_gauss(both):
+    figure = c2c_figure(both.as_dict())
+    assert len(figure.axes) == 6  # as it came, corrected, Dietrich; either way
+    normal, count = both.c2c.after.normal, both.c2c.after.statistics.count
+    axes = figure.axes[2]  # of the second row the first
+    assert "mean = " + f"{normal.mu_m:.6f}" in axes.get_title()
+    x, y = axes.lines[0].get_data()
+    width = np.diff(both.c2c.after.histogram.edges_m[:2])[0]
+    top = count * width / (normal.sigma_m * math.sqrt(2.0 * math.pi))
+    assert y.max() == pytest.approx(top, rel=1e-4)
+    assert x[y.argmax()] == pytest.approx(normal.mu_m, abs=0.002)
+    pictures, tables = evaluation(both.as_dict(), [])
+    (picture,) = (one for one in pictures if one.name == "histogram_c2c")
+    assert "From reference, Dietrich" in picture.alt
+    (table,) = (one for one in tables if "Gauss" in one.title)
+    assert table.header[-2:] == ["0.6 to 1 m", "3 to 6 m"]
+    assert table.rows[1][1:4] == [f"{normal.mu_m:.6f}", f"{normal.sigma_m:.6f}", "142"]
+    largest = f"{both.c2c.after.statistics.max_m:.3f}"
+    assert ["C2C to reference, corrected", largest] in [[r[0], r[-1]] for r in tables[0].rows]
+
+
+def test_a_sparse_reference_is_noted_with_the_direction_that_serves(tmp_path, corrected):
+    """As at Amathounta, where the LiDAR of Skarlatos & Agrafiotis 2018 was a grid of 5 m."""
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(2.0, 60.0, 5.0), np.arange(2.0, 60.0, 5.0)))
+    corner = plane(1, 1, side_m=0.0)[0, :2]
+    grid = np.column_stack([x + corner[0], y + corner[1], -2.0 - 0.05 * x])
+    reference = write_las(tmp_path / "grid.las", grid)
+    cloud = write_las(tmp_path / "cloud.las", lifted(plane(90_000, 50), 0.2))
+    assert spacing_m(grid) == pytest.approx(5.0, rel=0.15)
+    there = compare_clouds(cloud, reference)
+    (note,) = (note for note in there.notes if "C2C" in note)
+    assert "the points of the reference are" in note
+    assert note.endswith("give --direction from-reference")
+    # the mean distance to the nearest node of a grid of 5 m is 0.383 times that; not 0.2 m
+    assert there.c2c.after.statistics.mean_m == pytest.approx(0.383 * 5.0, rel=0.05)
+    back = compare_clouds(cloud, reference, direction="from-reference")
+    assert not any("C2C" in note for note in back.notes)
+    # points every 0.2 m: at most 2 cm beside the vertical
+    assert back.c2c_from_reference.after.statistics.mean_m == pytest.approx(0.2, abs=0.03)
+    turned = compare_clouds(reference, cloud, direction="from-reference").notes
+    assert any(note.endswith("give --direction to-reference") for note in turned)
+    both_ways = compare_clouds(cloud, reference, direction="both").notes
+    assert any(note.endswith("from each point of the reference") for note in both_ways)
+    caption = evaluation(there.as_dict(), [])[0][1].alt
+    assert note[1:] in caption
+    assert not any("C2C" in note for note in compare_clouds(corrected, LIDAR).notes)
+
+
+def test_check_points_have_one_direction(tmp_path):
+    cloud = write_las(tmp_path / "a.las", plane(30_000, 51), crs=None)
+    rows = [f"{x:.3f},{y:.3f},{z:.4f}" for x, y, z in plane(12, 52)]
+    (tmp_path / "checks.csv").write_text("\n".join(["x,y,z", *rows]) + "\n")
+    checks = tmp_path / "checks.csv"
+    told = compare_clouds(cloud, checks, direction="from-reference")
+    assert told.c2c_from_reference == compare_clouds(cloud, checks).c2c
+    for way in ("to-reference", "both"):
+        refused(
+            pcfix.SettingError, r"checks\.csv: holds check points", cloud, checks, direction=way
+        )
+
+
+def test_bad_settings_are_one_clear_sentence(tmp_path, both):
+    cloud = write_las(tmp_path / "a.las", plane(100, 53))
+    bad = pcfix.SettingError
+    for share in ("1.0,0.6", "-1,2", "1,1", "x,1", "1", "1,2,3", "nan,1", "0,inf"):
+        refused(bad, f"share '{share}' must be two distances", cloud, cloud, share=[share])
+    refused(bad, "share '2.0,1.0' must be", cloud, cloud, share=[(2.0, 1.0)])
+    for also in ("a.las", "=a.las", "one=", "a,b=a.las", " =a.las", "a\tb=a.las"):
+        refused(bad, "must be NAME=CLOUD", cloud, cloud, also=[also])
+    refused(bad, "one is the name of another cloud", cloud, cloud, also=["one=a.las", "one=b.las"])
+    refused(bad, "water is the name of a line", cloud, cloud, also={"water": cloud})
+    refused(pcfix.InputError, "no such file", cloud, cloud, also={"one": tmp_path / "b.las"})
+    refused(bad, "direction 'back' is not one of", cloud, cloud, direction="back")
+    refused(bad, "classes 1 must be a whole number", cloud, cloud, classes=1)
+    refused(bad, "same file", cloud, cloud, plot=cloud, overwrite=True)
+    other = write_las(tmp_path / "b.las", plane(100, 53), crs=32634)
+    refused(pcfix.InputError, "UTM zone 34N", cloud, cloud, also={"one": other})
+    dry = {"direction": "from-reference", "submerged": True, "water": -3.0}
+    high = write_las(tmp_path / "high.las", lifted(plane(100, 54), 50.0))
+    refused(pcfix.GeometryError, "no point near the cloud is under", cloud, high, **dry)
+
+
+def test_a_raster_has_no_points_to_start_from(tmp_path, corrected):
+    pcfix.grid_dsm(corrected, tmp_path / "dsm.tif", resolution=1.0)
+    for way in ("from-reference", "both"):
+        refused(
+            pcfix.SettingError, rf"dsm\.tif: is a raster.*--direction {way} starts at",
+            corrected, tmp_path / "dsm.tif", direction=way,
+        )  # fmt: skip
+    assert compare_clouds(corrected, tmp_path / "dsm.tif", direction="to-reference").c2c
+
+
+def test_the_command_leaves_figures_picture_and_sections(tmp_path, both, corrected, other):
+    done = run_pcfix(
+        "compare", corrected, LIDAR, "--direction", "both", "--share", "0.6,1", "--share", "3,6",
+        "--also", f"Dietrich={other}", "--max-gap", "1000", "--sections", "1", "--plot", "c.png",
+        "--out-dir", "out", folder=tmp_path,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    said = json.loads((tmp_path / "out" / "compare.json").read_text())
+    for name in ("c2c", "c2c_from_reference", "also"):
+        assert said[name] == json.loads(json.dumps(both.as_dict()[name]))
+    assert said["settings"]["also"] == [["Dietrich", str(other)]]
+    assert (tmp_path / "c.png").read_bytes().startswith(b"\x89PNG")
+    with (tmp_path / "out" / "section_01.csv").open() as stream:
+        assert next(csv.reader(stream))[-1] == "Dietrich_m"
+    done = run_pcfix("compare", corrected, LIDAR, "--share", "-1,2")
+    assert done.returncode == 1
+    assert done.stderr.startswith("pcfix: share '-1,2' must be two distances LOW,HIGH")

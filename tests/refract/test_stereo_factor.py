@@ -1,0 +1,109 @@
+"""The factor of stereo pairs: by light traced through the water, and on simulated clouds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pcfix
+from pcfix.errors import GeometryError, SettingError
+from pcfix.refract.stereo_factor import NODES, ratios, stereo_factor
+from pcfix.simulate.refraction_effect import SWINGLETCAM, StereoPair, effect
+from tests.utils.twins import light_path
+
+N = 1.34
+SCENE = {"bed": "shore", "lidar_per_m2": 0.0}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return pcfix.simulate_scene(8000, seed=1, **SCENE)
+
+
+def test_air_changes_nothing_and_narrow_frames_have_the_index():
+    assert ratios(0.2, 0.5, 0.4, 1.0) == pytest.approx(1.0, abs=1e-12)
+    assert ratios(0.001, 0.002, 0.002, N) == pytest.approx(N, abs=1e-5)
+
+
+def test_each_place_is_that_of_traced_light():
+    height, base, along, across = 100.0, 20.0, 0.55, 0.75
+    found = ratios(base / height, along, across, N)
+    middles = (np.arange(NODES) + 0.5) / NODES * 2.0 - 1.0
+    for i, j in ((50, 50), (3, 90), (97, 10), (60, 99)):
+        x, y = height * middles[j] * (along - 0.1), height * middles[i] * across
+        bed = np.array([x, y, -0.05])  # shallow, as the formula takes depths
+        t = []
+        for centre in ([-base / 2, 0.0, height], [base / 2, 0.0, height]):
+            crossing = light_path(bed, np.array(centre), (0.0, 0.0, 0.0), N)
+            t.append((crossing[0], (crossing[0] - centre[0]) / height))
+        # x of both straight rays at the apparent depth d: crossing + d t
+        apparent = -(t[1][0] - t[0][0]) / (t[1][1] - t[0][1])
+        assert 0.05 / apparent == pytest.approx(found[i, j], rel=2e-4)
+
+
+def test_the_middle_of_the_overlap_is_that_of_twice_the_nodes():
+    fine = np.mean([ratios(0.2, 0.5 + d, 0.75, N).mean() for d in (-1e-4, 1e-4)])
+    assert ratios(0.2, 0.5, 0.75, N).mean() == pytest.approx(fine, rel=1e-6)
+
+
+def test_the_map_of_skarlatos_and_agrafiotis_has_it_in_shallow_water():
+    """Theirs starts from an exact apparent point, so that bent rays miss, not straight ones."""
+    pair = StereoPair(SWINGLETCAM, 100.0)
+    along, across = (side / 200.0 for side in SWINGLETCAM.footprint_m(100.0))
+    found = effect(pair, 0.01)
+    theirs = 1.0 - found.error_m / 0.01
+    ours = ratios(pair.base_m / 100.0, along, across, N)
+    assert ours.mean() == pytest.approx(theirs.mean(), rel=0.01)
+    assert ours[NODES // 2, NODES // 2] == pytest.approx(1.0 - found.centre_m / 0.01, rel=1e-3)
+
+
+def measured(scene):
+    """Return true by apparent depth of a simulated cloud, on average."""
+    apparent, true = (scene.depth_m(xyz) for xyz in (scene.apparent_xyz, scene.true_xyz))
+    wet = (np.diff(scene.views.start) > 1) & (apparent > 0.5)
+    return float(np.mean(true[wet] / apparent[wet]))
+
+
+def test_a_simulated_block_has_it_within_a_percent(scene):
+    found = stereo_factor(scene.cameras, scene.water.a, N)
+    # 1.4427 and 1.433: the points of the cloud have more images than a pair
+    assert found.factor == pytest.approx(measured(scene), rel=0.01)
+    assert found.height_m == pytest.approx(80.0, abs=0.5)
+    assert (found.images, found.aside) == (40, 0)
+    assert "base 15.77 m (medians of 40 images)." in str(found)
+
+
+def test_auto_is_that_number_through_arrays(scene):
+    found = stereo_factor(scene.cameras, scene.water.a, N)
+    auto, told = (
+        pcfix.correct_points(
+            scene.apparent_xyz, scene.cameras, scene.water, method="factor", depth_factor=factor
+        )
+        for factor in ("auto", found.factor)
+    )
+    assert np.array_equal(auto.xyz, told.xyz)
+
+
+def test_images_that_look_aside_do_not_count():
+    scene = pcfix.simulate_scene(500, seed=1, obliques_deg=35.0, **SCENE)
+    found = stereo_factor(scene.cameras, scene.water.a, N)
+    assert (found.images, found.aside) == (40, 72)
+    assert "72 images look aside" in str(found)
+
+
+def test_what_tells_no_factor_is_refused(scene):
+    cameras, level = scene.cameras, scene.water.a
+    bare = pcfix.Cameras(cameras.labels, cameras.centres)
+    with pytest.raises(SettingError, match="these have no angles or no lens: give --sensor"):
+        pcfix.correct_points(
+            scene.apparent_xyz, bare, scene.water, method="factor", depth_factor="auto"
+        )
+    far = replace(cameras, centres=cameras.centres * [20.0, 20.0, 1.0])
+    with pytest.raises(GeometryError, match="do not overlap"):
+        stereo_factor(far, level, N)
+    aside = replace(cameras, rotations=np.broadcast_to(np.eye(3), (40, 3, 3)))
+    with pytest.raises(GeometryError, match="and 0 of 40 images do, within 15 degrees"):
+        stereo_factor(aside, level, N)
+    one = replace(cameras, centres=np.broadcast_to(cameras.centres[0], (40, 3)))
+    with pytest.raises(GeometryError, match=r"images 0\.00 m apart"):
+        stereo_factor(one, level, N)

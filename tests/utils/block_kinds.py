@@ -1,0 +1,174 @@
+"""Blocks that are no square of nadir images over a beach, as an unaware adjustment leaves them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pcfix.adjust.block import Unknowns
+from pcfix.adjust.problem import prepare, solved_cameras
+from pcfix.adjust.solve import solve
+from pcfix.io.cameras.colmap.writing import write_colmap
+from pcfix.lens.imaging import unproject
+from pcfix.model import Cameras, GnssPositions, Lens, TiePoints, Views
+from pcfix.simulate.scene import ORIGIN_M
+from pcfix.simulate.tracing import triangulate
+from tests.utils.adjust_files import EPSG, write_gnss, write_las
+from tests.utils.bent_blocks import DOWN, FOCAL_PX, NOISE_PX, SIZE, N, TrueBlock
+from tests.utils.unaware_blocks import similarity
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pcfix.model import FloatArray
+
+GNSS_M = 0.025
+HEIGHT_M, DEPTH_M = 75.0, 6.0
+GSD_M = HEIGHT_M / FOCAL_PX
+BASE_M, STRIP_M = 12.0, 28.0
+ALONG, ACROSS = 90.0, 0.0
+
+
+def _strips(count, images, heading=ALONG, height=HEIGHT_M, spacing=STRIP_M):
+    """Return x, y, z and heading of images in strips to and fro about the origin."""
+    row, step = (a.ravel() for a in np.indices((count, images)))
+    along = (step - (images - 1) / 2.0) * BASE_M * height / HEIGHT_M
+    side = (row - (count - 1) / 2.0) * spacing
+    x, y = (along, side) if heading == ALONG else (side, along)
+    return np.column_stack([x, y, np.full(x.size, height), heading + 180.0 * (row % 2)])
+
+
+def _cross():
+    return np.vstack([_strips(3, 6), _strips(3, 6, ACROSS)])
+
+
+def _two_heights():
+    return np.vstack([_strips(3, 6, height=60.0, spacing=24.0), _strips(2, 5, height=90.0)])
+
+
+def _river(x, y, reach):
+    """Return the height of a winding channel and its banks."""
+    across = (y - 5.0 * np.sin(x / 25.0)) / (0.5 * reach[1])
+    return np.minimum(-0.5 * DEPTH_M * (1.0 - across**2), 1.5)
+
+
+def _shore(share):
+    """Return ground of which so much at the west end is land."""
+
+    def height(x, _, reach):
+        east = (x / reach[0] + 1.0) / 2.0
+        bed = -0.2 - DEPTH_M * (east - share) / (1.0 - share)
+        return np.where(east < share, 0.3 + 1.5 * (share - east) / max(share, 1e-9), bed)
+
+    return height
+
+
+def _open(x, y, reach):
+    """Return a bed that leans to both sides, all of it under water."""
+    return -0.5 * DEPTH_M * (1.0 + 0.4 * x / reach[0] + 0.3 * y / reach[1])
+
+
+KINDS = {
+    "corridor": (lambda: _strips(2, 12), _river),
+    "single strip": (lambda: _strips(1, 14), _shore(0.35)),
+    "cross strips": (_cross, _shore(0.3)),
+    "two heights": (_two_heights, _shore(0.3)),
+    "20 % land": (lambda: _strips(4, 6), _shore(0.2)),
+    "no land": (lambda: _strips(4, 6), _open),
+}
+"""How each kind is flown, and the height of its ground above the water at n places of an area that
+reaches so far to either side."""
+
+
+class KindBlock(TrueBlock):
+    """A block of one of `KINDS`, about the origin; water at zero."""
+
+    def __init__(self, kind: str, seed: int, points: int = 900, cloud: int = 3000):
+        rng = np.random.default_rng([seed, *kind.encode()])
+        flown, ground = KINDS[kind]
+        plan = flown()
+        lens = Lens(FOCAL_PX, *SIZE, 800.0 + rng.normal(0, 3), 600.0 + rng.normal(0, 3))
+        centres = plan[:, :3] + rng.normal(0.0, 0.5, (len(plan), 3))
+        angles = rng.normal(0.0, 2.0, centres.shape)
+        angles[:, 0] += plan[:, 3]
+        rotations = DOWN @ Rotation.from_euler("zyx", angles, degrees=True).as_matrix()
+        gnss = centres + rng.normal(0.0, GNSS_M, centres.shape)
+        self.cameras = Cameras(
+            tuple(f"{i:03d}.jpg" for i in range(len(plan))), centres, rotations,
+            (lens,) * len(plan),
+            gnss=GnssPositions(gnss, np.full(centres.shape, GNSS_M), None),
+        )  # fmt: skip
+        reach = np.abs(centres[:, :2]).max(axis=0) + 15.0
+        xy = rng.uniform(-reach, reach, (points + cloud, 2))
+        swell = 0.4 * np.sin(xy[:, 0] / 9) * np.sin(xy[:, 1] / 7)
+        z = ground(*xy.T, reach)
+        xyz = np.column_stack([xy, z + np.where(z < 0.0, swell * np.minimum(1.0, -z), swell)])
+        self._look(xyz, lens, N, rng)
+        self.ties = int(points * len(self.xyz) / len(xyz))
+
+    def unaware(self, *, weighs_gnss: bool) -> Cameras:
+        """Return the cameras as an adjustment with straight rays leaves them.
+
+        One with a full lens and GNSS positions of 10 cm; or one with focal length and k1, the
+        principal point in the middle of the image, that is laid onto the positions afterwards.
+        """
+        gnss, lens = self.cameras.gnss.xyz, self.cameras.lenses[0]
+        middle = replace(lens, principal_x=SIZE[0] / 2.0, principal_y=SIZE[1] / 2.0)
+        cameras = replace(self.cameras, lenses=(middle,) * len(self.cameras))
+        block = self.part(slice(0, self.ties)).block(cameras, None)
+        block = replace(block, sigma_px=np.full(len(block.camera), NOISE_PX))
+        unknowns = Unknowns(lens=("f", "k1"), free_network=True)
+        if weighs_gnss:
+            unknowns = Unknowns(lens=("f", "cx", "cy", "k1", "k2", "p1", "p2"))
+            block = replace(block, gnss_xyz=gnss, gnss_sigma_m=np.full(gnss.shape, 0.1))
+        problem, start = prepare(block, unknowns)
+        found = solved_cameras(problem, solve(problem, start))
+        if not weighs_gnss:
+            scale, turn, shift = similarity(found.centres, gnss)
+            found = replace(
+                found, centres=scale * found.centres @ turn.T + shift,
+                rotations=found.rotations @ turn.T,
+            )  # fmt: skip
+        return replace(found, gnss=None)
+
+    def part(self, rows: slice) -> KindBlock:
+        """Return the block with some of its points."""
+        first, last, _ = rows.indices(len(self.xyz))
+        some = object.__new__(KindBlock)
+        here = slice(self.start[first], self.start[last])
+        some.cameras, some.xyz = self.cameras, self.xyz[first:last]
+        some.start = self.start[first : last + 1] - self.start[first]
+        some.camera, some.image_xy = self.camera[here], self.image_xy[here]
+        return some
+
+    def apparent(self, cameras: Cameras) -> FloatArray:
+        """Return where straight rays of some cameras meet."""
+        lens = cameras.lenses[0]
+        ahead = unproject(lens, self.image_xy)
+        principal = [lens.principal_x, lens.principal_y]
+        plain = lens.focal * ahead[:, :2] / ahead[:, 2:] + principal
+        return triangulate(plain, cameras, self.camera, self.start, lens, self.xyz)
+
+
+def write_kind(
+    folder: Path, kind: str, seed: int, points: int = 900, cloud: int = 3000
+) -> FloatArray:
+    """Write what the user of such a block has, and return the true points of the cloud.
+
+    model/ : COLMAP, with tie points; cloud.las; gnss.csv; true/ : the model as it is in truth.
+    """
+    made = KindBlock(kind, seed, points, cloud)
+    old = made.unaware(weighs_gnss=seed % 2 == 0)
+    ties, cloud = made.part(slice(0, made.ties)), made.part(slice(made.ties, None))
+    tracks = TiePoints(ties.apparent(old) + ORIGIN_M, Views(ties.start, ties.camera), ties.image_xy)
+    placed = replace(old, centres=old.centres + ORIGIN_M)
+    write_colmap(folder / "model", placed, tracks, crs=EPSG)
+    true = replace(made.cameras, centres=made.cameras.centres + ORIGIN_M, gnss=None)
+    write_colmap(folder / "true", true, crs=EPSG)
+    write_las(folder / "cloud.las", cloud.apparent(old) + ORIGIN_M)
+    gnss = made.cameras.gnss
+    write_gnss(folder / "gnss.csv", made.cameras.labels, gnss.xyz + ORIGIN_M, gnss.sigma_m)
+    return cloud.xyz + ORIGIN_M
