@@ -99,6 +99,8 @@ class Members:
     def surface(self, member: int, water: WaterSurface, cameras: Cameras) -> WaterSurface:
         """Return the water of a member; that of a mesh or a dimension as it is."""
         level, b, c, _ = self.water[member, :4].tolist()
+        if not np.delete(self.water[member], INDEX).any():
+            return water
         x, y, _ = cameras.centres.mean(axis=0).tolist()
         if isinstance(water, WaterRaster):
             rows, columns = (np.arange(n) + 0.5 for n in water.height_m.shape)

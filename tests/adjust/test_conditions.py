@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from pcfix.adjust.block import PLANES, Conditions, Unknowns
+from pcfix.adjust.disagreement import pulls_of
+from pcfix.adjust.equations import undamped
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import prepare
 from pcfix.adjust.result import adjusted_of, redundancy_of
@@ -194,6 +196,20 @@ def test_points_on_a_level_raster_or_mesh(kind):
     _, wanted, as_plane = adjusted(plane, LEVEL)
     assert found.shared[0] == pytest.approx(wanted.shared[0], abs=1e-6)  # m
     assert precision.sigma_of("level") == pytest.approx(as_plane.sigma_of("level"), rel=1e-6)
+
+
+def test_what_groups_pull_adds_up_with_conditions():
+    made = scene(60)
+    made, conditions = put(made, {
+        "water": (np.arange(6), at_level(made)),
+        "floor": (np.arange(6, 12), at_level(made, depth=1.0)),
+    })  # fmt: skip
+    block = block_with(made, conditions, gnss=False, start_xyz=made.truth + 0.01)
+    problem, start = prepare(block, Unknowns(poses="fixed", lens=("f",), level_sigma_m=FREE))
+    equations = undamped(problem, start)
+    pulls = pulls_of(equations.problem, start, block.owner % 5, np.zeros((0, 2)))
+    right, active = equations.reduced.right, equations.reduced.active
+    np.testing.assert_allclose(pulls.sum(axis=0)[active], right, rtol=1e-7)
 
 
 def test_how_the_points_lie_is_told():
