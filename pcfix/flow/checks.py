@@ -183,7 +183,7 @@ def _diagnosis(
         Evidence(
             cameras, path, surface, index_of(given.index, given.index_formula)[0],
             view=view, reference=reference,
-            control=None if gcps is None else read_ground_control(gcps, cameras),
+            control=None if gcps is None else read_ground_control(gcps, cameras).surveyed,
             calibrated=given_focal_lengths(path) if lens is None else focal_length_of(lens),
             ties=ties_of(inputs, view.crs),
         )

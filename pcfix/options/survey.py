@@ -29,7 +29,7 @@ Poses = Literal["free", "fixed", "similarity"]
 Datum = Literal["observed", "free"]
 Ties = Literal["auto", "measured", "cloud"]
 AdjustWhen = Literal["auto", "yes", "no"]
-WATER_UNKNOWNS = ("level", "tilt", "index")
+WATER_UNKNOWNS = ("level", "tilt", "index", "shape", "distance", "centre")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,10 +153,17 @@ class AdjustRules(IndexOptions):
 
     free: tuple[str, ...] = option(
         (),
-        "What of the water moves too: some of level,tilt,index, with commas between.",
+        "What of the water moves too: some of level,tilt,index,shape (bent, to the second order),"
+        " with commas between; of a port: distance (flat), centre (dome), index.",
         rule=_water_unknowns,
         parse=one_or_more(str, "level,tilt"),
         default_is="nothing",
+        metavar="NAMES",
+    )
+    parallel: tuple[str, ...] = option(
+        (),
+        "Planes of --gcps that are parallel, as floor,deck; water is one too.",
+        parse=one_or_more(str, "water,floor"),
         metavar="NAMES",
     )
     sigma_level: float | None = option(
