@@ -266,6 +266,17 @@ class CompareRules(M3c2Option):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReferenceOption(OptionSet):
+    """What a cloud is compared with."""
+
+    panel = Panel.OUTPUT
+
+    reference: File | None = option(
+        None, "LiDAR cloud, CSV check points or GeoTIFF to compare with."
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class CompareOptions(OverwriteOption, SummaryOption, CompareRules):
     """The options of ``pcfix compare``."""
 
@@ -281,3 +292,8 @@ class CompareOptions(OverwriteOption, SummaryOption, CompareRules):
         metavar="X,Y,X,Y",
         old=("section_lines",),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageCompareOptions(ReferenceOption, CompareOptions):
+    """The options of the stage ``compare`` of PDAL, whose cloud is in no file."""

@@ -23,7 +23,7 @@ from pcfix.options.shared import (
     ViewOptions,
     WaterOptions,
 )
-from pcfix.options.steps import METRES, M3c2Option
+from pcfix.options.steps import METRES, M3c2Option, ReferenceOption
 
 Poses = Literal["free", "fixed", "similarity"]
 Datum = Literal["observed", "free"]
@@ -88,16 +88,19 @@ class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(
-    JobOptions, M3c2Option, SurveyedOptions, RefractionOptions, SubmergedOptions, SurveyOptions
+    ReferenceOption,
+    JobOptions,
+    M3c2Option,
+    SurveyedOptions,
+    RefractionOptions,
+    SubmergedOptions,
+    SurveyOptions,
 ):
     """The options of ``pcfix run``: everything that its results depend on is in ``run.json``."""
 
     panel = Panel.OUTPUT
     old_units = True
 
-    reference: File | None = option(
-        None, "LiDAR cloud, CSV check points or GeoTIFF to compare with."
-    )
     resolution: float | None = option(
         None, "Of the rasters.", unit="m", rule=METRES, default_is="4 points a cell"
     )
