@@ -17,6 +17,7 @@ from pcfix.options.shared import (
     OverwriteOption,
     Panel,
     PortOptions,
+    ShorelineOption,
     SubmergedOptions,
     SummaryOption,
     SurveyOptions,
@@ -77,7 +78,7 @@ class CamerasCheckOptions(
 
 
 @dataclass(frozen=True, kw_only=True)
-class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions):
+class WaterCheckOptions(ShorelineOption, OverwriteOption, SummaryOption, WaterOptions):
     """The options of ``pcfix water``."""
 
     panel = Panel.OUTPUT
@@ -85,10 +86,19 @@ class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions):
     cloud: File | None = option(None, "LAS or LAZ cloud under it.")
     plot: File | None = option(None, "PNG of points and residuals, or of evidence.")
 
+    def check(self) -> None:
+        """Check what options say together."""
+        super().check()
+        if self.shoreline is not None and self.cloud is None:
+            raise SettingError(
+                f"shoreline {self.shoreline}: is where a cloud meets the water; give --cloud too."
+            )
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(
     ReferenceOption,
+    ShorelineOption,
     JobOptions,
     M3c2Option,
     SurveyedOptions,
