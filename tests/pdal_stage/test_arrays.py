@@ -204,6 +204,18 @@ def test_report_is_the_summary(cloud, tmp_path):
     assert written["depth_m"] == summary.depth_m
 
 
+def test_shoreline_is_that_of_files(cloud, tmp_path):
+    pyogrio = pytest.importorskip("pyogrio")
+    path, ins, metadata = cloud
+    options = {"cameras": str(tmp_path / "cameras.csv"), "water": WATER_M}
+    _, report = run("correct", ins, metadata, **options, shoreline=str(tmp_path / "stage.gpkg"))
+    pcfix.correct_file(path, tmp_path / "o.las", **options, shoreline=tmp_path / "file.gpkg")
+    stage, file = (pyogrio.raw.read(tmp_path / f"{door}.gpkg") for door in ("stage", "file"))
+    assert list(stage[2]) == list(file[2])
+    told = next(node["value"] for node in report["children"] if node["name"] == "shoreline")
+    assert json.loads(told)["lines"] == len(stage[2])
+
+
 GOOD = {"cameras": "cameras.csv", "water": WATER_M}
 MISTAKES = {
     "an option that is none": ({**GOOD, "watre": 1}, "no option 'watre'"),
