@@ -6,7 +6,7 @@ The *camera frame* is OpenCV's: x right, y down, z forward; ``x_camera = R (x_wo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
 from typing import Literal, TypeAlias
@@ -386,6 +386,11 @@ class GroundControl:
         Standard deviations of u and v.
     crs : str or None
         None where the source does not say.
+    on : tuple of str, length m or 0
+        On which surface each point lies: ``water``, the name of a plane, or empty. Those on one
+        may be without coordinates: NaN, and infinite standard deviations.
+    on_sigma_m : array, shape (m,) or (0,)
+        Standard deviation of their distance from it.
     """
 
     names: tuple[str, ...]
@@ -398,6 +403,28 @@ class GroundControl:
     image_xy: FloatArray
     sigma_px: FloatArray
     crs: str | None = None
+    on: tuple[str, ...] = ()
+    on_sigma_m: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def surveyed(self) -> GroundControl:
+        """Those with coordinates."""
+        known = np.asarray(np.isfinite(self.xyz).all(axis=1))
+        kept, rows = known[self.point], np.flatnonzero(known)
+        return replace(
+            self,
+            names=tuple(self.names[i] for i in rows),
+            xyz=self.xyz[rows],
+            sigma_m=self.sigma_m[rows],
+            is_check=self.is_check[rows],
+            under_water=self.under_water[rows],
+            point=(np.cumsum(known) - 1)[self.point[kept]],
+            camera=self.camera[kept],
+            image_xy=self.image_xy[kept],
+            sigma_px=self.sigma_px[kept],
+            on=(),
+            on_sigma_m=np.zeros(0),
+        )
 
 
 class Outcome(IntEnum):

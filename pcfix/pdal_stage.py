@@ -1,18 +1,19 @@
-"""Door 2: the entry of PDAL's ``filters.python``.
+"""Door 2: the functions of PDAL's ``filters.python``: correct, label, clean and compare.
 
-A pipeline imports it and hands over its globals, through which PDAL passes options, metadata and
-the report::
+A pipeline imports one of them, which belongs to the stage that imported it: PDAL passes options,
+metadata and the report through the globals of the stage's source::
 
     {
       "type": "filters.python",
-      "source": "from pcfix.pdal_stage import stages; correct, label = stages(globals())",
+      "source": "from pcfix.pdal_stage import correct",
       "module": "pcfix_stage",
       "function": "correct",
       "add_dimension": "ShiftX=float,ShiftY=float,...",
       "pdalargs": {"cameras": "cameras.csv", "water": 0.37}
     }
 
-Options have the names of the command line, with underscores, and are checked by the same code.
+Options have the names of the command line, with underscores or dashes, and are checked by the same
+code.
 """
 
 from __future__ import annotations
@@ -36,27 +37,39 @@ from pcfix.io.pdal import (
     Flags,
     Results,
     check_dimensions,
+    column_values,
     crs_of,
     dimension,
     metadata_of,
-    node,
     scales_of,
 )
-from pcfix.model import WaterDimension, WaterSurface
+from pcfix.model import LOW_NOISE, WaterDimension, WaterSurface
 from pcfix.options.declare import Option, OptionSet, named, options_of
 
 Set = TypeVar("Set", bound=OptionSet)
 
 if TYPE_CHECKING:
+    from pcfix.compare.match import SurveyCloud
+    from pcfix.flow.clean import Tested
     from pcfix.flow.surfaces import CloudView, Points
+    from pcfix.model import FloatArray
 
 Stage: TypeAlias = Callable[[Dimensions, Dimensions], bool]
+Work: TypeAlias = Callable[[dict[str, Any], Dimensions, Dimensions], None]
 
 _WORD = {str: "a text", float: "a number", int: "a whole number", bool: "true or false"}
 
 
+def __getattr__(name: str) -> Stage:
+    """Return the function of that name for the globals of whoever imports it."""
+    work = {"correct": _correct, "label": _label, "clean": _clean, "compare": _compare}.get(name)
+    if work is None:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return _stage(work, sys._getframe(1).f_globals)
+
+
 def stages(namespace: dict[str, Any]) -> tuple[Stage, Stage]:
-    """Return the functions ``correct`` and ``label`` for a stage's globals.
+    """Return ``correct`` and ``label`` for a stage's globals, as pipelines of 0.1.0 ask for them.
 
     Parameters
     ----------
@@ -66,30 +79,24 @@ def stages(namespace: dict[str, Any]) -> tuple[Stage, Stage]:
     Returns
     -------
     correct, label : callable
-        Each takes PDAL's dictionaries of input and output arrays. ``correct`` does what
-        ``pcfix correct`` does; ``label`` sets classes as ``pcfix label`` does, and nothing else.
+        Each takes PDAL's dictionaries of input and output arrays.
     """
-
-    def correct(ins: Dimensions, outs: Dimensions) -> bool:
-        return _run(_correct, namespace, ins, outs)
-
-    def label(ins: Dimensions, outs: Dimensions) -> bool:
-        return _run(_label, namespace, ins, outs)
-
-    return correct, label
+    return _stage(_correct, namespace), _stage(_label, namespace)
 
 
-def _run(
-    work: Callable[[dict[str, Any], Dimensions, Dimensions], None],
-    namespace: dict[str, Any],
-    ins: Dimensions,
-    outs: Dimensions,
-) -> bool:
+def _stage(work: Work, namespace: dict[str, Any]) -> Stage:
+    def function(ins: Dimensions, outs: Dimensions) -> bool:
+        return _run(work, namespace, ins, outs)
+
+    return function
+
+
+def _run(work: Work, namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> bool:
     """Work with libraries kept apart from PDAL's, and leave the process usable after a failure."""
     before = sys.getdlopenflags()
     # PDAL links to a PROJ and a GDAL of its own; two of a kind crash the program at its exit
     sys.setdlopenflags(os.RTLD_NOW | getattr(os, "RTLD_DEEPBIND", 0))
-    in_program = "pdal" not in sys.modules
+    in_program = "redirector" in sys.modules and "pdal" not in sys.modules
     try:
         with warnings.catch_warnings():
             if in_program:
@@ -104,8 +111,12 @@ def _run(
         raise
     finally:
         sys.setdlopenflags(before)
-    if in_program:  # which shows the error as a Python repr
+    if in_program:
+        # the program shows an error as the repr of each line of a traceback, and always one: the
+        # sentence goes before that, and the traceback is cut down to its last line
         sys.stderr.write(f"pcfix: {mistake}\n")
+        sys.tracebacklimit = 0
+        raise type(mistake)("refused, as said above")
     raise type(mistake)(str(mistake))  # anew, without the places in pcfix that it came through
 
 
@@ -145,7 +156,7 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
     summary = job.summary(NAME, NAME, time.perf_counter() - started)
     job.save_regression()
     write_summary(options, summary.as_dict())
-    namespace["out_metadata"] = metadata_of(summary)
+    namespace["out_metadata"] = metadata_of(summary.as_dict(), flags)
 
 
 def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
@@ -164,16 +175,90 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     outs["Classification"] = classes
     outs.update(flags.dimensions())
     found = {**step.counts, "labelling": step.labelling.report()}
-    namespace["out_metadata"] = node(
-        "pcfix", children=[node(name, value) for name, value in found.items() if value is not None]
+    namespace["out_metadata"] = metadata_of(found, flags)
+
+
+def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
+    from pcfix.clean.points import Resources
+    from pcfix.flow.clean import NoiseSearch
+    from pcfix.flow.runner import check_summary, write_summary
+    from pcfix.kernels import threads
+    from pcfix.options.steps import CleanOptions
+
+    started = time.perf_counter()
+    options = _options(namespace, CleanOptions)
+    metadata = namespace.get("metadata")
+    flags = Flags(ins, metadata)
+    search = NoiseSearch(NAME, options, lambda: _view(ins, metadata, flags), ins)
+    check_summary(options)
+    with threads(options.jobs):
+        chunks = _tested(ins, search.water, flags, scales_of(metadata))
+        noise = search.run(chunks, len(ins["X"]), Resources(jobs=options.jobs))
+    if options.drop:
+        outs["Mask"] = ~noise
+    else:
+        flags.withheld |= noise
+        outs["Classification"] = np.where(noise, LOW_NOISE, flags.classes).astype(np.uint8)
+        outs.update(flags.dimensions())
+    seconds = time.perf_counter() - started
+    summary = search.summary(NAME, NAME, drop=options.drop, seconds=seconds).as_dict()
+    write_summary(options, summary)
+    namespace["out_metadata"] = metadata_of(summary, None if options.drop else flags)
+
+
+def _tested(
+    ins: Dimensions, water: WaterSurface | None, flags: Flags, scales: FloatArray | None
+) -> Iterator[Tested]:
+    """Yield the points of each chunk as the tests for noise need them."""
+    from pcfix.flow.clean import RAY_DIMENSIONS, Tested
+
+    rays = {name: column_values(ins, name, scales) for name in RAY_DIMENSIONS if name in ins}
+    for rows, points in _chunks(ins, water, flags):
+        yield Tested(points, flags.withheld[rows], {name: rays[name][rows] for name in rays})
+
+
+def _compare(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
+    """Compare, and let all points pass as they are."""
+    from pcfix.flow.compare import Held, compare_clouds
+    from pcfix.options.steps import StageCompareOptions
+
+    options = _options(namespace, StageCompareOptions, needed=("reference",))
+    metadata = namespace.get("metadata")
+    flags = Flags(ins, metadata)
+    cloud = Held(
+        lambda: _view(ins, metadata, flags), lambda water: _surveyed(ins, metadata, flags, water)
     )
+    found = compare_clouds(cloud, options.reference or "", options=options)
+    namespace["out_metadata"] = metadata_of(found.as_dict())
 
 
-def _options(namespace: dict[str, Any], kind: type[Set], needed: tuple[str, ...]) -> Set:
+def _surveyed(
+    ins: Dimensions, metadata: dict[str, Any] | None, flags: Flags, water: WaterSurface | None
+) -> SurveyCloud:
+    """Return the cloud as a comparison needs it."""
+    from pcfix.io.clouds import TOLD, Told, survey_cloud
+    from pcfix.io.crs import parse_crs
+
+    stated, scales = crs_of(metadata), scales_of(metadata)
+    told = {name: column_values(ins, name, scales) for name in TOLD if name in ins}
+    chunks = (
+        Told(points.xyz, points.classes, flags.withheld[rows], points.heights,
+             {name: told[name][rows] for name in told})
+        for rows, points in _chunks(ins, water, flags)
+    )  # fmt: skip
+    crs = None if stated is None else parse_crs(stated, NAME)
+    return survey_cloud(NAME, crs, chunks, water, water is not None)
+
+
+def _options(namespace: dict[str, Any], kind: type[Set], needed: tuple[str, ...] = ()) -> Set:
     """Return the stage's options, of the right types."""
     given = namespace.get("pdalargs") or {}
     if not isinstance(given, dict):
         raise SettingError(f"pdalargs: must be an object of options, not {given!r}.")
+    twice = next((name for name in given if "-" in name and name.replace("-", "_") in given), None)
+    if twice is not None:
+        raise SettingError(f"pdalargs: {twice} is given twice, with dashes and underscores.")
+    given = {name.replace("-", "_"): value for name, value in given.items()}
     known = {one.name: one for one in options_of(kind) if one.name != "port"}
     values = {
         name: _converted(known[name], value)
@@ -192,6 +277,10 @@ def _missing(name: str) -> SettingError:
 
 def _converted(one: Option, value: Any) -> Any:
     """Return a value of JSON as what the option takes; numbers may be text."""
+    if one.default == () and one.parse is None:  # may be repeated on the command line
+        texts = value if isinstance(value, list) else [value]
+        if all(isinstance(text, str) for text in texts):
+            return tuple(texts)
     kinds = one.plain_kinds
     for kind in kinds:
         if isinstance(value, kind) and (kind is bool or not isinstance(value, bool)):
@@ -214,7 +303,9 @@ def _slices(n: int) -> Iterator[slice]:
     return (slice(start, start + CHUNK_POINTS) for start in range(0, n, CHUNK_POINTS))
 
 
-def _chunks(ins: Dimensions, water: WaterSurface, flags: Flags) -> Iterator[tuple[slice, Points]]:
+def _chunks(
+    ins: Dimensions, water: WaterSurface | None, flags: Flags
+) -> Iterator[tuple[slice, Points]]:
     """Yield the rows of each chunk, and its coordinates, heights of the water and classes."""
     from pcfix.flow.surfaces import Points
     from pcfix.water.checks import checked_points

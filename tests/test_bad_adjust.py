@@ -223,7 +223,16 @@ def test_water_unknowns_from_the_cloud_alone(refuse):
     has(message, "tie points only", "leave the water fixed")
 
 
+def test_points_on_the_water_with_the_cloud_alone(refuse, folder):
+    rows = (folder / "gcps.csv").read_text().replace(",control", ",waterline")
+    (folder / "gcps.csv").write_text(rows)
+    message = refuse("bare", more=["--cloud=cloud.las", "--gcps=gcps.csv"])
+    has(message, "measured tie points only", "waterline")
+
+
 def test_words_that_are_not_understood(refuse):
+    has(refuse(more=["--free=distance"]), "free 'distance': the water has no distance", "shape")
+    has(refuse(more=["--parallel=water,floor"]), "parallel 'water,floor'", "the role on:NAME")
     has(refuse(more=["--free=hight"]), "'hight'", "level, tilt, index")
     has(refuse(more=["--lens-unknowns=f,q9"]), "'q9'")
     has(refuse(more=["--sigma-level=-1"]), "-1")

@@ -2,8 +2,9 @@
 
 `Block` and `Unknowns` are what the doors give; the named tuples are what the kernels take. Their
 coordinates are relative to an origin of the block, so that nothing is lost at large coordinates.
-The water's numbers are its plane z = a + b x + c y in these coordinates; over a mesh or raster `a`
-is by how much it stands higher than given, and b and c are unused.
+The water's numbers are its plane z = a + b x + c y in these coordinates, and what bends it,
+d x^2 + e x y + f y^2; over a mesh or raster `a` is by how much it stands higher than given, and the
+others are unused.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ class State(NamedTuple):
     centres : shape (k, 3); rotations : shape (k, 3, 3), world to camera.
     lenses : shape (l, ...), coefficients of `pcfix.lens.imaging.lens_table`.
     xyz : shape (m, 3), true points.
-    water : shape (4,), a, b, c and the refractive index.
+    water : shape (11 + 3 p,), the numbers of `WATER_NAMES`: a, b, c, the refractive index, d, e, f,
+    and of a port its distance or its centre; then height and slopes of each plane of `Conditions`.
     """
 
     centres: FloatArray
@@ -61,6 +63,7 @@ class Surface(NamedTuple):
     tin, field : a mesh or raster instead of the plane.
     origin : shape (3,), the block's origin in the world frame.
     port : coefficients of a housing port, of length 0 where there is none.
+    curved : whether the water is more than a plane: d, e, f count.
     """
 
     there: bool
@@ -68,6 +71,7 @@ class Surface(NamedTuple):
     field: Field | None
     origin: FloatArray
     port: FloatArray
+    curved: bool = False
 
 
 FOCAL, CX, CY, B1, B2, P1, P2, K1 = range(8)
@@ -77,7 +81,14 @@ CODES = {"f": FOCAL, "cx": CX, "cy": CY, "b1": B1, "b2": B2, "p1": P1, "p2": P2}
 CODES |= {f"k{i + 1}": K1 + i for i in range(8)}
 NAMES = {code: name for name, code in CODES.items()}
 
-WATER_NAMES = ("level", "tilt_x", "tilt_y", "index")
+WATER_NAMES = (
+    *("level", "tilt_x", "tilt_y", "index", "shape_xx", "shape_xy", "shape_yy"),
+    *("distance", "centre_x", "centre_y", "centre_z"),
+)
+"""What bends the light: numbers of the water, then of a port."""
+INDEX, SHAPE, PORT, PLANES = 3, 4, 7, 11
+"""Where the index, d, e, f, the numbers of a port and those of planes stand."""
+
 MOTIONS = ("shift x", "shift y", "shift z", "turn x", "turn y", "turn z", "scale")
 """What a similarity does."""
 
@@ -87,7 +98,7 @@ class Columns(NamedTuple):
 
     lens : shape (groups + 1,), where the parameters of each group begin.
     code : shape (lens[-1],), which parameter each one is.
-    water : shape (4,), -1 where fixed.
+    water : for each number of `State.water`, -1 where fixed; parallel planes share theirs.
     similarity : the first of seven, -1 where the poses move on their own.
     total : how many there are.
     pivot : shape (3,), about which a similarity turns and scales.
@@ -121,6 +132,22 @@ class PointPriors(NamedTuple):
     weight: FloatArray
 
 
+class OnSurfaces(NamedTuple):
+    """Points that lie on a surface; arrays of length 0 where there are none.
+
+    on : shape (m,), 0 on the water, 1, 2, ... on a plane, -1 on none.
+    weight : shape (m,), 1 / standard deviation of the distance, along `axis`.
+    axis : shape (1 + p,), that along which each surface has its height: 2 is up.
+    """
+
+    on: IntArray
+    weight: FloatArray
+    axis: IntArray
+
+
+ON_NOTHING = OnSurfaces(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int64))
+
+
 class Given(NamedTuple):
     """What stays as it is while a block is adjusted."""
 
@@ -128,16 +155,23 @@ class Given(NamedTuple):
     surface: Surface
     columns: Columns
     priors: PointPriors
+    on_surfaces: OnSurfaces = ON_NOTHING
 
 
 def columns_of(
-    codes: list[tuple[int, ...]], water: list[bool], similarity: bool, pivot: FloatArray
-) -> Columns:
-    """Return the columns of the free parameters of each group, the water's and a similarity's."""
+    codes: list[tuple[int, ...]], water: list[bool], similarity: bool, pivot: FloatArray,
+    alike: dict[int, int] | None = None,
+) -> Columns:  # fmt: skip
+    """Return the columns of the free parameters of each group, the water's and a similarity's.
+
+    `alike` says of numbers of the water, not free themselves, with which others they go.
+    """
     lens = np.concatenate([[0], np.cumsum([len(one) for one in codes])]).astype(np.int64)
-    place = np.full(4, -1, np.int64)
+    place = np.full(len(water), -1, np.int64)
     free = np.flatnonzero(water)
     place[free] = lens[-1] + np.arange(len(free))
+    for number, other in (alike or {}).items():
+        place[number] = place[other]
     first = int(lens[-1]) + len(free)
     flat = np.array([code for of_sensor in codes for code in of_sensor], np.int64)
     return Columns(lens, flat, place, first if similarity else -1, first + 7 * similarity, pivot)
@@ -145,6 +179,32 @@ def columns_of(
 
 Poses = Literal["free", "fixed", "similarity"]
 Robust = Literal["squares", "huber", "cauchy"]
+
+
+@dataclass(frozen=True, eq=False)
+class Conditions:
+    """Which points lie on the water or on a plane, and which of these are parallel.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the planes.
+    on : array of int, shape (m,)
+        0 on the water, i + 1 on the plane i, -1 on none.
+    sigma_m : array, shape (m,)
+        Standard deviation of the distance from it.
+    parallel : tuple of str
+        Names of planes that are parallel, `WATER` among them or not.
+    """
+
+    names: tuple[str, ...]
+    on: IntArray
+    sigma_m: FloatArray
+    parallel: tuple[str, ...] = ()
+
+
+WATER = "water"
+"""The name of the water among planes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,6 +240,8 @@ class Block:
         Of the surveyed points, which are the last ones of `xyz`.
     is_check : array of bool, shape (len(control_names),)
         Which of them are held out, to check the result.
+    conditions : Conditions or None
+        Which points lie on a surface.
     """
 
     cameras: Cameras
@@ -198,6 +260,7 @@ class Block:
     port: Port | None = None
     control_names: tuple[str, ...] = ()
     is_check: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
+    conditions: Conditions | None = None
 
     @property
     def owner(self) -> IntArray:
@@ -241,8 +304,10 @@ class Unknowns:
         Parameters of each sensor that are free: f, cx, cy, b1, b2, k1 ... k8, p1, p2.
     lens_sigma : dict
         Standard deviations of some of them about their start values, in their unit.
-    level_sigma_m, tilt_sigma, index_sigma : float
-        Of the water level, its slopes, and the refractive index.
+    level_sigma_m, tilt_sigma, index_sigma, shape_sigma : float
+        Of the water level, its slopes, the refractive index, and what is more than a plane (1/m).
+    distance_sigma_m, centre_sigma_m : float
+        Of the distance of a flat port, and of the centre of a dome.
     free_network : bool
         The datum is that of the start values: the projection centres keep mean place, mean
         direction and mean scale.
@@ -256,11 +321,18 @@ class Unknowns:
     tilt_sigma: float = 0.0
     index_sigma: float = 0.0
     free_network: bool = False
+    shape_sigma: float = 0.0
+    distance_sigma_m: float = 0.0
+    centre_sigma_m: float = 0.0
 
     @property
-    def water_sigma(self) -> tuple[float, float, float, float]:
-        """Of a, b, c and n."""
-        return self.level_sigma_m, self.tilt_sigma, self.tilt_sigma, self.index_sigma
+    def water_sigma(self) -> tuple[float, ...]:
+        """Of the numbers of `WATER_NAMES`."""
+        return (
+            *(self.level_sigma_m, self.tilt_sigma, self.tilt_sigma, self.index_sigma),
+            *(self.shape_sigma,) * 3,
+            *(self.distance_sigma_m, *(self.centre_sigma_m,) * 3),
+        )
 
 
 def sensor_groups(lenses: tuple[Lens, ...]) -> tuple[IntArray, list[list[int]]]:

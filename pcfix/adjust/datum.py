@@ -54,11 +54,12 @@ def offset_of(found: Adjusted) -> Offset | None:
     block lies, with all others.
     """
     block = replace(
-        found.block, cameras=found.cameras, xyz=found.xyz, water=found.water,
-        refractive_index=found.refractive_index,
+        found.block, cameras=found.cameras, xyz=found.xyz,
         sigma_px=np.where(found.used, found.block.sigma_px, np.inf),
     )  # fmt: skip
-    problem, now = prepare(block, found.unknowns)
+    problem, now = prepare(block, found.unknowns, found.origin)
+    if found.numbers is not None:
+        now = replace(now, state=now.state._replace(water=found.numbers))
     problem = with_sigma(problem, noise_px(problem, now))
     weight, ways = gnss_weights(block), _ways(np.asarray(found.cameras.rotations))
     with_centres = np.zeros((len(weight), 6, 3))

@@ -20,6 +20,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from pcfix.adjust.block import CX, CY, FOCAL, LEAST_SQUARES, Given, State
+from pcfix.adjust.conditions import condition
 from pcfix.adjust.equations import Undamped, solver, undamped
 from pcfix.adjust.lens_choice import effect_at_corner
 from pcfix.adjust.lens_field import pulls_of_field
@@ -201,6 +202,10 @@ def _sum_pulls(
                 add_point(v, rhs, own[count], r[count])
                 who[count] = o
                 count += 1
+        if count and condition(state, given, p, own[count], shared[count], r[count]):
+            add_point(v, rhs, own[count], r[count])
+            who[count] = who[0]
+            count += 1
         if count == 0 or not point_block(v, rhs, given.priors, state.xyz[p], p, 0.0):
             continue
         for a in range(count):

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pcfix.adjust.block import LEAST_SQUARES, Given, Loss, State
+from pcfix.adjust.conditions import condition
 from pcfix.adjust.normal import (
     Sums,
     Workspace,
@@ -206,6 +207,8 @@ def _find_fixed(state: State, given: Given, is_fixed: BoolArray) -> None:
         for o in range(seen.start[p], seen.start[p + 1]):
             if linearise(state, given, LEAST_SQUARES, p, o, room, own, shared, r):
                 add_point(v, rhs, own, r)
+        if condition(state, given, p, own, shared, r):
+            add_point(v, rhs, own, r)
         for i in range(3):
             v[i, i] += given.priors.weight[p, i]
         is_fixed[p] = inverted(v, FLAT)
@@ -237,6 +240,11 @@ def _point_covariances(
             for i in range(6):
                 at[size + i] = place[6 * seen.camera[o] + i]
             size += 6
+        if size > g and condition(state, given, p, own, shared, r):
+            add_point(v, rhs, own, r)
+            for i in range(g):
+                for j in range(3):
+                    w[i, j] += shared[0, i] * own[0, POINT + j]
         point_block(v, rhs, given.priors, state.xyz[p], p, 0.0)
         _add_up(v, w[:size], at[:size], inverse, out[p])
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.block import Block, plain_block
+from pcfix.adjust.block import WATER, Block, Conditions, plain_block
 from pcfix.errors import GeometryError, SettingError
 from pcfix.lens.imaging import project, unproject
 from pcfix.model import (
@@ -149,6 +149,8 @@ class Material:
         Standard deviation of the water level; infinite where it is to be found.
     no_gnss : str
         Why GNSS positions that there are do not count.
+    parallel : tuple of str
+        Planes on which control points lie, and the water, that are parallel.
     """
 
     name: str
@@ -162,6 +164,7 @@ class Material:
     inside: Callable[[FloatArray, FloatArray], BoolArray] | None = None
     level_sigma_m: float = 0.0
     no_gnss: str = ""
+    parallel: tuple[str, ...] = ()
 
     @property
     def start(self) -> Cameras:
@@ -203,19 +206,43 @@ def block_of(material: Material, ties: TiePoints, sigma_px: float) -> Block:
     _check_under_water(control, water, material.level_sigma_m)
     marks, sigma = marks_of(control)
     held = np.where(control.is_check[:, None], np.inf, control.sigma_m)
+    under_water = control.under_water.copy()
+    xyz = control.xyz
+    if control.on:
+        bare, on = np.asarray(np.isnan(xyz).any(axis=1)), np.array(control.on)
+        under_water[bare] = on[bare] != WATER
+        places = with_places(marks, material.old).xyz
+        xyz = np.where(bare[:, None], true_start(places, water, n, under_water), xyz)
+        if np.isnan(xyz).any():
+            name = control.names[int(np.argmax(np.isnan(xyz).any(axis=1)))]
+            raise GeometryError(
+                f"point {name}: has no coordinates, and its marks do not meet in a place; mark it"
+                " in two images at least, from different sides."
+            )
     return replace(
         block,
-        xyz=np.vstack([block.xyz, control.xyz]),
+        xyz=np.vstack([block.xyz, xyz]),
+        conditions=_conditions(control, len(block.xyz), material.parallel),
         start=np.concatenate([block.start, marks.views.start[1:] + block.start[-1]]),
         camera=np.concatenate([block.camera, marks.views.camera]),
         image_xy=np.vstack([block.image_xy, marks.image_xy]),
         sigma_px=np.concatenate([block.sigma_px, sigma]),
-        wet=np.concatenate([block.wet, control.under_water]),
+        wet=np.concatenate([block.wet, under_water]),
         surveyed_xyz=np.vstack([block.surveyed_xyz, control.xyz]),
         surveyed_sigma_m=np.vstack([block.surveyed_sigma_m, held]),
         control_names=control.names,
         is_check=control.is_check,
     )
+
+
+def _conditions(control: GroundControl, ties: int, parallel: tuple[str, ...]) -> Conditions | None:
+    """Return on which surfaces control points lie, that follow so many tie points."""
+    if not any(control.on):
+        return None
+    names = tuple(dict.fromkeys(name for name in control.on if name and name != WATER))
+    number = {"": -1, WATER: 0} | {name: i for i, name in enumerate(names, start=1)}
+    on = np.array([-1] * ties + [number[name] for name in control.on])
+    return Conditions(names, on, np.concatenate([np.ones(ties), control.on_sigma_m]), parallel)
 
 
 def marks_of(control: GroundControl) -> tuple[TiePoints, FloatArray]:

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.adjust.block import LEAST_SQUARES, Given, Seen, State
+from pcfix.adjust.conditions import condition
 from pcfix.adjust.equations import Undamped, solver
 from pcfix.adjust.normal import Workspace, add_point, in_parts, linearise, point_block
 from pcfix.adjust.observe import POINT
@@ -119,9 +120,14 @@ def _sum_tiles(
                 add_point(v, rhs, own[count], r[count])
                 who[count] = o
                 count += 1
+        images = count
+        if count and condition(state, given, p, own[count], shared[count], r[count]):
+            add_point(v, rhs, own[count], r[count])
+            who[count] = who[0]
+            count += 1
         if count == 0 or not point_block(v, rhs, given.priors, state.xyz[p], p, 0.0):
             continue
-        for a in range(count):
+        for a in range(images):
             for row in range(2):
                 at, weight, rest = 2 * tile[who[a]] + row, seen.weight[who[a]], r[a, row]
                 for i in range(3):
@@ -136,7 +142,8 @@ def _sum_tiles(
                         left[k] = weight if a == b and k == row else 0.0
                         for i in range(3):
                             left[k] -= own[b, k, POINT + i] * moved[i]
-                        sums.matrix[at, to + k] += seen.weight[who[b]] * left[k]
+                        if b < images:
+                            sums.matrix[at, to + k] += seen.weight[who[b]] * left[k]
                         for i in range(6):
                             sums.pulls[at, camera + i] += own[b, k, i] * left[k]
                         for i in range(g):

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import CODES, lens_parameter, moved_lens
-from pcfix.adjust.problem import Problem, Solution
+from pcfix.adjust.block import CODES, INDEX, PORT, SHAPE, lens_parameter, moved_lens
+from pcfix.adjust.problem import Problem, Solution, polynomial
 from pcfix.adjust.solve import moved_by
-from pcfix.model import Cameras, FloatArray, IntArray, WaterPlane, WaterSurface
+from pcfix.model import Cameras, FloatArray, IntArray, WaterPlane, WaterRaster, WaterSurface
 
 MEMBERS, AXES = 32, 16
 """Chance leaves an eighth of a standard deviation open with so many, but along the axes nothing."""
@@ -44,9 +44,10 @@ class Members:
     lens_names : tuple of str, length p
     lens : array, shape (m, k, p)
         Added to these parameters.
-    water : array, shape (m, 4)
+    water : array, shape (m, 7), or (m, 4) of a plane
         Added to the height of the water below the mean of the centres, to its slopes along x and
-        y, and to the refractive index; zero of what was fixed.
+        y, to the refractive index, and to d, e, f of d x^2 + e x y + f y^2 about there; zero of
+        what was fixed.
     """
 
     labels: tuple[str, ...]
@@ -96,11 +97,18 @@ class Members:
         )
 
     def surface(self, member: int, water: WaterSurface, cameras: Cameras) -> WaterSurface:
-        """Return the water of a member; that of a mesh, a raster or a dimension as it is."""
-        level, b, c, _ = self.water[member].tolist()
-        if not isinstance(water, WaterPlane):
+        """Return the water of a member; that of a mesh or a dimension as it is."""
+        level, b, c, _ = self.water[member, :4].tolist()
+        if not np.delete(self.water[member], INDEX).any():
             return water
         x, y, _ = cameras.centres.mean(axis=0).tolist()
+        if isinstance(water, WaterRaster):
+            rows, columns = (np.arange(n) + 0.5 for n in water.height_m.shape)
+            dx = (water.left_m + water.cell_m[0] * columns - x)[None, :]
+            dy = (water.top_m - water.cell_m[1] * rows - y)[:, None]
+            return replace(water, height_m=water.height_m + polynomial(self.water[member], dx, dy))
+        if not isinstance(water, WaterPlane):
+            return water
         return WaterPlane(water.a + level - b * x - c * y, water.b + b, water.c + c)
 
 
@@ -146,7 +154,10 @@ def members_of(problem: Problem, found: Solution, active: IntArray, steps: Float
         shift.append(np.einsum("kij,kj->ki", r, moved.state.centres - state.centres))
         lens.append(_parameters(moved, names) - _parameters(found, names))
         x, y, _ = state.centres.mean(axis=0)
-        water.append([by[0] + by[1] * x + by[2] * y, *by[1:]])
+        level = float(polynomial(by, x, y))
+        d, e, f = by[SHAPE:PORT]
+        slopes = by[1] + 2.0 * d * x + e * y, by[2] + e * x + 2.0 * f * y
+        water.append([level, *slopes, by[INDEX], d, e, f])
     k, m = len(state.centres), len(turn)
     return Members(
         problem.block.cameras.labels,
@@ -156,7 +167,7 @@ def members_of(problem: Problem, found: Solution, active: IntArray, steps: Float
         np.reshape(shift, (m, k, 3)),
         names,
         np.reshape(lens, (m, k, len(names))),
-        np.reshape(water, (m, 4)),
+        np.reshape(water, (m, 7)),
     )
 
 

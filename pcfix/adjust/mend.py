@@ -113,6 +113,11 @@ def mend(
             " of the cloud say of the images what the old adjustment left, not what they showed;"
             " give a model with tie points, or leave the water fixed."
         )
+    if first.conditions is not None:
+        raise GeometryError(
+            "points that lie on the water or on a plane count beside measured tie points only; give"
+            " a model with tie points, or take the roles waterline and on:... out of --gcps."
+        )
     best = min(
         (_fitting(one, replace(unknowns, lens=lens_sets[0]), progress) for one in candidates),
         key=lambda trial: (trial.sigma_px, trial.misfit),

@@ -21,7 +21,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.block import CAUCHY, HUBER, Given, Loss, PointPriors, Seen, State, Surface
+from pcfix.adjust.block import CAUCHY, HUBER, PLANES, Given, Loss, PointPriors, Seen, State, Surface
+from pcfix.adjust.conditions import condition
 from pcfix.adjust.observe import (
     POINT,
     WATER,
@@ -85,7 +86,7 @@ class Workspace(NamedTuple):
     """Room for the observations of a point, at most `most`, and g unknowns that all share.
 
     room : of `pcfix.adjust.observe`.
-    own, shared, r : shapes (most, 2, 13), (most, 2, g) and (most, 2), of `linearise`.
+    own, shared, r : shapes (most, 2, `WIDTH`), (most, 2, g) and (most, 2), of `linearise`.
     who : shape (most,), their cameras.
     v, rhs : shapes (3, 3) and (3,), of the point.
     w, w_g : shapes (most, 6, 3) and (g, 3).
@@ -106,7 +107,7 @@ class Workspace(NamedTuple):
 
 def workspace(seen: Seen, g: int) -> Workspace:
     """Return new room."""
-    most = int(np.diff(seen.start).max(initial=1))
+    most = int(np.diff(seen.start).max(initial=0)) + 1  # the last for a `condition`
     shapes = (most, 2, WIDTH), (most, 2, g), (most, 2)
     own, shared, r = (np.zeros(shape) for shape in shapes)
     v, rhs, w, w_g, y = (np.zeros(shape) for shape in ((3, 3), 3, (most, 6, 3), (g, 3), (6, 3)))
@@ -204,7 +205,7 @@ def linearise(
 ) -> bool:  # fmt: skip
     """Fill in the weighted residual and Jacobians of one observation; whether it counts.
 
-    `own`, shape (2, 13), by pose, point and water; `shared`, shape (2, g); `r`, shape (2,).
+    `own`, shape (2, `WIDTH`), by pose, point and water; `shared`, shape (2, g); `r`, shape (2,).
     """
     seen, columns = given.seen, given.columns
     c = seen.camera[o]
@@ -223,7 +224,7 @@ def linearise(
     if last > first:
         lens, codes = state.lenses[seen.lens_row[c]], columns.code[first:last]
         lens_gradients(lens, room.ahead, codes, shared[:, first:last])
-    for i in range(4):
+    for i in range(min(PLANES, columns.water.size)):
         if columns.water[i] >= 0:
             shared[0, columns.water[i]] = own[0, WATER + i]
             shared[1, columns.water[i]] = own[1, WATER + i]
@@ -294,6 +295,10 @@ def _sum_up(
                 who[count] = given.seen.camera[o]
                 add_point(v, rhs, own[count], r[count])
                 count += 1
+        if count and condition(state, given, p, own[count], shared[count], r[count]):
+            who[count] = who[0]  # of whose pose it says nothing
+            add_point(v, rhs, own[count], r[count])
+            count += 1
         # a point that its rays do not fix says nothing of the cameras either
         if count == 0 or not point_block(v, rhs, given.priors, state.xyz[p], p, damping):
             continue
@@ -399,6 +404,10 @@ def _point_steps(
                     r[row] -= shared[row, i] * moved[poses + i]
             add_point(v, rhs, own, r)
             count += 1
+        if count and condition(state, given, p, own, shared, r):
+            for i in range(g):
+                r[0] -= shared[0, i] * moved[poses + i]
+            add_point(v, rhs, own, r)
         if count and point_block(v, rhs, given.priors, state.xyz[p], p, damping):
             solved(v, rhs, steps[p])
 

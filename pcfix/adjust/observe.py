@@ -13,7 +13,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.block import B1, B2, CX, CY, FOCAL, K1, P1, Seen, State, Surface
+from pcfix.adjust.block import (
+    B1,
+    B2,
+    CX,
+    CY,
+    FOCAL,
+    K1,
+    P1,
+    PLANES,
+    PORT,
+    SHAPE,
+    Seen,
+    State,
+    Surface,
+)  # fmt: skip
+from pcfix.adjust.curved import curved_gradients, curved_plane
 from pcfix.kernels import kernel, lean
 from pcfix.lens import formulas as places
 from pcfix.lens.algebra import (
@@ -29,12 +44,13 @@ from pcfix.lens.algebra import (
 from pcfix.lens.formulas import distorted, jacobian, undistorted
 from pcfix.lens.imaging import image_and_gradients, image_of, in_plane
 from pcfix.model import FloatArray, IntArray
-from pcfix.port.light import through_port
+from pcfix.port.light import BY_PORT, FLAT, KIND, SIZE, X, through_port
 from pcfix.refract.rays import direction, lay, light_path, plane_at, settle
 from pcfix.refract.tracing.gradients import light_and_gradients
 
-POSE, POINT, WATER, WIDTH = 0, 6, 9, 13
-"""Columns of the gradients: omega and C, Q, and a, b, c, n."""
+POSE, POINT, WATER = 0, 6, 9
+WIDTH = WATER + PLANES
+"""Columns of the gradients: omega and C, Q, and the numbers of `pcfix.adjust.block.WATER_NAMES`."""
 
 
 class Scratch(NamedTuple):
@@ -42,8 +58,10 @@ class Scratch(NamedTuple):
 
     light, plane : shapes (3, 12) and (4,), the light with its derivatives and where it is bent.
     ahead : shape (3,), filled with the direction that the lens images, camera frame.
-    bent : shape (3, 5), that direction behind a port, with its derivatives.
+    bent : shape (3, 8), that direction behind a port, with its derivatives.
     origin : shape (3,), the block's origin, from the level of the water.
+    by_shape : shape (3, 3), the derivatives of the light by d, e, f.
+    port : shape (7,), the port as it is now.
     """
 
     light: FloatArray
@@ -51,12 +69,17 @@ class Scratch(NamedTuple):
     ahead: FloatArray
     bent: FloatArray
     origin: FloatArray
+    by_shape: FloatArray
+    port: FloatArray
 
 
 @kernel
 def scratch() -> Scratch:
     """Return new room."""
-    return Scratch(np.empty((3, 12)), np.empty(4), np.empty(3), np.empty((3, 5)), np.empty(3))
+    return Scratch(
+        np.empty((3, 12)), np.empty(4), np.empty(3), np.empty((3, 8)), np.empty(3),
+        np.empty((3, 3)), np.empty(7),
+    )  # fmt: skip
 
 
 _CENTRE_X, _CENTRE_Y, _INVERSE = places.CENTRE_X, places.CENTRE_Y, places.INVERSE
@@ -73,6 +96,8 @@ def water_plane(
     """Set the room's plane (N, h), where light from Q to C leaves the water; is Q below it."""
     plane, origin = room.plane, room.origin
     if surface.field is None and surface.tin is None:
+        if surface.curved:
+            return curved_plane(plane, water, vector(q), vector(centre))
         plane[0], plane[1], plane[2] = normal_of(water[1], water[2])
         plane[3] = plane[2] * water[0]
         return bool(water[0] + water[1] * q[0] + water[2] * q[1] > q[2])
@@ -84,6 +109,18 @@ def water_plane(
     lay(plane, q[0], q[1], z, b, c)
     settle(plane, surface.tin, surface.field, origin, vector(q), vector(centre), water[3])
     return True
+
+
+@lean
+def set_port(port: FloatArray, water: FloatArray, surface: Surface) -> None:
+    """Set the port, with the distance or the centre that is estimated."""
+    for i in range(port.size):
+        port[i] = surface.port[i]
+    if port[KIND] == FLAT:
+        port[SIZE] = water[PORT]
+    else:
+        for i in range(3):
+            port[X + i] = water[PORT + 1 + i]
 
 
 @lean
@@ -103,7 +140,8 @@ def image(
         w = direction(path, normal)
     x = times(r, w)
     if surface.port.size:
-        through_port(surface.port, water[3], *x, light)
+        set_port(room.port, water, surface)
+        through_port(room.port, water[3], *x, light)
         x = column_of(light, 0)
     return image_of(state.lenses[seen.lens_row[c]], *x)
 
@@ -114,7 +152,8 @@ def image_and_all_gradients(
 ) -> tuple[float, float]:
     """Return where camera c images point p, and fill in how that moves.
 
-    `out`, shape (2, 13), has the derivatives of u and v: by omega, C, Q, and a, b, c, n.
+    `out`, shape (2, `WIDTH`), has the derivatives of u and v: by omega, C, Q, and a, b, c, n; by
+    d, e, f where the water is curved, and by the numbers of a port where there is one.
     """
     q, centre, r, water = state.xyz[p], state.centres[c], state.rotations[c], state.water
     light, plane, ahead = room.light, room.plane, room.ahead
@@ -123,8 +162,10 @@ def image_and_all_gradients(
         refracted = water_plane(room, water, surface, q, centre)
     if refracted:
         light_and_gradients(vector(q), vector(centre), vector(plane), plane[3], water[3], light)
+        if surface.curved:
+            curved_gradients(plane, water, vector(centre), light, room.by_shape)
     else:
-        light[:] = 0.0
+        light[:], room.by_shape[:] = 0.0, 0.0
         for i in range(3):
             light[i, 0] = q[i] - centre[i]
             light[i, 1 + i], light[i, 4 + i] = 1.0, -1.0
@@ -132,7 +173,8 @@ def image_and_all_gradients(
     ahead[0], ahead[1], ahead[2] = x
     bent = room.bent
     if surface.port.size:
-        through_port(surface.port, water[3], *x, bent)
+        set_port(room.port, water, surface)
+        through_port(room.port, water[3], *x, bent)
         ahead[0], ahead[1], ahead[2] = column_of(bent, 0)
     u, v, both = image_and_gradients(state.lenses[seen.lens_row[c]], ahead[0], ahead[1], ahead[2])
     for row in range(2):
@@ -140,6 +182,9 @@ def image_and_all_gradients(
         along_n = 0.0
         if surface.port.size:
             along_n = dot(g, column_of(bent, 4))
+            out[row, WATER + PORT] = dot(g, column_of(bent, BY_PORT))
+            for i in range(3):
+                out[row, WATER + PORT + 1 + i] = dot(g, column_of(bent, BY_PORT + i))
             g = dot(g, column_of(bent, 1)), dot(g, column_of(bent, 2)), dot(g, column_of(bent, 3))
         out[row, 0], out[row, 1], out[row, 2] = cross(x, g)
         w = transposed_times(r, g)
@@ -149,6 +194,9 @@ def image_and_all_gradients(
         for i in range(4):
             out[row, WATER + i] = dot(w, column_of(light, 7 + i))
         out[row, WATER + 3] += along_n
+        if surface.curved:
+            for i in range(3):
+                out[row, WATER + SHAPE + i] = dot(w, column_of(room.by_shape, i))
     return u, v
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import chdtri
 
 from pcfix.adjust.block import MOTIONS, WATER_NAMES, Unknowns
 from pcfix.adjust.equations import Reduced, Undamped, point_covariances, solver, undamped
@@ -322,13 +323,52 @@ def _with_block(name: str, motion: str, r: float) -> str:
     )
 
 
+LEAST_BEND_M = 0.02
+"""Standard error of the bend of the water, from where it counts as undetermined, as the level."""
+
+SURE = 0.01
+"""Probability that flat water seems to be bent, by chance."""
+
+
+def shape_doubts(precision: Precision, wet_xy: FloatArray) -> list[str]:
+    """Return a sentence if the block cannot tell the shape of the water, where it was free.
+
+    Parameters
+    ----------
+    wet_xy : array, shape (m, 2)
+        Points under water, about the origin of the block, metres. What bends the water over them
+        is what a plane does not take up.
+    """
+    rows = [i for i, row in enumerate(precision.shared) if row.name.startswith("shape_")]
+    if not rows or len(wet_xy) < 6:
+        return []
+    x, y = wet_xy.T
+    terms, plane = np.column_stack([x * x, x * y, y * y]), np.column_stack([np.ones(len(x)), x, y])
+    terms = terms - plane @ np.linalg.lstsq(plane, terms, rcond=None)[0]
+    by, sigma = np.array([[precision.shared[i].added, precision.shared[i].sigma] for i in rows]).T
+    covariance = precision.correlation[np.ix_(rows, rows)] * sigma * sigma[:, None]
+    chi2 = float(by @ np.linalg.solve(covariance, by))
+    bend = float(np.sqrt(np.mean((terms @ by) ** 2)))
+    error = float(np.sqrt(np.mean(np.einsum("mi,ij,mj->m", terms, covariance, terms))))
+    if error <= LEAST_BEND_M and chi2 > chdtri(len(rows), SURE):
+        return []
+    figures = (
+        f"its shape bends it by {1000.0 * bend:.2g} mm (rms over the bed), with a standard error of"
+        f" {1000.0 * error:.2g} mm; leave shape out of --free"
+    )
+    if error > LEAST_BEND_M:
+        more = "mark waterline points, or give more tie points under water"
+        return [f"the block does not tell the shape of the water: {figures}, or {more}."]
+    return [f"the water is a plane as far as the block tells: {figures}."]
+
+
 def undetermined(precision: Precision, unknowns: Unknowns) -> list[str]:
     """Return a sentence for each unknown whose standard error is too large to be of use."""
     given = dict(zip(WATER_NAMES, unknowns.water_sigma, strict=True)) | unknowns.lens_sigma
     notes = []
     for row in precision.shared:
         limit, unit, _ = LIMITS.get(row.name, (math.inf, "", ""))
-        prior = given.get(row.name.partition(" of ")[0], math.inf)
+        prior = given.get(row.name.partition(" of sensor ")[0], math.inf)
         space = f" {unit}" if unit else ""
         if row.sigma > limit:
             notes.append(

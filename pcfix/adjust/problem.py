@@ -14,14 +14,18 @@ import numpy as np
 
 from pcfix.adjust.block import (
     CODES,
+    INDEX,
     LEAST_SQUARES,
     MOTIONS,
     NAMES,
+    PORT,
+    SHAPE,
     WATER_NAMES,
     Block,
     Columns,
     Given,
     Loss,
+    OnSurfaces,
     PointPriors,
     Seen,
     State,
@@ -31,6 +35,7 @@ from pcfix.adjust.block import (
     sensor_groups,
     usable_codes,
 )
+from pcfix.adjust.conditions import distances, planes_of
 from pcfix.adjust.normal import cost_of, pair_slots, point_steps, residuals
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import lens_table
@@ -46,6 +51,7 @@ from pcfix.model import (
     WaterSurface,
 )
 from pcfix.port.light import coefficients as port_coefficients
+from pcfix.port.shapes import DomePort, FlatPort, Port
 from pcfix.water.surface import build_field, build_tin
 
 NETWORK_SIGMA_M = 1e-4
@@ -88,11 +94,13 @@ class Problem:
     slots: tuple[IntArray, IntArray]
     priors: PointPriors
     moves: BoolArray
+    on_surfaces: OnSurfaces
+    numbers: tuple[str, ...]
 
     @property
     def given(self) -> Given:
         """What the kernels take of it."""
-        return Given(self.seen, self.surface, self.columns, self.priors)
+        return Given(self.seen, self.surface, self.columns, self.priors, self.on_surfaces)
 
     @property
     def names(self) -> list[str]:
@@ -102,7 +110,8 @@ class Problem:
             for i, codes in enumerate(self.codes, start=1)
             for code in codes
         ]
-        names += [name for name, at in zip(WATER_NAMES, self.columns.water, strict=True) if at >= 0]
+        by_column = dict(zip(self.columns.water[::-1].tolist(), self.numbers[::-1], strict=True))
+        names += [by_column[at] for at in sorted(by_column) if at >= 0]
         return names + list(MOTIONS if self.columns.similarity >= 0 else ())
 
 
@@ -122,8 +131,10 @@ class Solution:
     log: list[LogRow]
 
 
-def prepare(block: Block, unknowns: Unknowns) -> tuple[Problem, Solution]:
-    """Return a problem and its start.
+def prepare(
+    block: Block, unknowns: Unknowns, origin: FloatArray | None = None
+) -> tuple[Problem, Solution]:
+    """Return a problem and its start; the origin of its frame is the middle of the cameras.
 
     Raises
     ------
@@ -133,15 +144,21 @@ def prepare(block: Block, unknowns: Unknowns) -> tuple[Problem, Solution]:
     cameras = block.cameras
     if cameras.rotations is None or cameras.lenses is None:
         raise GeometryError("an adjustment needs cameras with angles and lenses.")
-    origin = np.round(cameras.centres.mean(axis=0))
+    origin = np.round(cameras.centres.mean(axis=0)) if origin is None else origin
     group, groups = sensor_groups(cameras.lenses)
     codes = [usable_codes(cameras.lenses[images[0]], unknowns.lens) for images in groups]
     plane = isinstance(block.water, WaterPlane) or block.water is None
-    if unknowns.tilt_sigma and not plane:
-        raise GeometryError("the tilt of the water can be free for a level or plane only.")
+    if (unknowns.tilt_sigma or unknowns.shape_sigma) and not plane:
+        what = "tilt" if unknowns.tilt_sigma else "shape"
+        raise GeometryError(f"the {what} of the water can be free for a level or plane only.")
+    water = _water_numbers(block, origin)
+    planes = planes_of(block, origin, water)
     free = [sigma != 0.0 for sigma in unknowns.water_sigma]
+    free += [len(WATER_NAMES) + i not in planes.alike for i in range(len(planes.numbers))]
     centres = cameras.centres - origin
-    columns = columns_of(codes, free, unknowns.poses == "similarity", centres.mean(axis=0))
+    columns = columns_of(
+        codes, free, unknowns.poses == "similarity", centres.mean(axis=0), planes.alike
+    )
     row, table = lens_table(cameras.lenses)
     seen = Seen(
         np.ascontiguousarray(block.start, np.int64),
@@ -154,23 +171,40 @@ def prepare(block: Block, unknowns: Unknowns) -> tuple[Problem, Solution]:
     )
     state = State(
         centres, np.ascontiguousarray(cameras.rotations, np.float64), table,
-        block.xyz - origin, _water_numbers(block, origin),
+        block.xyz - origin, np.concatenate([water, planes.numbers]),
     )  # fmt: skip
     problem = Problem(
-        block, unknowns, origin, seen, _surface(block, origin), columns, groups, codes,
+        block, unknowns, origin, seen, _surface(block, origin, unknowns), columns, groups, codes,
         pair_slots(seen, len(cameras)), _point_priors(block, origin),
-        _moves(block, unknowns, columns),
+        _moves(block, unknowns, columns), planes.rows, (*WATER_NAMES, *planes.names),
     )  # fmt: skip
     start = Solution(state, cameras.lenses, np.zeros(columns.total), np.inf, [])
     return problem, start
 
 
 def _water_numbers(block: Block, origin: FloatArray) -> FloatArray:
-    water, n = block.water, block.refractive_index
-    if not isinstance(water, WaterPlane):
-        return np.array([0.0, 0.0, 0.0, n])
-    a, b, c = water.a, water.b, water.c
-    return np.array([a + (b * origin[0] + c * origin[1]) - origin[2], b, c, n])
+    water, numbers = block.water, np.zeros(len(WATER_NAMES))
+    numbers[INDEX] = block.refractive_index
+    if isinstance(water, WaterPlane):
+        a, b, c = water.a, water.b, water.c
+        numbers[:3] = a + (b * origin[0] + c * origin[1]) - origin[2], b, c
+    match block.port:
+        case FlatPort(distance):
+            numbers[PORT] = distance
+        case DomePort(centre_m=centre):
+            numbers[PORT + 1 :] = centre
+    return numbers
+
+
+def port_of(block: Block, numbers: FloatArray) -> Port | None:
+    """Return the port of a block with the numbers of a state."""
+    match block.port:
+        case FlatPort():
+            return replace(block.port, distance_m=float(numbers[PORT]))
+        case DomePort():
+            x, y, z = numbers[PORT + 1 : PORT + 4].tolist()
+            return replace(block.port, centre_m=(x, y, z))
+    return None
 
 
 def water_of(problem: Problem, state: State) -> WaterSurface | None:
@@ -178,6 +212,8 @@ def water_of(problem: Problem, state: State) -> WaterSurface | None:
     water, origin = problem.block.water, problem.origin
     level, b, c = (float(value) for value in state.water[:3])
     match water:
+        case WaterPlane() if problem.surface.curved:
+            return _curved_raster(problem, state)
         case WaterPlane():
             return WaterPlane(level + origin[2] - (b * origin[0] + c * origin[1]), b, c)
         case WaterRaster() if level:
@@ -188,7 +224,33 @@ def water_of(problem: Problem, state: State) -> WaterSurface | None:
             return water
 
 
-def _surface(block: Block, origin: FloatArray) -> Surface:
+CELLS = 400
+"""Along the longer side of a raster of curved water: a bend of 10 cm in all is met within 1 um."""
+MARGIN = 0.2
+"""Of the block's extent, by which the raster goes beyond it."""
+
+
+def _curved_raster(problem: Problem, state: State) -> WaterRaster:
+    """Return water of the second order as a raster over all images and points."""
+    known = state.xyz[np.isfinite(state.xyz).all(axis=1)]
+    places = np.vstack([state.centres[:, :2], known[:, :2]])
+    low, high = places.min(axis=0), places.max(axis=0)
+    low, high = low - MARGIN * (high - low), high + MARGIN * (high - low)
+    cell = float((high - low).max()) / CELLS
+    columns, rows = np.maximum(np.ceil((high - low) / cell).astype(int), 2)
+    x, y = low[0] + cell * (np.arange(columns) + 0.5), high[1] - cell * (np.arange(rows) + 0.5)
+    height = polynomial(state.water, x[None, :], y[:, None]) + problem.origin[2]
+    left, top = float(problem.origin[0] + low[0]), float(problem.origin[1] + high[1])
+    return WaterRaster(height, left, top, (cell, cell), "water of second order")
+
+
+def polynomial(water: FloatArray, x: FloatArray | float, y: FloatArray | float) -> FloatArray:
+    """Return the height of the water's numbers at places, block frame."""
+    (a, b, c), (d, e, f) = water[:3], water[SHAPE:PORT] if len(water) > SHAPE else (0.0, 0.0, 0.0)
+    return np.asarray(a + b * x + c * y + d * x * x + e * x * y + f * y * y)
+
+
+def _surface(block: Block, origin: FloatArray, unknowns: Unknowns) -> Surface:
     water = block.water
     return Surface(
         water is not None,
@@ -196,6 +258,7 @@ def _surface(block: Block, origin: FloatArray) -> Surface:
         build_field(water) if isinstance(water, WaterRaster) else None,
         origin,
         np.zeros(0) if block.port is None else port_coefficients(block.port),
+        unknowns.shape_sigma != 0.0,
     )
 
 
@@ -328,9 +391,13 @@ def cost_at(problem: Problem, found: Solution, loss: Loss) -> float:
 
 
 def survey_cost(problem: Problem, found: Solution) -> float:
-    """Return the weighted squares by which surveyed points were moved."""
-    priors = problem.priors
-    return float((priors.weight * (priors.xyz - found.state.xyz) ** 2).sum())
+    """Return the weighted squares by which surveyed points were moved, or lie off their surface."""
+    priors, rows = problem.priors, problem.on_surfaces
+    cost = float((priors.weight * (priors.xyz - found.state.xyz) ** 2).sum())
+    if not len(rows.on):
+        return cost
+    off = distances(found.state, problem.given)
+    return cost + float(np.nansum((rows.weight * off) ** 2))
 
 
 def counts_of(problem: Problem, found: Solution) -> tuple[int, float]:
@@ -388,7 +455,7 @@ def intersect_fixed(block: Block) -> Intersected:
 
     A point that takes more than `STEPS` steps of Gauss and Newton has failed.
     """
-    problem, now = prepare(block, Unknowns(poses="fixed", lens=()))
+    problem, now = prepare(replace(block, conditions=None), Unknowns(poses="fixed", lens=()))
     nothing = np.zeros(len(problem.moves))
     state, step = now.state, np.full((len(block.xyz), 3), np.inf)
     for _ in range(STEPS):

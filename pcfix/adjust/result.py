@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.block import Block, Unknowns
+from pcfix.adjust.block import WATER, Block, Unknowns
+from pcfix.adjust.conditions import distances
 from pcfix.adjust.gather import LEAST_VIEWS
 from pcfix.adjust.normal import residuals
 from pcfix.adjust.precision import Precision
@@ -16,12 +17,14 @@ from pcfix.adjust.problem import (
     Problem,
     Solution,
     gnss_weights,
+    port_of,
     prepare,
     solved_cameras,
     water_of,
 )
 from pcfix.adjust.solve import solve
 from pcfix.model import BoolArray, Cameras, FloatArray, WaterSurface
+from pcfix.port.shapes import Port
 from pcfix.water.surface import surface_above
 
 Source = Literal["tie points", "cloud"]
@@ -39,6 +42,17 @@ class ControlRow:
     dz_m: float
     rms_px: float
     images: int
+
+
+class OnSurface(NamedTuple):
+    """How marked points lie on a surface: which, how many, stated and found distances in metres."""
+
+    surface: str
+    points: int
+    sigma_m: float
+    rms_m: float
+    largest_m: float
+    largest_point: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +76,7 @@ class Adjusted:
     used : array of bool, shape (o,)
         Observations that were not left out as outliers.
     is_wet : array of bool, shape (m,)
-        Points that lie below the water.
+        Points that lie below the water; before a port all.
     sigma0 : float
         A-posteriori standard deviation of unit weight.
     redundancy : int
@@ -77,6 +91,12 @@ class Adjusted:
     control : list of ControlRow
     notes : list of str
         What was decided and what a user should know.
+    port : Port or None
+        Adjusted.
+    on_surfaces : list of OnSurface
+        Of the points that shall lie on the water or on a plane.
+    origin, numbers : array or None
+        Where the block's frame has its origin, and `pcfix.adjust.block.State.water` there.
     """
 
     block: Block
@@ -97,6 +117,10 @@ class Adjusted:
     gnss_residual_m: FloatArray
     control: list[ControlRow]
     notes: list[str]
+    port: Port | None = None
+    on_surfaces: list[OnSurface] = field(default_factory=list)
+    origin: FloatArray | None = None
+    numbers: FloatArray | None = None
 
     def rms_px(self, points: BoolArray) -> float | None:
         """Return the root mean square residual of the used observations of some points."""
@@ -128,6 +152,7 @@ def redundancy_of(problem: Problem) -> int:
     priors = int((gnss_weights(block) > 0.0).sum() + (problem.priors.weight > 0.0).sum())
     sigma = [*problem.unknowns.lens_sigma.values(), *problem.unknowns.water_sigma]
     priors += sum(0.0 < value < np.inf for value in sigma)
+    priors += len(np.intersect1d(np.flatnonzero(problem.on_surfaces.on >= 0), block.owner[used]))
     datum = 7 if problem.unknowns.free_network else 0
     return int(2 * used.sum() + priors + datum - 3 * points - problem.moves.sum())
 
@@ -142,7 +167,8 @@ def adjusted_of(
     xyz = with_checks(problem, now, state.xyz + problem.origin)
     r = residuals(state._replace(xyz=xyz - problem.origin), problem.seen, problem.surface)
     water = water_of(problem, state)
-    level = np.full(len(xyz), -np.inf) if water is None else surface_above(water, xyz).height_m
+    none = -np.inf if block.port is None else np.inf  # before a port all is under water
+    level = np.full(len(xyz), none) if water is None else surface_above(water, xyz).height_m
     cameras = solved_cameras(problem, now)
     off = cameras.centres - block.gnss_xyz
     return Adjusted(
@@ -164,7 +190,27 @@ def adjusted_of(
         gnss_residual_m=np.where(gnss_weights(block) > 0.0, off, np.nan),
         control=_control_rows(block, xyz, r),
         notes=notes,
+        port=port_of(block, state.water),
+        on_surfaces=_on_surfaces(problem, now),
+        origin=problem.origin,
+        numbers=state.water,
     )
+
+
+def _on_surfaces(problem: Problem, now: Solution) -> list[OnSurface]:
+    given, block = problem.block.conditions, problem.block
+    if given is None:
+        return []
+    off = np.where(np.diff(block.start) > 0, distances(now.state, problem.given), np.nan)
+    first, found = len(block.xyz) - len(block.control_names), []
+    for number, name in enumerate((WATER, *given.names)):
+        rows = np.flatnonzero((given.on == number) & np.isfinite(off))
+        if len(rows):
+            worst = rows[np.argmax(np.abs(off[rows]))]
+            rms, sigma = (float(np.sqrt(np.mean(v[rows] ** 2))) for v in (off, given.sigma_m))
+            label = block.control_names[worst - first]
+            found.append(OnSurface(name, len(rows), sigma, rms, float(abs(off[worst])), label))
+    return found
 
 
 def with_checks(problem: Problem, now: Solution, xyz: FloatArray) -> FloatArray:
@@ -176,6 +222,7 @@ def with_checks(problem: Problem, now: Solution, xyz: FloatArray) -> FloatArray:
         return xyz
     whole = replace(
         block, cameras=solved_cameras(problem, now), xyz=xyz, water=water_of(problem, now.state),
+        conditions=None, port=port_of(block, now.state.water),
         refractive_index=float(now.state.water[3]),
         sigma_px=np.where(np.isin(block.owner, rows), 1.0, np.inf),
     )  # fmt: skip
@@ -191,7 +238,7 @@ def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlR
     for p, (name, check) in enumerate(zip(block.control_names, block.is_check, strict=True), first):
         marks = r[block.start[p] : block.start[p + 1]]
         marks = marks[np.isfinite(marks).all(axis=1)]
-        if check and len(marks) < LEAST_VIEWS:
+        if (check and len(marks) < LEAST_VIEWS) or np.isnan(block.surveyed_xyz[p]).any():
             continue
         dx, dy, dz = (xyz[p] - block.surveyed_xyz[p]).tolist()
         rms = float(np.sqrt((marks * marks).mean())) if len(marks) else float("nan")

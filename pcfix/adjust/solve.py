@@ -13,7 +13,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import CAUCHY, CODES, HUBER, SQUARES, Loss, Robust, State, moved_lens
+from pcfix.adjust.block import (
+    CAUCHY,
+    CODES,
+    HUBER,
+    PLANES,
+    PORT,
+    SQUARES,
+    Loss,
+    Robust,
+    State,
+    moved_lens,
+)
 from pcfix.adjust.equations import reduced_at, solver, undamped
 from pcfix.adjust.normal import point_steps
 from pcfix.adjust.problem import (
@@ -28,6 +39,7 @@ from pcfix.adjust.problem import (
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import lens_table
 from pcfix.model import FloatArray, IntArray, Lens
+from pcfix.port.shapes import DomePort, FlatPort, Port
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -135,7 +147,7 @@ def moved_by(
     water = state.water.copy()
     free = columns.water >= 0
     water[free] += shared[columns.water[free]]
-    if not 1.0 <= water[3] < 3.0:
+    if not 1.0 <= water[3] < 3.0 or not _is_port(problem.block.port, water[PORT:PLANES]):
         return None
     lenses = _moved_lenses(problem, now.lenses, shared)
     if lenses is None:
@@ -152,6 +164,16 @@ def moved_by(
         lenses=lenses,
         shared=now.shared + shared,
     )  # fmt: skip
+
+
+def _is_port(port: Port | None, numbers: FloatArray) -> bool:
+    """Whether a port may have this distance, or this centre."""
+    match port:
+        case FlatPort():
+            return bool(numbers[0] >= 0.0)
+        case DomePort():
+            return bool(np.linalg.norm(numbers[1:]) < port.radius_m)
+    return True
 
 
 def _moved_lenses(
@@ -179,6 +201,10 @@ LIMITS = {
     "tilt_y": (0.0005, "m/m", "the tilt of the water along y"),
     "index": (0.005, "", "the refractive index"),
     "scale": (0.001, "", "the scale of the block"),
+    "distance": (0.002, "m", "the distance of the port"),
+    "centre_x": (0.002, "m", "the dome's centre along x"),
+    "centre_y": (0.002, "m", "the dome's centre along y"),
+    "centre_z": (0.002, "m", "the dome's centre along z"),
 }
 """Standard errors beyond which an unknown counts as undetermined, its unit and its name."""
 
@@ -187,13 +213,14 @@ _WORDS = {name: words for name, (_, _, words) in LIMITS.items()} | {
     "f": "the focal length", "cx": "the principal point's x", "cy": "the principal point's y",
     "b1": "the affinity b1", "b2": "the skew b2",
 }  # fmt: skip
+_WORDS |= {f"shape_{which}": f"the water's shape {which}" for which in ("xx", "xy", "yy")}
 _WORDS |= {name: f"the distortion {name}" for name in CODES if name[0] in "kp"}
 for _axis in "xyz":
     _WORDS[f"shift {_axis}"] = f"the block's shift along {_axis}"
     _WORDS[f"turn {_axis}"] = f"the block's turn about {_axis}"
 
 
-BED = {"level", "index", "tilt_x", "tilt_y"}
+BED = {"level", "index", "tilt_x", "tilt_y", "shape_xx", "shape_xy", "shape_yy"}
 
 
 def words_of(name: str) -> str:
@@ -266,7 +293,7 @@ def _motions(problem: Problem, solution: Solution) -> Iterator[tuple[str, FloatA
     the water at the block's origin, whose level stays. The normal of z = a + b x + c y turns with
     the rest, and with it the slopes.
     """
-    a, b, c, _ = solution.state.water
+    a, b, c = solution.state.water[:3]
     pivot = np.array([0.0, 0.0, a]) if problem.surface.there else problem.columns.pivot
     poses = pose_gradients(solution.state, pivot)
     water: dict[str, dict[str, float]] = {

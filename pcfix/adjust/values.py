@@ -10,7 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pcfix.adjust.block import (
+    INDEX,
     NAMES,
+    PORT,
     WATER_NAMES,
     Unknowns,
     lens_parameter,
@@ -22,6 +24,7 @@ from pcfix.adjust.precision import Precision, strong_correlations, undetermined
 from pcfix.adjust.problem import intersect_fixed, prepare
 from pcfix.adjust.result import Adjusted, ControlRow
 from pcfix.model import BoolArray, FloatArray, WaterPlane
+from pcfix.port.shapes import spec_of
 from pcfix.water.surface import surface_above
 
 Plain = dict[str, Any]
@@ -85,8 +88,9 @@ def adjustment_dict(adjusted: Adjusted, before: Before | None = None) -> Plain:
             Whether light bends at a housing port instead of at water.
         unknowns : dict
             `lens`, the names of its free parameters; and standard deviations about the start of
-            `lens_sigma`, `level_sigma_m`, `tilt_sigma`, `index_sigma`, None where free without
-            bounds, 0 where fixed; `free_network`, a bool.
+            `lens_sigma`, `level_sigma_m`, `tilt_sigma`, `index_sigma`, `shape_sigma`,
+            `distance_sigma_m`, `centre_sigma_m`, None where free without bounds, 0 where fixed;
+            `free_network`, a bool; `parallel`, names of planes.
         points : dict
             `all` with observations that were used, those on `land` and under `water`; `left_out`,
             tie points without any; `control` and `check`, surveyed ones.
@@ -96,9 +100,9 @@ def adjustment_dict(adjusted: Adjusted, before: Before | None = None) -> Plain:
         sigma0 : float
         redundancy : int
         residuals : dict
-            Of `land` and `water`: `points`, `observations`, `rms_before_px`, `rms_px`, `rms_m`
-            (on the ground: residual by distance over focal length) and `sigma_xyz_m`, the root
-            mean square of the points' standard errors along x, y, z.
+            Of `land` and `water`: `points`, `observations`, `rms_before_px`, `rms_px`, `rms_xy_px`
+            (of x' and y' apart), `rms_m` (on the ground: residual by distance over focal length)
+            and `sigma_xyz_m`, the root mean square of the points' standard errors along x, y, z.
         depth_bins : list of dict
             `from_m`, `to_m`, `observations`, `rms_before_px`, `rms_px`, by depth below water.
         lens : list of dict
@@ -106,8 +110,16 @@ def adjustment_dict(adjusted: Adjusted, before: Before | None = None) -> Plain:
             those of the first), `name`, `before`, `after`, `sigma`.
         water : dict or None
             `surface`, `level` and `index` with `before`, `after`, `sigma` and `free`;
-            `tilt_x` and `tilt_y` likewise for a plane. The level is that below the middle of the
-            projection centres, or over a mesh or raster its mean over the points.
+            `tilt_x` and `tilt_y` likewise for a plane, and of one whose shape was free `shape_xx`,
+            `shape_xy`, `shape_yy` (1/m, the factors of x^2, x y, y^2). Level, tilt and shape are
+            those below the middle of the projection centres, or the level over a mesh or raster
+            its mean over the points.
+        port_found : dict or None
+            `port`, as --port takes it, and of what was free of `index`, `distance` or `centre_x`,
+            `centre_y`, `centre_z`: `before`, `after`, `sigma`, `free`.
+        on_surfaces : list of dict
+            Of marked points that shall lie on the water or a plane: `surface`, `points`,
+            `sigma_m` (stated), `rms_m`, `largest_m`, `largest_point`.
         poses : dict
             `moved_mean_m` east, north and up; `moved_rms_m`, `moved_largest_m` with
             `moved_largest_image`; `turned_rms_deg`, `turned_largest_deg`.
@@ -143,7 +155,11 @@ def adjustment_dict(adjusted: Adjusted, before: Before | None = None) -> Plain:
             "level_sigma_m": number(u.level_sigma_m),
             "tilt_sigma": number(u.tilt_sigma),
             "index_sigma": number(u.index_sigma),
+            "shape_sigma": number(u.shape_sigma),
+            "distance_sigma_m": number(u.distance_sigma_m),
+            "centre_sigma_m": number(u.centre_sigma_m),
             "free_network": u.free_network,
+            "parallel": list(() if block.conditions is None else block.conditions.parallel),
         },
         "points": _points(a),
         "observations": _observations(a),
@@ -156,6 +172,8 @@ def adjustment_dict(adjusted: Adjusted, before: Before | None = None) -> Plain:
         "depth_bins": _depth_bins(a, before),
         "lens": _lens(a),
         "water": _water(a),
+        "port_found": _port(a),
+        "on_surfaces": [row._asdict() for row in a.on_surfaces],
         "poses": _poses(a),
         "precision": None if known is None else _precision(known, u),
         "gnss": _gnss(a),
@@ -239,6 +257,7 @@ def _residuals(a: Adjusted, before: Before | None, points: BoolArray) -> Plain:
         "points": int(points.sum()),
         **_fit(a, before, rows),
         "rms_px": number(a.rms_px(points)) if known else None,
+        "rms_xy_px": _columns(rms, a.residual_px[rows]),
         "rms_m": number(a.rms_m(points)) if known else None,
         "sigma_xyz_m": None if sigma is None else _columns(rms, sigma[points]),
     }
@@ -325,7 +344,12 @@ def _water(a: Adjusted) -> Plain | None:
     values: dict[str, tuple[float, float]] = {
         "index": (a.block.refractive_index, a.refractive_index)
     }
-    if isinstance(old, WaterPlane) and isinstance(new, WaterPlane):
+    if a.unknowns.shape_sigma and a.numbers is not None and a.origin is not None:
+        start = prepare(a.block, a.unknowns, a.origin)[1].state.water
+        for i, name in enumerate(WATER_NAMES[:PORT]):
+            base = float(a.origin[2]) if name == "level" else 0.0
+            values[name] = base + float(start[i]), base + float(a.numbers[i])
+    elif isinstance(old, WaterPlane) and isinstance(new, WaterPlane):
         # the level that is estimated stands at the origin of the block
         origin = np.round(a.block.cameras.centres.mean(axis=0))[None]
         values["level"] = (
@@ -343,6 +367,20 @@ def _water(a: Adjusted) -> Plain | None:
         for name, (was, now) in values.items()
     }
     return {"surface": str(new), **found}
+
+
+def _port(a: Adjusted) -> Plain | None:
+    if a.port is None or a.numbers is None:
+        return None
+    start = prepare(a.block, a.unknowns, a.origin)[1].state.water
+    found: Plain = {"port": spec_of(a.port)}
+    for i, (name, sigma) in enumerate(zip(WATER_NAMES, a.unknowns.water_sigma, strict=True)):
+        if sigma and (i == INDEX or i >= PORT):
+            before, after = float(start[i]), float(a.numbers[i])
+            sigma_found = _sigma(a, name)
+            row = {"before": before, "after": after, "sigma": sigma_found, "free": True}
+            found[name] = row
+    return found
 
 
 def _poses(a: Adjusted) -> Plain:

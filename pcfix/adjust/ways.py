@@ -20,7 +20,7 @@ from pcfix.adjust.gather import (
 )
 from pcfix.adjust.lens_choice import default_lens
 from pcfix.adjust.mend import Candidate, mend
-from pcfix.adjust.precision import strong_correlations, undetermined
+from pcfix.adjust.precision import shape_doubts, strong_correlations, undetermined
 from pcfix.adjust.problem import Progress, intersect_fixed
 from pcfix.adjust.result import Adjusted
 from pcfix.adjust.rounds import adjust_ties, check_datum
@@ -73,6 +73,9 @@ def unknowns_of(rules: AdjustRules, lens: tuple[str, ...]) -> Unknowns:
         level_sigma_m=water["level"],
         tilt_sigma=water["tilt"],
         index_sigma=water["index"],
+        shape_sigma=np.inf if "shape" in rules.free else 0.0,
+        distance_sigma_m=np.inf if "distance" in rules.free else 0.0,
+        centre_sigma_m=np.inf if "centre" in rules.free else 0.0,
         free_network=rules.datum == "free",
     )
 
@@ -108,6 +111,9 @@ def by_ties(
     if found.precision is not None:
         notes += undetermined(found.precision, unknowns)
         notes += strong_correlations(found.precision)
+        if found.origin is not None:
+            wet = found.is_wet & np.isfinite(found.xyz).all(axis=1)
+            notes += shape_doubts(found.precision, (found.xyz - found.origin)[wet, :2])
     return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])
 
 
@@ -253,7 +259,7 @@ def check_marks(
     off = found.xyz - control.xyz
     middle = np.median(off[met], axis=0)
     apart = np.linalg.norm(off - middle, axis=1)
-    height = float(np.median(cameras.centres[:, 2]) - np.median(control.xyz[:, 2]))
+    height = float(np.median(cameras.centres[:, 2]) - np.nanmedian(control.xyz[:, 2]))
     if is_placed and np.abs(middle).max() > ELSEWHERE * height > 0.0:
         x, y, z = (-middle).tolist()
         raise GeometryError(

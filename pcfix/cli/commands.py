@@ -82,13 +82,28 @@ def correct(
 
 
 def pipeline(
-    input: Input, output: Output, /, *, options: Annotated[CorrectOptions, FLAGS] = CorrectOptions()
+    input: Input,
+    output: Annotated[Path | None, Parameter(help="LAS or LAZ to write.")] = None,
+    /,
+    *,
+    options: Annotated[CorrectOptions, FLAGS] = CorrectOptions(),
+    stage: Annotated[
+        bool,
+        Parameter(
+            negative=(), help="Print its stage alone, for a pipeline of one's own.", group="Output"
+        ),
+    ] = False,
 ) -> None:
     """Print the PDAL pipeline of the same 'pcfix correct', as JSON."""
-    from pcfix.flow.pipeline import pipeline_for
+    from pcfix.flow.pipeline import pipeline_for, stage_for
 
     check_needed(options)
-    say(json.dumps(pipeline_for(input, output, options), indent=2))
+    if output is None and not stage:
+        raise UsageError("OUTPUT is needed, or --stage for the stage alone")
+    job = (
+        pipeline_for(input, output, options) if output and not stage else stage_for(input, options)
+    )
+    say(json.dumps(job, indent=2))
 
 
 def adjust(

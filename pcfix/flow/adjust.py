@@ -20,13 +20,15 @@ from pcfix.adjust.ways import unknowns_of
 from pcfix.errors import InputError, SettingError
 from pcfix.flow.adjust_job import Survey, adjusted, read_job
 from pcfix.flow.inputs import Inputs
+from pcfix.flow.next_steps import WATER
 from pcfix.flow.surfaces import view_of
 from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.io.cameras.opensfm.models import write_opensfm
 from pcfix.io.cameras.table.sensor import write_table
 from pcfix.io.files import check_input
 from pcfix.io.members import write_members
-from pcfix.model import Cameras, TiePoints, Views
+from pcfix.io.water_rasters import write_water_raster
+from pcfix.model import Cameras, TiePoints, Views, WaterRaster
 from pcfix.options.declare import File, taken
 from pcfix.options.survey import AdjustOptions, AdjustRules
 
@@ -50,7 +52,8 @@ def adjust_cameras(
     out_dir : path, optional
         A new folder: the adjusted model as ``colmap/`` and ``opensfm/``, where one lens will do
         as ``cameras.csv``, ``ensemble.npz`` (see `pcfix.adjust.members`), ``adjustment.json`` and
-        ``report.html``. Nothing is written without.
+        ``report.html``; water that is no plane and was free as ``water.tif``. Nothing is written
+        without.
     options : AdjustOptions, optional
         Or its attributes as keywords, as of ``pcfix adjust``: water (or port), cloud (apparent;
         some of its points stand for tie points where there are none), gcps, gnss, lens (held
@@ -127,6 +130,9 @@ def write_adjustment(folder: Path, found: Adjusted, model: str) -> None:
     draft = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=parent))
     try:
         _write_models(draft, found)
+        moved = found.unknowns.level_sigma_m or found.unknowns.shape_sigma
+        if moved and isinstance(found.water, WaterRaster):
+            write_water_raster(draft / WATER, found.water, found.cameras.crs)
         if found.precision is not None and found.precision.members is not None:
             write_members(draft, found.precision.members)
         summary = {"model": model, **adjustment_dict(found, before)}

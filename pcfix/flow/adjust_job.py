@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from pcfix.adjust.block import WATER
 from pcfix.adjust.gather import (
     Datum,
     Material,
@@ -37,9 +38,10 @@ from pcfix.io.files import check_input
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.io.views import ViewList, ViewMatch
-from pcfix.model import Cameras, FloatArray, GroundControl, Lens, Views, WaterSurface
+from pcfix.model import Cameras, FloatArray, GroundControl, Lens, Views, WaterPlane, WaterSurface
 from pcfix.options.declare import File
-from pcfix.options.survey import AdjustRules
+from pcfix.options.survey import WATER_UNKNOWNS, AdjustRules
+from pcfix.port.shapes import FlatPort, Port
 from pcfix.refract.choice import views_in_frame
 from pcfix.water.index import index_of
 
@@ -98,9 +100,11 @@ def read_job(inputs: Inputs, rules: AdjustRules, view: CloudView | None, survey:
     water = None if inputs.water is None else inputs.surface(view).surface
     check_surface(water)
     check_images(name, old, water, rules.fixed_images)
+    _check_free(rules, inputs.port)
     index = index_of(rules.index, rules.index_formula)[0]
     gnss, no_gnss, notes = _datum(old, name, survey, rules.gnss_sigma)
     control = _control(old, water, survey, gnss)
+    _check_surfaces(rules.parallel, control, water, survey.gcps_name)
     calibrated = None if survey.lens is None else _calibration(survey.lens, old)
     low, high = old.centres.min(axis=0), old.centres.max(axis=0)
     if view is not None:
@@ -109,9 +113,42 @@ def read_job(inputs: Inputs, rules: AdjustRules, view: CloudView | None, survey:
     inside = None if mask is None else mask.inside
     material = Material(
         name, old, water, index, gnss, control, inputs.port, calibrated, inside,
-        unknowns_of(rules, ()).level_sigma_m, no_gnss,
+        unknowns_of(rules, ()).level_sigma_m, no_gnss, rules.parallel,
     )  # fmt: skip
     return Job(inputs, rules, view, crs, material, views, survey.gcps_name, notes)
+
+
+def _check_free(rules: AdjustRules, port: Port | None) -> None:
+    """Refuse unknowns that what bends the light does not have."""
+    what, known = "the water", [*WATER_UNKNOWNS[:4]]
+    if port is not None:
+        is_flat = isinstance(port, FlatPort)
+        what = "a flat port" if is_flat else "a dome"
+        known = ["index", "distance" if is_flat else "centre"]
+    given = {"level": rules.sigma_level, "tilt": rules.sigma_tilt}
+    for name in (*rules.free, *(name for name, sigma in given.items() if sigma)):
+        if name not in known:
+            raise SettingError(
+                f"free '{name}': {what} has no {name}; what can be free of it is"
+                f" {', '.join(known)}."
+            )
+
+
+def _check_surfaces(
+    parallel: tuple[str, ...], control: GroundControl | None, water: WaterSurface | None, name: str
+) -> None:
+    """Refuse points on water that is not there, and planes that nobody knows."""
+    on = () if control is None else control.on
+    planes = list(dict.fromkeys(one for one in on if one and one != WATER))
+    if WATER in on and water is None:
+        raise InputError(f"{name}: points have the role waterline, but there is no --water.")
+    known = planes + ([WATER] if isinstance(water, WaterPlane) else [])
+    for one in parallel:
+        if one not in known or len(parallel) < 2:
+            raise SettingError(
+                f"parallel '{','.join(parallel)}' needs two planes at least, of"
+                f" {', '.join(known) or 'none'}: mark points of --gcps with the role on:NAME."
+            )
 
 
 def _map_of(crs: str | None) -> str | None:

@@ -15,7 +15,9 @@ from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths,
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.next_steps import adjust_words
 from pcfix.flow.runner import check_summary, write_summary
+from pcfix.flow.shore import check_shoreline, write_shoreline
 from pcfix.flow.surfaces import CloudView, file_points, find_surface, view_of
+from pcfix.grid.shoreline import NearWater
 from pcfix.io.cameras.georeference import adjusted_minus_gnss
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.clouds import check_same_crs, read_reference
@@ -136,8 +138,10 @@ def check_water(
     given = taken(WaterCheckOptions, options, keywords, "check_water")
     cloud, plot = given.cloud, given.plot
     check_summary(given)
+    inputs = [] if cloud is None else [cloud]
     if plot is not None:
-        check_output(plot, overwrite=given.overwrite, inputs=[] if cloud is None else [cloud])
+        check_output(plot, overwrite=given.overwrite, inputs=inputs)
+    check_shoreline(given.shoreline, overwrite=given.overwrite, inputs=inputs)
     view = None if cloud is None else view_of(check_input(cloud))
     found = find_surface(spec, given, view)
     sample, below, unknown = np.zeros((0, 3)), None, None
@@ -148,7 +152,16 @@ def check_water(
             unknown = float(np.mean(~np.isfinite(height)))
             below = float(np.mean(sample[:, 2] < height))
     name = None if view is None else view.name
-    report = WaterReport(str(spec), found, name, below, unknown, sample)
+    shoreline = None
+    if view is not None and given.shoreline is not None:
+        points = NearWater()
+        for one in file_points(Path(view.name), found.surface):
+            above = surface_above(found.surface, one.xyz, one.heights)
+            points.add(one.xyz, one.xyz[:, 2] - above.height_m)
+        shoreline = write_shoreline(
+            given.shoreline, points, found.sigma_level_m, view.crs, overwrite=given.overwrite
+        )
+    report = WaterReport(str(spec), found, name, below, unknown, sample, shoreline)
     if plot is not None:
         write_bytes(plot, png_of(water_figure(report)), overwrite=given.overwrite)
     write_summary(given, report.as_dict())
@@ -183,7 +196,7 @@ def _diagnosis(
         Evidence(
             cameras, path, surface, index_of(given.index, given.index_formula)[0],
             view=view, reference=reference,
-            control=None if gcps is None else read_ground_control(gcps, cameras),
+            control=None if gcps is None else read_ground_control(gcps, cameras).surveyed,
             calibrated=given_focal_lengths(path) if lens is None else focal_length_of(lens),
             ties=ties_of(inputs, view.crs),
         )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,13 +20,13 @@ from pcfix.clean.points import (
 )
 from pcfix.errors import InputError
 from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
-from pcfix.flow.surfaces import find_surface, points_of, view_of
+from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
 from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import cleaning_vlr, noted_header, own_settings
 from pcfix.kernels import threads
-from pcfix.model import LOW_NOISE, NOISE_CLASSES
+from pcfix.model import LOW_NOISE, NOISE_CLASSES, BoolArray, FloatArray
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CleanOptions, CleanRules
@@ -77,7 +78,7 @@ def clean_file(
     given = taken(CleanOptions, options, keywords, "clean_file")
     check_tile(tile_m)
     task = file_task(input, output, given, reads=[given.water], progress=progress)
-    step = Cleaning(task, given)
+    step = _Cleaning(task, given)
     with threads(given.jobs), scratch_arrays(task.target) as empty:
         step.find(tile_m, empty)
     replace(task, progress=None).run(step)  # the step counts the points of all passes
@@ -86,134 +87,195 @@ def clean_file(
     return result
 
 
-class Cleaning(Step):
-    """The step that flags noise or leaves it out, once it was found in the whole cloud."""
+RAY_DIMENSIONS = ("RayCount", "RayMiss", "Incidence")
+"""What a correction said of each point, and the tests of weak intersections need."""
+
+
+class Tested(NamedTuple):
+    """Some points, and by name those of `RAY_DIMENSIONS` that the cloud has, shape (n,)."""
+
+    points: Points
+    withheld: BoolArray
+    rays: dict[str, FloatArray]
+
+
+class NoiseSearch:
+    """The tests of a whole cloud, whichever door it came through.
+
+    Parameters
+    ----------
+    name : str
+        Of the cloud, for messages.
+    options : CleanOptions
+    view : callable
+        Returns the cloud as a water surface needs it.
+    names : collection of str
+        The dimensions that the cloud has.
+    has_rays : bool
+        Whether, if it was corrected, there were cameras.
+    """
 
     cloud: Cloud
 
-    def __init__(self, task: FileTask, options: CleanOptions) -> None:
-        self._task, self._drop, self._rules = task, options.drop, options.part(CleanRules)
-        water = options.water
-        self._water = (
-            None
-            if water is None
-            else find_surface(water, WaterOptions(), view_of(task.source)).surface
-        )
-        self._passed = self._written = 0
-        self._distance_m: dict[str, float] = {}
-        self._not_run: list[str] = []
+    def __init__(
+        self,
+        name: str,
+        options: CleanOptions,
+        view: Callable[[], CloudView],
+        names: Collection[str],
+        *,
+        has_rays: bool = True,
+    ) -> None:
+        rules = options.part(CleanRules)
+        self._not_run = []
+        if rules.weak and not has_rays:
+            rules = replace(rules, weak=False)
+            self._not_run = [
+                "few rays, ray miss, incidence: the cloud was corrected without cameras"
+            ]
+        self._name, self._rules = name, rules
+        given = options.water
+        self.water = None if given is None else find_surface(given, WaterOptions(), view()).surface
+        self._has = [one for one in RAY_DIMENSIONS if {"RayCount", one} <= set(names)]
 
-    def find(self, tile_m: float | None, empty: Empty) -> None:
-        """Read the cloud and run the tests, with arrays on disk for what is large."""
-        jobs = self._task.jobs
-        with LasSource(self._task.source, jobs) as source:
-            self._rules = rules = self._rules_of(source)
-            names = set(source.header.point_format.dimension_names)
-            n = len(source)
-            used, submerged, reasons = (np.zeros(n, kind) for kind in (bool, bool, np.uint8))
-            self.cloud = Cloud(empty((n, 3), np.float64), used, submerged, reasons)
-            first = 0
-            for points in source.chunks():
-                self._read(points, source, slice(first, first + len(points)), names)
-                first += len(points)
-                self._count(len(points))
-            self._check(str(source.path))
-        if not rules.below_or_floating:
+    def run(self, chunks: Iterable[Tested], n: int, resources: Resources) -> BoolArray:
+        """Run the tests on all n points; return which are noise, shape (n,)."""
+        used, submerged, reasons = (np.zeros(n, kind) for kind in (bool, bool, np.uint8))
+        self.cloud = Cloud(resources.empty((n, 3), np.float64), used, submerged, reasons)
+        first = 0
+        for one in chunks:
+            self._add(one, slice(first, first + len(one.withheld)))
+            first += len(one.withheld)
+            if resources.progress is not None:
+                resources.progress(len(one.withheld))
+        self._check()
+        if not self._rules.below_or_floating:
             submerged[:] = False
-        resources = Resources(tile_m, empty, jobs, self._count)
-        self._distance_m = flag_neighbours(str(source.path), self.cloud, rules, resources)
-        self._not_run += self._tests_not_run(names)
+        self._distance_m = flag_neighbours(self._name, self.cloud, self._rules, resources)
         self.cloud = self.cloud._replace(xyz=np.zeros((0, 3)))  # gives the disk back
+        return reasons != 0
 
-    def _rules_of(self, source: LasSource) -> CleanRules:
-        """Return the rules without those about rays, where a cloud was corrected without any."""
-        try:
-            ours = own_settings(source.vlrs) or {}
-        except ValueError:  # whoever needs it says so
-            ours = {}
-        if ours.get("cameras") != 0 or not self._rules.weak:
-            return self._rules
-        self._not_run = ["few rays, ray miss, incidence: the cloud was corrected without cameras"]
-        return replace(self._rules, weak=False)
-
-    def _count(self, points: int) -> None:
-        """Report so many more points of a pass."""
-        self._passed += points
-        if self._task.progress is not None:
-            self._task.progress(self._passed // _PASSES, len(self.cloud.used))
-
-    def _read(self, points: Chunk, source: LasSource, rows: slice, names: set[str]) -> None:
-        """Read coordinates and masks, and flag weak intersections on the way."""
-        cloud, (xyz, heights, classes, _) = self.cloud, points_of(points, source, self._water)
-        withheld = np.asarray(points["withheld"]).astype(np.bool_)
-        used = ~(withheld | np.isin(classes, NOISE_CLASSES))
-        rays, miss, incidence = (
-            source.dimension(points, name) if name in names else None
-            for name in ("RayCount", "RayMiss", "Incidence")
-        )
+    def _add(self, one: Tested, rows: slice) -> None:
+        """Take coordinates and masks, and flag weak intersections on the way."""
+        cloud, (xyz, heights, classes, _) = self.cloud, one.points
+        used = ~(one.withheld | np.isin(classes, NOISE_CLASSES))
+        rays, miss, incidence = (one.rays.get(name) for name in RAY_DIMENSIONS)
         if rays is not None:
             flag_weak(self._rules, cloud.reasons[rows], rays, miss, incidence)
             cloud.reasons[rows][~used] = 0
         cloud.xyz[rows], cloud.used[rows] = xyz, used
-        if self._water is not None:
-            above = surface_above(self._water, xyz, heights)
+        if self.water is not None:
+            above = surface_above(self.water, xyz, heights)
             cloud.submerged[rows] = used & is_submerged(xyz[:, 2], above)
         elif rays is not None:
             cloud.submerged[rows] = used & (rays > 0)
 
-    def _check(self, name: str) -> None:
+    def _check(self) -> None:
         """Refuse a cloud that leaves nothing to test."""
         if not self.cloud.used.any():
             raise InputError(
-                f"{name}: all {len(self.cloud.used):,} points are withheld or noise (class 7 or"
-                " 18) already; there is nothing left to clean."
+                f"{self._name}: all {len(self.cloud.used):,} points are withheld or noise (class 7"
+                " or 18) already; there is nothing left to clean."
             )
-        if self._water is not None and self._rules.below_or_floating:
-            check_submerged(int(self.cloud.submerged.sum()), name, self._water)
+        if self.water is not None and self._rules.below_or_floating:
+            check_submerged(int(self.cloud.submerged.sum()), self._name, self.water)
 
-    def _tests_not_run(self, names: set[str]) -> list[str]:
-        """Return which tests the file does not allow, and why."""
-        rules = self._rules
+    def _tests_not_run(self) -> list[str]:
+        """Return which tests the cloud does not allow, and why."""
+        rules, has = self._rules, self._has
         needs = (
             ("few rays", "RayCount", rules.min_rays),
             ("ray miss", "RayMiss", rules.max_ray_miss),
             ("incidence", "Incidence", rules.max_incidence),
         )
-        missing = [
-            f"{test}: the cloud has no dimension {dimension if 'RayCount' in names else 'RayCount'}"
+        missing = self._not_run + [
+            f"{test}: the cloud has no dimension {dimension if has else 'RayCount'}"
             for test, dimension, limit in needs
-            if limit is not None and not {"RayCount", dimension} <= names
+            if limit is not None and dimension not in has
         ]
-        if rules.below_or_floating and self._water is None and "RayCount" not in names:
+        if rules.below_or_floating and self.water is None and not has:
             missing.append("below bed, floating: no --water, and no dimension RayCount")
         return missing
 
-    def _content(self) -> dict[str, Any]:
+    def content(self) -> dict[str, Any]:
         """Return what the file and the summary say of the cleaning."""
         reasons = self.cloud.reasons
         return {
             "pcfix": __version__,
             "settings": asdict(self._rules),
-            "water": None if self._water is None else str(self._water),
+            "water": None if self.water is None else str(self.water),
             "reasons": {
                 str(reason.name).lower(): int(np.count_nonzero(reasons & np.uint8(reason)))
                 for reason in Reason
             },
         }
 
+    def summary(self, input: str, output: str, *, drop: bool, seconds: float) -> CleanSummary:
+        """Return the numbers of the cleaning."""
+        cloud, noise = self.cloud, int(np.count_nonzero(self.cloud.reasons))
+        return CleanSummary(
+            input=input,
+            output=output,
+            points=len(cloud.used),
+            set_aside=int((~cloud.used).sum()),
+            submerged=int(cloud.submerged.sum()),
+            noise=noise,
+            dropped=noise if drop else 0,
+            neighbour_distance_m=self._distance_m,
+            not_run=self._tests_not_run(),
+            seconds=round(seconds, 3),
+            **self.content(),
+        )
+
+
+class _Cleaning(Step):
+    """The step that flags noise or leaves it out, once it was found in the whole file."""
+
+    def __init__(self, task: FileTask, options: CleanOptions) -> None:
+        self._task, self._drop = task, options.drop
+        with LasSource(task.source) as source:
+            names = set(source.header.point_format.dimension_names)
+            self._points, has_rays = len(source), _has_rays(source)
+        self._search = NoiseSearch(
+            str(task.source), options, lambda: view_of(task.source), names, has_rays=has_rays
+        )
+        self._passed = self._written = 0
+
+    def find(self, tile_m: float | None, empty: Empty) -> None:
+        """Read the cloud and run the tests, with arrays on disk for what is large."""
+        resources = Resources(tile_m, empty, self._task.jobs, self._count)
+        self._noise = self._search.run(self._chunks(), self._points, resources)
+
+    def _chunks(self) -> Iterator[Tested]:
+        water = self._search.water
+        with LasSource(self._task.source, self._task.jobs) as source:
+            names = set(source.header.point_format.dimension_names)
+            for chunk in source.chunks():
+                rays = {
+                    name: source.dimension(chunk, name) for name in RAY_DIMENSIONS if name in names
+                }
+                withheld = np.asarray(chunk["withheld"]).astype(np.bool_)
+                yield Tested(points_of(chunk, source, water), withheld, rays)
+
+    def _count(self, points: int) -> None:
+        """Report so many more points of a pass."""
+        self._passed += points
+        if self._task.progress is not None:
+            self._task.progress(self._passed // _PASSES, self._points)
+
     def header(self, source: LasSource) -> Header:
         """Return the header with the record of what is done."""
-        if self._drop and self.cloud.reasons.all():
+        if self._drop and self._noise.all():
             raise InputError(
                 f"{source.path}: every point is noise by these thresholds; choose wider ones, or"
                 " do not drop."
             )
-        return noted_header(source, cleaning_vlr({**self._content(), "drop": self._drop}))
+        return noted_header(source, cleaning_vlr({**self._search.content(), "drop": self._drop}))
 
     def chunk(self, points: Chunk, source: LasSource, header: Header) -> Chunk:
         """Return points with their noise flagged or left out."""
         new = convert(points, header.point_format)
-        noise = self.cloud.reasons[self._written : self._written + len(new)] != 0
+        noise = self._noise[self._written : self._written + len(new)]
         self._written += len(noise)
         self._count(len(noise))
         if self._drop:
@@ -224,17 +286,14 @@ class Cleaning(Step):
 
     def summary(self) -> CleanSummary:
         """Return the numbers of the cleaning."""
-        cloud, noise = self.cloud, int(np.count_nonzero(self.cloud.reasons))
-        return CleanSummary(
-            input=str(self._task.source),
-            output=str(self._task.target),
-            points=len(cloud.used),
-            set_aside=int((~cloud.used).sum()),
-            submerged=int(cloud.submerged.sum()),
-            noise=noise,
-            dropped=noise if self._drop else 0,
-            neighbour_distance_m=self._distance_m,
-            not_run=self._not_run,
-            seconds=round(self._task.seconds, 3),
-            **self._content(),
-        )
+        source, target = str(self._task.source), str(self._task.target)
+        return self._search.summary(source, target, drop=self._drop, seconds=self._task.seconds)
+
+
+def _has_rays(source: LasSource) -> bool:
+    """Return whether a cloud, if it was corrected, was so with cameras."""
+    try:
+        ours = own_settings(source.vlrs) or {}
+    except ValueError:  # whoever needs it says so
+        ours = {}
+    return bool(ours.get("cameras") != 0)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from pcfix.compare.figures import Comparison, bins_table, figures_of
 from pcfix.compare.m3c2 import load_py4dgeo
-from pcfix.compare.match import Match, match
+from pcfix.compare.match import Match, SurveyCloud, match
 from pcfix.compare.sections import parse_line
 from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_summary
@@ -22,9 +23,19 @@ from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CompareOptions, CompareRules
 
+if TYPE_CHECKING:
+    from pcfix.flow.surfaces import CloudView
+
+
+class Held(NamedTuple):
+    """A cloud that is at hand, in no file: its view, and what gives its points for a water."""
+
+    view: Callable[[], CloudView]
+    read: Callable[[WaterSurface | None], SurveyCloud]
+
 
 def compare_clouds(
-    cloud: File, reference: File, *, options: CompareOptions | None = None, **keywords: Any
+    cloud: File | Held, reference: File, *, options: CompareOptions | None = None, **keywords: Any
 ) -> Comparison:
     """Measure how far a cloud is from a reference; what ``pcfix compare`` runs.
 
@@ -58,16 +69,17 @@ def compare_clouds(
     started = time.perf_counter()
     given = taken(CompareOptions, options, keywords, "compare_clouds")
     lines = [parse_line(line) if isinstance(line, str) else line for line in given.section]
-    _check_outputs(given, [cloud, reference, *(path for _, path in given.also)])
+    held = cloud if isinstance(cloud, Held) else _held(cloud)
+    files = [] if isinstance(cloud, Held) else [cloud]
+    _check_outputs(given, [*files, reference, *(path for _, path in given.also)])
     if given.m3c2:
         load_py4dgeo()
     water = None
     if given.water is not None:
-        from pcfix.flow.surfaces import find_surface, view_of  # not quick to load
+        from pcfix.flow.surfaces import find_surface  # not quick to load
 
-        view = view_of(check_input(cloud))
-        water = find_surface(given.water, WaterOptions(), view).surface
-    target, whole = read_reference(reference), read_cloud(cloud, water)
+        water = find_surface(given.water, WaterOptions(), held.view()).surface
+    target, whole = read_reference(reference), held.read(water)
     check_same_crs(whole.name, whole.crs, target.name, target.crs)
     matched = match(whole, target, given.part(CompareRules), given=water is not None)
     others = {name: _further(path, water, matched) for name, path in given.also}
@@ -88,6 +100,17 @@ def _further(path: File, water: WaterSurface | None, first: Match) -> Match:
         cloud = replace(cloud, water_m=np.where(np.isnan(cloud.water_m), over, cloud.water_m))
     found = match(cloud, target, first.settings, given=water is not None)
     return replace(found, places=first.places)
+
+
+def _held(path: File) -> Held:
+    """Return the cloud of a LAS or LAZ file."""
+
+    def view() -> CloudView:
+        from pcfix.flow.surfaces import view_of  # not quick to load
+
+        return view_of(check_input(path))
+
+    return Held(view, lambda water: read_cloud(path, water))
 
 
 def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:

@@ -16,9 +16,13 @@ from pcfix.flow.inputs import Inputs
 from pcfix.model import Cameras, WaterPlane
 from pcfix.options.declare import File, options_of
 from pcfix.options.survey import AdjustOptions
+from pcfix.port.shapes import spec_of
 
 MODELS = ("colmap", "opensfm/reconstruction.json", "cameras.csv")
 """What an adjustment leaves, in the order in which a next step takes it."""
+
+WATER = "water.tif"
+"""The water of an adjustment, where it is no plane and something of it was free."""
 
 READ_ALIKE = (
     "sensor", "angles", "cameras_crs", "cameras_offset", "views", "views_are", "water_model",
@@ -76,13 +80,15 @@ def correct_words(found: Adjusted, model: File, out_dir: File, options: AdjustOp
     words = ["pcfix", "correct", str(options.cloud or "CLOUD.laz"), "corrected.laz"]
     words += ["--cameras", str(Path(out_dir) / cameras)]
     if options.port is not None:  # nothing is carried before a port: the cloud is made anew
-        return shlex.join([*words[:2], "CLOUD.laz", *words[3:], "--port", str(options.port)])
+        moved = found.port if {"distance", "centre"} & set(options.free) else None
+        port = str(options.port) if moved is None else spec_of(moved)
+        return shlex.join([*words[:2], "CLOUD.laz", *words[3:], "--port", port])
     words += ["--adjusted-from", str(model)]
-    if isinstance(found.water, WaterPlane):
-        words += ["--water", _plane(found.water)]
+    raster, water = Path(out_dir) / WATER, _water(options.water)
+    if isinstance(found.water, WaterPlane) or raster.exists():
+        water = _plane(found.water) if isinstance(found.water, WaterPlane) else str(raster)
         options = replace(options, water_model="auto", water_crs=None)
-    else:
-        words += ["--water", _water(options.water)]
+    words += ["--water", water]
     if options.water_mask is not None:
         words += ["--water-mask", str(options.water_mask)]
     if "index" in options.free or options.sigma_index is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, SettingError
 from pcfix.flow.correct import job_for
 from pcfix.io.las.columns import UPGRADE, Column, columns_for
 from pcfix.io.las.source import LasSource
@@ -15,6 +15,16 @@ from pcfix.options.correct import CorrectOptions
 
 if TYPE_CHECKING:
     import laspy
+
+
+def stage_for(input: Path, options: CorrectOptions) -> dict[str, Any]:
+    """Return the pipeline's stage that corrects, ready for JSON; see `pipeline_for`."""
+    if options.uncorrected == "drop":
+        raise SettingError(
+            "uncorrected 'drop' takes another stage to drop points; print the whole pipeline."
+        )
+    job_for(input, options)
+    return _stage(options)
 
 
 def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str, Any]:
@@ -42,24 +52,7 @@ def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str
             f"{input}: has waveforms (point format {point_format.id}), which PDAL does not write;"
             " use 'pcfix correct'."
         )
-    columns = columns_for(options.dimensions, options.unsure)
     drop = options.uncorrected == "drop"
-    plain = options.plain()
-    given: dict[str, Any] = {
-        **{name: plain[name] for name in ("cameras", "water") if name in plain},  # come first
-        **plain,
-        "uncorrected": "keep" if drop else options.uncorrected,
-        "dimensions": options.dimensions,
-    }
-    added = [add_dimension(columns), CLASS_FLAGS, f"{OUTCOME}=uint8" if drop else ""]
-    stage = {
-        "type": "filters.python",
-        "source": STAGE_SOURCE,
-        "module": "pcfix_stage",
-        "function": "correct",
-        "add_dimension": ",".join(filter(None, added)),
-        "pdalargs": given,
-    }
     dropping = {"type": "filters.range", "limits": f"{OUTCOME}[0:1]"}
     writer = {
         "type": "writers.las",
@@ -68,11 +61,31 @@ def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str
         "minor_version": 4,
         "dataformat_id": UPGRADE[point_format.id],
     }
-    extra = _extra_dims(point_format, columns)
+    extra = _extra_dims(point_format, columns_for(options.dimensions, options.unsure))
     if extra:
         writer["extra_dims"] = extra
     reader = {"type": "readers.las", "filename": str(input)}
-    return {"pipeline": [reader, stage, *([dropping] if drop else []), writer]}
+    return {"pipeline": [reader, _stage(options), *([dropping] if drop else []), writer]}
+
+
+def _stage(options: CorrectOptions) -> dict[str, Any]:
+    drop, plain = options.uncorrected == "drop", options.plain()
+    columns = columns_for(options.dimensions, options.unsure)
+    first = {name: plain[name] for name in ("cameras", "water") if name in plain}
+    added = [add_dimension(columns), CLASS_FLAGS, f"{OUTCOME}=uint8" if drop else ""]
+    return {
+        "type": "filters.python",
+        "source": STAGE_SOURCE.format("correct"),
+        "module": "pcfix_stage",
+        "function": "correct",
+        "add_dimension": ",".join(filter(None, added)),
+        "pdalargs": {
+            **first,
+            **plain,
+            "uncorrected": "keep" if drop else options.uncorrected,
+            "dimensions": options.dimensions,
+        },
+    }
 
 
 def _extra_dims(point_format: laspy.PointFormat, columns: tuple[Column, ...]) -> str:

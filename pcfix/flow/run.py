@@ -29,6 +29,7 @@ from pcfix.flow.run_adjust import (
     outputs_of,
 )
 from pcfix.flow.runner import json_text
+from pcfix.flow.shore import check_shoreline
 from pcfix.flow.surfaces import view_of
 from pcfix.io.clouds import own_water
 from pcfix.io.files import check_input, file_state, files_in, read_json, write_text
@@ -170,7 +171,9 @@ def run_all(
             f"{out_dir}: holds other files, or a run of another request; add --overwrite to"
             " replace them, or give another folder."
         )
+    check_shoreline(request.shoreline, overwrite=overwrite or record.resumes, inputs=inputs)
     files = Files(out_dir)
+    shore = [] if request.shoreline is None else [Path(request.shoreline)]
 
     def step(name: str, outputs: list[Path], work: Callable[[], Any]) -> Any:
         result, was_done = record.step(name, outputs, work)
@@ -185,7 +188,7 @@ def run_all(
     _say_adjusted(first, out_dir, was_done, say)
     request = request.with_adjusted(out_dir, first)
     clouds = [files.corrected] + ([] if request.check_depths is None else [files.regression])
-    corrected = step("correct", clouds, lambda: _correct(request, files, jobs, progress))
+    corrected = step("correct", [*clouds, *shore], lambda: _correct(request, files, jobs, progress))
     corrected = _with_checked(corrected, first)
     if not first["is_said"] and is_worth_saying(first, _is_bent(corrected)):
         first = {**first, "is_said": True}

@@ -174,7 +174,7 @@ def _diagnosed(
     lens, model = step.lens, str(step.inputs.cameras)
     evidence = Evidence(
         cameras, model, water, step.index, view=view,
-        control=None if step.gcps is None else read_ground_control(step.gcps, cameras),
+        control=None if step.gcps is None else read_ground_control(step.gcps, cameras).surveyed,
         calibrated=given_focal_lengths(model) if lens is None else focal_length_of(lens),
         in_passing=not step.survey,
     )  # fmt: skip

@@ -67,6 +67,7 @@ class ThroughPort:
             "occlusion on": options.occlusion == "on",
             "adjusted-from": options.adjusted_from is not None,
             "unsure withhold": options.unsure == "withhold",
+            "shoreline": options.shoreline is not None,
         }
         for name, is_given in given.items():
             if is_given:
@@ -125,7 +126,7 @@ class ThroughPort:
         return "no camera has a point in sight; check that cameras and cloud have the same CRS."
 
     def look_back(self) -> None:
-        """Nothing is known of poses bent by a port."""
+        """Nothing is known of poses bent by a port, and there is no shoreline."""
 
     def notes(self, tally: Tally) -> list[str]:
         """Say what forward intersection leaves out, where that was used."""

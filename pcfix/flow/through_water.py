@@ -13,11 +13,13 @@ from pcfix.adjust.carry import Carrying
 from pcfix.adjust.evidence import Evidence
 from pcfix.ahead import Rehearsal
 from pcfix.flow.diagnosis import Poses, diagnose_in_passing
-from pcfix.flow.inputs import Inputs
+from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.flow.learning import Learning
 from pcfix.flow.old_cameras import Blocks, ListedViews, old_tie_points
 from pcfix.flow.pose_errors import SAMPLE_POINTS, adjustment_of, pose_errors, sample_of, with_poses
+from pcfix.flow.shore import check_shoreline, write_shoreline
 from pcfix.flow.surfaces import CloudView, Points, parts_of
+from pcfix.grid.shoreline import NearWater
 from pcfix.label.labelling import Labelling
 from pcfix.model import (
     BoolArray,
@@ -67,6 +69,7 @@ class ThroughWater:
     def __init__(
         self, options: CorrectOptions, inputs: Inputs, blocks: Blocks, view: CloudView
     ) -> None:
+        check_shoreline(options.shoreline, overwrite=options.overwrite, inputs=paths_in(options))
         self.settings = {} if inputs.regression is None else {"regression": str(inputs.regression)}
         self._options, self._inputs, self._view = options, inputs, view
         self._cameras = blocks.cameras
@@ -86,6 +89,7 @@ class ThroughWater:
         self._kind: ViewKind | None = None
         self.verdicts: tuple[Verdict, ...] = ()
         self._poses: Poses | None = None
+        self._shoreline: dict[str, Any] | None = None
         self._adjustment, self._no_poses = None, ""
         told = options.dimensions == "all" and self.survey.settings.method != "regression"
         if told and len(self._cameras):
@@ -96,6 +100,7 @@ class ThroughWater:
         """Forget the chunks so far."""
         self._meeting = WaterMeeting(self.water)
         self._beyond: BeyondRange | None = None
+        self._shore = None if self._options.shoreline is None else NearWater()
         if self.carrying is not None:
             self.carrying.restart()
 
@@ -165,11 +170,15 @@ class ThroughWater:
         above = surface_above(self.water, xyz, points.heights)
         batch = Batch(xyz, above, self.survey, views, made_with, source=points.sources)
         batch = self._of_kind(batch)
-        correction = correct_checked(batch, label, self._level_sigma_m)
+        correction = correct_checked(batch, label, self.found.sigma_level_m)
         if self.regression is not None:
             least = LEAST_BEYOND if self._inputs.regression is None else 0.0
             self._beyond = self._beyond or BeyondRange(self.regression, least)
             self._beyond.add((above.height_m - xyz[:, 2])[correction.submerged])
+        if self._shore is not None:
+            higher = xyz[:, 2] + correction.shift_m[:, 2] - above.height_m
+            height = np.where(correction.submerged, -correction.depth_m, higher)
+            self._shore.add(xyz + correction.shift_m, height, correction.sigma_z_m)
         if self.carrying is not None and step is not None:
             correction = step.whole(correction)
             self.carrying.add(step, correction)
@@ -196,15 +205,17 @@ class ThroughWater:
                 self.survey = as_told(self.survey, verdict)
         return replace(batch, survey=self.survey, views=replace(batch.views, kind=self._kind))
 
-    def _level_sigma_m(self, xy: FloatArray) -> FloatArray | None:
-        """Return the standard error of the water's height at places, where its fit says one."""
-        found = self.found.evidence
-        if found is None:
-            return None
-        if hasattr(found, "sigma_at"):
-            return np.asarray(found.sigma_at(xy))
-        sigma = getattr(found, "sigma_level_m", None)
-        return None if sigma is None else np.full(len(xy), float(sigma))
+    def _write_shoreline(self) -> None:
+        """Write where the water meets the corrected cloud, where that is wanted."""
+        options, stated = self._options, self._options.sigma_level
+
+        def sigma(xy: FloatArray) -> FloatArray | None:
+            return self.found.sigma_level_m(xy) if stated is None else np.full(len(xy), stated)
+
+        if self._shore is not None and options.shoreline is not None:
+            self._shoreline = write_shoreline(
+                options.shoreline, self._shore, sigma, self._view.crs, overwrite=options.overwrite
+            )
 
     @property
     def made(self) -> dict[str, Any] | None:
@@ -271,7 +282,7 @@ class ThroughWater:
         )
 
     def look_back(self) -> None:
-        """Warn if what the correction was made with says that the poses are bent."""
+        """Warn if the poses are bent by what the correction was made with; write the shoreline."""
         if not len(self._cameras):
             self._poses = Poses(None, "not applicable: no cameras were given")
             return
@@ -279,6 +290,7 @@ class ThroughWater:
         name = "cameras" if isinstance(given, Cameras) else str(given)
         evidence = Evidence(self._cameras, name, self.water, self._options.refractive_index)
         self._poses = diagnose_in_passing(self._inputs, evidence, self._view, self.verdicts)
+        self._write_shoreline()
 
     def _told(self) -> list[str]:
         """Return what the cloud told beside the sentence on how it was made."""
@@ -311,6 +323,7 @@ class ThroughWater:
             "made": made,
             "told": notes,
             "poses": None if self._poses is None else self._poses.as_dict(),
+            "shoreline": self._shoreline,
         }
 
 

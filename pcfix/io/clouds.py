@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,11 +19,18 @@ from pcfix.io.las.source import LasSource, coordinates, stated_crs
 from pcfix.io.las.writing import own_settings
 from pcfix.io.rasters import place_of, read_masked
 from pcfix.io.tables import read_table
-from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, WaterDimension, WaterPlane, WaterSurface
+from pcfix.model import (
+    BATHYMETRIC_POINT,
+    NOISE_CLASSES,
+    BoolArray,
+    FloatArray,
+    WaterDimension,
+    WaterPlane,
+    WaterSurface,
+)
 from pcfix.options.declare import File
 
 if TYPE_CHECKING:
-    import laspy
     from pyproj import CRS
 
 
@@ -39,48 +46,77 @@ def read_cloud(
     with LasSource(path) as source:
         crs = stated_crs(source, "its CRS cannot be read", "export it again")
         own = water or own_water(source)
-        parts = [
-            _part(source, points, own, given=water is not None, skip=skip_classes)
+        extra = set(source.header.point_format.extra_dimension_names)
+        chunks = (
+            Told(
+                coordinates(points),
+                np.asarray(points["classification"]),
+                np.asarray(points["withheld"]).astype(bool),
+                source.dimension(points, own.name) if isinstance(own, WaterDimension) else None,
+                {name: source.dimension(points, name) for name in extra.intersection(TOLD)},
+            )
             for points in source.chunks()
-        ]
-        count = len(source)
+        )
+        return survey_cloud(str(path), crs, chunks, own, water is not None, skip_classes)
+
+
+TOLD = ("WaterDepth", *SHIFTS)
+"""What the dimensions of a correction say of the water, and of where the points were."""
+
+
+class Told(NamedTuple):
+    """Some points of a cloud, and by name what it says in the dimensions `TOLD`, metres."""
+
+    xyz: FloatArray
+    classes: npt.NDArray[Any]
+    withheld: BoolArray
+    heights: FloatArray | None  # of the water above each, where a dimension was named for it
+    dimensions: dict[str, FloatArray]
+
+
+def survey_cloud(
+    name: str,
+    crs: CRS | None,
+    chunks: Iterable[Told],
+    water: WaterSurface | None,
+    given: bool,
+    skip_classes: Sequence[int] = NOISE_CLASSES,
+) -> SurveyCloud:
+    """Return the points that count; the water is `given`, or else what the cloud says of its own.
+
+    An `InputError` if no point counts.
+    """
+    parts, count = [], 0
+    for points in chunks:
+        parts.append(_part(points, water, given=given, skip=skip_classes))
+        count += len(points.xyz)
     xyz, water_m, bathymetric, *shifts = (np.concatenate(of) for of in zip(*parts, strict=True))
     if len(xyz) == 0:
         raise InputError(
-            f"{path}: every point is withheld or of a class that does not count"
+            f"{name}: every point is withheld or of a class that does not count"
             f" ({', '.join(map(str, skip_classes))}); there is nothing to compare."
         )
-    exact = water is not None or not np.isfinite(water_m).any()
+    exact = given or not np.isfinite(water_m).any()
     return SurveyCloud(
-        str(path),
+        name,
         xyz,
         crs,
         count - len(xyz),
         shifts[0] if shifts else None,
         bathymetric,
         water_m,
-        own if exact and not isinstance(own, WaterDimension) else None,
+        water if exact and not isinstance(water, WaterDimension) else None,
     )
 
 
 def _part(
-    source: LasSource,
-    points: laspy.ScaleAwarePointRecord,
-    water: WaterSurface | None,
-    *,
-    given: bool,
-    skip: Sequence[int],
+    points: Told, water: WaterSurface | None, *, given: bool, skip: Sequence[int]
 ) -> list[npt.NDArray[Any]]:
-    """Return place, water and whether of the bed of a chunk's points that count; perhaps shifts."""
-    classes = np.asarray(points["classification"])
-    keep = ~(np.isin(classes, skip) | np.asarray(points["withheld"]).astype(bool))
-    xyz = coordinates(points)
-    names = set(points.point_format.extra_dimension_names)
-    heights = None
-    if isinstance(water, WaterDimension):
-        heights = source.dimension(points, water.name)
-    if not given and "WaterDepth" in names:
-        depth = np.asarray(points["WaterDepth"], np.float64)
+    """Return place, water and whether of the bed of the points that count; perhaps shifts."""
+    xyz, classes, withheld, heights, dimensions = points
+    keep = ~(np.isin(classes, skip) | withheld)
+    if not given and "WaterDepth" in dimensions:
+        depth = dimensions["WaterDepth"]
         above = np.where(depth > 0.0, xyz[:, 2] + depth, np.nan)
     elif water is not None:
         from pcfix.water.surface import surface_above  # with its compiler, not quick to load
@@ -89,9 +125,8 @@ def _part(
     else:
         above = np.full(len(xyz), np.nan)
     found = [xyz[keep], above[keep], classes[keep] == BATHYMETRIC_POINT]
-    if names.issuperset(SHIFTS):
-        shift = np.column_stack([np.asarray(points[name], np.float64) for name in SHIFTS])
-        found.append(shift[keep])
+    if dimensions.keys() >= set(SHIFTS):
+        found.append(np.column_stack([dimensions[name] for name in SHIFTS])[keep])
     return found
 
 

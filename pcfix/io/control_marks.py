@@ -5,7 +5,9 @@ A table has a header line and the columns
 - name (or point, gcp, marker, ...), image, u, v: pixels from the upper left corner of the image;
 - x, y, z (or easting, northing, height; longitude, latitude, height in degrees of WGS 84);
 - where known sx, sy, sz, or one column sigma, in metres; su, sv, or one column sigma_px; role (or
-  type): control or check; under_water: yes or no; crs. A comment before the header may state the
+  type): control, check, waterline (the point lies on the water) or on:NAME (on the plane of that
+  name), these two with sigma_on, metres, and x, y, z only where they were surveyed: then they count
+  as of a control point; under_water: yes or no; crs. A comment before the header may state the
   CRS too: ``# CRS: EPSG:32636``.
 
 OpenDroneMap's ``gcp_list.txt`` has no header: its first line is a CRS (EPSG code, ``WGS84 UTM 36N``
@@ -26,7 +28,7 @@ Reference: "Ground Control Points" in the manual of OpenDroneMap, https://docs.o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -63,12 +65,14 @@ SPELLINGS: dict[str, tuple[str, ...]] = {
     "sigma_u": ("su", "sigma_u", "sigma_px", "sigma_uv"),
     "sigma_v": ("sv", "sigma_v", "sigma_px", "sigma_uv"),
     "role": ("role", "type"),
+    "sigma_on": ("sigma_on",),
     "under_water": ("under_water", "underwater", "submerged"),
     "crs": ("crs", "srs"),
 }
 """What a column is, and its names; where several are there, the first counts."""
 CHECK = ("check", "check_point", "checkpoint", "cp", "chk")
 CONTROL = ("", "control", "control_point", "controlpoint", "gcp", "3d_gcp", "ground_control_point")
+ON, WATERLINE = "on:", ("waterline", "water_line", "shoreline", "on:water")
 YES, NO = ("yes", "y", "true", "1"), ("", "no", "n", "false", "0")
 PIXELS = ("", "px", "pixel", "pixels", "pix")
 _LEAST_ODM = 6
@@ -92,6 +96,8 @@ class Marks:
     under_water: BoolArray
     where: list[str]
     crs: str | None
+    on: tuple[str, ...] = ()  # surface on which the point lies; all rows, or none where none does
+    sigma_on: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def at(self, row: int) -> str:
         """Return file, place, point and image of a row, for messages."""
@@ -125,7 +131,10 @@ def _from_table(path: Path) -> Marks:
         )
     sigma = columns.where_there(("sigma_x", "sigma_y", "sigma_z"))
     sigma_uv = columns.where_there(("sigma_u", "sigma_v"))
-    every = np.column_stack([sigma, sigma_uv])
+    sigma_on, on = columns.where_there(("sigma_on",))[:, 0], _surfaces(columns)
+    roles = "control or check, waterline or on:NAME"
+    is_check = _flags(columns, "role", CHECK, CONTROL, roles, on)
+    every = np.column_stack([sigma, sigma_uv, sigma_on])
     for i in np.flatnonzero((every <= 0.0).any(axis=1))[:1]:
         value = every[i][every[i] <= 0.0][0]
         raise InputError(
@@ -139,15 +148,43 @@ def _from_table(path: Path) -> Marks:
         path=path,
         point=names,
         image=columns.labels,
-        xyz=centres(columns, needed=True),
+        xyz=_places(columns, on),
         sigma_m=sigma,
         uv=columns.of(("u", "v")),
         sigma_px=np.sqrt((sigma_uv**2).mean(axis=1)),
-        is_check=_flags(columns, "role", CHECK, CONTROL, "control or check"),
+        is_check=is_check,
         under_water=_flags(columns, "under_water", YES, NO, "yes or no"),
         where=[f"line {line}" for line in columns.table.line],
         crs=system,
+        on=on,
+        sigma_on=sigma_on,
     )
+
+
+def _surfaces(columns: Columns) -> tuple[str, ...]:
+    """Return the surface on which the point of each row lies, by its role; empty where on none."""
+    if "role" not in columns.place:
+        return ("",) * len(columns.table.rows)
+    found = []
+    for text in _texts(columns, "role"):
+        role = text.strip().lower().replace(" ", "_")
+        is_on = role.startswith(ON) and role != ON
+        found.append("water" if role in WATERLINE else role.removeprefix(ON) if is_on else "")
+    return tuple(found)
+
+
+def _places(columns: Columns, on: tuple[str, ...]) -> FloatArray:
+    """Return the coordinates of each row; those of points on a surface may be missing."""
+    if not any(on):
+        return centres(columns, needed=True)
+    xyz = centres(columns)
+    bare = [i for i in np.flatnonzero(np.isnan(xyz).any(axis=1)) if not on[i]]
+    if bare:
+        raise InputError(
+            f"{columns.where(int(bare[0]))}: the point has no x, y, z; only points with the role"
+            " waterline or on:NAME may be without."
+        )
+    return xyz
 
 
 def _with_roles(columns: Columns) -> Columns:
@@ -193,14 +230,18 @@ def _texts(columns: Columns, role: str) -> list[str]:
 
 
 def _flags(
-    columns: Columns, role: str, true: tuple[str, ...], false: tuple[str, ...], words: str
-) -> BoolArray:
-    """Return whether each row says one thing or the other; the latter where nothing is said."""
+    columns: Columns, role: str, true: tuple[str, ...], false: tuple[str, ...], words: str,
+    on: tuple[str, ...] = (),
+) -> BoolArray:  # fmt: skip
+    """Return whether each row says one thing or the other; the latter where nothing is said.
+
+    And where it says `on` which surface the point lies.
+    """
     if role not in columns.place:
         return np.zeros(len(columns.table.rows), bool)
     found = [text.strip().lower().replace(" ", "_") for text in _texts(columns, role)]
     for i, text in enumerate(found):
-        if text not in true and text not in false:
+        if text not in true and text not in false and not (on and on[i]):
             raise InputError(
                 f"{columns.where(i)}, column {columns.name(role)}: '{text}' is neither {words}."
             )

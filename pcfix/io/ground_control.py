@@ -55,6 +55,7 @@ def read_ground_control(path: File, cameras: Cameras, *, crs: str | None = None)
     _check_frames(marks, cameras, camera)
     used = np.unique(point[kept])
     first = first[used]
+    on = tuple(marks.on[i] for i in first) if any(marks.on) else ()
     xyz, way_notes = _to_cameras(marks, cameras, crs, first)
     _check_near(marks, cameras, xyz, first)
     unseen = [one for i, one in enumerate(name) if i not in used]
@@ -66,15 +67,21 @@ def read_ground_control(path: File, cameras: Cameras, *, crs: str | None = None)
     return GroundControl(
         names=tuple(name[i] for i in used),
         xyz=xyz,
-        sigma_m=np.where(np.isnan(marks.sigma_m[first]), SIGMA_M, marks.sigma_m[first]),
+        sigma_m=np.where(np.isnan(xyz), np.inf, _or_else(marks.sigma_m[first], SIGMA_M)),
         is_check=marks.is_check[first],
         under_water=marks.under_water[first],
         point=np.searchsorted(used, point[kept]),
         camera=camera[kept],
         image_xy=marks.uv[kept],
-        sigma_px=np.where(np.isnan(marks.sigma_px[kept]), SIGMA_PX, marks.sigma_px[kept]),
+        sigma_px=_or_else(marks.sigma_px[kept], SIGMA_PX),
         crs=cameras.crs,
+        on=on,
+        on_sigma_m=_or_else(marks.sigma_on[first], SIGMA_M) if on else np.zeros(0),
     )
+
+
+def _or_else(values: FloatArray, default: float) -> FloatArray:
+    return np.where(np.isnan(values), default, values)
 
 
 def _points(marks: Marks) -> tuple[list[str], IntArray, IntArray]:
@@ -140,6 +147,7 @@ def _check_agreement(marks: Marks, first: IntArray, point: IntArray) -> None:
         ("standard deviations", marks.sigma_m),
         ("roles", marks.is_check[:, None]),
         ("words on water", marks.under_water[:, None]),
+        ("surfaces", np.array(marks.on or [""] * len(marks.point))[:, None]),
     ):
         both_nan = (values != values) & (values[same] != values[same])
         other = ~((values == values[same]) | both_nan).all(axis=1)
@@ -154,7 +162,8 @@ def _check_agreement(marks: Marks, first: IntArray, point: IntArray) -> None:
 
 def _shown(values: npt.NDArray[np.generic]) -> str:
     return ", ".join(
-        "yes" if v is True else "no" if v is False else f"{v:.12g}" for v in values.tolist()
+        ("yes" if v else "no") if isinstance(v, bool) else v if isinstance(v, str) else f"{v:.12g}"
+        for v in values.tolist()
     )
 
 
@@ -214,7 +223,7 @@ def _to_cameras(
     if forward is None:
         return xyz, notes
     moved = forward(xyz)
-    lost = ~np.isfinite(moved).all(axis=1)
+    lost = ~np.isfinite(moved).all(axis=1) & np.isfinite(xyz).all(axis=1)
     if lost.any():
         row = int(rows[np.argmax(lost)])
         x, y, z = marks.xyz[row]

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from pcfix.errors import SettingError
 from pcfix.io.las.columns import (
+    COLUMNS,
     Column,
     changed_rows,
     column_scale,
@@ -24,7 +25,6 @@ from pcfix.io.las.columns import (
     unsure_anew,
 )
 from pcfix.model import BATHYMETRIC_POINT, Correction, FloatArray
-from pcfix.refract.tally import Summary
 
 Dimensions: TypeAlias = "dict[str, npt.NDArray[Any]]"
 
@@ -32,11 +32,14 @@ NAME = "the pipeline's cloud"
 OUTCOME = "Outcome"
 """A dimension that is filled where ``add_dimension`` asks for it: `pcfix.Outcome`."""
 
-STAGE_SOURCE = "from pcfix.pdal_stage import stages; correct, label = stages(globals())"
-"""What a pipeline says to have the stage."""
+STAGE_SOURCE = "from pcfix.pdal_stage import {}"
+"""What a pipeline says to have one of the stage's functions."""
 
 CLASS_FLAGS = "ClassFlags=uint8"
 """To be added for PDAL 2.2, where point formats 0 to 5 have no such dimension."""
+
+TAKEN_APART = "flags_taken_apart"
+"""In the metadata of a stage that took the flags out of packed classes."""
 
 _WITHHELD_FLAG = 4
 """Bit of ClassFlags, which older PDAL has in place of the dimension Withheld."""
@@ -58,6 +61,16 @@ def check_dimensions(ins: Dimensions, columns: tuple[Column, ...]) -> None:
     for column in columns:
         if column.scale != 1.0 and ins[column.name].dtype.kind != "f":
             raise SettingError(f"add_dimension: {column.name} must be float.")
+
+
+def column_values(ins: Dimensions, name: str, scales: FloatArray | None) -> FloatArray:
+    """Return a dimension of a correction as a file has it: whole steps, which a float rounds."""
+    column = next(one for one in COLUMNS if one.name == name)
+    values = dimension(ins, name)
+    if column.scale == 0.0 and scales is None:
+        return values
+    step = column_scale(column, np.ones(3) if scales is None else scales)
+    return np.asarray(np.rint(values / step) * step)
 
 
 def dimension(ins: Dimensions, name: str) -> FloatArray:
@@ -125,7 +138,12 @@ class Flags:
         self.classes = np.array(ins["Classification"], order="C")
         self._class_flags = np.array(ins["ClassFlags"]) if "ClassFlags" in ins else None
         formats = _reader_values(metadata, "dataformat_id")
-        if "Withheld" not in ins and any(int(format_id) < 6 for format_id in formats):
+        self.taken_apart = _mentions(_nodes(metadata, "filters.python"), TAKEN_APART)
+        if (
+            "Withheld" not in ins
+            and not self.taken_apart
+            and any(int(format_id) < 6 for format_id in formats)
+        ):
             packed = self.classes >> 5
             self.classes &= 31
             if self._class_flags is None:
@@ -134,6 +152,7 @@ class Flags:
                     ' where class 40 has no room; add "ClassFlags=uint8" to add_dimension.'
                 )
             self._class_flags |= packed.astype(self._class_flags.dtype)
+            self.taken_apart = True
         if "Withheld" in ins:
             self.withheld = ins["Withheld"] != 0
         elif self._class_flags is not None:
@@ -169,20 +188,33 @@ def crs_of(metadata: dict[str, Any] | None) -> str | None:
 
 def _reader_values(metadata: dict[str, Any] | None, name: str) -> list[str]:
     """Return what the readers' metadata say under a name."""
-    readers = [
-        node for node in (metadata or {}).get("children", []) if node["name"].startswith("readers.")
-    ]
     return [
         child["value"]
-        for reader in readers
+        for reader in _nodes(metadata, "readers.")
         for child in reader.get("children", [])
         if child["name"] == name
     ]
 
 
-def metadata_of(summary: Summary) -> dict[str, Any]:
-    """Return the summary as PDAL's metadata."""
-    values = {k: v for k, v in summary.as_dict().items() if k not in ("input", "output")}
+def _nodes(metadata: dict[str, Any] | None, kind: str) -> list[dict[str, Any]]:
+    """Return the metadata of the stages of a kind."""
+    return [one for one in (metadata or {}).get("children", []) if one["name"].startswith(kind)]
+
+
+def _mentions(nodes: list[dict[str, Any]], name: str) -> bool:
+    """Whether a name stands anywhere below some nodes."""
+    return any(
+        child["name"] == name or _mentions([child], name)
+        for node in nodes
+        for child in node.get("children", [])
+    )
+
+
+def metadata_of(figures: dict[str, Any], flags: Flags | None = None) -> dict[str, Any]:
+    """Return a summary as PDAL's metadata, and for later stages what became of packed `flags`."""
+    values = {k: v for k, v in figures.items() if k not in ("input", "output") and v is not None}
+    if flags is not None and flags.taken_apart:
+        values[TAKEN_APART] = True
     return node("pcfix", children=[node(name, value) for name, value in values.items()])
 
 

@@ -9,6 +9,7 @@ cameras go through, which refuse what PROJ can only guess.
 from __future__ import annotations
 
 import warnings
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy as np
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.crs import is_local, metres_up, parse_crs, parts
 from pcfix.io.rasters import open_raster, place_of, read_masked
-from pcfix.io.transformations import Points, transformation_in_plan, way_to_cloud
+from pcfix.io.transformations import LOCAL, Points, transformation_in_plan, way_to_cloud
 from pcfix.model import FloatArray, WaterRaster
 from pcfix.options.declare import File
 
@@ -81,6 +82,25 @@ def read_water_raster(
     if to_cloud is None and t.b == t.d == 0.0 and t.a > 0.0 > t.e:  # north-up: as it is
         return WaterRaster(part.heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), title)
     return sampled(part, to_cloud or (lambda xyz: xyz), from_cloud, bounds, (name, title))
+
+
+def write_water_raster(path: Path, water: WaterRaster, crs: str | None) -> None:
+    """Write a water surface as a GeoTIFF of one band, float64, which `read_water_raster` reads."""
+    import rasterio
+    from rasterio.transform import from_origin
+
+    rows, columns = water.height_m.shape
+    parsed = None if crs is None or crs.strip().lower() == LOCAL else parse_crs(crs, "cameras")
+    if parsed is not None and is_local(parsed):
+        parsed = None
+    profile = {
+        "driver": "GTiff", "width": columns, "height": rows, "count": 1, "dtype": "float64",
+        "nodata": np.nan, "compress": "deflate", "predictor": 3,
+        "crs": rasterio.CRS.from_wkt(parsed.to_wkt()) if parsed is not None else None,
+        "transform": from_origin(water.left_m, water.top_m, *water.cell_m),
+    }  # fmt: skip
+    with rasterio.open(path, "w", **profile) as target:
+        target.write(water.height_m, 1)
 
 
 def _check_band(source: DatasetReader, name: str) -> None:

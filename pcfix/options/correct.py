@@ -22,6 +22,7 @@ from pcfix.options.shared import (
     LandRules,
     NeededOptions,
     Panel,
+    ShorelineOption,
     SubmergedOptions,
     SummaryOption,
     WaterOptions,
@@ -248,7 +249,9 @@ class ScienceOptions(RefractionOptions, ResultOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorrectOptions(JobOptions, SummaryOption, ScienceOptions, SubmergedOptions, InputOptions):
+class CorrectOptions(
+    ShorelineOption, JobOptions, SummaryOption, ScienceOptions, SubmergedOptions, InputOptions
+):
     """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
 
     panel = Panel.OUTPUT

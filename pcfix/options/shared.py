@@ -254,6 +254,18 @@ class SummaryOption(OptionSet):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ShorelineOption(OptionSet):
+    """Where the line goes at which the water meets the cloud."""
+
+    panel = Panel.OUTPUT
+
+    shoreline: File | None = option(
+        None,
+        "Write the line where the water meets the cloud there (.gpkg), with its standard error.",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class NeededOptions(OptionSet):
     """Where the light bends."""
 

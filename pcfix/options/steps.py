@@ -350,6 +350,17 @@ class CompareRules(DistanceOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReferenceOption(OptionSet):
+    """What a cloud is compared with."""
+
+    panel = Panel.OUTPUT
+
+    reference: File | None = option(
+        None, "LiDAR cloud, CSV check points or GeoTIFF to compare with."
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class CompareOptions(OverwriteOption, SummaryOption, CompareRules):
     """The options of ``pcfix compare``."""
 
@@ -366,3 +377,8 @@ class CompareOptions(OverwriteOption, SummaryOption, CompareRules):
         old=("section_lines",),
     )
     plot: File | None = option(None, "PNG of the C2C histograms, each with its Gauss curve.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageCompareOptions(ReferenceOption, CompareOptions):
+    """The options of the stage ``compare`` of PDAL, whose cloud is in no file."""

@@ -17,19 +17,20 @@ from pcfix.options.shared import (
     OverwriteOption,
     Panel,
     PortOptions,
+    ShorelineOption,
     SubmergedOptions,
     SummaryOption,
     SurveyOptions,
     ViewOptions,
     WaterOptions,
 )
-from pcfix.options.steps import METRES, DistanceOptions
+from pcfix.options.steps import METRES, DistanceOptions, ReferenceOption
 
 Poses = Literal["free", "fixed", "similarity"]
 Datum = Literal["observed", "free"]
 Ties = Literal["auto", "measured", "cloud"]
 AdjustWhen = Literal["auto", "yes", "no"]
-WATER_UNKNOWNS = ("level", "tilt", "index")
+WATER_UNKNOWNS = ("level", "tilt", "index", "shape", "distance", "centre")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +78,7 @@ class CamerasCheckOptions(
 
 
 @dataclass(frozen=True, kw_only=True)
-class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions):
+class WaterCheckOptions(ShorelineOption, OverwriteOption, SummaryOption, WaterOptions):
     """The options of ``pcfix water``."""
 
     panel = Panel.OUTPUT
@@ -85,19 +86,31 @@ class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions):
     cloud: File | None = option(None, "LAS or LAZ cloud under it.")
     plot: File | None = option(None, "PNG of points and residuals, or of evidence.")
 
+    def check(self) -> None:
+        """Check what options say together."""
+        super().check()
+        if self.shoreline is not None and self.cloud is None:
+            raise SettingError(
+                f"shoreline {self.shoreline}: is where a cloud meets the water; give --cloud too."
+            )
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(
-    JobOptions, DistanceOptions, SurveyedOptions, RefractionOptions, SubmergedOptions, SurveyOptions
+    ReferenceOption,
+    ShorelineOption,
+    JobOptions,
+    DistanceOptions,
+    SurveyedOptions,
+    RefractionOptions,
+    SubmergedOptions,
+    SurveyOptions,
 ):
     """The options of ``pcfix run``: everything that its results depend on is in ``run.json``."""
 
     panel = Panel.OUTPUT
     old_units = True
 
-    reference: File | None = option(
-        None, "LiDAR cloud, CSV check points or GeoTIFF to compare with."
-    )
     resolution: float | None = option(
         None, "Of the rasters.", unit="m", rule=METRES, default_is="4 points a cell"
     )
@@ -153,10 +166,17 @@ class AdjustRules(IndexOptions):
 
     free: tuple[str, ...] = option(
         (),
-        "What of the water moves too: some of level,tilt,index, with commas between.",
+        "What of the water moves too: some of level,tilt,index,shape (bent, to the second order),"
+        " with commas between; of a port: distance (flat), centre (dome), index.",
         rule=_water_unknowns,
         parse=one_or_more(str, "level,tilt"),
         default_is="nothing",
+        metavar="NAMES",
+    )
+    parallel: tuple[str, ...] = option(
+        (),
+        "Planes of --gcps that are parallel, as floor,deck; water is one too.",
+        parse=one_or_more(str, "water,floor"),
         metavar="NAMES",
     )
     sigma_level: float | None = option(

@@ -42,6 +42,9 @@ def bent(s: Vector, normal: Vector, r: float) -> Vector:
     return plus(scaled(r, s), scaled(k, normal))
 
 
+BY_PORT = 5
+"""First column of the derivatives by what a port may be wrong by, of `through_port`."""
+
 FLAT_STEPS = 60
 FLAT_CLOSE = 1e-8
 """Of a step, relative; as each step squares the error, the next would be below rounding."""
@@ -89,6 +92,8 @@ def through_flat(
             gradient = by_depth * normal[j] + by_aside * aside[j]
             across = (1.0 if i == j else 0.0) - normal[i] * normal[j]
             out[i, 1 + j] = k * across + aside[i] * gradient
+        if out.shape[1] > BY_PORT:  # the farther the port, the less is water: dG = k (1 - 1 / S(n))
+            out[i, BY_PORT] = -below * k * (1.0 - 1.0 / root_n) * aside[i]
 
 
 @lean
@@ -154,8 +159,11 @@ def turn(y: float, u: float) -> tuple[float, float, float]:
 @lean
 def _miss(
     q: float, v: float, u: float, far: float, a: float, b: float, glass: float, n: float
-) -> tuple[float, float, float, float, float, float]:
-    """Return by how much the two sides differ at q, and its derivatives by q, v, u, R and n."""
+) -> tuple[float, float, float, float, float, float, float]:
+    """Return by how much the two sides differ at q, and its derivatives by q, v, u, R, n and o.o.
+
+    Those by v and u leave o.o, which is v^2 + u, as it is.
+    """
     cosine = np.sqrt(1.0 - q * q * u)
     cosine_q, cosine_u = -q * u / cosine, -0.5 * q * q / cosine
     length2 = a * a + v * v + u - 2.0 * a * (v * cosine + q * u)
@@ -176,7 +184,8 @@ def _miss(
     by_u = left_u - (in_1u - in_2u) - (out_1u - out_2u)
     by_far = -p * out_2p / (n * far * far)
     by_n = p * (out_1p / b - out_2p / far) / (n * n)
-    return total, left_q - by_p * p_q, -by_p * p_v, by_u - by_p * p_u, by_far, by_n
+    by_o2 = 0.5 * by_p * p / length2
+    return total, left_q - by_p * p_q, -by_p * p_v, by_u - by_p * p_u, by_far, by_n, by_o2
 
 
 @lean
@@ -247,7 +256,7 @@ def through_dome(
     across = minus(o, scaled(v, e))
     u = dot(across, across)
     q = _place(v, u, far, a, b, glass, n)
-    _, by_q, by_v, by_u, by_far, by_n = _miss(q, v, u, far, a, b, glass, n)
+    _, by_q, by_v, by_u, by_far, by_n, by_o2 = _miss(q, v, u, far, a, b, glass, n)
     cosine = np.sqrt(1.0 - q * q * u)
     lean = a * (cosine - q * v)
     q_n = -by_n / by_q
@@ -263,6 +272,15 @@ def through_dome(
         for i in range(3):
             turned = (1.0 if i == j else 0.0) - e[i] * e[j]
             out[i, 1 + j] = e[i] * lean_j + lean * turned / far + a * o[i] * q_j
+        if out.shape[1] <= BY_PORT:
+            continue
+        # with the centre both x and o move the other way; by o grad v = e, grad u = 2 across
+        v_o, u_o = e[j], 2.0 * across[j]
+        q_o = -(by_v * v_o + by_u * u_o + 2.0 * by_o2 * o[j]) / by_q
+        lean_o = lean_q * q_o - a * q * (0.5 * q * u_o / cosine + v_o)
+        for i in range(3):
+            by_o = e[i] * lean_o + a * o[i] * q_o + (a * q - 1.0 if i == j else 0.0)
+            out[i, BY_PORT + j] = -out[i, 1 + j] - by_o
 
 
 @lean
@@ -322,10 +340,11 @@ def through_port(port: FloatArray, n: float, x: float, y: float, z: float, out: 
         Refractive index of the water relative to air, at least 1.
     x, y, z : float
         The point, in the water outside of the port; camera frame, metres.
-    out : array, shape (3, 5)
+    out : array, shape (3, 5) or wider
         Filled. Column 0 is the direction w, camera frame, of any length; columns 1 to 3 are the
-        derivatives of w by x, y, z; column 4 is that by n. NaN where the point is not outside of
-        the port, or no light comes from it.
+        derivatives of w by x, y, z; column 4 is that by n; of a wider one, of eight columns at
+        least, column 5 is that by the distance of a flat port, or 5 to 7 are those by the centre
+        of a dome. NaN where the point is not outside of the port, or no light comes from it.
     """
     where = port[X], port[Y], port[Z]
     size, thickness, glass = port[SIZE], port[THICK], port[GLASS]

@@ -113,6 +113,18 @@ class DomePort:
 
 Port: TypeAlias = FlatPort | DomePort
 
+
+def spec_of(port: Port) -> str:
+    """Return the text from which `port_of` makes this port, to 0.1 um."""
+    glass = f"thickness={port.thickness_m:.7g},glass={port.glass_index:.7g}"
+    if isinstance(port, FlatPort):
+        nx, ny, _ = port.normal
+        tilt = f",nx={nx:.9g},ny={ny:.9g}" if nx or ny else ""
+        return f"flat:distance={port.distance_m:.7f},{glass}{tilt}"
+    x, y, z = port.centre_m
+    return f"dome:radius={port.radius_m:.7g},{glass},x={x:.7f},y={y:.7f},z={z:.7f}"
+
+
 _FLAT = ("distance", "thickness", "glass", "nx", "ny")
 _DOME = ("radius", "thickness", "glass", "x", "y", "z")
 _EXAMPLES = {

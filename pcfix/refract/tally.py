@@ -250,6 +250,8 @@ class Summary:
     """
     unsure: int | None = None
     """Corrected points that flat obliques alone see; None where these are not withheld."""
+    shoreline: dict[str, Any] | None = None
+    """Where it was written, how many lines, how long, and their standard error."""
 
     @property
     def absorbed(self) -> bool | None:
@@ -284,9 +286,10 @@ class Summary:
 
         `labelling` is there where it had rules, `poses` where the light bends at a surface,
         `carried` where the cloud was taken from old cameras to adjusted ones, `unsure` where such
-        points are withheld. Where no order of S-44 is claimed it is said why.
+        points are withheld, `shoreline` where one was written. Where no order of S-44 is claimed
+        it is said why.
         """
-        some, own = ("labelling", "carried", "unsure", "poses"), ("told",)
+        some, own = ("labelling", "carried", "unsure", "poses", "shoreline"), ("told",)
         values = {name: vars(self)[name] for name in vars(self) if name not in (*some, *own)}
         more = {name: getattr(self, name) for name in some if getattr(self, name) is not None}
         if self.uncertainty is not None and self.why_no_order:

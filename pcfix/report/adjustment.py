@@ -29,6 +29,7 @@ from pcfix.report.adjustment_text import (
     short,
     summary_lines,
     surveyed_words,
+    xy_words,
 )
 from pcfix.report.page import Layer, Report, Table, render
 
@@ -191,13 +192,14 @@ def _residual_table(d: Plain) -> Table:
     """Return residuals and precision on land and under water, as Mulsow 2024 tells them."""
     unit = d["image_unit"]
     header = [
-        "", "points", "observations", f"rms before ({unit})", f"rms ({unit})", "rms (m)",
+        "", "points", "observations", f"rms before ({unit})", f"rms ({unit})",
+        f"rms x' / y' ({unit})", "rms (m)",
         "sigma X (m)", "sigma Y (m)", "sigma Z (m)",
     ]  # fmt: skip
     rows = [
         [
             where, f"{r['points']:,}", f"{r['observations']:,}",
-            fixed(r["rms_before_px"], 3), fixed(r["rms_px"], 3), fixed(r["rms_m"], 4),
+            fixed(r["rms_before_px"], 3), fixed(r["rms_px"], 3), xy_words(r), fixed(r["rms_m"], 4),
             *(fixed(value, 4) for value in r["sigma_xyz_m"] or [None] * 3),
         ]
         for key, where in WHERE
@@ -225,7 +227,7 @@ def _unknown_rows(d: Plain) -> list[list[str]]:
         label = lens_label(row) + (f", {row['sensor']}" if has_many_sensors(d) else "")
         rows.append([label, *_unknown(row), lens_unit(row, d)])
     for key, (label, unit) in WATER_WORDS.items():
-        value = (d["water"] or {}).get(key)
+        value = (d["water"] or d["port_found"] or {}).get(key)
         if value is not None and value["free"]:
             rows.append([label, *_unknown(value), unit.strip()])
     if d["poses_are"] == "similarity" and d["precision"] is not None:
@@ -290,4 +292,9 @@ def what_was_free(d: Plain) -> Table:
         ["water tilt", how(u["tilt_sigma"])],
         ["refractive index", how(u["index_sigma"])],
     ]
+    more = {
+        "water shape": "shape_sigma", "distance of the port": "distance_sigma_m",
+        "centre of the dome": "centre_sigma_m",
+    }  # fmt: skip
+    rows += [[name, "free"] for name, key in more.items() if u[key] is None]
     return Table("What was free", ["unknown", ""], rows)

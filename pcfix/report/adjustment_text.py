@@ -108,21 +108,27 @@ def rounds_words(d: Plain) -> str:
 def _residual_lines(d: Plain) -> list[str]:
     unit, kinds = d["image_unit"], d["residuals"]
     head = f"{'residuals':<13}{'points':>9}{'observations':>14}"
-    head += f"{f'before, {unit}':>12}{f'rms, {unit}':>9}{'rms, m':>9}"
+    head += f"{f'before, {unit}':>12}{f'rms, {unit}':>9}{f'x / y, {unit}':>15}{'rms, m':>9}"
     has_sigma = any(kinds[key]["sigma_xyz_m"] for key, _ in WHERE)
     lines = [head + ("   standard errors X, Y, Z, m" if has_sigma else "")]
     for r, where in ((kinds[key], where) for key, where in WHERE if kinds[key]["points"]):
         line = f"  {where:<11}{r['points']:>9,}{r['observations']:>14,}"
         line += f"{fixed(r['rms_before_px'], 3):>12}{fixed(r['rms_px'], 3):>9}"
-        line += f"{fixed(r['rms_m'], 4):>9}"
+        line += f"{xy_words(r):>15}{fixed(r['rms_m'], 4):>9}"
         lines.append(line + (f"   {listed(r['sigma_xyz_m'], 4)}" if r["sigma_xyz_m"] else ""))
     return lines
+
+
+def xy_words(row: Plain) -> str:
+    """Return the residuals of x' and y' apart, as Mulsow 2024 has them."""
+    return " / ".join(fixed(value, 3) for value in row["rms_xy_px"])
 
 
 def found_rows(d: Plain) -> list[tuple[str, str]]:
     """Return what was found, as pairs of a label and words."""
     rows = [(lens_label(row), _lens_words(row, d)) for row in d["lens"]] or [("lens", "fixed")]
     rows += _water_rows(d)
+    rows += [("on " + one["surface"], _surface_words(one, d)) for one in d["on_surfaces"]]
     rows += _pose_rows(d)
     if d["gnss"] is not None:
         rows.append(("GNSS", _gnss_words(d["gnss"])))
@@ -169,20 +175,36 @@ def _lens_words(row: Plain, d: Plain) -> str:
 WATER_WORDS = {
     "level": ("water level", " m"), "tilt_x": ("tilt east", ""), "tilt_y": ("tilt north", ""),
     "index": ("index", ""),
+    "shape_xx": ("shape x^2", " /m"), "shape_xy": ("shape x y", " /m"),
+    "shape_yy": ("shape y^2", " /m"),
+    "distance": ("port's distance", " m"), "centre_x": ("dome's centre x", " m"),
+    "centre_y": ("dome's centre y", " m"), "centre_z": ("dome's centre z", " m"),
 }  # fmt: skip
 
 
 def _water_rows(d: Plain) -> list[tuple[str, str]]:
-    water = d["water"]
-    if water is None:
-        return [("water", "none; the light bends at a housing port" if d["port"] else "none")]
+    water, port = d["water"], d["port_found"]
     rows = []
+    if water is None:
+        rows = [("water", "none; the light bends at a housing port" if d["port"] else "none")]
+        if port is not None and len(port) > 1:
+            rows.append(("port", f"--port {port['port']}"))
     for key, (label, unit) in WATER_WORDS.items():
-        v = water.get(key)
+        v = (water or port or {}).get(key)
         if v is None or (key.startswith("tilt") and not v["free"] and v["after"] == 0.0):
             continue
         rows.append((label, _found(v, unit) if v["free"] else f"{v['after']:.6g}{unit}, fixed"))
     return rows
+
+
+def _surface_words(one: Plain, d: Plain) -> str:
+    parallel = d["unknowns"]["parallel"]
+    others = [name for name in parallel if name != one["surface"] and one["surface"] in parallel]
+    return (
+        f"{one['points']:,} marked points, {fixed(one['rms_m'], 4)} m off it (rms; given"
+        f" {one['sigma_m']:g} m), {one['largest_point']} most, {fixed(one['largest_m'], 4)} m"
+        + (f"; parallel to {', '.join(others)}" if others else "")
+    )
 
 
 def _pose_rows(d: Plain) -> list[tuple[str, str]]:

@@ -61,6 +61,7 @@ def summary_text(summary: Summary) -> str:
         f"water        {s.water}, refractive index {s.settings['index']:.6g}",
         *_index(s),
         *_water_fit(s),
+        *shoreline_lines(s.shoreline),
         *([] if s.poses is None else [f"poses        {s.poses['words']}"]),
         *_uncertainty(s),
     ]
@@ -88,6 +89,18 @@ def _head(s: Summary | LabelSummary | CleanSummary) -> list[str]:
     return [
         f"{s.input} -> {s.output}",
         f"points       {s.points:,} in {s.seconds:.1f} s ({rate:,.0f} points/s)",
+    ]
+
+
+def shoreline_lines(found: dict[str, Any] | None) -> list[str]:
+    """Say how long and how well known a shoreline is, where one was written."""
+    if found is None:
+        return []
+    if not found["lines"]:
+        return [f"shoreline    nowhere does the water meet the cloud: {found['path']} is empty"]
+    return [
+        f"shoreline    {found['lines']} lines, {found['length_m']:.1f} m, standard error in plan"
+        f" {found['sigma_m']:.2f} m: {found['path']}"
     ]
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from pcfix.model import BoolArray, FloatArray
 from pcfix.report.page import AFTER, BEFORE, WATER, draw_cloud, label_plan, new_figure
+from pcfix.report.text import shoreline_lines
 from pcfix.water.auto import WaterProposal
 from pcfix.water.fit import WaterFit
 from pcfix.water.river import RiverFit
@@ -41,6 +42,8 @@ class WaterReport:
         Share of the cloud's points below the surface, and of those without a surface above them.
     sample_xyz : array, shape (m, 3)
         Points of the cloud, evenly spread, for a picture.
+    shoreline : dict or None
+        What was written of it.
     """
 
     spec: str
@@ -49,6 +52,7 @@ class WaterReport:
     below: float | None
     unknown: float | None
     sample_xyz: FloatArray
+    shoreline: dict[str, Any] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
@@ -60,6 +64,7 @@ class WaterReport:
             "cloud": self.cloud,
             "share_below": self.below,
             "share_unknown": self.unknown,
+            "shoreline": self.shoreline,
             "notes": list(self.found.notes),
         }
 
@@ -100,6 +105,7 @@ def water_text(report: WaterReport) -> str:
             f"cloud        {100.0 * report.below:.1f} % of {report.cloud} lie below it,"
             f" {100.0 * report.unknown:.1f} % have no surface above them"
         )
+    lines += shoreline_lines(report.shoreline)
     return "\n".join([*lines, *(f"note         {note}" for note in found.notes)])
 
 

@@ -61,6 +61,16 @@ class FoundSurface:
         """Return the figures of a fit as plain values; None where nothing was fitted."""
         return None if self.evidence is None else dict(self.evidence.as_dict())
 
+    def sigma_level_m(self, xy: FloatArray) -> FloatArray | None:
+        """Return the standard error of the water's height at places, where its fit says one."""
+        found = self.evidence
+        if found is None:
+            return None
+        if hasattr(found, "sigma_at"):
+            return np.asarray(found.sigma_at(xy))
+        sigma = getattr(found, "sigma_level_m", None)
+        return None if sigma is None else np.full(len(xy), float(sigma))
+
 
 class SurfaceAbove(NamedTuple):
     """The plane of the water surface above each of n points.

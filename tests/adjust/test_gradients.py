@@ -8,6 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from pcfix.adjust.block import (
     CODES,
+    PORT,
+    SHAPE,
+    WATER_NAMES,
     Given,
     Loss,
     PointPriors,
@@ -18,9 +21,18 @@ from pcfix.adjust.block import (
     moved_lens,
 )
 from pcfix.adjust.normal import linearise
-from pcfix.adjust.observe import WATER, image, image_and_all_gradients, lens_gradients, scratch
+from pcfix.adjust.observe import (
+    WATER,
+    WIDTH,
+    image,
+    image_and_all_gradients,
+    lens_gradients,
+    scratch,
+)
 from pcfix.lens.imaging import coefficients, lens_table
 from pcfix.model import Lens, WaterRaster
+from pcfix.port.light import coefficients as port_coefficients
+from pcfix.port.shapes import DomePort, FlatPort
 from pcfix.water.surface import build_field
 
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -80,18 +92,19 @@ def at(q, centre, rotation, lens, water, surface):
 
 
 def gradients(q, centre, rotation, lens, water, surface):
-    room, out = scratch(), np.empty((2, 13))
+    room, out = scratch(), np.zeros((2, WIDTH))
     seen = one(q, centre, rotation, lens, water)
     uv = image_and_all_gradients(*seen, surface, 0, 0, room, out)
-    return np.array(uv), out, room.ahead
+    return np.array(uv), out[:, : WATER + len(water)], room.ahead
 
 
 def differences(q, centre, rotation, lens, water, surface):
-    """Return the derivatives by omega, C, Q, a, b, c, n, each by central differences."""
+    """Return the derivatives by omega, C, Q and the water's numbers, by central differences."""
     columns = []
-    for i in range(13):
+    for i in range(WATER + len(water)):
         ends = []
-        step = 1e-4 if 3 <= i <= WATER else 1e-6  # metres; radians, slopes and index
+        # metres; 1/m; radians, slopes, index and metres of a port
+        step = 1e-4 if 3 <= i <= WATER else 1e-8 if SHAPE <= i - WATER < PORT else 1e-6
         for sign in (1.0, -1.0):
             moved = [q.copy(), centre.copy(), rotation, np.array(water, float)]
             if i < 3:
@@ -134,6 +147,36 @@ def test_straight_below_the_camera():
     q, centre = np.array([0.0, 0.0, -66.0]), np.zeros(3)
     _, out, _ = gradients(q, centre, DOWN, coefficients(PLAIN), WATERS["level"], no_surface())
     close(out, differences(q, centre, DOWN, coefficients(PLAIN), WATERS["level"], no_surface()))
+
+
+@pytest.mark.parametrize("bend", [(0.0, 0.0, 0.0), (4e-4, -3e-4, 6e-4)], ids=["flat", "bent"])
+def test_gradients_through_water_of_second_order(bend):
+    """A bend of 4e-4 / m is 4 cm in 10 m, which no water has."""
+    surface = no_surface()._replace(curved=True)
+    water = (-60.0, 0.01, -0.02, 1.34, *bend)
+    for seed in range(3):
+        centre, rotation = pose(seed)
+        q = np.array([*np.random.default_rng(seed + 50).uniform(-12.0, 12.0, 2), -68.0])
+        _, out, _ = gradients(q, centre, rotation, coefficients(BROWN), water, surface)
+        close(out, differences(q, centre, rotation, coefficients(BROWN), water, surface))
+
+
+@pytest.mark.parametrize("port", [
+    FlatPort(0.02, 0.008), FlatPort(0.02, 0.0, 1.49, (0.05, -0.03, 1.0)),
+    DomePort(0.05, 0.004, 1.49, (0.003, -0.002, 0.006)),
+])  # fmt: skip
+def test_gradients_by_the_port(port):
+    surface = no_surface()._replace(port=port_coefficients(port))
+    is_flat = isinstance(port, FlatPort)
+    of_port = (port.distance_m, 0.0, 0.0, 0.0) if is_flat else (0.0, *port.centre_m)
+    water = (0.0, 0.0, 0.0, 1.34, 0.0, 0.0, 0.0, *of_port)
+    known = WATER + (np.array([PORT]) if is_flat else np.arange(PORT + 1, len(water)))
+    centre, rotation = pose(5)
+    q, lens = centre + rotation.T @ [0.9, -0.7, 3.0], coefficients(PLAIN)
+    _, out, _ = gradients(q, centre, rotation, lens, water, surface)
+    wanted = differences(q, centre, rotation, lens, water, surface)
+    close(out[:, known], wanted[:, known])
+    close(out[:, WATER + 3], wanted[:, WATER + 3])
 
 
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.02, -0.03)])
@@ -186,8 +229,8 @@ def test_columns_of_a_similarity():
     pivot = np.array([3.0, -14.0, 2.0])
     state, seen = one(q, centre, rotation, lens_table((BROWN,))[1][0], water)
     nothing = PointPriors(np.zeros((1, 3)), np.zeros((1, 3)))
-    columns = columns_of([()], [False] * 4, True, pivot)
-    own, shared = np.empty((2, 13)), np.zeros((2, 7))
+    columns = columns_of([()], [False] * len(WATER_NAMES), True, pivot)
+    own, shared = np.empty((2, WIDTH)), np.zeros((2, 7))
     given = Given(seen, no_surface(), columns, nothing)
     assert linearise(state, given, Loss(), 0, 0, scratch(), own, shared, np.empty(2))
     assert not own[:, :6].any()  # the poses do not move on their own

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 import pcfix
+from pcfix.adjust.gather import straight_images
 from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.adjust import adjust_cameras
 from pcfix.flow.next_steps import correct_words
 from pcfix.kernels import threads
 from pcfix.options.survey import AdjustOptions
+from pcfix.report.adjustment import adjustment_text
 from tests.utils.adjust_files import IMAGE_PX, write_block, write_gnss
 from tests.utils.program import run_pcfix
 
@@ -68,7 +70,7 @@ def home(files, new, **more):
     out = files.folder / "home.las"
     pcfix.correct_file(
         files.folder / "cloud.las", out, cameras=new, adjusted_from=files.folder / "model",
-        water=files.water, overwrite=True, **{**SNELL, **more},
+        overwrite=True, **{"water": files.water, **SNELL, **more},
     )  # fmt: skip
     return heights_rms_m(files, out)
 
@@ -194,6 +196,63 @@ def test_a_level_alone_is_found_within_two_centimetres(files):
         lens=files.folder / "lens.csv",
     )  # fmt: skip
     assert abs(found.water.a - files.water) < 0.02
+
+
+def write_waterline(files, path, count=12):
+    """Write the control points, and marks of points on the water, which have no coordinates."""
+    cameras, rng = files.scene.true_cameras, np.random.default_rng(8)
+    middle = cameras.centres[:, :2].mean(axis=0)
+    rows = (files.folder / "gcps.csv").read_text().splitlines()
+    each = np.arange(len(cameras))
+    for i in range(count):
+        xyz = np.array([*(middle + rng.uniform(-15.0, 15.0, 2)), files.water])
+        image_xy = straight_images(np.tile(xyz, (len(cameras), 1)), each, cameras)
+        image_xy += rng.normal(0.0, IMAGE_PX, image_xy.shape)
+        lens = cameras.lenses[0]
+        for label, (u, v) in zip(cameras.labels, image_xy, strict=True):
+            if 0.0 < u < lens.width and 0.0 < v < lens.height:
+                rows.append(f"W{i},,,,{label},{u:.3f},{v:.3f},waterline,no")
+    path.write_text("\n".join(rows) + "\n")
+
+
+def test_a_shape_and_waterline_points_go_from_file_to_file(files, tmp_path):
+    write_waterline(files, tmp_path / "marks.csv")
+    found = adjust(
+        files, out=tmp_path / "out", water=files.water + 0.25, free=("level", "tilt", "shape"),
+        gcps=tmp_path / "marks.csv", lens=files.folder / "lens.csv", sigma_image=IMAGE_PX,
+    )  # fmt: skip
+    told = json.loads((tmp_path / "out" / "adjustment.json").read_text())
+    (row,) = told["on_surfaces"]
+    assert (row["surface"], row["points"]) == ("water", 12)
+    assert row["rms_m"] < 0.01  # m: what is given
+    assert {row["name"] for row in told["control"]["points"]} == {
+        row.name for row in found.control if row.role == "control"
+    }
+    assert any("the water is a plane as far as the block tells" in note for note in found.notes)
+    for where in ("land", "water"):
+        fit = told["residuals"][where]
+        assert np.hypot(*fit["rms_xy_px"]) == pytest.approx(np.sqrt(2.0) * fit["rms_px"])
+    words = correct_words(found, "model", tmp_path / "out", AdjustOptions(water=files.water))
+    assert f"--water {tmp_path / 'out' / 'water.tif'}" in words
+    bed, _ = home(files, tmp_path / "out" / "colmap", water=tmp_path / "out" / "water.tif")
+    assert bed < 0.02
+    level = told["water"]["level"]
+    assert abs(level["after"] - files.water) < 3.5 * level["sigma"] < 0.04
+    assert "12 marked points" in adjustment_text(found)
+
+
+@pytest.mark.parametrize(("role", "more", "words"), [
+    ("on:floor", {}, "plane floor: 2 points lie there"),
+    ("waterline", {"parallel": ("water", "deck")}, "parallel 'water,deck' needs two planes"),
+    ("control", {}, "column x: '' is not a finite number"),
+    ("in the water", {}, "'in_the_water' is neither control or check, waterline or on:NAME"),
+])  # fmt: skip
+def test_marks_on_surfaces_that_do_not_do(files, tmp_path, role, more, words):
+    write_waterline(files, tmp_path / "marks.csv", 2)
+    text = (tmp_path / "marks.csv").read_text().replace("waterline", role)
+    (tmp_path / "marks.csv").write_text(text)
+    with pytest.raises(PcfixError, match=words):
+        adjust(files, gcps=tmp_path / "marks.csv", **more)
 
 
 def test_what_is_written_is_what_was_found(files, written):

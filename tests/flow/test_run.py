@@ -250,3 +250,27 @@ def test_a_record_that_is_none(tmp_path, text):
 @pytest.mark.parametrize("words", [[], ["a.laz", "out"], ["--config", "run.json"]])
 def test_wrong_usage(tmp_path, words):
     assert run(tmp_path, *words).returncode == 2
+
+
+def test_shoreline_is_written_once_and_not_over_others(tmp_path):
+    pytest.importorskip("pyogrio")
+    words = [
+        *WORDS[:6],
+        "--method",
+        "snell",
+        "--max-angle",
+        "none",
+        "--shoreline",
+        "out/shore.gpkg",
+    ]
+    done = run(tmp_path, *words)
+    assert (done.returncode, done.stderr) == (0, "")
+    written = (tmp_path / "out" / "shore.gpkg").stat().st_mtime_ns
+    again = run(tmp_path, *words)
+    assert again.stdout.count("done before") == len(again.stdout.splitlines())
+    assert (tmp_path / "out" / "shore.gpkg").stat().st_mtime_ns == written
+    (tmp_path / "mine.gpkg").write_bytes(b"work")
+    words[1], words[-1] = "other", "mine.gpkg"
+    done = run(tmp_path, *words)
+    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
+    assert (tmp_path / "mine.gpkg").read_bytes() == b"work"

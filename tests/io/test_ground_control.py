@@ -324,6 +324,38 @@ def test_bad_columns(tmp_path, column, values, word):
     fails(tmp_path, rows, word, head=f"{HEAD},{column}", crs=None)
 
 
+def test_points_on_the_water_and_on_planes(tmp_path):
+    head = f"{HEAD},role,sigma_on"
+    rows = [
+        *(f"{row},control," for row in ROWS),
+        "W1,,,,a.jpg,5,6,Waterline,0.03", "W1,,,,b.jpg,7,8,waterline,0.03",
+        "W2,500012,4000012,0.5,a.jpg,5,7,on:water,",
+        "F1,,,,b.jpg,9,9,on:floor,",
+    ]  # fmt: skip
+    found = read(tmp_path, *rows, head=head)
+    assert found.names == ("G1", "G2", "W1", "W2", "F1")
+    assert found.on == ("", "", "water", "water", "floor")
+    assert found.on_sigma_m.tolist() == [0.01, 0.01, 0.03, 0.01, 0.01]
+    bare = np.array([False, False, True, False, True])
+    assert (np.isnan(found.xyz).all(axis=1) == bare).all()
+    assert (np.isinf(found.sigma_m).all(axis=1) == bare).all()
+    assert not found.is_check.any()
+    surveyed = found.surveyed
+    assert surveyed.names == ("G1", "G2", "W2")
+    assert surveyed.point.tolist() == [0, 0, 1, 2]
+    np.testing.assert_array_equal(surveyed.image_xy, found.image_xy[[0, 1, 2, 5]])
+
+
+@pytest.mark.parametrize(("row", "word"), [
+    ("G3,,,,c.jpg,5,6,control,", "the point has no x, y, z; only points with the role waterline"),
+    ("W1,,,,b.jpg,5,6,on:floor,", "the surfaces of this point are not those of line 5"),
+    ("W2,,,,b.jpg,5,6,waterline,0", "the standard deviation 0 must be positive"),
+])  # fmt: skip
+def test_bad_points_on_surfaces(tmp_path, row, word):
+    rows = [*(f"{row},control," for row in ROWS), "W1,,,,a.jpg,5,6,waterline,", row]
+    fails(tmp_path, rows, word, head=f"{HEAD},role,sigma_on")
+
+
 @pytest.mark.parametrize("head", ["name,x,y,z", "name,x,y,z,image,u"])
 def test_missing_columns(tmp_path, head):
     rows = [",".join(ROWS[0].split(",")[: head.count(",") + 1])]

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import pcfix
+from pcfix import pdal_stage
 from pcfix.io.las.columns import COLUMNS, UNSURE
-from pcfix.io.pdal import add_dimension
-from pcfix.pdal_stage import stages
+from pcfix.io.pdal import STAGE_SOURCE, add_dimension
 from tests.utils.clouds import WATER_M, block, cameras_csv, framed_block, random_cloud, write_cloud
 from tests.utils.half_oblique import write_half_oblique
 
@@ -52,10 +52,23 @@ def metadata_of(header):
 
 def run(function, ins, metadata, **options):
     namespace = {"pdalargs": options, "metadata": metadata}
-    correct, label = stages(namespace)
+    exec(STAGE_SOURCE.format(function), namespace)
     outs = {}
-    assert {"correct": correct, "label": label}[function](ins, outs) is True
+    assert namespace[function](ins, outs) is True
     return outs, namespace.get("out_metadata")
+
+
+def test_the_line_of_earlier_pipelines_still_works(cloud):
+    _, ins, metadata = cloud
+    namespace = {"pdalargs": {"water": WATER_M}, "metadata": metadata}
+    line = "from pcfix.pdal_stage import stages; correct, label = stages(globals())"
+    exec(line, namespace)
+    outs = {}
+    assert namespace["label"](ins, outs)
+    expected, _ = run("label", ins, metadata, water=WATER_M)
+    np.testing.assert_array_equal(outs["Classification"], expected["Classification"])
+    with pytest.raises(ImportError, match="corect"):
+        exec(STAGE_SOURCE.format("corect"), {})
 
 
 def test_arrays_and_files_agree(cloud, tmp_path):
@@ -191,6 +204,18 @@ def test_report_is_the_summary(cloud, tmp_path):
     assert written["depth_m"] == summary.depth_m
 
 
+def test_shoreline_is_that_of_files(cloud, tmp_path):
+    pyogrio = pytest.importorskip("pyogrio")
+    path, ins, metadata = cloud
+    options = {"cameras": str(tmp_path / "cameras.csv"), "water": WATER_M}
+    _, report = run("correct", ins, metadata, **options, shoreline=str(tmp_path / "stage.gpkg"))
+    pcfix.correct_file(path, tmp_path / "o.las", **options, shoreline=tmp_path / "file.gpkg")
+    stage, file = (pyogrio.raw.read(tmp_path / f"{door}.gpkg") for door in ("stage", "file"))
+    assert list(stage[2]) == list(file[2])
+    told = next(node["value"] for node in report["children"] if node["name"] == "shoreline")
+    assert json.loads(told)["lines"] == len(stage[2])
+
+
 GOOD = {"cameras": "cameras.csv", "water": WATER_M}
 MISTAKES = {
     "an option that is none": ({**GOOD, "watre": 1}, "no option 'watre'"),
@@ -216,6 +241,8 @@ MISTAKES = {
     "no such dimension": ({**GOOD, "water": "dim:w_surf"}, "no dimension w_surf; it has X, Y, Z"),
     "a strange word": ({**GOOD, "water": "wet"}, "water 'wet' is not understood"),
     "summary over an input": ({**GOOD, "summary": "cameras.csv", "overwrite": True}, "same file"),
+    "a name twice": ({**GOOD, "max-angle": 30, "max_angle": 30}, "max-angle is given twice"),
+    "a dash": ({**GOOD, "max-angle": 95}, "max-angle 95 is outside 0 to 90"),
     "not an object": ("cameras.csv", "must be an object"),
 }
 
@@ -225,7 +252,7 @@ def test_mistakes_have_one_sentence(cloud, tmp_path, monkeypatch, capsys, case):
     _, ins, metadata = cloud
     options, sentence = MISTAKES[case]
     monkeypatch.chdir(tmp_path)
-    correct, _ = stages({"pdalargs": options, "metadata": metadata})
+    correct, _ = pdal_stage.stages({"pdalargs": options, "metadata": metadata})
     stdout, flags = sys.stdout, sys.getdlopenflags()
     before = sorted(tmp_path.iterdir())
     outs = {}
@@ -236,7 +263,12 @@ def test_mistakes_have_one_sentence(cloud, tmp_path, monkeypatch, capsys, case):
     assert message.count("\n") == 0
     assert outs == {}
     assert (sys.stdout, sys.getdlopenflags(), sorted(tmp_path.iterdir())) == (stdout, flags, before)
-    if "pdal" not in sys.modules:
+    if "pdal" not in sys.modules:  # and in PDAL's program, where a traceback follows
+        monkeypatch.setitem(sys.modules, "redirector", sys)
+        monkeypatch.setattr(sys, "tracebacklimit", None, raising=False)
+        with pytest.raises(pcfix.PcfixError, match="as said above") as caught:
+            correct(ins, outs)
+        assert sentence not in str(caught.value)
         assert capsys.readouterr().err.splitlines()[-1] == f"pcfix: {message}"
 
 

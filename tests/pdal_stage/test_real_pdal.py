@@ -52,7 +52,7 @@ def pipeline_of(folder: Path, *words: object) -> dict[str, Any]:
 def stage_of(**options: object) -> dict[str, Any]:
     return {
         "type": "filters.python",
-        "source": STAGE_SOURCE,
+        "source": STAGE_SOURCE.format("correct"),
         "module": "pcfix_stage",
         "function": "correct",
         "add_dimension": f"{add_dimension(COLUMNS)},{CLASS_FLAGS}",
@@ -316,6 +316,63 @@ def test_recipe_with_cleaning_and_surface_model(tmp_path: Path) -> None:
 
 
 @needs_pdal
+@pytest.mark.parametrize("point_format", [2, 7])
+def test_recipe_from_the_apparent_cloud_to_the_lidar(tmp_path: Path, point_format: int) -> None:
+    """Correct, clean and compare in one pipeline do what the commands do, one after the other."""
+    before = laspy.convert(laspy.read(SCENE / "cloud.laz"), point_format_id=point_format)
+    before.write(tmp_path / "cloud.las")
+    quick = {"method": "snell", "max-angle": "none"}  # an option's dashes are understood
+    args = {"cameras": str(SCENE / "cameras.csv"), "water": 0.37, **quick}
+    compared = {"reference": str(SCENE / "lidar.laz"), "summary": "compared.json"}
+    done = pdal(
+        "pipeline", ROOT / "pipelines" / "correct_clean_compare.json",
+        f"--readers.las.filename={tmp_path / 'cloud.las'}",
+        f"--writers.las.filename={tmp_path / 'out.las'}",
+        f"--stage.correct.pdalargs={json.dumps(args)}",
+        f"--stage.compare.pdalargs={json.dumps(compared)}",
+        "--metadata", "meta.json", folder=tmp_path,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    pcfix.correct_file(
+        tmp_path / "cloud.las", tmp_path / "corrected.las",
+        cameras=SCENE / "cameras.csv", water=0.37, method="snell", max_angle=None,
+    )  # fmt: skip
+    cleaned = pcfix.clean_file(tmp_path / "corrected.las", tmp_path / "cleaned.las")
+    assert cleaned.noise > 0
+    assert_same(tmp_path / "cleaned.las", tmp_path / "out.las")
+    whole = pcfix.compare_clouds(tmp_path / "cleaned.las", SCENE / "lidar.laz").as_dict()
+    found = json.loads((tmp_path / "compared.json").read_text())
+    assert found["counts"] == whole["counts"]
+    for name in ("c2c", "vertical", "bed", "land"):
+        for when in ("after", "before"):
+            one, other = (figures[name][when] for figures in (found, whole))
+            one, other = (f.get("statistics", f) for f in (one, other))
+            for of in ("count", "mean_m", "rmse_m", "nmad_m"):
+                assert one[of] == pytest.approx(other[of], abs=1e-6), (name, when, of)
+    report = (tmp_path / "meta.json").read_text()
+    assert f'"noise": {cleaned.noise}' in report
+    assert '"c2c": ' in report
+
+
+@needs_pdal
+def test_noise_that_is_dropped(tmp_path: Path) -> None:
+    stage = stage_of()
+    stage |= {"source": STAGE_SOURCE.format("clean"), "function": "clean",
+              "pdalargs": {"water": WATER_M, "deviations": 0.5, "drop": True}}  # fmt: skip
+    write_cloud(tmp_path / "cloud.las", 7, plain=True)
+    writer = {"type": "writers.las", "filename": "out.las", "forward": "all",
+              "minor_version": 4, "dataformat_id": 7}  # fmt: skip
+    done = run_pipeline("program", ["cloud.las", stage, writer], tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    result = pcfix.clean_file(
+        tmp_path / "cloud.las", tmp_path / "cli.las", water=WATER_M, deviations=0.5, drop=True
+    )
+    assert result.dropped > 0
+    cli, found = laspy.read(tmp_path / "cli.las"), laspy.read(tmp_path / "out.las")
+    np.testing.assert_array_equal(found.xyz, cli.xyz)
+
+
+@needs_pdal
 def test_recipe_for_many_tiles(tmp_path: Path) -> None:
     (tmp_path / "tiles").mkdir()
     las = laspy.read(SCENE / "cloud.laz")
@@ -347,11 +404,11 @@ def test_recipe_for_many_tiles(tmp_path: Path) -> None:
 def test_recipes_say_what_must_be_said(path: Path) -> None:
     """PDAL's defaults are LAS 1.2 and centimetres; 2.2 and current releases share these options."""
     stages = json.loads(path.read_text())["pipeline"]
-    stage = next(s for s in stages if s["type"] == "filters.python")
-    assert stage["source"] == STAGE_SOURCE
-    assert "script" not in stage
-    if stage["function"] == "correct":
-        assert stage["add_dimension"].startswith(f"{add_dimension(COLUMNS)},{CLASS_FLAGS}")
+    for stage in (s for s in stages if s["type"] == "filters.python"):
+        assert stage["source"] == STAGE_SOURCE.format(stage["function"])
+        assert "script" not in stage
+        if stage["function"] == "correct":
+            assert stage["add_dimension"].startswith(f"{add_dimension(COLUMNS)},{CLASS_FLAGS}")
     writer = next(s for s in stages if s["type"] == "writers.las")
     assert writer["minor_version"] == 4
     assert writer["dataformat_id"] >= 6
@@ -412,6 +469,7 @@ def test_program_fails_with_the_sentence_and_writes_nothing(tmp_path: Path, case
     lines = [line for line in done.stderr.splitlines() if line.startswith("pcfix: ")]
     assert len(lines) == 1, done.stderr
     assert sentence in lines[0]
+    assert done.stderr.count(sentence) == 1
     assert not (tmp_path / "out.las").exists()
 
 
@@ -472,7 +530,19 @@ def test_pipeline_command_refuses_what_correct_refuses(tmp_path: Path) -> None:
         assert sentence in done.stderr
 
 
+def test_pipeline_command_prints_the_stage_alone(tmp_path: Path) -> None:
+    write_cloud(tmp_path / "cloud.las", 7, plain=True, count=300)
+    cameras_csv(tmp_path / "cameras.csv", block())
+    words = ["cloud.las", "--cameras", "cameras.csv", "--water", "5"]
+    whole = pipeline_of(tmp_path, *words[:1], "out.las", *words[1:])
+    assert pipeline_of(tmp_path, *words, "--stage") == whole["pipeline"][1]
+    assert run_pcfix("pipeline", *words, folder=tmp_path).returncode == 2
+    done = run_pcfix("pipeline", *words, "--stage", "--uncorrected", "drop", folder=tmp_path)
+    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
+
+
 def test_recipes_are_all_there() -> None:
     assert [path.name for path in RECIPES] == [
-        "correct.json", "correct_clean_dsm.json", "correct_many.json", "label.json",
+        "correct.json", "correct_clean_compare.json", "correct_clean_dsm.json",
+        "correct_many.json", "label.json",
     ]  # fmt: skip

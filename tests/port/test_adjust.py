@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import pcfix
+from pcfix.adjust.block import Unknowns, plain_block
+from pcfix.adjust.problem import port_of, prepare
+from pcfix.adjust.solve import solve
+from pcfix.errors import SettingError
 from pcfix.flow.adjust import adjust_cameras
+from pcfix.flow.next_steps import correct_words
 from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.kernels import threads
 from pcfix.model import TiePoints
+from pcfix.options.survey import AdjustOptions
+from pcfix.port.light import coefficients
 from pcfix.port.shapes import DomePort, FlatPort
+from pcfix.port.shapes import port_of as port_of_text
+from pcfix.report.adjustment import adjustment_text
 from tests.utils.adjust_files import EPSG, write_gnss
 from tests.utils.port_scenes import simulate_port
 from tests.utils.program import run_pcfix
@@ -71,3 +81,70 @@ def test_the_program_writes_it(tmp_path):
     off = read.centres - made.cameras.centres
     assert np.sqrt((off**2).mean()) < 0.02  # m: what they were off before
     assert (tmp_path / "out" / "report.html").is_file()
+
+
+@pytest.mark.parametrize("port", [FLAT, DomePort(0.05, 0.004, 1.49, (0.003, -0.002, 0.006))])
+def test_exact_images_tell_the_port(port):
+    """Light by Fermat's principle; the start is off by millimetres."""
+    made, is_flat = simulate_port(port, points=200, seed=4), isinstance(port, FlatPort)
+    start = replace(port, distance_m=0.03) if is_flat else replace(port, centre_m=(0.0, 0.0, 0.0))
+    free = {"distance_sigma_m": np.inf} if is_flat else {"centre_sigma_m": np.inf}
+    unknowns = Unknowns(lens=(), **free)
+    ties = TiePoints(made.truth, made.views, made.image_xy)
+    block = replace(
+        plain_block(made.cameras, ties, None, made.refractive_index), port=start,
+        gnss_xyz=made.cameras.centres, gnss_sigma_m=np.full((len(made.cameras), 3), SIGMA_M),
+    )  # fmt: skip
+    problem, begin = prepare(block, unknowns)
+    with threads(1):
+        found = solve(problem, begin)
+    home = port_of(block, found.state.water)
+    if is_flat:
+        assert home.distance_m == pytest.approx(port.distance_m, abs=1e-8)  # m
+    else:
+        np.testing.assert_allclose(home.centre_m, port.centre_m, atol=1e-8)
+    np.testing.assert_allclose(found.state.xyz + problem.origin, made.truth, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("port", "free"),
+    [(FLAT, "distance"), (DomePort(0.05, 0.0, 1.49, (0.003, 0.0, 0.004)), "centre")],
+)
+def test_noisy_images_tell_the_port_within_its_standard_error(tmp_path, port, free):
+    made = write_scene(tmp_path, port)
+    is_flat = free == "distance"
+    start = replace(port, distance_m=0.03) if is_flat else replace(port, centre_m=(0.0, 0.0, 0.0))
+    with threads(1):
+        found = adjust_cameras(
+            tmp_path / "model", tmp_path / "out", water=None, port=start, free=(free,),
+            gnss=tmp_path / "gnss.csv", index=made.refractive_index, lens_unknowns=(),
+        )  # fmt: skip
+    told = json.loads((tmp_path / "out" / "adjustment.json").read_text())["port_found"]
+    again = port_of_text(told["port"])  # to 0.1 um
+    np.testing.assert_allclose(coefficients(again), coefficients(found.port), atol=1e-7)
+    names = ("distance",) if is_flat else ("centre_x", "centre_y", "centre_z")
+    true = dict(zip(names, (port.distance_m,) if is_flat else port.centre_m, strict=True))
+    for name, value in true.items():
+        row = told[name]
+        assert abs(row["after"] - value) < 3.5 * row["sigma"]
+        assert abs(row["before"] - value) > 0.0 or value == 0.0
+    assert f"--port {told['port']}" in adjustment_text(found)
+    options = AdjustOptions(port=port, free=(free,))
+    words = correct_words(found, "model", tmp_path / "out", options)
+    assert words.endswith(f"--port {told['port']}")
+
+
+def test_a_port_has_its_own_unknowns(tmp_path):
+    write_scene(tmp_path, FLAT)
+    for free, port, words in (
+        ("level", FLAT, "a flat port has no level; what can be free of it is index, distance"),
+        ("centre", FLAT, "a flat port has no centre"),
+        (
+            "distance",
+            DomePort(0.05),
+            "a dome has no distance; what can be free of it is index, centre",
+        ),
+    ):
+        with pytest.raises(SettingError, match=f"free '{free}': {words}"):
+            adjust_cameras(tmp_path / "model", water=None, port=port, free=(free,),
+                           gnss=tmp_path / "gnss.csv")  # fmt: skip

@@ -141,6 +141,15 @@ def test_text_says_what_was_calculated_by_hand(adjusted):
     assert "nan" not in text.lower() and "none" not in text.lower()
 
 
+def test_residuals_of_x_and_y_stand_apart(adjusted):
+    adjusted.residual_px[:, 1] *= 2.0
+    told = adjustment_dict(adjusted)["residuals"]
+    assert told["land"]["rms_xy_px"] == pytest.approx([0.3, 0.6])
+    assert told["water"]["rms_xy_px"] == pytest.approx([0.4, 0.8])
+    assert "0.400 / 0.800" in adjustment_text(adjusted)
+    assert "0.300 / 0.600" in adjustment_page(adjusted)
+
+
 def test_residuals_on_the_ground_are_those_of_similar_triangles(adjusted):
     found = adjustment_dict(adjusted)["residuals"]["land"]["rms_m"]
     total = count = 0.0

@@ -2,7 +2,8 @@
 
 Nothing of `pcfix.adjust` or `pcfix.refract` is in it. Unknowns stand in one vector: of each free
 camera a rotation vector, applied on the left (camera frame), and its centre; then focal length,
-level, tilt and index as asked; then all points. Lenses have no distortion.
+level, tilt, index and shape as asked, height and slopes of planes; then all points. Lenses have no
+distortion.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from scipy.optimize._numdiff import approx_derivative
 from scipy.spatial.transform import Rotation
 
 from pcfix.simulate.tracing import piercing_points_of_planes, project
+from tests.utils.curved_water import height, piercing_points
 
 if TYPE_CHECKING:
     from pcfix.adjust.block import Block
@@ -65,14 +67,18 @@ class Twin(NamedTuple):
         a = block.water.a + block.water.b * self.origin[0] + block.water.c * self.origin[1]
         a += added.get("level", 0.0) - self.origin[2]
         b, c = block.water.b + added.get("tilt_x", 0.0), block.water.c + added.get("tilt_y", 0.0)
-        normal = np.array([-b, -c, 1.0]) / np.sqrt(1.0 + b * b + c * c)
-        surface = piercing_points_of_planes(
-            xyz[point],
-            centres[block.camera],
-            np.tile([0.0, 0.0, a], (len(point), 1)),
-            np.tile(normal, (len(point), 1)),
-            block.refractive_index + added.get("index", 0.0),
-        )
+        n = block.refractive_index + added.get("index", 0.0)
+        shape = [added.get(name, 0.0) for name in ("shape_xx", "shape_xy", "shape_yy")]
+        if any(name.startswith("shape") for name in added):
+            surface = piercing_points(
+                xyz[point], centres[block.camera], np.array([a, b, c, *shape]), n
+            )
+        else:
+            normal = np.array([-b, -c, 1.0]) / np.sqrt(1.0 + b * b + c * c)
+            surface = piercing_points_of_planes(
+                xyz[point], centres[block.camera], np.tile([0.0, 0.0, a], (len(point), 1)),
+                np.tile(normal, (len(point), 1)), n,
+            )  # fmt: skip
         lens = block.cameras.lenses[0]
         lens = replace(lens, focal=lens.focal + added.get("f", 0.0))
         seen, _ = project(surface, cameras, block.camera, lens)
@@ -83,6 +89,15 @@ class Twin(NamedTuple):
         ):
             known = np.isfinite(sigma)
             parts.append((found[known] - (given - self.origin)[known]) / sigma[known])
+        given = block.conditions
+        for number, name in enumerate(() if given is None else ("water", *given.names)):
+            on = given.on == number
+            plane = [added.get(f"{word} of {name}", 0.0) for word in ("level", "tilt_x", "tilt_y")]
+            if name in given.parallel:  # slopes are those of the water
+                plane[1:] = b, c
+            numbers = (a, b, c, *shape) if number == 0 else (*plane, 0.0, 0.0, 0.0)
+            off = height(numbers, *xyz[on, :2].T) - xyz[on, 2]
+            parts.append(off / given.sigma_m[on])
         if np.isfinite(self.index_sigma):
             parts.append(np.array([added["index"] / self.index_sigma]))
         return np.concatenate(parts)

@@ -1,0 +1,195 @@
+"""The shoreline: where the water surface meets the cloud, and how well that is known.
+
+Points near the water's height are averaged in cells, by their height above the water; the line is
+where that is zero. A height that is off by some amount moves the line by as much over the slope of
+the bed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from pcfix.model import FloatArray
+
+REACH_M = 2.0
+"""Points higher above the water or deeper say nothing of the line."""
+MOST_POINTS = 2_000_000
+"""So many are kept, evenly spread."""
+POINTS_PER_CELL = 4.0
+MAX_CELLS = 25_000_000
+SMOOTH_CELLS = 1.0
+"""Standard deviation of the filter over the cells; it takes the mean of some 50 points."""
+KNOWN_SHARE = 0.4
+"""Of the filter's weight, on cells with points: gaps up to some two cells are bridged."""
+LEAST_CELLS = 12.0
+LEAST_SIGMAS = 4.0
+"""Lines shorter than so many cells, or standard errors, are scraps."""
+FLATTEST = 0.01
+"""A slope below this counts as this: where ground is flat the line may be anywhere."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shoreline:
+    """A line, and what is known of it.
+
+    Attributes
+    ----------
+    xy : array, shape (n, 2)
+        World frame, metres; an island's or a pool's ends where it begins.
+    level_m : float
+        Mean height of the water along it.
+    sigma_m : float
+        Standard error in plan, across the line; the root mean square along it.
+    """
+
+    xy: FloatArray
+    level_m: float
+    sigma_m: float
+
+    @property
+    def length_m(self) -> float:
+        """Along the line, in plan."""
+        return float(np.hypot(*np.diff(self.xy, axis=0).T).sum())
+
+
+class NearWater:
+    """The points of a cloud near the height of the water, gathered chunk by chunk."""
+
+    def __init__(self) -> None:
+        self._parts: list[FloatArray] = []
+        self._every = 1
+
+    def add(
+        self, xyz: FloatArray, above_m: FloatArray, sigma_z_m: FloatArray | None = None
+    ) -> None:
+        """Add a chunk.
+
+        Parameters
+        ----------
+        xyz : array, shape (n, 3)
+            World frame, metres.
+        above_m : array, shape (n,)
+            Height above the water surface; NaN where that is not known.
+        sigma_z_m : array, shape (n,), optional
+            Standard error of the heights; zero where it is not known.
+        """
+        rows = np.flatnonzero(np.abs(above_m) <= REACH_M)[:: self._every]
+        sigma = np.zeros(len(xyz)) if sigma_z_m is None else sigma_z_m
+        self._parts.append(np.column_stack([xyz, above_m, sigma])[rows])
+        while sum(map(len, self._parts)) > MOST_POINTS:
+            self._parts = [part[::2] for part in self._parts]
+            self._every *= 2
+
+    def lines(self, sigma_level_m: Callable[[FloatArray], FloatArray]) -> list[Shoreline]:
+        """Return the lines, the longest first; several where there are islands or pools.
+
+        Parameters
+        ----------
+        sigma_level_m : callable
+            Returns the standard error of the water's height at places, shape (m, 2).
+        """
+        points = np.concatenate([np.empty((0, 5)), *self._parts])
+        if not len(points) or not points[:, 3].min() < 0.0 < points[:, 3].max():
+            return []
+        field = _field_of(points, _cell_m(points[:, :2]))
+        wanted_m = math.sqrt(2.0 / 7.0 * field.blur_m * field.cell_m)
+        if wanted_m > field.cell_m:  # so that the line's own scatter is half a cell
+            field = _field_of(points, wanted_m)
+        found = [_measured(line, field, sigma_level_m) for line in _contours(field)]
+        least_m = LEAST_CELLS * field.cell_m
+        kept = [one for one in found if one.length_m >= max(least_m, LEAST_SIGMAS * one.sigma_m)]
+        return sorted(kept, key=lambda one: -one.length_m)
+
+
+def _cell_m(xy: FloatArray) -> float:
+    """Return the side of cells that hold `POINTS_PER_CELL` points where they hold any."""
+    extent = np.maximum(np.ptp(xy, axis=0), 1e-3)
+    side = math.sqrt(float(extent.prod()) * POINTS_PER_CELL / len(xy))
+    for _ in range(2):  # a strip along a shore fills little of its box
+        cells = np.unique(((xy - xy.min(axis=0)) / side).astype(np.int64), axis=0)
+        side *= math.sqrt(len(cells) * POINTS_PER_CELL / len(xy))
+    return max(side, math.sqrt(float(extent.prod()) / MAX_CELLS))
+
+
+class _Field(NamedTuple):
+    """Smoothed cells, each (rows, columns); what is not known is NaN."""
+
+    low: FloatArray  # (2,), the centre of the first cell
+    cell_m: float
+    above_m: FloatArray
+    water_m: FloatArray
+    sigma_z_m: FloatArray  # of a point
+    slope: FloatArray
+    blur_m: float  # how far the scatter of one point's height moves the line, in the median
+
+
+def _field_of(points: FloatArray, cell_m: float) -> _Field:
+    """Return points (n, 5): x, y, z, height above the water, standard error, in cells."""
+    from scipy.ndimage import distance_transform_edt, gaussian_filter
+
+    low = points[:, :2].min(axis=0) - 2.0 * cell_m
+    column, row = ((points[:, :2] - low) / cell_m).astype(np.int64).T
+    shape = int(row.max()) + 3, int(column.max()) + 3
+    number = row * shape[1] + column
+
+    def summed(values: npt.ArrayLike) -> FloatArray:
+        total = np.bincount(number, np.broadcast_to(values, len(number)), shape[0] * shape[1])
+        return np.asarray(gaussian_filter(total.reshape(shape), SMOOTH_CELLS))
+
+    z, above, sigma = points[:, 2:].T
+    counts = summed(1.0)
+    held = np.bincount(number, minlength=counts.size).reshape(shape) > 0
+    known = gaussian_filter(held.astype(np.float64), SMOOTH_CELLS) >= KNOWN_SHARE
+    with np.errstate(invalid="ignore", divide="ignore"):
+        height = np.where(known, summed(above) / counts, np.nan)
+        water = summed(z - above) / counts
+        errors = summed(sigma) / summed(sigma > 0.0)
+    slope = np.hypot(*np.gradient(height, cell_m))
+    steep = np.isfinite(slope)
+    if steep.any():  # at the edge of the cloud that of the nearest place within
+        nearest = distance_transform_edt(~steep, return_distances=False, return_indices=True)
+        slope = slope[tuple(nearest)]
+    field = _Field(low + cell_m / 2.0, cell_m, height, water, errors, slope, 0.0)
+    off = above - _at(field, height, points[:, :2])
+    scatter = 1.4826 * float(np.nanmedian(np.abs(off - np.nanmedian(off))))
+    near = np.abs(height) < np.nanmedian(np.abs(above))
+    flat = float(np.nanmedian(slope[near])) if np.isfinite(slope[near]).any() else FLATTEST
+    return field._replace(
+        sigma_z_m=np.where(np.isfinite(errors), errors, scatter),
+        blur_m=scatter / max(flat, FLATTEST),
+    )
+
+
+def _at(field: _Field, values: FloatArray, xy: FloatArray) -> FloatArray:
+    """Return a field at places (n, 2), bilinear."""
+    from scipy.ndimage import map_coordinates
+
+    place = ((xy - field.low) / field.cell_m)[:, ::-1].T
+    return np.asarray(map_coordinates(values, place, order=1, mode="nearest"))
+
+
+def _contours(field: _Field) -> list[FloatArray]:
+    """Return where the field is level with the water, each line (n, 2), world frame."""
+    from contourpy import contour_generator
+
+    maker = contour_generator(z=np.ma.masked_invalid(field.above_m))
+    lines = [np.asarray(line) for line in maker.lines(0.0)]
+    return [field.low + line * field.cell_m for line in lines]
+
+
+def _measured(
+    xy: FloatArray, field: _Field, sigma_level_m: Callable[[FloatArray], FloatArray]
+) -> Shoreline:
+    """Return a line with its standard error: of the heights, over the slope, along its length."""
+    slope = np.maximum(np.nan_to_num(_at(field, field.slope, xy)), FLATTEST)
+    height_m = np.hypot(sigma_level_m(xy), _at(field, field.sigma_z_m, xy))
+    step = np.hypot(*np.diff(xy, axis=0).T)
+    weight = np.append(step, 0.0) + np.append(0.0, step)
+    sigma = math.sqrt(float(np.average((height_m / slope) ** 2, weights=weight)))
+    return Shoreline(xy, float(np.nanmean(_at(field, field.water_m, xy))), sigma)

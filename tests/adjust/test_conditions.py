@@ -1,0 +1,230 @@
+"""Points that lie on the water or on planes, and planes that are parallel."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pcfix.adjust.block import PLANES, Conditions, Unknowns
+from pcfix.adjust.disagreement import pulls_of
+from pcfix.adjust.equations import undamped
+from pcfix.adjust.precision import precision_of
+from pcfix.adjust.problem import prepare
+from pcfix.adjust.result import adjusted_of, redundancy_of
+from pcfix.adjust.solve import solve
+from pcfix.errors import GeometryError
+from pcfix.kernels import threads
+from pcfix.model import WaterMesh, WaterPlane, WaterRaster
+from tests.utils.adjust_twin import Twin
+from tests.utils.curved_water import under_bent_water
+from tests.utils.tie_blocks import block_of
+from tests.utils.tie_points import simulate_tie_points
+
+FREE = np.inf
+LEVEL = Unknowns(lens=(), level_sigma_m=FREE)
+HOME_M = 1e-6
+SIGMA_M = 0.01
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """Small blocks spend more on waking a second thread than it does."""
+    with threads(1):
+        yield
+
+
+def scene(points, **settings):
+    given = {"area_m": (50, 40), "greatest_depth_m": 5, "position_noise_m": 0.2,
+             "attitude_noise_deg": 0.2, "obliques_deg": 30, "oblique_directions": 2,
+             "oblique_share": 0.4, "block": "oblique"}  # fmt: skip
+    return simulate_tie_points(points, **(given | settings))
+
+
+def put(made, surfaces):
+    """Return a scene with points moved onto surfaces, and the conditions that say so.
+
+    `surfaces` maps a name to rows of the points and a function from their coordinates to new ones.
+    """
+    truth, on = made.truth.copy(), np.full(len(made.truth), -1)
+    planes = [name for name in surfaces if name != "water"]
+    for name, (rows, place) in surfaces.items():
+        truth[rows] = place(truth[rows])
+        on[rows] = 0 if name == "water" else 1 + planes.index(name)
+    made = under_bent_water(replace(made, truth=truth), np.zeros(3))
+    return made, Conditions(tuple(planes), on, np.full(len(on), SIGMA_M))
+
+
+def at_level(made, b=0.0, c=0.0, depth=0.0):
+    """Return what moves points to a plane so deep under the water at the middle."""
+    x, y = np.round(made.true_cameras.centres.mean(axis=0))[:2]
+    level = made.water.a + made.water.b * x + made.water.c * y - depth
+    return lambda q: np.column_stack([q[:, :2], level + (q[:, :2] - [x, y]) @ [b, c]])
+
+
+def block_with(made, conditions, **how):
+    block = block_of(made, **how)
+    more = len(block.xyz) - len(conditions.on)
+    on = np.concatenate([conditions.on, np.full(more, -1)])
+    sigma = np.concatenate([conditions.sigma_m, np.ones(more)])
+    return replace(
+        block, wet=on != 0, conditions=replace(conditions, on=on, sigma_m=sigma),
+        control_names=tuple(f"P{i}" for i in range(len(on))), is_check=np.zeros(len(on), bool),
+    )  # fmt: skip
+
+
+def adjusted(block, unknowns):
+    problem, start = prepare(block, unknowns)
+    found = solve(problem, start)
+    return problem, found, precision_of(problem, found)
+
+
+def test_points_on_the_water_and_on_a_floor_come_home():
+    made = scene(90)
+    made, conditions = put(made, {
+        "water": (np.arange(8), at_level(made)),
+        "floor": (np.arange(8, 20), at_level(made, 0.02, -0.01, 2.0)),
+    })  # fmt: skip
+    block = block_with(made, conditions, exact=True, water=WaterPlane(made.water.a + 0.2))
+    problem, found, _ = adjusted(block, LEVEL)
+    assert problem.names == ["level", "level of floor", "tilt_x of floor", "tilt_y of floor"]
+    truth = made.truth - problem.origin
+    np.testing.assert_allclose(found.state.xyz[: len(truth)], truth, atol=HOME_M)
+    floor = made.water.a - 2.0 - problem.origin[2], 0.02, -0.01
+    np.testing.assert_allclose(found.state.water[PLANES:], floor, atol=HOME_M)
+    assert found.state.water[0] == pytest.approx(made.water.a - problem.origin[2], abs=HOME_M)
+
+
+def test_a_steep_wall_has_its_height_along_another_axis():
+    made = scene(60)
+    middle = np.round(made.true_cameras.centres.mean(axis=0))
+    rows = np.flatnonzero(~made.is_wet)[:9]
+    east = lambda q: np.column_stack([middle[0] + 0.1 * (q[:, 2] - made.water.a), q[:, 1:]])  # noqa: E731
+    made, conditions = put(made, {"wall": (rows, east)})
+    problem, found, _ = adjusted(block_with(made, conditions, exact=True), Unknowns(lens=()))
+    assert problem.on_surfaces.axis.tolist() == [2, 0]
+    np.testing.assert_allclose(found.state.water[PLANES + 1 :], [0.0, 0.1], atol=1e-7)
+    np.testing.assert_allclose(found.state.xyz + problem.origin, made.truth, atol=HOME_M)
+
+
+def test_waterline_points_tell_the_level_better():
+    made = scene(200)
+    rows = np.arange(10)
+    made, conditions = put(made, {"water": (rows, at_level(made))})
+    block = block_with(made, conditions, water=WaterPlane(made.water.a + 0.2), control=True)
+    _, found, precision = adjusted(block, LEVEL)
+    sigma = precision.sigma_of("level")
+    assert abs(found.shared[0] + 0.2) < 3.5 * sigma
+    without = adjusted(replace(block, conditions=None), LEVEL)[2].sigma_of("level")
+    assert sigma < 0.9 * without
+    assert redundancy_of(prepare(block, LEVEL)[0]) == 10 + redundancy_of(
+        prepare(replace(block, conditions=None), LEVEL)[0]
+    )
+
+
+@pytest.mark.parametrize("parallel", [("floor", "deck"), ("water", "floor", "deck")])
+def test_parallel_planes_have_the_same_slopes(parallel):
+    made = scene(120, tilt_percent=1.0)
+    b, c = made.water.b, made.water.c
+    made, conditions = put(made, {
+        "floor": (np.arange(8), at_level(made, b, c, 2.0)),
+        "deck": (np.arange(8, 12), at_level(made, b, c, -0.5)),
+    })  # fmt: skip
+    unknowns = Unknowns(lens=(), tilt_sigma=FREE)
+    apart = adjusted(block_with(made, conditions, control=True), unknowns)[2]
+    conditions = replace(conditions, parallel=parallel)
+    problem, found, precision = adjusted(block_with(made, conditions, control=True), unknowns)
+    floor, deck = found.state.water[PLANES:].reshape(2, 3)
+    assert (floor[1:] == deck[1:]).all()
+    if "water" in parallel:
+        assert (floor[1:] == found.state.water[1:3]).all()
+        assert problem.names == ["tilt_x", "tilt_y", "level of floor", "level of deck"]
+        sigma = precision.sigma_of("tilt_x")
+        assert sigma < apart.sigma_of("tilt_x")
+    else:
+        sigma = precision.sigma_of("tilt_x of floor")
+        assert sigma < min(apart.sigma_of(f"tilt_x of {name}") for name in ("floor", "deck"))
+    assert abs(floor[1] - b) < 3.5 * sigma
+
+
+def test_same_as_scipy():
+    made = simulate_tie_points(
+        20, seed=2, area_m=(25, 20), greatest_depth_m=6, position_noise_m=0.05,
+        attitude_noise_deg=0.05, forward_overlap=0.6, side_overlap=0.5, obliques_deg=25,
+        oblique_directions=2, oblique_share=0.3, tilt_percent=1.0,
+    )  # fmt: skip
+    made, conditions = put(made, {
+        "water": (np.arange(4), at_level(made, made.water.b, made.water.c)),
+        "floor": (np.arange(4, 10), at_level(made, 0.01, 0.0, 1.0)),
+    })  # fmt: skip
+    nowhere = {"gnss_xyz": np.full((len(made.cameras), 3), np.nan),
+               "gnss_sigma_m": np.full((len(made.cameras), 3), np.inf)}  # fmt: skip
+    for parallel in ((), ("water", "floor")):
+        given = replace(conditions, parallel=parallel)
+        block = replace(block_with(made, given, cameras=made.true_cameras), **nowhere)
+        # the twin has no word for points that are never wet: a waterline that it meets from above
+        block = replace(block, wet=np.ones(len(block.wet), bool))
+        unknowns = Unknowns(poses="fixed", lens=(), level_sigma_m=FREE, tilt_sigma=FREE)
+        problem, found, precision = adjusted(block, unknowns)
+        twin = Twin(block, tuple(problem.names), free_poses=False)
+        x = twin.solve()
+        _, _, added, xyz = twin.parts(x)
+        # the twin's planes are told as a whole, ours as what was added to a fitted start
+        added = {name: value for name, value in added.items() if " of " not in name}
+        assert abs((twin.residuals(x) ** 2).sum() - found.cost) < 1e-6
+        np.testing.assert_allclose(found.state.xyz, xyz, atol=1e-5)  # m
+        sigma = np.sqrt(np.diag(twin.covariance(x)))[: len(problem.names)]
+        np.testing.assert_allclose([row.sigma for row in precision.shared], sigma, rtol=2e-3)
+        for name, value in added.items():
+            row = next(row for row in precision.shared if row.name == name)
+            assert abs(row.added - value) < 1e-3 * row.sigma
+
+
+@pytest.mark.parametrize("kind", ["raster", "mesh"])
+def test_points_on_a_level_raster_or_mesh(kind):
+    made = scene(90)
+    made, conditions = put(made, {"water": (np.arange(8), at_level(made))})
+    (x, y, _), level = np.round(made.cameras.centres.mean(axis=0)), made.water.a + 0.2
+    corners = [[x + i, y + j, level] for i, j in ((-99, -99), (99, -99), (99, 99), (-99, 99))]
+    water = {
+        "raster": WaterRaster(np.full((40, 40), level), x - 100.0, y + 100.0, (5.0, 5.0)),
+        "mesh": WaterMesh(np.array(corners), np.array([[0, 1, 2], [0, 2, 3]])),
+    }[kind]
+    _, found, precision = adjusted(block_with(made, conditions, water=water), LEVEL)
+    plane = block_with(made, conditions, water=WaterPlane(level))
+    _, wanted, as_plane = adjusted(plane, LEVEL)
+    assert found.shared[0] == pytest.approx(wanted.shared[0], abs=1e-6)  # m
+    assert precision.sigma_of("level") == pytest.approx(as_plane.sigma_of("level"), rel=1e-6)
+
+
+def test_what_groups_pull_adds_up_with_conditions():
+    made = scene(60)
+    made, conditions = put(made, {
+        "water": (np.arange(6), at_level(made)),
+        "floor": (np.arange(6, 12), at_level(made, depth=1.0)),
+    })  # fmt: skip
+    block = block_with(made, conditions, gnss=False, start_xyz=made.truth + 0.01)
+    problem, start = prepare(block, Unknowns(poses="fixed", lens=("f",), level_sigma_m=FREE))
+    equations = undamped(problem, start)
+    pulls = pulls_of(equations.problem, start, block.owner % 5, np.zeros((0, 2)))
+    right, active = equations.reduced.right, equations.reduced.active
+    np.testing.assert_allclose(pulls.sum(axis=0)[active], right, rtol=1e-7)
+
+
+def test_how_the_points_lie_is_told():
+    made = scene(60)
+    made, conditions = put(made, {"water": (np.arange(6), at_level(made))})
+    problem, found, precision = adjusted(block_with(made, conditions), LEVEL)
+    (row,) = adjusted_of(problem, found, precision, [], "tie points", "direct").on_surfaces
+    off = found.state.water[0] - found.state.xyz[:6, 2]
+    assert (row.surface, row.points, row.sigma_m) == ("water", 6, pytest.approx(SIGMA_M))
+    assert row.rms_m == pytest.approx(np.sqrt(np.mean(off**2)))
+    assert row.largest_point == f"P{np.argmax(np.abs(off))}"
+
+
+def test_three_points_of_a_plane_say_nothing():
+    made = scene(60)
+    made, conditions = put(made, {"floor": (np.arange(3), at_level(made, depth=1.0))})
+    with pytest.raises(GeometryError, match=r"plane floor: 3 points lie there.*mark 4 at least"):
+        prepare(block_with(made, conditions), Unknowns(lens=()))

@@ -1,0 +1,147 @@
+"""The shape of the water as an unknown: exact light through bent water comes home."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from pcfix.adjust.block import Unknowns
+from pcfix.adjust.members import members_of
+from pcfix.adjust.precision import precision_of, shape_doubts
+from pcfix.adjust.problem import prepare, water_of
+from pcfix.adjust.solve import solve
+from pcfix.errors import GeometryError
+from pcfix.kernels import threads
+from pcfix.model import WaterPlane, WaterRaster
+from pcfix.water.surface import surface_above
+from tests.utils.adjust_twin import Twin
+from tests.utils.curved_water import under_bent_water
+from tests.utils.tie_blocks import block_of, clear_of_the_waterline
+from tests.utils.tie_points import simulate_tie_points
+
+FREE = np.inf
+SHAPED = Unknowns(lens=(), level_sigma_m=FREE, tilt_sigma=FREE, shape_sigma=FREE)
+BEND = np.array([1.2e-4, -6e-5, -9e-5])
+"""1/m: 6 cm at 25 m from the middle, as before a weir."""
+SCENE = {
+    "area_m": (50, 40), "greatest_depth_m": 5, "position_noise_m": 0.2, "attitude_noise_deg": 0.2,
+    "block": "oblique", "obliques_deg": 30, "oblique_directions": 2, "oblique_share": 0.4,
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """Small blocks spend more on waking a second thread than it does."""
+    with threads(1):
+        yield
+
+
+@cache
+def scene(points, bend=tuple(BEND), **settings):
+    made = simulate_tie_points(points, **(SCENE | settings))
+    # the straight images of points that the bend puts under water or lifts out of it have a kink
+    return under_bent_water(clear_of_the_waterline(made, 0.4), np.array(bend))
+
+
+def adjusted(block, unknowns=SHAPED):
+    problem, start = prepare(block, unknowns)
+    found = solve(problem, start)
+    return problem, found, precision_of(problem, found)
+
+
+def test_exact_images_through_bent_water_come_home():
+    made = scene(150)
+    start = WaterPlane(made.water.a + 0.1)
+    block = block_of(made, exact=True, control=True, water=start)
+    problem, found, _ = adjusted(block)
+    np.testing.assert_allclose(found.state.water[4:7], BEND, atol=1e-10)  # 1/m: 0.06 um at 25 m
+    ties = found.state.xyz[: len(made.truth)] + problem.origin
+    np.testing.assert_allclose(ties, made.truth, atol=1e-6)  # m: Newton's last step
+    water = water_of(problem, found.state)
+    assert isinstance(water, WaterRaster)
+    x, y = (made.truth - problem.origin)[:, :2].T
+    wanted = made.water.a + BEND @ [x * x, x * y, y * y]
+    # m: between the centres of cells of half a metre the raster is bilinear, and this much bent
+    np.testing.assert_allclose(surface_above(water, made.truth).height_m, wanted, atol=2e-5)
+
+
+def test_noisy_images_tell_it_within_the_standard_errors():
+    """Level, tilt and shape with their correlations, over draws of all noise."""
+    made, rng, chi2, repeats = scene(300), np.random.default_rng(5), [], 16
+    for _ in range(repeats):
+        _, found, precision = adjusted(block_of(made.measured(rng), control=True))
+        sigma = np.array([row.sigma for row in precision.shared])
+        off = (found.shared - [0.0, 0.0, 0.0, *BEND]) / sigma
+        chi2.append(off @ np.linalg.solve(precision.correlation, off))
+        wet = made.is_wet
+        assert not shape_doubts(precision, found.state.xyz[: len(wet)][wet, :2])
+    assert (np.abs(BEND) > 2.5 * sigma[3:]).all()  # so that there is something to find
+    # chi-square of six numbers has a variance of twelve
+    assert np.mean(chi2) == pytest.approx(6.0, abs=3.0 * np.sqrt(12.0 / repeats))
+
+
+def test_water_that_is_flat_is_said_to_be_so():
+    made = scene(600, (0.0, 0.0, 0.0))
+    _, found, precision = adjusted(block_of(made, control=True))
+    wet = made.is_wet
+    (note,) = shape_doubts(precision, found.state.xyz[: len(wet)][wet, :2])
+    assert "as far as the block tells" in note and "leave shape out" in note
+
+
+def test_a_block_that_hardly_has_water_does_not_tell_its_shape():
+    made = scene(60)
+    _, found, precision = adjusted(block_of(made, control=True, sigma_px=8.0))
+    wet = made.is_wet
+    (note,) = shape_doubts(precision, found.state.xyz[: len(wet)][wet, :2])
+    assert "does not tell the shape" in note
+
+
+def test_without_a_point_under_water_it_is_refused():
+    made = scene(60)
+    block = block_of(made, control=True)
+    dry = replace(block, wet=np.zeros(len(block.wet), bool))
+    with pytest.raises(GeometryError, match=r"the water's shape xx.*no point lies under water"):
+        adjusted(dry)
+
+
+def test_same_as_scipy_with_fermats_principle():
+    made = simulate_tie_points(
+        14, seed=2, area_m=(25, 20), greatest_depth_m=6, position_noise_m=0.05,
+        attitude_noise_deg=0.05, forward_overlap=0.6, side_overlap=0.5, obliques_deg=25,
+        oblique_directions=2, oblique_share=0.3,
+    )  # fmt: skip
+    block = block_of(under_bent_water(made, 4.0 * BEND), control=True)
+    unknowns = replace(SHAPED, poses="fixed")
+    block = replace(block, cameras=made.true_cameras, gnss_xyz=np.full_like(block.gnss_xyz, np.nan),
+                    gnss_sigma_m=np.full_like(block.gnss_sigma_m, np.inf))  # fmt: skip
+    problem, found, precision = adjusted(block, unknowns)
+    twin = Twin(block, tuple(problem.names), free_poses=False)
+    x = twin.solve()
+    _, _, added, xyz = twin.parts(x)
+    assert abs((twin.residuals(x) ** 2).sum() - found.cost) < 1e-6
+    np.testing.assert_allclose(found.state.xyz, xyz, atol=1e-5)  # m
+    sigma = np.sqrt(np.diag(twin.covariance(x)))[: len(added)]
+    # 0.2 percent: what differences of an ill-conditioned Jacobian are good to
+    np.testing.assert_allclose([row.sigma for row in precision.shared], sigma, rtol=2e-3)
+    off = np.array([row.added - added[row.name] for row in precision.shared])
+    assert np.abs(off / sigma).max() < 1e-3
+
+
+def test_members_bend_the_water_as_they_do():
+    made = scene(60)
+    problem, found, precision = adjusted(block_of(made, control=True))
+    step = np.zeros((1, len(problem.moves)))
+    step[0, -6:] = [0.02, 1e-3, -2e-3, 1e-5, 2e-5, -3e-5]
+    active = np.arange(len(problem.moves))
+    member = members_of(problem, found, active, step)
+    raster, cameras = water_of(problem, found.state), made.true_cameras
+    cameras = replace(cameras, centres=found.state.centres + problem.origin)
+    moved = member.surface(0, raster, cameras)
+    x, y = (made.truth - problem.origin)[:, :2].T
+    by = step[0, -6:] @ [np.ones(len(x)), x, y, x * x, x * y, y * y]
+    risen = surface_above(moved, made.truth).height_m - surface_above(raster, made.truth).height_m
+    np.testing.assert_allclose(risen, by, atol=5e-6)  # m: as above
+    assert precision.members.water.shape == (32, 7)

@@ -1,0 +1,149 @@
+"""The shoreline: as near to the true one as it says, one line for each shore, island and pool."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import shapely
+
+import pcfix
+from pcfix.flow.checks import check_water
+from pcfix.grid import shoreline
+from pcfix.grid.shoreline import NearWater
+from pcfix.io.scenes import write_scene
+from pcfix.io.vectors import read_vectors
+from pcfix.simulate.scene import ORIGIN_M
+from pcfix.simulate.terrain import Terrain
+from tests.utils.program import run_pcfix
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pyogrio = pytest.importorskip("pyogrio")
+LEVEL_M, SIGMA_M = 0.37, 0.03
+
+
+@pytest.fixture(scope="module")
+def beach(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Terrain]:
+    """Return the folder of a simulated shore, and the ground that it was made of."""
+    made, folder = [], tmp_path_factory.mktemp("shore")
+    with pytest.MonkeyPatch.context() as patch:
+        whole = Terrain.random
+        patch.setattr(Terrain, "random", lambda *a: made.append(whole(*a)) or made[-1])
+        scene = pcfix.simulate_scene(points=20_000, water=LEVEL_M, seed=4)
+    write_scene(scene, folder / "scene", overwrite=False)
+    return folder / "scene", made[0]
+
+
+def distance_m(ground: Terrain, xy: np.ndarray) -> np.ndarray:
+    """Return how far places are from the true waterline, by Newton along the slope."""
+    at, step = xy - ORIGIN_M[:2], 1e-4
+    start = at.copy()
+    for _ in range(8):
+        x, y = at.T
+        east, north = (
+            (ground.height(x + dx, y + dy) - ground.height(x - dx, y - dy)) / (2.0 * step)
+            for dx, dy in ((step, 0.0), (0.0, step))
+        )
+        slope = np.column_stack([east, north])
+        fall = (ground.height(x, y) - LEVEL_M) / np.maximum((slope**2).sum(axis=1), 1e-4)
+        at = at - np.clip(fall[:, None] * slope, -0.2, 0.2)
+    return np.hypot(*(at - start).T)
+
+
+@pytest.mark.parametrize("off_m", [0.0, SIGMA_M])
+def test_as_near_as_it_says(beach, tmp_path, off_m):
+    """Also where the level is wrong by its standard error: then by about that over the slope."""
+    folder, ground = beach
+    summary = pcfix.correct_file(
+        folder / "cloud.laz", tmp_path / "out.laz", cameras=folder / "cameras.csv",
+        water=LEVEL_M + off_m, sigma_level=SIGMA_M, method="snell", max_angle=None,
+        shoreline=tmp_path / "shore.gpkg",
+    )  # fmt: skip
+    meta, _, wkb, values = pyogrio.raw.read(tmp_path / "shore.gpkg", layer="shoreline")
+    found = dict(zip(meta["fields"], values, strict=True))
+    lines = shapely.from_wkb(wkb)
+    assert meta["geometry_type"] == "LineString"
+    assert "32633" in str(meta["crs"])
+    assert summary.shoreline["lines"] == len(lines) >= 1
+    for line, level, sigma, length in zip(
+        lines, *(found[name] for name in ("level_m", "sigma_m", "length_m")), strict=True
+    ):
+        distance = distance_m(ground, shapely.get_coordinates(line))
+        rms = math.sqrt(np.mean(distance**2))
+        assert rms < 2.0 * sigma
+        assert off_m == 0.0 or rms > 0.3 * sigma  # it is no larger than it need be
+        assert level == pytest.approx(LEVEL_M + off_m, abs=1e-6)
+        assert length == pytest.approx(line.length)
+
+
+def test_apparent_cloud_has_it_too(beach, tmp_path):
+    folder, ground = beach
+    report = check_water(LEVEL_M, cloud=folder / "cloud.laz", shoreline=tmp_path / "shore.gpkg")
+    xy = read_vectors(tmp_path / "shore.gpkg").coordinates[:, :2]
+    assert math.sqrt(np.mean(distance_m(ground, xy) ** 2)) < 2.0 * report.shoreline["sigma_m"]
+
+
+def island_and_pool(count=60_000, noise_m=0.02):
+    """Return points of a beach at x = 10 with an island of radius 6 m and a pool of 4 m."""
+    rng = np.random.default_rng(5)
+    x, y = rng.uniform(0.0, (100.0, 60.0), (count, 2)).T
+    island = 0.2 * (6.0 - np.hypot(x - 60.0, y - 30.0))
+    above = np.maximum(0.1 * (10.0 - x), island)
+    pool = 0.2 * (np.hypot(x - 30.0, y - 20.0) - 4.0)
+    spit = 0.2 * (8.0 - np.hypot(x - 30.0, y - 20.0))  # the land about the pool
+    above = np.maximum(above, np.minimum(pool, spit))
+    return np.column_stack([x, y, above + rng.normal(0.0, noise_m, count)])
+
+
+@pytest.mark.parametrize("most", [2_000_000, 20_000])
+def test_every_island_and_pool_has_its_line(monkeypatch, most):
+    monkeypatch.setattr(shoreline, "MOST_POINTS", most)
+    points, near = island_and_pool(), NearWater()
+    for part in np.array_split(points, 7):
+        near.add(part + np.array([4e5, 4e6, 0.0]), part[:, 2])
+    lines = near.lines(lambda xy: np.full(len(xy), 0.01))
+    expected = [60.0, 16.0 * math.pi, 12.0 * math.pi, 8.0 * math.pi]
+    assert [one.length_m for one in lines] == pytest.approx(expected, rel=0.05)
+    closed = [bool((one.xy[0] == one.xy[-1]).all()) for one in lines]
+    assert closed == [False, True, True, True]
+    # heights scatter by 2 cm and the level by 1 cm, over slopes of 0.1 and 0.2
+    # (the thinner the cloud, the more of its form counts as scatter)
+    expected = math.hypot(0.02, 0.01) / np.array([0.1, 0.2, 0.2, 0.2])
+    ratio = np.array([one.sigma_m for one in lines]) / expected
+    assert (ratio > 0.9).all()
+    assert (ratio < (1.3 if most > 60_000 else 1.6)).all()
+
+
+def test_flat_water_has_no_scraps():
+    """Ground within its noise of the water would be all line."""
+    rng = np.random.default_rng(2)
+    x, y = rng.uniform(0.0, 50.0, (2, 20_000))
+    above = -0.05 + rng.normal(0.0, 0.03, 20_000)
+    near = NearWater()
+    near.add(np.column_stack([x, y, above]), above)
+    assert sum(one.length_m for one in near.lines(lambda xy: np.full(len(xy), 0.02))) < 10.0
+    assert NearWater().lines(lambda xy: np.zeros(len(xy))) == []
+
+
+def test_mistakes_are_one_sentence(beach, tmp_path):
+    cloud = beach[0] / "cloud.laz"
+    for words, sentence in [
+        (["--cloud", cloud, "--shoreline", "a.shp"], "give a name in .gpkg"),
+        (["--shoreline", "a.gpkg"], "give --cloud too"),
+        (["--cloud", cloud, "--shoreline", "no/a.gpkg"], "does not exist"),
+    ]:
+        done = run_pcfix("water", LEVEL_M, *words, folder=tmp_path)
+        assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
+        assert sentence in done.stderr
+
+
+def test_command_says_it(beach, tmp_path):
+    words = [LEVEL_M, "--cloud", beach[0] / "cloud.laz", "--shoreline", "shore.gpkg"]
+    done = run_pcfix("water", *words, folder=tmp_path)
+    assert "shoreline    1 lines, " in done.stdout
+    high = run_pcfix("water", 50, *words[1:], "--overwrite", folder=tmp_path)
+    assert "shore.gpkg is empty" in high.stdout
