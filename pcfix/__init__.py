@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from pcfix.flow.correct import correct_file, correct_points
     from pcfix.flow.dsm import grid_dsm
     from pcfix.flow.label import label_file, label_points
+    from pcfix.flow.ortho import ortho_photo
     from pcfix.flow.restore import restore_file
     from pcfix.io.cameras import read_cameras
     from pcfix.io.water import read_water
@@ -50,6 +51,7 @@ _NAMES = {
     "pcfix.flow.correct": "correct_file correct_points",
     "pcfix.flow.dsm": "grid_dsm",
     "pcfix.flow.label": "label_file label_points",
+    "pcfix.flow.ortho": "ortho_photo",
     "pcfix.flow.restore": "restore_file",
     "pcfix.io.cameras": "read_cameras",
     "pcfix.io.water": "read_water",
@@ -91,6 +93,7 @@ __all__ = [
     "grid_dsm",
     "label_file",
     "label_points",
+    "ortho_photo",
     "read_cameras",
     "read_water",
     "refractive_index",

@@ -13,6 +13,7 @@ import pcfix
 from pcfix.cli.flags import FLAGS, Quiet, UsageError, check_needed, progress_bar, say, status_line
 from pcfix.options.correct import CorrectOptions, LabelOptions
 from pcfix.options.declare import options_of
+from pcfix.options.photos import OrthoOptions
 from pcfix.options.scenes import DemoOptions, SimulateOptions
 from pcfix.options.shared import JobOptions
 from pcfix.options.steps import CleanOptions, CompareOptions, DsmOptions
@@ -163,6 +164,23 @@ def dsm(
     say(dsm_text(result), quiet)
 
 
+def ortho(
+    images: Annotated[Path, Parameter(help="Folder of photographs.")],
+    output: Annotated[Path, Parameter(help="GeoTIFF to write.")],
+    /,
+    *,
+    options: Annotated[OrthoOptions, FLAGS] = OrthoOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Lay photographs on the corrected DSM: the orthophoto of land and bed."""
+    check_needed(options)
+    from pcfix.report.ortho import ortho_text
+
+    with progress_bar("Laying out", quiet) as progress:
+        result = pcfix.ortho_photo(images, output, options=options, progress=progress)
+    say(ortho_text(result), quiet)
+
+
 def compare(
     cloud: Input,
     reference: Annotated[
@@ -265,6 +283,7 @@ EXAMPLES: tuple[tuple[Callable[..., None], str], ...] = (
     (label, "pcfix label cloud.laz labelled.laz --water shore.csv"),
     (clean, "pcfix clean corrected.laz cleaned.laz"),
     (dsm, "pcfix dsm cleaned.laz bed.tif --resolution 0.5 --surface bed"),
+    (ortho, "pcfix ortho images bed.tif --cameras cameras.xml --dsm dsm.tif --water 0.37"),
     (compare, "pcfix compare cleaned.laz lidar.laz --submerged"),
     (cameras, "pcfix cameras cameras.xml --cloud cloud.laz --water 0.37 --plot block.png"),
     (water, "pcfix water shore.csv --cloud cloud.laz --plot water.png"),

@@ -68,6 +68,43 @@ class GroundOptions(OptionSet):
 
 
 @dataclass(frozen=True, kw_only=True)
+class OrthoRules(OptionSet):
+    """What an orthophoto is made of."""
+
+    panel = Panel.NEED
+
+    dsm: Any = option(
+        None,
+        "Heights of land and bed where they are: a GeoTIFF, or a cloud (.las, .laz) that was"
+        " corrected, which is gridded to cells twice as wide as those of the orthophoto.",
+        metavar="PATH",
+        needed=True,
+    )
+    resolution: float | None = option(
+        None, "Side of a cell.", unit="m", rule=METRES, default_is="a ground pixel"
+    )
+    water: Any = option(
+        None,
+        "For photographs as they were taken: the water surface, as of 'pcfix photos'; without it"
+        " they are photographs without water.",
+        metavar="SPEC",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class OrthoOptions(
+    JobOptions,
+    SummaryOption,
+    CameraFileOptions,
+    IndexOptions,
+    WaterOptions,
+    OrthoRules,
+    CamerasOptions,
+):
+    """The options of ``pcfix ortho``."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class PhotosOptions(
     JobOptions,
     SummaryOption,
