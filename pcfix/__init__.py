@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from pcfix.flow.dsm import grid_dsm
     from pcfix.flow.label import label_file, label_points
     from pcfix.flow.ortho import ortho_photo
+    from pcfix.flow.photos import map_photos
+    from pcfix.flow.rebuild import rebuild_rounds
     from pcfix.flow.restore import restore_file
     from pcfix.io.cameras import read_cameras
     from pcfix.io.water import read_water
@@ -52,6 +54,8 @@ _NAMES = {
     "pcfix.flow.dsm": "grid_dsm",
     "pcfix.flow.label": "label_file label_points",
     "pcfix.flow.ortho": "ortho_photo",
+    "pcfix.flow.photos": "map_photos",
+    "pcfix.flow.rebuild": "rebuild_rounds",
     "pcfix.flow.restore": "restore_file",
     "pcfix.io.cameras": "read_cameras",
     "pcfix.io.water": "read_water",
@@ -93,9 +97,11 @@ __all__ = [
     "grid_dsm",
     "label_file",
     "label_points",
+    "map_photos",
     "ortho_photo",
     "read_cameras",
     "read_water",
+    "rebuild_rounds",
     "refractive_index",
     "restore_file",
     "simulate_scene",

@@ -13,7 +13,7 @@ import pcfix
 from pcfix.cli.flags import FLAGS, Quiet, UsageError, check_needed, progress_bar, say, status_line
 from pcfix.options.correct import CorrectOptions, LabelOptions
 from pcfix.options.declare import options_of
-from pcfix.options.photos import OrthoOptions
+from pcfix.options.photos import OrthoOptions, PhotosOptions
 from pcfix.options.scenes import DemoOptions, SimulateOptions
 from pcfix.options.shared import JobOptions
 from pcfix.options.steps import CleanOptions, CompareOptions, DsmOptions
@@ -164,6 +164,28 @@ def dsm(
     say(dsm_text(result), quiet)
 
 
+def photos(
+    images: Annotated[Path, Parameter(help="Folder of photographs.")],
+    out_dir: Annotated[Path, Parameter(help="Folder for them without water, or for the rounds.")],
+    /,
+    *,
+    options: Annotated[PhotosOptions, FLAGS] = PhotosOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Take the water out of photographs, and with --rebuild make the cloud anew from them."""
+    check_needed(options)
+    from pcfix.report.ortho import photos_text, rounds_text
+
+    with progress_bar("Mapping", quiet) as progress:
+        if options.rebuild is None:
+            text = photos_text(pcfix.map_photos(images, out_dir, options=options, progress=progress))
+        else:
+            text = rounds_text(
+                pcfix.rebuild_rounds(images, out_dir, options=options, progress=progress)
+            )
+    say(text, quiet)
+
+
 def ortho(
     images: Annotated[Path, Parameter(help="Folder of photographs.")],
     output: Annotated[Path, Parameter(help="GeoTIFF to write.")],
@@ -283,6 +305,7 @@ EXAMPLES: tuple[tuple[Callable[..., None], str], ...] = (
     (label, "pcfix label cloud.laz labelled.laz --water shore.csv"),
     (clean, "pcfix clean corrected.laz cleaned.laz"),
     (dsm, "pcfix dsm cleaned.laz bed.tif --resolution 0.5 --surface bed"),
+    (photos, "pcfix photos images free --cameras cameras.xml --dsm bed.tif --water 0.37"),
     (ortho, "pcfix ortho images bed.tif --cameras cameras.xml --dsm dsm.tif --water 0.37"),
     (compare, "pcfix compare cleaned.laz lidar.laz --submerged"),
     (cameras, "pcfix cameras cameras.xml --cloud cloud.laz --water 0.37 --plot block.png"),
