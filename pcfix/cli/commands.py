@@ -178,11 +178,14 @@ def photos(
 
     with progress_bar("Mapping", quiet) as progress:
         if options.rebuild is None:
-            text = photos_text(pcfix.map_photos(images, out_dir, options=options, progress=progress))
-        else:
-            text = rounds_text(
-                pcfix.rebuild_rounds(images, out_dir, options=options, progress=progress)
+            text = photos_text(
+                pcfix.map_photos(images, out_dir, options=options, progress=progress)
             )
+        else:
+            found = pcfix.rebuild_rounds(
+                images, out_dir, options=options, progress=progress, say=lambda t: say(t, quiet)
+            )
+            text = rounds_text(found)
     say(text, quiet)
 
 

@@ -22,7 +22,7 @@ from pcfix.io.files import replaced_when_whole
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.kernels import threads
 from pcfix.model import FloatArray, WaterPlane
-from pcfix.options.declare import File, taken
+from pcfix.options.declare import File, options_of, taken
 from pcfix.options.photos import OrthoOptions, PhotosOptions
 from pcfix.photos.ortho import OrthoSummary, Picture, mosaic, picture_of
 
@@ -97,7 +97,7 @@ def ortho_photo(
 
 def _as_photos(given: OrthoOptions) -> PhotosOptions:
     """Return what `block_of` needs: photographs without water have it below all ground."""
-    same = given.as_dict() | {"cameras": given.cameras, "dsm": given.dsm}
+    same = {one.name: getattr(given, one.name) for one in options_of(OrthoOptions)}
     same["water"] = NO_WATER if given.water is None else given.water
     is_cloud = Path(given.dsm).suffix.lower() in (".las", ".laz")
     same["resolution"] = 2.0 * given.resolution if is_cloud and given.resolution else None
@@ -137,7 +137,12 @@ def _write(
     names = COLOURS.get(bands, tuple(f"band {b + 1}" for b in range(bands)))
     covered = ground = done = 0
     with rasters.new_raster(
-        path, lattice, block.crs, dict.fromkeys((*names, "alpha"), ""), dtype=str(dtype), nodata=None
+        path,
+        lattice,
+        block.crs,
+        dict.fromkeys((*names, "alpha"), ""),
+        dtype=str(dtype),
+        nodata=None,
     ) as target:
         for window in lattice.windows(TILE_CELLS):
             xyz, known = _cells(block, lattice, window)

@@ -134,8 +134,11 @@ class _Record:
         if old is None:
             for folder in target.glob("round[0-9]*"):
                 if not given.overwrite:
-                    raise SettingError(f"{folder}: exists; add --overwrite, or give another folder.")
+                    raise SettingError(
+                        f"{folder}: exists; add --overwrite, or give another folder."
+                    )
                 shutil.rmtree(folder)
+            write_text(path, json_text(new | {"rounds": []}), overwrite=True)
             return cls(path, new | {"rounds": []}, 0, start)
         if {k: old.get(k) for k in new} != json.loads(json.dumps(new)):
             raise SettingError(
@@ -250,8 +253,8 @@ class _Run:
             return None
         wrong = f"ended with code {code}" if code else f"left no {cloud}"
         raise InputError(
-            f"--rebuild {wrong} in round {number}, and said: {' / '.join(last) or 'nothing'} (all of"
-            f" it in {log}); mend it and call again, which goes on from the photographs in {images}."
+            f"--rebuild {wrong} in round {number}, and said: {' / '.join(last) or 'nothing'} (all"
+            f" of it in {log}); mend it and call again, which goes on from {images}."
         )
 
     def _stereo(self, images: Path, cloud: Path) -> None:
@@ -290,9 +293,9 @@ class _Run:
     def _paper_note(self) -> str:
         index = self.block.scene.refractive_index
         return (
-            f"--mapping paper tends to the apparent depth over 2 - n, not to n times it: with n ="
-            f" {index:g} the bed ends {100 * paper_excess(index):.0f} % of its depth too deep where"
-            " it is seen from above; correct the cloud and take --mapping exact for the true one."
+            "--mapping paper tends to the apparent depth over 2 - n, not to n times it: with n ="
+            f" {index:g} the bed ends up to {100 * paper_excess(index):.0f} % of its depth too"
+            " deep; correct the cloud and take --mapping exact for the true one."
         )
 
 

@@ -14,6 +14,7 @@ from pcfix.io.files import check_output, write_bytes
 from pcfix.io.las.writing import write_points
 from pcfix.model import BATHYMETRIC_POINT, Cameras, FloatArray, IntArray, Views
 from pcfix.options.declare import File
+from pcfix.version import __version__
 
 if TYPE_CHECKING:
     from pcfix.simulate.scene import Scene

@@ -96,7 +96,7 @@ def picture_of(pixels: npt.NDArray[Any], shrunk: int = 1, *, blanks: bool = Fals
         pixels = cv2.resize(inner, size, interpolation=cv2.INTER_AREA).reshape(*size[::-1], bands)
         if blank is not None:
             inner = blank[: size[1] * shrunk, : size[0] * shrunk]
-            blank = inner.reshape(size[1], shrunk, size[0], shrunk).any(axis=(1, 3))
+            blank = np.asarray(inner.reshape(size[1], shrunk, size[0], shrunk).any(axis=(1, 3)))
     return Picture(pixels, shrunk, blank)
 
 

@@ -32,7 +32,10 @@ SPARE_RELIEF = 0.5
 """Of the range of heights: so much lower the bed is looked for than the ground before."""
 BLOCK_PX = 5
 FEWEST_PAIRS = 2
-"""Heights of a cell; one alone has nobody to agree with."""
+"""Of a cell, and half of all there, whose heights are within a pixel of parallax of the median."""
+
+HALF = 1 << 31
+"""Added to columns, so that those west of x = 0 share a number with their rows."""
 
 
 class Grey(NamedTuple):
@@ -113,7 +116,12 @@ def stereo_cloud(
             "stereo found no pairs of photographs that overlap and match; rebuild with a command of"
             " a photogrammetry package."
         )
-    return _fused(np.concatenate(cells), np.concatenate(z), cell_m)
+    middle = float(np.nanmedian(ground.height_m))
+    parallax = [
+        (photo.centre[2] - middle) / (BASE_SHARES[1] * min(photo.lens.width, photo.lens.height))
+        for photo in photos
+    ]
+    return _fused(np.concatenate(cells), np.concatenate(z), cell_m, float(np.median(parallax)))
 
 
 def pairs_of(photos: Sequence[Photo], ground_m: float) -> list[tuple[int, int]]:
@@ -231,17 +239,21 @@ def _means(xyz: FloatArray, cell_m: float) -> tuple[IntArray, FloatArray]:
     """Return the cells that have points, as one number each, and the mean heights there."""
     column, row = np.floor(xyz[:, :2] / cell_m).astype(np.int64).T
     cells, inverse, counts = np.unique(
-        (row << 32) + column, return_inverse=True, return_counts=True
+        (row << 32) + column + HALF, return_inverse=True, return_counts=True
     )
     return cells, np.bincount(inverse, xyz[:, 2], len(cells)) / counts
 
 
-def _fused(cells: IntArray, z: FloatArray, cell_m: float) -> FloatArray:
-    """Return the medians of the heights of each cell, over its centre."""
+def _fused(cells: IntArray, z: FloatArray, cell_m: float, parallax_m: float) -> FloatArray:
+    """Return the medians of the heights of each cell, over its centre, where most pairs agree."""
     order = np.lexsort((z, cells))
+    z = z[order]
     own, first, counts = np.unique(cells[order], return_index=True, return_counts=True)
-    height = 0.5 * (z[order][first + (counts - 1) // 2] + z[order][first + counts // 2])
+    height = 0.5 * (z[first + (counts - 1) // 2] + z[first + counts // 2])
+    agreeing = np.add.reduceat(
+        np.abs(z - np.repeat(height, counts)) <= parallax_m, first, dtype=int
+    )
     row = own >> 32
-    column = own - (row << 32)
+    column = own - (row << 32) - HALF
     xyz = np.column_stack([(column + 0.5) * cell_m, (row + 0.5) * cell_m, height])
-    return np.asarray(xyz[counts >= FEWEST_PAIRS])
+    return np.asarray(xyz[agreeing >= np.maximum(FEWEST_PAIRS, 0.5 * counts)])

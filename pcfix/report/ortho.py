@@ -28,20 +28,14 @@ def photos_text(found: Any) -> str:
 
 
 def rounds_text(found: RebuildSummary) -> str:
-    """Return a line for each round, why they ended, and the command that compares them."""
-    lines = ["round   mean of change   sd        within a ground pixel"]
-    for number, one in enumerate(found.rounds, start=1):
-        change = f"{one.mean_m:+.3f} m{one.sd_m:12.3f} m"
-        lines.append(f"{number:5}{change:>29}{100 * one.within_gsd:13.0f} %")
-    last = found.rounds[-1].cloud
-    limit = f"{found.threshold_m:.3f} m on average"
-    if found.settled:
-        lines.append(f"settled      the last round moved the bed by less than {limit}")
-    else:
-        lines.append(f"not settled  the last round moved the bed by more than {limit}")
-    lines.append(f"cloud        {last}")
-    if found.compared is None:
-        lines.append(f"compare      {found.compare}")
-    else:
-        lines.append(f"compared     {found.compared}")
-    return "\n".join(lines)
+    """Return why the rounds ended, and where their clouds and the comparison are."""
+    many = "less" if found.settled else "more"
+    next_step = f"compare      {found.compare}"
+    return "\n".join(
+        [
+            f"{'settled' if found.settled else 'not settled':13}the last round moved the bed by"
+            f" {many} than {found.threshold_m:.3f} m on average",
+            f"cloud        {found.rounds[-1].cloud}",
+            next_step if found.compared is None else f"compared     {found.compared}",
+        ]
+    )

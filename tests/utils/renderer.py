@@ -50,7 +50,7 @@ class Relief(NamedTuple):
 
 
 def rendered(photo, relief, texture, water_m=None, n=1.34):
-    """Return an image of uint8, shape (rows, columns), of a pinhole camera; and the ground places."""
+    """Return an image of uint8, shape (rows, columns), of a pinhole; and the ground places."""
     lens = photo.lens
     u, v = np.meshgrid(np.arange(int(lens.width)) + 0.5, np.arange(int(lens.height)) + 0.5)
     direction = np.column_stack(
