@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from pcfix.flow.correct import correct_file, correct_points
     from pcfix.flow.dsm import grid_dsm
     from pcfix.flow.label import label_file, label_points
+    from pcfix.flow.ortho import ortho_photo
     from pcfix.flow.photos import map_photos
+    from pcfix.flow.rebuild import rebuild_rounds
     from pcfix.flow.restore import restore_file
     from pcfix.io.cameras import read_cameras
     from pcfix.io.water import read_water
@@ -51,7 +53,9 @@ _NAMES = {
     "pcfix.flow.correct": "correct_file correct_points",
     "pcfix.flow.dsm": "grid_dsm",
     "pcfix.flow.label": "label_file label_points",
+    "pcfix.flow.ortho": "ortho_photo",
     "pcfix.flow.photos": "map_photos",
+    "pcfix.flow.rebuild": "rebuild_rounds",
     "pcfix.flow.restore": "restore_file",
     "pcfix.io.cameras": "read_cameras",
     "pcfix.io.water": "read_water",
@@ -94,8 +98,10 @@ __all__ = [
     "label_file",
     "label_points",
     "map_photos",
+    "ortho_photo",
     "read_cameras",
     "read_water",
+    "rebuild_rounds",
     "refractive_index",
     "restore_file",
     "simulate_scene",

@@ -13,7 +13,7 @@ import pcfix
 from pcfix.cli.flags import FLAGS, Quiet, UsageError, check_needed, progress_bar, say, status_line
 from pcfix.options.correct import CorrectOptions, LabelOptions
 from pcfix.options.declare import options_of
-from pcfix.options.photos import PhotosOptions
+from pcfix.options.photos import OrthoOptions, PhotosOptions
 from pcfix.options.scenes import DemoOptions, SimulateOptions
 from pcfix.options.shared import JobOptions
 from pcfix.options.steps import CleanOptions, CompareOptions, DsmOptions
@@ -179,6 +179,48 @@ def dsm(
     say(dsm_text(result), quiet)
 
 
+def photos(
+    images: Annotated[Path, Parameter(help="Folder of photographs.")],
+    out_dir: Annotated[Path, Parameter(help="Folder for them without water, or for the rounds.")],
+    /,
+    *,
+    options: Annotated[PhotosOptions, FLAGS] = PhotosOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Take the water out of photographs, and with --rebuild make the cloud anew from them."""
+    check_needed(options)
+    from pcfix.report.photos import photos_text, rounds_text
+
+    with progress_bar("Mapping", quiet, unit="photographs") as progress:
+        if options.rebuild is None:
+            text = photos_text(
+                pcfix.map_photos(images, out_dir, options=options, progress=progress)
+            )
+        else:
+            found = pcfix.rebuild_rounds(
+                images, out_dir, options=options, progress=progress, say=lambda t: say(t, quiet)
+            )
+            text = rounds_text(found)
+    say(text, quiet)
+
+
+def ortho(
+    images: Annotated[Path, Parameter(help="Folder of photographs.")],
+    output: Annotated[Path, Parameter(help="GeoTIFF to write.")],
+    /,
+    *,
+    options: Annotated[OrthoOptions, FLAGS] = OrthoOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Lay photographs on the corrected DSM: the orthophoto of land and bed."""
+    check_needed(options)
+    from pcfix.report.photos import ortho_text
+
+    with progress_bar("Laying out", quiet, unit="cells") as progress:
+        result = pcfix.ortho_photo(images, output, options=options, progress=progress)
+    say(ortho_text(result), quiet)
+
+
 def compare(
     cloud: Input,
     reference: Annotated[
@@ -194,23 +236,6 @@ def compare(
 
     result = pcfix.compare_clouds(cloud, reference, options=options)
     say(comparison_text(result), quiet)
-
-
-def photos(
-    images: Annotated[Path, Parameter(help="Folder of photographs.")],
-    out: Annotated[Path, Parameter(help="Folder for those without water.")],
-    /,
-    *,
-    options: Annotated[PhotosOptions, FLAGS] = PhotosOptions(),
-    quiet: Quiet = False,
-) -> None:
-    """Resample photographs to those that would have been taken without water."""
-    check_needed(options)
-    from pcfix.report.photos import photos_text
-
-    with progress_bar("Mapping photographs", quiet, unit="photographs") as progress:
-        result = pcfix.map_photos(images, out, options=options, progress=progress)
-    say(photos_text(result), quiet)
 
 
 def cameras(
@@ -298,6 +323,7 @@ EXAMPLES: tuple[tuple[Callable[..., None], str], ...] = (
     (label, "pcfix label cloud.laz labelled.laz --water shore.csv"),
     (clean, "pcfix clean corrected.laz cleaned.laz"),
     (dsm, "pcfix dsm cleaned.laz bed.tif --resolution 0.5 --surface bed"),
+    (ortho, "pcfix ortho images bed.tif --cameras cameras.xml --dsm dsm.tif --water 0.37"),
     (compare, "pcfix compare cleaned.laz lidar.laz --submerged"),
     (photos, "pcfix photos images dry --cameras cameras.xml --dsm bed.tif --water 0.37"),
     (cameras, "pcfix cameras cameras.xml --cloud cloud.laz --water 0.37 --plot block.png"),

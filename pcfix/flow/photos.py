@@ -115,6 +115,10 @@ class Block:
     step_px : int
         Between the nodes of the grid.
     notes : tuple of str
+    crs : CRS, str or None
+        Of the DSM, which all is in.
+    gsd_m : float
+        A pixel on the lowest ground, median of the photographs.
     """
 
     paths: tuple[Path, ...]
@@ -122,6 +126,8 @@ class Block:
     scene: Scene
     step_px: int
     notes: tuple[str, ...]
+    crs: Any
+    gsd_m: float
 
 
 def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> Block:
@@ -156,7 +162,8 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> Block:
     )
     gsd = _ground_pixel_m(photos, ground)
     step = given.spacing or max(LEAST_STEP_PX, int(np.ceil(ground.cell_m / gsd)))
-    return Block(tuple(mine), photos, Scene(ground, surface, index), step, (*notes, *more))
+    scene = Scene(ground, surface, index)
+    return Block(tuple(mine), photos, scene, step, (*notes, *more), crs, gsd)
 
 
 def check_above(centres: FloatArray, water: WaterSurface, name: str) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -24,6 +25,10 @@ from pcfix.options.declare import File
 
 if TYPE_CHECKING:
     from pcfix.clean.neighbours import Empty
+
+
+LAST_LINES = 3
+"""Of what another program says when it fails."""
 
 
 def check_input(path: File) -> Path:
@@ -108,6 +113,20 @@ def write_bytes(path: File, data: bytes, *, overwrite: bool) -> None:
 def write_text(path: File, text: str, *, overwrite: bool) -> None:
     """Write a small text file under the same rules."""
     write_bytes(path, text.encode(), overwrite=overwrite)
+
+
+def run_logged(words: list[str], log: Path) -> tuple[int, list[str]]:
+    """Run a program without a shell, and return its exit code and the last lines that it wrote.
+
+    All that it writes goes to a file. An `InputError` if it cannot be started.
+    """
+    try:
+        with log.open("wb") as stream:
+            done = subprocess.run(words, stdout=stream, stderr=subprocess.STDOUT, check=False)
+    except OSError as error:
+        raise InputError(f"{words[0]}: cannot be run ({error.strerror or error}).") from error
+    lines = log.read_text("utf-8", errors="replace").splitlines()
+    return done.returncode, [line.strip() for line in lines if line.strip()][-LAST_LINES:]
 
 
 @contextmanager

@@ -64,6 +64,24 @@ def read_photograph(path: Path) -> Pixels:
     return pixels if pixels.ndim == 3 else pixels[..., None]
 
 
+def read_colours(path: Path) -> Pixels:
+    """Return the pixels as `read_photograph`, red before blue in every format, without alpha.
+
+    Raises
+    ------
+    InputError
+        If they are numbers of another kind than 8 or 16 bits.
+    """
+    pixels = read_photograph(path)
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{path}: has {pixels.dtype} pixels; give photographs of 8 or 16 bits.")
+    if pixels.shape[2] == 4 and path.suffix.lower() not in TIFF:
+        pixels = pixels[..., :3]
+    if pixels.shape[2] == 3 and path.suffix.lower() in PNG:
+        pixels = pixels[..., ::-1]
+    return np.ascontiguousarray(pixels)
+
+
 def _pixels(path: Path) -> Pixels:
     suffix = path.suffix.lower()
     if suffix in TIFF:

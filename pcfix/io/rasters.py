@@ -140,19 +140,20 @@ def check_cog() -> None:
 def new_raster(
     path: Path,
     lattice: Lattice,
-    crs: CRS | None,
+    crs: CRS | str | None,
     bands: Mapping[str, str],
     *,
     dtype: str = "float32",
-    nodata: float = NO_HEIGHT,
+    nodata: float | None = NO_HEIGHT,
     tags: Mapping[str, str] | None = None,
 ) -> Iterator[DatasetWriter]:
     """Open a new tiled, compressed GeoTIFF for `write_part`.
 
     `bands` maps the description of each band to its unit; `dtype` and `nodata` are those of all
-    bands, `tags` the metadata of the file.
+    bands, `tags` the metadata of the file. Bands with names of colours, alpha too, are such.
     """
     import rasterio
+    from rasterio.enums import ColorInterp
     from rasterio.transform import from_origin
 
     size = lattice.resolution_m
@@ -163,7 +164,7 @@ def new_raster(
         "count": len(bands),
         "dtype": dtype,
         "nodata": nodata,
-        "crs": None if crs is None else rasterio.CRS.from_wkt(crs.to_wkt()),
+        "crs": None if crs is None else rasterio.CRS.from_wkt(_wkt(crs)),
         "transform": from_origin(lattice.left_m, lattice.top_m, size, size),
         "interleave": "band",
         "tiled": True,
@@ -176,10 +177,17 @@ def new_raster(
             for number, (name, unit) in enumerate(bands.items(), start=1):
                 target.set_band_description(number, name)
                 target.set_band_unit(number, unit)
+            known = ColorInterp.__members__
+            if bands.keys() & known.keys():
+                target.colorinterp = [known.get(name, ColorInterp.undefined) for name in bands]
             target.update_tags(**(tags or {}))
             yield target
     except rasterio.errors.RasterioError as error:
         raise InputError(f"{path}: the raster cannot be written ({error}).") from error
+
+
+def _wkt(crs: CRS | str) -> str:
+    return crs if isinstance(crs, str) else crs.to_wkt()
 
 
 def add_overviews(path: Path) -> None:

@@ -8,12 +8,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import laspy
 import numpy as np
-from pyproj import CRS
 
 from pcfix.io.files import check_output, write_bytes
-from pcfix.io.las.writing import LasSink
+from pcfix.io.las.writing import write_points
 from pcfix.model import BATHYMETRIC_POINT, Cameras, FloatArray, IntArray, Views
 from pcfix.options.declare import File
 from pcfix.version import __version__
@@ -184,9 +182,9 @@ def _write_clouds(scene: Scene, folder: Path) -> None:
     classes = np.where(wet, BATHYMETRIC_POINT, GROUND).astype(np.uint8)
     step = 0.001 if scene.gsd_m >= _FINE_GSD_M else 0.0001
     place = (scene.epsg, step)
-    _write_cloud(folder / "cloud.laz", scene.apparent_xyz, place, _colours(scene))
-    _write_cloud(folder / "truth.laz", scene.true_xyz, place)
-    _write_cloud(folder / "lidar.laz", scene.lidar_xyz, place, classes=classes)
+    write_points(folder / "cloud.laz", scene.apparent_xyz, place, _colours(scene))
+    write_points(folder / "truth.laz", scene.true_xyz, place)
+    write_points(folder / "lidar.laz", scene.lidar_xyz, place, classes=classes)
 
 
 def _colours(scene: Scene) -> FloatArray:
@@ -194,30 +192,3 @@ def _colours(scene: Scene) -> FloatArray:
     depth = np.clip(scene.depth_m(scene.apparent_xyz) / 10.0, 0.0, 1.0)[:, None]
     sand, sea = np.array([[214, 196, 150]]), np.array([[22, 66, 110]])
     return np.asarray(np.rint(sand + depth * (sea - sand)) * 257.0)
-
-
-def _write_cloud(
-    path: Path,
-    xyz: FloatArray,
-    place: tuple[int, float],
-    colours: FloatArray | None = None,
-    classes: np.ndarray | None = None,
-) -> None:
-    epsg, step_m = place
-    header = laspy.LasHeader(version="1.4", point_format=6 if colours is None else 7)
-    header.scales = np.full(3, step_m)
-    header.offsets = np.floor(xyz.min(axis=0))
-    header.add_crs(CRS.from_epsg(epsg))
-    header.generating_software = f"pcfix {__version__}"
-    points = laspy.ScaleAwarePointRecord.zeros(len(xyz), header=header)
-    for axis, name in enumerate("XYZ"):
-        points.array[name] = np.rint((xyz[:, axis] - header.offsets[axis]) / step_m)
-    points["return_number"][:] = 1
-    points["number_of_returns"][:] = 1
-    if classes is not None:
-        points.array["classification"] = classes
-    if colours is not None:
-        for i, name in enumerate(("red", "green", "blue")):
-            points.array[name] = colours[:, i]
-    with LasSink(path, header, []) as sink:
-        sink.write(points)

@@ -41,6 +41,7 @@ class Panel(StrEnum):
     FIGURES = "Figures"
     UNKNOWNS = "What moves, and how much counts"
     CLOUDS = "Clouds"
+    ROUNDS = "Rounds"
     EFFECT = "With --refraction-effect"
     OUTPUT = "Output"
 

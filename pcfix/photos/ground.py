@@ -94,6 +94,16 @@ class Ground:
         rays[:, :3], rays[:, 3:] = origin - self.middle, direction
         return self._scene.cast_rays(rays)["t_hit"].numpy().astype(np.float64)
 
+    def heights_at(self, xy: FloatArray) -> FloatArray:
+        """Return heights between the centres of cells, shape (n,); NaN where there is none."""
+        from scipy.ndimage import map_coordinates
+
+        row = (self.top_m - xy[:, 1]) / self.cell_m - 0.5
+        column = (xy[:, 0] - self.left_m) / self.cell_m - 0.5
+        return np.asarray(
+            map_coordinates(self.height_m, [row, column], order=1, mode="constant", cval=np.nan)
+        )
+
 
 def ground_of(height_m: FloatArray, left_m: float, top_m: float, cell_m: float) -> Ground:
     """Return a ground of no more than `MOST_CELLS` cells, means of the raster's own."""

@@ -102,7 +102,7 @@ def exact(photo: Photo, scene: Scene, step_px: int) -> Shifts:
     camera = (path.piercing_xyz - photo.centre) @ photo.rotation.T
     place = project(photo.lens, camera)
     free = path.converged & np.isfinite(place).all(axis=1)
-    free[free] = ~_hidden(scene.ground, path.piercing_xyz[free], seen.xyz[wet[free]])
+    free[free] = ~hidden(scene.ground, path.piercing_xyz[free], seen.xyz[wet[free]])
     shift[wet[free]] = place[free] - nodes[wet[free]]
     known[wet[~free]] = False
     return _as_grid(step_px, shift, known, shape)
@@ -160,15 +160,15 @@ def _ground_seen(photo: Photo, scene: Scene, nodes: FloatArray) -> _Seen:
     return _Seen(xyz, depth, known, known & (depth > 0.0))
 
 
-def _hidden(ground: Ground, start: FloatArray, end: FloatArray) -> BoolArray:
-    """Return whether the ground stands between places on the water and points under it."""
+def hidden(ground: Ground, start: FloatArray, end: FloatArray) -> BoolArray:
+    """Return whether the ground stands between places, shapes (n, 3), and others beyond."""
     way = end - start
     length = np.linalg.norm(way, axis=1)
-    deep = length > 0.0
-    hidden = np.zeros(len(way), bool)
-    hit = ground.hit(start[deep], way[deep] / length[deep, None])
-    hidden[deep] = hit < length[deep] - OCCLUSION_CELLS * ground.cell_m
-    return hidden
+    apart = length > 0.0
+    found = np.zeros(len(way), bool)
+    hit = ground.hit(start[apart], way[apart] / length[apart, None])
+    found[apart] = hit < length[apart] - OCCLUSION_CELLS * ground.cell_m
+    return found
 
 
 def _as_grid(step_px: int, shift: FloatArray, known: BoolArray, shape: tuple[int, int]) -> Shifts:

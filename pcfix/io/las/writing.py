@@ -19,6 +19,7 @@ import lazrs
 import numpy as np
 from laspy.vlrs.known import ExtraBytesStruct, WktCoordinateSystemVlr
 from laspy.vlrs.vlr import VLR
+from pyproj import CRS
 
 from pcfix.errors import InputError, SettingError
 from pcfix.io.files import replaced_when_whole
@@ -346,3 +347,44 @@ def _write_errors(path: Path) -> Iterator[None]:
         yield
     except (laspy.LaspyException, lazrs.LazrsError, OSError) as error:
         raise InputError(f"{path}: cannot be written ({error}).") from error
+
+
+def write_points(
+    path: Path,
+    xyz: FloatArray,
+    place: tuple[CRS | str | int | None, float],
+    colours: FloatArray | None = None,
+    classes: np.ndarray | None = None,
+) -> None:
+    """Write points as a new LAS or LAZ file.
+
+    Parameters
+    ----------
+    path : path
+    xyz : array, shape (n, 3)
+        Metres.
+    place : tuple
+        The CRS, as pyproj takes one, and the step of coordinates in metres.
+    colours : array, shape (n, 3), optional
+        Red, green and blue, 16 bit.
+    classes : array, shape (n,), optional
+    """
+    crs, step_m = place
+    header = laspy.LasHeader(version="1.4", point_format=6 if colours is None else 7)
+    header.scales = np.full(3, step_m)
+    header.offsets = np.floor(xyz.min(axis=0))
+    if crs is not None:
+        header.add_crs(CRS.from_user_input(crs))
+    header.generating_software = f"pcfix {__version__}"
+    points = laspy.ScaleAwarePointRecord.zeros(len(xyz), header=header)
+    for axis, name in enumerate("XYZ"):
+        points.array[name] = np.rint((xyz[:, axis] - header.offsets[axis]) / step_m)
+    points["return_number"][:] = 1
+    points["number_of_returns"][:] = 1
+    if classes is not None:
+        points.array["classification"] = classes
+    if colours is not None:
+        for i, name in enumerate(("red", "green", "blue")):
+            points.array[name] = colours[:, i]
+    with LasSink(path, header, []) as sink:
+        sink.write(points)

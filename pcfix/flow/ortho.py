@@ -1,0 +1,174 @@
+"""Photographs to an orthophoto of land and bed, tile by tile."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from pcfix.errors import GeometryError, InputError, PcfixWarning
+from pcfix.flow.inputs import paths_in
+from pcfix.flow.photos import Block, block_of
+from pcfix.flow.runner import Progress, check_summary, write_summary
+from pcfix.grid.lattice import Lattice, Window, lattice_over, refuse_size
+from pcfix.io import rasters
+from pcfix.io.files import replaced_when_whole
+from pcfix.io.photographs import photographs_in, read_colours
+from pcfix.kernels import threads
+from pcfix.model import FloatArray, WaterPlane
+from pcfix.options.declare import File, options_of, taken
+from pcfix.options.photos import OrthoOptions, PhotosOptions
+from pcfix.photos.ortho import OrthoSummary, Picture, mosaic, picture_of
+
+TILE_CELLS = 512
+CACHE_BYTES = 400_000_000
+"""Of photographs that are kept for the next tile."""
+NO_WATER = WaterPlane(-100_000.0)
+"""Below all ground, so that every ray is straight."""
+COLOURS = {1: ("gray",), 3: ("red", "green", "blue")}
+
+
+def ortho_photo(
+    images: File,
+    output: File,
+    *,
+    options: OrthoOptions | None = None,
+    progress: Progress | None = None,
+    **keywords: Any,
+) -> OrthoSummary:
+    """Lay photographs on a DSM of land and bed; what ``pcfix ortho`` runs.
+
+    The file is a cloud optimised GeoTIFF in the CRS of the DSM, with the bands of the photographs
+    and alpha: 0 where no photograph sees the cell. See `pcfix.photos.ortho`.
+
+    Parameters
+    ----------
+    images : path
+        Folder of JPEG, TIFF or PNG files of 8 or 16 bits.
+    output : path
+        The name ends in ``.tif`` or ``.tiff``.
+    options : OrthoOptions, optional
+        Or its attributes as keywords: cameras, dsm and, for photographs as they were taken, water
+        among them.
+    progress : callable, optional
+        Called with (cells done, cells in all).
+
+    Returns
+    -------
+    OrthoSummary
+
+    Raises
+    ------
+    PcfixError
+        With one sentence on what to mend; no output is left behind.
+    """
+    started = time.perf_counter()
+    given = taken(OrthoOptions, options, keywords, "ortho_photo")
+    paths = photographs_in(Path(images))
+    known = [*paths_in(given), *([given.dsm] if given.dsm else []), *paths]
+    target = rasters.check_tif(output, overwrite=given.overwrite, inputs=known)
+    check_summary(given, [*known, target])
+    rasters.check_cog()
+    with threads(given.jobs), TemporaryDirectory(dir=target.parent, prefix=".pcfix-ortho-") as name:
+        folder = Path(name)
+        block = block_of(_as_photos(given), paths, folder)
+        for note in block.notes:
+            warnings.warn(note, PcfixWarning, stacklevel=2)
+        lattice = _lattice(block, given)
+        covered, ground = _write(block, lattice, given, folder / "plain.tif", progress)
+        if not covered:
+            raise GeometryError(f"{given.dsm}: no photograph sees it; check the CRS of both.")
+        with replaced_when_whole(target) as draft:
+            rasters.copy_as_cog(folder / "plain.tif", draft)
+    summary = OrthoSummary(
+        str(target), len(block.photos), lattice.width, lattice.height, lattice.resolution_m,
+        lattice.bounds_m, round(covered / ground, 5), round(time.perf_counter() - started, 3),
+        str(given.dsm), None if given.water is None else str(given.water), block.notes,
+    )  # fmt: skip
+    write_summary(given, asdict(summary))
+    return summary
+
+
+def _as_photos(given: OrthoOptions) -> PhotosOptions:
+    """Return what `block_of` needs: photographs without water have it below all ground."""
+    same = {one.name: getattr(given, one.name) for one in options_of(OrthoOptions)}
+    same["water"] = NO_WATER if given.water is None else given.water
+    is_cloud = Path(given.dsm).suffix.lower() in (".las", ".laz")
+    same["resolution"] = 2.0 * given.resolution if is_cloud and given.resolution else None
+    return PhotosOptions(**same)
+
+
+def _lattice(block: Block, given: OrthoOptions) -> Lattice:
+    """Return the cells over the DSM; by default two digits of the ground pixel are their side."""
+    ground = block.scene.ground
+    rows, columns = ground.height_m.shape
+    low = np.array([ground.left_m, ground.top_m - rows * ground.cell_m])
+    high = np.array([ground.left_m + columns * ground.cell_m, ground.top_m])
+    side = given.resolution or float(f"{block.gsd_m:.1e}")
+    refuse_size(low, high, side, str(given.dsm))
+    return lattice_over(low, high - 1e-6 * side, side)
+
+
+def _write(
+    block: Block, lattice: Lattice, given: OrthoOptions, path: Path, progress: Progress | None
+) -> tuple[int, int]:
+    """Write the raster, and return how many cells have a colour, and how many a height."""
+    first = read_colours(block.paths[0])
+    bands, dtype = first.shape[2], first.dtype
+    shrunk = max(1, int(lattice.resolution_m / block.gsd_m))
+    kept = max(4, CACHE_BYTES // first.nbytes)
+
+    @lru_cache(maxsize=kept)
+    def picture(row: int) -> Picture:
+        pixels = read_colours(block.paths[row])
+        if pixels.shape[2] != bands or pixels.dtype != dtype:
+            raise InputError(
+                f"{block.paths[row]}: has {pixels.shape[2]} bands of {pixels.dtype}, and"
+                f" {block.paths[0].name} {bands} of {dtype}; give photographs of one kind."
+            )
+        return picture_of(pixels, shrunk, blanks=given.water is None)
+
+    names = COLOURS.get(bands, tuple(f"band {b + 1}" for b in range(bands)))
+    covered = ground = done = 0
+    with rasters.new_raster(
+        path,
+        lattice,
+        block.crs,
+        dict.fromkeys((*names, "alpha"), ""),
+        dtype=str(dtype),
+        nodata=None,
+    ) as target:
+        for window in lattice.windows(TILE_CELLS):
+            xyz, known = _cells(block, lattice, window)
+            found = mosaic(xyz, block.photos, block.scene, picture) if len(xyz) else None
+            ground += len(xyz)
+            if found is not None:
+                tile = np.zeros((bands + 1, window.height, window.width), dtype)
+                most = np.iinfo(dtype).max
+                colour = np.where(found.covered[:, None], found.colour, 0.0)
+                tile[:-1, known] = np.clip(np.rint(colour), 0, most).T
+                tile[-1, known] = most * found.covered
+                for number, band in enumerate(tile, start=1):
+                    rasters.write_part(target, band, window, number)
+                covered += int(found.covered.sum())
+            done += window.height * window.width
+            if progress is not None:
+                progress(done, lattice.height * lattice.width)
+    return covered, ground
+
+
+def _cells(block: Block, lattice: Lattice, window: Window) -> tuple[FloatArray, Any]:
+    """Return the centres of the cells that have a height, shape (n, 3), and which they are."""
+    side = lattice.resolution_m
+    x = lattice.left_m + (np.arange(window.column, window.column_stop) + 0.5) * side
+    y = lattice.top_m - (np.arange(window.row, window.row_stop) + 0.5) * side
+    xy = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x))])
+    z = block.scene.ground.heights_at(xy)
+    known = np.isfinite(z)
+    return np.column_stack([xy, z])[known], known.reshape(window.height, window.width)

@@ -1,0 +1,234 @@
+"""The orthophoto of the bed: each cell in the colour of the photograph that sees it most steeply.
+
+A cell of the bed is looked for in the photographs themselves: where there is water over it, the
+light is traced from the bed through the surface to the projection centre, and the lens says where
+it ends. So photographs as they were taken serve as well as those without water, are resampled once
+only, and nothing is lost to the frames of photographs that have become smaller.
+
+Of the photographs that see a cell, those count of which the ray is nearly as steep as the steepest
+one, less the flatter they look, so that colours run into each other at the seams.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from pcfix.lens.imaging import project
+from pcfix.model import BoolArray, FloatArray
+from pcfix.photos.mapping import Photo, Scene, hidden
+from pcfix.refract.tracing import trace
+from pcfix.water.surface import surface_above
+
+FEATHER = 0.01
+"""Tangents off the vertical within which photographs are mixed: 15 pixels of a lens of 1500."""
+SPARE_SHARE = 0.15
+"""Of the frame: so far outside a straight ray may end, and the bent one inside."""
+BLACK = 3
+"""Of 255: what is as dark as this over `BLACK_PX`, as JPEG leaves it, is no picture."""
+BLACK_PX = 7
+REMAP_COLUMNS = 1024
+
+
+@dataclass(frozen=True)
+class OrthoSummary:
+    """What `pcfix.ortho_photo` did.
+
+    Attributes
+    ----------
+    output : str
+    images, width, height : int
+        Photographs, and cells.
+    resolution_m : float
+    bounds_m : tuple of float
+        Left, bottom, right, top.
+    covered_share : float
+        Of the cells over the DSM.
+    seconds : float
+    dsm : str
+    water : str or None
+    notes : tuple of str
+    """
+
+    output: str
+    images: int
+    width: int
+    height: int
+    resolution_m: float
+    bounds_m: tuple[float, float, float, float]
+    covered_share: float
+    seconds: float
+    dsm: str
+    water: str | None
+    notes: tuple[str, ...]
+
+
+class Picture(NamedTuple):
+    """The pixels of a photograph.
+
+    Attributes
+    ----------
+    pixels : array, shape (rows, columns, bands)
+    shrunk : int
+        So many pixels of the photograph taken, each way, are one of these.
+    blank : array of bool, shape (rows, columns), or None
+        Where there is no picture.
+    """
+
+    pixels: npt.NDArray[Any]
+    shrunk: int = 1
+    blank: BoolArray | None = None
+
+
+def picture_of(pixels: npt.NDArray[Any], shrunk: int = 1, *, blanks: bool = False) -> Picture:
+    """Return a photograph, made smaller for coarse rasters, and without what is left black."""
+    import cv2
+
+    blank = blank_in(pixels) if blanks else None
+    if shrunk > 1:
+        rows, columns, bands = pixels.shape
+        size = columns // shrunk, rows // shrunk
+        inner = np.ascontiguousarray(pixels[: size[1] * shrunk, : size[0] * shrunk])
+        pixels = cv2.resize(inner, size, interpolation=cv2.INTER_AREA).reshape(*size[::-1], bands)
+        if blank is not None:
+            inner = blank[: size[1] * shrunk, : size[0] * shrunk]
+            blank = np.asarray(inner.reshape(size[1], shrunk, size[0], shrunk).any(axis=(1, 3)))
+    return Picture(pixels, shrunk, blank)
+
+
+def blank_in(pixels: npt.NDArray[Any]) -> BoolArray:
+    """Return where a photograph without water was left black, and what lies next to that."""
+    import cv2
+
+    limit = BLACK * (257 if pixels.dtype == np.uint16 else 1)
+    dark = (pixels.max(axis=2) <= limit).astype(np.uint8)
+    square = np.ones((BLACK_PX, BLACK_PX), np.uint8)
+    wide = cv2.morphologyEx(
+        dark, cv2.MORPH_OPEN, square, borderType=cv2.BORDER_REPLICATE
+    )  # single dark pixels are shadows
+    return np.asarray(cv2.dilate(wide, square) > 0)
+
+
+class Mosaic(NamedTuple):
+    """Colours of cells, shape (n, bands), and which of them any photograph sees."""
+
+    colour: FloatArray
+    covered: BoolArray
+
+
+def mosaic(
+    xyz: FloatArray, photos: Sequence[Photo], scene: Scene, picture: Callable[[int], Picture]
+) -> Mosaic | None:
+    """Return the colours of places on the ground, None where no photograph sees one.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 3)
+        Metres, world frame.
+    photos : sequence of Photo
+    scene : Scene
+        Ground, and the water over it.
+    picture : callable
+        From the place of a photograph in the sequence to its pixels.
+    """
+    slopes = [slope_of(photo, xyz) for photo in photos]
+    near = [k for k, one in enumerate(slopes) if np.isfinite(one).any()]
+    if not near:
+        return None
+    slope = np.stack([slopes[k] for k in near])
+    place = np.zeros((*slope.shape, 2), np.float32)
+    looked = np.zeros(slope.shape, bool)
+    while True:
+        best = slope.min(axis=0)
+        wanted = np.isfinite(slope) & (slope <= best + FEATHER) & ~looked
+        if not wanted.any():
+            break
+        for k in np.flatnonzero(wanted.any(axis=1)):
+            rows = np.flatnonzero(wanted[k])
+            place[k, rows], seen = seen_at(photos[near[k]], xyz[rows], scene)
+            seen[seen] = ~_is_blank(picture(near[k]), place[k, rows[seen]])
+            slope[k, rows[~seen]] = np.inf
+            looked[k, rows] = True
+    covered = np.isfinite(best)
+    if not covered.any():
+        return None
+    share = np.clip(1.0 - (slope - np.where(covered, best, 0.0)) / FEATHER, 0.0, 1.0)
+    share /= np.maximum(share.sum(axis=0), 1e-9)
+    colour: Any = 0.0
+    for k in np.flatnonzero((share > 0.0).any(axis=1)):
+        rows = np.flatnonzero(share[k] > 0.0)
+        found = _colours(picture(near[k]), place[k, rows])
+        if np.isscalar(colour):
+            colour = np.zeros((len(xyz), found.shape[1]), np.float32)
+        colour[rows] += share[k, rows, None] * found
+    return Mosaic(colour, covered)
+
+
+def slope_of(photo: Photo, xyz: FloatArray) -> npt.NDArray[np.float32]:
+    """Return the tangent off the vertical of straight rays; infinite well outside the frame."""
+    away = xyz - photo.centre
+    lens = photo.lens
+    place = project(lens, away @ photo.rotation.T) / [lens.width, lens.height]
+    inside = ((place > -SPARE_SHARE) & (place < 1.0 + SPARE_SHARE)).all(axis=1)
+    inside &= away[:, 2] < 0.0
+    tangent = np.hypot(away[:, 0], away[:, 1]) / np.where(inside, -away[:, 2], 1.0)
+    return np.where(inside, tangent, np.inf).astype(np.float32)
+
+
+def seen_at(photo: Photo, xyz: FloatArray, scene: Scene) -> tuple[FloatArray, BoolArray]:
+    """Return where places on the ground are in a photograph, and whether they are in sight.
+
+    Parameters
+    ----------
+    photo : Photo
+    xyz : array, shape (n, 3)
+        Metres, world frame.
+    scene : Scene
+
+    Returns
+    -------
+    place : array, shape (n, 2)
+        u and v in pixels.
+    seen : array of bool, shape (n,)
+        Whether the place is in the frame, and neither the way through the air nor that through
+        the water meets the ground before.
+    """
+    depth = np.nan_to_num(surface_above(scene.water, xyz).height_m - xyz[:, 2], nan=0.0)
+    wet = np.flatnonzero(depth > 0.0)
+    seen, pierced = np.ones(len(xyz), bool), xyz.copy()
+    path = trace(photo.centre, xyz[wet], scene.water, refractive_index=scene.refractive_index)
+    pierced[wet], seen[wet] = path.piercing_xyz, path.converged
+    place = project(photo.lens, (pierced - photo.centre) @ photo.rotation.T)
+    frame = np.array([photo.lens.width, photo.lens.height])
+    seen &= ((place >= 0.0) & (place <= frame)).all(axis=1)
+    rows = np.flatnonzero(seen)
+    start = np.broadcast_to(photo.centre, (len(rows), 3))
+    seen[rows] = ~hidden(scene.ground, start, pierced[rows])
+    rows = np.flatnonzero(seen)
+    seen[rows] = ~hidden(scene.ground, pierced[rows], xyz[rows])
+    return place, seen
+
+
+def _is_blank(picture: Picture, place: FloatArray) -> BoolArray:
+    if picture.blank is None:
+        return np.zeros(len(place), bool)
+    rows, columns = picture.blank.shape
+    column = np.clip((place[:, 0] / picture.shrunk).astype(int), 0, columns - 1)
+    row = np.clip((place[:, 1] / picture.shrunk).astype(int), 0, rows - 1)
+    return np.asarray(picture.blank[row, column])
+
+
+def _colours(picture: Picture, place: FloatArray) -> npt.NDArray[Any]:
+    """Return the pixels at places, shape (n, bands), bicubic."""
+    import cv2
+
+    n = len(place)
+    at = np.zeros((-(-n // REMAP_COLUMNS) * REMAP_COLUMNS, 2), np.float32)
+    at[:n] = place / picture.shrunk - 0.5
+    u, v = (np.ascontiguousarray(one).reshape(-1, REMAP_COLUMNS) for one in at.T)
+    found = cv2.remap(picture.pixels, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(found.reshape(len(at), -1)[:n])

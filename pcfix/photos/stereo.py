@@ -1,0 +1,259 @@
+"""A dense cloud by stereo pairs, for rounds without another program.
+
+As on the slide "Processing of stereo images" of Mulsow 2024: pairs, matching, intersection of
+straight rays, fusion of the clouds, filtering. Each photograph is paired with a few neighbours,
+both are turned so that rows correspond, OpenCV's semi-global matcher (Hirschmueller 2008) finds
+disparities from left to right and back, and of the heights that the pairs give a cell the median is
+taken. It is modest: no weights, no visibility, heights of all pairs in memory (a few hundred
+photographs), and good for land and bed that are seen from above.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from pcfix.errors import GeometryError
+from pcfix.lens.imaging import project, unproject
+from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.photos.ground import Ground
+from pcfix.photos.mapping import Photo
+
+PARTNERS = 4
+BASE_SHARES = (0.1, 0.3, 0.55)
+"""Of the shorter side of the photograph: shortest base, best, longest."""
+MOST_ANGLE_DEG = 30.0
+"""Between the axes of a pair."""
+SPARE_PX = 4
+SPARE_RELIEF = 0.5
+"""Of the range of heights: so much lower the bed is looked for than the ground before."""
+BLOCK_PX = 5
+FEWEST_PAIRS = 2
+"""Of a cell, and half of all there, whose heights are within a pixel of parallax of the median."""
+
+HALF = 1 << 31
+"""Added to columns, so that those west of x = 0 share a number with their rows."""
+
+
+class Grey(NamedTuple):
+    """A photograph for matching: uint8, shape (rows, columns), and where it has no picture."""
+
+    pixels: npt.NDArray[np.uint8]
+    blank: BoolArray
+
+
+class Rectified(NamedTuple):
+    """The common frame of a pair, x along the base: rotation from the world, and its window.
+
+    Attributes
+    ----------
+    rotation : array, shape (3, 3)
+    base_m, focal_px : float
+    left_px, top_px : float
+        Where the window begins in the left photograph, from the foot of the axis.
+    width, height : int
+    least_px, disparities : int
+        Smallest disparity, and how many.
+    """
+
+    rotation: FloatArray
+    base_m: float
+    focal_px: float
+    left_px: float
+    top_px: float
+    width: int
+    height: int
+    least_px: int
+    disparities: int
+
+
+def stereo_cloud(
+    photos: Sequence[Photo],
+    ground: Ground,
+    cell_m: float,
+    picture: Callable[[int], Grey],
+    progress: Callable[[int, int], None] | None = None,
+) -> FloatArray:
+    """Return a point for each cell of land and bed that two pairs of photographs see.
+
+    Parameters
+    ----------
+    photos : sequence of Photo
+    ground : Ground
+        Roughly: from it are the range of depths and the flying height.
+    cell_m : float
+    picture : callable
+        From the place of a photograph in the sequence to its pixels.
+    progress : callable, optional
+        Called with (pairs done, pairs in all).
+
+    Returns
+    -------
+    array, shape (n, 3)
+        Metres, world frame.
+
+    Raises
+    ------
+    GeometryError
+        If there are no pairs, or none gives heights.
+    """
+    low, high = np.nanquantile(ground.height_m, [0.001, 0.999])
+    heights = float(low - SPARE_RELIEF * (high - low) - 1.0), float(high + 1.0)
+    pairs = pairs_of(photos, float(np.nanmedian(ground.height_m)))
+    cells, z = [], []
+    for done, (one, other) in enumerate(pairs, start=1):
+        xyz = pair_points(photos[one], photos[other], picture(one), picture(other), heights)
+        own, mean = _means(xyz, cell_m)
+        cells.append(own)
+        z.append(mean)
+        if progress is not None:
+            progress(done, len(pairs))
+    if not sum(map(len, z)):
+        raise GeometryError(
+            "stereo found no pairs of photographs that overlap and match; rebuild with a command of"
+            " a photogrammetry package."
+        )
+    middle = float(np.nanmedian(ground.height_m))
+    parallax = [
+        (photo.centre[2] - middle) / (BASE_SHARES[1] * min(photo.lens.width, photo.lens.height))
+        for photo in photos
+    ]
+    return _fused(np.concatenate(cells), np.concatenate(z), cell_m, float(np.median(parallax)))
+
+
+def pairs_of(photos: Sequence[Photo], ground_m: float) -> list[tuple[int, int]]:
+    """Return pairs, each photograph with the neighbours whose bases are nearest to the best."""
+    shortest, best, longest = BASE_SHARES
+    centres = np.array([photo.centre for photo in photos])
+    axes = np.array([photo.rotation[2] for photo in photos])
+    chosen = set()
+    for row, photo in enumerate(photos):
+        side = min(photo.lens.width, photo.lens.height)
+        base = np.linalg.norm(centres - photo.centre, axis=1)
+        share = base * photo.lens.focal / (photo.centre[2] - ground_m) / side
+        fits = (share > shortest) & (share < longest)
+        fits &= axes @ axes[row] > np.cos(np.radians(MOST_ANGLE_DEG))
+        near = np.flatnonzero(fits)
+        for other in near[np.argsort(np.abs(share[near] - best), kind="stable")][:PARTNERS]:
+            chosen.add((min(row, int(other)), max(row, int(other))))
+    return sorted(chosen)
+
+
+def rectified(left: Photo, right: Photo, heights: tuple[float, float]) -> Rectified | None:
+    """Return the common frame of a pair, None where they have no ground in common."""
+    way = right.centre - left.centre
+    base = float(np.linalg.norm(way))
+    x = way / base
+    z = left.rotation[2] + right.rotation[2]
+    z = z - (z @ x) * x
+    z /= np.linalg.norm(z)
+    rotation = np.stack([x, np.cross(z, x), z])
+    corners = [_corners(photo) for photo in (left, right)]
+    ahead = [one @ rotation.T for one in corners]
+    if min((one[:, 2] / np.linalg.norm(one, axis=1)).min() for one in ahead) < 0.3:
+        return None
+    focal = left.lens.focal
+    plane = [focal * one[:, :2] / one[:, 2:] for one in ahead]
+    top = max(one[:, 1].min() for one in plane)
+    bottom = min(one[:, 1].max() for one in plane)
+    far = []
+    for height in heights:
+        length = (left.centre[2] - height) / -corners[0][:, 2]
+        far += list(length * ahead[0][:, 2])
+    far = [one for one in far if one > 0.0]
+    if not far or bottom - top < 8 * BLOCK_PX:
+        return None
+    least = int(np.floor(focal * base / max(far))) - SPARE_PX
+    most = int(np.ceil(focal * base / min(far))) + SPARE_PX
+    start = max(plane[0][:, 0].min(), plane[1][:, 0].min() + least)
+    stop = min(plane[0][:, 0].max(), plane[1][:, 0].max() + most)
+    disparities = -(-(most - least) // 16) * 16
+    width = int(stop - start)
+    if width <= disparities + 8 * BLOCK_PX:
+        return None
+    return Rectified(
+        rotation, base, focal, start, top, width, int(bottom - top), least, disparities
+    )
+
+
+def _corners(photo: Photo) -> FloatArray:
+    """Return where the corners of a photograph look to, shape (4, 3), world frame."""
+    w, h = photo.lens.width, photo.lens.height
+    places = np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]])
+    return np.asarray(unproject(photo.lens, places) @ photo.rotation)
+
+
+def pair_points(
+    left: Photo, right: Photo, one: Grey, other: Grey, heights: tuple[float, float]
+) -> FloatArray:
+    """Return what two photographs see both, shape (n, 3), metres, world frame."""
+    import cv2
+
+    frame = rectified(left, right, heights)
+    if frame is None:
+        return np.empty((0, 3))
+    seen, lost = _turned(left, one, frame, 0)
+    found, gone = _turned(right, other, frame, frame.least_px)
+    matcher: Any = cv2.StereoSGBM.create(
+        minDisparity=0, numDisparities=frame.disparities, blockSize=BLOCK_PX,
+        P1=8 * BLOCK_PX**2, P2=32 * BLOCK_PX**2, disp12MaxDiff=1, preFilterCap=31,
+        uniquenessRatio=5, speckleWindowSize=100, speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )  # fmt: skip
+    disparity = matcher.compute(seen, found).astype(np.float32) / 16.0
+    row, column = np.nonzero((disparity > 0.0) & ~lost)
+    shift = disparity[row, column]
+    partner = np.rint(column - shift).astype(int)
+    fine = (partner >= 0) & ~gone[row, np.maximum(partner, 0)]
+    row, column, shift = row[fine], column[fine], shift[fine].astype(np.float64)
+    depth = frame.focal_px * frame.base_m / (shift + frame.least_px)
+    x = (column + 0.5 + frame.left_px) / frame.focal_px
+    y = (row + 0.5 + frame.top_px) / frame.focal_px
+    ahead = depth[:, None] * np.column_stack([x, y, np.ones_like(x)])
+    return np.asarray(left.centre + ahead @ frame.rotation)
+
+
+def _turned(photo: Photo, grey: Grey, frame: Rectified, least_px: int) -> tuple[Any, BoolArray]:
+    """Return a photograph in the frame of a pair, and where it has no picture there."""
+    import cv2
+
+    u = np.arange(frame.width) + 0.5 + frame.left_px - least_px
+    v = np.arange(frame.height) + 0.5 + frame.top_px
+    ahead = np.ones((frame.height, frame.width, 3))
+    ahead[..., 0], ahead[..., 1] = u / frame.focal_px, v[:, None] / frame.focal_px
+    directions = ahead.reshape(-1, 3) @ (photo.rotation @ frame.rotation.T).T
+    place = (project(photo.lens, directions) - 0.5).astype(np.float32)
+    at = np.nan_to_num(place, nan=-9.0).reshape(frame.height, frame.width, 2)
+    turned = cv2.remap(grey.pixels, at, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
+    blank = cv2.remap(
+        grey.blank.astype(np.uint8), at, None, cv2.INTER_NEAREST,
+        borderMode=cv2.BORDER_CONSTANT, borderValue=1,
+    )  # fmt: skip
+    return turned, np.asarray(blank > 0)
+
+
+def _means(xyz: FloatArray, cell_m: float) -> tuple[IntArray, FloatArray]:
+    """Return the cells that have points, as one number each, and the mean heights there."""
+    column, row = np.floor(xyz[:, :2] / cell_m).astype(np.int64).T
+    cells, inverse, counts = np.unique(
+        (row << 32) + column + HALF, return_inverse=True, return_counts=True
+    )
+    return cells, np.bincount(inverse, xyz[:, 2], len(cells)) / counts
+
+
+def _fused(cells: IntArray, z: FloatArray, cell_m: float, parallax_m: float) -> FloatArray:
+    """Return the medians of the heights of each cell, over its centre, where most pairs agree."""
+    order = np.lexsort((z, cells))
+    z = z[order]
+    own, first, counts = np.unique(cells[order], return_index=True, return_counts=True)
+    height = 0.5 * (z[first + (counts - 1) // 2] + z[first + counts // 2])
+    agreeing = np.add.reduceat(
+        np.abs(z - np.repeat(height, counts)) <= parallax_m, first, dtype=int
+    )
+    row = own >> 32
+    column = own - (row << 32) - HALF
+    xyz = np.column_stack([(column + 0.5) * cell_m, (row + 0.5) * cell_m, height])
+    return np.asarray(xyz[agreeing >= np.maximum(FEWEST_PAIRS, 0.5 * counts)])

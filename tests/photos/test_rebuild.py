@@ -1,0 +1,186 @@
+"""Rounds: when they stop, what is kept, and the cloud that stereo pairs give."""
+
+import json
+import sys
+import warnings
+
+import laspy
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2", reason="photographs need the extra 'photos'")
+
+import cv2
+
+import pcfix
+from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.io.las.writing import write_points
+from pcfix.photos.ground import Ground
+from pcfix.photos.rounds import paper_excess, round_of
+from pcfix.photos.stereo import Grey, pairs_of, stereo_cloud
+from tests.photos.test_mapping import GSD_M, photo, relief
+from tests.utils.renderer import Texture, rendered
+
+DEPTHS_M = (2.5, 2.66, 2.71, 2.73)
+"""Of the cloud that each round's command writes; the first one is 2 m deep."""
+
+COMMAND = """
+import pathlib, sys, laspy, numpy as np
+images, cameras, cloud, notes = map(pathlib.Path, sys.argv[1:])
+assert len(list(images.iterdir())) == 3 and cameras.exists()  # two and the record
+if (notes / "broken").exists():
+    print("reading images"); print("no licence left"); sys.exit(3)
+calls = notes / "calls"
+done = calls.read_text() if calls.exists() else ""
+depth = {depths}[len(done)]
+calls.write_text(done + "x")
+first = laspy.read(notes / "apparent.laz")
+first.z = np.full(len(first.points), -depth)
+first.write(cloud)
+"""
+
+
+@pytest.fixture
+def block(tmp_path):
+    """Two photographs of a flat bed, a command that deepens it, and how to call it."""
+    images = tmp_path / "images with space"
+    images.mkdir()
+    for name in ("P0.png", "P1.png"):
+        cv2.imwrite(str(images / name), np.full((60, 80, 3), 99, np.uint8))
+    (tmp_path / "cameras.csv").write_text(
+        "label,x,y,z,yaw,pitch,roll\nP0.png,-4,0,60,0,0,0\nP1.png,4,0,60,0,0,0\n"
+    )
+    (tmp_path / "sensor.csv").write_text("focal,sensor_x,sensor_y\n10,8,6\n")
+    x, y = (one.ravel() for one in np.meshgrid(np.arange(-29.5, 30), np.arange(-29.5, 30)))
+    xyz = np.column_stack([x, y, np.full(len(x), -2.0)])
+    write_points(tmp_path / "apparent.laz", xyz, ("EPSG:32636", 0.001))
+    (tmp_path / "command.py").write_text(COMMAND.format(depths=DEPTHS_M))
+    words = [sys.executable, tmp_path / "command.py", "{images}", "{cameras}", "{cloud}", tmp_path]
+    how = {
+        "cameras": tmp_path / "cameras.csv", "dsm": tmp_path / "apparent.laz", "resolution": 1.0,
+        "water": 0.0, "mapping": "paper", "rebuild": " ".join(f'"{word}"' for word in words),
+    }  # fmt: skip
+    return images, tmp_path / "out", how
+
+
+def rounds(block, **more):
+    images, out, how = block
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return pcfix.rebuild_rounds(images, out, **(how | more))
+
+
+def calls(block):
+    return (block[1].parent / "calls").read_text()
+
+
+def test_rounds_stop_when_the_bed_stays(block):
+    # the ground pixel is 0.62 m: 62 m over 100 px
+    found = rounds(block, until_gsd=0.04)
+    assert found.gsd_m == pytest.approx(0.62, abs=0.01)
+    assert [one.mean_m for one in found.rounds] == pytest.approx([-0.5, -0.16, -0.05, -0.02])
+    assert found.settled
+    assert found.rounds[0].sd_m == pytest.approx(0.0, abs=1e-3)
+    assert all(one.within_gsd == 1.0 for one in found.rounds)
+    assert len(rounds(block, until_gsd=0.5).rounds) == 2  # the same, and asked for less
+    assert not rounds(block, until_gsd=0.001).settled
+    assert calls(block) == "xxxx"
+    for name in ("round0=", "round1=", "round3=", "round4/cloud.laz REFERENCE"):
+        assert name in found.compare
+
+
+def test_paper_warns_of_where_it_tends_to(block):
+    images, out, how = block
+    with (
+        pytest.warns(PcfixWarning, match=r"apparent depth over 2 - n.* 13 % of its depth too"),
+        pytest.warns(PcfixWarning, match="does not say that it is of a cloud"),
+    ):
+        found = pcfix.rebuild_rounds(images, out, **how, until_gsd=0.001, most_rounds=3)
+    assert len(found.notes) == 1
+    assert paper_excess(1.34) == pytest.approx(0.131, abs=0.001)
+
+
+def test_a_command_that_fails_loses_nothing(block):
+    out = block[1]
+    broken = out.parent / "broken"
+    first = rounds(block, most_rounds=1)
+    broken.touch()
+    with pytest.raises(
+        InputError, match="ended with code 3 in round 2, and said: reading images / no licence left"
+    ):
+        rounds(block, until_gsd=0.05, most_rounds=2)
+    mapped = {one: one.stat().st_mtime_ns for one in (out / "round2" / "images").iterdir()}
+    broken.unlink()
+    found = rounds(block, until_gsd=0.05, most_rounds=2)
+    assert calls(block) == "xx"
+    assert found.done_before == 1
+    assert found.rounds[0] == first.rounds[0]
+    assert {one: one.stat().st_mtime_ns for one in mapped} == mapped
+    assert not list(out.parent.glob("*.part*"))
+
+
+def test_interrupted_between_cloud_and_dsm(block):
+    rounds(block, most_rounds=1)
+    out = block[1]
+    record = json.loads((out / "pcfix-rebuild.json").read_text())
+    record["rounds"][0] = {key: record["rounds"][0][key] for key in ("command", "state")}
+    (out / "pcfix-rebuild.json").write_text(json.dumps(record))
+    (out / "round1" / "dsm.tif").unlink()
+    assert rounds(block, most_rounds=1).rounds[0].mean_m == pytest.approx(-0.5)
+    assert calls(block) == "x"
+
+
+def test_other_calls_do_not_go_on_from_these(block):
+    rounds(block, most_rounds=1)
+    with pytest.raises(SettingError, match="holds the rounds of another call"):
+        rounds(block, water=0.1)
+    assert rounds(block, water=0.1, overwrite=True, most_rounds=1).done_before == 0
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        ({"rebuild": "odm {images}"}, "rebuild 'odm {images}' lacks {cloud}; name the folder"),
+        ({"rebuild": None, "reference": "lidar.laz"}, "reference is of no use without rebuild"),
+        ({"until_gsd": 0}, "until-gsd 0 is not positive"),
+        ({"most_rounds": 0}, "most-rounds 0"),
+    ],
+)
+def test_what_cannot_be_is_refused(block, more, sentence):
+    with pytest.raises(SettingError, match=sentence):
+        rounds(block, **more)
+
+
+def test_programs_that_are_not_there_or_leave_nothing(block):
+    with pytest.raises(InputError, match="no-such-program: cannot be run"):
+        rounds(block, rebuild="no-such-program {images} {cloud}")
+    with pytest.raises(InputError, match=r"left no .*cloud.laz in round 1, and said: nothing"):
+        rounds(block, rebuild=f'"{sys.executable}" -c pass {{images}} {{cloud}}')
+
+
+def test_only_the_bed_counts():
+    difference = np.array([[0.0, 0.0, -0.2], [0.0, np.nan, -0.4]])
+    wet = np.array([[False, False, True], [False, True, True]])
+    found = round_of(("c", "d"), difference, wet, 0.25)
+    assert (found.cells, found.mean_m, found.within_gsd) == (2, -0.3, 0.5)
+    assert found.sd_m == pytest.approx(0.1)
+
+
+def test_stereo_finds_a_ground_without_water():
+    photos = [photo(x, tilt) for x, tilt in ((-8, (2, 1)), (0, (-1, 2)), (8, (1, -2)))]
+    assert pairs_of(photos, 0.0) == [(0, 1), (0, 2), (1, 2)]
+    texture = Texture(3.0 * GSD_M, 3.0)
+    seen = [rendered(one, relief(), texture)[0] for one in photos]
+    pictures = [Grey(one, np.zeros(one.shape, bool)) for one in seen]
+    ground = relief()
+    xyz = stereo_cloud(photos, Ground(*ground), 2.0 * GSD_M, lambda k: pictures[k])
+    off = xyz[:, 2] - ground.at(xyz[:, :2])
+    assert len(xyz) > 10_000
+    # m: a pixel of parallax is 0.5 m at the best base; ledge and boulders are steeper than cells
+    assert abs(np.median(off)) < 0.02
+    assert np.quantile(np.abs(off), [0.5, 0.95]) == pytest.approx([0.0, 0.0], abs=0.25)
+
+
+def test_clouds_are_las_in_the_crs_of_the_dsm(tmp_path):
+    write_points(tmp_path / "cloud.laz", np.ones((3, 3)), (None, 0.001))
+    assert laspy.read(tmp_path / "cloud.laz").header.parse_crs() is None
