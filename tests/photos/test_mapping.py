@@ -38,6 +38,14 @@ def scene():
     return Scene(Ground(*ground), WaterPlane(LEVEL_M), 1.34)
 
 
+@pytest.fixture(scope="module")
+def views():
+    """Return the image with water and its places on the ground, then those without."""
+    texture = Texture(5.0 * GSD_M, 1.5)
+    wet, dry = (rendered(photo(), relief(), texture, level) for level in (LEVEL_M, None))
+    return *wet, *dry
+
+
 def displacement_px(one, other, every=6):
     """Return how far places of an image lie from where another has them (Lucas and Kanade)."""
     import cv2
@@ -51,10 +59,8 @@ def displacement_px(one, other, every=6):
     return (moved - at)[found.ravel() == 1]
 
 
-def test_the_photograph_is_that_without_water(scene):
-    texture = Texture(5.0 * GSD_M, 1.5)
-    wet, _ = rendered(photo(), relief(), texture, LEVEL_M)
-    dry, place = rendered(photo(), relief(), texture)
+def test_the_photograph_is_that_without_water(scene, views):
+    wet, _, dry, place = views
     found = resample(wet[..., None], exact(photo(), scene, 4))
     lost = found.touched & (found.image[..., 0] == 0)
     before = np.hypot(*displacement_px(wet, dry).T)
@@ -70,9 +76,8 @@ def test_the_photograph_is_that_without_water(scene):
 
 
 @pytest.mark.parametrize("step_px", [1, 4, 8])
-def test_every_pixel_comes_from_where_its_ground_was_seen(scene, step_px):
-    _, seen = rendered(photo(), relief(), Texture(1.0, 2.0), LEVEL_M)
-    _, straight = rendered(photo(), relief(), Texture(1.0, 2.0))
+def test_every_pixel_comes_from_where_its_ground_was_seen(scene, views, step_px):
+    _, seen, _, straight = views
     mapped = resample(seen[..., :2].astype(np.float32), exact(photo(), scene, step_px)).image
     known = (np.abs(mapped).max(axis=2) > 0.0)[10:-10, 10:-10]
     off = np.hypot(*(mapped - straight[..., :2])[10:-10, 10:-10][known].T) / GSD_M
