@@ -179,7 +179,10 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> Block:
     rotations: Any = cameras.rotations
     photos = tuple(
         Photo(
-            cameras.labels[row], cameras.centres[row], rotations[row], _lens_of(path, cameras, row)
+            cameras.labels[row],
+            cameras.centres[row],
+            rotations[row],
+            lens_of(path, cameras, row, size_of(path)),
         )
         for path, row in zip(mine, theirs, strict=True)
     )
@@ -253,9 +256,9 @@ def _matched(
     return mine, [row for row in rows if row >= 0], tuple(notes)
 
 
-def _lens_of(path: Path, cameras: Cameras, row: int) -> Lens:
-    """Return the lens in pixels of the photograph, whose size it must have."""
-    columns, rows = size_of(path)
+def lens_of(path: Path, cameras: Cameras, row: int, size: tuple[int, int]) -> Lens:
+    """Return the lens in pixels of a photograph of so many columns and rows, which it must have."""
+    columns, rows = size
     lenses: Any = cameras.lenses
     lens: Lens = lenses[row]
     if lens.unit == "px":
