@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from pcfix.flow.runner import Progress, check_summary, json_text, write_summary
 from pcfix.io.files import file_state, read_json, write_text
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
 from pcfix.io.rasters import filled_heights, open_raster
+from pcfix.io.water_rasters import read_water_raster
 from pcfix.kernels import cores, threads
 from pcfix.model import Cameras, FloatArray, Lens, WaterDimension
 from pcfix.options.declare import File, taken
@@ -145,6 +146,9 @@ class Block:
     step_px : int
         Between the nodes of the grid.
     notes : tuple of str
+    waters : dict
+        Rasters of the water of some photographs, by their stems.
+    crs : str or None
     """
 
     paths: tuple[Path, ...]
@@ -152,6 +156,14 @@ class Block:
     scene: Scene
     step_px: int
     notes: tuple[str, ...]
+    waters: dict[str, Path] = field(default_factory=dict)
+    crs: str | None = None
+
+    def scene_of(self, path: Path) -> Scene:
+        """Return what a photograph sees, through its own water where that is known."""
+        if path.stem not in self.waters:
+            return self.scene
+        return replace(self.scene, water=read_water_raster(self.waters[path.stem], self.crs))
 
 
 def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> Block:
@@ -188,7 +200,26 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> Block:
     )
     gsd = _ground_pixel_m(photos, ground)
     step = given.spacing or max(LEAST_STEP_PX, int(np.ceil(ground.cell_m / gsd)))
-    return Block(tuple(mine), photos, Scene(ground, surface, index), step, (*notes, *more))
+    waters, few = _waters(given, mine)
+    return Block(
+        tuple(mine), photos, Scene(ground, surface, index), step, (*notes, *more, *few), waters, crs
+    )
+
+
+def _waters(given: PhotosOptions, paths: list[Path]) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """Return the rasters of the water that belong to photographs, and a note on the others."""
+    if given.water_per_image is None:
+        return {}, ()
+    folder = Path(given.water_per_image)
+    own = {path.stem: folder / f"{path.stem}.tif" for path in paths}
+    found = {stem: path for stem, path in own.items() if path.is_file()}
+    if not found:
+        raise InputError(
+            f"{folder}: holds no raster of a photograph's name, as {paths[0].stem}.tif; give the"
+            " folder that 'pcfix calm --surface' wrote."
+        )
+    lost = len(paths) - len(found)
+    return found, (f"{lost} photographs have no water of their own in {folder}.",) * (lost > 0)
 
 
 def _heights(
@@ -297,6 +328,7 @@ def _begin(target: Path, given: PhotosOptions, block: Block, *, overwrite: bool)
     for name in ("overwrite", "jobs", "summary"):
         asked.pop(name)
     files = [given.cameras, given.dsm, given.sensor, given.water]
+    files += block.waters.values()
     states = [file_state(Path(f)) for f in files if f is not None and Path(str(f)).exists()]
     record = {"pcfix": __version__, "asked": asked, "files": states}
     place = target / RECORD
@@ -344,7 +376,7 @@ def _all(
 
 
 def _one(path: Path, photo: Photo, block: Block, way: Callable[..., Any], target: Path) -> _Done:
-    shifts = way(photo, block.scene, block.step_px)
+    shifts = way(photo, block.scene_of(path), block.step_px)
     found = resample(read_photograph(path), shifts)
     write_photograph(path, target / path.name, found.image, found.touched)
     pixels = found.touched.size

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from pcfix.errors import SettingError
-from pcfix.options.declare import OptionSet, must_be, option, positive
+from pcfix.options.declare import File, OptionSet, must_be, option, positive
 from pcfix.options.shared import (
     CameraFileOptions,
     CamerasOptions,
@@ -69,7 +69,21 @@ class GroundOptions(OptionSet):
 
 
 @dataclass(frozen=True, kw_only=True)
+class WaterPerImageOption(OptionSet):
+    """Water that is another for each photograph."""
+
+    panel = Panel.WATER
+
+    water_per_image: File | None = option(
+        None,
+        "Folder of rasters of the water, each of the name of a photograph, as 'pcfix calm"
+        " --surface' writes them; the others go by --water.",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class PhotosOptions(
+    WaterPerImageOption,
     JobOptions,
     SummaryOption,
     MappingRules,
@@ -152,7 +166,7 @@ class CalmOptions(JobOptions, SummaryOption, CameraFileOptions, IndexOptions, Wa
         """Check what options say together."""
         super().check()
         if not self.surface:
-            for name in ("depth", "cameras", "gsd", "interval", "resolution"):
+            for name in ("depth", "cameras", "gsd", "interval"):
                 if getattr(self, name) is not None:
                     raise SettingError(f"{name} is of no use without surface; add it, or leave it.")
             return
