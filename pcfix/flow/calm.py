@@ -268,7 +268,7 @@ def _water(
     """Return heights and standard errors of the water in each frame."""
     nodes = nodes_of(view, given.resolution)
     measure = Displacements(median, view, nodes)
-    interval = given.interval or frames.interval_s
+    interval = given.interval * given.every if given.interval else frames.interval_s
     times = np.arange(len(stack)) * (interval or 0.0)
     shifts, weights = (
         np.zeros((len(stack), len(nodes.xy), 2)),

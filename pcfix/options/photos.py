@@ -130,7 +130,7 @@ class WavesOptions(OptionSet):
     )
     interval: float | None = option(
         None,
-        "With --surface: time between frames; without it frames are not tied together.",
+        "With --surface: time between frames, before --every; without it each stands alone.",
         unit="s",
         rule=positive("{option} {value:g} is not positive; give seconds."),
         default_is="what the video says",

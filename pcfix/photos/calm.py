@@ -257,7 +257,8 @@ def median_of(
         noise; mean over the bands, NaN where fewer than three frames are known.
     """
     count = known.sum(axis=0)[..., None, None]
-    values = np.where(known[..., None], frames, np.inf).astype(np.float32)
+    values = frames.astype(np.float32)
+    values[~known] = np.inf
     median = _middle(np.moveaxis(values, 0, -1), count)
     np.abs(values - median, out=values, where=known[..., None])
     spread = 1.4826 * _middle(np.moveaxis(values, 0, -1), count).mean(axis=2)

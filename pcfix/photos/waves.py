@@ -165,6 +165,7 @@ class Displacements:
         side = int(np.hypot(*np.diff(_pixels(view, step), axis=0)[0]))
         self._side = (side | 1, side | 1)
         self._flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self._flow.setFinestScale(0)  # waves are short, and patches of 8 px smooth enough
         self._base = cv2.blur(self._weight, self._side)
 
     def of(self, frame: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
@@ -303,24 +304,22 @@ def _solved(given: Slopes, number: FloatArray, frequency: FloatArray) -> _Fit:
     along = np.tile(number / np.hypot(*number.T)[:, None], (2, 1))
     size = len(along)
     gram, right = np.zeros((size, size)), np.zeros(size)
+    used = np.flatnonzero((given.weight > 0.0).any(axis=0))
     for slope, weight, time in zip(given.slope, given.weight, given.time_s, strict=True):
-        basis = _basis(number, frequency, given.xy, time)
-        weighted = basis * weight[:, None]
+        basis = _basis(number, frequency, given.xy[used], time)
+        weighted = basis * weight[used, None]
         gram += basis.T @ weighted
-        right += ((weighted.T @ slope) * along).sum(axis=1)
+        right += ((weighted.T @ slope[used]) * along).sum(axis=1)
     gram *= along @ along.T
     count = max(float(given.weight.sum()), 1e-30)
     prior = float((given.weight[..., None] * given.slope**2).sum()) / count
-    residual, noise = given.slope, 0.1 * prior
+    residual, noise = given.slope.copy(), 0.1 * prior
     for _ in range(2):  # the noise first guessed, then that of the residuals
         covariance = np.linalg.inv(gram + (noise / prior) * np.eye(size))
         found = covariance @ right
-        residual = np.stack(
-            [
-                slope - _basis(number, frequency, given.xy, time) @ (found[:, None] * along)
-                for slope, time in zip(given.slope, given.time_s, strict=True)
-            ]
-        )
+        for left, slope, time in zip(residual, given.slope, given.time_s, strict=True):
+            basis = _basis(number, frequency, given.xy[used], time)
+            left[used] = slope[used] - basis @ (found[:, None] * along)
         noise = float((given.weight[..., None] * residual**2).sum()) / (2.0 * count)
     return _Fit(found, np.asarray(covariance * noise, np.float64), residual)
 
