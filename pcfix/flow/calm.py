@@ -26,7 +26,7 @@ from pcfix.io.files import replaced_when_whole, scratch_arrays
 from pcfix.io.frames import Frames, check_calm, read_frames, write_calm, write_spread
 from pcfix.io.rasters import filled_heights, new_raster, open_raster, write_part
 from pcfix.kernels import threads
-from pcfix.model import BoolArray, FloatArray, Lens, WaterRaster
+from pcfix.model import FloatArray, Lens, WaterRaster
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import CalmOptions
 from pcfix.photos.calm import (
@@ -153,7 +153,8 @@ def _standing(frames: int) -> Registration:
 
 
 def _registered(frames: Frames, count: _Counted) -> Registration:
-    follower, places = None, list[FloatArray]()
+    follower: Follower | None = None
+    places: list[FloatArray] = []
     for frame in count(frames):
         follower = follower or Follower(frame)
         places.append(follower.follow(frame) if places else follower.full(follower.at))
@@ -269,7 +270,7 @@ def _water(
     nodes = nodes_of(view, given.resolution)
     measure = Displacements(median, view, nodes)
     interval = given.interval * given.every if given.interval else frames.interval_s
-    times = np.arange(len(stack)) * (interval or 0.0)
+    times = np.arange(len(stack), dtype=np.float64) * (interval or 0.0)
     shifts, weights = (
         np.zeros((len(stack), len(nodes.xy), 2)),
         np.zeros((len(stack), len(nodes.xy))),
@@ -286,11 +287,11 @@ def _water(
         slope = np.stack(
             [slopes_of(view, nodes.xy, *one) for one in zip(heights, shifts, strict=True)]
         )
-        known: BoolArray = np.asarray(np.isfinite(slope).all(axis=2))
+        known = np.isfinite(slope.sum(axis=2))
         if not (known & (weights > 0.0)).any():
             raise GeometryError("no part of the image shows a bed under moving water; check depth.")
         data = Slopes(
-            np.where(known[..., None], slope, 0.0), np.where(known, weights, 0.0), times,
+            np.nan_to_num(slope), np.where(known, weights, 0.0), times,
             nodes.xy - middle, nodes.shape, nodes.cell_m,
         )  # fmt: skip
         waves = _waves(data, depth, tied=interval is not None)

@@ -29,6 +29,10 @@ time, and fitted by least squares to the slopes of all frames at once, weighted 
 the bed, with a prior of the slopes' own variance. Where the time between frames is not known,
 each frame is fitted alone.
 
+The median over few frames is not calm water: it keeps about the mean of each wave over them, and the
+slopes lack it. So what is fitted is each wave less its mean over the frames; of one that hardly turns
+meanwhile little is left, and its standard error says so.
+
 What it cannot know: the mean level; waves longer than twice the image, or shorter than three
 cells; and, where there is no land that holds the frames still, the part of the waves that looks
 like a move of the camera.
@@ -36,7 +40,7 @@ like a move of the camera.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -293,10 +297,18 @@ class _Fit(NamedTuple):
     residual: FloatArray
 
 
-def _basis(number: FloatArray, frequency: FloatArray, xy: FloatArray, time_s: float) -> FloatArray:
-    """Return what unit slopes of cosines and sines of height give along their waves, (n, 2 m)."""
-    angle = xy @ number.T - frequency * time_s
-    return np.hstack([-np.sin(angle), np.cos(angle)])
+def _bases(given: Slopes, number: FloatArray, frequency: FloatArray) -> Iterator[FloatArray]:
+    """Yield what unit slopes of cosines and sines of height give along their waves, (n, 2 m).
+
+    One for each frame, less the mean over the frames, which the median has kept.
+    """
+    place = np.exp(1j * (given.xy @ number.T))
+    turn = np.exp(-1j * given.time_s[:, None] * frequency)
+    if len(turn) > 1:
+        turn -= turn.mean(axis=0)
+    for one in turn:
+        wave = place * one
+        yield np.hstack([-wave.imag, wave.real])
 
 
 def _solved(given: Slopes, number: FloatArray, frequency: FloatArray) -> _Fit:
@@ -305,8 +317,9 @@ def _solved(given: Slopes, number: FloatArray, frequency: FloatArray) -> _Fit:
     size = len(along)
     gram, right = np.zeros((size, size)), np.zeros(size)
     used = np.flatnonzero((given.weight > 0.0).any(axis=0))
-    for slope, weight, time in zip(given.slope, given.weight, given.time_s, strict=True):
-        basis = _basis(number, frequency, given.xy[used], time)
+    part = given._replace(xy=given.xy[used])
+    bases = _bases(part, number, frequency)
+    for basis, slope, weight in zip(bases, given.slope, given.weight, strict=True):
         weighted = basis * weight[used, None]
         gram += basis.T @ weighted
         right += ((weighted.T @ slope[used]) * along).sum(axis=1)
@@ -317,8 +330,8 @@ def _solved(given: Slopes, number: FloatArray, frequency: FloatArray) -> _Fit:
     for _ in range(2):  # the noise first guessed, then that of the residuals
         covariance = np.linalg.inv(gram + (noise / prior) * np.eye(size))
         found = covariance @ right
-        for left, slope, time in zip(residual, given.slope, given.time_s, strict=True):
-            basis = _basis(number, frequency, given.xy[used], time)
+        bases = _bases(part, number, frequency)
+        for basis, left, slope in zip(bases, residual, given.slope, strict=True):
             left[used] = slope[used] - basis @ (found[:, None] * along)
         noise = float((given.weight[..., None] * residual**2).sum()) / (2.0 * count)
     return _Fit(found, np.asarray(covariance * noise, np.float64), residual)
