@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from pcfix.clean.points import clean_points
     from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
     from pcfix.flow.adjust import adjust_cameras
+    from pcfix.flow.calm import calm_frames
     from pcfix.flow.clean import clean_file
     from pcfix.flow.compare import compare_clouds
     from pcfix.flow.correct import correct_file, correct_points
@@ -48,6 +49,7 @@ _NAMES = {
     "pcfix.clean.points": "clean_points",
     "pcfix.errors": "GeometryError InputError PcfixError PcfixWarning SettingError",
     "pcfix.flow.adjust": "adjust_cameras",
+    "pcfix.flow.calm": "calm_frames",
     "pcfix.flow.clean": "clean_file",
     "pcfix.flow.compare": "compare_clouds",
     "pcfix.flow.correct": "correct_file correct_points",
@@ -89,6 +91,7 @@ __all__ = [
     "WaterSurface",
     "__version__",
     "adjust_cameras",
+    "calm_frames",
     "clean_file",
     "clean_points",
     "compare_clouds",

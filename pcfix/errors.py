@@ -3,7 +3,9 @@
 Each message is one sentence that a person can act on: the file, the value, the rule, the remedy.
 """
 
+import importlib
 import sys
+from typing import Any
 
 
 class PcfixError(Exception):
@@ -24,6 +26,16 @@ class GeometryError(PcfixError):
 
 class PcfixWarning(UserWarning):
     """Something that was done on the user's behalf and that they should know of."""
+
+
+def photo_library(name: str) -> Any:
+    """Return a library of the extra ``photos``, or say how to get it."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(
+            f"Photographs need {name}, which is not installed; run: pip install 'pcfix[photos]'."
+        ) from error
 
 
 def show_warning(

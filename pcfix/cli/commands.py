@@ -13,7 +13,7 @@ import pcfix
 from pcfix.cli.flags import FLAGS, Quiet, UsageError, check_needed, progress_bar, say, status_line
 from pcfix.options.correct import CorrectOptions, LabelOptions
 from pcfix.options.declare import options_of
-from pcfix.options.photos import OrthoOptions, PhotosOptions
+from pcfix.options.photos import CalmOptions, OrthoOptions, PhotosOptions
 from pcfix.options.scenes import DemoOptions, SimulateOptions
 from pcfix.options.shared import JobOptions
 from pcfix.options.steps import CleanOptions, CompareOptions, DsmOptions
@@ -238,6 +238,22 @@ def compare(
     say(comparison_text(result), quiet)
 
 
+def calm(
+    frames: Annotated[Path, Parameter(help="Folder of photographs, or a video.")],
+    out: Annotated[Path, Parameter(help="Image to write, of the frames' format; PNG of a video.")],
+    /,
+    *,
+    options: Annotated[CalmOptions, FLAGS] = CalmOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Make of a sequence of one place through waves the image through calm water."""
+    from pcfix.report.text import calm_text
+
+    with progress_bar("Calming", quiet) as progress:
+        result = pcfix.calm_frames(frames, out, options=options, progress=progress)
+    say(calm_text(result), quiet)
+
+
 def cameras(
     path: Annotated[Path, Parameter(help="File or folder of camera poses.")],
     /,
@@ -326,6 +342,7 @@ EXAMPLES: tuple[tuple[Callable[..., None], str], ...] = (
     (ortho, "pcfix ortho images bed.tif --cameras cameras.xml --dsm dsm.tif --water 0.37"),
     (compare, "pcfix compare cleaned.laz lidar.laz --submerged"),
     (photos, "pcfix photos images dry --cameras cameras.xml --dsm bed.tif --water 0.37"),
+    (calm, "pcfix calm frames calm.jpg --surface --depth 2.5 --gsd 0.01 --interval 0.2"),
     (cameras, "pcfix cameras cameras.xml --cloud cloud.laz --water 0.37 --plot block.png"),
     (water, "pcfix water shore.csv --cloud cloud.laz --plot water.png"),
     (restore, "pcfix restore corrected.laz cloud.laz"),

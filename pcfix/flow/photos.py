@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from pcfix.flow.runner import Progress, check_summary, json_text, write_summary
 from pcfix.io.files import file_state, read_json, write_text
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
 from pcfix.io.rasters import filled_heights, open_raster
+from pcfix.io.water_rasters import read_water_raster
 from pcfix.kernels import cores, threads
 from pcfix.model import Cameras, FloatArray, Lens, WaterDimension, WaterSurface
 from pcfix.options.declare import File, taken
@@ -119,6 +120,8 @@ class Block:
         Of the DSM, which all is in.
     gsd_m : float
         A pixel on the lowest ground, median of the photographs.
+    waters : dict
+        Rasters of the water of some photographs, by their stems.
     """
 
     paths: tuple[Path, ...]
@@ -128,6 +131,13 @@ class Block:
     notes: tuple[str, ...]
     crs: Any
     gsd_m: float
+    waters: dict[str, Path]
+
+    def scene_of(self, path: Path) -> Scene:
+        """Return what a photograph sees, through its own water where that is known."""
+        if path.stem not in self.waters:
+            return self.scene
+        return replace(self.scene, water=read_water_raster(self.waters[path.stem], self.crs))
 
 
 def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> Block:
@@ -156,14 +166,17 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> Block:
     rotations: Any = cameras.rotations
     photos = tuple(
         Photo(
-            cameras.labels[row], cameras.centres[row], rotations[row], _lens_of(path, cameras, row)
+            cameras.labels[row],
+            cameras.centres[row],
+            rotations[row],
+            lens_of(path, cameras, row, size_of(path)),
         )
         for path, row in zip(mine, theirs, strict=True)
     )
     gsd = _ground_pixel_m(photos, ground)
     step = given.spacing or max(LEAST_STEP_PX, int(np.ceil(ground.cell_m / gsd)))
-    scene = Scene(ground, surface, index)
-    return Block(tuple(mine), photos, scene, step, (*notes, *more), crs, gsd)
+    scene, (waters, few) = Scene(ground, surface, index), _waters(given, mine)
+    return Block(tuple(mine), photos, scene, step, (*notes, *more, *few), crs, gsd, waters)
 
 
 def check_above(centres: FloatArray, water: WaterSurface, name: str) -> None:
@@ -174,6 +187,22 @@ def check_above(centres: FloatArray, water: WaterSurface, name: str) -> None:
             f"{name}: {int(under.sum())} of {len(centres)} cameras do not stand above the water,"
             f" the lowest at {centres[:, 2].min():.1f} m; check the CRS and vertical datum of both."
         )
+
+
+def _waters(given: PhotosOptions, paths: list[Path]) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """Return the rasters of the water that belong to photographs, and a note on the others."""
+    if given.water_per_image is None:
+        return {}, ()
+    folder = Path(given.water_per_image)
+    own = {path.stem: folder / f"{path.stem}.tif" for path in paths}
+    found = {stem: path for stem, path in own.items() if path.is_file()}
+    if not found:
+        raise InputError(
+            f"{folder}: holds no raster of a photograph's name, as {paths[0].stem}.tif; give the"
+            " folder that 'pcfix calm --surface' wrote."
+        )
+    lost = len(paths) - len(found)
+    return found, (f"{lost} photographs have no water of their own in {folder}.",) * (lost > 0)
 
 
 def _heights(
@@ -241,9 +270,9 @@ def _matched(
     return mine, [row for row in rows if row >= 0], tuple(notes)
 
 
-def _lens_of(path: Path, cameras: Cameras, row: int) -> Lens:
-    """Return the lens in pixels of the photograph, whose size it must have."""
-    columns, rows = size_of(path)
+def lens_of(path: Path, cameras: Cameras, row: int, size: tuple[int, int]) -> Lens:
+    """Return the lens in pixels of a photograph of so many columns and rows, which it must have."""
+    columns, rows = size
     lenses: Any = cameras.lenses
     lens: Lens = lenses[row]
     if lens.unit == "px":
@@ -282,6 +311,7 @@ def _begin(target: Path, given: PhotosOptions, block: Block, *, overwrite: bool)
     for name in ("overwrite", "jobs", "summary"):
         asked.pop(name)
     files = [given.cameras, given.dsm, given.sensor, given.water]
+    files += block.waters.values()
     states = [file_state(Path(f)) for f in files if f is not None and Path(str(f)).exists()]
     record = {"pcfix": __version__, "asked": asked, "files": states}
     place = target / RECORD
@@ -329,7 +359,7 @@ def _all(
 
 
 def _one(path: Path, photo: Photo, block: Block, way: Callable[..., Any], target: Path) -> _Done:
-    shifts = way(photo, block.scene, block.step_px)
+    shifts = way(photo, block.scene_of(path), block.step_px)
     found = resample(read_photograph(path), shifts)
     write_photograph(path, target / path.name, found.image, found.touched)
     pixels = found.touched.size

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, photo_library
 from pcfix.io.files import replaced_when_whole
 from pcfix.model import BoolArray
 
@@ -85,13 +85,13 @@ def read_colours(path: Path) -> Pixels:
 def _pixels(path: Path) -> Pixels:
     suffix = path.suffix.lower()
     if suffix in TIFF:
-        import tifffile
+        tifffile = photo_library("tifffile")
 
         with tifffile.TiffFile(path) as file:
             page = file.pages[0]
             return page.asarray() if page.planarconfig == 1 else np.moveaxis(page.asarray(), 0, -1)
     if suffix in PNG:
-        import cv2
+        cv2 = photo_library("cv2")
 
         found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if found is None:
@@ -144,7 +144,7 @@ def write_photograph(source: Path, target: Path, pixels: Pixels, touched: BoolAr
 
 def _write_jpeg(source: Path, draft: Path, pixels: Pixels, touched: BoolArray) -> None:
     """Write the blocks that were touched anew, by the tables of the source, and copy the others."""
-    import jpeglib
+    jpeglib = photo_library("jpeglib")
     from PIL import Image
     from PIL.JpegImagePlugin import JpegImageFile, get_sampling
 
@@ -175,7 +175,7 @@ def _any_in_blocks(touched: BoolArray, side: npt.NDArray[Any], shape: tuple[int,
 
 def _write_tiff(source: Path, draft: Path, pixels: Pixels, touched: BoolArray) -> None:
     """Write the pixels into a copy where they lie plain; else a new file with the same tags."""
-    import tifffile
+    tifffile = photo_library("tifffile")
 
     with tifffile.TiffFile(source) as file:
         page = file.pages[0]
@@ -208,7 +208,7 @@ _TIFF_KEPT = {270, 271, 272, 274, 282, 283, 296, 305, 306, 315, 700, 33432, 3355
 
 def _write_png(source: Path, draft: Path, pixels: Pixels, touched: BoolArray) -> None:
     """Write the pixels, and every other chunk of the source."""
-    import cv2
+    cv2 = photo_library("cv2")
 
     _, data = cv2.imencode(".png", pixels)
     new, old = _chunks(data.tobytes()), _chunks(source.read_bytes())

@@ -130,6 +130,19 @@ class OrthoRules(OptionSet):
 
 
 @dataclass(frozen=True, kw_only=True)
+class WaterPerImageOption(OptionSet):
+    """Water that is another for each photograph."""
+
+    panel = Panel.WATER
+
+    water_per_image: File | None = option(
+        None,
+        "Folder of rasters of the water, each of the name of a photograph, as 'pcfix calm"
+        " --surface' writes them; the others go by --water.",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class OrthoOptions(
     JobOptions,
     SummaryOption,
@@ -144,6 +157,7 @@ class OrthoOptions(
 
 @dataclass(frozen=True, kw_only=True)
 class PhotosOptions(
+    WaterPerImageOption,
     JobOptions,
     SummaryOption,
     RebuildOptions,
@@ -156,3 +170,88 @@ class PhotosOptions(
     CamerasOptions,
 ):
     """The options of ``pcfix photos``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WavesOptions(OptionSet):
+    """The water surface from what waves do to the frames."""
+
+    panel = Panel.WATER
+
+    surface: bool = option(
+        False,
+        "Also the water surface of each frame, from how far the bed is displaced in it: rasters in"
+        " OUT_water, which --water-per-image of 'pcfix photos' takes.",
+    )
+    depth: Any = option(
+        None,
+        "With --surface: the true depth in metres, or heights of the bed: a GeoTIFF or cloud, taken"
+        " as it appears through the water where pcfix did not correct it.",
+        metavar="SPEC",
+    )
+    level: float = option(0.0, "With --surface: height of the calm water.", unit="m")
+    cameras: Any = option(
+        None,
+        "With --surface: the pose of the hovering camera, that of the first frame by its name, or"
+        " the only one in the file.",
+        metavar="PATH",
+    )
+    gsd: float | None = option(
+        None,
+        "With --surface, instead of --cameras, for a view straight down: the size of a pixel at the"
+        " bed.",
+        unit="m",
+        rule=METRES,
+    )
+    interval: float | None = option(
+        None,
+        "With --surface: time between frames, before --every; without it each stands alone.",
+        unit="s",
+        rule=positive("{option} {value:g} is not positive; give seconds."),
+        default_is="what the video says",
+    )
+    resolution: float | None = option(
+        None,
+        "Of the rasters of the water.",
+        unit="m",
+        rule=METRES,
+        default_is="so that it has 2,000 cells",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalmOptions(JobOptions, SummaryOption, CameraFileOptions, IndexOptions, WavesOptions):
+    """The options of ``pcfix calm``."""
+
+    panel = Panel.METHOD
+
+    every: int = option(
+        1,
+        "Take every so many frames.",
+        rule=must_be(1, 100_000, "give 2 for every other one", whole=True),
+    )
+
+    still: bool = option(
+        False,
+        "The camera stood still, as on a mast: frames are taken as they are. Else they are laid on"
+        " the first by what moves least; without land the waves of the first move the image a bit.",
+    )
+
+    def check(self) -> None:
+        """Check what options say together."""
+        super().check()
+        if not self.surface:
+            for name in ("depth", "cameras", "gsd", "interval"):
+                if getattr(self, name) is not None:
+                    raise SettingError(f"{name} is of no use without surface; add it, or leave it.")
+            return
+        if self.depth is None:
+            raise SettingError(
+                "surface needs depth, which says how far a slope displaces the bed; give metres, or"
+                " heights of the bed."
+            )
+        if (self.cameras is None) == (self.gsd is None):
+            raise SettingError(
+                "surface needs either cameras, the pose of the hovering camera, or gsd, the size of"
+                " a pixel at the bed in metres."
+            )

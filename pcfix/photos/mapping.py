@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pcfix.errors import photo_library
 from pcfix.lens.imaging import project, unproject
 from pcfix.model import BoolArray, FloatArray, Lens, WaterMesh, WaterPlane, WaterRaster
 from pcfix.photos.ground import Ground
@@ -177,7 +178,7 @@ def _as_grid(step_px: int, shift: FloatArray, known: BoolArray, shape: tuple[int
 
 def _inverse(forward: Shifts) -> FloatArray:
     """Return for each node q the p - q with p + shift(p) = q."""
-    import cv2
+    cv2 = photo_library("cv2")
 
     rows, columns = forward.known.shape
     here = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=2).astype(np.float32)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from pcfix.errors import photo_library
 from pcfix.model import BoolArray
 from pcfix.photos.mapping import Shifts
 
@@ -57,7 +58,7 @@ def resample(image: npt.NDArray[Any], shifts: Shifts) -> Resampled:
 
 def _strip(shifts: Shifts, top: int, bottom: int, columns: int) -> tuple[Any, BoolArray]:
     """Return shifts and what is not known of some rows, from the nodes around them."""
-    import cv2
+    cv2 = photo_library("cv2")
 
     step = shifts.step_px
     first, last = top // step, -(-bottom // step) + 2  # nodes half a step above and below
@@ -72,7 +73,7 @@ def _strip(shifts: Shifts, top: int, bottom: int, columns: int) -> tuple[Any, Bo
 
 
 def _looked_up(image: npt.NDArray[Any], shift: Any, top: int) -> npt.NDArray[Any]:
-    import cv2
+    cv2 = photo_library("cv2")
 
     rows, columns = shift.shape[:2]
     u = np.arange(columns, dtype=np.float32)[None, :] + shift[..., 0]

@@ -10,6 +10,7 @@ from pcfix.clean.points import CleanSummary
 from pcfix.grid.model import DsmSummary
 from pcfix.options.correct import LEVEL_M
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
+from pcfix.photos.calm import CalmSummary
 from pcfix.refract.tally import ORDERS, Summary
 
 if TYPE_CHECKING:
@@ -370,4 +371,26 @@ def dsm_text(summary: DsmSummary) -> str:
         )
     if s.hillshade is not None:
         lines.append(f"hillshade    {s.hillshade}")
+    return "\n".join(lines)
+
+
+def calm_text(summary: CalmSummary) -> str:
+    """Return what a person wants to know of an image through calm water."""
+    s = summary
+    lines = [
+        f"{s.input} -> {s.output}",
+        f"frames       {s.frames} of {s.columns:,} x {s.rows:,} pixels in {s.seconds:.1f} s",
+        f"registered   by {s.corners:,} corners, of which half scatter by less than"
+        f" {s.scatter_px:.2f} px; the camera moved by up to {s.moved_px:.1f} px"
+        if s.corners
+        else "registered   not at all: the camera stood still",
+        f"spread       median {s.spread:.1f} grey values: {s.spread_file}",
+    ]
+    if s.water is not None:
+        w = s.water
+        lines.append(
+            f"water        {w.waves} waves, slopes of {w.slope_deg:.2f} deg rms, heights of"
+            f" {100 * w.height_m:.1f} cm rms with a standard error of {100 * w.sigma_m:.1f} cm,"
+            f" {100 * w.explained:.0f} % of the slopes explained: {w.folder}"
+        )
     return "\n".join(lines)

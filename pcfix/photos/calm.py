@@ -1,0 +1,321 @@
+"""The image through calm water, from many through waves: registration, and the pixel-wise median.
+
+Mulsow 2024, "strategies for wavy water", the simple method: a wave moves what a pixel sees of the
+bed to and fro about where calm water would have it, so that the median over a sequence is about the
+image taken through flat water. First the camera, which hovers but does not stand, is held still:
+each frame is laid onto the first by a homography.
+
+What the homographies go by is what does not move. Corners of the first frame are followed through
+all the others; how far one scatters, once the frames lie on each other, is how much waves move it,
+and it counts by the inverse of its variance. So land decides where there is some, and elsewhere
+many corners, each about its own mean over the frames, of which the first is only one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from pcfix.errors import photo_library
+from pcfix.model import BoolArray, FloatArray
+
+FOLLOWED_PX = 2048
+"""Longer sides of images in which corners are followed; larger ones are reduced."""
+COARSE_PX = 1024
+"""And in which features are matched, which says where to begin."""
+CORNERS = 2000
+LEAST_CORNERS = 12
+RETURN_PX = 0.7
+"""A corner that is followed there and back comes home so nearly."""
+OUTLIER_PX = 5.0
+"""Waves move corners about; what lies farther off, of an image as it was reduced, is a mismatch."""
+ROUNDS = 20
+STILL_PX = 0.1
+"""Scatter below which corners do not count more: what following a corner is good for."""
+SORTED_BYTES = 200_000_000
+"""Of the frames of a strip at once, in single precision."""
+
+
+def grey8(image: npt.NDArray[Any], longest_px: int | None = None) -> npt.NDArray[np.uint8]:
+    """Return an image, shape (rows, columns, bands), as grey of 8 bits, reduced where larger.
+
+    The bands count alike; of images of more bits the darkest and brightest percent are cut off.
+    """
+    cv2 = photo_library("cv2")
+    grey = image[..., :3].mean(axis=2, dtype=np.float32)
+    step = 1.0 if longest_px is None else max(1.0, max(grey.shape) / longest_px)
+    if step > 1.0:
+        size = (round(grey.shape[1] / step), round(grey.shape[0] / step))
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    if image.dtype != np.uint8:
+        low, high = np.percentile(grey, (1.0, 99.0))
+        grey = (grey - low) * (255.0 / max(high - low, 1e-9))
+    return np.asarray(np.clip(np.rint(grey), 0, 255).astype(np.uint8))
+
+
+@dataclass(eq=False)
+class Follower:
+    """The corners of a first frame, which are found again in others.
+
+    Attributes
+    ----------
+    first : array, shape (rows, columns, bands)
+        The frame.
+    """
+
+    first: npt.NDArray[Any]
+    at: FloatArray = field(init=False)
+    _grey: Any = field(init=False)
+    _features: Any = field(init=False)
+
+    def __post_init__(self) -> None:
+        cv2 = photo_library("cv2")
+        self._grey = grey8(self.first, FOLLOWED_PX)
+        self.scale = self.first.shape[1] / self._grey.shape[1]
+        apart = max(self._grey.shape) / 80.0
+        found = cv2.goodFeaturesToTrack(self._grey, CORNERS, 0.01, apart)
+        self.at = np.empty((0, 2)) if found is None else found[:, 0].astype(np.float64)
+        self._features = _features(self._grey)
+
+    def follow(self, frame: npt.NDArray[Any]) -> FloatArray:
+        """Return where the corners lie in another frame, in pixels of it, shape (k, 2), or NaN."""
+        cv2 = photo_library("cv2")
+        lost = np.full(self.at.shape, np.nan)
+        grey = grey8(frame, FOLLOWED_PX)
+        coarse = _coarse(self._features, _features(grey))
+        if coarse is None or len(self.at) < LEAST_CORNERS:
+            return lost
+        start = self.at.astype(np.float32)[:, None]
+        guess = cv2.perspectiveTransform(start, coarse)
+        there, back = self._flow(grey, start, guess)
+        away = np.hypot(*(back - start)[:, 0].T)
+        return np.where((away < RETURN_PX)[:, None], self.full(there[:, 0]), lost)
+
+    def _flow(self, grey: Any, start: Any, guess: Any) -> tuple[Any, Any]:
+        cv2 = photo_library("cv2")
+        how: dict[str, Any] = {
+            "winSize": (21, 21), "maxLevel": 2, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+        }  # fmt: skip
+        there, found, _ = cv2.calcOpticalFlowPyrLK(self._grey, grey, start, guess.copy(), **how)
+        back, again, _ = cv2.calcOpticalFlowPyrLK(grey, self._grey, there, start.copy(), **how)
+        back[(found & again).ravel() == 0] = np.inf
+        return there, back
+
+    def full(self, places: FloatArray) -> FloatArray:
+        """Return places in the reduced image as those in the whole one; centres are whole."""
+        return np.asarray((places + 0.5) * self.scale - 0.5, np.float64)
+
+
+def _features(grey: Any) -> tuple[FloatArray, Any]:
+    """Return places, in pixels of the image, and descriptors."""
+    cv2 = photo_library("cv2")
+    step = max(1.0, max(grey.shape) / COARSE_PX)
+    small = cv2.resize(grey, None, fx=1.0 / step, fy=1.0 / step, interpolation=cv2.INTER_AREA)
+    keys, described = cv2.SIFT_create(nfeatures=1500).detectAndCompute(small, None)
+    return np.array([key.pt for key in keys], np.float32).reshape(-1, 2) * step, described
+
+
+def _coarse(one: tuple[FloatArray, Any], other: tuple[FloatArray, Any]) -> Any:
+    """Return the homography from an image to another, or None."""
+    cv2 = photo_library("cv2")
+    if min(len(one[0]), len(other[0])) < LEAST_CORNERS:
+        return None
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(one[1], other[1], k=2)
+    good = [p[0] for p in pairs if len(p) == 2 and p[0].distance < 0.8 * p[1].distance]
+    if len(good) < LEAST_CORNERS:
+        return None
+    mine = one[0][[match.queryIdx for match in good]]
+    theirs = other[0][[match.trainIdx for match in good]]
+    found, kept = cv2.findHomography(mine, theirs, cv2.RANSAC, OUTLIER_PX)
+    return None if found is None or kept.sum() < LEAST_CORNERS else found
+
+
+class Registration(NamedTuple):
+    """How frames lie on the first.
+
+    Attributes
+    ----------
+    homography : array, shape (f, 3, 3)
+        From pixels of a frame to pixels of the first, the centre of the first pixel at (0, 0); NaN
+        where a frame could not be laid on it.
+    scatter_px : array, shape (k,)
+        Of each corner that counted, an axis.
+    """
+
+    homography: FloatArray
+    scatter_px: FloatArray
+
+
+def register(places: FloatArray) -> Registration:
+    """Lay frames onto the first by corners, the still ones before the others.
+
+    Parameters
+    ----------
+    places : array, shape (f, k, 2)
+        Where corners lie in each frame, pixels; NaN where one was not found.
+    """
+    cv2 = photo_library("cv2")
+    found = np.isfinite(places[..., 0])
+    often = found & (found.sum(axis=0) >= max(2, len(places) // 2))
+    ways = np.full((len(places), 3, 3), np.nan)
+    for way, there, known in zip(ways, places, often & often[0], strict=True):
+        if known.sum() >= LEAST_CORNERS:
+            first = cv2.findHomography(there[known], places[0][known], cv2.RANSAC, OUTLIER_PX)[0]
+            way[:] = np.nan if first is None else first
+    scatter = np.empty(0)
+    for _ in range(ROUNDS):
+        on = np.stack([_moved(way, there) for way, there in zip(ways, places, strict=True)])
+        on[~often] = np.nan
+        counted = np.flatnonzero(np.isfinite(on[..., 0]).sum(axis=0) >= 2)
+        mean = np.nanmedian(on[:, counted], axis=0)
+        off = np.hypot(*np.moveaxis(on[:, counted] - mean, 2, 0))
+        scatter = np.maximum(np.nanmedian(off, axis=0) / 1.1774, STILL_PX)  # Rayleigh's median
+        weight = np.minimum(1.0, 2.0 * scatter / np.maximum(off, 1e-9)) / scatter**2
+        for way, there, each in zip(ways, places[:, counted], weight, strict=True):
+            known = np.isfinite(each)
+            if known.sum() >= LEAST_CORNERS:
+                way[:] = _fitted(there[known], mean[known], each[known])
+    ways = np.linalg.inv(ways[0]) @ ways
+    ways[0] = np.eye(3)  # to the last bit
+    return Registration(ways, scatter)
+
+
+def _moved(way: FloatArray, places: FloatArray) -> FloatArray:
+    whole = np.column_stack([places, np.ones(len(places))]) @ way.T
+    return np.asarray(whole[:, :2] / whole[:, 2:])
+
+
+def _fitted(one: FloatArray, other: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the homography between places by weighted least squares, linear: it is near 1."""
+    middle, size = one.mean(axis=0), one.std() + 1e-9
+    (x, y), (u, v) = ((one - middle) / size).T, ((other - middle) / size).T
+    zero, full = np.zeros(len(x)), np.ones(len(x))
+    rows = np.vstack(
+        [
+            np.column_stack([x, y, full, zero, zero, zero, -u * x, -u * y]),
+            np.column_stack([zero, zero, zero, x, y, full, -v * x, -v * y]),
+        ]
+    )
+    root = np.sqrt(np.tile(weight, 2))
+    found = np.linalg.lstsq(rows * root[:, None], np.concatenate([u, v]) * root, rcond=None)[0]
+    scale = np.array([[size, 0.0, middle[0]], [0.0, size, middle[1]], [0.0, 0.0, 1.0]])
+    return np.asarray(scale @ np.append(found, 1.0).reshape(3, 3) @ np.linalg.inv(scale))
+
+
+def laid(frame: npt.NDArray[Any], way: FloatArray) -> npt.NDArray[Any]:
+    """Return a frame, shape (rows, columns, bands), as the first lies; bicubic."""
+    cv2 = photo_library("cv2")
+    rows, columns, bands = frame.shape
+    out = np.empty_like(frame)
+    for first in range(0, bands, 4):
+        part = np.ascontiguousarray(frame[..., first : first + 4])
+        found = cv2.warpPerspective(
+            part, way, (columns, rows), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+        )
+        out[..., first : first + 4] = found.reshape(part.shape)
+    return out
+
+
+def covered(way: FloatArray, shape: tuple[int, int], top: int, bottom: int) -> BoolArray:
+    """Return where a frame, laid, covers rows from `top` to `bottom` of the first."""
+    rows, columns = shape
+    edge = np.array([[0.0, 0.0], [columns, 0.0], [columns, rows], [0.0, rows]]) - 0.5
+    corners = _moved(way, edge) - [0.0, top]
+    inside = np.ones((bottom - top, columns), bool)
+    x, y = np.arange(columns)[None, :], np.arange(bottom - top)[:, None]
+    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        inside &= (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) >= -1e-6 * np.hypot(columns, rows)
+    return inside
+
+
+def strip_rows(frames: int, columns: int, bands: int) -> int:
+    """Return how many rows of all frames are sorted at once."""
+    return max(1, SORTED_BYTES // (4 * frames * columns * bands))
+
+
+def median_of(
+    frames: npt.NDArray[Any], known: BoolArray
+) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32]]:
+    """Return the median over frames and how far they spread about it.
+
+    Parameters
+    ----------
+    frames : array, shape (f, rows, columns, bands)
+        Laid on each other; of one type.
+    known : array of bool, shape (f, rows, columns)
+        Where each has pixels; somewhere for every pixel, or the median is 0.
+
+    Returns
+    -------
+    median : array, shape (rows, columns, bands)
+        Of the frames' type.
+    spread : array, shape (rows, columns)
+        1.4826 times the median of the absolute deviations, the standard deviation of normal
+        noise; mean over the bands, NaN where fewer than three frames are known.
+    """
+    count = known.sum(axis=0)[..., None, None]
+    values = frames.astype(np.float32)
+    values[~known] = np.inf
+    median = _middle(np.moveaxis(values, 0, -1), count)
+    np.abs(values - median, out=values, where=known[..., None])
+    spread = 1.4826 * _middle(np.moveaxis(values, 0, -1), count).mean(axis=2)
+    spread[count[..., 0, 0] < 3] = np.nan
+    whole = np.issubdtype(frames.dtype, np.integer)
+    return (np.rint(median) if whole else median).astype(frames.dtype), spread
+
+
+def _middle(values: npt.NDArray[np.float32], count: Any) -> npt.NDArray[np.float32]:
+    """Return the medians of the first so many along the last axis once they are sorted."""
+    ordered = np.sort(values, axis=-1)
+    low = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis=-1)
+    high = np.take_along_axis(ordered, np.minimum(count // 2, values.shape[-1] - 1), axis=-1)
+    middle = 0.5 * (low + high)[..., 0]
+    return np.where(count[..., 0] > 0, middle, np.float32(0.0))
+
+
+class WaterFound(NamedTuple):
+    """What is known of the water of a sequence: how many waves, rms values, and where it is."""
+
+    folder: str
+    waves: int
+    slope_deg: float
+    height_m: float
+    sigma_m: float
+    explained: float
+
+
+@dataclass(frozen=True)
+class CalmSummary:
+    """What `calm_frames` did.
+
+    Attributes
+    ----------
+    input, output, spread_file : str
+    frames, columns, rows : int
+    corners : int
+        By which the frames were laid on each other.
+    scatter_px, moved_px : float
+        Median scatter of a corner, an axis; how far at most the camera moved the frame's middle.
+    spread : float
+        Median over the image of how much the frames differ, grey values.
+    seconds : float
+    water : WaterFound or None
+    notes : tuple of str
+    """
+
+    input: str
+    output: str
+    spread_file: str
+    frames: int
+    columns: int
+    rows: int
+    corners: int
+    scatter_px: float
+    moved_px: float
+    spread: float
+    seconds: float
+    water: WaterFound | None
+    notes: tuple[str, ...] = ()

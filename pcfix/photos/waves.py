@@ -1,0 +1,410 @@
+"""The water surface above a bed, from how far waves displace the bed in the frames of a sequence.
+
+Mulsow 2024, "strategies for wavy water", the complex method: a spatio-temporal model of the
+surface.
+
+*From displacement to slope.* A camera ray s that looks straight down meets the surface where its
+normal is N = (-z_x, -z_y, 1), nearly. Snell's law in vector form (eq 10 of Skarlatos & Agrafiotis
+2018), t = r s + (r c - sqrt(1 - r^2 (1 - c^2))) N with r = 1/n and c = -N.s = 1, is to the first
+order t = r s - (1 - r) N = ((1 - r) z_x, (1 - r) z_y, -1): at the depth h the ray meets the bed
+displaced by
+
+    h (1 - 1/n) grad z
+
+from where it met it under calm water, a quarter of depth times slope. No need for the first
+order: the law says that n t - s is along the normal. Of a pixel p of a frame, s is known by the
+camera and the piercing point A by s and the level; the median image shows at p + d what the frame
+shows at p, and calm water puts that at the place Q of the bed. So t = (Q - A) / |Q - A|, N is
+along s - n t, and the slope is -N_xy / N_z: exact, for any angle of view. A needs the height of
+the water itself, which is zero at first and that of the first solution then.
+
+*From slopes to heights.* The surface is a sum of plane waves,
+
+    z(x, t) = sum a cos(k.x - w t) + b sin(k.x - w t),    w^2 = g k tanh(k h),
+
+which has no curl, needs no border, and ties the frames together: each wave runs as fast as water
+lets it (the dispersion relation; no current, no surface tension, the mean depth). The waves are
+chosen where the slopes have most energy on the dispersion shell of their spectrum, some at a
+time, and fitted by least squares to the slopes of all frames at once, weighted by the texture of
+the bed, with a prior of the slopes' own variance. Where the time between frames is not known,
+each frame is fitted alone.
+
+The median over few frames is not calm water: it keeps about the mean of each wave over them, and the
+slopes lack it. So what is fitted is each wave less its mean over the frames; of one that hardly turns
+meanwhile little is left, and its standard error says so.
+
+What it cannot know: the mean level; waves longer than twice the image, or shorter than three
+cells; and, where there is no land that holds the frames still, the part of the waves that looks
+like a move of the camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from pcfix.errors import GeometryError, photo_library
+from pcfix.lens.imaging import project, unproject
+from pcfix.model import BoolArray, FloatArray
+from pcfix.photos.calm import grey8
+from pcfix.photos.mapping import Photo
+
+GRAVITY = 9.81
+CELLS = 2000
+"""Of the rasters by default: more make more short waves, at a price of time."""
+MARGIN = 0.4
+"""Of the depth, by which the rasters go beyond what the camera sees of the level."""
+SHORTEST_CELLS = 3.0
+WAVES_AT_ONCE = 40
+ROUNDS = 6
+LEAST_GAIN = 0.003
+"""Of the slopes' energy that a further round must explain."""
+OVER_NOISE = 8.0
+"""Of the mean energy of the shell that a wave must have to be one."""
+STILL = 0.15
+"""Of the usual displacement; what moves less, over the whole sequence, is land."""
+
+
+class View(NamedTuple):
+    """What the frames are of: the first one's camera, calm water, and the true bed's height.
+
+    `bed` takes places in plan, shape (n, 2), and gives heights, shape (n,); NaN where not known.
+    """
+
+    photo: Photo
+    level_m: float
+    refractive_index: float
+    bed: Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Nodes:
+    """The cells of the rasters: their centres, and what of them the first frame sees.
+
+    Attributes
+    ----------
+    left_m, top_m, cell_m : float
+    shape : tuple of 2 int
+        Rows and columns.
+    xy : array, shape (n, 2)
+        Centres, world frame, row by row from the north.
+    seen : array of bool, shape (n,)
+        In the image and over water.
+    """
+
+    left_m: float
+    top_m: float
+    cell_m: float
+    shape: tuple[int, int]
+    xy: FloatArray
+    seen: BoolArray
+
+
+def on_level(view: View, pixels: FloatArray) -> FloatArray:
+    """Return where the straight rays of pixels meet the level, shape (n, 3)."""
+    ray = unproject(view.photo.lens, pixels) @ view.photo.rotation
+    far = (view.level_m - view.photo.centre[2]) / ray[:, 2]
+    return np.asarray(view.photo.centre + np.where(far > 0.0, far, np.nan)[:, None] * ray)
+
+
+def bed_places(view: View, pixels: FloatArray) -> FloatArray:
+    """Return where pixels see the bed through calm water, shape (n, 3), by eq 10 on a level."""
+    start = on_level(view, pixels)
+    ray = start - view.photo.centre
+    ray /= np.linalg.norm(ray, axis=1)[:, None]
+    bent = ray / view.refractive_index
+    bent[:, 2] = -np.sqrt(1.0 - (bent[:, :2] ** 2).sum(axis=1))
+    place = start
+    for _ in range(10):
+        far = (view.bed(place[:, :2]) - start[:, 2]) / bent[:, 2]
+        place = start + far[:, None] * bent
+    return place
+
+
+def nodes_of(view: View, cell_m: float | None) -> Nodes:
+    """Return the cells over what the camera sees of the level."""
+    lens = view.photo.lens
+    u, v = np.linspace(0.0, lens.width, 20), np.linspace(0.0, lens.height, 20)
+    edge = np.array([[a, b] for a in u for b in v if a in u[[0, -1]] or b in v[[0, -1]]])
+    outline = on_level(view, edge)[:, :2]
+    if not np.isfinite(outline).all():
+        raise GeometryError(
+            "the camera does not look down onto the water with its whole image; check the pose, and"
+            " level."
+        )
+    cell = cell_m or float(np.sqrt(np.ptp(outline, axis=0).prod() / CELLS))
+    depth = float(np.nanmedian(view.level_m - view.bed(outline)))
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    beyond = max(cell, MARGIN * depth)
+    west, north = np.floor((low[0] - beyond) / cell), np.ceil((high[1] + beyond) / cell)
+    left, top = west * cell, north * cell
+    columns, rows = (int(n) for n in np.ceil((high - low + 2.0 * beyond) / cell) + 1)
+    x, y = left + (np.arange(columns) + 0.5) * cell, top - (np.arange(rows) + 0.5) * cell
+    xy = np.column_stack([np.tile(x, rows), np.repeat(y, columns)])
+    pixel = _pixels(view, np.column_stack([xy, np.full(len(xy), view.level_m)]))
+    inside = ((pixel > 0.0) & (pixel < [lens.width, lens.height])).all(axis=1)
+    return Nodes(float(left), float(top), cell, (rows, columns), xy, np.asarray(inside))
+
+
+def _pixels(view: View, xyz: FloatArray) -> FloatArray:
+    return project(view.photo.lens, (xyz - view.photo.centre) @ view.photo.rotation.T)
+
+
+class Displacements:
+    """How far each frame shows the bed from where the median has it, at the nodes."""
+
+    def __init__(self, median: npt.NDArray[Any], view: View, nodes: Nodes) -> None:
+        cv2 = photo_library("cv2")
+        self._median, self._view, self._nodes = grey8(median), view, nodes
+        texture = cv2.cornerMinEigenVal(self._median, 7).astype(np.float64)
+        weight = texture / (texture + np.median(texture[texture > 0.0]) + 1e-30)
+        self._weight = weight.astype(np.float32)
+        gsd = nodes.cell_m / 2.0 * np.ones(2)
+        centre = np.append(nodes.xy[len(nodes.xy) // 2], view.level_m)
+        step = np.array([[-gsd[0], 0.0, 0.0], [gsd[0], 0.0, 0.0]]) + centre
+        side = int(np.hypot(*np.diff(_pixels(view, step), axis=0)[0]))
+        self._side = (side | 1, side | 1)
+        self._flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self._flow.setFinestScale(0)  # waves are short, and patches of 8 px smooth enough
+        self._base = cv2.blur(self._weight, self._side)
+
+    def of(self, frame: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
+        """Return displacements, shape (n, 2), pixels, and weights, shape (n,), at the level."""
+        cv2 = photo_library("cv2")
+        flow = self._flow.calc(grey8(frame), self._median, None)
+        mean = cv2.blur(flow * self._weight[..., None], self._side) / (self._base[..., None] + 1e-9)
+        height = np.full(len(self._nodes.xy), self._view.level_m)
+        at = (_pixels(self._view, np.column_stack([self._nodes.xy, height])) - 0.5).astype(
+            np.float32
+        )
+        shift = cv2.remap(mean, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[:, 0]
+        weight = cv2.remap(self._base, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[:, 0]
+        return shift.astype(np.float64), np.where(self._nodes.seen, weight, 0.0).astype(np.float64)
+
+
+def slopes_of(view: View, xy: FloatArray, height_m: FloatArray, shift_px: FloatArray) -> FloatArray:
+    """Return the slopes that displace the bed so, by Snell's law in vector form.
+
+    Parameters
+    ----------
+    view : View
+    xy : array, shape (n, 2)
+        Where the surface is met, world frame.
+    height_m : array, shape (n,)
+        Of the surface there.
+    shift_px : array, shape (n, 2)
+        From the pixel of a frame to where the median shows the same.
+
+    Returns
+    -------
+    array, shape (n, 2)
+        dz/dx and dz/dy; NaN where the bed is not known, or not under water.
+    """
+    pierced = np.column_stack([xy, height_m])
+    seen = pierced - view.photo.centre
+    seen /= np.linalg.norm(seen, axis=1)[:, None]
+    wet = bed_places(view, _pixels(view, pierced) + shift_px) - pierced
+    wet[~(wet[:, 2] < 0.0)] = np.nan
+    wet /= np.linalg.norm(wet, axis=1)[:, None]
+    normal = seen - view.refractive_index * wet
+    return np.asarray(-normal[:, :2] / normal[:, 2:])
+
+
+@dataclass(frozen=True, eq=False)
+class Waves:
+    """Plane waves, and how well they are known.
+
+    Attributes
+    ----------
+    number : array, shape (m, 2)
+        Wave numbers k, rad/m.
+    frequency : array, shape (m,)
+        w, rad/s.
+    slope : array, shape (2 m,)
+        Of the cosines, then the sines: amplitude of the slope, k times that of the height.
+    covariance : array, shape (2 m, 2 m)
+        Of `slope`.
+    left_over_m : float
+        Heights, rms, that the slopes left over would make.
+    explained : float
+        Of the energy of the slopes.
+    """
+
+    number: FloatArray
+    frequency: FloatArray
+    slope: FloatArray
+    covariance: FloatArray
+    left_over_m: float
+    explained: float
+
+    def at(self, xy: FloatArray, time_s: float) -> tuple[FloatArray, FloatArray]:
+        """Return heights above the level and their standard errors, each of shape (n,)."""
+        if not len(self.number):
+            return np.zeros(len(xy)), np.full(len(xy), self.left_over_m)
+        angle = xy @ self.number.T - self.frequency * time_s
+        size = np.hypot(*self.number.T)
+        basis = np.hstack([np.cos(angle) / size, np.sin(angle) / size])
+        variance = ((basis @ self.covariance) * basis).sum(axis=1)
+        return basis @ self.slope, np.sqrt(np.maximum(variance, 0.0) + self.left_over_m**2)
+
+
+class Slopes(NamedTuple):
+    """What waves are fitted to: slopes of all frames, shape (f, n, 2), weights and times.
+
+    `xy`, shape (n, 2), is the lattice of `shape` and `cell_m`, relative to any point.
+    """
+
+    slope: FloatArray
+    weight: FloatArray
+    time_s: FloatArray
+    xy: FloatArray
+    shape: tuple[int, int]
+    cell_m: float
+
+
+def fit_waves(given: Slopes, depth_m: float) -> Waves:
+    """Return the plane waves that slopes show; of one frame alone, where the time tells nothing."""
+    spectrum = _Spectrum(given, depth_m)
+    chosen = np.empty(0, np.int64)
+    total = float((given.weight[..., None] * given.slope**2).sum())
+    found = _Fit(np.empty(0), np.empty((0, 0)), given.slope)
+    left = total
+    for _ in range(ROUNDS):
+        more = spectrum.strongest(found.residual, chosen)
+        if not len(more):
+            break
+        trial = np.concatenate([chosen, more])
+        new = _solved(given, spectrum.number[trial], spectrum.frequency[trial])
+        now = float((given.weight[..., None] * new.residual**2).sum())
+        chosen, found, gain, left = trial, new, (left - now) / max(total, 1e-30), now
+        if gain < LEAST_GAIN:
+            break
+    inflated = spectrum.redness(found.residual, chosen)
+    return Waves(
+        spectrum.number[chosen], spectrum.frequency[chosen], found.slope,
+        found.covariance * inflated, spectrum.height_rms(found.residual),
+        1.0 - left / max(total, 1e-30),
+    )  # fmt: skip
+
+
+class _Fit(NamedTuple):
+    slope: FloatArray
+    covariance: FloatArray
+    residual: FloatArray
+
+
+def _bases(given: Slopes, number: FloatArray, frequency: FloatArray) -> Iterator[FloatArray]:
+    """Yield what unit slopes of cosines and sines of height give along their waves, (n, 2 m).
+
+    One for each frame, less the mean over the frames, which the median has kept.
+    """
+    place = np.exp(1j * (given.xy @ number.T))
+    turn = np.exp(-1j * given.time_s[:, None] * frequency)
+    if len(turn) > 1:
+        turn -= turn.mean(axis=0)
+    for one in turn:
+        wave = place * one
+        yield np.hstack([-wave.imag, wave.real])
+
+
+def _solved(given: Slopes, number: FloatArray, frequency: FloatArray) -> _Fit:
+    """Fit waves to the slopes of all frames by least squares, with a prior of their variance."""
+    along = np.tile(number / np.hypot(*number.T)[:, None], (2, 1))
+    size = len(along)
+    gram, right = np.zeros((size, size)), np.zeros(size)
+    used = np.flatnonzero((given.weight > 0.0).any(axis=0))
+    part = given._replace(xy=given.xy[used])
+    bases = _bases(part, number, frequency)
+    for basis, slope, weight in zip(bases, given.slope, given.weight, strict=True):
+        weighted = basis * weight[used, None]
+        gram += basis.T @ weighted
+        right += ((weighted.T @ slope[used]) * along).sum(axis=1)
+    gram *= along @ along.T
+    count = max(float(given.weight.sum()), 1e-30)
+    prior = float((given.weight[..., None] * given.slope**2).sum()) / count
+    residual, noise = given.slope.copy(), 0.1 * prior
+    for _ in range(2):  # the noise first guessed, then that of the residuals
+        covariance = np.linalg.inv(gram + (noise / prior) * np.eye(size))
+        found = covariance @ right
+        bases = _bases(part, number, frequency)
+        for basis, left, slope in zip(bases, residual, given.slope, strict=True):
+            left[used] = slope[used] - basis @ (found[:, None] * along)
+        noise = float((given.weight[..., None] * residual**2).sum()) / (2.0 * count)
+    return _Fit(found, np.asarray(covariance * noise, np.float64), residual)
+
+
+class _Spectrum:
+    """The wave numbers that may be, and the energy of slopes at each of them on the shell."""
+
+    def __init__(self, given: Slopes, depth_m: float) -> None:
+        self._given = given
+        rows, columns = (2 * side for side in given.shape)
+        x = 2.0 * np.pi * np.fft.fftfreq(columns, given.cell_m)
+        y = -2.0 * np.pi * np.fft.fftfreq(rows, given.cell_m)  # rows go south
+        every = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
+        size = np.hypot(*every.T)
+        longest = 2.0 * given.cell_m * max(given.shape)
+        may = (size >= 2.0 * np.pi / longest) & (
+            size <= 2.0 * np.pi / (SHORTEST_CELLS * given.cell_m)
+        )
+        if len(given.time_s) == 1:  # a wave and its opposite look the same
+            may &= (every[:, 0] > 0.0) | ((every[:, 0] == 0.0) & (every[:, 1] > 0.0))
+        self._rows = np.flatnonzero(may)
+        self._shape = (rows, columns)
+        self.number = every[may]
+        size = size[may]
+        self._size = size
+        self.frequency = np.sqrt(GRAVITY * size * np.tanh(size * depth_m))
+
+    def _transformed(self, slope: FloatArray, weight: FloatArray) -> npt.NDArray[np.complex128]:
+        """Return the slope along each wave number of a frame, as its Fourier coefficient."""
+        planes = (slope * weight[:, None]).T.reshape(2, *self._given.shape)
+        whole = np.fft.fft2(planes, s=self._shape).reshape(2, -1)[:, self._rows]
+        return np.asarray((self.number.T * whole).sum(axis=0) / self._size)
+
+    def energy(self, slope: FloatArray) -> FloatArray:
+        """Return the energy of slopes, shape (f, n, 2), on the shell."""
+        given = self._given
+        total = np.zeros(len(self.number), np.complex128)
+        for one, weight, time in zip(slope, given.weight, given.time_s, strict=True):
+            total += self._transformed(one, weight) * np.exp(1j * self.frequency * time)
+        return np.abs(total) ** 2
+
+    def strongest(self, slope: FloatArray, chosen: npt.NDArray[np.int64]) -> Any:
+        """Return the rows of the next waves, those with most energy of what is not chosen."""
+        energy = self.energy(slope)
+        least = OVER_NOISE * float(self._white(slope))
+        energy[chosen] = 0.0
+        first = np.argsort(-energy, kind="stable")[:WAVES_AT_ONCE]
+        return first[energy[first] > least]
+
+    def _white(self, slope: FloatArray) -> float:
+        """Return the energy that slopes would have everywhere, were they white noise."""
+        weight = self._given.weight[..., None]
+        return float(((weight * slope) ** 2).sum()) / 2.0
+
+    def redness(self, residual: FloatArray, chosen: npt.NDArray[np.int64]) -> float:
+        """Return how much more of the residuals is on the shell than of white noise."""
+        energy = np.delete(self.energy(residual), chosen)
+        return max(1.0, float(energy.mean()) / max(self._white(residual), 1e-30))
+
+    def height_rms(self, residual: FloatArray) -> float:
+        """Return the heights that slopes would make, rms, as Frankot & Chellappa integrate."""
+        given, total, count = self._given, 0.0, 0.0
+        half = 2.0 if len(given.time_s) == 1 else 1.0
+        for one, weight in zip(residual, given.weight, strict=True):
+            full = self._transformed(one, (weight > 0.0).astype(np.float64)) / self._size
+            total += half * float((np.abs(full) ** 2).sum()) / np.prod(self._shape)
+            count += float((weight > 0.0).sum())
+        return float(np.sqrt(total / max(count, 1.0)))
+
+
+def still(shifts_px: FloatArray, weight: FloatArray) -> BoolArray:
+    """Return which nodes hardly ever move: land, by displacements of shape (f, n, 2)."""
+    moved = np.sqrt((shifts_px**2).sum(axis=2).mean(axis=0))
+    known = weight.mean(axis=0) > 0.0
+    return np.asarray(known & (moved < STILL * np.median(moved[known])) if known.any() else ~known)
