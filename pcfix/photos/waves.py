@@ -29,9 +29,9 @@ time, and fitted by least squares to the slopes of all frames at once, weighted 
 the bed, with a prior of the slopes' own variance. Where the time between frames is not known,
 each frame is fitted alone.
 
-The median over few frames is not calm water: it keeps about the mean of each wave over them, and the
-slopes lack it. So what is fitted is each wave less its mean over the frames; of one that hardly turns
-meanwhile little is left, and its standard error says so.
+The median over few frames is not calm water: it keeps about the mean of each wave over them, and
+the slopes lack it. So what is fitted is each wave less its mean over the frames; of one that hardly
+turns meanwhile little is left, and its standard error says so.
 
 What it cannot know: the mean level; waves longer than twice the image, or shorter than three
 cells; and, where there is no land that holds the frames still, the part of the waves that looks
