@@ -296,20 +296,30 @@ class PortOptions(OptionSet):
     )
 
 
+_CAMERAS: dict[str, Any] = {
+    "help": "File or folder of camera poses: Metashape, Pix4D, ODM, OpenSfM, COLMAP, MicMac,"
+    " Bundler, VisualSFM, BlocksExchange, RealityCapture, or a CSV table.",
+    "metavar": "PATH",
+    "needed": True,
+}
+
+
 @dataclass(frozen=True, kw_only=True)
 class CamerasOptions(OptionSet):
     """The exterior orientation."""
 
     panel = Panel.NEED
 
-    cameras: Any = option(
-        None,
-        "File or folder of camera poses: Metashape, Pix4D, ODM, OpenSfM, COLMAP, MicMac, Bundler,"
-        " VisualSFM, BlocksExchange, RealityCapture, or a CSV table.",
-        metavar="PATH",
-        needed=True,
-        default_is="but with --method factor or regression",
-    )
+    cameras: Any = option(None, **_CAMERAS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CamerasOrNoneOptions(OptionSet):
+    """The exterior orientation, where the method looks at it."""
+
+    panel = Panel.NEED
+
+    cameras: Any = option(None, default_is="but with --method factor or regression", **_CAMERAS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -359,7 +369,7 @@ class SurveyOptions(
     TideOptions,
     WaterOptions,
     NeededOptions,
-    CamerasOptions,
+    CamerasOrNoneOptions,
 ):
     """What a correction through a water surface is made with, as the user names it."""
 
