@@ -160,26 +160,19 @@ def test_bad_input_gets_a_sentence(project, more, sentence):
     assert "Traceback" not in done.stderr
 
 
-def test_photographs_of_another_size(project, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "rows", "sentence"),
+    [
+        ("IMG_0.JPG", 400, "has 480 x 400 pixels"),
+        ("DJI_7.JPG", 360, "knows none of the photographs (DJI_7.JPG ... against IMG_0 ...)"),
+    ],
+)
+def test_photographs_of_another_block(project, tmp_path, name, rows, sentence):
     (tmp_path / "images").mkdir()
-    Image.new("RGB", (480, 400)).save(tmp_path / "images" / "IMG_0.JPG")
-    done = run_pcfix(
-        "photos", str(tmp_path / "images"), str(tmp_path / "out"), "--cameras",
-        str(project / "cameras.csv"), "--dsm", str(project / "bed.tif"), "--water", "0.3",
-    )  # fmt: skip
+    Image.new("RGB", (480, rows)).save(tmp_path / "images" / name)
+    done = run_pcfix("photos", str(tmp_path / "images"), str(tmp_path / "out"), *words(project)[3:])
     assert done.returncode == 1
-    assert "has 480 x 400 pixels" in done.stderr
-
-
-def test_photographs_that_no_camera_knows(project, tmp_path):
-    (tmp_path / "images").mkdir()
-    Image.new("RGB", (480, 360)).save(tmp_path / "images" / "DJI_7.JPG")
-    done = run_pcfix(
-        "photos", str(tmp_path / "images"), str(tmp_path / "out"), "--cameras",
-        str(project / "cameras.csv"), "--dsm", str(project / "bed.tif"), "--water", "0.3",
-    )  # fmt: skip
-    assert done.returncode == 1
-    assert "knows none of the photographs (DJI_7.JPG ... against IMG_0 ...)" in done.stderr
+    assert sentence in done.stderr
 
 
 def test_the_lens_of_the_table_is_that_of_the_renderer():
