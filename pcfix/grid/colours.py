@@ -13,10 +13,13 @@ RAYS = "Purples"
 DIFFERENCE = "RdBu_r"
 
 
-def stops_of(ramp: str, steps: int = 9) -> list[tuple[float, tuple[int, int, int]]]:
+def stops_of(ramp: str, steps: int = 9) -> list[tuple[float, tuple[int, ...]]]:
     """Return shares of a ramp's way, 0 to 1, and their colours (red, green, blue; 0 to 255)."""
     from matplotlib import colormaps
 
-    colours = colormaps[ramp]
     shares = [step / (steps - 1) for step in range(steps)]
-    return [(share, tuple(round(255 * part) for part in colours(share)[:3])) for share in shares]
+    colours = colormaps[ramp](shares)[:, :3]
+    return [
+        (share, tuple(round(255 * part) for part in colour))
+        for share, colour in zip(shares, colours.tolist(), strict=True)
+    ]
