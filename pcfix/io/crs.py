@@ -75,6 +75,14 @@ def heights_of(crs: CRS) -> Heights:
     return "ellipsoidal" if len(crs.axis_info) == 3 else "unstated"
 
 
+def heights_name(crs: CRS) -> str | None:
+    """Return what z is counted from, in words; None where that is not stated."""
+    vertical = parts(crs)[1]
+    if vertical is None:
+        return "ellipsoidal" if heights_of(crs) == "ellipsoidal" else None
+    return str(vertical.name)
+
+
 def is_same(one: CRS, other: CRS) -> bool:
     """Whether two CRS are one, whatever their order of axes and their shift to WGS 84."""
     one, other = unbound(one), unbound(other)

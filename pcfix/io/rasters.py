@@ -218,7 +218,10 @@ def copy_as_cog(source: Path, target: Path) -> None:
 
     with open_raster(source) as raster:
         options = _compression(raster.dtypes[0])
-    copy(source, target, driver="COG", blocksize=TILE, **options)
+    copy(
+        source, target, driver="COG", blocksize=TILE, overview_resampling="average",
+        statistics="YES", **options,
+    )  # fmt: skip
 
 
 PREVIEW_CELLS = 600

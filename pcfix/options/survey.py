@@ -112,7 +112,11 @@ class RunOptions(
     old_units = True
 
     resolution: float | None = option(
-        None, "Of the rasters.", unit="m", rule=METRES, default_is="4 points a cell"
+        None,
+        "Of the rasters.",
+        unit="m",
+        rule=METRES,
+        default_is="2 to 4 points a cell, or the GSD",
     )
     adjust: AdjustWhen = option(
         "auto",
