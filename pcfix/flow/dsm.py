@@ -261,10 +261,7 @@ class _Run:
             ) as out,
         ):
             for window in self.lattice.windows(BLOCK_CELLS):
-                wide = window.grown(1)
-                around = wide.clipped(self.lattice.window)
-                height = np.full((wide.height, wide.width), np.nan)
-                height[around.within(wide)] = rasters.read_heights(heights, around)
+                height = rasters.read_within(heights, window.grown(1), self.lattice.window)
                 light = hillshade(height, s.cell_m, s.azimuth, s.altitude)
                 rasters.write_part(out, light, window, 1)
         self.finish(plain, target)
@@ -376,11 +373,7 @@ class SortedPoints:
 
     def _stored(self, window: Window) -> Window:
         """Return a window of the raster as the store counts cells."""
-        row, column = self.lattice.first_row, self.lattice.first_column
-        return Window(
-            window.row + row, window.row_stop + row, window.column + column,
-            window.column_stop + column,
-        )  # fmt: skip
+        return window.moved(self.lattice.first_row, self.lattice.first_column)
 
     def points_in(self, window: Window) -> tuple[FloatArray, IntArray]:
         """Return the points of a window, and their columns and rows in the raster.

@@ -19,6 +19,7 @@ from pcfix.flow.correct import correct_file
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.flow.old_cameras import read_blocks
+from pcfix.flow.rasters import SURFACE, raster_files, resolution_sentence, write_rasters
 from pcfix.flow.report import write_report
 from pcfix.flow.run_adjust import (
     FOLDER,
@@ -35,6 +36,7 @@ from pcfix.io.clouds import own_water
 from pcfix.io.files import check_input, file_state, files_in, read_json, write_text
 from pcfix.io.las.source import LasSource
 from pcfix.io.rasters import open_raster, preview, write_dod
+from pcfix.model import Cameras
 from pcfix.options.correct import CorrectOptions
 from pcfix.options.declare import named, options_of
 from pcfix.options.steps import DistanceOptions
@@ -51,8 +53,6 @@ RECORD = "run.json"
 SECTIONS = 3
 DOD, REFERENCE_DSM = "dod.tif", "reference_dsm.tif"
 CLOUDS = (".las", ".laz")
-POINTS_PER_CELL = 4.0
-"""Where no resolution is given, cells hold so many points on average."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,8 +118,7 @@ class Files:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.corrected, self.cleaned = folder / "corrected.laz", folder / "cleaned.laz"
-        self.dsm, self.dsm_bed = folder / "dsm.tif", folder / "dsm_bed.tif"
-        self.hillshade = folder / "hillshade.tif"
+        self.surface = folder / SURFACE
         self.compare, self.report = folder / "compare", folder / "report.html"
         self.regression = folder / "regression.json"
 
@@ -175,9 +174,14 @@ def run_all(
     files = Files(out_dir)
     shore = [] if request.shoreline is None else [Path(request.shoreline)]
 
-    def step(name: str, outputs: list[Path], work: Callable[[], Any]) -> Any:
+    def step(
+        name: str,
+        outputs: list[Path],
+        work: Callable[[], Any],
+        more: Callable[[Any], str] = lambda result: "",
+    ) -> Any:
         result, was_done = record.step(name, outputs, work)
-        say(f"{name:<9} {'done before' if was_done else 'done'}: {outputs[0]}")
+        say(f"{name:<9} {'done before' if was_done else 'done'}: {outputs[0]}{more(result)}")
         return result
 
     first, was_done = record.step(
@@ -196,7 +200,10 @@ def run_all(
     # the surface of a dimension is still in the cloud, and what was corrected is known anyway
     clean = partial(clean_file, files.corrected, files.cleaned, overwrite=True, jobs=jobs)
     step("clean", [files.cleaned], lambda: clean().as_dict())
-    step("dsm", [files.dsm, files.dsm_bed, files.hillshade], lambda: _grid(request, files))
+    errors = corrected["uncertainty"] is not None
+    outputs = raster_files(out_dir, errors=errors)
+    cells = partial(resolution_sentence, given=request.resolution is not None)
+    step("dsm", outputs, lambda: _grid(request, files, errors), cells)
     compared = None
     if request.reference is not None:
         compared = step(
@@ -244,24 +251,19 @@ def _is_bent(corrected: dict[str, Any]) -> bool:
     return bool((corrected["poses"] or {}).get("absorbed"))
 
 
-def _grid(request: Request, files: Files) -> dict[str, Any]:
-    resolution = request.resolution or _resolution_m(files.cleaned)
-    whole = grid_dsm(
-        files.cleaned, files.dsm, resolution=resolution, hillshade=files.hillshade, overwrite=True
+def _grid(request: Request, files: Files, errors: bool) -> dict[str, Any]:
+    cameras = _cameras(request, files)
+    return write_rasters(
+        files.cleaned, files.folder, resolution=request.resolution, cameras=cameras, errors=errors
     )
-    bed = grid_dsm(
-        files.cleaned, files.dsm_bed, resolution=resolution, surface="bed", overwrite=True
-    )
-    return {"dsm": whole.as_dict(), "bed": bed.as_dict()}
 
 
-def _resolution_m(path: Path) -> float:
-    """Return a round resolution with about `POINTS_PER_CELL` points in the cells of the bounds."""
-    with LasSource(path) as source:
-        size = source.header.maxs[:2] - source.header.mins[:2]
-        side = math.sqrt(max(float(size.prod()), 1e-6) * POINTS_PER_CELL / len(source))
-    power = 10.0 ** math.floor(math.log10(side))
-    return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= side * 0.999)
+def _cameras(request: Request, files: Files) -> Cameras:
+    """Return the cameras in the CRS of the cloud; notes were shown when it was corrected."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PcfixWarning)
+        inputs = replace(request, views=None).part(Inputs)
+        return read_blocks(inputs, view_of(files.corrected).crs).cameras
 
 
 def _compare(request: Request, files: Files) -> dict[str, Any]:
@@ -274,12 +276,12 @@ def _compare(request: Request, files: Files) -> dict[str, Any]:
         heights = reference
         if reference.suffix.lower() in CLOUDS:
             heights = files.compare / REFERENCE_DSM
-            with open_raster(files.dsm) as dsm:
+            with open_raster(files.surface) as dsm:
                 resolution = float(dsm.res[0])
             with warnings.catch_warnings():  # the cells are those of the cloud
                 warnings.simplefilter("ignore", PcfixWarning)
                 grid_dsm(reference, heights, resolution=resolution, overwrite=True)
-        write_dod(files.dsm, heights, files.compare / DOD, overwrite=True)
+        write_dod(files.surface, heights, files.compare / DOD, overwrite=True)
     sections = [
         {
             "distance_m": section.distance_m.tolist(),
@@ -320,14 +322,13 @@ def _report(
         with LasSource(files.corrected) as source:
             water = own_water(source)
         view = view_of(files.corrected)
-        cameras = read_blocks(inputs_again, view.crs).cameras
     summary = Summary(**done["correct"])
     later = Later(pictures, tables, verdict, {} if compared is None else compared["figures"])
     page = write_report(
         files.corrected,
         files.folder,
         summary=summary,
-        cameras=cameras,
+        cameras=_cameras(request, files),
         water=water or inputs_again.surface(view).surface,
         inputs=inputs,
         later=later,

@@ -42,6 +42,13 @@ class Window(NamedTuple):
             self.row - cells, self.row_stop + cells, self.column - cells, self.column_stop + cells
         )
 
+    def moved(self, rows: int, columns: int) -> Window:
+        """Return the window so many rows and columns further."""
+        return Window(
+            self.row + rows, self.row_stop + rows, self.column + columns,
+            self.column_stop + columns,
+        )  # fmt: skip
+
     def holds(self, cell: IntArray) -> BoolArray:
         """Return which columns and rows, shape (n, 2), are in the window."""
         column, row = cell.T

@@ -79,6 +79,22 @@ def read_heights(source: DatasetReader, window: Window) -> FloatArray:
     return np.asarray(height)
 
 
+def read_within(source: DatasetReader, window: Window, whole: Window) -> FloatArray:
+    """Return part of the first band as `read_heights`, NaN beyond the raster."""
+    values = np.full((window.height, window.width), np.nan)
+    inside = window.clipped(whole)
+    if inside.height > 0 and inside.width > 0:
+        values[inside.within(window)] = read_heights(source, inside)
+    return values
+
+
+def lattice_of(source: DatasetReader) -> Lattice:
+    """Return the cells of a raster that pcfix wrote."""
+    size, t = source.res[0], source.transform
+    first = round(t.c / size), round(-t.f / size)
+    return Lattice(size, *first, source.width, source.height)
+
+
 def read_masked(raster: Any, **how: Any) -> FloatArray:
     """Return the first band as float64, NaN where it has no value; `how` is of rasterio's read."""
     return np.asarray(raster.read(1, masked=True, **how).astype(np.float64).filled(np.nan))

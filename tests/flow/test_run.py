@@ -25,8 +25,9 @@ WORDS = [
     "--reference", str(SCENE / "lidar.laz"),
 ]  # fmt: skip
 RESULTS = [
-    "cleaned.laz", "compare", "corrected.laz", "dsm.tif", "dsm_bed.tif", "figures",
-    "hillshade.tif", "report.html", "run.json",
+    "bed.qml", "bed.tif", "cleaned.laz", "compare", "corrected.laz", "depth.qml", "depth.tif",
+    "figures", "report.html", "run.json", "shaded.tif", "surface.qml", "surface.tif",
+    "surface_counts.tif", "uncertainty.qml", "uncertainty.tif",
 ]  # fmt: skip
 
 
@@ -71,7 +72,7 @@ def test_cloud_is_that_of_correct(finished, tmp_path):
 
 
 def test_difference_of_the_surfaces_is_that_of_the_rasters(finished):
-    names = ("dsm.tif", "compare/reference_dsm.tif", "compare/dod.tif")
+    names = ("surface.tif", "compare/reference_dsm.tif", "compare/dod.tif")
     dsm, reference, dod = (rasterio.open(finished[0] / name) for name in names)
     with dsm, reference, dod:
         window = rasterio.windows.from_bounds(*dod.bounds, reference.transform)
@@ -152,14 +153,14 @@ def test_a_finished_run_is_not_done_again(copied):
 
 
 def test_a_run_resumes_where_a_file_is_missing(copied):
-    (copied / "out" / "dsm.tif").unlink()
+    (copied / "out" / "surface.tif").unlink()
     done = run(copied, *WORDS)
     assert (done.returncode, done.stderr) == (0, "")
     steps = {line.split()[0]: "done before" in line for line in done.stdout.splitlines()}
     assert steps == {
         "correct": True, "clean": True, "dsm": False, "compare": False, "report": False,
     }  # fmt: skip
-    assert (copied / "out" / "dsm.tif").exists()
+    assert (copied / "out" / "surface.tif").exists()
 
 
 def test_another_request_does_not_replace_a_run_unasked(copied):
