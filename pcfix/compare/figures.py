@@ -82,6 +82,8 @@ class Comparison:
     notes : tuple of str
         What was left out, and why.
     seconds : float
+    check_points : array, shape (p, 4), or None
+        x, y and z of single points of the reference, and the error there.
     """
 
     cloud: str
@@ -103,10 +105,11 @@ class Comparison:
     settings: CompareRules
     notes: tuple[str, ...]
     seconds: float
+    check_points: FloatArray | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON; a section by its line, its heights are CSV."""
-        names = [name for name in self.__slots__ if name != "sections"]
+        names = [name for name in self.__slots__ if name not in ("sections", "check_points")]
         plain = {name: _plain(getattr(self, name)) for name in names}
         plain["sections"] = [
             {**asdict(s.line), "half_width_m": s.half_width_m, "stations": len(s.distance_m)}
@@ -199,7 +202,15 @@ def figures_of(
         settings=match.settings,
         notes=tuple(notes),
         seconds=round(time.perf_counter() - started, 3),
+        check_points=_residuals(match, pairs),
     )
+
+
+def _residuals(match: Match, pairs: AfterBefore[Pairs] | None) -> FloatArray | None:
+    if pairs is None or not match.reference.sparse:
+        return None
+    after = pairs.after
+    return np.column_stack([after.xy, after.reference_m, after.error_m])
 
 
 def _check_enough(match: Match) -> None:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.errors import InputError, PcfixWarning, SettingError
@@ -18,8 +19,10 @@ from pcfix.flow.compare import compare_clouds
 from pcfix.flow.correct import correct_file
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs, paths_in
+from pcfix.flow.layers import Drawn, write_map
 from pcfix.flow.old_cameras import read_blocks
 from pcfix.flow.rasters import SURFACE, raster_files, resolution_sentence, write_rasters
+from pcfix.flow.record import Record, read_record
 from pcfix.flow.report import write_report
 from pcfix.flow.run_adjust import (
     FOLDER,
@@ -29,14 +32,14 @@ from pcfix.flow.run_adjust import (
     is_worth_saying,
     outputs_of,
 )
-from pcfix.flow.runner import json_text
 from pcfix.flow.shore import check_shoreline
 from pcfix.flow.surfaces import view_of
 from pcfix.io.clouds import own_water
-from pcfix.io.files import check_input, file_state, files_in, read_json, write_text
+from pcfix.io.files import check_input, files_in
+from pcfix.io.geopackage import check_layers
 from pcfix.io.las.source import LasSource
 from pcfix.io.rasters import open_raster, preview, write_dod
-from pcfix.model import Cameras
+from pcfix.model import Cameras, WaterSurface
 from pcfix.options.correct import CorrectOptions
 from pcfix.options.declare import named, options_of
 from pcfix.options.steps import DistanceOptions
@@ -118,7 +121,7 @@ class Files:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.corrected, self.cleaned = folder / "corrected.laz", folder / "cleaned.laz"
-        self.surface = folder / SURFACE
+        self.surface, self.map = folder / SURFACE, folder / "map.gpkg"
         self.compare, self.report = folder / "compare", folder / "report.html"
         self.regression = folder / "regression.json"
 
@@ -210,6 +213,12 @@ def run_all(
             "compare", [files.compare / "compare.json"], lambda: _compare(request, files)
         )
     done = {"adjust": first, "correct": corrected, "compare": compared}
+    try:
+        check_layers(files.map)
+    except SettingError as error:
+        say(f"{'map':<9} not written: {error}")
+    else:
+        step("map", [files.map], lambda: _map(request, files, done))
     step("report", [files.report], lambda: _report(request, files, inputs, done))
     return files.report
 
@@ -292,7 +301,36 @@ def _compare(request: Request, files: Files) -> dict[str, Any]:
         }
         for section in result.sections
     ]
-    return {"figures": result.as_dict(), "sections": sections}
+    points = [] if result.check_points is None else result.check_points.tolist()
+    return {"figures": result.as_dict(), "sections": sections, "check_points": points}
+
+
+def _map(request: Request, files: Files, done: dict[str, Any]) -> dict[str, int]:
+    """Write the vectors; of the water's height only its standard error as a whole is known."""
+    summary, compared = done["correct"], done["compare"] or {}
+    fitted = (summary["water_fit"] or {}).get("sigma_level_m")
+    drawn = Drawn(
+        cloud=files.cleaned,
+        folder=files.folder,
+        water=_water(request, files),
+        sigma_level_m=request.sigma_level if request.sigma_level is not None else fitted,
+        cameras=_cameras(request, files),
+        unused=summary["cameras_unused"],
+        sections=compared.get("figures", {}).get("sections", []),
+        check_points=np.array(compared.get("check_points", [])).reshape(-1, 4),
+        check_depths=request.check_depths,
+    )
+    return write_map(files.map, drawn, view_of(files.cleaned).crs)
+
+
+def _water(request: Request, files: Files) -> WaterSurface:
+    """Return the surface as the corrected cloud states it, else as it was asked for."""
+    with warnings.catch_warnings():  # they were shown when the cloud was corrected
+        warnings.simplefilter("ignore", PcfixWarning)
+        with LasSource(files.corrected) as source:
+            stated = own_water(source)
+        inputs = replace(request, views=None).part(Inputs)
+        return stated or inputs.surface(view_of(files.corrected)).surface
 
 
 def _rasters(request: Request) -> list[str]:
@@ -316,12 +354,6 @@ def _report(
         verdict += in_a_sentence(compared["figures"])
     if first["adjusted"]:
         tables.insert(0, adjustment_table(figures_of(files.folder), f"{FOLDER}/report.html"))
-    inputs_again = replace(request, views=None).part(Inputs)
-    with warnings.catch_warnings():  # they were shown when the cloud was corrected
-        warnings.simplefilter("ignore", PcfixWarning)
-        with LasSource(files.corrected) as source:
-            water = own_water(source)
-        view = view_of(files.corrected)
     summary = Summary(**done["correct"])
     later = Later(pictures, tables, verdict, {} if compared is None else compared["figures"])
     page = write_report(
@@ -329,80 +361,9 @@ def _report(
         files.folder,
         summary=summary,
         cameras=_cameras(request, files),
-        water=water or inputs_again.surface(view).surface,
+        water=_water(request, files),
         inputs=inputs,
         later=later,
         overwrite=True,
     )
     return {"page": str(page), "uncertainty": uncertainty_sentence(summary, later.tvu)}
-
-
-class Record:
-    """What was asked for, from which files, and which steps are done.
-
-    A step counts as done while the request and the input files are those of the record, every
-    step before it was found done, and its own files are as it left them. The JSON file at `path`
-    is written after each step; the request has everything that the results depend on.
-    """
-
-    def __init__(self, path: Path, request: dict[str, Any], inputs: Sequence[Path]) -> None:
-        self._path = path
-        self._content: dict[str, Any] = {
-            "request": request,
-            "inputs": [file_state(p) for p in inputs],
-            "steps": {},
-        }
-        self._earlier = self._read()
-
-    @property
-    def resumes(self) -> bool:
-        """Whether there is an earlier run that was asked for the same."""
-        return bool(self._earlier)
-
-    def _read(self) -> dict[str, Any]:
-        """Return the steps of an earlier run that was asked for the same."""
-        if not self._path.exists():
-            return {}
-        earlier = read_record(self._path)
-        plain = json.loads(json.dumps(self._content))
-        same = all(earlier.get(key) == plain[key] for key in ("request", "inputs"))
-        steps: dict[str, Any] = earlier["steps"] if same else {}
-        return steps
-
-    def step(self, name: str, outputs: Sequence[Path], work: Callable[[], Any]) -> tuple[Any, bool]:
-        """Do a step unless it is done; return its result and whether it was done.
-
-        `outputs` are all files that `work` leaves; it returns what later steps need, as JSON can
-        hold it.
-        """
-        earlier = self._earlier.get(name)
-        if earlier is not None and earlier["outputs"] == [file_state(p) for p in outputs]:
-            self._note(name, earlier)
-            return earlier["result"], True
-        self._earlier = {}  # what follows was made from other files
-        result = work()
-        self._note(name, {"outputs": [file_state(p) for p in outputs], "result": result})
-        return json.loads(json.dumps(result)), False
-
-    def _note(self, name: str, step: dict[str, Any]) -> None:
-        self._content["steps"][name] = step
-        write_text(self._path, json_text(self._content), overwrite=True)
-
-
-def read_record(path: Path) -> dict[str, Any]:
-    """Return the content of a record.
-
-    Raises
-    ------
-    InputError
-        If the file is none.
-    """
-    try:
-        content: dict[str, Any] = read_json(path)
-        _ = content["request"], content["inputs"], content["steps"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{path}: is not the record of a run ({error}); give the run.json of an earlier run,"
-            " or remove it."
-        ) from error
-    return content

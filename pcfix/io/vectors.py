@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,7 @@ import shapely
 
 from pcfix.errors import InputError, SettingError
 from pcfix.io.crs import parse_crs
-from pcfix.io.files import check_input, check_output, replaced_when_whole
+from pcfix.io.files import check_input
 from pcfix.io.tables import Table, read_lines, split_header, table_below
 from pcfix.io.transformations import LOCAL, way_to_cloud
 from pcfix.model import FloatArray
@@ -169,7 +169,7 @@ def _split_layer(path: File) -> tuple[str, str | None]:
     return file, layer.removeprefix("layername=") or None
 
 
-def _pyogrio() -> Any:
+def load_pyogrio() -> Any:
     """Return the library of vector files."""
     try:
         import pyogrio
@@ -180,40 +180,9 @@ def _pyogrio() -> Any:
     return pyogrio
 
 
-def check_lines(path: Path) -> None:
-    """Refuse what `write_lines` cannot write."""
-    if path.suffix.lower() != ".gpkg":
-        raise SettingError(f"{path}: lines are written as GeoPackage; give a name in .gpkg.")
-    _pyogrio()
-
-
-def write_lines(
-    path: File,
-    layer: str,
-    lines: Sequence[FloatArray],
-    values: dict[str, FloatArray],
-    crs: CRS | str | None,
-    *,
-    overwrite: bool,
-) -> None:
-    """Write lines, each (n, 2), and by name a value of each, as one layer of a GeoPackage."""
-    target = check_output(path, overwrite=overwrite)
-    geometry = shapely.to_wkb(np.array([shapely.linestrings(one) for one in lines], object))
-    wkt = None if crs is None else parse_crs(crs, "the cloud").to_wkt()
-    with replaced_when_whole(target) as draft, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a cloud may have no CRS
-        try:
-            _pyogrio().raw.write(
-                draft, geometry, list(values.values()), list(values), layer=layer, crs=wkt,
-                driver="GPKG", geometry_type="LineString",
-            )  # fmt: skip
-        except RuntimeError as error:
-            raise InputError(f"{target}: cannot be written ({error}).") from error
-
-
 def _read_gdal(path: Path, layer: str | None) -> tuple[npt.NDArray[Any], str | None, str]:
     """Return geometries (None where one is missing), CRS and name."""
-    pyogrio = _pyogrio()
+    pyogrio = load_pyogrio()
     try:
         layer = _layer(path, pyogrio.list_layers(path), layer)
         with warnings.catch_warnings():

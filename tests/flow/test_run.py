@@ -26,7 +26,7 @@ WORDS = [
 ]  # fmt: skip
 RESULTS = [
     "bed.qml", "bed.tif", "cleaned.laz", "compare", "corrected.laz", "depth.qml", "depth.tif",
-    "figures", "report.html", "run.json", "shaded.tif", "surface.qml", "surface.tif",
+    "figures", "map.gpkg", "report.html", "run.json", "shaded.tif", "surface.qml", "surface.tif",
     "surface_counts.tif", "uncertainty.qml", "uncertainty.tif",
 ]  # fmt: skip
 
@@ -59,7 +59,7 @@ def test_every_step_leaves_its_files(finished):
     folder, said = finished
     assert sorted(path.name for path in folder.iterdir()) == RESULTS
     assert [line.split()[0] for line in said.splitlines()] == [
-        "correct", "clean", "dsm", "compare", "report",
+        "correct", "clean", "dsm", "compare", "map", "report",
     ]  # fmt: skip
 
 
@@ -146,7 +146,7 @@ def test_a_finished_run_is_not_done_again(copied):
     before = {path: path.stat().st_mtime_ns for path in (copied / "out").glob("*.*")}
     done = run(copied, *WORDS)
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.count("done before") == 5
+    assert done.stdout.count("done before") == 6
     after = {path: path.stat().st_mtime_ns for path in (copied / "out").glob("*.*")}
     changed = {path.name for path in before if before[path] != after[path]}
     assert changed == {"run.json"}
@@ -158,7 +158,8 @@ def test_a_run_resumes_where_a_file_is_missing(copied):
     assert (done.returncode, done.stderr) == (0, "")
     steps = {line.split()[0]: "done before" in line for line in done.stdout.splitlines()}
     assert steps == {
-        "correct": True, "clean": True, "dsm": False, "compare": False, "report": False,
+        "correct": True, "clean": True, "dsm": False, "compare": False, "map": False,
+        "report": False,
     }  # fmt: skip
     assert (copied / "out" / "surface.tif").exists()
 
