@@ -120,12 +120,12 @@ def _parts(
     """
     from scipy.ndimage import maximum_filter
 
-    below = rasters.lattice_of(depth)
+    below, edge = rasters.lattice_of(depth), int(HOLE_CELLS)
     row, column = below.first_row - lattice.first_row, below.first_column - lattice.first_column
     for window in lattice.windows(BLOCK_CELLS):
-        wide = window.grown(1)
+        wide = window.grown(edge)
         height = rasters.read_within(surface, wide, lattice.window)
         deep = rasters.read_within(depth, wide.moved(-row, -column), below.window)
-        level = maximum_filter(np.nan_to_num(height + deep, nan=-np.inf), 3)
+        level = maximum_filter(np.nan_to_num(height + deep, nan=-np.inf), 2 * edge + 1)
         deep = np.where(np.isnan(deep) & (height < level), level - height, deep)
-        yield window, height, deep[1:-1, 1:-1]
+        yield window, height[edge - 1 : 1 - edge, edge - 1 : 1 - edge], deep[edge:-edge, edge:-edge]

@@ -9,7 +9,7 @@ import numpy as np
 
 from pcfix.model import FloatArray
 
-MOST_LEVELS = 12
+MOST_LEVELS = 15
 SMOOTH_CELLS = 1.0
 """Standard deviation of the filter before the lines are drawn."""
 LEAST_CELLS = 12.0

@@ -19,6 +19,8 @@ from pcfix.options.declare import File
 if TYPE_CHECKING:
     from pyproj import CRS
 
+OLDER = {"VERSION": "1.2"}
+"""Of GeoPackage: GDAL before 3.7 warns of newer ones."""
 STYLES = "layer_styles"
 """The table in which QGIS looks for styles, and keeps its own."""
 
@@ -58,6 +60,7 @@ def write_layers(
                     draft, geometry, [np.asarray(v) for v in one.values.values()],
                     list(one.values), layer=one.name, crs=wkt, driver="GPKG",
                     geometry_type=one.kind, append=number > 0,
+                    **({} if number else {"dataset_options": OLDER}),
                 )  # fmt: skip
             _write_styles(draft, [one for one in layers if one.style])
         except RuntimeError as error:

@@ -60,6 +60,8 @@ _METRES_PER_DEGREE = 111_000.0
 
 SPACING_M = 1.0
 """Along lines without heights, which take them from the cloud."""
+SHORE_RADIUS_M = 1.0
+"""About shoreline points without a height, which they take from the cloud."""
 MOST_POINTS = 1_000_000
 FEW = 3
 
@@ -322,12 +324,15 @@ def _check_degrees(vectors: Vectors) -> None:
 class Shoreline(NamedTuple):
     """Points on the edge of the water, shape (n, 3): metres, the cloud's CRS, z NaN where unknown.
 
-    `name` is the file's, for messages; `notes` are for the summary.
+    `name` is the file's, for messages; `notes` are for the summary. `counts`, shape (n,), is how
+    many independent observations each point is worth: one that was measured or drawn 1, those
+    between the vertices of a drawn line less; see `_worth`.
     """
 
     xyz: FloatArray
     name: str
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...]
+    counts: FloatArray
 
 
 class WaterPolygons(NamedTuple):
@@ -345,7 +350,8 @@ def read_shoreline(
 
     A line with heights gives its vertices, as these were measured; what lies between them was
     not, and would make the fit look better than it is. A line without heights gives a point at
-    least every `SPACING_M`, as each takes a height of its own from the cloud. For the arguments
+    least every `SPACING_M`, as each takes a height of its own from the cloud, and says what these
+    are worth. For the arguments
     and errors see `read_vectors` and `in_cloud_crs`.
     """
     vectors = in_cloud_crs(read_vectors(path, crs=crs), cloud_crs, heights=True)
@@ -357,16 +363,37 @@ def read_shoreline(
             f"{vectors.name}: would give {count:.3g} points; check its CRS and unit, or thin it"
             " out."
         )
-    parts = [points, lines[level], shapely.segmentize(lines[~level], SPACING_M)]
-    xyz = np.vstack([_vertices(part) for part in parts])
+    drawn = lines[~level]
+    dense = [shapely.segmentize(line, SPACING_M) for line in drawn]
+    parts = [points, lines[level], *([one] for one in dense)]
+    vertices = [_vertices(np.array(part, object)) for part in parts]
+    xyz = np.vstack(vertices)
+    counts = [np.ones(len(one)) for one in vertices[:2]]
+    counts += [_worth(line, len(one)) for line, one in zip(drawn, vertices[2:], strict=True)]
+    worth = np.concatenate(counts)
     known = xyz[np.isfinite(xyz[:, 2]), 2]
     if len(known) < FEW or known.any():
-        return Shoreline(xyz, vectors.name, vectors.notes)
+        return Shoreline(xyz, vectors.name, vectors.notes, worth)
     xyz[:, 2] = np.nan  # all exactly zero, as of a flat drawing
     note = (
         f"{vectors.name}: all {len(known)} heights are exactly 0; taken as points without heights."
     )
-    return Shoreline(xyz, vectors.name, (*vectors.notes, note))
+    return Shoreline(xyz, vectors.name, (*vectors.notes, note), worth)
+
+
+def _worth(line: Any, points: int) -> FloatArray:
+    """Return how many independent observations each of the points along a drawn line is worth.
+
+    Whoever draws a line is off at each vertex by some amount, and between two by what lies between
+    these: straight interpolation between independent errors has two thirds of their variance, so a
+    line of v vertices says as much as 2 v / 3 points that scatter like those on it, however many
+    are put on it. Nor do points say more where the vertices are so dense that neighbours take
+    their heights from the same part of the cloud.
+    """
+    vertices = len(line.coords) - line.is_closed
+    apart = max(line.length / (2.0 * SHORE_RADIUS_M), 1.0)
+    drawn = 2.0 / 3.0 * vertices if vertices < points else float(vertices)
+    return np.full(points, min(1.0, min(drawn, apart) / points))
 
 
 def _lines_and_points(geometries: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
