@@ -6,15 +6,24 @@ import importlib.util
 import json
 import os
 import shutil
+import sqlite3
+from contextlib import closing
 from pathlib import Path
+from xml.etree import ElementTree
 
 import laspy
 import numpy as np
 import pytest
 import rasterio
+import shapely
 
 import pcfix
+from pcfix.errors import SettingError
 from pcfix.flow.run import Request, request_of, run_all
+from pcfix.grid.colours import DEPTH, stops_of
+from pcfix.io import geopackage
+from pcfix.io.rasters import values_at
+from pcfix.io.styles import hex_colour
 from pcfix.refract.tally import Summary
 from pcfix.report.text import tvu_sentence
 from tests.utils.program import run_pcfix
@@ -85,6 +94,80 @@ def test_difference_of_the_surfaces_is_that_of_the_rasters(finished):
     # float32 heights of about 10 m are stored to 1e-6 m
     np.testing.assert_allclose(found[both], expected[both], atol=2e-6)
     assert abs(np.median(found.compressed())) < 0.02  # a bed gridded at 2 m, noise of 4 cm
+
+
+def test_rasters_are_cloud_optimised_and_of_one_band(finished):
+    units = {"surface": "height", "bed": "height", "depth": "depth", "uncertainty": "uncertainty"}
+    for name, what in units.items():
+        with rasterio.open(finished[0] / f"{name}.tif") as raster:
+            assert (raster.count, raster.nodata, raster.units) == (1, -9999.0, ("metre",))
+            assert raster.descriptions == (what,)
+            assert raster.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+            assert "STATISTICS_MEAN" in raster.tags(1)
+            assert raster.crs.to_epsg() == 32633, "no vertical datum was stated"
+    with rasterio.open(finished[0] / "surface_counts.tif") as counts:
+        assert counts.descriptions == ("count", "spread")
+
+
+def test_depth_and_bed_make_the_level(finished):
+    """Where no hole was filled both are of the same points; each is kept to the millimetre."""
+    bed, depth, surface, shaded = (
+        rasterio.open(finished[0] / f"{name}.tif") for name in ("bed", "depth", "surface", "shaded")
+    )
+    with bed, depth, surface, shaded:
+        assert bed.transform == depth.transform
+        level = bed.read(1, masked=True) + depth.read(1, masked=True)
+        assert level.count() > 5000
+        np.testing.assert_allclose(level.compressed(), 0.37, atol=1.1e-3)
+        red, _, blue, alpha = shaded.read().astype(float)
+        np.testing.assert_array_equal(alpha == 0.0, surface.read_masks(1) == 0)
+        height = surface.read(1)
+    deep, land = (height < -8.0) & (alpha > 0), (height > 1.0) & (alpha > 0)
+    assert (blue[deep] > red[deep]).all()
+    assert (red[land] > blue[land]).all()
+
+
+def test_styles_have_the_colours_of_the_report(finished):
+    items = ElementTree.parse(finished[0] / "depth.qml").findall(".//colorrampshader/item")
+    assert [one.get("color") for one in items] == [
+        hex_colour(colour) for _, colour in stops_of(DEPTH)
+    ]
+    assert float(items[0].get("value")) == 0.0
+
+
+def layer(folder, name):
+    pyogrio = pytest.importorskip("pyogrio")
+    meta, _, wkb, values = pyogrio.raw.read(folder / "map.gpkg", layer=name)
+    return shapely.from_wkb(wkb), dict(zip(meta["fields"], values, strict=True))
+
+
+def test_layers_of_the_map(finished):
+    folder = finished[0]
+    lines, values = layer(folder, "depth_contours")
+    assert set(values["interval_m"]) == {1.0}
+    for line, depth in zip(lines, values["depth_m"], strict=True):
+        found = values_at(folder / "depth.tif", shapely.get_coordinates(line))
+        assert np.nanmedian(np.abs(found - depth)) < 0.2  # half a cell on slopes of 1 in 8
+    (area,), _ = layer(folder, "corrected_area")
+    with rasterio.open(folder / "depth.tif") as raster:
+        assert area.area == pytest.approx(raster.read(1, masked=True).count(), rel=0.02)
+    shore, of_shore = layer(folder, "waterline")
+    assert area.buffer(1.5).contains(shore[0])
+    assert 0.0 < of_shore["sigma_m"][0] < 2.0
+    assert of_shore["level_m"][0] == pytest.approx(0.37, abs=1e-3)
+    cameras, of_cameras = layer(folder, "cameras")
+    assert (len(cameras), set(of_cameras["use"])) == (40, {"used"})
+    assert shapely.get_z(cameras).min() > 10.0
+    assert len(layer(folder, "cross_sections")[0]) == 3
+    with closing(sqlite3.connect(folder / "map.gpkg")) as store:
+        styled = store.execute(
+            "select f_table_name, styleQML from layer_styles where useAsDefault"
+        ).fetchall()
+    assert {name for name, _ in styled} == {
+        "corrected_area", "depth_contours", "waterline", "cross_sections", "cameras",
+    }  # fmt: skip
+    for _, text in styled:
+        assert ElementTree.fromstring(text.split("\n", 1)[1]).find("renderer-v2") is not None
 
 
 def test_report_holds_the_comparison(finished):
@@ -183,11 +266,18 @@ def test_a_record_repeats_its_run(finished, tmp_path):
     assert request_of(tmp_path / "again" / "run.json") == request_of(finished[0] / "run.json")
 
 
-def test_without_a_reference_there_is_a_report_all_the_same(tmp_path):
+def test_without_reference_and_vectors_there_is_a_report_all_the_same(tmp_path, monkeypatch):
     request = Request(
         input=str(SCENE / "cloud.laz"), cameras=str(SCENE / "cameras.csv"), water="0.37"
     )
-    page = run_all(request, tmp_path / "out")
+    said: list[str] = []
+
+    def lacking():
+        raise SettingError("Vector files need pyogrio; run: pip install 'pcfix[vector]'.")
+
+    monkeypatch.setattr(geopackage, "load_pyogrio", lacking)
+    page = run_all(request, tmp_path / "out", say=said.append)
+    assert sum("map       not written: Vector files need pyogrio" in line for line in said) == 1
     text = page.read_text()
     assert "Cross-section" not in text
     assert "on average, formal; no order is claimed: the poses were not checked" in text
@@ -208,6 +298,10 @@ def test_check_points_as_reference(tmp_path):
     with pytest.warns(pcfix.PcfixWarning, match="CRS"):
         page = run_all(request, tmp_path / "out")
     assert "check.csv" in page.read_text()
+    points, values = layer(tmp_path / "out", "check_points")
+    assert len(points) > 280
+    np.testing.assert_allclose(shapely.get_z(points), values["z_m"])
+    assert np.sqrt(np.mean(values["residual_m"] ** 2)) < 0.06  # the noise of cloud and reference
     assert not (tmp_path / "out" / "compare" / "dod.tif").exists()
 
 
