@@ -118,7 +118,7 @@ def _parts(
     Holes of the surface are filled between land and bed, so some cells are under water that have
     no depth: that of the water beside them.
     """
-    from scipy.ndimage import maximum_filter
+    from scipy.ndimage import minimum_filter
 
     below, edge = rasters.lattice_of(depth), int(HOLE_CELLS)
     row, column = below.first_row - lattice.first_row, below.first_column - lattice.first_column
@@ -126,6 +126,7 @@ def _parts(
         wide = window.grown(edge)
         height = rasters.read_within(surface, wide, lattice.window)
         deep = rasters.read_within(depth, wide.moved(-row, -column), below.window)
-        level = maximum_filter(np.nan_to_num(height + deep, nan=-np.inf), 2 * edge + 1)
-        deep = np.where(np.isnan(deep) & (height < level), level - height, deep)
+        level = minimum_filter(np.nan_to_num(height + deep, nan=np.inf), 2 * edge + 1)
+        is_wet = np.isnan(deep) & (height < level) & np.isfinite(level)
+        deep = np.where(is_wet, level - height, deep)
         yield window, height[edge - 1 : 1 - edge, edge - 1 : 1 - edge], deep[edge:-edge, edge:-edge]
