@@ -46,10 +46,7 @@ TWINS = {"simulate": {"label", "refract", "port", "adjust", "clean", "grid", "co
 FILE_LIBRARIES = {"laspy", "rasterio", "pyproj", "fiona", "pyogrio", "PIL", "tifffile", "jpeglib"}
 OPENING = {"read_text", "read_bytes", "write_text", "write_bytes"}
 # Files and libraries of files outside io/, with the reason.
-OUTSIDE_IO = {
-    "pcfix.flow.adjust": "its results are a folder that is replaced as a whole",
-    "pcfix.ahead": "what its second process says goes nowhere",
-}
+OUTSIDE_IO = {"pcfix.ahead": "what its second process says goes nowhere"}
 
 MOST_PARAMETERS = 9
 

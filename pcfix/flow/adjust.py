@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +23,7 @@ from pcfix.flow.surfaces import view_of
 from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.io.cameras.opensfm.models import write_opensfm
 from pcfix.io.cameras.table.sensor import write_table
-from pcfix.io.files import check_input
+from pcfix.io.files import check_input, folder_when_whole, write_text
 from pcfix.io.members import write_members
 from pcfix.io.water_rasters import write_water_raster
 from pcfix.model import Cameras, TiePoints, Views, WaterRaster
@@ -126,9 +124,7 @@ def write_adjustment(folder: Path, found: Adjusted, model: str) -> None:
     from pcfix.report.adjustment import adjustment_dict, adjustment_page, before_of
 
     before = before_of(found)
-    parent = folder.resolve().parent
-    draft = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=parent))
-    try:
+    with folder_when_whole(folder) as draft:
         _write_models(draft, found)
         moved = found.unknowns.level_sigma_m or found.unknowns.shape_sigma
         if moved and isinstance(found.water, WaterRaster):
@@ -136,17 +132,9 @@ def write_adjustment(folder: Path, found: Adjusted, model: str) -> None:
         if found.precision is not None and found.precision.members is not None:
             write_members(draft, found.precision.members)
         summary = {"model": model, **adjustment_dict(found, before)}
-        text = json.dumps(summary, indent=2, allow_nan=False)
-        (draft / SUMMARY).write_text(text + "\n", "utf-8")
-        (draft / "report.html").write_text(adjustment_page(found, before), "utf-8")
-        draft.chmod(0o755)
-        if folder.exists():
-            shutil.rmtree(folder)
-        draft.replace(folder)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror or error}).") from error
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
+        text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+        write_text(draft / SUMMARY, text, overwrite=False)
+        write_text(draft / "report.html", adjustment_page(found, before), overwrite=False)
 
 
 def _write_models(folder: Path, found: Adjusted) -> None:

@@ -22,7 +22,7 @@ from pcfix.flow.photos import lens_of
 from pcfix.flow.runner import Progress, check_summary, write_summary
 from pcfix.grid.lattice import Lattice
 from pcfix.io.crs import parse_crs
-from pcfix.io.files import replaced_when_whole, scratch_arrays
+from pcfix.io.files import folder_when_whole, replaced_when_whole, scratch_arrays
 from pcfix.io.frames import Frames, check_calm, read_frames, write_calm, write_spread
 from pcfix.io.rasters import filled_heights, new_raster, open_raster, write_part
 from pcfix.kernels import threads
@@ -113,7 +113,8 @@ def calm_frames(
         water = None
         if view is not None:
             waters, nodes, water = _water(given, found, view, count, median=median, stack=stack)
-            _write_waters(folder, found.names, view.level_m, nodes, waters, crs)
+            with folder_when_whole(folder) as draft:
+                _write_waters(draft, found.names, view.level_m, nodes, waters, crs)
             water = water._replace(folder=str(folder))
             notes = _notes_of(water, tied=bool(given.interval or found.interval_s))
     write_calm(target, found, median)
@@ -323,8 +324,8 @@ def _waves(data: Slopes, depth_m: float, *, tied: bool) -> list[Waves]:
 def _write_waters(
     folder: Path, names: tuple[str, ...], level_m: float, nodes: Nodes, waters: Any, crs: str | None
 ) -> None:
-    """Write a raster of the water of each frame, and its standard error in a folder beside."""
-    (folder / "sigma").mkdir(parents=True, exist_ok=True)
+    """Write a raster of the water of each frame, and its standard error in a folder of those."""
+    (folder / "sigma").mkdir()
     size = nodes.cell_m
     lattice = Lattice(
         size, round(nodes.left_m / size), -round(nodes.top_m / size), *nodes.shape[::-1]

@@ -18,16 +18,18 @@ from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.runner import Progress, check_summary, json_text, write_summary
+from pcfix.io.crs import is_same, parse_crs
 from pcfix.io.files import file_state, read_json, write_text
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
 from pcfix.io.rasters import filled_heights, open_raster
 from pcfix.io.water_rasters import read_water_raster
 from pcfix.kernels import cores, threads
+from pcfix.lens.imaging import unproject
 from pcfix.model import Cameras, FloatArray, Lens, WaterDimension, WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import PhotosOptions
 from pcfix.photos.ground import Ground, ground_of
-from pcfix.photos.mapping import Photo, Scene, exact, paper
+from pcfix.photos.mapping import Photo, Scene, exact, nodes_of, paper
 from pcfix.photos.model import PhotosSummary
 from pcfix.photos.resample import resample
 from pcfix.version import __version__
@@ -35,8 +37,10 @@ from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
 
 RECORD = "pcfix-photos.json"
-LEAST_STEP_PX = 4
+LEAST_STEP_PX = 8
 GROUND_PIXELS_A_CELL = 2.0
+COARSE_STEP_PX = 100
+"""Between the rays that tell whether a photograph sees anything of the ground."""
 MOST_BLACK = 0.2
 """Of a photograph; more is worth a warning."""
 LENS_TOLERANCE = 0.005
@@ -176,7 +180,33 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> Block:
     gsd = _ground_pixel_m(photos, ground)
     step = given.spacing or max(LEAST_STEP_PX, int(np.ceil(ground.cell_m / gsd)))
     scene, (waters, few) = Scene(ground, surface, index), _waters(given, mine)
-    return Block(tuple(mine), photos, scene, step, (*notes, *more, *few), crs, gsd, waters)
+    _check_seen(photos, ground, given)
+    notes = (*_brought(given, read, crs), *notes, *more, *few)
+    return Block(tuple(mine), photos, scene, step, notes, crs, gsd, waters)
+
+
+def _brought(given: PhotosOptions, read: Cameras, crs: str | None) -> tuple[str, ...]:
+    """Return a note where the cameras were in another CRS than the ground."""
+    theirs = given.cameras_crs or read.crs
+    if theirs is None or crs is None:
+        return ()
+    own, other = parse_crs(theirs, str(given.cameras)), parse_crs(crs, str(given.dsm))
+    if is_same(own, other):
+        return ()
+    return (f"{given.cameras}: its cameras were brought from {own.name} to {other.name}.",)
+
+
+def _check_seen(photos: tuple[Photo, ...], ground: Ground, given: PhotosOptions) -> None:
+    """Refuse a ground that no photograph sees anything of."""
+    for photo in photos:
+        nodes, _ = nodes_of(photo.lens, COARSE_STEP_PX)
+        rays = unproject(photo.lens, nodes) @ photo.rotation
+        if np.isfinite(ground.hit(photo.centre, rays[np.isfinite(rays).all(axis=1)])).any():
+            return
+    raise GeometryError(
+        f"{given.dsm}: none of the {len(photos)} photographs sees anything of it; check its CRS"
+        f" against that of {given.cameras} (--cameras-crs, --cameras-offset)."
+    )
 
 
 def check_above(centres: FloatArray, water: WaterSurface, name: str) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -82,6 +83,27 @@ def replaced_when_whole(target: Path) -> Iterator[Path]:
         raise InputError(f"{target}: cannot be written ({error.strerror or error}).") from error
     finally:
         draft.unlink(missing_ok=True)
+
+
+@contextmanager
+def folder_when_whole(target: Path) -> Iterator[Path]:
+    """Give a folder to write into, which takes the place of the target once the block ends well.
+
+    An older folder of that name goes as a whole, with whatever it held.
+    """
+    draft = Path(
+        tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".part", dir=target.resolve().parent)
+    )
+    try:
+        yield draft
+        draft.chmod(0o755)
+        if target.exists():
+            shutil.rmtree(target)
+        draft.replace(target)
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written ({error.strerror or error}).") from error
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
 
 
 def sha256(path: Path) -> str:

@@ -39,7 +39,7 @@ class MappingRules(OptionSet):
         "Between the nodes of the grid over the photograph.",
         unit="px",
         rule=must_be(1, 512, "give pixels from 1 to 512", whole=True),
-        default_is="a cell of the DSM, and 4 px at least",
+        default_is="a cell of the DSM, and 8 px at least",
     )
     holes: Holes = option(
         "fill", "Holes of the DSM: interpolated from around them, or black in the photographs."
