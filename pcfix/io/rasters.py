@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -221,9 +222,6 @@ def copy_as_cog(source: Path, target: Path) -> None:
     copy(source, target, driver="COG", blocksize=TILE, **options)
 
 
-PREVIEW_CELLS = 600
-
-
 def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = False) -> int:
     """Write the first band of one raster minus that of another, metres, and count its cells.
 
@@ -259,10 +257,10 @@ def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = Fal
     return known
 
 
-def preview(path: Path) -> tuple[FloatArray, tuple[float, float, float, float]]:
-    """Return a small version of a raster with NaN for no data, and west, east, south, north."""
+def preview(path: Path, cells: int) -> tuple[FloatArray, tuple[float, float, float, float]]:
+    """Return a raster of at most so many cells, NaN for no data, and west, east, south, north."""
     with open_raster(path) as source:
-        scale = max(1.0, max(source.height, source.width) / PREVIEW_CELLS)
+        scale = max(1.0, math.sqrt(source.height * source.width / cells))
         shape = max(1, int(source.height / scale)), max(1, int(source.width / scale))
         values = read_masked(source, out_shape=shape)
         west, south, east, north = source.bounds
