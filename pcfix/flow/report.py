@@ -26,6 +26,7 @@ SIGMA_Z = "SigmaZ"
 SAMPLE_POINTS = 200_000
 """Points whose numbers go into histogram and picture, evenly spread over the file."""
 NO_SURVEY = Survey()
+PAGE = "report.html"
 ENDINGS = (".laz", ".las", ".tif", ".gpkg", ".csv", ".html", ".json")
 RESULTS = {
     "corrected.laz": "all points, the bed where it is",
@@ -106,7 +107,7 @@ def write_report(
     figures.mkdir(exist_ok=True)
     for picture in report.pictures:
         write_bytes(figures / f"{picture.name}.png", picture.png(), overwrite=overwrite)
-    page = out_dir / "report.html"
+    page = out_dir / PAGE
     write_text(page, render(report), overwrite=overwrite)
     return page
 
@@ -118,7 +119,7 @@ def _beside(folder: Path) -> list[tuple[str, str]]:
     return [
         (name, RESULTS.get(name, "a cross-section" if "/section_" in name else ""))
         for name in names
-        if name.endswith(ENDINGS) and not name.startswith((".", "figures/"))
+        if name.endswith(ENDINGS) and not name.startswith((".", "figures/", PAGE))
     ]
 
 

@@ -78,9 +78,10 @@ def water_words(s: Summary) -> str:
         sigma, of = fit["sigma_level_m"], "of the fit"
     if stated is not None:
         sigma, of = stated, "as stated"
-    return (
-        f"{s.water}, {origin}; standard error {sigma:.3f} m ({of}); index {s.settings['index']:g}"
-    )
+    is_level = fit is not None and not fit.get("tilt_percent", 1.0)
+    water = f"level {fit['level_m']:.3f} m" if fit and is_level else s.water
+    index = s.settings["index"]
+    return f"{water}, {origin}; standard error {sigma:.3f} m ({of}); index {index:g}"
 
 
 def tiles_of(s: Summary, survey: Survey, compared: Plain, depth_m: Plain) -> list[Tile]:
@@ -119,7 +120,7 @@ def accuracy_tile(s: Summary, compared: Plain) -> Tile:
     return Tile(
         "Accuracy of the bed",
         "predicted",
-        [("bias", "not known"), ("standard error", f"{sigma:.3f} m"), ("95 %", f"{tvu:.3f} m")],
+        [("standard error", f"{sigma:.3f} m"), ("95 %", f"{tvu:.3f} m"), ("bias", "not known")],
         ["No reference was given: predicted from the errors assumed, which hold no common bias."],
     )
 

@@ -238,7 +238,11 @@
     box.append(label);
   });
   drawLegend();
-  fit();
-  new ResizeObserver(fit).observe(canvas);
+  let wide = 0;
+  new ResizeObserver(() => {
+    if (canvas.clientWidth === wide) { draw(); return; } /* a phone hides its bars while one scrolls */
+    wide = canvas.clientWidth;
+    fit();
+  }).observe(canvas);
   window.addEventListener("beforeprint", () => { cursor = null; fit(); });
 })();
