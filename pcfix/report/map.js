@@ -8,8 +8,10 @@
   /* The data: zlib in base 64, whole numbers of 16 bits, each less the one before. */
   async function unpack(text) {
     const bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
-    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-    const whole = new Int16Array(await new Response(stream).arrayBuffer());
+    const stream = new DecompressionStream("deflate"), writer = stream.writable.getWriter();
+    writer.write(bytes);
+    writer.close();
+    const whole = new Int16Array(await new Response(stream.readable).arrayBuffer());
     for (let i = 1; i < cells; i++) whole[i] += whole[i - 1];
     return whole;
   }

@@ -192,9 +192,8 @@ def render(report: Report) -> str:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
-    folder = Path(__file__).parent
     environment = Environment(
-        loader=FileSystemLoader(folder),
+        loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -202,8 +201,5 @@ def render(report: Report) -> str:
         finalize=_as_read,
     )
     return environment.get_template("page.html.j2").render(
-        report=report,
-        figures=FIGURES,
-        map_data=Markup(map_json(report.maps, report.layers)),
-        script=Markup((folder / "map.js").read_text("utf-8")),
+        report=report, figures=FIGURES, map_data=Markup(map_json(report.maps, report.layers))
     )

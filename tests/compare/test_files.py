@@ -356,7 +356,7 @@ def test_a_cloud_that_came_as_deep_as_the_reference_was_corrected_before(tmp_pat
     found = compare_clouds(cloud, write_las(tmp_path / "lidar.las", true))
     assert (CORRECTED_BEFORE in found.notes) == twice
     said = in_a_sentence(found.as_dict())
-    assert (CORRECTED_BEFORE in said) == ("error grew" in said) == twice
+    assert (CORRECTED_BEFORE in said) == ("bed grew" in said) == twice
     assert found.tvu.count == 500
 
 
