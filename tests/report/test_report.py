@@ -112,9 +112,10 @@ def test_figures_of_the_run_are_on_the_page(report):
 
 
 PROBE = """<script>const ready = setInterval(() => {
-  if (!document.querySelector("[name=layer]")) return;
+  const map = document.getElementById("map");
+  if (!map.clientWidth || map.width !== map.clientWidth) return; /* not drawn yet */
   clearInterval(ready);
-  const map = document.getElementById("map"), box = map.getBoundingClientRect(), said = [];
+  const box = map.getBoundingClientRect(), said = [];
   const middle = box.left + box.width / 2;
   const at = { clientX: middle, clientY: box.top + box.height / 2, bubbles: true };
   const place = x => {
