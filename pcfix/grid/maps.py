@@ -24,6 +24,8 @@ Extent = tuple[float, float, float, float]
 class Maps:
     """Means of the points of each cell, shape (rows, columns); NaN where there are none.
 
+    They reach as far as there are any.
+
     The first row lies in the north. A single empty cell amid others has their mean. All but the
     height is of the corrected points; the uncertainty is 1.96 times the root mean square of their
     standard errors of Z.
@@ -122,9 +124,14 @@ class MapsBuilder:
             means = [self._all[1] / self._all[0], *(self._moved[1:] / self._moved[0])]
         heights, depth, shift, rays, variance = (_filled(one.reshape(shape)) for one in means)
         uncertainty = np.where(variance > 0.0, 1.96 * np.sqrt(variance), np.nan)
-        north = float(self._low[1]) + self._rows * self._cell_m
-        place = float(self._low[0]), north, self._cell_m
-        return Maps(*place, heights, depth, shift, rays, uncertainty)
+        known = np.argwhere(np.isfinite(heights))
+        (top, left), (last, right) = (
+            (known.min(axis=0), known.max(axis=0)) if len(known) else ((0, 0), np.array(shape) - 1)
+        )
+        part = np.s_[top : last + 1, left : right + 1]  # bounds hold what is noise too
+        north = float(self._low[1]) + (self._rows - top) * self._cell_m
+        place = float(self._low[0]) + left * self._cell_m, float(north), self._cell_m
+        return Maps(*place, heights[part], depth[part], shift[part], rays[part], uncertainty[part])
 
 
 def _filled(values: FloatArray) -> FloatArray:

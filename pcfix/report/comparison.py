@@ -227,8 +227,13 @@ def in_a_sentence(compared: Plain) -> str:
         f" Against {name} the vertical error{' of the bed' if is_of_bed else ''} {way} from"
         f" {before['rmse_m']:.3f} to {after['rmse_m']:.3f} m (RMSE of {after['count']:,} points,"
         f" the reference's noise included); what is left has a bias of"
-        f" {after['mean_m']:+.3f} m.{_of_land(compared)}{twice}"
+        f" {signed(after['mean_m'])}.{_of_land(compared)}{twice}"
     )
+
+
+def signed(value_m: float) -> str:
+    """Return metres with their sign, which is plus for what rounds to zero."""
+    return f"{round(value_m, 3) + 0.0:+.3f} m"
 
 
 def _of_land(compared: Plain) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 from pcfix.options.correct import LEVEL_M
 from pcfix.refract.tally import COVERAGE_95, Summary
-from pcfix.report.comparison import noise_sentence, raw_of
+from pcfix.report.comparison import noise_sentence, raw_of, signed
 from pcfix.report.page import Table, Tile
 from pcfix.report.text import FEWEST, share
 
@@ -141,9 +141,9 @@ def _measured(compared: Plain) -> Tile:
     if own["of"] == "bed" and compared["land"]:
         land = compared["land"]["after"]
         notes.append(
-            f"Land: bias {land['mean_m']:+.3f} m, RMSE {land['rmse_m']:.3f} m, reference included."
+            f"Land: bias {signed(land['mean_m'])}, RMSE {land['rmse_m']:.3f} m, reference included."
         )
-    figures = [("bias", f"{own['mean_m']:+.3f} m"), ("RMSE", f"{rmse:.3f} m")]
+    figures = [("bias", signed(own["mean_m"])), ("RMSE", f"{rmse:.3f} m")]
     return Tile(f"Accuracy of the {of}", "measured", [*figures, ("95 %", f"{within:.3f} m")], notes)
 
 

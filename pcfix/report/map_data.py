@@ -23,7 +23,7 @@ _SMALLEST_STEP = {"m": 0.001, "px": 0.001}
 """By unit; finer ones would only be noise that does not pack."""
 _COLOURS = 64
 _CONTOURS = 12
-_TICKS = 5
+_TICKS = 7
 SMOOTH_CELLS = 1.5
 """Single cells are noisy: contours and shade are of a surface smoothed by this."""
 

@@ -320,7 +320,11 @@ def _uncertainty_picture(sample: FloatArray, s: Summary, later: Later) -> list[P
     text = (
         "Total vertical uncertainty at 95 % (1.96 standard errors of Z) over depth, and the"
         f" largest that the orders of IHO S-44 allow. It is formal: {formal_words(s)}."
-        + (" Dots: within which 95 % of the differences to the reference lie." if bins else "")
+        + (
+            " Dots: within which 95 % of the differences to the reference lie, its noise included."
+            if bins
+            else ""
+        )
         + " S-44 asks for more than the TVU: position, features and coverage."
     )
     figure = tvu_figure(sample[known, 1], sample[known, 2], bins)
