@@ -76,7 +76,7 @@ def _area(folder: Path) -> Layer:
 
 def _contours(folder: Path) -> Layer:
     """Return the lines of equal depth, no closer than the depth is known."""
-    depth, bounds = rasters.preview(folder / DEPTH, MOST_CELLS)
+    depth, bounds = rasters.preview(folder / DEPTH, MOST_CELLS**2)
     sigma = 0.0
     if (folder / UNCERTAINTY).exists():
         sigma = float(np.nanmedian(rasters.preview(folder / UNCERTAINTY)[0]))

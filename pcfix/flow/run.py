@@ -34,6 +34,7 @@ from pcfix.flow.run_adjust import (
 )
 from pcfix.flow.shore import check_shoreline
 from pcfix.flow.surfaces import view_of
+from pcfix.grid.maps import MOST_CELLS
 from pcfix.io.clouds import own_water
 from pcfix.io.files import check_input, files_in
 from pcfix.io.geopackage import check_layers
@@ -47,9 +48,11 @@ from pcfix.options.survey import RunOptions
 from pcfix.refract.tally import Summary
 from pcfix.report.adjustment_text import all_notes
 from pcfix.report.comparison import evaluation, in_a_sentence
+from pcfix.report.first_screen import Survey, is_found
 from pcfix.report.page import Picture, Table
 from pcfix.report.run import Later, adjustment_sentence, adjustment_table, reason_sentence
 from pcfix.report.text import uncertainty_sentence
+from pcfix.report.water import found_picture
 from pcfix.water.index import with_index
 
 RECORD = "run.json"
@@ -346,23 +349,32 @@ def _report(
 ) -> dict[str, str]:
     pictures: list[Picture] = []
     tables: list[Table] = []
+    dod = None
     first, compared = done["adjust"], done["compare"]
     verdict = reason_sentence(first["adjusted"], first["why"]) if first["is_said"] else ""
     if compared is not None:
-        dod = preview(files.compare / DOD) if _rasters(request) else None
+        dod = preview(files.compare / DOD, MOST_CELLS) if _rasters(request) else None
         pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
         verdict += in_a_sentence(compared["figures"])
     if first["adjusted"]:
-        tables.insert(0, adjustment_table(figures_of(files.folder), f"{FOLDER}/report.html"))
+        tables.append(adjustment_table(figures_of(files.folder), f"{FOLDER}/report.html"))
     summary = Summary(**done["correct"])
-    later = Later(pictures, tables, verdict, {} if compared is None else compared["figures"])
+    again = replace(request, views=None).part(Inputs)
+    cameras = _cameras(request, files)
+    if is_found(summary):
+        pictures.append(found_picture(again.surface(view_of(Path(request.input)))))
+    with open_raster(files.surface) as dsm:
+        resolution = float(dsm.res[0])
+    figures = {} if compared is None else compared["figures"]
+    later = Later(pictures, tables, verdict, figures, dod, resolution)
     page = write_report(
-        files.corrected,
+        files.cleaned,
         files.folder,
         summary=summary,
-        cameras=_cameras(request, files),
+        cameras=cameras,
         water=_water(request, files),
         inputs=inputs,
+        survey=Survey(request.project or "", request.date or again.dates(cameras)),
         later=later,
         overwrite=True,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import re
 import shutil
 import sqlite3
 from contextlib import closing
@@ -177,6 +178,23 @@ def test_report_holds_the_comparison(finished):
     assert len(list((finished[0] / "figures").glob("*.png"))) == text.count("<img ")
 
 
+def test_accuracy_is_that_of_the_bed_as_measured_and_land_stands_apart(finished):
+    steps, page = steps_and_page(finished[0])
+    text, found = page.read_text(), steps["compare"]["figures"]
+    bed, land, own = (found[name] for name in ("bed", "land", "own"))
+    assert bed["after"]["count"] + land["after"]["count"] == found["counts"]["compared"]
+    tile = re.search(r"<h2>Accuracy of the bed.*?</section>", text, re.S)[0]
+    assert ">measured<" in tile and "predicted" not in tile
+    assert f"<dd>{own['rmse_m']:.3f} m</dd>" in tile and own["rmse_m"] < bed["after"]["rmse_m"]
+    assert f"with it RMSE {bed['after']['rmse_m']:.3f} m" in tile
+    assert f"RMSE {land['after']['rmse_m']:.3f} m, reference included" in tile
+    assert str(finished[0]) not in text and str(SCENE) not in text
+    assert page.stat().st_size < 8_000_000
+    links = re.findall(r'<a href="([^"]*)"', text)
+    assert "corrected.laz" in links and "compare/compare.json" in links
+    assert all((finished[0] / link).is_file() for link in links)
+
+
 def steps_and_page(folder):
     steps = json.loads((folder / "run.json").read_text())["steps"]
     return {name: step["result"] for name, step in steps.items()}, (folder / "report.html")
@@ -282,7 +300,7 @@ def test_without_reference_and_vectors_there_is_a_report_all_the_same(tmp_path, 
     assert "Cross-section" not in text
     assert "on average, formal; no order is claimed: the poses were not checked" in text
     assert "<td>Exclusive</td>" not in text
-    assert "measured" not in text
+    assert ">predicted</span>" in text and ">measured</span>" not in text
     assert not (tmp_path / "out" / "compare").exists()
 
 
