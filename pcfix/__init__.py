@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from pcfix.flow.label import label_file, label_points
     from pcfix.flow.ortho import ortho_photo
     from pcfix.flow.photos import map_photos
+    from pcfix.flow.plan import plan_flight
     from pcfix.flow.rebuild import rebuild_rounds
     from pcfix.flow.restore import restore_file
     from pcfix.io.cameras import read_cameras
@@ -57,6 +58,7 @@ _NAMES = {
     "pcfix.flow.label": "label_file label_points",
     "pcfix.flow.ortho": "ortho_photo",
     "pcfix.flow.photos": "map_photos",
+    "pcfix.flow.plan": "plan_flight",
     "pcfix.flow.rebuild": "rebuild_rounds",
     "pcfix.flow.restore": "restore_file",
     "pcfix.io.cameras": "read_cameras",
@@ -102,6 +104,7 @@ __all__ = [
     "label_points",
     "map_photos",
     "ortho_photo",
+    "plan_flight",
     "read_cameras",
     "read_water",
     "rebuild_rounds",

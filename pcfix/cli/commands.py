@@ -13,6 +13,7 @@ import pcfix
 from pcfix.cli.flags import FLAGS, Quiet, UsageError, check_needed, progress_bar, say, status_line
 from pcfix.options.correct import CorrectOptions, LabelOptions
 from pcfix.options.declare import options_of
+from pcfix.options.handover import PlanOptions
 from pcfix.options.photos import CalmOptions, OrthoOptions, PhotosOptions
 from pcfix.options.scenes import DemoOptions, SimulateOptions
 from pcfix.options.shared import JobOptions
@@ -315,6 +316,15 @@ def simulate(
     say(f"{out_dir}: {scene.description}", quiet)
 
 
+def plan(*, options: Annotated[PlanOptions, FLAGS] = PlanOptions(), quiet: Quiet = False) -> None:
+    """Predict what a flight over water will measure, and say what would make it better."""
+    from pcfix.report.plan import plan_text
+
+    with progress_bar("Planning", quiet, unit="beds") as progress:
+        found = pcfix.plan_flight(options=options, progress=progress)
+    say(plan_text(found), quiet)
+
+
 def demo(
     out_dir: Annotated[Path, Parameter(help="Folder to make.")] = Path("pcfix-demo"),
     /,
@@ -348,6 +358,7 @@ EXAMPLES: tuple[tuple[Callable[..., None], str], ...] = (
     (restore, "pcfix restore corrected.laz cloud.laz"),
     (simulate, "pcfix simulate scene --points 20000"),
     (pipeline, "pcfix pipeline cloud.laz corrected.laz --cameras cameras.csv --water 0.37"),
+    (plan, "pcfix plan --height 60 --overlap 0.8 --sidelap 0.7 --depth 5 --plot plan.png"),
     (demo, "pcfix demo"),
 )
 """The commands in the order of the help, each with a line that shows it at work."""
