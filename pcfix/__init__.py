@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from pcfix.flow.plan import plan_flight
     from pcfix.flow.rebuild import rebuild_rounds
     from pcfix.flow.restore import restore_file
+    from pcfix.flow.view import view_clouds
     from pcfix.io.cameras import read_cameras
     from pcfix.io.water import read_water
     from pcfix.model import (
@@ -61,6 +62,7 @@ _NAMES = {
     "pcfix.flow.plan": "plan_flight",
     "pcfix.flow.rebuild": "rebuild_rounds",
     "pcfix.flow.restore": "restore_file",
+    "pcfix.flow.view": "view_clouds",
     "pcfix.io.cameras": "read_cameras",
     "pcfix.io.water": "read_water",
     "pcfix.model": "Cameras Correction Lens Outcome Views WaterDimension WaterMesh"
@@ -112,6 +114,7 @@ __all__ = [
     "restore_file",
     "simulate_scene",
     "trace",
+    "view_clouds",
 ]
 
 

@@ -13,7 +13,7 @@ import pcfix
 from pcfix.cli.flags import FLAGS, Quiet, UsageError, check_needed, progress_bar, say, status_line
 from pcfix.options.correct import CorrectOptions, LabelOptions
 from pcfix.options.declare import options_of
-from pcfix.options.handover import PlanOptions
+from pcfix.options.handover import PlanOptions, ViewerOptions
 from pcfix.options.photos import CalmOptions, OrthoOptions, PhotosOptions
 from pcfix.options.scenes import DemoOptions, SimulateOptions
 from pcfix.options.shared import JobOptions
@@ -325,6 +325,17 @@ def plan(*, options: Annotated[PlanOptions, FLAGS] = PlanOptions(), quiet: Quiet
     say(plan_text(found), quiet)
 
 
+def view(
+    *clouds: Annotated[Path, Parameter(help="LAS or LAZ clouds.")],
+    options: Annotated[ViewerOptions, FLAGS] = ViewerOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Show clouds in space, before and after, with reference, cameras and water."""
+    found = pcfix.view_clouds(clouds, options=options)
+    if found:
+        say(found, quiet)
+
+
 def demo(
     out_dir: Annotated[Path, Parameter(help="Folder to make.")] = Path("pcfix-demo"),
     /,
@@ -353,6 +364,7 @@ EXAMPLES: tuple[tuple[Callable[..., None], str], ...] = (
     (compare, "pcfix compare cleaned.laz lidar.laz --submerged"),
     (photos, "pcfix photos images dry --cameras cameras.xml --dsm bed.tif --water 0.37"),
     (calm, "pcfix calm frames calm.jpg --surface --depth 2.5 --gsd 0.01 --interval 0.2"),
+    (view, "pcfix view corrected.laz --reference lidar.laz --colour error --image errors.png"),
     (cameras, "pcfix cameras cameras.xml --cloud cloud.laz --water 0.37 --plot block.png"),
     (water, "pcfix water shore.csv --cloud cloud.laz --plot water.png"),
     (restore, "pcfix restore corrected.laz cloud.laz"),

@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Literal
 
 from pcfix.errors import SettingError
 from pcfix.options.correct import BudgetOptions
-from pcfix.options.declare import File, OptionSet, option, positive, rule, within
+from pcfix.options.declare import File, OptionSet, at_least, option, positive, rule, within
 from pcfix.options.scenes import depth_series
-from pcfix.options.shared import IndexOptions, OverwriteOption, Panel, SummaryOption
+from pcfix.options.shared import (
+    CameraFileOptions,
+    IndexOptions,
+    OverwriteOption,
+    Panel,
+    SummaryOption,
+    WaterOptions,
+)
+
+Colour = Literal["depth", "shift", "error", "uncertainty", "height"]
 
 
 def _lens(name: str, text: str) -> tuple[float, ...]:
@@ -105,3 +115,27 @@ class PlanOptions(
     panel = Panel.OUTPUT
 
     plot: File | None = option(None, "PNG of the block and of the errors by depth.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewerOptions(OverwriteOption, CameraFileOptions, WaterOptions):
+    """The options of ``pcfix view``."""
+
+    panel = Panel.OUTPUT
+
+    colour: Colour = option(
+        "depth", "What the colours are; error goes with --reference, the others by dimensions."
+    )
+    reference: File | None = option(
+        None, "LiDAR cloud, CSV check points or GeoTIFF to show beside, and to measure errors from."
+    )
+    cameras: Any = option(None, "Camera poses to show, as of 'pcfix correct'.", metavar="PATH")
+    water: Any = option(
+        None,
+        "Water to show, as of 'pcfix correct'; depths of clouds that do not have them go by it.",
+        metavar="SPEC",
+    )
+    image: File | None = option(None, "PNG to draw instead of opening a window.")
+    points: int = option(
+        2_000_000, "Of each cloud at most, evenly spread.", rule=at_least(1, "show some points")
+    )
