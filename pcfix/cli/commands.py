@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +14,7 @@ import pcfix
 from pcfix.cli.flags import FLAGS, Quiet, UsageError, check_needed, progress_bar, say, status_line
 from pcfix.options.correct import CorrectOptions, LabelOptions
 from pcfix.options.declare import options_of
-from pcfix.options.handover import PlanOptions, ViewerOptions
+from pcfix.options.handover import PlanOptions, PluginOptions, ViewerOptions
 from pcfix.options.photos import CalmOptions, OrthoOptions, PhotosOptions
 from pcfix.options.scenes import DemoOptions, SimulateOptions
 from pcfix.options.shared import JobOptions
@@ -336,6 +337,26 @@ def view(
         say(found, quiet)
 
 
+def qgis_plugin(
+    out: Annotated[Path, Parameter(help="ZIP to write.")],
+    /,
+    *,
+    options: Annotated[PluginOptions, FLAGS] = PluginOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Pack the plugin of QGIS: pcfix's commands as algorithms of its toolbox.
+
+    In QGIS: Plugins > Manage and Install Plugins > Install from ZIP.
+    """
+    from pcfix.cli.plugin import plugin_zip
+    from pcfix.io.files import write_bytes
+
+    write_bytes(out, plugin_zip(one for one, _ in EXAMPLES), overwrite=options.overwrite)
+    say(f"{out}: install it in QGIS by Plugins > Manage and Install Plugins > Install from ZIP;"
+        f" its environment of pcfix (Settings > Options > Processing > Providers > pcfix) is"
+        f" {Path(sys.prefix)}", quiet)  # fmt: skip
+
+
 def demo(
     out_dir: Annotated[Path, Parameter(help="Folder to make.")] = Path("pcfix-demo"),
     /,
@@ -371,6 +392,7 @@ EXAMPLES: tuple[tuple[Callable[..., None], str], ...] = (
     (simulate, "pcfix simulate scene --points 20000"),
     (pipeline, "pcfix pipeline cloud.laz corrected.laz --cameras cameras.csv --water 0.37"),
     (plan, "pcfix plan --height 60 --overlap 0.8 --sidelap 0.7 --depth 5 --plot plan.png"),
+    (qgis_plugin, "pcfix qgis-plugin pcfix.zip"),
     (demo, "pcfix demo"),
 )
 """The commands in the order of the help, each with a line that shows it at work."""

@@ -139,3 +139,8 @@ class ViewerOptions(OverwriteOption, CameraFileOptions, WaterOptions):
     points: int = option(
         2_000_000, "Of each cloud at most, evenly spread.", rule=at_least(1, "show some points")
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PluginOptions(OverwriteOption):
+    """The options of ``pcfix qgis-plugin``."""
