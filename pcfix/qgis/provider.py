@@ -23,6 +23,7 @@ from qgis.core import (
     QgsProcessingParameterNumber,
     QgsProcessingParameterString,
     QgsProcessingProvider,
+    QgsProviderRegistry,
     QgsRasterLayer,
     QgsVectorLayer,
 )
@@ -218,7 +219,7 @@ def _layers(path: Path) -> list[Any]:
     suffix = path.suffix.lower()
     if suffix == ".tif":
         return [QgsRasterLayer(str(path), path.stem)]
-    if suffix in (".las", ".laz"):
+    if suffix in (".las", ".laz") and "pdal" in QgsProviderRegistry.instance().providerList():
         return [QgsPointCloudLayer(str(path), path.stem, "pdal")]
     if suffix == ".gpkg":
         found = QgsVectorLayer(str(path), path.stem, "ogr").dataProvider()
