@@ -46,7 +46,7 @@ POINTS = 400
 """Of each bed; they are also the tie points of the adjustments."""
 MOST_BASES, MOST_SPACINGS = 8, 4
 """The block that is computed is no larger: farther inside, it is the same again."""
-FEWEST_SEEN = 50
+FEWEST_SEEN, NOTHING_PX = 50, 1e-6
 PARTS = {
     "image": ("sigma_image",), "level": ("sigma_level", "sigma_tilt"), "waves": ("sigma_waves",),
     "index": ("sigma_index",), "poses": ("sigma_centre", "sigma_attitude"),
@@ -273,7 +273,8 @@ def _absorbed(given: PlanOptions, bed: _Bed) -> tuple[float, float]:
     moved = _budget(given, bed._replace(apparent=apparent, cameras=cameras))
     known = moved.corrected
     off = bed.truth[known, 2] - moved.xyz[known, 2]
-    return 1.0 - after / before, float(off.mean())
+    share = 1.0 - after / before if before > NOTHING_PX else 0.0
+    return share, float(off.mean())
 
 
 def _prepared(given: PlanOptions, bed: _Bed, *, through_water: bool) -> Any:

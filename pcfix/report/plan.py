@@ -138,16 +138,17 @@ def plan_text(plan: Plan) -> str:
         "standard error of a corrected bed, cm, and what it comes from"
         f" (n = {plan.index:g}; every image that shows a point takes part):",
         " depth  looks   rays " + "".join(f"{part:>8}" for part in plan.deepest.parts_m)
-        + "   total     95 %  S-44       absorbed  then off",
+        + "   total     95 %  TVU of S-44  absorbed  then off",
     ]  # fmt: skip
     rows = [
         f"{one.depth_m:>5.4g} m{one.apparent_m:>6.2f} m{one.rays:>6.1f} "
         + "".join(f"{100.0 * part:>8.2f}" for part in one.parts_m.values())
-        + f"{100.0 * one.sigma_m:>8.2f}{100.0 * COVERAGE_95 * one.sigma_m:>9.2f}  {one.order:<11}"
+        + f"{100.0 * one.sigma_m:>8.2f}{100.0 * COVERAGE_95 * one.sigma_m:>9.2f}  {one.order:<13}"
         f"{one.absorbed:>6.0%}{100.0 * one.left_m:>+10.1f}"
         for one in plan.depths
     ]
     legend = [
+        "TVU        the strictest order of IHO S-44 whose vertical uncertainty it would keep",
         f"poses      after 'pcfix adjust' with GNSS of {plan.gnss_sigma_m:g} m and a calibrated"
         " lens, unless --sigma-centre or --sigma-attitude say how good they are",
         "absorbed   of the misfit of straight rays, what an adjustment without water hides in poses"
@@ -195,7 +196,7 @@ def advice_of(plan: Plan) -> list[str]:
     )  # fmt: skip
     found.append(
         "Wind: wait for a calm day; see what --sigma-waves 1 adds"
-        if not deepest.parts_m["waves"]
+        if not plan.budget["sigma_waves"]
         else "Wind: wait for a calmer day; 'pcfix calm' takes sequences through waves"
     )
     found[-1] += ". The water must be clear, and the bed have texture (none on plain sand)."
