@@ -31,12 +31,10 @@ ENDINGS = (".laz", ".las", ".tif", ".gpkg", ".csv", ".html", ".json")
 RESULTS = {
     "corrected.laz": "all points, the bed where it is",
     "cleaned.laz": "the same, outliers flagged as noise",
-    "dsm.tif": "heights of land and bed",
-    "dsm_bed.tif": "heights of the bed",
-    "hillshade.tif": "shaded relief",
     "depth.tif": "depth below the water",
     "bed.tif": "heights of the bed",
     "surface.tif": "heights of land and bed",
+    "surface_counts.tif": "points of each cell, and their spread",
     "uncertainty.tif": "vertical uncertainty at 95 %",
     "shaded.tif": "coloured, shaded relief",
     "map.gpkg": "contours, waterline and other lines and places, for a GIS",
