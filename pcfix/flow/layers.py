@@ -26,8 +26,8 @@ from pcfix.options.correct import LEVEL_M
 from pcfix.options.declare import File
 from pcfix.water.surface import surface_above
 
-MOST_CELLS = 2000
-"""Longest side of the raster that contours and footprint are drawn of."""
+MOST_CELLS = 4_000_000
+"""Of the rasters that contours and footprint are drawn of."""
 SECTIONS = 3
 DARK, RED, GREY = (8, 48, 107), (203, 24, 29), (120, 120, 120)
 ORANGE, GREEN = (253, 141, 60), (35, 139, 69)
@@ -76,7 +76,7 @@ def _area(folder: Path) -> Layer:
 
 def _contours(folder: Path) -> Layer:
     """Return the lines of equal depth, no closer than the depth is known."""
-    depth, bounds = rasters.preview(folder / DEPTH, MOST_CELLS**2)
+    depth, bounds = rasters.preview(folder / DEPTH, MOST_CELLS)
     sigma = 0.0
     if (folder / UNCERTAINTY).exists():
         sigma = float(np.nanmedian(rasters.preview(folder / UNCERTAINTY)[0]))
