@@ -34,7 +34,6 @@ RESULTS = {
     "depth.tif": "depth below the water",
     "bed.tif": "heights of the bed",
     "surface.tif": "heights of land and bed",
-    "surface_counts.tif": "points of each cell, and their spread",
     "uncertainty.tif": "vertical uncertainty at 95 %",
     "surface_counts.tif": "points of each cell, and their spread",
     "shaded.tif": "coloured, shaded relief",
