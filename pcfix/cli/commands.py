@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -53,15 +54,14 @@ def run(
         check_needed(options)
         values = {one.name: getattr(options, one.name) for one in options_of(RunOptions)}
         request, folder = Request(input=str(input), **values), out_dir
-    with progress_bar("Correcting", quiet) as progress:
-        run_all(
-            request,
-            Path(str(folder)),
-            overwrite=options.overwrite,
-            jobs=options.jobs,
-            say=lambda text: say(text, quiet),
-            progress=progress,
-        )
+    run_all(
+        request,
+        Path(str(folder)),
+        overwrite=options.overwrite,
+        jobs=options.jobs,
+        say=lambda text: say(text, quiet),
+        bar=partial(progress_bar, quiet=quiet),
+    )
 
 
 def correct(
@@ -367,11 +367,8 @@ def demo(
     """Simulate, correct, and show how far the cloud is from the truth."""
     from pcfix.flow.demo import run_demo
 
-    with progress_bar("Simulating and correcting", quiet) as progress:
-        table = run_demo(
-            out_dir, points=options.points, overwrite=options.overwrite, progress=progress
-        )
-    say(table)
+    bar = partial(progress_bar, quiet=quiet)
+    say(run_demo(out_dir, points=options.points, overwrite=options.overwrite, bar=bar))
 
 
 EXAMPLES: tuple[tuple[Callable[..., None], str], ...] = (

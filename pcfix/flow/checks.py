@@ -10,7 +10,7 @@ import numpy as np
 
 from pcfix.adjust.diagnosis import Diagnosis
 from pcfix.adjust.evidence import Evidence
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import InputError, SettingError, shown_once
 from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, has_datum, ties_of
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.next_steps import adjust_words
@@ -73,7 +73,7 @@ def check_cameras(
         _refuse_surveys(given)
     water = 0.0 if given.water is None else given.water
     inputs = replace(replace(given, water=water).part(Inputs), cameras=path)
-    read = inputs.read()
+    read = shown_once(inputs.read, lambda cameras: cameras.notes)
     view = None if cloud is None else view_of(check_input(cloud))
     surface = None if given.water is None else inputs.surface(view).surface
     xyz, heights = np.zeros((0, 3)), None
@@ -143,7 +143,7 @@ def check_water(
         check_output(plot, overwrite=given.overwrite, inputs=inputs)
     check_shoreline(given.shoreline, overwrite=given.overwrite, inputs=inputs)
     view = None if cloud is None else view_of(check_input(cloud))
-    found = find_surface(spec, given, view)
+    found = shown_once(lambda: find_surface(spec, given, view), lambda found: found.notes)
     sample, below, unknown = np.zeros((0, 3)), None, None
     if view is not None:
         sample, _ = _sample(view, WATER_SAMPLE_POINTS)

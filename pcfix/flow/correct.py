@@ -72,7 +72,7 @@ def correct_points(
         Or its attributes as keywords, as of ``pcfix correct``: index, method, max_angle (degrees
         from the surface normal), max_cameras, camera_set, matcher, depth_factor, unsure (with
         ``"withhold"`` the result says which are), sigma_image and the other standard errors;
-        occlusion is off unless asked for, as these points may not be the whole cloud.
+        `xyz` is taken for the whole cloud, so with a part of one set ``occlusion="off"``.
     views : Views, optional
         Which cameras made each point, rows of `adjusted_from` where that is given, else of
         `cameras`. Default: as the option `camera_set` says.
@@ -120,7 +120,7 @@ def correct_points(
     >>> result.xyz.round(3).tolist()
     [[0.0, 0.0, -2.703]]
     """
-    given = taken(RefractionOptions, options, keywords, "correct_points", occlusion="off")
+    given = taken(RefractionOptions, options, keywords, "correct_points")
     settings = with_index(given.part(ScienceOptions))
     if not cameras:
         given.check_no_cameras()

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
@@ -13,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 from pcfix.io.files import check_input, check_output, write_text
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import LasSink, check_suffix, corrected_identity, output_evlrs
+from pcfix.kernels import telling
 from pcfix.options.declare import File
 
 if TYPE_CHECKING:
@@ -21,6 +24,20 @@ if TYPE_CHECKING:
 Chunk: TypeAlias = "laspy.ScaleAwarePointRecord"
 Header: TypeAlias = "laspy.LasHeader"
 Progress: TypeAlias = Callable[[int, int], None]
+Bar: TypeAlias = Callable[[str], AbstractContextManager[Progress | None]]
+"""Of the name of a step: what shows, while it runs, how far it is."""
+
+
+def no_bar(title: str) -> AbstractContextManager[None]:
+    """Show nothing."""
+    return nullcontext()
+
+
+def part_of(progress: Progress | None, number: int, count: int) -> Progress | None:
+    """Return what a job tells that is one of several alike."""
+    if progress is None:
+        return None
+    return lambda done, total: progress(number * total + done, count * total)
 
 
 class Step(Protocol):
@@ -49,7 +66,7 @@ class FileTask:
     summary : path or None
         Where the summary goes, as JSON.
     progress : callable or None
-        Called with (points done, points in all) after each chunk.
+        Called with (points done, points in all), after each chunk and while it is corrected.
     started : float
         `time.perf_counter` then.
     """
@@ -75,12 +92,17 @@ class FileTask:
             with LasSink(self.target, header, output_evlrs(source), identity, self.jobs) as sink:
                 done = 0
                 for points in source.chunks():
-                    count = len(points)
-                    sink.write(step.chunk(points, source, header))
-                    done += count
-                    if self.progress is not None:
-                        self.progress(done, len(source))
+                    with telling(partial(self._tell, done, len(points), len(source))):
+                        new = step.chunk(points, source, header)
+                    sink.write(new)
+                    done += len(points)
+                    self._tell(done, 0, len(source))
                 step.finish()
+
+    def _tell(self, done: int, chunk: int, total: int, of_chunk: int = 0) -> None:
+        """Show that so many points are done, and so many of a chunk, which may go twice."""
+        if self.progress is not None:
+            self.progress(done + min(of_chunk, chunk), total)
 
     def tell(self, summary: dict[str, Any]) -> None:
         """Write the summary, where one is wanted."""

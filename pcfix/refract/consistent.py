@@ -138,7 +138,7 @@ def consistent(batch: Batch) -> Intersection:
     check_consistent(batch.survey.cameras)
     survey, result = batch.survey, np.zeros((len(batch), COLUMNS))
     optics, shapes = optics_of(survey.cameras), shapes_of(survey.water)
-    in_tiles(_correct, len(batch), batch.chosen(), optics, *shapes, result)
+    in_tiles(_correct, len(batch), batch.chosen(), optics, *shapes, result, points=len(batch))
     return intersection_of(batch, result)
 
 

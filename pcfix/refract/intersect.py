@@ -76,6 +76,7 @@ def intersect(batch: Batch) -> Intersection:
         _chosen, tiles_of(batch), points_of(batch), rig_of(survey), rule_of(survey),
         *shapes_of(survey.water),
         (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)), result, used,
+        points=len(batch),
     )  # fmt: skip
     return _as_intersection(result, used)
 
@@ -96,6 +97,7 @@ def intersect_in_frame(batch: Batch) -> Intersection:
     in_tiles(
         _all_in_frame, tiles_of(batch), points_of(batch), rig_of(survey), frames_of(survey.cameras),
         rule_of(survey), budget_of(survey), level_sigma_of(batch), (result, used, covariance),
+        points=len(batch),
     )  # fmt: skip
     found = _as_intersection(result, used)
     return with_errors(found, covariance if len(covariance) == len(batch) else None)

@@ -30,6 +30,8 @@ from pcfix.io.files import check_input
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
 
+LISTS = (".xml", ".csv", ".txt", ".json", ".geojson", ".psx", ".out", ".nvm")
+"""How files are named that cameras may be in."""
 FORMATS = (
     CameraFormat(
         "Agisoft Metashape, PhotoScan",
@@ -163,7 +165,20 @@ def _recognised(
     for form in FORMATS:
         if form.reader.recognises(source):
             return source, form
+    inside = _camera_files(where)
+    if inside:
+        raise InputError(
+            f"{where}: is a folder that holds {' and '.join(inside)}; give"
+            f" {where / inside[0]} itself."
+        )
     raise InputError(
         f"{where}: is not a camera file that pcfix knows; give a CSV table with the columns"
         " label, x, y, z and, if you have them, yaw, pitch, roll."
     )
+
+
+def _camera_files(folder: Path) -> list[str]:
+    """Return the names of camera files in a folder, three at most."""
+    paths = sorted(p for p in folder.glob("*") if p.suffix.lower() in LISTS and p.is_file())
+    known = [form.reader for form in FORMATS if form.reader is not unsupported]
+    return [p.name for p in paths if any(one.recognises(Source(p)) for one in known)][:3]

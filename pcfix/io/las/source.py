@@ -146,6 +146,17 @@ def las_errors(path: Path) -> Iterator[None]:
         ) from error
 
 
+def refuse_ply(path: Path, head: bytes) -> None:
+    """Refuse a cloud in a format that is whole, and not LAS; say how to convert it."""
+    if head.startswith((b"ply\n", b"ply\r")):
+        millimetres = " ".join(f"--writers.las.scale_{axis}=0.001" for axis in "xyz")
+        raise InputError(
+            f"{path}: is a PLY file, and pcfix takes LAS and LAZ; convert it with: pdal translate"
+            f" {path} {path.with_suffix('.laz')} {millimetres} --writers.las.offset_x=auto"
+            " --writers.las.offset_y=auto --writers.las.offset_z=auto --writers.las.a_srs=EPSG:CODE"
+        )
+
+
 class LasSource:
     """An open LAS or LAZ file; use it as a context manager.
 
@@ -159,6 +170,8 @@ class LasSource:
         self.path = check_input(path)
         with las_errors(self.path):
             with self.path.open("rb") as stream:
+                refuse_ply(self.path, stream.read(4))
+                stream.seek(0)
                 self.vlrs, self.evlrs = read_records(stream)
                 stream.seek(IDENTITY_PLACE)
                 self.identity = stream.read(_IDENTITY_SIZE)
