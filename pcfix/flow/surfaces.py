@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
-from pcfix.flow.runner import Chunk
+from pcfix.flow.runner import Chunk, read_ahead
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.water import read_water
 from pcfix.label.labelling import Part
@@ -127,9 +127,8 @@ def file_points(
     path: Path, water: WaterSurface | None, jobs: int | None = None
 ) -> Iterator[Points]:
     """Yield all points of a LAS or LAZ file, chunk by chunk."""
-    with LasSource(path, jobs) as source:
-        for chunk in source.chunks():
-            yield points_of(chunk, source, water)
+    with LasSource(path, jobs, places_only=not isinstance(water, WaterDimension)) as source:
+        yield from read_ahead((points_of(one, source, water) for one in source.chunks()), jobs)
 
 
 def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Points:

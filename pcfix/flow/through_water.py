@@ -170,7 +170,7 @@ class ThroughWater:
         above = surface_above(self.water, xyz, points.heights)
         batch = Batch(xyz, above, self.survey, views, made_with, source=points.sources)
         batch = self._of_kind(batch)
-        correction = correct_checked(batch, label, self.found.sigma_level_m)
+        correction = correct_checked(batch, label, self.found.sigma_level_m, heights_only=True)
         if self.regression is not None:
             least = LEAST_BEYOND if self._inputs.regression is None else 0.0
             self._beyond = self._beyond or BeyondRange(self.regression, least)
@@ -331,6 +331,8 @@ def correct_checked(
     batch: Batch,
     label: Label | None = None,
     level_sigma_m: Callable[[FloatArray], FloatArray | None] | None = None,
+    *,
+    heights_only: bool = False,
 ) -> Correction:
     """Label, refract, and spread the result over all rows: what every door runs.
 
@@ -342,6 +344,8 @@ def correct_checked(
         Says which are submerged. Default: those below the surface.
     level_sigma_m : callable, optional
         Returns the standard deviation of the water's height at places, shape (m, 2).
+    heights_only : bool
+        Leave the covariances out, of which files have the standard error of Z alone.
     """
     xyz, surface = batch.xyz, batch.surface
     submerged = is_submerged(xyz[:, 2], surface) if label is None else label(xyz, surface)
@@ -350,6 +354,8 @@ def correct_checked(
     if level_sigma_m is not None:
         wet = replace(wet, level_sigma_m=level_sigma_m(wet.xyz[:, :2]))
     found = correct(wet)
+    if heights_only:
+        found = found._replace(covariance_m2=None)
     below = _below_m(wet, found)
     if batch.made_with is not None:
         # their own images put them lower than all images together, by which they were carried
@@ -388,6 +394,8 @@ _PER_POINT = (
 def spread_over(found: Intersection, rows: IntArray, n: int) -> dict[str, Any]:
     """Return the values of corrected rows as those of n points, zero elsewhere."""
     full: dict[str, Any] = dict.fromkeys(_PER_POINT)
+    if len(rows) == n:
+        return {name: getattr(found, name) for name in _PER_POINT}
     for name in _PER_POINT:
         values = getattr(found, name)
         if values is not None:

@@ -110,17 +110,21 @@ def with_errors(found: Intersection, covariance: FloatArray | None) -> Intersect
     if covariance is None:
         return found._replace(sigma_z_m=np.zeros(len(found.outcome)))
     moved = found.outcome == Outcome.CORRECTED
-    covariance[~moved] = 0.0
+    if not moved.all():
+        covariance[~moved] = 0.0
     return found._replace(sigma_z_m=np.sqrt(covariance[:, _ZZ]), covariance_m2=covariance)
 
 
 def with_doubt(found: Intersection, batch: Batch) -> Intersection:
-    """Return a result whose standard errors of Z have what cloud and poses tell of them."""
+    """Return a result whose standard errors of Z have what cloud and poses tell of them.
+
+    They are added to its covariances where these stand.
+    """
     doubt, poses = batch.survey.learned.doubt, batch.survey.learned.poses
     if (doubt is None and poses is None) or found.covariance_m2 is None:
         return found
     moved = found.outcome == Outcome.CORRECTED
-    covariance = found.covariance_m2.copy()
+    covariance = found.covariance_m2
     if doubt is not None:
         depth = batch.surface.height_m - (batch.xyz[:, 2] + found.shift_m[:, 2])
         covariance[moved, _ZZ] += doubt.scatter_m**2 + (doubt.per_depth * depth[moved]) ** 2
