@@ -15,7 +15,7 @@ from pcfix.flow.inputs import paths_in
 from pcfix.flow.job import Job
 from pcfix.flow.old_cameras import paired
 from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
-from pcfix.flow.surfaces import file_points, points_of, view_of
+from pcfix.flow.surfaces import corners, file_points, own_water_of, points_of, view_of
 from pcfix.flow.through_water import Label, correct_checked
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps
@@ -53,6 +53,7 @@ def correct_points(
     level_offset_m: npt.ArrayLike | None = None,
     adjusted_from: Cameras | None = None,
     regression: DepthRegression | File | None = None,
+    water_per_image: File | None = None,
     **keywords: Any,
 ) -> Correction:
     """Correct apparent points for refraction at the water surface.
@@ -89,6 +90,10 @@ def correct_points(
         from those to these; see `pcfix.adjust.carry`.
     regression : DepthRegression or path, optional
         With the method regression: see `pcfix.refract.regression`, or the file of a line.
+    water_per_image : path, optional
+        Folder of rasters of the water, each of the name of an image, in the frame of the points, as
+        ``pcfix calm --surface`` writes them, with standard errors. The rays of these images bend
+        there, by the method snell; which points are submerged, and how deep, goes by `water`.
 
     Returns
     -------
@@ -122,6 +127,8 @@ def correct_points(
     """
     given = taken(RefractionOptions, options, keywords, "correct_points", occlusion="off")
     settings = with_index(given.part(ScienceOptions))
+    if water_per_image is not None:
+        settings = settings.through_own_water()
     if not cameras:
         given.check_no_cameras()
         if not (views is None and level_offset_m is None and adjusted_from is None):
@@ -144,7 +151,10 @@ def correct_points(
         made_with = MadeWith(points, pair.old)
         points, views, label = step.xyz, step.views, step.rule(label)
     above = surface_above(surface, points, dimension)
-    batch = Batch(points, above, Survey(surface, cameras, settings, offset), views, made_with)
+    place = None, *corners(points[:, 0], points[:, 1])
+    own, notes = own_water_of(water_per_image, cameras, surface, place, offset)
+    survey = Survey(surface, cameras, settings, offset, own_water=own)
+    batch = Batch(points, above, survey, views, made_with)
     line = regression
     if line is not None and not isinstance(line, DepthRegression):
         line = read_regression(line)
@@ -152,8 +162,9 @@ def correct_points(
     if line is not None and line is not regression:
         beyond = BeyondRange(line)
         beyond.add((above.height_m - points[:, 2])[found.submerged])
-        for note in (*line.notes, *beyond.notes()):
-            warnings.warn(note, PcfixWarning, stacklevel=2)
+        notes = (*notes, *line.notes, *beyond.notes())
+    for note in notes:
+        warnings.warn(note, PcfixWarning, stacklevel=2)
     return found if step is None else step.whole(found)
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, Self
 
 from pcfix.errors import SettingError
 from pcfix.options.declare import (
@@ -26,6 +26,7 @@ from pcfix.options.shared import (
     SubmergedOptions,
     SummaryOption,
     WaterOptions,
+    WaterPerImageOption,
 )
 
 Uncorrected = Literal["withhold", "keep", "drop"]
@@ -172,6 +173,21 @@ class MethodOptions(IndexOptions):
                     " cameras too."
                 )
 
+    def through_own_water(self) -> Self:
+        """Return the options by which points are corrected whose images have each its own water.
+
+        Raises
+        ------
+        SettingError
+            If the method takes the water to be one.
+        """
+        if self.method not in ("auto", "snell"):
+            raise SettingError(
+                f"method {self.method} takes the water to be one for all images; with"
+                " water-per-image give snell, or leave one of the two out."
+            )
+        return replace(self, method="snell")
+
     @property
     def limit_deg(self) -> float | None:
         """The largest incidence angle; None where there is none, or it is still open."""
@@ -250,7 +266,13 @@ class ScienceOptions(RefractionOptions, ResultOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectOptions(
-    ShorelineOption, JobOptions, SummaryOption, ScienceOptions, SubmergedOptions, InputOptions
+    ShorelineOption,
+    JobOptions,
+    SummaryOption,
+    ScienceOptions,
+    WaterPerImageOption,
+    SubmergedOptions,
+    InputOptions,
 ):
     """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
 

@@ -10,6 +10,7 @@ of five million.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -18,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import GeometryError, SettingError
-from pcfix.kernels import Span, in_tiles, kernel, lean, lean_kernel
+from pcfix.kernels import Span, in_tiles, kernel, lean, lean_kernel, part
 from pcfix.model import (
     BoolArray,
     FloatArray,
@@ -203,6 +204,50 @@ def _set_heights(
 ) -> None:
     for i in range(*span):
         height[i], slope[i, 0], slope[i, 1] = height_at(field, x[i], y[i])
+
+
+class Fields(NamedTuple):
+    """Rasters of k images as the kernels take them; an image without one has no cells.
+
+    heights : shape (cells,), of one raster after the other.
+    first : shape (k + 1,), where the cells of each image begin.
+    columns : shape (k,)
+    frame : shape (k, 4), west_x, north_y, cell_x and cell_y of each; see `Field`.
+    """
+
+    heights: FloatArray
+    first: IntArray
+    columns: IntArray
+    frame: FloatArray
+
+
+def build_fields(rasters: Mapping[int, WaterRaster], k: int) -> Fields:
+    """Return the rasters of some of k images, by the rows of these."""
+    cells, columns, frame = np.zeros(k, np.int64), np.ones(k, np.int64), np.ones((k, 4))
+    for c, raster in rasters.items():
+        cells[c], columns[c] = raster.height_m.size, raster.height_m.shape[1]
+        frame[c] = build_field(raster)[1:]
+    known = [np.ravel(rasters[c].height_m) for c in sorted(rasters)]
+    return Fields(
+        np.concatenate([np.zeros(0), *known]), np.append(0, np.cumsum(cells)), columns, frame
+    )
+
+
+@part
+def field_of(fields: Fields, c: int) -> Field:
+    """Return the raster of an image; without cells where it has none."""
+    cells, columns, frame = (
+        fields.heights[fields.first[c] : fields.first[c + 1]], fields.columns[c], fields.frame[c]
+    )  # fmt: skip
+    table = cells.reshape(cells.size // columns, columns)
+    return Field(table, frame[0], frame[1], frame[2], frame[3])
+
+
+class OwnWater(NamedTuple):
+    """The water that the rays of single images go through, and its standard error, metres."""
+
+    heights: Fields
+    sigma: Fields
 
 
 EDGE_TOLERANCE = 1e-9  # of a barycentric coordinate: a point on an edge belongs to both sides
