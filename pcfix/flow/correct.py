@@ -93,7 +93,7 @@ def correct_points(
     water_per_image : path, optional
         Folder of rasters of the water, each of the name of an image, in the frame of the points, as
         ``pcfix calm --surface`` writes them, with standard errors. The rays of these images bend
-        there, by the method snell; which points are submerged, and how deep, goes by `water`.
+        there, with snell or consistent; what is submerged, and how deep, goes by `water`.
 
     Returns
     -------
@@ -128,7 +128,7 @@ def correct_points(
     given = taken(RefractionOptions, options, keywords, "correct_points", occlusion="off")
     settings = with_index(given.part(ScienceOptions))
     if water_per_image is not None:
-        settings = settings.through_own_water()
+        settings = settings.through_own_water(None if views is None else views.kind)
     if not cameras:
         given.check_no_cameras()
         if not (views is None and level_offset_m is None and adjusted_from is None):

@@ -18,7 +18,15 @@ from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.water import read_water
 from pcfix.io.water_rasters import rasters_of_images, read_water_raster
 from pcfix.label.labelling import Part
-from pcfix.model import Cameras, FloatArray, IntArray, WaterDimension, WaterRaster, WaterSurface
+from pcfix.model import (
+    Cameras,
+    FloatArray,
+    IntArray,
+    WaterDimension,
+    WaterMesh,
+    WaterRaster,
+    WaterSurface,
+)
 from pcfix.options.declare import File
 from pcfix.options.shared import WaterOptions
 from pcfix.water.fit import WaterFit
@@ -221,6 +229,11 @@ def own_water_of(
     """
     if folder is None:
         return None, ()
+    if isinstance(water, WaterMesh):
+        raise SettingError(
+            "water-per-image does not go with a mesh as the water of the other images; give a"
+            " level, a plane or a raster."
+        )
     crs, low, high = view
     paths, notes = rasters_of_images(folder, cameras.labels)
     heights = _read_alike(paths, crs)
@@ -247,7 +260,8 @@ def own_water_of(
             f"{folder}: its water stands {off:+.2f} m from --water ({water}); give both the same"
             " vertical datum, 'pcfix calm' the --level of the calm water."
         )
-    return OwnWater(build_fields(heights, len(cameras)), build_fields(sigma, len(cameras))), notes
+    k, common = len(cameras), water if isinstance(water, WaterRaster) else None
+    return OwnWater(build_fields(heights, k, common), build_fields(sigma, k)), notes
 
 
 def _read_alike(paths: dict[int, Path], crs: CRS | str | None) -> dict[int, WaterRaster]:

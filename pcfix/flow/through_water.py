@@ -45,7 +45,7 @@ from pcfix.refract.tally import Tally
 from pcfix.water.checks import WaterMeeting, check_above_water, check_tilt, refuse_under_water
 from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
-OWN_WATER = "Images have water of their own, which methods but snell take to be one for all."
+OWN_WATER = "Images have water of their own, which snell and consistent alone allow for."
 Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
 
 
@@ -80,14 +80,14 @@ class ThroughWater:
         self.level_offset_m = inputs.level_offset_m(self._cameras)
         check_above_water(self._cameras, self.water, self.level_offset_m)
         check_tilt(self.water)
+        self._listed = None if blocks.views is None else blocks.views.kind
         folder, place = options.water_per_image, (view.crs, view.low, view.high)
         if folder is not None:
-            options = options.through_own_water()
+            options = options.through_own_water(self._listed)
             self.settings["water_per_image"] = str(folder)
         own, self._own_notes = own_water_of(
             folder, self._cameras, self.water, place, self.level_offset_m
         )
-        self._listed = None if blocks.views is None else blocks.views.kind
         self._learning = Learning(
             Survey(self.water, self._cameras, options, self.level_offset_m, own_water=own),
             inputs, view, self._listed,

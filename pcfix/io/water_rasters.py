@@ -306,7 +306,8 @@ def _heights_at(part: Part, places: FloatArray, to_cloud: Points) -> FloatArray:
     from pcfix.water.surface import Field, heights_above
 
     column, row = place_of(~part.transform, places[:, 0], places[:, 1])
-    cells = Field(np.ascontiguousarray(part.heights), 0.5, -0.5, 1.0, 1.0)
+    rows, columns = part.heights.shape
+    cells = Field(part.heights.ravel(), 0, rows, columns, 0.5, -0.5, 1.0, 1.0)
     height, _ = heights_above(cells, np.ascontiguousarray(column), np.ascontiguousarray(-row))
     known = np.isfinite(height)
     height[known] = to_cloud(np.column_stack([places[known, :2], height[known]]))[:, 2]

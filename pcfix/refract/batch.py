@@ -128,7 +128,8 @@ class Survey:
         Surveys of points that were made in another way than most: by their source, and of those in
         no list, where there is one, by `UNLISTED`.
     own_water : OwnWater or None
-        What images have of water of their own, through which the rays of ``snell`` go.
+        Rasters of the water as single images saw it, in which all rays of ``snell`` and
+        ``consistent`` bend; at `water` where they do not reach.
     """
 
     water: WaterSurface

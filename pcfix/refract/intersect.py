@@ -8,9 +8,8 @@ cameras, so that they agree to the bit wherever both apply.
 
 Each camera may have had its own water level, the surface shifted along the vertical. The point is
 lowered by the shift instead, where only its distance from the surface counts. A camera whose own
-water lay below the apparent point saw it through air; its ray goes straight on. Or a camera has a
-raster of the water as it stood for it, which its ray pierces near where it meets the common
-surface; beyond the raster's edge the ray bends at the common one.
+water lay below the apparent point saw it through air; its ray goes straight on. Or it has a raster
+of its own, see `Survey.own_water`.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 
 from pcfix.kernels import Span, in_tiles, kernel, lean, part
-from pcfix.lens.algebra import Vector, dot, minus, row_of, scaled
+from pcfix.lens.algebra import dot, minus, row_of, scaled
 from pcfix.lens.frames import (
     ALL,
     NOT_DISTORTED,
@@ -48,7 +47,7 @@ from pcfix.refract.choice import (
     shapes_of,
     tiles_of,
 )
-from pcfix.refract.rays import add_line, line_terms, nearest_point, pierce, refracted
+from pcfix.refract.rays import add_line, line_terms, nearest_point, pierce_of, refracted
 from pcfix.refract.sensitivity import SUMS, TILE_RUNS, Budget, add_below
 from pcfix.refract.uncertainty import (
     add_errors,
@@ -57,7 +56,7 @@ from pcfix.refract.uncertainty import (
     level_sigma_of,
     with_errors,
 )
-from pcfix.water.surface import Field, Fields, Tin, field_of, height_at, locate
+from pcfix.water.surface import Fields, Tin, locate
 
 
 def intersect(batch: Batch) -> Intersection:
@@ -76,7 +75,7 @@ def intersect(batch: Batch) -> Intersection:
     result, used = np.zeros((len(batch), 8)), np.zeros(len(survey.cameras), np.bool_)
     in_tiles(
         _chosen, tiles_of(batch), points_of(batch), rig_of(survey), rule_of(survey),
-        *shapes_of(survey.water), None if survey.own_water is None else survey.own_water.heights,
+        *shapes_of(survey),
         (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)), result, used,
     )  # fmt: skip
     return _as_intersection(result, used)
@@ -251,10 +250,10 @@ def _all_in_frame(
 
 @kernel
 def _chosen(
-    span: Span, points: Points, rig: Rig, rule: Rule, tin: Tin | None, field: Field | None,
-    own: Fields | None, views: tuple[IntArray, IntArray], result: FloatArray, used: BoolArray,
+    span: Span, points: Points, rig: Rig, rule: Rule, tin: Tin | None, fields: Fields | None,
+    views: tuple[IntArray, IntArray], result: FloatArray, used: BoolArray,
 ) -> None:  # fmt: skip
-    """Chosen cameras per point, and rays that may bend at a mesh or raster, or each at its own."""
+    """Chosen cameras per point, and rays that may bend at a mesh or raster."""
     start, camera = views
     for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
@@ -266,17 +265,15 @@ def _chosen(
             cameras = camera[start[i] : start[i + 1]]
             for c in cameras:
                 used[c] = True  # threads may write it at once: always the same value
-            water = tin, field, own, facet
-            _intersect_one(result[i], cameras, tile, j, rig, rule.bend, water)
+            _intersect_one(result[i], cameras, tile, j, rig, rule.bend, tin, fields, facet)
 
 
 @part
 def _intersect_one(
     row: FloatArray, cameras: IntArray, tile: FloatArray, j: int, rig: Rig, r: float,
-    water: tuple[Tin | None, Field | None, Fields | None, int],
+    tin: Tin | None, fields: Fields | None, facet: int,
 ) -> None:  # fmt: skip
     """Intersect the rays of one point with its own cameras."""
-    tin, field, own, facet = water
     x, y, z = tile[j], tile[TILE + j], tile[2 * TILE + j]
     upward = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
     sums, least = np.zeros(11), 1.0
@@ -287,29 +284,13 @@ def _intersect_one(
         f, bend, normal = 0.0, 1.0, upward
         if h > 0.0:
             bend = r
-            f, normal = pierce(tin, field, lowered, e, h, upward, facet)
-            if own is not None:
-                f, normal = _pierce_own(own, c, (x, y, z), e, f, normal)
+            f, normal = pierce_of(c, tin, fields, lowered, e, h, upward, facet)
         height = dot(normal, e)
         q = 1.0 / (length2 * height)
-        if h > 0.0 and tin is None and field is None and own is None:
+        if h > 0.0 and tin is None and fields is None:
             f = h * length2 * q  # as in `_add_camera`
         inv = height * q
         add_line(sums, scaled(f, e), refracted(e, length2, normal, height, bend), inv)
         least = min(least, height * height * inv)
     sums[10] = least
     _solve(row, float(cameras.size), sums)
-
-
-@part
-def _pierce_own(
-    own: Fields, c: int, p: Vector, e: Vector, f: float, normal: Vector
-) -> tuple[float, Vector]:
-    """Return where a ray pierces the water of its image, from where it pierces the common one.
-
-    That is as `pierce` has it, and where the image has no raster, or none there, the answer too.
-    """
-    field = field_of(own, c)
-    if field.heights.size == 0 or np.isnan(height_at(field, p[0] + f * e[0], p[1] + f * e[1])[0]):
-        return f, normal
-    return pierce(None, field, p, e, f * dot(normal, e), normal, -1)

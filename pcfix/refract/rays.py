@@ -68,7 +68,7 @@ from pcfix.lens.algebra import (
     vector,
 )
 from pcfix.model import FloatArray
-from pcfix.water.surface import Field, Tin, height_at, locate
+from pcfix.water.surface import Field, Fields, Tin, field_of, height_at, locate
 
 
 @lean
@@ -202,6 +202,15 @@ def pierce(
     if field is not None:
         return _pierce_raster(field, p, e, h, normal)
     return h / dot(normal, e), normal
+
+
+@lean
+def pierce_of(
+    c: int, tin: Tin | None, fields: Fields | None, p: Vector, e: Vector, h: float, normal: Vector,
+    facet: int,
+) -> tuple[float, Vector]:  # fmt: skip
+    """Return `pierce` with the raster of camera c, where cameras have rasters."""
+    return pierce(tin, field_of(fields, c), p, e, h, normal, facet)
 
 
 @lean

@@ -24,7 +24,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, inlined, kernel, lean, part
+from pcfix.kernels import Span, in_tiles, inlined, kernel, lean, lean_kernel, part
 from pcfix.lens.algebra import Symmetric, Vector
 from pcfix.model import FloatArray, IntArray, Outcome
 from pcfix.options.correct import LEVEL_M
@@ -154,7 +154,7 @@ def level_sigma_of(batch: Batch) -> FloatArray:
     return np.hypot(full, of_own)
 
 
-@kernel
+@lean_kernel
 def _own_sigma(
     span: Span, points: Points, rig: Rig, sigma: Fields, views: tuple[IntArray, IntArray],
     found: FloatArray,
@@ -171,8 +171,7 @@ def _own_sigma(
             up = rig.centres[c, 2] - points.xyz[i, 2]
             f = (points.height[i] + rig.offset[c] - points.xyz[i, 2]) / up
             x, y = x + f * (rig.centres[c, 0] - x), y + f * (rig.centres[c, 1] - y)
-            field = field_of(sigma, c)
-            error = height_at(field, x, y)[0] if field.heights.size else 0.0
+            error = height_at(field_of(sigma, c), x, y)[0]
             total += error * error if error > 0.0 else 0.0
         found[i] = np.sqrt(total) / max(start[i + 1] - start[i], 1)
 

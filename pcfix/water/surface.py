@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import GeometryError, SettingError
-from pcfix.kernels import Span, in_tiles, kernel, lean, lean_kernel, part
+from pcfix.kernels import Span, in_tiles, kernel, lean, lean_kernel
 from pcfix.model import (
     BoolArray,
     FloatArray,
@@ -145,12 +145,16 @@ def is_submerged(z: FloatArray, surface: SurfaceAbove) -> BoolArray:
 class Field(NamedTuple):
     """The numbers of the lookup; see `build_field`.
 
-    heights : shape (rows, columns), metres, northern row first.
-    west_x, north_y : the centre of the upper left cell, world frame.
+    heights : shape (cells,), metres, row by row, northern row first; of other rasters too.
+    first, rows, columns : where those of this one begin, and how many they are.
+    west_x, north_y : the centre of the upper left cell, world frame; NaN where there is no raster.
     cell_x, cell_y : width and height of a cell, metres.
     """
 
     heights: FloatArray
+    first: int
+    rows: int
+    columns: int
     west_x: float
     north_y: float
     cell_x: float
@@ -161,8 +165,12 @@ class Field(NamedTuple):
 def build_field(raster: WaterRaster) -> Field:
     """Return a raster as the kernels take it."""
     width, height = (float(side) for side in raster.cell_m)
+    rows, columns = raster.height_m.shape
     return Field(
-        np.ascontiguousarray(raster.height_m, np.float64),
+        np.ascontiguousarray(raster.height_m, np.float64).ravel(),
+        0,
+        rows,
+        columns,
         float(raster.left_m) + width / 2.0,
         float(raster.top_m) - height / 2.0,
         width,
@@ -171,22 +179,29 @@ def build_field(raster: WaterRaster) -> Field:
 
 
 @lean
-def height_at(field: Field, x: float, y: float) -> tuple[float, float, float]:
-    """Return height, dz/dx and dz/dy at a plan position (world frame); NaN where not known.
+def patch_at(field: Field, x: float, y: float) -> tuple[float, float, float, float, float, float]:
+    """Return z00, s, t, both differences and k at a plan position (world frame); NaN if not known.
 
     In the outer half of the cells at the edge the outermost patch goes on.
     """
-    rows, columns = field.heights.shape
+    rows, columns = field.rows, field.columns
     u, v = (x - field.west_x) / field.cell_x, (field.north_y - y) / field.cell_y
     if not (-0.5 <= u <= columns - 0.5 and -0.5 <= v <= rows - 0.5):
-        return np.nan, 0.0, 0.0
+        return np.nan, 0.0, 0.0, 0.0, 0.0, 0.0
     column = min(max(int(np.floor(u)), 0), columns - 2)
     row = min(max(int(np.floor(v)), 0), rows - 2)
-    s, t = u - column, v - row
-    z = field.heights[row, column]
-    east = field.heights[row, column + 1] - z
-    south = field.heights[row + 1, column] - z
-    twist = field.heights[row + 1, column + 1] - z - east - south
+    at = field.first + row * columns + column
+    z = field.heights[at]
+    east = field.heights[at + 1] - z
+    south = field.heights[at + columns] - z
+    twist = field.heights[at + columns + 1] - z - east - south
+    return z, u - column, v - row, east, south, twist
+
+
+@lean
+def height_at(field: Field, x: float, y: float) -> tuple[float, float, float]:
+    """Return height, dz/dx and dz/dy at a plan position (world frame); NaN where not known."""
+    z, s, t, east, south, twist = patch_at(field, x, y)
     height = z + s * east + t * south + s * t * twist
     return height, (east + t * twist) / field.cell_x, -(south + s * twist) / field.cell_y
 
@@ -207,44 +222,50 @@ def _set_heights(
 
 
 class Fields(NamedTuple):
-    """Rasters of k images as the kernels take them; an image without one has no cells.
+    """The `Field` of each of k images, for kernels; several may share one, some have none.
 
-    heights : shape (cells,), of one raster after the other.
-    first : shape (k + 1,), where the cells of each image begin.
-    columns : shape (k,)
-    frame : shape (k, 4), west_x, north_y, cell_x and cell_y of each; see `Field`.
+    heights : shape (cells,), of all rasters.
+    shape : shape (k, 3), first, rows and columns of each.
+    frame : shape (k, 4), west_x, north_y, cell_x and cell_y of each.
     """
 
     heights: FloatArray
-    first: IntArray
-    columns: IntArray
+    shape: IntArray
     frame: FloatArray
 
 
-def build_fields(rasters: Mapping[int, WaterRaster], k: int) -> Fields:
-    """Return the rasters of some of k images, by the rows of these."""
-    cells, columns, frame = np.zeros(k, np.int64), np.ones(k, np.int64), np.ones((k, 4))
-    for c, raster in rasters.items():
-        cells[c], columns[c] = raster.height_m.size, raster.height_m.shape[1]
-        frame[c] = build_field(raster)[1:]
-    known = [np.ravel(rasters[c].height_m) for c in sorted(rasters)]
-    return Fields(
-        np.concatenate([np.zeros(0), *known]), np.append(0, np.cumsum(cells)), columns, frame
+def build_fields(
+    rasters: Mapping[int, WaterRaster], k: int, common: WaterRaster | None = None
+) -> Fields:
+    """Return the rasters of some of k images, by their rows, and what the others have in common."""
+    shape, frame = np.zeros((k, 3), np.int64), np.full((k, 4), np.nan)
+    cells, count = [np.zeros(0)], 0
+    for raster in dict.fromkeys([*rasters.values(), common]):
+        if raster is not None:
+            images = [c for c in range(k) if rasters.get(c, common) is raster]
+            heights, _, rows, columns, *place = build_field(raster)
+            shape[images], frame[images] = (count, rows, columns), place
+            cells.append(heights)
+            count += heights.size
+    return Fields(np.concatenate(cells), shape, frame)
+
+
+@lean
+def field_of(fields: Fields | None, c: int) -> Any:
+    """Return the `Field` of an image; None where no image has one.
+
+    Only lean parts may call it: what counts references would count too few for its array.
+    """
+    if fields is None:
+        return None
+    shape, frame = fields.shape[c], fields.frame[c]
+    return Field(
+        fields.heights, shape[0], shape[1], shape[2], frame[0], frame[1], frame[2], frame[3]
     )
 
 
-@part
-def field_of(fields: Fields, c: int) -> Field:
-    """Return the raster of an image; without cells where it has none."""
-    cells, columns, frame = (
-        fields.heights[fields.first[c] : fields.first[c + 1]], fields.columns[c], fields.frame[c]
-    )  # fmt: skip
-    table = cells.reshape(cells.size // columns, columns)
-    return Field(table, frame[0], frame[1], frame[2], frame[3])
-
-
 class OwnWater(NamedTuple):
-    """The water that the rays of single images go through, and its standard error, metres."""
+    """The water of each image where images have one of their own, and its standard error."""
 
     heights: Fields
     sigma: Fields
