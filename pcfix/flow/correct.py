@@ -34,7 +34,7 @@ from pcfix.model import (
 from pcfix.options.correct import CorrectOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import File, taken
 from pcfix.refract.batch import Batch, MadeWith, Survey
-from pcfix.refract.learning import learn_of_points
+from pcfix.refract.learning import for_own_water, learn_of_points
 from pcfix.refract.regression import BeyondRange, DepthRegression
 from pcfix.refract.tally import Summary
 from pcfix.water.checks import as_surface, check_above_water, checked_points
@@ -127,8 +127,6 @@ def correct_points(
     """
     given = taken(RefractionOptions, options, keywords, "correct_points", occlusion="off")
     settings = with_index(given.part(ScienceOptions))
-    if water_per_image is not None:
-        settings = settings.through_own_water(None if views is None else views.kind)
     if not cameras:
         given.check_no_cameras()
         if not (views is None and level_offset_m is None and adjusted_from is None):
@@ -137,6 +135,8 @@ def correct_points(
                 " leave them out, or give cameras too."
             )
     cameras = cameras or NO_CAMERAS
+    if water_per_image is not None:
+        settings = for_own_water(settings, cameras, None if views is None else views.kind)
     points = checked_points(xyz)
     surface, dimension = as_surface(water, len(points))
     offset = None if level_offset_m is None else _offsets(level_offset_m, len(cameras))

@@ -34,10 +34,10 @@ from pcfix.model import (
     WaterDimension,
     WaterPlane,
 )
-from pcfix.options.correct import CorrectOptions
+from pcfix.options.correct import CorrectOptions, ScienceOptions
 from pcfix.refract.batch import Batch, Intersection, MadeWith, Survey
 from pcfix.refract.hypotheses import Verdict
-from pcfix.refract.learning import as_told, weigh_lists
+from pcfix.refract.learning import as_told, for_own_water, weigh_lists
 from pcfix.refract.methods import correct, shift_of_land
 from pcfix.refract.regression import LEAST_BEYOND, BeyondRange, DepthRegression
 from pcfix.refract.rehearsal import rehearsals
@@ -81,15 +81,16 @@ class ThroughWater:
         check_above_water(self._cameras, self.water, self.level_offset_m)
         check_tilt(self.water)
         self._listed = None if blocks.views is None else blocks.views.kind
+        settings: ScienceOptions = options
         folder, place = options.water_per_image, (view.crs, view.low, view.high)
         if folder is not None:
-            options = options.through_own_water(self._listed)
+            settings = for_own_water(options, self._cameras, self._listed)
             self.settings["water_per_image"] = str(folder)
         own, self._own_notes = own_water_of(
             folder, self._cameras, self.water, place, self.level_offset_m
         )
         self._learning = Learning(
-            Survey(self.water, self._cameras, options, self.level_offset_m, own_water=own),
+            Survey(self.water, self._cameras, settings, self.level_offset_m, own_water=own),
             inputs, view, self._listed,
             None if blocks.pair is None else self._old_ties,
         )  # fmt: skip

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal, Self
+from dataclasses import dataclass
+from typing import Literal
 
 from pcfix.errors import SettingError
 from pcfix.options.declare import (
@@ -172,27 +172,6 @@ class MethodOptions(IndexOptions):
                     f"{one.flag[2:]} is about cameras, and there are none: leave it out, or give"
                     " cameras too."
                 )
-
-    def through_own_water(self, views: str | None) -> Self:
-        """Return the options by which points are corrected whose images have each its own water.
-
-        With `auto` that is snell. A list of views is of a kind, see `pcfix.model.ViewKind`.
-
-        Raises
-        ------
-        SettingError
-            If the method takes the water to be one.
-        """
-        method = "snell" if self.method == "auto" else self.method
-        dense = self.camera_set == "mvs" or views not in (None, "tracks")
-        if method not in ("snell", "consistent") or (method == "consistent" and dense):
-            of = " of a dense matcher" if method == "consistent" else ""
-            raise SettingError(
-                f"method {method}{of} takes the water to be one for all images; with"
-                " water-per-image give snell, or leave one of the two out."
-            )
-        camera_set = "all" if self.camera_set == "auto" else self.camera_set
-        return replace(self, method=method, camera_set=camera_set)
 
     @property
     def limit_deg(self) -> float | None:

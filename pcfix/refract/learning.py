@@ -56,6 +56,31 @@ def resolved(settings: ScienceOptions, cameras: Cameras, views: ViewKind | None)
     return settings if views is None else replace(settings, method="consistent")
 
 
+def for_own_water(
+    settings: ScienceOptions, cameras: Cameras, views: ViewKind | None
+) -> ScienceOptions:
+    """Return options without ``auto`` where images have water of their own.
+
+    Raises
+    ------
+    SettingError
+        If the method takes the water to be one for all images.
+    """
+    bare = cameras.lenses is None or cameras.rotations is None
+    dense = settings.camera_set == "mvs" or views not in (None, "tracks")
+    method = settings.method
+    if method == "auto":
+        method = "snell" if bare or dense else "consistent"
+    if method not in ("snell", "consistent") or (method == "consistent" and dense):
+        of = ", as it inverts a dense matcher," if method == "consistent" else ""
+        raise SettingError(
+            f"method {method}{of} takes the water to be one for all images; with water-per-image"
+            " give snell, or leave one of the two out."
+        )
+    camera_set = "all" if settings.camera_set == "auto" else settings.camera_set
+    return replace(settings, method=method, camera_set=camera_set)
+
+
 def wants_sample(survey: Survey, views: ViewKind | None) -> bool:
     """Return whether points of the whole cloud tell something of the correction."""
     known = survey.settings.depth_factor != "auto"
