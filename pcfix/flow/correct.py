@@ -31,7 +31,7 @@ from pcfix.model import (
     Views,
     WaterSurface,
 )
-from pcfix.options.correct import CorrectOptions, RefractionOptions, ScienceOptions
+from pcfix.options.correct import CorrectOptions, PointsOptions, ScienceOptions
 from pcfix.options.declare import File, taken
 from pcfix.refract.batch import Batch, MadeWith, Survey
 from pcfix.refract.learning import for_own_water, learn_of_points
@@ -47,13 +47,12 @@ def correct_points(
     cameras: Cameras | None,
     water: WaterSurface | float | npt.ArrayLike,
     *,
-    options: RefractionOptions | None = None,
+    options: PointsOptions | None = None,
     views: Views | None = None,
     may_be_submerged: npt.ArrayLike | None = None,
     level_offset_m: npt.ArrayLike | None = None,
     adjusted_from: Cameras | None = None,
     regression: DepthRegression | File | None = None,
-    water_per_image: File | None = None,
     **keywords: Any,
 ) -> Correction:
     """Correct apparent points for refraction at the water surface.
@@ -69,11 +68,13 @@ def correct_points(
     water : WaterSurface, float, or array of shape (n,)
         The water surface (see `pcfix.read_water`), its level in metres, or its height above
         each point, NaN where it is not known.
-    options : RefractionOptions, optional
+    options : PointsOptions, optional
         Or its attributes as keywords, as of ``pcfix correct``: index, method, max_angle (degrees
         from the surface normal), max_cameras, camera_set, matcher, depth_factor, unsure (with
         ``"withhold"`` the result says which are), sigma_image and the other standard errors;
-        occlusion is off unless asked for, as these points may not be the whole cloud.
+        occlusion is off unless asked for, as these points may not be the whole cloud. With
+        water_per_image, rasters in the frame of the points, what is submerged, and how deep, goes
+        by `water`.
     views : Views, optional
         Which cameras made each point, rows of `adjusted_from` where that is given, else of
         `cameras`. Default: as the option `camera_set` says.
@@ -90,10 +91,6 @@ def correct_points(
         from those to these; see `pcfix.adjust.carry`.
     regression : DepthRegression or path, optional
         With the method regression: see `pcfix.refract.regression`, or the file of a line.
-    water_per_image : path, optional
-        Folder of rasters of the water, each of the name of an image, in the frame of the points, as
-        ``pcfix calm --surface`` writes them, with standard errors. The rays of these images bend
-        there, with snell or consistent; what is submerged, and how deep, goes by `water`.
 
     Returns
     -------
@@ -125,7 +122,7 @@ def correct_points(
     >>> result.xyz.round(3).tolist()
     [[0.0, 0.0, -2.703]]
     """
-    given = taken(RefractionOptions, options, keywords, "correct_points", occlusion="off")
+    given = taken(PointsOptions, options, keywords, "correct_points", occlusion="off")
     settings = with_index(given.part(ScienceOptions))
     if not cameras:
         given.check_no_cameras()
@@ -135,7 +132,7 @@ def correct_points(
                 " leave them out, or give cameras too."
             )
     cameras = cameras or NO_CAMERAS
-    if water_per_image is not None:
+    if given.water_per_image is not None:
         settings = for_own_water(settings, cameras, None if views is None else views.kind)
     points = checked_points(xyz)
     surface, dimension = as_surface(water, len(points))
@@ -152,7 +149,7 @@ def correct_points(
         points, views, label = step.xyz, step.views, step.rule(label)
     above = surface_above(surface, points, dimension)
     place = None, *corners(points[:, 0], points[:, 1])
-    own, notes = own_water_of(water_per_image, cameras, surface, place, offset)
+    own, notes = own_water_of(given.water_per_image, cameras, surface, place, offset)
     survey = Survey(surface, cameras, settings, offset, own_water=own)
     batch = Batch(points, above, survey, views, made_with)
     line = regression

@@ -306,8 +306,8 @@ def _heights_at(part: Part, places: FloatArray, to_cloud: Points) -> FloatArray:
     from pcfix.water.surface import Field, heights_above
 
     column, row = place_of(~part.transform, places[:, 0], places[:, 1])
-    rows, columns = part.heights.shape
-    cells = Field(part.heights.ravel(), 0, rows, columns, 0.5, -0.5, 1.0, 1.0)
+    shape, frame = np.array([[0, *part.heights.shape]]), np.array([[0.5, -0.5, 1.0, 1.0]])
+    cells = Field(part.heights.ravel(), shape, frame, 0)
     height, _ = heights_above(cells, np.ascontiguousarray(column), np.ascontiguousarray(-row))
     known = np.isfinite(height)
     height[known] = to_cloud(np.column_stack([places[known, :2], height[known]]))[:, 2]

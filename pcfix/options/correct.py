@@ -229,7 +229,12 @@ class UnsureOption(OptionSet):
 
 @dataclass(frozen=True, kw_only=True)
 class RefractionOptions(BudgetOptions, MethodOptions, UnsureOption):
-    """What the correction of points goes by; `pcfix.correct_points` takes these."""
+    """What the correction of points goes by."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointsOptions(RefractionOptions, WaterPerImageOption):
+    """The options of `pcfix.correct_points`."""
 
 
 @dataclass(frozen=True, kw_only=True)

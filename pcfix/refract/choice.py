@@ -26,7 +26,7 @@ from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterMesh, WaterPl
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.rays import pierce_of
-from pcfix.water.surface import Fields, SurfaceAbove, Tin, build_fields, build_tin, locate
+from pcfix.water.surface import Field, SurfaceAbove, Tin, build_fields, build_tin, locate
 
 NOMINAL_FOCAL_PX = 3700.0
 """Of cameras without a lens: a survey drone's of 20 megapixels, 0.27 mrad a pixel."""
@@ -114,7 +114,7 @@ def rule_of(survey: Survey) -> Rule:
     return Rule(least, settings.max_cameras or ANY_NUMBER, 1.0 / settings.refractive_index)
 
 
-def shapes_of(survey: Survey) -> tuple[Tin | None, Fields | None]:
+def shapes_of(survey: Survey) -> tuple[Tin | None, Field | None]:
     """Return a mesh, or the rasters of the images, for kernels; of another surface neither."""
     water, k = survey.water, len(survey.cameras)
     if survey.own_water is not None:
@@ -212,7 +212,7 @@ def _make_room(span: Span, points: Points, rig: Rig, frames: Frames, first: IntA
 @kernel
 def _choose_all(
     span: Span, points: Points, rig: Rig, frames: Frames, rule: Rule, tin: Tin | None,
-    fields: Fields | None, views: tuple[IntArray, IntArray],
+    fields: Field | None, views: tuple[IntArray, IntArray],
     found: tuple[IntArray, IntArray, IntArray, npt.NDArray[np.int32]],
 ) -> None:  # fmt: skip
     """Fill in where the entries of point i begin, how many they are (at i + 1), and the entries.
@@ -341,7 +341,7 @@ def near_cameras(
 @part
 def choose(
     candidates: IntArray, tile: FloatArray, j: int, rig: Rig, frames: Frames, rule: Rule,
-    tin: Tin | None, fields: Fields | None, facet: int,
+    tin: Tin | None, fields: Field | None, facet: int,
 ) -> IntArray:  # fmt: skip
     """Return which of the candidates give a ray to a point of the tile, in their order.
 

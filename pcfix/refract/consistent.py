@@ -68,10 +68,10 @@ from pcfix.refract.rays import (
     nearest_point,
     pierce_of,
     refracted,
-    settle,
+    settle_of,
     slope_of_path,
 )
-from pcfix.water.surface import Fields, Tin, field_of, locate
+from pcfix.water.surface import Field, Tin, locate
 
 MAX_STEPS = 30
 CLOSE_M = 1e-7
@@ -161,7 +161,7 @@ def intersection_of(batch: Batch, result: FloatArray) -> Intersection:
 
 @kernel
 def _correct(
-    span: Span, points: Chosen, optics: Optics, tin: Tin | None, fields: Fields | None,
+    span: Span, points: Chosen, optics: Optics, tin: Tin | None, fields: Field | None,
     result: FloatArray,
 ) -> None:  # fmt: skip
     """Correct every point on its own."""
@@ -185,7 +185,7 @@ def room_for(rays: int) -> Room:
 @lean
 def correct_one(
     out: FloatArray, points: Chosen, i: int, cameras: IntArray, optics: Optics,
-    tin: Tin | None, fields: Fields | None, room: Room,
+    tin: Tin | None, fields: Field | None, room: Room,
 ) -> None:  # fmt: skip
     """Correct one point with some cameras and write its row."""
     rays, sums, g, inverse = room
@@ -212,7 +212,7 @@ def _are_one(cameras: IntArray) -> bool:
 @lean
 def begin(
     ray: FloatArray, sums: FloatArray, points: Chosen, i: int, c: int,
-    tin: Tin | None, fields: Fields | None, facet: int,
+    tin: Tin | None, fields: Field | None, facet: int,
 ) -> None:  # fmt: skip
     """Fill in where a ray comes from, and add its refracted line to the sums of `snell`.
 
@@ -250,7 +250,7 @@ def add_image(ray: FloatArray, optics: Optics, c: int) -> None:
 @lean
 def _solve(
     out: FloatArray, rays: FloatArray, room: tuple[FloatArray, FloatArray, FloatArray],
-    cameras: IntArray, optics: Optics, n: float, tin: Tin | None, fields: Fields | None,
+    cameras: IntArray, optics: Optics, n: float, tin: Tin | None, fields: Field | None,
 ) -> None:  # fmt: skip
     """Solve one point and write its row; the room is its sums, and that of the search."""
     (sums, g, inverse), k = room, float(cameras.size)
@@ -278,7 +278,7 @@ def miss(k: float, s: FloatArray, q: Vector) -> float:
 @lean
 def _search(
     start: Vector, room: tuple[FloatArray, FloatArray], rays: FloatArray, cameras: IntArray,
-    optics: Optics, n: float, tin: Tin | None, fields: Fields | None,
+    optics: Optics, n: float, tin: Tin | None, fields: Field | None,
 ) -> tuple[bool, Vector]:  # fmt: skip
     """Return whether a Q was found where g is zero, and it, else the start.
 
@@ -312,7 +312,7 @@ def _search(
 @lean
 def _gradient(
     g: FloatArray, slope: FloatArray, q: Vector, rays: FloatArray, cameras: IntArray,
-    optics: Optics, n: float, tin: Tin | None, fields: Fields | None,
+    optics: Optics, n: float, tin: Tin | None, fields: Field | None,
 ) -> None:  # fmt: skip
     """Sum up g(Q), and d g / d Q where it has rows."""
     g[:] = 0.0
@@ -323,12 +323,12 @@ def _gradient(
 @lean
 def add_residual(
     g: FloatArray, slope: FloatArray, q: Vector, ray: FloatArray, c: int, optics: Optics, n: float,
-    tin: Tin | None, fields: Fields | None,
+    tin: Tin | None, fields: Field | None,
 ) -> None:  # fmt: skip
     """Add what one ray says to g(Q), and to d g / d Q where it has rows."""
     e, plane = vector(ray), ray[_PLANE:_GRADIENTS]
     if tin is not None or fields is not None:
-        settle(plane, tin, field_of(fields, c), ray[_ORIGIN:], q, e, n)
+        settle_of(c, plane, tin, fields, ray[_ORIGIN:], q, e, n)
     normal = vector(plane)
     path = light_path(q, e, normal, plane[3], n)
     w = times(optics.rotations[c], direction(path, normal))

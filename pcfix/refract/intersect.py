@@ -56,7 +56,7 @@ from pcfix.refract.uncertainty import (
     level_sigma_of,
     with_errors,
 )
-from pcfix.water.surface import Fields, Tin, locate
+from pcfix.water.surface import Field, Tin, locate
 
 
 def intersect(batch: Batch) -> Intersection:
@@ -250,7 +250,7 @@ def _all_in_frame(
 
 @kernel
 def _chosen(
-    span: Span, points: Points, rig: Rig, rule: Rule, tin: Tin | None, fields: Fields | None,
+    span: Span, points: Points, rig: Rig, rule: Rule, tin: Tin | None, fields: Field | None,
     views: tuple[IntArray, IntArray], result: FloatArray, used: BoolArray,
 ) -> None:  # fmt: skip
     """Chosen cameras per point, and rays that may bend at a mesh or raster."""
@@ -271,7 +271,7 @@ def _chosen(
 @part
 def _intersect_one(
     row: FloatArray, cameras: IntArray, tile: FloatArray, j: int, rig: Rig, r: float,
-    tin: Tin | None, fields: Fields | None, facet: int,
+    tin: Tin | None, fields: Field | None, facet: int,
 ) -> None:  # fmt: skip
     """Intersect the rays of one point with its own cameras."""
     x, y, z = tile[j], tile[TILE + j], tile[2 * TILE + j]

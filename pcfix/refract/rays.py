@@ -68,7 +68,7 @@ from pcfix.lens.algebra import (
     vector,
 )
 from pcfix.model import FloatArray
-from pcfix.water.surface import Field, Fields, Tin, field_of, height_at, locate
+from pcfix.water.surface import Field, Tin, height_at, locate
 
 
 @lean
@@ -206,11 +206,14 @@ def pierce(
 
 @lean
 def pierce_of(
-    c: int, tin: Tin | None, fields: Fields | None, p: Vector, e: Vector, h: float, normal: Vector,
+    c: int, tin: Tin | None, fields: Field | None, p: Vector, e: Vector, h: float, normal: Vector,
     facet: int,
 ) -> tuple[float, Vector]:  # fmt: skip
-    """Return `pierce` with the raster of camera c, where cameras have rasters."""
-    return pierce(tin, field_of(fields, c), p, e, h, normal, facet)
+    """Return `pierce` in the raster of camera c, where there are rasters."""
+    if fields is None:
+        return pierce(tin, None, p, e, h, normal, facet)
+    field = Field(fields.heights, fields.shape, fields.frame, c)
+    return pierce(tin, field, p, e, h, normal, facet)
 
 
 @lean
@@ -374,6 +377,19 @@ def settle(
         lay(plane, x, y, z, b_there, c_there)
         before, b, c = (b, c), b_there, c_there
     _settle_on_crease(plane, tin, field, origin, before, (b, c), q, e, n)
+
+
+@lean
+def settle_of(
+    c: int, plane: FloatArray, tin: Tin | None, fields: Field | None, origin: FloatArray,
+    q: Vector, e: Vector, n: float,
+) -> None:  # fmt: skip
+    """Do as `settle` with the raster of camera c, where there are rasters."""
+    if fields is None:
+        settle(plane, tin, None, origin, q, e, n)
+    else:
+        field = Field(fields.heights, fields.shape, fields.frame, c)
+        settle(plane, tin, field, origin, q, e, n)
 
 
 @lean

@@ -42,7 +42,7 @@ from pcfix.refract.choice import (
     tiles_of,
 )
 from pcfix.refract.sensitivity import Budget
-from pcfix.water.surface import Fields, field_of, height_at
+from pcfix.water.surface import Field, height_at
 
 Four: TypeAlias = tuple[float, float, float, float]
 Nine: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
@@ -156,7 +156,7 @@ def level_sigma_of(batch: Batch) -> FloatArray:
 
 @lean_kernel
 def _own_sigma(
-    span: Span, points: Points, rig: Rig, sigma: Fields, views: tuple[IntArray, IntArray],
+    span: Span, points: Points, rig: Rig, sigma: Field, views: tuple[IntArray, IntArray],
     found: FloatArray,
 ) -> None:  # fmt: skip
     """Set what the errors of the images' own water come to in the mean over the rays of a point.
@@ -171,7 +171,7 @@ def _own_sigma(
             up = rig.centres[c, 2] - points.xyz[i, 2]
             f = (points.height[i] + rig.offset[c] - points.xyz[i, 2]) / up
             x, y = x + f * (rig.centres[c, 0] - x), y + f * (rig.centres[c, 1] - y)
-            error = height_at(field_of(sigma, c), x, y)[0]
+            error = height_at(Field(sigma.heights, sigma.shape, sigma.frame, c), x, y)[0]
             total += error * error if error > 0.0 else 0.0
         found[i] = np.sqrt(total) / max(start[i + 1] - start[i], 1)
 

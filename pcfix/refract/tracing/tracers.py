@@ -219,7 +219,7 @@ def _twist_at(field: Field | None, x: float, y: float) -> float:
     """Return the second derivative z_xy of a raster's patch at a place (world frame), 1 / m."""
     if field is not None:
         twist = patch_at(field, x, y)[5]
-        return -twist / (field.cell_x * field.cell_y)
+        return -twist / (field.frame[field.which, 2] * field.frame[field.which, 3])
     return 0.0
 
 
