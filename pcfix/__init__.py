@@ -23,8 +23,10 @@ if TYPE_CHECKING:
     from pcfix.flow.label import label_file, label_points
     from pcfix.flow.ortho import ortho_photo
     from pcfix.flow.photos import map_photos
+    from pcfix.flow.plan import plan_flight
     from pcfix.flow.rebuild import rebuild_rounds
     from pcfix.flow.restore import restore_file
+    from pcfix.flow.view import view_clouds
     from pcfix.io.cameras import read_cameras
     from pcfix.io.water import read_water
     from pcfix.model import (
@@ -57,8 +59,10 @@ _NAMES = {
     "pcfix.flow.label": "label_file label_points",
     "pcfix.flow.ortho": "ortho_photo",
     "pcfix.flow.photos": "map_photos",
+    "pcfix.flow.plan": "plan_flight",
     "pcfix.flow.rebuild": "rebuild_rounds",
     "pcfix.flow.restore": "restore_file",
+    "pcfix.flow.view": "view_clouds",
     "pcfix.io.cameras": "read_cameras",
     "pcfix.io.water": "read_water",
     "pcfix.model": "Cameras Correction Lens Outcome Views WaterDimension WaterMesh"
@@ -102,6 +106,7 @@ __all__ = [
     "label_points",
     "map_photos",
     "ortho_photo",
+    "plan_flight",
     "read_cameras",
     "read_water",
     "rebuild_rounds",
@@ -109,6 +114,7 @@ __all__ = [
     "restore_file",
     "simulate_scene",
     "trace",
+    "view_clouds",
 ]
 
 

@@ -16,7 +16,7 @@ PRINTED = {
     "01": "14,736 of 20,000", "02": "as it came   bias +1.8", "03": "depth.png: 12.",
     "04": "cloud.laz: 14,736 of", "05": "14,736 of 20,000", "06": "201 stations",
 }  # fmt: skip
-WRITTEN = {"03": ["bed.tif", "depth.png"], "06": ["section.png"]}
+WRITTEN = {"03": ["depth.tif", "depth.qml", "depth.png"], "06": ["section.png"]}
 
 
 @pytest.fixture(scope="module")

@@ -27,6 +27,11 @@ class UsageError(Exception):
     """Flags that say nothing together; exit code 2."""
 
 
+def name_of(command: Callable[..., None]) -> str:
+    """Return what a command is called on the command line."""
+    return command.__name__.replace("_", "-")
+
+
 def prepare(command: Callable[..., None]) -> None:
     """Tell cyclopts of the options of a command: their types as text, panels and help."""
     kind = get_args(get_type_hints(command, include_extras=True)["options"])[0]
@@ -95,7 +100,13 @@ COMPILING = "kernels are compiled first, once after an installation: about a min
 def progress_bar(
     title: str, quiet: bool, unit: str = "points"
 ) -> Iterator[Callable[[int, int], None] | None]:
-    """Show a bar with units/s and the time left on a terminal; nothing when piped."""
+    """Show a bar with units/s and the time left on a terminal; nothing when piped.
+
+    With ``PCFIX_PROGRESS=lines`` it is a line for each percent, for programs that call this one.
+    """
+    if os.environ.get("PCFIX_PROGRESS") == "lines":
+        yield _percent_lines()
+        return
     if quiet or not sys.stderr.isatty():
         yield None
         return
@@ -121,6 +132,20 @@ def progress_bar(
             bar.update(task, description=title, completed=done, total=total, rate=text)
 
         yield update
+
+
+def _percent_lines() -> Callable[[int, int], None]:
+    last = -1
+
+    def update(done: int, total: int) -> None:
+        nonlocal last
+        percent = 100 * done // max(total, 1)
+        if percent != last:
+            last = percent
+            sys.stderr.write(f"progress {percent}\n")
+            sys.stderr.flush()
+
+    return update
 
 
 @contextmanager

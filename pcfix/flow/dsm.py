@@ -1,4 +1,4 @@
-"""A LAS or LAZ cloud to a raster of heights, with bounded memory.
+"""A LAS or LAZ cloud to a raster of heights, depths or whatever it holds, with bounded memory.
 
 The points go once through, into files for squares of the plan; then the raster is made window by
 window. Whatever decides on a cell is read with its window, so the raster does not depend on where
@@ -11,7 +11,8 @@ import json
 import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -21,16 +22,26 @@ import numpy as np
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.runner import FileTask, Progress, file_task
 from pcfix.grid.delaunay import fill_holes, margin_cells
-from pcfix.grid.heights import Gridding, grid_window
-from pcfix.grid.lattice import Occupancy, Window, cells_of, fits, lattice_over, refuse_size
+from pcfix.grid.heights import Gridding, as_uncertainty, grid_window
+from pcfix.grid.lattice import (
+    Occupancy,
+    Window,
+    cells_of,
+    fits,
+    lattice_over,
+    refuse_size,
+    round_resolution,
+)
 from pcfix.grid.model import NO_LIGHT, DsmSummary, Tally, hillshade
 from pcfix.io import rasters
-from pcfix.io.files import Bins, replaced_when_whole
+from pcfix.io.crs import crs_words, parts
+from pcfix.io.files import Bins, check_output, replaced_when_whole, write_text
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.las.writing import is_ours
+from pcfix.io.styles import raster_style
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, BoolArray, FloatArray, IntArray
 from pcfix.options.declare import File, taken
-from pcfix.options.steps import DsmOptions, DsmRules, SurfaceChoice
+from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules, SurfaceChoice
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
@@ -51,10 +62,9 @@ TIN_REACH_SPACINGS = 5.0
 TIN_REACH_CELLS = 3.0
 """Circles around triangles may be as wide as the larger of the two, or as --fill."""
 
-BANDS = {"height": "metre", "count": "", "spread": "metre"}
-HEIGHT, *_ = ALL_BANDS = (1, 2, 3, 4)
-WITH_SIGMA = {**BANDS, "uncertainty": "metre"}
-"""Of clouds that have standard errors of Z."""
+DIMENSIONS = {"depth": "WaterDepth", "uncertainty": SIGMA_Z}
+"""What is not height is made of a dimension: of one of these, or of that of its own name."""
+METRE = "metre"
 
 
 def grid_dsm(
@@ -65,16 +75,18 @@ def grid_dsm(
     progress: Progress | None = None,
     **keywords: Any,
 ) -> DsmSummary:
-    """Grid a cloud to a GeoTIFF of heights; what ``pcfix dsm`` runs.
+    """Grid a cloud to a GeoTIFF of heights or of another quantity; what ``pcfix dsm`` runs.
 
-    The file has three bands of float32: height (m), count (points in the cell) and spread
-    (population standard deviation of their heights, m). A cell without a height holds -9999, the
-    nodata value, and count 0. A cell with a height and count 0 has no points of its own: its
-    height was interpolated, and its spread is nodata.
+    The file has one band of float32, -9999 (nodata) where a cell has no value. Heights keep the
+    vertical datum that the cloud states, if any; a file of anything else has the plan alone, as
+    programs would take its values for heights.
 
-    A cloud with the dimension ``SigmaZ``, as `pcfix.correct_file` writes it, gives a fourth band,
-    uncertainty: the standard uncertainty of the height (m), the root mean square of the ``SigmaZ``
-    of the cell's corrected points; see `pcfix.grid.heights.cell_uncertainty`. Nodata without any.
+    Depth is `WaterDepth`, and uncertainty the vertical one at 95 %, of the bed (class 40), as
+    `pcfix.correct_file` leaves them; see `pcfix.grid.heights.as_uncertainty`.
+
+    With `counts` a second file has two bands: count (points in the cell) and spread (population
+    standard deviation of their values). A cell that has a value and count 0 has no points of its
+    own: its value was interpolated, and its spread is nodata.
 
     Parameters
     ----------
@@ -83,13 +95,14 @@ def grid_dsm(
     output : path
         The name ends in ``.tif`` or ``.tiff``.
     options : DsmOptions, optional
-        Or its attributes as keywords, as of ``pcfix dsm``, resolution (m) among them. The bounds
-        of the raster are multiples of it; a point on an edge belongs to the cell east or north of
-        it. Of the methods "idw" weights points around the centre of cells that have some with 1 /
-        distance squared; "tin" takes the height at the centre from Delaunay's triangles, and fill
-        is the width of the widest circle without a point that is bridged, by default five times
-        the spacing of the points and at least three cells. Withheld points and noise (classes 7
-        and 18) are never used. The hillshade is uint8: 1 dark to 255 bright, nodata 0.
+        Or its attributes as keywords, as of ``pcfix dsm``. The bounds of the raster are multiples
+        of the resolution (m); a point on an edge belongs to the cell east or north of it. Without
+        one it is chosen by `pcfix.grid.lattice.round_resolution`. Of the methods "idw" weights
+        points around the centre of cells that have some with 1 / distance squared; "tin" takes the
+        height at the centre from Delaunay's triangles, and fill is the width of the widest circle
+        without a point that is bridged, by default five times the spacing of the points and at
+        least three cells. Withheld points and noise (classes 7 and 18) are never used. The
+        hillshade is uint8: 1 dark to 255 bright, nodata 0.
     progress : callable, optional
         Called with (points done, points in all), reading and gridding counting half each.
 
@@ -108,20 +121,49 @@ def grid_dsm(
         If the cells are so small that most would have no point.
     """
     given = taken(DsmOptions, options, keywords, "grid_dsm")
-    if given.resolution is None:
-        raise SettingError("resolution is missing: give the side of a cell, metres.")
-    more = [] if given.hillshade is None else [given.hillshade]
-    task = file_task(input, output, given, more=more, check=rasters.check_tif, progress=progress)
+    more = {name: getattr(given, name) for name in ("hillshade", "counts")}
+    more = {name: Path(path) for name, path in more.items() if path is not None}
+    task = file_task(
+        input, output, given, more=more.values(), check=rasters.check_tif, progress=progress
+    )
+    style = task.target.with_suffix(".qml")
+    if given.style:
+        check_output(style, overwrite=given.overwrite, inputs=[input])
     if given.cog:
         rasters.check_cog()
-    run = _Run(task, given.part(DsmRules), given.cog)
+    rules = given.part(DsmRules)
+    if given.resolution is None:
+        spacing_m = point_spacing_m(task.source, rules)
+        rules = replace(rules, resolution=round_resolution(spacing_m, 0.0))
+    run = _Run(task, rules, given.cog)
     with ExitStack() as stack:
-        drafts = [stack.enter_context(replaced_when_whole(Path(one))) for one in (output, *more)]
+        drafts = {
+            name: stack.enter_context(replaced_when_whole(path))
+            for name, path in {"dsm": task.target, **more}.items()
+        }
         folder = TemporaryDirectory(dir=task.target.parent, prefix=".pcfix-dsm-")
-        run.write(Path(stack.enter_context(folder)), *drafts)
-    result = run.summary(None if given.hillshade is None else str(Path(given.hillshade)))
+        run.write(Path(stack.enter_context(folder)), **drafts)
+    if given.style:
+        write_text(style, raster_style(task.target, rules.what), overwrite=given.overwrite)
+    result = replace(
+        run.summary(),
+        hillshade=str(more["hillshade"]) if "hillshade" in more else None,
+        counts=str(more["counts"]) if "counts" in more else None,
+        resolution_is="given" if given.resolution else "chosen",
+    )
     task.tell(result.as_dict())
     return result
+
+
+def point_spacing_m(path: Path, settings: DsmRules) -> float:
+    """Return the side of the square that each point of a raster has for itself, metres."""
+    with LasSource(path) as source:
+        area, _ = _stated_extent(source, MIN_RESOLUTION_M)
+        near = Occupancy(area, len(source), MIN_RESOLUTION_M)
+        for points in source.chunks():
+            near.add(coordinates(points)[_wanted(points, settings.surface)])
+    _refuse_none(near.points, path, settings.surface)
+    return near.spacing_m
 
 
 @dataclass
@@ -133,39 +175,53 @@ class _Run:
     cog: bool
     tally: Tally = field(default_factory=Tally)
 
-    def write(self, folder: Path, draft: Path, shade: Path | None = None) -> None:
-        """Write the raster, and its hillshade if a path is given."""
+    def write(
+        self, folder: Path, dsm: Path, hillshade: Path | None = None, counts: Path | None = None
+    ) -> None:
+        """Write the raster, and its hillshade and its counts if paths are given."""
         with LasSource(self.task.source) as source:
             self.crs, self.points = metric_crs(source), len(source)
+            self.plan = None if self.crs is None else parts(self.crs)[0]
             corrected = any(is_ours(vlr) for vlr in source.vlrs)
             self.sorted = SortedPoints(
                 source, self.settings, folder, lambda done, total: self.report(0.5 * done / total)
             )
         self.near, self.lattice = self.sorted.near, self.sorted.lattice
-        plain = folder / "dsm.tif" if self.cog else draft
         made = {"pcfix": __version__, "corrected": corrected, **asdict(self.settings)}
-        tags = {"PCFIX": json.dumps(made)}
-        bands = WITH_SIGMA if self.sorted.has_sigma else BANDS
-        with rasters.new_raster(plain, self.lattice, self.crs, bands, tags=tags) as dsm:
+        tags, what = {"PCFIX": json.dumps(made)}, self.settings.what
+        unit = METRE if what in ("height", *DIMENSIONS) else ""
+        crs = self.crs if what == "height" else self.plan
+        plain = folder / "dsm.tif" if self.cog else dsm
+        numbers = folder / "counts.tif" if self.cog else counts
+        with ExitStack() as stack:
+            new = partial(rasters.new_raster, lattice=self.lattice, tags=tags)
+            out, both = stack.enter_context(new(plain, crs=crs, bands={what: unit})), None
+            if counts is not None and numbers is not None:
+                bands = {"count": "", "spread": unit}
+                both = stack.enter_context(new(numbers, crs=self.plan, bands=bands))
             if self.settings.fill is None or self.settings.method == "tin":
-                self.grid(dsm, dsm)
+                self.grid(out, both)
             else:
-                self.grid_and_fill(dsm, folder / "unfilled.tif")
-        if shade is not None:
-            self.shade(plain, shade, folder)
-        self.finish(plain, draft)
+                self.grid_and_fill(out, both, folder / "unfilled.tif")
+        if hillshade is not None:
+            self.shade(plain, hillshade, folder)
+        self.finish(plain, dsm)
+        if counts is not None and numbers is not None:
+            self.finish(numbers, counts)
 
-    def grid(self, heights: DatasetWriter, dsm: DatasetWriter) -> None:
-        """Write heights to one raster, the other bands to another (or the same)."""
+    def grid(self, heights: DatasetWriter, counts: DatasetWriter | None) -> None:
+        """Write values to one raster, the numbers of points and their spread to another."""
         done, lattice = 0, self.lattice
         how = Gridding(lattice, self.settings.method, self.reach_m, self.near.spacing_m)
-        into = (heights, dsm, dsm, dsm)
+        into = ((heights, 1), (counts, 1), (counts, 2))
         limit = TIN_BLOCK_POINTS if self.settings.method == "tin" else BLOCK_POINTS
         for window in self.sorted.windows(limit):
             points = self.sorted.points_in(window.grown(how.margin_cells))
             bands = grid_window(*points, window, how)
-            for raster, band, values in zip(into, ALL_BANDS, bands, strict=True):
-                if values is not None:
+            if self.settings.what == "uncertainty":
+                bands = as_uncertainty(bands)
+            for (raster, band), values in zip(into, bands, strict=True):
+                if raster is not None:
                     rasters.write_part(raster, values, window, band)
             self.tally.add(bands)
             done += window.height * window.width
@@ -175,19 +231,21 @@ class _Run:
     def reach_m(self) -> float:
         """Width of the widest circle around a triangle of the TIN."""
         spacings = TIN_REACH_SPACINGS * self.near.spacing_m
-        cells = TIN_REACH_CELLS * self.settings.resolution
+        cells = TIN_REACH_CELLS * self.settings.cell_m
         return max(spacings, cells, self.settings.fill or 0.0)
 
-    def grid_and_fill(self, dsm: DatasetWriter, unfilled: Path) -> None:
-        """Write heights to a raster of their own, and from there, with holes filled, to the DSM."""
-        with rasters.new_raster(unfilled, self.lattice, None, {"height": "metre"}) as heights:
-            self.grid(heights, dsm)
-        widest = (self.settings.fill or 0.0) / self.settings.resolution
+    def grid_and_fill(
+        self, dsm: DatasetWriter, counts: DatasetWriter | None, unfilled: Path
+    ) -> None:
+        """Write values to a raster of their own, and from there, with holes filled, to the DSM."""
+        with rasters.new_raster(unfilled, self.lattice, None, {"height": METRE}) as heights:
+            self.grid(heights, counts)
+        widest = (self.settings.fill or 0.0) / self.settings.cell_m
         with rasters.open_raster(unfilled) as heights:
             for window in self.lattice.windows(BLOCK_CELLS):
                 around = window.grown(margin_cells(widest)).clipped(self.lattice.window)
                 height = fill_holes(rasters.read_heights(heights, around), window, around, widest)
-                rasters.write_part(dsm, height, window, HEIGHT)
+                rasters.write_part(dsm, height, window, 1)
                 self.tally.filled += int((~np.isnan(height)).sum())
         self.tally.filled -= self.tally.known
         self.tally.known += self.tally.filled
@@ -199,15 +257,12 @@ class _Run:
         with (
             rasters.open_raster(dsm) as heights,
             rasters.new_raster(
-                plain, self.lattice, self.crs, band, dtype="uint8", nodata=NO_LIGHT
+                plain, self.lattice, self.plan, band, dtype="uint8", nodata=NO_LIGHT
             ) as out,
         ):
             for window in self.lattice.windows(BLOCK_CELLS):
-                wide = window.grown(1)
-                around = wide.clipped(self.lattice.window)
-                height = np.full((wide.height, wide.width), np.nan)
-                height[around.within(wide)] = rasters.read_heights(heights, around)
-                light = hillshade(height, s.resolution, s.azimuth, s.altitude)
+                height = rasters.read_within(heights, window.grown(1), self.lattice.window)
+                light = hillshade(height, s.cell_m, s.azimuth, s.altitude)
                 rasters.write_part(out, light, window, 1)
         self.finish(plain, target)
 
@@ -223,15 +278,18 @@ class _Run:
         if self.task.progress is not None:
             self.task.progress(round(share * self.points), self.points)
 
-    def summary(self, hillshade: str | None) -> DsmSummary:
+    def summary(self) -> DsmSummary:
         """Return the numbers of the run."""
         settings, lattice, tally = self.settings, self.lattice, self.tally
         return DsmSummary(
             input=str(self.task.source),
             output=str(self.task.target),
-            hillshade=hillshade,
+            hillshade=None,
+            counts=None,
+            what=settings.what,
             pcfix=__version__,
             crs=None if self.crs is None else self.crs.name,
+            heights=crs_words(self.crs)[1] or None,
             width=lattice.width,
             height=lattice.height,
             bounds_m=lattice.bounds_m,
@@ -245,7 +303,7 @@ class _Run:
             hole_m=self.reach_m if settings.method == "tin" else settings.fill,
             settings=asdict(settings),
             seconds=round(self.task.seconds, 3),
-            uncertainty_m=tally.uncertainty_m(),
+            values=tally.values(),
         )
 
 
@@ -257,8 +315,6 @@ class SortedPoints:
     near : Occupancy
         How many points there are, and how close together.
     lattice : Lattice
-    has_sigma : bool
-        Whether the cloud has standard errors of Z, as a correction leaves them.
 
     Raises
     ------
@@ -270,17 +326,23 @@ class SortedPoints:
         self, source: LasSource, settings: DsmRules, folder: Path, progress: Progress
     ) -> None:
         """Read the cloud, store the wanted points, and lay out the raster."""
-        resolution = settings.resolution
+        resolution = settings.cell_m
         self._resolution_m = resolution
         area, corner = _stated_extent(source, resolution)
-        self.has_sigma = SIGMA_Z in source.header.point_format.dimension_names
+        self._dimension = _dimension_of(source, settings.what)
         cells = max(np.sqrt(BIN_POINTS / (len(source) / area)) / resolution, 1.0)
         side = int(min(2 ** np.floor(np.log2(cells)), BLOCK_CELLS))  # of a square with so many
-        self._bins = Bins(folder, side, cells_of(corner, resolution)[0], 4 if self.has_sigma else 3)
+        self._bins = Bins(folder, side, cells_of(corner, resolution)[0], 3)
         self.near = Occupancy(area, len(source), resolution)
         done = 0
         for points in source.chunks():
-            xyz = self._numbers(points)[_wanted(points, settings.surface)]
+            xyz = coordinates(points)
+            if self._dimension is not None:
+                xyz[:, 2] = source.dimension(points, self._dimension)
+            wanted = _wanted(points, settings.surface) & np.isfinite(xyz[:, 2])
+            if self._dimension == SIGMA_Z:
+                wanted &= xyz[:, 2] > 0.0  # others have none
+            xyz = xyz[wanted]
             self.near.add(xyz)
             if len(xyz) and fits(self.near.low, self.near.high, resolution):
                 self._bins.add(cells_of(xyz, resolution), xyz)
@@ -292,11 +354,6 @@ class SortedPoints:
         refuse_size(low, high, resolution, str(source.path))
         _warn_of_fine_cells(self.near.spacing_m, resolution)
         self.lattice = lattice_over(low, high, resolution)
-
-    def _numbers(self, points: laspy.ScaleAwarePointRecord) -> FloatArray:
-        """Return coordinates, and beside them the standard error of Z where there is one."""
-        xyz = coordinates(points)
-        return np.column_stack([xyz, np.asarray(points[SIGMA_Z])]) if self.has_sigma else xyz
 
     def windows(self, limit: int) -> Iterator[Window]:
         """Yield windows that cover the raster, small enough to have about `limit` points."""
@@ -316,23 +373,36 @@ class SortedPoints:
 
     def _stored(self, window: Window) -> Window:
         """Return a window of the raster as the store counts cells."""
-        row, column = self.lattice.first_row, self.lattice.first_column
-        return Window(
-            window.row + row, window.row_stop + row, window.column + column,
-            window.column_stop + column,
-        )  # fmt: skip
+        return window.moved(self.lattice.first_row, self.lattice.first_column)
 
     def points_in(self, window: Window) -> tuple[FloatArray, IntArray]:
         """Return the points of a window, and their columns and rows in the raster.
 
-        The first are metres in the world frame, shape (n, 3), or (n, 4) with the standard error
-        of Z, zero of points that were not corrected; the second have shape (n, 2).
+        The first are metres in the world frame, shape (n, 3), with what the raster is made of in
+        the place of z; the second have shape (n, 2).
         """
         xyz = self._bins.read(self._stored(window))
         first = [self.lattice.first_column, self.lattice.first_row]
         cell = cells_of(xyz, self._resolution_m) - first
         rows = window.holds(cell)
         return xyz[rows], cell[rows]
+
+
+def _dimension_of(source: LasSource, what: str) -> str | None:
+    """Return the dimension that a raster is made of, None of heights; refuse what is not there."""
+    name = None if what == "height" else DIMENSIONS.get(what, what)
+    known = list(source.header.point_format.dimension_names)
+    if name is None or name in known:
+        return name
+    if what in DIMENSIONS:
+        raise InputError(
+            f"{source.path}: has no dimension {name}, of which the {what} is made; correct the"
+            " cloud first, with --dimensions all."
+        )
+    raise SettingError(
+        f"{source.path}: has no dimension {what}; --what is one of height, {', '.join(DIMENSIONS)},"
+        f" {', '.join(known)}."
+    )
 
 
 def _wanted(points: laspy.ScaleAwarePointRecord, surface: SurfaceChoice) -> BoolArray:

@@ -234,10 +234,7 @@ def _heights(
     path = Path(given.dsm)
     if path.suffix.lower() in (".las", ".laz"):
         raster = scratch / "dsm.tif"
-        cell = given.resolution
-        if cell is None:
-            raise SettingError("resolution is needed where --dsm is a cloud; give metres.")
-        grid_dsm(path, raster, resolution=cell)
+        grid_dsm(path, raster, resolution=given.resolution)
         path = raster
     elif given.resolution is not None:
         raise SettingError("resolution is of a cloud that is gridded; the DSM has its own.")

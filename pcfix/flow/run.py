@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.errors import InputError, PcfixWarning, SettingError
@@ -18,7 +19,10 @@ from pcfix.flow.compare import compare_clouds
 from pcfix.flow.correct import correct_file
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs, paths_in
+from pcfix.flow.layers import Drawn, write_map
 from pcfix.flow.old_cameras import read_blocks
+from pcfix.flow.rasters import SURFACE, raster_files, resolution_sentence, write_rasters
+from pcfix.flow.record import Record, read_record
 from pcfix.flow.report import write_report
 from pcfix.flow.run_adjust import (
     FOLDER,
@@ -28,13 +32,15 @@ from pcfix.flow.run_adjust import (
     is_worth_saying,
     outputs_of,
 )
-from pcfix.flow.runner import json_text
 from pcfix.flow.shore import check_shoreline
 from pcfix.flow.surfaces import view_of
+from pcfix.grid.maps import MOST_CELLS
 from pcfix.io.clouds import own_water
-from pcfix.io.files import check_input, file_state, files_in, read_json, write_text
+from pcfix.io.files import check_input, files_in
+from pcfix.io.geopackage import check_layers
 from pcfix.io.las.source import LasSource
 from pcfix.io.rasters import open_raster, preview, write_dod
+from pcfix.model import Cameras, WaterSurface
 from pcfix.options.correct import CorrectOptions
 from pcfix.options.declare import named, options_of
 from pcfix.options.steps import DistanceOptions
@@ -42,17 +48,17 @@ from pcfix.options.survey import RunOptions
 from pcfix.refract.tally import Summary
 from pcfix.report.adjustment_text import all_notes
 from pcfix.report.comparison import evaluation, in_a_sentence
+from pcfix.report.first_screen import Survey, is_found
 from pcfix.report.page import Picture, Table
 from pcfix.report.run import Later, adjustment_sentence, adjustment_table, reason_sentence
 from pcfix.report.text import uncertainty_sentence
+from pcfix.report.water import found_picture
 from pcfix.water.index import with_index
 
 RECORD = "run.json"
 SECTIONS = 3
 DOD, REFERENCE_DSM = "dod.tif", "reference_dsm.tif"
 CLOUDS = (".las", ".laz")
-POINTS_PER_CELL = 4.0
-"""Where no resolution is given, cells hold so many points on average."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,8 +124,7 @@ class Files:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.corrected, self.cleaned = folder / "corrected.laz", folder / "cleaned.laz"
-        self.dsm, self.dsm_bed = folder / "dsm.tif", folder / "dsm_bed.tif"
-        self.hillshade = folder / "hillshade.tif"
+        self.surface, self.map = folder / SURFACE, folder / "map.gpkg"
         self.compare, self.report = folder / "compare", folder / "report.html"
         self.regression = folder / "regression.json"
 
@@ -175,9 +180,14 @@ def run_all(
     files = Files(out_dir)
     shore = [] if request.shoreline is None else [Path(request.shoreline)]
 
-    def step(name: str, outputs: list[Path], work: Callable[[], Any]) -> Any:
+    def step(
+        name: str,
+        outputs: list[Path],
+        work: Callable[[], Any],
+        more: Callable[[Any], str] = lambda result: "",
+    ) -> Any:
         result, was_done = record.step(name, outputs, work)
-        say(f"{name:<9} {'done before' if was_done else 'done'}: {outputs[0]}")
+        say(f"{name:<9} {'done before' if was_done else 'done'}: {outputs[0]}{more(result)}")
         return result
 
     first, was_done = record.step(
@@ -196,13 +206,22 @@ def run_all(
     # the surface of a dimension is still in the cloud, and what was corrected is known anyway
     clean = partial(clean_file, files.corrected, files.cleaned, overwrite=True, jobs=jobs)
     step("clean", [files.cleaned], lambda: clean().as_dict())
-    step("dsm", [files.dsm, files.dsm_bed, files.hillshade], lambda: _grid(request, files))
+    errors = corrected["uncertainty"] is not None
+    outputs = raster_files(out_dir, errors=errors)
+    cells = partial(resolution_sentence, given=request.resolution is not None)
+    step("dsm", outputs, lambda: _grid(request, files, errors), cells)
     compared = None
     if request.reference is not None:
         compared = step(
             "compare", [files.compare / "compare.json"], lambda: _compare(request, files)
         )
     done = {"adjust": first, "correct": corrected, "compare": compared}
+    try:
+        check_layers(files.map)
+    except SettingError as error:
+        say(f"{'map':<9} not written: {error}")
+    else:
+        step("map", [files.map], lambda: _map(request, files, done))
     step("report", [files.report], lambda: _report(request, files, inputs, done))
     return files.report
 
@@ -244,24 +263,19 @@ def _is_bent(corrected: dict[str, Any]) -> bool:
     return bool((corrected["poses"] or {}).get("absorbed"))
 
 
-def _grid(request: Request, files: Files) -> dict[str, Any]:
-    resolution = request.resolution or _resolution_m(files.cleaned)
-    whole = grid_dsm(
-        files.cleaned, files.dsm, resolution=resolution, hillshade=files.hillshade, overwrite=True
+def _grid(request: Request, files: Files, errors: bool) -> dict[str, Any]:
+    cameras = _cameras(request, files)
+    return write_rasters(
+        files.cleaned, files.folder, resolution=request.resolution, cameras=cameras, errors=errors
     )
-    bed = grid_dsm(
-        files.cleaned, files.dsm_bed, resolution=resolution, surface="bed", overwrite=True
-    )
-    return {"dsm": whole.as_dict(), "bed": bed.as_dict()}
 
 
-def _resolution_m(path: Path) -> float:
-    """Return a round resolution with about `POINTS_PER_CELL` points in the cells of the bounds."""
-    with LasSource(path) as source:
-        size = source.header.maxs[:2] - source.header.mins[:2]
-        side = math.sqrt(max(float(size.prod()), 1e-6) * POINTS_PER_CELL / len(source))
-    power = 10.0 ** math.floor(math.log10(side))
-    return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= side * 0.999)
+def _cameras(request: Request, files: Files) -> Cameras:
+    """Return the cameras in the CRS of the cloud; notes were shown when it was corrected."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PcfixWarning)
+        inputs = replace(request, views=None).part(Inputs)
+        return read_blocks(inputs, view_of(files.corrected).crs).cameras
 
 
 def _compare(request: Request, files: Files) -> dict[str, Any]:
@@ -274,12 +288,12 @@ def _compare(request: Request, files: Files) -> dict[str, Any]:
         heights = reference
         if reference.suffix.lower() in CLOUDS:
             heights = files.compare / REFERENCE_DSM
-            with open_raster(files.dsm) as dsm:
+            with open_raster(files.surface) as dsm:
                 resolution = float(dsm.res[0])
             with warnings.catch_warnings():  # the cells are those of the cloud
                 warnings.simplefilter("ignore", PcfixWarning)
                 grid_dsm(reference, heights, resolution=resolution, overwrite=True)
-        write_dod(files.dsm, heights, files.compare / DOD, overwrite=True)
+        write_dod(files.surface, heights, files.compare / DOD, overwrite=True)
     sections = [
         {
             "distance_m": section.distance_m.tolist(),
@@ -290,7 +304,36 @@ def _compare(request: Request, files: Files) -> dict[str, Any]:
         }
         for section in result.sections
     ]
-    return {"figures": result.as_dict(), "sections": sections}
+    points = [] if result.check_points is None else result.check_points.tolist()
+    return {"figures": result.as_dict(), "sections": sections, "check_points": points}
+
+
+def _map(request: Request, files: Files, done: dict[str, Any]) -> dict[str, int]:
+    """Write the vectors; of the water's height only its standard error as a whole is known."""
+    summary, compared = done["correct"], done["compare"] or {}
+    fitted = (summary["water_fit"] or {}).get("sigma_level_m")
+    drawn = Drawn(
+        cloud=files.cleaned,
+        folder=files.folder,
+        water=_water(request, files),
+        sigma_level_m=request.sigma_level if request.sigma_level is not None else fitted,
+        cameras=_cameras(request, files),
+        unused=summary["cameras_unused"],
+        sections=compared.get("figures", {}).get("sections", []),
+        check_points=np.array(compared.get("check_points", [])).reshape(-1, 4),
+        check_depths=request.check_depths,
+    )
+    return write_map(files.map, drawn, view_of(files.cleaned).crs)
+
+
+def _water(request: Request, files: Files) -> WaterSurface:
+    """Return the surface as the corrected cloud states it, else as it was asked for."""
+    with warnings.catch_warnings():  # they were shown when the cloud was corrected
+        warnings.simplefilter("ignore", PcfixWarning)
+        with LasSource(files.corrected) as source:
+            stated = own_water(source)
+        inputs = replace(request, views=None).part(Inputs)
+        return stated or inputs.surface(view_of(files.corrected)).surface
 
 
 def _rasters(request: Request) -> list[str]:
@@ -306,102 +349,33 @@ def _report(
 ) -> dict[str, str]:
     pictures: list[Picture] = []
     tables: list[Table] = []
+    dod = None
     first, compared = done["adjust"], done["compare"]
     verdict = reason_sentence(first["adjusted"], first["why"]) if first["is_said"] else ""
     if compared is not None:
-        dod = preview(files.compare / DOD) if _rasters(request) else None
+        dod = preview(files.compare / DOD, MOST_CELLS) if _rasters(request) else None
         pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
         verdict += in_a_sentence(compared["figures"])
     if first["adjusted"]:
-        tables.insert(0, adjustment_table(figures_of(files.folder), f"{FOLDER}/report.html"))
-    inputs_again = replace(request, views=None).part(Inputs)
-    with warnings.catch_warnings():  # they were shown when the cloud was corrected
-        warnings.simplefilter("ignore", PcfixWarning)
-        with LasSource(files.corrected) as source:
-            water = own_water(source)
-        view = view_of(files.corrected)
-        cameras = read_blocks(inputs_again, view.crs).cameras
+        tables.append(adjustment_table(figures_of(files.folder), f"{FOLDER}/report.html"))
     summary = Summary(**done["correct"])
-    later = Later(pictures, tables, verdict, {} if compared is None else compared["figures"])
+    again = replace(request, views=None).part(Inputs)
+    cameras = _cameras(request, files)
+    if is_found(summary):
+        pictures.append(found_picture(again.surface(view_of(Path(request.input)))))
+    with open_raster(files.surface) as dsm:
+        resolution = float(dsm.res[0])
+    figures = {} if compared is None else compared["figures"]
+    later = Later(pictures, tables, verdict, figures, dod, resolution)
     page = write_report(
-        files.corrected,
+        files.cleaned,
         files.folder,
         summary=summary,
         cameras=cameras,
-        water=water or inputs_again.surface(view).surface,
+        water=_water(request, files),
         inputs=inputs,
+        survey=Survey(request.project or "", request.date or again.dates(cameras)),
         later=later,
         overwrite=True,
     )
     return {"page": str(page), "uncertainty": uncertainty_sentence(summary, later.tvu)}
-
-
-class Record:
-    """What was asked for, from which files, and which steps are done.
-
-    A step counts as done while the request and the input files are those of the record, every
-    step before it was found done, and its own files are as it left them. The JSON file at `path`
-    is written after each step; the request has everything that the results depend on.
-    """
-
-    def __init__(self, path: Path, request: dict[str, Any], inputs: Sequence[Path]) -> None:
-        self._path = path
-        self._content: dict[str, Any] = {
-            "request": request,
-            "inputs": [file_state(p) for p in inputs],
-            "steps": {},
-        }
-        self._earlier = self._read()
-
-    @property
-    def resumes(self) -> bool:
-        """Whether there is an earlier run that was asked for the same."""
-        return bool(self._earlier)
-
-    def _read(self) -> dict[str, Any]:
-        """Return the steps of an earlier run that was asked for the same."""
-        if not self._path.exists():
-            return {}
-        earlier = read_record(self._path)
-        plain = json.loads(json.dumps(self._content))
-        same = all(earlier.get(key) == plain[key] for key in ("request", "inputs"))
-        steps: dict[str, Any] = earlier["steps"] if same else {}
-        return steps
-
-    def step(self, name: str, outputs: Sequence[Path], work: Callable[[], Any]) -> tuple[Any, bool]:
-        """Do a step unless it is done; return its result and whether it was done.
-
-        `outputs` are all files that `work` leaves; it returns what later steps need, as JSON can
-        hold it.
-        """
-        earlier = self._earlier.get(name)
-        if earlier is not None and earlier["outputs"] == [file_state(p) for p in outputs]:
-            self._note(name, earlier)
-            return earlier["result"], True
-        self._earlier = {}  # what follows was made from other files
-        result = work()
-        self._note(name, {"outputs": [file_state(p) for p in outputs], "result": result})
-        return json.loads(json.dumps(result)), False
-
-    def _note(self, name: str, step: dict[str, Any]) -> None:
-        self._content["steps"][name] = step
-        write_text(self._path, json_text(self._content), overwrite=True)
-
-
-def read_record(path: Path) -> dict[str, Any]:
-    """Return the content of a record.
-
-    Raises
-    ------
-    InputError
-        If the file is none.
-    """
-    try:
-        content: dict[str, Any] = read_json(path)
-        _ = content["request"], content["inputs"], content["steps"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{path}: is not the record of a run ({error}); give the run.json of an earlier run,"
-            " or remove it."
-        ) from error
-    return content

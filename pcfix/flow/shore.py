@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
+import shapely
 
-from pcfix.grid.shoreline import NearWater
+from pcfix.grid.shoreline import NearWater, Shoreline
 from pcfix.io.files import check_output
-from pcfix.io.vectors import check_lines, write_lines
+from pcfix.io.geopackage import Layer, check_layers, write_layers
 from pcfix.model import FloatArray
 from pcfix.options.correct import LEVEL_M
 from pcfix.options.declare import File
@@ -20,7 +21,7 @@ LAYER = "shoreline"
 def check_shoreline(path: File | None, *, overwrite: bool, inputs: Iterable[File] = ()) -> None:
     """Refuse a file that could not be written, before anything is computed."""
     if path is not None:
-        check_lines(check_output(path, overwrite=overwrite, inputs=inputs))
+        check_layers(check_output(path, overwrite=overwrite, inputs=inputs))
 
 
 def write_shoreline(
@@ -41,11 +42,19 @@ def write_shoreline(
         return np.full(len(xy), LEVEL_M) if known is None else known
 
     lines = points.lines(sigma)
-    values = {
-        name: np.array([getattr(one, name) for one in lines], np.float64)
-        for name in ("level_m", "sigma_m", "length_m")
-    }
-    write_lines(path, LAYER, [one.xy for one in lines], values, crs, overwrite=overwrite)
+    layer = shoreline_layer(LAYER, lines)
+    write_layers(path, [layer], crs, overwrite=overwrite)
+    values = layer.values
     length = float(values["length_m"].sum())
     mean = float(np.sqrt(values["sigma_m"] ** 2 @ values["length_m"] / length)) if lines else None
     return {"path": str(path), "lines": len(lines), "length_m": length, "sigma_m": mean}
+
+
+def shoreline_layer(name: str, lines: Sequence[Shoreline], style: str = "") -> Layer:
+    """Return lines as a layer: of each the level, the standard error across it, the length."""
+    values = {
+        figure: np.array([getattr(one, figure) for one in lines], np.float64)
+        for figure in ("level_m", "sigma_m", "length_m")
+    }
+    geometries = [shapely.linestrings(one.xy) for one in lines]
+    return Layer(name, "LineString", geometries, values, style)

@@ -67,8 +67,6 @@ class Points(NamedTuple):
 
 SAMPLE_POINTS = 2_000_000
 """Points of a cloud that are looked at for a surface, evenly spread."""
-SHORE_RADIUS_M = 1.0
-"""About shoreline points without a height, which they take from the cloud."""
 
 
 CloudPlace: TypeAlias = "tuple[CRS | str | None, FloatArray, FloatArray]"
@@ -310,11 +308,16 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
     if options.water_model == "river":
         corners = (xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0))
         low, high = corners if view is None else (view.low, view.high)
-        found = fit_river(xyz, _bounds(low, high), name=shore.name)
+        found = fit_river(xyz, _bounds(low, high), name=shore.name, counts=shore.counts)
     else:
-        found = fit_water(xyz, model=options.water_model)
+        found = fit_water(xyz, model=options.water_model, counts=shore.counts)
     for note in notes:
         warnings.warn(note, PcfixWarning, stacklevel=2)
+    if (shore.counts < 1.0).any():
+        notes.append(
+            f"{shore.name}: {len(xyz):,} points along lines that were drawn count as"
+            f" {shore.counts.sum():.0f} independent ones."
+        )
     return FoundSurface(found.surface, found, xyz, (*notes, *found.notes))
 
 
@@ -322,6 +325,7 @@ def _with_heights(
     xyz: FloatArray, name: str, view: CloudView | None, notes: list[str]
 ) -> FloatArray:
     """Give the points without a height that of the cloud about them."""
+    from pcfix.io.vectors import SHORE_RADIUS_M
     from pcfix.water.fit import heights_from_cloud, is_near
 
     if view is None:

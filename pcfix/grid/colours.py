@@ -6,6 +6,12 @@ light where it is shallow, and what is high in a difference is red.
 
 from __future__ import annotations
 
+import numpy as np
+import numpy.typing as npt
+
+from pcfix.grid.model import NO_LIGHT
+from pcfix.model import FloatArray
+
 DEPTH = "YlGnBu"
 HEIGHT = "cividis"
 UNCERTAINTY = "OrRd"
@@ -23,3 +29,36 @@ def stops_of(ramp: str, steps: int = 9) -> list[tuple[float, tuple[int, ...]]]:
         (share, tuple(round(255 * part) for part in colour))
         for share, colour in zip(shares, colours.tolist(), strict=True)
     ]
+
+
+LAND = (214, 205, 188)
+DARKEST = 0.35
+"""Of the colour that is left where no light falls."""
+
+
+def relief_colours(
+    light: npt.NDArray[np.uint8], depth_m: FloatArray, deepest_m: float, *, flat: float
+) -> npt.NDArray[np.uint8]:
+    """Return red, green, blue and alpha, shape (4, rows, columns), of a lit bed and its land.
+
+    Parameters
+    ----------
+    light : array of uint8, shape (rows, columns)
+        Of `pcfix.grid.model.hillshade`.
+    depth_m : array, shape (rows, columns)
+        NaN on land.
+    deepest_m : float
+        What has the last colour of the ramp.
+    flat : float
+        Share of the light that level ground has; it keeps its colour.
+    """
+    stops = stops_of(DEPTH, 33)
+    at = np.array([share for share, _ in stops]) * deepest_m
+    lit = DARKEST + (1.0 - DARKEST) * (light - 1.0) / 254.0 / flat
+    colours = [
+        np.where(np.isnan(depth_m), land, np.interp(np.nan_to_num(depth_m), at, ramp))
+        for land, ramp in zip(LAND, np.array([colour for _, colour in stops]).T, strict=True)
+    ]
+    alpha = np.where(light == NO_LIGHT, 0, 255)
+    bands = [np.clip(np.rint(band * lit), 0, 255) for band in colours]
+    return np.where(alpha > 0, [*bands, alpha], 0).astype(np.uint8)

@@ -13,6 +13,9 @@ from pcfix.kernels import kernel
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.steps import DsmMethod
 
+TO_95 = 1.959964
+"""From a standard deviation to the half-width that holds 95 % of a normal distribution."""
+
 
 class Gridding(NamedTuple):
     """How heights are made: the raster, the key of `HEIGHTS`, and distances in metres.
@@ -52,15 +55,11 @@ class Block(NamedTuple):
 
 
 class Gridded(NamedTuple):
-    """The bands of a window, each of its shape; NaN where nothing is known.
-
-    uncertainty : None where the points have no standard errors.
-    """
+    """The bands of a window, each of its shape; NaN where nothing is known."""
 
     height: FloatArray
     points: IntArray
     spread: FloatArray
-    uncertainty: FloatArray | None
 
 
 def grid_window(points: FloatArray, cell: IntArray, window: Window, how: Gridding) -> Gridded:
@@ -68,8 +67,8 @@ def grid_window(points: FloatArray, cell: IntArray, window: Window, how: Griddin
 
     Parameters
     ----------
-    points : array, shape (n, 3) or (n, 4)
-        Metres, world frame, and the standard error of Z (m), zero of points that have none.
+    points : array, shape (n, 3)
+        x and y, world frame, metres, and the height, or what else the raster is made of.
     cell : array of int, shape (n, 2)
         Column and row of each point in the raster.
     window : Window
@@ -83,14 +82,8 @@ def grid_window(points: FloatArray, cell: IntArray, window: Window, how: Griddin
         how.lattice.positions(points), cell, points[:, 2], window, numbers,
         how.reach_m / size, how.spacing_m / size,
     )  # fmt: skip
-    uncertainty = None
-    if points.shape[1] > 3:
-        sigma_m = cell_uncertainty(code, points[inner, 3], numbers.points.size)
-        uncertainty = sigma_m.reshape(shape)
     height = HEIGHTS[how.method].of(block).reshape(shape)
-    return Gridded(
-        height, numbers.points.reshape(shape), numbers.spread.reshape(shape), uncertainty
-    )
+    return Gridded(height, numbers.points.reshape(shape), numbers.spread.reshape(shape))
 
 
 class Cells(NamedTuple):
@@ -135,23 +128,15 @@ def cell_numbers(cell: IntArray, z: FloatArray, size: int) -> Cells:
     return Cells(count, *(_spread_out(values, filled, size) for values in columns))
 
 
-def cell_uncertainty(cell: IntArray, sigma_m: FloatArray, size: int) -> FloatArray:
-    """Return the standard uncertainty of each cell: the root mean square of its points'.
+def as_uncertainty(bands: Gridded) -> Gridded:
+    """Return the vertical uncertainty (m) at 95 % of cells whose bands are of standard errors.
 
-    It is not divided by the square root of their number. What the points of a cell are wrong by
-    comes in good part from level, index and tilt of the water and from poses, which they share,
-    and which more points do not average out; to take all of it as shared is the cautious side.
-    Points and cells are those of `cell_numbers`. Points with a standard error (m) of 0 have none
-    and do not count; NaN where no point of a cell has one.
+    It is the root mean square of the points', and not divided by the square root of their number.
+    What the points of a cell are wrong by comes in good part from level, index and tilt of the
+    water and from poses, which they share, and which more points do not average out; to take all
+    of it as shared is the cautious side.
     """
-    known = sigma_m > 0.0
-    cell, sigma_m = cell[known], sigma_m[known]
-    order = np.lexsort((sigma_m, cell))
-    count = np.bincount(cell, minlength=size)
-    filled = np.flatnonzero(count)
-    n = count[filled]
-    mean_square = _sums(sigma_m[order] ** 2, np.cumsum(n) - n) / n
-    return _spread_out(np.sqrt(mean_square), filled, size)
+    return bands._replace(height=TO_95 * np.hypot(bands.height, bands.spread))
 
 
 def _sums(values: FloatArray, first: IntArray) -> FloatArray:

@@ -13,7 +13,7 @@ from pcfix.errors import SettingError
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.options.steps import MIN_RESOLUTION_M
 
-MAX_CELLS = 4_000_000_000
+MAX_CELLS = 1_000_000_000
 EDGE_M = 1e-7
 """A point this near to an edge lies on it: 5432000.1 / 0.1 in floating point may fall short."""
 
@@ -41,6 +41,13 @@ class Window(NamedTuple):
         return Window(
             self.row - cells, self.row_stop + cells, self.column - cells, self.column_stop + cells
         )
+
+    def moved(self, rows: int, columns: int) -> Window:
+        """Return the window so many rows and columns further."""
+        return Window(
+            self.row + rows, self.row_stop + rows, self.column + columns,
+            self.column_stop + columns,
+        )  # fmt: skip
 
     def holds(self, cell: IntArray) -> BoolArray:
         """Return which columns and rows, shape (n, 2), are in the window."""
@@ -140,8 +147,7 @@ def refuse_size(low: FloatArray, high: FloatArray, resolution_m: float, name: st
     columns, rows = _size(low, high, resolution_m)
     raise SettingError(
         f"{name}: a resolution of {resolution_m:g} m makes {columns:,.0f} x {rows:,.0f} cells, more"
-        f" than the {MAX_CELLS / 1e9:g} gigapixels that are allowed; take"
-        f" {finest_m(low, high):g} m or coarser."
+        f" than the {MAX_CELLS:,} that are allowed; take {finest_m(low, high):g} m or coarser."
     )
 
 
@@ -159,6 +165,26 @@ def _size(low: FloatArray, high: FloatArray, resolution_m: float) -> tuple[float
     first = np.floor((low + EDGE_M) / resolution_m)
     columns, rows = (np.floor((high + EDGE_M) / resolution_m) - first + 1.0).tolist()
     return columns, rows
+
+
+POINTS_A_CELL = 2.0, 4.0
+"""Where no resolution is given."""
+ROUND = (1.0, 2.0, 5.0, 2.5, 4.0, 8.0, 1.25, 1.6, 3.2, 6.4)
+"""Figures of a resolution, the roundest first; those that neighbour differ by less than sqrt 2."""
+
+
+def round_resolution(spacing_m: float, finest_m: float) -> float:
+    """Return a round side of cells with `POINTS_A_CELL`, by the distance of the points, metres.
+
+    It is not finer than `finest_m`, such as the size of a pixel on the ground: then more points
+    share a cell.
+    """
+    least = spacing_m * math.sqrt(POINTS_A_CELL[0])
+    least = max(least, finest_m, MIN_RESOLUTION_M)
+    power = 10.0 ** math.floor(math.log10(least))
+    most = least * math.sqrt(POINTS_A_CELL[1] / POINTS_A_CELL[0])
+    sides = (figure * scale for figure in ROUND for scale in (power, 10.0 * power))
+    return next(float(f"{side:.6g}") for side in sides if least * 0.999 <= side <= most * 1.001)
 
 
 POINTS_A_SQUARE = 6.0

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -21,11 +22,13 @@ class DsmSummary:
     Attributes
     ----------
     input, output : str
-    hillshade : str or None
+    hillshade, counts : str or None
+    what : str
+        The cells hold; see `DsmRules`.
     pcfix : str
         Version.
-    crs : str or None
-        Name of the coordinate system that the cloud states.
+    crs, heights : str or None
+        Names of the coordinate system, and of its vertical part, that the cloud states.
     width, height : int
         Columns and rows.
     bounds_m : tuple of float
@@ -46,15 +49,19 @@ class DsmSummary:
         Width of the widest hole that was bridged.
     settings : dict
     seconds : float
-    uncertainty_m : dict or None
-        Mean and largest standard uncertainty of the cells that have one.
+    values : dict
+        Least, mean and largest of the cells, before holes are filled.
+    resolution_is : {"given", "chosen"}
     """
 
     input: str
     output: str
     hillshade: str | None
+    counts: str | None
+    what: str
     pcfix: str
     crs: str | None
+    heights: str | None
     width: int
     height: int
     bounds_m: tuple[float, float, float, float]
@@ -68,7 +75,8 @@ class DsmSummary:
     hole_m: float | None
     settings: dict[str, Any]
     seconds: float
-    uncertainty_m: dict[str, float] | None = None
+    values: dict[str, float]
+    resolution_is: Literal["given", "chosen"] = "given"
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""
@@ -77,14 +85,15 @@ class DsmSummary:
 
 @dataclass
 class Tally:
-    """Cells of a DSM so far, and what their uncertainties come to."""
+    """Cells of a DSM so far, and what their values come to."""
 
     cells: int = 0
     filled: int = 0
     known: int = 0
-    with_sigma: int = 0
-    sigma_sum_m: float = 0.0
-    sigma_max_m: float = 0.0
+    total: float = 0.0
+    low: float = math.inf
+    high: float = -math.inf
+    gridded: int = 0
 
     def add(self, bands: Gridded) -> None:
         """Add a part of the raster."""
@@ -92,18 +101,18 @@ class Tally:
         self.cells += int((bands.points > 0).sum())
         self.filled += int((known & (bands.points == 0)).sum())
         self.known += int(known.sum())
-        if bands.uncertainty is not None:
-            sigma = bands.uncertainty[~np.isnan(bands.uncertainty)]
-            self.with_sigma += sigma.size
-            self.sigma_sum_m += float(sigma.sum())
-            self.sigma_max_m = max(self.sigma_max_m, float(sigma.max(initial=0.0)))
+        values = bands.height[known]
+        self.gridded += values.size
+        self.total += float(values.sum())
+        self.low = min(self.low, float(values.min(initial=math.inf)))
+        self.high = max(self.high, float(values.max(initial=-math.inf)))
 
-    def uncertainty_m(self) -> dict[str, float] | None:
-        """Return mean and largest; None where no cell has one."""
-        if not self.with_sigma:
-            return None
-        mean = self.sigma_sum_m / self.with_sigma
-        return {"mean": round(mean, 4), "max": round(self.sigma_max_m, 4)}
+    def values(self) -> dict[str, float]:
+        """Return least, mean and largest; nothing where no cell has a value."""
+        if not self.gridded:
+            return {}
+        mean = self.total / self.gridded
+        return {"min": round(self.low, 4), "mean": round(mean, 4), "max": round(self.high, 4)}
 
 
 NO_LIGHT = 0

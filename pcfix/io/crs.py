@@ -75,6 +75,21 @@ def heights_of(crs: CRS) -> Heights:
     return "ellipsoidal" if len(crs.axis_info) == 3 else "unstated"
 
 
+def crs_words(crs: CRS | None) -> tuple[str, str]:
+    """Return the name of a system in plan, with its code, and what heights are above.
+
+    Each is empty where it is not stated.
+    """
+    if crs is None:
+        return "", ""
+    plan, vertical = parts(crs)
+    code = (plan.to_json_dict() or {}).get("id")
+    name = f"{plan.name} ({code['authority']}:{code['code']})" if code else plan.name
+    if vertical is not None:
+        return name, vertical.name
+    return name, "above the ellipsoid" if heights_of(crs) == "ellipsoidal" else ""
+
+
 def is_same(one: CRS, other: CRS) -> bool:
     """Whether two CRS are one, whatever their order of axes and their shift to WGS 84."""
     one, other = unbound(one), unbound(other)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -77,6 +78,22 @@ def read_heights(source: DatasetReader, window: Window) -> FloatArray:
     height = source.read(1, window=_slices(window)).astype(np.float64)
     height[height == source.nodata] = np.nan
     return np.asarray(height)
+
+
+def read_within(source: DatasetReader, window: Window, whole: Window) -> FloatArray:
+    """Return part of the first band as `read_heights`, NaN beyond the raster."""
+    values = np.full((window.height, window.width), np.nan)
+    inside = window.clipped(whole)
+    if inside.height > 0 and inside.width > 0:
+        values[inside.within(window)] = read_heights(source, inside)
+    return values
+
+
+def lattice_of(source: DatasetReader) -> Lattice:
+    """Return the cells of a raster that pcfix wrote."""
+    size, t = source.res[0], source.transform
+    first = round(t.c / size), round(-t.f / size)
+    return Lattice(size, *first, source.width, source.height)
 
 
 def read_masked(raster: Any, **how: Any) -> FloatArray:
@@ -218,10 +235,10 @@ def copy_as_cog(source: Path, target: Path) -> None:
 
     with open_raster(source) as raster:
         options = _compression(raster.dtypes[0])
-    copy(source, target, driver="COG", blocksize=TILE, **options)
-
-
-PREVIEW_CELLS = 600
+    copy(
+        source, target, driver="COG", blocksize=TILE, overview_resampling="average",
+        statistics="YES", **options,
+    )  # fmt: skip
 
 
 def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = False) -> int:
@@ -259,11 +276,45 @@ def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = Fal
     return known
 
 
-def preview(path: Path) -> tuple[FloatArray, tuple[float, float, float, float]]:
-    """Return a small version of a raster with NaN for no data, and west, east, south, north."""
+Bounds = tuple[float, float, float, float]
+PREVIEW_CELLS = 360_000
+
+
+def preview(path: Path, cells: int = PREVIEW_CELLS) -> tuple[FloatArray, Bounds]:
+    """Return a raster of at most so many cells, NaN for no data, and west, east, south, north."""
     with open_raster(path) as source:
-        scale = max(1.0, max(source.height, source.width) / PREVIEW_CELLS)
+        scale = max(1.0, math.sqrt(source.height * source.width / cells))
         shape = max(1, int(source.height / scale)), max(1, int(source.width / scale))
         values = read_masked(source, out_shape=shape)
         west, south, east, north = source.bounds
     return values, (west, east, south, north)
+
+
+def centres(place: FloatArray, values: FloatArray, bounds: Bounds) -> FloatArray:
+    """Return x and y of columns and rows, shape (n, 2), of a `preview`: whole ones are centres."""
+    west, east, south, north = bounds
+    size = (east - west) / values.shape[1], (south - north) / values.shape[0]
+    return np.asarray((west, north) + (place + 0.5) * size)
+
+
+def outlines(path: Path, cells: int) -> list[Any]:
+    """Return the polygons around what a raster knows, by a `preview`; gaps of a cell close."""
+    import shapely
+    from rasterio.features import shapes
+    from rasterio.transform import from_bounds
+    from scipy.ndimage import binary_closing
+
+    values, (west, east, south, north) = preview(path, cells)
+    rows, columns = values.shape
+    known = np.pad(np.isfinite(values), 2)
+    known = binary_closing(known, np.ones((3, 3), bool))[2:-2, 2:-2]
+    transform = from_bounds(west, south, east, north, columns, rows)
+    found = shapes(known.astype(np.uint8), mask=known, transform=transform)
+    return [shapely.geometry.shape(polygon) for polygon, _ in found]
+
+
+def values_at(path: Path, xy: FloatArray) -> FloatArray:
+    """Return the first band at places (n, 2), that of their cell; NaN where it has no value."""
+    with open_raster(path) as source:
+        found = np.array([value[0] for value in source.sample(xy, 1, masked=True)], object)
+    return np.array([np.nan if np.ma.is_masked(one) else one for one in found], np.float64)

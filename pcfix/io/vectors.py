@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,7 @@ import shapely
 
 from pcfix.errors import InputError, SettingError
 from pcfix.io.crs import parse_crs
-from pcfix.io.files import check_input, check_output, replaced_when_whole
+from pcfix.io.files import check_input
 from pcfix.io.tables import Table, read_lines, split_header, table_below
 from pcfix.io.transformations import LOCAL, way_to_cloud
 from pcfix.model import FloatArray
@@ -60,6 +60,8 @@ _METRES_PER_DEGREE = 111_000.0
 
 SPACING_M = 1.0
 """Along lines without heights, which take them from the cloud."""
+SHORE_RADIUS_M = 1.0
+"""About shoreline points without a height, which they take from the cloud."""
 MOST_POINTS = 1_000_000
 FEW = 3
 
@@ -169,7 +171,7 @@ def _split_layer(path: File) -> tuple[str, str | None]:
     return file, layer.removeprefix("layername=") or None
 
 
-def _pyogrio() -> Any:
+def load_pyogrio() -> Any:
     """Return the library of vector files."""
     try:
         import pyogrio
@@ -180,40 +182,9 @@ def _pyogrio() -> Any:
     return pyogrio
 
 
-def check_lines(path: Path) -> None:
-    """Refuse what `write_lines` cannot write."""
-    if path.suffix.lower() != ".gpkg":
-        raise SettingError(f"{path}: lines are written as GeoPackage; give a name in .gpkg.")
-    _pyogrio()
-
-
-def write_lines(
-    path: File,
-    layer: str,
-    lines: Sequence[FloatArray],
-    values: dict[str, FloatArray],
-    crs: CRS | str | None,
-    *,
-    overwrite: bool,
-) -> None:
-    """Write lines, each (n, 2), and by name a value of each, as one layer of a GeoPackage."""
-    target = check_output(path, overwrite=overwrite)
-    geometry = shapely.to_wkb(np.array([shapely.linestrings(one) for one in lines], object))
-    wkt = None if crs is None else parse_crs(crs, "the cloud").to_wkt()
-    with replaced_when_whole(target) as draft, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a cloud may have no CRS
-        try:
-            _pyogrio().raw.write(
-                draft, geometry, list(values.values()), list(values), layer=layer, crs=wkt,
-                driver="GPKG", geometry_type="LineString",
-            )  # fmt: skip
-        except RuntimeError as error:
-            raise InputError(f"{target}: cannot be written ({error}).") from error
-
-
 def _read_gdal(path: Path, layer: str | None) -> tuple[npt.NDArray[Any], str | None, str]:
     """Return geometries (None where one is missing), CRS and name."""
-    pyogrio = _pyogrio()
+    pyogrio = load_pyogrio()
     try:
         layer = _layer(path, pyogrio.list_layers(path), layer)
         with warnings.catch_warnings():
@@ -353,12 +324,15 @@ def _check_degrees(vectors: Vectors) -> None:
 class Shoreline(NamedTuple):
     """Points on the edge of the water, shape (n, 3): metres, the cloud's CRS, z NaN where unknown.
 
-    `name` is the file's, for messages; `notes` are for the summary.
+    `name` is the file's, for messages; `notes` are for the summary. `counts`, shape (n,), is how
+    many independent observations each point is worth: one that was measured or drawn 1, those
+    between the vertices of a drawn line less; see `_worth`.
     """
 
     xyz: FloatArray
     name: str
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...]
+    counts: FloatArray
 
 
 class WaterPolygons(NamedTuple):
@@ -376,7 +350,8 @@ def read_shoreline(
 
     A line with heights gives its vertices, as these were measured; what lies between them was
     not, and would make the fit look better than it is. A line without heights gives a point at
-    least every `SPACING_M`, as each takes a height of its own from the cloud. For the arguments
+    least every `SPACING_M`, as each takes a height of its own from the cloud, and says what these
+    are worth. For the arguments
     and errors see `read_vectors` and `in_cloud_crs`.
     """
     vectors = in_cloud_crs(read_vectors(path, crs=crs), cloud_crs, heights=True)
@@ -388,16 +363,37 @@ def read_shoreline(
             f"{vectors.name}: would give {count:.3g} points; check its CRS and unit, or thin it"
             " out."
         )
-    parts = [points, lines[level], shapely.segmentize(lines[~level], SPACING_M)]
-    xyz = np.vstack([_vertices(part) for part in parts])
+    drawn = lines[~level]
+    dense = [shapely.segmentize(line, SPACING_M) for line in drawn]
+    parts = [points, lines[level], *([one] for one in dense)]
+    vertices = [_vertices(np.array(part, object)) for part in parts]
+    xyz = np.vstack(vertices)
+    counts = [np.ones(len(one)) for one in vertices[:2]]
+    counts += [_worth(line, len(one)) for line, one in zip(drawn, vertices[2:], strict=True)]
+    worth = np.concatenate(counts)
     known = xyz[np.isfinite(xyz[:, 2]), 2]
     if len(known) < FEW or known.any():
-        return Shoreline(xyz, vectors.name, vectors.notes)
+        return Shoreline(xyz, vectors.name, vectors.notes, worth)
     xyz[:, 2] = np.nan  # all exactly zero, as of a flat drawing
     note = (
         f"{vectors.name}: all {len(known)} heights are exactly 0; taken as points without heights."
     )
-    return Shoreline(xyz, vectors.name, (*vectors.notes, note))
+    return Shoreline(xyz, vectors.name, (*vectors.notes, note), worth)
+
+
+def _worth(line: Any, points: int) -> FloatArray:
+    """Return how many independent observations each of the points along a drawn line is worth.
+
+    Whoever draws a line is off at each vertex by some amount, and between two by what lies between
+    these: straight interpolation between independent errors has two thirds of their variance, so a
+    line of v vertices says as much as 2 v / 3 points that scatter like those on it, however many
+    are put on it. Nor do points say more where the vertices are so dense that neighbours take
+    their heights from the same part of the cloud.
+    """
+    vertices = len(line.coords) - line.is_closed
+    apart = max(line.length / (2.0 * SHORE_RADIUS_M), 1.0)
+    drawn = 2.0 / 3.0 * vertices if vertices < points else float(vertices)
+    return np.full(points, min(1.0, min(drawn, apart) / points))
 
 
 def _lines_and_points(geometries: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:

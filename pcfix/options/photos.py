@@ -65,7 +65,7 @@ class GroundOptions(OptionSet):
         "Of the raster that a cloud is gridded to.",
         unit="m",
         rule=METRES,
-        default_is="two ground pixels",
+        default_is="2 to 4 points a cell",
     )
 
 

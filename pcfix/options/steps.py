@@ -11,7 +11,17 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from pcfix.errors import SettingError
-from pcfix.options.declare import File, OptionSet, Rule, at_least, must_be, option, positive, rule
+from pcfix.options.declare import (
+    File,
+    OptionSet,
+    Rule,
+    at_least,
+    must_be,
+    not_negative,
+    option,
+    positive,
+    rule,
+)
 from pcfix.options.shared import JobOptions, OverwriteOption, Panel, SummaryOption
 
 LEAST_NEIGHBOURS, MOST_NEIGHBOURS = 6, 500
@@ -168,8 +178,16 @@ class DsmRules(OptionSet):
     panel = Panel.RASTER
     old_units = True
 
-    resolution: float = option(None, "Side of a cell.", unit="m", needed=True, rule=_RESOLUTION)
-    method: DsmMethod = option("mean", "How a cell gets its height.", rule=_one_of(DsmMethod))
+    resolution: float | None = option(
+        None, "Side of a cell.", unit="m", rule=_RESOLUTION, default_is="2 to 4 points a cell"
+    )
+    what: str = option(
+        "height",
+        "What a cell holds: height; depth of the bed below the water; uncertainty, the vertical"
+        " one of the bed at 95 %; or the values of a dimension, by its name.",
+        metavar="height|depth|uncertainty|DIMENSION",
+    )
+    method: DsmMethod = option("mean", "How a cell gets its value.", rule=_one_of(DsmMethod))
     surface: SurfaceChoice = option(
         "all",
         "Land and bed without noise, or only the bed (class 40).",
@@ -197,9 +215,23 @@ class DsmRules(OptionSet):
         ),
     )
 
+    @property
+    def cell_m(self) -> float:
+        """The resolution, once there is one."""
+        if self.resolution is None:
+            raise SettingError("resolution is missing: give the side of a cell, metres.")
+        return self.resolution
+
     def check(self) -> None:
         """Check what options say together."""
         super().check()
+        if self.what == "uncertainty" and (self.method != "mean" or self.fill is not None):
+            raise SettingError(
+                "The uncertainty of a cell is the root mean square of its points'; leave --method"
+                " and --fill out."
+            )
+        if self.what in ("depth", "uncertainty"):
+            object.__setattr__(self, "surface", "bed")
         most = MAX_HOLE_CELLS * (self.resolution or math.inf)
         if self.fill is not None and self.fill > most:
             raise SettingError(
@@ -215,12 +247,20 @@ class DsmOptions(OverwriteOption, SummaryOption, DsmRules):
     panel = Panel.OUTPUT
 
     hillshade: File | None = option(None, "Write a hillshade there (.tif).")
+    counts: File | None = option(
+        None, "Write the number of points and their spread in each cell there (.tif)."
+    )
+    style: bool = option(False, "Write a style for QGIS beside it (.qml).")
     cog: bool = option(False, "Write cloud optimised GeoTIFF.")
 
 
 LAYERS = ("water", "apparent", "corrected", "reference")
 """Lines of a cross-section; a further cloud goes by another name."""
 _NAME = re.compile(r"[\w .+-]*\w[\w .+-]*")
+
+
+SIGMA_REFERENCE_M = {"cloud": 0.03, "raster": 0.03, "table of check points": 0.02}
+"""Assumed noise of a height by kind of reference: LiDAR over hard ground, RTK or levelling."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,6 +295,14 @@ class DistanceOptions(OptionSet):
         (),
         "A further cloud, in the C2C table and the cross-sections; may be repeated.",
         metavar="NAME=CLOUD",
+    )
+    sigma_reference: float | None = option(
+        None,
+        "Noise of a height of the reference, a standard deviation: it is taken out of what is said"
+        " of the cloud's own errors.",
+        unit="m",
+        rule=not_negative("give a standard deviation in metres; 0 takes nothing out"),
+        default_is=", ".join(f"{sigma:g} of a {kind}" for kind, sigma in SIGMA_REFERENCE_M.items()),
     )
 
     def check(self) -> None:

@@ -112,7 +112,17 @@ class RunOptions(
     old_units = True
 
     resolution: float | None = option(
-        None, "Of the rasters.", unit="m", rule=METRES, default_is="4 points a cell"
+        None,
+        "Of the rasters.",
+        unit="m",
+        rule=METRES,
+        default_is="2 to 4 points a cell, or the GSD",
+    )
+    project: str | None = option(
+        None, "Its name, the title of the report.", default_is="the name of the cloud"
+    )
+    date: str | None = option(
+        None, "When the images were taken, for the report.", default_is="what --image-times says"
     )
     adjust: AdjustWhen = option(
         "auto",

@@ -245,7 +245,7 @@ def block_figure(report: CamerasReport) -> Figure:
     level = report.level_m  # where to draw footprints: at the water, else amid the cloud
     if level is None:
         level = float(np.median(xyz[:, 2])) if len(xyz) else np.nan
-    shown = draw_cloud(figure, plan, xyz, label="cloud")
+    shown = draw_cloud(figure, plan, xyz, report.level_m, label="cloud")
     if len(shown):
         side.plot(shown[:, 0], shown[:, 2], ".", color="0.6", markersize=1, label="cloud")
     rows = range(0, len(cameras), max(1, len(cameras) // MOST_FOOTPRINTS))

@@ -347,13 +347,18 @@ def dsm_text(summary: DsmSummary) -> str:
     left, bottom, right, top = s.bounds_m
     total = s.width * s.height
     wanted = {"all": "land and bed", "bed": "bed, class 40"}[s.settings["surface"]]
+    low, mean, high = (s.values.get(name, np.nan) for name in ("min", "mean", "max"))
+    chosen = ", chosen for 2 to 4 points each" if s.resolution_is == "chosen" else ""
     lines = [
         f"{s.input} -> {s.output}",
         f"points       {s.points_used:,} of {s.points:,} ({wanted}) in {s.seconds:.1f} s",
-        f"raster       {s.width:,} x {s.height:,} cells of {s.settings['resolution']:g} m,"
+        f"raster       {s.width:,} x {s.height:,} cells of {s.settings['resolution']:g} m{chosen},"
         f" {s.settings['method']}",
+        f"{s.what:<12} {low:.4g} to {high:.4g}, mean {mean:.4g}"
+        f"{' m at 95 %, formal' if s.what == 'uncertainty' else ''}",
         f"bounds       x {left:.10g} to {right:.10g}, y {bottom:.10g} to {top:.10g} m",
-        f"CRS          {s.crs or 'the cloud states none'}",
+        f"CRS          {s.crs or 'the cloud states none'}; heights:"
+        f" {s.heights or 'the cloud states no vertical datum'}",
         f"with points  {s.cells:,} cells ({share(s.cells, total)}),"
         f" {s.points_per_cell:.1f} points each",
     ]
@@ -363,14 +368,8 @@ def dsm_text(summary: DsmSummary) -> str:
             f" across holes up to {s.hole_m:.3g} m"
         )
     lines.append(f"empty        {s.empty:,} cells ({share(s.empty, total)})")
-    if s.uncertainty_m is not None:
-        sigma = s.uncertainty_m
-        lines.append(
-            f"uncertainty  of the bed's cells, formal, standard: mean {sigma['mean']:.3f} m,"
-            f" largest {sigma['max']:.3f} m (band 4)"
-        )
-    if s.hillshade is not None:
-        lines.append(f"hillshade    {s.hillshade}")
+    also = {"hillshade": s.hillshade, "counts": s.counts}
+    lines += [f"{name:<12} {path}" for name, path in also.items() if path is not None]
     return "\n".join(lines)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import BoolArray, FloatArray, WaterPlane
-from pcfix.water.robust import Regression, ShoreFit, of_all, robust_regression, usable_rows
+from pcfix.water.robust import Regression, ShoreFit, of_all, robust_regression, shared, usable_rows
 
 Model = Literal["auto", "level", "plane", "along"]
 MAX_TILT_PERCENT = 5.0
@@ -129,7 +129,9 @@ class _Plan(NamedTuple):
 _UNKNOWNS: dict[Model, int] = {"level": 1, "along": 2, "plane": 3}
 
 
-def fit_water(xyz: FloatArray, *, model: Model = "auto") -> WaterFit:
+def fit_water(
+    xyz: FloatArray, *, model: Model = "auto", counts: FloatArray | None = None
+) -> WaterFit:
     """Fit the water surface to shoreline points, nearly half of which may be wrong.
 
     Parameters
@@ -140,6 +142,9 @@ def fit_water(xyz: FloatArray, *, model: Model = "auto") -> WaterFit:
         ``along`` is tilted in the direction in which the points lie and level across it. ``auto``
         takes a tilt only where it is significant, and only along the points where these are
         nearly on one line, or lie along a river and show no tilt across it.
+    counts : array, shape (n,), optional
+        How many independent observations each point is worth, up to 1: 1 by default, less where
+        neighbours share their errors. Standard errors and tests of tilts go by their sum.
 
     Returns
     -------
@@ -163,7 +168,8 @@ def fit_water(xyz: FloatArray, *, model: Model = "auto") -> WaterFit:
     if len(known) == 0:
         raise GeometryError(f"None of {len(points)} shoreline points has a height.")
     plan = _plan(points[known, :2])
-    chosen, found, notes = _choose(points[known], plan, model)
+    worth = np.ones(len(known)) if counts is None else np.asarray(counts, np.float64)[known]
+    chosen, found, notes = _choose(points[known], plan, model, worth)
     fit = WaterFit(
         model=chosen,
         **_located(points[known[found.weight > 0.0], :2].mean(axis=0), chosen, plan, found),
@@ -189,22 +195,22 @@ def _plan(xy: FloatArray) -> _Plan:
 
 
 def _choose(
-    xyz: FloatArray, plan: _Plan, model: Model
+    xyz: FloatArray, plan: _Plan, model: Model, worth: FloatArray
 ) -> tuple[Model, Regression, tuple[str, ...]]:
     """Return the model, its fit, and why."""
     if model != "auto":
         _check_enough(len(xyz), plan, model)
-        return model, _regression(xyz, plan, model), ()
+        return model, _regression(xyz, plan, model, worth), ()
     if len(xyz) <= _FEWEST_FOR_PLANE or plan.spread_m[0] < _SAME_PLACE_M:
         note = f"{len(xyz)} points, too few or too close together to show a tilt: a level."
-        return "level", _regression(xyz, plan, "level"), (note,)
+        return "level", _regression(xyz, plan, "level", worth), (note,)
     along, across = plan.spread_m
     tilted: Model = "along" if across < LINE_RATIO * along else "plane"
-    found = _regression(xyz, plan, tilted)
-    chance = _chance_of_tilt(found)
+    found = _regression(xyz, plan, tilted, worth)
+    chance = _chance_of_tilt(found, worth)
     if not chance < SIGNIFICANCE:
         note = f"The tilt of the points is not significant (chance gives it in {chance:.0%})."
-        return "level", _regression(xyz, plan, "level"), (f"{note[:-1]}: a level.",)
+        return "level", _regression(xyz, plan, "level", worth), (f"{note[:-1]}: a level.",)
     significant = f"The tilt of the points is significant (chance gives it in {chance:.2g})."
     if tilted == "along":
         note = (
@@ -215,7 +221,7 @@ def _choose(
     is_level_across = abs(found.beta[2]) < 2.0 * math.sqrt(found.covariance[2, 2])
     if across < LONG_RATIO * along and is_level_across:
         note = "No tilt across the direction in which the points lie: level across it."
-        return "along", _regression(xyz, plan, "along"), (significant, note)
+        return "along", _regression(xyz, plan, "along", worth), (significant, note)
     return tilted, found, (significant,)
 
 
@@ -236,22 +242,24 @@ def _check_enough(n: int, plan: _Plan, model: Model) -> None:
         )
 
 
-def _regression(xyz: FloatArray, plan: _Plan, model: Model) -> Regression:
+def _regression(xyz: FloatArray, plan: _Plan, model: Model, worth: FloatArray) -> Regression:
     found = robust_regression(plan.columns(xyz[:, :2], model), xyz[:, 2])
     if found is None:
         raise GeometryError(
             f"The {len(xyz)} shoreline points do not fix a surface of the kind '{model}': too many"
             " are on one line; fit a level."
         )
-    return found
+    return found._replace(
+        covariance=found.covariance * shared(found.weight, worth, len(found.beta))
+    )
 
 
-def _chance_of_tilt(fit: Regression) -> float:
+def _chance_of_tilt(fit: Regression, worth: FloatArray) -> float:
     """Return how often points of a level would show such a tilt (Wald's test, F distribution)."""
     from scipy.stats import f
 
-    tilt, spare = fit.beta[1:], int((fit.weight > 0.0).sum()) - len(fit.beta)
-    if spare <= 0:
+    tilt, spare = fit.beta[1:], float(worth[fit.weight > 0.0].sum()) - len(fit.beta)
+    if spare <= 0.0:
         return 1.0
     if fit.sigma_m < _NO_SCATTER_M:
         return float(np.abs(tilt).max() < _NO_SCATTER_M)

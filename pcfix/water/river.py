@@ -76,7 +76,9 @@ class RiverFit(ShoreFit):
         }
 
 
-def fit_river(xyz: FloatArray, bounds: Bounds, *, name: str = "river") -> RiverFit:
+def fit_river(
+    xyz: FloatArray, bounds: Bounds, *, name: str = "river", counts: FloatArray | None = None
+) -> RiverFit:
     """Fit the water surface along a river to shoreline points, of which some may be wrong.
 
     Parameters
@@ -87,6 +89,8 @@ def fit_river(xyz: FloatArray, bounds: Bounds, *, name: str = "river") -> RiverF
         Least x, least y, greatest x, greatest y of the cloud: what the mesh has to cover.
     name : str
         Of the mesh.
+    counts : array, shape (n,), optional
+        See `pcfix.water.fit.fit_water`.
 
     Returns
     -------
@@ -112,7 +116,8 @@ def fit_river(xyz: FloatArray, bounds: Bounds, *, name: str = "river") -> RiverF
         )
     used = points[known]
     axis = _downstream(flow_axis(used[:, :2]), used)
-    profile = fit_profile(axis.locate(used[:, :2])[0], used[:, 2])
+    worth = None if counts is None else counts[known]
+    profile = fit_profile(axis.locate(used[:, :2])[0], used[:, 2], worth)
     return RiverFit(
         surface=_mesh(axis, profile, bounds, name),
         axis=axis,

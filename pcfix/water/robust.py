@@ -127,6 +127,19 @@ def robust_regression(X: FloatArray, z: FloatArray) -> Regression | None:
     return Regression(beta, covariance, sigma, residual, tukey_weight(residual / limit))
 
 
+def shared(weight: FloatArray, worth: FloatArray, unknowns: float) -> float:
+    """Return by how much a covariance grows, as points are not independent of their neighbours.
+
+    The k accepted ones are `worth` m independent observations in all: with p unknowns the
+    covariance is (k - p) / (m - p) times as large; NaN where m does not exceed p.
+    """
+    accepted = weight > 0.0
+    k, m = float(accepted.sum()), float(worth[accepted].sum())
+    if m >= k:
+        return 1.0
+    return (k - unknowns) / (m - unknowns) if m > unknowns else np.nan
+
+
 def tukey_weight(u: FloatArray) -> FloatArray:
     """Return Tukey's biweight (1 - u^2)^2, zero beyond |u| = 1."""
     return np.asarray(np.where(np.abs(u) < 1.0, (1.0 - u * u) ** 2, 0.0))
@@ -286,8 +299,11 @@ class _Data(NamedTuple):
         return (1.0 - self.share) * height[self.node] + self.share * height[self.node + 1]
 
 
-def fit_profile(station_m: FloatArray, z: FloatArray) -> Profile:
-    """Fit the height of the water, shape (n,), which falls with the station, downstream."""
+def fit_profile(station_m: FloatArray, z: FloatArray, worth: FloatArray | None = None) -> Profile:
+    """Fit the height of the water, shape (n,), which falls with the station, downstream.
+
+    `worth` is how many independent observations each point is, 1 by default; see `shared`.
+    """
     order = np.lexsort((z, station_m))
     nodes = int(np.clip(NODES_A_POINT * len(z), 20, MOST_NODES))
     at = np.linspace(station_m.min(), station_m.max(), nodes)
@@ -297,7 +313,11 @@ def fit_profile(station_m: FloatArray, z: FloatArray) -> Profile:
     falling, free = (_fit(data, at, falls=falls) for falls in (True, False))
     held = falling.sigma_m <= RISES_IF_WORSE * max(free.sigma_m, LEAST_SCALE_M)
     fit, back = falling if held else free, np.argsort(order)
-    return replace(fit, weight=fit.weight[back], residual_m=fit.residual_m[back])
+    fit = replace(fit, weight=fit.weight[back], residual_m=fit.residual_m[back])
+    if worth is None:
+        return fit
+    grown = np.sqrt(shared(fit.weight, worth, 0.0))
+    return replace(fit, sigma_height_m=fit.sigma_height_m * grown)
 
 
 def _best_penalty(data: _Data, *, falls: bool) -> float:

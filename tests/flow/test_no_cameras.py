@@ -237,6 +237,12 @@ def test_a_whole_run_without_cameras(tmp_path):
     assert not (tmp_path / "out" / "figures" / "cameras.png").exists()
     line = read_regression(tmp_path / "out" / "regression.json")
     assert 1.38 < line.slope < 1.48
+    pyogrio = pytest.importorskip("pyogrio")
+    meta, _, _, values = pyogrio.raw.read(tmp_path / "out" / "map.gpkg", layer="check_depths")
+    assert list(meta["fields"]) == ["measured_m", "residual_m"]
+    measured, residual = values
+    expected = np.sqrt(np.nanmean(line.sigma_m(measured / line.slope) ** 2))
+    assert np.sqrt(np.nanmean(residual**2)) == pytest.approx(expected, rel=0.5)
     again = run_pcfix(*words, folder=tmp_path)
     assert again.stdout.splitlines()[0].startswith("correct   done before")
     refused = run_pcfix(*words, "--adjust", "yes", "--overwrite", folder=tmp_path)

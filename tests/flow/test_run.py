@@ -5,16 +5,26 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import re
 import shutil
+import sqlite3
+from contextlib import closing
 from pathlib import Path
+from xml.etree import ElementTree
 
 import laspy
 import numpy as np
 import pytest
 import rasterio
+import shapely
 
 import pcfix
+from pcfix.errors import SettingError
 from pcfix.flow.run import Request, request_of, run_all
+from pcfix.grid.colours import DEPTH, stops_of
+from pcfix.io import geopackage
+from pcfix.io.rasters import values_at
+from pcfix.io.styles import hex_colour
 from pcfix.refract.tally import Summary
 from pcfix.report.text import tvu_sentence
 from tests.utils.program import run_pcfix
@@ -25,8 +35,9 @@ WORDS = [
     "--reference", str(SCENE / "lidar.laz"),
 ]  # fmt: skip
 RESULTS = [
-    "cleaned.laz", "compare", "corrected.laz", "dsm.tif", "dsm_bed.tif", "figures",
-    "hillshade.tif", "report.html", "run.json",
+    "bed.qml", "bed.tif", "cleaned.laz", "compare", "corrected.laz", "depth.qml", "depth.tif",
+    "figures", "map.gpkg", "report.html", "run.json", "shaded.tif", "surface.qml", "surface.tif",
+    "surface_counts.tif", "uncertainty.qml", "uncertainty.tif",
 ]  # fmt: skip
 
 
@@ -58,7 +69,7 @@ def test_every_step_leaves_its_files(finished):
     folder, said = finished
     assert sorted(path.name for path in folder.iterdir()) == RESULTS
     assert [line.split()[0] for line in said.splitlines()] == [
-        "correct", "clean", "dsm", "compare", "report",
+        "correct", "clean", "dsm", "compare", "map", "report",
     ]  # fmt: skip
 
 
@@ -71,7 +82,7 @@ def test_cloud_is_that_of_correct(finished, tmp_path):
 
 
 def test_difference_of_the_surfaces_is_that_of_the_rasters(finished):
-    names = ("dsm.tif", "compare/reference_dsm.tif", "compare/dod.tif")
+    names = ("surface.tif", "compare/reference_dsm.tif", "compare/dod.tif")
     dsm, reference, dod = (rasterio.open(finished[0] / name) for name in names)
     with dsm, reference, dod:
         window = rasterio.windows.from_bounds(*dod.bounds, reference.transform)
@@ -86,11 +97,102 @@ def test_difference_of_the_surfaces_is_that_of_the_rasters(finished):
     assert abs(np.median(found.compressed())) < 0.02  # a bed gridded at 2 m, noise of 4 cm
 
 
+def test_rasters_are_cloud_optimised_and_of_one_band(finished):
+    units = {"surface": "height", "bed": "height", "depth": "depth", "uncertainty": "uncertainty"}
+    for name, what in units.items():
+        with rasterio.open(finished[0] / f"{name}.tif") as raster:
+            assert (raster.count, raster.nodata, raster.units) == (1, -9999.0, ("metre",))
+            assert raster.descriptions == (what,)
+            assert raster.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+            assert "STATISTICS_MEAN" in raster.tags(1)
+            assert raster.crs.to_epsg() == 32633, "no vertical datum was stated"
+    with rasterio.open(finished[0] / "surface_counts.tif") as counts:
+        assert counts.descriptions == ("count", "spread")
+
+
+def test_depth_and_bed_make_the_level(finished):
+    """Where no hole was filled both are of the same points; each is kept to the millimetre."""
+    bed, depth, surface, shaded = (
+        rasterio.open(finished[0] / f"{name}.tif") for name in ("bed", "depth", "surface", "shaded")
+    )
+    with bed, depth, surface, shaded:
+        assert bed.transform == depth.transform
+        level = bed.read(1, masked=True) + depth.read(1, masked=True)
+        assert level.count() > 5000
+        np.testing.assert_allclose(level.compressed(), 0.37, atol=1.1e-3)
+        red, _, blue, alpha = shaded.read().astype(float)
+        np.testing.assert_array_equal(alpha == 0.0, surface.read_masks(1) == 0)
+        height = surface.read(1)
+    deep, land = (height < -8.0) & (alpha > 0), (height > 1.0) & (alpha > 0)
+    assert (blue[deep] > red[deep]).all()
+    assert (red[land] > blue[land]).all()
+
+
+def test_styles_have_the_colours_of_the_report(finished):
+    items = ElementTree.parse(finished[0] / "depth.qml").findall(".//colorrampshader/item")
+    assert [one.get("color") for one in items] == [
+        hex_colour(colour) for _, colour in stops_of(DEPTH)
+    ]
+    assert float(items[0].get("value")) == 0.0
+
+
+def layer(folder, name):
+    pyogrio = pytest.importorskip("pyogrio")
+    meta, _, wkb, values = pyogrio.raw.read(folder / "map.gpkg", layer=name)
+    return shapely.from_wkb(wkb), dict(zip(meta["fields"], values, strict=True))
+
+
+def test_layers_of_the_map(finished):
+    folder = finished[0]
+    lines, values = layer(folder, "depth_contours")
+    assert set(values["interval_m"]) == {1.0}
+    for line, depth in zip(lines, values["depth_m"], strict=True):
+        found = values_at(folder / "depth.tif", shapely.get_coordinates(line))
+        assert np.nanmedian(np.abs(found - depth)) < 0.2  # half a cell on slopes of 1 in 8
+    (area,), _ = layer(folder, "corrected_area")
+    with rasterio.open(folder / "depth.tif") as raster:
+        assert area.area == pytest.approx(raster.read(1, masked=True).count(), rel=0.02)
+    shore, of_shore = layer(folder, "waterline")
+    assert area.buffer(1.5).contains(shore[0])
+    assert 0.0 < of_shore["sigma_m"][0] < 2.0
+    assert of_shore["level_m"][0] == pytest.approx(0.37, abs=1e-3)
+    cameras, of_cameras = layer(folder, "cameras")
+    assert (len(cameras), set(of_cameras["use"])) == (40, {"used"})
+    assert shapely.get_z(cameras).min() > 10.0
+    assert len(layer(folder, "cross_sections")[0]) == 3
+    with closing(sqlite3.connect(folder / "map.gpkg")) as store:
+        styled = store.execute(
+            "select f_table_name, styleQML from layer_styles where useAsDefault"
+        ).fetchall()
+    assert {name for name, _ in styled} == {
+        "corrected_area", "depth_contours", "waterline", "cross_sections", "cameras",
+    }  # fmt: skip
+    for _, text in styled:
+        assert ElementTree.fromstring(text.split("\n", 1)[1]).find("renderer-v2") is not None
+
+
 def test_report_holds_the_comparison(finished):
     text = (finished[0] / "report.html").read_text()
     for word in ("RMSE", "Cross-section 3", "Difference of the surfaces", "Against lidar.laz"):
         assert word in text
     assert len(list((finished[0] / "figures").glob("*.png"))) == text.count("<img ")
+
+
+def test_accuracy_is_that_of_the_bed_as_measured_and_land_stands_apart(finished):
+    steps, page = steps_and_page(finished[0])
+    text, found = page.read_text(), steps["compare"]["figures"]
+    bed, land, own = (found[name] for name in ("bed", "land", "own"))
+    assert bed["after"]["count"] + land["after"]["count"] == found["counts"]["compared"]
+    tile = re.search(r"<h2>Accuracy of the bed.*?</section>", text, re.S)[0]
+    assert ">measured<" in tile and "predicted" not in tile
+    assert f"<dd>{own['rmse_m']:.3f} m</dd>" in tile and own["rmse_m"] < bed["after"]["rmse_m"]
+    assert f"with it RMSE {bed['after']['rmse_m']:.3f} m" in tile
+    assert f"RMSE {land['after']['rmse_m']:.3f} m, reference included" in tile
+    assert str(finished[0]) not in text and str(SCENE) not in text
+    assert page.stat().st_size < 8_000_000
+    links = re.findall(r'<a href="([^"]*)"', text)
+    assert "corrected.laz" in links and "compare/compare.json" in links
+    assert all((finished[0] / link).is_file() for link in links)
 
 
 def steps_and_page(folder):
@@ -145,21 +247,22 @@ def test_a_finished_run_is_not_done_again(copied):
     before = {path: path.stat().st_mtime_ns for path in (copied / "out").glob("*.*")}
     done = run(copied, *WORDS)
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.count("done before") == 5
+    assert done.stdout.count("done before") == 6
     after = {path: path.stat().st_mtime_ns for path in (copied / "out").glob("*.*")}
     changed = {path.name for path in before if before[path] != after[path]}
     assert changed == {"run.json"}
 
 
 def test_a_run_resumes_where_a_file_is_missing(copied):
-    (copied / "out" / "dsm.tif").unlink()
+    (copied / "out" / "surface.tif").unlink()
     done = run(copied, *WORDS)
     assert (done.returncode, done.stderr) == (0, "")
     steps = {line.split()[0]: "done before" in line for line in done.stdout.splitlines()}
     assert steps == {
-        "correct": True, "clean": True, "dsm": False, "compare": False, "report": False,
+        "correct": True, "clean": True, "dsm": False, "compare": False, "map": False,
+        "report": False,
     }  # fmt: skip
-    assert (copied / "out" / "dsm.tif").exists()
+    assert (copied / "out" / "surface.tif").exists()
 
 
 def test_another_request_does_not_replace_a_run_unasked(copied):
@@ -181,16 +284,23 @@ def test_a_record_repeats_its_run(finished, tmp_path):
     assert request_of(tmp_path / "again" / "run.json") == request_of(finished[0] / "run.json")
 
 
-def test_without_a_reference_there_is_a_report_all_the_same(tmp_path):
+def test_without_reference_and_vectors_there_is_a_report_all_the_same(tmp_path, monkeypatch):
     request = Request(
         input=str(SCENE / "cloud.laz"), cameras=str(SCENE / "cameras.csv"), water="0.37"
     )
-    page = run_all(request, tmp_path / "out")
+    said: list[str] = []
+
+    def lacking():
+        raise SettingError("Vector files need pyogrio; run: pip install 'pcfix[vector]'.")
+
+    monkeypatch.setattr(geopackage, "load_pyogrio", lacking)
+    page = run_all(request, tmp_path / "out", say=said.append)
+    assert sum("map       not written: Vector files need pyogrio" in line for line in said) == 1
     text = page.read_text()
     assert "Cross-section" not in text
     assert "on average, formal; no order is claimed: the poses were not checked" in text
     assert "<td>Exclusive</td>" not in text
-    assert "measured" not in text
+    assert ">predicted</span>" in text and ">measured</span>" not in text
     assert not (tmp_path / "out" / "compare").exists()
 
 
@@ -206,6 +316,10 @@ def test_check_points_as_reference(tmp_path):
     with pytest.warns(pcfix.PcfixWarning, match="CRS"):
         page = run_all(request, tmp_path / "out")
     assert "check.csv" in page.read_text()
+    points, values = layer(tmp_path / "out", "check_points")
+    assert len(points) > 280
+    np.testing.assert_allclose(shapely.get_z(points), values["z_m"])
+    assert np.sqrt(np.mean(values["residual_m"] ** 2)) < 0.06  # the noise of cloud and reference
     assert not (tmp_path / "out" / "compare" / "dod.tif").exists()
 
 

@@ -35,7 +35,9 @@ def cloud(tmp_path_factory):
 )
 def test_every_cell(cloud, tmp_path, method, resolution):
     path, xyz = cloud
-    summary = grid_dsm(path, tmp_path / "d.tif", resolution=float(resolution), method=method)
+    files = tmp_path / "d.tif", tmp_path / "n.tif"
+    options = {"resolution": float(resolution), "method": method, "counts": files[1]}
+    summary = grid_dsm(path, files[0], **options)
     steps = np.rint((xyz - (EAST, NORTH, 0.0)) / float(SCALE))
     axes = [exact(steps[:, i], SCALE, (int(EAST), int(NORTH), 0)[i]) for i in range(3)]
     if method == "tin":
@@ -48,9 +50,10 @@ def test_every_cell(cloud, tmp_path, method, resolution):
             Fraction(resolution),
             "mean",
         )
-    raster = read_raster(tmp_path / "d.tif")
-    found = np.where(raster.array == raster.nodata, np.nan, raster.array)
-    assert raster.array.shape == (3, *height.shape)
+    raster = read_raster(files[0])
+    array = np.vstack([raster.array, read_raster(files[1]).array])
+    found = np.where(array == raster.nodata, np.nan, array)
+    assert array.shape == (3, *height.shape)
     assert raster.transform.c == pytest.approx(left * float(resolution), abs=1e-9)
     assert raster.transform.f == pytest.approx((top + 1) * float(resolution), abs=1e-9)
     np.testing.assert_allclose(found[0], height, rtol=0, atol=FLOAT32_M)

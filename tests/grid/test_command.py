@@ -20,6 +20,7 @@ def cloud(tmp_path, monkeypatch):
 def test_options_reach_the_raster(cloud):
     words = "c.laz d.tif --resolution 0.5 --method idw --surface bed --fill 1.5 --summary s.json"
     words += " --hillshade h.tif --azimuth 300 --altitude 30 --cog"
+    words += " --counts n.tif --what height --style"
     answer = run_pcfix("dsm", *words.split())
     assert answer.returncode == 0, answer.stderr
     assert "raster       40 x 20 cells of 0.5 m, idw" in answer.stdout
@@ -27,13 +28,16 @@ def test_options_reach_the_raster(cloud):
     settings = json.loads((cloud.parent / "s.json").read_text())["settings"]
     assert settings == {
         "resolution": 0.5,
+        "what": "height",
         "method": "idw",
         "surface": "bed",
         "fill": 1.5,
         "azimuth": 300.0,
         "altitude": 30.0,
     }
-    assert read_raster("d.tif").array.shape == (3, 20, 40)
+    assert read_raster("d.tif").array.shape == (1, 20, 40)
+    assert read_raster("n.tif").array.shape == (2, 20, 40)
+    assert (cloud.parent / "d.qml").exists()
     assert read_raster("h.tif").array.dtype == "uint8"
 
 
@@ -45,7 +49,9 @@ def test_quiet_and_overwrite(cloud):
     assert run_pcfix(*words, "--overwrite").returncode == 0
 
 
-def test_resolution_is_asked_for(cloud):
-    assert run_pcfix("dsm", "c.laz", "d.tif").returncode == 2
+def test_resolution_is_said_where_it_is_chosen(cloud):
+    answer = run_pcfix("dsm", "c.laz", "d.tif")
+    assert "cells of 0.5 m, chosen for 2 to 4 points each, mean" in answer.stdout
+    assert "heights: the cloud states no vertical datum" in answer.stdout
     wrong = ["dsm", "c.laz", "d.tif", "--resolution", "1", "--method", "kriging"]
     assert run_pcfix(*wrong).returncode == 2

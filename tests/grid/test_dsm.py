@@ -16,6 +16,7 @@ import pcfix
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow import dsm as flow
 from pcfix.flow.dsm import grid_dsm
+from pcfix.grid.lattice import round_resolution
 from pcfix.io.las import source
 from pcfix.io.rasters import read_raster
 from pcfix.report.text import dsm_text
@@ -53,9 +54,10 @@ def test_no_seams(awkward_cloud, tmp_path, monkeypatch, method, fill):
 
     def run(name):
         shade = tmp_path / f"{name}_shade.tif"
-        options = {"resolution": 0.3, "method": method, "fill": fill, "hillshade": shade}
+        files = {"hillshade": shade, "counts": tmp_path / f"{name}_counts.tif"}
+        options = {"resolution": 0.3, "method": method, "fill": fill, **files}
         grid_dsm(awkward_cloud, tmp_path / f"{name}.tif", **options)
-        return read_raster(tmp_path / f"{name}.tif").array, read_raster(shade).array
+        return [read_raster(one).array for one in (tmp_path / f"{name}.tif", *files.values())]
 
     whole = run("whole")
     for name, sizes in SIZES.items():
@@ -120,7 +122,7 @@ def test_a_plane_between_scattered_points(tmp_path):
 
 def with_sigma(path, xyz, sigma):
     """Write a cloud with the dimension that a correction leaves, in tenths of a millimetre."""
-    las = laspy.read(write(path, xyz))
+    las = laspy.read(write(path, xyz, classes=40))
     las.add_extra_dim(
         laspy.ExtraBytesParams("SigmaZ", "uint16", scales=np.array([1e-4]), offsets=np.zeros(1))
     )
@@ -129,37 +131,58 @@ def with_sigma(path, xyz, sigma):
     return path
 
 
-@pytest.mark.parametrize("method", ["mean", "tin"])
-def test_uncertainty_is_the_root_mean_square_of_the_points(tmp_path, method):
+def test_uncertainty_is_the_root_mean_square_of_the_points(tmp_path):
     xyz = scattered(4000, 20.0, 15.0)
     sigma = np.round(np.random.default_rng(1).uniform(0.01, 0.3, 4000), 4)
     sigma[xyz[:, 0] < EAST + 8.0] = 0.0  # land
     path = with_sigma(tmp_path / "cloud.las", xyz, sigma)
-    summary = grid_dsm(path, tmp_path / "d.tif", resolution=1.0, method=method)
+    with pytest.raises(InputError, match="no dimension WaterDepth, of which the depth is made"):
+        grid_dsm(path, tmp_path / "d.tif", what="depth")
+    summary = grid_dsm(path, tmp_path / "d.tif", resolution=1.0, what="uncertainty")
     with rasterio.open(tmp_path / "d.tif") as dsm:
-        assert dsm.descriptions == ("height", "count", "spread", "uncertainty")
-        found = dsm.read(4)
+        assert (dsm.descriptions, dsm.units) == (("uncertainty",), ("metre",))
+        assert dsm.bounds.left == EAST + 8.0
+        found = dsm.read(1)
     expected = np.full((15, 20), np.nan)
     for row in range(15):
         for column in range(8, 20):
             x, y = xyz[:, 0] - EAST - column, NORTH + 15.0 - row - xyz[:, 1]
             own = sigma[(x >= 0) & (x < 1) & (y > 0) & (y <= 1)]
-            expected[row, column] = np.sqrt((own**2).mean())
-    assert (found[:, :8] == -9999.0).all()
-    np.testing.assert_allclose(found[:, 8:], expected[:, 8:], rtol=1e-6)  # float32
+            expected[row, column] = 1.959964 * np.sqrt((own**2).mean())
+    np.testing.assert_allclose(found, expected[:, 8:], rtol=1e-6)  # float32
     known = expected[:, 8:]
-    assert summary.uncertainty_m["mean"] == pytest.approx(known.mean(), abs=5e-5)
-    assert summary.uncertainty_m["max"] == pytest.approx(known.max(), abs=5e-5)
-    assert "band 4" in dsm_text(summary)
+    assert summary.values["mean"] == pytest.approx(known.mean(), abs=5e-5)
+    assert summary.values["max"] == pytest.approx(known.max(), abs=5e-5)
+    assert "m at 95 %, formal" in dsm_text(summary)
 
 
-def test_a_cloud_without_standard_errors_has_no_such_band(tmp_path):
-    summary = grid_dsm(
-        write(tmp_path / "c.las", scattered(500, 5.0, 5.0)), tmp_path / "d.tif", resolution=1.0
-    )
-    assert summary.uncertainty_m is None
+def test_any_dimension_has_its_mean(tmp_path):
+    xyz = scattered(2000, 10.0, 10.0)
+    path = write(tmp_path / "c.las", xyz)
+    las = laspy.read(path)
+    las.intensity[:] = 100.0 * (xyz[:, 0] - EAST)
+    las.write(path)
+    grid_dsm(path, tmp_path / "d.tif", resolution=1.0, what="intensity", style=True)
     with rasterio.open(tmp_path / "d.tif") as dsm:
-        assert dsm.count == 3
+        assert (dsm.descriptions, dsm.units) == (("intensity",), (None,))
+        rows = dsm.read(1)[-10:, :10].mean(axis=0)
+    np.testing.assert_allclose(rows, 100.0 * np.arange(0.5, 10.0), atol=8.0)
+    assert "singlebandpseudocolor" in (tmp_path / "d.qml").read_text()
+
+
+def test_a_resolution_is_chosen_by_the_distance_of_the_points(tmp_path):
+    """Points at random: so many a cell are as many as those of the cells without any, too."""
+    for count, side in ((4000, 40.0), (9000, 25.0)):
+        cloud = write(tmp_path / "c.las", scattered(count, side, side))
+        summary = grid_dsm(cloud, tmp_path / "d.tif", overwrite=True)
+        assert 2.0 <= count / (side / summary.settings["resolution"]) ** 2 <= 4.0
+        assert "chosen for 2 to 4 points each" in dsm_text(summary)
+
+
+def test_a_pixel_is_the_least_side_of_a_cell():
+    for spacing in np.geomspace(0.003, 30.0, 200):
+        assert 1.99 < (round_resolution(spacing, 0.0) / spacing) ** 2 < 4.01
+        assert round_resolution(spacing, 0.5) >= 0.5
 
 
 @pytest.mark.parametrize("cog", [False, True])
@@ -167,14 +190,22 @@ def test_the_file(tmp_path, cog):
     cloud = write(tmp_path / "cloud.laz", scattered(20_000, 80.0, 70.0), crs="EPSG:32633+5773")
     shade = tmp_path / "shade.tif"
     with pytest.warns(PcfixWarning, match=r"resolution 0\.2 m is finer .* apart, so there are 0\."):
-        grid_dsm(cloud, tmp_path / "d.tif", resolution=0.2, hillshade=shade, cog=cog)
+        grid_dsm(
+            cloud, tmp_path / "d.tif", resolution=0.2, hillshade=shade, cog=cog,
+            counts=tmp_path / "n.tif",
+        )  # fmt: skip
+    with rasterio.open(tmp_path / "n.tif") as counts:
+        assert counts.descriptions == ("count", "spread")
+        assert counts.crs.to_epsg() == 32633, "no vertical datum of what is no height"
+        count, spread = counts.read()
     with rasterio.open(tmp_path / "d.tif") as dsm:
-        assert dsm.descriptions == ("height", "count", "spread")
-        assert dsm.dtypes == ("float32",) * 3
+        assert dsm.descriptions == ("height",)
+        assert dsm.dtypes == ("float32",)
+        assert ("STATISTICS_MEAN" in dsm.tags(1)) is cog
         assert dsm.nodata == -9999.0
         assert dsm.crs.to_wkt().count("32633") == 1
         assert "EGM96" in dsm.crs.to_wkt()
-        assert dsm.overviews(1) == dsm.overviews(3) == [2]
+        assert dsm.overviews(1) == [2]
         assert dsm.profile["tiled"]
         assert dsm.profile["blockysize"] == 256
         assert dsm.profile["compress"] == "deflate"
@@ -182,14 +213,13 @@ def test_the_file(tmp_path, cog):
         assert (dsm.tags(ns="IMAGE_STRUCTURE").get("LAYOUT") == "COG") is cog
         assert dsm.bounds == pytest.approx((EAST, NORTH, EAST + 80.0, NORTH + 70.0), abs=1e-6)
         assert json.loads(dsm.tags()["PCFIX"])["resolution"] == 0.2
-        count = dsm.read(2)
         assert count.sum() == 20_000
         np.testing.assert_array_equal(dsm.read(1) == -9999.0, count == 0)
-        np.testing.assert_array_equal(dsm.read(3) == -9999.0, count == 0)
+        np.testing.assert_array_equal(spread == -9999.0, count == 0)
     with rasterio.open(shade) as light:
         assert (light.dtypes, light.nodata, light.overviews(1)) == (("uint8",), 0, [2])
         np.testing.assert_array_equal(light.read(1) == 0, count == 0)
-    assert {p.name for p in tmp_path.iterdir()} == {"cloud.laz", "d.tif", "shade.tif"}
+    assert {p.name for p in tmp_path.iterdir()} == {"cloud.laz", "d.tif", "n.tif", "shade.tif"}
 
 
 @pytest.mark.skipif(shutil.which("gdalinfo") is None, reason="gdalinfo is not installed")
@@ -200,7 +230,7 @@ def test_gdalinfo_reads_it(tmp_path):
     answer = subprocess.run(command, capture_output=True, text=True, check=True)
     info = json.loads(answer.stdout)
     assert info["size"] == [20, 16]
-    assert [band["description"] for band in info["bands"]] == ["height", "count", "spread"]
+    assert [band["description"] for band in info["bands"]] == ["height"]
     assert not answer.stderr
 
 
@@ -213,8 +243,9 @@ def test_fills_are_marked(tmp_path):
     cloud = write(tmp_path / "c.las", np.column_stack([x + EAST, y + NORTH, 5.0 + x / 4.0]))
     plain = grid_dsm(cloud, tmp_path / "plain.tif", resolution=1.0)
     assert (plain.cells, plain.filled, plain.empty) == (600 - 45, 0, 45)
-    summary = grid_dsm(cloud, tmp_path / "filled.tif", resolution=1.0, fill=3.0)
-    found = read_raster(tmp_path / "filled.tif").array
+    counts = tmp_path / "counts.tif"
+    summary = grid_dsm(cloud, tmp_path / "filled.tif", resolution=1.0, fill=3.0, counts=counts)
+    found = np.vstack([read_raster(one).array for one in (tmp_path / "filled.tif", counts)])
     filled = (found[1] == 0) & (found[0] != -9999.0)
     assert filled[12:15, 5:8].all()
     assert (found[2][found[1] == 0] == -9999.0).all()
@@ -296,6 +327,8 @@ BAD = {
     "far": ({"fill": 2000.0}, "more than 1,000 cells of 1 m"),
     "sun": ({"altitude": 0.0}, "altitude of the sun is 0 degrees"),
     "azimuth": ({"azimuth": float("nan")}, "azimuth is nan"),
+    "rms": ({"what": "uncertainty", "method": "tin"}, "leave --method and --fill out"),
+    "what": ({"what": "Colour"}, "no dimension Colour; --what is one of height, depth, "),
     "suffix": ({"output": "d.asc"}, "written as GeoTIFF; end the name in .tif"),
     "shade": ({"hillshade": "h.png"}, "h.png: a raster is written as GeoTIFF"),
     "twice": ({"hillshade": "d.tif"}, "are the same file"),
@@ -318,7 +351,7 @@ def test_bad_settings(tmp_path, monkeypatch, case):
 
 def test_too_many_cells(tmp_path):
     cloud = write(tmp_path / "c.las", scattered(5000, 900.0, 300.0))
-    with pytest.raises(SettingError, match=r"899,\d{3} x 299,\d{3} cells.* 4 gig.*0\.00822 m or"):
+    with pytest.raises(SettingError, match=r"899,\d{3} x 299,\d{3} cells,.* 1,000,.*0\.0165 m or"):
         grid_dsm(cloud, tmp_path / "d.tif", resolution=0.001)
     assert [p.name for p in tmp_path.iterdir()] == ["c.las"]
 

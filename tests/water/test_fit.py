@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from pcfix.errors import GeometryError, SettingError
+from pcfix.io.vectors import read_shoreline
 from pcfix.model import WaterPlane
 from pcfix.water.fit import fit_water, heights_from_cloud, is_near
 from pcfix.water.river import fit_river, flow_axis
@@ -376,3 +377,42 @@ def test_chance_of_a_tilt_is_wald_s():
     wald = float(fit.tilt @ np.linalg.solve(fit.covariance[1:, 1:], fit.tilt))
     chosen = fit_water(np.column_stack([xy, z])).model
     assert (chosen == "level") == (chi2.sf(wald, 2) > 0.05)
+
+
+def drawn_by_hand(seed, folder, every_m=30.0, off_m=0.3):
+    """Return what is read of a line along a beach of 300 m and 1 in 10, off at each vertex."""
+    rng = np.random.default_rng(seed)
+    along = np.arange(0.0, 301.0, every_m)
+    vertices = np.column_stack([along, rng.normal(0.0, off_m, len(along))])
+    path = folder / "shore.wkt"
+    path.write_text(f"LINESTRING ({', '.join(f'{x} {y}' for x, y in vertices)})")
+    shore = read_shoreline(path)
+    xyz = shore.xyz.copy()
+    xyz[:, 2] = 0.1 * xyz[:, 1] + rng.normal(0.0, 0.004, len(xyz))  # medians of the cloud
+    return xyz, shore.counts
+
+
+def test_a_drawn_line_is_worth_its_vertices(tmp_path):
+    """Of 300 points along it 11 were drawn: its standard error is theirs."""
+    level, sigma, naive = [], [], []
+    for seed in range(60):
+        xyz, counts = drawn_by_hand(seed, tmp_path)
+        fit = fit_water(xyz, model="level", counts=counts)
+        level.append(fit.level_m)
+        sigma.append(fit.sigma_level_m)
+        naive.append(fit_water(xyz, model="level").sigma_level_m)
+    error, said = np.sqrt(np.mean(np.square([level, sigma]), axis=1))
+    assert 0.75 < error / said < 1.3  # of 60: a standard deviation of 0.09
+    assert error / np.mean(naive) > 4.0
+    with_tilt = sum(
+        fit_water(xyz, counts=counts).model != "level"
+        for xyz, counts in (drawn_by_hand(seed, tmp_path) for seed in range(15))
+    )
+    assert with_tilt <= 3  # of 15 at 5 %: more in 1 of 100 cases
+
+
+def test_a_dense_line_is_worth_no_more_than_its_heights(tmp_path):
+    """Vertices every 0.1 m take their heights from the same points of the cloud, within 1 m."""
+    xyz, counts = drawn_by_hand(1, tmp_path, every_m=0.1, off_m=0.01)
+    assert counts.sum() == pytest.approx(150.0, rel=0.05)
+    assert len(xyz) >= 3000

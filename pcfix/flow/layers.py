@@ -1,0 +1,154 @@
+"""The vectors that a run leaves for a GIS, as layers of ``map.gpkg``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import shapely
+
+from pcfix.compare.sections import SectionLine, lines_downslope
+from pcfix.errors import GeometryError
+from pcfix.flow.rasters import BED, DEPTH, UNCERTAINTY
+from pcfix.flow.shore import shoreline_layer
+from pcfix.flow.surfaces import points_of
+from pcfix.grid.contours import contours, interval_of
+from pcfix.grid.shoreline import NearWater
+from pcfix.io import rasters
+from pcfix.io.geopackage import Layer, write_layers
+from pcfix.io.las.source import LasSource
+from pcfix.io.styles import Symbol, vector_style
+from pcfix.io.tables import read_check_depths
+from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, Cameras, FloatArray, WaterSurface
+from pcfix.options.correct import LEVEL_M
+from pcfix.options.declare import File
+from pcfix.water.surface import surface_above
+
+MOST_CELLS = 4_000_000
+"""Of the rasters that contours and footprint are drawn of."""
+SECTIONS = 3
+DARK, RED, GREY = (8, 48, 107), (203, 24, 29), (120, 120, 120)
+ORANGE, GREEN = (253, 141, 60), (35, 139, 69)
+
+
+class Drawn(NamedTuple):
+    """What a run knows that goes into the map.
+
+    sigma_level_m : standard error of the water's height, None where it was not known.
+    sections : lines of the comparison, as its figures have them.
+    check_points : x, y, reference height and cloud minus reference, shape (n, 4).
+    """
+
+    cloud: Path
+    folder: Path
+    water: WaterSurface
+    sigma_level_m: float | None
+    cameras: Cameras
+    unused: list[str]
+    sections: list[Mapping[str, float]]
+    check_points: FloatArray
+    check_depths: File | None
+
+
+def write_map(path: Path, drawn: Drawn, crs: Any) -> dict[str, int]:
+    """Write all layers; return how many features each has."""
+    layers = [
+        _area(drawn.folder),
+        _contours(drawn.folder),
+        _waterline(drawn),
+        _sections(drawn),
+        _cameras(drawn.cameras, drawn.unused),
+        *_check_points(drawn),
+    ]
+    write_layers(path, layers, crs, overwrite=True)
+    return {one.name: len(one.geometries) for one in layers}
+
+
+def _area(folder: Path) -> Layer:
+    """Return the outline of the corrected bed."""
+    shapes = rasters.outlines(folder / DEPTH, MOST_CELLS)
+    area = shapely.area(np.array(shapes, object)) if shapes else np.zeros(0)
+    style = vector_style({"area": Symbol("fill", DARK, 0.5)})
+    return Layer("corrected_area", "Polygon", shapes, {"area_m2": area}, style)
+
+
+def _contours(folder: Path) -> Layer:
+    """Return the lines of equal depth, no closer than the depth is known."""
+    depth, bounds = rasters.preview(folder / DEPTH, MOST_CELLS)
+    sigma = 0.0
+    if (folder / UNCERTAINTY).exists():
+        sigma = float(np.nanmedian(rasters.preview(folder / UNCERTAINTY)[0]))
+    interval = interval_of(float(np.nanmax(depth)), sigma)
+    found = contours(depth, interval)
+    lines = [shapely.linestrings(rasters.centres(one.place, depth, bounds)) for one in found]
+    level = np.array([one.level for one in found])
+    values = {"depth_m": level, "interval_m": np.full(len(found), interval)}
+    style = vector_style({"line": Symbol("line", DARK, 0.25)}, label='"depth_m"')
+    return Layer("depth_contours", "LineString", lines, values, style)
+
+
+def _waterline(drawn: Drawn) -> Layer:
+    """Return where the water meets the corrected cloud."""
+    near = NearWater()
+    with LasSource(drawn.cloud) as source:
+        for chunk in source.chunks():
+            points = points_of(chunk, source, drawn.water)
+            above = (
+                points.xyz[:, 2] - surface_above(drawn.water, points.xyz, points.heights).height_m
+            )
+            bed = points.classes == BATHYMETRIC_POINT
+            above[bed] = -source.dimension(chunk, "WaterDepth")[bed]
+            above[np.isin(points.classes, NOISE_CLASSES) | (chunk["withheld"] == 1)] = np.nan
+            near.add(points.xyz, above, source.dimension(chunk, "SigmaZ"))
+    sigma = LEVEL_M if drawn.sigma_level_m is None else drawn.sigma_level_m
+    lines = near.lines(lambda xy: np.full(len(xy), sigma))
+    style = vector_style({"line": Symbol("line", RED, 0.5)})
+    return shoreline_layer("waterline", lines, style)
+
+
+def _sections(drawn: Drawn) -> Layer:
+    """Return the cross-sections of the comparison, else lines down the slope of the bed."""
+    lines = [SectionLine(s["x1"], s["y1"], s["x2"], s["y2"]) for s in drawn.sections]
+    if not lines:
+        bed, bounds = rasters.preview(drawn.folder / BED)
+        row, column = np.nonzero(np.isfinite(bed))
+        xy = rasters.centres(np.column_stack([column, row]), bed, bounds)
+        try:
+            lines = list(lines_downslope(np.column_stack([xy, bed[row, column]]), SECTIONS))
+        except GeometryError:  # the bed is a line in plan
+            lines = []
+    names = np.array([f"Cross-section {n}" for n, _ in enumerate(lines, start=1)], object)
+    values = {"name": names, "length_m": np.array([one.length_m for one in lines])}
+    ends = [shapely.linestrings([(one.x1, one.y1), (one.x2, one.y2)]) for one in lines]
+    style = vector_style({"line": Symbol("line", GREY, 0.4)}, label='"name"')
+    return Layer("cross_sections", "LineString", ends, values, style)
+
+
+def _cameras(cameras: Cameras, unused: list[str]) -> Layer:
+    """Return the projection centres, and whether each made a corrected point."""
+    use = ["not used" if label in set(unused) else "used" for label in cameras.labels]
+    symbols = {"used": Symbol("marker", GREEN, 2.0), "not used": Symbol("marker", GREY, 1.6)}
+    values = {"label": np.array(cameras.labels, object), "use": np.array(use, object)}
+    points = list(shapely.points(cameras.centres))
+    return Layer("cameras", "Point Z", points, values, vector_style(symbols, "use"))
+
+
+def _check_points(drawn: Drawn) -> list[Layer]:
+    """Return surveyed points with what the cloud, or the map of depths, says more than they."""
+    symbol = {"point": Symbol("marker", ORANGE, 2.2, "diamond")}
+    style = vector_style(symbol, label="""format_number("residual_m", 2)""")
+    layers = []
+    if len(drawn.check_points):
+        values = {"z_m": drawn.check_points[:, 2], "residual_m": drawn.check_points[:, 3]}
+        points = list(shapely.points(drawn.check_points[:, :3]))
+        layers.append(Layer("check_points", "Point Z", points, values, style))
+    if drawn.check_depths is not None:
+        checks = read_check_depths(Path(drawn.check_depths))
+        raster = BED if checks.are_heights else DEPTH
+        more = rasters.values_at(drawn.folder / raster, checks.xy) - checks.value_m
+        values = {"measured_m": checks.value_m, "residual_m": more}
+        points = list(shapely.points(checks.xy))
+        layers.append(Layer("check_depths", "Point", points, values, style))
+    return layers

@@ -1,0 +1,132 @@
+"""Styles for QGIS (QML) with the colours of the report: of rasters, and of layers of a GeoPackage.
+
+QGIS reads that of a raster from the file of its name that ends in ``.qml``, and those of a
+GeoPackage from its table ``layer_styles``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from pcfix.grid.colours import DEPTH, HEIGHT, RAYS, UNCERTAINTY, stops_of
+from pcfix.io.rasters import preview
+from pcfix.model import FloatArray
+
+RAMPS = {"depth": DEPTH, "height": HEIGHT, "uncertainty": UNCERTAINTY, "RayCount": RAYS}
+"""By what a raster holds; for anything else that of heights."""
+FROM_ZERO = ("depth", "uncertainty", "RayCount")
+CUT = 0.5
+"""So many percent of the cells at either end share the last colour: one cell shall not rule."""
+
+_PAGE = """<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>
+<qgis version="3.22" styleCategories="{categories}">
+{body}
+</qgis>
+"""
+
+
+def hex_colour(colour: tuple[int, ...]) -> str:
+    """Return red, green and blue, 0 to 255, as #rrggbb."""
+    return "#" + "".join(f"{part:02x}" for part in colour)
+
+
+def limits_of(values: FloatArray, what: str) -> tuple[float, float]:
+    """Return which values get the first and the last colour of a map; NaN does not count."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return 0.0, 1.0
+    low, high = (float(value) for value in np.percentile(known, (CUT, 100.0 - CUT)))
+    low = 0.0 if what in FROM_ZERO else low
+    return low, max(high, low + 1e-3)
+
+
+def raster_style(path: Path, what: str) -> str:
+    """Return the style of a raster of one band, by what it holds."""
+    low, high = limits_of(preview(path)[0], what)
+    items = "\n".join(
+        f'     <item value="{low + share * (high - low):.6g}" color="{hex_colour(colour)}"'
+        f' alpha="255" label="{low + share * (high - low):.2f}"/>'
+        for share, colour in stops_of(RAMPS.get(what, HEIGHT))
+    )
+    body = f""" <pipe>
+  <rasterrenderer type="singlebandpseudocolor" band="1" opacity="1" alphaBand="-1"
+    classificationMin="{low:.6g}" classificationMax="{high:.6g}">
+   <rasterTransparency/>
+   <rastershader>
+    <colorrampshader colorRampType="INTERPOLATED" classificationMode="1" clip="0"
+      minimumValue="{low:.6g}" maximumValue="{high:.6g}">
+{items}
+    </colorrampshader>
+   </rastershader>
+  </rasterrenderer>
+ </pipe>
+ <blendMode>0</blendMode>"""
+    return _PAGE.format(categories="Symbology", body=body)
+
+
+class Symbol(NamedTuple):
+    """How the features of a layer look: of points the `size`, of lines the width, millimetres."""
+
+    kind: str  # marker, line or fill
+    colour: tuple[int, ...]
+    size: float
+    shape: str = "circle"
+
+
+_LAYERS = {
+    "marker": (
+        "SimpleMarker",
+        {"color": "{c},255", "name": "{shape}", "size": "{size}", "outline_color": "40,40,40,255"},
+    ),
+    "line": ("SimpleLine", {"line_color": "{c},255", "line_width": "{size}"}),
+    "fill": (
+        "SimpleFill",
+        {"color": "{c},0", "style": "no", "outline_color": "{c},255", "outline_width": "{size}"},
+    ),
+}
+
+
+def vector_style(symbols: dict[str, Symbol], attribute: str = "", label: str = "") -> str:
+    """Return the style of a layer.
+
+    The symbols are those of each value of an attribute; without one the only symbol is that of all
+    features. The label is an expression that is written beside each.
+    """
+    drawn = "\n".join(_symbol(str(row), one) for row, one in enumerate(symbols.values()))
+    head, rows = 'type="singleSymbol"', ""
+    if attribute:
+        head = f'type="categorizedSymbol" attr={quoteattr(attribute)}'
+        rows = "<categories>" + "".join(
+            f'<category value={quoteattr(name)} symbol="{row}" label={quoteattr(name)}'
+            ' render="true"/>'
+            for row, name in enumerate(symbols)
+        )
+        rows += "</categories>"
+    body = f" <renderer-v2 {head}>{rows}<symbols>\n{drawn}\n</symbols></renderer-v2>"
+    if label:
+        body += (
+            f'\n <labeling type="simple"><settings><text-style fieldName={quoteattr(label)}'
+            ' isExpression="1" fontSize="8" textColor="30,30,30,255"><text-buffer bufferDraw="1"'
+            ' bufferSize="0.8" bufferColor="255,255,255,255"/></text-style>'
+            '<placement placement="2" placementFlags="9"/></settings></labeling>'
+        )
+    return _PAGE.format(categories="Symbology|Labeling", body=body)
+
+
+def _symbol(name: str, one: Symbol) -> str:
+    """Return a symbol of QGIS."""
+    kind, options = _LAYERS[one.kind]
+    colour = ",".join(map(str, one.colour))
+    given = "".join(
+        f'<Option type="QString" name="{key}"'
+        f" value={quoteattr(value.format(c=colour, shape=one.shape, size=one.size))}/>"
+        for key, value in options.items()
+    )
+    return (
+        f'<symbol type="{one.kind}" name="{name}" alpha="1"><layer class="{kind}" enabled="1">'
+        f'<Option type="Map">{given}</Option></layer></symbol>'
+    )

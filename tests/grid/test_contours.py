@@ -1,0 +1,32 @@
+"""Contours: where the height is that of their level, and as many as a map can bear."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pcfix.grid.contours import contours, interval_of
+
+
+def test_rings_of_a_cone():
+    """A bowl of 1 in 10 about the middle: the ring of a level has ten times its radius."""
+    row, column = np.mgrid[:201, :201]
+    depth = 0.1 * np.hypot(row - 100.0, column - 80.0)
+    depth[:40, 150:] = np.nan
+    found = contours(depth, 2.0)
+    assert {one.level for one in found} == {2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0}
+    for one in found:
+        radius = np.hypot(*(one.place - (80.0, 100.0)).T)
+        away = one.place[:, 1] > 43.0  # by the gap the filter takes one side alone
+        np.testing.assert_allclose(radius[away], 10.0 * one.level, atol=0.6)
+        inside = np.rint(one.place).astype(int)
+        assert np.isfinite(depth[inside[:, 1], inside[:, 0]]).all()
+    assert contours(np.full((5, 5), np.nan), 1.0) == []
+
+
+@pytest.mark.parametrize(
+    ("height", "least", "expected"),
+    [(12.0, 0.0, 1.0), (1.0, 0.0, 0.1), (1.0, 0.3, 0.5), (80, 0, 10)],
+)
+def test_interval(height, least, expected):
+    assert interval_of(height, least) == pytest.approx(expected)
