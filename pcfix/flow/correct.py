@@ -31,7 +31,7 @@ from pcfix.model import (
     Views,
     WaterSurface,
 )
-from pcfix.options.correct import CorrectOptions, PointsOptions, ScienceOptions
+from pcfix.options.correct import CorrectOptions, PointsOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import File, taken
 from pcfix.refract.batch import Batch, MadeWith, Survey
 from pcfix.refract.learning import for_own_water, learn_of_points
@@ -47,7 +47,7 @@ def correct_points(
     cameras: Cameras | None,
     water: WaterSurface | float | npt.ArrayLike,
     *,
-    options: PointsOptions | None = None,
+    options: RefractionOptions | None = None,
     views: Views | None = None,
     may_be_submerged: npt.ArrayLike | None = None,
     level_offset_m: npt.ArrayLike | None = None,
@@ -68,7 +68,7 @@ def correct_points(
     water : WaterSurface, float, or array of shape (n,)
         The water surface (see `pcfix.read_water`), its level in metres, or its height above
         each point, NaN where it is not known.
-    options : PointsOptions, optional
+    options : RefractionOptions, optional
         Or its attributes as keywords, as of ``pcfix correct``: index, method, max_angle (degrees
         from the surface normal), max_cameras, camera_set, matcher, depth_factor, unsure (with
         ``"withhold"`` the result says which are), sigma_image and the other standard errors;
