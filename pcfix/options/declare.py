@@ -263,7 +263,11 @@ def table_of(kind: type) -> str:
 
 
 def taken(
-    kind: type[Set], given: Set | None, keywords: Mapping[str, Any], where: str, **defaults: Any
+    kind: type[Set],
+    given: OptionSet | None,
+    keywords: Mapping[str, Any],
+    where: str,
+    **defaults: Any,
 ) -> Set:
     """Return the options that a Python function is called with.
 
