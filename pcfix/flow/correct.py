@@ -15,7 +15,7 @@ from pcfix.flow.inputs import paths_in
 from pcfix.flow.job import Job
 from pcfix.flow.old_cameras import paired
 from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
-from pcfix.flow.surfaces import file_points, points_of, view_of
+from pcfix.flow.surfaces import corners, file_points, own_water_of, points_of, view_of
 from pcfix.flow.through_water import Label, correct_checked
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps
@@ -31,10 +31,10 @@ from pcfix.model import (
     Views,
     WaterSurface,
 )
-from pcfix.options.correct import CorrectOptions, RefractionOptions, ScienceOptions
+from pcfix.options.correct import CorrectOptions, PointsOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import File, taken
 from pcfix.refract.batch import Batch, MadeWith, Survey
-from pcfix.refract.learning import learn_of_points
+from pcfix.refract.learning import for_own_water, learn_of_points
 from pcfix.refract.regression import BeyondRange, DepthRegression
 from pcfix.refract.tally import Summary
 from pcfix.water.checks import as_surface, check_above_water, checked_points
@@ -72,7 +72,9 @@ def correct_points(
         Or its attributes as keywords, as of ``pcfix correct``: index, method, max_angle (degrees
         from the surface normal), max_cameras, camera_set, matcher, depth_factor, unsure (with
         ``"withhold"`` the result says which are), sigma_image and the other standard errors;
-        `xyz` is taken for the whole cloud, so with a part of one set ``occlusion="off"``.
+        `xyz` is taken for the whole cloud, so with a part of one set ``occlusion="off"``. With
+        water_per_image, rasters in the frame of the points, what is submerged, and how deep, goes
+        by `water`.
     views : Views, optional
         Which cameras made each point, rows of `adjusted_from` where that is given, else of
         `cameras`. Default: as the option `camera_set` says.
@@ -120,7 +122,7 @@ def correct_points(
     >>> result.xyz.round(3).tolist()
     [[0.0, 0.0, -2.703]]
     """
-    given = taken(RefractionOptions, options, keywords, "correct_points")
+    given = taken(PointsOptions, options, keywords, "correct_points")
     settings = with_index(given.part(ScienceOptions))
     if not cameras:
         given.check_no_cameras()
@@ -130,6 +132,8 @@ def correct_points(
                 " leave them out, or give cameras too."
             )
     cameras = cameras or NO_CAMERAS
+    if given.water_per_image is not None:
+        settings = for_own_water(settings, cameras, None if views is None else views.kind)
     points = checked_points(xyz)
     surface, dimension = as_surface(water, len(points))
     offset = None if level_offset_m is None else _offsets(level_offset_m, len(cameras))
@@ -144,7 +148,10 @@ def correct_points(
         made_with = MadeWith(points, pair.old)
         points, views, label = step.xyz, step.views, step.rule(label)
     above = surface_above(surface, points, dimension)
-    batch = Batch(points, above, Survey(surface, cameras, settings, offset), views, made_with)
+    place = None, *corners(points[:, 0], points[:, 1])
+    own, notes = own_water_of(given.water_per_image, cameras, surface, place, offset)
+    survey = Survey(surface, cameras, settings, offset, own_water=own)
+    batch = Batch(points, above, survey, views, made_with)
     line = regression
     if line is not None and not isinstance(line, DepthRegression):
         line = read_regression(line)
@@ -152,8 +159,9 @@ def correct_points(
     if line is not None and line is not regression:
         beyond = BeyondRange(line)
         beyond.add((above.height_m - points[:, 2])[found.submerged])
-        for note in (*line.notes, *beyond.notes()):
-            warnings.warn(note, PcfixWarning, stacklevel=2)
+        notes = (*notes, *line.notes, *beyond.notes())
+    for note in notes:
+        warnings.warn(note, PcfixWarning, stacklevel=2)
     return found if step is None else step.whole(found)
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from os import PathLike
@@ -91,12 +92,13 @@ class FileTask:
             identity = step.identity or corrected_identity(source)
             with LasSink(self.target, header, output_evlrs(source), identity, self.jobs) as sink:
                 done = 0
-                for points in source.chunks():
-                    with telling(partial(self._tell, done, len(points), len(source))):
-                        new = step.chunk(points, source, header)
-                    sink.write(new)
-                    done += len(points)
-                    self._tell(done, 0, len(source))
+                with written_behind(sink.write, self.jobs) as write:
+                    for points in read_ahead(source.chunks(), self.jobs):
+                        count = len(points)
+                        with telling(partial(self._tell, done, count, len(source))):
+                            write(step.chunk(points, source, header))
+                        done += count
+                        self._tell(done, 0, len(source))
                 step.finish()
 
     def _tell(self, done: int, chunk: int, total: int, of_chunk: int = 0) -> None:
@@ -107,6 +109,38 @@ class FileTask:
     def tell(self, summary: dict[str, Any]) -> None:
         """Write the summary, where one is wanted."""
         write_summary(self, summary)
+
+
+def read_ahead(chunks: Iterator[Any], jobs: int | None) -> Iterator[Any]:
+    """Yield chunks, of which the next is being read meanwhile, but with one job."""
+    if jobs == 1:
+        yield from chunks
+        return
+    with ThreadPoolExecutor(1) as reader:
+        following = reader.submit(next, chunks, None)
+        while (one := following.result()) is not None:
+            following = reader.submit(next, chunks, None)
+            yield one
+
+
+@contextmanager
+def written_behind(write: Callable[[Any], None], jobs: int | None) -> Iterator[Callable[..., None]]:
+    """Give a function that writes chunks in order, one at a time, while others are computed."""
+    if jobs == 1:
+        yield write
+        return
+    with ThreadPoolExecutor(1) as writer:
+        last: Future[None] | None = None
+
+        def later(chunk: Any) -> None:
+            nonlocal last
+            if last is not None:
+                last.result()
+            last = writer.submit(write, chunk)
+
+        yield later
+        if last is not None:
+            last.result()
 
 
 def json_text(content: dict[str, Any]) -> str:

@@ -7,22 +7,31 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
-from pcfix.flow.runner import Chunk
+from pcfix.flow.runner import Chunk, read_ahead
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.water import read_water
+from pcfix.io.water_rasters import rasters_of_images, read_water_raster
 from pcfix.label.labelling import Part
-from pcfix.model import FloatArray, IntArray, WaterDimension, WaterSurface
+from pcfix.model import (
+    Cameras,
+    FloatArray,
+    IntArray,
+    WaterDimension,
+    WaterMesh,
+    WaterRaster,
+    WaterSurface,
+)
 from pcfix.options.declare import File
 from pcfix.options.shared import WaterOptions
 from pcfix.water.fit import WaterFit
 from pcfix.water.river import RiverFit
-from pcfix.water.surface import FoundSurface, surface_above
+from pcfix.water.surface import FoundSurface, OwnWater, build_fields, surface_above
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -58,6 +67,9 @@ class Points(NamedTuple):
 
 SAMPLE_POINTS = 2_000_000
 """Points of a cloud that are looked at for a surface, evenly spread."""
+
+
+CloudPlace: TypeAlias = "tuple[CRS | str | None, FloatArray, FloatArray]"
 
 
 class Seen(NamedTuple):
@@ -127,9 +139,8 @@ def file_points(
     path: Path, water: WaterSurface | None, jobs: int | None = None
 ) -> Iterator[Points]:
     """Yield all points of a LAS or LAZ file, chunk by chunk."""
-    with LasSource(path, jobs) as source:
-        for chunk in source.chunks():
-            yield points_of(chunk, source, water)
+    with LasSource(path, jobs, places_only=not isinstance(water, WaterDimension)) as source:
+        yield from read_ahead((points_of(one, source, water) for one in source.chunks()), jobs)
 
 
 def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Points:
@@ -180,6 +191,84 @@ def find_surface(
     if view is None:
         return FoundSurface(read_water(water))
     return FoundSurface(read_water(water, view.crs, _bounds(view.low, view.high)))
+
+
+APART_M = 2.0
+"""Between the common water and that of an image, in the median: waves and tides are smaller."""
+
+
+def own_water_of(
+    folder: File | None,
+    cameras: Cameras,
+    water: WaterSurface,
+    view: CloudPlace,
+    level_offset_m: FloatArray | None = None,
+) -> tuple[OwnWater | None, tuple[str, ...]]:
+    """Return the water of images that have one of their own, and what to say of it.
+
+    Parameters
+    ----------
+    folder : path or None
+        Of rasters with the names of the images, and their standard errors in a folder ``sigma``.
+    cameras : Cameras
+    water : WaterSurface
+        That of the others.
+    view : CRS, and two arrays, shape (2,)
+        Of the cloud: its CRS, its south-west and its north-east corner, metres.
+    level_offset_m : array, shape (k,), optional
+        How much higher than `water` it stood when each camera took its image.
+
+    Raises
+    ------
+    InputError
+        If no raster bears the name of an image, one cannot be read, or none lies where the cloud
+        and the other water do.
+    """
+    if folder is None:
+        return None, ()
+    if isinstance(water, WaterMesh):
+        raise SettingError(
+            "water-per-image does not go with a mesh as the water of the other images; give a"
+            " level, a plane or a raster."
+        )
+    crs, low, high = view
+    paths, notes = rasters_of_images(folder, cameras.labels)
+    heights = _read_alike(paths, crs)
+    errors = {row: path.parent / "sigma" / path.name for row, path in paths.items()}
+    sigma = _read_alike({row: path for row, path in errors.items() if path.is_file()}, crs)
+    if len(sigma) < len(heights):
+        lost = len(heights) - len(sigma)
+        notes += (f"{folder}: {lost} rasters have no standard error in its folder sigma.",)
+    offset = np.zeros(len(cameras)) if level_offset_m is None else level_offset_m
+    places, apart = [], []
+    for image, raster in heights.items():
+        rows, columns = np.nonzero(np.isfinite(raster.height_m))
+        x = raster.left_m + (columns + 0.5) * raster.cell_m[0]
+        y = raster.top_m - (rows + 0.5) * raster.cell_m[1]
+        places.append(((x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])).any())
+        if not isinstance(water, WaterDimension):
+            level = surface_above(water, np.column_stack([x, y, x])).height_m + offset[image]
+            apart.append(np.nanmedian(np.append(raster.height_m[rows, columns] - level, np.nan)))
+    if np.isfinite(low).all() and not any(places):
+        raise InputError(f"{folder}: none of its rasters lies over the cloud; check their CRS.")
+    off = float(np.nanmedian(apart)) if np.isfinite(apart).any() else 0.0
+    if abs(off) > APART_M:
+        raise InputError(
+            f"{folder}: its water stands {off:+.2f} m from --water ({water}); give both the same"
+            " vertical datum, 'pcfix calm' the --level of the calm water."
+        )
+    k, common = len(cameras), water if isinstance(water, WaterRaster) else None
+    return OwnWater(build_fields(heights, k, common), build_fields(sigma, k)), notes
+
+
+def _read_alike(paths: dict[int, Path], crs: CRS | str | None) -> dict[int, WaterRaster]:
+    """Read rasters of one kind, and warn of the first alone."""
+    rasters = dict[int, WaterRaster]()
+    with warnings.catch_warnings():
+        for row, path in paths.items():
+            rasters[row] = read_water_raster(path, crs)
+            warnings.simplefilter("ignore", PcfixWarning)
+    return rasters
 
 
 def _bounds(low: FloatArray, high: FloatArray) -> tuple[float, float, float, float]:

@@ -57,6 +57,7 @@ class ThroughPort:
         """Refuse what needs a water surface, or a model of what happens above one."""
         given = {
             "tide": options.tide is not None,
+            "water-per-image": options.water_per_image is not None,
             "image-times": options.image_times is not None,
             "check-depths": options.check_depths is not None,
             "regression": options.regression is not None,

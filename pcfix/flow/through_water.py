@@ -18,7 +18,7 @@ from pcfix.flow.learning import Learning
 from pcfix.flow.old_cameras import Blocks, ListedViews, old_tie_points
 from pcfix.flow.pose_errors import SAMPLE_POINTS, adjustment_of, pose_errors, sample_of, with_poses
 from pcfix.flow.shore import check_shoreline, write_shoreline
-from pcfix.flow.surfaces import CloudView, Points, parts_of
+from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of
 from pcfix.grid.shoreline import NearWater
 from pcfix.label.labelling import Labelling
 from pcfix.model import (
@@ -34,10 +34,10 @@ from pcfix.model import (
     WaterDimension,
     WaterPlane,
 )
-from pcfix.options.correct import CorrectOptions
+from pcfix.options.correct import CorrectOptions, ScienceOptions
 from pcfix.refract.batch import Batch, Intersection, MadeWith, Survey
 from pcfix.refract.hypotheses import Verdict
-from pcfix.refract.learning import as_told, weigh_lists
+from pcfix.refract.learning import as_told, for_own_water, weigh_lists
 from pcfix.refract.methods import correct, shift_of_land
 from pcfix.refract.regression import LEAST_BEYOND, BeyondRange, DepthRegression
 from pcfix.refract.rehearsal import rehearsals
@@ -45,6 +45,7 @@ from pcfix.refract.tally import Tally
 from pcfix.water.checks import WaterMeeting, check_above_water, check_tilt, refuse_under_water
 from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
+OWN_WATER = "Images have water of their own, which snell and consistent alone allow for."
 Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
 
 
@@ -80,9 +81,17 @@ class ThroughWater:
         check_above_water(self._cameras, self.water, self.level_offset_m)
         check_tilt(self.water)
         self._listed = None if blocks.views is None else blocks.views.kind
+        settings: ScienceOptions = options
+        folder, place = options.water_per_image, (view.crs, view.low, view.high)
+        if folder is not None:
+            settings = for_own_water(options, self._cameras, self._listed)
+            self.settings["water_per_image"] = str(folder)
+        own, self._own_notes = own_water_of(
+            folder, self._cameras, self.water, place, self.level_offset_m
+        )
         self._learning = Learning(
-            Survey(self.water, self._cameras, options, self.level_offset_m), inputs, view,
-            self._listed,
+            Survey(self.water, self._cameras, settings, self.level_offset_m, own_water=own),
+            inputs, view, self._listed,
             None if blocks.pair is None else self._old_ties,
         )  # fmt: skip
         self.survey = self._learning.survey
@@ -170,7 +179,7 @@ class ThroughWater:
         above = surface_above(self.water, xyz, points.heights)
         batch = Batch(xyz, above, self.survey, views, made_with, source=points.sources)
         batch = self._of_kind(batch)
-        correction = correct_checked(batch, label, self.found.sigma_level_m)
+        correction = correct_checked(batch, label, self.found.sigma_level_m, heights_only=True)
         if self.regression is not None:
             least = LEAST_BEYOND if self._inputs.regression is None else 0.0
             self._beyond = self._beyond or BeyondRange(self.regression, least)
@@ -221,8 +230,9 @@ class ThroughWater:
     def made(self) -> dict[str, Any] | None:
         """What the cloud was taken for, and why, where the options leave it open."""
         settings, views = self.survey.settings, self._listed
-        if self.verdicts:
-            because = " ".join(str(one) for one in self.verdicts)
+        own = [] if self.survey.own_water is None else [OWN_WATER]
+        if self.verdicts or own:
+            because = " ".join([*own, *map(str, self.verdicts)])
         elif self._options.method != "auto":
             return None
         elif settings.method == "snell":
@@ -302,7 +312,7 @@ class ThroughWater:
         """Return what was done on the user's behalf."""
         bent = self._poses.warning if self._poses else ""
         said = [one for one in (bent, self._no_poses) if one]
-        return [*self._told(), *self.found.notes, *self._meeting.notes, *said]
+        return [*self._told(), *self.found.notes, *self._own_notes, *self._meeting.notes, *said]
 
     def figures(self, tally: Tally) -> dict[str, Any]:
         """Return what the summary says of depths and water."""
@@ -331,6 +341,8 @@ def correct_checked(
     batch: Batch,
     label: Label | None = None,
     level_sigma_m: Callable[[FloatArray], FloatArray | None] | None = None,
+    *,
+    heights_only: bool = False,
 ) -> Correction:
     """Label, refract, and spread the result over all rows: what every door runs.
 
@@ -342,6 +354,8 @@ def correct_checked(
         Says which are submerged. Default: those below the surface.
     level_sigma_m : callable, optional
         Returns the standard deviation of the water's height at places, shape (m, 2).
+    heights_only : bool
+        Leave the covariances out, of which files have the standard error of Z alone.
     """
     xyz, surface = batch.xyz, batch.surface
     submerged = is_submerged(xyz[:, 2], surface) if label is None else label(xyz, surface)
@@ -350,6 +364,8 @@ def correct_checked(
     if level_sigma_m is not None:
         wet = replace(wet, level_sigma_m=level_sigma_m(wet.xyz[:, :2]))
     found = correct(wet)
+    if heights_only:
+        found = found._replace(covariance_m2=None)
     below = _below_m(wet, found)
     if batch.made_with is not None:
         # their own images put them lower than all images together, by which they were carried
@@ -388,6 +404,8 @@ _PER_POINT = (
 def spread_over(found: Intersection, rows: IntArray, n: int) -> dict[str, Any]:
     """Return the values of corrected rows as those of n points, zero elsewhere."""
     full: dict[str, Any] = dict.fromkeys(_PER_POINT)
+    if len(rows) == n:
+        return {name: getattr(found, name) for name in _PER_POINT}
     for name in _PER_POINT:
         values = getattr(found, name)
         if values is not None:

@@ -26,6 +26,7 @@ from pcfix.options.shared import (
     SubmergedOptions,
     SummaryOption,
     WaterOptions,
+    WaterPerImageOption,
 )
 
 Uncorrected = Literal["withhold", "keep", "drop"]
@@ -228,7 +229,12 @@ class UnsureOption(OptionSet):
 
 @dataclass(frozen=True, kw_only=True)
 class RefractionOptions(BudgetOptions, MethodOptions, UnsureOption):
-    """What the correction of points goes by; `pcfix.correct_points` takes these."""
+    """What the correction of points goes by."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointsOptions(RefractionOptions, WaterPerImageOption):
+    """The options of `pcfix.correct_points`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -250,7 +256,13 @@ class ScienceOptions(RefractionOptions, ResultOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectOptions(
-    ShorelineOption, JobOptions, SummaryOption, ScienceOptions, SubmergedOptions, InputOptions
+    ShorelineOption,
+    JobOptions,
+    SummaryOption,
+    ScienceOptions,
+    WaterPerImageOption,
+    SubmergedOptions,
+    InputOptions,
 ):
     """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
 

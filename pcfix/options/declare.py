@@ -262,7 +262,7 @@ def table_of(kind: type) -> str:
     return "\n".join(rows)
 
 
-def taken(kind: type[Set], given: Set | None, keywords: Mapping[str, Any], where: str) -> Set:
+def taken(kind: type[Set], given: OptionSet | None, keywords: Mapping[str, Any], where: str) -> Set:
     """Return the options that a Python function is called with.
 
     Parameters

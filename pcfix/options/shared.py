@@ -126,6 +126,19 @@ class WaterOptions(OptionSet):
 
 
 @dataclass(frozen=True, kw_only=True)
+class WaterPerImageOption(OptionSet):
+    """Water that is another for each photograph."""
+
+    panel = Panel.WATER
+
+    water_per_image: File | None = option(
+        None,
+        "Folder of rasters of the water, each of the name of a photograph, as 'pcfix calm"
+        " --surface' writes them; the others go by --water.",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class LandRules(OptionSet):
     """Which points below the surface are land all the same."""
 

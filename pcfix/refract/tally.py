@@ -53,7 +53,7 @@ def largest_tvu_m(order: Order, depth_m: FloatArray) -> FloatArray:
     depth_m : array
         Depths d, positive down.
     """
-    return np.asarray(np.hypot(order.a_m, order.b * depth_m))
+    return np.asarray(np.sqrt(order.a_m**2 + (order.b * depth_m) ** 2))
 
 
 def within_orders(tvu_m: FloatArray, depth_m: FloatArray) -> IntArray:

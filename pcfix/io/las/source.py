@@ -42,6 +42,13 @@ _DAMAGED = (
 )
 """What the LAS libraries raise."""
 
+_PLACES = (
+    laspy.DecompressionSelection.base()
+    .decompress_z()
+    .decompress_classification()
+    .decompress_point_source_id()
+)
+
 CHUNK_POINTS = 1_000_000
 """Points that are worked on at a time, which bounds the memory."""
 
@@ -165,8 +172,12 @@ class LasSource:
     what laspy would not.
     """
 
-    def __init__(self, path: File, jobs: int | None = None) -> None:
-        """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable."""
+    def __init__(self, path: File, jobs: int | None = None, *, places_only: bool = False) -> None:
+        """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable.
+
+        With `places_only` nothing is unpacked but coordinates, classes and sources, where the file
+        holds its dimensions apart (LAZ of format 6 and up); the others may be zero then.
+        """
         self.path = check_input(path)
         with las_errors(self.path):
             with self.path.open("rb") as stream:
@@ -175,7 +186,10 @@ class LasSource:
                 self.vlrs, self.evlrs = read_records(stream)
                 stream.seek(IDENTITY_PLACE)
                 self.identity = stream.read(_IDENTITY_SIZE)
-            self._reader = laspy.open(self.path, laz_backend=backend(jobs))
+            some = _PLACES if places_only else laspy.DecompressionSelection.all()
+            self._reader = laspy.open(
+                self.path, laz_backend=backend(jobs), decompression_selection=some
+            )
         self.header: laspy.LasHeader = self._reader.header
         try:
             self._check_header()
