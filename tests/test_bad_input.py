@@ -632,7 +632,7 @@ def test_wrong_usage_is_exit_code_2(
 KEYS = {
     "input", "output", "pcfix", "points", "submerged", "corrected", "uncorrected", "dropped",
     "water_unknown", "depth_m", "shift_z_m", "rays", "cameras", "cameras_used", "cameras_unused",
-    "water", "settings", "seconds", "views", "water_fit", "warnings", "points_per_s",
+    "cameras_left_out", "water", "settings", "seconds", "views", "water_fit", "warnings", "points_per_s",
     "uncertainty", "made", "poses", "incidence_deg",
 }  # fmt: skip
 

@@ -22,6 +22,7 @@ from pcfix.kernels import cores
 from pcfix.label.labelling import Labelling
 from pcfix.model import Correction, Outcome, WaterSurface
 from pcfix.options.correct import CorrectOptions, LabelRules, ScienceOptions
+from pcfix.refract.choice import views_in_frame
 from pcfix.refract.tally import Summary, Tally
 from pcfix.version import __version__
 from pcfix.water.index import with_index
@@ -153,6 +154,7 @@ class Job:
             cameras=len(self.cameras),
             cameras_used=len(self.cameras) - len(unused),
             cameras_unused=unused,
+            cameras_left_out=self._left_out(),
             seconds=round(seconds, 3),
             views=None if report is None else report.as_dict(),
             warnings=[
@@ -165,3 +167,22 @@ class Job:
             settings={**self.options.part(ScienceOptions).as_dict(), **self.medium.settings},
             **self.medium.figures(tally),
         )
+
+    def _left_out(self) -> dict[str, list[str]]:
+        """Return the unused cameras in whose frame corrected points lie, by what left them out."""
+        unused = ~self.tally.camera_used
+        if isinstance(self.medium, ThroughPort) or not self.tally.moved or not unused.any():
+            return {}
+        xyz, limit = np.vstack(self.tally.moved), self.medium.survey.settings.limit_deg or 90.0
+        seen = views_in_frame(xyz, self.cameras)
+        points = np.repeat(np.arange(len(xyz)), np.diff(seen.start))
+        across, along, up = (self.cameras.centres[seen.camera] - xyz[points]).T
+        steepest = np.full(len(unused), np.inf)
+        np.minimum.at(steepest, seen.camera, np.degrees(np.arctan2(np.hypot(across, along), up)))
+        beyond, within = unused & np.isfinite(steepest) & (steepest > limit), steepest <= limit
+        reasons = {f"beyond {limit:g} degrees alone": beyond, "but are not chosen": unused & within}
+        return {
+            why: list(compress(self.cameras.labels, rows))
+            for why, rows in reasons.items()
+            if rows.any()
+        }

@@ -14,7 +14,7 @@ from pcfix.errors import GeometryError
 from pcfix.flow.rasters import BED, DEPTH, UNCERTAINTY
 from pcfix.flow.shore import shoreline_layer
 from pcfix.flow.surfaces import points_of
-from pcfix.grid.contours import contours, interval_of
+from pcfix.grid.contours import contours, depth_interval
 from pcfix.grid.shoreline import NearWater
 from pcfix.io import rasters
 from pcfix.io.geopackage import Layer, write_layers
@@ -77,10 +77,8 @@ def _area(folder: Path) -> Layer:
 def _contours(folder: Path) -> Layer:
     """Return the lines of equal depth, no closer than the depth is known."""
     depth, bounds = rasters.preview(folder / DEPTH, MOST_CELLS)
-    sigma = 0.0
-    if (folder / UNCERTAINTY).exists():
-        sigma = float(np.nanmedian(rasters.preview(folder / UNCERTAINTY)[0]))
-    interval = interval_of(float(np.nanmax(depth)), sigma)
+    path = folder / UNCERTAINTY
+    interval = depth_interval(depth, rasters.preview(path)[0] if path.exists() else np.zeros(0))
     found = contours(depth, interval)
     lines = [shapely.linestrings(rasters.centres(one.place, depth, bounds)) for one in found]
     level = np.array([one.level for one in found])

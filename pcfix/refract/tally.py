@@ -125,6 +125,10 @@ class UncertaintyTally:
         }
 
 
+SAMPLE_POINTS = 2000
+"""Of a chunk, that are looked for in the frames of cameras that no point used."""
+
+
 class Tally:
     """Counts, extremes, and histograms of shift and standard error in Z, over all chunks so far."""
 
@@ -138,6 +142,8 @@ class Tally:
         self.high: FloatArray = np.full(3, -np.inf)
         self.lowest_water_m, self.incidence_deg = np.inf, 0.0
         self._depth_low_m, self._depth_high_m, self._depth_sum_m = np.inf, -np.inf, 0.0
+        self.moved: list[FloatArray] = []
+        """Some of the apparent points that were corrected, evenly spread over each chunk."""
         self._shift = _Histogram(-100.0, 100.0)
         self._uncertainty = UncertaintyTally()
 
@@ -157,6 +163,7 @@ class Tally:
         self.lowest_water_m = min(self.lowest_water_m, correction.lowest_water_m)
         moved = correction.corrected
         if moved.any():
+            self.moved.append(apparent[moved][:: 1 + int(moved.sum()) // SAMPLE_POINTS])
             self.incidence_deg = max(self.incidence_deg, float(correction.incidence_deg.max()))
             depth = correction.depth_m[moved]
             self._depth_low_m = min(self._depth_low_m, float(depth.min()))
@@ -232,6 +239,7 @@ class Summary:
     cameras: int
     cameras_used: int
     cameras_unused: list[str]
+    """Those that see no corrected point, and those of `cameras_left_out`."""
     water: str
     settings: dict[str, Any]
     seconds: float
@@ -248,6 +256,8 @@ class Summary:
     poses: dict[str, Any] | None = None
     """Whether they have absorbed the refraction, in a line and sign by sign, where that was asked.
     """
+    cameras_left_out: dict[str, list[str]] = field(default_factory=dict)
+    """Cameras that see corrected points, by why no ray of theirs was used."""
     unsure: int | None = None
     """Corrected points that flat obliques alone see; None where these are not withheld."""
     shoreline: dict[str, Any] | None = None

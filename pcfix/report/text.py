@@ -75,11 +75,16 @@ def _cameras(s: Summary) -> list[str]:
             "cameras      none: a corrected point has a ray count of 1 and an incidence of 0, and"
             " which images made it, or were hidden, is not known"
         ]
-    unused = len(s.cameras_unused)
-    names = ", ".join(s.cameras_unused[:5]) + (", ..." if unused > 5 else "")
+    left_out = [name for names in s.cameras_left_out.values() for name in names]
+    blind = [name for name in s.cameras_unused if name not in left_out]
+    unused = {f"see the bed {why}": names for why, names in s.cameras_left_out.items()}
+    unused |= {"see no corrected point": blind} if blind else {}
     return [
         f"cameras      {s.cameras_used} of {s.cameras} used"
-        + (f"; {unused} see no corrected point: {names}" if unused else ""),
+        + "".join(
+            f"; {len(names)} {why}: {', '.join(names[:5])}{', ...' if len(names) > 5 else ''}"
+            for why, names in unused.items()
+        ),
         f"rays         {s.rays:,} ({s.rays / max(s.corrected, 1):.1f} a point, incidence up to"
         f" {s.incidence_deg:.0f} degrees)",
     ]
