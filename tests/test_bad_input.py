@@ -123,6 +123,13 @@ def test_a_file_that_is_no_cloud(refuse: Refuse, folder: Path, content: bytes) -
     assert "text.las" in refuse(*job(cloud="text.las"))
 
 
+def test_ply_is_told_how_to_be_converted(refuse: Refuse, folder: Path) -> None:
+    (folder / "cloud.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
+    said = refuse(*job(cloud="cloud.ply"))
+    assert "is a PLY file" in said and "damaged" not in said
+    assert "pdal translate cloud.ply cloud.laz --writers.las.scale_x=0.001" in said
+
+
 def test_a_folder_as_input(refuse: Refuse, folder: Path) -> None:
     (folder / "folder.las").mkdir()
     assert "folder.las" in refuse(*job(cloud="folder.las"))
@@ -331,6 +338,15 @@ def test_cameras_under_the_water(refuse: Refuse, folder: Path, water: str) -> No
 
 def test_cameras_that_are_not_there(refuse: Refuse) -> None:
     assert "none.csv" in refuse(*job("--cameras", "none.csv"))
+
+
+def test_a_folder_that_holds_cameras(refuse: Refuse, folder: Path) -> None:
+    (folder / "images").mkdir()
+    assert "is not a camera file" in refuse(*job("--cameras", "images"))
+    (folder / "images" / "cameras.csv").write_bytes((folder / "cameras.csv").read_bytes())
+    (folder / "images" / "notes.txt").write_text("flown on a Tuesday")
+    said = refuse(*job("--cameras", "images"))
+    assert "is a folder that holds cameras.csv; give images/cameras.csv itself" in said
 
 
 @pytest.mark.parametrize("angles", [False, True])
@@ -632,8 +648,8 @@ def test_wrong_usage_is_exit_code_2(
 KEYS = {
     "input", "output", "pcfix", "points", "submerged", "corrected", "uncorrected", "dropped",
     "water_unknown", "depth_m", "shift_z_m", "rays", "cameras", "cameras_used", "cameras_unused",
-    "cameras_left_out", "water", "settings", "seconds", "views", "water_fit", "warnings", "points_per_s",
-    "uncertainty", "made", "poses", "incidence_deg",
+    "cameras_left_out", "water", "settings", "seconds", "views", "water_fit", "warnings",
+    "points_per_s", "uncertainty", "made", "poses", "incidence_deg",
 }  # fmt: skip
 
 
@@ -646,7 +662,7 @@ def test_labels_that_repeat_are_a_warning(folder: Path) -> None:
     (line,) = done.stderr.splitlines()
     assert line.startswith("pcfix: warning: ")
     assert "c0" in line
-    assert "c1" in line
+    assert "c1" in line and "1 exact copies are dropped" in line
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["cameras"] == 10
     assert len(summary["warnings"]) == 1
