@@ -160,7 +160,8 @@ def refuse_ply(path: Path, head: bytes) -> None:
         raise InputError(
             f"{path}: is a PLY file, and pcfix takes LAS and LAZ; convert it with: pdal translate"
             f" {path} {path.with_suffix('.laz')} {millimetres} --writers.las.offset_x=auto"
-            " --writers.las.offset_y=auto --writers.las.offset_z=auto --writers.las.a_srs=EPSG:CODE"
+            " --writers.las.offset_y=auto --writers.las.offset_z=auto"
+            " --writers.las.a_srs=EPSG:CODE (CODE is that of its CRS)"
         )
 
 
