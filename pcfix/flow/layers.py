@@ -56,7 +56,7 @@ def write_map(path: Path, drawn: Drawn, crs: Any) -> dict[str, int]:
     """Write all layers; return how many features each has."""
     layers = [
         _area(drawn.folder),
-        _contours(drawn.folder),
+        contours_layer(drawn.folder),
         _waterline(drawn),
         _sections(drawn),
         _cameras(drawn.cameras, drawn.unused),
@@ -74,13 +74,13 @@ def _area(folder: Path) -> Layer:
     return Layer("corrected_area", "Polygon", shapes, {"area_m2": area}, style)
 
 
-def _contours(folder: Path) -> Layer:
-    """Return the lines of equal depth, no closer than the depth is known."""
+def contours_layer(folder: Path, interval: float | None = None) -> Layer:
+    """Return the lines of equal depth; without an interval no closer than the depth is known."""
     depth, bounds = rasters.preview(folder / DEPTH, MOST_CELLS)
     sigma = 0.0
     if (folder / UNCERTAINTY).exists():
         sigma = float(np.nanmedian(rasters.preview(folder / UNCERTAINTY)[0]))
-    interval = interval_of(float(np.nanmax(depth)), sigma)
+    interval = interval or interval_of(float(np.nanmax(depth)), sigma)
     found = contours(depth, interval)
     lines = [shapely.linestrings(rasters.centres(one.place, depth, bounds)) for one in found]
     level = np.array([one.level for one in found])

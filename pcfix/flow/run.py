@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -346,7 +346,7 @@ def _rasters(request: Request) -> list[str]:
 
 def _report(
     request: Request, files: Files, inputs: list[Path], done: dict[str, Any]
-) -> dict[str, str]:
+) -> dict[str, Any]:
     pictures: list[Picture] = []
     tables: list[Table] = []
     dod = None
@@ -367,7 +367,7 @@ def _report(
         resolution = float(dsm.res[0])
     figures = {} if compared is None else compared["figures"]
     later = Later(pictures, tables, verdict, figures, dod, resolution)
-    page = write_report(
+    report = write_report(
         files.cleaned,
         files.folder,
         summary=summary,
@@ -378,4 +378,10 @@ def _report(
         later=later,
         overwrite=True,
     )
-    return {"page": str(page), "uncertainty": uncertainty_sentence(summary, later.tvu)}
+    return {
+        "page": str(files.report),
+        "uncertainty": uncertainty_sentence(summary, later.tvu),
+        "title": report.title,
+        "tiles": [asdict(tile) for tile in report.tiles],
+        "place": report.place,
+    }
