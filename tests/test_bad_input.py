@@ -123,6 +123,16 @@ def test_a_file_that_is_no_cloud(refuse: Refuse, folder: Path, content: bytes) -
     assert "text.las" in refuse(*job(cloud="text.las"))
 
 
+@pytest.mark.parametrize(("suffix", "count"), [(".las", 300), (".laz", 120_000)])
+def test_a_header_that_counts_too_few(
+    refuse: Refuse, folder: Path, suffix: str, count: int
+) -> None:
+    """Of LAZ the chunk table tells: full chunks hold 50,000 points."""
+    path = write_cloud(folder / f"few{suffix}", 7, count=count)
+    patched(path, 247, struct.pack("<Q", count // 3))
+    assert f"counts {count // 3:,} points" in refuse(*job(cloud=path.name))
+
+
 def test_a_folder_as_input(refuse: Refuse, folder: Path) -> None:
     (folder / "folder.las").mkdir()
     assert "folder.las" in refuse(*job(cloud="folder.las"))

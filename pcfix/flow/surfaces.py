@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.runner import Chunk
+from pcfix.io.las.counts import check_count
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.water import read_water
 from pcfix.label.labelling import Part
@@ -106,6 +107,7 @@ def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 def view_of(path: Path, jobs: int | None = None) -> CloudView:
     """Return the view of a LAS or LAZ file."""
     with LasSource(path, jobs) as source:
+        check_count(source)
         crs, points = metric_crs(source), len(source)
         low, high = np.array(source.header.mins[:2]), np.array(source.header.maxs[:2])
         software = str(source.header.generating_software or "")
