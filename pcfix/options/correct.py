@@ -230,6 +230,12 @@ class UnsureOption(OptionSet):
 class RefractionOptions(BudgetOptions, MethodOptions, UnsureOption):
     """What the correction of points goes by; `pcfix.correct_points` takes these."""
 
+    panel = Panel.WATER
+
+    deep: bool = option(
+        False, "Accept depths of more than 60 m, which else are taken for a wrong water level."
+    )
+
 
 @dataclass(frozen=True, kw_only=True)
 class ResultOptions(OptionSet):

@@ -96,7 +96,7 @@ def finite(ties: TiePoints) -> tuple[TiePoints, str]:
     A point without any coordinate is one that the source has not placed, and stays.
     """
     placed, unplaced = np.isfinite(ties.xyz).all(axis=1), np.isnan(ties.xyz).all(axis=1)
-    kept = placed | unplaced
+    kept: BoolArray = np.asarray(placed | unplaced)
     point = np.repeat(np.arange(len(ties.xyz)), np.diff(ties.views.start))
     seen = np.isfinite(ties.image_xy).all(axis=1)
     if kept.all() and seen.all():
