@@ -643,7 +643,7 @@ KEYS = {
     "input", "output", "pcfix", "points", "submerged", "corrected", "uncorrected", "dropped",
     "water_unknown", "depth_m", "shift_z_m", "rays", "cameras", "cameras_used", "cameras_unused",
     "water", "settings", "seconds", "views", "water_fit", "warnings", "points_per_s",
-    "uncertainty", "made", "poses", "incidence_deg",
+    "uncertainty", "made", "poses", "incidence_deg", "fit",
 }  # fmt: skip
 
 
@@ -675,6 +675,24 @@ def test_summary_is_json_with_the_documented_keys(folder: Path) -> None:
     assert sorted(path.name for path in folder.iterdir()) == [
         "cameras.csv", "cloud.las", "out.las", "summary.json",
     ]  # fmt: skip
+
+
+def test_nothing_corrected_is_an_error(refuse: Refuse, folder: Path) -> None:
+    lines = (folder / "cameras.csv").read_text().splitlines()
+    (folder / "cameras.csv").write_text("\n".join(lines[:2]) + "\n")
+    message = refuse(*job("--method", "snell"))
+    assert "submerged points can be corrected" in message
+    assert "one usable ray only" in message
+
+
+def test_little_corrected_is_said_first(
+    run: Callable[..., subprocess.CompletedProcess[str]],
+) -> None:
+    done = run(*job("--max-angle", "20"))
+    assert done.returncode == 0, done.stderr
+    first = done.stdout.splitlines()[0]
+    assert first.startswith("WARNING      only ")
+    assert "submerged points were corrected" in first
 
 
 def test_quiet_says_nothing(folder: Path) -> None:

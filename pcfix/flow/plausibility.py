@@ -39,12 +39,14 @@ class Plausible(NamedTuple):
     """What was tested.
 
     fits : tests that cameras and cloud passed, in words; doubts : a sentence on each that they, or
-    the water, did not; unchecked : what nothing tells of.
+    the water, did not; unchecked : what nothing tells of; noted : whether the cloud itself, by its
+    steps, said besides that they may not fit.
     """
 
     fits: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
     unchecked: tuple[str, ...] = ()
+    noted: bool = False
 
     def warn(self) -> None:
         """Warn of every doubt."""
@@ -53,15 +55,21 @@ class Plausible(NamedTuple):
 
     def __str__(self) -> str:
         """Return a line that claims no more than was tested."""
-        found = "see the warnings" if self.doubts else "cameras and cloud fit"
-        passed = f"{found}; tested: {', '.join(self.fits)}" if self.fits else "not checked"
-        if not self.fits and self.doubts:
-            passed = found
-        return passed + (f"; not checked: {', '.join(self.unchecked)}" if self.unchecked else "")
+        if self.doubts or self.noted:
+            found = "in doubt, see the warnings" if self.doubts else "in doubt, see the notes"
+        else:
+            found = "cameras and cloud fit" if self.fits else "nothing was tested"
+        tested = f"; tested: {', '.join(self.fits)}" if self.fits else ""
+        return (
+            found
+            + tested
+            + (f"; not checked: {', '.join(self.unchecked)}" if self.unchecked else "")
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        return {name: list(values) for name, values in self._asdict().items()}
+        lists = {name: list(getattr(self, name)) for name in ("fits", "doubts", "unchecked")}
+        return {"words": str(self), **lists}
 
 
 class CloudSample:
@@ -248,7 +256,8 @@ def _heights(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Res
         return Result(
             doubt=f"The tie points of the cameras lie {abs(off):.1f} m"
             f" {'above' if off > 0.0 else 'below'} the cloud (median of {int(near.sum()):,}): the"
-            " heights of cameras and cloud count from different places, or one is in feet."
+            " block is shifted, or the heights of cameras and cloud count from different places, or"
+            " are in feet and metres."
         )
     return Result(f"tie points in their image places and {abs(off):.2f} m from the cloud's heights")
 

@@ -37,7 +37,7 @@ from pcfix.model import (
 )
 from pcfix.options.correct import CorrectOptions
 from pcfix.refract.batch import Batch, Intersection, MadeWith, Survey
-from pcfix.refract.hypotheses import Verdict
+from pcfix.refract.hypotheses import CAUSES, Verdict
 from pcfix.refract.learning import as_told, weigh_lists
 from pcfix.refract.methods import correct, shift_of_land
 from pcfix.refract.regression import LEAST_BEYOND, BeyondRange, DepthRegression
@@ -290,7 +290,8 @@ class ThroughWater:
         ties = quick_ties(self._inputs, self._view.crs) if len(self._cameras) else None
         sought = (self.found.as_dict() or {}).get("model") == "auto"
         doubts = () if sought else self._sample.level_doubts()
-        self._plausible = plausible(self._cameras, self._sample.xyz, ties, doubts)
+        tested = plausible(self._cameras, self._sample.xyz, ties, doubts)
+        self._plausible = tested._replace(noted=CAUSES in self._told())
         self._plausible.warn()
         if not len(self._cameras):
             self._poses = Poses(None, "not applicable: no cameras were given")
@@ -334,7 +335,7 @@ class ThroughWater:
             "told": notes,
             "poses": None if self._poses is None else self._poses.as_dict(),
             "shoreline": self._shoreline,
-            "fit": self._plausible.as_dict() | {"words": str(self._plausible)},
+            "fit": self._plausible.as_dict(),
         }
 
 
