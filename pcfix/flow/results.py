@@ -15,6 +15,7 @@ from pcfix.flow.layers import contours_layer
 from pcfix.flow.rasters import BED, DEPTH, SHADED, SURFACE, UNCERTAINTY
 from pcfix.flow.record import read_record
 from pcfix.flow.run import RECORD, Files, Request, run_all
+from pcfix.flow.runner import Bar, no_bar
 from pcfix.io import analysis, rasters
 from pcfix.io.styles import limits_of
 from pcfix.options.declare import File, options_of, taken
@@ -158,7 +159,7 @@ def run(
     *,
     options: RunOptions | None = None,
     say: Callable[[str], None] = lambda text: None,
-    progress: Callable[[int, int], None] | None = None,
+    bar: Bar = no_bar,
     **keywords: Any,
 ) -> RunResults:
     """Adjust, correct, clean, grid, compare and report; what ``pcfix run`` runs.
