@@ -47,6 +47,7 @@ _PLACES = (
     .decompress_z()
     .decompress_classification()
     .decompress_point_source_id()
+    .decompress_rgb()
 )
 
 CHUNK_POINTS = 1_000_000
@@ -176,8 +177,8 @@ class LasSource:
     def __init__(self, path: File, jobs: int | None = None, *, places_only: bool = False) -> None:
         """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable.
 
-        With `places_only` nothing is unpacked but coordinates, classes and sources, where the file
-        holds its dimensions apart (LAZ of format 6 and up); the others may be zero then.
+        With `places_only` nothing is unpacked but coordinates, classes, sources and colours, where
+        the file holds its dimensions apart (LAZ of format 6 and up); the others may be zero then.
         """
         self.path = check_input(path)
         with las_errors(self.path):
