@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 from pcfix.cli import app
+from pcfix.cli.commands import EXAMPLES
+from pcfix.cli.flags import prepare
 from tests.utils.option_tables import DOCUMENT, with_tables
 
 ROOT = Path(__file__).parents[1]
@@ -38,13 +40,17 @@ def commands():
         text = path.read_text("utf-8").replace("\\\n", " ")
         blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.M | re.S)
         shell = "\n".join(block for language, block in blocks if not language)
-        lines = re.findall(r"^pcfix .*", shell, re.M) + re.findall(r"`(pcfix [a-z]+ .*?)`", text)
+        lines = re.findall(r"^pcfix .*", shell, re.M) + re.findall(
+            r"`(pcfix [a-z]+ [^-].*?)`", text
+        )
         found |= {line: path for line in lines if not PATTERN.search(line)}
     return found
 
 
 def test_commands_are_understood():
     assert len(commands()) > 20
+    for command, _ in EXAMPLES:
+        prepare(command)
     for line, path in commands().items():
         words = shlex.split(line, comments=True)[1:]
         try:
