@@ -314,7 +314,11 @@ def _chunks(
         xyz = checked_points(np.column_stack([ins[axis][rows] for axis in "XYZ"]))
         heights = dimension(ins, water.name)[rows] if isinstance(water, WaterDimension) else None
         sources = ins["PointSourceId"][rows] if "PointSourceId" in ins else None
-        yield rows, Points(xyz, heights, flags.classes[rows], sources)
+        has_colours = all(name in ins for name in ("Red", "Green", "Blue"))
+        colours = (
+            tuple(ins[name][rows] for name in ("Red", "Green", "Blue")) if has_colours else None
+        )
+        yield rows, Points(xyz, heights, flags.classes[rows], sources, colours)
 
 
 def _view(ins: Dimensions, metadata: dict[str, Any] | None, flags: Flags) -> CloudView:

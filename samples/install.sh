@@ -46,7 +46,7 @@ if [ ${#missing[@]} -gt 0 ]; then system_packages "${missing[@]}"; fi
 if [ ! -x "$folder/bin/python" ]; then "$python" -m venv "$folder"; fi
 "$folder/bin/python" -m pip install --quiet --upgrade pip
 "$folder/bin/python" -m pip install --quiet --editable ".$extras"
-if [ $# -lt 2 ]; then
+if [ -z "${2:-}" ]; then
     echo "compiling the kernels, so that the first correction need not wait for it ..."
     warm=$(mktemp -d)
     "$folder/bin/pcfix" correct samples/scene/cloud.laz "$warm/out.laz" \

@@ -130,6 +130,16 @@ def test_ply_is_told_how_to_be_converted(refuse: Refuse, folder: Path) -> None:
     assert "pdal translate cloud.ply cloud.laz --writers.las.scale_x=0.001" in said
 
 
+@pytest.mark.parametrize(("suffix", "count"), [(".las", 300), (".laz", 120_000)])
+def test_a_header_that_counts_too_few(
+    refuse: Refuse, folder: Path, suffix: str, count: int
+) -> None:
+    """Of LAZ the chunk table tells: full chunks hold 50,000 points."""
+    path = write_cloud(folder / f"few{suffix}", 7, count=count)
+    patched(path, 247, struct.pack("<Q", count // 3))
+    assert f"counts {count // 3:,} points" in refuse(*job(cloud=path.name))
+
+
 def test_a_folder_as_input(refuse: Refuse, folder: Path) -> None:
     (folder / "folder.las").mkdir()
     assert "folder.las" in refuse(*job(cloud="folder.las"))
@@ -649,7 +659,7 @@ KEYS = {
     "input", "output", "pcfix", "points", "submerged", "corrected", "uncorrected", "dropped",
     "water_unknown", "depth_m", "shift_z_m", "rays", "cameras", "cameras_used", "cameras_unused",
     "cameras_left_out", "water", "settings", "seconds", "views", "water_fit", "warnings",
-    "points_per_s", "uncertainty", "made", "poses", "incidence_deg",
+    "points_per_s", "uncertainty", "made", "poses", "incidence_deg", "fit",
 }  # fmt: skip
 
 
@@ -681,6 +691,24 @@ def test_summary_is_json_with_the_documented_keys(folder: Path) -> None:
     assert sorted(path.name for path in folder.iterdir()) == [
         "cameras.csv", "cloud.las", "out.las", "summary.json",
     ]  # fmt: skip
+
+
+def test_nothing_corrected_is_an_error(refuse: Refuse, folder: Path) -> None:
+    lines = (folder / "cameras.csv").read_text().splitlines()
+    (folder / "cameras.csv").write_text("\n".join(lines[:2]) + "\n")
+    message = refuse(*job("--method", "snell"))
+    assert "submerged points can be corrected" in message
+    assert "one usable ray only" in message
+
+
+def test_little_corrected_is_said_first(
+    run: Callable[..., subprocess.CompletedProcess[str]],
+) -> None:
+    done = run(*job("--max-angle", "20"))
+    assert done.returncode == 0, done.stderr
+    first = done.stdout.splitlines()[0]
+    assert first.startswith("WARNING      only ")
+    assert "submerged points were corrected" in first
 
 
 def test_quiet_says_nothing(folder: Path) -> None:

@@ -14,8 +14,9 @@ from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.inputs import paths_in
 from pcfix.flow.job import Job
 from pcfix.flow.old_cameras import paired
+from pcfix.flow.plausibility import CloudSample, plausible
 from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
-from pcfix.flow.surfaces import corners, file_points, own_water_of, points_of, view_of
+from pcfix.flow.surfaces import Points, corners, file_points, own_water_of, points_of, view_of
 from pcfix.flow.through_water import Label, correct_checked
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps
@@ -37,7 +38,7 @@ from pcfix.refract.batch import Batch, MadeWith, Survey
 from pcfix.refract.learning import for_own_water, learn_of_points
 from pcfix.refract.regression import BeyondRange, DepthRegression
 from pcfix.refract.tally import Summary
-from pcfix.water.checks import as_surface, check_above_water, checked_points
+from pcfix.water.checks import WaterMeeting, as_surface, check_above_water, checked_points
 from pcfix.water.index import with_index
 from pcfix.water.surface import is_submerged, surface_above
 
@@ -156,6 +157,11 @@ def correct_points(
     if line is not None and not isinstance(line, DepthRegression):
         line = read_regression(line)
     found = correct_checked(learn_of_points(batch, line), label)
+    meeting, sample = WaterMeeting(surface, deep=settings.deep), CloudSample(len(points))
+    meeting.add(points, found)
+    meeting.check_reach("xyz")
+    sample.add(Points(points, None, np.zeros(len(points), np.uint8)), above.height_m)
+    plausible(cameras, sample.xyz, level_doubts=sample.level_doubts()).warn()
     if line is not None and line is not regression:
         beyond = BeyondRange(line)
         beyond.add((above.height_m - points[:, 2])[found.submerged])

@@ -123,6 +123,12 @@ class Job:
             found = None if flat else likely_mistake(*block)
             mistake = f" {found}" if found else ""
             raise GeometryError(f"{self.name}: {self.medium.out_of_sight(tally)}{mistake}")
+        if not tally.corrected and tally.submerged:
+            reasons = [f"{n:,}: {why}" for why, n in tally.uncorrected().items() if n]
+            raise GeometryError(
+                f"{self.name}: none of {tally.submerged:,} submerged points can be corrected"
+                f" ({'; '.join(reasons)}); check that cameras and cloud belong together."
+            )
         self.medium.look_back()
 
     def save_regression(self) -> None:

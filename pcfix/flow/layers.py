@@ -56,7 +56,7 @@ def write_map(path: Path, drawn: Drawn, crs: Any) -> dict[str, int]:
     """Write all layers; return how many features each has."""
     layers = [
         _area(drawn.folder),
-        _contours(drawn.folder),
+        contours_layer(drawn.folder),
         _waterline(drawn),
         _sections(drawn),
         _cameras(drawn.cameras, drawn.unused),
@@ -74,11 +74,13 @@ def _area(folder: Path) -> Layer:
     return Layer("corrected_area", "Polygon", shapes, {"area_m2": area}, style)
 
 
-def _contours(folder: Path) -> Layer:
-    """Return the lines of equal depth, no closer than the depth is known."""
+def contours_layer(folder: Path, interval: float | None = None) -> Layer:
+    """Return the lines of equal depth; without an interval no closer than the depth is known."""
     depth, bounds = rasters.preview(folder / DEPTH, MOST_CELLS)
-    path = folder / UNCERTAINTY
-    interval = depth_interval(depth, rasters.preview(path)[0] if path.exists() else np.zeros(0))
+    if interval is None:
+        path = folder / UNCERTAINTY
+        sigma = rasters.preview(path)[0] if path.exists() else np.zeros(0)
+        interval = depth_interval(depth, sigma)
     found = contours(depth, interval)
     lines = [shapely.linestrings(rasters.centres(one.place, depth, bounds)) for one in found]
     level = np.array([one.level for one in found])

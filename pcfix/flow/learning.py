@@ -206,7 +206,9 @@ class Learning:
         survey, taken = self.survey, list[Batch]()
         done = 0
         of_chunks = repeat(None) if makers is None else makers()
-        for (xyz, heights, classes, sources), made_with in zip(chunks(), of_chunks, strict=False):
+        for (xyz, heights, classes, sources, _), made_with in zip(
+            chunks(), of_chunks, strict=False
+        ):
             rows = np.arange(-done % step, len(xyz), step)
             rows = rows[~np.isin(classes[rows], NOISE_CLASSES)]
             above = surface_above(

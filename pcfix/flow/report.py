@@ -17,8 +17,8 @@ from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, stated_crs
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, WaterSurface
 from pcfix.refract.tally import Summary
-from pcfix.report.first_screen import Survey, in_short
-from pcfix.report.page import Table, render
+from pcfix.report.first_screen import Survey
+from pcfix.report.page import Report, Table, render
 from pcfix.report.run import NOTHING_LATER, Corrected, Later, run_report
 
 NEEDED = (*SHIFTS, "WaterDepth", "RayCount")
@@ -60,7 +60,7 @@ def write_report(
     survey: Survey = NO_SURVEY,
     later: Later = NOTHING_LATER,
     overwrite: bool = False,
-) -> str:
+) -> Report:
     """Write ``report.html`` and ``figures/*.png`` about a corrected cloud.
 
     Parameters
@@ -84,8 +84,8 @@ def write_report(
 
     Returns
     -------
-    str
-        What the page says first, in a line.
+    Report
+        What the page says.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def write_report(
     for picture in report.pictures:
         write_bytes(figures / f"{picture.name}.png", picture.png(), overwrite=overwrite)
     write_text(out_dir / PAGE, render(report), overwrite=overwrite)
-    return in_short(report.tiles)
+    return report
 
 
 def _beside(folder: Path) -> list[tuple[str, str]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -49,7 +49,7 @@ from pcfix.options.survey import RunOptions
 from pcfix.refract.tally import Summary
 from pcfix.report.adjustment_text import all_notes
 from pcfix.report.comparison import evaluation, in_a_sentence
-from pcfix.report.first_screen import Survey, is_found
+from pcfix.report.first_screen import Survey, in_short, is_found
 from pcfix.report.page import Picture, Table
 from pcfix.report.run import Later, adjustment_sentence, adjustment_table, reason_sentence
 from pcfix.report.text import uncertainty_sentence
@@ -390,7 +390,7 @@ def _rasters(request: Request) -> list[str]:
 
 def _report(
     request: Request, files: Files, inputs: list[Path], done: dict[str, Any]
-) -> dict[str, str]:
+) -> dict[str, Any]:
     pictures: list[Picture] = []
     tables: list[Table] = []
     dod = None
@@ -411,7 +411,7 @@ def _report(
         resolution = float(dsm.res[0])
     figures = {} if compared is None else compared["figures"]
     later = Later(pictures, tables, verdict, figures, dod, resolution)
-    in_short = write_report(
+    report = write_report(
         files.cleaned,
         files.folder,
         summary=summary,
@@ -422,4 +422,10 @@ def _report(
         later=later,
         overwrite=True,
     )
-    return {"in_short": in_short, "uncertainty": uncertainty_sentence(summary, later.tvu)}
+    return {
+        "in_short": in_short(report.tiles),
+        "uncertainty": uncertainty_sentence(summary, later.tvu),
+        "title": report.title,
+        "tiles": [asdict(tile) for tile in report.tiles],
+        "place": report.place,
+    }

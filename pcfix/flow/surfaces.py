@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.runner import Chunk, read_ahead
+from pcfix.io.las.counts import check_count
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.water import read_water
 from pcfix.io.water_rasters import rasters_of_images, read_water_raster
@@ -49,21 +50,27 @@ class Points(NamedTuple):
     classes : array of uint8, shape (n,)
     sources : array of int, shape (n,), or None
         The point source of each, where the cloud has it: which of several clouds it came from.
+    colours : tuple of array, each of shape (n,), or None
+        Red, green and blue, where the cloud has them.
     """
 
     xyz: FloatArray
     heights: FloatArray | None
     classes: npt.NDArray[np.uint8]
     sources: IntArray | None = None
+    colours: tuple[npt.NDArray[Any], ...] | None = None
 
     def take(self, rows: IntArray) -> Points:
         """Return some of the points."""
         heights = None if self.heights is None else self.heights[rows]
         sources = None if self.sources is None else self.sources[rows]
-        return Points(self.xyz[rows], heights, self.classes[rows], sources)
+        colours = None if self.colours is None else tuple(one[rows] for one in self.colours)
+        return Points(self.xyz[rows], heights, self.classes[rows], sources, colours)
 
 
 """Some points: coordinates (n, 3), water heights where those are a dimension, classes."""
+
+RGB = ("red", "green", "blue")
 
 SAMPLE_POINTS = 2_000_000
 """Points of a cloud that are looked at for a surface, evenly spread."""
@@ -118,6 +125,7 @@ def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 def view_of(path: Path, jobs: int | None = None) -> CloudView:
     """Return the view of a LAS or LAZ file."""
     with LasSource(path, jobs) as source:
+        check_count(source)
         crs, points = metric_crs(source), len(source)
         low, high = np.array(source.header.mins[:2]), np.array(source.header.maxs[:2])
         software = str(source.header.generating_software or "")
@@ -148,8 +156,10 @@ def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Po
     heights = None
     if isinstance(water, WaterDimension):
         heights = source.dimension(chunk, water.name)
-    classes = np.asarray(chunk["classification"])
-    return Points(coordinates(chunk), heights, classes, np.asarray(chunk["point_source_id"]))
+    classes, sources = np.asarray(chunk["classification"]), np.asarray(chunk["point_source_id"])
+    has_colours = "red" in (chunk.array.dtype.names or ())
+    colours = tuple(chunk.array[one] for one in RGB) if has_colours else None
+    return Points(coordinates(chunk), heights, classes, sources, colours)
 
 
 def parts_of(chunks: Iterable[Points], water: WaterSurface) -> Iterable[Part]:

@@ -12,10 +12,11 @@ import numpy as np
 from pcfix.adjust.carry import Carrying
 from pcfix.adjust.evidence import Evidence
 from pcfix.ahead import Rehearsal
-from pcfix.flow.diagnosis import Poses, diagnose_in_passing
+from pcfix.flow.diagnosis import Poses, diagnose_in_passing, quick_ties
 from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.flow.learning import Learning
 from pcfix.flow.old_cameras import Blocks, ListedViews, old_tie_points
+from pcfix.flow.plausibility import CloudSample, Plausible, plausible
 from pcfix.flow.pose_errors import SAMPLE_POINTS, adjustment_of, pose_errors, sample_of, with_poses
 from pcfix.flow.shore import check_shoreline, write_shoreline
 from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of
@@ -36,7 +37,7 @@ from pcfix.model import (
 )
 from pcfix.options.correct import CorrectOptions, ScienceOptions
 from pcfix.refract.batch import Batch, Intersection, MadeWith, Survey
-from pcfix.refract.hypotheses import Verdict
+from pcfix.refract.hypotheses import CAUSES, Verdict
 from pcfix.refract.learning import as_told, for_own_water, weigh_lists
 from pcfix.refract.methods import correct, shift_of_land
 from pcfix.refract.regression import LEAST_BEYOND, BeyondRange, DepthRegression
@@ -107,7 +108,8 @@ class ThroughWater:
 
     def restart(self) -> None:
         """Forget the chunks so far."""
-        self._meeting = WaterMeeting(self.water)
+        self._meeting = WaterMeeting(self.water, deep=self._options.deep)
+        self._sample, self._plausible = CloudSample(self._view.points), Plausible()
         self._beyond: BeyondRange | None = None
         self._shore = None if self._options.shoreline is None else NearWater()
         if self.carrying is not None:
@@ -192,6 +194,7 @@ class ThroughWater:
             correction = step.whole(correction)
             self.carrying.add(step, correction)
         self._meeting.add(xyz, correction)
+        self._sample.add(points._replace(xyz=xyz), above.height_m)
         return correction
 
     @property
@@ -293,12 +296,19 @@ class ThroughWater:
 
     def look_back(self) -> None:
         """Warn if the poses are bent by what the correction was made with; write the shoreline."""
+        given = self._inputs.cameras
+        ties = quick_ties(self._inputs, self._view.crs) if len(self._cameras) else None
+        sought = (self.found.as_dict() or {}).get("model") == "auto"
+        doubts = () if sought else self._sample.level_doubts()
+        tested = plausible(self._cameras, self._sample.xyz, ties, doubts)
+        self._plausible = tested._replace(noted=CAUSES in self._told())
+        self._plausible.warn()
         if not len(self._cameras):
             self._poses = Poses(None, "not applicable: no cameras were given")
             return
-        given = self._inputs.cameras
         name = "cameras" if isinstance(given, Cameras) else str(given)
-        evidence = Evidence(self._cameras, name, self.water, self._options.refractive_index)
+        n = self._options.refractive_index
+        evidence = Evidence(self._cameras, name, self.water, n, ties=ties)
         self._poses = diagnose_in_passing(self._inputs, evidence, self._view, self.verdicts)
         self._write_shoreline()
 
@@ -312,7 +322,8 @@ class ThroughWater:
         """Return what was done on the user's behalf."""
         bent = self._poses.warning if self._poses else ""
         said = [one for one in (bent, self._no_poses) if one]
-        return [*self._told(), *self.found.notes, *self._own_notes, *self._meeting.notes, *said]
+        doubts, own = self._plausible.doubts, self._own_notes
+        return [*doubts, *self._told(), *self.found.notes, *own, *self._meeting.notes, *said]
 
     def figures(self, tally: Tally) -> dict[str, Any]:
         """Return what the summary says of depths and water."""
@@ -334,6 +345,7 @@ class ThroughWater:
             "told": notes,
             "poses": None if self._poses is None else self._poses.as_dict(),
             "shoreline": self._shoreline,
+            "fit": self._plausible.as_dict(),
         }
 
 

@@ -231,6 +231,12 @@ class UnsureOption(OptionSet):
 class RefractionOptions(BudgetOptions, MethodOptions, UnsureOption):
     """What the correction of points goes by."""
 
+    panel = Panel.WATER
+
+    deep: bool = option(
+        False, "Accept depths of more than 60 m, which else are taken for a wrong water level."
+    )
+
 
 @dataclass(frozen=True, kw_only=True)
 class PointsOptions(RefractionOptions, WaterPerImageOption):

@@ -262,6 +262,8 @@ class Summary:
     """Corrected points that flat obliques alone see; None where these are not withheld."""
     shoreline: dict[str, Any] | None = None
     """Where it was written, how many lines, how long, and their standard error."""
+    fit: dict[str, Any] | None = None
+    """What cameras, cloud and water were tested with; see `pcfix.flow.plausibility`."""
 
     @property
     def absorbed(self) -> bool | None:
@@ -299,7 +301,7 @@ class Summary:
         points are withheld, `shoreline` where one was written. Where no order of S-44 is claimed
         it is said why.
         """
-        some, own = ("labelling", "carried", "unsure", "poses", "shoreline"), ("told",)
+        some, own = ("labelling", "carried", "unsure", "poses", "shoreline", "fit"), ("told",)
         values = {name: vars(self)[name] for name in vars(self) if name not in (*some, *own)}
         more = {name: getattr(self, name) for name in some if getattr(self, name) is not None}
         if self.uncertainty is not None and self.why_no_order:

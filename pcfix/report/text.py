@@ -32,6 +32,11 @@ def summary_text(summary: Summary) -> str:
         f"corrected    {s.corrected:,} ({share(s.corrected, s.submerged)} of the submerged)",
     ]
     lines[2:2] = _carried(s)
+    if 2 * s.corrected < s.submerged:
+        lines[:0] = [
+            f"WARNING      only {s.corrected:,} of {s.submerged:,} submerged points were corrected"
+            f" ({share(s.corrected, s.submerged)}): see below why"
+        ]
     for reason, count in s.uncorrected.items():
         if count:
             lines.append(f"  not        {count:,}: {reason} ({_FATE[s.settings['uncorrected']]})")
@@ -63,6 +68,7 @@ def summary_text(summary: Summary) -> str:
         *_index(s),
         *_water_fit(s),
         *shoreline_lines(s.shoreline),
+        *([] if s.fit is None or not s.cameras else [f"fit          {s.fit['words']}"]),
         *([] if s.poses is None else [f"poses        {s.poses['words']}"]),
         *_uncertainty(s),
     ]

@@ -23,6 +23,7 @@ from pcfix.io.cameras import (
     pix4d,
     realitycapture,
     table,
+    tracks,
     unsupported,
 )
 from pcfix.io.cameras.formats import Angles, CameraFormat, Source, SparseReader
@@ -146,11 +147,21 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
     ------
     InputError
         If the format has no tie points, or the file has none.
+
+    Warns
+    -----
+    PcfixWarning
+        When numbers are not finite: such image places, and points with such a coordinate, are
+        left out.
     """
     source, form = _recognised(path, None, None)
     if not isinstance(form.reader, SparseReader):
         raise InputError(f"{source.path}: the format ({form.software}) has no tie points.")
-    return form.reader.tie_points(source, cameras)
+    found = form.reader.tie_points(source, cameras)
+    ties, note = tracks.finite(found)
+    if note:
+        warnings.warn(f"{source.path}: {note}", PcfixWarning, stacklevel=2)
+    return ties
 
 
 def _recognised(
