@@ -35,7 +35,7 @@ def first_step(request, folder):
 
 ORIGIN_M = (319900.0, 3842700.0, 0.0)
 GSD_M = 0.05
-STEPS = ["adjust", "correct", "clean", "dsm", "compare", "report"]
+STEPS = ["adjust", "correct", "clean", "dsm", "compare", "map", "report"]
 pytestmark = pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
 
 
