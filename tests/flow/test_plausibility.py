@@ -117,7 +117,7 @@ def test_tie_points_tell_of_poses(with_ties, fault):
 @rendered
 def test_tie_points_tell_of_heights(with_ties):
     """Cameras and tie points moved alike: an offset, or another datum."""
-    ties = replace(with_ties.ties, xyz=with_ties.ties.xyz + [0.0, 0.0, 47.0])
+    ties = replace(with_ties.ties, xyz=np.add(with_ties.ties.xyz, [0.0, 0.0, 47.0]))
     found = plausible(moved(with_ties, 0, 0, 47), with_ties.xyz, ties)
     assert "The tie points of the cameras lie 47.0 m above the cloud" in " ".join(found.doubts)
 
