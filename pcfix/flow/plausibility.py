@@ -197,14 +197,16 @@ def _directions(cameras: Cameras, xyz: FloatArray) -> Result:
         return Result("yaw along the flight lines")
     read = _common(heading - np.degrees(yaw))
     radians = read is not None and abs(read) <= MOST_TURN_DEG and np.ptp(yaw) <= 2.0 * np.pi
-    likely = "they fit as radians" if radians else "or the yaw counts from another direction"
+    if radians:
+        return Result(
+            doubt=f"The tops of the images point {abs(turn):.0f} degrees off the flight lines, on"
+            " all of them, but along them if the angles are read as radians: give them in degrees."
+        )
+    side = "left" if turn > 0.0 else "right"
     return Result(
-        doubt=f"The tops of the images point {abs(turn):.0f} degrees to the"
-        f" {'left' if turn > 0.0 else 'right'} of the flight lines, on all of them: the camera was"
-        f" mounted so, {likely}; check the convention and unit of the angles."
-        if not radians
-        else f"The tops of the images point {abs(turn):.0f} degrees off the flight lines, on all of"
-        " them, but along them if the angles are read as radians: give them in degrees."
+        doubt=f"The tops of the images point {abs(turn):.0f} degrees to the {side} of the flight"
+        " lines, on all of them: the camera was mounted so, or the yaw counts from another"
+        " direction; check the convention and unit of the angles."
     )
 
 
