@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from pcfix import Cameras, cli
+from tests.utils.beyond_frames import BEYOND_FRAMES, DEEP
 from tests.utils.clouds import (
     EAST_M,
     NORTH_M,
@@ -742,6 +743,8 @@ def test_tables_as_spreadsheets_write_them(
     assert run(*job()).returncode == 0
 
 
+@BEYOND_FRAMES
+@DEEP
 def test_the_bed_may_lie_below_zero(
     folder: Path, run: Callable[..., subprocess.CompletedProcess[str]]
 ) -> None:

@@ -196,17 +196,17 @@ def _directions(cameras: Cameras, xyz: FloatArray) -> Result:
     if abs(turn) <= MOST_TURN_DEG:
         return Result("yaw along the flight lines")
     read = _common(heading - np.degrees(yaw))
-    radians = read is not None and abs(read) <= MOST_TURN_DEG and np.ptp(yaw) <= 2.0 * np.pi
-    if radians:
+    if read is not None and abs(read) <= MOST_TURN_DEG and np.ptp(yaw) <= 2.0 * np.pi:
         return Result(
             doubt=f"The tops of the images point {abs(turn):.0f} degrees off the flight lines, on"
             " all of them, but along them if the angles are read as radians: give them in degrees."
         )
-    side = "left" if turn > 0.0 else "right"
+    if abs(turn) < 180.0 - MOST_TURN_DEG:  # as cameras are mounted in aircraft
+        return Result(unchecked="yaw (the images lie across the flight lines)")
     return Result(
-        doubt=f"The tops of the images point {abs(turn):.0f} degrees to the {side} of the flight"
-        " lines, on all of them: the camera was mounted so, or the yaw counts from another"
-        " direction; check the convention and unit of the angles."
+        doubt=f"The tops of the images point {abs(turn):.0f} degrees away from the flight lines, on"
+        " all of them: the camera was mounted so, or the yaw counts from another direction; check"
+        " the convention of the angles."
     )
 
 

@@ -14,8 +14,11 @@ from pcfix.lens.frames import ALL, NOT_DISTORTED, NOTHING, frames_of, holds, jud
 from pcfix.lens.imaging import project
 from pcfix.refract.intersect import TILE
 from tests.refract.test_kernels import interpreted_environment, same
+from tests.utils.beyond_frames import BEYOND_FRAMES
 from tests.utils.nightly import mostly_nightly
 from tests.utils.twins import image_slowly
+
+pytestmark = BEYOND_FRAMES
 
 snell = partial(pcfix.correct_points, method="snell", max_angle=None)
 
