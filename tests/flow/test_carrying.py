@@ -16,7 +16,7 @@ from pcfix.flow.old_cameras import paired, told_apart
 from pcfix.flow.run import Request, request_of
 from pcfix.model import Cameras, Outcome, Views
 from pcfix.report.text import summary_text
-from tests.utils.beyond_frames import BEYOND_FRAMES
+from tests.utils.beyond_frames import BEYOND_FRAMES, DEEP
 from tests.utils.clouds import (
     CAMERA_HEIGHT_M,
     EAST_M,
@@ -270,6 +270,7 @@ def test_undistorted_images_are_refused(old):
         paired(replace(old, lenses=cut), old)
 
 
+@DEEP
 def test_one_image_far_off_is_warned_of(cloud, old):
     centres = old.centres.copy()
     centres[4] += [0.2 * CAMERA_HEIGHT_M, 0.0, 0.0]

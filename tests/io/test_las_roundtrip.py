@@ -15,6 +15,7 @@ from laspy.vlrs.vlrlist import VLRList
 
 import pcfix
 from pcfix import PcfixError
+from pcfix.errors import GeometryError
 from pcfix.io.las.columns import COLUMNS, UNSURE, UPGRADE
 from tests.utils.beyond_frames import BEYOND_FRAMES, DEEP
 from tests.utils.clouds import (
@@ -490,7 +491,7 @@ class TestUncorrectedPoints:
 def test_points_with_parallel_rays_alone_cannot_be_corrected(tmp_path: Path) -> None:
     source = write_cloud(tmp_path / "cloud.las", 3)
     one = block().centres[4]
-    with pytest.raises(GeometryError, match="can be corrected .*: rays nearly parallel"):
+    with pytest.raises(GeometryError, match=r"can be corrected .*: rays nearly parallel"):
         round_trip(source, cameras=Cameras(("a", "b"), np.array([one, one])))
     assert [path.name for path in tmp_path.iterdir()] == ["cloud.las"]
 
