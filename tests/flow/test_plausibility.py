@@ -82,7 +82,7 @@ BY_TIES = {
 
 def test_images_across_the_flight_lines_are_said_not_to_be_tested(scene):
     """As cameras are mounted in aircraft, so that the base runs along the short side."""
-    found = plausible(turned(scene.cameras, 90), scene.xyz)
+    found = plausible(turned(scene, 90), scene.xyz)
     assert "yaw (the images lie across the flight lines)" in found.unchecked
 
 

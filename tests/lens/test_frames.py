@@ -128,7 +128,7 @@ def boxes(rng, count=400):
     return middle - half, middle + half
 
 
-@pytest.mark.parametrize("name", mostly_nightly(LENSES, "everything", "fisheye"))
+@pytest.mark.parametrize("name", mostly_nightly(LENSES, "everything"))
 def test_tiles_are_never_judged_wrongly(name):
     rng = np.random.default_rng(5)
     cameras = block(LENSES[name], k=8, seed=3)
