@@ -60,7 +60,7 @@ def _type(one: Option) -> Any:
     if one.metavar == "PATH" or os.PathLike[str] in one.kinds:
         return Path | None
     if one.parse is not None or one.type is Any:
-        return str | one.type if one.default == () else str | None
+        return str | one.type if isinstance(one.default, tuple) else str | None
     if one.default == ():
         return tuple[str, ...]
     return one.type | None if one.default is None else one.type
