@@ -186,20 +186,7 @@ def run_all(
     inputs = [path for some in read.values() for path in some]
     if request.m3c2:
         load_py4dgeo()
-    if not out_dir.parent.is_dir():
-        raise SettingError(f"{out_dir}: the folder {out_dir.parent} does not exist; make it first.")
-    out_dir.mkdir(exist_ok=True)
-    record = Record(out_dir / RECORD, request.record(), read, _since)
-    changed = ", ".join(record.changed)
-    if not (overwrite or record.resumes) and any(out_dir.iterdir()):
-        other = f"a run with another {changed}" if changed else "other files"
-        raise SettingError(
-            f"{out_dir}: holds {other}; add --overwrite to replace what it has, or give another"
-            " folder."
-        )
-    if changed:
-        say(f"{'changed':<9} {changed}: {record.first} and what follows is done"
-            " anew, what comes before is kept")  # fmt: skip
+    record = _begun(request, out_dir, read, overwrite, say)
     check_shoreline(request.shoreline, overwrite=overwrite or record.resumes, inputs=inputs)
     files = Files(out_dir)
     shore = [] if request.shoreline is None else [Path(request.shoreline)]
@@ -255,6 +242,31 @@ def run_all(
         lambda result: f": {result['in_short']}",
     )
     return files.report
+
+
+def _begun(
+    request: Request,
+    out_dir: Path,
+    read: dict[str, list[Path]],
+    overwrite: bool,
+    say: Callable[[str], None],
+) -> Record:
+    """Return the record of a folder, made where it is missing; refuse one of another run."""
+    if not out_dir.parent.is_dir():
+        raise SettingError(f"{out_dir}: the folder {out_dir.parent} does not exist; make it first.")
+    out_dir.mkdir(exist_ok=True)
+    record = Record(out_dir / RECORD, request.record(), read, _since)
+    changed = ", ".join(record.changed)
+    if not (overwrite or record.resumes) and any(out_dir.iterdir()):
+        other = f"a run with another {changed}" if changed else "other files"
+        raise SettingError(
+            f"{out_dir}: holds {other}; add --overwrite to replace what it has, or give another"
+            " folder."
+        )
+    if changed:
+        say(f"{'changed':<9} {changed}: {record.first} and what follows is done"
+            " anew, what comes before is kept")  # fmt: skip
+    return record
 
 
 _TITLES = {
