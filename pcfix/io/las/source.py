@@ -53,6 +53,9 @@ _PLACES = (
 CHUNK_POINTS = 1_000_000
 """Points that are worked on at a time, which bounds the memory."""
 
+HELD_BYTES = 200_000_000
+"""Point records of a cloud that are kept when it is gone through more than once."""
+
 
 class Record(VLR):  # type: ignore[misc]  # laspy is untyped
     """A record that remembers the bytes before its data."""
@@ -174,11 +177,20 @@ class LasSource:
     what laspy would not.
     """
 
-    def __init__(self, path: File, jobs: int | None = None, *, places_only: bool = False) -> None:
+    def __init__(
+        self,
+        path: File,
+        jobs: int | None = None,
+        *,
+        places_only: bool = False,
+        held: list[laspy.ScaleAwarePointRecord] | None = None,
+    ) -> None:
         """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable.
 
         With `places_only` nothing is unpacked but coordinates, classes, sources and colours, where
         the file holds its dimensions apart (LAZ of format 6 and up); the others may be zero then.
+        The chunks of a small cloud are kept in `held`, for the next to read it, and must not be
+        changed.
         """
         self.path = check_input(path)
         with las_errors(self.path):
@@ -188,16 +200,17 @@ class LasSource:
                 self.vlrs, self.evlrs = read_records(stream)
                 stream.seek(IDENTITY_PLACE)
                 self.identity = stream.read(_IDENTITY_SIZE)
-            some = _PLACES if places_only else laspy.DecompressionSelection.all()
-            self._reader = laspy.open(
-                self.path, laz_backend=backend(jobs), decompression_selection=some
-            )
+            self._reader = laspy.open(self.path, laz_backend=backend(jobs))
         self.header: laspy.LasHeader = self._reader.header
         try:
             self._check_header()
         except BaseException:
             self._reader.close()
             raise
+        small = len(self) * self.header.point_format.size <= HELD_BYTES
+        self._held = held if small else None
+        if places_only and self._held is None:
+            self._reader.decompression_selection = _PLACES
 
     def __enter__(self) -> LasSource:
         return self
@@ -223,6 +236,11 @@ class LasSource:
 
         An `InputError` if the file ends before its last point.
         """
+        if self._held is not None:
+            if sum(map(len, self._held)) == len(self):
+                yield from self._held
+                return
+            self._held.clear()
         read = 0
         while read < len(self):
             with las_errors(self.path):
@@ -233,6 +251,8 @@ class LasSource:
                     f" the file holds {read + len(points):,}; copy it again."
                 )
             read += len(points)
+            if self._held is not None:
+                self._held.append(points)
             yield points
 
     def dimension(self, points: laspy.ScaleAwarePointRecord, name: str) -> FloatArray:
