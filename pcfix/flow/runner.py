@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from pcfix.io.files import check_input, check_output, write_text
+from pcfix.io.las.part import cloud_part
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import LasSink, check_suffix, corrected_identity, output_evlrs
 from pcfix.kernels import telling
@@ -201,7 +202,7 @@ def file_task(
         If a file is missing, or would be replaced.
     """
     started = time.perf_counter()
-    source = check_input(input)
+    source = cloud_part(check_input(input), options)
     known = [one for one in (input, *reads) if isinstance(one, str | PathLike)]
     for path in (output, *more):
         known.append(check(path, overwrite=options.overwrite, inputs=known))

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter, defaultdict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import laspy
 import numpy as np
 import pytest
 
 import pcfix
-from pcfix import SettingError
-from pcfix.io.las import copc
+from pcfix import PcfixError, SettingError
+from pcfix.io.las import copc, part
+from pcfix.io.las.part import Box, cloud_part
+from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import LasSink
+from pcfix.options.shared import PartOptions
 from tests.utils.clouds import (
     EAST_M,
     NORTH_M,
     SIDE_M,
     WATER_M,
     block,
+    cameras_csv,
     random_cloud,
     read_raw,
     write_cloud,
 )
+from tests.utils.program import run_pcfix
 from tests.utils.real_pdal import needs_pdal, pdal
 
 if TYPE_CHECKING:
@@ -262,3 +268,111 @@ def test_pdal_reads_it(tmp_path: Path) -> None:
     found = laspy.read(tmp_path / "out.las")
     for name in [*"XYZ", "classification", "gps_time", "red"]:
         np.testing.assert_array_equal(np.sort(found[name]), np.sort(np.array(las[name])[inside]))
+
+
+# A part of a cloud
+
+
+WEST, SOUTH = EAST_M + 0.2 * SIDE_M, NORTH_M + 0.2 * SIDE_M
+BOX = (WEST, SOUTH, WEST + 40.0, SOUTH + 50.0)
+
+
+def inside(las: laspy.LasData) -> np.ndarray:
+    x, y = np.array(las.x), np.array(las.y)
+    return (x >= BOX[0]) & (x <= BOX[2]) & (y >= BOX[1]) & (y <= BOX[3])
+
+
+@pytest.mark.usefixtures("small_nodes")
+@pytest.mark.parametrize("name", ["cloud.las", "cloud.laz", "cloud.copc.laz"])
+@pytest.mark.parametrize("chunk", [1_000_000, 150])
+def test_bounds_read_what_lies_within(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, chunk: int
+) -> None:
+    monkeypatch.setattr("pcfix.io.las.source.CHUNK_POINTS", chunk)
+    las = random_cloud(7)
+    source = written(las, tmp_path / name)
+    how = {"cameras": block(), "water": WATER_M, "method": "snell", "max_angle": None}
+    summary = pcfix.correct_file(
+        source, tmp_path / "part.laz", bounds=BOX, summary=tmp_path / "part.json", **how
+    )
+    expected = {"points": int(inside(las).sum()), "of": 2000, "bounds": list(BOX),
+                "read_resolution": None}  # fmt: skip
+    assert summary.part == json.loads((tmp_path / "part.json").read_text())["part"] == expected
+    assert summary.points == len(laspy.read(tmp_path / "part.laz")) == expected["points"]
+    pcfix.correct_file(source, tmp_path / "whole.laz", **how)
+    whole = laspy.read(tmp_path / "whole.laz")
+    some = whole.points.array[inside(laspy.read(source))]
+    assert rows(tmp_path / "part.laz") == sorted(map(bytes, some))
+    ours = next(v for v in laspy.read(tmp_path / "part.laz").vlrs if v.user_id == "pcfix")
+    assert json.loads(ours.record_data)["part"] == expected
+    pcfix.restore_file(tmp_path / "part.laz", tmp_path / "back.laz")
+    before = laspy.read(source)
+    assert rows(tmp_path / "back.laz") == sorted(map(bytes, before.points.array[inside(before)]))
+
+
+@pytest.mark.usefixtures("small_nodes")
+def test_of_copc_only_the_nodes_within_are_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, unpacked = written(random_cloud(7), tmp_path / "tree.copc.laz"), []
+    of = part._unpacked
+    monkeypatch.setattr(part, "_unpacked", lambda *a: unpacked.append(len(a[1])) or of(*a))
+    with LasSource(cloud_part(source, PartOptions(bounds=BOX))) as cloud:
+        points = np.concatenate([one.array for one in cloud.chunks()])
+    assert len(points) == len(cloud) == inside(laspy.read(source)).sum()
+    assert 0 < sum(unpacked) / 2 < len(nodes_of(source)) / 2
+
+
+@pytest.mark.usefixtures("small_nodes")
+@pytest.mark.parametrize("resolution", [100.0, 20.0, 3.0])
+@pytest.mark.parametrize("box", [None, BOX])
+def test_coarse_levels_of_copc(tmp_path: Path, resolution: float, box: Box | None) -> None:
+    source = written(random_cloud(7), tmp_path / "tree.copc.laz")
+    summary = pcfix.label_file(
+        source, tmp_path / "part.las", water=WATER_M, bounds=box, read_resolution=resolution
+    )
+    corners = None if box is None else laspy.copc.Bounds(np.array(box[:2]), np.array(box[2:]))
+    with laspy.CopcReader.open(source) as reader:
+        expected = reader.query(bounds=corners, resolution=resolution)
+    found = laspy.read(tmp_path / "part.las")
+    np.testing.assert_array_equal(np.sort(found.gps_time), np.sort(expected["gps_time"]))
+    assert summary.part is not None
+    assert (summary.part["points"], summary.part["of"]) == (len(expected), 2000)
+
+
+def test_a_surface_model_of_a_part(tmp_path: Path) -> None:
+    source = written(random_cloud(7), tmp_path / "tree.copc.laz")
+    done = run_pcfix(
+        "dsm", source, "dsm.tif", "--bounds", ",".join(map(str, BOX)), "--resolution", 10,
+        folder=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    count = inside(laspy.read(source)).sum()
+    assert f"of {count:,} of 2,000, those within 456024,5432024,456064,5432074," in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"bounds": (0, 0, 1, 1)}, "no point lies within 0,0,1,1; it reaches from 456000."),
+        ({"read_resolution": 1.0}, "is not COPC, so it has no coarser levels to read; leave out"),
+        ({"bounds": "1,2,3"}, "bounds must be four numbers X0,Y0,X1,Y1 in metres, west and"),
+        ({"bounds": (2, 0, 1, 1)}, "bounds must be four numbers X0,Y0,X1,Y1 in metres, west and"),
+        ({"read_resolution": 0.0}, "read-resolution 0 must be above 0: give metres."),
+    ],
+)
+def test_parts_that_cannot_be(tmp_path: Path, options: dict[str, Any], message: str) -> None:
+    source = write_cloud(tmp_path / "cloud.laz", 7)
+    with pytest.raises(PcfixError) as refusal:
+        pcfix.label_file(source, tmp_path / "out.las", water=WATER_M, **options)
+    assert message in str(refusal.value)
+    assert list(tmp_path.iterdir()) == [source]
+
+
+def test_in_a_pipeline_the_reader_chooses(tmp_path: Path) -> None:
+    write_cloud(tmp_path / "cloud.laz", 7)
+    cameras_csv(tmp_path / "cameras.csv", block())
+    words = ["cloud.laz", "out.laz", "--cameras", "cameras.csv", "--water", WATER_M]
+    done = run_pcfix("pipeline", *words, "--bounds=0,0,1,1", folder=tmp_path)
+    assert done.returncode == 1
+    assert "give readers.copc its bounds and resolution" in done.stderr

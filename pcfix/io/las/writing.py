@@ -25,6 +25,7 @@ from pcfix.errors import InputError, SettingError
 from pcfix.io.files import replaced_when_whole
 from pcfix.io.las.columns import Column, column_scale, upgraded
 from pcfix.io.las.copc import CopcWriter, check_copc, is_copc
+from pcfix.io.las.part import part_report
 from pcfix.io.las.source import (
     IDENTITY_PLACE,
     LasSource,
@@ -76,7 +77,9 @@ def corrected_header(
         "steps": list(steps),
         **changes,
     }
-    note = _note(_SETTINGS, {**content, "before": before})
+    part = part_report(source.path)
+    told = content if part is None else {**content, "part": part}
+    note = _note(_SETTINGS, {**told, "before": before})
     _set_records(header, [*vlrs, note], described + records)
     return header
 
