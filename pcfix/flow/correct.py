@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
 from pcfix.flow.surfaces import Points, corners, file_points, own_water_of, points_of, view_of
 from pcfix.flow.through_water import Label, correct_checked
 from pcfix.io.las import columns
+from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource, centring_steps
 from pcfix.io.las.writing import corrected_header
 from pcfix.io.regressions import read_regression
@@ -237,11 +239,12 @@ def correct_file(
     step = Correcting(job_for(task.source, given))
     with threads(given.jobs), step.job.compiling():
         step.job.look_around(
-            partial(file_points, task.source, step.job.water, given.jobs, task.held)
+            partial(file_points, task.source, step.job.water, given.jobs, task.kept)
         )
         _run_until_it_fits(task, step)
     step.job.save_regression()
     result = step.job.summary(str(task.source), str(task.target), task.seconds)
+    result = replace(result, part=part_report(task.source))
     task.tell(result.as_dict())
     return result
 

@@ -36,6 +36,7 @@ from pcfix.grid.model import NO_LIGHT, DsmSummary, Tally, hillshade
 from pcfix.io import rasters
 from pcfix.io.crs import crs_words, parts
 from pcfix.io.files import Bins, check_output, replaced_when_whole, write_text
+from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.las.writing import is_ours
 from pcfix.io.styles import raster_style
@@ -304,6 +305,7 @@ class _Run:
             settings=asdict(settings),
             seconds=round(self.task.seconds, 3),
             values=tally.values(),
+            part=part_report(self.task.source),
         )
 
 

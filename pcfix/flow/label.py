@@ -24,6 +24,7 @@ from pcfix.flow.surfaces import (
     view_of,
 )
 from pcfix.io.las.columns import convert
+from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import labelling_vlr, noted_header
 from pcfix.kernels import threads
@@ -153,6 +154,7 @@ def label_file(
         labelling=step.labelling.report(),
         seconds=round(task.seconds, 3),
         warnings=list(step.labelling.notes),
+        part=part_report(task.source),
     )
     task.tell(result.as_dict())
     return result

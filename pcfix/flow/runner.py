@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from pcfix.io.files import check_input, check_output, write_text
+from pcfix.io.las.part import cloud_part
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import LasSink, check_suffix, corrected_identity, output_evlrs
 from pcfix.kernels import telling
@@ -70,7 +71,7 @@ class FileTask:
         Called with (points done, points in all), after each chunk and while it is corrected.
     started : float
         `time.perf_counter` then.
-    held : list
+    kept : list
         The chunks of a small cloud that is gone through more than once; see `LasSource`.
     """
 
@@ -81,7 +82,7 @@ class FileTask:
     jobs: int | None = None
     progress: Progress | None = None
     started: float = field(default_factory=time.perf_counter)
-    held: list[Chunk] = field(default_factory=list)
+    kept: list[Chunk] = field(default_factory=list)
 
     @property
     def seconds(self) -> float:
@@ -90,7 +91,7 @@ class FileTask:
 
     def run(self, step: Step) -> None:
         """Take every chunk through a step; the target appears when all went well."""
-        with LasSource(self.source, self.jobs, held=self.held or None) as source:
+        with LasSource(self.source, self.jobs, kept=self.kept or None) as source:
             header = step.header(source)
             identity = step.identity or corrected_identity(source)
             with LasSink(self.target, header, output_evlrs(source), identity, self.jobs) as sink:
@@ -204,7 +205,7 @@ def file_task(
         If a file is missing, or would be replaced.
     """
     started = time.perf_counter()
-    source = check_input(input)
+    source = cloud_part(check_input(input), options)
     known = [one for one in (input, *reads) if isinstance(one, str | PathLike)]
     for path in (output, *more):
         known.append(check(path, overwrite=options.overwrite, inputs=known))

@@ -34,7 +34,7 @@ LAST_LINES = 3
 
 def check_input(path: File) -> Path:
     """Return the path of a file; one that does not exist is an `InputError`."""
-    found = Path(path)
+    found = path if isinstance(path, Path) else Path(path)
     if not found.is_file():
         raise InputError(f"{found}: there is no such file.")
     return found

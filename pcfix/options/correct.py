@@ -22,6 +22,7 @@ from pcfix.options.shared import (
     LandRules,
     NeededOptions,
     Panel,
+    PartOptions,
     ShorelineOption,
     SubmergedOptions,
     SummaryOption,
@@ -262,6 +263,7 @@ class ScienceOptions(RefractionOptions, ResultOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectOptions(
+    PartOptions,
     ShorelineOption,
     JobOptions,
     SummaryOption,
@@ -326,7 +328,7 @@ class StageLabelOptions(LabelRules, SubmergedOptions, WaterOptions, NeededOption
 
 
 @dataclass(frozen=True, kw_only=True)
-class LabelOptions(JobOptions, SummaryOption, StageLabelOptions):
+class LabelOptions(PartOptions, JobOptions, SummaryOption, StageLabelOptions):
     """The options of ``pcfix label``."""
 
 

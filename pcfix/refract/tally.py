@@ -264,6 +264,8 @@ class Summary:
     """Where it was written, how many lines, how long, and their standard error."""
     fit: dict[str, Any] | None = None
     """What cameras, cloud and water were tested with; see `pcfix.flow.plausibility`."""
+    part: dict[str, Any] | None = None
+    """How many points were read, of how many, and by which bounds; None where all were."""
 
     @property
     def absorbed(self) -> bool | None:
@@ -298,10 +300,11 @@ class Summary:
 
         `labelling` is there where it had rules, `poses` where the light bends at a surface,
         `carried` where the cloud was taken from old cameras to adjusted ones, `unsure` where such
-        points are withheld, `shoreline` where one was written. Where no order of S-44 is claimed
-        it is said why.
+        points are withheld, `shoreline` where one was written, `part` where not all was read. Where
+        no order of S-44 is claimed it is said why.
         """
-        some, own = ("labelling", "carried", "unsure", "poses", "shoreline", "fit"), ("told",)
+        some = ("labelling", "carried", "unsure", "poses", "shoreline", "fit", "part")
+        own = ("told",)
         values = {name: vars(self)[name] for name in vars(self) if name not in (*some, *own)}
         more = {name: getattr(self, name) for name in some if getattr(self, name) is not None}
         if self.uncertainty is not None and self.why_no_order:
