@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -237,7 +238,9 @@ def correct_file(
     task = file_task(input, output, given, reads=paths_in(given), progress=progress)
     step = Correcting(job_for(task.source, given))
     with threads(given.jobs), step.job.compiling():
-        step.job.look_around(lambda: file_points(task.source, step.job.water, given.jobs))
+        step.job.look_around(
+            partial(file_points, task.source, step.job.water, given.jobs, task.kept)
+        )
         _run_until_it_fits(task, step)
     step.job.save_regression()
     result = step.job.summary(str(task.source), str(task.target), task.seconds)
@@ -272,8 +275,16 @@ class Correcting(Step):
     def chunk(self, points: Chunk, source: LasSource, header: Header) -> Chunk:
         """Return corrected points with their new dimensions, classes and flags."""
         correction = self.job.correct(points_of(points, source, self.job.water))
-        moved = columns.shift_steps(correction, header.scales)
-        new = columns.shifted(points, header, moved + np.array(self.steps))
+        new = columns.convert(points, header.point_format)
+        new.offsets = header.offsets
+        for rows, part in correction.parts():
+            self._fill(new[rows], part)
+        return new[~correction.uncorrected] if self.job.options.uncorrected == "drop" else new
+
+    def _fill(self, new: Chunk, correction: Correction) -> None:
+        """Move points, and write their new dimensions, classes and flags."""
+        moved = columns.shift_steps(correction, new.scales)
+        columns.move(new, moved + np.array(self.steps))
         withheld = np.asarray(new["withheld"]).astype(bool)
         withhold = self.job.options.uncorrected == "withhold"
         correction = columns.unsure_anew(correction, withheld)
@@ -282,7 +293,6 @@ class Correcting(Step):
         new.array["classification"][correction.corrected] = BATHYMETRIC_POINT
         flagged = withheld | columns.to_withhold(correction, withhold=withhold)
         new["withheld"][:] = flagged.astype(np.uint8)
-        return new[~correction.uncorrected] if self.job.options.uncorrected == "drop" else new
 
     def finish(self) -> None:
         """Refuse a result in which cloud, water and cameras did not meet."""

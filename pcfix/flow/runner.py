@@ -71,6 +71,8 @@ class FileTask:
         Called with (points done, points in all), after each chunk and while it is corrected.
     started : float
         `time.perf_counter` then.
+    kept : list
+        The chunks of a small cloud that is gone through more than once; see `LasSource`.
     """
 
     source: Path
@@ -80,6 +82,7 @@ class FileTask:
     jobs: int | None = None
     progress: Progress | None = None
     started: float = field(default_factory=time.perf_counter)
+    kept: list[Chunk] = field(default_factory=list)
 
     @property
     def seconds(self) -> float:
@@ -88,7 +91,7 @@ class FileTask:
 
     def run(self, step: Step) -> None:
         """Take every chunk through a step; the target appears when all went well."""
-        with LasSource(self.source, self.jobs) as source:
+        with LasSource(self.source, self.jobs, kept=self.kept or None) as source:
             header = step.header(source)
             identity = step.identity or corrected_identity(source)
             with LasSink(self.target, header, output_evlrs(source), identity, self.jobs) as sink:

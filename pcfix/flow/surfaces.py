@@ -144,10 +144,11 @@ def view_of(path: Path, jobs: int | None = None) -> CloudView:
 
 
 def file_points(
-    path: Path, water: WaterSurface | None, jobs: int | None = None
+    path: Path, water: WaterSurface | None, jobs: int | None = None, kept: list[Chunk] | None = None
 ) -> Iterator[Points]:
-    """Yield all points of a LAS or LAZ file, chunk by chunk."""
-    with LasSource(path, jobs, places_only=not isinstance(water, WaterDimension)) as source:
+    """Yield all points of a LAS or LAZ file, chunk by chunk, see `LasSource`."""
+    places = not isinstance(water, WaterDimension)
+    with LasSource(path, jobs, places_only=places, kept=kept) as source:
         yield from read_ahead((points_of(one, source, water) for one in source.chunks()), jobs)
 
 

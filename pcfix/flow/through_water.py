@@ -388,7 +388,8 @@ def correct_checked(
     depth = np.zeros(len(xyz))
     depth[rows] = below
     values = spread_over(found, rows, len(xyz))
-    values["shift_m"] = values["shift_m"] + _land_shift(batch, submerged)
+    if batch.made_with is not None:
+        values["shift_m"] = values["shift_m"] + _land_shift(batch, submerged)
     known = np.isfinite(surface.height_m)
     return Correction(
         apparent_xyz=xyz,
@@ -426,10 +427,8 @@ def spread_over(found: Intersection, rows: IntArray, n: int) -> dict[str, Any]:
     return full
 
 
-def _land_shift(batch: Batch, submerged: BoolArray) -> FloatArray | float:
+def _land_shift(batch: Batch, submerged: BoolArray) -> FloatArray:
     """Return the shift of points made with other cameras, shape (n, 3), zero where submerged."""
-    if batch.made_with is None:
-        return 0.0
     shift = np.zeros((len(batch), 3))
     rows = np.flatnonzero(~submerged)
     shift[rows] = shift_of_land(batch.take(rows))

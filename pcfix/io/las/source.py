@@ -55,6 +55,9 @@ _PLACES = (
 CHUNK_POINTS = 1_000_000
 """Points that are worked on at a time, which bounds the memory."""
 
+KEPT_BYTES = 200_000_000
+"""Point records of a cloud that are kept when it is gone through more than once."""
+
 
 class Record(VLR):  # type: ignore[misc]  # laspy is untyped
     """A record that remembers the bytes before its data."""
@@ -177,11 +180,20 @@ class LasSource:
     so; `held` is how many points the whole file has.
     """
 
-    def __init__(self, path: File, jobs: int | None = None, *, places_only: bool = False) -> None:
+    def __init__(
+        self,
+        path: File,
+        jobs: int | None = None,
+        *,
+        places_only: bool = False,
+        kept: list[laspy.ScaleAwarePointRecord] | None = None,
+    ) -> None:
         """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable.
 
         With `places_only` nothing is unpacked but coordinates, classes, sources and colours, where
         the file holds its dimensions apart (LAZ of format 6 and up); the others may be zero then.
+        The chunks of a small cloud are put into `kept`, for the next to read it, and must not be
+        changed.
         """
         self.path = check_input(path)
         with las_errors(self.path):
@@ -191,11 +203,7 @@ class LasSource:
                 self.vlrs, self.evlrs = read_records(stream)
                 stream.seek(IDENTITY_PLACE)
                 self.identity = stream.read(_IDENTITY_SIZE)
-            some = _PLACES if places_only else laspy.DecompressionSelection.all()
-            self._selection = some
-            self._reader = laspy.open(
-                self.path, laz_backend=backend(jobs), decompression_selection=some
-            )
+            self._reader = laspy.open(self.path, laz_backend=backend(jobs))
         self.header: laspy.LasHeader = self._reader.header
         self.held = len(self)
         try:
@@ -205,6 +213,11 @@ class LasSource:
         except BaseException:
             self._reader.close()
             raise
+        small = len(self) * self.header.point_format.size <= KEPT_BYTES
+        self._kept = kept if small else None
+        places_only = places_only and self._kept is None
+        self._selection = _PLACES if places_only else laspy.DecompressionSelection.all()
+        self._reader.decompression_selection = self._selection
 
     def __enter__(self) -> LasSource:
         return self
@@ -238,7 +251,16 @@ class LasSource:
 
         An `InputError` if the file ends before its last point.
         """
-        return self._chunks_of(self.path) if isinstance(self.path, CloudPart) else self._whole()
+        if self._kept is not None:
+            if sum(map(len, self._kept)) == len(self):
+                yield from self._kept
+                return
+            self._kept.clear()
+        some = self._chunks_of(self.path) if isinstance(self.path, CloudPart) else self._whole()
+        for points in some:
+            if self._kept is not None:
+                self._kept.append(points)
+            yield points
 
     def _whole(self) -> Iterator[laspy.ScaleAwarePointRecord]:
         read = 0
