@@ -340,6 +340,8 @@ def test_coarse_levels_of_copc(tmp_path: Path, resolution: float, box: Box | Non
     np.testing.assert_array_equal(np.sort(found.gps_time), np.sort(expected["gps_time"]))
     assert summary.part is not None
     assert (summary.part["points"], summary.part["of"]) == (len(expected), 2000)
+    ours = next(v for v in found.vlrs if v.user_id == "pcfix")
+    assert json.loads(ours.record_data)["part"] == summary.part
 
 
 def test_a_surface_model_of_a_part(tmp_path: Path) -> None:
