@@ -328,6 +328,7 @@ class LasSink:
             packing: Any = backend(self._jobs)
             if is_copc(self._path):
                 packing = self._copc = CopcWriter(draft.parent, self._jobs)
+                stack.callback(self._copc.forget)
             self._writer = laspy.LasWriter(
                 self._stream, self.header, do_compress=laz, laz_backend=packing, closefd=False
             )
