@@ -28,14 +28,19 @@ class PcfixWarning(UserWarning):
     """Something that was done on the user's behalf and that they should know of."""
 
 
-def photo_library(name: str) -> Any:
-    """Return a library of the extra ``photos``, or say how to get it."""
+def optional_library(name: str, extra: str, who: str) -> Any:
+    """Return a library of an extra, or say who needs it and how to get it."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
         raise InputError(
-            f"Photographs need {name}, which is not installed; run: pip install 'pcfix[photos]'."
+            f"{who} needs {name}, which is not installed; run: pip install 'pcfix[{extra}]'."
         ) from error
+
+
+def photo_library(name: str) -> Any:
+    """Return a library of the extra ``photos``, or say how to get it."""
+    return optional_library(name, "photos", "Work on photographs")
 
 
 def show_warning(

@@ -10,9 +10,11 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
+from pcfix.errors import SettingError
 from pcfix.io.files import check_input, check_output, write_text
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import LasSink, check_suffix, corrected_identity, output_evlrs
+from pcfix.io.tiles import Tiles, inputs_of
 from pcfix.options.declare import File
 
 if TYPE_CHECKING:
@@ -50,6 +52,8 @@ class FileTask:
         Where the summary goes, as JSON.
     progress : callable or None
         Called with (points done, points in all) after each chunk.
+    is_tile : bool
+        Whether it is a part of a cloud; `Step.finish` is about a whole one.
     started : float
         `time.perf_counter` then.
     """
@@ -60,6 +64,7 @@ class FileTask:
     overwrite: bool = False
     jobs: int | None = None
     progress: Progress | None = None
+    is_tile: bool = False
     started: float = field(default_factory=time.perf_counter)
 
     @property
@@ -80,7 +85,8 @@ class FileTask:
                     done += count
                     if self.progress is not None:
                         self.progress(done, len(source))
-                step.finish()
+                if not self.is_tile:
+                    step.finish()
 
     def tell(self, summary: dict[str, Any]) -> None:
         """Write the summary, where one is wanted."""
@@ -115,7 +121,7 @@ def check_cloud(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> 
 
 
 def file_task(
-    input: File,
+    input: File | Tiles,
     output: File,
     options: Any,
     *,
@@ -129,6 +135,7 @@ def file_task(
     Parameters
     ----------
     input, output : path
+        The input may be many files.
     options : OptionSet
         With overwrite, and where the command has them summary and jobs.
     reads : iterable
@@ -145,11 +152,16 @@ def file_task(
         If a file is missing, or would be replaced.
     """
     started = time.perf_counter()
-    source = check_input(input)
-    known = [one for one in (input, *reads) if isinstance(one, str | PathLike)]
+    if getattr(options, "scheduler", None) is not None and not isinstance(input, Tiles):
+        raise SettingError(
+            "scheduler is of use with many files alone: give a folder, glob or list of tiles, or"
+            " leave it out."
+        )
+    source = Path(str(input)) if isinstance(input, Tiles) else check_input(input)
+    known = [one for one in (*inputs_of(input), *reads) if isinstance(one, str | PathLike)]
     for path in (output, *more):
         known.append(check(path, overwrite=options.overwrite, inputs=known))
     check_summary(options, known)
     target = Path(output)
     summary, jobs = (getattr(options, name, None) for name in ("summary", "jobs"))
-    return FileTask(source, target, summary, options.overwrite, jobs, progress, started)
+    return FileTask(source, target, summary, options.overwrite, jobs, progress, started=started)

@@ -14,15 +14,17 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
+from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import InputError, SettingError, optional_library
 from pcfix.grid.lattice import Window
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.declare import File
+from pcfix.sums import Counted
 
 if TYPE_CHECKING:
     from pcfix.clean.neighbours import Empty
@@ -32,11 +34,31 @@ LAST_LINES = 3
 """Of what another program says when it fails."""
 
 
+def is_remote(path: Any) -> bool:
+    """Whether a path is the address of something in an object store, as ``s3://bucket/key``."""
+    return "://" in str(path)
+
+
+def path_of(path: Any) -> Path:
+    """Return a path as an object, also that of an object store, which reads by fsspec."""
+    if not is_remote(path):
+        return Path(path)
+    upath = optional_library("upath", "remote", f"{path}: reading from object stores")
+    try:
+        return cast(Path, upath.UPath(path))
+    except (ImportError, ValueError) as error:  # of a store that fsspec does not know
+        raise InputError(f"{path}: cannot be read ({error}).") from error
+
+
 def check_input(path: File) -> Path:
     """Return the path of a file; one that does not exist is an `InputError`."""
-    found = Path(path)
-    if not found.is_file():
-        raise InputError(f"{found}: there is no such file.")
+    found, why = path_of(path), "there is no such file"
+    try:
+        is_there = found.is_file()
+    except Exception as error:  # each object store has errors of its own
+        is_there, why = False, f"cannot be read ({error})"
+    if not is_there:
+        raise InputError(f"{found}: {why}.")
     return found
 
 
@@ -53,6 +75,8 @@ def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) ->
 
     A `SettingError` if it is one of the inputs, exists without `overwrite`, or has no folder.
     """
+    if is_remote(path):
+        raise SettingError(f"{path}: outputs go to a folder; write there, and copy them after.")
     target = Path(path)
     for source in inputs:
         both = target.exists() and Path(source).exists()
@@ -110,6 +134,30 @@ def sha256(path: Path) -> str:
     """Return the checksum of a file, as hexadecimal digits."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def digest_of(path: Path) -> str:
+    """Return the checksum of the content of a file, or of all files in a folder."""
+    if path.is_dir():
+        parts = {str(p.relative_to(path)): digest_of(p) for p in path.rglob("*") if p.is_file()}
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+    return sha256(path)
+
+
+def write_counted(path: Path, note: dict[str, Any], counted: Counted) -> None:
+    """Write arrays and a note into one file, whole or not at all."""
+    with replaced_when_whole(path) as draft, draft.open("wb") as stream:
+        np.savez_compressed(stream, **{**counted, "note": np.array(json.dumps(note))})  # type: ignore
+
+
+def read_counted(path: Path) -> tuple[dict[str, Any], Counted]:
+    """Return the note and the arrays of a file; nothing where there is none that is whole."""
+    try:
+        with np.load(path, allow_pickle=False) as held:
+            counted = {name: held[name] for name in held.files}
+        return json.loads(str(counted.pop("note"))), counted
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+        return {}, {}
 
 
 def file_state(path: Path) -> dict[str, Any]:

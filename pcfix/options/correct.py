@@ -18,13 +18,13 @@ from pcfix.options.declare import (
 from pcfix.options.shared import (
     IndexOptions,
     InputOptions,
-    JobOptions,
     LandRules,
     NeededOptions,
     Panel,
     ShorelineOption,
     SubmergedOptions,
     SummaryOption,
+    TileOptions,
     WaterOptions,
 )
 
@@ -250,7 +250,7 @@ class ScienceOptions(RefractionOptions, ResultOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectOptions(
-    ShorelineOption, JobOptions, SummaryOption, ScienceOptions, SubmergedOptions, InputOptions
+    ShorelineOption, TileOptions, SummaryOption, ScienceOptions, SubmergedOptions, InputOptions
 ):
     """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
 
@@ -308,7 +308,7 @@ class StageLabelOptions(LabelRules, SubmergedOptions, WaterOptions, NeededOption
 
 
 @dataclass(frozen=True, kw_only=True)
-class LabelOptions(JobOptions, SummaryOption, StageLabelOptions):
+class LabelOptions(TileOptions, SummaryOption, StageLabelOptions):
     """The options of ``pcfix label``."""
 
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.model import BoolArray, Correction, FloatArray, IntArray, Outcome
+from pcfix.sums import Sums
 
 COVERAGE_95 = 1.96
 """Standard errors of a Gaussian quantity within which 95 % lie, as S-44 takes it in one dimension.
@@ -66,11 +67,13 @@ def share_of_orders(within: IntArray, count: int) -> dict[str, float]:
     return {o.name: round(int(n) / count, 6) for o, n in zip(ORDERS, within, strict=True)}
 
 
-class _Histogram:
+class _Histogram(Sums):
     """Sum and percentiles, to a millimetre, of values that are added array by array.
 
     Values beyond `low_m` and `high_m` share the last bins, which only percentiles would notice.
     """
+
+    added = ("count", "_sum_m", "_bins")
 
     def __init__(self, low_m: float, high_m: float) -> None:
         self.count = 0
@@ -92,8 +95,10 @@ class _Histogram:
         return place * _BIN_M + self._low_m
 
 
-class UncertaintyTally:
+class UncertaintyTally(Sums):
     """Adds up standard errors of Z."""
+
+    added, most = ("_sigma", "_within"), ("_most_m",)
 
     def __init__(self) -> None:
         self._sigma = _Histogram(0.0, 10.0)
@@ -125,8 +130,15 @@ class UncertaintyTally:
         }
 
 
-class Tally:
+class Tally(Sums):
     """Counts, extremes, and histograms of shift and standard error in Z, over all chunks so far."""
+
+    added = (
+        *("points", "water_unknown", "unsure", "rays", "outcomes"),
+        *("_depth_sum_m", "_shift", "_uncertainty"),
+    )
+    least = ("low", "lowest_water_m", "_depth_low_m")
+    most = ("camera_used", "high", "incidence_deg", "_depth_high_m")
 
     def __init__(self, cameras: int) -> None:
         self.points = 0

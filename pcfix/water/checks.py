@@ -19,6 +19,7 @@ from pcfix.model import (
     WaterRaster,
     WaterSurface,
 )
+from pcfix.sums import Sums
 from pcfix.water.surface import surface_above
 
 MOST_TILT = 0.05
@@ -168,8 +169,11 @@ def _tilt_of(xyz: FloatArray) -> float:
     return float(np.hypot(*slope))
 
 
-class WaterMeeting:
+class WaterMeeting(Sums):
     """How cloud and water lie to each other, added up chunk by chunk."""
+
+    added = ("_points", "_submerged", "_uncovered", "_uncovered_low")
+    least, most = ("_low_m", "_least_depth_m", "_lowest_water_m"), ("_high_m",)
 
     def __init__(self, water: WaterSurface) -> None:
         self._water = water
