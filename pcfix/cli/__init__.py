@@ -20,6 +20,7 @@ app = App(
     version_flags=["--version"],
     help_flags=["--help", "-h"],
     help_format="plaintext",
+    suppress_keyboard_interrupt=False,
 )
 for place, (command, example) in enumerate(EXAMPLES):
     summary, _, more = str(command.__doc__).partition("\n")
@@ -47,6 +48,8 @@ def main(tokens: Sequence[str] | None = None) -> None:
         _stop(f"{error}\n{_try(arguments)}", 2)
     except PcfixError as error:
         _stop(str(error), 1)
+    except KeyboardInterrupt as stop:
+        _stop(str(stop) or "stopped.", 130)
     except BrokenPipeError:
         sys.exit(1)
 

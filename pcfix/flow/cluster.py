@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing import get_context
 from types import ModuleType
 from typing import Any, TypeVar
@@ -20,19 +21,21 @@ from pcfix.kernels import cores
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 Work = Callable[[bytes, Task, int | None], Result]
+Run = Callable[..., Iterator[Any]]
 
 WAIT_S = 10
 """For a scheduler to answer, and for its first worker."""
 
 
 def in_processes(
-    jobs: int | None, work: Work[Task, Result], shared: bytes, tasks: Sequence[Task]
+    jobs: int | None, most: int, work: Work[Task, Result], shared: bytes, tasks: Sequence[Task]
 ) -> Iterator[tuple[Task, Result | str]]:
-    """Yield tasks with their results, as they are done by so many processes.
+    """Yield tasks with their results, or why they failed, as they are done.
 
-    A single task, or a single job, needs no other process.
+    So many processes at most share so many jobs, all cores by default. A single one is this
+    process. What is shared goes to all tasks.
     """
-    count = min(jobs or cores(), len(tasks))
+    count = min(most, jobs or cores(), len(tasks))
     if count <= 1:
         for task in tasks:
             yield task, work(shared, task, jobs)
@@ -88,10 +91,9 @@ def version_here() -> str:
     return version.__version__
 
 
-def on_cluster(
-    address: str, work: Work[Task, Result], shared: bytes, tasks: Sequence[Task]
-) -> Iterator[tuple[Task, Result | str]]:
-    """Yield tasks with their results, or why they failed, as the workers of a cluster do them.
+@contextmanager
+def on_cluster(address: str) -> Iterator[Run]:
+    """Give what runs tasks on the workers of a cluster; see `in_processes`.
 
     Raises
     ------
@@ -108,18 +110,24 @@ def on_cluster(
         ) from error
     with client:
         _check_workers(client, address)
-        everywhere = client.scatter(shared, broadcast=True)
-        futures = {client.submit(work, everywhere, one, 1, pure=False): one for one in tasks}
-        try:
-            for future in distributed.as_completed(list(futures)):
-                task = futures[future]
-                if future.status == "finished":
-                    yield task, future.result()
-                else:
-                    why = future.exception() if future.status == "error" else future.status
-                    yield task, f"{task}: was given up by the cluster ({why})."
-        finally:
-            client.cancel(list(futures))
+        yield partial(_on_workers, client, distributed.as_completed)
+
+
+def _on_workers(
+    client: Any, as_completed: Any, work: Work[Task, Result], shared: bytes, tasks: Sequence[Task]
+) -> Iterator[tuple[Task, Result | str]]:
+    everywhere = client.scatter(shared, broadcast=True)  # a worker that is lost takes its own
+    futures = {client.submit(work, everywhere, one, 1, pure=False): one for one in tasks}
+    try:
+        for future in as_completed(list(futures), loop=client.loop):
+            task = futures[future]
+            if future.status == "finished":
+                yield task, future.result()
+            else:
+                why = future.exception() if future.status == "error" else future.status
+                yield task, f"{task}: was given up by the cluster ({why})."
+    finally:
+        client.cancel(list(futures))
 
 
 def _check_workers(client: Any, address: str) -> None:

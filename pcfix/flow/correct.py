@@ -19,6 +19,7 @@ from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
 from pcfix.flow.surfaces import file_points, first_points, points_of, view_of
 from pcfix.flow.through_water import Label, correct_checked
 from pcfix.flow.tiles import TiledRun
+from pcfix.io.files import local_path
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps
 from pcfix.io.las.writing import corrected_header
@@ -227,7 +228,7 @@ def correct_file(
     given = taken(CorrectOptions, options, keywords, "correct_file")
     tiles = tiles_of(input)
     if tiles is not None:
-        run = TiledRun("correct", tiles, Path(output), given, progress)
+        run = TiledRun("correct", tiles, local_path(output), given, progress)
         return run.run(partial(_step_over, given), partial(_summary_over, run), Summary)
     task = file_task(single(input), output, given, reads=paths_in(given), progress=progress)
     step = Correcting(job_for(task.source, given))

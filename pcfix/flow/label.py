@@ -25,6 +25,7 @@ from pcfix.flow.surfaces import (
     view_of,
 )
 from pcfix.flow.tiles import TiledRun
+from pcfix.io.files import local_path
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import labelling_vlr, noted_header
@@ -144,7 +145,7 @@ def label_file(
     given = taken(LabelOptions, options, keywords, "label_file")
     tiles = tiles_of(input)
     if tiles is not None:
-        run = TiledRun("label", tiles, Path(output), given, progress)
+        run = TiledRun("label", tiles, local_path(output), given, progress)
         return run.run(
             lambda part: _step_for(part, given),
             lambda step: _summary(step, str(tiles), str(output), run.seconds),

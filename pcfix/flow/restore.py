@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.flow.runner import Chunk, FileTask, Header, Step, file_task
 from pcfix.flow.tiles import TiledRun
+from pcfix.io.files import local_path
 from pcfix.io.las.columns import (
     SHIFTS,
     UNSURE,
@@ -63,7 +63,7 @@ def restore_file(
     given = taken(TileOptions, options, keywords, "restore_file")
     tiles = tiles_of(input)
     if tiles is not None:
-        run = TiledRun("restore", tiles, Path(output), given, progress)
+        run = TiledRun("restore", tiles, local_path(output), given, progress)
         return run.run(lambda _: Restoring(), lambda step: step.points)
     task = file_task(single(input), output, given, progress=progress)
     step = Restoring()

@@ -12,7 +12,9 @@ import pickle
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from time import perf_counter
@@ -20,17 +22,20 @@ from typing import Any, Protocol
 
 from pcfix import version
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
-from pcfix.flow.cluster import in_processes, on_cluster
-from pcfix.flow.runner import FileTask, Progress, Step, check_cloud, check_summary
-from pcfix.io.files import digest_of, path_of, read_counted, write_counted
+from pcfix.flow.cluster import Run, in_processes, on_cluster
+from pcfix.flow.runner import FileTask, Progress, Step, check_cloud, check_summary, write_summary
+from pcfix.io.files import digest_of, is_remote, path_of, read_counted, write_counted
 from pcfix.io.tiles import BrokenTileError, Tiles, output_name
+from pcfix.io.vectors import LAYER_MARK
 from pcfix.kernels import threads
-from pcfix.options.declare import File, OptionSet, options_of
+from pcfix.options.declare import File, options_of
 from pcfix.sums import Counted
 
 RECORDS = ".pcfix"
 HOW = ("overwrite", "jobs", "scheduler", "summary")
 """Options on which no output depends."""
+POINTS_A_PROCESS = 500_000
+"""So many take about as long as another process takes to begin."""
 
 
 class TileStep(Step, Protocol):
@@ -166,60 +171,72 @@ class TiledRun:
         """
         self._check_folder()
         check_summary(self.options, self.tiles.paths)
-        whole = self._key()
-        work = self._work(whole)
-        found = {tile: tile.finished() for tile in work}
+        key = self._key()
+        work = self._work(key)
+        found = {tile: tile.finished() for tile in work.values()}
         done = {tile: counted for tile, counted in found.items() if counted is not None}
         result_file = self.folder / RECORDS / f"{self.name}.npz"
         note, _ = read_counted(result_file)
-        if kind and len(done) == len(work) and not self.tiles.broken and note.get("key") == whole:
+        if kind and len(done) == len(work) and not self.tiles.broken and note.get("key") == key:
             return self._told(kind(**note["result"]))
-        before = set(done)
-        for tile in work:
-            if tile not in before:
-                check_cloud(tile.target, overwrite=self.options.overwrite, inputs=self.tiles.paths)
-        step, tiles = self._made(make)
-        failed = {path_of(path).name: why for path, why in tiles.broken.items()}
-        todo = [
-            tile
-            for tile, path in zip(work, self.tiles.paths, strict=True)
-            if tile not in done and path in tiles.paths
-        ]
-        with threads(self.options.jobs):
+        todo = [tile for tile in work.values() if tile not in done]
+        for tile in todo:
+            check_cloud(tile.target, overwrite=self.options.overwrite, inputs=self.tiles.paths)
+        points = sum(tile.points for tile in todo)
+        with threads(self.options.jobs), self._machines(points) as machines:
+            step, tiles = self._made(make)
             step.begin(0)
-            for tile, outcome in self._results(step, todo):
+            todo = [work[path] for path in tiles.paths if work[path] not in done]
+            failed = list(tiles.broken.values())
+            self._work_on(partial(machines, do_tile, pickle.dumps(step), todo), done, failed)
+            if done:
+                self._count(step, [tile for tile in work.values() if tile in done], done, todo)
+                result = self._told(tell(step))
+        if failed:
+            raise InputError(
+                f"{self.tiles}: {len(failed)} of {len(work) + len(self.tiles.broken)} files failed,"
+                " the others are finished; the same command goes on, with --overwrite where files"
+                " were changed, as each counts for all:\n" + "\n".join(f"  {one}" for one in failed)
+            )
+        if kind:
+            write_counted(result_file, {"key": key, "result": vars(result)}, {})
+        return result
+
+    def _work_on(self, run: Run, done: dict[Tile, Counted], failed: list[str]) -> None:
+        """Run tasks, and add what they counted to what is done, or why they failed."""
+        total = sum(self.tiles.points)
+        try:
+            for tile, outcome in run():
                 if isinstance(outcome, str):
-                    failed[tile.source.name] = outcome
+                    failed.append(outcome)
                 else:
                     done[tile] = outcome
                 if self.progress is not None:
-                    self.progress(sum(one.points for one in done), len(self.tiles))
-            for tile in work:  # in their order, so that no sum depends on who was first
-                if tile in done:
-                    step.add_counted(done[tile])
-            try:
-                if done:
-                    step.finish()
-            except PcfixError:
-                for tile in done.keys() - before:
-                    tile.record.unlink(missing_ok=True)
-                    tile.target.unlink(missing_ok=True)
-                raise
-        result = self._told(tell(step)) if done else None
-        if failed:
-            raise InputError(
-                f"{self.tiles}: {len(failed)} of {len(work)} files failed, the others are finished"
-                " (the same command goes on, once these are mended):\n"
-                + "\n".join(f"  {why}" for _, why in sorted(failed.items()))
-            )
-        if kind:
-            write_counted(result_file, {"key": whole, "result": vars(result)}, {})
-        return result
+                    self.progress(sum(one.points for one in done), total)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"stopped; {len(done)} of {len(self.tiles.paths)} files are finished, the same"
+                " command goes on."
+            ) from None
+
+    @staticmethod
+    def _count(
+        step: TileStep, work: list[Tile], done: dict[Tile, Counted], new: list[Tile]
+    ) -> None:
+        """Let the step count all files, and judge; what it refuses does not stay."""
+        for tile in work:  # in their order, so that no sum depends on who was first
+            step.add_counted(done[tile])
+        try:
+            step.finish()
+        except PcfixError:
+            for tile in new:
+                tile.record.unlink(missing_ok=True)
+                tile.target.unlink(missing_ok=True)
+            raise
 
     def _told(self, result: Any) -> Any:
-        FileTask(
-            self.folder, self.folder, getattr(self.options, "summary", None), self.options.overwrite
-        ).tell(result.as_dict() if hasattr(result, "as_dict") else {"points": result})
+        if hasattr(result, "as_dict"):
+            write_summary(self.options, result.as_dict())
         return result
 
     def _check_folder(self) -> None:
@@ -256,13 +273,13 @@ class TiledRun:
             ]
         return sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
 
-    def _work(self, key: str) -> list[Tile]:
-        """Return a tile for each file."""
-        work, row = [], 0
+    def _work(self, key: str) -> dict[Path, Tile]:
+        """Return a tile for each file, in their order."""
+        work, row = {}, 0
         for path, points in zip(self.tiles.paths, self.tiles.points, strict=True):
-            source = path if "://" in str(path) else path.resolve()
+            source = path if is_remote(path) else path.resolve()
             target = self.folder.resolve() / output_name(path)
-            work.append(Tile(source, target, points, row, key, version.__version__))
+            work[path] = Tile(source, target, points, row, key, version.__version__)
             row += points
         return work
 
@@ -276,20 +293,29 @@ class TiledRun:
             except BrokenTileError as error:
                 tiles = tiles.without(error.path, str(error))
 
-    def _results(self, step: TileStep, todo: list[Tile]) -> Iterator[tuple[Tile, Counted | str]]:
-        pickled = pickle.dumps(step)
-        if self.options.scheduler is not None:
-            return on_cluster(self.options.scheduler, do_tile, pickled, todo)
-        return in_processes(self.options.jobs, do_tile, pickled, todo)
+    @contextmanager
+    def _machines(self, points: int) -> Iterator[Run]:
+        """Give what runs tasks of so many points."""
+        if self.options.scheduler is None:
+            jobs = self.options.jobs
+            yield partial(in_processes, jobs, jobs or 1 + points // POINTS_A_PROCESS)
+        else:
+            with on_cluster(self.options.scheduler) as run:
+                yield run
 
 
 def _plain(value: Any) -> Any:
-    """Return an option as JSON holds it; of a file or a folder its content counts."""
-    if isinstance(value, OptionSet):
-        return value.as_dict()
+    """Return an option as JSON holds it; of files it is their content, and what lies beside them.
+
+    A shapefile, a model of several files or a sensor is named by one of them.
+    """
     if isinstance(value, str) or hasattr(value, "joinpath"):
-        path = Path(str(value).partition("|")[0])
-        return digest_of(path) if path.exists() else str(value)
+        path = Path(str(value).partition(LAYER_MARK)[0])
+        if not path.exists():
+            return str(value)
+        beside = path.resolve().parent.iterdir()
+        files = [one for one in beside if one.stem == path.stem or one.name == "sensor.csv"]
+        return [[one.name, digest_of(one)] for one in sorted(files)]
     if value is None or isinstance(value, int | float | tuple):
         return value
     return sha256(pickle.dumps(value)).hexdigest()

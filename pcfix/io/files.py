@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import mimetypes
 import os
+import re
 import shutil
 import subprocess
 import tempfile
@@ -30,13 +32,14 @@ if TYPE_CHECKING:
     from pcfix.clean.neighbours import Empty
 
 
+LARGE_BYTES = 2**26
 LAST_LINES = 3
 """Of what another program says when it fails."""
 
 
 def is_remote(path: Any) -> bool:
     """Whether a path is the address of something in an object store, as ``s3://bucket/key``."""
-    return "://" in str(path)
+    return re.match(r"\w{2,}:/", str(path)) is not None  # of s3:// a Path leaves s3:/
 
 
 def path_of(path: Any) -> Path:
@@ -45,9 +48,16 @@ def path_of(path: Any) -> Path:
         return Path(path)
     upath = optional_library("upath", "remote", f"{path}: reading from object stores")
     try:
-        return cast(Path, upath.UPath(path))
+        return cast(Path, upath.UPath(re.sub(":/+", "://", str(path), count=1)))
     except (ImportError, ValueError) as error:  # of a store that fsspec does not know
         raise InputError(f"{path}: cannot be read ({error}).") from error
+
+
+def local_path(path: File) -> Path:
+    """Return the path of an output; a `SettingError` if it is in an object store."""
+    if is_remote(path):
+        raise SettingError(f"{path}: outputs go to a folder; write there, and copy them after.")
+    return Path(path)
 
 
 def check_input(path: File) -> Path:
@@ -75,9 +85,7 @@ def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) ->
 
     A `SettingError` if it is one of the inputs, exists without `overwrite`, or has no folder.
     """
-    if is_remote(path):
-        raise SettingError(f"{path}: outputs go to a folder; write there, and copy them after.")
-    target = Path(path)
+    target = local_path(path)
     for source in inputs:
         both = target.exists() and Path(source).exists()
         if target.samefile(source) if both else target.resolve() == Path(source).resolve():
@@ -137,11 +145,20 @@ def sha256(path: Path) -> str:
 
 
 def digest_of(path: Path) -> str:
-    """Return the checksum of the content of a file, or of all files in a folder."""
-    if path.is_dir():
-        parts = {str(p.relative_to(path)): digest_of(p) for p in path.rglob("*") if p.is_file()}
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
-    return sha256(path)
+    """Return the checksum of the content of a file, or of a folder of a project.
+
+    There images, videos and whatever is large go by size and time.
+    """
+    if not path.is_dir():
+        return sha256(path)
+    parts = []
+    for one in sorted(path.rglob("*")):
+        kind = mimetypes.guess_type(one.name)[0] or ""
+        if one.is_file():
+            light = one.stat().st_size < LARGE_BYTES and not kind.startswith(("image", "video"))
+            parts.append(sha256(one) if light else str(file_state(one)))
+            parts.append(str(one.relative_to(path)))
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
 def write_counted(path: Path, note: dict[str, Any], counted: Counted) -> None:
