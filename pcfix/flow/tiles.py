@@ -102,6 +102,9 @@ def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> Counted | st
                 f"{tile.source}: this worker has pcfix {version.__version__}, not {tile.pcfix};"
                 " install that there."
             )
+        earlier = tile.finished()  # by a worker that was lost before it could say so
+        if earlier is not None:
+            return earlier
         step: TileStep = pickle.loads(pickled)
         step.begin(tile.first_row)
         for left in tile.target.parent.glob(f".{tile.target.stem}.*.part{tile.target.suffix}"):
@@ -241,9 +244,9 @@ class TiledRun:
 
     def _check_folder(self) -> None:
         """Make the folder of the outputs; refuse one that has inputs, or lies in their folder."""
-        folder, named = self.folder.resolve(), path_of(self.tiles.name)
+        folder, named = self.folder.resolve(), Path(self.tiles.name)
         for path in self.tiles.paths:
-            if path.parent.resolve() == folder:
+            if not is_remote(path) and path.parent.resolve() == folder:
                 raise SettingError(
                     f"{self.folder}: is the folder of {path.name}, an input; give another one."
                 )

@@ -86,7 +86,7 @@ def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) ->
     A `SettingError` if it is one of the inputs, exists without `overwrite`, or has no folder.
     """
     target = local_path(path)
-    for source in inputs:
+    for source in (one for one in inputs if not is_remote(one)):
         both = target.exists() and Path(source).exists()
         if target.samefile(source) if both else target.resolve() == Path(source).resolve():
             raise SettingError(

@@ -19,7 +19,7 @@ def cut(folder, count, *, cloud=SCENE / "cloud.laz", suffix=".laz", **changes):
     tile = np.searchsorted(np.quantile(x, np.linspace(0, 1, count + 1)[1:-1]), x)
     rows = [np.flatnonzero(tile == i) for i in range(count)]
     for i, some in enumerate(rows):
-        write(folder / f"tile{i}{suffix}", las, some, **changes)
+        write(folder / f"tile{i:0{len(str(count - 1))}}{suffix}", las, some, **changes)
     return folder, write(folder.parent / "merged.laz", las, np.concatenate(rows), **changes)
 
 
