@@ -23,8 +23,11 @@ if TYPE_CHECKING:
     from pcfix.flow.label import label_file, label_points
     from pcfix.flow.ortho import ortho_photo
     from pcfix.flow.photos import map_photos
+    from pcfix.flow.plan import plan_flight
     from pcfix.flow.rebuild import rebuild_rounds
     from pcfix.flow.restore import restore_file
+    from pcfix.flow.results import RunResults, open_run, run
+    from pcfix.flow.view import view_clouds
     from pcfix.io.cameras import read_cameras
     from pcfix.io.water import read_water
     from pcfix.model import (
@@ -57,8 +60,11 @@ _NAMES = {
     "pcfix.flow.label": "label_file label_points",
     "pcfix.flow.ortho": "ortho_photo",
     "pcfix.flow.photos": "map_photos",
+    "pcfix.flow.plan": "plan_flight",
     "pcfix.flow.rebuild": "rebuild_rounds",
     "pcfix.flow.restore": "restore_file",
+    "pcfix.flow.results": "RunResults open_run run",
+    "pcfix.flow.view": "view_clouds",
     "pcfix.io.cameras": "read_cameras",
     "pcfix.io.water": "read_water",
     "pcfix.model": "Cameras Correction Lens Outcome Views WaterDimension WaterMesh"
@@ -81,6 +87,7 @@ __all__ = [
     "Outcome",
     "PcfixError",
     "PcfixWarning",
+    "RunResults",
     "SettingError",
     "Summary",
     "Views",
@@ -101,14 +108,18 @@ __all__ = [
     "label_file",
     "label_points",
     "map_photos",
+    "open_run",
     "ortho_photo",
+    "plan_flight",
     "read_cameras",
     "read_water",
     "rebuild_rounds",
     "refractive_index",
     "restore_file",
+    "run",
     "simulate_scene",
     "trace",
+    "view_clouds",
 ]
 
 

@@ -13,9 +13,9 @@ Counted: TypeAlias = dict[str, npt.NDArray[Any]]
 class Sums:
     """The base of what is added up chunk by chunk; others' counts can be added to it.
 
-    A class names its attributes: `added` are numbers, arrays, or dictionaries of numbers; of
-    `least` and `most` the smallest or the largest counts. One that is `Sums` itself goes by its
-    own names, and one that is None stays so.
+    A class names its attributes: `added` are numbers, arrays, dictionaries of numbers, or lists of
+    arrays, which are joined; of `least` and `most` the smallest or the largest counts. One that is
+    `Sums` itself goes by its own names, and one that is None stays so.
     """
 
     added: ClassVar[tuple[str, ...]] = ()
@@ -29,6 +29,8 @@ class Sums:
             value = getattr(self, name)
             if isinstance(value, Sums):
                 found.update({f"{name}.{key}": one for key, one in value.counted().items()})
+            elif isinstance(value, list):
+                found.update({name: np.concatenate(value)} if value else {})
             elif value is not None:
                 found[name] = np.array([*value.values()] if isinstance(value, dict) else value)
         return found
@@ -44,6 +46,8 @@ class Sums:
             elif isinstance(own, dict):
                 both = join([*own.values()], counted[name]).tolist()
                 own.update(zip(own, both, strict=True))
+            elif isinstance(own, list):
+                own.extend([counted[name]] if name in counted else [])
             elif own is not None and name in counted:
                 both = join(own, counted[name])
                 setattr(self, name, both if isinstance(own, np.ndarray) else both.item())

@@ -19,7 +19,7 @@ HOUSE = Path(__file__).parents[1] / "pcfix"
 # The floors, from the ground up. What shares a floor stands side by side; a file may import from
 # lower floors and from its own room. "pcfix" is the front door, pcfix/__init__.py.
 FLOORS = (
-    ("version", "errors", "ahead"),
+    ("version", "errors", "ahead", "qgis"),
     ("parts",),
     ("kernels",),
     ("options",),
@@ -43,10 +43,25 @@ FLOORS = (
 # The simulator checks the rooms that correct, so it may not use what they do.
 TWINS = {"simulate": {"label", "refract", "port", "adjust", "clean", "grid", "compare"}}
 
-FILE_LIBRARIES = {"laspy", "rasterio", "pyproj", "fiona", "pyogrio", "PIL", "tifffile", "jpeglib"}
+FILE_LIBRARIES = {
+    "laspy",
+    "rasterio",
+    "pyproj",
+    "fiona",
+    "pyogrio",
+    "PIL",
+    "tifffile",
+    "jpeglib",
+    "rioxarray",
+    "geopandas",
+}
 OPENING = {"read_text", "read_bytes", "write_text", "write_bytes"}
 # Files and libraries of files outside io/, with the reason.
-OUTSIDE_IO = {"pcfix.ahead": "what its second process says goes nowhere"}
+OUTSIDE_IO = {
+    "pcfix.qgis.command": "it runs in QGIS's Python, without pcfix",
+    "pcfix.qgis.provider": "as its neighbour",
+    "pcfix.ahead": "what its second process says goes nowhere",
+}
 
 MOST_PARAMETERS = 9
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from cyclopts import App, CycloptsError
 
 from pcfix.cli.commands import EXAMPLES
-from pcfix.cli.flags import UsageError, prepare
+from pcfix.cli.flags import UsageError, name_of, prepare
 from pcfix.errors import PcfixError, show_warning
 from pcfix.version import __version__
 
@@ -25,7 +25,12 @@ app = App(
 for place, (command, example) in enumerate(EXAMPLES):
     summary, _, more = str(command.__doc__).partition("\n")
     lines = [summary, *(line.strip() for line in more.splitlines()), "", f"Example: {example}"]
-    app.command(command, help="\n".join(lines).replace("\n\n\n", "\n\n"), sort_key=place)
+    app.command(
+        command,
+        name=name_of(command),
+        help="\n".join(lines).replace("\n\n\n", "\n\n"),
+        sort_key=place,
+    )
 
 
 def main(tokens: Sequence[str] | None = None) -> None:
@@ -33,7 +38,7 @@ def main(tokens: Sequence[str] | None = None) -> None:
     warnings.showwarning = show_warning
     arguments = list(sys.argv[1:] if tokens is None else tokens)
     for command, _ in EXAMPLES:
-        if command.__name__ in arguments[:1]:
+        if name_of(command) in arguments[:1]:
             prepare(command)
     if arguments in ([], *([name] for name in app if name not in ("demo", "--version"))):
         app([*arguments, "--help"], result_action="return_value")
@@ -56,7 +61,7 @@ def main(tokens: Sequence[str] | None = None) -> None:
 
 def _try(arguments: list[str]) -> str:
     """Return where help is."""
-    name = next((c.__name__ for c, _ in EXAMPLES if c.__name__ in arguments[:1]), "")
+    name = next((name_of(c) for c, _ in EXAMPLES if name_of(c) in arguments[:1]), "")
     return f"Try '{' '.join(filter(None, ('pcfix', name, '--help')))}'."
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +15,7 @@ import pcfix
 from pcfix.cli.flags import FLAGS, Quiet, UsageError, check_needed, progress_bar, say, status_line
 from pcfix.options.correct import CorrectOptions, LabelOptions
 from pcfix.options.declare import options_of
+from pcfix.options.handover import PlanOptions, PluginOptions, ViewerOptions
 from pcfix.options.photos import CalmOptions, OrthoOptions, PhotosOptions
 from pcfix.options.scenes import DemoOptions, SimulateOptions
 from pcfix.options.shared import TileOptions
@@ -54,15 +57,14 @@ def run(
         check_needed(options)
         values = {one.name: getattr(options, one.name) for one in options_of(RunOptions)}
         request, folder = Request(input=str(input), **values), out_dir
-    with progress_bar("Correcting", quiet) as progress:
-        run_all(
-            request,
-            Path(str(folder)),
-            overwrite=options.overwrite,
-            jobs=options.jobs,
-            say=lambda text: say(text, quiet),
-            progress=progress,
-        )
+    run_all(
+        request,
+        Path(str(folder)),
+        overwrite=options.overwrite,
+        jobs=options.jobs,
+        say=lambda text: say(text, quiet),
+        bar=partial(progress_bar, quiet=quiet),
+    )
 
 
 def correct(
@@ -318,6 +320,46 @@ def simulate(
     say(f"{out_dir}: {scene.description}", quiet)
 
 
+def plan(*, options: Annotated[PlanOptions, FLAGS] = PlanOptions(), quiet: Quiet = False) -> None:
+    """Predict what a flight over water will measure, and say what would make it better."""
+    from pcfix.report.plan import plan_text
+
+    with progress_bar("Planning", quiet, unit="beds") as progress:
+        found = pcfix.plan_flight(options=options, progress=progress)
+    say(plan_text(found), quiet)
+
+
+def view(
+    *clouds: Annotated[Path, Parameter(help="LAS or LAZ clouds.")],
+    options: Annotated[ViewerOptions, FLAGS] = ViewerOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Show clouds in space, before and after, with reference, cameras and water."""
+    found = pcfix.view_clouds(clouds, options=options)
+    if found:
+        say(found, quiet)
+
+
+def qgis_plugin(
+    out: Annotated[Path, Parameter(help="ZIP to write.")],
+    /,
+    *,
+    options: Annotated[PluginOptions, FLAGS] = PluginOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Pack the plugin of QGIS: pcfix's commands as algorithms of its toolbox.
+
+    In QGIS: Plugins > Manage and Install Plugins > Install from ZIP.
+    """
+    from pcfix.cli.plugin import plugin_zip
+    from pcfix.io.files import write_bytes
+
+    write_bytes(out, plugin_zip(one for one, _ in EXAMPLES), overwrite=options.overwrite)
+    say(f"{out}: install it in QGIS by Plugins > Manage and Install Plugins > Install from ZIP;"
+        f" its environment of pcfix (Settings > Options > Processing > Providers > pcfix) is"
+        f" {Path(sys.prefix)}", quiet)  # fmt: skip
+
+
 def demo(
     out_dir: Annotated[Path, Parameter(help="Folder to make.")] = Path("pcfix-demo"),
     /,
@@ -328,11 +370,8 @@ def demo(
     """Simulate, correct, and show how far the cloud is from the truth."""
     from pcfix.flow.demo import run_demo
 
-    with progress_bar("Simulating and correcting", quiet) as progress:
-        table = run_demo(
-            out_dir, points=options.points, overwrite=options.overwrite, progress=progress
-        )
-    say(table)
+    bar = partial(progress_bar, quiet=quiet)
+    say(run_demo(out_dir, points=options.points, overwrite=options.overwrite, bar=bar))
 
 
 EXAMPLES: tuple[tuple[Callable[..., None], str], ...] = (
@@ -346,11 +385,14 @@ EXAMPLES: tuple[tuple[Callable[..., None], str], ...] = (
     (compare, "pcfix compare cleaned.laz lidar.laz --submerged"),
     (photos, "pcfix photos images dry --cameras cameras.xml --dsm bed.tif --water 0.37"),
     (calm, "pcfix calm frames calm.jpg --surface --depth 2.5 --gsd 0.01 --interval 0.2"),
+    (view, "pcfix view corrected.laz --reference lidar.laz --colour error --image errors.png"),
     (cameras, "pcfix cameras cameras.xml --cloud cloud.laz --water 0.37 --plot block.png"),
     (water, "pcfix water shore.csv --cloud cloud.laz --plot water.png"),
     (restore, "pcfix restore corrected.laz cloud.laz"),
     (simulate, "pcfix simulate scene --points 20000"),
     (pipeline, "pcfix pipeline cloud.laz corrected.laz --cameras cameras.csv --water 0.37"),
+    (plan, "pcfix plan --height 60 --overlap 0.8 --sidelap 0.7 --depth 5 --plot plan.png"),
+    (qgis_plugin, "pcfix qgis-plugin pcfix.zip"),
     (demo, "pcfix demo"),
 )
 """The commands in the order of the help, each with a line that shows it at work."""

@@ -7,11 +7,13 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_type_hints
 
 from cyclopts import Group, Parameter
 
+from pcfix.ahead import announce
 from pcfix.options.declare import Option, OptionSet, options_of
 from pcfix.options.shared import Panel
 
@@ -25,6 +27,11 @@ _GROUPS: dict[str, Group] = {
 
 class UsageError(Exception):
     """Flags that say nothing together; exit code 2."""
+
+
+def name_of(command: Callable[..., None]) -> str:
+    """Return what a command is called on the command line."""
+    return command.__name__.replace("_", "-")
 
 
 def prepare(command: Callable[..., None]) -> None:
@@ -53,7 +60,7 @@ def _type(one: Option) -> Any:
     if one.metavar == "PATH" or os.PathLike[str] in one.kinds:
         return Path | None
     if one.parse is not None or one.type is Any:
-        return str | one.type if one.default == () else str | None
+        return str | one.type if isinstance(one.default, tuple) else str | None
     if one.default == ():
         return tuple[str, ...]
     return one.type | None if one.default is None else one.type
@@ -88,17 +95,27 @@ Quiet = Annotated[
 ]
 
 
-COMPILING = "kernels are compiled first, once after an installation: about a minute"
+@cache
+def _announce_compiling() -> None:
+    """Say on a terminal, once, that kernels are compiled."""
+    announce.append(lambda: sys.stderr.write("compiling the kernels, once (half a minute)\n"))
 
 
 @contextmanager
 def progress_bar(
     title: str, quiet: bool, unit: str = "points"
 ) -> Iterator[Callable[[int, int], None] | None]:
-    """Show a bar with units/s and the time left on a terminal; nothing when piped."""
+    """Show a bar with units/s and the time left on a terminal; nothing when piped.
+
+    With ``PCFIX_PROGRESS=lines`` it is a line for each percent, for programs that call this one.
+    """
+    if os.environ.get("PCFIX_PROGRESS") == "lines":
+        yield _percent_lines()
+        return
     if quiet or not sys.stderr.isatty():
         yield None
         return
+    _announce_compiling()
     from rich import progress
     from rich.console import Console
 
@@ -107,20 +124,32 @@ def progress_bar(
         progress.BarColumn(),
         progress.TaskProgressColumn(),
         progress.TextColumn("{task.fields[rate]}"),
-        progress.TimeRemainingColumn(),
+        progress.TimeRemainingColumn(elapsed_when_finished=True),
     )
     with progress.Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        kept = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[1] / "refract")
-        first = "" if any(kept.glob("**/*.nbi")) else f" ({COMPILING})"
-        task = bar.add_task(title + first, total=None, rate="")
+        task = bar.add_task(title, total=None, rate="")
         started = time.perf_counter()
 
         def update(done: int, total: int) -> None:
             rate = done / (time.perf_counter() - started)
             text = f"{rate:,.0f} {unit}/s" if rate > 10.0 else f"{60.0 * rate:.0f} {unit}/min"
-            bar.update(task, description=title, completed=done, total=total, rate=text)
+            bar.update(task, completed=done, total=total, rate=text)
 
         yield update
+
+
+def _percent_lines() -> Callable[[int, int], None]:
+    last = -1
+
+    def update(done: int, total: int) -> None:
+        nonlocal last
+        percent = 100 * done // max(total, 1)
+        if percent != last:
+            last = percent
+            sys.stderr.write(f"progress {percent}\n")
+            sys.stderr.flush()
+
+    return update
 
 
 @contextmanager
@@ -129,6 +158,7 @@ def status_line(title: str, quiet: bool) -> Iterator[Callable[[Any], None] | Non
     if quiet or not sys.stderr.isatty():
         yield None
         return
+    _announce_compiling()
     from rich.console import Console
 
     with Console(stderr=True).status(title) as status:

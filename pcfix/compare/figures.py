@@ -19,12 +19,14 @@ from pcfix.compare.statistics import (
     Bin,
     Distribution,
     Line,
+    Own,
     Statistics,
     Tvu,
     binned,
     distance_from_shore,
     distribution_of,
     fit_line,
+    own_of,
     statistics_of,
     tvu_of,
 )
@@ -70,6 +72,8 @@ class Comparison:
         Signed, along the vertical.
     bed, land : AfterBefore of Statistics, or None
         The same of what lies under water and of what does not.
+    own : Own or None
+        Those of the bed, or of all where it is not known, without the noise of the reference.
     depth : AfterBefore of Line, or None
         Depth against reference depth; None where the water surface is not known.
     depth_bins, shore_bins : tuple of Bin
@@ -96,6 +100,7 @@ class Comparison:
     vertical: AfterBefore[Distribution] | None
     bed: AfterBefore[Statistics] | None
     land: AfterBefore[Statistics] | None
+    own: Own | None
     depth: AfterBefore[Line | None] | None
     depth_bins: tuple[Bin, ...]
     shore_bins: tuple[Bin, ...]
@@ -179,6 +184,11 @@ def figures_of(
     if match.settings.vertical:
         _check_enough(match)
         pairs = both(partial(_pairs, match), match.cloud.xyz, match.cloud.apparent)
+    vertical = (
+        None
+        if pairs is None
+        else both(lambda p: distribution_of(p.error_m), pairs.after, pairs.before)
+    )
     of_depth = _by_depth(match, pairs, notes)
     return Comparison(
         cloud=match.whole.name,
@@ -188,11 +198,10 @@ def figures_of(
         c2c=c2c.to_reference,
         c2c_from_reference=c2c.from_reference,
         also=further_of(others),
-        vertical=None
-        if pairs is None
-        else both(lambda p: distribution_of(p.error_m), pairs.after, pairs.before),
+        vertical=vertical,
         bed=of_depth.bed,
         land=of_depth.land,
+        own=_own(match, of_depth.bed, vertical),
         depth=of_depth.fits,
         depth_bins=of_depth.depth_bins,
         shore_bins=of_depth.shore_bins,
@@ -286,6 +295,15 @@ def _errors_of(pairs: AfterBefore[Pairs], rows: BoolArray) -> AfterBefore[Statis
     if not rows.any():
         return None
     return both(lambda p: statistics_of(p.error_m[rows]), pairs.after, pairs.before)
+
+
+def _own(
+    match: Match, bed: AfterBefore[Statistics] | None, vertical: AfterBefore[Distribution] | None
+) -> Own | None:
+    if vertical is None:
+        return None
+    errors = (vertical.after.statistics, "all") if bed is None else (bed.after, "bed")
+    return own_of(*errors, match.settings.sigma_reference, match.reference.kind)
 
 
 def _ratio(depth_m: FloatArray, error_m: FloatArray) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 
 from pcfix.compare.nearest import Neighbours
 from pcfix.compare.statistics import Statistics, statistics_of
-from pcfix.errors import GeometryError, SettingError
+from pcfix.errors import GeometryError, SettingError, installing
 from pcfix.model import FloatArray, IntArray
 
 MAX_CORE_POINTS = 100_000
@@ -56,7 +56,7 @@ def load_py4dgeo() -> Any:
             return import_module("py4dgeo")
     except ImportError as error:
         raise SettingError(
-            "M3C2 needs py4dgeo, which is not installed; run: pip install 'pcfix[m3c2]'."
+            f"M3C2 needs py4dgeo, which is not installed; run: {installing('m3c2')}"
         ) from error
 
 

@@ -60,6 +60,11 @@ class Reference:
     sparse: bool = False  # whether these are single check points, not a sampled surface
     raster: bool = False  # whether these are the centres of cells
 
+    @property
+    def kind(self) -> str:
+        """Of the `SIGMA_REFERENCE_M`."""
+        return "table of check points" if self.sparse else "raster" if self.raster else "cloud"
+
 
 @dataclass(frozen=True, eq=False)
 class Match:

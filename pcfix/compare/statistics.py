@@ -11,6 +11,7 @@ import numpy as np
 from pcfix.compare.nearest import Neighbours
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import FloatArray
+from pcfix.options.steps import SIGMA_REFERENCE_M
 from pcfix.refract.tally import share_of_orders, within_orders
 
 PERCENTILES = (5, 25, 50, 75, 95)
@@ -217,6 +218,40 @@ class Tvu:
     count: int
     tvu_95_m: float
     s44: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Own:
+    """Errors without the noise of the reference, metres; the bias stays as it is.
+
+    Attributes
+    ----------
+    of : {"bed", "all"}
+    sigma_reference_m : float
+    is_assumed : bool
+        Whether the noise is that of its kind of reference, as none was stated.
+    mean_m : float
+    rmse_m, within_95_m : float or None
+        None where the errors scatter no more than the reference is said to, so that nothing is
+        known of the cloud's own part. 95 % shrink as the RMSE does.
+    """
+
+    of: str
+    sigma_reference_m: float
+    is_assumed: bool
+    mean_m: float
+    rmse_m: float | None
+    within_95_m: float | None
+
+
+def own_of(s: Statistics, of: str, stated_m: float | None, kind: str) -> Own:
+    """Return errors without the noise of the reference: variances of independent errors add up."""
+    sigma = SIGMA_REFERENCE_M[kind] if stated_m is None else stated_m
+    if 0.0 < s.sd_m <= sigma:
+        return Own(of, sigma, stated_m is None, s.mean_m, None, None)
+    rmse = math.sqrt(s.rmse_m**2 - min(sigma, s.sd_m) ** 2)
+    within = s.within_95_m * (rmse / s.rmse_m if s.rmse_m else 1.0)
+    return Own(of, sigma, stated_m is None, s.mean_m, rmse, within)
 
 
 def tvu_of(error_m: FloatArray, depth_m: FloatArray) -> Tvu:

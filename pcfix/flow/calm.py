@@ -247,8 +247,6 @@ def _bed(given: CalmOptions) -> tuple[Callable[[FloatArray], FloatArray], str | 
     path = Path(given.depth)
     with tempfile.TemporaryDirectory() as scratch:
         if path.suffix.lower() in (".las", ".laz"):
-            if given.resolution is None:
-                raise SettingError("resolution is needed where depth is a cloud; give metres.")
             grid_dsm(path, Path(scratch) / "bed.tif", resolution=given.resolution)
             path = Path(scratch) / "bed.tif"
         with open_raster(path) as source:

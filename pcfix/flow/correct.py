@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,22 @@ from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.inputs import paths_in
 from pcfix.flow.job import Job
 from pcfix.flow.old_cameras import paired
+from pcfix.flow.plausibility import CloudSample, plausible
 from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
-from pcfix.flow.surfaces import file_points, first_points, points_of, view_of
+from pcfix.flow.surfaces import (
+    Points,
+    corners,
+    file_points,
+    first_points,
+    own_water_of,
+    points_of,
+    view_of,
+)
 from pcfix.flow.through_water import Label, correct_checked
 from pcfix.flow.tiles import TiledRun
 from pcfix.io.files import local_path
 from pcfix.io.las import columns
+from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource, centring_steps
 from pcfix.io.las.writing import corrected_header
 from pcfix.io.regressions import read_regression
@@ -35,14 +46,14 @@ from pcfix.model import (
     Views,
     WaterSurface,
 )
-from pcfix.options.correct import CorrectOptions, RefractionOptions, ScienceOptions
+from pcfix.options.correct import CorrectOptions, PointsOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import File, taken
 from pcfix.refract.batch import Batch, MadeWith, Survey
-from pcfix.refract.learning import learn_of_points
+from pcfix.refract.learning import for_own_water, learn_of_points
 from pcfix.refract.regression import BeyondRange, DepthRegression
 from pcfix.refract.tally import Summary
 from pcfix.sums import Sums
-from pcfix.water.checks import as_surface, check_above_water, checked_points
+from pcfix.water.checks import WaterMeeting, as_surface, check_above_water, checked_points
 from pcfix.water.index import with_index
 from pcfix.water.surface import is_submerged, surface_above
 
@@ -77,7 +88,9 @@ def correct_points(
         Or its attributes as keywords, as of ``pcfix correct``: index, method, max_angle (degrees
         from the surface normal), max_cameras, camera_set, matcher, depth_factor, unsure (with
         ``"withhold"`` the result says which are), sigma_image and the other standard errors;
-        occlusion is off unless asked for, as these points may not be the whole cloud.
+        `xyz` is taken for the whole cloud, so with a part of one set ``occlusion="off"``. With
+        water_per_image, rasters in the frame of the points, what is submerged, and how deep, goes
+        by `water`.
     views : Views, optional
         Which cameras made each point, rows of `adjusted_from` where that is given, else of
         `cameras`. Default: as the option `camera_set` says.
@@ -125,7 +138,7 @@ def correct_points(
     >>> result.xyz.round(3).tolist()
     [[0.0, 0.0, -2.703]]
     """
-    given = taken(RefractionOptions, options, keywords, "correct_points", occlusion="off")
+    given = taken(PointsOptions, options, keywords, "correct_points")
     settings = with_index(given.part(ScienceOptions))
     if not cameras:
         given.check_no_cameras()
@@ -135,6 +148,8 @@ def correct_points(
                 " leave them out, or give cameras too."
             )
     cameras = cameras or NO_CAMERAS
+    if given.water_per_image is not None:
+        settings = for_own_water(settings, cameras, None if views is None else views.kind)
     points = checked_points(xyz)
     surface, dimension = as_surface(water, len(points))
     offset = None if level_offset_m is None else _offsets(level_offset_m, len(cameras))
@@ -149,16 +164,25 @@ def correct_points(
         made_with = MadeWith(points, pair.old)
         points, views, label = step.xyz, step.views, step.rule(label)
     above = surface_above(surface, points, dimension)
-    batch = Batch(points, above, Survey(surface, cameras, settings, offset), views, made_with)
+    place = None, *corners(points[:, 0], points[:, 1])
+    own, notes = own_water_of(given.water_per_image, cameras, surface, place, offset)
+    survey = Survey(surface, cameras, settings, offset, own_water=own)
+    batch = Batch(points, above, survey, views, made_with)
     line = regression
     if line is not None and not isinstance(line, DepthRegression):
         line = read_regression(line)
     found = correct_checked(learn_of_points(batch, line), label)
+    meeting, sample = WaterMeeting(surface, deep=settings.deep), CloudSample(len(points))
+    meeting.add(points, found)
+    meeting.check_reach("xyz")
+    sample.add(Points(points, None, np.zeros(len(points), np.uint8)), above.height_m)
+    plausible(cameras, sample.xyz, level_doubts=sample.level_doubts()).warn()
     if line is not None and line is not regression:
         beyond = BeyondRange(line)
         beyond.add((above.height_m - points[:, 2])[found.submerged])
-        for note in (*line.notes, *beyond.notes()):
-            warnings.warn(note, PcfixWarning, stacklevel=2)
+        notes = (*notes, *line.notes, *beyond.notes())
+    for note in notes:
+        warnings.warn(note, PcfixWarning, stacklevel=2)
     return found if step is None else step.whole(found)
 
 
@@ -233,10 +257,13 @@ def correct_file(
     task = file_task(single(input), output, given, reads=paths_in(given), progress=progress)
     step = Correcting(job_for(task.source, given))
     with threads(given.jobs), step.job.compiling():
-        step.job.look_around(lambda: file_points(task.source, step.job.water, given.jobs))
+        step.job.look_around(
+            partial(file_points, task.source, step.job.water, given.jobs, task.kept)
+        )
         step.run(task)
     step.job.save_regression()
     result = step.job.summary(str(task.source), str(task.target), task.seconds)
+    result = replace(result, part=part_report(task.source))
     task.tell(result.as_dict())
     return result
 
@@ -305,8 +332,16 @@ class Correcting(Sums, Step):
     def chunk(self, points: Chunk, source: LasSource, header: Header) -> Chunk:
         """Return corrected points with their new dimensions, classes and flags."""
         correction = self.job.correct(points_of(points, source, self.job.water))
-        moved = columns.shift_steps(correction, header.scales)
-        new = columns.shifted(points, header, moved + np.array(self.steps))
+        new = columns.convert(points, header.point_format)
+        new.offsets = header.offsets
+        for rows, part in correction.parts():
+            self._fill(new[rows], part)
+        return new[~correction.uncorrected] if self.job.options.uncorrected == "drop" else new
+
+    def _fill(self, new: Chunk, correction: Correction) -> None:
+        """Move points, and write their new dimensions, classes and flags."""
+        moved = columns.shift_steps(correction, new.scales)
+        columns.move(new, moved + np.array(self.steps))
         withheld = np.asarray(new["withheld"]).astype(bool)
         withhold = self.job.options.uncorrected == "withhold"
         correction = columns.unsure_anew(correction, withheld)
@@ -315,7 +350,6 @@ class Correcting(Sums, Step):
         new.array["classification"][correction.corrected] = BATHYMETRIC_POINT
         flagged = withheld | columns.to_withhold(correction, withhold=withhold)
         new["withheld"][:] = flagged.astype(np.uint8)
-        return new[~correction.uncorrected] if self.job.options.uncorrected == "drop" else new
 
     def finish(self) -> None:
         """Refuse a result in which cloud, water and cameras did not meet."""

@@ -34,8 +34,9 @@ from pcfix.grid.lattice import (
 )
 from pcfix.grid.model import NO_LIGHT, DsmSummary, Tally, hillshade
 from pcfix.io import rasters
-from pcfix.io.crs import heights_name, parts
+from pcfix.io.crs import crs_words, parts
 from pcfix.io.files import Bins, check_output, replaced_when_whole, write_text
+from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.las.writing import is_ours
 from pcfix.io.styles import raster_style
@@ -294,7 +295,7 @@ class _Run:
             what=settings.what,
             pcfix=__version__,
             crs=None if self.crs is None else self.crs.name,
-            heights=None if self.crs is None else heights_name(self.crs),
+            heights=crs_words(self.crs)[1] or None,
             width=lattice.width,
             height=lattice.height,
             bounds_m=lattice.bounds_m,
@@ -309,6 +310,7 @@ class _Run:
             settings=asdict(settings),
             seconds=round(self.task.seconds, 3),
             values=tally.values(),
+            part=part_report(self.task.source),
         )
 
 

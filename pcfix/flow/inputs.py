@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.surfaces import CloudView, find_surface
 from pcfix.io.cameras import read_cameras, read_tie_points
 from pcfix.io.cameras.georeference import Georeference, georeference
@@ -25,6 +25,10 @@ from pcfix.water.surface import FoundSurface
 
 if TYPE_CHECKING:
     from pyproj import CRS
+
+
+TIMED = (".json", ".geojson")
+"""Camera files that may say when each image was taken."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +91,20 @@ class Inputs(InputOptions):
         for note in notes:
             warnings.warn(note, PcfixWarning, stacklevel=2)
         return offset
+
+    def dates(self, cameras: Cameras) -> str:
+        """Return the first and last day of the images; empty where it is not known."""
+        from pcfix.io.tides import read_image_times
+
+        given = self.image_times or self.adjusted_from or self.cameras
+        if self.image_times is None and Path(str(given)).suffix.lower() not in TIMED:
+            return ""
+        try:
+            days = read_image_times(given, cameras.labels).time_s.astype("datetime64[s]")
+        except PcfixError:  # the correction is done without them
+            return ""
+        first, last = (str(day.astype("datetime64[D]")) for day in (days.min(), days.max()))
+        return first if first == last else f"{first} to {last}"
 
     def read(self) -> Cameras:
         """Return the cameras in the frame of their file."""
@@ -200,7 +218,7 @@ def paths_in(options: Any, but: tuple[str, ...] = ()) -> list[File]:
 
     A vector file may be named with a layer, which is left out.
     """
-    names = [one.name for one in options_of(InputOptions)] + ["water_mask"]
+    names = [one.name for one in options_of(InputOptions)] + ["water_mask", "water_per_image"]
     given = [getattr(options, name, None) for name in names if name not in (*NO_FILES, *but)]
     paths = [str(one) for one in given if isinstance(one, str | PathLike)]
     return [Path(path.partition(LAYER_MARK)[0]) for path in paths]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from pcfix.flow.surfaces import (
 from pcfix.flow.tiles import TiledRun
 from pcfix.io.files import local_path
 from pcfix.io.las.columns import convert
+from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import labelling_vlr, noted_header
 from pcfix.io.tiles import Clouds, Tiles, single, tiles_of
@@ -156,6 +157,7 @@ def label_file(
         step = _step_for(task.source, given)
         task.run(step)
     result = _summary(step, str(task.source), str(task.target), task.seconds)
+    result = replace(result, part=part_report(task.source))
     task.tell(result.as_dict())
     return result
 

@@ -12,6 +12,7 @@ from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix
 from pcfix.io.pdal import CLASS_FLAGS, OUTCOME, STAGE_SOURCE, add_dimension
 from pcfix.options.correct import CorrectOptions
+from pcfix.options.shared import PartOptions
 
 if TYPE_CHECKING:
     import laspy
@@ -69,6 +70,11 @@ def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str
 
 
 def _stage(options: CorrectOptions) -> dict[str, Any]:
+    if options.part(PartOptions) != PartOptions():
+        raise SettingError(
+            "bounds and read-resolution are the reader's in a pipeline: leave them out, and give"
+            " readers.copc its bounds and resolution."
+        )
     drop, plain = options.uncorrected == "drop", options.plain()
     columns = columns_for(options.dimensions, options.unsure)
     first = {name: plain[name] for name in ("cameras", "water") if name in plain}

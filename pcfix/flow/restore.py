@@ -15,9 +15,10 @@ from pcfix.io.las.columns import (
     SHIFTS,
     UNSURE,
     columns_for,
+    convert,
     is_corrected,
     is_marked_uncorrected,
-    shifted,
+    move,
 )
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import read_settings, restored_header
@@ -109,7 +110,10 @@ class Restoring(Sums, Step):
         withheld = np.asarray(points["withheld"]).astype(bool)
         points["withheld"][:] = (withheld & ~ours).astype(np.uint8)
         shift = np.column_stack([points.array[name] for name in SHIFTS]).astype(np.int64)
-        return shifted(points, header, -shift - self._offset)
+        old = convert(points, header.point_format)
+        old.offsets = header.offsets
+        move(old, -shift - self._offset)
+        return old
 
 
 def _ours(source: LasSource, settings: dict[str, Any]) -> set[str]:

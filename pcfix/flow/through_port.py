@@ -60,6 +60,7 @@ class ThroughPort(Sums):
         """Refuse what needs a water surface, or a model of what happens above one."""
         given = {
             "tide": options.tide is not None,
+            "water-per-image": options.water_per_image is not None,
             "image-times": options.image_times is not None,
             "check-depths": options.check_depths is not None,
             "regression": options.regression is not None,
@@ -81,8 +82,9 @@ class ThroughPort(Sums):
                 " consistent."
             )
 
-    def restart(self) -> None:
+    def restart(self, first_row: int = 0) -> None:
         """Forget the chunks so far."""
+        del first_row
         self._miss_sum_m = 0.0
 
     def rehearsals(self) -> tuple[Rehearsal, ...]:

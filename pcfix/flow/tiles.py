@@ -25,7 +25,7 @@ from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.cluster import Run, in_processes, on_cluster
 from pcfix.flow.runner import FileTask, Progress, Step, check_cloud, check_summary, write_summary
 from pcfix.io.files import digest_of, is_remote, path_of, read_counted, write_counted
-from pcfix.io.tiles import BrokenTileError, Tiles, output_name
+from pcfix.io.tiles import BrokenTileError, Tiles, check_one_file
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.kernels import threads
 from pcfix.options.declare import File, options_of
@@ -172,6 +172,7 @@ class TiledRun:
             With the list of the files that failed, once the others are finished, or if the step
             cannot be made or refuses the result.
         """
+        check_one_file(self.tiles, self.options)
         self._check_folder()
         check_summary(self.options, self.tiles.paths)
         key = self._key()
@@ -281,7 +282,7 @@ class TiledRun:
         work, row = {}, 0
         for path, points in zip(self.tiles.paths, self.tiles.points, strict=True):
             source = path if is_remote(path) else path.resolve()
-            target = self.folder.resolve() / output_name(path)
+            target = self.folder.resolve() / path.name
             work[path] = Tile(source, target, points, row, key, version.__version__)
             row += points
         return work

@@ -9,15 +9,26 @@ import numpy as np
 from pcfix.model import BoolArray, FloatArray, IntArray
 
 LONG_SIDE_CELLS = 360
+MOST_CELLS = 500_000
+"""Of a map at the resolution of a raster, so that a page with half a dozen stays below 8 MB."""
 POINTS_PER_CELL = 6.0
 """A sparse cloud gets larger cells, so that its maps have few holes."""
+FEWEST_AROUND = 5
+"""Of the eight cells about one without points, so that it has their mean."""
+
+Extent = tuple[float, float, float, float]
+"""West, east, south and north, metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class Maps:
     """Means of the points of each cell, shape (rows, columns); NaN where there are none.
 
-    The first row lies in the north. Depth, shift and number of rays are of the corrected points.
+    They reach as far as there are any.
+
+    The first row lies in the north. A single empty cell amid others has their mean. All but the
+    height is of the corrected points; the uncertainty is 1.96 times the root mean square of their
+    standard errors of Z.
     """
 
     west_m: float  # the outer corner of the upper left cell, in the cloud's CRS
@@ -26,15 +37,29 @@ class Maps:
     height_m: FloatArray
     depth_m: FloatArray
     shift_z_m: FloatArray
-    shift_xy_m: FloatArray
     rays: FloatArray
+    uncertainty_m: FloatArray
 
     @property
-    def extent_m(self) -> tuple[float, float, float, float]:
+    def extent_m(self) -> Extent:
         """West, east, south and north."""
         rows, columns = self.height_m.shape
         east = self.west_m + columns * self.cell_m
         return self.west_m, east, self.north_m - rows * self.cell_m, self.north_m
+
+    def sampled(self, values: FloatArray, extent_m: Extent) -> FloatArray:
+        """Return a raster of any resolution as it is at the centres of the cells."""
+        west, east, south, north = extent_m
+        rows, columns = self.height_m.shape
+        x = self.west_m + (np.arange(columns) + 0.5) * self.cell_m
+        y = self.north_m - (np.arange(rows) + 0.5) * self.cell_m
+        column = np.floor((x - west) / (east - west) * values.shape[1]).astype(np.int64)
+        row = np.floor((north - y) / (north - south) * values.shape[0]).astype(np.int64)
+        inside = np.ix_((row >= 0) & (row < values.shape[0]),
+                        (column >= 0) & (column < values.shape[1]))  # fmt: skip
+        found = np.full((rows, columns), np.nan)
+        found[inside] = values[np.ix_(row[inside[0].ravel()], column[inside[1].ravel()])]
+        return found
 
 
 class MapsBuilder:
@@ -46,39 +71,47 @@ class MapsBuilder:
         Corners of the area in plan, metres.
     points : int
         How many there will be.
+    resolution_m : float, optional
+        Of a raster of the same points, whose cells the maps have then, or some of them in one.
     """
 
-    def __init__(self, low: FloatArray, high: FloatArray, points: int) -> None:
+    def __init__(
+        self, low: FloatArray, high: FloatArray, points: int, resolution_m: float | None = None
+    ) -> None:
         size = np.maximum(high - low, 1e-3)
-        sparse_m = np.sqrt(POINTS_PER_CELL * size.prod() / max(points, 1))
-        self._cell_m = float(max(size.max() / LONG_SIDE_CELLS, sparse_m))
-        self._low = low
-        self._columns, self._rows = (max(1, round(s / self._cell_m)) for s in size)
+        if resolution_m is None:
+            sparse_m = np.sqrt(POINTS_PER_CELL * size.prod() / max(points, 1))
+            self._cell_m = float(max(size.max() / LONG_SIDE_CELLS, sparse_m))
+            self._low = low
+            self._columns, self._rows = (max(1, round(s / self._cell_m)) for s in size)
+        else:
+            several = np.ceil(np.sqrt(size.prod() / MOST_CELLS) / resolution_m)
+            self._cell_m = resolution_m * float(max(several, 1.0))
+            first, last = (np.floor(corner / self._cell_m) for corner in (low, high))
+            self._low = first * self._cell_m
+            self._columns, self._rows = (last - first + 1.0).astype(np.int64).tolist()
         cells = self._rows * self._columns
         self._all = np.zeros((2, cells))
         self._moved = np.zeros((5, cells))
 
     def add(
-        self,
-        xyz: FloatArray,
-        depth_m: FloatArray,
-        shift_m: FloatArray,
-        ray_count: IntArray,
-        moved: BoolArray,
+        self, xyz: FloatArray, moved: BoolArray | None = None, told: FloatArray | None = None
     ) -> None:
-        """Add n points; coordinates and shift have the shape (n, 3), the others (n,)."""
+        """Add n points, shape (n, 3), and of the m that moved what is `told`, shape (m, 4).
+
+        That is depth, shift in Z, number of rays and standard error of Z.
+        """
         column, row = ((xyz[:, :2] - self._low) / self._cell_m).astype(np.int64).T
         column = np.clip(column, 0, self._columns - 1)
         row = np.clip(row, 0, self._rows - 1)
         cell = (self._rows - 1 - row) * self._columns + column
         self._sum(self._all, cell, xyz[:, 2])
-        plan = np.hypot(shift_m[moved, 0], shift_m[moved, 1])
-        self._sum(
-            self._moved, cell[moved], depth_m[moved], shift_m[moved, 2], plan, ray_count[moved]
-        )
+        if moved is not None and told is not None:
+            depth, shift, rays, sigma = told.T
+            self._sum(self._moved, cell[moved], depth, shift, rays, sigma**2)
 
     @staticmethod
-    def _sum(sums: FloatArray, cell: IntArray, *values: FloatArray | IntArray) -> None:
+    def _sum(sums: FloatArray, cell: IntArray, *values: FloatArray) -> None:
         cells = sums.shape[1]
         sums[0] += np.bincount(cell, minlength=cells)
         for i, value in enumerate(values, start=1):
@@ -88,11 +121,35 @@ class MapsBuilder:
         """Return the means."""
         shape = self._rows, self._columns
         with np.errstate(invalid="ignore"):
-            heights = (self._all[1] / self._all[0]).reshape(shape)
-            depth, shift_z, shift_xy, rays = (
-                (sums / self._moved[0]).reshape(shape) for sums in self._moved[1:]
-            )
-        north = float(self._low[1]) + self._rows * self._cell_m
-        return Maps(
-            float(self._low[0]), north, self._cell_m, heights, depth, shift_z, shift_xy, rays
+            means = [self._all[1] / self._all[0], *(self._moved[1:] / self._moved[0])]
+        heights, depth, shift, rays, variance = (_filled(one.reshape(shape)) for one in means)
+        uncertainty = np.where(variance > 0.0, 1.96 * np.sqrt(variance), np.nan)
+        known = np.argwhere(np.isfinite(heights))
+        (top, left), (last, right) = (
+            (known.min(axis=0), known.max(axis=0)) if len(known) else ((0, 0), np.array(shape) - 1)
         )
+        part = np.s_[top : last + 1, left : right + 1]  # bounds hold what is noise too
+        north = float(self._low[1]) + (self._rows - top) * self._cell_m
+        place = float(self._low[0]) + left * self._cell_m, float(north), self._cell_m
+        return Maps(*place, heights[part], depth[part], shift[part], rays[part], uncertainty[part])
+
+
+def _filled(values: FloatArray) -> FloatArray:
+    """Return values with the mean of those around where one amid others is NaN."""
+    from scipy.ndimage import uniform_filter
+
+    known = np.isfinite(values)
+    around = 9.0 * uniform_filter(known.astype(np.float64), 3, mode="constant")
+    total = 9.0 * uniform_filter(np.where(known, values, 0.0), 3, mode="constant")
+    fill = ~known & (around > FEWEST_AROUND - 0.5)
+    return np.where(fill, total / np.maximum(around, 1.0), values)
+
+
+def smoothed(values: FloatArray, sigma_cells: float) -> FloatArray:
+    """Return a map smoothed by a Gaussian bell, NaN where it was NaN."""
+    from scipy.ndimage import gaussian_filter
+
+    known = np.isfinite(values)
+    weight = gaussian_filter(known.astype(np.float64), sigma_cells)
+    total = gaussian_filter(np.where(known, values, 0.0), sigma_cells)
+    return np.where(known, total / np.maximum(weight, 1e-9), np.nan)

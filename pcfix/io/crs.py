@@ -75,12 +75,19 @@ def heights_of(crs: CRS) -> Heights:
     return "ellipsoidal" if len(crs.axis_info) == 3 else "unstated"
 
 
-def heights_name(crs: CRS) -> str | None:
-    """Return what z is counted from, in words; None where that is not stated."""
-    vertical = parts(crs)[1]
-    if vertical is None:
-        return "ellipsoidal" if heights_of(crs) == "ellipsoidal" else None
-    return str(vertical.name)
+def crs_words(crs: CRS | None) -> tuple[str, str]:
+    """Return the name of a system in plan, with its code, and what heights are above.
+
+    Each is empty where it is not stated.
+    """
+    if crs is None:
+        return "", ""
+    plan, vertical = parts(crs)
+    code = (plan.to_json_dict() or {}).get("id")
+    name = f"{plan.name} ({code['authority']}:{code['code']})" if code else plan.name
+    if vertical is not None:
+        return name, vertical.name
+    return name, "above the ellipsoid" if heights_of(crs) == "ellipsoidal" else ""
 
 
 def is_same(one: CRS, other: CRS) -> bool:

@@ -45,7 +45,7 @@ def is_remote(path: Any) -> bool:
 def path_of(path: Any) -> Path:
     """Return a path as an object, also that of an object store, which reads by fsspec."""
     if not is_remote(path):
-        return Path(path)
+        return path if isinstance(path, Path) else Path(path)
     upath = optional_library("upath", "remote", f"{path}: reading from object stores")
     try:
         return cast(Path, upath.UPath(re.sub(":/+", "://", str(path), count=1)))

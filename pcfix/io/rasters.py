@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -240,9 +241,6 @@ def copy_as_cog(source: Path, target: Path) -> None:
     )  # fmt: skip
 
 
-PREVIEW_CELLS = 600
-
-
 def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = False) -> int:
     """Write the first band of one raster minus that of another, metres, and count its cells.
 
@@ -279,16 +277,28 @@ def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = Fal
 
 
 Bounds = tuple[float, float, float, float]
+PREVIEW_CELLS = 360_000
 
 
 def preview(path: Path, cells: int = PREVIEW_CELLS) -> tuple[FloatArray, Bounds]:
-    """Return a small version of a raster with NaN for no data, and west, east, south, north."""
+    """Return a raster of at most so many cells, NaN for no data, and west, east, south, north."""
     with open_raster(path) as source:
-        scale = max(1.0, max(source.height, source.width) / cells)
-        shape = max(1, int(source.height / scale)), max(1, int(source.width / scale))
-        values = read_masked(source, out_shape=shape)
-        west, south, east, north = source.bounds
-    return values, (west, east, south, north)
+        shape, bounds = _small(source, cells)
+        return read_masked(source, out_shape=shape), bounds
+
+
+def picture(path: Path, cells: int = PREVIEW_CELLS) -> tuple[npt.NDArray[np.uint8], Bounds]:
+    """Return a coloured raster as `preview` does, shape (rows, columns, bands)."""
+    with open_raster(path) as source:
+        shape, bounds = _small(source, cells)
+        return np.moveaxis(source.read(out_shape=(source.count, *shape)), 0, -1), bounds
+
+
+def _small(source: DatasetReader, cells: int) -> tuple[tuple[int, int], Bounds]:
+    scale = max(1.0, math.sqrt(source.height * source.width / cells))
+    west, south, east, north = source.bounds
+    shape = max(1, int(source.height / scale)), max(1, int(source.width / scale))
+    return shape, (west, east, south, north)
 
 
 def centres(place: FloatArray, values: FloatArray, bounds: Bounds) -> FloatArray:

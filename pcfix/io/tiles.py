@@ -14,6 +14,7 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.io.files import is_remote, path_of, read_json
+from pcfix.io.las.counts import check_count
 from pcfix.io.las.source import LasSource, metric_crs
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -88,10 +89,11 @@ class Tiles:
 class TiledSource(LasSource):
     """Many open files, one after another; see `LasSource`. What is not of points is the first's."""
 
-    def __init__(self, tiles: Tiles, jobs: int | None = None) -> None:
+    def __init__(self, tiles: Tiles, jobs: int | None = None, *, places_only: bool = False) -> None:
         """Open the first."""
         super().__init__(tiles.paths[0], jobs)
         self._tiles, self._jobs, self.path = tiles, jobs, Path(tiles.name)
+        self._places_only = places_only
         self.header.mins, self.header.maxs = tiles.lows.min(axis=0), tiles.highs.max(axis=0)
         self.header.scales = np.full(3, tiles.step_m)
         self.header.point_count = len(tiles)
@@ -100,15 +102,28 @@ class TiledSource(LasSource):
         """Yield all points; a `BrokenTileError` if a file cannot be read to its end."""
         for path in self._tiles.paths:
             try:
-                with LasSource(path, self._jobs) as source:
+                with LasSource(path, self._jobs, places_only=self._places_only) as source:
                     yield from source.chunks()
             except InputError as error:
                 raise BrokenTileError(path, str(error)) from error
 
 
-def open_cloud(cloud: Path | Tiles, jobs: int | None = None) -> LasSource:
-    """Return the points of a file, or of many."""
-    return TiledSource(cloud, jobs) if isinstance(cloud, Tiles) else LasSource(cloud, jobs)
+def open_cloud(
+    cloud: Path | Tiles, jobs: int | None = None, *, places_only: bool = False, kept: Any = None
+) -> LasSource:
+    """Return the points of a file, or of many; see `LasSource`."""
+    if isinstance(cloud, Tiles):
+        return TiledSource(cloud, jobs, places_only=places_only)
+    return LasSource(cloud, jobs, places_only=places_only, kept=kept)
+
+
+def check_one_file(cloud: Any, options: Any) -> None:
+    """Refuse options that are about one file, or about many, where it is the other."""
+    many = isinstance(cloud, Tiles)
+    for name in ("bounds", "read_resolution") if many else ("scheduler",):
+        if getattr(options, name, None) is not None:
+            kind = "a single file" if many else "many files (a folder, glob or list of tiles)"
+            raise SettingError(f"{name.replace('_', '-')} is for {kind} alone; leave it out.")
 
 
 def inputs_of(cloud: Any) -> list[Any]:
@@ -119,11 +134,6 @@ def inputs_of(cloud: Any) -> list[Any]:
 def single(cloud: Clouds) -> File:
     """Return the path of a single file."""
     return cast(File, cloud)
-
-
-def output_name(path: Path) -> str:
-    """Return the name of what is made of a tile; it has no index of COPC any more."""
-    return path.name.replace(".copc.", ".")
 
 
 def tiles_of(cloud: Clouds) -> Tiles | None:
@@ -156,10 +166,10 @@ def tiles_of(cloud: Clouds) -> Tiles | None:
         raise InputError(f"{name}: has no LAS or LAZ files; give a folder, glob or list of some.")
     by_name: dict[str, Path] = {}
     for path in paths:
-        other = by_name.setdefault(output_name(path), path)
+        other = by_name.setdefault(path.name, path)
         if other is not path:
             raise SettingError(
-                f"{name}: {other} and {path} would both become {output_name(path)}; give them"
+                f"{name}: {other} and {path} would both become {path.name}; give them"
                 " names of their own, or correct them one by one."
             )
     return tiles_from(name, paths)
@@ -170,11 +180,11 @@ def _listed(path: Path) -> list[Path] | None:
     text = str(path)
     if path.suffix.lower() in SUFFIXES and not glob.has_magic(text):
         return None
-    if glob.has_magic(text) and (is_remote(path) or not path.exists()):
-        root = Path(path.anchor) if not is_remote(path) else path_of(path.anchor)
-        if not path.is_absolute():
-            return sorted(Path().glob(text))
-        return sorted(root.glob("/".join(path.parts[1:])))
+    if glob.has_magic(text) and is_remote(path):
+        store = cast(Any, path).fs
+        return sorted(path_of(store.unstrip_protocol(one)) for one in store.glob(text))
+    if glob.has_magic(text) and not path.exists():
+        return sorted(path_of(one) for one in glob.glob(text, recursive=True))
     if path.suffix.lower() == ".vpc":
         return _of_index(path)
     if path.suffix.lower() in LISTS and path.is_file():
@@ -219,6 +229,7 @@ def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
     for path in paths:
         try:
             with LasSource(path) as source:
+                check_count(source)
                 header = source.header
                 crs, format = metric_crs(source), header.point_format
                 words = f"CRS {crs.name}" if crs else "no CRS"

@@ -269,6 +269,8 @@ class LabelSummary:
         Points without a known height of the water.
     labelling : dict or None
         What was left out, by the rules beyond the surface.
+    part : dict or None
+        How many points were read, of how many, and by which bounds; None where all were.
     """
 
     input: str
@@ -284,6 +286,7 @@ class LabelSummary:
     labelling: dict[str, Any] | None
     seconds: float
     warnings: list[str] = field(default_factory=list)
+    part: dict[str, Any] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""

@@ -231,7 +231,7 @@ def _effect_numbers(option: str, text: str, most: int = 6) -> tuple[float, ...]:
     return found
 
 
-def _effect_depths(option: str, text: str) -> tuple[float, ...]:
+def depth_series(option: str, text: str) -> tuple[float, ...]:
     """Return the depths of a list, or of FROM:TO:STEP with TO where a step ends there."""
     if ":" not in text:
         return _effect_numbers(option, text, _MOST_DEPTHS)
@@ -304,7 +304,7 @@ class EffectOptions(OptionSet):
         None,
         "Depths that the cloud shows, metres: a list, or FROM:TO:STEP; maps are of the largest.",
         rule=_SEVERAL,
-        parse=_effect_depths,
+        parse=depth_series,
         default_is="0:15:1",
         metavar="M,M",
     )

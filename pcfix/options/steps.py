@@ -11,8 +11,18 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from pcfix.errors import SettingError
-from pcfix.options.declare import File, OptionSet, Rule, at_least, must_be, option, positive, rule
-from pcfix.options.shared import JobOptions, OverwriteOption, Panel, SummaryOption
+from pcfix.options.declare import (
+    File,
+    OptionSet,
+    Rule,
+    at_least,
+    must_be,
+    not_negative,
+    option,
+    positive,
+    rule,
+)
+from pcfix.options.shared import JobOptions, OverwriteOption, Panel, PartOptions, SummaryOption
 
 LEAST_NEIGHBOURS, MOST_NEIGHBOURS = 6, 500
 MAX_HOLE_CELLS = 1000
@@ -231,7 +241,7 @@ class DsmRules(OptionSet):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DsmOptions(OverwriteOption, SummaryOption, DsmRules):
+class DsmOptions(PartOptions, OverwriteOption, SummaryOption, DsmRules):
     """The options of ``pcfix dsm``."""
 
     panel = Panel.OUTPUT
@@ -247,6 +257,10 @@ class DsmOptions(OverwriteOption, SummaryOption, DsmRules):
 LAYERS = ("water", "apparent", "corrected", "reference")
 """Lines of a cross-section; a further cloud goes by another name."""
 _NAME = re.compile(r"[\w .+-]*\w[\w .+-]*")
+
+
+SIGMA_REFERENCE_M = {"cloud": 0.03, "raster": 0.03, "table of check points": 0.02}
+"""Assumed noise of a height by kind of reference: LiDAR over hard ground, RTK or levelling."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -281,6 +295,14 @@ class DistanceOptions(OptionSet):
         (),
         "A further cloud, in the C2C table and the cross-sections; may be repeated.",
         metavar="NAME=CLOUD",
+    )
+    sigma_reference: float | None = option(
+        None,
+        "Noise of a height of the reference, a standard deviation: it is taken out of what is said"
+        " of the cloud's own errors.",
+        unit="m",
+        rule=not_negative("give a standard deviation in metres; 0 takes nothing out"),
+        default_is=", ".join(f"{sigma:g} of a {kind}" for kind, sigma in SIGMA_REFERENCE_M.items()),
     )
 
     def check(self) -> None:

@@ -118,6 +118,12 @@ class RunOptions(
         rule=METRES,
         default_is="2 to 4 points a cell, or the GSD",
     )
+    project: str | None = option(
+        None, "Its name, the title of the report.", default_is="the name of the cloud"
+    )
+    date: str | None = option(
+        None, "When the images were taken, for the report.", default_is="what --image-times says"
+    )
     adjust: AdjustWhen = option(
         "auto",
         "First adjust the cameras with the light bent at the water, as 'pcfix adjust'; auto: where"

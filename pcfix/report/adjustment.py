@@ -8,6 +8,7 @@ import numpy as np
 
 from pcfix.adjust.result import Adjusted
 from pcfix.adjust.values import Before, Plain, adjustment_dict, before_of, carried_by, depth_of
+from pcfix.grid.colours import DEPTH, DIFFERENCE, RAYS, UNCERTAINTY
 from pcfix.grid.maps import Maps, MapsBuilder
 from pcfix.model import FloatArray
 from pcfix.report.adjustment_figures import pictures_of
@@ -31,7 +32,8 @@ from pcfix.report.adjustment_text import (
     surveyed_words,
     xy_words,
 )
-from pcfix.report.page import Layer, Report, Table, render
+from pcfix.report.map_data import Layer
+from pcfix.report.page import Report, Table, render
 
 __all__ = ["Before", "adjustment_dict", "adjustment_page", "adjustment_text", "before_of"]
 
@@ -62,7 +64,7 @@ def adjustment_page(adjusted: Adjusted, before: Before | None = None) -> str:
     report = Report(
         title="Refractive bundle adjustment",
         lead=_lead(d),
-        facts=_facts(d),
+        head=_facts(d),
         warnings=all_notes(d),
         maps=maps,
         layers=layers,
@@ -121,13 +123,16 @@ def _map(a: Adjusted, before: Before | None) -> tuple[Maps, list[Layer]]:
     layers = [Layer("Height", "m", heights.height_m)]
     if depth is not None and a.is_wet.any():
         under = np.where(a.is_wet, depth, np.nan)
-        layers.append(Layer("Depth", "m", _means(a, under).height_m))
+        layers.append(Layer("Depth", "m", _means(a, under).height_m, DEPTH))
     if before is not None:
         higher = a.xyz[:, 2] - before.xyz[:, 2]
-        layers.append(Layer("Change in height", "m", _means(a, higher).height_m))
-    layers.append(Layer("Residual", unit, np.sqrt(_means(a, _mean_squares(a)).height_m)))
+        layers.append(
+            Layer("Change in height", "m", _means(a, higher).height_m, DIFFERENCE, is_centred=True)
+        )
+    residual = np.sqrt(_means(a, _mean_squares(a)).height_m)
+    layers.append(Layer("Residual", unit, residual, UNCERTAINTY))
     images = np.bincount(a.block.owner[a.used], minlength=len(a.xyz)).astype(np.float64)
-    return heights, [*layers, Layer("Images", "", _means(a, images).height_m)]
+    return heights, [*layers, Layer("Images", "", _means(a, images).height_m, RAYS)]
 
 
 def _means(a: Adjusted, values: FloatArray) -> Maps:
@@ -136,11 +141,7 @@ def _means(a: Adjusted, values: FloatArray) -> Maps:
     plan = a.xyz[carried, :2]
     builder = MapsBuilder(plan.min(axis=0), plan.max(axis=0), len(plan))
     known = np.isfinite(values) & carried
-    n = int(known.sum())
-    builder.add(
-        np.column_stack([a.xyz[known, :2], values[known]]),
-        np.zeros(n), np.zeros((n, 3)), np.zeros(n, np.int64), np.zeros(n, np.bool_),
-    )  # fmt: skip
+    builder.add(np.column_stack([a.xyz[known, :2], values[known]]))
     return builder.maps()
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from pcfix.adjust.block import sensor_groups
 from pcfix.adjust.result import Adjusted
 from pcfix.adjust.values import Before, Plain, carried_by, nice_step, rms
+from pcfix.grid.colours import DIFFERENCE
 from pcfix.model import BoolArray, FloatArray
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, label_plan, new_figure
 from pcfix.water.surface import surface_above
@@ -75,7 +76,7 @@ def _arrows(figure: Figure, axes: Axes, a: Adjusted, vectors: FloatArray, rows: 
     key = nice_step(max(float(np.percentile(length, 95.0)), 1e-6) / 2.0)
     reach = max(float(np.abs(by[:, 2]).max()), 1e-6)
     arrows = axes.quiver(
-        at[:, 0], at[:, 1], by[:, 0], by[:, 1], by[:, 2], cmap="RdYlBu_r",
+        at[:, 0], at[:, 1], by[:, 0], by[:, 1], by[:, 2], cmap=DIFFERENCE,
         scale=key / (ARROW * side), clim=(-reach, reach), edgecolor="0.3", linewidth=0.5,
         width=0.007, **ARROW_LOOK,
     )  # fmt: skip

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.compare.figures import CORRECTED_BEFORE
+from pcfix.grid.colours import DIFFERENCE
 from pcfix.model import FloatArray
 from pcfix.options.steps import LAYERS
 from pcfix.report.c2c import (
@@ -61,8 +62,13 @@ def comparison_text(comparison: Comparison) -> str:
         )
     plain = c.as_dict()
     distances = [(f"C2C {way}, {name}", of["statistics"]) for way, name, _, of in c2c_rows(plain)]
-    for table in ([*_table(_signed(plain)), *_normal(c)], _table(distances) + c2c_lines(plain)):
+    for table in (
+        [*_table(signed_statistics(plain)), *_normal(c)],
+        _table(distances) + c2c_lines(plain),
+    ):
         lines += ["", *table] if table else []
+    if c.own is not None:
+        lines += ["", *_own(plain)]
     if c.depth is not None:
         lines += [
             "",
@@ -87,7 +93,35 @@ def comparison_text(comparison: Comparison) -> str:
     return "\n".join([*lines, *(f"note: {note}" for note in c.notes)])
 
 
-def _signed(plain: Plain) -> list[tuple[str, Plain]]:
+def _own(plain: Plain) -> list[str]:
+    """Return the cloud's own errors, and what was taken out for them."""
+    own, title = plain["own"], "bed" if plain["own"]["of"] == "bed" else "cloud"
+    raw = raw_of(plain)["after"]
+    if own["rmse_m"] is None:
+        return [f"of the {title} alone: {noise_sentence(own, raw)}"]
+    return [
+        f"of the {title} alone: RMSE {own['rmse_m']:.3f} m, 95 % {own['within_95_m']:.3f} m,"
+        f" {noise_sentence(own, raw)}"
+    ]
+
+
+def raw_of(compared: Plain) -> Plain:
+    """Return the statistics that the cloud's own errors were taken from, before and after."""
+    if compared["own"]["of"] == "bed":
+        return dict(compared["bed"])
+    return {when: of and of["statistics"] for when, of in compared["vertical"].items()}
+
+
+def noise_sentence(own: Plain, raw: Plain) -> str:
+    """Say what the noise of the reference has to do with the errors of the cloud."""
+    source = "assumed" if own["is_assumed"] else "stated"
+    noise = f"the reference's noise ({own['sigma_reference_m']:.3f} m, {source})"
+    if own["rmse_m"] is None:
+        return f"the differences scatter no more than {noise}, so its own part is not known."
+    return f"without {noise}; with it RMSE {raw['rmse_m']:.3f} m, 95 % {raw['within_95_m']:.3f} m."
+
+
+def signed_statistics(plain: Plain) -> list[tuple[str, Plain]]:
     """Return the statistics of all that has a sign, by title."""
     rows = []
     kinds = (("dZ", "vertical"), ("dZ bed", "bed"), ("dZ land", "land"), ("M3C2", "m3c2"))
@@ -175,7 +209,7 @@ def _difference(values: FloatArray, extent_m: tuple[float, float, float, float])
         f" 98 % of the cells differ by less than {reach:.2f} m."
     )
     figure, axes = new_map(extent_m)
-    image = axes.imshow(values, extent=extent_m, cmap="RdBu_r", vmin=-reach, vmax=reach)
+    image = axes.imshow(values, extent=extent_m, cmap=DIFFERENCE, vmin=-reach, vmax=reach)
     figure.colorbar(image, ax=axes, label="Cloud minus reference (m)", shrink=0.9)
     return Picture("dod", "Difference of the surfaces (DoD)", alt, figure)
 
@@ -185,25 +219,32 @@ def in_a_sentence(compared: Plain) -> str:
     pair = compared["vertical"]
     if pair is None or pair["before"] is None:
         return ""
-    before, after = (pair[when]["statistics"] for when, _, _ in TIMES)
+    is_of_bed = compared.get("bed") is not None
+    if is_of_bed:
+        pair = compared["bed"]
+    before, after = (pair[when].get("statistics", pair[when]) for when, _, _ in TIMES)
     name = compared["reference"].rsplit("/", 1)[-1]
     way = "fell" if after["rmse_m"] <= before["rmse_m"] else "grew"
     twice = f" {CORRECTED_BEFORE}" if CORRECTED_BEFORE in compared["notes"] else ""
     return (
-        f" Against {name} the vertical error {way} from {before['rmse_m']:.3f} to"
-        f" {after['rmse_m']:.3f} m (RMSE of {after['count']:,} points{_apart(compared)}); what is"
-        f" left has a bias of {after['mean_m']:+.3f} m.{twice}"
+        f" Against {name} the vertical error{' of the bed' if is_of_bed else ''} {way} from"
+        f" {before['rmse_m']:.3f} to {after['rmse_m']:.3f} m (RMSE of {after['count']:,} points,"
+        f" the reference's noise included); what is left has a bias of"
+        f" {signed(after['mean_m'])}.{_of_land(compared)}{twice}"
     )
 
 
-def _apart(compared: Plain) -> str:
-    """Return how bed and land changed, where there are both."""
-    parts = [(name, compared.get(name)) for name in ("bed", "land")]
-    return "".join(
-        f"; {name} {pair['before']['rmse_m']:.3f} to {pair['after']['rmse_m']:.3f} m"
-        for name, pair in parts
-        if pair is not None and all(pair for _, pair in parts)
-    )
+def signed(value_m: float) -> str:
+    """Return metres with their sign, which is plus for what rounds to zero."""
+    return f"{round(value_m, 3) + 0.0:+.3f} m"
+
+
+def _of_land(compared: Plain) -> str:
+    """Return how land changed, where there is a bed too."""
+    land = compared.get("land")
+    if land is None or compared["bed"] is None:
+        return ""
+    return f" Land: {land['before']['rmse_m']:.3f} to {land['after']['rmse_m']:.3f} m."
 
 
 def _histograms(compared: Plain) -> list[Picture]:

@@ -7,24 +7,27 @@ from __future__ import annotations
 
 import base64
 import io
-import json
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.grid.colours import DEPTH, HEIGHT
 from pcfix.grid.maps import Maps
 from pcfix.model import FloatArray
+from pcfix.report.map_data import Layer, map_json
 
 if TYPE_CHECKING:
+    from jinja2 import Environment
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 MOST_POINTS = 8000
-_NO_DATA = -32768
-_STEPS = 32_000
-"""Of the 16 bits in which the page holds the values of its map."""
+FIGURES = 4
+"""So many are shown at once."""
 
 BEFORE, AFTER, WATER, REFERENCE = "#b3541e", "#0b5e8a", "#4aa3c7", "#222222"
 """Colours that differ in lightness too, for those who cannot tell the hues apart."""
@@ -70,13 +73,26 @@ def label_side(axes: Axes) -> None:
     axes.set(xlabel="East (m)", ylabel="Height (m)")
 
 
-def draw_cloud(figure: Figure, plan: Axes, xyz: FloatArray, **look: Any) -> FloatArray:
-    """Draw points of a cloud in plan, coloured by their heights; return those that are shown."""
+def draw_cloud(
+    figure: Figure, plan: Axes, xyz: FloatArray, level_m: float | None = None, **look: Any
+) -> FloatArray:
+    """Draw points of a cloud in plan; return those that are shown.
+
+    They are coloured by their apparent depths below a level, land grey, or else by their heights.
+    """
     shown = xyz[:: max(1, len(xyz) // MOST_POINTS)]
-    if len(shown):
-        x, y, z = shown.T
-        dots = plan.scatter(x, y, c=z, s=2, cmap="cividis", **look)
-        figure.colorbar(dots, ax=plan, label="Height of the cloud (m)", shrink=0.8)
+    if len(shown) == 0:
+        return shown
+    x, y, z = shown.T
+    wet = np.zeros(len(z), bool) if level_m is None else z < level_m
+    if level_m is not None and wet.any():
+        plan.plot(x[~wet], y[~wet], ".", color="0.75", markersize=2, markeredgewidth=0)
+        dots = plan.scatter(x[wet], y[wet], c=level_m - z[wet], s=2, cmap=DEPTH, vmin=0.0, **look)
+        label = "Apparent depth (m)"
+    else:
+        dots = plan.scatter(x, y, c=z, s=2, cmap=HEIGHT, **look)
+        label = "Height of the cloud (m)"
+    figure.colorbar(dots, ax=plan, label=label, shrink=0.8)
     return shown
 
 
@@ -96,7 +112,9 @@ class Picture:
     @property
     def data(self) -> str:
         """The picture for an HTML page."""
-        return base64.b64encode(self.png()).decode()
+        from markupsafe import Markup
+
+        return Markup(base64.b64encode(self.png()).decode())
 
 
 @dataclass(frozen=True)
@@ -109,79 +127,89 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Layer:
-    """One choice of the map: values per cell, shape (rows, columns), NaN where there are none."""
+class Tile:
+    """What one must know at once: figures by name, and what they rest on.
 
-    name: str
-    unit: str
-    values: FloatArray
+    `tag` says what kind of figures they are, as "measured".
+    """
+
+    title: str
+    tag: str = ""
+    figures: Sequence[tuple[str, str]] = ()
+    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
 class Report:
-    """All that the page says, in its order."""
+    """All that the page says, in its order.
+
+    Attributes
+    ----------
+    title, lead : str
+    head : Table
+        Beside the map, in a line each.
+    tiles : sequence of Tile
+    warnings : list of str
+    maps : Maps
+    layers : list of Layer
+    place : str
+        What the map's coordinates and heights are.
+    pictures : list of Picture
+        The first `FIGURES` are shown, the others folded.
+    tables : list of Table
+        The first is shown, the others folded.
+    provenance : list of Table
+    files : list of pair
+        Path from the page, and what lies there.
+    """
 
     title: str
     lead: str
-    facts: Table
+    head: Table
     warnings: list[str]
     maps: Maps
     layers: list[Layer]
     pictures: list[Picture]
     tables: list[Table]
     provenance: list[Table] = field(default_factory=list)
+    tiles: Sequence[Tile] = ()
+    place: str = ""
+    files: Sequence[tuple[str, str]] = ()
 
 
-def render(report: Report) -> str:
-    """Return the page: no address outside it is used, and it works without scripts too."""
+_FOLDERS = re.compile(r"(?<![\w.:/~-])(?:[A-Za-z]:)?[/\\](?:[^/\\\s:*?\"<>|]+[/\\])+")
+"""Of an absolute path, which is of no use to a reader elsewhere."""
+
+
+def _as_read(value: Any) -> Any:
+    """Return a value as a reader sees it: files by their names, and a dash for nothing."""
+    if isinstance(value, str) and not hasattr(value, "__html__"):
+        return _FOLDERS.sub("", value)
+    return "-" if value is None else value
+
+
+def environment() -> Environment:
+    """Return how templates are filled: what is put in is escaped."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
 
-    environment = Environment(
+    return Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        finalize=_as_read,
     )
-    # no "</script>" can end the data early, as JSON may say "<" in another way
-    data = json.dumps(_map_data(report)).replace("<", "\\u003c")
-    return environment.get_template("page.html.j2").render(report=report, map_data=Markup(data))
 
 
-def _map_data(report: Report) -> dict[str, Any]:
-    from matplotlib import colormaps
+def render(report: Report) -> str:
+    """Return the page: no address outside it is used, and it works without scripts too."""
+    from markupsafe import Markup
 
-    colours = colormaps["viridis"](np.linspace(0, 1, 64))[:, :3] * 255
-    west, _, _, north = report.maps.extent_m
-    rows, columns = report.maps.height_m.shape
-    return {
-        "rows": rows,
-        "columns": columns,
-        "west": west,
-        "north": north,
-        "cell": report.maps.cell_m,
-        "noData": _NO_DATA,
-        "colours": colours.astype(int).tolist(),
-        "layers": [_packed(layer) for layer in report.layers],
-    }
-
-
-def _packed(layer: Layer) -> dict[str, Any]:
-    """Return a layer as 16-bit whole numbers; its range leaves out a percent at each end."""
-    known = layer.values[np.isfinite(layer.values)]
-    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-    step = max(high - low, 1e-9) / _STEPS
-    whole = np.where(
-        np.isfinite(layer.values), np.rint((layer.values - low) / step), _NO_DATA
-    ).astype("<i2")
-    shown = np.percentile(known, [1.0, 99.0]) if known.size else np.array([0.0, 1.0])
-    return {
-        "name": layer.name,
-        "unit": layer.unit,
-        "offset": low,
-        "step": step,
-        "low": float(shown[0]),
-        "high": float(max(shown[1], shown[0] + 1e-9)),
-        "values": base64.b64encode(whole.tobytes()).decode(),
-    }
+    return (
+        environment()
+        .get_template("page.html.j2")
+        .render(
+            report=report, figures=FIGURES, map_data=Markup(map_json(report.maps, report.layers))
+        )
+    )

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.grid.colours import DEPTH, HEIGHT
 from pcfix.model import FloatArray
 from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, new_figure
 from pcfix.simulate.hsu_wang import EDGES_M, METHODS, PRINTED_RMSE_MM, DepthBins
@@ -93,7 +94,7 @@ def error_map_figure(effects: list[Effect]) -> Figure:
     levels = _levels(low, high)
     figure, panels = _panels(effects, 2.9, 4.6)
     for axes, (one,) in panels:
-        filled = axes.contourf(one.x_m, one.y_m, one.error_m, levels, cmap="viridis")
+        filled = axes.contourf(one.x_m, one.y_m, one.error_m, levels, cmap=HEIGHT)
         _draw_contours(axes, one, levels)
         _mark_places(axes, one)
         axes.set_aspect("equal")
@@ -127,7 +128,7 @@ def stack_figure(effects: list[Effect]) -> Figure:
     from matplotlib.colors import Normalize
 
     depths = [one.apparent_depth_m for one in effects]
-    colours = ScalarMappable(Normalize(min(depths), max(depths)), "viridis_r")
+    colours = ScalarMappable(Normalize(min(depths), max(depths)), DEPTH)
     shades = dict(zip(depths, colours.to_rgba(np.array(depths)), strict=True))
     figure, panels = _panels(effects, 4.2, 4.2, subplot_kw={"projection": "3d"})
     for axes, stack in panels:

@@ -14,17 +14,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.grid.maps import Maps
-from pcfix.grid.model import NO_LIGHT, hillshade
+from pcfix.grid.colours import DEPTH, DIFFERENCE, HEIGHT, RAYS, UNCERTAINTY
+from pcfix.grid.contours import contours, depth_interval
+from pcfix.grid.maps import Extent, Maps
 from pcfix.model import BoolArray, Cameras, FloatArray, WaterPlane, WaterSurface
 from pcfix.refract.tally import COVERAGE_95, ORDERS, Summary, largest_tvu_m
 from pcfix.report.adjustment_text import WHERE, all_notes, fixed, lens_label, listed, short
+from pcfix.report.first_screen import Survey, head_of, notes_of, tiles_of
+from pcfix.report.map_data import Layer, relief
 from pcfix.report.page import (
     AFTER,
     BEFORE,
     REFERENCE,
     WATER,
-    Layer,
     Picture,
     Report,
     Table,
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
 
 
 Plain = dict[str, Any]
+Pair = tuple[str, str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,17 +53,22 @@ class Corrected:
     Attributes
     ----------
     summary : Summary
+    survey : Survey
     cameras : Cameras
     water : WaterSurface
     maps : Maps
-    sample : array, shape (m, 5)
-        Shift, depth and standard error of Z of corrected points, metres; zero where none is.
+    depth_m : dict
+        Least (min), mean and greatest (max) of the bed's points that are not noise.
+    sample : array, shape (m, 3)
+        Shift in Z, depth and standard error of Z of corrected points, metres; zero where none is.
     """
 
     summary: Summary
+    survey: Survey
     cameras: Cameras
     water: WaterSurface
     maps: Maps
+    depth_m: dict[str, float]
     sample: FloatArray
 
 
@@ -71,16 +79,23 @@ class Later:
     Attributes
     ----------
     pictures, tables : sequence
+        Those that matter most first.
     verdict : str
         A sentence that they come to.
     compared : dict
         `Comparison.as_dict`; what it measured replaces what was predicted.
+    difference : pair, optional
+        From the reference, shape (rows, columns), metres, and its extent.
+    resolution_m : float, optional
+        Of the rasters, which is that of the map too.
     """
 
     pictures: Sequence[Picture] = ()
     tables: Sequence[Table] = ()
     verdict: str = ""
     compared: Plain = field(default_factory=dict)
+    difference: tuple[FloatArray, Extent] | None = None
+    resolution_m: float | None = None
 
     @property
     def tvu(self) -> Plain | None:
@@ -89,39 +104,75 @@ class Later:
 
 
 NOTHING_LATER = Later()
+FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras", "shift")
+"""Those that are shown where they are there, the first four of them."""
 
 
-def run_report(corrected: Corrected, files: Table, later: Later = NOTHING_LATER) -> Report:
-    """Return what the page of a run says; `files` are those that went in."""
-    s, maps = corrected.summary, corrected.maps
-    settings = [[name.replace("_", " "), str(value)] for name, value in s.settings.items()]
+def run_report(
+    corrected: Corrected, inputs: Table, files: Sequence[Pair], later: Later = NOTHING_LATER
+) -> Report:
+    """Return what the page of a run says; `inputs` went in, and `files` lie beside it."""
+    s, maps, survey = corrected.summary, corrected.maps, corrected.survey
     versions = [["pcfix", __version__], ["Python", platform.python_version()]]
     versions += [[name, version(name)] for name in ("numpy", "scipy", "numba", "laspy", "lazrs")]
+    pictures = [*_pictures(corrected), *_uncertainty_picture(corrected.sample, s, later)]
+    pictures += later.pictures
+    order = {name: place for place, name in enumerate(FIRST_FIGURES)}
     return Report(
-        title=f"Refraction correction of {Path(s.input).name}",
+        title=survey.project or Path(s.input).stem,
         lead=_lead(s) + later.verdict,
-        facts=_facts(s, later.tvu),
-        warnings=_warnings(s),
+        head=head_of(s, survey),
+        tiles=tiles_of(s, survey, later.compared, corrected.depth_m),
+        warnings=notes_of(s, survey, later.compared),
         maps=maps,
-        layers=[
-            Layer("Depth", "m", maps.depth_m),
-            Layer("Height", "m", maps.height_m),
-            Layer("Shift in Z", "m", maps.shift_z_m),
-            Layer("Shift in plan", "m", maps.shift_xy_m),
-            Layer("Rays", "", maps.rays),
-        ],
-        pictures=[
-            *_pictures(corrected),
-            *_uncertainty_picture(corrected.sample, s, later),
-            *later.pictures,
-        ],
-        tables=[*_orders(s, later.tvu), *later.tables],
+        place=survey.place,
+        layers=_layers(maps, later),
+        pictures=sorted(pictures, key=lambda one: order.get(one.name, len(order))),
+        tables=[*later.tables, *_orders(s, later.tvu)],
+        files=files,
         provenance=[
-            Table("Settings", ["setting", "value"], settings),
-            files,
+            _facts(s, later.tvu),
+            Table("Settings", ["setting", "value"], settings_rows(s.settings)),
+            inputs,
             Table("Software", ["name", "version"], versions),
         ],
     )
+
+
+def _layers(maps: Maps, later: Later) -> list[Layer]:
+    known = np.isfinite(maps.uncertainty_m).any()
+    by = "Uncertainty (95 %)" if known else ""
+    layers = [Layer("Depth", "m", maps.depth_m, DEPTH, by, has_contours=True)]
+    if known:
+        layers.append(Layer(by, "m", maps.uncertainty_m, UNCERTAINTY))
+    if later.difference is not None:
+        values = maps.sampled(*later.difference)
+        layers.append(Layer("Cloud minus reference", "m", values, DIFFERENCE, is_centred=True))
+    return [
+        *layers,
+        Layer("Rays", "", maps.rays, RAYS),
+        Layer("Shift in Z", "m", maps.shift_z_m),
+        Layer("Height", "m", maps.height_m),
+    ]
+
+
+def settings_rows(settings: Plain) -> list[list[str]]:
+    """Return settings as a reader reads them, without those that were not set."""
+    return [
+        [name.replace("_", " "), _worded(value)]
+        for name, value in settings.items()
+        if value not in (None, "", {}, [])
+    ]
+
+
+def _worded(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, dict):
+        return "; ".join(f"{name} {_worded(one)}" for name, one in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_worded, value))
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def _lead(s: Summary) -> str:
@@ -134,9 +185,9 @@ def _lead(s: Summary) -> str:
             f" adjusted ones, which moved it by {s.carried['shift_m']['rms']:.2f} m (rms)."
         )
     return (
-        f"{s.corrected:,} of {s.points:,} points lay under water and were moved to where the bed"
-        f" is: {abs(mean):.2f} m {way} on average, down to a depth of"
-        f" {s.depth_m['max']:.2f} m.{land}"
+        f"Correction for refraction of {Path(s.input).name}: {s.corrected:,} of {s.points:,} points"
+        f" lay under water and were moved to where the bed is, {abs(mean):.2f} m {way} on"
+        f" average.{land}"
     )
 
 
@@ -166,45 +217,32 @@ def _facts(s: Summary, measured: Plain | None) -> Table:
     return Table("In short", [], rows)
 
 
-def _warnings(s: Summary) -> list[str]:
-    warnings = list(s.warnings)
-    fate = {"withhold": "flagged as withheld", "keep": "left as they were", "drop": "left out"}
-    for reason, count in s.uncorrected.items():
-        if count:
-            warnings.append(
-                f"{count:,} points under water could not be corrected ({reason}); they were not"
-                f" moved and are {fate[s.settings['uncorrected']]}."
-            )
-    if s.water_unknown:
-        warnings.append(f"{s.water_unknown:,} points have no known water surface above them.")
-    return warnings
-
-
 def _pictures(corrected: Corrected) -> list[Picture]:
     s, maps, water = corrected.summary, corrected.maps, corrected.water
     cameras = corrected.cameras
     used = ~np.isin(np.array(cameras.labels), s.cameras_unused)
     flat = isinstance(water, WaterPlane) and water.b == water.c == 0.0
     level = water.a if isinstance(water, WaterPlane) and flat else None
-    depth, shift = s.depth_m, s.shift_z_m
+    depth, shift = corrected.depth_m, s.shift_z_m
     return [
         Picture(
             "depth", "Depth",
             f"Map of the corrected depth over the shaded relief; {depth['min']:.2f} to"
-            f" {depth['max']:.2f} m, mean {depth['mean']:.2f} m.",
-            map_figure(maps, maps.depth_m, "Depth (m)", "viridis_r"),
+            f" {depth['max']:.2f} m, mean {depth['mean']:.2f} m; contours every"
+            f" {depth_interval(maps.depth_m, maps.uncertainty_m):g} m.",
+            map_figure(maps, maps.depth_m, "Depth (m)", DEPTH),
         ),
         Picture(
             "shift", "Shift in Z",
             f"Map of how far the bed moved down; mean {shift['mean']:.2f} m,"
             + (" growing with depth and towards flat rays." if s.carried is None else " with what"
                " the adjustment changed."),
-            map_figure(maps, maps.shift_z_m, "True minus apparent Z (m)", "magma"),
+            map_figure(maps, maps.shift_z_m, "True minus apparent Z (m)", HEIGHT),
         ),
         Picture(
             "shift_histogram", "How far the points moved",
             "Histogram of the shift in Z of the corrected points.",
-            histogram_figure(corrected.sample[:, 2], "shift in Z", "True minus apparent Z (m)"),
+            histogram_figure(corrected.sample[:, 0], "shift in Z", "True minus apparent Z (m)"),
         ),
         *([] if not s.cameras else [Picture(
             "cameras", "Cameras",
@@ -215,21 +253,18 @@ def _pictures(corrected: Corrected) -> list[Picture]:
     ]  # fmt: skip
 
 
-def map_figure(maps: Maps, values: FloatArray, label: str, colours: str) -> Figure:
-    """Draw a map of values over the shaded relief."""
+def map_figure(maps: Maps, values: FloatArray, label: str, ramp: str) -> Figure:
+    """Draw a map of values over the shaded relief, with contours where they are depths."""
     figure, axes = new_map(maps.extent_m)
-    axes.imshow(
-        relief(maps.height_m, maps.cell_m), extent=maps.extent_m, cmap="gray", vmin=0.0, vmax=1.0
-    )
-    image = axes.imshow(values, extent=maps.extent_m, cmap=colours, alpha=0.75)
+    shade = relief(maps.height_m, maps.cell_m)
+    axes.imshow(shade, extent=maps.extent_m, cmap="gray", vmin=0.0, vmax=1.0)
+    image = axes.imshow(values, extent=maps.extent_m, cmap=ramp, alpha=0.75)
+    if ramp == DEPTH:
+        for _, place in contours(values, depth_interval(values, maps.uncertainty_m)):
+            x, y = (place + 0.5).T * maps.cell_m  # from the corner of the map
+            axes.plot(maps.west_m + x, maps.north_m - y, color=REFERENCE, linewidth=0.5)
     figure.colorbar(image, ax=axes, label=label, shrink=0.9)
     return figure
-
-
-def relief(height_m: FloatArray, cell_m: float) -> FloatArray:
-    """Return the shade of a surface lit from the north-west, 45 degrees up, 0 to 1."""
-    light = hillshade(np.pad(height_m, 1, constant_values=np.nan), cell_m, 315.0, 45.0)
-    return np.where(light == NO_LIGHT, np.nan, (light - 1.0) / 254.0)
 
 
 def histogram_figure(values: FloatArray, name: str, label: str) -> Figure:
@@ -252,6 +287,8 @@ def cameras_figure(
     """Draw the projection centres in plan and in profile, shape (k, 3), over the cloud."""
     figure, (plan, profile) = new_figure(8.0, 7.0, nrows=2, height_ratios=[3, 2])
     plan.imshow(maps.height_m, extent=maps.extent_m, cmap="Greys_r", alpha=0.6)
+    depth = plan.imshow(maps.depth_m, extent=maps.extent_m, cmap=DEPTH)
+    figure.colorbar(depth, ax=plan, label="Depth (m)", shrink=0.8)
     marks = (used, "o", AFTER, "used"), (~used, "x", BEFORE, "not used")
     for chosen, mark, colour, name in marks:
         if chosen.any():
@@ -277,17 +314,21 @@ def cameras_figure(
 
 def _uncertainty_picture(sample: FloatArray, s: Summary, later: Later) -> list[Picture]:
     """Return TVU over depth, where the cloud has standard errors."""
-    known = sample[:, 4] > 0.0
+    known = sample[:, 2] > 0.0
     if s.uncertainty is None or not known.any():
         return []
     bins = later.compared["depth_bins"] if later.tvu else []
     text = (
         "Total vertical uncertainty at 95 % (1.96 standard errors of Z) over depth, and the"
         f" largest that the orders of IHO S-44 allow. It is formal: {formal_words(s)}."
-        + (" Dots: within which 95 % of the differences to the reference lie." if bins else "")
+        + (
+            " Dots: within which 95 % of the differences to the reference lie, its noise included."
+            if bins
+            else ""
+        )
         + " S-44 asks for more than the TVU: position, features and coverage."
     )
-    figure = tvu_figure(sample[known, 3], sample[known, 4], bins)
+    figure = tvu_figure(sample[known, 1], sample[known, 2], bins)
     return [Picture("uncertainty", "Vertical uncertainty", text, figure)]
 
 

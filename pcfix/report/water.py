@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.grid.colours import DIFFERENCE
 from pcfix.model import BoolArray, FloatArray
-from pcfix.report.page import AFTER, BEFORE, WATER, draw_cloud, label_plan, new_figure
+from pcfix.report.page import AFTER, BEFORE, WATER, Picture, draw_cloud, label_plan, new_figure
 from pcfix.report.text import shoreline_lines
 from pcfix.water.auto import WaterProposal
 from pcfix.water.fit import WaterFit
@@ -162,7 +163,7 @@ def water_figure(report: WaterReport) -> Figure:
     if isinstance(found.evidence, WaterProposal):
         return shoreline_figure(found.evidence)
     figure, (plan, side) = new_figure(8.0, 7.5, nrows=2, height_ratios=[3, 2])
-    draw_cloud(figure, plan, report.sample_xyz)
+    draw_cloud(figure, plan, report.sample_xyz, getattr(found.evidence, "level_m", None))
     if found.evidence is not None and found.points is not None:
         _points(plan, side, found.points, found.evidence)
     label_plan(plan, 20.0)
@@ -204,6 +205,15 @@ def _station(points: FloatArray, fit: WaterFit | RiverFit) -> FloatArray:
     return np.asarray(station - station.min())
 
 
+def found_picture(found: FoundSurface) -> Picture:
+    """Return what a level that was found in the cloud rests on, for a page."""
+    alt = "How the water was found: the shoreline in plan, the heights, and what speaks for which."
+    reasons = found.evidence.reasons if isinstance(found.evidence, WaterProposal) else ()
+    alt += "".join(f" {reason[:1].upper()}{reason[1:].rstrip('.')}." for reason in reasons)
+    figure = water_figure(WaterReport("auto", found, None, None, None, np.zeros((0, 3))))
+    return Picture("water", "The water level found in the cloud", alt, figure)
+
+
 def shoreline_figure(found: WaterProposal) -> Figure:
     """Draw the shoreline in plan, and heights and evidence beside it."""
     figure, axes = new_figure(
@@ -238,7 +248,7 @@ def _plan(axes: Axes, figure: Figure, found: WaterProposal) -> None:
     x, y = (ground[:, :2] - corner).T
     size = 60.0 * np.sqrt(1_000.0 / len(ground))
     dots = axes.scatter(
-        x, y, c=above_m, s=size, cmap="BrBG_r", vmin=-reach, vmax=reach, linewidths=0, marker="s"
+        x, y, c=above_m, s=size, cmap=DIFFERENCE, vmin=-reach, vmax=reach, linewidths=0, marker="s"
     )
     label = "Apparent height above the surface (m)"
     figure.colorbar(dots, ax=axes, label=label, location="bottom", shrink=0.7, aspect=30)

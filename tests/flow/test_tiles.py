@@ -125,13 +125,6 @@ def test_a_folder_a_glob_a_list_and_an_index_name_the_same_files(cloud):
     assert tiles_of(cloud[1]) is None
 
 
-def test_an_index_of_copc_tiles_becomes_plain_tiles(cloud, tmp_path):
-    path = tmp_path / "a.copc.laz"
-    path.write_bytes(tiles_in(cloud[0])[0].read_bytes())
-    pcfix.label_file([path], tmp_path / "out", water=0.37)
-    assert tiles_in(tmp_path / "out") == [tmp_path / "out" / "a.laz"]
-
-
 def test_a_second_call_does_only_what_is_not_finished(cloud, tmp_path):
     given = {"cameras": CAMERAS, "water": 0.37, "method": "snell"}
     first = pcfix.correct_file(cloud[0], tmp_path / "out", **given)
@@ -292,7 +285,7 @@ def test_outputs_that_are_refused(cloud, tmp_path):
         assert sentence in done.stderr
         assert len(done.stderr.splitlines()) == 1
     done = run_pcfix("label", merged, tmp_path / "a.laz", "--water", "0", "--scheduler", "x:1")
-    assert "scheduler is of use with many files alone" in done.stderr
+    assert "scheduler is for many files (a folder, glob or list of tiles) alone" in done.stderr
 
 
 def test_tiles_that_overlap_are_warned_of(tmp_path):

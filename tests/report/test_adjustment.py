@@ -276,7 +276,7 @@ def test_similarity_tells_shift_turn_and_scale(adjusted):
                         block_correlation=np.zeros((3, 3)))  # fmt: skip
     free = Unknowns(poses="similarity", level_sigma_m=0.1)
     page = adjustment_page(replace(adjusted, precision=precision, unknowns=free))
-    row = re.search(r"<td>shift z</td>(.*?)</tr>", page)[1]
+    row = re.search(r">shift z</th>(.*?)</tr>", page)[1]
     assert re.findall(r"<td>(.*?)</td>", row) == ["", "", "+0.31", "0.02", "m"]
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import base64
 import json
 import re
+import zlib
 from html.parser import HTMLParser
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +16,9 @@ import pytest
 import pcfix
 from pcfix.flow.report import write_report
 from pcfix.grid.maps import MapsBuilder
-from pcfix.report.page import Layer, Report, Table, render
-from pcfix.report.run import histogram_figure, relief
+from pcfix.report.map_data import Layer, relief
+from pcfix.report.page import Report, Table, Tile, render
+from pcfix.report.run import histogram_figure, settings_rows
 from tests.utils.browser import needs_browser, open_page
 
 SCENE = Path(__file__).parents[2] / "samples" / "scene"
@@ -55,7 +58,8 @@ def test_page_needs_nothing_outside_itself(report):
     for _, attributes in elements.found:
         for key in ("src", "href", "srcset", "action", "data"):
             if key in attributes:
-                assert attributes[key].startswith("data:")
+                inside = attributes[key].startswith("data:")
+                assert inside or (report[0] / attributes[key]).is_file()
     assert not re.search(r"https?://|@import|url\((?!data:)", text)
 
 
@@ -69,20 +73,34 @@ def test_every_picture_says_what_it_shows_and_is_a_file_too(report):
         assert path.read_bytes().startswith(b"\x89PNG")
 
 
+def map_data(text):
+    return json.loads(re.search(r'id="data">(.*?)</script>', text, re.S)[1])
+
+
+def values_of(data, name):
+    layer = next(one for one in data["layers"] if one["name"] == name)
+    steps = np.frombuffer(zlib.decompress(base64.b64decode(layer["values"])), "<i2")
+    whole = np.cumsum(steps, dtype="<i2").reshape(data["rows"], data["columns"])
+    return np.where(whole == data["noData"], np.nan, layer["offset"] + layer["step"] * whole)
+
+
 def test_map_holds_the_values_of_the_cloud(report):
     folder, summary = report
-    text = (folder / "report.html").read_text()
-    data = json.loads(re.search(r'id="data">(.*?)</script>', text, re.S)[1])
+    data = map_data((folder / "report.html").read_text())
     layers = {layer["name"]: layer for layer in data["layers"]}
-    assert list(layers) == ["Depth", "Height", "Shift in Z", "Shift in plan", "Rays"]
+    assert list(layers) == ["Depth", "Uncertainty (95 %)", "Rays", "Shift in Z", "Height"]
     depth = layers["Depth"]
-    whole = np.frombuffer(base64.b64decode(depth["values"]), "<i2")
-    assert whole.size == data["rows"] * data["columns"]
-    values = depth["offset"] + depth["step"] * whole[whole != data["noData"]]
+    assert depth["plusMinus"] in layers
+    # light is shallow: the sum of red, green and blue falls with depth
+    assert all(sum(a) >= sum(b) for a, b in pairwise(depth["colours"]))
+    values = values_of(data, "Depth")
+    values = values[np.isfinite(values)]
     # cells have about the same number of points each, so their mean is near that of the points
     assert values.mean() == pytest.approx(summary.depth_m["mean"], abs=0.1)
     assert summary.depth_m["min"] - 0.001 <= values.min()
     assert values.max() <= summary.depth_m["max"] + 0.001
+    levels = [one["level"] for one in data["contours"]]
+    assert levels and min(levels) > 0.0 and max(levels) < depth["high"]
 
 
 def test_figures_of_the_run_are_on_the_page(report):
@@ -93,48 +111,105 @@ def test_figures_of_the_run_are_on_the_page(report):
     assert f"mean {summary.shift_z_m['mean']:.3f} m" in text
 
 
-@needs_browser
-@pytest.mark.parametrize("width", [1000, 360], ids=["desk", "phone"])
-def test_scripts_run_without_complaint(report, tmp_path, width):
-    done = open_page(report[0] / "report.html", tmp_path, f"--window-size={width},900")
-    complaints = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
-    assert complaints == []
-    assert re.search(r'<output id="value"[^>]*>E 4102\d\d\.\d, N 46503\d\d\.\d: Depth', done.stdout)
-    assert done.stdout.count('type="radio"') == 5
+PROBE = """<script>const ready = setInterval(() => {
+  const map = document.getElementById("map");
+  if (!map.clientWidth || map.width !== map.clientWidth) return; /* not drawn yet */
+  clearInterval(ready);
+  const box = map.getBoundingClientRect(), said = [];
+  const middle = box.left + box.width / 2;
+  const at = { clientX: middle, clientY: box.top + box.height / 2, bubbles: true };
+  const place = x => {
+    map.dispatchEvent(new PointerEvent("pointermove", { ...at, clientX: middle + x }));
+    said.push(document.getElementById("value").textContent);
+  };
+  place(0); place(60);
+  map.dispatchEvent(new WheelEvent("wheel", { ...at, deltaY: -400, cancelable: true }));
+  place(0); place(60);
+  said.push(document.documentElement.scrollWidth);
+  document.title = said.join("|");
+}, 50)</script></body>"""
 
 
 @needs_browser
-def test_nothing_is_wider_than_a_phone(report, tmp_path):
+def test_map_zooms_and_says_its_values_on_a_phone(report, tmp_path):
     text = (report[0] / "report.html").read_text()
-    probe = "<script>document.title='width '+document.documentElement.scrollWidth</script></body>"
     page = tmp_path / "probe.html"
-    page.write_text(text.replace("</body>", probe))
+    page.write_text(text.replace("</body>", PROBE))
     done = open_page(page, tmp_path / "profile", "--window-size=500,900")
-    assert int(re.search(r"<title>width (\d+)", done.stdout)[1]) <= 500
+    assert [line for line in done.stderr.splitlines() if "CONSOLE" in line] == []
+    *said, width = re.search(r"<title>([^<]*)", done.stdout)[1].split("|")
+    assert int(width) <= 500  # nothing is wider than the page
+    told = [
+        re.match(r"X ([\d.]+), Y ([\d.]+), Depth ([\d.]+) m ± ([\d.]+) m,", one) for one in said
+    ]
+    x, y, depth, error = np.array([one.groups() for one in told], float).T
+    assert abs(x[2] - x[0]) < 2.0  # a cell: the place under the wheel stays
+    assert (x[1] - x[0]) / (x[3] - x[2]) == pytest.approx(np.e, rel=0.2)
+    data = map_data(text)
+    column = ((x - data["west"]) / data["cell"]).astype(int)
+    row = ((data["north"] - y) / data["cell"]).astype(int)
+    values, errors = (
+        values_of(data, name)[row, column] for name in ("Depth", "Uncertainty (95 %)")
+    )
+    # written with two and three digits
+    np.testing.assert_allclose(depth, values, atol=0.006)
+    np.testing.assert_allclose(error, errors, atol=0.0011)
 
 
 def test_names_cannot_become_markup():
     maps = MapsBuilder(np.zeros(2), np.ones(2), 10)
-    ones = np.ones(10)
-    maps.add(np.random.default_rng(1).random((10, 3)), ones, np.zeros((10, 3)), ones, ones > 0)
+    maps.add(np.random.default_rng(1).random((10, 3)), np.ones(10) > 0, np.ones((10, 4)))
     evil = "</script><script>alert(1)</script>"
-    built = maps.maps()
+    built, table = maps.maps(), Table(evil, [evil], [[evil, evil]])
     page = render(
-        Report(evil, evil, Table(evil, [], [[evil, evil]]), [evil], built,
-               [Layer(evil, "m", built.depth_m)], [], [Table(evil, [evil], [[evil]])])
+        Report(
+            evil, evil, table, [evil], built, [Layer(evil, evil, built.depth_m, plus_minus=evil)],
+            [], [table, table], [table], [Tile(evil, evil, [(evil, evil)], [evil])], evil,
+            [(f"compare/{evil}.csv", evil)],
+        )
     )  # fmt: skip
-    assert evil not in page
+    assert "<script>alert" not in page
     assert len(Elements(page).all("script")) == 2
+
+
+def test_nothing_of_the_machine_or_of_python_is_on_the_page(report):
+    folder, _ = report
+    page = folder / "report.html"
+    text = page.read_text()
+    assert str(folder) not in text and str(SCENE) not in text
+    words = re.sub(r"<(script|style).*?</\1>|<[^>]*>", " ", text, flags=re.S)
+    assert not re.search(r"\b(None|nan|inf|True|False)\b|[{}]", words)
+    assert page.stat().st_size < 8_000_000
+
+
+def test_settings_are_words():
+    given = {"a_b": True, "none": None, "empty": "", "d": {"x": 1.0, "y": [1, 2]}, "f": 0.1 + 0.2}
+    assert settings_rows(given) == [["a b", "yes"], ["d", "x 1; y 1, 2"], ["f", "0.3"]]
+
+
+def test_paths_are_names():
+    table = Table("", [], [["/home/me/data/cloud.laz: 1/2 m/s", "C:\\Users\\me\\a.laz", "a/b.csv"]])
+    maps = MapsBuilder(np.zeros(2), np.ones(2), 10).maps()
+    page = render(Report("", "", table, [], maps, [Layer("", "m", maps.depth_m)], [], []))
+    for words in (">cloud.laz: 1/2 m/s<", ">a.laz<", ">a/b.csv<"):
+        assert words in page
+
+
+def test_without_a_reference_the_accuracy_is_predicted(report):
+    text = (report[0] / "report.html").read_text()
+    tile = re.search(r"<h2>Accuracy of the bed.*?</section>", text, re.S)[0]
+    sigma = report[1].uncertainty["sigma_z_m"]["mean"]
+    assert ">predicted<" in tile and "measured" not in tile and f"{sigma:.3f} m" in tile
+    assert "date not stated" in text and "vertical datum not known" in text
 
 
 def test_cells_are_means_of_their_points():
     rng = np.random.default_rng(4)
     xyz = rng.uniform((0, 0, -5), (30, 12, 0), (5000, 3)) + np.array([5e5, 4e6, 0.0])
-    depth, shift = rng.random(5000), rng.normal(size=(5000, 3))
-    rays, moved = rng.integers(2, 9, 5000), rng.random(5000) < 0.6
+    told, moved = rng.random((5000, 4)), rng.random(5000) < 0.6
     builder = MapsBuilder(xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0), 5000)
     for part in np.array_split(np.arange(5000), 3):
-        builder.add(xyz[part], depth[part], shift[part], rays[part], moved[part])
+        builder.add(xyz[part], moved[part], told[part][moved[part]])
     maps = builder.maps()
     west, _, south, north = maps.extent_m
     expected = np.full((*maps.height_m.shape, 2), np.nan)
@@ -148,12 +223,12 @@ def test_cells_are_means_of_their_points():
         if inside.any():
             expected[row, column, 0] = xyz[inside, 2].mean()
         if (inside & moved).any():
-            expected[row, column, 1] = np.hypot(*shift[inside & moved, :2].T).mean()
+            expected[row, column, 1] = told[inside & moved, 1].mean()
     assert south == pytest.approx(xyz[:, 1].min())
     corner = np.isclose(expected[..., 0], maps.height_m, equal_nan=True)
     # points on the very edge of a cell may fall to either side
     assert corner.mean() > 0.97
-    assert np.isclose(expected[..., 1], maps.shift_xy_m, equal_nan=True).mean() > 0.97
+    assert np.isclose(expected[..., 1], maps.shift_z_m, equal_nan=True).mean() > 0.97
 
 
 def test_a_slope_facing_the_light_is_bright():

@@ -1,0 +1,92 @@
+"""The plugin of QGIS as a ZIP: its files, and a table of the commands that it offers."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Callable, Iterable
+from typing import Any, get_args, get_type_hints
+
+from pcfix.io.qgis_plugin import packed
+from pcfix.options.declare import Option, options_of
+from pcfix.version import __version__
+
+OFFERED = ("run", "correct", "label", "water", "compare", "photos")
+_PLACES = {
+    "output": "written", "out_dir": "folder written", "images": "folder", "reference": "file",
+    "spec": "text",
+}  # fmt: skip
+"""What the places of commands are; the others are clouds."""
+_WRITTEN = ("summary", "shoreline", "save_regression", "plot")
+"""Options that name a file to write; `out_dir` a folder."""
+
+
+def plugin_zip(commands: Iterable[Callable[..., None]]) -> bytes:
+    """Return the plugin with those of the commands that it offers."""
+    by_name = {command.__name__: command for command in commands}
+    table = {"version": __version__, "commands": [_command(by_name[name]) for name in OFFERED]}
+    return packed(json.dumps(table, indent=1) + "\n", __version__)
+
+
+def _command(command: Callable[..., None]) -> dict[str, Any]:
+    hints = get_type_hints(command, include_extras=True)
+    options = options_of(get_args(hints["options"])[0])
+    has_port = any(one.name == "port" for one in options)
+    return {
+        "name": command.__name__,
+        "help": inspect.getdoc(command),
+        "places": [
+            _place(name, _help_of(hints[name]))
+            for name, one in inspect.signature(command).parameters.items()
+            if one.kind is inspect.Parameter.POSITIONAL_ONLY
+        ],
+        "options": [
+            _option(one, instead=has_port and one.name == "water")
+            for one in options
+            if not one.hidden
+        ],
+    }
+
+
+def _help_of(hint: Any) -> str:
+    """Return the help that is written beside the type of a place."""
+    return next(one.help for one in get_args(hint)[1:] if hasattr(one, "help"))
+
+
+def _place(name: str, words: str) -> dict[str, Any]:
+    kind = _PLACES.get(name, "cloud")
+    return {"name": name, "kind": kind, "help": words, "unit": "", "default": None, "needed": True}
+
+
+def _option(one: Option, *, instead: bool) -> dict[str, Any]:
+    """Return an option as a form needs it; `instead` tells whether another may stand for it."""
+    kind, default = _kind(one), one.default
+    if kind not in ("bool", "int", "float", "choice"):
+        default = None  # the text stays empty where pcfix shall take its own
+    default_words = f" Default: {one.default_text}." if one.default_text else ""
+    return {
+        "name": one.name,
+        "flag": one.flag,
+        "kind": kind,
+        "choices": list(one.choices),
+        "unit": one.unit,
+        "default": default,
+        "repeated": one.default == () and one.parse is None,
+        "needed": one.needed and not one.default_is and not instead,
+        "help": one.help + default_words,
+    }
+
+
+def _kind(one: Option) -> str:
+    if one.name in _WRITTEN:
+        return "written"
+    if one.name == "out_dir":
+        return "folder written"
+    if one.metavar == "PATH" or one.placeholder == "PATH":
+        return "file"
+    if one.choices and one.parse is None:
+        return "choice"
+    for kind in (bool, int, float):
+        if one.kinds == (kind,) and one.parse is None:
+            return kind.__name__
+    return "text"

@@ -1,0 +1,248 @@
+"""Clouds before and after a correction, a reference, cameras and water, in one view."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pcfix.compare.match import near_in_plan
+from pcfix.compare.nearest import mean_spacing_m
+from pcfix.compare.vertical import heights_at
+from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.flow.inputs import Inputs
+from pcfix.flow.surfaces import find_surface, view_of
+from pcfix.io.clouds import check_same_crs, read_reference
+from pcfix.io.files import check_input, check_output, write_bytes
+from pcfix.io.las.columns import SHIFTS
+from pcfix.io.las.source import LasSource, coordinates, metric_crs
+from pcfix.io.viewer import Scene3d, render, show
+from pcfix.lens.imaging import unproject
+from pcfix.model import Cameras, FloatArray, IntArray, WaterDimension, WaterSurface
+from pcfix.options.declare import File, taken
+from pcfix.options.handover import ViewerOptions
+from pcfix.refract.tally import COVERAGE_95
+from pcfix.report.page import png_of
+from pcfix.report.view import Scale, view_figure
+from pcfix.water.surface import surface_above
+
+NEIGHBOURS, GAP_SPACINGS, LEAST_GAP_M = 8, 5.0, 1.0
+"""As a comparison takes them, by default."""
+FRUSTUM_SHARE = 0.06
+"""Length of a frustum, as a share of the height of its camera above the clouds."""
+WATER_CELLS = 40
+WIDTH_PX, HEIGHT_PX = 1000, 750
+SEEN = ("WaterDepth", "SigmaZ", *SHIFTS)
+
+
+class _Layer(NamedTuple):
+    """Some points of a cloud, world frame, and what is known of each by name."""
+
+    name: str
+    xyz: FloatArray
+    known: dict[str, FloatArray]
+
+
+def view_clouds(
+    clouds: Sequence[File], *, options: ViewerOptions | None = None, **keywords: Any
+) -> str:
+    """Show clouds in space, in open3d's viewer or as a picture; ``pcfix view``.
+
+    A cloud that `correct_file` wrote with all its dimensions is shown as it was before, too.
+
+    Parameters
+    ----------
+    clouds : sequence of path
+        LAS or LAZ, in one CRS.
+    options : ViewerOptions, optional
+        Or its attributes as keywords: colour, reference, cameras, water, image and others.
+
+    Returns
+    -------
+    str
+        What was drawn, and by what, where it is a picture; empty after a window.
+
+    Raises
+    ------
+    PcfixError
+        With one sentence on what to mend.
+    """
+    given = taken(ViewerOptions, options, keywords, "view_clouds")
+    if not clouds:
+        raise SettingError("there is no cloud to show; give one or more.")
+    if given.image is not None:
+        check_output(given.image, overwrite=given.overwrite, inputs=clouds)
+    if given.colour == "error" and given.reference is None:
+        raise SettingError("colour error is the height above a reference; give --reference too.")
+    paths = [check_input(cloud) for cloud in clouds]
+    first = view_of(paths[0])
+    surface = None if given.water is None else find_surface(given.water, given, first).surface
+    layers = [layer for path in paths for layer in _read(path, given.points)]
+    with LasSource(paths[0]) as source:
+        crs = metric_crs(source)
+    for path in paths[1:]:
+        with LasSource(path) as source:
+            check_same_crs(str(paths[0]), crs, str(path), metric_crs(source))
+    if given.reference is not None:
+        target = read_reference(given.reference)
+        check_same_crs(str(paths[0]), crs, target.name, target.crs)
+        step = 1 + len(target.xyz) // given.points
+        layers.append(_Layer(f"reference {Path(target.name).name}", target.xyz[::step], {}))
+    cameras = None
+    if given.cameras is not None:
+        inputs = replace(given, water=0.0 if given.water is None else given.water).part(Inputs)
+        cameras, _ = inputs.block(first.crs)
+    values = _values(given.colour, layers, surface)
+    scale = Scale.of(given.colour, np.concatenate(values))
+    scene = _scene(layers, [scale.colours(one) for one in values], cameras, surface)
+    if given.image is None:
+        show(scene, f"pcfix view: {given.colour}")
+        return ""
+    images, why = render(scene, WIDTH_PX, HEIGHT_PX)
+    if not images:
+        warnings.warn(
+            f"open3d cannot draw without a screen here ({why}), so that thinned clouds are drawn"
+            " by matplotlib; on Debian and Ubuntu: apt-get install libvulkan1"
+            " mesa-vulkan-drivers libegl1.",
+            PcfixWarning,
+            stacklevel=2,
+        )
+    picture = png_of(view_figure(scene, images, scale))
+    write_bytes(given.image, picture, overwrite=given.overwrite)
+    return f"{given.image}: {', '.join(scene.names)} by {given.colour}"
+
+
+def _read(path: Path, most: int) -> list[_Layer]:
+    """Return a cloud, and before it what it was before its correction, where it says so."""
+    xyz, known = [], dict[str, list[FloatArray]]()
+    with LasSource(path) as source:
+        names = [n for n in SEEN if n in source.header.point_format.extra_dimension_names]
+        step, row = 1 + (len(source) - 1) // most, 0
+        for points in source.chunks():
+            rows = np.arange(-row % step, len(points), step)
+            xyz.append(coordinates(points)[rows])
+            for name in names:
+                known.setdefault(name, []).append(source.dimension(points, name)[rows])
+            row += len(points)
+    if not xyz:
+        raise InputError(f"{path}: has no points to show.")
+    after = _Layer(path.name, np.vstack(xyz), {n: np.concatenate(v) for n, v in known.items()})
+    if not known.keys() >= {*SHIFTS, "WaterDepth"}:
+        return [after]
+    shift = np.column_stack([after.known[name] for name in SHIFTS])
+    depth = after.known["WaterDepth"]
+    apparent = np.where(depth > 0.0, depth + shift[:, 2], 0.0)
+    before = _Layer(f"{path.name} before", after.xyz - shift, {"WaterDepth": apparent})
+    return [before, after]
+
+
+def _values(colour: str, layers: list[_Layer], surface: WaterSurface | None) -> list[FloatArray]:
+    """Return what the colours of each layer are, NaN where that is not known."""
+    if colour == "error":
+        *clouds, target = layers
+        values = [_error(one.xyz, target.xyz) for one in clouds]
+        values.append(np.full(len(target.xyz), np.nan))
+    else:
+        values = [_own(colour, one, surface) for one in layers]
+    if not any(np.isfinite(one).any() for one in values):
+        raise SettingError(f"colour {colour}: no cloud has it; {_REMEDY[colour]}.")
+    return values
+
+
+_REMEDY = {
+    "depth": "give --water, or a cloud that 'pcfix correct' wrote",
+    "shift": "give a cloud that 'pcfix correct' wrote",
+    "uncertainty": "give a cloud that 'pcfix correct' wrote with --dimensions all",
+    "error": "cloud and reference do not overlap",
+    "height": "its heights are no numbers",
+}
+
+
+def _own(colour: str, layer: _Layer, surface: WaterSurface | None) -> FloatArray:
+    nothing = np.full(len(layer.xyz), np.nan)
+    if colour == "height":
+        return np.asarray(layer.xyz[:, 2])
+    if colour == "depth":
+        depth = layer.known.get("WaterDepth")
+        if depth is None and surface is not None and not isinstance(surface, WaterDimension):
+            depth = surface_above(surface, layer.xyz).height_m - layer.xyz[:, 2]
+        return nothing if depth is None else np.where(depth > 0.0, depth, np.nan)
+    name, sign = {"shift": ("ShiftZ", -1.0), "uncertainty": ("SigmaZ", COVERAGE_95)}[colour]
+    found = layer.known.get(name)
+    return nothing if found is None else np.where(found != 0.0, sign * found, np.nan)
+
+
+def _error(xyz: FloatArray, reference: FloatArray) -> FloatArray:
+    """Return the height above a reference, NaN away from it."""
+    gap_m = max(GAP_SPACINGS * mean_spacing_m(reference[:, :2]), LEAST_GAP_M)
+    near, error = near_in_plan(xyz[:, :2], reference[:, :2], gap_m), np.full(len(xyz), np.nan)
+    if near.any():
+        found = heights_at(xyz[near, :2], reference, min(NEIGHBOURS, len(reference)))
+        error[near] = xyz[near, 2] - found.height_m
+    return error
+
+
+def _scene(
+    layers: list[_Layer],
+    rgb: list[FloatArray],
+    cameras: Cameras | None,
+    surface: WaterSurface | None,
+) -> Scene3d:
+    """Return all of it about the middle of the clouds."""
+    low = np.min([one.xyz.min(axis=0) for one in layers], axis=0)
+    high = np.max([one.xyz.max(axis=0) for one in layers], axis=0)
+    lines = np.zeros((0, 2, 3)) if cameras is None else _frusta(cameras, float(high[2]))
+    water, triangles = _sheet(surface, low, high)
+    ends = np.vstack([low, high, lines.reshape(-1, 3)])
+    origin = (ends.min(axis=0) + ends.max(axis=0)) / 2.0
+    return Scene3d(
+        [one.name for one in layers], [one.xyz - origin for one in layers], rgb, lines - origin,
+        water - origin, triangles,
+    )  # fmt: skip
+
+
+def _frusta(cameras: Cameras, ground_m: float) -> FloatArray:
+    """Return the edges of each camera's frustum, or a stroke down where it has no frame."""
+    length = FRUSTUM_SHARE * max(float(np.median(cameras.centres[:, 2])) - ground_m, 1.0)
+    lines = []
+    for row, centre in enumerate(cameras.centres):
+        if cameras.rotations is None or cameras.lenses is None:
+            lines.append([centre, centre - [0.0, 0.0, length]])
+            continue
+        lens = cameras.lenses[row]
+        frame = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * [lens.width, lens.height]
+        rays = unproject(lens, frame) @ cameras.rotations[row]
+        corner = centre + length * rays
+        lines += [[centre, one] for one in corner]
+        lines += [[corner[i], corner[(i + 1) % 4]] for i in range(4)]
+    found = np.array(lines)
+    return np.asarray(found[np.isfinite(found).all(axis=(1, 2))])
+
+
+def _sheet(
+    surface: WaterSurface | None, low: FloatArray, high: FloatArray
+) -> tuple[FloatArray, IntArray]:
+    """Return the water over the clouds as a mesh; nothing where it is not known everywhere about.
+
+    A dimension has no surface away from its points.
+    """
+    if surface is None or isinstance(surface, WaterDimension):
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    sides = [np.linspace(low[axis], high[axis], WATER_CELLS + 1) for axis in (0, 1)]
+    x, y = (side.ravel() for side in np.meshgrid(*sides))
+    xyz = np.column_stack([x, y, np.zeros(len(x))])
+    xyz[:, 2] = surface_above(surface, xyz).height_m
+    corner = np.arange(len(x)).reshape(WATER_CELLS + 1, -1)
+    a, b, c, d = (
+        part.ravel()
+        for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1])
+    )
+    triangles = np.vstack([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    known = np.isfinite(xyz[:, 2])
+    return np.where(known[:, None], xyz, (low + high) / 2.0), triangles[
+        known[triangles].all(axis=1)
+    ]

@@ -1,0 +1,228 @@
+"""pcfix in QGIS's toolbox: the provider, its setting, and an algorithm for each command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from processing.core.ProcessingConfig import ProcessingConfig, Setting
+from qgis.core import (
+    QgsApplication,
+    QgsPointCloudLayer,
+    QgsProcessingAlgorithm,
+    QgsProcessingContext,
+    QgsProcessingException,
+    QgsProcessingOutputString,
+    QgsProcessingParameterBoolean,
+    QgsProcessingParameterDefinition,
+    QgsProcessingParameterEnum,
+    QgsProcessingParameterFile,
+    QgsProcessingParameterFileDestination,
+    QgsProcessingParameterFolderDestination,
+    QgsProcessingParameterNumber,
+    QgsProcessingParameterString,
+    QgsProcessingProvider,
+    QgsProviderRegistry,
+    QgsRasterLayer,
+    QgsVectorLayer,
+)
+
+from .command import CommandError, check_cloud, program_of, run, words_of
+
+PROGRAM = "PCFIX_PROGRAM"
+SAID = "said"
+CLOUDS = "Point clouds (*.las *.laz);;All files (*.*)"
+
+
+class Plugin:
+    """What QGIS loads."""
+
+    def __init__(self) -> None:
+        self.provider: Any = None
+
+    def initProcessing(self) -> None:  # noqa: N802
+        """Add the algorithms; all that ``qgis_process`` asks for."""
+        self.provider = Provider()
+        QgsApplication.processingRegistry().addProvider(self.provider)
+
+    def initGui(self) -> None:  # noqa: N802
+        """Add the algorithms to the window's toolbox."""
+        self.initProcessing()
+
+    def unload(self) -> None:
+        """Take them away again."""
+        if self.provider is not None:
+            QgsApplication.processingRegistry().removeProvider(self.provider)
+
+
+class Provider(QgsProcessingProvider):
+    """All commands that `pcfix qgis-plugin` put into ``commands.json``."""
+
+    def id(self) -> str:
+        """Return what stands before the colon."""
+        return "pcfix"
+
+    def name(self) -> str:
+        """Return its name in the toolbox."""
+        return "pcfix (refraction correction)"
+
+    def load(self) -> bool:
+        """Add the setting that names pcfix's environment."""
+        words = "Environment that pcfix is installed in, or its program (empty: on the PATH)"
+        ProcessingConfig.settingIcons["pcfix"] = self.icon()
+        ProcessingConfig.addSetting(Setting("pcfix", PROGRAM, words, ""))
+        ProcessingConfig.readSettings()
+        self.refreshAlgorithms()
+        return True
+
+    def unload(self) -> None:
+        """Take the setting away."""
+        ProcessingConfig.removeSetting(PROGRAM)
+
+    def loadAlgorithms(self) -> None:  # noqa: N802
+        """Add an algorithm for each command."""
+        table = json.loads(Path(__file__).with_name("commands.json").read_text("utf-8"))
+        for command in table["commands"]:
+            self.addAlgorithm(Algorithm(command))
+
+
+class Algorithm(QgsProcessingAlgorithm):
+    """One command of pcfix."""
+
+    def __init__(self, command: dict[str, Any]) -> None:
+        super().__init__()
+        self.command = command
+
+    def createInstance(self) -> Algorithm:  # noqa: N802
+        """Return another one."""
+        return Algorithm(self.command)
+
+    def name(self) -> str:
+        """Return what stands behind the colon."""
+        return str(self.command["name"])
+
+    def displayName(self) -> str:  # noqa: N802
+        """Return its name in the toolbox."""
+        return str(self.command["name"]).capitalize()
+
+    def shortHelpString(self) -> str:  # noqa: N802
+        """Return what it does."""
+        return str(self.command["help"])
+
+    def initAlgorithm(self, configuration: dict[str, Any] | None = None) -> None:  # noqa: N802
+        """Declare places and options."""
+        for one in (*self.command["places"], *self.command["options"]):
+            parameter = _parameter(one)
+            parameter.setHelp(one["help"])
+            if not one["needed"]:
+                flag = QgsProcessingParameterDefinition.FlagAdvanced
+                parameter.setFlags(parameter.flags() | flag)
+            self.addParameter(parameter, createOutput=True)
+        self.addOutput(QgsProcessingOutputString(SAID, "What pcfix said"))
+
+    def processAlgorithm(  # noqa: N802
+        self, parameters: dict[str, Any], context: Any, feedback: Any
+    ) -> dict[str, Any]:
+        """Run pcfix, and load what it wrote."""
+        values = {
+            one["name"]: self._value(one, parameters, context)
+            for one in (*self.command["places"], *self.command["options"])
+        }
+        said: list[str] = []
+
+        def say(line: str) -> None:
+            said.append(line)
+            (feedback.pushWarning if "warning:" in line else feedback.pushInfo)(line)
+
+        try:
+            for one in self.command["places"]:
+                if one["kind"] == "cloud" and (note := check_cloud(values[one["name"]])):
+                    feedback.pushWarning(note)
+            program = program_of(ProcessingConfig.getSetting(PROGRAM) or "")
+            words = words_of(self.command, values)
+            feedback.pushCommandInfo(" ".join(["pcfix", *words]))
+            run(program, words, feedback.isCanceled, feedback.setProgress, say)
+        except CommandError as error:
+            raise QgsProcessingException(str(error)) from error
+        written = {
+            one["name"]: values[one["name"]]
+            for one in (*self.command["places"], *self.command["options"])
+            if one["kind"] in ("written", "folder written") and values[one["name"]]
+        }
+        for path in written.values():
+            _load(Path(path), context)
+        return {**written, SAID: "\n".join(said)}
+
+    def _value(self, one: dict[str, Any], parameters: dict[str, Any], context: Any) -> Any:
+        name, kind = one["name"], one["kind"]
+        if parameters.get(name) is None and not one["needed"]:
+            return None
+        if kind == "bool":
+            return self.parameterAsBool(parameters, name, context)
+        if kind == "int":
+            return self.parameterAsInt(parameters, name, context)
+        if kind == "float":
+            return self.parameterAsDouble(parameters, name, context)
+        if kind == "choice":
+            return self.parameterAsEnumString(parameters, name, context)
+        if kind.endswith("written"):
+            return self.parameterAsFileOutput(parameters, name, context)
+        return self.parameterAsString(parameters, name, context)
+
+
+def _parameter(one: dict[str, Any]) -> Any:
+    """Return the field of a form for a place or an option; all but the needed may stay empty."""
+    name, kind, default = one["name"], one["kind"], one["default"]
+    label = name.replace("_", " ").capitalize() + (f" [{one['unit']}]" if one["unit"] else "")
+    optional = not one["needed"]
+    file = QgsProcessingParameterFile
+    if kind == "bool":
+        return QgsProcessingParameterBoolean(name, label, default, optional)
+    if kind in ("int", "float"):
+        number = QgsProcessingParameterNumber
+        return number(name, label, number.Integer if kind == "int" else number.Double, default,
+                      optional)  # fmt: skip
+    if kind == "choice":
+        return QgsProcessingParameterEnum(
+            name, label, one["choices"], False, default, optional, usesStaticStrings=True
+        )
+    if kind == "folder":
+        return file(name, label, file.Folder, optional=optional)
+    if kind == "cloud":
+        return file(name, label, file.File, optional=optional, fileFilter=CLOUDS)
+    if kind == "file":
+        return file(name, label, file.File, optional=optional)
+    if kind == "folder written":
+        return QgsProcessingParameterFolderDestination(name, label, None, optional, not optional)
+    if kind == "written":
+        filters = "LAZ (*.laz);;LAS (*.las)" if one["needed"] else "All files (*.*)"
+        return QgsProcessingParameterFileDestination(
+            name, label, filters, None, optional, not optional
+        )
+    return QgsProcessingParameterString(name, label, default, False, optional)
+
+
+def _load(path: Path, context: Any) -> None:
+    """Load what was written, a folder's rasters and vectors; a .qml beside one is its style."""
+    paths = sorted(path.iterdir()) if path.is_dir() else [path]
+    for one in paths:
+        for layer in _layers(one):
+            if layer.isValid():
+                layer.loadDefaultStyle()
+                context.temporaryLayerStore().addMapLayer(layer)
+                details = QgsProcessingContext.LayerDetails(layer.name(), context.project(), "")
+                context.addLayerToLoadOnCompletion(layer.id(), details)
+
+
+def _layers(path: Path) -> list[Any]:
+    suffix = path.suffix.lower()
+    if suffix == ".tif":
+        return [QgsRasterLayer(str(path), path.stem)]
+    if suffix in (".las", ".laz") and "pdal" in QgsProviderRegistry.instance().providerList():
+        return [QgsPointCloudLayer(str(path), path.stem, "pdal")]
+    if suffix == ".gpkg":
+        found = QgsVectorLayer(str(path), path.stem, "ogr").dataProvider()
+        names = [word.split("!!::!!")[1] for word in found.subLayers()] if found else []
+        return [QgsVectorLayer(f"{path}|layername={name}", name, "ogr") for name in names]
+    return []

@@ -1,0 +1,111 @@
+"""What a plan predicts is what the correction of such a block says, and what its errors are."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pcfix
+from pcfix.errors import SettingError
+from pcfix.flow import plan as flight
+from pcfix.options.handover import PlanOptions
+from pcfix.report.plan import plan_text
+from tests.utils.program import run_pcfix
+
+DEPTH_M = 4.0
+FLIGHT = {"height": 50.0, "overlap": 0.75, "area": (60.0, 40.0)}
+SIGMAS = {"sigma_waves": 0.5, "sigma_level": 0.01, "sigma_centre": 0.01}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("plan")
+
+
+@pytest.fixture(scope="module")
+def plan(folder):
+    files = {"plot": folder / "plan.png", "summary": folder / "plan.json"}
+    return pcfix.plan_flight(**FLIGHT, depth=(1.0, DEPTH_M), **SIGMAS, **files)
+
+
+def block(noise_px):
+    """Return a cloud of a block that is flown as planned, with other points."""
+    return pcfix.simulate_scene(
+        3000, flying_height_m=50.0, forward_overlap=0.75, area_m=(60.0, 40.0), water=0.0,
+        bed="flat", greatest_depth_m=DEPTH_M, image_noise=noise_px,
+    )  # fmt: skip
+
+
+def test_the_parts_add_up(plan):
+    for one in plan.depths:
+        total = np.sqrt(sum(part**2 for part in one.parts_m.values()))
+        assert one.sigma_m == pytest.approx(total, rel=1e-6)
+    shallow, deep = plan.depths
+    assert deep.parts_m["index"] == pytest.approx(4.0 * shallow.parts_m["index"], rel=0.05)
+    assert deep.parts_m["waves"] > 3.0 * shallow.parts_m["waves"]
+    assert plan.gsd_m == pytest.approx(50.0 / 8.8 * 13.2 / 5472)
+    assert 0.0 < deep.absorbed < 1.0
+
+
+@pytest.mark.parametrize(("noise_px", "most"), [(0.0, 1.01), (0.5, 1.1)])
+def test_predicted_is_what_a_correction_says(plan, noise_px, most):
+    """Of other points; a noisy cloud itself tells of up to 10 % more."""
+    scene = block(noise_px)
+    found = pcfix.correct_points(
+        scene.apparent_xyz, scene.cameras, 0.0, views=scene.views, **SIGMAS
+    )
+    said = np.sqrt(np.mean(found.sigma_z_m[found.corrected] ** 2))
+    assert 0.99 < said / plan.deepest.sigma_m < most
+
+
+def test_predicted_noise_is_the_noise(plan):
+    """Of 3,000 points with true level, index, poses: 1.3 % for one sigma."""
+    scene = block(0.5)
+    found = pcfix.correct_points(scene.apparent_xyz, scene.cameras, 0.0, views=scene.views)
+    off = found.xyz[found.corrected, 2] - scene.true_xyz[found.corrected, 2]
+    assert plan.deepest.parts_m["image"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=0.05)
+
+
+def test_adjusted_poses_are_as_good_as_what_holds_them():
+    given = PlanOptions(**FLIGHT, gnss_sigma=0.02)
+    bed = flight._bed(given, DEPTH_M)
+    fine, coarse = (
+        flight._of_adjusted_poses(replace(given, gnss_sigma=sigma), bed) for sigma in (0.02, 0.2)
+    )
+    assert 0.1 * 0.02 < fine < 0.02  # all images together are better than one
+    assert 4.0 * fine < coarse < 12.0 * fine
+
+
+def test_without_refraction_there_is_nothing_to_absorb():
+    given = PlanOptions(**FLIGHT, index=1.0)
+    share, left_m = flight._absorbed(given, flight._bed(given, DEPTH_M))
+    assert share == 0.0
+    assert abs(left_m) < 1e-6
+
+
+def test_the_command_and_its_files(monkeypatch, folder, plan):
+    monkeypatch.setattr(pcfix, "plan_flight", lambda *, options, progress: plan, raising=False)
+    done = run_pcfix("plan", "--area", 60, 40, "--lens", "8.8,13.2,8.8,5472")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == plan_text(plan) + "\n"
+    assert "50 m above the water over 60 x 40 m: 28 images" in done.stdout
+    assert (folder / "plan.png").read_bytes()[:4] == b"\x89PNG"
+    found = json.loads((folder / "plan.json").read_text("utf-8"))
+    assert found["depths"][1]["sigma_m"] == plan.deepest.sigma_m
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"lens": "8.8,13.2"}, "is not FOCAL,WIDTH,HEIGHT,PIXELS"),
+        ({"depth": "0"}, "must be above 0: give metres below the water"),
+        ({"sidelap": 0.0, "overlap": 0.3}, "is seen by three images; give more overlap"),
+        ({"height": 3.0, "depth": (8.0,)}, "fly higher or give a smaller greatest depth"),
+    ],
+)
+def test_refused(given, sentence):
+    with pytest.raises(SettingError, match=sentence):
+        pcfix.plan_flight(**given)

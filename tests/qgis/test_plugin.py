@@ -1,0 +1,168 @@
+"""The plugin of QGIS: its table, its words, its process, and the same bytes under Debian's QGIS."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+import zipfile
+
+import pytest
+
+import pcfix
+from pcfix.cli.commands import EXAMPLES
+from pcfix.cli.plugin import OFFERED, plugin_zip
+from pcfix.io.scenes import write_scene
+from pcfix.options.declare import options_of
+from pcfix.options.survey import RunOptions
+from pcfix.qgis.command import CommandError, check_cloud, program_of, run, words_of
+from tests.utils.program import run_pcfix
+
+QGIS = shutil.which("qgis_process.bin") or shutil.which("qgis_process")
+
+
+@pytest.fixture(scope="module")
+def packed():
+    return plugin_zip(one for one, _ in EXAMPLES)
+
+
+@pytest.fixture(scope="module")
+def commands(packed):
+    with zipfile.ZipFile(io.BytesIO(packed)) as file:
+        table = json.loads(file.read("pcfix/commands.json"))
+    return {one["name"]: one for one in table["commands"]}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    write_scene(pcfix.simulate_scene(1000), folder, overwrite=True)
+    return folder
+
+
+def test_every_option_is_offered(commands):
+    assert tuple(commands) == OFFERED
+    assert [one["kind"] for one in commands["run"]["places"]] == ["cloud", "folder written"]
+    shown = [one.name for one in options_of(RunOptions) if not one.hidden]
+    found = {one["name"]: one for one in commands["run"]["options"]}
+    assert list(found) == shown
+    assert found["water"]["needed"]
+    assert not found["cameras"]["needed"]  # but with a method that looks at none
+    assert found["method"]["choices"][:2] == ["auto", "snell"]
+    assert {one["kind"] for one in found.values()} == {
+        "bool", "int", "float", "choice", "file", "written", "text",
+    }  # fmt: skip
+
+
+def test_words_are_those_of_the_command_line(commands):
+    values = {
+        "input": "a b.laz", "output": "o.laz", "water": "-0.37", "sigma_image": 0.5, "exact": True,
+        "sigma_index": 0.01, "method": "auto", "overwrite": False, "views": "", "max_angle": None,
+    }  # fmt: skip
+    assert words_of(commands["correct"], values) == [
+        "correct", "a b.laz", "o.laz", "--water=-0.37", "--exact", "--sigma-index=0.01",
+    ]  # fmt: skip
+    sections = {"cloud": "a.laz", "reference": "b.laz", "section": "0,0,1,1; 2,2,3,3"}
+    expected = ["compare", "a.laz", "b.laz", "--section=0,0,1,1", "--section=2,2,3,3"]
+    assert words_of(commands["compare"], sections) == expected
+
+
+def test_an_environment_without_pcfix(tmp_path):
+    for setting in (str(tmp_path), str(tmp_path / "none")):
+        with pytest.raises(CommandError, match=r"pcfix is not at '.*': install pcfix into an env"):
+            program_of(setting)
+    program = tmp_path / "bin" / "pcfix"
+    program.parent.mkdir()
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    assert program_of(str(tmp_path)) == program_of(str(program)) == str(program)
+
+
+def test_clouds(scene, tmp_path):
+    import laspy
+
+    assert check_cloud(str(scene / "cloud.laz")) == ""
+    cloud = laspy.create(point_format=6, file_version="1.4")
+    cloud.write(tmp_path / "bare.las")
+    assert "bare.las names no CRS: it is taken to be in metres" in check_cloud(
+        str(tmp_path / "bare.las")
+    )
+    (tmp_path / "text.las").write_text("no cloud")
+    for name, sentence in (("a.ply", "reads LAS and LAZ; export"), ("text.las", "not a LAS file")):
+        with pytest.raises(CommandError, match=sentence):
+            check_cloud(str(tmp_path / name))
+
+
+def test_progress_and_what_is_said(scene, tmp_path, monkeypatch, commands):
+    monkeypatch.setenv("PCFIX_PROGRESS", "lines")
+    done = run_pcfix("label", scene / "cloud.laz", tmp_path / "l.laz", "--water", 0.37)
+    assert done.stderr.splitlines()[-1] == "progress 100"
+    program = (
+        "import sys; print('progress 40'); print('done well'); print('pcfix: no'); sys.exit(1)"
+    )
+    percents, said = [], []
+    with pytest.raises(CommandError, match=r"^no$"):
+        run(sys.executable, ["-c", program], lambda: False, percents.append, said.append)
+    assert percents == [40.0]
+    assert said == ["done well", "pcfix: no"]
+
+
+def test_cancelled():
+    """It is asked to stop, as by Ctrl-C, and does so long before its end."""
+    program = "import time; print('here', flush=True); time.sleep(60)"
+    said, started = [], time.monotonic()
+    with pytest.raises(CommandError, match="cancelled"):
+        run(sys.executable, ["-c", program], lambda: bool(said), float, said.append)
+    assert time.monotonic() - started < 30.0
+
+
+@pytest.fixture(scope="module")
+def qgis(packed, tmp_path_factory):
+    """Return what runs an algorithm in a profile of its own, with the plugin and its setting."""
+    if QGIS is None:
+        pytest.skip("qgis_process is not installed")
+    root = tmp_path_factory.mktemp("qgis")
+    profile = root / "profiles" / "default"
+    (profile / "QGIS").mkdir(parents=True)
+    with zipfile.ZipFile(io.BytesIO(packed)) as file:
+        file.extractall(profile / "python" / "plugins")
+    program = root / "pcfix"
+    python = f"PYTHONPATH='{os.pathsep.join(sys.path)}' exec '{sys.executable}'"
+    program.write_text(f'#!/bin/sh\n{python} -m pcfix "$@"\n')
+    program.chmod(0o755)
+
+    def call(name: str, setting: str = str(program), **values: object):
+        (profile / "QGIS" / "QGIS3.ini").write_text(
+            "[PythonPlugins]\npcfix=true\nprocessing=true\n\n"
+            f"[Processing]\nConfiguration\\PCFIX_PROGRAM={setting}\n"
+        )
+        words = [f"{key}={value}" for key, value in values.items()]
+        settings = {"QGIS_CUSTOM_CONFIG_PATH": str(root), "QT_QPA_PLATFORM": "offscreen"}
+        return subprocess.run(
+            [QGIS, "run", f"pcfix:{name}", "--", *words], capture_output=True, text=True,
+            env=os.environ | settings, check=False,
+        )  # fmt: skip
+
+    return call
+
+
+def test_qgis_writes_the_same_bytes(qgis, scene, tmp_path):
+    given = {"cameras": scene / "cameras.csv", "water": 0.37, "method": "snell"}
+    done = qgis("correct", input=scene / "cloud.laz", output=tmp_path / "qgis.laz", **given)
+    assert done.returncode == 0, done.stderr
+    assert "corrected" in done.stdout
+    pcfix.correct_file(scene / "cloud.laz", tmp_path / "python.laz", **given)
+    assert (tmp_path / "qgis.laz").read_bytes() == (tmp_path / "python.laz").read_bytes()
+
+
+def test_qgis_says_what_to_install(qgis, scene, tmp_path):
+    done = qgis(
+        "label", "/no/pcfix", input=scene / "cloud.laz", output=tmp_path / "l.laz", water=0.37
+    )
+    assert done.returncode != 0
+    assert "pcfix is not at '/no/pcfix': install pcfix into an environment" in done.stderr
+    assert not (tmp_path / "l.laz").exists()
