@@ -184,7 +184,7 @@ def _listed(path: Path) -> list[Path] | None:
         store = cast(Any, path).fs
         return sorted(path_of(store.unstrip_protocol(one)) for one in store.glob(text))
     if glob.has_magic(text) and not path.exists():
-        return sorted(path_of(one) for one in glob.glob(text, recursive=True))
+        return sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
     if path.suffix.lower() == ".vpc":
         return _of_index(path)
     if path.suffix.lower() in LISTS and path.is_file():
