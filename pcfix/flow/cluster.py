@@ -56,7 +56,7 @@ def in_processes(
                 " on, with fewer --jobs it needs less memory."
             ) from error
         except BaseException:
-            for process in list(pool._processes.values()):
+            for process in list((pool._processes or {}).values()):
                 os.kill(process.pid or 0, signal.SIGINT)
             pool.shutdown(cancel_futures=True)
             raise

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from hashlib import sha256
+from itertools import compress
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Protocol
@@ -24,11 +25,11 @@ from pcfix import version
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.cluster import Run, in_processes, on_cluster
 from pcfix.flow.runner import FileTask, Progress, Step, check_cloud, check_summary, write_summary
-from pcfix.io.files import digest_of, is_remote, path_of, read_counted, write_counted
+from pcfix.io.files import digest_of, is_remote, read_counted, write_counted
 from pcfix.io.tiles import BrokenTileError, Tiles, check_one_file
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.kernels import threads
-from pcfix.options.declare import File, options_of
+from pcfix.options.declare import options_of
 from pcfix.sums import Counted
 
 RECORDS = ".pcfix"
@@ -83,16 +84,16 @@ class Tile:
         """Where it is written that the output is finished."""
         return self.target.parent / RECORDS / f"{self.target.name}.npz"
 
-    def finished(self) -> Counted | None:
-        """Return what was counted, if the output is there, whole, and of the same key."""
-        note, counted = read_counted(self.record)
-        if note.get("key") != self.key or not self.target.is_file():
-            return None
-        return counted if note["output"] == digest_of(self.target) else None
+    @property
+    def is_finished(self) -> bool:
+        """Whether the output is there, as it was left, and made of the same."""
+        note, _ = read_counted(self.record)
+        there = note.get("key") == self.key and self.target.is_file()
+        return there and note["output"] == digest_of(self.target)
 
 
-def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> Counted | str:
-    """Take one file through a step and return what was counted, or why it failed.
+def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> str:
+    """Take one file through a step, record what it counted, and return why that failed, if it did.
 
     This is what runs in a process here and on a worker of a cluster.
     """
@@ -102,9 +103,8 @@ def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> Counted | st
                 f"{tile.source}: this worker has pcfix {version.__version__}, not {tile.pcfix};"
                 " install that there."
             )
-        earlier = tile.finished()  # by a worker that was lost before it could say so
-        if earlier is not None:
-            return earlier
+        if tile.is_finished:  # by a worker that was lost before it could say so
+            return ""
         step: TileStep = pickle.loads(pickled)
         step.begin(tile.first_row)
         for left in tile.target.parent.glob(f".{tile.target.stem}.*.part{tile.target.suffix}"):
@@ -112,12 +112,11 @@ def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> Counted | st
         with threads(jobs), warnings.catch_warnings():
             warnings.simplefilter("ignore", PcfixWarning)  # said once, where the step was made
             step.run(FileTask(tile.source, tile.target, jobs=jobs, is_tile=True))
-        found = step.counted()
         note = {"key": tile.key, "pcfix": tile.pcfix, "output": digest_of(tile.target)}
-        write_counted(tile.record, note, found)
+        write_counted(tile.record, note, step.counted())
     except PcfixError as error:
         return str(error)
-    return found
+    return ""
 
 
 @dataclass
@@ -177,24 +176,26 @@ class TiledRun:
         check_summary(self.options, self.tiles.paths)
         key = self._key()
         work = self._work(key)
-        found = {tile: tile.finished() for tile in work.values()}
-        done = {tile: counted for tile, counted in found.items() if counted is not None}
+        with ThreadPoolExecutor() as pool:
+            is_finished = pool.map(lambda tile: tile.is_finished, work.values())
+            done = set(compress(work.values(), is_finished))
         result_file = self.folder / RECORDS / f"{self.name}.npz"
         note, _ = read_counted(result_file)
         if kind and len(done) == len(work) and not self.tiles.broken and note.get("key") == key:
             return self._told(kind(**note["result"]))
         todo = [tile for tile in work.values() if tile not in done]
-        for tile in todo:
+        for tile in todo if self.folder.exists() else ():
             check_cloud(tile.target, overwrite=self.options.overwrite, inputs=self.tiles.paths)
         points = sum(tile.points for tile in todo)
         with threads(self.options.jobs), self._machines(points) as machines:
             step, tiles = self._made(make)
             step.begin(0)
+            self._make_folder()
             todo = [work[path] for path in tiles.paths if work[path] not in done]
             failed = list(tiles.broken.values())
             self._work_on(partial(machines, do_tile, pickle.dumps(step), todo), done, failed)
             if done:
-                self._count(step, [tile for tile in work.values() if tile in done], done, todo)
+                self._count(step, [tile for tile in work.values() if tile in done], todo)
                 result = self._told(tell(step))
         if failed:
             raise InputError(
@@ -206,15 +207,15 @@ class TiledRun:
             write_counted(result_file, {"key": key, "result": vars(result)}, {})
         return result
 
-    def _work_on(self, run: Run, done: dict[Tile, Counted], failed: list[str]) -> None:
-        """Run tasks, and add what they counted to what is done, or why they failed."""
+    def _work_on(self, run: Run, done: set[Tile], failed: list[str]) -> None:
+        """Run tasks, and add them to what is done, or why they failed."""
         total = sum(self.tiles.points)
         try:
-            for tile, outcome in run():
-                if isinstance(outcome, str):
-                    failed.append(outcome)
+            for tile, why in run():
+                if why:
+                    failed.append(why)
                 else:
-                    done[tile] = outcome
+                    done.add(tile)
                 if self.progress is not None:
                     self.progress(sum(one.points for one in done), total)
         except KeyboardInterrupt:
@@ -224,12 +225,10 @@ class TiledRun:
             ) from None
 
     @staticmethod
-    def _count(
-        step: TileStep, work: list[Tile], done: dict[Tile, Counted], new: list[Tile]
-    ) -> None:
+    def _count(step: TileStep, work: list[Tile], new: list[Tile]) -> None:
         """Let the step count all files, and judge; what it refuses does not stay."""
         for tile in work:  # in their order, so that no sum depends on who was first
-            step.add_counted(done[tile])
+            step.add_counted(read_counted(tile.record)[1])
         try:
             step.finish()
         except PcfixError:
@@ -244,7 +243,7 @@ class TiledRun:
         return result
 
     def _check_folder(self) -> None:
-        """Make the folder of the outputs; refuse one that has inputs, or lies in their folder."""
+        """Refuse a folder that has inputs, or lies in theirs."""
         folder, named = self.folder.resolve(), Path(self.tiles.name)
         for path in self.tiles.paths:
             if not is_remote(path) and path.parent.resolve() == folder:
@@ -259,6 +258,8 @@ class TiledRun:
             raise SettingError(
                 f"{self.folder}: is a file; many files go to a folder, give the name of one."
             )
+
+    def _make_folder(self) -> None:
         try:
             (self.folder / RECORDS).mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -325,5 +326,8 @@ def _plain(value: Any) -> Any:
     return sha256(pickle.dumps(value)).hexdigest()
 
 
-def _digest(path: File) -> str:
-    return digest_of(path_of(path))
+def _digest(path: Path) -> str:
+    try:
+        return digest_of(path)
+    except OSError:  # it is among the broken ones
+        return ""

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
-from urllib.parse import urljoin
 
 import numpy as np
 
@@ -188,7 +187,7 @@ def _listed(path: Path) -> list[Path] | None:
     if path.suffix.lower() == ".vpc":
         return _of_index(path)
     if path.suffix.lower() in LISTS and path.is_file():
-        lines = [line.strip() for line in path.read_text("utf-8").splitlines()]
+        lines = [one.strip() for one in path.read_text("utf-8", errors="replace").splitlines()]
         return [_beside(path, line) for line in lines if line and not line.startswith("#")]
     if path.is_dir():
         return sorted(one for one in path.iterdir() if one.suffix.lower() in SUFFIXES)
@@ -207,7 +206,7 @@ def _of_index(path: Path) -> list[Path]:
     try:
         features = read_json(path)["features"]
         links = [next(iter(one["assets"].values()))["href"] for one in features]
-        return [_beside(path, urljoin("", str(link)).removeprefix("file://")) for link in links]
+        return [_beside(path, link.removeprefix("file://")) for link in links]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as error:
         raise InputError(
             f"{path}: is not a virtual point cloud ({type(error).__name__}: {error}); give the"

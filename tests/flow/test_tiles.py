@@ -173,6 +173,10 @@ def test_a_broken_tile_does_not_stop_the_others(tmp_path):
     assert "tile1.las: is cut short: the header promises" in failures[1]
     assert [path.name for path in tiles_in(tmp_path / "out")] == ["tile0.las", "tile2.las"]
     (folder / "tile3.las").unlink()
+    listed = folder.parent / "list.txt"
+    listed.write_text("tiles/tile0.las\ntiles/tile3.las")
+    done = run_pcfix("label", listed, tmp_path / "labels", "--water", "0.37")
+    assert done.stderr.splitlines()[1:] == ["  tiles/tile3.las: there is no such file."]
     (folder / "tile1.las").write_bytes(whole)
     done = run_pcfix("correct", folder, tmp_path / "out", *WORDS, "--overwrite")
     assert (done.returncode, done.stderr) == (0, "")
@@ -211,7 +215,7 @@ def test_a_result_that_cannot_be_right_leaves_nothing(cloud, tmp_path):
 def test_ctrl_c_is_a_clean_stop_and_the_same_command_goes_on(tmp_path):
     """In processes of its own, as only these are interrupted as a terminal does it."""
     folder, _ = cut(tmp_path / "tiles", 2)
-    for i in range(2, 30):
+    for i in range(2, 16):
         (folder / f"tile{i}.laz").write_bytes((folder / f"tile{i % 2}.laz").read_bytes())
     out, words = tmp_path / "out", ["--jobs", "2", "--method", "snell", *map(str, WORDS)]
     command = [sys.executable, "-m", "pcfix", "correct", str(folder), str(out), *words]
@@ -227,12 +231,12 @@ def test_ctrl_c_is_a_clean_stop_and_the_same_command_goes_on(tmp_path):
     assert error.splitlines()[-1].startswith("pcfix: stopped; ")
     assert "Traceback" not in error
     finished = tiles_in(out)
-    assert 2 <= len(finished) < 30
+    assert 2 <= len(finished) < 16
     assert not list(out.glob(".*.part*"))
     before = {path: path.stat().st_mtime_ns for path in finished}
     done = run_pcfix("correct", folder, out, "--jobs", "1", *words[2:])
     assert done.returncode == 0, done.stderr
-    assert len(tiles_in(out)) == 30
+    assert len(tiles_in(out)) == 16
     assert all(path.stat().st_mtime_ns == then for path, then in before.items())
 
 
