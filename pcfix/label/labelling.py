@@ -28,6 +28,7 @@ from pcfix.model import (
     IntArray,
 )
 from pcfix.options.correct import LabelRules
+from pcfix.sums import Sums
 from pcfix.water.surface import SurfaceAbove, is_submerged
 
 Classes = npt.NDArray[np.uint8]
@@ -49,8 +50,11 @@ class Labels(NamedTuple):
     at_surface: BoolArray
 
 
-class Labelling:
+class Labelling(Sums):
     """The rules of a labelling, the surroundings of its points, and what it left out so far."""
+
+    added = ("_below", "_outside_mask", "_respected", "_in_pool")
+    least, most = ("_low",), ("_high",)
 
     def __init__(self, settings: LabelRules, mask: WaterMask | None = None) -> None:
         self.settings, self.mask = settings, mask

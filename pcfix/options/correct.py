@@ -18,7 +18,6 @@ from pcfix.options.declare import (
 from pcfix.options.shared import (
     IndexOptions,
     InputOptions,
-    JobOptions,
     LandRules,
     NeededOptions,
     Panel,
@@ -26,6 +25,7 @@ from pcfix.options.shared import (
     ShorelineOption,
     SubmergedOptions,
     SummaryOption,
+    TileOptions,
     WaterOptions,
     WaterPerImageOption,
 )
@@ -265,7 +265,7 @@ class ScienceOptions(RefractionOptions, ResultOptions):
 class CorrectOptions(
     PartOptions,
     ShorelineOption,
-    JobOptions,
+    TileOptions,
     SummaryOption,
     ScienceOptions,
     WaterPerImageOption,
@@ -328,7 +328,7 @@ class StageLabelOptions(LabelRules, SubmergedOptions, WaterOptions, NeededOption
 
 
 @dataclass(frozen=True, kw_only=True)
-class LabelOptions(PartOptions, JobOptions, SummaryOption, StageLabelOptions):
+class LabelOptions(PartOptions, TileOptions, SummaryOption, StageLabelOptions):
     """The options of ``pcfix label``."""
 
 

@@ -299,6 +299,26 @@ class PartOptions(OptionSet):
 
 
 @dataclass(frozen=True, kw_only=True)
+class TileOptions(JobOptions):
+    """How the work is done where the input may be many files."""
+
+    panel = Panel.OUTPUT
+
+    jobs: int | None = option(
+        None,
+        "Threads; of many files so many are worked on at once, each in a process of its own.",
+        rule=at_least(1, "give a number of threads"),
+        default_is="all cores",
+    )
+    scheduler: str | None = option(
+        None,
+        "With many files: work on them on a cluster, by the address of its Dask scheduler, as"
+        " tcp://host:8786.",
+        metavar="ADDRESS",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class SummaryOption(OptionSet):
     """What is told of the work."""
 

@@ -117,7 +117,7 @@ def read_records(stream: BinaryIO) -> tuple[list[Record], list[Record]]:
 
 def _read(stream: BinaryIO, start: int, count: int, layout: str, end: int) -> list[Record]:
     """Read records that lie one behind another, up to a place that they must not pass."""
-    end = min(end, os.fstat(stream.fileno()).st_size)
+    end = min(end, stream.seek(0, os.SEEK_END))
     records: list[Record] = []
     size = struct.calcsize(layout)
     for _ in range(count):
@@ -203,7 +203,7 @@ class LasSource:
                 self.vlrs, self.evlrs = read_records(stream)
                 stream.seek(IDENTITY_PLACE)
                 self.identity = stream.read(_IDENTITY_SIZE)
-            self._reader = laspy.open(self.path, laz_backend=backend(jobs))
+            self._reader = laspy.open(self.path.open("rb"), laz_backend=backend(jobs))
         self.header: laspy.LasHeader = self._reader.header
         self.held = len(self)
         self._selection = laspy.DecompressionSelection.all()  # also where a part is counted
