@@ -191,7 +191,7 @@ def test_a_full_disk_leaves_nothing_half_written(cloud, tmp_path, monkeypatch):
     def full(sink, points):
         wrote(sink, points)
         if sink._path.name == "tile2.laz":
-            with writing._write_errors(sink._path):
+            with sink._write_errors():
                 raise OSError(28, "No space left on device")
 
     given = {"cameras": CAMERAS, "water": 0.37, "method": "snell", "jobs": 1}
