@@ -6,27 +6,27 @@ What is written is whole or not at all, and never over another's work.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
+import mmap
 import os
 import shutil
 import subprocess
 import tempfile
+import weakref
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from pcfix.blocks import Empty, on_disk
 from pcfix.errors import InputError, SettingError
 from pcfix.grid.lattice import Window
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.declare import File
-
-if TYPE_CHECKING:
-    from pcfix.clean.neighbours import Empty
-
 
 LAST_LINES = 3
 """Of what another program says when it fails."""
@@ -155,7 +155,8 @@ def run_logged(words: list[str], log: Path) -> tuple[int, list[str]]:
 def scratch_arrays(target: Path) -> Iterator[Empty]:
     """Give a maker of arrays in temporary files beside the target, gone when the block ends.
 
-    An `InputError` if the disk cannot hold them.
+    Within the block the large arrays of `pcfix.blocks` are such, too. The disk has its place back
+    as soon as an array is no longer used. An `InputError` if it cannot hold them.
     """
     try:
         folder = tempfile.TemporaryDirectory(
@@ -163,25 +164,35 @@ def scratch_arrays(target: Path) -> Iterator[Empty]:
         )
     except OSError as error:
         raise InputError(f"{target}: cannot be written ({error.strerror or error}).") from error
-    files: list[Path] = []
+    maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
+    made = itertools.count()
 
     def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-        files.append(Path(folder.name) / f"{len(files)}.bin")
+        path = Path(folder.name) / f"{next(made)}.bin"
         size = int(np.prod(shape)) * np.dtype(dtype).itemsize
         try:
-            with files[-1].open("wb") as stream:  # a full disk kills whoever writes to a map
+            with path.open("w+b") as stream:  # a full disk kills whoever writes to a map
                 if hasattr(os, "posix_fallocate"):
                     os.posix_fallocate(stream.fileno(), 0, size)
                 else:
                     stream.truncate(size)
+                one = mmap.mmap(stream.fileno(), size)
         except OSError as error:
             raise InputError(
                 f"{target}: {size / 1e9:,.1f} GB of temporary space beside it cannot be had"
                 f" ({error.strerror or error}); make room, or write to another disk."
             ) from error
-        return np.memmap(files[-1], dtype=dtype, mode="r+", shape=shape)
+        with suppress(OSError):  # Windows keeps it until the block ends
+            path.unlink()
+        maps.add(one)
+        return np.frombuffer(one, dtype).reshape(shape)
 
-    with folder:
+    def let_go() -> None:
+        for one in maps:
+            if hasattr(mmap, "MADV_DONTNEED"):
+                one.madvise(mmap.MADV_DONTNEED)
+
+    with folder, on_disk(empty, let_go):
         yield empty
 
 
