@@ -80,8 +80,13 @@ class Neighbours:
             rest = rest[distance[rest, -1] * SLACK >= gaps[tile]]
             if not rest.size:
                 break
-            gap = _gap(points[rest], points[rest], self._low[tile], self._high[tile])
-            rows = rest[distance[rest, -1] * SLACK >= gap]
+            rows = rest
+            for axis in range(self.axes):  # most lie beyond a side of it, which is quick to see
+                at, reach = points[rows, axis], distance[rows, -1] * SLACK
+                low, high = self._low[tile, axis], self._high[tile, axis]
+                rows = rows[(low - at <= reach) & (at - high <= reach)]
+            gap = _gap(points[rows], points[rows], self._low[tile], self._high[tile])
+            rows = rows[distance[rows, -1] * SLACK >= gap]
             if rows.size:
                 self._add(int(tile), points, rows, distance, place)
         return distance, place
@@ -281,6 +286,8 @@ def make_tiles(
     used: BoolArray | None = None,
     tile_m: float | None = None,
     points: int = POINTS_PER_TILE,
+    *,
+    strips: bool = True,
 ) -> Tiles:
     """Sort the used points into square tiles.
 
@@ -292,6 +299,8 @@ def make_tiles(
         At least one is true; default all.
     tile_m : float, optional
         Side of a tile; default such that a tile holds about so many `points`.
+    strips : bool
+        Whether the points of a tile are put in an order that trees are quick in.
     """
     lattice = _Lattice(xyz, used, tile_m, points)
     tiles = lattice.columns * lattice.rows
@@ -302,8 +311,9 @@ def make_tiles(
     start = np.unique(start[:-1])
     boxes = []
     for a, b in pairwise(start):
-        order = _along_strips(sorted_xyz[a:b], lattice.side_m)
-        sorted_xyz[a:b], row[a:b] = sorted_xyz[a:b][order], row[a:b][order]
+        if strips:
+            order = _along_strips(sorted_xyz[a:b], lattice.side_m)
+            sorted_xyz[a:b], row[a:b] = sorted_xyz[a:b][order], row[a:b][order]
         boxes.append(bounds(sorted_xyz[a:b]))
         let_go()
     low, high = np.swapaxes(np.array(boxes), 0, 1)

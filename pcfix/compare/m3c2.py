@@ -87,7 +87,7 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
     reference : array, shape (m, 3)
         The same frame.
     max_distance_m : float
-        Half the length of the cylinders.
+        Half the length of the cylinders at least.
 
     Raises
     ------
@@ -101,6 +101,10 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
         *(point_spacing_m(*one) for one in zip((xyz, reference), clouds, strict=True)), 1e-3
     )
     normal, cylinder = NORMAL_SPACINGS * spacing, CYLINDER_SPACINGS * spacing
+    # py4dgeo cuts a cylinder into lengths of its radius: an odd number of them, as a core point on
+    # the border of two would count twice, once or not at all
+    pieces = 2 * math.ceil((max_distance_m / cylinder - 1.0) / 2.0) + 1
+    max_distance_m = (max(pieces, 1) - 1e-6) * cylinder
     core = xyz[sample_rows(len(xyz), MAX_CORE_POINTS)]
     distance, detection = _in_tiles(clouds, core, normal, cylinder, max_distance_m)
     known = np.isfinite(distance)

@@ -263,4 +263,4 @@ def cloud_to_cloud(xyz: FloatArray, reference: FloatArray) -> FloatArray:
 
 def _tiles(xyz: FloatArray) -> Tiles:
     few = len(xyz) <= 2 * TILE_POINTS
-    return one_tile(xyz) if few else make_tiles(xyz, points=TILE_POINTS)
+    return one_tile(xyz) if few else make_tiles(xyz, points=TILE_POINTS, strips=False)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from pcfix.compare.match import near_in_plan
 from pcfix.clean.neighbours import nearest_of
+from pcfix.compare.match import near_in_plan
 from pcfix.compare.nearest import cloud_to_cloud
 from pcfix.compare.sections import lines_downslope, parse_line, section_along
 from pcfix.compare.statistics import (
