@@ -18,7 +18,7 @@ from pcfix.errors import GeometryError, SettingError
 from pcfix.model import FloatArray, IntArray
 
 MAX_CORE_POINTS = 100_000
-TILE_POINTS = 1_000_000
+TILE_POINTS = 500_000
 """Points of either cloud that py4dgeo is given at a time, but for those around."""
 SPACING_SAMPLE = 10_000
 NORMAL_SPACINGS, CYLINDER_SPACINGS = 6.0, 3.0
