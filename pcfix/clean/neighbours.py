@@ -157,10 +157,10 @@ def nearest_distance(places: FloatArray, points: FloatArray, axes: int) -> Float
 
 def _trees(tiles: Tiles, axes: int) -> Callable[[int], cKDTree]:
     """Return what grows the tree of a tile, and keeps the last few."""
-    from scipy.spatial import cKDTree  # not quick to load, and C2C seldom needs it
-
     @lru_cache(maxsize=_TREES)
     def tree(tile: int) -> cKDTree:
+        from scipy.spatial import cKDTree  # not quick to load, and C2C seldom needs it
+
         first, last = tiles.start[tile : tile + 2]
         return cKDTree(np.array(tiles.xyz[first:last, :axes]), balanced_tree=False)
 
