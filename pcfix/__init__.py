@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from pcfix.flow.plan import plan_flight
     from pcfix.flow.rebuild import rebuild_rounds
     from pcfix.flow.restore import restore_file
+    from pcfix.flow.results import RunResults, open_run, run
     from pcfix.flow.view import view_clouds
     from pcfix.io.cameras import read_cameras
     from pcfix.io.water import read_water
@@ -62,6 +63,7 @@ _NAMES = {
     "pcfix.flow.plan": "plan_flight",
     "pcfix.flow.rebuild": "rebuild_rounds",
     "pcfix.flow.restore": "restore_file",
+    "pcfix.flow.results": "RunResults open_run run",
     "pcfix.flow.view": "view_clouds",
     "pcfix.io.cameras": "read_cameras",
     "pcfix.io.water": "read_water",
@@ -85,6 +87,7 @@ __all__ = [
     "Outcome",
     "PcfixError",
     "PcfixWarning",
+    "RunResults",
     "SettingError",
     "Summary",
     "Views",
@@ -105,6 +108,7 @@ __all__ = [
     "label_file",
     "label_points",
     "map_photos",
+    "open_run",
     "ortho_photo",
     "plan_flight",
     "read_cameras",
@@ -112,6 +116,7 @@ __all__ = [
     "rebuild_rounds",
     "refractive_index",
     "restore_file",
+    "run",
     "simulate_scene",
     "trace",
     "view_clouds",

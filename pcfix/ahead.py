@@ -71,6 +71,16 @@ def wait_for(kernel: str) -> None:
         _team.wait_for(kernel)
 
 
+announce: list[Callable[[], object]] = []
+"""Called once, and taken out, when this process begins to compile a kernel that is not kept."""
+
+
+def compiles() -> None:
+    """Say so; numba calls this by way of `pcfix.parts`."""
+    while announce:
+        announce.pop()()
+
+
 FREE, HERE, THERE, DONE = range(4)
 """Who compiles."""
 
@@ -91,6 +101,7 @@ class _Team:
         global _team
         try:
             _team = None
+            announce.clear()  # another thread may hold the lock of the terminal
             nothing = os.open(os.devnull, os.O_WRONLY)
             for stream in (1, 2):
                 os.dup2(nothing, stream)

@@ -5,7 +5,12 @@ Each message is one sentence that a person can act on: the file, the value, the 
 
 import importlib
 import sys
-from typing import Any
+import warnings
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+_Found = TypeVar("_Found")
 
 
 class PcfixError(Exception):
@@ -28,14 +33,38 @@ class PcfixWarning(UserWarning):
     """Something that was done on the user's behalf and that they should know of."""
 
 
-def photo_library(name: str) -> Any:
-    """Return a library of the extra ``photos``, or say how to get it."""
+def installing(extra: str) -> str:
+    """Return the command that installs an extra, from a checkout too."""
+    root = Path(__file__).parents[1]
+    what = f"-e '{root}[{extra}]'" if (root / "pyproject.toml").is_file() else f"'pcfix[{extra}]'"
+    return f"{sys.executable} -m pip install {what}"
+
+
+def shown_once(read: Callable[[], _Found], notes: Callable[[_Found], Iterable[str]]) -> _Found:
+    """Return what a function returns, and show of its warnings those that are none of its notes."""
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always", PcfixWarning)
+        found = read()
+    known = set(notes(found))
+    for one in shown:
+        if str(one.message) not in known:
+            warnings.warn(one.message, one.category, stacklevel=3)
+    return found
+
+
+def optional_library(name: str, extra: str, who: str) -> Any:
+    """Return a library of an extra, or say who needs it and how to get it."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
         raise InputError(
-            f"Photographs need {name}, which is not installed; run: pip install 'pcfix[photos]'."
+            f"{who} needs {name}, which is not installed; run: {installing(extra)}"
         ) from error
+
+
+def photo_library(name: str) -> Any:
+    """Return a library of the extra ``photos``, or say how to get it."""
+    return optional_library(name, "photos", "Work on photographs")
 
 
 def show_warning(

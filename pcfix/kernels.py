@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -73,20 +73,46 @@ def cores() -> int:
     return _most_threads or 1
 
 
-def in_tiles(run: Callable[..., Any], rows: int, *given: Any) -> None:
+def _tell(points: float) -> None:
+    """Tell that so many more points are done; `telling` replaces it for a while."""
+
+
+@contextmanager
+def telling(report: Callable[[int], None]) -> Iterator[None]:
+    """Report how many points the methods of correction have done so far, while they run."""
+    global _tell
+    before, done = _tell, 0.0
+
+    def tell(points: float) -> None:
+        nonlocal done
+        done += points
+        report(round(done))
+
+    _tell = tell
+    try:
+        yield
+    finally:
+        _tell = before
+
+
+def in_tiles(run: Callable[..., Any], rows: int, *given: Any, points: int = 0) -> None:
     """Call ``run((first, last), *given)`` for all rows, a tile of them at a time in each thread.
 
-    No row may depend on another one: which share a tile depends on the number of threads.
+    No row may depend on another one: which share a tile depends on the number of threads. Of
+    `points`, where there are so many in all rows, each tile is told to be done; see `telling`.
     """
     count = min(cores(), rows)
-    if count < 2:
-        if rows:
-            run((0, rows), *given)
+    if not rows:
         return
-    tiles = min(rows, TILES_A_THREAD * count)
+    tiles = min(rows, TILES_A_THREAD * count) if count > 1 or points else 1
     edges = [rows * i // tiles for i in range(tiles + 1)]
-    with ThreadPoolExecutor(count) as pool:
-        list(pool.map(lambda i: run((edges[i], edges[i + 1]), *given), range(tiles)))
+
+    def one(i: int) -> None:
+        run((edges[i], edges[i + 1]), *given)
+
+    with ThreadPoolExecutor(count) if count > 1 else nullcontext() as pool:
+        for _ in map(one, range(tiles)) if pool is None else pool.map(one, range(tiles)):
+            _tell(points / tiles)
 
 
 @lean

@@ -18,12 +18,12 @@ from typing import Any, TypeAlias
 import numba
 from llvmlite.binding import Linkage
 from numba import njit
-from numba.core import config
+from numba.core import config, event
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompileResult
 from numba.core.registry import CPUDispatcher
 
-from pcfix.ahead import wait_for
+from pcfix.ahead import compiles, wait_for
 
 Decorator: TypeAlias = Callable[[Any], Any]
 
@@ -31,6 +31,18 @@ TRIED = ("0.68",)
 """Versions of numba."""
 
 _are_linked = numba.__version__.rpartition(".")[0] in TRIED and not config.DISABLE_JIT
+
+
+class _Listener(event.Listener):
+    def on_start(self, event: Any) -> None:
+        """Be told that something is compiled which is not kept."""
+        compiles()
+
+    def on_end(self, event: Any) -> None:
+        """Be told that it is done."""
+
+
+event.register("numba:compile", _Listener())
 
 
 def kernel(**options: Any) -> Decorator:

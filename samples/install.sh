@@ -4,7 +4,7 @@
 #   bash samples/install.sh [FOLDER] [EXTRAS]
 #
 # FOLDER   of the environment, default .venv in this checkout
-# EXTRAS   such as "test", default none
+# EXTRAS   such as "vector,photos" or "test", default "vector": maps and shorelines
 #
 # Needs Python 3.11 or newer (PYTHON=... names another than python3). What Debian and Ubuntu keep
 # apart (venv, and the libraries that open3d links to) is installed with apt where that is
@@ -12,7 +12,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 folder=${1:-.venv}
-extras=${2:+[$2]}
+extras=[${2:-vector}]
 python=${PYTHON:-python3}
 
 as_root() {
@@ -46,7 +46,7 @@ if [ ${#missing[@]} -gt 0 ]; then system_packages "${missing[@]}"; fi
 if [ ! -x "$folder/bin/python" ]; then "$python" -m venv "$folder"; fi
 "$folder/bin/python" -m pip install --quiet --upgrade pip
 "$folder/bin/python" -m pip install --quiet --editable ".$extras"
-if [ -z "$extras" ]; then
+if [ -z "${2:-}" ]; then
     echo "compiling the kernels, so that the first correction need not wait for it ..."
     warm=$(mktemp -d)
     "$folder/bin/pcfix" correct samples/scene/cloud.laz "$warm/out.laz" \

@@ -63,3 +63,16 @@ def said(way: str, cache: Path) -> str:
 @pytest.mark.parametrize("way", ["two", "error", "killed"])
 def test_it_says_nothing_and_changes_nothing(way: str, tmp_path: Path) -> None:
     assert said(way, tmp_path / way) == said("alone", tmp_path / "alone")
+
+
+def test_compiling_is_announced_once(monkeypatch):
+    import numba
+
+    from pcfix import ahead, parts  # noqa: F401  # which listens to numba
+
+    said = []
+    monkeypatch.setattr(ahead, "announce", [lambda: said.append("compiling")])
+    for function in (numba.njit(lambda x: x + 1), numba.njit(lambda x: x + 2)):
+        function(1)
+        function(2)
+    assert said == ["compiling"]

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from pcfix import Cameras, cli
+from tests.utils.beyond_frames import BEYOND_FRAMES, DEEP
 from tests.utils.clouds import (
     EAST_M,
     NORTH_M,
@@ -121,6 +122,23 @@ def test_a_cloud_that_is_not_there(refuse: Refuse) -> None:
 def test_a_file_that_is_no_cloud(refuse: Refuse, folder: Path, content: bytes) -> None:
     (folder / "text.las").write_bytes(content)
     assert "text.las" in refuse(*job(cloud="text.las"))
+
+
+def test_ply_is_told_how_to_be_converted(refuse: Refuse, folder: Path) -> None:
+    (folder / "cloud.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
+    said = refuse(*job(cloud="cloud.ply"))
+    assert "is a PLY file" in said and "damaged" not in said
+    assert "pdal translate cloud.ply cloud.laz --writers.las.scale_x=0.001" in said
+
+
+@pytest.mark.parametrize(("suffix", "count"), [(".las", 300), (".laz", 120_000)])
+def test_a_header_that_counts_too_few(
+    refuse: Refuse, folder: Path, suffix: str, count: int
+) -> None:
+    """Of LAZ the chunk table tells: full chunks hold 50,000 points."""
+    path = write_cloud(folder / f"few{suffix}", 7, count=count)
+    patched(path, 247, struct.pack("<Q", count // 3))
+    assert f"counts {count // 3:,} points" in refuse(*job(cloud=path.name))
 
 
 def test_a_folder_as_input(refuse: Refuse, folder: Path) -> None:
@@ -331,6 +349,15 @@ def test_cameras_under_the_water(refuse: Refuse, folder: Path, water: str) -> No
 
 def test_cameras_that_are_not_there(refuse: Refuse) -> None:
     assert "none.csv" in refuse(*job("--cameras", "none.csv"))
+
+
+def test_a_folder_that_holds_cameras(refuse: Refuse, folder: Path) -> None:
+    (folder / "images").mkdir()
+    assert "is not a camera file" in refuse(*job("--cameras", "images"))
+    (folder / "images" / "cameras.csv").write_bytes((folder / "cameras.csv").read_bytes())
+    (folder / "images" / "notes.txt").write_text("flown on a Tuesday")
+    said = refuse(*job("--cameras", "images"))
+    assert "is a folder that holds cameras.csv; give images/cameras.csv itself" in said
 
 
 @pytest.mark.parametrize("angles", [False, True])
@@ -632,8 +659,8 @@ def test_wrong_usage_is_exit_code_2(
 KEYS = {
     "input", "output", "pcfix", "points", "submerged", "corrected", "uncorrected", "dropped",
     "water_unknown", "depth_m", "shift_z_m", "rays", "cameras", "cameras_used", "cameras_unused",
-    "water", "settings", "seconds", "views", "water_fit", "warnings", "points_per_s",
-    "uncertainty", "made", "poses", "incidence_deg",
+    "cameras_left_out", "water", "settings", "seconds", "views", "water_fit", "warnings",
+    "points_per_s", "uncertainty", "made", "poses", "incidence_deg", "fit",
 }  # fmt: skip
 
 
@@ -646,7 +673,7 @@ def test_labels_that_repeat_are_a_warning(folder: Path) -> None:
     (line,) = done.stderr.splitlines()
     assert line.startswith("pcfix: warning: ")
     assert "c0" in line
-    assert "c1" in line
+    assert "c1" in line and "1 exact copies are dropped" in line
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["cameras"] == 10
     assert len(summary["warnings"]) == 1
@@ -665,6 +692,24 @@ def test_summary_is_json_with_the_documented_keys(folder: Path) -> None:
     assert sorted(path.name for path in folder.iterdir()) == [
         "cameras.csv", "cloud.las", "out.las", "summary.json",
     ]  # fmt: skip
+
+
+def test_nothing_corrected_is_an_error(refuse: Refuse, folder: Path) -> None:
+    lines = (folder / "cameras.csv").read_text().splitlines()
+    (folder / "cameras.csv").write_text("\n".join(lines[:2]) + "\n")
+    message = refuse(*job("--method", "snell"))
+    assert "submerged points can be corrected" in message
+    assert "one usable ray only" in message
+
+
+def test_little_corrected_is_said_first(
+    run: Callable[..., subprocess.CompletedProcess[str]],
+) -> None:
+    done = run(*job("--max-angle", "20"))
+    assert done.returncode == 0, done.stderr
+    first = done.stdout.splitlines()[0]
+    assert first.startswith("WARNING      only ")
+    assert "submerged points were corrected" in first
 
 
 def test_quiet_says_nothing(folder: Path) -> None:
@@ -698,6 +743,8 @@ def test_tables_as_spreadsheets_write_them(
     assert run(*job()).returncode == 0
 
 
+@BEYOND_FRAMES
+@DEEP
 def test_the_bed_may_lie_below_zero(
     folder: Path, run: Callable[..., subprocess.CompletedProcess[str]]
 ) -> None:

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from pathlib import Path
 
+import pytest
+
+from pcfix.cli import app
+from pcfix.cli.commands import EXAMPLES
+from pcfix.cli.flags import prepare
 from tests.utils.option_tables import DOCUMENT, with_tables
 
 ROOT = Path(__file__).parents[1]
@@ -20,3 +27,33 @@ def test_readme_is_short_and_pictures_are_small():
     assert len((ROOT / "README.md").read_text("utf-8").splitlines()) <= 200
     pictures = [*ROOT.glob("samples/**/*.png"), *ROOT.glob("samples/**/*.jpg")]
     assert 0 < sum(path.stat().st_size for path in pictures) < 1_000_000
+
+
+PATTERN = re.compile(r"[\[\]|]|\.\.\.|(?<!\S)[A-Z_]{3,}(?!\S)")
+"""Of what is no command, as ``INPUT [OPTION]``."""
+
+
+def commands():
+    """Return the commands of the documents, and which of these each is in."""
+    found = {}
+    for path in (*ROOT.glob("*.md"), *ROOT.glob("samples/*.md"), *ROOT.glob("pcfix/**/*.md")):
+        text = path.read_text("utf-8").replace("\\\n", " ")
+        blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.M | re.S)
+        shell = "\n".join(block for language, block in blocks if not language)
+        lines = re.findall(r"^pcfix .*", shell, re.M) + re.findall(
+            r"`(pcfix [a-z]+ [^-].*?)`", text
+        )
+        found |= {line: path for line in lines if not PATTERN.search(line)}
+    return found
+
+
+def test_commands_are_understood():
+    assert len(commands()) > 20
+    for command, _ in EXAMPLES:
+        prepare(command)
+    for line, path in commands().items():
+        words = shlex.split(line, comments=True)[1:]
+        try:
+            app.parse_args(words, exit_on_error=False, print_error=False)
+        except Exception as error:
+            pytest.fail(f"{path.name}: {line}: {error}")

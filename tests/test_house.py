@@ -23,7 +23,7 @@ FLOORS = (
     ("parts",),
     ("kernels",),
     ("options",),
-    ("model",),
+    ("model", "sums"),
     ("lens",),
     ("water",),
     ("label",),
@@ -43,7 +43,18 @@ FLOORS = (
 # The simulator checks the rooms that correct, so it may not use what they do.
 TWINS = {"simulate": {"label", "refract", "port", "adjust", "clean", "grid", "compare"}}
 
-FILE_LIBRARIES = {"laspy", "rasterio", "pyproj", "fiona", "pyogrio", "PIL", "tifffile", "jpeglib"}
+FILE_LIBRARIES = {
+    "laspy",
+    "rasterio",
+    "pyproj",
+    "fiona",
+    "pyogrio",
+    "PIL",
+    "tifffile",
+    "jpeglib",
+    "rioxarray",
+    "geopandas",
+}
 OPENING = {"read_text", "read_bytes", "write_text", "write_bytes"}
 # Files and libraries of files outside io/, with the reason.
 OUTSIDE_IO = {

@@ -28,9 +28,17 @@ lens = pcfix.Lens(3000.0, 4000.0, 3000.0, 2010.0, 1490.0)
 cameras = pcfix.Cameras(
     tuple("abcdefghi"), centres, np.tile(np.diag([1.0, -1.0, -1.0]), (9, 1, 1)), (lens,) * 9
 )
+from pcfix.options.correct import ScienceOptions
+from pcfix.refract.batch import Batch, Survey
+from pcfix.refract.shan import shan
+from pcfix.water.surface import SurfaceAbove
 places = np.random.default_rng(5).uniform([-30, -30, -6], [30, 30, -1], (500, 3))
-found = pcfix.correct_points(places, cameras, 0.0, method="snell", max_angle=None)
-sys.stdout.buffer.write(np.column_stack([found.xyz, found.sigma_z_m]).tobytes())
+above = SurfaceAbove(np.zeros(500), np.zeros((500, 2)))
+survey = Survey(pcfix.WaterPlane(0.0), cameras, ScienceOptions(method="shan"))
+views = pcfix.Views(9 * np.arange(501), np.tile(np.arange(9), 500))
+found = shan(Batch(places, above, survey, views))
+assert (found.outcome == pcfix.Outcome.CORRECTED).all()
+sys.stdout.buffer.write(np.column_stack([found.shift_m, found.ray_miss_m]).tobytes())
 """
 
 

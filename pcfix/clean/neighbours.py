@@ -157,6 +157,7 @@ def nearest_distance(places: FloatArray, points: FloatArray, axes: int) -> Float
 
 def _trees(tiles: Tiles, axes: int) -> Callable[[int], cKDTree]:
     """Return what grows the tree of a tile, and keeps the last few."""
+
     @lru_cache(maxsize=_TREES)
     def tree(tile: int) -> cKDTree:
         from scipy.spatial import cKDTree  # not quick to load, and C2C seldom needs it

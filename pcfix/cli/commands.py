@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -17,12 +18,15 @@ from pcfix.options.declare import options_of
 from pcfix.options.handover import PlanOptions, PluginOptions, ViewerOptions
 from pcfix.options.photos import CalmOptions, OrthoOptions, PhotosOptions
 from pcfix.options.scenes import DemoOptions, SimulateOptions
-from pcfix.options.shared import JobOptions
+from pcfix.options.shared import TileOptions
 from pcfix.options.steps import CleanOptions, CompareOptions, DsmOptions
 from pcfix.options.survey import AdjustOptions, CamerasCheckOptions, RunOptions, WaterCheckOptions
 
 Input = Annotated[Path, Parameter(help="LAS or LAZ cloud.")]
-Output = Annotated[Path, Parameter(help="LAS or LAZ to write.")]
+Inputs = Annotated[
+    str, Parameter(help="LAS or LAZ cloud; a folder, glob, list (.txt) or index (.vpc) of tiles.")
+]
+Output = Annotated[Path, Parameter(help="LAS or LAZ to write; a folder for tiles.")]
 
 
 def run(
@@ -53,19 +57,18 @@ def run(
         check_needed(options)
         values = {one.name: getattr(options, one.name) for one in options_of(RunOptions)}
         request, folder = Request(input=str(input), **values), out_dir
-    with progress_bar("Correcting", quiet) as progress:
-        run_all(
-            request,
-            Path(str(folder)),
-            overwrite=options.overwrite,
-            jobs=options.jobs,
-            say=lambda text: say(text, quiet),
-            progress=progress,
-        )
+    run_all(
+        request,
+        Path(str(folder)),
+        overwrite=options.overwrite,
+        jobs=options.jobs,
+        say=lambda text: say(text, quiet),
+        bar=partial(progress_bar, quiet=quiet),
+    )
 
 
 def correct(
-    input: Input,
+    input: Inputs,
     output: Output,
     /,
     *,
@@ -132,7 +135,7 @@ def adjust(
 
 
 def label(
-    input: Input,
+    input: Inputs,
     output: Output,
     /,
     *,
@@ -165,7 +168,7 @@ def clean(
 
 
 def dsm(
-    input: Input,
+    input: Inputs,
     output: Annotated[Path, Parameter(help="GeoTIFF to write.")],
     /,
     *,
@@ -283,11 +286,11 @@ def water(
 
 
 def restore(
-    input: Input,
+    input: Inputs,
     output: Output,
     /,
     *,
-    options: Annotated[JobOptions, FLAGS] = JobOptions(),
+    options: Annotated[TileOptions, FLAGS] = TileOptions(),
     quiet: Quiet = False,
 ) -> None:
     """Give back the cloud as it was before 'pcfix correct', bit for bit."""
@@ -367,11 +370,8 @@ def demo(
     """Simulate, correct, and show how far the cloud is from the truth."""
     from pcfix.flow.demo import run_demo
 
-    with progress_bar("Simulating and correcting", quiet) as progress:
-        table = run_demo(
-            out_dir, points=options.points, overwrite=options.overwrite, progress=progress
-        )
-    say(table)
+    bar = partial(progress_bar, quiet=quiet)
+    say(run_demo(out_dir, points=options.points, overwrite=options.overwrite, bar=bar))
 
 
 EXAMPLES: tuple[tuple[Callable[..., None], str], ...] = (

@@ -7,11 +7,13 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_type_hints
 
 from cyclopts import Group, Parameter
 
+from pcfix.ahead import announce
 from pcfix.options.declare import Option, OptionSet, options_of
 from pcfix.options.shared import Panel
 
@@ -58,7 +60,7 @@ def _type(one: Option) -> Any:
     if one.metavar == "PATH" or os.PathLike[str] in one.kinds:
         return Path | None
     if one.parse is not None or one.type is Any:
-        return str | one.type if one.default == () else str | None
+        return str | one.type if isinstance(one.default, tuple) else str | None
     if one.default == ():
         return tuple[str, ...]
     return one.type | None if one.default is None else one.type
@@ -93,7 +95,10 @@ Quiet = Annotated[
 ]
 
 
-COMPILING = "kernels are compiled first, once after an installation: about a minute"
+@cache
+def _announce_compiling() -> None:
+    """Say on a terminal, once, that kernels are compiled."""
+    announce.append(lambda: sys.stderr.write("compiling the kernels, once (half a minute)\n"))
 
 
 @contextmanager
@@ -110,6 +115,7 @@ def progress_bar(
     if quiet or not sys.stderr.isatty():
         yield None
         return
+    _announce_compiling()
     from rich import progress
     from rich.console import Console
 
@@ -118,18 +124,16 @@ def progress_bar(
         progress.BarColumn(),
         progress.TaskProgressColumn(),
         progress.TextColumn("{task.fields[rate]}"),
-        progress.TimeRemainingColumn(),
+        progress.TimeRemainingColumn(elapsed_when_finished=True),
     )
     with progress.Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        kept = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[1] / "refract")
-        first = "" if any(kept.glob("**/*.nbi")) else f" ({COMPILING})"
-        task = bar.add_task(title + first, total=None, rate="")
+        task = bar.add_task(title, total=None, rate="")
         started = time.perf_counter()
 
         def update(done: int, total: int) -> None:
             rate = done / (time.perf_counter() - started)
             text = f"{rate:,.0f} {unit}/s" if rate > 10.0 else f"{60.0 * rate:.0f} {unit}/min"
-            bar.update(task, description=title, completed=done, total=total, rate=text)
+            bar.update(task, completed=done, total=total, rate=text)
 
         yield update
 
@@ -154,6 +158,7 @@ def status_line(title: str, quiet: bool) -> Iterator[Callable[[Any], None] | Non
     if quiet or not sys.stderr.isatty():
         yield None
         return
+    _announce_compiling()
     from rich.console import Console
 
     with Console(stderr=True).status(title) as status:

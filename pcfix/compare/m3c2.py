@@ -14,7 +14,7 @@ import numpy as np
 
 from pcfix.clean.neighbours import SLACK, Neighbours, Tiles, make_tiles
 from pcfix.compare.statistics import Statistics, statistics_of
-from pcfix.errors import GeometryError, SettingError
+from pcfix.errors import GeometryError, SettingError, installing
 from pcfix.model import FloatArray, IntArray
 
 MAX_CORE_POINTS = 100_000
@@ -59,7 +59,7 @@ def load_py4dgeo() -> Any:
             return import_module("py4dgeo")
     except ImportError as error:
         raise SettingError(
-            "M3C2 needs py4dgeo, which is not installed; run: pip install 'pcfix[m3c2]'."
+            f"M3C2 needs py4dgeo, which is not installed; run: {installing('m3c2')}"
         ) from error
 
 

@@ -10,10 +10,18 @@ import numpy as np
 
 from pcfix.adjust.diagnosis import Diagnosis
 from pcfix.adjust.evidence import Evidence
-from pcfix.errors import InputError, SettingError
-from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, has_datum, ties_of
+from pcfix.errors import InputError, SettingError, shown_once
+from pcfix.flow.diagnosis import (
+    diagnose,
+    focal_length_of,
+    given_focal_lengths,
+    has_datum,
+    quick_ties,
+    ties_of,
+)
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.next_steps import adjust_words
+from pcfix.flow.plausibility import plausible
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.shore import check_shoreline, write_shoreline
 from pcfix.flow.surfaces import CloudView, file_points, find_surface, view_of
@@ -25,7 +33,7 @@ from pcfix.io.files import check_input, check_output, write_bytes
 from pcfix.io.gnss_positions import read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.lens.frames import cameras_in_sight
-from pcfix.model import Cameras, FloatArray, Lens, WaterDimension, WaterSurface
+from pcfix.model import Cameras, FloatArray, Lens, TiePoints, WaterDimension, WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.survey import CamerasCheckOptions, WaterCheckOptions
 from pcfix.report.cameras import CamerasReport, Fit, GnssResiduals, Sensor, block_figure
@@ -36,8 +44,6 @@ from pcfix.water.surface import surface_above
 
 SAMPLE_POINTS, WATER_SAMPLE_POINTS = 50_000, 200_000
 """Points of the cloud that are looked for in the frames, and below the water; evenly spread."""
-LEAST_SEEN_TWICE = 0.9
-"""Share of a cloud that two frames or more should hold, as two made each point."""
 
 
 def check_cameras(
@@ -73,7 +79,7 @@ def check_cameras(
         _refuse_surveys(given)
     water = 0.0 if given.water is None else given.water
     inputs = replace(replace(given, water=water).part(Inputs), cameras=path)
-    read = inputs.read()
+    read = shown_once(inputs.read, lambda cameras: cameras.notes)
     view = None if cloud is None else view_of(check_input(cloud))
     surface = None if given.water is None else inputs.surface(view).surface
     xyz, heights = np.zeros((0, 3)), None
@@ -105,7 +111,9 @@ def check_cameras(
         else (float(above.min()), float(above.mean()), float(above.max())),
         tilt_deg=None if problem else _tilt_deg(cameras),
         gnss=_gnss(cameras, str(path)),
-        fit=None if view is None else _fit(cameras, str(cloud), xyz, view.crs),
+        fit=None
+        if view is None
+        else _fit(cameras, str(cloud), xyz, view.crs, quick_ties(inputs, view.crs)),
         sample_xyz=xyz,
         level_m=level,
         problem=problem,
@@ -143,7 +151,7 @@ def check_water(
         check_output(plot, overwrite=given.overwrite, inputs=inputs)
     check_shoreline(given.shoreline, overwrite=given.overwrite, inputs=inputs)
     view = None if cloud is None else view_of(check_input(cloud))
-    found = find_surface(spec, given, view)
+    found = shown_once(lambda: find_surface(spec, given, view), lambda found: found.notes)
     sample, below, unknown = np.zeros((0, 3)), None, None
     if view is not None:
         sample, _ = _sample(view, WATER_SAMPLE_POINTS)
@@ -293,7 +301,7 @@ def _gnss(cameras: Cameras, name: str) -> GnssResiduals | None:
     )  # fmt: skip
 
 
-def _fit(cameras: Cameras, cloud: str, xyz: FloatArray, crs: Any) -> Fit:
+def _fit(cameras: Cameras, cloud: str, xyz: FloatArray, crs: Any, ties: TiePoints | None) -> Fit:
     seen = cameras_in_sight(xyz, cameras)
     shares = {str(k): float(np.mean(seen == k)) for k in (0, 1, 2)}
     shares["3 or more"] = float(np.mean(seen >= 3))
@@ -307,14 +315,9 @@ def _fit(cameras: Cameras, cloud: str, xyz: FloatArray, crs: Any) -> Fit:
             f"{below} of {len(cameras)} cameras stand below the ground: heights of cameras and"
             " cloud have different datums, or the axes are swapped."
         )
-    twice = float(np.mean(seen >= 2))
-    if not verdict and twice < LEAST_SEEN_TWICE:
-        verdict = (
-            f"only {100 * twice:.0f} % of the points lie in the frames of two"
-            " cameras or more, although the block is over the cloud: check the convention of the"
-            " angles and the interior orientation."
-        )
-    return Fit(cloud, len(xyz), shares, float(np.hypot(*apart)), below, verdict)
+    found = plausible(cameras, xyz, ties)
+    verdict = verdict or " ".join(found.doubts)
+    return Fit(cloud, len(xyz), shares, float(np.hypot(*apart)), below, verdict, str(found))
 
 
 def _below_ground(centres: FloatArray, xyz: FloatArray) -> int:

@@ -158,7 +158,7 @@ class NoiseSearch:
 
     def _add(self, one: Tested, rows: slice) -> None:
         """Take coordinates and masks, and flag weak intersections on the way."""
-        cloud, (xyz, heights, classes, _) = self.cloud, one.points
+        cloud, (xyz, heights, classes, *_) = self.cloud, one.points
         used = ~(one.withheld | np.isin(classes, NOISE_CLASSES))
         rays, miss, incidence = (one.rays.get(name) for name in RAY_DIMENSIONS)
         if rays is not None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 from pcfix.compare.statistics import errors_against_truth
 from pcfix.flow.correct import correct_points
 from pcfix.flow.run import Request, run_all
+from pcfix.flow.runner import Bar, no_bar
 from pcfix.io.las.source import read_xyz
 from pcfix.io.scenes import write_scene
 from pcfix.model import FloatArray
@@ -21,31 +21,24 @@ REPORT = "run"
 
 
 def run_demo(
-    out_dir: File,
-    *,
-    points: int = 50_000,
-    overwrite: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    out_dir: File, *, points: int = 50_000, overwrite: bool = False, bar: Bar = no_bar
 ) -> str:
     """Make both blocks of scenes in a folder, run all steps on them, return the table."""
     sections = []
-    for number, kind in enumerate(BLOCKS):
+    for kind in BLOCKS:
         folder = Path(out_dir) / kind
-
-        def step(done: int, total: int, number: int = number) -> None:
-            if progress is not None:
-                progress(number * total + done, len(BLOCKS) * total)
-
-        scene = simulate_scene(points, block=kind, progress=step)
+        with bar(f"Simulating, {kind}") as progress:
+            scene = simulate_scene(points, block=kind, progress=progress)
         write_scene(scene, folder, overwrite=overwrite)
-        table = _table(scene, folder, overwrite)
+        corrected = _corrected(scene, folder, f"pcfix demo, {kind} block", overwrite, bar)
+        table = _table(scene, corrected)
         sections.append(
             f"{folder}\n{scene.description}\n{table}\nreport: {folder / REPORT / 'report.html'}"
         )
     return "\n\n".join(sections)
 
 
-def _table(scene: Scene, folder: Path, overwrite: bool) -> str:
+def _table(scene: Scene, corrected: FloatArray) -> str:
     deep = scene.true_xyz[:, 2] < scene.water_level_m - LEAST_DEPTH_M
     below = scene.apparent_xyz[:, 2] < scene.water_level_m
     times_n = scene.apparent_xyz.copy()
@@ -58,7 +51,7 @@ def _table(scene: Scene, folder: Path, overwrite: bool) -> str:
         ("as it came", scene.apparent_xyz),
         (f"depth times {scene.refractive_index:g}", times_n),
         ("without any option", by_default.xyz),
-        ("consistent, own cameras", _corrected(scene, folder, overwrite)),
+        ("consistent, own cameras", corrected),
     ]
     head = f"error of {deep.sum():,} bed points"
     lines = [f"{head:<30}{'mean Z':>20}{'RMSE Z':>20}{'RMSE XY':>20}"]
@@ -69,7 +62,7 @@ def _table(scene: Scene, folder: Path, overwrite: bool) -> str:
     return "\n".join(lines)
 
 
-def _corrected(scene: Scene, folder: Path, overwrite: bool) -> FloatArray:
+def _corrected(scene: Scene, folder: Path, project: str, overwrite: bool, bar: Bar) -> FloatArray:
     """Run all steps on the scene's files and read the corrected cloud."""
     request = Request(
         input=str(folder / "cloud.laz"),
@@ -80,6 +73,7 @@ def _corrected(scene: Scene, folder: Path, overwrite: bool) -> FloatArray:
         method="consistent",
         views=str(folder / "fused.ply.vis"),
         views_are="tracks",
+        project=project,
     )
-    run_all(request, folder / REPORT, overwrite=overwrite)
+    run_all(request, folder / REPORT, overwrite=overwrite, bar=bar)
     return read_xyz(folder / REPORT / "corrected.laz")

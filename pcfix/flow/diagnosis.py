@@ -74,8 +74,8 @@ def diagnose_in_passing(
 ) -> Poses:
     """Say what a correction is made with anyway tells of its poses; warn once if they are bent.
 
-    The cameras of the evidence are in the cloud's CRS; the verdicts are what the cloud was taken
-    for.
+    The cameras and `quick_ties` of the evidence are in the cloud's CRS; the verdicts are what the
+    cloud was taken for.
     """
     if inputs.adjusted_from is not None:
         return ADJUSTED
@@ -87,7 +87,7 @@ def diagnose_in_passing(
         if path is not None and _size_of(Path(path)) > QUICK_BYTES:
             why = f"a file of more than {QUICK_BYTES / 1e6:g} MB is looked at by 'pcfix cameras'"
         elif path is not None:
-            ties = ties_of(inputs, view.crs) if evidence.has_rays else None
+            ties = evidence.ties if evidence.has_rays else None
             evidence = replace(evidence, ties=ties, calibrated=given_focal_lengths(path))
         found = diagnose(evidence)
     except (PcfixError, OSError) as error:  # a look in passing stops no correction
@@ -123,6 +123,15 @@ def ties_of(inputs: Inputs, crs: Any) -> TiePoints | None:
     with warnings.catch_warnings():  # they were shown when the cameras were read
         warnings.simplefilter("ignore", PcfixWarning)
         return inputs.tie_points(crs)
+
+
+def quick_ties(inputs: Inputs, crs: Any) -> TiePoints | None:
+    """Return the tie points of `ties_of` where reading them takes a second or two at most."""
+    path = None if isinstance(inputs.cameras, Cameras) else Path(inputs.cameras)
+    try:
+        return None if path is None or _size_of(path) > QUICK_BYTES else ties_of(inputs, crs)
+    except (PcfixError, OSError):  # a look in passing stops no correction
+        return None
 
 
 def _size_of(path: Path) -> int:

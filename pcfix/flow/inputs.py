@@ -218,7 +218,7 @@ def paths_in(options: Any, but: tuple[str, ...] = ()) -> list[File]:
 
     A vector file may be named with a layer, which is left out.
     """
-    names = [one.name for one in options_of(InputOptions)] + ["water_mask"]
+    names = [one.name for one in options_of(InputOptions)] + ["water_mask", "water_per_image"]
     given = [getattr(options, name, None) for name in names if name not in (*NO_FILES, *but)]
     paths = [str(one) for one in given if isinstance(one, str | PathLike)]
     return [Path(path.partition(LAYER_MARK)[0]) for path in paths]

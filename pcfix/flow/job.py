@@ -22,12 +22,14 @@ from pcfix.kernels import cores
 from pcfix.label.labelling import Labelling
 from pcfix.model import Correction, Outcome, WaterSurface
 from pcfix.options.correct import CorrectOptions, LabelRules, ScienceOptions
+from pcfix.refract.choice import views_in_frame
 from pcfix.refract.tally import Summary, Tally
+from pcfix.sums import Sums
 from pcfix.version import __version__
 from pcfix.water.index import with_index
 
 
-class Job:
+class Job(Sums):
     """A correction: its options, cameras and water or port, and the tally of its chunks.
 
     Parameters
@@ -45,6 +47,8 @@ class Job:
     PcfixError
         If an input cannot be read or they do not fit, or a camera stands under the water.
     """
+
+    added = ("tally", "labelling", "medium", "views")
 
     def __init__(
         self, name: str, options: CorrectOptions, view: CloudView, step_m: float = 0.0
@@ -66,11 +70,12 @@ class Job:
         """The water surface; infinitely high behind a port."""
         return self.medium.water
 
-    def restart(self) -> None:
-        """Forget the chunks so far."""
-        self.tally = Tally(len(self.cameras))
+    def restart(self, first_row: int = 0) -> None:
+        """Forget the chunks so far; the next one begins at a row of the whole cloud."""
+        self.first_row = first_row
+        self.tally = Tally(len(self.cameras), self._view.points, first_row)
         self.labelling.restart()
-        self.medium.restart()
+        self.medium.restart(first_row)
         self.views.restart()
 
     def compiling(self) -> AbstractContextManager[None]:
@@ -83,7 +88,7 @@ class Job:
 
     def correct(self, points: Points) -> Correction:
         """Correct one chunk."""
-        views = self.views.of(points.xyz, self.tally.points)
+        views = self.views.of(points.xyz, self.first_row + self.tally.points)
         correction = self.medium.correct(points, views, self.labelling)
         self.tally.add(correction.apparent_xyz, correction)
         return correction
@@ -122,6 +127,12 @@ class Job:
             found = None if flat else likely_mistake(*block)
             mistake = f" {found}" if found else ""
             raise GeometryError(f"{self.name}: {self.medium.out_of_sight(tally)}{mistake}")
+        if not tally.corrected and tally.submerged:
+            reasons = [f"{n:,}: {why}" for why, n in tally.uncorrected().items() if n]
+            raise GeometryError(
+                f"{self.name}: none of {tally.submerged:,} submerged points can be corrected"
+                f" ({'; '.join(reasons)}); check that cameras and cloud belong together."
+            )
         self.medium.look_back()
 
     def save_regression(self) -> None:
@@ -153,6 +164,7 @@ class Job:
             cameras=len(self.cameras),
             cameras_used=len(self.cameras) - len(unused),
             cameras_unused=unused,
+            cameras_left_out=self._left_out(),
             seconds=round(seconds, 3),
             views=None if report is None else report.as_dict(),
             warnings=[
@@ -165,3 +177,22 @@ class Job:
             settings={**self.options.part(ScienceOptions).as_dict(), **self.medium.settings},
             **self.medium.figures(tally),
         )
+
+    def _left_out(self) -> dict[str, list[str]]:
+        """Return the unused cameras in whose frame corrected points lie, by what left them out."""
+        unused = ~self.tally.camera_used
+        if isinstance(self.medium, ThroughPort) or not self.tally.moved or not unused.any():
+            return {}
+        xyz, limit = np.vstack(self.tally.moved), self.medium.survey.settings.limit_deg or 90.0
+        seen = views_in_frame(xyz, self.cameras)
+        points = np.repeat(np.arange(len(xyz)), np.diff(seen.start))
+        across, along, up = (self.cameras.centres[seen.camera] - xyz[points]).T
+        steepest = np.full(len(unused), np.inf)
+        np.minimum.at(steepest, seen.camera, np.degrees(np.arctan2(np.hypot(across, along), up)))
+        beyond, within = unused & np.isfinite(steepest) & (steepest > limit), steepest <= limit
+        reasons = {f"beyond {limit:g} degrees alone": beyond, "but are not chosen": unused & within}
+        return {
+            why: list(compress(self.cameras.labels, rows))
+            for why, rows in reasons.items()
+            if rows.any()
+        }

@@ -14,7 +14,7 @@ from pcfix.errors import GeometryError
 from pcfix.flow.rasters import BED, DEPTH, UNCERTAINTY
 from pcfix.flow.shore import shoreline_layer
 from pcfix.flow.surfaces import points_of
-from pcfix.grid.contours import contours, interval_of
+from pcfix.grid.contours import contours, depth_interval
 from pcfix.grid.shoreline import NearWater
 from pcfix.io import rasters
 from pcfix.io.geopackage import Layer, write_layers
@@ -26,8 +26,8 @@ from pcfix.options.correct import LEVEL_M
 from pcfix.options.declare import File
 from pcfix.water.surface import surface_above
 
-MOST_CELLS = 2000
-"""Longest side of the raster that contours and footprint are drawn of."""
+MOST_CELLS = 4_000_000
+"""Of the rasters that contours and footprint are drawn of."""
 SECTIONS = 3
 DARK, RED, GREY = (8, 48, 107), (203, 24, 29), (120, 120, 120)
 ORANGE, GREEN = (253, 141, 60), (35, 139, 69)
@@ -56,7 +56,7 @@ def write_map(path: Path, drawn: Drawn, crs: Any) -> dict[str, int]:
     """Write all layers; return how many features each has."""
     layers = [
         _area(drawn.folder),
-        _contours(drawn.folder),
+        contours_layer(drawn.folder),
         _waterline(drawn),
         _sections(drawn),
         _cameras(drawn.cameras, drawn.unused),
@@ -74,13 +74,13 @@ def _area(folder: Path) -> Layer:
     return Layer("corrected_area", "Polygon", shapes, {"area_m2": area}, style)
 
 
-def _contours(folder: Path) -> Layer:
-    """Return the lines of equal depth, no closer than the depth is known."""
-    depth, bounds = rasters.preview(folder / DEPTH, MOST_CELLS**2)
-    sigma = 0.0
-    if (folder / UNCERTAINTY).exists():
-        sigma = float(np.nanmedian(rasters.preview(folder / UNCERTAINTY)[0]))
-    interval = interval_of(float(np.nanmax(depth)), sigma)
+def contours_layer(folder: Path, interval: float | None = None) -> Layer:
+    """Return the lines of equal depth; without an interval no closer than the depth is known."""
+    depth, bounds = rasters.preview(folder / DEPTH, MOST_CELLS)
+    if interval is None:
+        path = folder / UNCERTAINTY
+        sigma = rasters.preview(path)[0] if path.exists() else np.zeros(0)
+        interval = depth_interval(depth, sigma)
     found = contours(depth, interval)
     lines = [shapely.linestrings(rasters.centres(one.place, depth, bounds)) for one in found]
     level = np.array([one.level for one in found])

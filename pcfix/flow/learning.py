@@ -103,9 +103,8 @@ class Learning:
         occluder = self._occluder(chunks, listed=self._views is not None)
         learned = Learned(regression=self._regression(chunks), occluder=occluder)
         self.survey = replace(self.survey, learned=learned)
-        settings, cameras = self.survey.settings, self.survey.cameras
         some_listed = self._views is not None and not all_listed
-        if not (some_listed or wants_sample(settings, cameras, self._views)):
+        if not (some_listed or wants_sample(self.survey, self._views)):
             return self.survey
         sample, ties = self._sample(chunks, makers), self._ties()
         sample, factor = with_factor(sample)
@@ -114,7 +113,7 @@ class Learning:
             self.survey = sample.survey
             self._given = replace(self._given, depth_factor=factor.factor)
         self._note_corrected(sample, ties)
-        points, hint = self._view.points, hint_of((self._view.software, cameras.source))
+        points, hint = self._view.points, hint_of((self._view.software, self.survey.cameras.source))
         if self._views is None:
             self.survey, self.verdicts = learn_of_sample(sample, points, ties, hint)
             self._note_flat(sample)
@@ -207,7 +206,9 @@ class Learning:
         survey, taken = self.survey, list[Batch]()
         done = 0
         of_chunks = repeat(None) if makers is None else makers()
-        for (xyz, heights, classes, sources), made_with in zip(chunks(), of_chunks, strict=False):
+        for (xyz, heights, classes, sources, _), made_with in zip(
+            chunks(), of_chunks, strict=False
+        ):
             rows = np.arange(-done % step, len(xyz), step)
             rows = rows[~np.isin(classes[rows], NOISE_CLASSES)]
             above = surface_above(

@@ -22,7 +22,7 @@ from pcfix.io.crs import is_same, parse_crs
 from pcfix.io.files import file_state, read_json, write_text
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
 from pcfix.io.rasters import filled_heights, open_raster
-from pcfix.io.water_rasters import read_water_raster
+from pcfix.io.water_rasters import rasters_of_images, read_water_raster
 from pcfix.kernels import cores, threads
 from pcfix.lens.imaging import unproject
 from pcfix.model import Cameras, FloatArray, Lens, WaterDimension, WaterSurface
@@ -223,16 +223,8 @@ def _waters(given: PhotosOptions, paths: list[Path]) -> tuple[dict[str, Path], t
     """Return the rasters of the water that belong to photographs, and a note on the others."""
     if given.water_per_image is None:
         return {}, ()
-    folder = Path(given.water_per_image)
-    own = {path.stem: folder / f"{path.stem}.tif" for path in paths}
-    found = {stem: path for stem, path in own.items() if path.is_file()}
-    if not found:
-        raise InputError(
-            f"{folder}: holds no raster of a photograph's name, as {paths[0].stem}.tif; give the"
-            " folder that 'pcfix calm --surface' wrote."
-        )
-    lost = len(paths) - len(found)
-    return found, (f"{lost} photographs have no water of their own in {folder}.",) * (lost > 0)
+    found, notes = rasters_of_images(given.water_per_image, [path.name for path in paths])
+    return {paths[row].stem: path for row, path in found.items()}, notes
 
 
 def _heights(
@@ -242,10 +234,7 @@ def _heights(
     path = Path(given.dsm)
     if path.suffix.lower() in (".las", ".laz"):
         raster = scratch / "dsm.tif"
-        cell = given.resolution
-        if cell is None:
-            raise SettingError("resolution is needed where --dsm is a cloud; give metres.")
-        grid_dsm(path, raster, resolution=cell)
+        grid_dsm(path, raster, resolution=given.resolution)
         path = raster
     elif given.resolution is not None:
         raise SettingError("resolution is of a cloud that is gridded; the DSM has its own.")

@@ -157,7 +157,7 @@ def _survey_of(survey: Survey, members: Members, member: int, row: IntArray) -> 
 
 def _heights(sample: Sample, survey: Survey, made: Pair) -> FloatArray:
     """Return the true heights of a sample, shape (n,), NaN where it cannot be told."""
-    (xyz, heights, _, sources), listed = sample
+    (xyz, heights, _, sources, _), listed = sample
     step = Carrying(replace(made, new=survey.cameras)).step(xyz, listed)
     above = surface_above(survey.water, step.xyz, heights)
     found = correct(

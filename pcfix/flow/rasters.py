@@ -6,17 +6,17 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
+from pcfix.flow.runner import Progress, part_of
 from pcfix.grid.colours import relief_colours
 from pcfix.grid.lattice import Lattice, Window, round_resolution
 from pcfix.grid.model import hillshade
 from pcfix.io import rasters
-from pcfix.io.files import replaced_when_whole
+from pcfix.io.drafts import draft_folder, replaced_when_whole
 from pcfix.io.las.source import LasSource
 from pcfix.io.styles import limits_of
 from pcfix.model import Cameras, FloatArray
@@ -37,8 +37,9 @@ def raster_files(folder: Path, *, errors: bool) -> list[Path]:
 
 
 def write_rasters(
-    cloud: Path, folder: Path, *, resolution: float | None, cameras: Cameras, errors: bool
-) -> dict[str, Any]:
+    cloud: Path, folder: Path, *, resolution: float | None, cameras: Cameras, errors: bool,
+    progress: Progress | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Write all rasters of a corrected cloud as cloud optimised GeoTIFF, with styles for QGIS.
 
     Without a resolution the cells have 2 to 4 points, and are no smaller than a pixel on the
@@ -55,9 +56,10 @@ def write_rasters(
         DEPTH: replace(filled, what="depth"),
         **({UNCERTAINTY: replace(plain, what="uncertainty")} if errors else {}),
     }
-    made = {
-        name: grid_dsm(cloud, folder / name, options=options) for name, options in asked.items()
-    }
+    made = {}
+    for number, (name, options) in enumerate(asked.items()):
+        part = part_of(progress, number, len(asked))
+        made[name] = grid_dsm(cloud, folder / name, options=options, progress=part)
     _write_shaded(folder)
     density = (cell_m / spacing_m) ** 2 if spacing_m else None
     return {
@@ -94,8 +96,7 @@ def _write_shaded(folder: Path) -> None:
     high = limits_of(rasters.preview(folder / DEPTH)[0], "depth")[1]
     with ExitStack() as stack:
         draft = stack.enter_context(replaced_when_whole(target))
-        scratch = stack.enter_context(TemporaryDirectory(dir=folder, prefix=".pcfix-shaded-"))
-        plain = Path(scratch) / SHADED
+        plain = stack.enter_context(draft_folder(folder)) / SHADED
         surface = stack.enter_context(rasters.open_raster(folder / SURFACE))
         depth = stack.enter_context(rasters.open_raster(folder / DEPTH))
         lattice = rasters.lattice_of(surface)

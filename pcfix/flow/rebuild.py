@@ -163,8 +163,6 @@ def _with_raster(given: PhotosOptions, target: Path) -> PhotosOptions:
     """Return options whose DSM is a raster: that of a cloud stays in the folder."""
     if Path(given.dsm).suffix.lower() not in (".las", ".laz"):
         return given
-    if given.resolution is None:
-        raise SettingError("resolution is needed where --dsm is a cloud; give metres.")
     raster = target / "dsm.tif"
     fresh = raster.exists() and raster.stat().st_mtime_ns > Path(given.dsm).stat().st_mtime_ns
     if given.overwrite or not fresh:

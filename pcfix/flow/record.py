@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,38 +11,60 @@ from pcfix.errors import InputError
 from pcfix.flow.runner import json_text
 from pcfix.io.files import file_state, read_json, write_text
 
+STEPS = ("adjust", "correct", "clean", "dsm", "compare", "map", "report")
+"""In their order; each depends on those before it."""
+
 
 class Record:
     """What was asked for, from which files, and which steps are done.
 
-    A step counts as done while the request and the input files are those of the record, every
-    step before it was found done, and its own files are as it left them. The JSON file at `path`
-    is written after each step; the request has everything that the results depend on.
+    A step counts as done while the request and the input files are those of the record, but for
+    what matters to later steps only, every step before it was found done, and its own files are as
+    it left them. The JSON file at `path` is written after each step.
+
+    Parameters
+    ----------
+    path : Path
+    request : dict
+        Everything that the results depend on.
+    inputs : dict
+        Input files, by the first step that reads them.
+    since : callable
+        Returns the first step that an option of the request matters to.
     """
 
-    def __init__(self, path: Path, request: dict[str, Any], inputs: Sequence[Path]) -> None:
-        self._path = path
-        self._content: dict[str, Any] = {
-            "request": request,
-            "inputs": [file_state(p) for p in inputs],
-            "steps": {},
-        }
-        self._earlier = self._read()
+    def __init__(
+        self,
+        path: Path,
+        request: dict[str, Any],
+        inputs: Mapping[str, Sequence[Path]],
+        since: Callable[[str], str],
+    ) -> None:
+        self._path, self._since = path, since
+        states = [{**file_state(p), "step": step} for step, some in inputs.items() for p in some]
+        self._content: dict[str, Any] = {"request": request, "inputs": states, "steps": {}}
+        self._earlier: dict[str, Any] = {}
+        self.changed: list[str] = []
+        """What an earlier run was asked otherwise: options, or else files."""
+        self.first: str | None = None
+        """The first step of an earlier run that is not kept for that."""
+        self.resumes = path.exists() and self._kept(read_record(path))
+        """Whether there is an earlier run whose corrected cloud is not replaced."""
 
-    @property
-    def resumes(self) -> bool:
-        """Whether there is an earlier run that was asked for the same."""
-        return bool(self._earlier)
-
-    def _read(self) -> dict[str, Any]:
-        """Return the steps of an earlier run that was asked for the same."""
-        if not self._path.exists():
-            return {}
-        earlier = read_record(self._path)
+    def _kept(self, earlier: dict[str, Any]) -> bool:
+        """Keep the steps of an earlier run that nothing changed for."""
         plain = json.loads(json.dumps(self._content))
-        same = all(earlier.get(key) == plain[key] for key in ("request", "inputs"))
-        steps: dict[str, Any] = earlier["steps"] if same else {}
-        return steps
+        now, then = plain["request"], earlier["request"]
+        names = [one for one in {**now, **then} if now.get(one) != then.get(one)]
+        both = [*plain["inputs"], *earlier["inputs"]]
+        files = [one for one in both if both.count(one) == 1]
+        self.changed = [f"--{name.replace('_', '-')}" for name in names]
+        self.changed = self.changed or list(dict.fromkeys(Path(one["path"]).name for one in files))
+        firsts = [*map(self._since, names), *(one.get("step", STEPS[0]) for one in files)]
+        self.first = min(firsts, key=STEPS.index, default=None)
+        kept = STEPS[: STEPS.index(self.first)] if self.first else STEPS
+        self._earlier = {step: done for step, done in earlier["steps"].items() if step in kept}
+        return "correct" in kept and bool(self._earlier)
 
     def step(self, name: str, outputs: Sequence[Path], work: Callable[[], Any]) -> tuple[Any, bool]:
         """Do a step unless it is done; return its result and whether it was done.

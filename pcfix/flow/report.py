@@ -18,7 +18,7 @@ from pcfix.io.las.source import LasSource, coordinates, stated_crs
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, WaterSurface
 from pcfix.refract.tally import Summary
 from pcfix.report.first_screen import Survey
-from pcfix.report.page import Table, render
+from pcfix.report.page import Report, Table, render
 from pcfix.report.run import NOTHING_LATER, Corrected, Later, run_report
 
 NEEDED = (*SHIFTS, "WaterDepth", "RayCount")
@@ -60,7 +60,7 @@ def write_report(
     survey: Survey = NO_SURVEY,
     later: Later = NOTHING_LATER,
     overwrite: bool = False,
-) -> Path:
+) -> Report:
     """Write ``report.html`` and ``figures/*.png`` about a corrected cloud.
 
     Parameters
@@ -84,8 +84,8 @@ def write_report(
 
     Returns
     -------
-    Path
-        Of the page.
+    Report
+        What the page says.
 
     Raises
     ------
@@ -105,9 +105,8 @@ def write_report(
     figures.mkdir(exist_ok=True)
     for picture in report.pictures:
         write_bytes(figures / f"{picture.name}.png", picture.png(), overwrite=overwrite)
-    page = out_dir / PAGE
-    write_text(page, render(report), overwrite=overwrite)
-    return page
+    write_text(out_dir / PAGE, render(report), overwrite=overwrite)
+    return report
 
 
 def _beside(folder: Path) -> list[tuple[str, str]]:

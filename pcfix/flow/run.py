@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from pcfix.flow.run_adjust import (
     is_worth_saying,
     outputs_of,
 )
+from pcfix.flow.runner import Bar, Progress, no_bar
 from pcfix.flow.shore import check_shoreline
 from pcfix.flow.surfaces import view_of
 from pcfix.grid.maps import MOST_CELLS
@@ -48,12 +49,12 @@ from pcfix.options.survey import RunOptions
 from pcfix.refract.tally import Summary
 from pcfix.report.adjustment_text import all_notes
 from pcfix.report.comparison import evaluation, in_a_sentence
-from pcfix.report.first_screen import Survey, is_found
+from pcfix.report.first_screen import Survey, in_short, is_found
 from pcfix.report.page import Picture, Table
 from pcfix.report.run import Later, adjustment_sentence, adjustment_table, reason_sentence
 from pcfix.report.text import uncertainty_sentence
 from pcfix.report.water import found_picture
-from pcfix.water.index import with_index
+from pcfix.water.index import Water, with_index
 
 RECORD = "run.json"
 SECTIONS = 3
@@ -95,13 +96,29 @@ class Request(RunOptions):
         values = self.as_dict()
         return {name: values[name] for name in values if name not in ("overwrite", "jobs")}
 
-    def files(self) -> list[Path]:
-        """Return the input files, each of which exists."""
-        names = [self.input, *paths_in(self, but=("water",)), self.reference]
-        names += [self.gcps, self.gnss, self.lens]
+    def files(self) -> dict[str, list[Path]]:
+        """Return the input files, each of which exists, by the first step that reads them."""
+        names = [self.input, *paths_in(self, but=("water",)), self.gcps, self.gnss, self.lens]
         found = [path for name in names if name is not None for path in files_in(name)]
-        found += [check_input(path) for _, path in self.also]
-        return [*found, Path(self.water)] if Path(self.water).is_file() else found
+        found += [Path(self.water)] if Path(self.water).is_file() else []
+        compared = [] if self.reference is None else files_in(self.reference)
+        return {"adjust": found, "compare": [*compared, *(check_input(p) for _, p in self.also)]}
+
+
+_CORRECTION = {one.name for one in options_of(CorrectOptions)}.difference(
+    ("input", "adjust", "index_formula"), Water._fields, (one.name for one in options_of(Inputs))
+) - {"index"}
+_LATER = {
+    **{one.name: "compare" for one in options_of(DistanceOptions)},
+    "reference": "compare", "resolution": "dsm", "project": "report", "date": "report",
+}  # fmt: skip
+
+
+def _since(name: str) -> str:
+    """Return the first step that an option of a request matters to."""
+    if name in _CORRECTION:
+        return "correct"
+    return _LATER.get(name, "adjust")
 
 
 def request_of(record: Path) -> Request:
@@ -136,7 +153,7 @@ def run_all(
     overwrite: bool = False,
     jobs: int | None = None,
     say: Callable[[str], None] = lambda text: None,
-    progress: Callable[[int, int], None] | None = None,
+    bar: Bar = no_bar,
 ) -> Path:
     """Do every step that is not done yet; what ``pcfix run`` runs.
 
@@ -144,15 +161,16 @@ def run_all(
     ----------
     request : Request
     out_dir : Path
-        Made where its parent exists. A run with the same request resumes there.
+        Made where its parent exists. A run with the same request resumes there; with other
+        options of later steps alone, such as a reference, only these are done anew.
     overwrite : bool
-        Replace the results of another request.
+        Replace a cloud that was corrected in another way, and what else lies there.
     jobs : int, optional
         Threads.
     say : callable, optional
         Called with a line on each step.
-    progress : callable, optional
-        See `correct_file`.
+    bar : callable, optional
+        Shows the progress of a step; see `pcfix.flow.runner.Bar`.
 
     Returns
     -------
@@ -164,18 +182,11 @@ def run_all(
     PcfixError
         With one sentence on what to mend; the steps before it stay done.
     """
-    inputs = request.files()
+    read = request.files()
+    inputs = [path for some in read.values() for path in some]
     if request.m3c2:
         load_py4dgeo()
-    if not out_dir.parent.is_dir():
-        raise SettingError(f"{out_dir}: the folder {out_dir.parent} does not exist; make it first.")
-    out_dir.mkdir(exist_ok=True)
-    record = Record(out_dir / RECORD, request.record(), inputs)
-    if not (overwrite or record.resumes) and any(out_dir.iterdir()):
-        raise SettingError(
-            f"{out_dir}: holds other files, or a run of another request; add --overwrite to"
-            " replace them, or give another folder."
-        )
+    record = _begun(request, out_dir, read, overwrite, say)
     check_shoreline(request.shoreline, overwrite=overwrite or record.resumes, inputs=inputs)
     files = Files(out_dir)
     shore = [] if request.shoreline is None else [Path(request.shoreline)]
@@ -183,37 +194,39 @@ def run_all(
     def step(
         name: str,
         outputs: list[Path],
-        work: Callable[[], Any],
+        work: Callable[[Progress | None], Any],
         more: Callable[[Any], str] = lambda result: "",
     ) -> Any:
-        result, was_done = record.step(name, outputs, work)
+        result, was_done = record.step(name, outputs, lambda: _with_bar(bar, name, work))
         say(f"{name:<9} {'done before' if was_done else 'done'}: {outputs[0]}{more(result)}")
         return result
 
     first, was_done = record.step(
         "adjust",
         outputs_of(out_dir),
-        lambda: adjust_first(request.adjust_step(), out_dir, inputs, jobs),
+        lambda: _with_bar(
+            bar, "adjust", lambda _: adjust_first(request.adjust_step(), out_dir, inputs, jobs)
+        ),
     )
     _say_adjusted(first, out_dir, was_done, say)
     request = request.with_adjusted(out_dir, first)
     clouds = [files.corrected] + ([] if request.check_depths is None else [files.regression])
-    corrected = step("correct", [*clouds, *shore], lambda: _correct(request, files, jobs, progress))
+    corrected = step("correct", [*clouds, *shore], partial(_correct, request, files, jobs))
     corrected = _with_checked(corrected, first)
     if not first["is_said"] and is_worth_saying(first, _is_bent(corrected)):
         first = {**first, "is_said": True}
         _say_adjusted(first, out_dir, was_done, say)
     # the surface of a dimension is still in the cloud, and what was corrected is known anyway
     clean = partial(clean_file, files.corrected, files.cleaned, overwrite=True, jobs=jobs)
-    step("clean", [files.cleaned], lambda: clean().as_dict())
+    step("clean", [files.cleaned], lambda progress: clean(progress=progress).as_dict())
     errors = corrected["uncertainty"] is not None
     outputs = raster_files(out_dir, errors=errors)
     cells = partial(resolution_sentence, given=request.resolution is not None)
-    step("dsm", outputs, lambda: _grid(request, files, errors), cells)
+    step("dsm", outputs, partial(_grid, request, files, errors), cells)
     compared = None
     if request.reference is not None:
         compared = step(
-            "compare", [files.compare / "compare.json"], lambda: _compare(request, files)
+            "compare", [files.compare / "compare.json"], lambda _: _compare(request, files)
         )
     done = {"adjust": first, "correct": corrected, "compare": compared}
     try:
@@ -221,9 +234,50 @@ def run_all(
     except SettingError as error:
         say(f"{'map':<9} not written: {error}")
     else:
-        step("map", [files.map], lambda: _map(request, files, done))
-    step("report", [files.report], lambda: _report(request, files, inputs, done))
+        step("map", [files.map], lambda _: _map(request, files, done))
+    step(
+        "report",
+        [files.report],
+        lambda _: _report(request, files, inputs, done),
+        lambda result: f": {result['in_short']}",
+    )
     return files.report
+
+
+def _begun(
+    request: Request,
+    out_dir: Path,
+    read: dict[str, list[Path]],
+    overwrite: bool,
+    say: Callable[[str], None],
+) -> Record:
+    """Return the record of a folder, made where it is missing; refuse one of another run."""
+    if not out_dir.parent.is_dir():
+        raise SettingError(f"{out_dir}: the folder {out_dir.parent} does not exist; make it first.")
+    out_dir.mkdir(exist_ok=True)
+    record = Record(out_dir / RECORD, request.record(), read, _since)
+    changed = ", ".join(record.changed)
+    if not (overwrite or record.resumes) and any(out_dir.iterdir()):
+        other = f"a run with another {changed}" if changed else "other files"
+        raise SettingError(
+            f"{out_dir}: holds {other}; add --overwrite to replace what it has, or give another"
+            " folder."
+        )
+    if changed:
+        say(f"{'changed':<9} {changed}: {record.first} and what follows is done"
+            " anew, what comes before is kept")  # fmt: skip
+    return record
+
+
+_TITLES = {
+    "adjust": "Adjusting", "correct": "Correcting", "clean": "Cleaning", "dsm": "Gridding",
+    "compare": "Comparing", "map": "Drawing the map", "report": "Writing the report",
+}  # fmt: skip
+
+
+def _with_bar(bar: Bar, name: str, work: Callable[[Progress | None], Any]) -> Any:
+    with bar(_TITLES[name]) as progress:
+        return work(progress)
 
 
 def _say_adjusted(
@@ -240,7 +294,7 @@ def _say_adjusted(
 
 
 def _correct(
-    request: Request, files: Files, jobs: int | None, progress: Callable[[int, int], None] | None
+    request: Request, files: Files, jobs: int | None, progress: Progress | None
 ) -> dict[str, Any]:
     options = replace(request, overwrite=True, jobs=jobs).part(CorrectOptions)
     if request.check_depths is not None:
@@ -263,11 +317,13 @@ def _is_bent(corrected: dict[str, Any]) -> bool:
     return bool((corrected["poses"] or {}).get("absorbed"))
 
 
-def _grid(request: Request, files: Files, errors: bool) -> dict[str, Any]:
-    cameras = _cameras(request, files)
+def _grid(
+    request: Request, files: Files, errors: bool, progress: Progress | None
+) -> dict[str, Any]:
     return write_rasters(
-        files.cleaned, files.folder, resolution=request.resolution, cameras=cameras, errors=errors
-    )
+        files.cleaned, files.folder, resolution=request.resolution,
+        cameras=_cameras(request, files), errors=errors, progress=progress,
+    )  # fmt: skip
 
 
 def _cameras(request: Request, files: Files) -> Cameras:
@@ -346,7 +402,7 @@ def _rasters(request: Request) -> list[str]:
 
 def _report(
     request: Request, files: Files, inputs: list[Path], done: dict[str, Any]
-) -> dict[str, str]:
+) -> dict[str, Any]:
     pictures: list[Picture] = []
     tables: list[Table] = []
     dod = None
@@ -367,7 +423,7 @@ def _report(
         resolution = float(dsm.res[0])
     figures = {} if compared is None else compared["figures"]
     later = Later(pictures, tables, verdict, figures, dod, resolution)
-    page = write_report(
+    report = write_report(
         files.cleaned,
         files.folder,
         summary=summary,
@@ -378,4 +434,10 @@ def _report(
         later=later,
         overwrite=True,
     )
-    return {"page": str(page), "uncertainty": uncertainty_sentence(summary, later.tvu)}
+    return {
+        "in_short": in_short(report.tiles),
+        "uncertainty": uncertainty_sentence(summary, later.tvu),
+        "title": report.title,
+        "tiles": [asdict(tile) for tile in report.tiles],
+        "place": report.place,
+    }

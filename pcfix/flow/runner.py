@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from pcfix.io.files import check_input, check_output, write_text
+from pcfix.io.las.part import cloud_part
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import LasSink, check_suffix, corrected_identity, output_evlrs
+from pcfix.io.tiles import Tiles, check_one_file, inputs_of
+from pcfix.kernels import telling
 from pcfix.options.declare import File
 
 if TYPE_CHECKING:
@@ -21,6 +27,20 @@ if TYPE_CHECKING:
 Chunk: TypeAlias = "laspy.ScaleAwarePointRecord"
 Header: TypeAlias = "laspy.LasHeader"
 Progress: TypeAlias = Callable[[int, int], None]
+Bar: TypeAlias = Callable[[str], AbstractContextManager[Progress | None]]
+"""Of the name of a step: what shows, while it runs, how far it is."""
+
+
+def no_bar(title: str) -> AbstractContextManager[None]:
+    """Show nothing."""
+    return nullcontext()
+
+
+def part_of(progress: Progress | None, number: int, count: int) -> Progress | None:
+    """Return what a job tells that is one of several alike."""
+    if progress is None:
+        return None
+    return lambda done, total: progress(number * total + done, count * total)
 
 
 class Step(Protocol):
@@ -49,9 +69,13 @@ class FileTask:
     summary : path or None
         Where the summary goes, as JSON.
     progress : callable or None
-        Called with (points done, points in all) after each chunk.
+        Called with (points done, points in all), after each chunk and while it is corrected.
+    is_tile : bool
+        Whether it is a part of a cloud; `Step.finish` is about a whole one.
     started : float
         `time.perf_counter` then.
+    kept : list
+        The chunks of a small cloud that is gone through more than once; see `LasSource`.
     """
 
     source: Path
@@ -60,7 +84,9 @@ class FileTask:
     overwrite: bool = False
     jobs: int | None = None
     progress: Progress | None = None
+    is_tile: bool = False
     started: float = field(default_factory=time.perf_counter)
+    kept: list[Chunk] = field(default_factory=list)
 
     @property
     def seconds(self) -> float:
@@ -69,22 +95,61 @@ class FileTask:
 
     def run(self, step: Step) -> None:
         """Take every chunk through a step; the target appears when all went well."""
-        with LasSource(self.source, self.jobs) as source:
+        with LasSource(self.source, self.jobs, kept=self.kept or None) as source:
             header = step.header(source)
             identity = step.identity or corrected_identity(source)
             with LasSink(self.target, header, output_evlrs(source), identity, self.jobs) as sink:
                 done = 0
-                for points in source.chunks():
-                    count = len(points)
-                    sink.write(step.chunk(points, source, header))
-                    done += count
-                    if self.progress is not None:
-                        self.progress(done, len(source))
-                step.finish()
+                with written_behind(sink.write, self.jobs) as write:
+                    for points in read_ahead(source.chunks(), self.jobs):
+                        count = len(points)
+                        with telling(partial(self._tell, done, count, len(source))):
+                            write(step.chunk(points, source, header))
+                        done += count
+                        self._tell(done, 0, len(source))
+                if not self.is_tile:
+                    step.finish()
+
+    def _tell(self, done: int, chunk: int, total: int, of_chunk: int = 0) -> None:
+        """Show that so many points are done, and so many of a chunk, which may go twice."""
+        if self.progress is not None:
+            self.progress(done + min(of_chunk, chunk), total)
 
     def tell(self, summary: dict[str, Any]) -> None:
         """Write the summary, where one is wanted."""
         write_summary(self, summary)
+
+
+def read_ahead(chunks: Iterator[Any], jobs: int | None) -> Iterator[Any]:
+    """Yield chunks, of which the next is being read meanwhile, but with one job."""
+    if jobs == 1:
+        yield from chunks
+        return
+    with ThreadPoolExecutor(1) as reader:
+        following = reader.submit(next, chunks, None)
+        while (one := following.result()) is not None:
+            following = reader.submit(next, chunks, None)
+            yield one
+
+
+@contextmanager
+def written_behind(write: Callable[[Any], None], jobs: int | None) -> Iterator[Callable[..., None]]:
+    """Give a function that writes chunks in order, one at a time, while others are computed."""
+    if jobs == 1:
+        yield write
+        return
+    with ThreadPoolExecutor(1) as writer:
+        last: Future[None] | None = None
+
+        def later(chunk: Any) -> None:
+            nonlocal last
+            if last is not None:
+                last.result()
+            last = writer.submit(write, chunk)
+
+        yield later
+        if last is not None:
+            last.result()
 
 
 def json_text(content: dict[str, Any]) -> str:
@@ -115,7 +180,7 @@ def check_cloud(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> 
 
 
 def file_task(
-    input: File,
+    input: File | Tiles,
     output: File,
     options: Any,
     *,
@@ -129,6 +194,7 @@ def file_task(
     Parameters
     ----------
     input, output : path
+        The input may be many files.
     options : OptionSet
         With overwrite, and where the command has them summary and jobs.
     reads : iterable
@@ -145,11 +211,13 @@ def file_task(
         If a file is missing, or would be replaced.
     """
     started = time.perf_counter()
-    source = check_input(input)
-    known = [one for one in (input, *reads) if isinstance(one, str | PathLike)]
+    check_one_file(input, options)
+    source = Path(str(input)) if isinstance(input, Tiles) else check_input(input)
+    source = cloud_part(source, options)
+    known = [one for one in (*inputs_of(input), *reads) if isinstance(one, str | PathLike)]
     for path in (output, *more):
         known.append(check(path, overwrite=options.overwrite, inputs=known))
     check_summary(options, known)
     target = Path(output)
     summary, jobs = (getattr(options, name, None) for name in ("summary", "jobs"))
-    return FileTask(source, target, summary, options.overwrite, jobs, progress, started)
+    return FileTask(source, target, summary, options.overwrite, jobs, progress, started=started)

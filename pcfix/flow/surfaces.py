@@ -5,24 +5,37 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
-from pcfix.flow.runner import Chunk
+from pcfix.flow.runner import Chunk, read_ahead
+from pcfix.io.las import source as las
+from pcfix.io.las.counts import check_count
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
+from pcfix.io.tiles import Tiles, open_cloud
 from pcfix.io.water import read_water
+from pcfix.io.water_rasters import rasters_of_images, read_water_raster
 from pcfix.label.labelling import Part
-from pcfix.model import FloatArray, IntArray, WaterDimension, WaterSurface
+from pcfix.model import (
+    Cameras,
+    FloatArray,
+    IntArray,
+    WaterDimension,
+    WaterMesh,
+    WaterRaster,
+    WaterSurface,
+)
 from pcfix.options.declare import File
 from pcfix.options.shared import WaterOptions
 from pcfix.water.fit import WaterFit
 from pcfix.water.river import RiverFit
-from pcfix.water.surface import FoundSurface, surface_above
+from pcfix.water.surface import FoundSurface, OwnWater, build_fields, surface_above
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -40,24 +53,33 @@ class Points(NamedTuple):
     classes : array of uint8, shape (n,)
     sources : array of int, shape (n,), or None
         The point source of each, where the cloud has it: which of several clouds it came from.
+    colours : tuple of array, each of shape (n,), or None
+        Red, green and blue, where the cloud has them.
     """
 
     xyz: FloatArray
     heights: FloatArray | None
     classes: npt.NDArray[np.uint8]
     sources: IntArray | None = None
+    colours: tuple[npt.NDArray[Any], ...] | None = None
 
     def take(self, rows: IntArray) -> Points:
         """Return some of the points."""
         heights = None if self.heights is None else self.heights[rows]
         sources = None if self.sources is None else self.sources[rows]
-        return Points(self.xyz[rows], heights, self.classes[rows], sources)
+        colours = None if self.colours is None else tuple(one[rows] for one in self.colours)
+        return Points(self.xyz[rows], heights, self.classes[rows], sources, colours)
 
 
 """Some points: coordinates (n, 3), water heights where those are a dimension, classes."""
 
+RGB = ("red", "green", "blue")
+
 SAMPLE_POINTS = 2_000_000
 """Points of a cloud that are looked at for a surface, evenly spread."""
+
+
+CloudPlace: TypeAlias = "tuple[CRS | str | None, FloatArray, FloatArray]"
 
 
 class Seen(NamedTuple):
@@ -103,33 +125,52 @@ def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
 
 
-def view_of(path: Path, jobs: int | None = None) -> CloudView:
-    """Return the view of a LAS or LAZ file."""
-    with LasSource(path, jobs) as source:
+def view_of(cloud: Path | Tiles, jobs: int | None = None) -> CloudView:
+    """Return the view of a LAS or LAZ file, or of many as one cloud."""
+    with open_cloud(cloud, jobs) as source:
+        if not isinstance(cloud, Tiles):
+            check_count(source)
         crs, points = metric_crs(source), len(source)
         low, high = np.array(source.header.mins[:2]), np.array(source.header.maxs[:2])
         software = str(source.header.generating_software or "")
+    chunks = partial(_seen, cloud, jobs)
+    return CloudView(str(cloud), crs, low, high, points, chunks, software)
 
-    def chunks() -> Iterator[Seen]:
-        with LasSource(path, jobs) as source:
-            names = set(source.header.point_format.dimension_names)
-            for chunk in source.chunks():
-                rgb = None
-                if {"red", "green", "blue"} <= names:
-                    rgb = np.column_stack([chunk["red"], chunk["green"], chunk["blue"]])
-                classes, returns = chunk["classification"], chunk["number_of_returns"]
-                yield Seen(coordinates(chunk), rgb, np.asarray(classes), np.asarray(returns))
 
-    return CloudView(str(path), crs, low, high, points, chunks, software)
+def _seen(cloud: Path | Tiles, jobs: int | None) -> Iterator[Seen]:
+    with open_cloud(cloud, jobs) as source:
+        names = set(source.header.point_format.dimension_names)
+        for chunk in source.chunks():
+            rgb = None
+            if {"red", "green", "blue"} <= names:
+                rgb = np.column_stack([chunk["red"], chunk["green"], chunk["blue"]])
+            classes, returns = chunk["classification"], chunk["number_of_returns"]
+            yield Seen(coordinates(chunk), rgb, np.asarray(classes), np.asarray(returns))
 
 
 def file_points(
-    path: Path, water: WaterSurface | None, jobs: int | None = None
+    cloud: Path | Tiles,
+    water: WaterSurface | None,
+    jobs: int | None = None,
+    kept: list[Chunk] | None = None,
 ) -> Iterator[Points]:
-    """Yield all points of a LAS or LAZ file, chunk by chunk."""
-    with LasSource(path, jobs) as source:
-        for chunk in source.chunks():
-            yield points_of(chunk, source, water)
+    """Yield all points of a LAS or LAZ file, or of many, chunk by chunk, see `LasSource`."""
+    places = not isinstance(water, WaterDimension)
+    with open_cloud(cloud, jobs, places_only=places, kept=kept) as source:
+        yield from read_ahead((points_of(one, source, water) for one in source.chunks()), jobs)
+
+
+def first_points(chunks: Iterable[Points]) -> Points:
+    """Return as many points of a cloud as a chunk has, however many these chunks have."""
+    parts: list[Points] = []
+    count = 0
+    for one in chunks:
+        parts.append(one.take(np.arange(min(len(one.xyz), las.CHUNK_POINTS - count))))
+        count += len(parts[-1].xyz)
+        if count >= las.CHUNK_POINTS:
+            break
+    columns = zip(*parts, strict=True)
+    return Points(*(None if c[0] is None else np.concatenate(c) for c in columns))  # type: ignore
 
 
 def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Points:
@@ -137,8 +178,10 @@ def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Po
     heights = None
     if isinstance(water, WaterDimension):
         heights = source.dimension(chunk, water.name)
-    classes = np.asarray(chunk["classification"])
-    return Points(coordinates(chunk), heights, classes, np.asarray(chunk["point_source_id"]))
+    classes, sources = np.asarray(chunk["classification"]), np.asarray(chunk["point_source_id"])
+    has_colours = "red" in (chunk.array.dtype.names or ())
+    colours = tuple(chunk.array[one] for one in RGB) if has_colours else None
+    return Points(coordinates(chunk), heights, classes, sources, colours)
 
 
 def parts_of(chunks: Iterable[Points], water: WaterSurface) -> Iterable[Part]:
@@ -180,6 +223,84 @@ def find_surface(
     if view is None:
         return FoundSurface(read_water(water))
     return FoundSurface(read_water(water, view.crs, _bounds(view.low, view.high)))
+
+
+APART_M = 2.0
+"""Between the common water and that of an image, in the median: waves and tides are smaller."""
+
+
+def own_water_of(
+    folder: File | None,
+    cameras: Cameras,
+    water: WaterSurface,
+    view: CloudPlace,
+    level_offset_m: FloatArray | None = None,
+) -> tuple[OwnWater | None, tuple[str, ...]]:
+    """Return the water of images that have one of their own, and what to say of it.
+
+    Parameters
+    ----------
+    folder : path or None
+        Of rasters with the names of the images, and their standard errors in a folder ``sigma``.
+    cameras : Cameras
+    water : WaterSurface
+        That of the others.
+    view : CRS, and two arrays, shape (2,)
+        Of the cloud: its CRS, its south-west and its north-east corner, metres.
+    level_offset_m : array, shape (k,), optional
+        How much higher than `water` it stood when each camera took its image.
+
+    Raises
+    ------
+    InputError
+        If no raster bears the name of an image, one cannot be read, or none lies where the cloud
+        and the other water do.
+    """
+    if folder is None:
+        return None, ()
+    if isinstance(water, WaterMesh):
+        raise SettingError(
+            "water-per-image does not go with a mesh as the water of the other images; give a"
+            " level, a plane or a raster."
+        )
+    crs, low, high = view
+    paths, notes = rasters_of_images(folder, cameras.labels)
+    heights = _read_alike(paths, crs)
+    errors = {row: path.parent / "sigma" / path.name for row, path in paths.items()}
+    sigma = _read_alike({row: path for row, path in errors.items() if path.is_file()}, crs)
+    if len(sigma) < len(heights):
+        lost = len(heights) - len(sigma)
+        notes += (f"{folder}: {lost} rasters have no standard error in its folder sigma.",)
+    offset = np.zeros(len(cameras)) if level_offset_m is None else level_offset_m
+    places, apart = [], []
+    for image, raster in heights.items():
+        rows, columns = np.nonzero(np.isfinite(raster.height_m))
+        x = raster.left_m + (columns + 0.5) * raster.cell_m[0]
+        y = raster.top_m - (rows + 0.5) * raster.cell_m[1]
+        places.append(((x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])).any())
+        if not isinstance(water, WaterDimension):
+            level = surface_above(water, np.column_stack([x, y, x])).height_m + offset[image]
+            apart.append(np.nanmedian(np.append(raster.height_m[rows, columns] - level, np.nan)))
+    if np.isfinite(low).all() and not any(places):
+        raise InputError(f"{folder}: none of its rasters lies over the cloud; check their CRS.")
+    off = float(np.nanmedian(apart)) if np.isfinite(apart).any() else 0.0
+    if abs(off) > APART_M:
+        raise InputError(
+            f"{folder}: its water stands {off:+.2f} m from --water ({water}); give both the same"
+            " vertical datum, 'pcfix calm' the --level of the calm water."
+        )
+    k, common = len(cameras), water if isinstance(water, WaterRaster) else None
+    return OwnWater(build_fields(heights, k, common), build_fields(sigma, k)), notes
+
+
+def _read_alike(paths: dict[int, Path], crs: CRS | str | None) -> dict[int, WaterRaster]:
+    """Read rasters of one kind, and warn of the first alone."""
+    rasters = dict[int, WaterRaster]()
+    with warnings.catch_warnings():
+        for row, path in paths.items():
+            rasters[row] = read_water_raster(path, crs)
+            warnings.simplefilter("ignore", PcfixWarning)
+    return rasters
 
 
 def _bounds(low: FloatArray, high: FloatArray) -> tuple[float, float, float, float]:

@@ -12,13 +12,14 @@ import numpy as np
 from pcfix.adjust.carry import Carrying
 from pcfix.adjust.evidence import Evidence
 from pcfix.ahead import Rehearsal
-from pcfix.flow.diagnosis import Poses, diagnose_in_passing
+from pcfix.flow.diagnosis import Poses, diagnose_in_passing, quick_ties
 from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.flow.learning import Learning
 from pcfix.flow.old_cameras import Blocks, ListedViews, old_tie_points
+from pcfix.flow.plausibility import CloudSample, Plausible, plausible
 from pcfix.flow.pose_errors import SAMPLE_POINTS, adjustment_of, pose_errors, sample_of, with_poses
 from pcfix.flow.shore import check_shoreline, write_shoreline
-from pcfix.flow.surfaces import CloudView, Points, parts_of
+from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of
 from pcfix.grid.shoreline import NearWater
 from pcfix.label.labelling import Labelling
 from pcfix.model import (
@@ -34,21 +35,23 @@ from pcfix.model import (
     WaterDimension,
     WaterPlane,
 )
-from pcfix.options.correct import CorrectOptions
+from pcfix.options.correct import CorrectOptions, ScienceOptions
 from pcfix.refract.batch import Batch, Intersection, MadeWith, Survey
-from pcfix.refract.hypotheses import Verdict
-from pcfix.refract.learning import as_told, weigh_lists
+from pcfix.refract.hypotheses import CAUSES, Verdict
+from pcfix.refract.learning import as_told, for_own_water, weigh_lists
 from pcfix.refract.methods import correct, shift_of_land
 from pcfix.refract.regression import LEAST_BEYOND, BeyondRange, DepthRegression
 from pcfix.refract.rehearsal import rehearsals
 from pcfix.refract.tally import Tally
+from pcfix.sums import Sums
 from pcfix.water.checks import WaterMeeting, check_above_water, check_tilt, refuse_under_water
 from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
+OWN_WATER = "Images have water of their own, which snell and consistent alone allow for."
 Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
 
 
-class ThroughWater:
+class ThroughWater(Sums):
     """The light bends at a water surface, and the cloud may come from other cameras.
 
     Raises
@@ -58,6 +61,7 @@ class ThroughWater:
         something that it cannot do without.
     """
 
+    added = ("_meeting", "_sample", "_beyond", "_shore", "carrying")
     settings: dict[str, Any]
 
     @staticmethod
@@ -80,9 +84,17 @@ class ThroughWater:
         check_above_water(self._cameras, self.water, self.level_offset_m)
         check_tilt(self.water)
         self._listed = None if blocks.views is None else blocks.views.kind
+        settings: ScienceOptions = options
+        folder, place = options.water_per_image, (view.crs, view.low, view.high)
+        if folder is not None:
+            settings = for_own_water(options, self._cameras, self._listed)
+            self.settings["water_per_image"] = str(folder)
+        own, self._own_notes = own_water_of(
+            folder, self._cameras, self.water, place, self.level_offset_m
+        )
         self._learning = Learning(
-            Survey(self.water, self._cameras, options, self.level_offset_m), inputs, view,
-            self._listed,
+            Survey(self.water, self._cameras, settings, self.level_offset_m, own_water=own),
+            inputs, view, self._listed,
             None if blocks.pair is None else self._old_ties,
         )  # fmt: skip
         self.survey = self._learning.survey
@@ -96,10 +108,14 @@ class ThroughWater:
             self._adjustment, self._no_poses = adjustment_of(inputs.cameras, self._cameras)
         self.restart()
 
-    def restart(self) -> None:
+    def restart(self, first_row: int = 0) -> None:
         """Forget the chunks so far."""
-        self._meeting = WaterMeeting(self.water)
+        self._meeting = WaterMeeting(self.water, deep=self._options.deep)
+        self._sample, self._plausible = CloudSample(self._view.points, first_row), Plausible()
         self._beyond: BeyondRange | None = None
+        if self.regression is not None:
+            least = LEAST_BEYOND if self._inputs.regression is None else 0.0
+            self._beyond = BeyondRange(self.regression, least)
         self._shore = None if self._options.shoreline is None else NearWater()
         if self.carrying is not None:
             self.carrying.restart()
@@ -125,6 +141,7 @@ class ThroughWater:
             self.settings["depth_factor"] = self.survey.settings.depth_factor
         self.verdicts = self._learning.verdicts
         self._learn_poses(chunks, views)
+        self.restart()
 
     def _learn_poses(self, chunks: Callable[[], Iterable[Points]], views: ListedViews) -> None:
         """Find what the errors of the adjustment come to in the heights of the bed."""
@@ -170,10 +187,8 @@ class ThroughWater:
         above = surface_above(self.water, xyz, points.heights)
         batch = Batch(xyz, above, self.survey, views, made_with, source=points.sources)
         batch = self._of_kind(batch)
-        correction = correct_checked(batch, label, self.found.sigma_level_m)
-        if self.regression is not None:
-            least = LEAST_BEYOND if self._inputs.regression is None else 0.0
-            self._beyond = self._beyond or BeyondRange(self.regression, least)
+        correction = correct_checked(batch, label, self.found.sigma_level_m, heights_only=True)
+        if self._beyond is not None:
             self._beyond.add((above.height_m - xyz[:, 2])[correction.submerged])
         if self._shore is not None:
             higher = xyz[:, 2] + correction.shift_m[:, 2] - above.height_m
@@ -183,6 +198,7 @@ class ThroughWater:
             correction = step.whole(correction)
             self.carrying.add(step, correction)
         self._meeting.add(xyz, correction)
+        self._sample.add(points._replace(xyz=xyz), above.height_m)
         return correction
 
     @property
@@ -221,8 +237,9 @@ class ThroughWater:
     def made(self) -> dict[str, Any] | None:
         """What the cloud was taken for, and why, where the options leave it open."""
         settings, views = self.survey.settings, self._listed
-        if self.verdicts:
-            because = " ".join(str(one) for one in self.verdicts)
+        own = [] if self.survey.own_water is None else [OWN_WATER]
+        if self.verdicts or own:
+            because = " ".join([*own, *map(str, self.verdicts)])
         elif self._options.method != "auto":
             return None
         elif settings.method == "snell":
@@ -283,12 +300,19 @@ class ThroughWater:
 
     def look_back(self) -> None:
         """Warn if the poses are bent by what the correction was made with; write the shoreline."""
+        given = self._inputs.cameras
+        ties = quick_ties(self._inputs, self._view.crs) if len(self._cameras) else None
+        sought = (self.found.as_dict() or {}).get("model") == "auto"
+        doubts = () if sought else self._sample.level_doubts()
+        tested = plausible(self._cameras, self._sample.xyz, ties, doubts)
+        self._plausible = tested._replace(noted=CAUSES in self._told())
+        self._plausible.warn()
         if not len(self._cameras):
             self._poses = Poses(None, "not applicable: no cameras were given")
             return
-        given = self._inputs.cameras
         name = "cameras" if isinstance(given, Cameras) else str(given)
-        evidence = Evidence(self._cameras, name, self.water, self._options.refractive_index)
+        n = self._options.refractive_index
+        evidence = Evidence(self._cameras, name, self.water, n, ties=ties)
         self._poses = diagnose_in_passing(self._inputs, evidence, self._view, self.verdicts)
         self._write_shoreline()
 
@@ -302,7 +326,8 @@ class ThroughWater:
         """Return what was done on the user's behalf."""
         bent = self._poses.warning if self._poses else ""
         said = [one for one in (bent, self._no_poses) if one]
-        return [*self._told(), *self.found.notes, *self._meeting.notes, *said]
+        doubts, own = self._plausible.doubts, self._own_notes
+        return [*doubts, *self._told(), *self.found.notes, *own, *self._meeting.notes, *said]
 
     def figures(self, tally: Tally) -> dict[str, Any]:
         """Return what the summary says of depths and water."""
@@ -324,6 +349,7 @@ class ThroughWater:
             "told": notes,
             "poses": None if self._poses is None else self._poses.as_dict(),
             "shoreline": self._shoreline,
+            "fit": self._plausible.as_dict(),
         }
 
 
@@ -331,6 +357,8 @@ def correct_checked(
     batch: Batch,
     label: Label | None = None,
     level_sigma_m: Callable[[FloatArray], FloatArray | None] | None = None,
+    *,
+    heights_only: bool = False,
 ) -> Correction:
     """Label, refract, and spread the result over all rows: what every door runs.
 
@@ -342,6 +370,8 @@ def correct_checked(
         Says which are submerged. Default: those below the surface.
     level_sigma_m : callable, optional
         Returns the standard deviation of the water's height at places, shape (m, 2).
+    heights_only : bool
+        Leave the covariances out, of which files have the standard error of Z alone.
     """
     xyz, surface = batch.xyz, batch.surface
     submerged = is_submerged(xyz[:, 2], surface) if label is None else label(xyz, surface)
@@ -350,6 +380,8 @@ def correct_checked(
     if level_sigma_m is not None:
         wet = replace(wet, level_sigma_m=level_sigma_m(wet.xyz[:, :2]))
     found = correct(wet)
+    if heights_only:
+        found = found._replace(covariance_m2=None)
     below = _below_m(wet, found)
     if batch.made_with is not None:
         # their own images put them lower than all images together, by which they were carried
@@ -360,7 +392,8 @@ def correct_checked(
     depth = np.zeros(len(xyz))
     depth[rows] = below
     values = spread_over(found, rows, len(xyz))
-    values["shift_m"] = values["shift_m"] + _land_shift(batch, submerged)
+    if batch.made_with is not None:
+        values["shift_m"] = values["shift_m"] + _land_shift(batch, submerged)
     known = np.isfinite(surface.height_m)
     return Correction(
         apparent_xyz=xyz,
@@ -388,6 +421,8 @@ _PER_POINT = (
 def spread_over(found: Intersection, rows: IntArray, n: int) -> dict[str, Any]:
     """Return the values of corrected rows as those of n points, zero elsewhere."""
     full: dict[str, Any] = dict.fromkeys(_PER_POINT)
+    if len(rows) == n:
+        return {name: getattr(found, name) for name in _PER_POINT}
     for name in _PER_POINT:
         values = getattr(found, name)
         if values is not None:
@@ -396,10 +431,8 @@ def spread_over(found: Intersection, rows: IntArray, n: int) -> dict[str, Any]:
     return full
 
 
-def _land_shift(batch: Batch, submerged: BoolArray) -> FloatArray | float:
+def _land_shift(batch: Batch, submerged: BoolArray) -> FloatArray:
     """Return the shift of points made with other cameras, shape (n, 3), zero where submerged."""
-    if batch.made_with is None:
-        return 0.0
     shift = np.zeros((len(batch), 3))
     rows = np.flatnonzero(~submerged)
     shift[rows] = shift_of_land(batch.take(rows))

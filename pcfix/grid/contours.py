@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pcfix.grid.maps import smoothed
 from pcfix.model import FloatArray
 
 MOST_LEVELS = 15
@@ -33,21 +34,23 @@ def interval_of(height: float, least: float) -> float:
     return next(s * power for s in (1.0, 2.0, 5.0, 10.0) if s * power >= wanted * (1.0 - 1e-9))
 
 
+def depth_interval(depth_m: FloatArray, uncertainty_m: FloatArray) -> float:
+    """Return the interval for a map of depths; both NaN where not known, of any shape."""
+    known = uncertainty_m[np.isfinite(uncertainty_m)]
+    deepest = np.max(depth_m, where=np.isfinite(depth_m), initial=0.0)
+    return interval_of(float(deepest), float(np.median(known)) if known.size else 0.0)
+
+
 def contours(values: FloatArray, interval: float) -> list[Contour]:
     """Return the contours of cells (rows, columns), NaN where not known, at whole intervals.
 
     The lowest and the highest value are no levels.
     """
     from contourpy import contour_generator
-    from scipy.ndimage import gaussian_filter
 
-    known = np.isfinite(values)
-    if not known.any():
+    if min(values.shape) < 2 or not np.isfinite(values).any():
         return []
-    weight = gaussian_filter(known.astype(np.float64), SMOOTH_CELLS)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        smooth = gaussian_filter(np.where(known, values, 0.0), SMOOTH_CELLS) / weight
-    maker = contour_generator(z=np.ma.array(smooth, mask=~known))
+    maker = contour_generator(z=np.ma.masked_invalid(smoothed(values, SMOOTH_CELLS)))
     first = math.floor(float(np.nanmin(values)) / interval) + 1
     last = math.ceil(float(np.nanmax(values)) / interval)
     lines = [

@@ -153,23 +153,3 @@ def smoothed(values: FloatArray, sigma_cells: float) -> FloatArray:
     weight = gaussian_filter(known.astype(np.float64), sigma_cells)
     total = gaussian_filter(np.where(known, values, 0.0), sigma_cells)
     return np.where(known, total / np.maximum(weight, 1e-9), np.nan)
-
-
-def contours_of(
-    values: FloatArray, step: float, sigma_cells: float
-) -> list[tuple[float, FloatArray]]:
-    """Return levels and lines, each (n, 2), column and row of the map, of its smoothed values."""
-    from contourpy import contour_generator
-
-    field = smoothed(values, sigma_cells)
-    known = field[np.isfinite(field)]
-    if not known.size or min(field.shape) < 2:
-        return []
-    maker = contour_generator(z=np.ma.masked_invalid(field))
-    levels = step * np.arange(np.floor(known.min() / step) + 1.0, np.ceil(known.max() / step))
-    return [
-        (float(level), np.asarray(line) + 0.5)
-        for level in levels
-        for line in maker.lines(level)
-        if len(line) > 8
-    ]

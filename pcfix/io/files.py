@@ -8,35 +8,66 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import mimetypes
 import mmap
 import os
-import shutil
+import re
 import subprocess
-import tempfile
 import weakref
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.blocks import Empty, on_disk
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import InputError, SettingError, optional_library
 from pcfix.grid.lattice import Window
+from pcfix.io.drafts import cannot_write, draft_folder, replaced_when_whole
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.declare import File
+from pcfix.sums import Counted
 
+LARGE_BYTES = 2**26
 LAST_LINES = 3
 """Of what another program says when it fails."""
 
 
+def is_remote(path: Any) -> bool:
+    """Whether a path is the address of something in an object store, as ``s3://bucket/key``."""
+    return re.match(r"\w{2,}:/", str(path)) is not None  # of s3:// a Path leaves s3:/
+
+
+def path_of(path: Any) -> Path:
+    """Return a path as an object, also that of an object store, which reads by fsspec."""
+    if not is_remote(path):
+        return path if isinstance(path, Path) else Path(path)
+    upath = optional_library("upath", "remote", f"{path}: reading from object stores")
+    try:
+        return cast(Path, upath.UPath(re.sub(":/+", "://", str(path), count=1)))
+    except (ImportError, ValueError) as error:  # of a store that fsspec does not know
+        raise InputError(f"{path}: cannot be read ({error}).") from error
+
+
+def local_path(path: File) -> Path:
+    """Return the path of an output; a `SettingError` if it is in an object store."""
+    if is_remote(path):
+        raise SettingError(f"{path}: outputs go to a folder; write there, and copy them after.")
+    return Path(path)
+
+
 def check_input(path: File) -> Path:
     """Return the path of a file; one that does not exist is an `InputError`."""
-    found = Path(path)
-    if not found.is_file():
-        raise InputError(f"{found}: there is no such file.")
+    found, why = path_of(path), "there is no such file"
+    try:
+        is_there = found.is_file()
+    except Exception as error:  # each object store has errors of its own
+        is_there, why = False, f"cannot be read ({error})"
+    if not is_there:
+        raise InputError(f"{found}: {why}.")
     return found
 
 
@@ -53,8 +84,8 @@ def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) ->
 
     A `SettingError` if it is one of the inputs, exists without `overwrite`, or has no folder.
     """
-    target = Path(path)
-    for source in inputs:
+    target = local_path(path)
+    for source in (one for one in inputs if not is_remote(one)):
         both = target.exists() and Path(source).exists()
         if target.samefile(source) if both else target.resolve() == Path(source).resolve():
             raise SettingError(
@@ -69,47 +100,43 @@ def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) ->
     return target
 
 
-@contextmanager
-def replaced_when_whole(target: Path) -> Iterator[Path]:
-    """Give a name beside the target to write to, and rename it once the block ends well.
-
-    The name keeps the target's suffix. Whatever goes wrong, nothing is left behind.
-    """
-    draft = target.with_name(f".{target.stem}.{os.getpid()}.part{target.suffix}")
-    try:
-        yield draft
-        draft.replace(target)
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written ({error.strerror or error}).") from error
-    finally:
-        draft.unlink(missing_ok=True)
-
-
-@contextmanager
-def folder_when_whole(target: Path) -> Iterator[Path]:
-    """Give a folder to write into, which takes the place of the target once the block ends well.
-
-    An older folder of that name goes as a whole, with whatever it held.
-    """
-    draft = Path(
-        tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".part", dir=target.resolve().parent)
-    )
-    try:
-        yield draft
-        draft.chmod(0o755)
-        if target.exists():
-            shutil.rmtree(target)
-        draft.replace(target)
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written ({error.strerror or error}).") from error
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
-
-
 def sha256(path: Path) -> str:
     """Return the checksum of a file, as hexadecimal digits."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def digest_of(path: Path) -> str:
+    """Return the checksum of the content of a file, or of a folder of a project.
+
+    There images, videos and whatever is large go by size and time.
+    """
+    if not path.is_dir():
+        return sha256(path)
+    parts = []
+    for one in sorted(path.rglob("*")):
+        kind = mimetypes.guess_type(one.name)[0] or ""
+        if one.is_file():
+            light = one.stat().st_size < LARGE_BYTES and not kind.startswith(("image", "video"))
+            parts.append(sha256(one) if light else str(file_state(one)))
+            parts.append(str(one.relative_to(path)))
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+def write_counted(path: Path, note: dict[str, Any], counted: Counted) -> None:
+    """Write arrays and a note into one file, whole or not at all."""
+    with replaced_when_whole(path) as draft, draft.open("wb") as stream:
+        np.savez_compressed(stream, **{**counted, "note": np.array(json.dumps(note))})  # type: ignore
+
+
+def read_counted(path: Path) -> tuple[dict[str, Any], Counted]:
+    """Return the note and the arrays of a file; nothing where there is none that is whole."""
+    try:
+        with np.load(path, allow_pickle=False) as held:
+            counted = {name: held[name] for name in held.files}
+        return json.loads(str(counted.pop("note"))), counted
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+        return {}, {}
 
 
 def file_state(path: Path) -> dict[str, Any]:
@@ -158,41 +185,40 @@ def scratch_arrays(target: Path) -> Iterator[Empty]:
     Within the block the large arrays of `pcfix.blocks` are such, too. The disk has its place back
     as soon as an array is no longer used. An `InputError` if it cannot hold them.
     """
-    try:
-        folder = tempfile.TemporaryDirectory(
-            prefix=f".{target.stem}.", suffix=".part", dir=target.parent, ignore_cleanup_errors=True
-        )
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written ({error.strerror or error}).") from error
     maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
     made = itertools.count()
-
-    def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-        path = Path(folder.name) / f"{next(made)}.bin"
-        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    with ExitStack() as stack:
         try:
-            with path.open("w+b") as stream:  # a full disk kills whoever writes to a map
-                if hasattr(os, "posix_fallocate"):
-                    os.posix_fallocate(stream.fileno(), 0, size)
-                else:
-                    stream.truncate(size)
-                one = mmap.mmap(stream.fileno(), size)
+            folder = stack.enter_context(draft_folder(target.parent))
         except OSError as error:
-            raise InputError(
-                f"{target}: {size / 1e9:,.1f} GB of temporary space beside it cannot be had"
-                f" ({error.strerror or error}); make room, or write to another disk."
-            ) from error
-        with suppress(OSError):  # Windows keeps it until the block ends
-            path.unlink()
-        maps.add(one)
-        return np.frombuffer(one, dtype).reshape(shape)
+            raise cannot_write(target, error) from error
 
-    def let_go() -> None:
-        for one in maps:
-            if hasattr(mmap, "MADV_DONTNEED"):
-                one.madvise(mmap.MADV_DONTNEED)
+        def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+            path = folder / f"{next(made)}.bin"
+            size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+            try:
+                with path.open("w+b") as stream:  # a full disk kills whoever writes to a map
+                    if hasattr(os, "posix_fallocate"):
+                        os.posix_fallocate(stream.fileno(), 0, size)
+                    else:
+                        stream.truncate(size)
+                    one = mmap.mmap(stream.fileno(), size)
+            except OSError as error:
+                raise InputError(
+                    f"{target}: {size / 1e9:,.1f} GB of temporary space beside it cannot be had"
+                    f" ({error.strerror or error}); make room, or write to another disk."
+                ) from error
+            with suppress(OSError):  # Windows keeps it until the block ends
+                path.unlink()
+            maps.add(one)
+            return np.frombuffer(one, dtype).reshape(shape)
 
-    with folder, on_disk(empty, let_go):
+        def let_go() -> None:
+            for one in maps:
+                if hasattr(mmap, "MADV_DONTNEED"):
+                    one.madvise(mmap.MADV_DONTNEED)
+
+        stack.enter_context(on_disk(empty, let_go))
         yield empty
 
 

@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from pcfix.errors import GeometryError, InputError, SettingError
 from pcfix.grid.lattice import Lattice, Window
-from pcfix.io.files import check_input, check_output, replaced_when_whole
+from pcfix.io.drafts import replaced_when_whole
+from pcfix.io.files import check_input, check_output
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 
@@ -283,11 +284,22 @@ PREVIEW_CELLS = 360_000
 def preview(path: Path, cells: int = PREVIEW_CELLS) -> tuple[FloatArray, Bounds]:
     """Return a raster of at most so many cells, NaN for no data, and west, east, south, north."""
     with open_raster(path) as source:
-        scale = max(1.0, math.sqrt(source.height * source.width / cells))
-        shape = max(1, int(source.height / scale)), max(1, int(source.width / scale))
-        values = read_masked(source, out_shape=shape)
-        west, south, east, north = source.bounds
-    return values, (west, east, south, north)
+        shape, bounds = _small(source, cells)
+        return read_masked(source, out_shape=shape), bounds
+
+
+def picture(path: Path, cells: int = PREVIEW_CELLS) -> tuple[npt.NDArray[np.uint8], Bounds]:
+    """Return a coloured raster as `preview` does, shape (rows, columns, bands)."""
+    with open_raster(path) as source:
+        shape, bounds = _small(source, cells)
+        return np.moveaxis(source.read(out_shape=(source.count, *shape)), 0, -1), bounds
+
+
+def _small(source: DatasetReader, cells: int) -> tuple[tuple[int, int], Bounds]:
+    scale = max(1.0, math.sqrt(source.height * source.width / cells))
+    west, south, east, north = source.bounds
+    shape = max(1, int(source.height / scale)), max(1, int(source.width / scale))
+    return shape, (west, east, south, north)
 
 
 def centres(place: FloatArray, values: FloatArray, bounds: Bounds) -> FloatArray:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import InputError, SettingError, installing
 from pcfix.io.crs import parse_crs
 from pcfix.io.files import check_input
 from pcfix.io.tables import Table, read_lines, split_header, table_below
@@ -177,7 +177,7 @@ def load_pyogrio() -> Any:
         import pyogrio
     except ImportError as error:
         raise SettingError(
-            "Vector files need pyogrio, which is not installed; run: pip install 'pcfix[vector]'."
+            f"Vector files need pyogrio, which is not installed; run: {installing('vector')}"
         ) from error
     return pyogrio
 

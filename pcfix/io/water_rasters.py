@@ -9,6 +9,7 @@ cameras go through, which refuse what PROJ can only guess.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.crs import is_local, metres_up, parse_crs, parts
+from pcfix.io.labels import match_labels
 from pcfix.io.rasters import open_raster, place_of, read_masked
 from pcfix.io.transformations import LOCAL, Points, transformation_in_plan, way_to_cloud
 from pcfix.model import FloatArray, WaterRaster
@@ -82,6 +84,40 @@ def read_water_raster(
     if to_cloud is None and t.b == t.d == 0.0 and t.a > 0.0 > t.e:  # north-up: as it is
         return WaterRaster(part.heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), title)
     return sampled(part, to_cloud or (lambda xyz: xyz), from_cloud, bounds, (name, title))
+
+
+def rasters_of_images(
+    folder: File, names: Sequence[str]
+) -> tuple[dict[int, Path], tuple[str, ...]]:
+    """Find the rasters of the water, TIFF files in a folder, that bear the names of images.
+
+    Returns
+    -------
+    paths : dict
+        By the rows of the images.
+    notes : tuple of str
+        On images without one.
+
+    Raises
+    ------
+    InputError
+        If there is none, or one could be that of several images.
+    """
+    files = sorted(Path(folder).glob("*.tif"))
+    row, unclear = match_labels(names, [one.stem for one in files])
+    if unclear:
+        raise InputError(
+            f"{folder}: its raster for {unclear[0]} could be that of several images; give every"
+            " image a name of its own."
+        )
+    found = {image: files[at] for image, at in enumerate(row.tolist()) if at >= 0}
+    if not found:
+        raise InputError(
+            f"{folder}: holds no raster of an image's name, as {Path(names[0]).stem}.tif; give the"
+            " folder that 'pcfix calm --surface' wrote."
+        )
+    lost = len(names) - len(found)
+    return found, (f"{lost} images have no water of their own in {folder}.",) * (lost > 0)
 
 
 def write_water_raster(path: Path, water: WaterRaster, crs: str | None) -> None:
@@ -270,7 +306,8 @@ def _heights_at(part: Part, places: FloatArray, to_cloud: Points) -> FloatArray:
     from pcfix.water.surface import Field, heights_above
 
     column, row = place_of(~part.transform, places[:, 0], places[:, 1])
-    cells = Field(np.ascontiguousarray(part.heights), 0.5, -0.5, 1.0, 1.0)
+    shape, frame = np.array([[0, *part.heights.shape]]), np.array([[0.5, -0.5, 1.0, 1.0]])
+    cells = Field(part.heights.ravel(), shape, frame, 0)
     height, _ = heights_above(cells, np.ascontiguousarray(column), np.ascontiguousarray(-row))
     known = np.isfinite(height)
     height[known] = to_cloud(np.column_stack([places[known, :2], height[known]]))[:, 2]

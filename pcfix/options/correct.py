@@ -18,14 +18,16 @@ from pcfix.options.declare import (
 from pcfix.options.shared import (
     IndexOptions,
     InputOptions,
-    JobOptions,
     LandRules,
     NeededOptions,
     Panel,
+    PartOptions,
     ShorelineOption,
     SubmergedOptions,
     SummaryOption,
+    TileOptions,
     WaterOptions,
+    WaterPerImageOption,
 )
 
 Uncorrected = Literal["withhold", "keep", "drop"]
@@ -228,7 +230,18 @@ class UnsureOption(OptionSet):
 
 @dataclass(frozen=True, kw_only=True)
 class RefractionOptions(BudgetOptions, MethodOptions, UnsureOption):
-    """What the correction of points goes by; `pcfix.correct_points` takes these."""
+    """What the correction of points goes by."""
+
+    panel = Panel.WATER
+
+    deep: bool = option(
+        False, "Accept depths of more than 60 m, which else are taken for a wrong water level."
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointsOptions(RefractionOptions, WaterPerImageOption):
+    """The options of `pcfix.correct_points`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -250,7 +263,14 @@ class ScienceOptions(RefractionOptions, ResultOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectOptions(
-    ShorelineOption, JobOptions, SummaryOption, ScienceOptions, SubmergedOptions, InputOptions
+    PartOptions,
+    ShorelineOption,
+    TileOptions,
+    SummaryOption,
+    ScienceOptions,
+    WaterPerImageOption,
+    SubmergedOptions,
+    InputOptions,
 ):
     """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
 
@@ -308,7 +328,7 @@ class StageLabelOptions(LabelRules, SubmergedOptions, WaterOptions, NeededOption
 
 
 @dataclass(frozen=True, kw_only=True)
-class LabelOptions(JobOptions, SummaryOption, StageLabelOptions):
+class LabelOptions(PartOptions, TileOptions, SummaryOption, StageLabelOptions):
     """The options of ``pcfix label``."""
 
 

@@ -262,9 +262,7 @@ def table_of(kind: type) -> str:
     return "\n".join(rows)
 
 
-def taken(
-    kind: type[Set], given: Set | None, keywords: Mapping[str, Any], where: str, **defaults: Any
-) -> Set:
+def taken(kind: type[Set], given: OptionSet | None, keywords: Mapping[str, Any], where: str) -> Set:
     """Return the options that a Python function is called with.
 
     Parameters
@@ -277,8 +275,6 @@ def taken(
         The others, by name; names of old work with a warning.
     where : str
         Whose options they are, for messages.
-    **defaults
-        Other defaults than those of the class.
 
     Raises
     ------
@@ -292,7 +288,7 @@ def taken(
         )
     if given is not None:
         return given if isinstance(given, kind) else given.part(kind)
-    return kind(**{**defaults, **named(keywords, options_of(kind), where)})
+    return kind(**named(keywords, options_of(kind), where))
 
 
 def named(given: Mapping[str, Any], known: Iterable[Option], where: str) -> dict[str, Any]:

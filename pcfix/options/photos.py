@@ -16,6 +16,7 @@ from pcfix.options.shared import (
     Panel,
     SummaryOption,
     WaterOptions,
+    WaterPerImageOption,
 )
 from pcfix.options.steps import METRES
 
@@ -64,7 +65,7 @@ class GroundOptions(OptionSet):
         "Of the raster that a cloud is gridded to.",
         unit="m",
         rule=METRES,
-        default_is="two ground pixels",
+        default_is="2 to 4 points a cell",
     )
 
 
@@ -130,19 +131,6 @@ class OrthoRules(OptionSet):
 
 
 @dataclass(frozen=True, kw_only=True)
-class WaterPerImageOption(OptionSet):
-    """Water that is another for each photograph."""
-
-    panel = Panel.WATER
-
-    water_per_image: File | None = option(
-        None,
-        "Folder of rasters of the water, each of the name of a photograph, as 'pcfix calm"
-        " --surface' writes them; the others go by --water.",
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
 class OrthoOptions(
     JobOptions,
     SummaryOption,
@@ -181,7 +169,7 @@ class WavesOptions(OptionSet):
     surface: bool = option(
         False,
         "Also the water surface of each frame, from how far the bed is displaced in it: rasters in"
-        " OUT_water, which --water-per-image of 'pcfix photos' takes.",
+        " OUT_water, which --water-per-image of 'pcfix correct' and 'photos' takes.",
     )
     depth: Any = option(
         None,

@@ -29,7 +29,7 @@ from pcfix.refract.matcher import Bed, Matcher
 from pcfix.refract.occlusion import Occluder
 from pcfix.refract.pose_errors import PoseErrors
 from pcfix.refract.regression import DepthRegression
-from pcfix.water.surface import SurfaceAbove
+from pcfix.water.surface import OwnWater, SurfaceAbove
 
 NO_CAMERA, ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
 PARALLEL, CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
@@ -127,6 +127,9 @@ class Survey:
     parts : mapping
         Surveys of points that were made in another way than most: by their source, and of those in
         no list, where there is one, by `UNLISTED`.
+    own_water : OwnWater or None
+        Rasters of the water as single images saw it, in which all rays of ``snell`` and
+        ``consistent`` bend; at `water` where they do not reach.
     """
 
     water: WaterSurface
@@ -135,6 +138,7 @@ class Survey:
     level_offset_m: FloatArray | None = None
     learned: Learned = field(default_factory=Learned)
     parts: Mapping[int, Survey] = field(default_factory=dict)
+    own_water: OwnWater | None = None
 
     @property
     def offset_m(self) -> FloatArray:

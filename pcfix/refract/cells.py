@@ -71,7 +71,7 @@ FIT_SOME = _fit_at(BASIS[SOME, :QUADRATIC])
 
 def is_bent(survey: Survey) -> bool:
     """Whether rays of one point may pierce the water under different slopes."""
-    return isinstance(survey.water, WaterMesh | WaterRaster)
+    return isinstance(survey.water, WaterMesh | WaterRaster) or survey.own_water is not None
 
 
 def is_quick(batch: Batch) -> bool:

@@ -22,20 +22,11 @@ from pcfix.lens.frames import (
     may_hold,
     no_frames,
 )
-from pcfix.model import (
-    Cameras,
-    FloatArray,
-    IntArray,
-    Views,
-    WaterMesh,
-    WaterPlane,
-    WaterRaster,
-    WaterSurface,
-)
+from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey
-from pcfix.refract.rays import pierce
-from pcfix.water.surface import Field, SurfaceAbove, Tin, build_field, build_tin, locate
+from pcfix.refract.rays import pierce_of
+from pcfix.water.surface import Field, SurfaceAbove, Tin, build_fields, build_tin, locate
 
 NOMINAL_FOCAL_PX = 3700.0
 """Of cameras without a lens: a survey drone's of 20 megapixels, 0.27 mrad a pixel."""
@@ -123,11 +114,14 @@ def rule_of(survey: Survey) -> Rule:
     return Rule(least, settings.max_cameras or ANY_NUMBER, 1.0 / settings.refractive_index)
 
 
-def shapes_of(water: WaterSurface) -> tuple[Tin | None, Field | None]:
-    """Return a mesh or raster for kernels; of another surface neither."""
+def shapes_of(survey: Survey) -> tuple[Tin | None, Field | None]:
+    """Return a mesh, or the rasters of the images, for kernels; of another surface neither."""
+    water, k = survey.water, len(survey.cameras)
+    if survey.own_water is not None:
+        return None, survey.own_water.heights
     return (
         build_tin(water) if isinstance(water, WaterMesh) else None,
-        build_field(water) if isinstance(water, WaterRaster) else None,
+        build_fields({}, k, water) if isinstance(water, WaterRaster) else None,
     )
 
 
@@ -159,7 +153,7 @@ def chosen_views(batch: Batch) -> Views:
         begin = entries[0][:-1].copy()
         place = np.empty(len(views.camera), np.int32)
     in_tiles(
-        _choose_all, tiles, points, rig, frames, rule_of(survey), *shapes_of(survey.water),
+        _choose_all, tiles, points, rig, frames, rule_of(survey), *shapes_of(survey),
         entries, (first, begin, count, place),
     )  # fmt: skip
     start = np.cumsum(count)
@@ -218,7 +212,7 @@ def _make_room(span: Span, points: Points, rig: Rig, frames: Frames, first: IntA
 @kernel
 def _choose_all(
     span: Span, points: Points, rig: Rig, frames: Frames, rule: Rule, tin: Tin | None,
-    field: Field | None, views: tuple[IntArray, IntArray],
+    fields: Field | None, views: tuple[IntArray, IntArray],
     found: tuple[IntArray, IntArray, IntArray, npt.NDArray[np.int32]],
 ) -> None:  # fmt: skip
     """Fill in where the entries of point i begin, how many they are (at i + 1), and the entries.
@@ -240,7 +234,7 @@ def _choose_all(
                 candidates = views[1][begin[i] : views[0][i + 1]]
             else:
                 begin[i] = free
-            kept = choose(candidates, tile, j, rig, frames, rule, tin, field, facet)
+            kept = choose(candidates, tile, j, rig, frames, rule, tin, fields, facet)
             for k in range(kept.size):
                 at = kept[k]
                 place[begin[i] + k] = begin[i] + at if listed else candidates[at]
@@ -347,7 +341,7 @@ def near_cameras(
 @part
 def choose(
     candidates: IntArray, tile: FloatArray, j: int, rig: Rig, frames: Frames, rule: Rule,
-    tin: Tin | None, field: Field | None, facet: int,
+    tin: Tin | None, fields: Field | None, facet: int,
 ) -> IntArray:  # fmt: skip
     """Return which of the candidates give a ray to a point of the tile, in their order.
 
@@ -368,8 +362,8 @@ def choose(
         )
         if not (height > h and holds(frames, c, e)):
             continue
-        if h > 0.0 and is_limited and (tin is not None or field is not None):
-            _, normal = pierce(tin, field, lowered, e, h, upward, facet)
+        if h > 0.0 and is_limited and (tin is not None or fields is not None):
+            _, normal = pierce_of(c, tin, fields, lowered, e, h, upward, facet)
             height = max(dot(normal, e), 0.0)
         if height * height >= rule.least_cosine2 * length2:
             chosen[k], cosine2[k] = at, height * height / length2

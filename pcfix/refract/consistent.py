@@ -66,9 +66,9 @@ from pcfix.refract.rays import (
     direction,
     light_path,
     nearest_point,
-    pierce,
+    pierce_of,
     refracted,
-    settle,
+    settle_of,
     slope_of_path,
 )
 from pcfix.water.surface import Field, Tin, locate
@@ -137,8 +137,8 @@ def consistent(batch: Batch) -> Intersection:
     """
     check_consistent(batch.survey.cameras)
     survey, result = batch.survey, np.zeros((len(batch), COLUMNS))
-    optics, shapes = optics_of(survey.cameras), shapes_of(survey.water)
-    in_tiles(_correct, len(batch), batch.chosen(), optics, *shapes, result)
+    optics, shapes = optics_of(survey.cameras), shapes_of(survey)
+    in_tiles(_correct, len(batch), batch.chosen(), optics, *shapes, result, points=len(batch))
     return intersection_of(batch, result)
 
 
@@ -161,7 +161,7 @@ def intersection_of(batch: Batch, result: FloatArray) -> Intersection:
 
 @kernel
 def _correct(
-    span: Span, points: Chosen, optics: Optics, tin: Tin | None, field: Field | None,
+    span: Span, points: Chosen, optics: Optics, tin: Tin | None, fields: Field | None,
     result: FloatArray,
 ) -> None:  # fmt: skip
     """Correct every point on its own."""
@@ -169,7 +169,7 @@ def _correct(
     room = room_for(most_between(span, start))
     for i in range(*span):
         cameras = points.camera[start[i] : start[i + 1]]
-        correct_one(result[i], points, i, cameras, optics, tin, field, room)
+        correct_one(result[i], points, i, cameras, optics, tin, fields, room)
 
 
 Room: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
@@ -185,7 +185,7 @@ def room_for(rays: int) -> Room:
 @lean
 def correct_one(
     out: FloatArray, points: Chosen, i: int, cameras: IntArray, optics: Optics,
-    tin: Tin | None, field: Field | None, room: Room,
+    tin: Tin | None, fields: Field | None, room: Room,
 ) -> None:  # fmt: skip
     """Correct one point with some cameras and write its row."""
     rays, sums, g, inverse = room
@@ -195,9 +195,9 @@ def correct_one(
     facet = -1 if tin is None else locate(tin, points.xyz[i, 0], points.xyz[i, 1])
     sums[:9], sums[9] = 0.0, 1.0
     for j in range(cameras.size):
-        begin(rays[j], sums, points, i, cameras[j], tin, field, facet)
+        begin(rays[j], sums, points, i, cameras[j], tin, fields, facet)
         add_image(rays[j], optics, cameras[j])
-    _solve(out, rays, (sums, g, inverse), cameras, optics, points.n, tin, field)
+    _solve(out, rays, (sums, g, inverse), cameras, optics, points.n, tin, fields)
 
 
 @lean
@@ -212,7 +212,7 @@ def _are_one(cameras: IntArray) -> bool:
 @lean
 def begin(
     ray: FloatArray, sums: FloatArray, points: Chosen, i: int, c: int,
-    tin: Tin | None, field: Field | None, facet: int,
+    tin: Tin | None, fields: Field | None, facet: int,
 ) -> None:  # fmt: skip
     """Fill in where a ray comes from, and add its refracted line to the sums of `snell`.
 
@@ -226,7 +226,7 @@ def begin(
     f, bend = 0.0, 1.0
     if h > 0.0:
         bend = 1.0 / points.n
-        f, normal = pierce(tin, field, lowered, e, h, normal, facet)
+        f, normal = pierce_of(c, tin, fields, lowered, e, h, normal, facet)
         height = dot(normal, e)
         h = f * height
     add_line(sums, scaled(f, e), refracted(e, length2, normal, height, bend), 1.0 / length2)
@@ -250,7 +250,7 @@ def add_image(ray: FloatArray, optics: Optics, c: int) -> None:
 @lean
 def _solve(
     out: FloatArray, rays: FloatArray, room: tuple[FloatArray, FloatArray, FloatArray],
-    cameras: IntArray, optics: Optics, n: float, tin: Tin | None, field: Field | None,
+    cameras: IntArray, optics: Optics, n: float, tin: Tin | None, fields: Field | None,
 ) -> None:  # fmt: skip
     """Solve one point and write its row; the room is its sums, and that of the search."""
     (sums, g, inverse), k = room, float(cameras.size)
@@ -258,7 +258,7 @@ def _solve(
     if not solved:
         out[OUTCOME] = PARALLEL
         return
-    found, q = _search(q, (g, inverse), rays, cameras, optics, n, tin, field)
+    found, q = _search(q, (g, inverse), rays, cameras, optics, n, tin, fields)
     out[0], out[1], out[2] = q
     out[MISS], out[SIGMA_Z] = miss(k, sums, q), sigma_z
     out[COSINE2], out[OUTCOME], out[FOUND] = sums[9], CORRECTED, 1.0 if found else 0.0
@@ -278,7 +278,7 @@ def miss(k: float, s: FloatArray, q: Vector) -> float:
 @lean
 def _search(
     start: Vector, room: tuple[FloatArray, FloatArray], rays: FloatArray, cameras: IntArray,
-    optics: Optics, n: float, tin: Tin | None, field: Field | None,
+    optics: Optics, n: float, tin: Tin | None, fields: Field | None,
 ) -> tuple[bool, Vector]:  # fmt: skip
     """Return whether a Q was found where g is zero, and it, else the start.
 
@@ -289,7 +289,7 @@ def _search(
     g, inverse = room
     inverse[:] = 0.0
     for step in range(MAX_STEPS):
-        _gradient(g, inverse[: 0 if step else 3], q, rays, cameras, optics, n, tin, field)
+        _gradient(g, inverse[: 0 if step else 3], q, rays, cameras, optics, n, tin, fields)
         if step == 0 and not inverted(inverse, 0.0):
             return False, start
         t = scaled(-1.0, times(inverse, vector(g)))
@@ -312,23 +312,23 @@ def _search(
 @lean
 def _gradient(
     g: FloatArray, slope: FloatArray, q: Vector, rays: FloatArray, cameras: IntArray,
-    optics: Optics, n: float, tin: Tin | None, field: Field | None,
+    optics: Optics, n: float, tin: Tin | None, fields: Field | None,
 ) -> None:  # fmt: skip
     """Sum up g(Q), and d g / d Q where it has rows."""
     g[:] = 0.0
     for j in range(cameras.size):
-        add_residual(g, slope, q, rays[j], cameras[j], optics, n, tin, field)
+        add_residual(g, slope, q, rays[j], cameras[j], optics, n, tin, fields)
 
 
 @lean
 def add_residual(
     g: FloatArray, slope: FloatArray, q: Vector, ray: FloatArray, c: int, optics: Optics, n: float,
-    tin: Tin | None, field: Field | None,
+    tin: Tin | None, fields: Field | None,
 ) -> None:  # fmt: skip
     """Add what one ray says to g(Q), and to d g / d Q where it has rows."""
     e, plane = vector(ray), ray[_PLANE:_GRADIENTS]
-    if tin is not None or field is not None:
-        settle(plane, tin, field, ray[_ORIGIN:], q, e, n)
+    if tin is not None or fields is not None:
+        settle_of(c, plane, tin, fields, ray[_ORIGIN:], q, e, n)
     normal = vector(plane)
     path = light_path(q, e, normal, plane[3], n)
     w = times(optics.rotations[c], direction(path, normal))

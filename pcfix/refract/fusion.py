@@ -82,7 +82,10 @@ def likely_beds(batch: Batch) -> FloatArray:
 
 def _in_cells(batch: Batch, run: Callable[..., None], *given: FloatArray) -> None:
     order, first = cells_of(batch)
-    in_tiles(run, len(first) - 1, (order, first), block_of(batch), is_quick(batch), *given)
+    in_tiles(
+        run, len(first) - 1, (order, first), block_of(batch), is_quick(batch), *given,
+        points=len(batch),
+    )  # fmt: skip
 
 
 class Groups(NamedTuple):

@@ -77,6 +77,10 @@ FITS = 0.3
 cameras that were moved, and of smoothed clouds, the best way has 0.35 to 0.48; of a wrong level the
 steps say nothing."""
 
+MOST_BEYOND = -0.5
+"""Steps that are turned over by more than so much of them were never there: of good blocks nothing
+lies three standard errors beyond."""
+
 CAUSES = (
     "Where no way fits, the cameras may be of another block or moved against the cloud, the poses"
     " may have absorbed the refraction (see pcfix cameras), or the cloud was filtered or meshed."
@@ -170,7 +174,9 @@ class Verdict(NamedTuple):
         apart = self.is_against and abs(self.deeper_m) > self.doubt.formal_m
         unsure = apart if self.is_told else not self.is_sure
         is_way = "method" in self.chosen.changes and not self.is_told
-        none_fits = is_way and self.patches > 0 and not self.is_sure and self.share > FITS
+        open_ = not self.is_sure and self.share > FITS
+        absurd = self.share < MOST_BEYOND and self.share < -SURE * self.sigma
+        none_fits = is_way and self.patches > 0 and (open_ or absurd)
         said = ((str(self), unsure), (CAUSES, none_fits))
         return (*self.remarks, *(sentence for sentence, holds in said if holds))
 

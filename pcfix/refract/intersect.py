@@ -8,7 +8,8 @@ cameras, so that they agree to the bit wherever both apply.
 
 Each camera may have had its own water level, the surface shifted along the vertical. The point is
 lowered by the shift instead, where only its distance from the surface counts. A camera whose own
-water lay below the apparent point saw it through air; its ray goes straight on.
+water lay below the apparent point saw it through air; its ray goes straight on. Or it has a raster
+of its own, see `Survey.own_water`.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ from pcfix.refract.choice import (
     shapes_of,
     tiles_of,
 )
-from pcfix.refract.rays import add_line, line_terms, nearest_point, pierce, refracted
+from pcfix.refract.rays import add_line, line_terms, nearest_point, pierce_of, refracted
 from pcfix.refract.sensitivity import SUMS, TILE_RUNS, Budget, add_below
 from pcfix.refract.uncertainty import (
     add_errors,
@@ -74,8 +75,9 @@ def intersect(batch: Batch) -> Intersection:
     result, used = np.zeros((len(batch), 8)), np.zeros(len(survey.cameras), np.bool_)
     in_tiles(
         _chosen, tiles_of(batch), points_of(batch), rig_of(survey), rule_of(survey),
-        *shapes_of(survey.water),
+        *shapes_of(survey),
         (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)), result, used,
+        points=len(batch),
     )  # fmt: skip
     return _as_intersection(result, used)
 
@@ -96,6 +98,7 @@ def intersect_in_frame(batch: Batch) -> Intersection:
     in_tiles(
         _all_in_frame, tiles_of(batch), points_of(batch), rig_of(survey), frames_of(survey.cameras),
         rule_of(survey), budget_of(survey), level_sigma_of(batch), (result, used, covariance),
+        points=len(batch),
     )  # fmt: skip
     found = _as_intersection(result, used)
     return with_errors(found, covariance if len(covariance) == len(batch) else None)
@@ -249,7 +252,7 @@ def _all_in_frame(
 
 @kernel
 def _chosen(
-    span: Span, points: Points, rig: Rig, rule: Rule, tin: Tin | None, field: Field | None,
+    span: Span, points: Points, rig: Rig, rule: Rule, tin: Tin | None, fields: Field | None,
     views: tuple[IntArray, IntArray], result: FloatArray, used: BoolArray,
 ) -> None:  # fmt: skip
     """Chosen cameras per point, and rays that may bend at a mesh or raster."""
@@ -264,13 +267,13 @@ def _chosen(
             cameras = camera[start[i] : start[i + 1]]
             for c in cameras:
                 used[c] = True  # threads may write it at once: always the same value
-            _intersect_one(result[i], cameras, tile, j, rig, rule.bend, tin, field, facet)
+            _intersect_one(result[i], cameras, tile, j, rig, rule.bend, tin, fields, facet)
 
 
 @part
 def _intersect_one(
     row: FloatArray, cameras: IntArray, tile: FloatArray, j: int, rig: Rig, r: float,
-    tin: Tin | None, field: Field | None, facet: int,
+    tin: Tin | None, fields: Field | None, facet: int,
 ) -> None:  # fmt: skip
     """Intersect the rays of one point with its own cameras."""
     x, y, z = tile[j], tile[TILE + j], tile[2 * TILE + j]
@@ -283,10 +286,10 @@ def _intersect_one(
         f, bend, normal = 0.0, 1.0, upward
         if h > 0.0:
             bend = r
-            f, normal = pierce(tin, field, lowered, e, h, upward, facet)
+            f, normal = pierce_of(c, tin, fields, lowered, e, h, upward, facet)
         height = dot(normal, e)
         q = 1.0 / (length2 * height)
-        if h > 0.0 and tin is None and field is None:
+        if h > 0.0 and tin is None and fields is None:
             f = h * length2 * q  # as in `_add_camera`
         inv = height * q
         add_line(sums, scaled(f, e), refracted(e, length2, normal, height, bend), inv)

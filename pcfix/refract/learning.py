@@ -56,10 +56,35 @@ def resolved(settings: ScienceOptions, cameras: Cameras, views: ViewKind | None)
     return settings if views is None else replace(settings, method="consistent")
 
 
-def wants_sample(settings: ScienceOptions, cameras: Cameras, views: ViewKind | None) -> bool:
+def for_own_water(
+    settings: ScienceOptions, cameras: Cameras, views: ViewKind | None
+) -> ScienceOptions:
+    """Return options without ``auto`` where images have water of their own.
+
+    Raises
+    ------
+    SettingError
+        If the method takes the water to be one for all images.
+    """
+    bare = cameras.lenses is None or cameras.rotations is None
+    dense = settings.camera_set == "mvs" or views not in (None, "tracks")
+    method = settings.method
+    if method == "auto":
+        method = "snell" if bare or dense else "consistent"
+    if method not in ("snell", "consistent") or (method == "consistent" and dense):
+        of = ", as it inverts a dense matcher," if method == "consistent" else ""
+        raise SettingError(
+            f"method {method}{of} takes the water to be one for all images; with water-per-image"
+            " give snell, or leave one of the two out."
+        )
+    camera_set = "all" if settings.camera_set == "auto" else settings.camera_set
+    return replace(settings, method=method, camera_set=camera_set)
+
+
+def wants_sample(survey: Survey, views: ViewKind | None) -> bool:
     """Return whether points of the whole cloud tell something of the correction."""
-    known = settings.depth_factor != "auto"
-    return wants_matcher(settings, cameras, views) or _wants_limit(settings, views) or not known
+    known = survey.settings.depth_factor != "auto"
+    return wants_matcher(survey, views) or _wants_limit(survey.settings, views) or not known
 
 
 def with_factor(batch: Batch) -> tuple[Batch, StereoFactor | None]:
@@ -81,15 +106,20 @@ def _wants_limit(settings: ScienceOptions, views: ViewKind | None) -> bool:
     return views is None and settings.max_angle == "auto" and settings.method in ALIKE
 
 
-def _wants_comparison(settings: ScienceOptions, cameras: Cameras) -> bool:
-    """Whether SigmaZ shall have how far the method is from the way that fits the cloud best."""
+def _wants_comparison(survey: Survey) -> bool:
+    """Whether SigmaZ shall have how far the method is from the way that fits the cloud best.
+
+    That takes the water to be one.
+    """
+    settings, cameras = survey.settings, survey.cameras
     told = settings.dimensions == "all" and settings.method != "regression"
-    return told and cameras.lenses is not None and cameras.rotations is not None
+    full = cameras.lenses is not None and cameras.rotations is not None
+    return told and full and survey.own_water is None
 
 
-def wants_matcher(settings: ScienceOptions, cameras: Cameras, views: ViewKind | None) -> bool:
+def wants_matcher(survey: Survey, views: ViewKind | None) -> bool:
     """Return whether the images' partners must be known, with views of a kind or without any."""
-    compared = _wants_comparison(settings, cameras)
+    settings, compared = survey.settings, _wants_comparison(survey)
     if views is None:
         return settings.models_matcher or settings.method == "auto" or compared
     dense = views in ("depth-maps", "pair-images")
@@ -117,7 +147,7 @@ def learn_of_points(batch: Batch, regression: DepthRegression | None) -> Batch:
     occluder = occluder_of(batch.xyz) if hides and not listed else None
     learned = Learned(regression=regression, occluder=occluder)
     batch = replace(batch, survey=replace(batch.survey, settings=settings, learned=learned))
-    if not wants_sample(settings, cameras, kind):
+    if not wants_sample(batch.survey, kind):
         return batch
     survey, _ = learn_of_sample(batch, len(batch))
     if views is not None and (np.diff(views.start) == 0).any():
@@ -157,7 +187,7 @@ def learn_of_sample(
             return found
     survey, step = batch.survey, points / max(len(batch), 1)
     kind = None if batch.views is None else batch.views.kind
-    if wants_matcher(survey.settings, survey.cameras, kind):
+    if wants_matcher(survey, kind):
         survey = with_matcher(batch, ties)
     rows = np.flatnonzero(is_submerged(batch.xyz[:, 2], batch.surface))
     sample = replace(batch.take(rows), survey=survey)
@@ -229,7 +259,7 @@ def _weighed(sample: Batch, step: float, hint: Hint | None) -> tuple[Survey, tup
     if _wants_limit(survey.settings, None):
         verdicts.append(weigh(replace(sample, survey=survey), LIMITS, step))
         survey = as_told(survey, verdicts[0], LIMITS[0])
-    if _wants_comparison(survey.settings, survey.cameras):
+    if _wants_comparison(survey):
         told = told_by(replace(sample, survey=survey))
         verdicts.append(weigh(sample, IN_FRAME, step, told=told))
         survey = as_told(survey, verdicts[-1])
@@ -323,9 +353,8 @@ def weigh_lists(batch: Batch, *, is_open: bool) -> Verdict | None:
 
     None where there are too few points, or nothing is to be told.
     """
-    settings = batch.survey.settings
-    if is_open and settings.method == "consistent":
+    if is_open and batch.survey.settings.method == "consistent":
         return weigh(batch, hypotheses_of(batch), 1.0)
-    if not _wants_comparison(settings, batch.survey.cameras):
+    if not _wants_comparison(batch.survey):
         return None
     return weigh(batch, hypotheses_of(batch), 1.0, told=told_by(batch))

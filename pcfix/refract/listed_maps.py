@@ -58,8 +58,9 @@ def invert_depth_maps(batch: Batch) -> Intersection:
     given = np.zeros(0) if weights is None else weights.astype(np.float64)
     order, first = cells_of(batch)
     in_tiles(
-        _invert, len(first) - 1, (order, first), block_of(batch), is_quick(batch), given, result
-    )
+        _invert, len(first) - 1, (order, first), block_of(batch), is_quick(batch), given, result,
+        points=len(batch),
+    )  # fmt: skip
     return intersection_of(batch, result)
 
 

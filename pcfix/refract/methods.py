@@ -155,6 +155,7 @@ def on_land(survey: Survey) -> Survey:
         level_offset_m=None,
         learned=survey.learned._replace(bed=None),
         parts={},
+        own_water=None,
     )
 
 

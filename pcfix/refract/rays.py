@@ -205,6 +205,18 @@ def pierce(
 
 
 @lean
+def pierce_of(
+    c: int, tin: Tin | None, fields: Field | None, p: Vector, e: Vector, h: float, normal: Vector,
+    facet: int,
+) -> tuple[float, Vector]:  # fmt: skip
+    """Return `pierce` in the raster of camera c, where there are rasters."""
+    if fields is None:
+        return pierce(tin, None, p, e, h, normal, facet)
+    field = Field(fields.heights, fields.shape, fields.frame, c)
+    return pierce(tin, field, p, e, h, normal, facet)
+
+
+@lean
 def _pierce_mesh(tin: Tin, p: Vector, e: Vector, facet: int) -> tuple[float, Vector]:
     f, b, c = 0.0, 0.0, 0.0
     for _ in range(PIERCING_STEPS):
@@ -365,6 +377,19 @@ def settle(
         lay(plane, x, y, z, b_there, c_there)
         before, b, c = (b, c), b_there, c_there
     _settle_on_crease(plane, tin, field, origin, before, (b, c), q, e, n)
+
+
+@lean
+def settle_of(
+    c: int, plane: FloatArray, tin: Tin | None, fields: Field | None, origin: FloatArray,
+    q: Vector, e: Vector, n: float,
+) -> None:  # fmt: skip
+    """Do as `settle` with the raster of camera c, where there are rasters."""
+    if fields is None:
+        settle(plane, tin, None, origin, q, e, n)
+    else:
+        field = Field(fields.heights, fields.shape, fields.frame, c)
+        settle(plane, tin, field, origin, q, e, n)
 
 
 @lean

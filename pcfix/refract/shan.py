@@ -56,7 +56,7 @@ def shan(batch: Batch) -> Intersection:
     """
     found = np.zeros((len(batch.xyz), 4))
     failed = np.zeros(len(batch.xyz), np.bool_)
-    in_tiles(_solve_all, len(batch), batch.chosen(), found, failed)
+    in_tiles(_solve_all, len(batch), batch.chosen(), found, failed, points=len(batch))
     outcome = np.where(failed, np.uint8(Outcome.PARALLEL_RAYS), batch.outcome())
     return batch.result(found[:, :3], outcome=outcome, ray_miss_m=found[:, 3])
 

@@ -126,7 +126,7 @@ def consistent_in_cells(batch: Batch) -> Intersection:
     order, first = cells_of(batch)
     in_tiles(
         _correct_cells, len(first) - 1, (order, first), points, optics_of(cameras),
-        1.0 / rig_of(batch.survey).focal_px, result,
+        1.0 / rig_of(batch.survey).focal_px, result, points=len(batch),
     )  # fmt: skip
     return intersection_of(batch, result)
 

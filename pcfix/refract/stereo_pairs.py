@@ -151,7 +151,7 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     order, first = cells_of(batch)
     in_tiles(
         _invert, len(first) - 1, (order, first), batch.chosen(), optics, both, (*listed, matched),
-        used, result,
+        used, result, points=len(batch),
     )  # fmt: skip
     outcome = result[:, _OUTCOME].astype(np.uint8)
     moved = outcome == Outcome.CORRECTED

@@ -24,7 +24,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, inlined, kernel, lean, part
+from pcfix.kernels import Span, in_tiles, inlined, kernel, lean, lean_kernel, part
 from pcfix.lens.algebra import Symmetric, Vector
 from pcfix.model import FloatArray, IntArray, Outcome
 from pcfix.options.correct import LEVEL_M
@@ -42,6 +42,7 @@ from pcfix.refract.choice import (
     tiles_of,
 )
 from pcfix.refract.sensitivity import Budget
+from pcfix.water.surface import Field, height_at
 
 Four: TypeAlias = tuple[float, float, float, float]
 Nine: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
@@ -110,17 +111,21 @@ def with_errors(found: Intersection, covariance: FloatArray | None) -> Intersect
     if covariance is None:
         return found._replace(sigma_z_m=np.zeros(len(found.outcome)))
     moved = found.outcome == Outcome.CORRECTED
-    covariance[~moved] = 0.0
+    if not moved.all():
+        covariance[~moved] = 0.0
     return found._replace(sigma_z_m=np.sqrt(covariance[:, _ZZ]), covariance_m2=covariance)
 
 
 def with_doubt(found: Intersection, batch: Batch) -> Intersection:
-    """Return a result whose standard errors of Z have what cloud and poses tell of them."""
+    """Return a result whose standard errors of Z have what cloud and poses tell of them.
+
+    They are added to its covariances where these stand.
+    """
     doubt, poses = batch.survey.learned.doubt, batch.survey.learned.poses
     if (doubt is None and poses is None) or found.covariance_m2 is None:
         return found
     moved = found.outcome == Outcome.CORRECTED
-    covariance = found.covariance_m2.copy()
+    covariance = found.covariance_m2
     if doubt is not None:
         depth = batch.surface.height_m - (batch.xyz[:, 2] + found.shift_m[:, 2])
         covariance[moved, _ZZ] += doubt.scatter_m**2 + (doubt.per_depth * depth[moved]) ** 2
@@ -133,12 +138,46 @@ _XZ, _YZ, _ZZ = 2, 4, 5
 
 
 def level_sigma_of(batch: Batch) -> FloatArray:
-    """Return the standard deviation of the water above each point, metres, shape (m,)."""
+    """Return the standard deviation of the water above each point, metres, shape (m,).
+
+    That of the level is common to all rays; where images have water of their own, its errors, of
+    which each ray has another, are added as those of the mean over the rays.
+    """
     stated, fitted = batch.survey.settings.sigma_level, batch.level_sigma_m
     known = stated if stated is not None else LEVEL_M if fitted is None else fitted
     full = np.array(np.broadcast_to(known, len(batch)), np.float64)
     full[np.isnan(full)] = LEVEL_M
-    return full
+    own, views = batch.survey.own_water, batch.views
+    if own is None or views is None:
+        return full
+    of_own, points = np.zeros(len(batch)), points_of(batch)
+    in_tiles(
+        _own_sigma, len(batch), points, rig_of(batch.survey), own.sigma,
+        (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)), of_own,
+    )  # fmt: skip
+    return np.hypot(full, of_own)
+
+
+@lean_kernel
+def _own_sigma(
+    span: Span, points: Points, rig: Rig, sigma: Field, views: tuple[IntArray, IntArray],
+    found: FloatArray,
+) -> None:  # fmt: skip
+    """Set what the errors of the images' own water come to in the mean over the rays of a point.
+
+    They are independent from image to image. The water is taken as level above the point.
+    """
+    start, camera = views
+    for i in range(*span):
+        total = 0.0
+        for at in range(start[i], start[i + 1]):
+            c, x, y = camera[at], points.xyz[i, 0], points.xyz[i, 1]
+            up = rig.centres[c, 2] - points.xyz[i, 2]
+            f = (points.height[i] + rig.offset[c] - points.xyz[i, 2]) / up
+            x, y = x + f * (rig.centres[c, 0] - x), y + f * (rig.centres[c, 1] - y)
+            error = height_at(Field(sigma.heights, sigma.shape, sigma.frame, c), x, y)[0]
+            total += error * error if error > 0.0 else 0.0
+        found[i] = np.sqrt(total) / max(start[i + 1] - start[i], 1)
 
 
 def budget_of(survey: Survey) -> Budget:

@@ -63,6 +63,8 @@ class Fit:
         Cameras lower than the cloud's highest point within their reach in plan.
     verdict : str
         What is likely wrong; empty where they fit.
+    tested : str
+        What they were tested with, and what not.
     """
 
     cloud: str
@@ -71,6 +73,7 @@ class Fit:
     distance_m: float
     below_ground: int
     verdict: str
+    tested: str = "not checked"
 
     @property
     def fits(self) -> bool:
@@ -219,7 +222,7 @@ def _fit(report: CamerasReport) -> list[str]:
         lines.append(f"apart        {fit.distance_m:,.1f} m in plan between block and cloud")
     if fit.below_ground:
         lines.append(f"below ground {fit.below_ground} cameras")
-    return [*lines, f"fit          {fit.verdict or 'cameras and cloud fit'}"]
+    return [*lines, f"fit          {fit.verdict or fit.tested}"]
 
 
 def _refraction(report: CamerasReport) -> list[str]:

@@ -62,7 +62,10 @@ def comparison_text(comparison: Comparison) -> str:
         )
     plain = c.as_dict()
     distances = [(f"C2C {way}, {name}", of["statistics"]) for way, name, _, of in c2c_rows(plain)]
-    for table in ([*_table(_signed(plain)), *_normal(c)], _table(distances) + c2c_lines(plain)):
+    for table in (
+        [*_table(signed_statistics(plain)), *_normal(c)],
+        _table(distances) + c2c_lines(plain),
+    ):
         lines += ["", *table] if table else []
     if c.own is not None:
         lines += ["", *_own(plain)]
@@ -118,7 +121,7 @@ def noise_sentence(own: Plain, raw: Plain) -> str:
     return f"without {noise}; with it RMSE {raw['rmse_m']:.3f} m, 95 % {raw['within_95_m']:.3f} m."
 
 
-def _signed(plain: Plain) -> list[tuple[str, Plain]]:
+def signed_statistics(plain: Plain) -> list[tuple[str, Plain]]:
     """Return the statistics of all that has a sign, by title."""
     rows = []
     kinds = (("dZ", "vertical"), ("dZ bed", "bed"), ("dZ land", "land"), ("M3C2", "m3c2"))

@@ -5,6 +5,7 @@ Measured figures come before formal ones, those of the bed before all others.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -99,6 +100,17 @@ def tiles_of(s: Summary, survey: Survey, compared: Plain, depth_m: Plain) -> lis
         accuracy_tile(s, compared),
         Tile("What to watch out for", notes=notes[:SHOWN_NOTES] or ["Nothing stood out."]),
     ]
+
+
+def in_short(tiles: Sequence[Tile]) -> str:
+    """Return the figures of `tiles_of` in a line, for the terminal."""
+    parts = []
+    for tile in tiles:
+        if tile.figures:
+            tag = f", {tile.tag}" if tile.tag else ""
+            figures = ", ".join(f"{name} {value}" for name, value in tile.figures)
+            parts.append(f"{tile.title[0].lower()}{tile.title[1:]}{tag}: {figures}")
+    return "; ".join(parts)
 
 
 def _moved(s: Summary) -> str:

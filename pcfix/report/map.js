@@ -42,11 +42,12 @@
   }
 
   /* The view: the cell at the upper left corner, and pixels of the page a cell. */
-  let shown = layers[0], cursor = null, view = { x: 0, y: 0, scale: 1 }, whole = 1;
+  let shown = layers[0], cursor = null, view = { x: 0, y: 0, scale: 1 }, whole = 1, moved = false;
   const size = () => [canvas.clientWidth, canvas.clientHeight];
   function fit() {
     const [width, height] = size();
     whole = Math.min(width / columns, height / rows) * 0.96;
+    moved = false;
     view = { scale: whole, x: (columns - width / whole) / 2, y: (rows - height / whole) / 2 };
     draw();
   }
@@ -55,11 +56,13 @@
     view.x += x / view.scale - x / scale;
     view.y += y / view.scale - y / scale;
     view.scale = scale;
+    moved = true;
     /* a finger moves the page until the map is larger than its frame */
     canvas.style.touchAction = scale > whole * 1.05 ? "none" : "pan-y";
     draw();
   }
   function pan(x, y) {
+    moved = true;
     const [width, height] = size();
     view.x = Math.min(Math.max(view.x - x / view.scale, -0.8 * width / view.scale), columns - 0.2 * width / view.scale);
     view.y = Math.min(Math.max(view.y - y / view.scale, -0.8 * height / view.scale), rows - 0.2 * height / view.scale);
@@ -242,9 +245,10 @@
   drawLegend();
   let wide = 0;
   new ResizeObserver(() => {
-    if (canvas.clientWidth === wide) { draw(); return; } /* a phone hides its bars while one scrolls */
+    /* a phone hides its bars while one scrolls: what was zoomed to stays */
+    if (moved && canvas.clientWidth === wide) draw();
+    else fit();
     wide = canvas.clientWidth;
-    fit();
   }).observe(canvas);
   window.addEventListener("beforeprint", () => { cursor = null; fit(); });
 })();

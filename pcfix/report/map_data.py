@@ -12,7 +12,8 @@ import numpy as np
 
 from pcfix.adjust.values import nice_step
 from pcfix.grid.colours import HEIGHT, stops_of
-from pcfix.grid.maps import Maps, contours_of, smoothed
+from pcfix.grid.contours import contours, depth_interval
+from pcfix.grid.maps import Maps, smoothed
 from pcfix.grid.model import NO_LIGHT, hillshade
 from pcfix.model import FloatArray
 
@@ -22,10 +23,9 @@ _STEPS = 32_000
 _SMALLEST_STEP = {"m": 0.001, "px": 0.001}
 """By unit; finer ones would only be noise that does not pack."""
 _COLOURS = 64
-_CONTOURS = 12
 _TICKS = 7
 SMOOTH_CELLS = 1.5
-"""Single cells are noisy: contours and shade are of a surface smoothed by this."""
+"""Single cells are noisy: the shade is of a surface smoothed by this."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def map_json(maps: Maps, layers: list[Layer]) -> str:
         "noData": _NO_DATA,
         "shade": _packed(shade),
         "layers": [_of_layer(layer) for layer in layers],
-        **next((_contours(layer) for layer in layers if layer.has_contours), _NO_CONTOURS),
+        **next((_contours(a, maps.uncertainty_m) for a in layers if a.has_contours), _NO_CONTOURS),
     }
     return json.dumps(data, allow_nan=False).replace("<", "\\u003c")
 
@@ -81,21 +81,14 @@ def map_json(maps: Maps, layers: list[Layer]) -> str:
 _NO_CONTOURS: dict[str, Any] = {"interval": 0, "contours": []}
 
 
-def contour_step(values: FloatArray) -> float:
-    """Return a round interval of contours: so many that they can be told apart."""
-    known = values[np.isfinite(values)]
-    return (
-        nice_step(float(np.ptp(np.percentile(known, [1, 99]))) / _CONTOURS) if known.size else 1.0
-    )
-
-
-def _contours(layer: Layer) -> dict[str, Any]:
-    step = contour_step(layer.values)
+def _contours(layer: Layer, uncertainty_m: FloatArray) -> dict[str, Any]:
+    """Return lines whose places count from the corner of the map."""
+    interval = depth_interval(layer.values, uncertainty_m)
     lines = [
-        {"level": level, "line": np.round(line, 1).ravel().tolist()}
-        for level, line in contours_of(layer.values, step, SMOOTH_CELLS)
+        {"level": level, "line": np.round(place + 0.5, 1).ravel().tolist()}
+        for level, place in contours(layer.values, interval)
     ]
-    return {"interval": step, "contours": lines}
+    return {"interval": interval, "contours": lines}
 
 
 def relief(height_m: FloatArray, cell_m: float) -> FloatArray:

@@ -21,6 +21,7 @@ from pcfix.model import FloatArray
 from pcfix.report.map_data import Layer, map_json
 
 if TYPE_CHECKING:
+    from jinja2 import Environment
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -187,12 +188,11 @@ def _as_read(value: Any) -> Any:
     return "-" if value is None else value
 
 
-def render(report: Report) -> str:
-    """Return the page: no address outside it is used, and it works without scripts too."""
+def environment() -> Environment:
+    """Return how templates are filled: what is put in is escaped."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
 
-    environment = Environment(
+    return Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
         undefined=StrictUndefined,
@@ -200,6 +200,16 @@ def render(report: Report) -> str:
         lstrip_blocks=True,
         finalize=_as_read,
     )
-    return environment.get_template("page.html.j2").render(
-        report=report, figures=FIGURES, map_data=Markup(map_json(report.maps, report.layers))
+
+
+def render(report: Report) -> str:
+    """Return the page: no address outside it is used, and it works without scripts too."""
+    from markupsafe import Markup
+
+    return (
+        environment()
+        .get_template("page.html.j2")
+        .render(
+            report=report, figures=FIGURES, map_data=Markup(map_json(report.maps, report.layers))
+        )
     )

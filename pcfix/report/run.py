@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.grid.colours import DEPTH, DIFFERENCE, HEIGHT, RAYS, UNCERTAINTY
-from pcfix.grid.maps import Extent, Maps, contours_of
+from pcfix.grid.contours import contours, depth_interval
+from pcfix.grid.maps import Extent, Maps
 from pcfix.model import BoolArray, Cameras, FloatArray, WaterPlane, WaterSurface
 from pcfix.refract.tally import COVERAGE_95, ORDERS, Summary, largest_tvu_m
 from pcfix.report.adjustment_text import WHERE, all_notes, fixed, lens_label, listed, short
 from pcfix.report.first_screen import Survey, head_of, notes_of, tiles_of
-from pcfix.report.map_data import SMOOTH_CELLS, Layer, contour_step, relief
+from pcfix.report.map_data import Layer, relief
 from pcfix.report.page import (
     AFTER,
     BEFORE,
@@ -228,7 +229,7 @@ def _pictures(corrected: Corrected) -> list[Picture]:
             "depth", "Depth",
             f"Map of the corrected depth over the shaded relief; {depth['min']:.2f} to"
             f" {depth['max']:.2f} m, mean {depth['mean']:.2f} m; contours every"
-            f" {contour_step(maps.depth_m):g} m.",
+            f" {depth_interval(maps.depth_m, maps.uncertainty_m):g} m.",
             map_figure(maps, maps.depth_m, "Depth (m)", DEPTH),
         ),
         Picture(
@@ -259,9 +260,9 @@ def map_figure(maps: Maps, values: FloatArray, label: str, ramp: str) -> Figure:
     axes.imshow(shade, extent=maps.extent_m, cmap="gray", vmin=0.0, vmax=1.0)
     image = axes.imshow(values, extent=maps.extent_m, cmap=ramp, alpha=0.75)
     if ramp == DEPTH:
-        for _, line in contours_of(values, contour_step(values), SMOOTH_CELLS):
-            x = maps.west_m + line[:, 0] * maps.cell_m
-            axes.plot(x, maps.north_m - line[:, 1] * maps.cell_m, color=REFERENCE, linewidth=0.5)
+        for _, place in contours(values, depth_interval(values, maps.uncertainty_m)):
+            x, y = (place + 0.5).T * maps.cell_m  # from the corner of the map
+            axes.plot(maps.west_m + x, maps.north_m - y, color=REFERENCE, linewidth=0.5)
     figure.colorbar(image, ax=axes, label=label, shrink=0.9)
     return figure
 

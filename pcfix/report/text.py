@@ -32,6 +32,11 @@ def summary_text(summary: Summary) -> str:
         f"corrected    {s.corrected:,} ({share(s.corrected, s.submerged)} of the submerged)",
     ]
     lines[2:2] = _carried(s)
+    if 2 * s.corrected < s.submerged:
+        lines[:0] = [
+            f"WARNING      only {s.corrected:,} of {s.submerged:,} submerged points were corrected"
+            f" ({share(s.corrected, s.submerged)}): see below why"
+        ]
     for reason, count in s.uncorrected.items():
         if count:
             lines.append(f"  not        {count:,}: {reason} ({_FATE[s.settings['uncorrected']]})")
@@ -63,6 +68,7 @@ def summary_text(summary: Summary) -> str:
         *_index(s),
         *_water_fit(s),
         *shoreline_lines(s.shoreline),
+        *([] if s.fit is None or not s.cameras else [f"fit          {s.fit['words']}"]),
         *([] if s.poses is None else [f"poses        {s.poses['words']}"]),
         *_uncertainty(s),
     ]
@@ -75,11 +81,16 @@ def _cameras(s: Summary) -> list[str]:
             "cameras      none: a corrected point has a ray count of 1 and an incidence of 0, and"
             " which images made it, or were hidden, is not known"
         ]
-    unused = len(s.cameras_unused)
-    names = ", ".join(s.cameras_unused[:5]) + (", ..." if unused > 5 else "")
+    left_out = [name for names in s.cameras_left_out.values() for name in names]
+    blind = [name for name in s.cameras_unused if name not in left_out]
+    unused = {f"see the bed {why}": names for why, names in s.cameras_left_out.items()}
+    unused |= {"see no corrected point": blind} if blind else {}
     return [
         f"cameras      {s.cameras_used} of {s.cameras} used"
-        + (f"; {unused} see no corrected point: {names}" if unused else ""),
+        + "".join(
+            f"; {len(names)} {why}: {', '.join(names[:5])}{', ...' if len(names) > 5 else ''}"
+            for why, names in unused.items()
+        ),
         f"rays         {s.rays:,} ({s.rays / max(s.corrected, 1):.1f} a point, incidence up to"
         f" {s.incidence_deg:.0f} degrees)",
     ]
@@ -89,8 +100,19 @@ def _head(s: Summary | LabelSummary | CleanSummary) -> list[str]:
     rate = s.points / max(s.seconds, 1e-9)
     return [
         f"{s.input} -> {s.output}",
-        f"points       {s.points:,} in {s.seconds:.1f} s ({rate:,.0f} points/s)",
+        f"points       {s.points:,}{_of_whole(getattr(s, 'part', None))} in {s.seconds:.1f} s"
+        f" ({rate:,.0f} points/s)",
     ]
+
+
+def _of_whole(part: dict[str, Any] | None) -> str:
+    """Say of how many points a part was read, and which."""
+    if part is None:
+        return ""
+    box, step = part["bounds"], part["read_resolution"]
+    words = [] if box is None else ["within " + ",".join(f"{one:.12g}" for one in box)]
+    words += [] if step is None else [f"at a resolution of {step:g} m"]
+    return f" of {part['of']:,}, those {' '.join(words)},"
 
 
 def shoreline_lines(found: dict[str, Any] | None) -> list[str]:
@@ -351,7 +373,8 @@ def dsm_text(summary: DsmSummary) -> str:
     chosen = ", chosen for 2 to 4 points each" if s.resolution_is == "chosen" else ""
     lines = [
         f"{s.input} -> {s.output}",
-        f"points       {s.points_used:,} of {s.points:,} ({wanted}) in {s.seconds:.1f} s",
+        f"points       {s.points_used:,} of {s.points:,}{_of_whole(s.part)} ({wanted}) in"
+        f" {s.seconds:.1f} s",
         f"raster       {s.width:,} x {s.height:,} cells of {s.settings['resolution']:g} m{chosen},"
         f" {s.settings['method']}",
         f"{s.what:<12} {low:.4g} to {high:.4g}, mean {mean:.4g}"

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import NOISE_CLASSES, FloatArray, WaterPlane
 from pcfix.water import search
-from pcfix.water.cues import gain_of
+from pcfix.water.cues import SLOPE, gain_of
 from pcfix.water.fit import fit_water
 from pcfix.water.samples import Samples, layer_gain, sample_cloud
 from pcfix.water.search import INSTEAD, LAYER, Looked, Peak, judge
@@ -87,6 +87,60 @@ def find_water(
         if water.sum() >= LEAST_CLASSIFIED:
             return _from_classes(points[water], samples)
     return _from_cues(samples)
+
+
+APART_M, APART_SIGMAS = 0.5, 3.0
+"""By how much a level must miss the shoreline of a cloud to be worth a word."""
+LEAST_AGAINST, SURE_AGAINST = 100.0, 0.8
+"""Evidence of colours alone, and confidence of slope and colours together, that stands against a
+level that was given: more than is asked of a level where there is none, as none may be wrong."""
+
+
+def find_elsewhere(
+    xyz: FloatArray, water_m: FloatArray, rgb: npt.NDArray[Any] | None
+) -> WaterProposal | None:
+    """Return the water that a cloud shows at another height than that which was given, if any.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 3)
+        Apparent points, metres, world frame.
+    water_m : array, shape (n,)
+        Height of the given water surface above each.
+    rgb : array, shape (n, 3), or None
+
+    Returns
+    -------
+    WaterProposal or None
+        With heights above the given surface; None where the cloud shows it there, or nothing.
+        Only where another height gains most is it looked at as closely as `find_water` does.
+    """
+    samples = sample_cloud(np.column_stack([xyz[:, :2], xyz[:, 2] - water_m]), rgb, None)
+    heights = search.all_heights(samples)
+    if np.ptp(heights) < LEAST_RELIEF_M:
+        return None
+    whole = search.look(samples, heights, search.NO_TILT)
+    gain = search.gains(whole, search.NO_TILT)
+    here = gain[np.abs(heights + samples.origin[2]) <= APART_M].max(initial=0.0)
+    best = int(np.argmax(gain))
+    slope = next((gain_of(sums) for cue, sums in whole.cues if cue == SLOPE), None)
+    lifted = slope is not None and (
+        slope.gain[best] >= search.LEAST_EACH
+        and search.LIFTS[0] <= slope.amplitude[best] <= search.LIFTS[1]
+    )
+    few = gain[best] < (search.LEAST_AGREED if lifted else LEAST_AGAINST)
+    if few or here > search.MOST_RIVAL_AGREED * gain[best]:
+        return None
+    try:
+        found = _from_cues(samples)
+    except GeometryError:
+        return None
+    apart = abs(found.level_m) > max(APART_M, APART_SIGMAS * found.sigma_level_m)
+    alone = found.evidence["total gain"] >= LEAST_AGAINST
+    sure = alone or (
+        found.confidence >= SURE_AGAINST and f"{SLOPE.name} amplitude" in found.evidence
+    )
+    return found if apart and sure else None
 
 
 def _column(

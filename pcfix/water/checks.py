@@ -19,12 +19,16 @@ from pcfix.model import (
     WaterRaster,
     WaterSurface,
 )
+from pcfix.sums import Sums
 from pcfix.water.surface import surface_above
 
 MOST_TILT = 0.05
 """Rise per metre of a whole surface. Rapids reach 2 %; a weir is steeper, but only in part."""
 DEEPEST_M = 100.0
 """No photograph shows a bed as deep as this."""
+DOUBTFUL_M, TOO_DEEP_M, DEEP_SHARE = 30.0, 60.0, 0.05
+"""Through clear water photographs show a bed down to the first; nobody has reported the second.
+More than this share of the points must be so deep, as a few may be mismatches."""
 FOOT_M = 0.3048
 CLEARLY_OFF_M = 10.0
 _ENOUGH_HEIGHTS = 200_000
@@ -168,11 +172,20 @@ def _tilt_of(xyz: FloatArray) -> float:
     return float(np.hypot(*slope))
 
 
-class WaterMeeting:
+class WaterMeeting(Sums):
     """How cloud and water lie to each other, added up chunk by chunk."""
 
-    def __init__(self, water: WaterSurface) -> None:
-        self._water = water
+    added = (
+        *("_points", "_submerged", "_uncovered", "_uncovered_low"),
+        *("_doubtful", "_too_deep"),
+    )
+    least = ("_low_m", "_least_depth_m", "_lowest_water_m")
+    most = ("_high_m", "_most_depth_m")
+
+    def __init__(self, water: WaterSurface, *, deep: bool = False) -> None:
+        self._water, self._may_be_deep = water, deep
+        self._doubtful = self._too_deep = 0
+        self._most_depth_m = 0.0
         self._highest_m = _highest(water)
         self._points = self._submerged = self._uncovered = self._uncovered_low = 0
         self._low_m, self._high_m = np.inf, -np.inf
@@ -189,6 +202,9 @@ class WaterMeeting:
         depth = correction.depth_m[correction.submerged]
         self._submerged += len(depth)
         self._least_depth_m = min(self._least_depth_m, float(depth.min(initial=np.inf)))
+        self._doubtful += int((depth > DOUBTFUL_M).sum())
+        self._too_deep += int((depth > TOO_DEEP_M).sum())
+        self._most_depth_m = max(self._most_depth_m, float(depth.max(initial=0.0)))
         self._uncovered += int(unknown.sum())
         self._uncovered_low += int((z[unknown] < self._highest_m).sum())
 
@@ -208,7 +224,8 @@ class WaterMeeting:
         Raises
         ------
         GeometryError
-            If all points lie deeper than `DEEPEST_M`.
+            If all points lie deeper than `DEEPEST_M`, or many deeper than `TOO_DEEP_M` where that
+            was not allowed.
         """
         if self._submerged == self._points and self._least_depth_m > DEEPEST_M:
             raise GeometryError(
@@ -216,14 +233,35 @@ class WaterMeeting:
                 f" ({self._water}), the highest {self._least_depth_m:.0f} m{self._heights()}; check"
                 " the water's height, and that it has the cloud's vertical datum."
             )
+        self.notes = []
+        self._check_depths(name)
         if self._uncovered_low:
-            self.notes = [
+            self.notes += [
                 f"{name}: the water surface ({self._water}) does not cover"
                 f" {100.0 * self._uncovered / self._points:.1f} % of the points; of these"
                 f" {self._uncovered_low:,} lie lower than its highest place and may be under water,"
                 " but are not touched."
             ]
-            warnings.warn(self.notes[0], PcfixWarning, stacklevel=2)
+        for note in self.notes:
+            warnings.warn(note, PcfixWarning, stacklevel=2)
+
+    def _check_depths(self, name: str) -> None:
+        """Refuse, or note, depths that are not seen through water."""
+        least = DEEP_SHARE * self._submerged
+        deepest = f"the deepest {self._most_depth_m:.0f} m below the water ({self._water})"
+        land = "" if self._submerged < self._points else "; no point is left as land"
+        why = f"{deepest}{land}{self._heights()}: check the water's height and its vertical datum"
+        if self._too_deep > least and not self._may_be_deep:
+            raise GeometryError(
+                f"{name}: {self._too_deep:,} of {self._submerged:,} submerged points lie deeper"
+                f" than {TOO_DEEP_M:g} m, which no photograph shows, {why}, or say --deep if that"
+                " is right."
+            )
+        if self._doubtful > least:
+            self.notes = [
+                f"{name}: {self._doubtful:,} of {self._submerged:,} submerged points lie deeper"
+                f" than {DOUBTFUL_M:g} m, which photographs hardly ever show, {why}."
+            ]
 
     def _heights(self) -> str:
         """Return between which heights the cloud lies, and whether one of the two is in feet."""

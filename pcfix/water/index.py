@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar, get_args
 
@@ -165,6 +166,11 @@ def index_of(given: float | str | None, formula: IndexFormula = "skarlatos") -> 
         return DEFAULT_REFRACTIVE_INDEX, ""
     text = str(given).strip().lower()
     water = WATERS.get(text)
+    if re.fullmatch(r"1,\d+", text):
+        raise SettingError(
+            f"index '{given}' has a decimal comma: write {text.replace(',', '.')}; a water of 1 PSU"
+            f" at {text[2:]} degrees is {text.replace(',', '.0,')}."
+        )
     try:
         if water is None and "," in text:
             water = Water(*(float(word) for word in text.split(",")))

@@ -10,6 +10,7 @@ of five million.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -142,52 +143,74 @@ def is_submerged(z: FloatArray, surface: SurfaceAbove) -> BoolArray:
 
 
 class Field(NamedTuple):
-    """The numbers of the lookup; see `build_field`.
+    """The numbers of the lookup in one of k rasters; see `build_field`.
 
-    heights : shape (rows, columns), metres, northern row first.
-    west_x, north_y : the centre of the upper left cell, world frame.
-    cell_x, cell_y : width and height of a cell, metres.
+    heights : shape (cells,), metres, of all rasters, row by row, northern row first.
+    shape : shape (k, 3), where the cells of each begin, its rows and its columns.
+    frame : shape (k, 4), x and y of the centre of the upper left cell of each, world frame, and
+    width and height of a cell, metres; NaN where there is no raster.
+    which : the raster that is meant.
     """
 
     heights: FloatArray
-    west_x: float
-    north_y: float
-    cell_x: float
-    cell_y: float
+    shape: IntArray
+    frame: FloatArray
+    which: int
 
 
 @lru_cache(maxsize=4)
 def build_field(raster: WaterRaster) -> Field:
     """Return a raster as the kernels take it."""
-    width, height = (float(side) for side in raster.cell_m)
-    return Field(
-        np.ascontiguousarray(raster.height_m, np.float64),
-        float(raster.left_m) + width / 2.0,
-        float(raster.top_m) - height / 2.0,
-        width,
-        height,
-    )
+    return build_fields({0: raster}, 1)
+
+
+def build_fields(
+    rasters: Mapping[int, WaterRaster], k: int, common: WaterRaster | None = None
+) -> Field:
+    """Return the rasters of some of k images, by their rows, and what the others have in common."""
+    shape, frame = np.zeros((k, 3), np.int64), np.full((k, 4), np.nan)
+    cells, count = list[FloatArray](), 0
+    for raster in dict.fromkeys([*rasters.values(), common]):
+        if raster is not None:
+            images = [c for c in range(k) if rasters.get(c, common) is raster]
+            width, height = (float(side) for side in raster.cell_m)
+            west, north = raster.left_m + width / 2.0, raster.top_m - height / 2.0
+            shape[images] = count, *raster.height_m.shape
+            frame[images] = west, north, width, height
+            cells.append(np.ascontiguousarray(raster.height_m, np.float64).ravel())
+            count += raster.height_m.size
+    heights = cells[0] if len(cells) == 1 else np.concatenate([np.zeros(0), *cells])
+    return Field(heights, shape, frame, 0)
+
+
+@lean
+def patch_at(field: Field, x: float, y: float) -> tuple[float, float, float, float, float, float]:
+    """Return z00, s, t, both differences and k at a plan position (world frame); NaN if not known.
+
+    In the outer half of the cells at the edge the outermost patch goes on.
+    """
+    k, shape, frame = field.which, field.shape, field.frame
+    first, rows, columns = shape[k, 0], shape[k, 1], shape[k, 2]
+    u, v = (x - frame[k, 0]) / frame[k, 2], (frame[k, 1] - y) / frame[k, 3]
+    if not (-0.5 <= u <= columns - 0.5 and -0.5 <= v <= rows - 0.5):
+        return np.nan, 0.0, 0.0, 0.0, 0.0, 0.0
+    column = min(max(int(np.floor(u)), 0), columns - 2)
+    row = min(max(int(np.floor(v)), 0), rows - 2)
+    at = first + row * columns + column
+    z = field.heights[at]
+    east = field.heights[at + 1] - z
+    south = field.heights[at + columns] - z
+    twist = field.heights[at + columns + 1] - z - east - south
+    return z, u - column, v - row, east, south, twist
 
 
 @lean
 def height_at(field: Field, x: float, y: float) -> tuple[float, float, float]:
-    """Return height, dz/dx and dz/dy at a plan position (world frame); NaN where not known.
-
-    In the outer half of the cells at the edge the outermost patch goes on.
-    """
-    rows, columns = field.heights.shape
-    u, v = (x - field.west_x) / field.cell_x, (field.north_y - y) / field.cell_y
-    if not (-0.5 <= u <= columns - 0.5 and -0.5 <= v <= rows - 0.5):
-        return np.nan, 0.0, 0.0
-    column = min(max(int(np.floor(u)), 0), columns - 2)
-    row = min(max(int(np.floor(v)), 0), rows - 2)
-    s, t = u - column, v - row
-    z = field.heights[row, column]
-    east = field.heights[row, column + 1] - z
-    south = field.heights[row + 1, column] - z
-    twist = field.heights[row + 1, column + 1] - z - east - south
+    """Return height, dz/dx and dz/dy at a plan position (world frame); NaN where not known."""
+    z, s, t, east, south, twist = patch_at(field, x, y)
     height = z + s * east + t * south + s * t * twist
-    return height, (east + t * twist) / field.cell_x, -(south + s * twist) / field.cell_y
+    cell_x, cell_y = field.frame[field.which, 2], field.frame[field.which, 3]
+    return height, (east + t * twist) / cell_x, -(south + s * twist) / cell_y
 
 
 def heights_above(field: Field, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -203,6 +226,13 @@ def _set_heights(
 ) -> None:
     for i in range(*span):
         height[i], slope[i, 0], slope[i, 1] = height_at(field, x[i], y[i])
+
+
+class OwnWater(NamedTuple):
+    """The water of each image where images have one of their own, and its standard error."""
+
+    heights: Field
+    sigma: Field
 
 
 EDGE_TOLERANCE = 1e-9  # of a barycentric coordinate: a point on an edge belongs to both sides

@@ -19,6 +19,7 @@ from pcfix.kernels import threads
 from pcfix.model import WaterMesh, WaterPlane, WaterRaster
 from tests.utils.adjust_twin import Twin
 from tests.utils.curved_water import under_bent_water
+from tests.utils.nightly import mostly_nightly
 from tests.utils.tie_blocks import block_of
 from tests.utils.tie_points import simulate_tie_points
 
@@ -181,7 +182,7 @@ def test_same_as_scipy():
             assert abs(row.added - value) < 1e-3 * row.sigma
 
 
-@pytest.mark.parametrize("kind", ["raster", "mesh"])
+@pytest.mark.parametrize("kind", mostly_nightly(["raster", "mesh"], "mesh"))
 def test_points_on_a_level_raster_or_mesh(kind):
     made = scene(90)
     made, conditions = put(made, {"water": (np.arange(8), at_level(made))})

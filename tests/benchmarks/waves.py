@@ -6,6 +6,8 @@ python -m tests.benchmarks.waves [--frames 24] [--slopes 1 2 5]
 from __future__ import annotations
 
 import argparse
+import itertools
+import shutil
 import tempfile
 import warnings
 from pathlib import Path
@@ -54,19 +56,14 @@ def sequence(folder, camera, sea, frames, start_s=0.0):
     )  # fmt: skip
 
 
-def through(xy, camera, water):
-    """Return where a wet ray to places of the surface comes from and goes to, by a raster or 0."""
-    height, slope = np.zeros(len(xy)), np.zeros((len(xy), 2))
-    if water is not None:
-        height, slope = surface_above(water, np.column_stack([xy, height]))
-    start = np.column_stack([xy, height])
-    ray = start - camera.centre
-    ray /= np.linalg.norm(ray, axis=1)[:, None]
-    normal = np.column_stack([-slope, np.ones(len(xy))])
-    normal /= np.linalg.norm(normal, axis=1)[:, None]
-    cosine = -(ray * normal).sum(axis=1)
-    bend = cosine / 1.34 - np.sqrt(1.0 - (1.0 - cosine**2) / 1.34**2)
-    return start, ray / 1.34 + bend[:, None] * normal
+def apparent(places, cameras, sea, time_s):
+    """Return where straight rays to places of the sea's surface meet, two each."""
+    pairs = []
+    for xy, camera in zip(places, cameras, strict=True):
+        ray = np.column_stack([xy, sea.at(xy, time_s)[0]]) - camera.centre
+        ray /= np.linalg.norm(ray, axis=1)[:, None]
+        pairs.append((np.broadcast_to(camera.centre, ray.shape), ray))
+    return met(pairs)
 
 
 def met(pairs):
@@ -136,20 +133,17 @@ def measured(degrees, frames, folder):
     bed = np.column_stack([bed, np.full(800, -DEPTH_M)])
     places = [crossing(bed, camera, sea, time) for camera in (left, right)]
     both = np.isfinite(places[0] + places[1]).all(axis=1)
+    points = apparent([place[both] for place in places], (left, right), sea, time)
+    own = folder / "own"
+    (own / "sigma").mkdir(parents=True)
+    for side, part in itertools.product(("left", "right"), (".", "sigma")):
+        shutil.copy(folder / side / "calm_water" / part / name, own / part / f"{side}.tif")
+    centres = np.array([left.centre, right.centre])
+    block = pcfix.Cameras(("left", "right"), centres, np.array([DOWN, DOWN]), (LENS, LENS))
     rmse = []
-    for waters in (
-        [None, None],
-        [read_water_raster(folder / s / "calm_water" / name) for s in ("left", "right")],
-    ):
-        pairs = []
-        for place, camera, water in zip(places, (left, right), waters, strict=True):
-            flat = place[both]
-            if water is None:  # where the ray of the image point meets the level
-                height = sea.at(flat, time)[0]
-                ray = np.column_stack([flat, height]) - camera.centre
-                flat = camera.centre[:2] + (-10.0 / ray[:, 2])[:, None] * ray[:, :2]
-            pairs.append(through(flat, camera, water))
-        rmse.append(np.sqrt(np.mean((met(pairs)[:, 2] + DEPTH_M) ** 2)))
+    for way in ({"camera_set": "all"}, {"water_per_image": own}):
+        found = pcfix.correct_points(points, block, 0.0, method="consistent", **way)
+        rmse.append(np.sqrt(np.mean((found.xyz[found.corrected, 2] + DEPTH_M) ** 2)))
     ground = Ground(np.full((80, 80), -DEPTH_M), -10.0, 10.0, 0.25)
     dry, _ = rendered(left, Relief(np.full((80, 80), -DEPTH_M), -10.0, 10.0, 0.25), TEXTURE)
     photos = []

@@ -164,7 +164,7 @@ def test_m3c2_takes_fewer_core_points_and_says_nothing(tmp_path, capfd, monkeypa
 
 def test_without_py4dgeo_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "py4dgeo", None)
-    with pytest.raises(pcfix.SettingError, match=r"pip install 'pcfix\[m3c2\]'"):
+    with pytest.raises(pcfix.SettingError, match=r"pip install .*\[m3c2\]'"):
         compare_clouds(SCENE / "cloud.laz", LIDAR, m3c2=True)
 
 

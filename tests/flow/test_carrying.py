@@ -16,6 +16,7 @@ from pcfix.flow.old_cameras import paired, told_apart
 from pcfix.flow.run import Request, request_of
 from pcfix.model import Cameras, Outcome, Views
 from pcfix.report.text import summary_text
+from tests.utils.beyond_frames import BEYOND_FRAMES, DEEP
 from tests.utils.clouds import (
     CAMERA_HEIGHT_M,
     EAST_M,
@@ -31,6 +32,8 @@ from tests.utils.clouds import (
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
+
+pytestmark = BEYOND_FRAMES
 
 FREE, free = needs("rendered_a_free")
 TRUE, true = needs("rendered_a")
@@ -267,11 +270,12 @@ def test_undistorted_images_are_refused(old):
         paired(replace(old, lenses=cut), old)
 
 
+@DEEP
 def test_one_image_far_off_is_warned_of(cloud, old):
     centres = old.centres.copy()
     centres[4] += [0.2 * CAMERA_HEIGHT_M, 0.0, 0.0]
     with pytest.warns(PcfixWarning, match="1 of 9 images were moved by more than a tenth"):
-        correct(cloud, cameras=old, adjusted_from=replace(old, centres=centres))
+        correct(cloud, cameras=old, adjusted_from=replace(old, centres=centres), deep=True)
 
 
 def test_a_port_and_the_tracks_of_the_adjusted_model_are_refused(cloud, old, tmp_path):

@@ -89,6 +89,7 @@ def test_without_refraction_there_is_nothing_to_absorb():
 def test_the_command_and_its_files(monkeypatch, folder, plan):
     monkeypatch.setattr(pcfix, "plan_flight", lambda *, options, progress: plan, raising=False)
     done = run_pcfix("plan", "--area", 60, 40, "--lens", "8.8,13.2,8.8,5472")
+    assert done.returncode == 0, done.stderr
     assert done.stdout == plan_text(plan) + "\n"
     assert "50 m above the water over 60 x 40 m: 28 images" in done.stdout
     assert (folder / "plan.png").read_bytes()[:4] == b"\x89PNG"

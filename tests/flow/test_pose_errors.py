@@ -27,10 +27,13 @@ from pcfix.refract.pose_errors import pose_errors_of
 from pcfix.report.text import summary_text
 from pcfix.simulate.tracing import piercing_points, project, triangulate
 from pcfix.water.surface import surface_above
+from tests.utils.beyond_frames import BEYOND_FRAMES
 from tests.utils.clouds import WATER_M, cameras_csv, framed_block, write_cloud
 from tests.utils.tie_blocks import block_of, some_ties
 from tests.utils.tie_points import simulate_tie_points
 from tests.utils.unaware_blocks import parted
+
+pytestmark = BEYOND_FRAMES
 
 
 @pytest.fixture(autouse=True)

@@ -20,7 +20,8 @@ import shapely
 
 import pcfix
 from pcfix.errors import SettingError
-from pcfix.flow.run import Request, request_of, run_all
+from pcfix.flow.record import STEPS, Record
+from pcfix.flow.run import Request, _since, request_of, run_all
 from pcfix.grid.colours import DEPTH, stops_of
 from pcfix.io import geopackage
 from pcfix.io.rasters import values_at
@@ -268,12 +269,65 @@ def test_a_run_resumes_where_a_file_is_missing(copied):
 def test_another_request_does_not_replace_a_run_unasked(copied):
     done = run(copied, *WORDS, "--index", "1.33")
     assert done.returncode == 1
-    assert "--overwrite" in done.stderr
+    assert "holds a run with another --index; add --overwrite" in done.stderr
     done = run(copied, *WORDS, "--index", "1.33", "--overwrite")
     assert (done.returncode, done.stderr) == (0, "")
     assert "done before" not in done.stdout
     record = json.loads((copied / "out" / "run.json").read_text())
     assert record["request"]["index"] == 1.33
+
+
+@pytest.mark.parametrize(
+    ("more", "first", "changed"),
+    [
+        (["--project", "Lake <2>", "--date", "2024-06-01"], "report", "--project, --date"),
+        (["--sigma-reference", "0.05"], "compare", "--sigma-reference"),
+        (["--resolution", "2"], "dsm", "--resolution"),
+    ],
+)
+def test_another_option_redoes_what_depends_on_it(copied, more, first, changed):
+    done = run(copied, *WORDS, *more)
+    assert (done.returncode, done.stderr) == (0, "")
+    said, *lines = done.stdout.splitlines()
+    assert said.split() == [
+        "changed", *f"{changed}: {first} and what follows is done anew,".split(),
+        *["what", "comes", "before", "is", "kept"],
+    ]  # fmt: skip
+    again = [line.split()[0] for line in lines if "done before" not in line]
+    assert again == ["correct", "clean", "dsm", "compare", "map", "report"][-len(again) :]
+    assert again[0] == first
+    accuracy = "accuracy of the bed, measured: bias"
+    assert lines[-1].startswith("report    done: out/report.html: depth: range 0.")
+    assert accuracy in lines[-1]
+    assert ("Lake &lt;2&gt;" in (copied / "out" / "report.html").read_text()) is (first == "report")
+
+
+def test_a_reference_that_is_added_is_compared_with(finished, tmp_path):
+    request = request_of(finished[0] / "run.json")
+    files = request.files()
+    touched = tmp_path / "lidar.laz"
+    shutil.copy(SCENE / "lidar.laz", touched)
+
+    def record(**other):
+        later = {"reference": str(touched), **other}
+        read = {**files, "compare": [touched] if later["reference"] else []}
+        return Record(tmp_path / "run.json", {**request.record(), **later}, read, _since)
+
+    before = record(reference=None)
+    for name in ("adjust", "correct", "clean", "dsm", "map", "report"):
+        before.step(name, [], lambda: None)
+    added = record()
+    assert (added.changed, added.first, added.resumes) == (["--reference"], "compare", True)
+    done = {name: added.step(name, [], lambda: None)[1] for name in STEPS}
+    assert [name for name, kept in done.items() if kept] == ["adjust", "correct", "clean", "dsm"]
+    assert (record().changed, record().first) == ([], None)
+    os.utime(touched)
+    assert (record().changed, record().first) == (["lidar.laz"], "compare")
+    other = record(uncorrected="drop")
+    assert (other.first, other.resumes) == ("correct", False)
+    assert other.step("adjust", [], lambda: None)[1]
+    for name in ("index", "water", "gnss"):
+        assert record(**{name: "1.33"}).first == "adjust"
 
 
 def test_a_record_repeats_its_run(finished, tmp_path):

@@ -30,12 +30,13 @@ from tests.utils.program import run_pcfix
 
 
 def first_step(request, folder):
-    return adjust_first(request.adjust_step(), folder, request.files())
+    inputs = [path for some in request.files().values() for path in some]
+    return adjust_first(request.adjust_step(), folder, inputs)
 
 
 ORIGIN_M = (319900.0, 3842700.0, 0.0)
 GSD_M = 0.05
-STEPS = ["adjust", "correct", "clean", "dsm", "compare", "report"]
+STEPS = ["adjust", "correct", "clean", "dsm", "compare", "map", "report"]
 pytestmark = pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from pathlib import Path
 
 import laspy
 import numpy as np
@@ -155,3 +156,23 @@ def test_command_line_and_python_give_the_same_file(folder, needed, tmp_path):
 
 def test_a_whole_run_has_the_option():
     assert RunOptions(unsure="withhold").part(CorrectOptions).unsure == "withhold"
+
+
+@pytest.mark.parametrize(
+    ("more", "why"),
+    [({"max_angle": 15}, "beyond 15 degrees alone"), ({"max_cameras": 2}, "but are not chosen")],
+)
+def test_what_left_a_camera_out_is_said(tmp_path, more, why):
+    scene = Path(__file__).parents[2] / "samples" / "scene"
+    cloud, cameras = laspy.read(scene / "cloud.laz"), pcfix.read_cameras(scene / "cameras.csv")
+    found = pcfix.correct_file(
+        scene / "cloud.laz", tmp_path / "out.laz", cameras=scene / "cameras.csv", water=0.37,
+        method="snell", **more,
+    )  # fmt: skip
+    assert found.cameras_left_out == {why: found.cameras_unused}  # the frames overlap the bed
+    bed = cloud.xyz[cloud.xyz[:, 2] < 0.37]
+    for label in found.cameras_unused:
+        across, along, up = (cameras.centres[cameras.labels.index(label)] - bed).T
+        steepest = np.degrees(np.arctan2(np.hypot(across, along), up)).min()
+        assert steepest > 15.0 or "max_angle" not in more
+    assert f"; {len(found.cameras_unused)} see the bed {why}: IMG_0001" in summary_text(found)

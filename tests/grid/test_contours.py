@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pcfix.grid.contours import contours, interval_of
+from pcfix.grid.contours import contours, depth_interval, interval_of
 
 
 def test_rings_of_a_cone():
@@ -30,3 +30,10 @@ def test_rings_of_a_cone():
 )
 def test_interval(height, least, expected):
     assert interval_of(height, least) == pytest.approx(expected)
+
+
+def test_depths_have_no_lines_closer_than_they_are_known():
+    depth, unknown = np.array([[0.0, 1.0], [np.nan, 12.0]]), np.array([np.nan, 1.5, 1.5])
+    assert depth_interval(depth, np.zeros(0)) == 1.0
+    assert depth_interval(depth, unknown) == 2.0
+    assert depth_interval(np.full((2, 2), np.nan), unknown) == 2.0

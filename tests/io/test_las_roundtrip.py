@@ -15,7 +15,9 @@ from laspy.vlrs.vlrlist import VLRList
 
 import pcfix
 from pcfix import PcfixError
+from pcfix.errors import GeometryError
 from pcfix.io.las.columns import COLUMNS, UNSURE, UPGRADE
+from tests.utils.beyond_frames import BEYOND_FRAMES, DEEP
 from tests.utils.clouds import (
     CAMERA_HEIGHT_M,
     EAST_M,
@@ -37,6 +39,8 @@ from tests.utils.clouds import (
     write_cloud,
     xyz_of,
 )
+
+pytestmark = [BEYOND_FRAMES, DEEP]
 
 BATHYMETRIC_POINT = 40
 ALL = ["ShiftX", "ShiftY", "ShiftZ", "WaterDepth", "RayMiss", "SigmaZ", "Incidence", "RayCount"]
@@ -484,13 +488,12 @@ class TestUncorrectedPoints:
         assert summary.corrected == summary.submerged - stuck.sum()
 
 
-def test_points_with_parallel_rays_only_are_not_moved(tmp_path: Path) -> None:
+def test_points_with_parallel_rays_alone_cannot_be_corrected(tmp_path: Path) -> None:
     source = write_cloud(tmp_path / "cloud.las", 3)
     one = block().centres[4]
-    trip = round_trip(source, cameras=Cameras(("a", "b"), np.array([one, one])))
-    np.testing.assert_array_equal(xyz_of(trip.after), xyz_of(trip.before))
-    assert fields(trip.after)["withheld"][submerged(trip.before)].all()
-    assert trip.back.read_bytes() == source.read_bytes()
+    with pytest.raises(GeometryError, match=r"can be corrected .*: rays nearly parallel"):
+        round_trip(source, cameras=Cameras(("a", "b"), np.array([one, one])))
+    assert [path.name for path in tmp_path.iterdir()] == ["cloud.las"]
 
 
 @pytest.mark.parametrize("number", [2, 7])

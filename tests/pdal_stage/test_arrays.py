@@ -14,8 +14,11 @@ import pcfix
 from pcfix import pdal_stage
 from pcfix.io.las.columns import COLUMNS, UNSURE
 from pcfix.io.pdal import STAGE_SOURCE, add_dimension
+from tests.utils.beyond_frames import BEYOND_FRAMES
 from tests.utils.clouds import WATER_M, block, cameras_csv, framed_block, random_cloud, write_cloud
 from tests.utils.half_oblique import write_half_oblique
+
+pytestmark = BEYOND_FRAMES
 
 DTYPES = {"float": "f4", "uint16": "u2", "uint8": "u1"}
 

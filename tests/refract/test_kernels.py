@@ -11,6 +11,9 @@ import pytest
 import pcfix
 from pcfix.kernels import threads
 from pcfix.refract.choice import TILE, spatial_order
+from tests.utils.beyond_frames import BEYOND_FRAMES
+
+pytestmark = BEYOND_FRAMES
 
 snell = partial(pcfix.correct_points, method="snell", max_angle=None)
 

@@ -16,6 +16,7 @@ from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import is_submerged, surface_above
 from tests.utils.batches import batch_of
 from tests.utils.depth_map_twin import looking
+from tests.utils.nightly import mostly_nightly
 
 BLOCKS = {"nadir": {}, "half oblique": {"obliques_deg": 30.0, "area_m": (70.0, 50.0)}}
 
@@ -41,7 +42,7 @@ def both(part):
 
 
 @pytest.mark.parametrize("with_list", [True, False], ids=["list", "no list"])
-@pytest.mark.parametrize("block", BLOCKS)
+@pytest.mark.parametrize("block", mostly_nightly(BLOCKS, "half oblique"))
 def test_maps_of_neighbours_are_as_alone(block, with_list):
     part, views, gsd_m = batch(block)
     if with_list:

@@ -8,7 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import pcfix
+from tests.utils.beyond_frames import BEYOND_FRAMES, DEEP
 from tests.utils.twins import correct_slowly, light_path, stacked_intersection
+
+pytestmark = [BEYOND_FRAMES, DEEP]
 
 UTM = np.array([512_345.678, 4_987_654.321, 0.0])
 NANOMETRE = 1e-9  # doubles at UTM coordinates have steps of 1e-9 m; results are relative to P

@@ -89,6 +89,7 @@ def test_slope_is_the_gradient_of_the_height():
         assert np.mean(np.abs(slope[:, axis] - difference) < 1e-6) > 0.99
 
 
+@pytest.mark.filterwarnings("ignore:.*does not cover:pcfix.errors.PcfixWarning")
 def test_an_unknown_cell_makes_four_patches_unknown():
     water = raster(plane(0.0, 0, 0), half=5.0)
     water.height_m[4, 3] = np.nan  # its centre lies at (-1.5, 0.5)

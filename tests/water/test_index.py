@@ -133,3 +133,10 @@ def test_values_outside_the_fit_are_refused(words, message):
 def test_words_that_are_no_water_are_refused(words):
     with pytest.raises(pcfix.SettingError, match="neither a number nor fresh nor sea"):
         index_of(words)
+
+
+@pytest.mark.parametrize("number", ["1,3", "1,34", "1,333"])
+def test_a_decimal_comma_is_no_salinity(number):
+    with pytest.raises(pcfix.SettingError, match=f"write {number.replace(',', '.')};"):
+        index_of(number)
+    assert index_of("1.0,15")[1].startswith("1 PSU")

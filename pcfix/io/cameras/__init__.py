@@ -23,6 +23,7 @@ from pcfix.io.cameras import (
     pix4d,
     realitycapture,
     table,
+    tracks,
     unsupported,
 )
 from pcfix.io.cameras.formats import Angles, CameraFormat, Source, SparseReader
@@ -30,6 +31,8 @@ from pcfix.io.files import check_input
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
 
+LISTS = (".xml", ".csv", ".txt", ".json", ".geojson", ".psx", ".out", ".nvm")
+"""How files are named that cameras may be in."""
 FORMATS = (
     CameraFormat(
         "Agisoft Metashape, PhotoScan",
@@ -144,11 +147,21 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
     ------
     InputError
         If the format has no tie points, or the file has none.
+
+    Warns
+    -----
+    PcfixWarning
+        When numbers are not finite: such image places, and points with such a coordinate, are
+        left out.
     """
     source, form = _recognised(path, None, None)
     if not isinstance(form.reader, SparseReader):
         raise InputError(f"{source.path}: the format ({form.software}) has no tie points.")
-    return form.reader.tie_points(source, cameras)
+    found = form.reader.tie_points(source, cameras)
+    ties, note = tracks.finite(found)
+    if note:
+        warnings.warn(f"{source.path}: {note}", PcfixWarning, stacklevel=2)
+    return ties
 
 
 def _recognised(
@@ -163,7 +176,20 @@ def _recognised(
     for form in FORMATS:
         if form.reader.recognises(source):
             return source, form
+    inside = _camera_files(where)
+    if inside:
+        raise InputError(
+            f"{where}: is a folder that holds {' and '.join(inside)}; give"
+            f" {where / inside[0]} itself."
+        )
     raise InputError(
         f"{where}: is not a camera file that pcfix knows; give a CSV table with the columns"
         " label, x, y, z and, if you have them, yaw, pitch, roll."
     )
+
+
+def _camera_files(folder: Path) -> list[str]:
+    """Return the names of camera files in a folder, three at most."""
+    paths = sorted(p for p in folder.glob("*") if p.suffix.lower() in LISTS and p.is_file())
+    known = [form.reader for form in FORMATS if form.reader is not unsupported]
+    return [p.name for p in paths if any(one.recognises(Source(p)) for one in known)][:3]

@@ -48,10 +48,11 @@ def repeated(path: Path, labels: Sequence[str], dropped: int = 0) -> tuple[str, 
     names = [label for label, count in Counter(labels).items() if count > 1]
     if not names:
         return ()
+    copies = f"; {dropped} exact copies are dropped" if dropped else ""
     listed = ", ".join(names[:10]) + (", ..." if len(names) > 10 else "")
     return (
         f"{path}: {len(names)} labels occur more than once ({listed}); cameras at different"
-        f" positions are kept as different images, {dropped} exact copies dropped.",
+        f" positions are kept as different images{copies}.",
     )
 
 

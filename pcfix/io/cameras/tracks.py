@@ -90,6 +90,28 @@ def tie_points(xyz: FloatArray, point: IntArray, camera: IntArray, uv: FloatArra
     return TiePoints(xyz, Views(start, camera[kept]), uv[kept])
 
 
+def finite(ties: TiePoints) -> tuple[TiePoints, str]:
+    """Return tie points without those that are not finite, and in words how many these were.
+
+    A point without any coordinate is one that the source has not placed, and stays.
+    """
+    placed, unplaced = np.isfinite(ties.xyz).all(axis=1), np.isnan(ties.xyz).all(axis=1)
+    kept: BoolArray = np.asarray(placed | unplaced)
+    point = np.repeat(np.arange(len(ties.xyz)), np.diff(ties.views.start))
+    seen = np.isfinite(ties.image_xy).all(axis=1)
+    if kept.all() and seen.all():
+        return ties, ""
+    rows = np.flatnonzero(seen & kept[point])
+    number = np.cumsum(kept) - 1
+    left = tie_points(
+        ties.xyz[kept], number[point[rows]], ties.views.camera[rows], ties.image_xy[rows]
+    )
+    return left, (
+        f"{int((~kept).sum()):,} tie points and {int((~seen).sum()):,} image places have a number"
+        " that is not finite; they are left out."
+    )
+
+
 def from_principal_point(
     points: PointList, posed: IntArray, cameras: Cameras, places: FloatArray
 ) -> TiePoints:

@@ -19,7 +19,7 @@ from pcfix.kernels import lean
 from pcfix.lens.algebra import Vector, cross, dot, minus, normal_of, scaled
 from pcfix.model import FloatArray
 from pcfix.refract.rays import plane_at, refracted
-from pcfix.water.surface import Field, Tin
+from pcfix.water.surface import Field, Tin, patch_at
 
 Found: TypeAlias = tuple[float, float, int, bool]
 """Plan place (x, y) where a tracer ended, its number of steps, and whether it hit the point."""
@@ -218,15 +218,8 @@ def _snell_at(
 def _twist_at(field: Field | None, x: float, y: float) -> float:
     """Return the second derivative z_xy of a raster's patch at a place (world frame), 1 / m."""
     if field is not None:
-        rows, columns = field.heights.shape
-        u, v = (x - field.west_x) / field.cell_x, (field.north_y - y) / field.cell_y
-        if not (-0.5 <= u <= columns - 0.5 and -0.5 <= v <= rows - 0.5):
-            return 0.0
-        column = min(max(int(np.floor(u)), 0), columns - 2)
-        row = min(max(int(np.floor(v)), 0), rows - 2)
-        z = field.heights
-        twist = z[row + 1, column + 1] - z[row, column + 1] - z[row + 1, column] + z[row, column]
-        return -float(twist) / (field.cell_x * field.cell_y)
+        twist = patch_at(field, x, y)[5]
+        return -twist / (field.frame[field.which, 2] * field.frame[field.which, 3])
     return 0.0
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pcfix import InputError
-from pcfix.io.cameras import colmap
+from pcfix import InputError, PcfixWarning
+from pcfix.io.cameras import colmap, read_tie_points
 from pcfix.io.cameras.colmap.files import MODELS, Camera, lens
 from pcfix.io.cameras.formats import Source
 from pcfix.lens.imaging import project
@@ -203,6 +203,27 @@ def test_largest_of_several_models(tmp_path):
     cameras = read(tmp_path)
     assert len(cameras) == 3
     assert [note for note in cameras.notes if "largest of 2 models" in note]
+
+
+def test_incomplete_models_beside_the_one_that_is_read(tmp_path):
+    used = folder(tmp_path / "sparse/0")
+    (used / "images.bin").write_bytes(b"")
+    folder(tmp_path / "sparse/1", points=None)
+    (tmp_path / "sparse/1/cameras.txt").unlink()
+    notes = "\n".join(read(tmp_path).notes)
+    assert "sparse/0: a model beside the one that is read lacks cameras.bin and points" in notes
+    assert "sparse/1: a model beside the one that is read lacks cameras.txt and points" in notes
+
+
+def test_tie_points_that_are_not_finite(tmp_path):
+    points = POINTS.replace("6 1.5", "6 nan") + "10 1 2 3 0 0 0 0\n"
+    path = folder(tmp_path, images=IMAGES.replace("50 60 6", "inf 60 10"), points=points)
+    with pytest.warns(PcfixWarning, match="1 tie points and 1 image places .* left out"):
+        ties = read_tie_points(path, read(path))
+    assert np.isfinite(ties.xyz).all()
+    assert len(ties.xyz) == 3
+    assert ties.image_xy.tolist() == [[10.0, 20.0]]
+    assert ties.views.start.tolist() == [0, 1, 1, 1]
 
 
 def test_other_files_are_not_recognised(tmp_path):
@@ -447,6 +468,8 @@ def test_databases_that_are_left_out(tmp_path):
         ("images", "4 1 0 0 0", "4 0 0 0 0", r"image a\.jpg: the quaternion has length 0 "),
         ("images", " 3 a.jpg", "", r"images\.txt: line 4 must give an image"),
         ("images", "4 1 0", "4 one 0", r"images\.txt: line 4 has a word"),
+        ("cameras", "# Cam", "# Number of cameras: 3\n# Cam", r"cameras\.txt: is cut short: .* 3"),
+        ("images", "# Im", "# Number of images: 32, mean 8\n# Im", r"counts 32 images, .* has 3"),
         ("images", "a.jpg\n\n", "a.jpg\n", r"images\.txt: line 5 must give the image points"),
     ],
 )  # fmt: skip
@@ -475,6 +498,8 @@ def test_tie_points_that_are_not_there(tmp_path):
         tie_points_of(folder(tmp_path, points="# none\n"))
     with pytest.raises(InputError, match=r"points3D\.txt: line 1 must give a point"):
         tie_points_of(folder(tmp_path, points="1 2 x 4\n"))
+    with pytest.raises(InputError, match="counts 9 points, the file has 3"):
+        tie_points_of(folder(tmp_path, points="# Number of points: 9\n" + POINTS))
     with pytest.raises(InputError, match=r"images\.txt: line 3 must give the image points"):
         tie_points_of(folder(tmp_path, images=IMAGES.replace("10 20 5", "10 20 5 9")))
 

@@ -135,7 +135,7 @@ def test_river_keeps_cameras_that_share_a_label():
 
 def test_exact_copies_count_once(tmp_path):
     text = "label,x,y,z\na,1,2,3\na,1,2,3\na,1,2,4\nb,1,2,3\n"
-    with pytest.warns(pcfix.PcfixWarning, match="1 exact copies dropped"):
+    with pytest.warns(pcfix.PcfixWarning, match="1 exact copies are dropped"):
         cameras = pcfix.read_cameras(write(tmp_path, text, sensor=None))
     assert cameras.labels == ("a", "a", "b")
     assert cameras.centres[:, 2].tolist() == [3, 4, 3]

@@ -86,6 +86,7 @@ def read(source: Source) -> Cameras:
         f"{model.folder}: is the largest of {model.others + 1} models of the block, which are not"
         " tied to each other; the images of the others are left out."
     )
+    notes = (*incomplete_notes(model), *notes)
     return Cameras(
         labels=labels,
         centres=centres if place is None else centres + place.offset_m,
@@ -179,6 +180,23 @@ def _in_folder(folder: Path, *suffixes: str) -> Model | None:
             if _CAMERA_LINE.search(stream.read(4096)):
                 return model
     return None
+
+
+def incomplete_notes(model: Model) -> tuple[str, ...]:
+    """Return a sentence on each model beside the one that is read of which files are missing."""
+    folder, notes = model.folder, []
+    beside = folder.parent.iterdir() if folder.name.isdecimal() else ()
+    for other in (folder, *sorted(p for p in beside if p.name.isdecimal() and p.is_dir())):
+        names = {path.name for path in other.iterdir()}
+        for suffix in ("bin", "txt"):
+            parts = [f"{part}.{suffix}" for part in ("cameras", "images", "points3D")]
+            missing = [part for part in parts if part not in names]
+            if 0 < len(missing) < len(parts) and (other, suffix) != (folder, model.suffix):
+                notes.append(
+                    f"{other}: a model beside the one that is read lacks {' and '.join(missing)}:"
+                    " it is left out; export it again if it belongs to the block."
+                )
+    return tuple(notes)
 
 
 FILE = "georeference.json"

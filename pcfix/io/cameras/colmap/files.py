@@ -14,8 +14,10 @@ and prism terms are of the radially distorted place.
 from __future__ import annotations
 
 import mmap
+import re
 import struct
 from collections.abc import Iterator
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -262,6 +264,7 @@ def _binary_points(path: Path) -> Points:
 _CAMERA_WORDS = 4
 _IMAGE_WORDS = 10
 _POINT_WORDS = 4
+_STATED = re.compile(r"Number of (cameras|images|points): (\d{1,15})\b")
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -274,6 +277,18 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 
 def _wrong(path: Path, number: int, rule: str) -> InputError:
     return InputError(f"{path}: line {number} {rule}; export the model again.")
+
+
+def _check_count(path: Path, found: int) -> None:
+    """Refuse a text that has fewer rows than its comments announce."""
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        comments = "".join(takewhile(lambda line: line.lstrip().startswith("#"), stream))
+    stated = _STATED.search(comments)
+    if stated and int(stated[2]) > found:
+        raise InputError(
+            f"{path}: is cut short: its header counts {int(stated[2]):,} {stated[1]}, the file has"
+            f" {found:,}; export the model again."
+        )
 
 
 def _text_cameras(path: Path) -> dict[int, Camera]:
@@ -298,6 +313,7 @@ def _text_cameras(path: Path) -> dict[int, Camera]:
             cameras[int(words[0])] = Camera(model, width, height, tuple(values))
         except ValueError as error:
             raise _wrong(path, number, "has a word that must be a number") from error
+    _check_count(path, len(cameras))
     return cameras
 
 
@@ -317,6 +333,7 @@ def _text_images(path: Path, *, points: bool) -> list[Image]:
             raise _wrong(path, number, "has a word that must be a number") from error
         xy, seen = _image_points(path, *next(lines, (number + 1, "")), points=points)
         images.append(Image(identifier, pose, camera, words[9], xy, seen))
+    _check_count(path, len(images))
     return images
 
 
@@ -346,6 +363,7 @@ def _text_points(path: Path) -> Points:
             rows.append((int(identifier), float(x), float(y), float(z)))
         except ValueError as error:
             raise _wrong(path, number, "must give a point: number, X, Y, Z, ...") from error
+    _check_count(path, len(rows))
     values = np.array(rows, float).reshape(-1, 4)
     return Points(values[:, 0].astype(np.int64), values[:, 1:])
 

@@ -1,0 +1,238 @@
+"""A whole run from Python, and what it left: rasters, lines and tables as analysts have them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from numbers import Real
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pcfix.errors import InputError, SettingError
+from pcfix.flow.layers import contours_layer
+from pcfix.flow.rasters import BED, DEPTH, SHADED, SURFACE, UNCERTAINTY
+from pcfix.flow.record import read_record
+from pcfix.flow.run import RECORD, Files, Request, run_all
+from pcfix.flow.runner import Bar, no_bar
+from pcfix.io import analysis, rasters
+from pcfix.io.styles import limits_of
+from pcfix.options.declare import File, options_of, taken
+from pcfix.options.steps import METRES
+from pcfix.options.survey import RunOptions
+from pcfix.refract.tally import Summary
+from pcfix.report.comparison import signed_statistics
+from pcfix.report.notebook import overview, run_html
+from pcfix.report.page import Tile
+
+if TYPE_CHECKING:
+    from geopandas import GeoDataFrame
+    from pandas import DataFrame
+    from xarray import DataArray
+
+Plain = dict[str, Any]
+
+_WHY = {
+    UNCERTAINTY: "the points have no standard errors",
+    "map.gpkg": "lines need pyogrio; run: pip install 'pcfix[analysis]', then run again",
+}
+
+
+@dataclass(frozen=True)
+class RunResults:
+    """What a run left in its folder; a notebook shows its tiles and a map.
+
+    Rasters and lines are in the CRS of the cloud, metres. They need the extra ``analysis``, and are
+    read from the files each time they are asked for.
+
+    Attributes
+    ----------
+    folder : Path
+    """
+
+    folder: Path
+
+    @cached_property
+    def _steps(self) -> dict[str, Plain]:
+        """What each step came to, of ``run.json``."""
+        steps = read_record(self._file(RECORD))["steps"]
+        if "report" not in steps:
+            raise InputError(
+                f"{self.folder}: holds a run that did not come to its end; run it again, it resumes"
+                " where it stopped."
+            )
+        return {name: step["result"] for name, step in steps.items()}
+
+    @property
+    def report(self) -> Path:
+        """The page for clients."""
+        return Files(self.folder).report
+
+    @property
+    def summary(self) -> Summary:
+        """What the correction came to."""
+        return Summary(**self._steps["correct"])
+
+    @property
+    def compared(self) -> Plain:
+        """All figures of the comparison with the reference; empty where there was none."""
+        return dict(self._steps.get("compare", {}).get("figures", {}))
+
+    @property
+    def depth(self) -> DataArray:
+        """Depth of the bed, shape (y, x), metres below the water, positive down; NaN on land."""
+        return analysis.open_array(self._file(DEPTH))
+
+    @property
+    def bed(self) -> DataArray:
+        """Heights of the bed, shape (y, x), metres; NaN on land."""
+        return analysis.open_array(self._file(BED))
+
+    @property
+    def surface(self) -> DataArray:
+        """Heights of land and bed, shape (y, x), metres."""
+        return analysis.open_array(self._file(SURFACE))
+
+    @property
+    def uncertainty(self) -> DataArray:
+        """Vertical uncertainty of the bed at 95 %, shape (y, x), metres, predicted."""
+        return analysis.open_array(self._file(UNCERTAINTY))
+
+    def contours(self, interval: float | None = None) -> GeoDataFrame:
+        """Return lines of equal depth, ``depth_m``.
+
+        Parameters
+        ----------
+        interval : float, optional
+            Metres. Default that of ``map.gpkg``, no finer than the depth is known.
+        """
+        if interval is None:
+            return self.layer("depth_contours")
+        if wrong := METRES("interval", interval):
+            raise SettingError(wrong)
+        crs = analysis.open_array(self._file(DEPTH)).rio.crs
+        return analysis.frame_of(contours_layer(self.folder, interval), crs)
+
+    @property
+    def waterline(self) -> GeoDataFrame:
+        """Where the water meets the corrected cloud, with its standard error in plan, metres."""
+        return self.layer("waterline")
+
+    def layer(self, name: str) -> GeoDataFrame:
+        """Return a layer of ``map.gpkg``: waterline, corrected_area, cross_sections, cameras ..."""
+        return analysis.frame_of_layer(self._file("map.gpkg"), name)
+
+    @property
+    def tables(self) -> dict[str, DataFrame]:
+        """Tables of the comparison by name, metres; empty where there was no reference.
+
+        ``statistics`` of the errors before and after; ``depth_bins`` and ``shore_bins``, errors by
+        depth and by distance from the shore; ``section_01`` and so on, heights along a line.
+        """
+        if not self.compared:
+            return {}
+        files = sorted(Files(self.folder).compare.glob("*.csv"))
+        rows = [{"of": title, **figures} for title, figures in signed_statistics(self.compared)]
+        statistics = analysis.load_for_analysis("pandas").json_normalize(rows).set_index("of")
+        return {"statistics": statistics, **{one.stem: analysis.table_of_csv(one) for one in files}}
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        first = self._steps["report"]
+        colours, bounds = rasters.picture(self._file(SHADED))
+        deepest = limits_of(rasters.preview(self._file(DEPTH))[0], "depth")[1]
+        tiles = [Tile(**one) for one in first["tiles"]]
+        return run_html(first["title"], tiles, first["place"], overview(colours, bounds, deepest))
+
+    def _file(self, name: str) -> Path:
+        path = self.folder / name
+        if not path.is_file():
+            why = f": {_WHY[name]}" if name in _WHY else ""
+            raise InputError(f"{path}: the run has not left this file{why}.")
+        return path
+
+
+def run(
+    input: File,
+    out_dir: File,
+    *,
+    options: RunOptions | None = None,
+    say: Callable[[str], None] = lambda text: None,
+    bar: Bar = no_bar,
+    **keywords: Any,
+) -> RunResults:
+    """Adjust, correct, clean, grid, compare and report; what ``pcfix run`` runs.
+
+    Parameters
+    ----------
+    input : path
+        LAS or LAZ cloud.
+    out_dir : path
+        Folder for all results, made where its parent exists. Called again with the same options it
+        resumes, and a finished run is opened at once.
+    options : RunOptions, optional
+        Or its attributes as keywords, as of ``pcfix run``: cameras, water, reference, resolution,
+        overwrite and so on. Cameras and water are files or text, as ``run.json`` keeps them.
+    say : callable, optional
+        Called with a line on each step, as ``print``.
+    bar : callable, optional
+        Shows the progress of a step; see `pcfix.flow.runner.Bar`.
+
+    Returns
+    -------
+    RunResults
+
+    Raises
+    ------
+    PcfixError
+        With one sentence on what to mend; the steps before it stay done.
+
+    Examples
+    --------
+    >>> import pcfix
+    >>> result = pcfix.run("cloud.laz", "out", cameras="cameras.csv", water=0.37)  # doctest: +SKIP
+    >>> float(result.depth.max())  # doctest: +SKIP
+    12.25
+    """
+    given = taken(RunOptions, options, keywords, "run")
+    values = {one.name: getattr(given, one.name) for one in options_of(RunOptions)}
+    for one in options_of(RunOptions):
+        value = values[one.name]
+        if one.type is Any and value is not None and not isinstance(value, tuple):
+            values[one.name] = _as_text(one.name, value)
+    request, folder = Request(input=os.fspath(input), **values), Path(out_dir)
+    run_all(request, folder, overwrite=given.overwrite, jobs=given.jobs, say=say, bar=bar)
+    return RunResults(folder)
+
+
+def _as_text(name: str, value: Any) -> str:
+    """Return what names cameras or water as the record of a run keeps it."""
+    if isinstance(value, str | os.PathLike | Real):
+        return str(value)
+    raise SettingError(
+        f"run: {name} is a {type(value).__name__}; give a file or text, which run.json can keep,"
+        " or take correct_file."
+    )
+
+
+def open_run(folder: File) -> RunResults:
+    """Open what a finished run left.
+
+    Parameters
+    ----------
+    folder : path
+        The OUT_DIR of ``pcfix run``.
+
+    Returns
+    -------
+    RunResults
+
+    Raises
+    ------
+    InputError
+        If the folder holds no run, or one that did not come to its end.
+    """
+    found = RunResults(Path(folder))
+    _ = found.summary
+    return found

@@ -1,0 +1,140 @@
+"""A run from Python, and its results as xarray, GeoPandas and pandas have them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import laspy
+import matplotlib
+import numpy as np
+import pytest
+import rasterio
+import shapely
+
+import pcfix
+from pcfix.io.rasters import values_at
+
+SAMPLES = Path(__file__).parents[2] / "samples"
+SCENE = SAMPLES / "scene"
+EVIL = "<script>alert(1)</script>"
+pytest.importorskip("rioxarray")
+pytest.importorskip("geopandas")
+
+
+@pytest.fixture(scope="module")
+def names(tmp_path_factory):
+    """Run the cells of the notebook one after the other; return the names that it leaves."""
+    matplotlib.use("agg")
+    cells = json.loads((SAMPLES / "07_analyse.ipynb").read_text())["cells"]
+    cells = [one for one in cells if one["cell_type"] == "code"]
+    assert all(one["outputs"] == [] and one["execution_count"] is None for one in cells)
+    folder = tmp_path_factory.mktemp("notebook")
+    (folder / "scene").symlink_to(SCENE)
+    found = {}
+    with contextlib.chdir(folder):
+        for one in cells:
+            exec("".join(one["source"]), found)
+        yield found
+
+
+@pytest.fixture
+def result(names):
+    return names["result"]
+
+
+def test_notebook(names):
+    truth = laspy.read(SCENE / "truth.laz")
+    area_m2 = np.prod(truth.header.maxs[:2] - truth.header.mins[:2])  # its points lie at random
+    expected = area_m2 * np.maximum(0.37 - np.asarray(truth.z), 0.0).mean()
+    assert names["volume_m3"] == pytest.approx(expected, rel=0.02)
+    assert names["area_m2"].sum() == names["depth"].count()
+    with rasterio.open("depth_west.tif") as raster:
+        assert raster.read(1, masked=True).max() == pytest.approx(float(names["part"].max()))
+
+
+def test_a_finished_run_is_opened(result):
+    said = []
+    again = pcfix.run(
+        "scene/cloud.laz", "out", cameras="scene/cameras.csv", water="0.37",
+        reference="scene/lidar.laz", say=said.append,
+    )  # fmt: skip
+    assert said and all("done before" in line for line in said)
+    assert pcfix.open_run("out") == again == result
+
+
+def test_arrays_are_those_of_the_files_and_read_when_used(result):
+    for name in ("depth", "bed", "surface", "uncertainty"):
+        array = getattr(result, name)
+        assert not array.variable._in_memory
+        with rasterio.open(result.folder / f"{name}.tif") as raster:
+            expected = raster.read(1, masked=True).filled(np.nan)
+            assert (array.rio.crs, array.rio.transform()) == (raster.crs, raster.transform)
+        np.testing.assert_array_equal(array.to_numpy(), expected)
+        assert (array.name, array.attrs["units"]) == (name, "metre")
+    # the water is level, so that depth and bed make its height, which is 0.37
+    np.testing.assert_allclose((result.depth + result.bed).median(), 0.37, atol=1e-3)
+
+
+def test_lines_lie_where_the_depth_is_theirs(result):
+    crs = result.depth.rio.crs
+    for lines, interval in ((result.contours(), 1.0), (result.contours(3.0), 3.0)):
+        assert lines.crs == crs and set(lines.depth_m % interval) == {0.0}
+        for depth, line in zip(lines.depth_m, lines.geometry, strict=True):
+            found = values_at(result.folder / "depth.tif", shapely.get_coordinates(line))
+            assert abs(np.nanmedian(found) - depth) < 0.2  # half a cell on slopes of 1 in 8
+    assert result.waterline.crs == crs
+    assert result.waterline.level_m.to_numpy() == pytest.approx(0.37, abs=1e-3)
+    assert len(result.layer("cameras")) == 40
+    with pytest.raises(pcfix.SettingError, match="interval 0 is not positive"):
+        result.contours(0)
+
+
+def test_tables_are_those_of_the_comparison(result):
+    tables = result.tables
+    assert {"statistics", "depth_bins", "section_03"} <= tables.keys()
+    bed = result.compared["bed"]["after"]
+    assert tables["statistics"].rmse_m["dZ bed after"] == bed["rmse_m"]
+    assert tables["depth_bins"].count_after.sum() == bed["count"]
+    assert result.summary.corrected == 14_736
+
+
+def test_a_notebook_shows_the_tiles_of_the_report_and_a_map(result, tmp_path):
+    for name in ("depth.tif", "shaded.tif"):
+        shutil.copy(result.folder / name, tmp_path)
+    record = (result.folder / "run.json").read_text()
+    evil = record.replace('"title": "cloud"', f'"title": "{EVIL}"')
+    assert evil != record
+    (tmp_path / "run.json").write_text(evil)
+    shown, page = pcfix.open_run(tmp_path)._repr_html_(), result.report.read_text()
+    assert EVIL not in shown and "&lt;script&gt;" in shown
+    words = re.sub(r"<[^>]*>", " ", shown)
+    assert not re.search(r"\b(None|nan|True|False)\b|[{}]", words)
+    figures = re.findall(r"<dd>([^<]*)</dd>", page.split('class="map"')[0])
+    assert figures and all(f"<strong>{one}</strong>" in shown for one in figures)
+    assert "(measured)" in shown and "vertical datum not known" in shown
+    assert shown.count("data:image/png;base64,") == 1 and len(shown) < 500_000
+
+
+def test_what_cannot_be_had_has_one_sentence(result, tmp_path, monkeypatch):
+    with pytest.raises(pcfix.InputError, match=r"run\.json: the run has not left this file"):
+        pcfix.open_run(tmp_path)
+    record = json.loads((result.folder / "run.json").read_text())
+    del record["steps"]["report"]
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    with pytest.raises(pcfix.InputError, match="did not come to its end; run it again"):
+        pcfix.open_run(tmp_path)
+    with pytest.raises(pcfix.InputError, match="pip install 'pcfix\\[analysis\\]'"):
+        _ = pcfix.open_run(result.folder) and type(result)(tmp_path).waterline
+    water = pcfix.WaterPlane(0.0, 0.0, 0.37)
+    with pytest.raises(pcfix.SettingError, match="water is a WaterPlane; give a file or text"):
+        pcfix.run(SCENE / "cloud.laz", tmp_path / "o", cameras=SCENE / "cameras.csv", water=water)
+    with pytest.raises(pcfix.SettingError, match="did you mean cameras"):
+        pcfix.run(SCENE / "cloud.laz", tmp_path / "o", camera="a.csv", water=0.37)
+    monkeypatch.setitem(sys.modules, "rioxarray", None)
+    with pytest.raises(pcfix.SettingError, match="needs rioxarray, which"):
+        _ = result.depth

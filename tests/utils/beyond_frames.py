@@ -1,0 +1,9 @@
+"""Clouds and blocks of tests that are wider, or deeper, than any that was photographed."""
+
+import pytest
+
+BEYOND_FRAMES = pytest.mark.filterwarnings(
+    "ignore:.*lie in fewer than two frames:pcfix.errors.PcfixWarning"
+)
+"""Points at random, many of them in one frame or none."""
+DEEP = pytest.mark.filterwarnings("ignore:.*deeper than 30 m:pcfix.errors.PcfixWarning")
