@@ -50,7 +50,8 @@ def png_of(figure: Figure) -> bytes:
 
     stream = io.BytesIO()
     figure.set_dpi(130)
-    FigureCanvasAgg(figure).print_png(stream)  # `savefig` would draw it twice
+    canvas = FigureCanvasAgg(figure)
+    canvas.print_png(stream)  # type: ignore[no-untyped-call]  # `savefig` would draw it twice
     return stream.getvalue()
 
 
