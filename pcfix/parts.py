@@ -26,6 +26,7 @@ from numba.core.compiler import Compiler, CompileResult
 from numba.core.registry import CPUDispatcher
 
 from pcfix.ahead import compiles, wait_for
+from pcfix.kept import Kept
 
 Decorator: TypeAlias = Callable[[Any], Any]
 
@@ -155,10 +156,14 @@ class _PartCompiler(_KernelCompiler):
 
 
 class _Kernel(CPUDispatcher):
+    def enable_caching(self) -> None:
+        """Keep it as `pcfix.kept` says."""
+        self._cache = Kept(self.py_func)
+
     def compile(self, signature: Any) -> Any:
         """Compile a kernel or load it, unless another process is compiling it."""
         wait_for(f"{self.py_func.__module__}.{self.py_func.__qualname__}")
-        with _no_collection():
+        with _no_collection(), self._cache.alone():
             return super().compile(signature)
 
 
