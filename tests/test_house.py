@@ -24,7 +24,7 @@ FLOORS = (
     ("parts",),
     ("kernels",),
     ("options",),
-    ("model",),
+    ("model", "sums"),
     ("lens",),
     ("water",),
     ("label",),

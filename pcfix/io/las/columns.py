@@ -225,7 +225,7 @@ def convert(
     new = laspy.ScaleAwarePointRecord(array, point_format, points.scales, points.offsets)
     if points.point_format.id == point_format.id and _one_begins_the_other(points.array, array):
         size = min(points.array.itemsize, array.itemsize)
-        _bytes(array)[:, :size] = _bytes(points.array)[:, :size]
+        _heads(array, size)[:] = _heads(points.array, size)
         return new
     for name in points.array.dtype.names:
         if name in array.dtype.names and name != "bit_fields":
@@ -251,22 +251,19 @@ def _one_begins_the_other(one: Records, other: Records) -> bool:
     return all(a == b for a, b in zip(*layouts, strict=False))
 
 
-def _bytes(array: Records) -> Records:
-    return np.ascontiguousarray(array).view(np.uint8).reshape(len(array), array.itemsize)
+def _heads(array: Records, size: int) -> Records:
+    """Return the first bytes of records, each as one value."""
+    head = np.dtype((np.void, size))
+    return np.ndarray(array.shape, head, array, strides=array.strides)
 
 
-def shifted(
-    points: laspy.ScaleAwarePointRecord, header: laspy.LasHeader, steps: npt.NDArray[np.int64]
-) -> laspy.ScaleAwarePointRecord:
-    """Return points in the header's format, moved by whole steps of its scale, shape (n, 3).
+def move(points: laspy.ScaleAwarePointRecord, steps: npt.NDArray[np.int64]) -> None:
+    """Move points by whole steps of their scale, shape (n, 3).
 
     An `OutOfRangeError` if a coordinate does not fit 32 bits.
     """
-    new = convert(points, header.point_format)
     for axis, name in enumerate("XYZ"):
-        moved = points.array[name].astype(np.int64) + steps[:, axis]
+        moved = points.array[name] + steps[:, axis]
         if moved.size and (moved.min() < _INT32.min or moved.max() > _INT32.max):
             raise OutOfRangeError(name)
-        new.array[name] = moved
-    new.offsets = header.offsets
-    return new
+        points.array[name] = moved
