@@ -20,6 +20,7 @@ HOUSE = Path(__file__).parents[1] / "pcfix"
 # lower floors and from its own room. "pcfix" is the front door, pcfix/__init__.py.
 FLOORS = (
     ("version", "errors", "ahead", "blocks", "qgis"),
+    ("kept",),
     ("parts",),
     ("kernels",),
     ("options",),
@@ -62,6 +63,7 @@ OUTSIDE_IO = {
     "pcfix.qgis.command": "it runs in QGIS's Python, without pcfix",
     "pcfix.qgis.provider": "as its neighbour",
     "pcfix.ahead": "what its second process says goes nowhere",
+    "pcfix.kept": "a kernel is valid for the text of its file",
 }
 
 MOST_PARAMETERS = 9
