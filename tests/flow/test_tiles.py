@@ -184,6 +184,7 @@ def test_a_broken_tile_does_not_stop_the_others(tmp_path):
 
 
 def test_a_full_disk_leaves_nothing_half_written(cloud, tmp_path, monkeypatch):
+    from pcfix.flow import tiles
     from pcfix.io.las import writing
 
     wrote = writing.LasSink.write
@@ -195,8 +196,16 @@ def test_a_full_disk_leaves_nothing_half_written(cloud, tmp_path, monkeypatch):
                 raise OSError(28, "No space left on device")
 
     given = {"cameras": CAMERAS, "water": 0.37, "method": "snell", "jobs": 1}
+    wrote_record = tiles.write_counted
+
+    def full_for_records(path, note, counted):
+        if path.name == "tile1.laz.npz" and note["output"]:
+            raise pcfix.InputError(f"{path}: cannot be written (No space left on device).")
+        wrote_record(path, note, counted)
+
     monkeypatch.setattr(writing.LasSink, "write", full)
-    with pytest.raises(pcfix.InputError, match="1 of 4 files failed") as error:
+    monkeypatch.setattr(tiles, "write_counted", full_for_records)
+    with pytest.raises(pcfix.InputError, match="2 of 4 files failed") as error:
         pcfix.correct_file(cloud[0], tmp_path / "out", **given)
     assert "tile2.laz: cannot be written" in str(error.value)
     left = {path.name for path in (tmp_path / "out").iterdir()}
