@@ -14,7 +14,6 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,7 +34,8 @@ from pcfix.grid.lattice import (
 from pcfix.grid.model import NO_LIGHT, DsmSummary, Tally, hillshade
 from pcfix.io import rasters
 from pcfix.io.crs import crs_words, parts
-from pcfix.io.files import Bins, check_output, replaced_when_whole, write_text
+from pcfix.io.drafts import draft_folder, replaced_when_whole
+from pcfix.io.files import Bins, check_output, write_text
 from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.las.writing import is_ours
@@ -146,8 +146,7 @@ def grid_dsm(
             name: stack.enter_context(replaced_when_whole(path))
             for name, path in {"dsm": task.target, **more}.items()
         }
-        folder = TemporaryDirectory(dir=task.target.parent, prefix=".pcfix-dsm-")
-        run.write(Path(stack.enter_context(folder)), **drafts)
+        run.write(stack.enter_context(draft_folder(task.target.parent)), **drafts)
     if given.style:
         write_text(style, raster_style(task.target, rules.what), overwrite=given.overwrite)
     result = replace(

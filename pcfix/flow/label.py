@@ -237,6 +237,8 @@ class LabellingStep(Sums, Step):
             "water_plane": list(astuple(water)) if isinstance(water, WaterPlane) else None,
             "water_mask": None if mask is None else mask.name,
         }
+        part = part_report(source.path)
+        content |= {} if part is None else {"part": part}
         return noted_header(source, labelling_vlr(content))
 
     def classes(self, points: Points) -> Classes:

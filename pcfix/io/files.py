@@ -10,11 +10,9 @@ import json
 import mimetypes
 import os
 import re
-import shutil
 import subprocess
-import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 from zipfile import BadZipFile
@@ -24,6 +22,7 @@ import numpy.typing as npt
 
 from pcfix.errors import InputError, SettingError, optional_library
 from pcfix.grid.lattice import Window
+from pcfix.io.drafts import cannot_write, draft_folder, replaced_when_whole
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.declare import File
 from pcfix.sums import Counted
@@ -99,43 +98,6 @@ def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) ->
     if not target.parent.is_dir():
         raise SettingError(f"{target}: the folder {target.parent} does not exist; make it first.")
     return target
-
-
-@contextmanager
-def replaced_when_whole(target: Path) -> Iterator[Path]:
-    """Give a name beside the target to write to, and rename it once the block ends well.
-
-    The name keeps the target's suffix. Whatever goes wrong, nothing is left behind.
-    """
-    draft = target.with_name(f".{target.stem}.{os.getpid()}.part{target.suffix}")
-    try:
-        yield draft
-        draft.replace(target)
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written ({error.strerror or error}).") from error
-    finally:
-        draft.unlink(missing_ok=True)
-
-
-@contextmanager
-def folder_when_whole(target: Path) -> Iterator[Path]:
-    """Give a folder to write into, which takes the place of the target once the block ends well.
-
-    An older folder of that name goes as a whole, with whatever it held.
-    """
-    draft = Path(
-        tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".part", dir=target.resolve().parent)
-    )
-    try:
-        yield draft
-        draft.chmod(0o755)
-        if target.exists():
-            shutil.rmtree(target)
-        draft.replace(target)
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written ({error.strerror or error}).") from error
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
 
 
 def sha256(path: Path) -> str:
@@ -222,31 +184,29 @@ def scratch_arrays(target: Path) -> Iterator[Empty]:
 
     An `InputError` if the disk cannot hold them.
     """
-    try:
-        folder = tempfile.TemporaryDirectory(
-            prefix=f".{target.stem}.", suffix=".part", dir=target.parent, ignore_cleanup_errors=True
-        )
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written ({error.strerror or error}).") from error
-    files: list[Path] = []
-
-    def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-        files.append(Path(folder.name) / f"{len(files)}.bin")
-        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    with ExitStack() as stack:
         try:
-            with files[-1].open("wb") as stream:  # a full disk kills whoever writes to a map
-                if hasattr(os, "posix_fallocate"):
-                    os.posix_fallocate(stream.fileno(), 0, size)
-                else:
-                    stream.truncate(size)
+            folder = stack.enter_context(draft_folder(target.parent))
         except OSError as error:
-            raise InputError(
-                f"{target}: {size / 1e9:,.1f} GB of temporary space beside it cannot be had"
-                f" ({error.strerror or error}); make room, or write to another disk."
-            ) from error
-        return np.memmap(files[-1], dtype=dtype, mode="r+", shape=shape)
+            raise cannot_write(target, error) from error
+        files: list[Path] = []
 
-    with folder:
+        def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+            files.append(folder / f"{len(files)}.bin")
+            size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+            try:
+                with files[-1].open("wb") as stream:  # a full disk kills whoever writes to a map
+                    if hasattr(os, "posix_fallocate"):
+                        os.posix_fallocate(stream.fileno(), 0, size)
+                    else:
+                        stream.truncate(size)
+            except OSError as error:
+                raise InputError(
+                    f"{target}: {size / 1e9:,.1f} GB of temporary space beside it cannot be had"
+                    f" ({error.strerror or error}); make room, or write to another disk."
+                ) from error
+            return np.memmap(files[-1], dtype=dtype, mode="r+", shape=shape)
+
         yield empty
 
 

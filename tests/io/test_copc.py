@@ -28,6 +28,7 @@ from tests.utils.clouds import (
     read_raw,
     write_cloud,
 )
+from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
 from tests.utils.real_pdal import needs_pdal, pdal
 
@@ -166,7 +167,7 @@ def test_queries_find_what_lies_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("small_nodes")
-@pytest.mark.parametrize("point_format", [2, 6, 7, 8])
+@pytest.mark.parametrize("point_format", mostly_nightly([2, 6, 7, 8], 2, 8))
 def test_all_that_a_cloud_has_goes_into_copc_and_back(tmp_path: Path, point_format: int) -> None:
     source = write_cloud(tmp_path / "cloud.laz", point_format)
     plain = corrected(source, tmp_path / "plain.laz")
@@ -283,8 +284,9 @@ def inside(las: laspy.LasData) -> np.ndarray:
 
 
 @pytest.mark.usefixtures("small_nodes")
-@pytest.mark.parametrize("name", ["cloud.las", "cloud.laz", "cloud.copc.laz"])
-@pytest.mark.parametrize("chunk", [1_000_000, 150])
+@pytest.mark.parametrize(
+    ("name", "chunk"), [("cloud.las", 1_000_000), ("cloud.laz", 150), ("cloud.copc.laz", 150)]
+)
 def test_bounds_read_what_lies_within(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, chunk: int
 ) -> None:
@@ -338,6 +340,8 @@ def test_coarse_levels_of_copc(tmp_path: Path, resolution: float, box: Box | Non
     np.testing.assert_array_equal(np.sort(found.gps_time), np.sort(expected["gps_time"]))
     assert summary.part is not None
     assert (summary.part["points"], summary.part["of"]) == (len(expected), 2000)
+    ours = next(v for v in found.vlrs if v.user_id == "pcfix")
+    assert json.loads(ours.record_data)["part"] == summary.part
 
 
 def test_a_surface_model_of_a_part(tmp_path: Path) -> None:
@@ -369,10 +373,19 @@ def test_parts_that_cannot_be(tmp_path: Path, options: dict[str, Any], message: 
     assert list(tmp_path.iterdir()) == [source]
 
 
-def test_in_a_pipeline_the_reader_chooses(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("output", "more", "message"),
+    [
+        ("out.laz", ["--bounds=0,0,1,1"], "give readers.copc its bounds and resolution"),
+        ("out.copc.laz", [], "the pipeline would write LAZ without the octree of COPC; give"),
+    ],
+)
+def test_what_a_pipeline_of_pdal_does_otherwise(
+    tmp_path: Path, output: str, more: list[str], message: str
+) -> None:
     write_cloud(tmp_path / "cloud.laz", 7)
     cameras_csv(tmp_path / "cameras.csv", block())
-    words = ["cloud.laz", "out.laz", "--cameras", "cameras.csv", "--water", WATER_M]
-    done = run_pcfix("pipeline", *words, "--bounds=0,0,1,1", folder=tmp_path)
+    words = ["cloud.laz", output, "--cameras", "cameras.csv", "--water", WATER_M, *more]
+    done = run_pcfix("pipeline", *words, folder=tmp_path)
     assert done.returncode == 1
-    assert "give readers.copc its bounds and resolution" in done.stderr
+    assert message in done.stderr

@@ -308,6 +308,10 @@ class CopcWriter:
             self._ends[end] = least(ends, axis=0)
             self._gps_time[end] = least([self._gps_time[end], least(rows["gps_time"])])
 
+    def forget(self) -> None:
+        """Let go of the points that were put aside, however it ended."""
+        self._spill.close()
+
     def done(self) -> None:
         """Sort the points, and write them node by node."""
         if not self._count:
@@ -317,7 +321,7 @@ class CopcWriter:
         side = float((np.maximum(high - low, 1) * self._header.scales).max())
         cube = Cube(self._header, low, side)
         nodes = Nodes(self._stream, self._laz, self._jobs)
-        with self._spill, _scratch(self._folder) as keys:
+        with _scratch(self._folder) as keys:
             if self._count:
                 Octree(SortedRuns(self._spill, keys, self._count, cube), nodes)
             else:

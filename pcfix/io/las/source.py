@@ -206,6 +206,7 @@ class LasSource:
             self._reader = laspy.open(self.path.open("rb"), laz_backend=backend(jobs))
         self.header: laspy.LasHeader = self._reader.header
         self.held = len(self)
+        self._selection = laspy.DecompressionSelection.all()  # also where a part is counted
         try:
             self._check_header()
             if isinstance(self.path, CloudPart):
@@ -216,8 +217,8 @@ class LasSource:
         small = len(self) * self.header.point_format.size <= KEPT_BYTES
         self._kept = kept if small else None
         places_only = places_only and self._kept is None
-        self._selection = _PLACES if places_only else laspy.DecompressionSelection.all()
-        self._reader.decompression_selection = self._selection
+        if places_only:
+            self._selection = self._reader.decompression_selection = _PLACES
 
     def __enter__(self) -> LasSource:
         return self

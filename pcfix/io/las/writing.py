@@ -22,7 +22,7 @@ from laspy.vlrs.vlr import VLR
 from pyproj import CRS
 
 from pcfix.errors import InputError, SettingError
-from pcfix.io.files import replaced_when_whole
+from pcfix.io.drafts import cannot_write, replaced_when_whole
 from pcfix.io.las.columns import Column, column_scale, upgraded
 from pcfix.io.las.copc import CopcWriter, check_copc, is_copc
 from pcfix.io.las.part import part_report
@@ -322,11 +322,13 @@ class LasSink:
             check_copc(self._path, self.header)
         with ExitStack() as stack:
             draft = stack.enter_context(replaced_when_whole(self._path))
-            stack.enter_context(_write_errors(self._path))
+            self._draft = draft
+            stack.enter_context(self._write_errors())
             self._stream = stack.enter_context(draft.open("w+b"))
             packing: Any = backend(self._jobs)
             if is_copc(self._path):
                 packing = self._copc = CopcWriter(draft.parent, self._jobs)
+                stack.callback(self._copc.forget)
             self._writer = laspy.LasWriter(
                 self._stream, self.header, do_compress=laz, laz_backend=packing, closefd=False
             )
@@ -335,7 +337,7 @@ class LasSink:
 
     def write(self, points: laspy.ScaleAwarePointRecord) -> None:
         """Append points, in the header's format and scale."""
-        with _write_errors(self._path):
+        with self._write_errors():
             self._writer.write_points(points)
 
     def __exit__(self, kind: Any, value: Any, traceback: Any) -> None:
@@ -348,13 +350,12 @@ class LasSink:
             self._stream.seek(IDENTITY_PLACE)
             self._stream.write(self._identity)
 
-
-@contextmanager
-def _write_errors(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except (laspy.LaspyException, lazrs.LazrsError, OSError) as error:
-        raise InputError(f"{path}: cannot be written ({error}).") from error
+    @contextmanager
+    def _write_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except (laspy.LaspyException, lazrs.LazrsError, OSError) as error:
+            raise cannot_write(self._path, error, self._draft) from error
 
 
 def write_points(
