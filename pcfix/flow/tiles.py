@@ -114,8 +114,6 @@ def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> str:
         write_counted(tile.record, {"key": tile.key, "output": ""}, {})
         step: TileStep = pickle.loads(pickled)
         step.begin(tile.first_row)
-        for left in tile.target.parent.glob(f".{tile.target.stem}.*.part{tile.target.suffix}"):
-            left.unlink(missing_ok=True)  # of a worker that was killed
         with threads(jobs), warnings.catch_warnings():
             warnings.simplefilter("ignore", PcfixWarning)  # said once, where the step was made
             step.run(FileTask(tile.source, tile.target, jobs=jobs, is_tile=True))
@@ -226,7 +224,9 @@ class TiledRun:
                     done.add(tile)
                 if self.progress is not None:
                     self.progress(sum(one.points for one in done), total)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as stop:
+            if stop.args:  # it is another signal
+                raise
             raise KeyboardInterrupt(
                 f"stopped; {len(done)} of {len(self.tiles.paths)} files are finished, the same"
                 " command goes on."
