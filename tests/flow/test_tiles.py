@@ -67,6 +67,24 @@ def test_neither_the_number_of_tiles_nor_of_jobs_counts(count, jobs, tmp_path):
     assert figures(one) == figures(many)
 
 
+def test_a_view_list_counts_the_rows_of_all_tiles(tmp_path):
+    from pcfix.io.scenes import write_scene
+
+    write_scene(pcfix.simulate_scene(3000, cloud="depth-maps"), tmp_path / "s", overwrite=False)
+    folder, merged = cut(tmp_path / "tiles", 2, cloud=tmp_path / "s" / "cloud.laz")
+    given = {"cameras": tmp_path / "s" / "cameras.csv", "water": 0.37}
+    given["views"] = tmp_path / "s" / "dense.ply"
+    one = pcfix.correct_file(merged, tmp_path / "merged.las", **given)
+    many = pcfix.correct_file(folder, tmp_path / "out", **given)
+    assert many.made == one.made
+    names = ("by_row", "by_position", "unmatched", "entries", "distance_95_m")
+    assert [many.views[name] for name in names] == [one.views[name] for name in names]
+    here, there = records(tmp_path / "merged.las"), records(*tiles_in(tmp_path / "out"))
+    # the depth maps about a point are those of its chunk: to the last digit for nearly all
+    assert np.mean(here["Z"] != there["Z"]) < 0.02
+    assert np.abs(here["Z"] - there["Z"]).max() <= 5
+
+
 def test_a_shoreline_is_that_of_one_cloud(cloud, tmp_path):
     pyogrio = pytest.importorskip("pyogrio")
     given = {"cameras": CAMERAS, "water": 0.37, "method": "snell"}
