@@ -19,7 +19,7 @@ HOUSE = Path(__file__).parents[1] / "pcfix"
 # The floors, from the ground up. What shares a floor stands side by side; a file may import from
 # lower floors and from its own room. "pcfix" is the front door, pcfix/__init__.py.
 FLOORS = (
-    ("version", "errors", "ahead", "qgis"),
+    ("version", "errors", "ahead", "blocks", "qgis"),
     ("parts",),
     ("kernels",),
     ("options",),
@@ -30,7 +30,8 @@ FLOORS = (
     ("refract",),
     ("port",),
     ("adjust",),
-    ("clean", "grid", "compare", "photos"),
+    ("clean",),
+    ("grid", "compare", "photos"),
     ("simulate",),
     ("io",),
     ("report",),
