@@ -31,7 +31,19 @@ from pcfix.io.files import check_input
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
 
-LISTS = (".xml", ".csv", ".txt", ".json", ".geojson", ".psx", ".out", ".nvm")
+LISTS = (
+    ".xml",
+    ".csv",
+    ".txt",
+    ".json",
+    ".geojson",
+    ".psx",
+    ".psz",
+    ".xmlz",
+    ".opf",
+    ".out",
+    ".nvm",
+)
 """How files are named that cameras may be in."""
 FORMATS = (
     CameraFormat(
@@ -173,23 +185,34 @@ def _recognised(
         None if sensor is None else check_input(sensor),
         angles,
     )
-    for form in FORMATS:
-        if form.reader.recognises(source):
-            return source, form
+    known = _format_of(source)
+    if known is not None and known.reader is not unsupported:
+        return source, known
     inside = _camera_files(where)
     if inside:
+        listed = " and ".join(f"{name} ({software})" for name, software in inside)
         raise InputError(
-            f"{where}: is a folder that holds {' and '.join(inside)}; give"
-            f" {where / inside[0]} itself."
+            f"{where}: is a folder that holds {listed}; give {where / inside[0][0]} itself."
         )
+    if known is not None:
+        return source, known
     raise InputError(
         f"{where}: is not a camera file that pcfix knows; give a CSV table with the columns"
         " label, x, y, z and, if you have them, yaw, pitch, roll."
     )
 
 
-def _camera_files(folder: Path) -> list[str]:
-    """Return the names of camera files in a folder, three at most."""
-    paths = sorted(p for p in folder.glob("*") if p.suffix.lower() in LISTS and p.is_file())
-    known = [form.reader for form in FORMATS if form.reader is not unsupported]
-    return [p.name for p in paths if any(one.recognises(Source(p)) for one in known)][:3]
+def _format_of(source: Source) -> CameraFormat | None:
+    """Return the first format that knows the content; standard errors look like poses."""
+    asked = FORMATS[-1:] if unsupported.is_part(source) else FORMATS
+    return next((form for form in asked if form.reader.recognises(source)), None)
+
+
+def _camera_files(folder: Path) -> list[tuple[str, str]]:
+    """Return the names of camera files in a folder and whose they are, three at most."""
+    found = []
+    for path in sorted(p for p in folder.glob("*") if p.suffix.lower() in LISTS and p.is_file()):
+        form = _format_of(Source(path))
+        if form is not None and form.reader is not unsupported:
+            found.append((path.name, form.software))
+    return found[:3]
