@@ -58,7 +58,7 @@ FORMATS = (
     CameraFormat("OpenDroneMap", "the project folder, `reconstruction.json`, `shots.geojson`", odm),
     CameraFormat("OpenSfM", "`reconstruction.json` or its folder", opensfm),
     CameraFormat("COLMAP", "the model folder or workspace, text or binary", colmap),
-    CameraFormat("MicMac", "the `Ori-...` folder", micmac),
+    CameraFormat("MicMac", "the `Ori-...` folder, of MMVII too", micmac),
     CameraFormat(
         "Bundler, MVE",
         "`bundle.out`, `synth_0.out`, with the images or their list beside it",
