@@ -52,14 +52,19 @@ def shown_once(read: Callable[[], _Found], notes: Callable[[_Found], Iterable[st
     return found
 
 
-def photo_library(name: str) -> Any:
-    """Return a library of the extra ``photos``, or say how to get it."""
+def optional_library(name: str, extra: str, who: str) -> Any:
+    """Return a library of an extra, or say who needs it and how to get it."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
         raise InputError(
-            f"Photographs need {name}, which is not installed; run: {installing('photos')}"
+            f"{who} needs {name}, which is not installed; run: {installing(extra)}"
         ) from error
+
+
+def photo_library(name: str) -> Any:
+    """Return a library of the extra ``photos``, or say how to get it."""
+    return optional_library(name, "photos", "Work on photographs")
 
 
 def show_warning(

@@ -45,6 +45,7 @@ from pcfix.io.pdal import (
 )
 from pcfix.model import LOW_NOISE, WaterDimension, WaterSurface
 from pcfix.options.declare import Option, OptionSet, named, options_of
+from pcfix.options.shared import PartOptions
 
 Set = TypeVar("Set", bound=OptionSet)
 
@@ -259,7 +260,8 @@ def _options(namespace: dict[str, Any], kind: type[Set], needed: tuple[str, ...]
     if twice is not None:
         raise SettingError(f"pdalargs: {twice} is given twice, with dashes and underscores.")
     given = {name.replace("-", "_"): value for name, value in given.items()}
-    known = {one.name: one for one in options_of(kind) if one.name != "port"}
+    elsewhere = {"port", *(one.name for one in options_of(PartOptions))}  # readers choose points
+    known = {one.name: one for one in options_of(kind) if one.name not in elsewhere}
     values = {
         name: _converted(known[name], value)
         for name, value in named(given, known.values(), "pdalargs").items()

@@ -23,7 +23,7 @@ FLOORS = (
     ("parts",),
     ("kernels",),
     ("options",),
-    ("model",),
+    ("model", "sums"),
     ("lens",),
     ("water",),
     ("label",),

@@ -37,6 +37,7 @@ from pcfix.model import (
     Views,
 )
 from pcfix.refract.choice import spatial_order, views_in_frame
+from pcfix.sums import Sums
 from pcfix.water.surface import SurfaceAbove, is_submerged
 
 Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
@@ -249,8 +250,10 @@ class Step(NamedTuple):
         return replace(found, apparent_xyz=self.old_xyz, shift_m=shift)
 
 
-class Carrying:
+class Carrying(Sums):
     """The two models of a block, and what became of the points so far."""
+
+    added, most = ("_points", "_not_carried", "_land", "_sum_m"), ("_most_m",)
 
     def __init__(self, pair: Pair) -> None:
         self.pair = pair

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 from cyclopts import App, CycloptsError
 
@@ -20,6 +22,7 @@ app = App(
     version_flags=["--version"],
     help_flags=["--help", "-h"],
     help_format="plaintext",
+    suppress_keyboard_interrupt=False,
 )
 for place, (command, example) in enumerate(EXAMPLES):
     summary, _, more = str(command.__doc__).partition("\n")
@@ -34,16 +37,10 @@ for place, (command, example) in enumerate(EXAMPLES):
 
 def main(tokens: Sequence[str] | None = None) -> None:
     """Run the command line; a user's mistake is one line on stderr and exit code 1."""
-    warnings.showwarning = show_warning
     arguments = list(sys.argv[1:] if tokens is None else tokens)
-    for command, _ in EXAMPLES:
-        if name_of(command) in arguments[:1]:
-            prepare(command)
-    if arguments in ([], *([name] for name in app if name not in ("demo", "--version"))):
-        app([*arguments, "--help"], result_action="return_value")
-        sys.exit(0 if arguments in (["--help"], ["-h"]) else 2)
     try:
-        app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
+        _end_cleanly()
+        _run(arguments)
     except CycloptsError as error:
         if isinstance(error.__cause__, PcfixError):
             _stop(str(error.__cause__), 1)
@@ -52,8 +49,39 @@ def main(tokens: Sequence[str] | None = None) -> None:
         _stop(f"{error}\n{_try(arguments)}", 2)
     except PcfixError as error:
         _stop(str(error), 1)
+    except _EndedError as end:
+        _stop("stopped.", 128 + end.args[0])
+    except KeyboardInterrupt as stop:
+        _stop(str(stop) or "stopped.", 130)
     except BrokenPipeError:
         sys.exit(1)
+
+
+def _run(arguments: list[str]) -> None:
+    warnings.showwarning = show_warning
+    for command, _ in EXAMPLES:
+        if name_of(command) in arguments[:1]:
+            prepare(command)
+    if arguments in ([], *([name] for name in app if name not in ("demo", "--version"))):
+        app([*arguments, "--help"], result_action="return_value")
+        sys.exit(0 if arguments in (["--help"], ["-h"]) else 2)
+    app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
+
+
+class _EndedError(KeyboardInterrupt):
+    """Another process ends this one, which tidies up as after Ctrl-C."""
+
+
+def _end_cleanly() -> None:
+    """Let signals that end a process do so as Ctrl-C does, but where they are ignored."""
+
+    def end(number: int, frame: Any) -> None:
+        raise _EndedError(number)
+
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, end)
 
 
 def _try(arguments: list[str]) -> str:

@@ -18,12 +18,15 @@ from pcfix.options.declare import options_of
 from pcfix.options.handover import PlanOptions, PluginOptions, ViewerOptions
 from pcfix.options.photos import CalmOptions, OrthoOptions, PhotosOptions
 from pcfix.options.scenes import DemoOptions, SimulateOptions
-from pcfix.options.shared import JobOptions
+from pcfix.options.shared import TileOptions
 from pcfix.options.steps import CleanOptions, CompareOptions, DsmOptions
 from pcfix.options.survey import AdjustOptions, CamerasCheckOptions, RunOptions, WaterCheckOptions
 
 Input = Annotated[Path, Parameter(help="LAS or LAZ cloud.")]
-Output = Annotated[Path, Parameter(help="LAS or LAZ to write.")]
+Inputs = Annotated[
+    str, Parameter(help="LAS or LAZ cloud; a folder, glob, list (.txt) or index (.vpc) of tiles.")
+]
+Output = Annotated[Path, Parameter(help="LAS or LAZ to write; a folder for tiles.")]
 
 
 def run(
@@ -65,7 +68,7 @@ def run(
 
 
 def correct(
-    input: Input,
+    input: Inputs,
     output: Output,
     /,
     *,
@@ -132,7 +135,7 @@ def adjust(
 
 
 def label(
-    input: Input,
+    input: Inputs,
     output: Output,
     /,
     *,
@@ -165,7 +168,7 @@ def clean(
 
 
 def dsm(
-    input: Input,
+    input: Inputs,
     output: Annotated[Path, Parameter(help="GeoTIFF to write.")],
     /,
     *,
@@ -283,11 +286,11 @@ def water(
 
 
 def restore(
-    input: Input,
+    input: Inputs,
     output: Output,
     /,
     *,
-    options: Annotated[JobOptions, FLAGS] = JobOptions(),
+    options: Annotated[TileOptions, FLAGS] = TileOptions(),
     quiet: Quiet = False,
 ) -> None:
     """Give back the cloud as it was before 'pcfix correct', bit for bit."""

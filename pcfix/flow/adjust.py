@@ -23,7 +23,8 @@ from pcfix.flow.surfaces import view_of
 from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.io.cameras.opensfm.models import write_opensfm
 from pcfix.io.cameras.table.sensor import write_table
-from pcfix.io.files import check_input, folder_when_whole, write_text
+from pcfix.io.drafts import folder_when_whole
+from pcfix.io.files import check_input, write_text
 from pcfix.io.members import write_members
 from pcfix.io.water_rasters import write_water_raster
 from pcfix.model import Cameras, TiePoints, Views, WaterRaster

@@ -22,7 +22,8 @@ from pcfix.flow.photos import lens_of
 from pcfix.flow.runner import Progress, check_summary, write_summary
 from pcfix.grid.lattice import Lattice
 from pcfix.io.crs import parse_crs
-from pcfix.io.files import folder_when_whole, replaced_when_whole, scratch_arrays
+from pcfix.io.drafts import folder_when_whole, replaced_when_whole
+from pcfix.io.files import scratch_arrays
 from pcfix.io.frames import Frames, check_calm, read_frames, write_calm, write_spread
 from pcfix.io.rasters import filled_heights, new_raster, open_raster, write_part
 from pcfix.kernels import threads

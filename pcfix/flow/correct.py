@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,24 @@ from pcfix.flow.job import Job
 from pcfix.flow.old_cameras import paired
 from pcfix.flow.plausibility import CloudSample, plausible
 from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
-from pcfix.flow.surfaces import Points, corners, file_points, own_water_of, points_of, view_of
+from pcfix.flow.surfaces import (
+    Points,
+    corners,
+    file_points,
+    first_points,
+    own_water_of,
+    points_of,
+    view_of,
+)
 from pcfix.flow.through_water import Label, correct_checked
+from pcfix.flow.tiles import TiledRun
+from pcfix.io.files import local_path
 from pcfix.io.las import columns
+from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource, centring_steps
 from pcfix.io.las.writing import corrected_header
 from pcfix.io.regressions import read_regression
+from pcfix.io.tiles import Clouds, Tiles, open_cloud, single, tiles_of
 from pcfix.kernels import threads
 from pcfix.model import (
     BATHYMETRIC_POINT,
@@ -39,6 +52,7 @@ from pcfix.refract.batch import Batch, MadeWith, Survey
 from pcfix.refract.learning import for_own_water, learn_of_points
 from pcfix.refract.regression import BeyondRange, DepthRegression
 from pcfix.refract.tally import Summary
+from pcfix.sums import Sums
 from pcfix.water.checks import WaterMeeting, as_surface, check_above_water, checked_points
 from pcfix.water.index import with_index
 from pcfix.water.surface import is_submerged, surface_above
@@ -202,30 +216,33 @@ def _check_views(views: Views, n: int, k: int) -> None:
 
 
 def correct_file(
-    input: File,
+    input: Clouds,
     output: File,
     *,
     options: CorrectOptions | None = None,
     progress: Progress | None = None,
     **keywords: Any,
 ) -> Summary:
-    """Correct a LAS or LAZ cloud; what ``pcfix correct`` runs.
+    """Correct a LAS or LAZ cloud, of one file or many; what ``pcfix correct`` runs.
 
     Parameters
     ----------
     input, output : path
         The names end in ``.las`` or ``.laz``; the output is LAS 1.4, point format 6, 7 or 8 (9
-        or 10 for inputs with waveforms).
+        or 10 for inputs with waveforms). For many files (a list of paths, or what else
+        `pcfix.io.tiles.tiles_of` takes) the output is a folder, and every point becomes what it
+        would in one file of them all.
     options : CorrectOptions, optional
         Or its attributes as keywords, as of ``pcfix correct``: ``cameras`` (a path or
         `pcfix.Cameras`), ``water`` (what `pcfix.read_water` takes, a `pcfix.WaterSurface`,
         shoreline points in a vector file, or ``auto``) and many more.
     progress : callable, optional
-        Called with (points done, points in all) after each chunk.
+        Called with (points done, points in all) after each chunk, or each of many files.
 
     Returns
     -------
     Summary
+        Of them all.
 
     Raises
     ------
@@ -233,35 +250,78 @@ def correct_file(
         With one sentence on what to mend; no output is left behind.
     """
     given = taken(CorrectOptions, options, keywords, "correct_file")
-    task = file_task(input, output, given, reads=paths_in(given), progress=progress)
+    tiles = tiles_of(input)
+    if tiles is not None:
+        run = TiledRun("correct", tiles, local_path(output), given, progress)
+        return run.run(partial(_step_over, given), partial(_summary_over, run), Summary)
+    task = file_task(single(input), output, given, reads=paths_in(given), progress=progress)
     step = Correcting(job_for(task.source, given))
     with threads(given.jobs), step.job.compiling():
         step.job.look_around(
-            partial(file_points, task.source, step.job.water, given.jobs, task.held)
+            partial(file_points, task.source, step.job.water, given.jobs, task.kept)
         )
-        _run_until_it_fits(task, step)
+        step.run(task)
     step.job.save_regression()
     result = step.job.summary(str(task.source), str(task.target), task.seconds)
+    result = replace(result, part=part_report(task.source))
     task.tell(result.as_dict())
     return result
 
 
-def job_for(path: Path, options: CorrectOptions) -> Job:
-    """Return the job of correcting a LAS or LAZ file."""
-    view = view_of(path)
-    with LasSource(path) as source:
+def _step_over(options: CorrectOptions, tiles: Tiles) -> Correcting:
+    """Return the step for many files, with what is learned of the cloud that they are."""
+    job = job_for(tiles, options)
+    with job.compiling():
+        job.look_around(partial(file_points, tiles, job.water, options.jobs))
+        if job.views.list is not None:  # the first chunk tells what it lists
+            job.correct(first_points(file_points(tiles, job.water, options.jobs)))
+    return Correcting(job)
+
+
+def _summary_over(run: TiledRun, step: Correcting) -> Summary:
+    step.job.save_regression()
+    return step.job.summary(str(run.tiles), str(run.folder), run.seconds)
+
+
+def job_for(cloud: Path | Tiles, options: CorrectOptions) -> Job:
+    """Return the job of correcting a LAS or LAZ file, or many as one cloud."""
+    view = view_of(cloud)
+    with open_cloud(cloud) as source:
         step_m = float(max(source.header.scales))
-    return Job(str(path), options, view, step_m)
+    return Job(str(cloud), options, view, step_m)
 
 
-class Correcting(Step):
+class Correcting(Sums, Step):
     """The step that corrects points."""
+
+    added = ("job",)
 
     def __init__(self, job: Job) -> None:
         self.job = job
         self._columns = columns.columns_for(job.options.dimensions, job.options.unsure)
+        self.begin(0)
+
+    def begin(self, first_row: int) -> None:
+        """Forget the chunks so far; the next one begins at a row of the whole cloud."""
         self.wide = False
         self.steps: tuple[int, ...] = (0, 0, 0)
+        self.job.restart(first_row)
+
+    def run(self, task: FileTask) -> None:
+        """Write with narrow types and the input's offsets, and again where they do not do."""
+        while True:
+            try:
+                return task.run(self)
+            except columns.TooNarrowError:
+                self.wide = True
+            except columns.OutOfRangeError as axis:
+                old, self.steps = self.steps, centring_steps(task.source, task.jobs)
+                if self.steps == old:
+                    raise InputError(
+                        f"{task.source}: the scale of {axis} is too fine to hold the result in 32"
+                        " bits; write the cloud with a coarser scale first."
+                    ) from axis
+            self.job.restart(self.job.first_row)
 
     def header(self, source: LasSource) -> Header:
         """Return the header with the new dimensions and the record of what is done."""
@@ -294,20 +354,3 @@ class Correcting(Step):
     def finish(self) -> None:
         """Refuse a result in which cloud, water and cameras did not meet."""
         self.job.check_fit()
-
-
-def _run_until_it_fits(task: FileTask, step: Correcting) -> None:
-    """Write with narrow types and the input's offsets, and again where a cloud is beyond them."""
-    while True:
-        try:
-            return task.run(step)
-        except columns.TooNarrowError:
-            step.wide = True
-        except columns.OutOfRangeError as axis:
-            old, step.steps = step.steps, centring_steps(task.source, task.jobs)
-            if step.steps == old:
-                raise InputError(
-                    f"{task.source}: the scale of {axis} is too fine to hold the result in 32"
-                    " bits; write the cloud with a coarser scale first."
-                ) from axis
-        step.job.restart()

@@ -14,7 +14,6 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,10 +34,13 @@ from pcfix.grid.lattice import (
 from pcfix.grid.model import NO_LIGHT, DsmSummary, Tally, hillshade
 from pcfix.io import rasters
 from pcfix.io.crs import crs_words, parts
-from pcfix.io.files import Bins, check_output, replaced_when_whole, write_text
+from pcfix.io.drafts import draft_folder, replaced_when_whole
+from pcfix.io.files import Bins, check_output, write_text
+from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.las.writing import is_ours
 from pcfix.io.styles import raster_style
+from pcfix.io.tiles import Clouds, Tiles, inputs_of, open_cloud, single, tiles_of
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, BoolArray, FloatArray, IntArray
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules, SurfaceChoice
@@ -68,7 +70,7 @@ METRE = "metre"
 
 
 def grid_dsm(
-    input: File,
+    input: Clouds,
     output: File,
     *,
     options: DsmOptions | None = None,
@@ -90,8 +92,8 @@ def grid_dsm(
 
     Parameters
     ----------
-    input : path
-        LAS or LAZ, in metres.
+    input : path, or list of paths
+        LAS or LAZ, in metres; of many, as `pcfix.io.tiles.tiles_of` has them, one raster is made.
     output : path
         The name ends in ``.tif`` or ``.tiff``.
     options : DsmOptions, optional
@@ -123,26 +125,28 @@ def grid_dsm(
     given = taken(DsmOptions, options, keywords, "grid_dsm")
     more = {name: getattr(given, name) for name in ("hillshade", "counts")}
     more = {name: Path(path) for name, path in more.items() if path is not None}
+    tiles = tiles_of(input)
     task = file_task(
-        input, output, given, more=more.values(), check=rasters.check_tif, progress=progress
-    )
+        single(input) if tiles is None else tiles, output, given,
+        more=more.values(), check=rasters.check_tif, progress=progress,
+    )  # fmt: skip
+    cloud = tiles or task.source
     style = task.target.with_suffix(".qml")
     if given.style:
-        check_output(style, overwrite=given.overwrite, inputs=[input])
+        check_output(style, overwrite=given.overwrite, inputs=inputs_of(cloud))
     if given.cog:
         rasters.check_cog()
     rules = given.part(DsmRules)
     if given.resolution is None:
-        spacing_m = point_spacing_m(task.source, rules)
+        spacing_m = point_spacing_m(cloud, rules)
         rules = replace(rules, resolution=round_resolution(spacing_m, 0.0))
-    run = _Run(task, rules, given.cog)
+    run = _Run(task, cloud, rules, given.cog)
     with ExitStack() as stack:
         drafts = {
             name: stack.enter_context(replaced_when_whole(path))
             for name, path in {"dsm": task.target, **more}.items()
         }
-        folder = TemporaryDirectory(dir=task.target.parent, prefix=".pcfix-dsm-")
-        run.write(Path(stack.enter_context(folder)), **drafts)
+        run.write(stack.enter_context(draft_folder(task.target.parent)), **drafts)
     if given.style:
         write_text(style, raster_style(task.target, rules.what), overwrite=given.overwrite)
     result = replace(
@@ -155,14 +159,14 @@ def grid_dsm(
     return result
 
 
-def point_spacing_m(path: Path, settings: DsmRules) -> float:
+def point_spacing_m(cloud: Path | Tiles, settings: DsmRules) -> float:
     """Return the side of the square that each point of a raster has for itself, metres."""
-    with LasSource(path) as source:
+    with open_cloud(cloud) as source:
         area, _ = _stated_extent(source, MIN_RESOLUTION_M)
         near = Occupancy(area, len(source), MIN_RESOLUTION_M)
         for points in source.chunks():
             near.add(coordinates(points)[_wanted(points, settings.surface)])
-    _refuse_none(near.points, path, settings.surface)
+    _refuse_none(near.points, cloud, settings.surface)
     return near.spacing_m
 
 
@@ -171,6 +175,7 @@ class _Run:
     """One cloud on its way into a raster."""
 
     task: FileTask
+    cloud: Path | Tiles
     settings: DsmRules
     cog: bool
     tally: Tally = field(default_factory=Tally)
@@ -179,7 +184,7 @@ class _Run:
         self, folder: Path, dsm: Path, hillshade: Path | None = None, counts: Path | None = None
     ) -> None:
         """Write the raster, and its hillshade and its counts if paths are given."""
-        with LasSource(self.task.source) as source:
+        with open_cloud(self.cloud) as source:
             self.crs, self.points = metric_crs(source), len(source)
             self.plan = None if self.crs is None else parts(self.crs)[0]
             corrected = any(is_ours(vlr) for vlr in source.vlrs)
@@ -304,6 +309,7 @@ class _Run:
             settings=asdict(settings),
             seconds=round(self.task.seconds, 3),
             values=tally.values(),
+            part=part_report(self.task.source),
         )
 
 
@@ -419,7 +425,7 @@ def _stated_extent(source: LasSource, resolution_m: float) -> tuple[float, Float
     return area, corner if (np.abs(corner) < 1e9).all() else np.zeros((1, 2))
 
 
-def _refuse_none(points: int, source: Path, surface: SurfaceChoice) -> None:
+def _refuse_none(points: int, source: Path | Tiles, surface: SurfaceChoice) -> None:
     if not points and surface == "bed":
         raise InputError(
             f"{source}: has no point of class {BATHYMETRIC_POINT} (bed) that is not withheld;"

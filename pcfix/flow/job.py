@@ -24,11 +24,12 @@ from pcfix.model import Correction, Outcome, WaterSurface
 from pcfix.options.correct import CorrectOptions, LabelRules, ScienceOptions
 from pcfix.refract.choice import views_in_frame
 from pcfix.refract.tally import Summary, Tally
+from pcfix.sums import Sums
 from pcfix.version import __version__
 from pcfix.water.index import with_index
 
 
-class Job:
+class Job(Sums):
     """A correction: its options, cameras and water or port, and the tally of its chunks.
 
     Parameters
@@ -46,6 +47,8 @@ class Job:
     PcfixError
         If an input cannot be read or they do not fit, or a camera stands under the water.
     """
+
+    added = ("tally", "labelling", "medium", "views")
 
     def __init__(
         self, name: str, options: CorrectOptions, view: CloudView, step_m: float = 0.0
@@ -67,11 +70,12 @@ class Job:
         """The water surface; infinitely high behind a port."""
         return self.medium.water
 
-    def restart(self) -> None:
-        """Forget the chunks so far."""
-        self.tally = Tally(len(self.cameras))
+    def restart(self, first_row: int = 0) -> None:
+        """Forget the chunks so far; the next one begins at a row of the whole cloud."""
+        self.first_row = first_row
+        self.tally = Tally(len(self.cameras), self._view.points, first_row)
         self.labelling.restart()
-        self.medium.restart()
+        self.medium.restart(first_row)
         self.views.restart()
 
     def compiling(self) -> AbstractContextManager[None]:
@@ -84,7 +88,7 @@ class Job:
 
     def correct(self, points: Points) -> Correction:
         """Correct one chunk."""
-        views = self.views.of(points.xyz, self.tally.points)
+        views = self.views.of(points.xyz, self.first_row + self.tally.points)
         correction = self.medium.correct(points, views, self.labelling)
         self.tally.add(correction.apparent_xyz, correction)
         return correction

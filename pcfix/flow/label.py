@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy.typing as npt
 
 from pcfix.errors import SettingError
 from pcfix.flow.inputs import mask_of, paths_in
-from pcfix.flow.runner import Chunk, Header, Progress, Step, file_task
+from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
 from pcfix.flow.surfaces import (
     CloudView,
     Points,
@@ -23,15 +24,20 @@ from pcfix.flow.surfaces import (
     points_of,
     view_of,
 )
+from pcfix.flow.tiles import TiledRun
+from pcfix.io.files import local_path
 from pcfix.io.las.columns import convert
+from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import labelling_vlr, noted_header
+from pcfix.io.tiles import Clouds, Tiles, single, tiles_of
 from pcfix.kernels import threads
 from pcfix.label.areas import WaterMask
 from pcfix.label.labelling import Labelling, LabelSummary, Part, sets_class
 from pcfix.model import WaterPlane, WaterSurface
 from pcfix.options.correct import LabelOptions, LabelRules, StageLabelOptions
 from pcfix.options.declare import File, taken
+from pcfix.sums import Sums
 from pcfix.version import __version__
 from pcfix.water.checks import as_surface, check_submerged, check_tilt, checked_points
 from pcfix.water.surface import surface_above
@@ -103,7 +109,7 @@ def label_points(
 
 
 def label_file(
-    input: File,
+    input: Clouds,
     output: File,
     *,
     options: LabelOptions | None = None,
@@ -119,7 +125,8 @@ def label_file(
     Parameters
     ----------
     input, output : path
-        The names end in ``.las`` or ``.laz``; the output is LAS 1.4, see `pcfix.correct_file`.
+        The names end in ``.las`` or ``.laz``; the output is LAS 1.4. Or many files and a folder,
+        see `pcfix.correct_file`.
     options : LabelOptions, optional
         Or its attributes as keywords, as of ``pcfix label``: water, water_mask, band and others.
         With a dead band or connectivity the cloud is read twice. The result does not depend on
@@ -137,28 +144,46 @@ def label_file(
         With one sentence on what to mend; no output is left behind.
     """
     given = taken(LabelOptions, options, keywords, "label_file")
-    task = file_task(input, output, given, reads=paths_in(given), progress=progress)
+    tiles = tiles_of(input)
+    if tiles is not None:
+        run = TiledRun("label", tiles, local_path(output), given, progress)
+        return run.run(
+            lambda part: _step_for(part, given),
+            lambda step: _summary(step, str(tiles), str(output), run.seconds),
+            LabelSummary,
+        )
+    task = file_task(single(input), output, given, reads=paths_in(given), progress=progress)
     with threads(given.jobs):
-        view = view_of(task.source)
-        step = LabellingStep(str(task.source), given, view)
-        step.look_around(lambda: file_points(task.source, step.water, given.jobs))
+        step = _step_for(task.source, given)
         task.run(step)
-    result = LabelSummary(
-        input=str(task.source),
-        output=str(task.target),
+    result = _summary(step, str(task.source), str(task.target), task.seconds)
+    result = replace(result, part=part_report(task.source))
+    task.tell(result.as_dict())
+    return result
+
+
+def _step_for(cloud: Path | Tiles, options: LabelOptions) -> LabellingStep:
+    """Return the step, with what it learns of the whole cloud."""
+    step = LabellingStep(str(cloud), options, view_of(cloud))
+    step.look_around(lambda: file_points(cloud, step.water, options.jobs))
+    return step
+
+
+def _summary(step: LabellingStep, input: str, output: str, seconds: float) -> LabelSummary:
+    return LabelSummary(
+        input=input,
+        output=output,
         pcfix=__version__,
         **step.counts,
         water=str(step.water),
         settings=step.labelling.settings.as_dict(),
         labelling=step.labelling.report(),
-        seconds=round(task.seconds, 3),
+        seconds=round(seconds, 3),
         warnings=list(step.labelling.notes),
     )
-    task.tell(result.as_dict())
-    return result
 
 
-class LabellingStep(Step):
+class LabellingStep(Sums, Step):
     """The step that labels points: of a file, and of the arrays that PDAL hands over.
 
     Parameters
@@ -175,13 +200,25 @@ class LabellingStep(Step):
         If the water or the mask cannot be read or do not fit.
     """
 
+    added = ("counts", "labelling")
+
     def __init__(self, name: str, options: StageLabelOptions, view: CloudView) -> None:
         self._name, self._view = name, view
         self.water = find_surface(options.water, options, view).surface
         check_tilt(self.water)
         mask = mask_of(options.water_mask, view.crs, view.low, view.high)
         self.labelling = Labelling(options.part(LabelRules), mask)
+        self.begin(0)
+
+    def begin(self, first_row: int) -> None:
+        """Forget the chunks so far, wherever the next one is."""
+        del first_row
         self.counts: dict[str, Any] = dict.fromkeys(COUNTS, 0)
+        self.labelling.restart()
+
+    def run(self, task: FileTask) -> None:
+        """Take a file through."""
+        task.run(self)
 
     def look_around(self, chunks: Callable[[], Iterable[Points]]) -> None:
         """Learn the surroundings of all points, where the rules need them."""
@@ -200,6 +237,8 @@ class LabellingStep(Step):
             "water_plane": list(astuple(water)) if isinstance(water, WaterPlane) else None,
             "water_mask": None if mask is None else mask.name,
         }
+        part = part_report(source.path)
+        content |= {} if part is None else {"part": part}
         return noted_header(source, labelling_vlr(content))
 
     def classes(self, points: Points) -> Classes:

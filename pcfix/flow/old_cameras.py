@@ -15,6 +15,7 @@ from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
 from pcfix.io.labels import match_labels
 from pcfix.io.views import ViewList, ViewMatch, ViewReport
 from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints, Views
+from pcfix.sums import Sums
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -191,17 +192,21 @@ def old_tie_points(
     return replace(ties, views=views, image_xy=ties.image_xy[entry]), True
 
 
-class ListedViews:
+class ListedViews(Sums):
     """The view list of a cloud, given to its points chunk by chunk; empty without a list."""
+
+    added = ("report",)
 
     def __init__(
         self, views: ViewList | None, cameras: Cameras, points: int, step_m: float
     ) -> None:
-        self.list, self._points = views, points
-        self._anew: Callable[[], ViewMatch | None] = lambda: (
-            None if views is None else ViewMatch(views, cameras, points=points, step_m=step_m)
-        )
+        self.list, self._cameras, self._points, self._step_m = views, cameras, points, step_m
         self.restart()
+
+    def _anew(self) -> ViewMatch | None:
+        if self.list is None:
+            return None
+        return ViewMatch(self.list, self._cameras, points=self._points, step_m=self._step_m)
 
     def restart(self) -> None:
         """Go back to the first row of the cloud."""

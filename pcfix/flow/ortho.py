@@ -7,7 +7,6 @@ import warnings
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from pcfix.flow.photos import Block, block_of
 from pcfix.flow.runner import Progress, check_summary, write_summary
 from pcfix.grid.lattice import Lattice, Window, lattice_over, refuse_size
 from pcfix.io import rasters
-from pcfix.io.files import replaced_when_whole
+from pcfix.io.drafts import draft_folder, replaced_when_whole
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.kernels import threads
 from pcfix.model import FloatArray, WaterPlane
@@ -75,8 +74,7 @@ def ortho_photo(
     target = rasters.check_tif(output, overwrite=given.overwrite, inputs=known)
     check_summary(given, [*known, target])
     rasters.check_cog()
-    with threads(given.jobs), TemporaryDirectory(dir=target.parent, prefix=".pcfix-ortho-") as name:
-        folder = Path(name)
+    with threads(given.jobs), draft_folder(target.parent) as folder:
         block = block_of(_as_photos(given), paths, folder)
         for note in block.notes:
             warnings.warn(note, PcfixWarning, stacklevel=2)

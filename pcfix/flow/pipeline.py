@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any
 from pcfix.errors import InputError, SettingError
 from pcfix.flow.correct import job_for
 from pcfix.io.las.columns import UPGRADE, Column, columns_for
+from pcfix.io.las.copc import is_copc
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix
 from pcfix.io.pdal import CLASS_FLAGS, OUTCOME, STAGE_SOURCE, add_dimension
 from pcfix.options.correct import CorrectOptions
+from pcfix.options.shared import PartOptions
 
 if TYPE_CHECKING:
     import laspy
@@ -44,6 +46,11 @@ def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str
         format.
     """
     check_suffix(output)
+    if is_copc(output):
+        raise SettingError(
+            f"{output}: the pipeline would write LAZ without the octree of COPC; give a name that"
+            " ends in .las, or use 'pcfix correct'."
+        )
     job_for(input, options)
     with LasSource(input) as source:
         point_format = source.header.point_format
@@ -69,6 +76,11 @@ def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str
 
 
 def _stage(options: CorrectOptions) -> dict[str, Any]:
+    if options.part(PartOptions) != PartOptions():
+        raise SettingError(
+            "bounds and read-resolution are the reader's in a pipeline: leave them out, and give"
+            " readers.copc its bounds and resolution."
+        )
     drop, plain = options.uncorrected == "drop", options.plain()
     columns = columns_for(options.dimensions, options.unsure)
     first = {name: plain[name] for name in ("cameras", "water") if name in plain}

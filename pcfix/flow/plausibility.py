@@ -18,6 +18,7 @@ from pcfix.flow.surfaces import Points
 from pcfix.lens.frames import cameras_in_sight
 from pcfix.lens.imaging import project
 from pcfix.model import BoolArray, Cameras, FloatArray, TiePoints
+from pcfix.sums import Sums
 
 SAMPLE_POINTS, IN_FRAMES = 30_000, 4_000
 """Points that are looked at for a shoreline, and in the frames; evenly spread over the cloud."""
@@ -72,11 +73,13 @@ class Plausible(NamedTuple):
         return {"words": str(self), **lists}
 
 
-class CloudSample:
-    """Points of a cloud, taken chunk by chunk, the same for any size of chunks."""
+class CloudSample(Sums):
+    """Points of a cloud, taken chunk by chunk from a row on, the same for any size of chunks."""
 
-    def __init__(self, points: int) -> None:
-        self._step, self._done = max(1, points // SAMPLE_POINTS), 0
+    added = ("_xyz", "_water", "_rgb")
+
+    def __init__(self, points: int, first_row: int = 0) -> None:
+        self._step, self._done = max(1, points // SAMPLE_POINTS), first_row
         self._xyz: list[FloatArray] = []
         self._water: list[FloatArray] = []
         self._rgb: list[FloatArray] = []

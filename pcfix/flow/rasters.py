@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from pcfix.grid.colours import relief_colours
 from pcfix.grid.lattice import Lattice, Window, round_resolution
 from pcfix.grid.model import hillshade
 from pcfix.io import rasters
-from pcfix.io.files import replaced_when_whole
+from pcfix.io.drafts import draft_folder, replaced_when_whole
 from pcfix.io.las.source import LasSource
 from pcfix.io.styles import limits_of
 from pcfix.model import Cameras, FloatArray
@@ -97,8 +96,7 @@ def _write_shaded(folder: Path) -> None:
     high = limits_of(rasters.preview(folder / DEPTH)[0], "depth")[1]
     with ExitStack() as stack:
         draft = stack.enter_context(replaced_when_whole(target))
-        scratch = stack.enter_context(TemporaryDirectory(dir=folder, prefix=".pcfix-shaded-"))
-        plain = Path(scratch) / SHADED
+        plain = stack.enter_context(draft_folder(folder)) / SHADED
         surface = stack.enter_context(rasters.open_raster(folder / SURFACE))
         depth = stack.enter_context(rasters.open_raster(folder / DEPTH))
         lattice = rasters.lattice_of(surface)

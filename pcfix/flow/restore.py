@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.flow.runner import Chunk, Header, Step, file_task
+from pcfix.flow.runner import Chunk, FileTask, Header, Step, file_task
+from pcfix.flow.tiles import TiledRun
+from pcfix.io.files import local_path
 from pcfix.io.las.columns import (
     SHIFTS,
     UNSURE,
@@ -20,16 +22,18 @@ from pcfix.io.las.columns import (
 )
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import read_settings, restored_header
+from pcfix.io.tiles import Clouds, single, tiles_of
 from pcfix.kernels import threads
 from pcfix.options.declare import File, taken
-from pcfix.options.shared import JobOptions
+from pcfix.options.shared import TileOptions
+from pcfix.sums import Sums
 
 
 def restore_file(
-    input: File,
+    input: Clouds,
     output: File,
     *,
-    options: JobOptions | None = None,
+    options: TileOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
     **keywords: Any,
 ) -> int:
@@ -38,11 +42,12 @@ def restore_file(
     Parameters
     ----------
     input : path
-        A cloud that pcfix corrected with ``dimensions="all"``.
+        A cloud that pcfix corrected with ``dimensions="all"``, or many and a folder for the
+        output; see `pcfix.correct_file`.
     output : path
         The cloud as it was: coordinates, classes, flags, point format, version.
-    options : JobOptions, optional
-        Or its attributes as keywords: overwrite, jobs.
+    options : TileOptions, optional
+        Or its attributes as keywords: overwrite, jobs, scheduler.
     progress : callable, optional
         See `pcfix.correct_file`.
 
@@ -56,19 +61,34 @@ def restore_file(
     InputError
         If pcfix did not correct the file, or without the dimensions that undo it.
     """
-    given = taken(JobOptions, options, keywords, "restore_file")
-    task = file_task(input, output, given, progress=progress)
+    given = taken(TileOptions, options, keywords, "restore_file")
+    tiles = tiles_of(input)
+    if tiles is not None:
+        run = TiledRun("restore", tiles, local_path(output), given, progress)
+        return run.run(lambda _: Restoring(), lambda step: step.points)
+    task = file_task(single(input), output, given, progress=progress)
     step = Restoring()
     with threads(given.jobs):
         task.run(step)
     return step.points
 
 
-class Restoring(Step):
+class Restoring(Sums, Step):
     """The step that takes points back."""
+
+    added = ("points",)
 
     def __init__(self) -> None:
         self.points, self._offset, self._has_unsure = 0, np.zeros(3, np.int64), False
+
+    def begin(self, first_row: int) -> None:
+        """Count from nothing, wherever the next point is."""
+        del first_row
+        self.points = 0
+
+    def run(self, task: FileTask) -> None:
+        """Take a file through."""
+        task.run(self)
 
     def header(self, source: LasSource) -> Header:
         """Return the header as it was before the correction."""

@@ -14,8 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from pcfix.io.files import check_input, check_output, write_text
+from pcfix.io.las.part import cloud_part
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import LasSink, check_suffix, corrected_identity, output_evlrs
+from pcfix.io.tiles import Tiles, check_one_file, inputs_of
 from pcfix.kernels import telling
 from pcfix.options.declare import File
 
@@ -68,9 +70,11 @@ class FileTask:
         Where the summary goes, as JSON.
     progress : callable or None
         Called with (points done, points in all), after each chunk and while it is corrected.
+    is_tile : bool
+        Whether it is a part of a cloud; `Step.finish` is about a whole one.
     started : float
         `time.perf_counter` then.
-    held : list
+    kept : list
         The chunks of a small cloud that is gone through more than once; see `LasSource`.
     """
 
@@ -80,8 +84,9 @@ class FileTask:
     overwrite: bool = False
     jobs: int | None = None
     progress: Progress | None = None
+    is_tile: bool = False
     started: float = field(default_factory=time.perf_counter)
-    held: list[Chunk] = field(default_factory=list)
+    kept: list[Chunk] = field(default_factory=list)
 
     @property
     def seconds(self) -> float:
@@ -90,7 +95,7 @@ class FileTask:
 
     def run(self, step: Step) -> None:
         """Take every chunk through a step; the target appears when all went well."""
-        with LasSource(self.source, self.jobs, held=self.held or None) as source:
+        with LasSource(self.source, self.jobs, kept=self.kept or None) as source:
             header = step.header(source)
             identity = step.identity or corrected_identity(source)
             with LasSink(self.target, header, output_evlrs(source), identity, self.jobs) as sink:
@@ -102,7 +107,8 @@ class FileTask:
                             write(step.chunk(points, source, header))
                         done += count
                         self._tell(done, 0, len(source))
-                step.finish()
+                if not self.is_tile:
+                    step.finish()
 
     def _tell(self, done: int, chunk: int, total: int, of_chunk: int = 0) -> None:
         """Show that so many points are done, and so many of a chunk, which may go twice."""
@@ -174,7 +180,7 @@ def check_cloud(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> 
 
 
 def file_task(
-    input: File,
+    input: File | Tiles,
     output: File,
     options: Any,
     *,
@@ -188,6 +194,7 @@ def file_task(
     Parameters
     ----------
     input, output : path
+        The input may be many files.
     options : OptionSet
         With overwrite, and where the command has them summary and jobs.
     reads : iterable
@@ -204,11 +211,13 @@ def file_task(
         If a file is missing, or would be replaced.
     """
     started = time.perf_counter()
-    source = check_input(input)
-    known = [one for one in (input, *reads) if isinstance(one, str | PathLike)]
+    check_one_file(input, options)
+    source = Path(str(input)) if isinstance(input, Tiles) else check_input(input)
+    source = cloud_part(source, options)
+    known = [one for one in (*inputs_of(input), *reads) if isinstance(one, str | PathLike)]
     for path in (output, *more):
         known.append(check(path, overwrite=options.overwrite, inputs=known))
     check_summary(options, known)
     target = Path(output)
     summary, jobs = (getattr(options, name, None) for name in ("summary", "jobs"))
-    return FileTask(source, target, summary, options.overwrite, jobs, progress, started)
+    return FileTask(source, target, summary, options.overwrite, jobs, progress, started=started)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -14,8 +15,10 @@ import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.runner import Chunk, read_ahead
+from pcfix.io.las import source as las
 from pcfix.io.las.counts import check_count
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
+from pcfix.io.tiles import Tiles, open_cloud
 from pcfix.io.water import read_water
 from pcfix.io.water_rasters import rasters_of_images, read_water_raster
 from pcfix.label.labelling import Part
@@ -122,34 +125,52 @@ def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
 
 
-def view_of(path: Path, jobs: int | None = None) -> CloudView:
-    """Return the view of a LAS or LAZ file."""
-    with LasSource(path, jobs) as source:
-        check_count(source)
+def view_of(cloud: Path | Tiles, jobs: int | None = None) -> CloudView:
+    """Return the view of a LAS or LAZ file, or of many as one cloud."""
+    with open_cloud(cloud, jobs) as source:
+        if not isinstance(cloud, Tiles):
+            check_count(source)
         crs, points = metric_crs(source), len(source)
         low, high = np.array(source.header.mins[:2]), np.array(source.header.maxs[:2])
         software = str(source.header.generating_software or "")
+    chunks = partial(_seen, cloud, jobs)
+    return CloudView(str(cloud), crs, low, high, points, chunks, software)
 
-    def chunks() -> Iterator[Seen]:
-        with LasSource(path, jobs) as source:
-            names = set(source.header.point_format.dimension_names)
-            for chunk in source.chunks():
-                rgb = None
-                if {"red", "green", "blue"} <= names:
-                    rgb = np.column_stack([chunk["red"], chunk["green"], chunk["blue"]])
-                classes, returns = chunk["classification"], chunk["number_of_returns"]
-                yield Seen(coordinates(chunk), rgb, np.asarray(classes), np.asarray(returns))
 
-    return CloudView(str(path), crs, low, high, points, chunks, software)
+def _seen(cloud: Path | Tiles, jobs: int | None) -> Iterator[Seen]:
+    with open_cloud(cloud, jobs) as source:
+        names = set(source.header.point_format.dimension_names)
+        for chunk in source.chunks():
+            rgb = None
+            if {"red", "green", "blue"} <= names:
+                rgb = np.column_stack([chunk["red"], chunk["green"], chunk["blue"]])
+            classes, returns = chunk["classification"], chunk["number_of_returns"]
+            yield Seen(coordinates(chunk), rgb, np.asarray(classes), np.asarray(returns))
 
 
 def file_points(
-    path: Path, water: WaterSurface | None, jobs: int | None = None, held: list[Chunk] | None = None
+    cloud: Path | Tiles,
+    water: WaterSurface | None,
+    jobs: int | None = None,
+    kept: list[Chunk] | None = None,
 ) -> Iterator[Points]:
-    """Yield all points of a LAS or LAZ file, chunk by chunk, see `LasSource`."""
+    """Yield all points of a LAS or LAZ file, or of many, chunk by chunk, see `LasSource`."""
     places = not isinstance(water, WaterDimension)
-    with LasSource(path, jobs, places_only=places, held=held) as source:
+    with open_cloud(cloud, jobs, places_only=places, kept=kept) as source:
         yield from read_ahead((points_of(one, source, water) for one in source.chunks()), jobs)
+
+
+def first_points(chunks: Iterable[Points]) -> Points:
+    """Return as many points of a cloud as a chunk has, however many these chunks have."""
+    parts: list[Points] = []
+    count = 0
+    for one in chunks:
+        parts.append(one.take(np.arange(min(len(one.xyz), las.CHUNK_POINTS - count))))
+        count += len(parts[-1].xyz)
+        if count >= las.CHUNK_POINTS:
+            break
+    columns = zip(*parts, strict=True)
+    return Points(*(None if c[0] is None else np.concatenate(c) for c in columns))  # type: ignore
 
 
 def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Points:

@@ -24,10 +24,11 @@ from pcfix.model import Correction, Views, WaterPlane
 from pcfix.options.correct import CorrectOptions
 from pcfix.port.methods import correct_through_port
 from pcfix.refract.tally import Tally
+from pcfix.sums import Sums
 from pcfix.water.surface import SurfaceAbove
 
 
-class ThroughPort:
+class ThroughPort(Sums):
     """The light bends at a port that is fixed to the camera.
 
     Raises
@@ -35,6 +36,8 @@ class ThroughPort:
     SettingError
         If the cameras have no angles.
     """
+
+    added = ("_miss_sum_m",)
 
     def __init__(
         self, options: CorrectOptions, inputs: Inputs, blocks: Blocks, view: CloudView
@@ -79,8 +82,9 @@ class ThroughPort:
                 " consistent."
             )
 
-    def restart(self) -> None:
+    def restart(self, first_row: int = 0) -> None:
         """Forget the chunks so far."""
+        del first_row
         self._miss_sum_m = 0.0
 
     def rehearsals(self) -> tuple[Rehearsal, ...]:

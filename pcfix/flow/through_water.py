@@ -43,6 +43,7 @@ from pcfix.refract.methods import correct, shift_of_land
 from pcfix.refract.regression import LEAST_BEYOND, BeyondRange, DepthRegression
 from pcfix.refract.rehearsal import rehearsals
 from pcfix.refract.tally import Tally
+from pcfix.sums import Sums
 from pcfix.water.checks import WaterMeeting, check_above_water, check_tilt, refuse_under_water
 from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
@@ -50,7 +51,7 @@ OWN_WATER = "Images have water of their own, which snell and consistent alone al
 Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
 
 
-class ThroughWater:
+class ThroughWater(Sums):
     """The light bends at a water surface, and the cloud may come from other cameras.
 
     Raises
@@ -60,6 +61,7 @@ class ThroughWater:
         something that it cannot do without.
     """
 
+    added = ("_meeting", "_sample", "_beyond", "_shore", "carrying")
     settings: dict[str, Any]
 
     @staticmethod
@@ -106,11 +108,14 @@ class ThroughWater:
             self._adjustment, self._no_poses = adjustment_of(inputs.cameras, self._cameras)
         self.restart()
 
-    def restart(self) -> None:
+    def restart(self, first_row: int = 0) -> None:
         """Forget the chunks so far."""
         self._meeting = WaterMeeting(self.water, deep=self._options.deep)
-        self._sample, self._plausible = CloudSample(self._view.points), Plausible()
+        self._sample, self._plausible = CloudSample(self._view.points, first_row), Plausible()
         self._beyond: BeyondRange | None = None
+        if self.regression is not None:
+            least = LEAST_BEYOND if self._inputs.regression is None else 0.0
+            self._beyond = BeyondRange(self.regression, least)
         self._shore = None if self._options.shoreline is None else NearWater()
         if self.carrying is not None:
             self.carrying.restart()
@@ -136,6 +141,7 @@ class ThroughWater:
             self.settings["depth_factor"] = self.survey.settings.depth_factor
         self.verdicts = self._learning.verdicts
         self._learn_poses(chunks, views)
+        self.restart()
 
     def _learn_poses(self, chunks: Callable[[], Iterable[Points]], views: ListedViews) -> None:
         """Find what the errors of the adjustment come to in the heights of the bed."""
@@ -182,9 +188,7 @@ class ThroughWater:
         batch = Batch(xyz, above, self.survey, views, made_with, source=points.sources)
         batch = self._of_kind(batch)
         correction = correct_checked(batch, label, self.found.sigma_level_m, heights_only=True)
-        if self.regression is not None:
-            least = LEAST_BEYOND if self._inputs.regression is None else 0.0
-            self._beyond = self._beyond or BeyondRange(self.regression, least)
+        if self._beyond is not None:
             self._beyond.add((above.height_m - xyz[:, 2])[correction.submerged])
         if self._shore is not None:
             higher = xyz[:, 2] + correction.shift_m[:, 2] - above.height_m

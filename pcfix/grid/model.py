@@ -52,6 +52,8 @@ class DsmSummary:
     values : dict
         Least, mean and largest of the cells, before holes are filled.
     resolution_is : {"given", "chosen"}
+    part : dict or None
+        How many points were read, of how many, and by which bounds; None where all were.
     """
 
     input: str
@@ -77,6 +79,7 @@ class DsmSummary:
     seconds: float
     values: dict[str, float]
     resolution_is: Literal["given", "chosen"] = "given"
+    part: dict[str, Any] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""

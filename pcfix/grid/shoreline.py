@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.model import FloatArray
+from pcfix.sums import Counted, Sums
 
 REACH_M = 2.0
 """Points higher above the water or deeper say nothing of the line."""
@@ -58,7 +59,7 @@ class Shoreline:
         return float(np.hypot(*np.diff(self.xy, axis=0).T).sum())
 
 
-class NearWater:
+class NearWater(Sums):
     """The points of a cloud near the height of the water, gathered chunk by chunk."""
 
     def __init__(self) -> None:
@@ -82,6 +83,26 @@ class NearWater:
         rows = np.flatnonzero(np.abs(above_m) <= REACH_M)[:: self._every]
         sigma = np.zeros(len(xyz)) if sigma_z_m is None else sigma_z_m
         self._parts.append(np.column_stack([xyz, above_m, sigma])[rows])
+        self._thin()
+
+    def counted(self) -> Counted:
+        """Return the points, and which part of all they are."""
+        return {
+            "points": np.concatenate([np.empty((0, 5)), *self._parts]),
+            "every": np.array(self._every),
+        }
+
+    def add_counted(self, counted: Counted) -> None:
+        """Take the points that another one has gathered."""
+        every = int(counted["every"])
+        most = max(every, self._every)
+        self._parts = [part[:: most // self._every] for part in self._parts]
+        self._parts.append(counted["points"][:: most // every])
+        self._every = most
+        self._thin()
+
+    def _thin(self) -> None:
+        """Keep no more points than are needed."""
         while sum(map(len, self._parts)) > MOST_POINTS:
             self._parts = [part[::2] for part in self._parts]
             self._every *= 2

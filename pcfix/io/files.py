@@ -7,36 +7,67 @@ from __future__ import annotations
 
 import hashlib
 import json
+import mimetypes
 import os
-import shutil
+import re
 import subprocess
-import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
+from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import InputError, SettingError, optional_library
 from pcfix.grid.lattice import Window
+from pcfix.io.drafts import cannot_write, draft_folder, replaced_when_whole
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.declare import File
+from pcfix.sums import Counted
 
 if TYPE_CHECKING:
     from pcfix.clean.neighbours import Empty
 
 
+LARGE_BYTES = 2**26
 LAST_LINES = 3
 """Of what another program says when it fails."""
 
 
+def is_remote(path: Any) -> bool:
+    """Whether a path is the address of something in an object store, as ``s3://bucket/key``."""
+    return re.match(r"\w{2,}:/", str(path)) is not None  # of s3:// a Path leaves s3:/
+
+
+def path_of(path: Any) -> Path:
+    """Return a path as an object, also that of an object store, which reads by fsspec."""
+    if not is_remote(path):
+        return path if isinstance(path, Path) else Path(path)
+    upath = optional_library("upath", "remote", f"{path}: reading from object stores")
+    try:
+        return cast(Path, upath.UPath(re.sub(":/+", "://", str(path), count=1)))
+    except (ImportError, ValueError) as error:  # of a store that fsspec does not know
+        raise InputError(f"{path}: cannot be read ({error}).") from error
+
+
+def local_path(path: File) -> Path:
+    """Return the path of an output; a `SettingError` if it is in an object store."""
+    if is_remote(path):
+        raise SettingError(f"{path}: outputs go to a folder; write there, and copy them after.")
+    return Path(path)
+
+
 def check_input(path: File) -> Path:
     """Return the path of a file; one that does not exist is an `InputError`."""
-    found = Path(path)
-    if not found.is_file():
-        raise InputError(f"{found}: there is no such file.")
+    found, why = path_of(path), "there is no such file"
+    try:
+        is_there = found.is_file()
+    except Exception as error:  # each object store has errors of its own
+        is_there, why = False, f"cannot be read ({error})"
+    if not is_there:
+        raise InputError(f"{found}: {why}.")
     return found
 
 
@@ -53,8 +84,8 @@ def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) ->
 
     A `SettingError` if it is one of the inputs, exists without `overwrite`, or has no folder.
     """
-    target = Path(path)
-    for source in inputs:
+    target = local_path(path)
+    for source in (one for one in inputs if not is_remote(one)):
         both = target.exists() and Path(source).exists()
         if target.samefile(source) if both else target.resolve() == Path(source).resolve():
             raise SettingError(
@@ -69,47 +100,43 @@ def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) ->
     return target
 
 
-@contextmanager
-def replaced_when_whole(target: Path) -> Iterator[Path]:
-    """Give a name beside the target to write to, and rename it once the block ends well.
-
-    The name keeps the target's suffix. Whatever goes wrong, nothing is left behind.
-    """
-    draft = target.with_name(f".{target.stem}.{os.getpid()}.part{target.suffix}")
-    try:
-        yield draft
-        draft.replace(target)
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written ({error.strerror or error}).") from error
-    finally:
-        draft.unlink(missing_ok=True)
-
-
-@contextmanager
-def folder_when_whole(target: Path) -> Iterator[Path]:
-    """Give a folder to write into, which takes the place of the target once the block ends well.
-
-    An older folder of that name goes as a whole, with whatever it held.
-    """
-    draft = Path(
-        tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".part", dir=target.resolve().parent)
-    )
-    try:
-        yield draft
-        draft.chmod(0o755)
-        if target.exists():
-            shutil.rmtree(target)
-        draft.replace(target)
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written ({error.strerror or error}).") from error
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
-
-
 def sha256(path: Path) -> str:
     """Return the checksum of a file, as hexadecimal digits."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def digest_of(path: Path) -> str:
+    """Return the checksum of the content of a file, or of a folder of a project.
+
+    There images, videos and whatever is large go by size and time.
+    """
+    if not path.is_dir():
+        return sha256(path)
+    parts = []
+    for one in sorted(path.rglob("*")):
+        kind = mimetypes.guess_type(one.name)[0] or ""
+        if one.is_file():
+            light = one.stat().st_size < LARGE_BYTES and not kind.startswith(("image", "video"))
+            parts.append(sha256(one) if light else str(file_state(one)))
+            parts.append(str(one.relative_to(path)))
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+def write_counted(path: Path, note: dict[str, Any], counted: Counted) -> None:
+    """Write arrays and a note into one file, whole or not at all."""
+    with replaced_when_whole(path) as draft, draft.open("wb") as stream:
+        np.savez_compressed(stream, **{**counted, "note": np.array(json.dumps(note))})  # type: ignore
+
+
+def read_counted(path: Path) -> tuple[dict[str, Any], Counted]:
+    """Return the note and the arrays of a file; nothing where there is none that is whole."""
+    try:
+        with np.load(path, allow_pickle=False) as held:
+            counted = {name: held[name] for name in held.files}
+        return json.loads(str(counted.pop("note"))), counted
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+        return {}, {}
 
 
 def file_state(path: Path) -> dict[str, Any]:
@@ -157,31 +184,29 @@ def scratch_arrays(target: Path) -> Iterator[Empty]:
 
     An `InputError` if the disk cannot hold them.
     """
-    try:
-        folder = tempfile.TemporaryDirectory(
-            prefix=f".{target.stem}.", suffix=".part", dir=target.parent, ignore_cleanup_errors=True
-        )
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written ({error.strerror or error}).") from error
-    files: list[Path] = []
-
-    def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-        files.append(Path(folder.name) / f"{len(files)}.bin")
-        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    with ExitStack() as stack:
         try:
-            with files[-1].open("wb") as stream:  # a full disk kills whoever writes to a map
-                if hasattr(os, "posix_fallocate"):
-                    os.posix_fallocate(stream.fileno(), 0, size)
-                else:
-                    stream.truncate(size)
+            folder = stack.enter_context(draft_folder(target.parent))
         except OSError as error:
-            raise InputError(
-                f"{target}: {size / 1e9:,.1f} GB of temporary space beside it cannot be had"
-                f" ({error.strerror or error}); make room, or write to another disk."
-            ) from error
-        return np.memmap(files[-1], dtype=dtype, mode="r+", shape=shape)
+            raise cannot_write(target, error) from error
+        files: list[Path] = []
 
-    with folder:
+        def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+            files.append(folder / f"{len(files)}.bin")
+            size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+            try:
+                with files[-1].open("wb") as stream:  # a full disk kills whoever writes to a map
+                    if hasattr(os, "posix_fallocate"):
+                        os.posix_fallocate(stream.fileno(), 0, size)
+                    else:
+                        stream.truncate(size)
+            except OSError as error:
+                raise InputError(
+                    f"{target}: {size / 1e9:,.1f} GB of temporary space beside it cannot be had"
+                    f" ({error.strerror or error}); make room, or write to another disk."
+                ) from error
+            return np.memmap(files[-1], dtype=dtype, mode="r+", shape=shape)
+
         yield empty
 
 

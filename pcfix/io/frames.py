@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError, SettingError, photo_library
-from pcfix.io.files import check_output, replaced_when_whole
+from pcfix.io.drafts import replaced_when_whole
+from pcfix.io.files import check_output
 from pcfix.io.photographs import PNG, photographs_in, read_photograph, size_of, write_photograph
 from pcfix.model import FloatArray
 from pcfix.options.declare import File

@@ -12,7 +12,8 @@ import shapely
 
 from pcfix.errors import InputError, SettingError
 from pcfix.io.crs import parse_crs
-from pcfix.io.files import check_output, replaced_when_whole
+from pcfix.io.drafts import replaced_when_whole
+from pcfix.io.files import check_output
 from pcfix.io.vectors import load_pyogrio
 from pcfix.options.declare import File
 

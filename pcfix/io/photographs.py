@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError, photo_library
-from pcfix.io.files import replaced_when_whole
+from pcfix.io.drafts import replaced_when_whole
 from pcfix.model import BoolArray
 
 JPEG, TIFF, PNG = (".jpg", ".jpeg"), (".tif", ".tiff"), (".png",)

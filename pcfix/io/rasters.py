@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from pcfix.errors import GeometryError, InputError, SettingError
 from pcfix.grid.lattice import Lattice, Window
-from pcfix.io.files import check_input, check_output, replaced_when_whole
+from pcfix.io.drafts import replaced_when_whole
+from pcfix.io.files import check_input, check_output
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 

@@ -28,6 +28,7 @@ from pcfix.model import (
     IntArray,
 )
 from pcfix.options.correct import LabelRules
+from pcfix.sums import Sums
 from pcfix.water.surface import SurfaceAbove, is_submerged
 
 Classes = npt.NDArray[np.uint8]
@@ -49,8 +50,11 @@ class Labels(NamedTuple):
     at_surface: BoolArray
 
 
-class Labelling:
+class Labelling(Sums):
     """The rules of a labelling, the surroundings of its points, and what it left out so far."""
+
+    added = ("_below", "_outside_mask", "_respected", "_in_pool")
+    least, most = ("_low",), ("_high",)
 
     def __init__(self, settings: LabelRules, mask: WaterMask | None = None) -> None:
         self.settings, self.mask = settings, mask
@@ -265,6 +269,8 @@ class LabelSummary:
         Points without a known height of the water.
     labelling : dict or None
         What was left out, by the rules beyond the surface.
+    part : dict or None
+        How many points were read, of how many, and by which bounds; None where all were.
     """
 
     input: str
@@ -280,6 +286,7 @@ class LabelSummary:
     labelling: dict[str, Any] | None
     seconds: float
     warnings: list[str] = field(default_factory=list)
+    part: dict[str, Any] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""

@@ -18,13 +18,14 @@ from pcfix.options.declare import (
 from pcfix.options.shared import (
     IndexOptions,
     InputOptions,
-    JobOptions,
     LandRules,
     NeededOptions,
     Panel,
+    PartOptions,
     ShorelineOption,
     SubmergedOptions,
     SummaryOption,
+    TileOptions,
     WaterOptions,
     WaterPerImageOption,
 )
@@ -262,8 +263,9 @@ class ScienceOptions(RefractionOptions, ResultOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectOptions(
+    PartOptions,
     ShorelineOption,
-    JobOptions,
+    TileOptions,
     SummaryOption,
     ScienceOptions,
     WaterPerImageOption,
@@ -326,7 +328,7 @@ class StageLabelOptions(LabelRules, SubmergedOptions, WaterOptions, NeededOption
 
 
 @dataclass(frozen=True, kw_only=True)
-class LabelOptions(JobOptions, SummaryOption, StageLabelOptions):
+class LabelOptions(PartOptions, TileOptions, SummaryOption, StageLabelOptions):
     """The options of ``pcfix label``."""
 
 

@@ -15,6 +15,8 @@ from pcfix.options.declare import (
     not_negative,
     one_or_more,
     option,
+    positive,
+    rule,
     within,
 )
 
@@ -30,6 +32,7 @@ class Panel(StrEnum):
     """The panels of the help, in its order."""
 
     NEED = "What you need"
+    INPUT = "Part of the cloud"
     FLIGHT = "Flight"
     CAMERA = "Camera"
     WATER = "Water"
@@ -255,6 +258,63 @@ class JobOptions(OverwriteOption):
 
     jobs: int | None = option(
         None, "Threads.", rule=at_least(1, "give a number of threads"), default_is="all cores"
+    )
+
+
+def _four_numbers(option: str, text: str) -> tuple[float, ...]:
+    try:
+        west, south, east, north = (float(word) for word in text.split(","))
+    except ValueError:
+        west = south = east = north = math.nan
+    return west, south, east, north
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartOptions(OptionSet):
+    """Which points of a cloud are read; see `pcfix.io.las.part`."""
+
+    panel = Panel.INPUT
+
+    bounds: tuple[float, float, float, float] | None = option(
+        None,
+        "Read the points within them alone: west, south, east, north. Of COPC no others are"
+        " unpacked.",
+        unit="m",
+        rule=rule(
+            lambda box: len(box) == 4 and box[0] <= box[2] and box[1] <= box[3],
+            "{option} must be four numbers X0,Y0,X1,Y1 in metres, west and south first, as"
+            " 500000,4650000,500100,4650100.",
+        ),
+        parse=_four_numbers,
+        metavar="X,Y,X,Y",
+        default_is="all",
+    )
+    read_resolution: float | None = option(
+        None,
+        "Of COPC: read its coarse levels alone, with a point in about each square of this side.",
+        unit="m",
+        rule=positive("read-resolution {value:g} must be above 0: give metres."),
+        default_is="all levels",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TileOptions(JobOptions):
+    """How the work is done where the input may be many files."""
+
+    panel = Panel.OUTPUT
+
+    jobs: int | None = option(
+        None,
+        "Threads; of many files so many are worked on at once, each in a process of its own.",
+        rule=at_least(1, "give a number of threads"),
+        default_is="all cores",
+    )
+    scheduler: str | None = option(
+        None,
+        "With many files: work on them on a cluster, by the address of its Dask scheduler, as"
+        " tcp://host:8786.",
+        metavar="ADDRESS",
     )
 
 

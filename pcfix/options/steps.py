@@ -22,7 +22,7 @@ from pcfix.options.declare import (
     positive,
     rule,
 )
-from pcfix.options.shared import JobOptions, OverwriteOption, Panel, SummaryOption
+from pcfix.options.shared import JobOptions, OverwriteOption, Panel, PartOptions, SummaryOption
 
 LEAST_NEIGHBOURS, MOST_NEIGHBOURS = 6, 500
 MAX_HOLE_CELLS = 1000
@@ -241,7 +241,7 @@ class DsmRules(OptionSet):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DsmOptions(OverwriteOption, SummaryOption, DsmRules):
+class DsmOptions(PartOptions, OverwriteOption, SummaryOption, DsmRules):
     """The options of ``pcfix dsm``."""
 
     panel = Panel.OUTPUT

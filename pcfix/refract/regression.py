@@ -9,6 +9,7 @@ import numpy as np
 
 from pcfix.errors import GeometryError
 from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.sums import Sums
 from pcfix.water.surface import SurfaceAbove, is_submerged
 
 LEAST_COUNT, FEW = 3, 10
@@ -197,7 +198,7 @@ LEAST_BEYOND = 0.05
 """Share of the points beyond the depths of a line from which its own cloud is worth a note."""
 
 
-class BeyondRange:
+class BeyondRange(Sums):
     """Counts apparent depths beyond those that a line was fitted on.
 
     Parameters
@@ -206,6 +207,8 @@ class BeyondRange:
     least : float
         The share of the points above which it is noted.
     """
+
+    added, most = ("_count", "_shallower", "_deeper"), ("_deepest_m",)
 
     def __init__(self, line: DepthRegression, least: float = 0.0) -> None:
         self._least = least

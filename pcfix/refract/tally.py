@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.model import BoolArray, Correction, FloatArray, IntArray, Outcome
+from pcfix.sums import Sums
 
 COVERAGE_95 = 1.96
 """Standard errors of a Gaussian quantity within which 95 % lie, as S-44 takes it in one dimension.
@@ -66,11 +67,13 @@ def share_of_orders(within: IntArray, count: int) -> dict[str, float]:
     return {o.name: round(int(n) / count, 6) for o, n in zip(ORDERS, within, strict=True)}
 
 
-class _Histogram:
+class _Histogram(Sums):
     """Sum and percentiles, to a millimetre, of values that are added array by array.
 
     Values beyond `low_m` and `high_m` share the last bins, which only percentiles would notice.
     """
+
+    added = ("count", "_sum_m", "_bins")
 
     def __init__(self, low_m: float, high_m: float) -> None:
         self.count = 0
@@ -92,8 +95,10 @@ class _Histogram:
         return place * _BIN_M + self._low_m
 
 
-class UncertaintyTally:
+class UncertaintyTally(Sums):
     """Adds up standard errors of Z."""
+
+    added, most = ("_sigma", "_within"), ("_most_m",)
 
     def __init__(self) -> None:
         self._sigma = _Histogram(0.0, 10.0)
@@ -125,14 +130,24 @@ class UncertaintyTally:
         }
 
 
-SAMPLE_POINTS = 2000
-"""Of a chunk, that are looked for in the frames of cameras that no point used."""
+SAMPLE_POINTS = 10_000
+"""Of a cloud, evenly spread, of which those corrected are looked for in the frames of cameras that
+no point used."""
 
 
-class Tally:
+class Tally(Sums):
     """Counts, extremes, and histograms of shift and standard error in Z, over all chunks so far."""
 
-    def __init__(self, cameras: int) -> None:
+    added = (
+        *("points", "water_unknown", "unsure", "rays", "outcomes"),
+        *("_depth_sum_m", "moved", "_shift", "_uncertainty"),
+    )
+    least = ("low", "lowest_water_m", "_depth_low_m")
+    most = ("camera_used", "high", "incidence_deg", "_depth_high_m")
+
+    def __init__(self, cameras: int, points: int = 0, first_row: int = 0) -> None:
+        """Begin at a row of a cloud of so many points."""
+        self._first_row, self._step = first_row, max(1, points // SAMPLE_POINTS)
         self.points = 0
         self.water_unknown = self.unsure = 0
         self.rays = 0
@@ -143,12 +158,15 @@ class Tally:
         self.lowest_water_m, self.incidence_deg = np.inf, 0.0
         self._depth_low_m, self._depth_high_m, self._depth_sum_m = np.inf, -np.inf, 0.0
         self.moved: list[FloatArray] = []
-        """Some of the apparent points that were corrected, evenly spread over each chunk."""
+        """Some of the apparent points that were corrected, whatever the chunks."""
         self._shift = _Histogram(-100.0, 100.0)
         self._uncertainty = UncertaintyTally()
 
     def add(self, apparent: FloatArray, correction: Correction) -> None:
         """Add one chunk: the apparent points, shape (n, 3), and their correction."""
+        rows = np.arange(-(self._first_row + self.points) % self._step, len(apparent), self._step)
+        rows = rows[correction.corrected[rows]]
+        self.moved += [apparent[rows]] if len(rows) else []
         self.points += len(apparent)
         self.water_unknown += int((~correction.water_known).sum())
         self.rays += int(correction.ray_count.sum())
@@ -163,7 +181,6 @@ class Tally:
         self.lowest_water_m = min(self.lowest_water_m, correction.lowest_water_m)
         moved = correction.corrected
         if moved.any():
-            self.moved.append(apparent[moved][:: 1 + int(moved.sum()) // SAMPLE_POINTS])
             self.incidence_deg = max(self.incidence_deg, float(correction.incidence_deg.max()))
             depth = correction.depth_m[moved]
             self._depth_low_m = min(self._depth_low_m, float(depth.min()))
@@ -264,6 +281,8 @@ class Summary:
     """Where it was written, how many lines, how long, and their standard error."""
     fit: dict[str, Any] | None = None
     """What cameras, cloud and water were tested with; see `pcfix.flow.plausibility`."""
+    part: dict[str, Any] | None = None
+    """How many points were read, of how many, and by which bounds; None where all were."""
 
     @property
     def absorbed(self) -> bool | None:
@@ -298,10 +317,11 @@ class Summary:
 
         `labelling` is there where it had rules, `poses` where the light bends at a surface,
         `carried` where the cloud was taken from old cameras to adjusted ones, `unsure` where such
-        points are withheld, `shoreline` where one was written. Where no order of S-44 is claimed
-        it is said why.
+        points are withheld, `shoreline` where one was written, `part` where not all was read. Where
+        no order of S-44 is claimed it is said why.
         """
-        some, own = ("labelling", "carried", "unsure", "poses", "shoreline", "fit"), ("told",)
+        some = ("labelling", "carried", "unsure", "poses", "shoreline", "fit", "part")
+        own = ("told",)
         values = {name: vars(self)[name] for name in vars(self) if name not in (*some, *own)}
         more = {name: getattr(self, name) for name in some if getattr(self, name) is not None}
         if self.uncertainty is not None and self.why_no_order:

@@ -100,8 +100,19 @@ def _head(s: Summary | LabelSummary | CleanSummary) -> list[str]:
     rate = s.points / max(s.seconds, 1e-9)
     return [
         f"{s.input} -> {s.output}",
-        f"points       {s.points:,} in {s.seconds:.1f} s ({rate:,.0f} points/s)",
+        f"points       {s.points:,}{_of_whole(getattr(s, 'part', None))} in {s.seconds:.1f} s"
+        f" ({rate:,.0f} points/s)",
     ]
+
+
+def _of_whole(part: dict[str, Any] | None) -> str:
+    """Say of how many points a part was read, and which."""
+    if part is None:
+        return ""
+    box, step = part["bounds"], part["read_resolution"]
+    words = [] if box is None else ["within " + ",".join(f"{one:.12g}" for one in box)]
+    words += [] if step is None else [f"at a resolution of {step:g} m"]
+    return f" of {part['of']:,}, those {' '.join(words)},"
 
 
 def shoreline_lines(found: dict[str, Any] | None) -> list[str]:
@@ -362,7 +373,8 @@ def dsm_text(summary: DsmSummary) -> str:
     chosen = ", chosen for 2 to 4 points each" if s.resolution_is == "chosen" else ""
     lines = [
         f"{s.input} -> {s.output}",
-        f"points       {s.points_used:,} of {s.points:,} ({wanted}) in {s.seconds:.1f} s",
+        f"points       {s.points_used:,} of {s.points:,}{_of_whole(s.part)} ({wanted}) in"
+        f" {s.seconds:.1f} s",
         f"raster       {s.width:,} x {s.height:,} cells of {s.settings['resolution']:g} m{chosen},"
         f" {s.settings['method']}",
         f"{s.what:<12} {low:.4g} to {high:.4g}, mean {mean:.4g}"

@@ -19,6 +19,7 @@ from pcfix.model import (
     WaterRaster,
     WaterSurface,
 )
+from pcfix.sums import Sums
 from pcfix.water.surface import surface_above
 
 MOST_TILT = 0.05
@@ -171,8 +172,15 @@ def _tilt_of(xyz: FloatArray) -> float:
     return float(np.hypot(*slope))
 
 
-class WaterMeeting:
+class WaterMeeting(Sums):
     """How cloud and water lie to each other, added up chunk by chunk."""
+
+    added = (
+        *("_points", "_submerged", "_uncovered", "_uncovered_low"),
+        *("_doubtful", "_too_deep"),
+    )
+    least = ("_low_m", "_least_depth_m", "_lowest_water_m")
+    most = ("_high_m", "_most_depth_m")
 
     def __init__(self, water: WaterSurface, *, deep: bool = False) -> None:
         self._water, self._may_be_deep = water, deep

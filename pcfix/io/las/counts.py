@@ -20,7 +20,7 @@ def check_count(source: LasSource) -> None:
     InputError
         With both counts.
     """
-    header, stated = source.header, len(source)
+    header, stated = source.header, source.held
     if header.are_points_compressed:
         held, words = _least_in_chunks(source), "at least "
     else:
@@ -34,7 +34,7 @@ def check_count(source: LasSource) -> None:
 
 def _held(source: LasSource) -> int:
     """Return how many records lie between the header and what comes behind the points."""
-    header, path, stated = source.header, source.path, len(source)
+    header, path, stated = source.header, source.path, source.held
     size, start = header.point_format.size, header.offset_to_point_data
     behind = [path.stat().st_size]
     for name in ("start_of_first_evlr", "start_of_waveform_data_packet_record"):

@@ -11,6 +11,7 @@ import os
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -23,6 +24,7 @@ from laspy.vlrs.vlrlist import VLRList
 from pcfix.errors import InputError
 from pcfix.io.crs import METRES
 from pcfix.io.files import check_input
+from pcfix.io.las.part import CloudPart, check_levels, extent_of, is_copc, nodes_in
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 
@@ -53,7 +55,7 @@ _PLACES = (
 CHUNK_POINTS = 1_000_000
 """Points that are worked on at a time, which bounds the memory."""
 
-HELD_BYTES = 200_000_000
+KEPT_BYTES = 200_000_000
 """Point records of a cloud that are kept when it is gone through more than once."""
 
 
@@ -115,7 +117,7 @@ def read_records(stream: BinaryIO) -> tuple[list[Record], list[Record]]:
 
 def _read(stream: BinaryIO, start: int, count: int, layout: str, end: int) -> list[Record]:
     """Read records that lie one behind another, up to a place that they must not pass."""
-    end = min(end, os.fstat(stream.fileno()).st_size)
+    end = min(end, stream.seek(0, os.SEEK_END))
     records: list[Record] = []
     size = struct.calcsize(layout)
     for _ in range(count):
@@ -174,7 +176,8 @@ class LasSource:
 
     It has `path`, laspy's `header`, `vlrs` and `evlrs` from `read_records`, and `identity`: system
     identifier, generating software and date as they are in the file, where other software writes
-    what laspy would not.
+    what laspy would not. Of a `CloudPart` it has the points of the part alone, and the header says
+    so; `held` is how many points the whole file has.
     """
 
     def __init__(
@@ -183,13 +186,13 @@ class LasSource:
         jobs: int | None = None,
         *,
         places_only: bool = False,
-        held: list[laspy.ScaleAwarePointRecord] | None = None,
+        kept: list[laspy.ScaleAwarePointRecord] | None = None,
     ) -> None:
         """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable.
 
         With `places_only` nothing is unpacked but coordinates, classes, sources and colours, where
         the file holds its dimensions apart (LAZ of format 6 and up); the others may be zero then.
-        The chunks of a small cloud are kept in `held`, for the next to read it, and must not be
+        The chunks of a small cloud are put into `kept`, for the next to read it, and must not be
         changed.
         """
         self.path = check_input(path)
@@ -200,17 +203,22 @@ class LasSource:
                 self.vlrs, self.evlrs = read_records(stream)
                 stream.seek(IDENTITY_PLACE)
                 self.identity = stream.read(_IDENTITY_SIZE)
-            self._reader = laspy.open(self.path, laz_backend=backend(jobs))
+            self._reader = laspy.open(self.path.open("rb"), laz_backend=backend(jobs))
         self.header: laspy.LasHeader = self._reader.header
+        self.held = len(self)
+        self._selection = laspy.DecompressionSelection.all()  # also where a part is counted
         try:
             self._check_header()
+            if isinstance(self.path, CloudPart):
+                self._take_part(self.path)
         except BaseException:
             self._reader.close()
             raise
-        small = len(self) * self.header.point_format.size <= HELD_BYTES
-        self._held = held if small else None
-        if places_only and self._held is None:
-            self._reader.decompression_selection = _PLACES
+        small = len(self) * self.header.point_format.size <= KEPT_BYTES
+        self._kept = kept if small else None
+        places_only = places_only and self._kept is None
+        if places_only:
+            self._selection = self._reader.decompression_selection = _PLACES
 
     def __enter__(self) -> LasSource:
         return self
@@ -231,29 +239,52 @@ class LasSource:
         if len(self) == 0:
             raise InputError(f"{self.path}: holds no points.")
 
+    def _take_part(self, path: CloudPart) -> None:
+        """Let the header tell of a part, whose points are counted the first time."""
+        check_levels(path, self.header)
+        extent = extent_of(path, self.header, self._chunks_of(path))
+        self._reader.seek(0)
+        self.header = copy(self.header)
+        self.header.point_count, self.header.mins, self.header.maxs = extent
+
     def chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
-        """Yield all points, in order, at most `CHUNK_POINTS` at a time.
+        """Yield all points, in order, at most `CHUNK_POINTS` at a time, or a larger node of COPC.
 
         An `InputError` if the file ends before its last point.
         """
-        if self._held is not None:
-            if sum(map(len, self._held)) == len(self):
-                yield from self._held
+        if self._kept is not None:
+            if sum(map(len, self._kept)) == len(self):
+                yield from self._kept
                 return
-            self._held.clear()
+            self._kept.clear()
+        some = self._chunks_of(self.path) if isinstance(self.path, CloudPart) else self._whole()
+        for points in some:
+            if self._kept is not None:
+                self._kept.append(points)
+            yield points
+
+    def _whole(self) -> Iterator[laspy.ScaleAwarePointRecord]:
         read = 0
-        while read < len(self):
+        while read < self.held:
             with las_errors(self.path):
                 points = self._reader.read_points(CHUNK_POINTS)
-            if len(points) < min(CHUNK_POINTS, len(self) - read):
+            if len(points) < min(CHUNK_POINTS, self.held - read):
                 raise InputError(
-                    f"{self.path}: is cut short: the header promises {len(self):,} points,"
+                    f"{self.path}: is cut short: the header promises {self.held:,} points,"
                     f" the file holds {read + len(points):,}; copy it again."
                 )
             read += len(points)
-            if self._held is not None:
-                self._held.append(points)
             yield points
+
+    def _chunks_of(self, path: CloudPart) -> Iterator[laspy.ScaleAwarePointRecord]:
+        """Yield the points of a part."""
+        chunks = self._whole()
+        if is_copc(self.header):
+            chunks = nodes_in(path, path.part, self._selection, CHUNK_POINTS)
+        for points in chunks:
+            inside = path.part.holds(points)
+            if inside.any():
+                yield points[inside]
 
     def dimension(self, points: laspy.ScaleAwarePointRecord, name: str) -> FloatArray:
         """Return one dimension of a chunk, scaled, as float64.

@@ -22,8 +22,10 @@ from laspy.vlrs.vlr import VLR
 from pyproj import CRS
 
 from pcfix.errors import InputError, SettingError
-from pcfix.io.files import replaced_when_whole
+from pcfix.io.drafts import cannot_write, replaced_when_whole
 from pcfix.io.las.columns import Column, column_scale, upgraded
+from pcfix.io.las.copc import CopcWriter, check_copc, is_copc
+from pcfix.io.las.part import part_report
 from pcfix.io.las.source import (
     IDENTITY_PLACE,
     LasSource,
@@ -75,7 +77,9 @@ def corrected_header(
         "steps": list(steps),
         **changes,
     }
-    note = _note(_SETTINGS, {**content, "before": before})
+    part = part_report(source.path)
+    told = content if part is None else {**content, "part": part}
+    note = _note(_SETTINGS, {**told, "before": before})
     _set_records(header, [*vlrs, note], described + records)
     return header
 
@@ -294,8 +298,9 @@ def check_suffix(path: Path) -> bool:
 class LasSink:
     """An output file that is being written; use it as a context manager.
 
-    The suffix of its path decides between LAS and LAZ; `evlrs` stand behind the points, `identity`
-    in the header as it is (see `LasSource`).
+    The suffix of its path decides between LAS, LAZ and COPC (``.copc.laz``), which puts the points
+    in the order of its octree; `evlrs` stand behind the points, `identity` in the header as it is
+    (see `LasSource`).
     """
 
     def __init__(
@@ -309,26 +314,30 @@ class LasSink:
         self.header = header
         self._path, self._evlrs, self._identity, self._jobs = path, evlrs or [], identity, jobs
         self._stack = ExitStack()
+        self._copc: CopcWriter | None = None
 
     def __enter__(self) -> LasSink:
         laz = check_suffix(self._path)
+        if is_copc(self._path):
+            check_copc(self._path, self.header)
         with ExitStack() as stack:
             draft = stack.enter_context(replaced_when_whole(self._path))
-            stack.enter_context(_write_errors(self._path))
+            self._draft = draft
+            stack.enter_context(self._write_errors())
             self._stream = stack.enter_context(draft.open("w+b"))
+            packing: Any = backend(self._jobs)
+            if is_copc(self._path):
+                packing = self._copc = CopcWriter(draft.parent, self._jobs)
+                stack.callback(self._copc.forget)
             self._writer = laspy.LasWriter(
-                self._stream,
-                self.header,
-                do_compress=laz,
-                laz_backend=backend(self._jobs),
-                closefd=False,
+                self._stream, self.header, do_compress=laz, laz_backend=packing, closefd=False
             )
             self._stack = stack.pop_all()
         return self
 
     def write(self, points: laspy.ScaleAwarePointRecord) -> None:
         """Append points, in the header's format and scale."""
-        with _write_errors(self._path):
+        with self._write_errors():
             self._writer.write_points(points)
 
     def __exit__(self, kind: Any, value: Any, traceback: Any) -> None:
@@ -336,17 +345,17 @@ class LasSink:
             if kind is not None:
                 raise value
             self._writer.close()
-            append_evlrs(self._stream, self._evlrs, self.header.version.minor)
+            evlrs = self._evlrs if self._copc is None else [self._copc.hierarchy, *self._evlrs]
+            append_evlrs(self._stream, evlrs, self.header.version.minor)
             self._stream.seek(IDENTITY_PLACE)
             self._stream.write(self._identity)
 
-
-@contextmanager
-def _write_errors(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except (laspy.LaspyException, lazrs.LazrsError, OSError) as error:
-        raise InputError(f"{path}: cannot be written ({error}).") from error
+    @contextmanager
+    def _write_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except (laspy.LaspyException, lazrs.LazrsError, OSError) as error:
+            raise cannot_write(self._path, error, self._draft) from error
 
 
 def write_points(

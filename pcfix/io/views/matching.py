@@ -19,6 +19,7 @@ from pcfix.errors import InputError
 from pcfix.io.views.lists import ViewList
 from pcfix.io.views.orders import entries, fitted
 from pcfix.model import Cameras, FloatArray, IntArray, Views
+from pcfix.sums import Sums
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -154,8 +155,14 @@ class ViewMatch:
 
 
 @dataclass
-class ViewReport:
+class ViewReport(Sums):
     """What was matched so far; it grows with every chunk."""
+
+    added = (
+        *("by_row", "by_position", "unmatched", "without_camera"),
+        *("entries", "unposed_entries", "_histogram"),
+    )
+    least = ("share_seen",)
 
     source: str  # kind and path of the list
     list_points: int

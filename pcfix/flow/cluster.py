@@ -1,0 +1,153 @@
+"""Where tasks run: in processes of this machine, or on the workers of a Dask cluster."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from functools import partial
+from multiprocessing import get_context
+from types import ModuleType
+from typing import Any, TypeVar
+
+from pcfix import version
+from pcfix.errors import InputError, optional_library
+from pcfix.kernels import cores
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+Work = Callable[[bytes, Task, int | None], Result]
+Run = Callable[..., Iterator[Any]]
+
+WAIT_S = 10
+"""For a scheduler to answer, and for its first worker."""
+
+
+def in_processes(
+    jobs: int | None, most: int, work: Work[Task, Result], shared: bytes, tasks: Sequence[Task]
+) -> Iterator[tuple[Task, Result | str]]:
+    """Yield tasks with their results, or why they failed, as they are done.
+
+    So many processes at most share so many jobs, all cores by default. A single one is this
+    process. What is shared goes to all tasks.
+    """
+    count = min(most, jobs or cores(), len(tasks))
+    if count <= 1:
+        for task in tasks:
+            yield task, work(shared, task, jobs)
+        return
+    each = max(1, (jobs or cores()) // count)
+    context = get_context("spawn")
+    with ProcessPoolExecutor(count, context, initializer=_ignore_interrupts) as pool:
+        with _without_main():
+            futures: dict[Future[Result], Task] = {
+                pool.submit(_interruptible, work, shared, task, each): task for task in tasks
+            }
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        except BrokenProcessPool as error:
+            raise InputError(
+                "A process came to a sudden end, for want of memory perhaps; the same command goes"
+                " on, with fewer --jobs it needs less memory."
+            ) from error
+        except BaseException:
+            for process in list((pool._processes or {}).values()):
+                os.kill(process.pid or 0, signal.SIGINT)
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _ignore_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _interruptible(work: Callable[..., Result], *given: Any) -> Result:
+    """Do a task that Ctrl-C ends; between tasks a process waits for its parent to end it."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return work(*given)
+    finally:
+        _ignore_interrupts()
+
+
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """Let processes begin without the user's script, which each would run again."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+
+
+def version_here() -> str:
+    """Return the version of pcfix, of whatever worker is asked."""
+    return version.__version__
+
+
+@contextmanager
+def on_cluster(address: str) -> Iterator[Run]:
+    """Give what runs tasks on the workers of a cluster; see `in_processes`.
+
+    Raises
+    ------
+    InputError
+        If the scheduler does not answer, has no workers, or one has another pcfix.
+    """
+    distributed = optional_library("distributed", "cluster", f"--scheduler {address}")
+    try:
+        client = distributed.Client(address, timeout=WAIT_S, set_as_default=False)
+    except (OSError, ValueError) as error:  # TimeoutError is an OSError
+        raise InputError(
+            f"scheduler {address}: does not answer within {WAIT_S} s ({error}); check the address,"
+            " and that 'dask scheduler' runs there."
+        ) from error
+    with client:
+        _check_workers(client, address)
+        yield partial(_on_workers, client, distributed.as_completed)
+
+
+def _on_workers(
+    client: Any, as_completed: Any, work: Work[Task, Result], shared: bytes, tasks: Sequence[Task]
+) -> Iterator[tuple[Task, Result | str]]:
+    everywhere = client.scatter(shared, broadcast=True)  # a worker that is lost takes its own
+    futures = {client.submit(work, everywhere, one, 1, pure=False): one for one in tasks}
+    try:
+        for future in as_completed(list(futures), loop=client.loop):
+            task = futures[future]
+            if future.status == "finished":
+                yield task, future.result()
+            else:
+                why = future.exception() if future.status == "error" else future.status
+                yield task, f"{task}: was given up by the cluster ({why})."
+    finally:
+        client.cancel(list(futures))
+
+
+def _check_workers(client: Any, address: str) -> None:
+    """Refuse a cluster without workers, or with other versions of pcfix."""
+    try:
+        client.wait_for_workers(1, timeout=WAIT_S)
+    except TimeoutError as error:
+        raise InputError(
+            f"scheduler {address}: has no workers; start some with 'dask worker {address}'."
+        ) from error
+    try:
+        found: dict[str, str] = client.run(version_here)
+    except Exception as error:  # of the worker, whatever it is
+        raise InputError(
+            f"scheduler {address}: its workers cannot run pcfix ({error}); install pcfix"
+            f" {version.__version__} there."
+        ) from error
+    for worker, other in found.items():
+        if other != version.__version__:
+            raise InputError(
+                f"scheduler {address}: worker {worker} has pcfix {other}, here it is"
+                f" {version.__version__}; install one version everywhere."
+            )

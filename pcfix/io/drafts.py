@@ -1,0 +1,134 @@
+"""What is being written: in a hidden folder beside its target, and renamed when it is whole.
+
+The folder has a random name and is its owner's alone. As long as its owner lives, a lock is held in
+it: a folder whose lock is free was left by a process that was killed, and the next draft beside it
+removes it.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import stat
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from pcfix.errors import InputError
+
+try:
+    import fcntl
+except ImportError:  # not on Windows: what a killed process leaves stays there
+    fcntl = None  # type: ignore[assignment]
+
+_PREFIX, _SUFFIX, _LOCK = ".pcfix-", ".part", "lock"
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+@contextmanager
+def draft_folder(parent: Path) -> Iterator[Path]:
+    """Give a new folder inside another, for what need not last; it goes when the block ends."""
+    _remove_orphans(parent)
+    folder = Path(tempfile.mkdtemp(prefix=_PREFIX, suffix=_SUFFIX, dir=parent)).absolute()
+    lock = _lock(folder)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        if lock is not None:
+            os.close(lock)
+
+
+@contextmanager
+def replaced_when_whole(target: Path) -> Iterator[Path]:
+    """Give a path to write to, and rename what is there to the target once the block ends well.
+
+    The name is that of the target. Whatever goes wrong, nothing is left behind; what is renamed is
+    on the disk, and has the mode of the file that it replaces.
+    """
+    with _draft(target) as draft:
+        yield draft
+        if target.is_file():
+            draft.chmod(stat.S_IMODE(target.stat().st_mode))
+        _settle(draft)
+        draft.replace(target)
+
+
+@contextmanager
+def folder_when_whole(target: Path) -> Iterator[Path]:
+    """Give a folder to write into, which takes the place of the target once the block ends well.
+
+    An older folder of that name goes as a whole, with whatever it held.
+    """
+    with _draft(target) as draft:
+        draft.mkdir()
+        yield draft
+        for path in draft.rglob("*"):
+            _settle(path)
+        if target.exists():
+            target.rename(draft.parent / "old")
+        draft.replace(target)
+
+
+def cannot_write(target: Path, error: Exception, written: Path | None = None) -> InputError:
+    """Return the sentence on a file that cannot be written, of which a part may be."""
+    reason = getattr(error, "strerror", None) or str(error).strip().rstrip(".")
+    if getattr(error, "errno", None) in _FULL or "No space left" in str(error):
+        size = 0 if written is None or not written.is_file() else written.stat().st_size
+        so_far = f" after {size / 1e6:,.1f} MB of it" if size else ""
+        reason = f"the disk of {target.absolute().parent} is full{so_far}; make room on it"
+    return InputError(f"{target}: cannot be written ({reason}).")
+
+
+@contextmanager
+def _draft(target: Path) -> Iterator[Path]:
+    """Give a place beside the target, and turn what the system refuses into a sentence."""
+    draft = None
+    try:
+        with draft_folder(target.parent) as folder:
+            draft = folder / target.name
+            try:
+                yield draft
+            except OSError as error:
+                raise cannot_write(target, error, draft) from error
+        _settle(target.parent)
+    except OSError as error:
+        raise cannot_write(target, error) from error
+
+
+def _settle(path: Path) -> None:
+    """Let what was written reach the disk, where the file system can tell."""
+    with suppress(OSError):
+        opened = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
+
+
+def _lock(folder: Path) -> int | None:
+    """Hold the lock of a folder; it has its name only once it is held."""
+    if fcntl is None:
+        return None
+    new = folder / "new"
+    opened = os.open(new, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600)
+    with suppress(OSError):  # of file systems without locks
+        fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        new.rename(folder / _LOCK)
+    return opened
+
+
+def _remove_orphans(parent: Path) -> None:
+    """Remove the folders of processes that are gone."""
+    if fcntl is None:
+        return
+    for folder in parent.glob(f"{_PREFIX}*{_SUFFIX}"):
+        with suppress(OSError):
+            opened = os.open(folder / _LOCK, os.O_RDWR | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(folder, ignore_errors=True)
+            finally:
+                os.close(opened)

@@ -1,0 +1,153 @@
+"""Whatever ends a command, no input is touched and nothing lies half-written under its name."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import laspy
+import pytest
+
+import pcfix
+from tests.utils.zygote import Zygote
+
+SCENE = Path(__file__).parents[2] / "samples" / "scene"
+LONGEST_S = 1.0
+"""After which a signal is sent at the latest; most commands have ended by then."""
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("inputs")
+    cloud = laspy.read(SCENE / "cloud.laz")
+    cloud.points = cloud.points[::8].copy()
+    cloud.write(folder / "cloud.laz")
+    for name in ("cameras.csv", "sensor.csv"):
+        (folder / name).write_bytes((SCENE / name).read_bytes())
+    return folder
+
+
+@pytest.fixture(scope="module")
+def commands(inputs):
+    """Arguments but for the output folder, and the files that are written there."""
+    cameras = ["--cameras", f"{inputs}/cameras.csv", "--sensor", f"{inputs}/sensor.csv"]
+    more = ["--water", "0.37", "--overwrite", "--jobs", "1", "--quiet"]
+    corrected = ["correct", f"{inputs}/cloud.laz", "OUT/corrected.laz", *cameras, *more]
+    return {
+        "correct": ([*corrected, "--method", "snell"], ["corrected.laz"]),
+        "correct with summary": (
+            [*corrected[:2], "OUT/other.las", *corrected[3:], "--summary", "OUT/other.json"],
+            ["other.las", "other.json"],
+        ),
+        "label": (
+            ["label", f"{inputs}/cloud.laz", "OUT/labelled.laz", *more, "--summary", "OUT/l.json"],
+            ["labelled.laz", "l.json"],
+        ),
+    }
+
+
+@pytest.fixture(scope="module")
+def whole(commands, tmp_path_factory):
+    """What the commands leave when nothing happens, by the name of the file."""
+    out = tmp_path_factory.mktemp("whole")
+    for arguments, _ in commands.values():
+        done = subprocess.run(
+            [sys.executable, "-m", "pcfix", *at(arguments, out)], capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+    return {path.name: path.read_bytes() for path in out.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def zygote(commands, tmp_path_factory):
+    out = tmp_path_factory.mktemp("loaded")
+    with Zygote(*(at(arguments, out) for arguments, _ in commands.values())) as found:
+        yield found
+
+
+def at(arguments, out):
+    return [word.replace("OUT", str(out)) for word in arguments]
+
+
+def state(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def is_whole(name, content, whole):
+    """Clouds are the same to the byte; a summary differs in its seconds and folders."""
+    return content.rstrip().endswith(b"}") if name.endswith("json") else content == whole[name]
+
+
+@pytest.mark.parametrize(
+    "seed", [1, *(pytest.param(s, marks=pytest.mark.nightly) for s in range(2, 18))]
+)
+def test_kills_at_random_moments(seed, inputs, commands, whole, zygote, tmp_path):
+    random_moment = random.Random(seed)
+    before, ended = state(inputs), []
+    for number in range(60):
+        name = random_moment.choice(list(commands))
+        arguments, files = commands[name]
+        signal_sent = random_moment.choice([signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+        delay_s = random_moment.uniform(0.0, LONGEST_S) ** 2
+        process = zygote.start(at(arguments, tmp_path))
+        time.sleep(delay_s)
+        with suppress(ProcessLookupError):  # it has ended
+            os.kill(process, signal_sent)
+        code = zygote.wait()
+        case = f"kill {number}: {name}, {signal_sent.name} after {delay_s:.3f} s, code {code}"
+        ended.append(code)
+        assert code in (0, -signal_sent, 128 + signal_sent), case
+        left = sorted(path.name for path in tmp_path.iterdir())
+        hidden = [one for one in left if one.startswith(".")]
+        if signal_sent != signal.SIGKILL:
+            assert hidden == [], case
+        assert len(hidden) <= 2, case  # those of the kill before are gone
+        for one in set(left) - set(hidden):
+            assert is_whole(one, (tmp_path / one).read_bytes(), whole), f"{case}: {one}"
+        if code == 0:
+            assert set(files) <= set(left), case
+    assert state(inputs) == before
+    assert sum(code != 0 for code in ended) >= 20  # most were stopped in their work
+
+
+def test_what_a_killed_process_left_goes_with_the_next(inputs, commands, zygote, tmp_path):
+    arguments, files = commands["correct"]
+    for _ in range(50):
+        process = zygote.start(at(arguments, tmp_path))
+        while Path(f"/proc/{process}").exists() and not any(tmp_path.glob(".pcfix-*")):
+            time.sleep(0.001)
+        with suppress(ProcessLookupError):
+            os.kill(process, signal.SIGKILL)
+        if zygote.wait() == -signal.SIGKILL and any(tmp_path.glob(".pcfix-*")):
+            break
+    (orphan,) = tmp_path.glob(".pcfix-*")
+    assert orphan.stat().st_mode & 0o077 == 0  # its owner's alone
+    zygote.start(at(arguments, tmp_path))
+    assert zygote.wait() == 0
+    assert [path.name for path in tmp_path.iterdir()] == files
+
+
+def test_what_a_living_process_writes_stays(tmp_path):
+    from pcfix.io.drafts import draft_folder, replaced_when_whole
+
+    with draft_folder(tmp_path) as one:
+        (one / "kept").write_text("kept")
+        with replaced_when_whole(tmp_path / "other.txt") as draft:
+            draft.write_text("whole")
+        assert (one / "kept").read_text() == "kept"
+    assert [path.name for path in tmp_path.iterdir()] == ["other.txt"]
+
+
+def test_the_mode_of_a_replaced_file_is_kept(inputs, tmp_path):
+    target = tmp_path / "labelled.las"
+    target.write_bytes(b"")
+    target.chmod(0o640)
+    pcfix.label_file(inputs / "cloud.laz", target, water=0.37, overwrite=True)
+    assert target.stat().st_mode & 0o777 == 0o640
+    assert target.stat().st_size > 2500 * 30

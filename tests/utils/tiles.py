@@ -1,0 +1,37 @@
+"""A cloud cut into tiles, and the same points in one file."""
+
+import laspy
+import numpy as np
+
+from tests.utils.shared import ROOT
+
+SCENE = ROOT / "samples" / "scene"
+
+
+def cut(folder, count, *, cloud=SCENE / "cloud.laz", suffix=".laz", **changes):
+    """Write so many tiles from west to east into a folder, and their points as merged.laz beside.
+
+    `changes` are attributes of the headers; returns the folder and the merged cloud.
+    """
+    folder.mkdir(parents=True)
+    las = laspy.read(cloud)
+    x = np.asarray(las.x)
+    tile = np.searchsorted(np.quantile(x, np.linspace(0, 1, count + 1)[1:-1]), x)
+    rows = [np.flatnonzero(tile == i) for i in range(count)]
+    for i, some in enumerate(rows):
+        write(folder / f"tile{i:0{len(str(count - 1))}}{suffix}", las, some, **changes)
+    return folder, write(folder.parent / "merged.laz", las, np.concatenate(rows), **changes)
+
+
+def write(path, las, rows, **changes):
+    part = laspy.LasData(las.header)
+    part.points = las.points[rows]
+    for name, value in changes.items():
+        setattr(part.header, name, value)
+    part.write(path)
+    return path
+
+
+def records(*paths):
+    """Return the points of files as one array, field by field."""
+    return np.concatenate([laspy.read(path).points.array for path in paths])
