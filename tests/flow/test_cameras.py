@@ -12,6 +12,9 @@ from pyproj import Transformer
 
 import pcfix
 from pcfix.flow.checks import _sensors, check_cameras
+from pcfix.flow.inputs import Inputs
+from pcfix.flow.old_cameras import told_apart
+from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.lens.imaging import project
 from pcfix.model import Cameras, Lens
 from pcfix.report.cameras import _sensor as _sensor_words
@@ -230,6 +233,18 @@ def test_an_offset_is_three_numbers(tmp_path, text):
     )  # fmt: skip
     assert done.returncode == 1
     assert "three numbers X,Y,Z" in done.stderr
+
+
+def test_the_sensor_of_a_table_is_not_for_the_adjusted_model(tmp_path):
+    """Which has its own lens, and would refuse another."""
+    read = pcfix.read_cameras(CAMERAS, SENSOR)
+    lens = replace(LENS, radial=())
+    write_colmap(tmp_path / "model", replace(read, lenses=(lens,) * len(read)))
+    model = Inputs(cameras=tmp_path / "model", adjusted_from=CAMERAS, sensor=SENSOR, water=0.37)
+    old, new = told_apart(model)
+    assert (old.sensor, new.sensor) == (SENSOR, None)
+    old, new = told_apart(replace(model, cameras=CAMERAS))
+    assert (old.sensor, new.sensor) == (SENSOR, SENSOR)
 
 
 def in_frame(xyz, cameras):

@@ -221,6 +221,17 @@ def test_without_input_cameras_frames_are_boundless(make, tmp_path):
         assert pcfix.read_cameras(path).lenses is None
 
 
+def test_a_sensor_is_honoured_where_the_file_has_no_lens_and_refused_where_it_has(make, tmp_path):
+    path, _ = make()
+    sensor = tmp_path / "sensor.csv"
+    sensor.write_text("focal_px,width_px,height_px\n3000,4000,3000\n")
+    with pytest.raises(InputError, match=r"has the lenses of its images \(OPF.*leave it out"):
+        pcfix.read_cameras(path, sensor)
+    change(tmp_path, "input-cameras.json", sensors=[])
+    found = pcfix.read_cameras(path, sensor)  # without the warning of boundless frames
+    assert [lens.focal for lens in found.lenses] == [3000.0, 3000.0]
+
+
 WRONG = {
     "no calibration": ("project.opf", {"items": []}, "has 0 files of calibrated cameras"),
     "gone": ("project.opf", None, "calibrated-cameras.json: is missing"),
