@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from typing import TYPE_CHECKING, Any, NamedTuple
+from uuid import NAMESPACE_URL, uuid5
 
 import numpy as np
 
@@ -61,7 +62,8 @@ def opf(folder: Path, block: Block, base: Base | None = None, ties: Any = None) 
             for i, label in enumerate(block.labels)
         ]}),
         "input_cameras": ("input-cameras", {"sensors": [
-            {**sensor, "pixel_size_um": 2.4, "internals": lens, "shutter_type": "global"}
+            {**sensor, "pixel_size_um": 2.4, "internals": lens, "shutter_type": "global",
+             "bands": [{"name": "Grey", "weight": 1.0}]}
         ], "captures": []}),
         "scene_reference_frame": ("scene-reference-frame", {
             "crs": {"definition": base.definition},
@@ -81,13 +83,17 @@ def opf(folder: Path, block: Block, base: Base | None = None, ties: Any = None) 
         if kind == "calibration" and ties is not None:
             write_tracks(folder, shift, ties)
             resources.append({"uri": "tracks.gltf", "format": "model/gltf+json"})
-        items.append({"id": kind, "type": kind, "resources": resources, "sources": []})
+        items.append({"id": uuid(kind), "type": kind, "resources": resources, "sources": []})
     project = {
-        "format": "application/opf-project+json", "version": "1.0", "id": "a", "name": "one",
+        "format": "application/opf-project+json", "version": "1.0", "id": uuid("a"), "name": "one",
         "description": "", "generator": {"name": "PIX4Dmatic", "version": "1.6"}, "items": items,
     }  # fmt: skip
     write_json(folder / "project.opf", project)
     return PoseFile(folder / "project.opf", {})
+
+
+def uuid(name: str) -> str:
+    return str(uuid5(NAMESPACE_URL, name))
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
@@ -110,13 +116,16 @@ def write_tracks(folder: Path, shift: np.ndarray, ties: Any) -> None:
         "ranges": (packed, UNSIGNED, "VEC2", len(xyz)),
         "ids": (camera[order].astype("<u4").tobytes(), UNSIGNED, "SCALAR", len(point)),
         "pixels": (uv[order].astype("<f4").tobytes(), FLOAT, "VEC2", len(point)),
+        "features": (bytes(8 * len(point)), UNSIGNED, "VEC2", len(point)),
+        "scales": (np.ones(len(point), "<f4").tobytes(), FLOAT, "SCALAR", len(point)),
     }
     for name, (data, *_) in buffers.items():
         (folder / f"{name}.bin").write_bytes(b"past" + data)
     x, y, z = middle.tolist()
     matches = {
         "cameraUids": [FIRST_ID + i for i in range(int(camera.max()) + 1)], "cameraIds": 2,
-        "pointIndexRanges": 1, "imagePoints": {"pixelCoordinates": 3},
+        "pointIndexRanges": 1,
+        "imagePoints": {"pixelCoordinates": 3, "featureIds": 4, "scales": 5},
     }  # fmt: skip
     primitive = {
         "attributes": {"POSITION": 0}, "mode": 0,
