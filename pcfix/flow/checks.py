@@ -302,6 +302,8 @@ def _sensor(
 
 def _folded(lens: Lens) -> float:
     """Return the share of the frame that no direction is imaged to, beyond the fold of the lens."""
+    if not _is_distorted(lens):  # the border of a fisheye's image is none
+        return 0.0
     across = np.linspace(0.0, 1.0, 41)
     places = np.stack(np.meshgrid(across * lens.width, across * lens.height), axis=-1)
     return float(np.mean(np.isnan(unproject(lens, places.reshape(-1, 2))).any(axis=1)))
