@@ -42,8 +42,9 @@ class Rehearsal(NamedTuple):
 def is_kept(kernel: str) -> bool:
     """Whether a kernel was compiled once, for any types of arguments."""
     module, _, name = kernel.rpartition(".")
-    folder = Path(getattr(importlib.import_module(module), name).stats.cache_path)
-    return any(folder.glob(f"*.{name}-*.nbi"))
+    function = getattr(importlib.import_module(module), name)
+    folders = getattr(function._cache, "places", [function.stats.cache_path])
+    return any(any(Path(one).glob(f"*.{name}-*.nbi")) for one in folders)
 
 
 @contextmanager

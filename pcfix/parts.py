@@ -11,7 +11,9 @@ compiled as kernels are elsewhere.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -24,6 +26,7 @@ from numba.core.compiler import Compiler, CompileResult
 from numba.core.registry import CPUDispatcher
 
 from pcfix.ahead import compiles, wait_for
+from pcfix.kept import Kept
 
 Decorator: TypeAlias = Callable[[Any], Any]
 
@@ -40,6 +43,18 @@ class _Listener(event.Listener):
 
     def on_end(self, event: Any) -> None:
         """Be told that it is done."""
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Collect no garbage for a while: compiling makes little, and looking for it takes a sixth."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 event.register("numba:compile", _Listener())
@@ -141,10 +156,15 @@ class _PartCompiler(_KernelCompiler):
 
 
 class _Kernel(CPUDispatcher):
+    def enable_caching(self) -> None:
+        """Keep it as `pcfix.kept` says."""
+        self._cache = Kept(self.py_func)
+
     def compile(self, signature: Any) -> Any:
         """Compile a kernel or load it, unless another process is compiling it."""
         wait_for(f"{self.py_func.__module__}.{self.py_func.__qualname__}")
-        return super().compile(signature)
+        with _no_collection(), self._cache.alone():
+            return super().compile(signature)
 
 
 class _Part(CPUDispatcher):

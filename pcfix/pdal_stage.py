@@ -248,7 +248,7 @@ def _surveyed(
         for rows, points in _chunks(ins, water, flags)
     )  # fmt: skip
     crs = None if stated is None else parse_crs(stated, NAME)
-    return survey_cloud(NAME, crs, chunks, water, water is not None)
+    return survey_cloud(NAME, crs, chunks, water, water is not None, len(ins["X"]))
 
 
 def _options(namespace: dict[str, Any], kind: type[Set], needed: tuple[str, ...] = ()) -> Set:

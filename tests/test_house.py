@@ -19,7 +19,8 @@ HOUSE = Path(__file__).parents[1] / "pcfix"
 # The floors, from the ground up. What shares a floor stands side by side; a file may import from
 # lower floors and from its own room. "pcfix" is the front door, pcfix/__init__.py.
 FLOORS = (
-    ("version", "errors", "ahead", "qgis"),
+    ("version", "errors", "ahead", "blocks", "qgis"),
+    ("kept",),
     ("parts",),
     ("kernels",),
     ("options",),
@@ -30,7 +31,8 @@ FLOORS = (
     ("refract",),
     ("port",),
     ("adjust",),
-    ("clean", "grid", "compare", "photos"),
+    ("clean",),
+    ("grid", "compare", "photos"),
     ("simulate",),
     ("io",),
     ("report",),
@@ -61,6 +63,7 @@ OUTSIDE_IO = {
     "pcfix.qgis.command": "it runs in QGIS's Python, without pcfix",
     "pcfix.qgis.provider": "as its neighbour",
     "pcfix.ahead": "what its second process says goes nowhere",
+    "pcfix.kept": "a kernel is valid for the text of its file",
 }
 
 MOST_PARAMETERS = 9

@@ -226,7 +226,9 @@ def _point_covariances(
     for p in range(*span):
         if not is_fixed[p]:
             continue
-        v[:], w[:g], at[:g], size = 0.0, 0.0, place[poses:], g
+        v[:], w[:g], size = 0.0, 0.0, g
+        for i in range(g):
+            at[i] = place[poses + i]
         for o in range(seen.start[p], seen.start[p + 1]):
             if not linearise(state, given, LEAST_SQUARES, p, o, room, own, shared, r):
                 continue

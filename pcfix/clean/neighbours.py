@@ -13,14 +13,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
-from scipy.spatial import cKDTree
 
+from pcfix.blocks import blocks, bounds, empty, grouped, let_go, mapped, row_numbers
 from pcfix.model import BoolArray, FloatArray, IntArray
 
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+PIECE_ROWS = 65_536
 SLACK = 1.0 + 1e-9
 """Distances nearer to each other than this count as equal: more than rounding, less than any
 step of a LAS file at the distance of neighbours."""
@@ -66,15 +69,24 @@ class Neighbours:
         points = np.ascontiguousarray(xyz[:, : self.axes])
         distance = np.full((len(points), k), np.inf)
         place = np.zeros((len(points), k), np.int64)
-        gaps = _gap(points.min(axis=0), points.max(axis=0), self._low, self._high)
-        middle = points.mean(axis=0) - (self._low + self._high) / 2.0
         rest = np.arange(len(points))
+        if len(self.tiles) == 1:
+            self._add(0, points, rest, distance, place)
+            return distance, place
+        low, high = bounds(points)
+        gaps = _gap(low, high, self._low, self._high)
+        middle = (low + high - self._low - self._high) / 2.0
         for tile in np.lexsort((np.hypot(*middle[:, :2].T), gaps)):
             rest = rest[distance[rest, -1] * SLACK >= gaps[tile]]
             if not rest.size:
                 break
-            gap = _gap(points[rest], points[rest], self._low[tile], self._high[tile])
-            rows = rest[distance[rest, -1] * SLACK >= gap]
+            rows = rest
+            for axis in range(self.axes):  # most lie beyond a side of it, which is quick to see
+                at, reach = points[rows, axis], distance[rows, -1] * SLACK
+                low, high = self._low[tile, axis], self._high[tile, axis]
+                rows = rows[(low - at <= reach) & (at - high <= reach)]
+            gap = _gap(points[rows], points[rows], self._low[tile], self._high[tile])
+            rows = rows[distance[rows, -1] * SLACK >= gap]
             if rows.size:
                 self._add(int(tile), points, rows, distance, place)
         return distance, place
@@ -101,11 +113,55 @@ class Neighbours:
         place[rows] = np.take_along_axis(places, order, axis=1)
 
 
+def nearest_of(
+    places: FloatArray, points: FloatArray, k: int, axes: int
+) -> Iterator[tuple[IntArray, FloatArray, FloatArray, FloatArray]]:
+    """Yield rows (c,) of places, these, and distances (c, k) and places of their k nearest points.
+
+    Places and points, (n, 2) or (n, 3), are in one frame, metres; there are at least k points. The
+    nearest comes first, and of equally far ones the first of the cloud, whatever the tiles.
+    """
+    near = Neighbours(make_tiles(points), axes)
+    asked = make_tiles(places)
+    for piece in asked.pieces(PIECE_ROWS):
+        xyz = asked.xyz[piece]
+        distance, place = _first_nearest(near, xyz, k, k + 1)
+        yield asked.row[piece], xyz, distance, near.tiles.xyz[place]
+
+
+def _first_nearest(
+    near: Neighbours, xyz: FloatArray, k: int, columns: int
+) -> tuple[FloatArray, IntArray]:
+    """Return distance and place of the k nearest, looking at more until all that tie are seen."""
+    columns = min(columns, len(near.tiles.row))
+    distance, place = near.nearest(xyz, columns)
+    tied = np.flatnonzero(distance[:, -1] == distance[:, k - 1])
+    order = np.lexsort((near.tiles.row[place], distance), axis=1)[:, :k]
+    distance = np.take_along_axis(distance, order, axis=1)
+    place = np.take_along_axis(place, order, axis=1)
+    if tied.size and columns < min(len(near.tiles.row), _MOST_COLUMNS):
+        size = max(1, _ENTRIES // (2 * columns))
+        for rows in (tied[a : a + size] for a in range(0, len(tied), size)):
+            distance[rows], place[rows] = _first_nearest(near, xyz[rows], k, 2 * columns)
+    return distance, place
+
+
+def nearest_distance(places: FloatArray, points: FloatArray, axes: int) -> FloatArray:
+    """Return the distance (m) of each place, (n,), to the nearest point; see `nearest_of`."""
+    near, asked = Neighbours(make_tiles(points), axes), make_tiles(places)
+    distance = empty((len(places),))
+    for piece in asked.pieces(PIECE_ROWS):
+        distance[asked.row[piece]] = near.nearest(asked.xyz[piece], 1)[0][:, 0]
+    return distance
+
+
 def _trees(tiles: Tiles, axes: int) -> Callable[[int], cKDTree]:
     """Return what grows the tree of a tile, and keeps the last few."""
 
     @lru_cache(maxsize=_TREES)
     def tree(tile: int) -> cKDTree:
+        from scipy.spatial import cKDTree  # not quick to load, and C2C seldom needs it
+
         first, last = tiles.start[tile : tile + 2]
         return cKDTree(np.array(tiles.xyz[first:last, :axes]), balanced_tree=False)
 
@@ -172,15 +228,9 @@ def _quartiles(ascending: FloatArray, count: IntArray) -> FloatArray:
 
 
 POINTS_PER_TILE = 250_000
-BLOCK_ROWS = 1_000_000
-"""Rows looked at together; sums are made by these blocks, whatever the tiles."""
-_MOST_TILES_A_SIDE = 300
+_MOST_TILES_A_SIDE = 200
 _SAMPLE = 100_000
 _SPACINGS_ACROSS = 8
-
-
-Empty = Callable[[tuple[int, ...], npt.DTypeLike], npt.NDArray[Any]]
-"""Makes an array of a shape and type, values not set: `numpy.empty`, or one on disk."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,51 +263,68 @@ class Tiles:
         for first, last in pairwise(self.start):
             for begin in range(int(first), int(last), size):
                 yield slice(begin, min(begin + size, int(last)))
+                let_go()
+
+    def within(self, low: FloatArray, high: FloatArray) -> IntArray:
+        """Return the places of the points in a box, (3,) each, those of the cloud's order."""
+        touched = np.flatnonzero(((self.low <= high) & (self.high >= low)).all(axis=1))
+        found = [np.empty(0, np.int64)]
+        for first, last in ((int(self.start[i]), int(self.start[i + 1])) for i in touched):
+            some = self.xyz[first:last]
+            found.append(first + np.flatnonzero(((some >= low) & (some <= high)).all(axis=1)))
+        places = np.concatenate(found)
+        return np.asarray(places[np.argsort(self.row[places])])
 
 
 def used_rows(used: BoolArray) -> Iterator[IntArray]:
     """Yield the rows that are used, block by block."""
-    for first in range(0, len(used), BLOCK_ROWS):
-        yield first + np.flatnonzero(used[first : first + BLOCK_ROWS])
+    for rows in blocks(len(used)):
+        yield rows.start + np.flatnonzero(used[rows])
 
 
 def make_tiles(
-    xyz: FloatArray, used: BoolArray, tile_m: float | None = None, empty: Empty = np.empty
+    xyz: FloatArray,
+    used: BoolArray | None = None,
+    tile_m: float | None = None,
+    points: int = POINTS_PER_TILE,
+    *,
+    strips: bool = True,
 ) -> Tiles:
     """Sort the used points into square tiles.
 
     Parameters
     ----------
-    xyz : array, shape (n, 3)
+    xyz : array, shape (n, 3), or (n, 2) in plan
         Metres, world frame.
-    used : array of bool, shape (n,)
-        At least one is true.
+    used : array of bool, shape (n,), optional
+        At least one is true; default all.
     tile_m : float, optional
-        Side of a tile; default such that a tile holds about `POINTS_PER_TILE` points.
-    empty : callable
-        Makes the arrays.
+        Side of a tile; default such that a tile holds about so many `points`.
+    strips : bool
+        Whether the points of a tile are put in an order that trees are quick in.
     """
-    lattice = _Lattice(xyz, used, tile_m)
-    counts = np.zeros(lattice.columns * lattice.rows, np.int64)
-    for rows in used_rows(used):
-        counts += np.bincount(lattice.tile_of(xyz[rows]), minlength=len(counts))
-    place = np.cumsum(counts) - counts
-    start = np.append(place[counts > 0], counts.sum())
-    sorted_xyz, row = empty((int(start[-1]), 3), np.float64), empty((int(start[-1]),), np.int64)
-    for rows in used_rows(used):
-        points = xyz[rows]
-        tile = lattice.tile_of(points)
-        order = np.argsort(tile, kind="stable")
-        tile = tile[order]
-        to = place[tile] + np.arange(len(tile)) - np.searchsorted(tile, tile)
-        sorted_xyz[to], row[to] = points[order], rows[order]
-        place += np.bincount(tile, minlength=len(place))
+    lattice = _Lattice(xyz, used, tile_m, points)
+    tiles = lattice.columns * lattice.rows
+    number = mapped(lattice.tile_of, xyz)
+    if used is not None:
+        number[~used] = tiles
+    start, (sorted_xyz, row) = grouped(number, tiles + 1, xyz, row_numbers(len(xyz)))
+    start = np.unique(start[:-1])
+    boxes = []
     for a, b in pairwise(start):
-        order = _along_strips(sorted_xyz[a:b], lattice.side_m)
-        sorted_xyz[a:b], row[a:b] = sorted_xyz[a:b][order], row[a:b][order]
-    parts = [sorted_xyz[a:b] for a, b in pairwise(start)]
-    low, high = (np.array([f(p, axis=0) for p in parts]) for f in (np.min, np.max))
-    return Tiles(sorted_xyz, row, start, low, high)
+        if strips:
+            order = _along_strips(sorted_xyz[a:b], lattice.side_m)
+            sorted_xyz[a:b], row[a:b] = sorted_xyz[a:b][order], row[a:b][order]
+        boxes.append(bounds(sorted_xyz[a:b]))
+        let_go()
+    low, high = np.swapaxes(np.array(boxes), 0, 1)
+    return Tiles(sorted_xyz[: start[-1]], row[: start[-1]], start, low, high)
+
+
+def one_tile(xyz: FloatArray) -> Tiles:
+    """Return the points of a cloud, (n, 3), as they are, as a single tile."""
+    low, high = bounds(xyz)
+    return Tiles(xyz, row_numbers(len(xyz)), np.array([0, len(xyz)]), low[None], high[None])
 
 
 def _along_strips(xyz: FloatArray, side_m: float) -> IntArray:
@@ -276,14 +343,16 @@ class _Lattice:
     It covers all but the outermost hundredth of the points, so that no outlier stretches it.
     """
 
-    def __init__(self, xyz: FloatArray, used: BoolArray, tile_m: float | None) -> None:
-        step = max(1, len(used) // _SAMPLE)
-        sample = xyz[::step][used[::step]]
-        if not len(sample):
+    def __init__(
+        self, xyz: FloatArray, used: BoolArray | None, tile_m: float | None, points: int
+    ) -> None:
+        step = max(1, len(xyz) // _SAMPLE)
+        sample = xyz[::step] if used is None else xyz[::step][used[::step]]
+        if used is not None and not len(sample):
             sample = np.array(xyz[int(np.argmax(used))])[None, :]
         self.origin, high = np.percentile(sample[:, :2], (1.0, 99.0), axis=0)
         extent = np.maximum(high - self.origin, 1e-3)
-        share = POINTS_PER_TILE / int(used.sum())
+        share = points / (len(xyz) if used is None else int(used.sum()))
         side = math.sqrt(float(extent.prod()) * share) if tile_m is None else tile_m
         self.side_m = max(side, float(extent.max()) / _MOST_TILES_A_SIDE)
         self.columns, self.rows = np.ceil(extent / self.side_m).astype(int).tolist()
@@ -291,5 +360,5 @@ class _Lattice:
     def tile_of(self, xyz: FloatArray) -> IntArray:
         """Return the number of the tile of each point, shape (n,)."""
         cell = np.floor((xyz[:, :2] - self.origin) / self.side_m)
-        column, row = np.clip(cell, 0, (self.columns - 1, self.rows - 1)).astype(np.int64).T
-        return np.asarray(column * self.rows + row)
+        column, row = np.clip(cell, 0, (self.columns - 1, self.rows - 1)).astype(np.uint16).T
+        return np.asarray(column * np.uint16(self.rows) + row)

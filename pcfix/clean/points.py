@@ -14,9 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from pcfix.blocks import empty
 from pcfix.clean.neighbours import (
+    PIECE_ROWS,
     SLACK,
-    Empty,
     Neighbours,
     height_quartiles,
     make_tiles,
@@ -31,8 +32,6 @@ from pcfix.water.checks import as_surface, checked_points
 from pcfix.water.surface import is_submerged, surface_above
 
 ReasonArray = npt.NDArray[np.uint8]
-
-PIECE_ROWS = 65_536
 
 
 class Reason(IntFlag):
@@ -74,7 +73,6 @@ class Resources(NamedTuple):
     """
 
     tile_m: float | None = None
-    empty: Empty = np.empty
     jobs: int | None = None
     progress: Callable[[int], None] | None = None
 
@@ -124,7 +122,7 @@ def flag_sparse(cloud: Cloud, settings: CleanRules, resources: Resources) -> dic
     zero, and where it is the same for all points, open3d takes them for outliers and pcfix does
     not.
     """
-    mean_m = np.zeros(len(cloud.xyz)) if settings.statistical else None
+    mean_m = empty((len(cloud.xyz),)) if settings.statistical else None
     for near, rows, xyz in _pieces(cloud.xyz, cloud.used, 3, resources):
         distance, _ = near.nearest(xyz, settings.nearest)
         if mean_m is not None:
@@ -139,7 +137,7 @@ def _pieces(
     xyz: FloatArray, used: BoolArray, axes: int, resources: Resources
 ) -> Iterator[tuple[Neighbours, IntArray, FloatArray]]:
     """Yield the used points piece by piece, with their rows and what finds their neighbours."""
-    tiles = make_tiles(xyz, used, resources.tile_m, resources.empty)
+    tiles = make_tiles(xyz, used, resources.tile_m)
     near = Neighbours(tiles, axes, resources.jobs)
     for piece in tiles.pieces(PIECE_ROWS):
         yield near, tiles.row[piece], tiles.xyz[piece]

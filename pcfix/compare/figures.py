@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 
+from pcfix.blocks import kept, mapped
 from pcfix.compare.c2c import AfterBefore, Further, both, c2c_of, far_of, further_of, sparse_notes
 from pcfix.compare.m3c2 import M3c2, m3c2_distances
 from pcfix.compare.match import Match
@@ -20,6 +21,7 @@ from pcfix.compare.statistics import (
     Distribution,
     Line,
     Own,
+    Sample,
     Statistics,
     Tvu,
     binned,
@@ -263,29 +265,31 @@ def _by_depth(match: Match, pairs: AfterBefore[Pairs] | None, notes: list[str]) 
     if surface is None:
         notes.append("no water surface is known, so nothing is said of depth; give --water")
         return nothing
-    wet = after.reference_m < surface if match.reference.sparse else match.wet
-    wet = wet & np.isfinite(surface)
+    wet = mapped(np.less, after.reference_m, surface) if match.reference.sparse else match.wet
+    wet = wet & mapped(np.isfinite, surface)
     if not wet.any():
         notes.append("no compared point is under water, so nothing is said of depth")
         return nothing
-    depth, error = (surface - after.reference_m)[wet], after.error_m[wet]
-    fits = AfterBefore(fit_line(depth, depth - error), None)
+    depth, error = _of(wet, np.subtract, surface, after.reference_m), kept(wet, after.error_m)
+    fits = AfterBefore(fit_line(depth, mapped(np.subtract, depth, error)), None)
     error_before: FloatArray | None = None
     if before is not None:
         over = match.water_at(before.xy)
-        depth_before = ((surface if over is None else over) - before.reference_m)[wet]
-        error_before = before.error_m[wet]
-        fits = replace(fits, before=fit_line(depth_before, depth_before - error_before))
+        over = surface if over is None else over
+        depth_before = _of(wet, np.subtract, over, before.reference_m)
+        error_before = kept(wet, before.error_m)
+        line = fit_line(depth_before, mapped(np.subtract, depth_before, error_before))
+        fits = replace(fits, before=line)
         now, came = _ratio(depth, error), _ratio(depth_before, error_before)
         if abs(came - 1.0) <= AS_DEEP and now > 1.0 + TOO_DEEP:
             notes.append(CORRECTED_BEFORE)
     bins = binned(depth, error, error_before, match.settings.bin_width)
     bed, land = _errors_of(pairs, wet), _errors_of(pairs, ~wet)
     found = _OfDepth(fits, bins, tvu=tvu_of(error, depth), bed=bed, land=land)
-    if len(match.dry_xy) == 0:
+    if not match.dry.any():
         notes.append("the cloud has no dry point, so nothing is said of the distance from shore")
         return found
-    shore = distance_from_shore(after.xy[wet], match.dry_xy)
+    shore = distance_from_shore(kept(wet, after.xy), kept(match.dry, match.whole.xyz)[:, :2])
     width = match.settings.shore_bin_width
     return replace(found, shore_bins=binned(shore, error, error_before, width))
 
@@ -294,7 +298,12 @@ def _errors_of(pairs: AfterBefore[Pairs], rows: BoolArray) -> AfterBefore[Statis
     """Return what the vertical errors of some places are; None without any."""
     if not rows.any():
         return None
-    return both(lambda p: statistics_of(p.error_m[rows]), pairs.after, pairs.before)
+    return both(lambda p: statistics_of(kept(rows, p.error_m)), pairs.after, pairs.before)
+
+
+def _of(rows: BoolArray, function: Callable[..., Any], *columns: FloatArray) -> FloatArray:
+    """Return a function of columns, (n,), at some rows."""
+    return mapped(function, *(kept(rows, one) for one in columns))
 
 
 def _own(
@@ -308,8 +317,11 @@ def _own(
 
 def _ratio(depth_m: FloatArray, error_m: FloatArray) -> float:
     """Return the median of depth over reference depth, where that is one; NaN if nowhere."""
-    some = depth_m > 0.0
-    return float(np.median(1.0 - error_m[some] / depth_m[some])) if some.any() else math.nan
+    some = mapped(lambda depth: depth > 0.0, depth_m)
+    if not some.any():
+        return math.nan
+    ratio = _of(some, lambda error, depth: 1.0 - error / depth, error_m, depth_m)
+    return float(Sample(ratio).percentiles(50))
 
 
 def _m3c2(match: Match, pairs: AfterBefore[Pairs] | None) -> AfterBefore[M3c2] | None:
@@ -318,8 +330,8 @@ def _m3c2(match: Match, pairs: AfterBefore[Pairs] | None) -> AfterBefore[M3c2] |
     if pairs is None:
         far = far_of(match, match.cloud.xyz)
     else:
-        far = np.abs((pairs.before or pairs.after).error_m)
-    reach = max(MIN_REACH_M, REACH_FACTOR * float(np.percentile(far, 99)))
+        far = mapped(np.abs, (pairs.before or pairs.after).error_m)
+    reach = max(MIN_REACH_M, REACH_FACTOR * float(Sample(far).percentiles(99)))
     cloud, target = match.cloud, match.reference.xyz
     return both(lambda xyz: m3c2_distances(xyz, target, reach), cloud.xyz, cloud.apparent)
 
@@ -329,7 +341,7 @@ def _sections(
 ) -> tuple[Section, ...]:
     """Return the cross-sections that were asked for."""
     if match.settings.sections:
-        bed = match.cloud.xyz[match.wet] if match.wet.any() else match.cloud.xyz
+        bed = kept(match.wet, match.cloud.xyz) if match.wet.any() else match.cloud.xyz
         lines = [*lines, *lines_downslope(bed, match.settings.sections)]
     layers = {
         "water": match.water_points,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
@@ -11,12 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.compare.nearest import Neighbours
+from pcfix.clean.neighbours import SLACK, Neighbours, Tiles, make_tiles
 from pcfix.compare.statistics import Statistics, statistics_of
 from pcfix.errors import GeometryError, SettingError, installing
 from pcfix.model import FloatArray, IntArray
 
 MAX_CORE_POINTS = 100_000
+TILE_POINTS = 500_000
+"""Points of either cloud that py4dgeo is given at a time, but for those around."""
 SPACING_SAMPLE = 10_000
 NORMAL_SPACINGS, CYLINDER_SPACINGS = 6.0, 3.0
 """Scales, in point spacings of the sparser cloud: a cylinder holds about 28 points."""
@@ -60,10 +63,12 @@ def load_py4dgeo() -> Any:
         ) from error
 
 
-def point_spacing_m(xyz: FloatArray) -> float:
+def point_spacing_m(xyz: FloatArray, tiles: Tiles) -> float:
     """Return the median distance to the nearest other point, of a sample of the cloud (n, 3)."""
-    rows = sample_rows(len(xyz), SPACING_SAMPLE)
-    found = [far[:, -1] for _, far, _ in Neighbours(xyz).find(xyz[rows], min(2, len(xyz)))]
+    near, rows = Neighbours(tiles, 3), sample_rows(len(xyz), SPACING_SAMPLE)
+    sample = make_tiles(xyz[rows])
+    pieces = (sample.xyz[piece] for piece in sample.pieces(SPACING_SAMPLE))
+    found = [near.nearest(some, min(2, len(xyz)))[0][:, -1] for some in pieces]
     return float(np.median(np.concatenate(found)))
 
 
@@ -82,7 +87,7 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
     reference : array, shape (m, 3)
         The same frame.
     max_distance_m : float
-        Half the length of the cylinders.
+        Half the length of the cylinders at least.
 
     Raises
     ------
@@ -91,13 +96,17 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
     GeometryError
         If no cylinder holds points of both clouds.
     """
-    spacing = max(point_spacing_m(xyz), point_spacing_m(reference), 1e-3)
-    normal, cylinder = NORMAL_SPACINGS * spacing, CYLINDER_SPACINGS * spacing
-    origin = np.floor(reference.mean(axis=0))
-    core = xyz[sample_rows(len(xyz), MAX_CORE_POINTS)] - origin
-    distance, detection = _run(
-        xyz - origin, reference - origin, core, normal, cylinder, max_distance_m
+    clouds = make_tiles(xyz, points=TILE_POINTS), make_tiles(reference, points=TILE_POINTS)
+    spacing = max(
+        *(point_spacing_m(*one) for one in zip((xyz, reference), clouds, strict=True)), 1e-3
     )
+    normal, cylinder = NORMAL_SPACINGS * spacing, CYLINDER_SPACINGS * spacing
+    # py4dgeo cuts a cylinder into lengths of its radius: an odd number of them, as a core point on
+    # the border of two would count twice, once or not at all
+    pieces = 2 * math.ceil((max_distance_m / cylinder - 1.0) / 2.0) + 1
+    max_distance_m = (max(pieces, 1) - 1e-6) * cylinder
+    core = xyz[sample_rows(len(xyz), MAX_CORE_POINTS)]
+    distance, detection = _in_tiles(clouds, core, normal, cylinder, max_distance_m)
     known = np.isfinite(distance)
     if not known.any():
         raise GeometryError(
@@ -117,27 +126,42 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
     )
 
 
-def _run(
-    xyz: FloatArray,
-    reference: FloatArray,
+def _in_tiles(
+    clouds: tuple[Tiles, Tiles],
     core: FloatArray,
     normal_m: float,
     cylinder_m: float,
     max_distance_m: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return distance and level of detection of each core point; NaN where not known."""
+    """Return distance and level of detection of each core point (n, 3); NaN where not known.
+
+    A tile of core points sees the cloud and the reference as far as a normal or a cylinder
+    reaches, whichever way it leans.
+    """
     py4dgeo = load_py4dgeo()
-    with _silence():
-        cloud, below = py4dgeo.Epoch(xyz), py4dgeo.Epoch(reference)
-        distance, uncertainty = py4dgeo.M3C2(
-            epochs=(below, cloud),
-            corepoints=np.ascontiguousarray(core),
-            normal_radii=[normal_m],
-            cyl_radius=cylinder_m,
-            max_distance=max_distance_m,
-            cloud_for_normals=cloud,
-        ).run()
-    return np.asarray(distance), np.asarray(uncertainty["lodetection"])
+    found = np.full((2, len(core)), np.nan)
+    reach = max(normal_m, math.hypot(cylinder_m, max_distance_m)) * SLACK
+    share = len(core) / max(len(one.row) for one in clouds)
+    tiles = make_tiles(core, points=max(1, round(TILE_POINTS * share)))
+    origin = np.floor(clouds[1].low.min(axis=0))
+    for piece in tiles.pieces(len(core)):
+        some = tiles.xyz[piece]
+        low, high = some.min(axis=0) - reach, some.max(axis=0) + reach
+        cloud, below = (one.xyz[one.within(low, high)] - origin for one in clouds)
+        if len(below) == 0:
+            continue
+        with _silence():
+            epoch = py4dgeo.Epoch(cloud)
+            distance, uncertainty = py4dgeo.M3C2(
+                epochs=(py4dgeo.Epoch(below), epoch),
+                corepoints=np.ascontiguousarray(some - origin),
+                normal_radii=[normal_m],
+                cyl_radius=cylinder_m,
+                max_distance=max_distance_m,
+                cloud_for_normals=epoch,
+            ).run()
+        found[:, tiles.row[piece]] = distance, uncertainty["lodetection"]
+    return found[0], found[1]
 
 
 @contextlib.contextmanager

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.compare.nearest import Neighbours, mean_spacing_m
+from pcfix.blocks import blocks, bounds, empty, kept, mapped
+from pcfix.clean.neighbours import nearest_of
+from pcfix.compare.nearest import mean_spacing_m
 from pcfix.errors import GeometryError, InputError, SettingError
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import CompareRules
@@ -36,16 +38,18 @@ class SurveyCloud:
     @cached_property
     def apparent(self) -> FloatArray | None:
         """Where the points were before the correction, shape (n, 3), metres."""
-        return None if self.shift_m is None else self.xyz - self.shift_m
+        return None if self.shift_m is None else mapped(np.subtract, self.xyz, self.shift_m)
 
     def take(self, rows: BoolArray) -> SurveyCloud:
-        """Return the cloud with these rows alone."""
+        """Return the cloud with these rows alone; itself where these are all."""
+        if rows.all():
+            return self
         return replace(
             self,
-            xyz=self.xyz[rows],
-            shift_m=None if self.shift_m is None else self.shift_m[rows],
-            bathymetric=self.bathymetric[rows],
-            water_m=self.water_m[rows],
+            xyz=kept(rows, self.xyz),
+            shift_m=None if self.shift_m is None else kept(rows, self.shift_m),
+            bathymetric=kept(rows, self.bathymetric),
+            water_m=kept(rows, self.water_m),
         )
 
 
@@ -73,7 +77,7 @@ class Match:
     whole: SurveyCloud  # all points that are neither withheld nor noise
     cloud: SurveyCloud  # the n points of it to compare
     wet: BoolArray  # (n,), which of these are under water
-    dry_xy: FloatArray  # (d, 2), where the whole cloud is above the water, metres
+    dry: BoolArray  # which of the whole cloud are above the water
     reference: Reference
     places: FloatArray  # (p, 3), points of the reference that the cloud reaches, metres
     asked: SurveyCloud  # of the cloud, the points that may be the nearest to one of these
@@ -84,8 +88,11 @@ class Match:
     @cached_property
     def water_points(self) -> FloatArray:
         """The water surface above the points that know it, shape (w, 3), metres."""
-        known = np.isfinite(self.whole.water_m)
-        return np.column_stack([self.whole.xyz[known, :2], self.whole.water_m[known]])
+        known = mapped(np.isfinite, self.whole.water_m)
+        if not known.any():
+            return np.empty((0, 3))
+        xyz, water_m = kept(known, self.whole.xyz), kept(known, self.whole.water_m)
+        return mapped(lambda p, w: np.column_stack([p[:, :2], w]), xyz, water_m)
 
     def water_at(self, xy: FloatArray) -> FloatArray | None:
         """Return the height of the water at places (n, 2); None where unknown.
@@ -95,11 +102,16 @@ class Match:
         if self.whole.water is not None:
             from pcfix.water.surface import surface_above  # with its compiler, not quick to load
 
-            return surface_above(self.whole.water, np.column_stack([xy, xy[:, 0]])).height_m
+            water = self.whole.water
+            return mapped(
+                lambda p: surface_above(water, np.column_stack([p, p[:, 0]])).height_m, xy
+            )
         if len(self.water_points) == 0:
             return None
-        _, row = Neighbours(self.water_points[:, :2]).nearest(xy)
-        return np.asarray(self.water_points[row, 2])
+        height = empty((len(xy),))
+        for rows, _, _, near in nearest_of(xy, self.water_points, 1, 2):
+            height[rows] = near[:, 0, 2]
+        return height
 
 
 def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, given: bool) -> Match:
@@ -110,8 +122,9 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
     overlap, or C2C is wanted in a direction that the reference does not have.
     """
     _check_direction(target, settings)
-    below = whole.xyz[:, 2] < whole.water_m
-    wet = below if given else whole.bathymetric | below
+    wet = mapped(lambda xyz, water: xyz[:, 2] < water, whole.xyz, whole.water_m)
+    if not given:
+        wet |= whole.bathymetric
     chosen = wet if settings.submerged else np.ones(len(whole), np.bool_)
     if not chosen.any():
         raise InputError(
@@ -122,24 +135,23 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
     places, near = target.xyz, chosen
     if target.sparse or settings.from_reference:
         gap = _gap(whole.xyz, settings)
-        places = places[near_in_plan(places[:, :2], whole.xyz[chosen, :2], gap)]
+        places = kept(near_in_plan(places, kept(chosen, whole.xyz), gap), places)
     if target.sparse:
         outside = len(target.xyz) - len(places)
     else:
         gap = _gap(target.xyz, settings)
-        near = chosen & near_in_plan(whole.xyz[:, :2], target.xyz[:, :2], gap)
+        near = chosen & near_in_plan(whole.xyz, target.xyz, gap)
         outside = int(chosen.sum() - near.sum())
     if not (near.any() and len(places)):
         raise GeometryError(
             f"{whole.name} and {target.name} do not overlap in plan: the points to compare lie in"
-            f" {_bounds(whole.xyz[chosen])}, the reference in {_bounds(target.xyz)}; check the"
-            " CRS of both."
+            f" {_bounds(kept(chosen, whole.xyz))}, the reference in {_bounds(target.xyz)}; check"
+            " the CRS of both."
         )
     cloud = whole.take(near)
     asked = whole.take(chosen) if settings.from_reference and not target.sparse else cloud
     found = Match(
-        whole, cloud, wet[near], whole.xyz[~wet, :2], target, places, asked, outside,
-        not_submerged, settings,
+        whole, cloud, kept(near, wet), ~wet, target, places, asked, outside, not_submerged, settings
     )  # fmt: skip
     by_place = target.sparse or settings.from_reference
     return _only_wet_places(found) if by_place and settings.submerged else found
@@ -165,7 +177,7 @@ def _only_wet_places(found: Match) -> Match:
     surface = found.water_at(found.places[:, :2])
     if surface is None:
         return found
-    wet = found.places[:, 2] < surface
+    wet = mapped(lambda xyz, water: xyz[:, 2] < water, found.places, surface)
     if not wet.any():
         raise GeometryError(
             f"{found.reference.name}: no check point is under water; compare without --submerged."
@@ -174,15 +186,15 @@ def _only_wet_places(found: Match) -> Match:
             " --submerged."
         )
     dry = int((~wet).sum()) if found.reference.sparse else 0
-    return replace(found, places=found.places[wet], not_submerged=found.not_submerged + dry)
+    return replace(found, places=kept(wet, found.places), not_submerged=found.not_submerged + dry)
 
 
 def _gap(xyz: FloatArray, settings: CompareRules) -> float:
-    return settings.max_gap or max(GAP_SPACINGS * mean_spacing_m(xyz[:, :2]), MIN_GAP_M)
+    return settings.max_gap or max(GAP_SPACINGS * mean_spacing_m(xyz), MIN_GAP_M)
 
 
 def _bounds(xyz: FloatArray) -> str:
-    (x0, y0), (x1, y1) = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
+    (x0, y0), (x1, y1) = bounds(xyz[:, :2])
     return f"x {x0:.1f} to {x1:.1f}, y {y0:.1f} to {y1:.1f}"
 
 
@@ -193,28 +205,32 @@ MAX_TABLE = 50_000_000
 def near_in_plan(xy: FloatArray, other_xy: FloatArray, limit_m: float) -> BoolArray:
     """Return which points have a point of the other cloud about them in plan.
 
-    The plan is cut into squares of side `limit_m`; a point, (n, 2) in metres, counts when its own
-    square or one of the eight around it holds a point of the other cloud, (m, 2). So all within the
-    limit count, and none beyond 2.83 times the limit.
+    The plan is cut into squares of side `limit_m`; a point, (n, 2) or (n, 3) in metres, counts when
+    its own square or one of the eight around it holds a point of the other cloud, (m, 2 or 3). So
+    all within the limit count, and none beyond 2.83 times the limit.
     """
-    low = np.array([other_xy[:, 0].min(), other_xy[:, 1].min()]) - 2.0 * limit_m
-    columns = int(np.ptp(other_xy[:, 0]) / limit_m) + 6
-    rows = int(np.ptp(other_xy[:, 1]) / limit_m) + 6
-    near = np.zeros(len(xy), np.bool_)
+    low, high = bounds(other_xy[:, :2])
+    columns, rows = (int(n / limit_m) + 6 for n in high - low)
+    low = low - 2.0 * limit_m
     high = low + np.array([columns, rows]) * limit_m
-    x, y = xy[:, 0], xy[:, 1]
-    inside = np.flatnonzero((x >= low[0]) & (x < high[0]) & (y >= low[1]) & (y < high[1]))
     steps = np.array([-1, 0, 1])
     around = (steps[:, np.newaxis] * columns + steps).ravel()
-    asked, held = (_codes(p, low, limit_m, columns) for p in (xy[inside], other_xy))
-    if columns * rows > MAX_TABLE:
-        near[inside] = np.isin(asked, (np.unique(held)[:, np.newaxis] + around).ravel())
-        return near
-    table = np.zeros(columns * rows, np.bool_)
-    table[held] = True
-    table[(np.flatnonzero(table)[:, np.newaxis] + around).ravel()] = True
-    near[inside] = table[asked]
-    return near
+    codes = (_codes(other_xy[some], low, limit_m, columns) for some in blocks(len(other_xy)))
+    table = np.zeros(columns * rows if columns * rows <= MAX_TABLE else 0, np.bool_)
+    for some in codes if len(table) else ():
+        table[some] = True
+    held = np.flatnonzero(table) if len(table) else np.unique(np.hstack([*map(np.unique, codes)]))
+    near = (held[:, np.newaxis] + around).ravel()
+    table[near if len(table) else []] = True
+
+    def asked(some: FloatArray) -> BoolArray:
+        x, y = some[:, 0], some[:, 1]
+        inside = (x >= low[0]) & (x < high[0]) & (y >= low[1]) & (y < high[1])
+        codes = _codes(some[inside], low, limit_m, columns)
+        inside[inside] = table[codes] if len(table) else np.isin(codes, near)
+        return np.asarray(inside)
+
+    return mapped(asked, xy)
 
 
 def _codes(xy: FloatArray, low: FloatArray, side_m: float, columns: int) -> IntArray:

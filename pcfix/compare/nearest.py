@@ -9,11 +9,13 @@ close together, and gives up where a neighbour is many rings away.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
+from pcfix.blocks import blocks, bounds, empty
+from pcfix.clean.neighbours import SLACK, Neighbours, Tiles, make_tiles, one_tile
 from pcfix.kernels import Span, in_tiles, kernel, lean, lean_kernel
 from pcfix.model import FloatArray, IntArray
 
@@ -33,6 +35,7 @@ class Cells(NamedTuple):
     start: IntArray
     points: FloatArray  # (m, 3), in the order of the cells
     z_range: FloatArray  # (cells, 2)
+    slack_m: float  # more than rounding
 
 
 def build_cells(points: FloatArray) -> Cells:
@@ -42,18 +45,22 @@ def build_cells(points: FloatArray) -> Cells:
     start, order = sorted_by_cell(cell_of(points, low, side, columns, rows), columns * rows)
     arranged = np.empty((len(order), 3))
     in_tiles(_gather, len(order), points, order, arranged)
-    return Cells(low, side, columns, rows, start, arranged, _z_range(start, arranged))
+    slack = 1e-12 * float(extent.max()) + 1e-15 * float(np.abs(low).max() + extent.max())
+    return Cells(low, side, columns, rows, start, arranged, _z_range(start, arranged), slack)
 
 
 def _lattice(points: FloatArray) -> tuple[FloatArray, FloatArray, float]:
     """Return the corner and the extent of points, and the side of their cells."""
-    low = np.array([points[:, 0].min(), points[:, 1].min()])
-    extent = np.array([points[:, 0].max(), points[:, 1].max()]) - low
+    low, high = bounds(points[:, :2])
+    extent = high - low
     side = _side(extent, len(points) / POINTS_PER_CELL)
     columns, rows = (int(n) + 1 for n in extent / side)
-    taken = np.count_nonzero(np.bincount(cell_of(points, low, side, columns, rows)))
+    taken = np.zeros(columns * rows, np.bool_)
+    for some in blocks(len(points)):
+        taken[cell_of(points[some], low, side, columns, rows)] = True
     # a cloud that fills little of its bounding box gets smaller cells
-    side = max(side * np.sqrt(taken * POINTS_PER_CELL / len(points)), _side(extent, MAX_CELLS))
+    share = np.count_nonzero(taken) * POINTS_PER_CELL / len(points)
+    side = max(side * np.sqrt(share), _side(extent, MAX_CELLS))
     return low, extent, float(side)
 
 
@@ -118,48 +125,52 @@ def _z_range(start: IntArray, points: FloatArray) -> FloatArray:
 
 
 @lean
-def _gap(x: float, cell: int, side_m: float) -> float:
-    """Return how far x lies outside the cell, along one axis."""
-    return max(cell * side_m - x, x - (cell + 1) * side_m, 0.0)
+def _gap(x: float, cell: int, grid: Cells) -> float:
+    """Return how far x lies outside the cell at least, along one axis."""
+    return max(cell * grid.side_m - x, x - (cell + 1) * grid.side_m, grid.slack_m) - grid.slack_m
 
 
 @lean
-def _best_in_cell(
-    grid: Cells, column: int, row: int, x: float, y: float, z: float, best: float
-) -> float:
-    """Return the least squared distance to the points of a cell, or `best` where that is less."""
+def _best_in_cell(grid: Cells, column: int, row: int, place: FloatArray, best: float) -> float:
+    """Return the least squared distance to the points of a cell, or `best` where that is less.
+
+    It goes by the coordinates as they came, so that it does not depend on the cells.
+    """
     cell = row * grid.columns + column
-    dx, dy = _gap(x, column, grid.side_m), _gap(y, row, grid.side_m)
+    x, y, z = place
+    dx, dy = _gap(x - grid.low[0], column, grid), _gap(y - grid.low[1], row, grid)
     dz = max(grid.z_range[cell, 0] - z, z - grid.z_range[cell, 1], 0.0)
     if dx * dx + dy * dy + dz * dz >= best:
         return best
     for i in range(grid.start[cell], grid.start[cell + 1]):
-        u = grid.points[i, 0] - grid.low[0] - x
-        v = grid.points[i, 1] - grid.low[1] - y
+        u = grid.points[i, 0] - x
+        v = grid.points[i, 1] - y
         w = grid.points[i, 2] - z
         best = min(best, u * u + v * v + w * w)
     return best
 
 
 @lean
-def _nearest_one(grid: Cells, place: FloatArray) -> float:
-    """Return the distance to the nearest point; NaN where it is too many rings away."""
-    x, y, z = place[0] - grid.low[0], place[1] - grid.low[1], place[2]
+def _nearest_one(grid: Cells, place: FloatArray, best: float) -> float:
+    """Return the distance to the nearest point, NaN where it is too many rings away.
+
+    `best` is a squared distance; where nothing is nearer its root is returned.
+    """
+    x, y = place[0] - grid.low[0], place[1] - grid.low[1]
     column = int(min(max(x / grid.side_m, 0.0), grid.columns - 1.0))
     row = int(min(max(y / grid.side_m, 0.0), grid.rows - 1.0))
-    best = np.inf
     for ring in range(MAX_RINGS + 1):
         left, right = column - ring, column + ring
         bottom, top = row - ring, row + ring
         for j in range(max(bottom, 0), min(top, grid.rows - 1) + 1):
             if j in (bottom, top):
                 for i in range(max(left, 0), min(right, grid.columns - 1) + 1):
-                    best = _best_in_cell(grid, i, j, x, y, z, best)
+                    best = _best_in_cell(grid, i, j, place, best)
             else:
                 if left >= 0:
-                    best = _best_in_cell(grid, left, j, x, y, z, best)
+                    best = _best_in_cell(grid, left, j, place, best)
                 if right < grid.columns:
-                    best = _best_in_cell(grid, right, j, x, y, z, best)
+                    best = _best_in_cell(grid, right, j, place, best)
         clear = np.inf  # nothing beyond the rings so far is nearer than this
         if left > 0:
             clear = min(clear, x - left * grid.side_m)
@@ -169,6 +180,7 @@ def _nearest_one(grid: Cells, place: FloatArray) -> float:
             clear = min(clear, y - bottom * grid.side_m)
         if top < grid.rows - 1:
             clear = min(clear, (top + 1) * grid.side_m - y)
+        clear -= grid.slack_m
         if clear > 0.0 and best <= clear * clear:
             return float(np.sqrt(best))
     return float(np.nan)
@@ -178,80 +190,60 @@ def _nearest_one(grid: Cells, place: FloatArray) -> float:
 def nearest_distances(
     span: Span, grid: Cells, places: FloatArray, order: IntArray, distance: FloatArray
 ) -> None:
-    """Set the distance of each place (n, 3) to its nearest point.
+    """Set the distance of each place (n, 3) to its nearest point where it was larger.
 
     NaN where that is more than `MAX_RINGS` cells away. Places are visited in the given order,
     which changes the time and nothing else.
     """
     for k in range(*span):
-        distance[order[k]] = _nearest_one(grid, places[order[k]])
+        i = order[k]
+        known = distance[i]
+        found = _nearest_one(grid, places[i], known * known * SLACK)
+        distance[i] = known if found > known else found
 
 
-CHUNK_POINTS = 200_000
-POINTS_ACROSS = 8
-"""Width of the strips of `strip_order`, in mean distances between points."""
-MAX_STRIPS = 30_000
-"""So that the number of a cell fits 32 bits."""
+TILE_POINTS = 1_000_000
+"""Points of a tile of cells; up to twice as many are one tile."""
+CELL_TILES = 6
+"""Tiles whose cells are kept."""
 
 
 def mean_spacing_m(xy: FloatArray) -> float:
     """Return the side of the square that each point (n, 2) has in the cloud's bounding box, m."""
-    extent = np.array([np.ptp(xy[:, 0]), np.ptp(xy[:, 1])])
+    low, high = bounds(xy[:, :2])
+    extent = high - low
     if extent.min() <= 0.0:
         return float(extent.max() / len(xy))
     return float(np.sqrt(extent.prod() / len(xy)))
 
 
-def strip_order(xy: FloatArray) -> IntArray:
-    """Return the row numbers of points in the order of a walk along narrow strips of the plan.
+class CellSearch(Neighbours):
+    """Finds the distance to the nearest point by cells, and by trees what is far away."""
 
-    A tree is built and asked several times faster in this order than in a random one, as each
-    point, (n, 2) or (n, 3) in metres, finds in the processor's cache what its predecessor needed.
-    """
-    longest = max(np.ptp(xy[:, 0]), np.ptp(xy[:, 1]))
-    width = max(mean_spacing_m(xy[:, :2]) * POINTS_ACROSS, longest / MAX_STRIPS, 1e-9)
-    column = ((xy[:, 0] - xy[:, 0].min()) / width).astype(np.int32)
-    row = ((xy[:, 1] - xy[:, 1].min()) / width).astype(np.int32)
-    backwards = row % 2 == 1
-    column[backwards] = column.max() - column[backwards]
-    return np.argsort(row * (column.max() + 1) + column, kind="stable")
+    def __init__(self, tiles: Tiles) -> None:
+        super().__init__(tiles, 3)
 
+        @lru_cache(maxsize=CELL_TILES)
+        def cells(tile: int) -> Cells:
+            first, last = tiles.start[tile : tile + 2]
+            return build_cells(tiles.xyz[first:last])
 
-class Neighbours:
-    """The nearest of m points, shape (m, 2) in plan or (m, 3) in space, metres, to any place.
+        self._cells = cells
 
-    `row`, shape (m,), has the row in `points` of each number that `find` returns.
-    """
-
-    def __init__(self, points: FloatArray) -> None:
-        from scipy.spatial import cKDTree  # not quick to load, and C2C seldom needs it
-
-        self.origin = np.floor(points.mean(axis=0))
-        self.row = strip_order(points)
-        self._tree = cKDTree(points[self.row] - self.origin, balanced_tree=False)
-
-    def find(
-        self, places: FloatArray, count: int = 1
-    ) -> Iterator[tuple[IntArray, FloatArray, IntArray]]:
-        """Yield c row numbers of places, and distance and number of their nearest points.
-
-        Places (n, d) are in the frame of the points. Distances (m) and numbers, into `row`, have
-        the shape (c, count), the nearest first; there are at least `count` points.
-        """
-        order = strip_order(places)
-        for start in range(0, len(order), CHUNK_POINTS):
-            rows = order[start : start + CHUNK_POINTS]
-            found = self._tree.query(
-                places[rows] - self.origin, k=np.arange(1, count + 1), workers=-1
-            )
-            yield rows, np.asarray(found[0]), np.asarray(found[1], np.int64)
-
-    def nearest(self, places: FloatArray) -> tuple[FloatArray, IntArray]:
-        """Return distance (m) to the nearest point, and its row, both of shape (n,)."""
-        distance, row = np.empty(len(places)), np.empty(len(places), np.int64)
-        for rows, far, number in self.find(places):
-            distance[rows], row[rows] = far[:, 0], self.row[number[:, 0]]
-        return distance, row
+    def _add(
+        self, tile: int, points: FloatArray, rows: IntArray, distance: FloatArray, place: IntArray
+    ) -> None:
+        grid = self._cells(tile)
+        some = points if len(rows) == len(points) else points[rows]
+        _, order = sorted_by_cell(
+            cell_of(some, grid.low, grid.side_m, grid.columns, grid.rows), grid.columns * grid.rows
+        )
+        best = distance[rows, 0]
+        in_tiles(nearest_distances, len(order), grid, some, order, best)
+        far = np.isnan(best)
+        distance[rows, 0] = np.where(far, distance[rows, 0], best)
+        if far.any():
+            super()._add(tile, points, rows[far], distance, place)
 
 
 def cloud_to_cloud(xyz: FloatArray, reference: FloatArray) -> FloatArray:
@@ -261,13 +253,14 @@ def cloud_to_cloud(xyz: FloatArray, reference: FloatArray) -> FloatArray:
     where the two clouds sample a surface at different places: half the spacing of the reference is
     its floor. See `vertical` for a signed difference.
     """
-    origin = np.floor(reference[0])
-    places, grid = xyz - origin, build_cells(reference - origin)
-    cell = cell_of(places, grid.low, grid.side_m, grid.columns, grid.rows)
-    _, order = sorted_by_cell(cell, grid.columns * grid.rows)
-    distance = np.empty(len(places))
-    in_tiles(nearest_distances, len(order), grid, places, order, distance)
-    far = np.isnan(distance)
-    if far.any():
-        distance[far], _ = Neighbours(grid.points).nearest(places[far])
-    return np.asarray(distance)
+    near, asked = CellSearch(_tiles(reference)), _tiles(xyz)
+    distance = empty((len(xyz),))
+    for piece in asked.pieces(2 * TILE_POINTS):
+        found = near.nearest(asked.xyz[piece], 1)[0][:, 0]
+        distance[asked.row[piece]] = found
+    return distance
+
+
+def _tiles(xyz: FloatArray) -> Tiles:
+    few = len(xyz) <= 2 * TILE_POINTS
+    return one_tile(xyz) if few else make_tiles(xyz, points=TILE_POINTS, strips=False)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
 
+from pcfix.blocks import blocks, bounds, kept, mapped
 from pcfix.errors import GeometryError, SettingError
-from pcfix.model import FloatArray
+from pcfix.model import BoolArray, FloatArray
 
 STATIONS = 200
 """Stations of a section at most; they are never closer than a quarter of the corridor's width."""
@@ -110,10 +112,14 @@ def _medians(
     line: SectionLine, xyz: FloatArray, stations: FloatArray, half_width_m: float, window_m: float
 ) -> FloatArray:
     """Return the median height within `window_m` along of each station."""
-    along, across = line.along_across(xyz[:, :2])
-    inside = np.flatnonzero(np.abs(across) <= half_width_m)
-    inside = inside[np.argsort(along[inside], kind="stable")]
-    along, z = along[inside], xyz[inside, 2]
+    found = []
+    for rows in blocks(len(xyz)):
+        along, across = line.along_across(xyz[rows])
+        inside = np.abs(across) <= half_width_m
+        found.append((along[inside], xyz[rows, 2][inside]))
+    along, z = np.hstack(found)
+    order = np.argsort(along, kind="stable")
+    along, z = along[order], z[order]
     first = np.searchsorted(along, stations - window_m, side="left")
     last = np.searchsorted(along, stations + window_m, side="right")
     return np.array(
@@ -128,23 +134,31 @@ def lines_downslope(xyz: FloatArray, count: int) -> tuple[SectionLine, ...]:
     runs over the extent of the points in its own share of the bed, from high to low. Points that
     lie on a line in plan are a `GeometryError`.
     """
-    origin = xyz.mean(axis=0)
-    local = xyz - origin
-    covariance = local[:, :2].T @ local[:, :2]
+    origin = np.sum([xyz[rows].sum(axis=0) for rows in blocks(len(xyz))], axis=0) / len(xyz)
+    locals_ = (xyz[rows] - origin for rows in blocks(len(xyz)))
+    products = np.sum([local[:, :2].T @ local for local in locals_], axis=0)
+    covariance = products[:, :2]
     eigenvalues = np.linalg.eigvalsh(covariance)
     if len(xyz) < 3 or eigenvalues[0] <= 1e-6 * eigenvalues[1]:
         raise GeometryError("The bed lies on a line in plan; give --section x1,y1,x2,y2 instead.")
-    gradient = np.linalg.solve(covariance, local[:, :2].T @ local[:, 2])
+    gradient = np.linalg.solve(covariance, products[:, 2])
     steepness = float(np.hypot(*gradient))
     down = -gradient / steepness if steepness > 1e-9 else np.array([1.0, 0.0])
     left = np.array([-down[1], down[0]])
-    along, across = local[:, :2] @ down, local[:, :2] @ left
-    edges = np.linspace(across.min(), across.max(), count + 1)
+    place = mapped(lambda p: (p[:, :2] - origin[:2]) @ np.column_stack([down, left]), xyz)
+    (_, right), (_, top) = bounds(place)
+    edges = np.linspace(right, top, count + 1)
     lines = []
     for low, high in pairwise(edges):
-        share = along[(across >= low) & (across <= high)]
-        if len(share) and np.ptp(share) > 0.0:
+        inside = mapped(partial(_between, low, high), place[:, 1])
+        share = kept(inside, place)
+        (start, _), (stop, _) = bounds(share) if len(share) else np.zeros((2, 2))
+        if stop > start:
             middle = origin[:2] + 0.5 * (low + high) * left
-            ends = np.append(middle + share.min() * down, middle + share.max() * down)
+            ends = np.append(middle + start * down, middle + stop * down)
             lines.append(SectionLine(*ends.tolist()))
     return tuple(lines)
+
+
+def _between(low: float, high: float, values: FloatArray) -> BoolArray:
+    return (values >= low) & (values <= high)

@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
-from pcfix.compare.nearest import Neighbours
+from pcfix.blocks import blocks, empty, grouped, mapped, total
+from pcfix.clean.neighbours import nearest_distance
 from pcfix.errors import GeometryError, SettingError
-from pcfix.model import FloatArray
+from pcfix.model import FloatArray, IntArray
 from pcfix.options.steps import SIGMA_REFERENCE_M
 from pcfix.refract.tally import share_of_orders, within_orders
 
@@ -94,31 +97,100 @@ class Distribution:
     shares: tuple[Share, ...] = ()
 
 
-def statistics_of(values: FloatArray) -> Statistics:
-    """Return the statistics of a sample, shape (n,), metres, finite; none is a `GeometryError`."""
-    if len(values) == 0:
+class Sample:
+    """Values, shape (n,), sorted block by block, so that any order statistic of all is at hand.
+
+    A value's rank is the sum of its ranks in the blocks. What has a rank is found by halving
+    between the bits of the smallest and the largest number: exactly, with nothing held in memory.
+    """
+
+    def __init__(self, values: FloatArray) -> None:
+        self.count = len(values)
+        runs = empty((self.count,))
+        for rows in blocks(self.count):
+            runs[rows] = np.sort(values[rows])
+        self._runs = [runs[rows] for rows in blocks(self.count)]
+
+    def below(self, marks: npt.ArrayLike, *, among: bool = False) -> IntArray:
+        """Return how many values are less than each mark, or `among` these."""
+        side: Literal["right", "left"] = "right" if among else "left"
+        return np.sum([np.searchsorted(run, marks, side) for run in self._runs], axis=0)
+
+    def ranked(self, ranks: IntArray) -> FloatArray:
+        """Return the values of so many smaller ones, counted from 0."""
+        if len(self._runs) == 1:
+            return np.asarray(self._runs[0][ranks])
+        low, high = np.full(ranks.shape, _key(-np.inf)), np.full(ranks.shape, _key(np.inf))
+        while (low < high).any():
+            middle = (low >> 1) + (high >> 1) + (low & high & 1)
+            enough = self.below(_value(middle), among=True) > ranks
+            low, high = np.where(enough, low, middle + 1), np.where(enough, middle, high)
+        return _value(low) + 0.0
+
+    def percentiles(self, marks: npt.ArrayLike) -> FloatArray:
+        """Return the values at so many percent, between two of them linear, as numpy does."""
+        place = np.asarray(marks) / 100.0 * (self.count - 1)
+        first = np.floor(place).astype(np.int64)
+        a, b = self.ranked(np.array([first, np.minimum(first + 1, self.count - 1)]))
+        part = place - first
+        return np.where(part < 0.5, a + (b - a) * part, b - (b - a) * (1.0 - part))
+
+    def counts(self, edges: FloatArray) -> list[int]:
+        """Return how many values lie between edges; the last one belongs to the last class."""
+        below = self.below(edges)
+        below[-1] = self.below(edges[-1], among=True)
+        return [int(n) for n in np.diff(below)]
+
+
+def _key(value: npt.ArrayLike) -> IntArray:
+    """Return whole numbers in the order of floats."""
+    bits = np.asarray(value, np.float64).view(np.int64)
+    return np.asarray(bits ^ ((bits >> 63) & np.int64(2**63 - 1)))
+
+
+def _value(key: IntArray) -> FloatArray:
+    return np.asarray(key ^ ((key >> 63) & np.int64(2**63 - 1))).view(np.float64)
+
+
+def mean_of(values: FloatArray) -> float:
+    """Return the mean of values, shape (n,)."""
+    return total(np.sum, values) / len(values)
+
+
+def statistics_of(values: FloatArray, sample: Sample | None = None) -> Statistics:
+    """Return the statistics of values, shape (n,), metres, finite; none is a `GeometryError`.
+
+    The `sample` has the same values.
+    """
+    count = len(values)
+    if count == 0:
         raise GeometryError("There is no difference to take statistics of: no point is left.")
-    marks = np.percentile(values, (*PERCENTILES, 0, 100))
-    median = float(marks[PERCENTILES.index(50)])
+    sample = sample or Sample(values)
+    marks = sample.percentiles((*PERCENTILES, 0, 100))
+    median, mean = float(marks[PERCENTILES.index(50)]), mean_of(values)
+    is_size = marks[-2] >= 0.0
+    sizes = sample if is_size else Sample(mapped(np.abs, values))
+    apart = Sample(mapped(lambda some: np.abs(some - median), values))
     return Statistics(
-        count=len(values),
-        mean_m=float(values.mean()),
-        sd_m=float(values.std()),
-        rmse_m=float(np.sqrt(np.mean(values * values))),
-        nmad_m=float(NMAD_FACTOR * np.median(np.abs(values - median))),
+        count=count,
+        mean_m=mean,
+        sd_m=math.sqrt(total(lambda some: np.sum((some - mean) ** 2), values) / count),
+        rmse_m=math.sqrt(total(lambda some: np.sum(some * some), values) / count),
+        nmad_m=float(NMAD_FACTOR * apart.percentiles(50)),
         median_m=median,
         min_m=float(marks[-2]),
         max_m=float(marks[-1]),
-        within_95_m=float(np.percentile(np.abs(values), 95)),
+        within_95_m=float(sizes.percentiles(95)),
         percentiles_m={
             f"p{name}": float(mark) for name, mark in zip(PERCENTILES, marks, strict=False)
         },
     )
 
 
-def distribution_of(values: FloatArray) -> Distribution:
+def distribution_of(values: FloatArray, sample: Sample | None = None) -> Distribution:
     """Return statistics, histogram and fitted normal distribution of a sample, shape (n,), m."""
-    statistics, histogram = statistics_of(values), histogram_of(values)
+    sample = sample or Sample(values)
+    statistics, histogram = statistics_of(values, sample), histogram_of(sample)
     return Distribution(statistics, histogram, normal_of(statistics, histogram))
 
 
@@ -130,24 +202,23 @@ def distances_of(
     The histogram has all values, shape (n,), metres; without a number of classes it has the square
     root of n, rounded up. A band is from its lower bound up to, and without, its upper one, m.
     """
-    plain = distribution_of(values)
-    counts, edges = np.histogram(values, classes or math.ceil(math.sqrt(len(values))))
-    shares = [
-        Share(low, high, float(np.mean((values >= low) & (values < high)))) for low, high in bands
-    ]
-    histogram = Histogram(edges.tolist(), counts.tolist(), 0, 0)
+    sample = Sample(values)
+    plain = distribution_of(values, sample)
+    ends = np.array([plain.statistics.min_m, plain.statistics.max_m])
+    edges = np.histogram_bin_edges(ends, classes or math.ceil(math.sqrt(len(values))))
+    shares = [Share(*band, float(np.diff(sample.below(band))[0]) / len(values)) for band in bands]
+    histogram = Histogram(edges.tolist(), sample.counts(edges), 0, 0)
     return replace(plain, histogram=histogram, shares=tuple(shares))
 
 
-def histogram_of(values: FloatArray) -> Histogram:
-    """Return the histogram of a sample, shape (n,), metres, between its outer half percents."""
-    tails = np.percentile(values, (TAIL_PERCENT, 100.0 - TAIL_PERCENT))
-    low, high = float(tails[0]), float(tails[1])
+def histogram_of(sample: Sample) -> Histogram:
+    """Return the histogram of a sample, metres, between its outer half percents."""
+    low, high = sample.percentiles((TAIL_PERCENT, 100.0 - TAIL_PERCENT)).tolist()
     if not high > low:
         low, high = low - 0.5e-3, high + 0.5e-3
-    counts, edges = np.histogram(values, BINS, (low, high))
-    below, above = int((values < low).sum()), int((values > high).sum())
-    return Histogram(edges.tolist(), counts.tolist(), below, above)
+    edges = np.histogram_bin_edges(np.empty(0), BINS, (low, high))
+    below, within = sample.below(low), sample.below(high, among=True)
+    return Histogram(edges.tolist(), sample.counts(edges), int(below), int(sample.count - within))
 
 
 def normal_of(statistics: Statistics, histogram: Histogram) -> Normal:
@@ -256,9 +327,10 @@ def own_of(s: Statistics, of: str, stated_m: float | None, kind: str) -> Own:
 
 def tvu_of(error_m: FloatArray, depth_m: FloatArray) -> Tvu:
     """Return the vertical uncertainty that errors at reference depths, shape (n,), m, come to."""
-    size = np.abs(error_m)
-    shares = share_of_orders(within_orders(size, depth_m), len(size))
-    return Tvu(len(size), float(np.percentile(size, 95)), shares)
+    size = mapped(np.abs, error_m)
+    within = sum(within_orders(size[rows], depth_m[rows]) for rows in blocks(len(size)))
+    shares = share_of_orders(np.asarray(within), len(size))
+    return Tvu(len(size), float(Sample(size).percentiles(95)), shares)
 
 
 def fit_line(reference_depth_m: FloatArray, depth_m: FloatArray) -> Line | None:
@@ -268,15 +340,22 @@ def fit_line(reference_depth_m: FloatArray, depth_m: FloatArray) -> Line | None:
     """
     if len(depth_m) < 3:
         return None
-    x, y = reference_depth_m - reference_depth_m.mean(), depth_m - depth_m.mean()
-    xx, yy, xy = float(x @ x), float(y @ y), float(x @ y)
-    scale = max(float(np.abs(reference_depth_m).max()), 1e-9)
-    if xx <= len(x) * (1e-9 * scale) ** 2:
+    x_mean, y_mean = mean_of(reference_depth_m), mean_of(depth_m)
+
+    def product(a: FloatArray, b: FloatArray, a_mean: float, b_mean: float) -> float:
+        return total(lambda u, v: (u - a_mean) @ (v - b_mean), a, b)
+
+    xx = product(reference_depth_m, reference_depth_m, x_mean, x_mean)
+    yy = product(depth_m, depth_m, y_mean, y_mean)
+    xy = product(reference_depth_m, depth_m, x_mean, y_mean)
+    scale = max(float(-reference_depth_m.min()), float(reference_depth_m.max()), 1e-9)
+    count = len(depth_m)
+    if xx <= count * (1e-9 * scale) ** 2:
         return None
     slope = xy / xx
-    intercept = float(depth_m.mean() - slope * reference_depth_m.mean())
+    intercept = y_mean - slope * x_mean
     r2 = xy * xy / (xx * yy) if yy > 0.0 else 1.0
-    return Line(slope, intercept, r2, len(x))
+    return Line(slope, intercept, r2, count)
 
 
 def binned(
@@ -289,26 +368,27 @@ def binned(
     """
     if len(by_m) == 0:
         return ()
-    place = np.floor(by_m / width_m)
-    numbers = np.unique(place)
+    place = mapped(lambda some: np.floor(some / width_m), by_m)
+    numbers = np.unique(np.hstack([np.unique(place[rows]) for rows in blocks(len(place))]))
     if len(numbers) > MAX_BINS:
         raise SettingError(f"bin width {width_m:g} m makes {len(numbers):,} bins; widen it.")
-    order = np.argsort(place, kind="stable")
-    groups = np.split(order, np.searchsorted(place[order], numbers[1:]))
+    group = mapped(lambda some: np.searchsorted(numbers, some).astype(np.uint16), place)
+    errors = [after_m] if before_m is None else [after_m, before_m]
+    start, errors = grouped(group, len(numbers), *errors)
     return tuple(
         Bin(
             float(number * width_m),
             float((number + 1) * width_m),
-            statistics_of(after_m[rows]),
-            None if before_m is None else statistics_of(before_m[rows]),
+            *(statistics_of(one[first:last]) for one in errors),
+            *([None] if before_m is None else []),
         )
-        for number, rows in zip(numbers, groups, strict=True)
+        for number, first, last in zip(numbers, start, start[1:], strict=False)
     )
 
 
 def distance_from_shore(xy: FloatArray, dry_xy: FloatArray) -> FloatArray:
     """Return the distance in plan, metres, of places (n, 2) to the nearest dry point of (m, 2)."""
-    return Neighbours(dry_xy).nearest(xy)[0]
+    return nearest_distance(xy, dry_xy, 2)
 
 
 def errors_against_truth(xyz: FloatArray, true_xyz: FloatArray) -> tuple[float, float, float]:

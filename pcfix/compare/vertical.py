@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.compare.nearest import Neighbours
+from pcfix.blocks import empty, mapped
+from pcfix.clean.neighbours import nearest_of
 from pcfix.model import BoolArray, FloatArray
 
 MIN_SHAPE = 1e-3
@@ -30,17 +32,15 @@ class Heights(NamedTuple):
 def heights_at(xy: FloatArray, surface: FloatArray, neighbours: int) -> Heights:
     """Return the height of a surface at places in plan.
 
-    At each place (n, 2) a plane is fitted to that many nearest points of the surface (m, 3), which
-    has no fewer, and evaluated there: nearest in plan, least squares in Z; metres, world frame.
+    At each place, (n, 2) or (n, 3), a plane is fitted to that many nearest points of the surface
+    (m, 3), which has no fewer, and evaluated there: nearest in plan, least squares in Z; metres,
+    world frame.
     Where these points lie on a line, or the place lies far outside them, a plane has no meaning,
     and the height of the nearest point is taken.
     """
-    index = Neighbours(surface[:, :2])
-    sorted_surface = surface[index.row]
-    height, by_nearest = np.empty(len(xy)), np.empty(len(xy), np.bool_)
-    for rows, _, number in index.find(xy, neighbours):
-        near = sorted_surface[number]
-        near[:, :, :2] -= xy[rows, np.newaxis]
+    height, by_nearest = empty((len(xy),)), empty((len(xy),), np.bool_)
+    for rows, here, _, near in nearest_of(xy, surface, neighbours, 2):
+        near[:, :, :2] -= here[:, np.newaxis, :2]
         height[rows], by_nearest[rows] = _plane_at_origin(near)
     return Heights(height, by_nearest)
 
@@ -62,7 +62,7 @@ def _plane_at_origin(near: FloatArray) -> Heights:
     return Heights(np.where(fitted, plane, near[:, 0, 2]), ~fitted)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Pairs:
     """Two heights at each of n places, world Z."""
 
@@ -71,19 +71,19 @@ class Pairs:
     reference_m: FloatArray  # (n,)
     by_nearest: BoolArray  # (n,), where one of the two is that of a single point: see `heights_at`
 
-    @property
+    @cached_property
     def error_m(self) -> FloatArray:
         """Measured minus reference, shape (n,): positive where the cloud is too high."""
-        return np.asarray(self.measured_m - self.reference_m)
+        return mapped(np.subtract, self.measured_m, self.reference_m)
 
 
 def pairs_at_cloud(xyz: FloatArray, reference: FloatArray, neighbours: int) -> Pairs:
     """Return a pair at each point of the cloud (n, 3): its Z, and the reference's plane there."""
-    plane = heights_at(xyz[:, :2], reference, neighbours)
+    plane = heights_at(xyz, reference, neighbours)
     return Pairs(xyz[:, :2], xyz[:, 2], plane.height_m, plane.by_nearest)
 
 
 def pairs_at_reference(xyz: FloatArray, reference: FloatArray, neighbours: int) -> Pairs:
     """Return a pair at each check point (m, 3): the cloud's plane there, and the check's Z."""
-    plane = heights_at(reference[:, :2], xyz, neighbours)
+    plane = heights_at(reference, xyz, neighbours)
     return Pairs(reference[:, :2], plane.height_m, reference[:, 2], plane.by_nearest)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.clean.neighbours import Empty
+from pcfix.blocks import empty, let_go
 from pcfix.clean.points import (
     CleanSummary,
     Cloud,
@@ -79,8 +79,8 @@ def clean_file(
     check_tile(tile_m)
     task = file_task(input, output, given, reads=[given.water], progress=progress)
     step = _Cleaning(task, given)
-    with threads(given.jobs), scratch_arrays(task.target) as empty:
-        step.find(tile_m, empty)
+    with threads(given.jobs), scratch_arrays(task.target):
+        step.find(tile_m)
     replace(task, progress=None).run(step)  # the step counts the points of all passes
     result = step.summary()
     task.tell(result.as_dict())
@@ -141,11 +141,12 @@ class NoiseSearch:
     def run(self, chunks: Iterable[Tested], n: int, resources: Resources) -> BoolArray:
         """Run the tests on all n points; return which are noise, shape (n,)."""
         used, submerged, reasons = (np.zeros(n, kind) for kind in (bool, bool, np.uint8))
-        self.cloud = Cloud(resources.empty((n, 3), np.float64), used, submerged, reasons)
+        self.cloud = Cloud(empty((n, 3)), used, submerged, reasons)
         first = 0
         for one in chunks:
             self._add(one, slice(first, first + len(one.withheld)))
             first += len(one.withheld)
+            let_go()
             if resources.progress is not None:
                 resources.progress(len(one.withheld))
         self._check()
@@ -241,9 +242,9 @@ class _Cleaning(Step):
         )
         self._passed = self._written = 0
 
-    def find(self, tile_m: float | None, empty: Empty) -> None:
+    def find(self, tile_m: float | None) -> None:
         """Read the cloud and run the tests, with arrays on disk for what is large."""
-        resources = Resources(tile_m, empty, self._task.jobs, self._count)
+        resources = Resources(tile_m, self._task.jobs, self._count)
         self._noise = self._search.run(self._chunks(), self._points, resources)
 
     def _chunks(self) -> Iterator[Tested]:

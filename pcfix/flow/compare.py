@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from pcfix.blocks import mapped
 from pcfix.compare.figures import Comparison, bins_table, figures_of
 from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.compare.match import Match, SurveyCloud, match
@@ -17,7 +19,7 @@ from pcfix.compare.sections import parse_line
 from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_summary
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference
-from pcfix.io.files import check_input, check_output, write_bytes, write_text
+from pcfix.io.files import check_input, check_output, scratch_arrays, write_bytes, write_text
 from pcfix.model import WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
@@ -79,13 +81,22 @@ def compare_clouds(
         from pcfix.flow.surfaces import find_surface  # not quick to load
 
         water = find_surface(given.water, WaterOptions(), held.view()).surface
-    target, whole = read_reference(reference), held.read(water)
-    check_same_crs(whole.name, whole.crs, target.name, target.crs)
-    matched = match(whole, target, given.part(CompareRules), given=water is not None)
-    others = {name: _further(path, water, matched) for name, path in given.also}
-    result = figures_of(matched, lines, started, others)
+    with scratch_arrays(_beside(given)):
+        target, whole = read_reference(reference), held.read(water)
+        check_same_crs(whole.name, whole.crs, target.name, target.crs)
+        matched = match(whole, target, given.part(CompareRules), given=water is not None)
+        others = {name: _further(path, water, matched) for name, path in given.also}
+        result = figures_of(matched, lines, started, others)
     _write(result, given)
     return result
+
+
+def _beside(given: CompareOptions) -> Path:
+    """Return a file or folder to write beside, where large clouds lie meanwhile."""
+    for path in (given.out_dir, given.summary, given.plot):
+        if path is not None:
+            return Path(path)
+    return Path(tempfile.gettempdir()) / "pcfix"
 
 
 def _further(path: File, water: WaterSurface | None, first: Match) -> Match:
@@ -95,9 +106,10 @@ def _further(path: File, water: WaterSurface | None, first: Match) -> Match:
     """
     cloud, target = read_cloud(path, water), first.reference
     check_same_crs(cloud.name, cloud.crs, target.name, target.crs)
-    over = first.water_at(cloud.xyz[:, :2]) if first.settings.submerged else None
+    over = first.water_at(cloud.xyz) if first.settings.submerged else None
     if over is not None:
-        cloud = replace(cloud, water_m=np.where(np.isnan(cloud.water_m), over, cloud.water_m))
+        known = mapped(lambda own, w: np.where(np.isnan(own), w, own), cloud.water_m, over)
+        cloud = replace(cloud, water_m=known)
     found = match(cloud, target, first.settings, given=water is not None)
     return replace(found, places=first.places)
 

@@ -104,7 +104,7 @@ def write_report(
     figures = out_dir / "figures"
     figures.mkdir(exist_ok=True)
     for picture in report.pictures:
-        write_bytes(figures / f"{picture.name}.png", picture.png(), overwrite=overwrite)
+        write_bytes(figures / f"{picture.name}.png", picture.png, overwrite=overwrite)
     write_text(out_dir / PAGE, render(report), overwrite=overwrite)
     return report
 

@@ -161,7 +161,7 @@ def file_points(
 
 
 def first_points(chunks: Iterable[Points]) -> Points:
-    """Return as many points of a cloud as a chunk has, however many these chunks have."""
+    """Return as many points of a cloud as a chunk has, however many these have, without colours."""
     parts: list[Points] = []
     count = 0
     for one in chunks:
@@ -169,8 +169,9 @@ def first_points(chunks: Iterable[Points]) -> Points:
         count += len(parts[-1].xyz)
         if count >= las.CHUNK_POINTS:
             break
-    columns = zip(*parts, strict=True)
-    return Points(*(None if c[0] is None else np.concatenate(c) for c in columns))  # type: ignore
+    columns = list(zip(*parts, strict=True))[:-1]
+    joined: list[Any] = [None if c[0] is None else np.concatenate(c) for c in columns]
+    return Points(*joined)
 
 
 def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Points:

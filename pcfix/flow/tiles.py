@@ -91,6 +91,12 @@ class Tile:
         there = note.get("key") == self.key and self.target.is_file()
         return there and note["output"] == digest_of(self.target)
 
+    @property
+    def is_begun(self) -> bool:
+        """Whether an output that is there is ours, of a call that came no further."""
+        note, _ = read_counted(self.record)
+        return note.get("key") == self.key and not note["output"]
+
 
 def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> str:
     """Take one file through a step, record what it counted, and return why that failed, if it did.
@@ -105,14 +111,13 @@ def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> str:
             )
         if tile.is_finished:  # by a worker that was lost before it could say so
             return ""
+        write_counted(tile.record, {"key": tile.key, "output": ""}, {})
         step: TileStep = pickle.loads(pickled)
         step.begin(tile.first_row)
-        for left in tile.target.parent.glob(f".{tile.target.stem}.*.part{tile.target.suffix}"):
-            left.unlink(missing_ok=True)  # of a worker that was killed
         with threads(jobs), warnings.catch_warnings():
             warnings.simplefilter("ignore", PcfixWarning)  # said once, where the step was made
             step.run(FileTask(tile.source, tile.target, jobs=jobs, is_tile=True))
-        note = {"key": tile.key, "pcfix": tile.pcfix, "output": digest_of(tile.target)}
+        note = {"key": tile.key, "output": digest_of(tile.target)}
         write_counted(tile.record, note, step.counted())
     except PcfixError as error:
         return str(error)
@@ -185,7 +190,8 @@ class TiledRun:
             return self._told(kind(**note["result"]))
         todo = [tile for tile in work.values() if tile not in done]
         for tile in todo if self.folder.exists() else ():
-            check_cloud(tile.target, overwrite=self.options.overwrite, inputs=self.tiles.paths)
+            overwrite = self.options.overwrite or tile.is_begun
+            check_cloud(tile.target, overwrite=overwrite, inputs=self.tiles.paths)
         points = sum(tile.points for tile in todo)
         with threads(self.options.jobs), self._machines(points) as machines:
             step, tiles = self._made(make)
@@ -218,7 +224,9 @@ class TiledRun:
                     done.add(tile)
                 if self.progress is not None:
                     self.progress(sum(one.points for one in done), total)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as stop:
+            if stop.args:  # it is another signal
+                raise
             raise KeyboardInterrupt(
                 f"stopped; {len(done)} of {len(self.tiles.paths)} files are finished, the same"
                 " command goes on."

@@ -55,6 +55,12 @@ class Window(NamedTuple):
         across = (column >= self.column) & (column < self.column_stop)
         return np.asarray(across & (row >= self.row) & (row < self.row_stop))
 
+    def parts(self, side: int) -> Iterator[Window]:
+        """Yield squares of `side` cells that cover the window, row by row."""
+        for row in range(self.row, self.row_stop, side):
+            for column in range(self.column, self.column_stop, side):
+                yield Window(row, row + side, column, column + side).clipped(self)
+
     def clipped(self, other: Window) -> Window:
         """Return what this window and another have in common."""
         return Window(
@@ -107,9 +113,7 @@ class Lattice:
 
     def windows(self, side: int) -> Iterator[Window]:
         """Yield squares of `side` cells that cover the raster, row by row."""
-        for row in range(0, self.height, side):
-            for column in range(0, self.width, side):
-                yield Window(row, row + side, column, column + side).clipped(self.window)
+        return self.window.parts(side)
 
     def positions(self, xyz: FloatArray) -> FloatArray:
         """Return columns and rows of points, shape (n, 2), cells from the top left corner."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from pcfix.blocks import empty, kept, let_go, mapped
 from pcfix.compare.match import Reference, SurveyCloud
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.crs import is_same, parts
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 def read_cloud(
     path: File, water: WaterSurface | None = None, skip_classes: Sequence[int] = NOISE_CLASSES
 ) -> SurveyCloud:
-    """Read the points that count of a LAS or LAZ cloud that fits in memory.
+    """Read the points that count of a LAS or LAZ cloud.
 
     Those of `skip_classes`, and withheld ones, are left out. The `water` is by default what a cloud
     that pcfix corrected says of its own. An `InputError` if the file is damaged, no point counts,
@@ -57,7 +58,8 @@ def read_cloud(
             )
             for points in source.chunks()
         )
-        return survey_cloud(str(path), crs, chunks, own, water is not None, skip_classes)
+        given = water is not None
+        return survey_cloud(str(path), crs, chunks, own, given, len(source), skip_classes)
 
 
 TOLD = ("WaterDepth", *SHIFTS)
@@ -80,28 +82,34 @@ def survey_cloud(
     chunks: Iterable[Told],
     water: WaterSurface | None,
     given: bool,
+    most: int,
     skip_classes: Sequence[int] = NOISE_CLASSES,
 ) -> SurveyCloud:
     """Return the points that count; the water is `given`, or else what the cloud says of its own.
 
-    An `InputError` if no point counts.
+    There are `most` points at most. An `InputError` if none counts.
     """
-    parts, count = [], 0
+    columns: list[npt.NDArray[Any]] = []
+    first = count = 0
     for points in chunks:
-        parts.append(_part(points, water, given=given, skip=skip_classes))
-        count += len(points.xyz)
-    xyz, water_m, bathymetric, *shifts = (np.concatenate(of) for of in zip(*parts, strict=True))
-    if len(xyz) == 0:
+        parts = _part(points, water, given=given, skip=skip_classes)
+        columns = columns or [empty((most, *part.shape[1:]), part.dtype) for part in parts]
+        for column, part in zip(columns, parts, strict=True):
+            column[first : first + len(part)] = part
+        first, count = first + len(parts[0]), count + len(points.xyz)
+        let_go()
+    xyz, water_m, bathymetric, *shifts = (column[:first] for column in columns)
+    if first == 0:
         raise InputError(
             f"{name}: every point is withheld or of a class that does not count"
             f" ({', '.join(map(str, skip_classes))}); there is nothing to compare."
         )
-    exact = given or not np.isfinite(water_m).any()
+    exact = given or not mapped(np.isfinite, water_m).any()
     return SurveyCloud(
         name,
         xyz,
         crs,
-        count - len(xyz),
+        count - first,
         shifts[0] if shifts else None,
         bathymetric,
         water_m,
@@ -114,7 +122,7 @@ def _part(
 ) -> list[npt.NDArray[Any]]:
     """Return place, water and whether of the bed of the points that count; perhaps shifts."""
     xyz, classes, withheld, heights, dimensions = points
-    keep = ~(np.isin(classes, skip) | withheld)
+    keep = ~(np.isin(np.arange(256), skip)[classes] | withheld)
     if not given and "WaterDepth" in dimensions:
         depth = dimensions["WaterDepth"]
         above = np.where(depth > 0.0, xyz[:, 2] + depth, np.nan)
@@ -124,7 +132,7 @@ def _part(
         above = surface_above(water, xyz, heights).height_m
     else:
         above = np.full(len(xyz), np.nan)
-    found = [xyz[keep], above[keep], classes[keep] == BATHYMETRIC_POINT]
+    found = [kept(keep, xyz), kept(keep, above), kept(keep, classes) == BATHYMETRIC_POINT]
     if dimensions.keys() >= set(SHIFTS):
         found.append(np.column_stack([dimensions[name] for name in SHIFTS])[keep])
     return found

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import errno
 import os
+import secrets
 import shutil
 import stat
-import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -24,6 +25,7 @@ except ImportError:  # not on Windows: what a killed process leaves stays there
     fcntl = None  # type: ignore[assignment]
 
 _PREFIX, _SUFFIX, _LOCK = ".pcfix-", ".part", "lock"
+_NEW, _NEW_S = "new", 60.0
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -31,14 +33,21 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 def draft_folder(parent: Path) -> Iterator[Path]:
     """Give a new folder inside another, for what need not last; it goes when the block ends."""
     _remove_orphans(parent)
-    folder = Path(tempfile.mkdtemp(prefix=_PREFIX, suffix=_SUFFIX, dir=parent)).absolute()
-    lock = _lock(folder)
+    folder = parent.absolute() / f"{_PREFIX}{secrets.token_hex(8)}{_SUFFIX}"
+    lock = None
     try:
+        folder.mkdir(0o700)
+        lock = _lock(folder)
         yield folder
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        if lock is not None:
-            os.close(lock)
+        try:
+            shutil.rmtree(folder, ignore_errors=True)
+        except KeyboardInterrupt:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        finally:
+            if lock is not None:
+                os.close(lock)
 
 
 @contextmanager
@@ -109,12 +118,15 @@ def _settle(path: Path) -> None:
 
 
 def _lock(folder: Path) -> int | None:
-    """Hold the lock of a folder; it has its name only once it is held."""
+    """Hold the lock of a folder; it has its name only once it is held.
+
+    Where a file system has no locks it keeps the other name, and the folder is left alone.
+    """
     if fcntl is None:
         return None
-    new = folder / "new"
+    new = folder / _NEW
     opened = os.open(new, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600)
-    with suppress(OSError):  # of file systems without locks
+    with suppress(OSError):
         fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
         new.rename(folder / _LOCK)
     return opened
@@ -126,7 +138,15 @@ def _remove_orphans(parent: Path) -> None:
         return
     for folder in parent.glob(f"{_PREFIX}*{_SUFFIX}"):
         with suppress(OSError):
-            opened = os.open(folder / _LOCK, os.O_RDWR | os.O_NOFOLLOW)
+            lock = folder / _LOCK
+            if not lock.exists():  # its owner was stopped before it held it, or while it tidied up
+                if time.time() - folder.stat().st_mtime < _NEW_S:
+                    continue
+                lock = folder / _NEW
+            if not lock.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                continue
+            opened = os.open(lock, os.O_RDWR | os.O_NOFOLLOW)
             try:
                 fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 shutil.rmtree(folder, ignore_errors=True)

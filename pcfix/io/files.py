@@ -6,30 +6,30 @@ What is written is whole or not at all, and never over another's work.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import mimetypes
+import mmap
 import os
 import re
 import subprocess
+import weakref
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
 
+from pcfix.blocks import Empty, on_disk
 from pcfix.errors import InputError, SettingError, optional_library
 from pcfix.grid.lattice import Window
 from pcfix.io.drafts import cannot_write, draft_folder, replaced_when_whole
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.declare import File
 from pcfix.sums import Counted
-
-if TYPE_CHECKING:
-    from pcfix.clean.neighbours import Empty
-
 
 LARGE_BYTES = 2**26
 LAST_LINES = 3
@@ -182,31 +182,43 @@ def run_logged(words: list[str], log: Path) -> tuple[int, list[str]]:
 def scratch_arrays(target: Path) -> Iterator[Empty]:
     """Give a maker of arrays in temporary files beside the target, gone when the block ends.
 
-    An `InputError` if the disk cannot hold them.
+    Within the block the large arrays of `pcfix.blocks` are such, too. The disk has its place back
+    as soon as an array is no longer used. An `InputError` if it cannot hold them.
     """
+    maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
+    made = itertools.count()
     with ExitStack() as stack:
         try:
             folder = stack.enter_context(draft_folder(target.parent))
         except OSError as error:
             raise cannot_write(target, error) from error
-        files: list[Path] = []
 
         def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-            files.append(folder / f"{len(files)}.bin")
+            path = folder / f"{next(made)}.bin"
             size = int(np.prod(shape)) * np.dtype(dtype).itemsize
             try:
-                with files[-1].open("wb") as stream:  # a full disk kills whoever writes to a map
+                with path.open("w+b") as stream:  # a full disk kills whoever writes to a map
                     if hasattr(os, "posix_fallocate"):
                         os.posix_fallocate(stream.fileno(), 0, size)
                     else:
                         stream.truncate(size)
+                    one = mmap.mmap(stream.fileno(), size)
             except OSError as error:
                 raise InputError(
                     f"{target}: {size / 1e9:,.1f} GB of temporary space beside it cannot be had"
                     f" ({error.strerror or error}); make room, or write to another disk."
                 ) from error
-            return np.memmap(files[-1], dtype=dtype, mode="r+", shape=shape)
+            with suppress(OSError):  # Windows keeps it until the block ends
+                path.unlink()
+            maps.add(one)
+            return np.frombuffer(one, dtype).reshape(shape)
 
+        def let_go() -> None:
+            for one in maps:
+                if hasattr(mmap, "MADV_DONTNEED"):
+                    one.madvise(mmap.MADV_DONTNEED)
+
+        stack.enter_context(on_disk(empty, let_go))
         yield empty
 
 

@@ -10,6 +10,7 @@ import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,8 +46,12 @@ def new_figure(width_in: float = 8.0, height_in: float = 4.5, **grid: Any) -> tu
 
 def png_of(figure: Figure) -> bytes:
     """Return a figure as a PNG file."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=130)
+    figure.set_dpi(130)
+    canvas = FigureCanvasAgg(figure)
+    canvas.print_png(stream)  # type: ignore[no-untyped-call]  # `savefig` would draw it twice
     return stream.getvalue()
 
 
@@ -105,8 +110,9 @@ class Picture:
     alt: str
     figure: Figure
 
+    @cached_property
     def png(self) -> bytes:
-        """Return the picture as a file."""
+        """The picture as a file; drawn once, for the page and beside it."""
         return png_of(self.figure)
 
     @property
@@ -114,7 +120,7 @@ class Picture:
         """The picture for an HTML page."""
         from markupsafe import Markup
 
-        return Markup(base64.b64encode(self.png()).decode())
+        return Markup(base64.b64encode(self.png).decode())
 
 
 @dataclass(frozen=True)

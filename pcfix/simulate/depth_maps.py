@@ -37,7 +37,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens, Views
-from pcfix.simulate.sight import Part, Partners, Rig, Sight, starts_of
+from pcfix.simulate.sight import Part, Partners, Sight, starts_of
 from pcfix.simulate.tracing import bed_points, piercing_points_of_planes, project, rotations_of
 
 AVERAGED_WITHIN = 0.012
@@ -71,6 +71,25 @@ class Matching(NamedTuple):
     known: IntArray
     noise_px: FloatArray
     cost_px2: FloatArray
+
+
+class Sightings(NamedTuple):
+    """Of which rays other images show a place, and where: e measured ideal pixels.
+
+    `owner` is the ray, shape (e,). In the frame of the other camera the ray is
+    ``start + depth * way``, both of shape (3, e).
+    """
+
+    owner: IntArray
+    measured: FloatArray
+    start: FloatArray
+    way: FloatArray
+
+    def take(self, kept: BoolArray) -> Sightings:
+        """Return some of them."""
+        return Sightings(
+            self.owner[kept], self.measured[kept], self.start[:, kept], self.way[:, kept]
+        )
 
 
 class Maps(NamedTuple):
@@ -175,13 +194,20 @@ def _depths(
     matching: Matching, rays: tuple[FloatArray, FloatArray, FloatArray], seen: FloatArray
 ) -> FloatArray:
     """Return the depth of the best pair of partners along each ray, from a first depth."""
-    reference, slot = np.nonzero(matching.partner >= 0)
+    rig, (reference, slot) = matching.sight.rig, np.nonzero(matching.partner >= 0)
     row = matching.partner[reference, slot]
     measured = _measured(matching, row, seen[reference], matching.noise_px[reference, slot])
-    edges = reference, measured, matching.sight.camera[row]
-    (origin, ray, first), rig = rays, matching.sight.rig
-    depth = _plausible(_least_squares(rays, edges, rig), first)
-    residual, slope = _residuals((origin, ray, depth), edges, rig)
+    origin, ray, first = rays
+    camera, given, lens = matching.sight.camera[row], rig.given, rig.optics.lens
+    turn = rotations_of(given)[camera]
+    sightings = Sightings(
+        reference,
+        measured,
+        np.einsum("mij,mj->im", turn, origin[reference] - given.centres[camera]),
+        np.einsum("mij,mj->im", turn, ray[reference]),
+    )
+    depth = _plausible(_least_squares(first, sightings, lens), first)
+    residual, slope = _residuals(depth, sightings, lens)
     shape = matching.partner.shape
     squares, right, curved = np.full(shape, np.inf), np.zeros(shape), np.ones(shape)
     squares[reference, slot] = (residual**2).sum(axis=1) + matching.cost_px2[reference, slot]
@@ -189,8 +215,7 @@ def _depths(
     curved[reference, slot] = (slope**2).sum(axis=1)
     best = _best_pair(squares, right, curved)
     taken = (best[reference] == slot[:, None]).any(axis=1)
-    pair = reference[taken], measured[taken], edges[2][taken]
-    return _plausible(_least_squares((origin, ray, depth), pair, rig), first)
+    return _plausible(_least_squares(depth, sightings.take(taken), lens), first)
 
 
 def _plausible(depth: FloatArray, first: FloatArray) -> FloatArray:
@@ -222,22 +247,17 @@ def _measured(
     return rig.optics.to_ideal(rig.optics.to_image(ideal) + noise_px)
 
 
-def _least_squares(
-    rays: tuple[FloatArray, FloatArray, FloatArray],
-    edges: tuple[IntArray, FloatArray, IntArray],
-    rig: Rig,
-) -> FloatArray:
+def _least_squares(depth: FloatArray, sightings: Sightings, lens: Lens) -> FloatArray:
     """Return the depths along rays with least squared residuals in other images, by Gauss-Newton.
 
-    `rays` are origin, direction and a first depth; `edges` the ray, measured pixels and camera.
-    A ray without edges gets NaN.
+    From first depths; a ray without sightings gets NaN.
     """
-    origin, ray, depth = rays
+    owner, count = sightings.owner, len(depth)
     for _ in range(_STEPS):
-        residual, slope = _residuals((origin, ray, depth), edges, rig)
-        right = np.bincount(edges[0], (slope * residual).sum(axis=1), len(depth))
-        curved = np.bincount(edges[0], (slope**2).sum(axis=1), len(depth))
-        step = np.divide(right, curved, out=np.full(len(depth), np.nan), where=curved > 0.0)
+        residual, slope = _residuals(depth, sightings, lens)
+        right = np.bincount(owner, (slope * residual).sum(axis=1), count)
+        curved = np.bincount(owner, (slope**2).sum(axis=1), count)
+        step = np.divide(right, curved, out=np.full(count, np.nan), where=curved > 0.0)
         depth = depth + step
         if np.nanmax(np.abs(step), initial=0.0) < _CONVERGED_M:
             break
@@ -245,19 +265,15 @@ def _least_squares(
 
 
 def _residuals(
-    rays: tuple[FloatArray, FloatArray, FloatArray],
-    edges: tuple[IntArray, FloatArray, IntArray],
-    rig: Rig,
+    depth: FloatArray, sightings: Sightings, lens: Lens
 ) -> tuple[FloatArray, FloatArray]:
     """Return measured minus predicted pixels, and how the predicted move with the depth."""
-    (origin, ray, depth), (owner, measured, camera) = rays, edges
-    lens = rig.optics.lens
-    turned = np.einsum("mij,mj->mi", rotations_of(rig.given)[camera], ray[owner])
-    xyz = (origin + depth[:, None] * ray)[owner]
-    seen, z = project(xyz, rig.given, camera, lens)
-    offset = (seen - [lens.principal_x, lens.principal_y]) / lens.focal
-    slope = (lens.focal / z)[:, None] * (turned[:, :2] - offset * turned[:, 2:])
-    return measured - seen, slope
+    way = sightings.way
+    x, y, z = sightings.start + depth[sightings.owner] * way
+    u, v, scale = x / z, y / z, lens.focal / z
+    seen = np.column_stack([lens.focal * u + lens.principal_x, lens.focal * v + lens.principal_y])
+    slope = np.column_stack([scale * (way[0] - u * way[2]), scale * (way[1] - v * way[2])])
+    return sightings.measured - seen, slope
 
 
 def _averaged(matching: Matching, maps: Maps) -> tuple[FloatArray, FloatArray]:

@@ -29,7 +29,7 @@ COMMAND = """
 import sys
 from pathlib import Path
 from pcfix.flow.compare import compare_clouds
-compare_clouds(*sys.argv[1:3], vertical=False, summary=Path(sys.argv[3]), overwrite=True)
+compare_clouds(*sys.argv[1:3], c2c_only=True, summary=Path(sys.argv[3]), overwrite=True)
 """
 SECOND_CALL = f"""{COMMAND}
 import time

@@ -14,8 +14,9 @@ import time
 
 import numpy as np
 
+from pcfix.clean.neighbours import make_tiles, nearest_of
 from pcfix.clean.points import clean_points
-from pcfix.compare.nearest import Neighbours, cloud_to_cloud, strip_order
+from pcfix.compare.nearest import cloud_to_cloud
 from pcfix.io.water import load_open3d
 from pcfix.options.steps import CleanRules
 
@@ -37,6 +38,10 @@ def bed(count, seed):
     return np.column_stack([xy, z])
 
 
+def in_strips(xyz):
+    return make_tiles(xyz).row
+
+
 def jobs(cloud, reference):
     """Return for each task what does it, the way of pcfix first."""
     o3d = load_open3d()
@@ -46,7 +51,7 @@ def jobs(cloud, reference):
 
     def ours(count):
         found = np.empty((len(cloud), count))
-        for rows, distance, _ in Neighbours(reference).find(cloud, count):
+        for rows, _, distance, _ in nearest_of(cloud, reference, count, 3):
             found[rows] = distance
         return found[:, -1]
 
@@ -93,13 +98,13 @@ def jobs(cloud, reference):
         f"{PLANE_POINTS} nearest": {
             "pcfix": lambda: ours(PLANE_POINTS),
             "open3d nns knn": lambda: knn(PLANE_POINTS),
-            "open3d nns, in strips": lambda: knn(PLANE_POINTS, strip_order),
+            "open3d nns, in strips": lambda: knn(PLANE_POINTS, in_strips),
             "open3d nns hybrid": lambda: hybrid(PLANE_POINTS),
         },
         "statistical outliers": {
             "pcfix": lambda: clean_points(cloud, settings=rules) == 0,
             "open3d": lambda: outliers(as_they_come(cloud)),
-            "open3d, in strips": lambda: outliers(strip_order(cloud)),
+            "open3d, in strips": lambda: outliers(in_strips(cloud)),
         },
     }
 

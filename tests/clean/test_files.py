@@ -274,6 +274,7 @@ def test_a_full_disk_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyP
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
+    monkeypatch.setattr("pcfix.blocks.LARGE", 1000)
     monkeypatch.setattr("os.posix_fallocate", full, raising=False)
     with pytest.raises(InputError, match="temporary space beside it cannot be had"):
         clean_file(source, tmp_path / "out.las")

@@ -87,7 +87,7 @@ def test_tiles_hold_every_used_point_once() -> None:
 def test_blocks_of_rows_do_not_change_the_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
     xyz, used = _clustered(), np.ones(900, bool)
     whole = make_tiles(xyz, used, 4.0)
-    monkeypatch.setattr(neighbours, "BLOCK_ROWS", 77)
+    monkeypatch.setattr("pcfix.blocks.ROWS", 77)
     cut = make_tiles(xyz, used, 4.0)
     assert np.array_equal(cut.row, whole.row)
     assert np.array_equal(cut.start, whole.start)

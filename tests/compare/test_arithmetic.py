@@ -4,9 +4,11 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
+from pcfix.clean.neighbours import nearest_of
 from pcfix.compare.match import near_in_plan
-from pcfix.compare.nearest import Neighbours, cloud_to_cloud, strip_order
+from pcfix.compare.nearest import cloud_to_cloud
 from pcfix.compare.sections import lines_downslope, parse_line, section_along
 from pcfix.compare.statistics import (
     binned,
@@ -62,15 +64,22 @@ def test_cells_and_tree_agree_however_points_are_spread():
     ]
     for reference in ways:
         for cloud in ways:
-            tree, _ = Neighbours(reference).nearest(cloud)
+            tree, _ = cKDTree(reference).query(cloud)
             np.testing.assert_allclose(cloud_to_cloud(cloud, reference), tree, atol=1e-9)
 
 
-def test_nearest_rows_are_those_of_the_arrays_that_came_in():
-    cloud, reference = scattered(250, 3), scattered(350, 4)
-    distance, row = Neighbours(reference).nearest(cloud)
-    np.testing.assert_allclose(np.linalg.norm(cloud - reference[row], axis=1), distance, atol=5e-9)
-    assert sorted(strip_order(cloud)) == list(range(250))
+def test_nearest_points_are_the_nearest_and_of_equals_the_first():
+    """On a lattice, between four of its points: which of them counts is not left to the tree."""
+    reference = np.array([[x, y, k] for k, (x, y) in enumerate(np.ndindex(9, 9))], float)
+    cloud = np.array([[x + 0.5, y + 0.5, 0.0] for x, y in np.ndindex(8, 8)])
+    seen = np.zeros(len(cloud), int)
+    for rows, xyz, distance, near in nearest_of(cloud, reference, 2, 2):
+        np.testing.assert_array_equal(xyz, cloud[rows])
+        np.testing.assert_array_equal(distance, math.sqrt(0.5))
+        first = 9 * (xyz[:, 0] - 0.5) + xyz[:, 1] - 0.5
+        np.testing.assert_array_equal(near[:, :, 2], np.column_stack([first, first + 1]))
+        seen[rows] += 1
+    assert (seen == 1).all()
 
 
 def test_one_point_and_points_on_a_line_can_be_asked():

@@ -12,10 +12,10 @@ from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.hypotheses import IN_FRAME, hypotheses_of
 from pcfix.refract.learning import learn_of_sample
 from pcfix.refract.patches import FEWEST_WITHOUT_LIST
-from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
 from tests.utils.nightly import mostly_nightly
 from tests.utils.shared import needs
+from tests.utils.simulated import simulated
 
 RENDERED, rendered = needs("rendered_a")
 AUTO = ScienceOptions(method="auto", index=1.34)
@@ -38,7 +38,7 @@ CLOUDS = {
 
 @pytest.mark.parametrize("name", mostly_nightly(CLOUDS, "tracks", "depth-maps"))
 def test_a_simulated_cloud_is_told(name):
-    scene = simulate_scene(12_000, seed=1, lidar_per_m2=0.0, **CLOUDS[name])
+    scene = simulated(12_000, seed=1, lidar_per_m2=0.0, **CLOUDS[name])
     settings, verdict = told(scene.apparent_xyz, scene.cameras, scene.water)
     kind = {"river of tracks": "tracks"}.get(name, name)
     place = ["tracks", "depth-maps", "pairs"].index(kind)
@@ -50,7 +50,7 @@ def test_a_simulated_cloud_is_told(name):
 
 
 def test_auto_is_the_correction_that_was_told():
-    scene = simulate_scene(12_000, seed=1, lidar_per_m2=0.0)
+    scene = simulated(12_000, seed=1, lidar_per_m2=0.0)
     points, given = scene.apparent_xyz, (scene.cameras, scene.water)
     found = pcfix.correct_points(points, *given, method="auto")
     same = pcfix.correct_points(points, *given, method="consistent", camera_set="all")
@@ -61,7 +61,7 @@ def test_auto_is_the_correction_that_was_told():
 
 
 def test_without_lenses_it_is_snell():
-    scene = simulate_scene(2_000, seed=1, lidar_per_m2=0.0)
+    scene = simulated(2_000, seed=1, lidar_per_m2=0.0)
     bare = Cameras(scene.cameras.labels, scene.cameras.centres)
     points = scene.apparent_xyz
     found = pcfix.correct_points(points, bare, scene.water, method="auto")
@@ -70,14 +70,14 @@ def test_without_lenses_it_is_snell():
 
 
 def test_few_points_tell_nothing():
-    scene = simulate_scene(FEWEST_WITHOUT_LIST - 1, seed=1, lidar_per_m2=0.0)
+    scene = simulated(FEWEST_WITHOUT_LIST - 1, seed=1, lidar_per_m2=0.0)
     settings, verdict = told(scene.apparent_xyz, scene.cameras, scene.water)
     assert verdict is None
     assert (settings.method, settings.camera_set) == ("consistent", "all")
 
 
 def test_a_camera_set_limits_what_is_asked():
-    scene = simulate_scene(500, seed=1, lidar_per_m2=0.0)
+    scene = simulated(500, seed=1, lidar_per_m2=0.0)
     batch = Batch(
         scene.apparent_xyz,
         surface_above(scene.water, scene.apparent_xyz),

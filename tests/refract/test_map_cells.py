@@ -12,18 +12,18 @@ from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import FLAT_DEG, Batch, Survey
 from pcfix.refract.learning import learn_of_sample, seen_flat
 from pcfix.refract.methods import correct
-from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import is_submerged, surface_above
 from tests.utils.batches import batch_of
 from tests.utils.depth_map_twin import looking
 from tests.utils.nightly import mostly_nightly
+from tests.utils.simulated import simulated
 
 BLOCKS = {"nadir": {}, "half oblique": {"obliques_deg": 30.0, "area_m": (70.0, 50.0)}}
 
 
 @lru_cache(maxsize=2)
 def batch(block):
-    scene = simulate_scene(12_000, seed=2, cloud="depth-maps", lidar_per_m2=0.0, **BLOCKS[block])
+    scene = simulated(12_000, seed=1, lidar_per_m2=0.0, cloud="depth-maps", **BLOCKS[block])
     water = scene.water
     settings = ScienceOptions(method="consistent", camera_set="mvs", dimensions="none")
     whole = Batch(
@@ -45,8 +45,9 @@ def both(part):
 @pytest.mark.parametrize("block", mostly_nightly(BLOCKS, "half oblique"))
 def test_maps_of_neighbours_are_as_alone(block, with_list):
     part, views, gsd_m = batch(block)
-    if with_list:
-        part = replace(part, views=replace(views, kind="depth-maps"))
+    if with_list:  # which is slow alone: a third of the area
+        rows = np.flatnonzero(part.xyz[:, 0] < np.quantile(part.xyz[:, 0], 0.33))
+        part = replace(part.take(rows), views=replace(views.take(rows), kind="depth-maps"))
     quick, alone = both(part)
     apart_px = np.linalg.norm(quick.shift_m - alone.shift_m, axis=1) / gsd_m
     assert np.median(apart_px) < 0.005

@@ -6,12 +6,12 @@ import pcfix
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Survey
 from pcfix.refract.rehearsal import rehearsals
-from pcfix.simulate.scene import simulate_scene
+from tests.utils.simulated import simulated
 
 
 def test_nothing_else_is_compiled():
     # of depth maps, so that the bed is learned too
-    scene = simulate_scene(12_000, seed=1, lidar_per_m2=0.0, cloud="depth-maps")
+    scene = simulated(12_000, seed=1, lidar_per_m2=0.0, cloud="depth-maps")
     pcfix.correct_points(scene.apparent_xyz, scene.cameras, scene.water, method="auto")
     for one in rehearsals(Survey(scene.water, scene.cameras, ScienceOptions())):
         before = [kernel_of(name).signatures for name in one.kernels]

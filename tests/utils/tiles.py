@@ -3,6 +3,7 @@
 import laspy
 import numpy as np
 
+from pcfix.io.files import read_counted
 from tests.utils.shared import ROOT
 
 SCENE = ROOT / "samples" / "scene"
@@ -35,3 +36,10 @@ def write(path, las, rows, **changes):
 def records(*paths):
     """Return the points of files as one array, field by field."""
     return np.concatenate([laspy.read(path).points.array for path in paths])
+
+
+def finished(folder):
+    """Return the outputs in a folder that are on record as finished, and when they were written."""
+    records = (folder / ".pcfix").glob("*.la?.npz")
+    paths = [folder / one.stem for one in records if read_counted(one)[0].get("output")]
+    return {path: path.stat().st_mtime_ns for path in paths}

@@ -6,11 +6,14 @@ the number of the process that runs it, and once it has ended with how.
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import signal
 import subprocess
 import sys
+import traceback
+from pathlib import Path
 
 ENDING = (signal.SIGINT, signal.SIGTERM)
 
@@ -22,11 +25,16 @@ class Zygote:
     use threads of libraries, which no process has that was forked: give them one job.
     """
 
-    def __init__(self, *first: list[str]) -> None:
-        self._first = first
+    def __init__(self, log: Path, *first: list[str]) -> None:
+        self._log, self._first = str(log), first
+
+    @property
+    def said(self) -> str:
+        """What the last command wrote to stderr."""
+        return Path(self._log).read_text()
 
     def __enter__(self) -> Zygote:
-        words = [sys.executable, "-m", "tests.utils.zygote", json.dumps(self._first)]
+        words = [sys.executable, "-m", "tests.utils.zygote", json.dumps(self._first), self._log]
         self._process = subprocess.Popen(
             words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
@@ -50,8 +58,9 @@ def _run(arguments: list[str]) -> None:
     from pcfix.cli import main
 
     nothing = os.open(os.devnull, os.O_RDWR)
-    for stream in range(3):
-        os.dup2(nothing, stream)
+    os.dup2(nothing, 0)
+    os.dup2(nothing, 1)
+    os.dup2(os.open(sys.argv[2], os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
     code = 0
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
@@ -62,7 +71,10 @@ def _run(arguments: list[str]) -> None:
     except SystemExit as end:
         code = int(end.code or 0)
     except BaseException:  # a traceback is a defect
+        traceback.print_exc()
         code = 99
+    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    gc.collect()  # as at the end of a process: what was cut off between two steps is closed
     os._exit(code)
 
 

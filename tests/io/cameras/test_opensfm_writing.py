@@ -51,10 +51,10 @@ def same(found, given, ties=None, given_ties=None):
     for read, wrote in zip(found.lenses, given.lenses, strict=True):
         assert project(read, rays) == pytest.approx(project(wrote, rays), abs=1e-8)
     if given_ties is not None:
-        assert ties.xyz == pytest.approx(given_ties.xyz, abs=1e-4, rel=0.0)
-        assert ties.views.start.tolist() == given_ties.views.start.tolist()
-        assert ties.views.camera.tolist() == given_ties.views.camera.tolist()
-        assert ties.image_xy == pytest.approx(given_ties.image_xy, abs=1e-4)
+        np.testing.assert_allclose(ties.xyz, given_ties.xyz, rtol=0.0, atol=1e-4)
+        np.testing.assert_array_equal(ties.views.start, given_ties.views.start)
+        np.testing.assert_array_equal(ties.views.camera, given_ties.views.camera)
+        np.testing.assert_allclose(ties.image_xy, given_ties.image_xy, rtol=0.0, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -185,4 +185,4 @@ def test_a_real_block_reprojects_as_before(tmp_path):
             project(c.lenses[i], (t.xyz[point] - c.centres[i]) @ c.rotations[i].T)
             for c, t in ((cameras, ties), found)
         ]
-        assert seen[0] == pytest.approx(seen[1], abs=1e-4)
+        np.testing.assert_allclose(seen[0], seen[1], rtol=0.0, atol=1e-4)

@@ -1,0 +1,130 @@
+"""Rows block by block: arrays that are larger than memory lie in files, and are never held whole.
+
+What is done to each row by itself, and every sum, goes by blocks of `ROWS` rows in the order of the
+file. So a result depends neither on tiles nor on threads, and up to one block it is plain numpy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+Array: TypeAlias = npt.NDArray[Any]
+Empty: TypeAlias = Callable[[tuple[int, ...], npt.DTypeLike], Array]
+"""Makes an array of a shape and type, values not set: `numpy.empty`, or one on disk."""
+
+ROWS = 1_000_000
+LARGE = 2_000_000
+"""Rows from which on an array goes to disk, where there is a place for it."""
+
+_on_disk: Empty = np.empty
+_let_go: Callable[[], object] = tuple
+
+
+@contextmanager
+def on_disk(empty: Empty, let_go: Callable[[], object]) -> Iterator[None]:
+    """Have large arrays made by `empty`; `let_go` takes out of memory what of them is on disk."""
+    global _on_disk, _let_go
+    before = _on_disk, _let_go
+    _on_disk, _let_go = empty, let_go
+    try:
+        yield
+    finally:
+        _on_disk, _let_go = before
+
+
+def empty(shape: tuple[int, ...], dtype: npt.DTypeLike = np.float64) -> Array:
+    """Return an array, on disk where it is large, values not set."""
+    return _on_disk(shape, dtype) if shape[0] > LARGE else np.empty(shape, dtype)
+
+
+def let_go() -> None:
+    """Take out of memory what was read of arrays on disk; it is read again when it is asked for."""
+    _let_go()
+
+
+def blocks(count: int) -> Iterator[slice]:
+    """Yield all rows, at most `ROWS` at a time."""
+    for first in range(0, count, ROWS):
+        yield slice(first, min(first + ROWS, count))
+        _let_go()
+
+
+def mapped(function: Callable[..., Any], *arrays: Array) -> Array:
+    """Return a function of arrays, (n, ...), whose rows depend on the same rows of these alone."""
+    count, result = len(arrays[0]), None
+    if count <= ROWS:
+        return np.asarray(function(*arrays))
+    for rows in blocks(count):
+        part = function(*(one[rows] for one in arrays))
+        if result is None:
+            result = empty((count, *part.shape[1:]), part.dtype)
+        result[rows] = part
+    return np.asarray(result)
+
+
+def kept(mask: Array, array: Array) -> Array:
+    """Return the rows of an array, (n, ...), where a mask, (n,), is true; itself where all are."""
+    count, done = int(np.count_nonzero(mask)), 0
+    if count == len(mask):
+        return array
+    result = empty((count, *array.shape[1:]), array.dtype)
+    for rows in blocks(len(mask)):
+        part = array[rows][mask[rows]]
+        result[done : done + len(part)] = part
+        done += len(part)
+    return result
+
+
+def total(function: Callable[..., Any], *arrays: Array) -> float:
+    """Return the sum over all blocks of a number that a function has of each, exactly rounded."""
+    return math.fsum(
+        float(function(*(one[rows] for one in arrays))) for rows in blocks(len(arrays[0]))
+    )
+
+
+def bounds(points: Array) -> tuple[Array, Array]:
+    """Return least and largest of each column of points, (n, d), both of shape (d,)."""
+    ends = [
+        [(column.min(), column.max()) for column in points[rows].T] for rows in blocks(len(points))
+    ]
+    return np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]
+
+
+def row_numbers(count: int) -> Array:
+    """Return 0 to count - 1."""
+    result = empty((count,), np.int64)
+    for rows in blocks(count):
+        result[rows] = np.arange(rows.start, rows.stop)
+    return result
+
+
+def grouped(number: Array, groups: int, *columns: Array) -> tuple[Array, list[Array]]:
+    """Sort columns, (n, ...), by the number of their rows' group, (n,); rows of one keep order.
+
+    Returns
+    -------
+    start : array, shape (groups + 1,)
+        Group i has the rows ``start[i]`` to ``start[i + 1]`` of the sorted columns.
+    sorted : list of array
+    """
+    count = len(number)
+    counts = np.zeros(groups, np.int64)
+    for rows in blocks(count):
+        counts += np.bincount(number[rows], minlength=groups)
+    place = np.cumsum(counts) - counts
+    start = np.append(place, count)
+    result = [empty(one.shape, one.dtype) for one in columns]
+    for rows in blocks(count):
+        order = np.argsort(number[rows], kind="stable")
+        group = number[rows][order]
+        to = place[group] + np.arange(len(group)) - np.searchsorted(group, group)
+        for one, into in zip(columns, result, strict=True):
+            into[to] = one[rows][order]
+        place += np.bincount(group, minlength=groups)
+    return start, result

@@ -1,0 +1,201 @@
+"""Where compiled kernels are kept, and that no two processes compile one at once.
+
+They lie in the package, so that whoever builds an image or installs for others compiles them once.
+Where it cannot be written, they are read there all the same, and what is missing is kept in a
+folder that is the user's alone. A kernel is valid for the text of its file, not for its time:
+copies, and the layers of an image, change times.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from typing import IO, Any
+
+from numba.core.caching import CacheImpl, CompileResultCacheImpl, FunctionCache, _CacheLocator
+
+from pcfix.errors import PcfixWarning
+
+waits: list[Callable[[], object]] = [
+    lambda: sys.stderr.write("another process is compiling kernels; waiting for it\n")
+]
+"""Called when a kernel is waited for; each once, and taken out."""
+
+
+@cache
+def _stamp(source: str) -> str:
+    return sha256(Path(source).read_bytes()).hexdigest()
+
+
+@cache
+def is_writable(folder: Path) -> bool:
+    """Whether files can be made in a folder, which is made if need be."""
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    return False
+
+
+def _is_private(folder: Path) -> bool:
+    """Whether nobody else can put files there, which would be run; it is made if need be."""
+    with suppress(OSError):
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = folder.lstat()
+        if not hasattr(os, "getuid"):
+            return is_writable(folder)
+        closed = found.st_uid == os.getuid() and not found.st_mode & (stat.S_IRWXG | stat.S_IRWXO)
+        return stat.S_ISDIR(found.st_mode) and closed and is_writable(folder)
+    return False
+
+
+@cache
+def private_folder() -> Path | None:
+    """Return where kernels are kept if not in the package; with one warning none, in memory."""
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    if given:
+        return Path(given) if is_writable(Path(given)) else _warn()
+    user = str(os.getuid()) if hasattr(os, "getuid") else ""
+    homes = [os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()]
+    for folder in (Path(homes[0], "pcfix-kernels"), Path(tempfile.gettempdir(), f"pcfix-{user}")):
+        if folder.is_absolute() and _is_private(folder):
+            return folder
+    return _warn()
+
+
+def _warn() -> Path | None:
+    warnings.warn(
+        "Kernels are compiled each time anew (half a minute), as neither the folder of pcfix, nor "
+        "the user's cache, nor that of temporary files can be written; set NUMBA_CACHE_DIR to one "
+        "that can.",
+        PcfixWarning,
+        stacklevel=2,
+    )
+    return None
+
+
+class _Locator(_CacheLocator):  # type: ignore[misc]  # numba has no types
+    """A folder for the kernels of a file, None while none can be written."""
+
+    def __init__(self, source: str, line: int, folder: Path | None) -> None:
+        self._source, self._line, self._folder = source, line, folder
+
+    def get_cache_path(self) -> str:
+        return str(self._folder or os.devnull)
+
+    def ensure_cache_path(self) -> None:
+        """Do nothing: the folder is there."""
+
+    def get_source_stamp(self) -> str:
+        return _stamp(self._source)
+
+    def get_disambiguator(self) -> str:
+        return str(self._line)
+
+
+class _Impl(CompileResultCacheImpl):  # type: ignore[misc]
+    """What numba writes of a kernel, in a folder that was chosen before."""
+
+    def __init__(self, function: Any, folder: Path | None) -> None:
+        code = function.__code__
+        self._locator = _Locator(code.co_filename, code.co_firstlineno, folder)
+        name = f"{Path(code.co_filename).stem}.{function.__qualname__}"
+        self._filename_base = CacheImpl.get_filename_base(self, name, sys.abiflags)
+
+
+class _Folder(FunctionCache):  # type: ignore[misc]
+    """A kernel in one folder."""
+
+    def __init__(self, function: Any, folder: Path | None) -> None:
+        self._impl_class = lambda function: _Impl(function, folder)
+        super().__init__(function)
+
+
+class Kept:
+    """A kernel as numba loads and saves it: in the package, or in the user's folder."""
+
+    def __init__(self, function: Any) -> None:
+        source = Path(function.__code__.co_filename)
+        inside = source.parent / "__pycache__"
+        given = "NUMBA_CACHE_DIR" in os.environ  # which is to hold all
+        elsewhere = given or not is_writable(inside)
+        folder = private_folder() if elsewhere else inside
+        if elsewhere and folder is not None:
+            of_path = sha256(str(source.parent).encode()).hexdigest()[:16]
+            folder = folder / f"{source.parent.name}-{of_path}"
+            folder = folder if is_writable(folder) else None
+        self._name, self._folder = f"{source.stem}.{function.__qualname__}", folder
+        self._own = None if folder is None else _Folder(function, folder)
+        self._shipped = _Folder(function, inside) if elsewhere and not given else None
+        self._lock: IO[bytes] | None = None
+        self.places = [one for one in (folder, None if given else inside) if one is not None]
+        self.cache_path = str(folder or inside)
+
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        """Return a kernel that is kept; else None, when no other process is compiling it."""
+        found = self._load(signature, context)
+        if found is None and self._folder is not None and self._take_lock():
+            found = self._load(signature, context)
+        return found
+
+    def _load(self, signature: Any, context: Any) -> Any:
+        for place in (self._own, self._shipped):
+            found = None if place is None else place.load_overload(signature, context)
+            if found is not None:
+                return found
+        return None
+
+    def save_overload(self, signature: Any, compiled: Any) -> None:
+        """Keep a kernel."""
+        if self._own is not None:
+            self._own.save_overload(signature, compiled)
+
+    def flush(self) -> None:
+        """Forget what is kept."""
+        if self._own is not None:
+            self._own.flush()
+
+    def enable(self) -> None:
+        """Do nothing: it is."""
+
+    def disable(self) -> None:
+        """Keep nothing more."""
+        self._own = self._shipped = None
+
+    def _take_lock(self) -> bool:
+        """Take the lock of the kernel, which ends with `alone`; whether it was waited for."""
+        try:
+            import fcntl
+        except ImportError:  # Windows: two processes may compile the same
+            return False
+        if self._lock is not None:
+            return False
+        self._lock = Path(str(self._folder), f"{self._name}.lock").open("wb")  # noqa: SIM115
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            while waits:
+                waits.pop()()
+            fcntl.flock(self._lock, fcntl.LOCK_EX)
+            return True
+        except OSError:  # a file system without locks
+            return False
+        return True
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Give the lock back in the end, whatever happened."""
+        try:
+            yield
+        finally:
+            if self._lock is not None:
+                self._lock.close()
+                self._lock = None

@@ -1,0 +1,228 @@
+"""In tiles and blocks, with what is large on disk, the figures are those of everything at once.
+
+The twin of each is brute force, or NumPy over the whole array.
+"""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from pcfix import blocks
+from pcfix.clean import neighbours
+from pcfix.compare import m3c2, nearest
+from pcfix.compare.match import near_in_plan
+from pcfix.compare.nearest import cloud_to_cloud
+from pcfix.compare.statistics import Sample, distances_of, statistics_of
+from pcfix.compare.vertical import heights_at
+from pcfix.errors import InputError, PcfixError
+from pcfix.flow.compare import compare_clouds
+from pcfix.io.files import scratch_arrays
+from pcfix.kernels import threads
+from tests.compare.test_files import py4dgeo, write_las
+
+
+def in_small_tiles(monkeypatch, points, rows=1_000_000, large=2_000_000):
+    """Have tiles of so many points, blocks of so many rows, and larger arrays on disk."""
+    for module, name in (
+        (nearest, "TILE_POINTS"), (neighbours, "POINTS_PER_TILE"), (m3c2, "TILE_POINTS")
+    ):  # fmt: skip
+        monkeypatch.setattr(module, name, points)
+    monkeypatch.setattr(blocks, "ROWS", rows)
+    monkeypatch.setattr(blocks, "LARGE", large)
+
+
+def bed(count, seed, lift_m=0.0):
+    """Return points to the millimetre on a wavy bed of 40 m by 60 m, far from the origin."""
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform((0.0, 0.0), (40.0, 60.0), (count, 2))
+    z = np.sin(xy[:, 0] / 6.0) + rng.normal(0.0, 0.03, count) + lift_m - 4.0
+    return np.round(np.column_stack([xy + np.array([500_000.0, 5_000_000.0]), z]), 3)
+
+
+def least_distances(cloud, reference):
+    apart = cloud[:, None] - reference
+    return np.sqrt((apart**2)[..., 0] + (apart**2)[..., 1] + (apart**2)[..., 2]).min(axis=1)
+
+
+def clustered(seed):
+    """Return islands far apart, so that a nearest point lies several tiles away."""
+    rng = np.random.default_rng(seed)
+    middles = rng.uniform(0.0, 900.0, (9, 3))
+    return np.round(middles[rng.integers(0, 9, 1500)] + rng.normal(0.0, 2.0, (1500, 3)), 3)
+
+
+def lattice(seed):
+    """Return points on the very borders of tiles, equally far from several others."""
+    some = np.array(list(np.ndindex(40, 40, 1)), float)
+    return some + 0.5 * (seed % 2) * np.array([1.0, 1.0, 0.0])
+
+
+@pytest.mark.parametrize("make", [clustered, lattice, lambda seed: bed(1500, seed, seed % 2 * 30)])
+def test_distances_are_the_least_of_all_to_the_bit_whatever_the_tiles(make, monkeypatch):
+    cloud, reference = make(1), make(2)
+    expected = least_distances(cloud, reference)
+    whole = cloud_to_cloud(cloud, reference)
+    np.testing.assert_array_equal(whole, expected)
+    for points, jobs in ((60, None), (200, 1), (700, 2)):
+        in_small_tiles(monkeypatch, points, rows=350)
+        with threads(jobs):
+            np.testing.assert_array_equal(cloud_to_cloud(cloud, reference), expected)
+
+
+@pytest.mark.parametrize("make", [clustered, lattice])
+def test_heights_do_not_depend_on_tiles(make, monkeypatch):
+    """On the lattice every place has four nearest points, and twelve more that tie for the rest."""
+    cloud, reference = make(1), make(2)
+    reference[:, 2] = np.random.default_rng(5).normal(0.0, 1.0, len(reference))
+    whole = heights_at(cloud, reference, 6)
+    for points in (60, 450):
+        in_small_tiles(monkeypatch, points, rows=350)
+        found = heights_at(cloud, reference, 6)
+        np.testing.assert_array_equal(found.height_m, whole.height_m)
+        np.testing.assert_array_equal(found.by_nearest, whole.by_nearest)
+
+
+@pytest.mark.parametrize("count", [1, 2, 999, 4321])
+def test_order_statistics_over_blocks_are_those_of_numpy(count, monkeypatch):
+    values = np.round(np.random.default_rng(count).standard_t(2, count), 2)  # with zeros and ties
+    monkeypatch.setattr(blocks, "ROWS", 100)
+    marks = (0, 0.5, 5, 25, 37.7, 50, 95, 99.5, 100)
+    np.testing.assert_array_equal(Sample(values).percentiles(marks), np.percentile(values, marks))
+    edges = np.histogram_bin_edges(values, 13)
+    assert Sample(values).counts(edges) == np.histogram(values, edges)[0].tolist()
+    s = statistics_of(values)
+    assert s.within_95_m == np.percentile(np.abs(values), 95)
+    assert s.nmad_m == 1.4826 * np.median(np.abs(values - np.median(values)))
+    assert s.mean_m == pytest.approx(math.fsum(values) / count, rel=1e-14, abs=1e-15)
+    assert s.sd_m == pytest.approx(values.std(), rel=1e-13)
+    classes = distances_of(np.abs(values), None, [(0.5, 1.0)]).histogram
+    assert classes.counts == np.histogram(np.abs(values), len(classes.counts))[0].tolist()
+
+
+def test_the_overlap_is_the_same_by_table_and_by_search(monkeypatch):
+    cloud, reference = clustered(1), clustered(2)
+    near = np.sqrt((np.subtract(cloud[:, None, :2], reference[:, :2]) ** 2).sum(axis=2)).min(axis=1)
+    found = near_in_plan(cloud, reference, 3.0)
+    assert found[near <= 3.0].all()
+    assert not found[near > 3.0 * math.sqrt(8.0)].any()
+    monkeypatch.setattr(blocks, "ROWS", 100)
+    np.testing.assert_array_equal(near_in_plan(cloud, reference, 3.0), found)
+    monkeypatch.setattr("pcfix.compare.match.MAX_TABLE", 10)
+    np.testing.assert_array_equal(near_in_plan(cloud, reference, 3.0), found)
+
+
+def figures(folder, name):
+    """Compare with all that there is, and return what stands in the files, but for the time."""
+    out = folder / name
+    compare_clouds(
+        folder / "cloud.las", folder / "reference.las", out_dir=out, water=-3.6, sections=2,
+        direction="both", max_gap=2.0, overwrite=True,
+    )  # fmt: skip
+    found = {path.name: path.read_text() for path in out.iterdir()}
+    said = json.loads(found["compare.json"])
+    del said["seconds"]
+    return found | {"compare.json": said}
+
+
+@pytest.fixture(scope="module")
+def clouds(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tiles")
+    shifts = {f"Shift{axis}": np.full(3000, 0.1) for axis in "XYZ"}
+    write_las(folder / "cloud.las", bed(3000, 1, 0.05), **shifts)
+    write_las(folder / "reference.las", bed(2500, 2))
+    return folder
+
+
+def test_a_comparison_does_not_depend_on_tiles_threads_and_disk(clouds, monkeypatch):
+    whole = figures(clouds, "whole")
+    in_small_tiles(monkeypatch, 300, large=500)
+    with threads(1):
+        assert figures(clouds, "tiled") == whole
+    in_small_tiles(monkeypatch, 170, large=500)
+    assert figures(clouds, "small") == whole
+    in_small_tiles(monkeypatch, 300, rows=400, large=500)  # sums of shorter blocks
+    found = figures(clouds, "blocks")
+    assert {name: found[name] for name in found if name.startswith("section")} == {
+        name: whole[name] for name in whole if name.startswith("section")
+    }
+    flat, expected = (dict(leaves(one["compare.json"])) for one in (found, whole))
+    assert flat.keys() == expected.keys()
+    for name, value in expected.items():
+        assert flat[name] == (pytest.approx(value, rel=1e-9) if isinstance(value, float) else value)
+    assert sorted(p.name for p in clouds.iterdir()) == sorted(
+        ["cloud.las", "reference.las", "whole", "tiled", "small", "blocks"]
+    )
+
+
+def leaves(value, name=""):
+    if isinstance(value, dict | list):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, one in items:
+            yield from leaves(one, f"{name}/{key}")
+    else:
+        yield name, value
+
+
+def m3c2_twin(cloud, reference, core, normal_m, cylinder_m, reach_m):
+    """Return M3C2 distances by the definition, every point of a cylinder looked at."""
+    found = []
+    for place in core:
+        around = cloud[np.linalg.norm(cloud - place, axis=1) <= normal_m]
+        normal = np.linalg.svd(around - around.mean(axis=0))[2][2]
+        normal *= np.sign(normal[2])
+        means = []
+        for one in (cloud, reference):
+            along = (one - place) @ normal
+            across = np.linalg.norm(one - place - along[:, None] * normal, axis=1)
+            inside = (across <= cylinder_m) & (np.abs(along) <= reach_m)
+            means.append(along[inside].mean() if inside.any() else np.nan)
+        found.append(means[0] - means[1])
+    return np.array(found)
+
+
+@py4dgeo
+@pytest.mark.parametrize("points", [10_000, 800, 300])
+def test_m3c2_in_tiles_is_that_of_the_definition(points, monkeypatch):
+    """Were the core point on the border of two pieces of the cylinder, one in two would be off."""
+    in_small_tiles(monkeypatch, points)
+    cloud, reference = bed(1200, 1, 0.05), bed(900, 2)
+    found = m3c2.m3c2_distances(cloud, reference, 1.84)
+    radii = found.normal_radius_m, found.cylinder_radius_m, found.max_distance_m
+    expected = m3c2_twin(cloud, reference, cloud, *radii)
+    expected = expected[np.isfinite(expected)]
+    assert found.statistics.count == len(expected)
+    assert found.statistics.mean_m == pytest.approx(expected.mean(), abs=1e-9)
+    assert found.statistics.sd_m == pytest.approx(expected.std(), abs=1e-9)
+
+
+def test_a_full_disk_is_one_sentence_and_nothing_stays(clouds, tmp_path, monkeypatch):
+    monkeypatch.setattr(blocks, "LARGE", 500)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.posix_fallocate", full, raising=False)
+    with pytest.raises(InputError, match="temporary space beside it cannot be had"):
+        compare_clouds(
+            clouds / "cloud.las", clouds / "reference.las", summary=tmp_path / "found.json"
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_after_an_error_the_disk_is_empty(clouds, tmp_path, monkeypatch):
+    monkeypatch.setattr(blocks, "LARGE", 500)
+    write_las(tmp_path / "far.las", bed(1000, 3) + 5000.0)
+    with pytest.raises(PcfixError, match="do not overlap"):
+        compare_clouds(clouds / "cloud.las", tmp_path / "far.las", summary=tmp_path / "found.json")
+    assert [p.name for p in tmp_path.iterdir()] == ["far.las"]
+
+
+def test_what_was_let_go_is_still_there(tmp_path):
+    with scratch_arrays(tmp_path / "out") as empty:
+        array = empty((300_000, 3), np.float64)
+        array[:] = np.arange(900_000.0).reshape(-1, 3)
+        blocks.let_go()
+        assert array.sum() == 899_999.0 * 450_000.0
+    assert list(tmp_path.iterdir()) == []
