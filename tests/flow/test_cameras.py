@@ -8,7 +8,7 @@ from dataclasses import replace
 import laspy
 import numpy as np
 import pytest
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 
 import pcfix
 from pcfix.flow.checks import _sensors, check_cameras
@@ -25,6 +25,7 @@ from tests.utils.shared import ROOT, needs
 SCENE = ROOT / "samples" / "scene"
 CLOUD, CAMERAS, SENSOR = SCENE / "cloud.laz", SCENE / "cameras.csv", SCENE / "sensor.csv"
 RENDERED, rendered = needs("rendered_a")
+SOROLLA, sorolla = needs("cameras", "metashape", "uclm_sorolla")
 
 
 def table(path, change=lambda xyz: xyz, crs=None):
@@ -106,6 +107,27 @@ def test_geocentric_cameras_without_a_map_have_no_height_over_the_water(tmp_path
     assert report.height_above_water_m is None
     assert "over water" not in said
     assert "GSD" not in said
+
+
+@sorolla
+def test_heights_off_by_the_geoid_are_no_fit(tmp_path):
+    """The real block is above the ellipsoid, 51.5 m above the GNSS that it states in the geoid's.
+
+    Frames hold the points all the same, as cameras that are too high see more.
+    """
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = [0.001] * 3, [725_000.0, 4_369_000.0, 0.0]
+    header.add_crs(CRS("EPSG:25830+5782"))
+    cloud = laspy.LasData(header)
+    x, y = (side.ravel() for side in np.mgrid[725_440:725_525:3, 4_369_105:4_369_170:3])
+    cloud.x, cloud.y, cloud.z = x, y, np.full(len(x), 84.0)
+    cloud.write(tmp_path / "cloud.las")
+    with pytest.warns(pcfix.PcfixWarning, match="51.5 m above the heights that their GNSS states"):
+        report = check_cameras(
+            SOROLLA / "markers.xml", cloud=tmp_path / "cloud.las", cameras_crs="EPSG:25830"
+        )
+    assert not report.fit.fits
+    assert "51.5 m above" in report.fit.verdict
 
 
 def test_cameras_below_the_water_have_no_gsd():
