@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 from pcfix.errors import InputError
 
 _VARIABLE_CHUNKS = 2**32 - 1
+_WITHOUT_CHUNKS = 1
+"""The compressor of files that are one stream (LASzip record)."""
 
 
 def check_count(path: Path, header: Any, vlrs: Any) -> None:
@@ -82,7 +84,7 @@ def check_chunks(path: Path, header: Any, vlrs: Any) -> None:
         raise ValueError("its chunks have no points")
     if table.chunks * header.point_format.size > max(table.size, 0):
         raise ValueError(f"it states {table.chunks:,} chunks of points in {table.size:,} bytes")
-    if 0 < table.chunks * table.points < header.point_count:
+    if table.chunks * table.points < header.point_count:
         raise ValueError(
             f"it states {header.point_count:,} points in {table.chunks:,} chunks of"
             f" {table.points:,}"
@@ -93,6 +95,8 @@ def _table(path: Path, header: Any, vlrs: Any) -> _Table | None:
     """Return what the table of chunks says; None where the file has none, or is cut short."""
     vlr = next((v for v in vlrs if v.user_id == "laszip encoded"), None)
     if vlr is None or not header.are_points_compressed:
+        return None
+    if struct.unpack_from("<H", vlr.record_data)[0] == _WITHOUT_CHUNKS:
         return None
     (points,) = struct.unpack_from("<I", vlr.record_data, 12)
     start, size = header.offset_to_point_data, path.stat().st_size
