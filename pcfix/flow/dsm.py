@@ -8,8 +8,6 @@ chunks, squares and windows end.
 from __future__ import annotations
 
 import json
-import warnings
-from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -18,45 +16,28 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.runner import FileTask, Progress, file_task
+from pcfix.flow.sorted_points import BLOCK_CELLS, DIMENSIONS, SortedPoints, point_spacing_m
 from pcfix.grid.delaunay import fill_holes, margin_cells
 from pcfix.grid.heights import Gridding, as_uncertainty, grid_window
-from pcfix.grid.lattice import (
-    Occupancy,
-    Window,
-    cells_of,
-    fits,
-    lattice_over,
-    refuse_size,
-    round_resolution,
-)
+from pcfix.grid.lattice import round_resolution
 from pcfix.grid.model import NO_LIGHT, DsmSummary, Tally, hillshade
 from pcfix.io import rasters
 from pcfix.io.crs import crs_words, parts
 from pcfix.io.drafts import draft_folder, replaced_when_whole
-from pcfix.io.files import Bins, check_output, write_text
+from pcfix.io.files import check_output, write_text
 from pcfix.io.las.part import part_report
-from pcfix.io.las.source import LasSource, coordinates, metric_crs
+from pcfix.io.las.source import metric_crs
 from pcfix.io.las.writing import is_ours
 from pcfix.io.styles import raster_style
 from pcfix.io.tiles import Clouds, Tiles, inputs_of, open_cloud, single, tiles_of
-from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, BoolArray, FloatArray, IntArray
 from pcfix.options.declare import File, taken
-from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules, SurfaceChoice
+from pcfix.options.steps import DsmOptions, DsmRules
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
-    import laspy
     from rasterio.io import DatasetWriter
 
-BLOCK_CELLS = 1024
-"""Longest side of a window; a power of two."""
-BIN_POINTS = 200_000
-"""So many points a square of the store has, on average."""
-SIGMA_Z = "SigmaZ"
-FEWEST_A_CELL = 0.9
-"""Points, on average where there are any; fewer are worth a warning."""
 BLOCK_POINTS = 2_000_000
 TIN_BLOCK_POINTS = 400_000
 """Windows are halved until they have no more points than this."""
@@ -64,8 +45,6 @@ TIN_REACH_SPACINGS = 5.0
 TIN_REACH_CELLS = 3.0
 """Circles around triangles may be as wide as the larger of the two, or as --fill."""
 
-DIMENSIONS = {"depth": "WaterDepth", "uncertainty": SIGMA_Z}
-"""What is not height is made of a dimension: of one of these, or of that of its own name."""
 METRE = "metre"
 
 
@@ -159,17 +138,6 @@ def grid_dsm(
     return result
 
 
-def point_spacing_m(cloud: Path | Tiles, settings: DsmRules) -> float:
-    """Return the side of the square that each point of a raster has for itself, metres."""
-    with open_cloud(cloud) as source:
-        area, _ = _stated_extent(source, MIN_RESOLUTION_M)
-        near = Occupancy(area, len(source), MIN_RESOLUTION_M)
-        for points in source.chunks():
-            near.add(coordinates(points)[_wanted(points, settings.surface)])
-    _refuse_none(near.points, cloud, settings.surface)
-    return near.spacing_m
-
-
 @dataclass
 class _Run:
     """One cloud on its way into a raster."""
@@ -189,8 +157,9 @@ class _Run:
             self.plan = None if self.crs is None else parts(self.crs)[0]
             corrected = any(is_ours(vlr) for vlr in source.vlrs)
             self.sorted = SortedPoints(
-                source, self.settings, folder, lambda done, total: self.report(0.5 * done / total)
-            )
+                source, self.settings, folder, lambda done, total: self.report(0.5 * done / total),
+                lambda: open_cloud(self.cloud, places_only=True),
+            )  # fmt: skip
         self.near, self.lattice = self.sorted.near, self.sorted.lattice
         made = {"pcfix": __version__, "corrected": corrected, **asdict(self.settings)}
         tags, what = {"PCFIX": json.dumps(made)}, self.settings.what
@@ -310,140 +279,5 @@ class _Run:
             seconds=round(self.task.seconds, 3),
             values=tally.values(),
             part=part_report(self.task.source),
-        )
-
-
-class SortedPoints:
-    """The points that a raster is made of, in a folder of the caller, and the raster's lattice.
-
-    Attributes
-    ----------
-    near : Occupancy
-        How many points there are, and how close together.
-    lattice : Lattice
-
-    Raises
-    ------
-    PcfixError
-        If no points are left, or the raster would be too large.
-    """
-
-    def __init__(
-        self, source: LasSource, settings: DsmRules, folder: Path, progress: Progress
-    ) -> None:
-        """Read the cloud, store the wanted points, and lay out the raster."""
-        resolution = settings.cell_m
-        self._resolution_m = resolution
-        area, corner = _stated_extent(source, resolution)
-        self._dimension = _dimension_of(source, settings.what)
-        cells = max(np.sqrt(BIN_POINTS / (len(source) / area)) / resolution, 1.0)
-        side = int(min(2 ** np.floor(np.log2(cells)), BLOCK_CELLS))  # of a square with so many
-        self._bins = Bins(folder, side, cells_of(corner, resolution)[0], 3)
-        self.near = Occupancy(area, len(source), resolution)
-        done = 0
-        for points in source.chunks():
-            xyz = coordinates(points)
-            if self._dimension is not None:
-                xyz[:, 2] = source.dimension(points, self._dimension)
-            wanted = _wanted(points, settings.surface) & np.isfinite(xyz[:, 2])
-            if self._dimension == SIGMA_Z:
-                wanted &= xyz[:, 2] > 0.0  # others have none
-            xyz = xyz[wanted]
-            self.near.add(xyz)
-            if len(xyz) and fits(self.near.low, self.near.high, resolution):
-                self._bins.add(cells_of(xyz, resolution), xyz)
-            # too large a raster is refused below, when the whole extent is known
-            done += len(points)
-            progress(done, len(source))
-        _refuse_none(self.near.points, source.path, settings.surface)
-        low, high = self.near.low, self.near.high
-        refuse_size(low, high, resolution, str(source.path))
-        _warn_of_fine_cells(self.near.spacing_m, resolution)
-        self.lattice = lattice_over(low, high, resolution)
-
-    def windows(self, limit: int) -> Iterator[Window]:
-        """Yield windows that cover the raster, small enough to have about `limit` points."""
-        for window in self.lattice.windows(BLOCK_CELLS):
-            yield from self._halved(window, BLOCK_CELLS, limit)
-
-    def _halved(self, window: Window, side: int, limit: int) -> Iterator[Window]:
-        """Yield a window, or its quarters where it has too many points."""
-        if side <= self._bins.side or self._bins.count(self._stored(window)) <= limit:
-            yield window
-            return
-        half = side // 2
-        for row in range(window.row, window.row_stop, half):
-            for column in range(window.column, window.column_stop, half):
-                quarter = Window(row, row + half, column, column + half).clipped(window)
-                yield from self._halved(quarter, half, limit)
-
-    def _stored(self, window: Window) -> Window:
-        """Return a window of the raster as the store counts cells."""
-        return window.moved(self.lattice.first_row, self.lattice.first_column)
-
-    def points_in(self, window: Window) -> tuple[FloatArray, IntArray]:
-        """Return the points of a window, and their columns and rows in the raster.
-
-        The first are metres in the world frame, shape (n, 3), with what the raster is made of in
-        the place of z; the second have shape (n, 2).
-        """
-        xyz = self._bins.read(self._stored(window))
-        first = [self.lattice.first_column, self.lattice.first_row]
-        cell = cells_of(xyz, self._resolution_m) - first
-        rows = window.holds(cell)
-        return xyz[rows], cell[rows]
-
-
-def _dimension_of(source: LasSource, what: str) -> str | None:
-    """Return the dimension that a raster is made of, None of heights; refuse what is not there."""
-    name = None if what == "height" else DIMENSIONS.get(what, what)
-    known = list(source.header.point_format.dimension_names)
-    if name is None or name in known:
-        return name
-    if what in DIMENSIONS:
-        raise InputError(
-            f"{source.path}: has no dimension {name}, of which the {what} is made; correct the"
-            " cloud first, with --dimensions all."
-        )
-    raise SettingError(
-        f"{source.path}: has no dimension {what}; --what is one of height, {', '.join(DIMENSIONS)},"
-        f" {', '.join(known)}."
-    )
-
-
-def _wanted(points: laspy.ScaleAwarePointRecord, surface: SurfaceChoice) -> BoolArray:
-    classes = np.asarray(points["classification"])
-    wanted = classes == BATHYMETRIC_POINT if surface == "bed" else ~np.isin(classes, NOISE_CLASSES)
-    return np.asarray(wanted & ~np.asarray(points["withheld"]).astype(bool))
-
-
-def _stated_extent(source: LasSource, resolution_m: float) -> tuple[float, FloatArray]:
-    """Return area and north-west corner, shape (1, 2), of the header; they need not be right."""
-    low, high = source.header.mins[:2], source.header.maxs[:2]
-    area, corner = float(np.prod(high - low)), np.array([[low[0], high[1]]])
-    area = max(area, resolution_m**2) if np.isfinite(area) else resolution_m**2
-    return area, corner if (np.abs(corner) < 1e9).all() else np.zeros((1, 2))
-
-
-def _refuse_none(points: int, source: Path | Tiles, surface: SurfaceChoice) -> None:
-    if not points and surface == "bed":
-        raise InputError(
-            f"{source}: has no point of class {BATHYMETRIC_POINT} (bed) that is not withheld;"
-            " correct the cloud first, or grid the surface all."
-        )
-    if not points:
-        raise InputError(
-            f"{source}: all points are noise (classes 7 and 18) or withheld; classify it again."
-        )
-
-
-def _warn_of_fine_cells(spacing_m: float, resolution_m: float) -> None:
-    if resolution_m**2 < FEWEST_A_CELL * spacing_m**2:
-        density = (resolution_m / spacing_m) ** 2
-        warnings.warn(
-            f"the resolution {resolution_m:g} m is finer than the points allow: they lie"
-            f" {spacing_m:.2g} m apart, so there are {density:.2g} a cell on average; take a"
-            " resolution of at least their distance.",
-            PcfixWarning,
-            stacklevel=5,
+            stray=self.sorted.stray,
         )

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
+from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.runner import Progress, part_of
+from pcfix.flow.sorted_points import BLOCK_CELLS, point_spacing_m
 from pcfix.grid.colours import relief_colours
 from pcfix.grid.lattice import Lattice, Window, round_resolution
 from pcfix.grid.model import hillshade

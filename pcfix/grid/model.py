@@ -54,6 +54,8 @@ class DsmSummary:
     resolution_is : {"given", "chosen"}
     part : dict or None
         How many points were read, of how many, and by which bounds; None where all were.
+    stray : int
+        Points that are left out, as they lie far from all others.
     """
 
     input: str
@@ -80,6 +82,7 @@ class DsmSummary:
     values: dict[str, float]
     resolution_is: Literal["given", "chosen"] = "given"
     part: dict[str, Any] | None = None
+    stray: int = 0
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""

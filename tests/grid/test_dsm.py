@@ -434,3 +434,26 @@ def test_summary_and_progress(tmp_path):
     assert saved["bounds_m"] == [EAST, NORTH, EAST + 10.0, NORTH + 10.0]
     assert steps == sorted(steps)
     assert steps[-1] == (500, 500)
+
+
+def test_a_stray_point_does_not_make_the_raster_huge(tmp_path):
+    cloud = laspy.read(SCENE / "cloud.laz")
+    cloud.x[5] += 200_000.0
+    cloud.write(tmp_path / "stray.laz")
+    with pytest.warns(pcfix.PcfixWarning, match="1 point lies far from all others .* at 610,"):
+        found = pcfix.grid_dsm(tmp_path / "stray.laz", tmp_path / "d.tif", resolution=1.0)
+    whole = pcfix.grid_dsm(SCENE / "cloud.laz", tmp_path / "w.tif", resolution=1.0)
+    assert (found.stray, found.points_used) == (1, 19_999)
+    assert (found.width, found.height) == (whole.width, whole.height)
+    with rasterio.open(tmp_path / "d.tif") as one, rasterio.open(tmp_path / "w.tif") as other:
+        differ = one.read(1) != other.read(1)
+    assert differ.sum() <= 1  # the cell that the point came from
+
+
+def test_a_cloud_of_two_places_keeps_both(tmp_path):
+    cloud = laspy.read(SCENE / "cloud.laz")
+    cloud.x[: len(cloud.x) // 10] += 3_000.0
+    cloud.write(tmp_path / "two.laz")
+    found = pcfix.grid_dsm(tmp_path / "two.laz", tmp_path / "d.tif", resolution=1.0)
+    assert (found.stray, found.points_used) == (0, 20_000)
+    assert found.width > 3_000
