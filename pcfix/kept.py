@@ -71,6 +71,22 @@ def private_folder() -> Path | None:
     return _warn()
 
 
+def roots() -> tuple[Path, ...]:
+    """Return under which folders kernels are looked for; the first is where new ones are kept."""
+    package = Path(__file__).parent
+    given = "NUMBA_CACHE_DIR" in os.environ
+    if not given and is_writable(package / "__pycache__"):
+        return (package,)
+    own = private_folder()
+    return () if own is None else (own,) if given else (own, package)
+
+
+def kept_kernels() -> set[tuple[Path, int]]:
+    """Return the files of all kernels that are kept, and when each was written, ns."""
+    files = (file for root in roots() for file in root.rglob("*.nbc"))
+    return {(file, file.stat().st_mtime_ns) for file in files}
+
+
 def _warn() -> Path | None:
     warnings.warn(
         "Kernels are compiled each time anew (half a minute), as neither the folder of pcfix, nor "
