@@ -128,6 +128,8 @@ class _Locator(_CacheLocator):  # type: ignore[misc]  # numba has no types
 class _Library(JITCodeLibrary):  # type: ignore[misc]
     """The code of a kernel that was kept; its text for LLVM is read when another links it alone."""
 
+    _shared_module: Any
+
     def __init__(self, codegen: Any, name: str, code: bytes, text: bytes) -> None:
         super().__init__(codegen, name)
         self._text = text

@@ -28,9 +28,9 @@ POINTS = 2000
 """Of each scene; fewer, and nothing is told of how a cloud was made."""
 
 LEVEL_M = 0.37
-SCENES: tuple[tuple[str, CloudKind, BlockKind], ...] = (
-    ("tracks", "tracks", "nadir"),
-    ("maps", "depth-maps", "oblique"),
+SCENES: tuple[tuple[str, tuple[CloudKind, BlockKind]], ...] = (
+    ("tracks", ("tracks", "nadir")),
+    ("maps", ("depth-maps", "oblique")),
 )
 VIEWS = {"tracks": "fused.ply.vis", "maps": "dense.ply"}
 CORRECTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -67,7 +67,8 @@ class WarmUp(NamedTuple):
         where = f"kept in {' and '.join(map(str, self.folders))}"
         if not self.kernels:
             return f"nothing was to be done: the kernels are {where} (seen in {self.seconds:.0f} s)"
-        return f"{self.kernels} kernels compiled in {self.seconds:.0f} s, {where}"
+        kernels = f"{self.kernels} kernel{'s' * (self.kernels > 1)}"
+        return f"{kernels} compiled in {self.seconds:.0f} s, {where}"
 
 
 def warm_up(options: WarmUpOptions, progress: Progress | None = None) -> WarmUp:
@@ -89,8 +90,8 @@ def warm_up(options: WarmUpOptions, progress: Progress | None = None) -> WarmUp:
         warnings.simplefilter("ignore")  # of scenes that nobody asked for
         if not roots():
             raise SettingError(
-                "Kernels cannot be kept: neither the folder of pcfix, nor the user's cache, nor that"
-                " of temporary files can be written; set NUMBA_CACHE_DIR to one that can."
+                "Kernels cannot be kept: neither the folder of pcfix, nor the user's cache, nor"
+                " that of temporary files can be written; set NUMBA_CACHE_DIR to one that can."
             )
         with TemporaryDirectory() as folder:
             _run(steps(options.commands, Path(folder)), progress)
@@ -102,7 +103,7 @@ def warm_up(options: WarmUpOptions, progress: Progress | None = None) -> WarmUp:
 
 def steps(commands: tuple[str, ...], folder: Path) -> list[Step]:
     """Return what is run in a folder so that these commands find their kernels."""
-    scenes: list[Step] = [partial(_make, folder, name, *kinds) for name, *kinds in SCENES]
+    scenes: list[Step] = [partial(_make, folder / name, *kinds) for name, kinds in SCENES]
     first, out = folder / SCENES[0][0], folder / "out.laz"
     cloud = first / "cloud.laz"
     of_command: dict[str, list[Step]] = {
@@ -117,9 +118,9 @@ def steps(commands: tuple[str, ...], folder: Path) -> list[Step]:
     return [*scenes, *(step for name in commands for step in of_command[name])]
 
 
-def _make(folder: Path, name: str, cloud: CloudKind, block: BlockKind) -> None:
+def _make(folder: Path, cloud: CloudKind, block: BlockKind) -> None:
     scene = simulate_scene(POINTS, cloud=cloud, block=block, water=LEVEL_M)
-    write_scene(scene, folder / name, overwrite=False)
+    write_scene(scene, folder, overwrite=False)
 
 
 def _correct(scene: Path, *, views: bool = False, **given: Any) -> None:

@@ -7,7 +7,16 @@ from typing import Any, Literal
 
 from pcfix.errors import SettingError
 from pcfix.options.correct import BudgetOptions
-from pcfix.options.declare import File, OptionSet, at_least, one_or_more, option, positive, rule, within
+from pcfix.options.declare import (
+    File,
+    OptionSet,
+    at_least,
+    one_or_more,
+    option,
+    positive,
+    rule,
+    within,
+)
 from pcfix.options.scenes import depth_series
 from pcfix.options.shared import (
     CameraFileOptions,
