@@ -1,7 +1,7 @@
 """How long pcfix takes to start: a process's CPU time, user and system, least of several.
 
-Imports, help, and a correction of the sample scene of 20,000 points: once kernels are kept, and with
-``--cold`` the first time, in an empty folder for them, which takes a minute.
+Imports, help, and a correction of the sample scene of 20,000 points: once kernels are kept, and
+with ``--cold`` the first time, in an empty folder for them, which takes a minute.
 
     python tests/benchmarks/start_up.py [--runs 5] [--cold]
 """
