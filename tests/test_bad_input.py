@@ -357,7 +357,7 @@ def test_a_folder_that_holds_cameras(refuse: Refuse, folder: Path) -> None:
     (folder / "images" / "cameras.csv").write_bytes((folder / "cameras.csv").read_bytes())
     (folder / "images" / "notes.txt").write_text("flown on a Tuesday")
     said = refuse(*job("--cameras", "images"))
-    assert "is a folder that holds cameras.csv; give images/cameras.csv itself" in said
+    assert "is a folder that holds cameras.csv (CSV table); give images/cameras.csv itself" in said
 
 
 @pytest.mark.parametrize("angles", [False, True])

@@ -27,12 +27,13 @@ from pcfix.flow.shore import check_shoreline, write_shoreline
 from pcfix.flow.surfaces import CloudView, file_points, find_surface, view_of
 from pcfix.grid.shoreline import NearWater
 from pcfix.io.cameras.georeference import adjusted_minus_gnss
-from pcfix.io.cameras.mistakes import likely_mistake
+from pcfix.io.cameras.mistakes import UNDULATION_M, likely_mistake
 from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.io.files import check_input, check_output, write_bytes
 from pcfix.io.gnss_positions import read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.lens.frames import cameras_in_sight
+from pcfix.lens.imaging import unproject
 from pcfix.model import Cameras, FloatArray, Lens, TiePoints, WaterDimension, WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.survey import CamerasCheckOptions, WaterCheckOptions
@@ -42,6 +43,8 @@ from pcfix.report.water import WaterReport, water_figure
 from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
 
+MOST_SENSORS = 8
+"""Lines on lenses; more are put together by sensor and frame, or by what kind they are."""
 SAMPLE_POINTS, WATER_SAMPLE_POINTS = 50_000, 200_000
 """Points of the cloud that are looked for in the frames, and below the water; evenly spread."""
 
@@ -100,7 +103,14 @@ def check_cameras(
         at = cameras.centres if heights is None else xyz
         known_m = surface_above(surface, at, heights).height_m
         level = float(np.nanmean(known_m)) if np.isfinite(known_m).any() else None
-    above = None if level is None else cameras.centres[:, 2] - level
+    above = None
+    if level is not None and not problem:  # geocentric cameras have no heights
+        above = cameras.centres[:, 2] - level
+    gnss, fit = _gnss(cameras, str(path)), None
+    if view is not None:
+        fit = _fit(cameras, str(cloud), xyz, view.crs, quick_ties(inputs, view.crs))
+        if inputs.cameras_crs is not None and gnss is not None and not fit.verdict:
+            fit = replace(fit, verdict=_height_doubt(gnss))
     report = CamerasReport(
         path=str(path),
         cameras=cameras,
@@ -110,10 +120,8 @@ def check_cameras(
         if above is None
         else (float(above.min()), float(above.mean()), float(above.max())),
         tilt_deg=None if problem else _tilt_deg(cameras),
-        gnss=_gnss(cameras, str(path)),
-        fit=None
-        if view is None
-        else _fit(cameras, str(cloud), xyz, view.crs, quick_ties(inputs, view.crs)),
+        gnss=gnss,
+        fit=fit,
         sample_xyz=xyz,
         level_m=level,
         problem=problem,
@@ -233,45 +241,72 @@ def _sample(
 
 
 def _sensors(cameras: Cameras, above_m: FloatArray | None) -> tuple[Sensor, ...]:
-    if cameras.lenses is None:
+    """Return the lenses of a block: each by itself, or those of one kind together if many."""
+    lenses = cameras.lenses
+    if lenses is None:
         return ()
-    groups: dict[Lens, list[int]] = {}
-    for row, lens in enumerate(cameras.lenses):
-        groups.setdefault(lens, []).append(row)
-    if len(groups) > 0.5 * len(cameras):  # each image has a calibration of its own
-        groups = _by_frame(groups)
-    return tuple(_sensor(lens, rows, above_m) for lens, rows in groups.items())
+    groups: dict[tuple[Any, ...], list[int]] = {}
+    for key in (_itself, _frame_of, _kind_of):
+        groups = {}
+        for row, lens in enumerate(lenses):
+            groups.setdefault(key(lens), []).append(row)
+        if len(groups) <= MOST_SENSORS and (key is not _itself or len(groups) <= len(lenses) // 2):
+            break
+    calibrated = any(_is_distorted(lens) for lens in lenses)
+    return tuple(_sensor(lenses, rows, above_m, calibrated) for rows in groups.values())
 
 
-def _by_frame(groups: dict[Lens, list[int]]) -> dict[Lens, list[int]]:
-    """Put together lenses of one sensor and frame, under the first of them."""
-    first: dict[tuple[Any, ...], Lens] = {}
-    merged: dict[Lens, list[int]] = {}
-    for lens, rows in groups.items():
-        leader = first.setdefault((lens.sensor, lens.width, lens.height, lens.projection), lens)
-        merged.setdefault(leader, []).extend(rows)
-    return merged
+def _itself(lens: Lens) -> tuple[Any, ...]:
+    return (lens,)
 
 
-def _sensor(lens: Lens, rows: list[int], above_m: FloatArray | None) -> Sensor:
+def _frame_of(lens: Lens) -> tuple[Any, ...]:
+    return lens.sensor, lens.width, lens.height, lens.unit, lens.projection
+
+
+def _kind_of(lens: Lens) -> tuple[Any, ...]:
+    return lens.unit, lens.projection, _is_distorted(lens)
+
+
+def _is_distorted(lens: Lens) -> bool:
+    return any((*lens.radial, *lens.denominator, *lens.tangential, *lens.thin_prism))
+
+
+def _sensor(
+    lenses: tuple[Lens, ...], rows: list[int], above_m: FloatArray | None, calibrated: bool
+) -> Sensor:
+    lens, alike = lenses[rows[0]], list(dict.fromkeys(lenses[row] for row in rows))
     pixel = lens.pixel_size_mm
     focal_px = lens.focal if lens.unit == "px" else None if pixel is None else lens.focal / pixel
-    distorted = any((*lens.radial, *lens.denominator, *lens.tangential, *lens.thin_prism))
+    above = None if above_m is None else float(np.mean(above_m[rows]))
+    middle = (lens.principal_x, lens.principal_y) == (lens.width / 2.0, lens.height / 2.0)
     return Sensor(
-        name=lens.sensor,
+        name=lens.sensor if all(one.sensor == lens.sensor for one in alike) else "several",
         images=len(rows),
         width=lens.width,
         height=lens.height,
-        focal=lens.focal,
+        focal=min(one.focal for one in alike),
         unit=lens.unit,
         focal_mm=lens.focal if lens.unit == "mm" else None if pixel is None else lens.focal * pixel,
         pixel_size_um=None if pixel is None else 1000.0 * pixel,
         projection=lens.projection,
-        distorted=distorted,
-        gsd_m=None
-        if above_m is None or focal_px is None
-        else float(np.mean(above_m[rows])) / focal_px,
+        distorted=_is_distorted(lens),
+        gsd_m=above / focal_px if above is not None and above > 0.0 and focal_px else None,
+        lenses=len(alike),
+        focal_most=max(one.focal for one in alike),
+        frames=len({(one.width, one.height) for one in alike}),
+        folded=max(_folded(one) for one in alike[:: 1 + len(alike) // 20]),
+        nominal=calibrated and middle and not _is_distorted(lens),
     )
+
+
+def _folded(lens: Lens) -> float:
+    """Return the share of the frame that no direction is imaged to, beyond the fold of the lens."""
+    if not _is_distorted(lens):  # the border of a fisheye's image is none
+        return 0.0
+    across = np.linspace(0.0, 1.0, 41)
+    places = np.stack(np.meshgrid(across * lens.width, across * lens.height), axis=-1)
+    return float(np.mean(np.isnan(unproject(lens, places.reshape(-1, 2))).any(axis=1)))
 
 
 def _tilt_deg(cameras: Cameras) -> tuple[float, float] | None:
@@ -299,6 +334,18 @@ def _gnss(cameras: Cameras, name: str) -> GnssResiduals | None:
         len(rows), plain(enu.mean(axis=0)), plain(enu.std(axis=0)), float(length[worst]),
         cameras.labels[rows[worst]], found.reason,
     )  # fmt: skip
+
+
+def _height_doubt(gnss: GnssResiduals) -> str:
+    """Return a sentence where --cameras-crs gave cameras other heights than their GNSS has."""
+    up = gnss.mean_m[2]
+    if up is None or abs(up) < UNDULATION_M[0]:
+        return ""
+    return (
+        f"With --cameras-crs the cameras are {abs(up):.1f} m {'above' if up > 0.0 else 'below'} the"
+        " heights that their GNSS states: heights of one are likely above the ellipsoid and of the"
+        " other above the geoid; see the vertical CRS of both."
+    )
 
 
 def _fit(cameras: Cameras, cloud: str, xyz: FloatArray, crs: Any, ties: TiePoints | None) -> Fit:

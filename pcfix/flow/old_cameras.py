@@ -12,6 +12,7 @@ import numpy as np
 
 from pcfix.adjust.carry import Pair, pair_of, renumbered
 from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
+from pcfix.io.cameras import takes_sensor
 from pcfix.io.labels import match_labels
 from pcfix.io.views import ViewList, ViewMatch, ViewReport
 from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints, Views
@@ -137,6 +138,12 @@ def told_apart(inputs: Inputs) -> tuple[Inputs, Inputs]:
     made_with = inputs.cameras if inputs.adjusted_from is None else inputs.adjusted_from
     old = replace(inputs, cameras=made_with, adjusted_from=None)
     new = replace(inputs, views=None, adjusted_from=None)
+    tables = [_takes_sensor(one) for one in (old, new)]
+    if inputs.sensor is not None and any(tables):  # a model has the lens itself
+        old, new = (
+            one if takes else replace(one, sensor=None)
+            for one, takes in zip((old, new), tables, strict=True)
+        )
     if inputs.cameras_crs is None and inputs.cameras_offset is None:
         return old, new
     read = old.read(), new.read()
@@ -154,6 +161,10 @@ def told_apart(inputs: Inputs) -> tuple[Inputs, Inputs]:
             for one, moved in zip((old, new), moves, strict=True)
         )
     return old, new
+
+
+def _takes_sensor(inputs: Inputs) -> bool:
+    return not isinstance(inputs.cameras, Cameras) and takes_sensor(inputs.cameras)
 
 
 def _refuse_adjusted_tracks(inputs: Inputs) -> None:

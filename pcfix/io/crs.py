@@ -198,6 +198,12 @@ def _code(crs: CRS) -> tuple[str, str] | None:
     return None if given is None else (str(given["authority"]), str(given["code"]))
 
 
+def typed(crs: CRS) -> str:
+    """Return what a person types for a CRS: its code, or that of the one that it equals."""
+    found = _code(crs) or crs.to_authority(min_confidence=70)
+    return ":".join(found) if found else f"'{crs.name}'"
+
+
 def shortened(text: str) -> str:
     """Return a text on one line that fits into a message."""
     text = " ".join(text.split())

@@ -16,7 +16,6 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.io.crs import (
     check_projected_metres,
-    crs_text,
     heights_of,
     is_local,
     is_same,
@@ -25,7 +24,7 @@ from pcfix.io.crs import (
     parse_crs,
     parts,
     plan_unit,
-    shortened,
+    typed,
 )
 from pcfix.model import FloatArray
 
@@ -259,11 +258,11 @@ def way_to_cloud(
     notes = _height_notes(source, cloud, name) if heights and agree else ()
     if agree and is_same_numbers(source, cloud, heights=heights):
         return None, notes
-    instead = (
+    instead = agree or (  # a search for the code of a CRS takes long
         "or, if the heights of the file are known to agree with the cloud's, give the file's CRS as"
-        f" {shortened(crs_text(parts(source)[0]))}, the horizontal CRS alone"
+        f" {typed(parts(source)[0])}, the horizontal CRS alone"
     )
-    step = transformation(source, cloud, at, name, heights=not agree, instead=instead)
+    step = transformation(source, cloud, at, name, heights=not agree, instead=str(instead))
     return step.forward, (*step.notes, *notes)
 
 

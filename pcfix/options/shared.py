@@ -370,7 +370,7 @@ class PortOptions(OptionSet):
 
 
 _CAMERAS: dict[str, Any] = {
-    "help": "File or folder of camera poses: Metashape, Pix4D, ODM, OpenSfM, COLMAP, MicMac,"
+    "help": "File or folder of camera poses: Metashape, Pix4D, OPF, ODM, OpenSfM, COLMAP, MicMac,"
     " Bundler, VisualSFM, BlocksExchange, RealityCapture, or a CSV table.",
     "metavar": "PATH",
     "needed": True,

@@ -42,7 +42,14 @@ from pcfix.options.correct import ScienceOptions
 from pcfix.port.light import coefficients, cosine_at_port, ray_through, through_port
 from pcfix.port.shapes import Port
 from pcfix.refract.batch import CORRECTED, NO_CAMERA, ONE_CAMERA, PARALLEL, Intersection
-from pcfix.refract.choice import ANY_NUMBER, NOMINAL_FOCAL_PX, TILE, near_cameras, spatial_order
+from pcfix.refract.choice import (
+    ANY_NUMBER,
+    NOMINAL_FOCAL_PX,
+    TILE,
+    cameras_around,
+    near_cameras,
+    spatial_order,
+)
 from pcfix.refract.rays import add_line, nearest_point
 
 # Columns of the result after the shift.
@@ -210,12 +217,14 @@ def _choose(
     Views and shifts are empty where there are none.
     """
     start, chosen = found
+    low, high = _box(xyz, order[span[0] * TILE : span[1] * TILE], shift)
+    around = cameras_around(frames, rig.centres, low, high)
     for t in range(*span):
         rows = order[t * TILE : (t + 1) * TILE]
         near = rows[:0]
         if not views[0].size:
             low, high = _box(xyz, rows, shift)
-            near = near_cameras(frames, rig.centres, low, high)
+            near = near_cameras(around, frames, rig.centres, low, high)
         for i in rows:
             candidates = near
             if views[0].size:

@@ -203,10 +203,12 @@ def tiles_of(batch: Batch) -> int:
 @kernel
 def _make_room(span: Span, points: Points, rig: Rig, frames: Frames, first: IntArray) -> None:
     """Set for each tile, one place on, how many entries it may get."""
+    low, high = box_of(span, points)
+    around = cameras_around(frames, rig.centres, low, high)
     for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
         low, high = gather(np.empty(7 * TILE), rows, points)
-        first[t + 1] = rows.size * near_cameras(frames, rig.centres, low, high).size
+        first[t + 1] = rows.size * near_cameras(around, frames, rig.centres, low, high).size
 
 
 @kernel
@@ -220,11 +222,13 @@ def _choose_all(
     An entry is the number of a camera, or, where there are views, that of one of their entries.
     """
     (first, begin, count, place), listed = found, views[0].size > 0
+    low, high = box_of(span, points)
+    around = cameras_around(frames, rig.centres, low, high)
     for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
         low, high = gather(tile, rows, points)
-        near = near_cameras(frames, rig.centres, low, high)
+        near = near_cameras(around, frames, rig.centres, low, high)
         free = first[t]
         for j in range(rows.size):
             i = rows[j]
@@ -322,14 +326,39 @@ def _keep_steepest(chosen: IntArray, cosine2: FloatArray, k: int, most: int) -> 
 
 
 @part
-def near_cameras(
+def cameras_around(
     frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray
 ) -> IntArray:
-    """Return the cameras whose frames may hold a point of the box."""
-    planes, row = frames.planes, frames.row
-    near = np.empty(len(centres), np.int64)
+    """Return the cameras whose pyramids may hold a point of the box of many tiles."""
+    around = np.empty(len(centres), np.int64)
     count = 0
     for c in range(len(centres)):
+        if may_hold(frames.planes[c], centres[c], low, high):
+            around[count] = c
+            count += 1
+    return around[:count]
+
+
+@part
+def box_of(span: Span, points: Points) -> tuple[FloatArray, FloatArray]:
+    """Return the corners of an upright box around the points of some tiles."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for i in points.order[span[0] * TILE : span[1] * TILE]:
+        for axis in range(3):
+            value = points.xyz[i, axis]
+            low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
+    return low, high
+
+
+@part
+def near_cameras(
+    around: IntArray, frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray
+) -> IntArray:
+    """Return those of some cameras whose frames may hold a point of the box."""
+    planes, row = frames.planes, frames.row
+    near = np.empty(len(around), np.int64)
+    count = 0
+    for c in around:
         if not may_hold(planes[c], centres[c], low, high):
             continue
         if row[c] == NOT_DISTORTED or judge(frames, c, centres[c], low, high) != NOTHING:

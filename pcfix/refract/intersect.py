@@ -40,6 +40,8 @@ from pcfix.refract.choice import (
     Points,
     Rig,
     Rule,
+    box_of,
+    cameras_around,
     gather,
     points_of,
     rig_of,
@@ -213,14 +215,16 @@ def _all_in_frame(
     """Every camera whose frame holds the point; the surface above it is a plane."""
     centres = rig.centres
     result, used, covariance = found
+    low, high = box_of(span, points)
+    around = cameras_around(frames, centres, low, high)
     for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
         tile, sums = np.empty(TILE_RUNS * TILE), np.zeros(11 * TILE)
         low, high = gather(tile, rows, points)
         sums[10 * TILE :] = 1.0
-        near = np.empty(len(centres), np.int64)
+        near = np.empty(len(around), np.int64)
         count = 0
-        for c in range(len(centres)):
+        for c in around:
             if may_hold(frames.planes[c], centres[c], low, high):
                 near[count] = c
                 count += 1

@@ -22,7 +22,12 @@ MOST_FOOTPRINTS = 400
 
 @dataclass(frozen=True)
 class Sensor:
-    """The images of one interior orientation; None where the file does not say."""
+    """The images of one interior orientation, or of several alike; None where the file is silent.
+
+    `focal` is the least and `focal_most` the greatest of its `lenses`, which have so many `frames`;
+    `folded` is the share of the frame beyond the fold of the distortion. A `nominal` one was not
+    calibrated, though others of the block were.
+    """
 
     name: str
     images: int
@@ -35,6 +40,11 @@ class Sensor:
     projection: str
     distorted: bool
     gsd_m: float | None
+    lenses: int = 1
+    focal_most: float | None = None
+    frames: int = 1
+    folded: float = 0.0
+    nominal: bool = False
 
 
 @dataclass(frozen=True)
@@ -183,11 +193,29 @@ def cameras_text(report: CamerasReport) -> str:
 
 def _sensor(s: Sensor) -> str:
     kind = s.projection + (", distorted" if s.distorted else "")
-    size = f"{s.width:g} x {s.height:g} {s.unit}, focal length {s.focal:.6g} {s.unit}"
+    low, high = f"{s.focal:.6g}", f"{s.focal_most or s.focal:.6g}"
+    focal = f"{low} {s.unit}" if low == high else f"{low} to {high} {s.unit}"
+    size = f"{s.width:g} x {s.height:g} {s.unit}"
+    if s.frames > 1:
+        size = f"{s.frames} sizes as {size}"
+    size += f", focal length {focal}"
     if s.pixel_size_um is not None and s.focal_mm is not None:
-        size += f" = {s.focal_mm:.3f} mm, pixel {s.pixel_size_um:.2f} um"
+        mm = "" if s.lenses > 1 else f" = {s.focal_mm:.3f} mm"
+        size += f"{mm}, pixel {s.pixel_size_um:.2f} um"
     gsd = "" if s.gsd_m is None else f", GSD {100.0 * s.gsd_m:.2f} cm at the water"
-    return f"sensor       {s.name or 'unnamed'}: {s.images:,} images, {size}, {kind}{gsd}"
+    lenses = f" with {s.lenses:,} lenses that differ" if s.lenses > 1 else ""
+    line = f"sensor       {s.name or 'unnamed'}: {s.images:,} images{lenses}, {size}, {kind}{gsd}"
+    if s.folded:
+        line += (
+            f"\n  note       its distortion folds within the frame: {100.0 * s.folded:.2g} % of it"
+            " has no direction, and points there count as not seen; see its radial coefficients"
+        )
+    if s.nominal:
+        line += (
+            "\n  note       not calibrated, unlike the others: no distortion, the principal point"
+            " in the middle; its images likely had no tie points, so do not trust their poses"
+        )
+    return line
 
 
 def _short(crs: str | None) -> str:

@@ -3,15 +3,21 @@
 import json
 import re
 import struct
+from dataclasses import replace
 
 import laspy
 import numpy as np
 import pytest
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 
 import pcfix
-from pcfix.flow.checks import check_cameras
+from pcfix.flow.checks import _sensors, check_cameras
+from pcfix.flow.inputs import Inputs
+from pcfix.flow.old_cameras import told_apart
+from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.lens.imaging import project
+from pcfix.model import Cameras, Lens
+from pcfix.report.cameras import _sensor as _sensor_words
 from pcfix.report.cameras import cameras_text
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
@@ -19,6 +25,7 @@ from tests.utils.shared import ROOT, needs
 SCENE = ROOT / "samples" / "scene"
 CLOUD, CAMERAS, SENSOR = SCENE / "cloud.laz", SCENE / "cameras.csv", SCENE / "sensor.csv"
 RENDERED, rendered = needs("rendered_a")
+SOROLLA, sorolla = needs("cameras", "metashape", "uclm_sorolla")
 
 
 def table(path, change=lambda xyz: xyz, crs=None):
@@ -86,6 +93,112 @@ def test_wrong_angles_are_noticed(tmp_path):
     assert report.tilt_deg[0] > 50.0
 
 
+def test_geocentric_cameras_without_a_map_have_no_height_over_the_water(tmp_path):
+    """Their third number is a distance from the equator's plane, not a height."""
+    to_earth = Transformer.from_crs("EPSG:32633", "EPSG:4978", always_xy=True)
+
+    def geocentric(xyz):
+        return np.column_stack(to_earth.transform(*xyz.T))
+
+    path = table(tmp_path / "cameras.csv", geocentric, "EPSG:4978")
+    report = check_cameras(path, sensor=SENSOR, water=0.37)
+    said = cameras_text(report)
+    assert report.problem
+    assert report.height_above_water_m is None
+    assert "over water" not in said
+    assert "GSD" not in said
+
+
+@sorolla
+def test_heights_off_by_the_geoid_are_no_fit(tmp_path):
+    """The real block is above the ellipsoid, 51.5 m above the GNSS that it states in the geoid's.
+
+    Frames hold the points all the same, as cameras that are too high see more.
+    """
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = [0.001] * 3, [725_000.0, 4_369_000.0, 0.0]
+    header.add_crs(CRS("EPSG:25830+5782"))
+    cloud = laspy.LasData(header)
+    x, y = (side.ravel() for side in np.mgrid[725_440:725_525:3, 4_369_105:4_369_170:3])
+    cloud.x, cloud.y, cloud.z = x, y, np.full(len(x), 84.0)
+    cloud.write(tmp_path / "cloud.las")
+    with pytest.warns(pcfix.PcfixWarning, match="51.5 m above the heights that their GNSS states"):
+        report = check_cameras(
+            SOROLLA / "markers.xml", cloud=tmp_path / "cloud.las", cameras_crs="EPSG:25830"
+        )
+    assert not report.fit.fits
+    assert "51.5 m above" in report.fit.verdict
+
+
+def test_cameras_below_the_water_have_no_gsd():
+    report = check_cameras(CAMERAS, sensor=SENSOR, water=1000.0)
+    assert report.height_above_water_m[2] < 0.0
+    assert "GSD" not in cameras_text(report)
+
+
+LENS = Lens(3650.0, 5472.0, 3648.0, 2736.0, 1824.0, radial=(-0.02,), sensor="S")
+
+
+def sensors_of(lenses):
+    """Return the sensors of images that have these lenses."""
+    k = len(lenses)
+    cameras = Cameras(
+        tuple(f"{i}.jpg" for i in range(k)), np.zeros((k, 3)), np.tile(np.eye(3), (k, 1, 1)), lenses
+    )
+    return _sensors(cameras, np.full(k, 80.0))
+
+
+@pytest.mark.parametrize("names", [("S",), ("1 OPENCV", "2 OPENCV", "3 OPENCV")])
+def test_lenses_that_differ_are_one_line_that_says_so(names):
+    """A calibration for each image, as 177 of a block: one sensor, or one of each image."""
+    lenses = tuple(
+        replace(LENS, focal=3650.0 + i, sensor=names[i % len(names)]) for i in range(177)
+    )
+    sensors = sensors_of(lenses)
+    assert len(sensors) == len(names)
+    assert sum(sensor.lenses for sensor in sensors) == 177
+    if len(names) == 1:
+        line = _sensor_words(sensors[0])
+        assert "177 lenses that differ" in line
+        assert "3650 to 3826 px" in line
+
+
+def test_sensors_of_each_image_come_together():
+    lenses = tuple(
+        replace(LENS, width=5472.0 + i, focal=3650.0 + i, sensor=f"{i} PINHOLE") for i in range(20)
+    )
+    sensors = sensors_of(lenses)
+    assert [sensor.images for sensor in sensors] == [20]
+    assert "20 sizes as 5472 x 3648 px" in _sensor_words(sensors[0])
+
+
+def test_lenses_that_are_few_have_a_line_each():
+    lenses = (LENS,) * 5 + (replace(LENS, focal=3700.0, sensor="T"),) * 5
+    sensors = sensors_of(lenses)
+    assert [(sensor.images, sensor.lenses, sensor.focal) for sensor in sensors] == [
+        (5, 1, 3650.0),
+        (5, 1, 3700.0),
+    ]
+
+
+@pytest.mark.parametrize(("k1", "folds"), [(-0.02, False), (-0.8, True)])
+def test_a_lens_that_folds_within_the_frame_is_said(k1, folds):
+    """x (1 + k1 x^2) turns at x^2 = -1 / (3 k1): for -0.8 at 0.65 of an angle that ends at 0.90."""
+    sensors = sensors_of((replace(LENS, radial=(k1,)),) * 3)
+    assert (sensors[0].folded > 0.0) == folds
+    assert ("folds within the frame" in _sensor_words(sensors[0])) == folds
+
+
+def test_lenses_that_were_not_calibrated_are_said_beside_others_that_were():
+    """As of the images of a rig that have no tie points."""
+    nominal = replace(LENS, radial=(), sensor="NIR")
+    sensors = sensors_of((LENS,) * 8 + (nominal,) * 8)
+    assert [sensor.nominal for sensor in sensors] == [False, True]
+    assert "not calibrated" in _sensor_words(sensors[1])
+    alone = sensors_of((nominal,) * 8)  # as undistorted photographs are
+    assert not alone[0].nominal
+
+
 SNELL = {"water": 0.37, "method": "snell", "max_angle": None}
 
 
@@ -142,6 +255,18 @@ def test_an_offset_is_three_numbers(tmp_path, text):
     )  # fmt: skip
     assert done.returncode == 1
     assert "three numbers X,Y,Z" in done.stderr
+
+
+def test_the_sensor_of_a_table_is_not_for_the_adjusted_model(tmp_path):
+    """Which has its own lens, and would refuse another."""
+    read = pcfix.read_cameras(CAMERAS, SENSOR)
+    lens = replace(LENS, radial=())
+    write_colmap(tmp_path / "model", replace(read, lenses=(lens,) * len(read)))
+    model = Inputs(cameras=tmp_path / "model", adjusted_from=CAMERAS, sensor=SENSOR, water=0.37)
+    old, new = told_apart(model)
+    assert (old.sensor, new.sensor) == (SENSOR, None)
+    old, new = told_apart(replace(model, cameras=CAMERAS))
+    assert (old.sensor, new.sensor) == (SENSOR, SENSOR)
 
 
 def in_frame(xyz, cameras):

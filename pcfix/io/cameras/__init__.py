@@ -8,6 +8,7 @@ entry of `FORMATS`, from which its line in README.md of this folder follows.
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 from pcfix.errors import InputError, PcfixWarning
@@ -20,6 +21,7 @@ from pcfix.io.cameras import (
     nvm,
     odm,
     opensfm,
+    opf,
     pix4d,
     realitycapture,
     table,
@@ -27,11 +29,24 @@ from pcfix.io.cameras import (
     unsupported,
 )
 from pcfix.io.cameras.formats import Angles, CameraFormat, Source, SparseReader
+from pcfix.io.cameras.table.sensor import read_sensor
 from pcfix.io.files import check_input
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
 
-LISTS = (".xml", ".csv", ".txt", ".json", ".geojson", ".psx", ".out", ".nvm")
+LISTS = (
+    ".xml",
+    ".csv",
+    ".txt",
+    ".json",
+    ".geojson",
+    ".psx",
+    ".psz",
+    ".xmlz",
+    ".opf",
+    ".out",
+    ".nvm",
+)
 """How files are named that cameras may be in."""
 FORMATS = (
     CameraFormat(
@@ -41,10 +56,11 @@ FORMATS = (
         metashape,
     ),
     CameraFormat("Pix4D", "the `params` folder, the project folder or one of its tables", pix4d),
+    CameraFormat("OPF: PIX4Dmatic, PIX4Dcatch", "the project (`.opf`) or its folder", opf),
     CameraFormat("OpenDroneMap", "the project folder, `reconstruction.json`, `shots.geojson`", odm),
     CameraFormat("OpenSfM", "`reconstruction.json` or its folder", opensfm),
     CameraFormat("COLMAP", "the model folder or workspace, text or binary", colmap),
-    CameraFormat("MicMac", "the `Ori-...` folder", micmac),
+    CameraFormat("MicMac", "the `Ori-...` folder, of MMVII too", micmac),
     CameraFormat(
         "Bundler, MVE",
         "`bundle.out`, `synth_0.out`, with the images or their list beside it",
@@ -68,6 +84,10 @@ FORMATS = (
 )
 """In the order in which they are asked: ODM knows more of an OpenSfM file than OpenSfM, and a plain
 table says least of all."""
+TAKE_SENSOR = (table, realitycapture)
+"""Readers that look for the sensor themselves."""
+BOUNDLESS = "frames are taken as boundless."
+"""What notes of readers end with where they find no lens."""
 
 
 def read_cameras(
@@ -90,9 +110,9 @@ def read_cameras(
             roll positive when the right side goes down (the angles of Metashape, the table of
             pyBathySfM). Needs the sensor.
     sensor : path, optional
-        For tables: a CSV table of one row for all images, ``focal, sensor_x, sensor_y`` in
-        millimetres or ``focal_px, width_px, height_px, ...``, or a calibration of Metashape.
-        Default: a ``sensor.csv`` beside the cameras.
+        For tables, and files of poses without lenses: a CSV table of one row for all images,
+        ``focal, sensor_x, sensor_y`` in millimetres or ``focal_px, width_px, height_px, ...``, or a
+        calibration of Metashape. Default: a ``sensor.csv`` beside the cameras.
     angles : {"omega-phi-kappa", "yaw-pitch-roll", "aircraft"}, optional
         What the angles of a table are, where its header cannot say. Of an aircraft's or a
         gimbal's, pitch -90 looks straight down.
@@ -112,6 +132,7 @@ def read_cameras(
     ------
     InputError
         If a file is missing, or a row or column is not what it should be; the message names it.
+        Or if there is a `sensor` for a file that has its own lenses.
 
     Examples
     --------
@@ -121,7 +142,7 @@ def read_cameras(
     (40, 3)
     """
     source, form = _recognised(path, sensor, angles)
-    cameras = form.reader.read(source)
+    cameras = _with_sensor(source, form.reader.read(source), form)
     if not len(cameras):
         raise InputError(f"{path}: has no image with a pose.")
     for note in cameras.notes:
@@ -173,23 +194,58 @@ def _recognised(
         None if sensor is None else check_input(sensor),
         angles,
     )
-    for form in FORMATS:
-        if form.reader.recognises(source):
-            return source, form
+    known = _format_of(source)
+    if known is not None and known.reader is not unsupported:
+        return source, known
     inside = _camera_files(where)
     if inside:
+        listed = " and ".join(f"{name} ({software})" for name, software in inside)
         raise InputError(
-            f"{where}: is a folder that holds {' and '.join(inside)}; give"
-            f" {where / inside[0]} itself."
+            f"{where}: is a folder that holds {listed}; give {where / inside[0][0]} itself."
         )
+    if known is not None:
+        return source, known
     raise InputError(
         f"{where}: is not a camera file that pcfix knows; give a CSV table with the columns"
         " label, x, y, z and, if you have them, yaw, pitch, roll."
     )
 
 
-def _camera_files(folder: Path) -> list[str]:
-    """Return the names of camera files in a folder, three at most."""
-    paths = sorted(p for p in folder.glob("*") if p.suffix.lower() in LISTS and p.is_file())
-    known = [form.reader for form in FORMATS if form.reader is not unsupported]
-    return [p.name for p in paths if any(one.recognises(Source(p)) for one in known)][:3]
+def takes_sensor(path: File) -> bool:
+    """Whether a file is of a format whose lens stands in a file of its own."""
+    return _recognised(path, None, None)[1].reader in TAKE_SENSOR
+
+
+def _with_sensor(source: Source, cameras: Cameras, form: CameraFormat) -> Cameras:
+    """Return cameras with the lens of ``--sensor`` where their file has none."""
+    if source.sensor is None or form.reader in TAKE_SENSOR or not len(cameras):
+        return cameras
+    if cameras.lenses is not None:
+        raise InputError(
+            f"{source.path}: has the lenses of its images ({form.software}), so --sensor"
+            f" {source.sensor} would say them twice; leave it out."
+        )
+    if cameras.rotations is None:
+        raise InputError(
+            f"{source.path}: has no angles, so the sensor {source.sensor} says nothing; leave it"
+            " out, or export the angles."
+        )
+    lenses = (read_sensor(source.sensor),) * len(cameras)
+    notes = tuple(note for note in cameras.notes if not note.endswith(BOUNDLESS))
+    return replace(cameras, lenses=lenses, notes=notes)
+
+
+def _format_of(source: Source) -> CameraFormat | None:
+    """Return the first format that knows the content; standard errors look like poses."""
+    asked = FORMATS[-1:] if unsupported.is_part(source) else FORMATS
+    return next((form for form in asked if form.reader.recognises(source)), None)
+
+
+def _camera_files(folder: Path) -> list[tuple[str, str]]:
+    """Return the names of camera files in a folder and whose they are, three at most."""
+    found = []
+    for path in sorted(p for p in folder.glob("*") if p.suffix.lower() in LISTS and p.is_file()):
+        form = _format_of(Source(path))
+        if form is not None and form.reader is not unsupported:
+            found.append((path.name, form.software))
+    return found[:3]

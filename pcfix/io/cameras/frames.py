@@ -12,7 +12,6 @@ from pcfix.io.crs import (
     GEOCENTRIC_WGS84,
     GEOGRAPHIC_WGS84,
     Topocentric,
-    crs_text,
     geographic_3d,
     heights_of,
     is_local,
@@ -21,7 +20,7 @@ from pcfix.io.crs import (
     parse_crs,
     parts,
     plan_unit,
-    shortened,
+    typed,
     with_heights,
 )
 from pcfix.io.transformations import heights_agree
@@ -200,5 +199,5 @@ def without_grid(frame: Frame, target: CRS) -> str:
     agree = "or, if the heights of cameras and cloud are known to agree, give --cameras-crs"
     if frame.topocentric:
         return f"{agree} ENU:latitude,longitude,height with the height in the cloud's system"
-    plan = shortened(crs_text(parts(frame.crs if frame.direct else target)[0]))
-    return f"{agree} {plan}, the horizontal CRS alone"
+    plan = parts(frame.crs if frame.direct else target)[0]
+    return f"{agree} {typed(plan)}, the horizontal CRS alone"

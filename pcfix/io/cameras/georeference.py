@@ -22,6 +22,7 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.io.cameras import frames
 from pcfix.io.cameras.frames import Frame, Statement
+from pcfix.io.cameras.mistakes import UNDULATION_M
 from pcfix.io.crs import (
     METRES,
     check_projected_metres,
@@ -216,13 +217,36 @@ def _into(
     frame.check(at, cameras.labels, name)
     target = frames.completed(cloud, frame, stated)
     crs, notes = crs_text(target), frames.height_notes(frame, target, stated, name)
-    heights, instead = not frames.agree(frame, target, stated), frames.without_grid(frame, target)
+    heights = not frames.agree(frame, target, stated)
+    instead = frames.without_grid(frame, target) if heights else ""
     if frame.direct and not heights and is_same_numbers(frame.crs, target):
         return Georeference(frame, None, offset, crs, notes, name)
     step = transformation(
         frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
     )
-    return Georeference(frame, step, offset, crs, (*step.notes, *notes), name)
+    found = Georeference(frame, step, offset, crs, (*step.notes, *notes), name)
+    if stated.trusted and not (frame.direct or frame.topocentric):
+        return replace(found, notes=found.notes + _on_trust(found, cameras, frame, target))
+    return found
+
+
+def _on_trust(found: Georeference, cameras: Cameras, frame: Frame, target: CRS) -> tuple[str, ...]:
+    """Return a note where heights that are the cloud's by --cameras-crs are not those of the GNSS.
+
+    Only a GNSS that the file states in heights like the cloud's can tell.
+    """
+    if heights_of(target) != "gravity" or cameras.gnss is None or cameras.gnss.crs is None:
+        return ()
+    up = adjusted_minus_gnss(found.cameras(cameras), found.name).enu_m[:, 2]
+    off = float(np.median(up[np.isfinite(up)])) if np.isfinite(up).any() else 0.0
+    if abs(off) < UNDULATION_M[0]:
+        return ()
+    return (
+        f"{found.name}: its heights are above the ellipsoid ({frame.crs.name}); --cameras-crs takes"
+        f" them for the cloud's ({target.name}), but then the cameras are {abs(off):.1f} m"
+        f" {'above' if off > 0.0 else 'below'} the heights that their GNSS states: the two do not"
+        " agree, so install the grid instead.",
+    )
 
 
 @dataclass(frozen=True, eq=False)

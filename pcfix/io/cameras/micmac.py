@@ -1,4 +1,4 @@
-"""MicMac: a folder Ori-*/ of Orientation-<image>.xml, or one such file.
+"""MicMac: a folder Ori-*/ of Orientation-<image>.xml (MMVII: Ori-PerspCentral-), or one such file.
 
 `Externe` has the projection centre (`Centre`) and the matrix camera to world as rows L1, L2, L3
 (`CodageMatr`); the camera is x right, y down, z forward. The interior orientation is `Interne` in
@@ -15,9 +15,15 @@ distortion: none; radial, d (k1 d^2 + k2 d^4 + ...); and Fraser's with decentrin
 the distorted one: it is read where that makes no difference, up to `AFFINITY_PX`. mm3d ConvertCalib
 turns any other formula into one of these.
 
+MMVII has the centre (`Center`) and the camera's axes in the world (`AxeI`, `AxeJ`, `AxeK`), the
+same matrix by columns, and the calibration in a file beside it. Its distortion is of the ideal
+place (X, Y) / Z and leads to the observed one: K1, K2, ... radial, p1 and p2 as P1 and P2 above, b1
+and b2 as there; anything beyond is refused.
+
 References: M. Pierrot-Deseilligny and others, "MicMac, Apero, Pastis and other beverages in a
 nutshell", https://github.com/micmacIGN/Documentation, "Distortion models" and ConvertCalib;
-include/XML_GEN/ParamChantierPhotogram.xml of https://github.com/micmacIGN/micmac for the elements.
+include/XML_GEN/ParamChantierPhotogram.xml of https://github.com/micmacIGN/micmac for the elements;
+MMVII's files write the formula of each coefficient beside it.
 """
 
 from __future__ import annotations
@@ -34,7 +40,7 @@ from pcfix.io.cameras.checks import number, numbers, read_xml
 from pcfix.io.cameras.formats import Source
 from pcfix.model import Cameras, FloatArray, Lens
 
-PREFIX, SUFFIX = "Orientation-", ".xml"
+PREFIX, PREFIX_2, SUFFIX = "Orientation-", "Ori-PerspCentral-", ".xml"
 UNIFIED = ("eModele_DRad_PPaEqPPs", "eModele_Fraser_PPaEqPPs")
 """Of `ModUnif`: radial and Fraser's about the principal point; five k, P1, P2, b1, b2."""
 NO_DISTORTION = ("ModNoDist", "eModelePolyDeg0")
@@ -47,15 +53,17 @@ _IS_INVERSE = {"": False, "eConvApero_DistM2C": False, "eConvApero_DistC2M": Tru
 def recognises(source: Source) -> bool:
     """Whether a folder has orientations by their names, or a file is one."""
     if source.path.is_dir():
-        return any(name.startswith(PREFIX) and name.endswith(SUFFIX) for name in source.names)
-    return "<OrientationConique" in source.text
+        begins = (PREFIX, PREFIX_2)
+        return any(name.startswith(begins) and name.endswith(SUFFIX) for name in source.names)
+    return "<OrientationConique" in source.text or "<NameInternalCalib>" in source.text
 
 
 def read(source: Source) -> Cameras:
     """Read every orientation of a folder, or the one."""
     paths = [source.path]
     if source.path.is_dir():
-        paths = sorted(p for p in source.path.glob(f"{PREFIX}*{SUFFIX}") if p.is_file())
+        found = [sorted(source.path.glob(f"{one}*{SUFFIX}")) for one in (PREFIX, PREFIX_2)]
+        paths = [path for path in found[0] or found[1] if path.is_file()]
     known: dict[Path, Lens] = {}
     poses = [_orientation(path, known) for path in paths]
     return Cameras(
@@ -68,13 +76,16 @@ def read(source: Source) -> Cameras:
 
 
 def _image(path: Path) -> str:
-    return path.name.removesuffix(SUFFIX).removeprefix(PREFIX)
+    return path.name.removesuffix(SUFFIX).removeprefix(PREFIX).removeprefix(PREFIX_2)
 
 
 def _orientation(path: Path, known: dict[Path, Lens]) -> tuple[FloatArray, FloatArray, Lens]:
     """Return centre, rotation world to camera, and lens."""
     image = f"image {_image(path)}"
-    conic = _first(path, read_xml(path), "OrientationConique")
+    root = read_xml(path)
+    if root.find(".//NameInternalCalib") is not None:
+        return _orientation_2(path, root, known)
+    conic = _first(path, root, "OrientationConique")
     projection = conic.findtext("TypeProj", "eProjStenope").strip()
     if projection != "eProjStenope":
         raise InputError(f"{path}: {image}: the projection {projection} is no camera's.")
@@ -90,6 +101,63 @@ def _orientation(path: Path, known: dict[Path, Lens]) -> tuple[FloatArray, Float
     centre = numbers(path, f"{image}, Centre", outer.findtext("Centre"), 3)
     rotation = checks.rotation(path, _image(path), np.array(rows)).T
     return centre, rotation, _scanned(path, conic.find("OrIntImaM2C"), _lens(path, conic, known))
+
+
+def _orientation_2(
+    path: Path, root: Element, known: dict[Path, Lens]
+) -> tuple[FloatArray, FloatArray, Lens]:
+    """Return the same of a file of MMVII."""
+    image = _image(path)
+    axes = [
+        numbers(path, f"image {image}, {tag}", root.findtext(f".//RotMatrix/{tag}"), 3)
+        for tag in ("AxeI", "AxeJ", "AxeK")
+    ]
+    centre = numbers(path, f"image {image}, Center", root.findtext(".//Center"), 3)
+    name = (root.findtext(".//NameInternalCalib") or "").strip().strip('"')
+    where = path.parent / f"{PurePosixPath(name).name}{SUFFIX}"
+    if where not in known:
+        if not where.is_file():
+            raise InputError(
+                f"{path}: image {image}: its calibration '{where.name}' is not beside it; copy it"
+                " there."
+            )
+        known[where] = _calibration_2(where, read_xml(where))
+    return centre, checks.rotation(path, image, np.array(axes)), known[where]
+
+
+def _calibration_2(path: Path, root: Element) -> Lens:
+    """Return the lens of a calibration of MMVII."""
+    projection = root.findtext(".//Projection", "").strip().strip('"')
+    if projection != "Stenope":
+        raise _not_held(path, f"of the projection {projection or 'that it does not name'}")
+    focal = number(path, "F", root.findtext(".//PerfectProj/F"))
+    x, y = numbers(path, "PP", root.findtext(".//PerfectProj/PP"), 2).tolist()
+    width, height = numbers(path, "NbPix", root.findtext(".//PixelFrame/NbPix"), 2).tolist()
+    given = {
+        str(term.tag): number(path, str(term.tag), term.text)
+        for part in root.iterfind(".//Distorsion/*")
+        for term in part
+    }
+    held = {f"K{i}" for i in range(1, 10)} | {"p1", "p2", "b1", "b2"}
+    others = sorted(name for name, value in given.items() if value and name not in held)
+    if others:
+        raise _not_held(path, f"with the terms {', '.join(others)}")
+    radial = tuple(given.get(f"K{i}", 0.0) for i in range(1, 10))
+    p1, p2, b1, b2 = (given.get(name, 0.0) for name in ("p1", "p2", "b1", "b2"))
+    lens = Lens(
+        *(focal, width, height, x, y, b1 * focal, b2 * focal),
+        radial=checks.without_zeros(radial),
+        tangential=checks.without_zeros((p1, p2)),
+        sensor=path.stem,
+    )
+    checks.lens(path, path.stem, lens)
+    corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
+    r = np.hypot(*((corners - [x, y]) / focal).T).max()
+    with np.errstate(over="ignore", invalid="ignore"):
+        away = r * sum(abs(k) * r ** (2 * i + 2) for i, k in enumerate(radial))
+        if not focal * np.hypot(b1, b2) * away <= AFFINITY_PX:
+            raise _not_held(path, "with an affinity (b1, b2)")
+    return lens
 
 
 def _lens(path: Path, conic: Element, known: dict[Path, Lens]) -> Lens:

@@ -1,7 +1,7 @@
 """Files that are known but not read: each is refused with its name and a way round.
 
-Only what no reader has claimed comes here. Recognised are signatures, keywords in the first bytes
-and, of folders, the names inside.
+Only what no reader has claimed comes here. Recognised are signatures, keywords in the first bytes,
+the names of files that are one part of an export and, of folders, the names inside.
 """
 
 from __future__ import annotations
@@ -46,6 +46,16 @@ IMAGES = Refusal("an image", rb"\A(\xff\xd8\xff|II[*+]\0|MM\0[*+]|\x89PNG)", ANY
 PIX4D = Refusal(
     "a project of Pix4D", rb"<pix4uav|<!DOCTYPE Pix4D", "give its folder 1_initial/params"
 )
+MICMAC = Refusal(
+    "a calibration of MicMac",
+    rb"<(CalibrationInternConique|InternalCalibration)>",
+    "give the folder that holds the orientations, Orientation-*.xml or Ori-PerspCentral-*.xml",
+)
+ODM = Refusal(
+    "a list of lenses of OpenDroneMap or OpenSfM, without poses",
+    rb'"projection_type"',
+    "give reconstruction.json or shots.geojson of the same project, or its folder",
+)
 
 FILES = (
     IMAGES,
@@ -86,13 +96,35 @@ FILES = (
         OMEGA_PHI_KAPPA,
     ),
     Refusal("a file of BINGO", rb"^\s*(ORI[AE]|PRO[JI]|GEOI|BILD)\s+\S+\s+\S", OMEGA_PHI_KAPPA),
+    MICMAC,
+    ODM,
     OPENMVG,
     ALICEVISION,
     NERFSTUDIO,
 )
 """The first that matches counts."""
 
+PIX4D_TABLES = (
+    "give calibrated_camera_parameters.txt of the same export, or the params folder that holds it"
+)
+PARTS = tuple(
+    (rf"(?i)(.*_)?{name}", Refusal(what, b"", PIX4D_TABLES))
+    for name, what in (
+        (r"calibrated_images_position\.txt", "a list of positions by Pix4D, without angles"),
+        (r"pmatrix\.txt", "a list of projection matrices by Pix4D, without the distortion"),
+        (r"offset\.xyz", "the offset of a project of Pix4D"),
+        (r"internal_camera_parameters\.cam", "a calibration of Pix4D, without poses"),
+        (
+            r"camera_parameters(_wgs84)?_error\.txt",
+            "a table of standard errors by Pix4D, without poses",
+        ),
+    )
+)
+"""What the name of a file says that is one part of an export."""
 FOLDERS = (
+    *PARTS,
+    (r"AutoCal.*\.xml|Calib-PerspCentral-.*\.xml", MICMAC),
+    (r"cameras\.json|camera_models\.json", ODM),
     (r"sfm_data\.(json|bin)", OPENMVG),
     (r".*\.(sfm|mg)", ALICEVISION),
     (r"transforms\.json", NERFSTUDIO),
@@ -113,6 +145,11 @@ def recognises(source: Source) -> bool:
     return _refusal(source) is not None
 
 
+def is_part(source: Source) -> bool:
+    """Whether a file is by its name one part of an export that alone has no poses."""
+    return source.path.is_file() and any(re.fullmatch(p, source.path.name) for p, _ in PARTS)
+
+
 def read(source: Source) -> NoReturn:
     """Refuse the file."""
     found = _refusal(source) or Refusal("a format that pcfix does not read", b"", ANY_CAMERAS)
@@ -124,8 +161,14 @@ def read(source: Source) -> NoReturn:
 def _refusal(source: Source) -> Refusal | None:
     """Return what the content is, or None where it is not known."""
     if source.path.is_dir():
-        known = (f for name, f in FOLDERS if any(re.fullmatch(name, n) for n in source.names))
-        return next(known, None)
+        for pattern, found in FOLDERS:
+            for name in sorted(source.names):
+                if re.fullmatch(pattern, name):
+                    return found._replace(what=f"a folder with {name}: {found.what}")
+        return None
+    part = next((f for name, f in PARTS if re.fullmatch(name, source.path.name)), None)
+    if part is not None:
+        return part
     for each in FILES:
         if re.search(each.pattern, source.head, re.MULTILINE):
             return each

@@ -1,16 +1,19 @@
-"""Whether a LAS or LAZ file holds more points than its header counts."""
+"""Whether what a LAS or LAZ file counts is what it holds."""
 
 from __future__ import annotations
 
 import struct
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from pcfix.errors import InputError
-from pcfix.io.las.source import LasSource
 
 _VARIABLE_CHUNKS = 2**32 - 1
+_WITHOUT_CHUNKS = 1
+"""The compressor of files that are one stream (LASzip record)."""
 
 
-def check_count(source: LasSource) -> None:
+def check_count(path: Path, header: Any, vlrs: Any) -> None:
     """Refuse a header that counts fewer points than its file holds.
 
     Bytes of zeros behind the last point are padding.
@@ -20,22 +23,21 @@ def check_count(source: LasSource) -> None:
     InputError
         With both counts.
     """
-    header, stated = source.header, source.held
     if header.are_points_compressed:
-        held, words = _least_in_chunks(source), "at least "
+        held, words = _least_in_chunks(path, header, vlrs), "at least "
     else:
-        held, words = _held(source), ""
-    if held > stated:
+        held, words = _held(path, header), ""
+    if held > header.point_count:
         raise InputError(
-            f"{source.path}: its header counts {stated:,} points, the file holds {words}{held:,}:"
-            " those beyond would be lost; mend the header, or export the cloud again."
+            f"{path}: its header counts {header.point_count:,} points, the file holds"
+            f" {words}{held:,}: those beyond would be lost; mend the header, or export the cloud"
+            " again."
         )
 
 
-def _held(source: LasSource) -> int:
+def _held(path: Path, header: Any) -> int:
     """Return how many records lie between the header and what comes behind the points."""
-    header, path, stated = source.header, source.path, source.held
-    size, start = header.point_format.size, header.offset_to_point_data
+    stated, size, start = header.point_count, header.point_format.size, header.offset_to_point_data
     behind = [path.stat().st_size]
     for name in ("start_of_first_evlr", "start_of_waveform_data_packet_record"):
         place = getattr(header, name, None) or 0
@@ -45,21 +47,70 @@ def _held(source: LasSource) -> int:
         with path.open("rb") as stream:
             stream.seek(start + stated * size)
             if not any(stream.read(size)):
-                return stated
+                return int(stated)
     return int(held)
 
 
-def _least_in_chunks(source: LasSource) -> int:
+def _least_in_chunks(path: Path, header: Any, vlrs: Any) -> int:
     """Return how many points the full chunks of a LAZ file hold, and one more; 0 if not known."""
-    vlr = next((v for v in source.vlrs if v.user_id == "laszip encoded"), None)
-    if vlr is None:
+    table = _table(path, header, vlrs)
+    if table is None or table.points == _VARIABLE_CHUNKS or not table.chunks:
         return 0
-    (chunk,) = struct.unpack_from("<I", vlr.record_data, 12)
-    with source.path.open("rb") as stream:
-        stream.seek(source.header.offset_to_point_data)
-        (table,) = struct.unpack("<q", stream.read(8))
-        if chunk == _VARIABLE_CHUNKS or not 0 < table <= source.path.stat().st_size - 8:
-            return 0
-        stream.seek(table + 4)
-        (chunks,) = struct.unpack("<I", stream.read(4))
-    return int((chunks - 1) * chunk + 1) if chunks else 0
+    return (table.chunks - 1) * table.points + 1
+
+
+class _Table(NamedTuple):
+    """The chunks of a LAZ file: points of each, how many there are, bytes of them all."""
+
+    points: int
+    chunks: int
+    size: int
+
+
+def check_chunks(path: Path, header: Any, vlrs: Any) -> None:
+    """Refuse a LAZ file that counts chunks which it cannot hold.
+
+    Its decompressor would take memory for as many as are stated, and end the process.
+
+    Raises
+    ------
+    ValueError
+        With what is wrong.
+    """
+    table = _table(path, header, vlrs)
+    if table is None:
+        return
+    if table.points == 0:
+        raise ValueError("its chunks have no points")
+    if table.chunks * header.point_format.size > max(table.size, 0):
+        raise ValueError(f"it states {table.chunks:,} chunks of points in {table.size:,} bytes")
+    if table.chunks * table.points < header.point_count:
+        raise ValueError(
+            f"it states {header.point_count:,} points in {table.chunks:,} chunks of"
+            f" {table.points:,}"
+        )
+
+
+def _table(path: Path, header: Any, vlrs: Any) -> _Table | None:
+    """Return what the table of chunks says; None where the file has none, or is cut short."""
+    vlr = next((v for v in vlrs if v.user_id == "laszip encoded"), None)
+    if vlr is None or not header.are_points_compressed:
+        return None
+    if struct.unpack_from("<H", vlr.record_data)[0] == _WITHOUT_CHUNKS:
+        return None
+    (points,) = struct.unpack_from("<I", vlr.record_data, 12)
+    start, size = header.offset_to_point_data, path.stat().st_size
+    with path.open("rb") as stream:
+        stream.seek(start)
+        place = _unpacked("<q", stream.read(8))
+        if place == -1:  # of writers that cannot go back
+            stream.seek(max(size - 8, 0))
+            place = _unpacked("<q", stream.read(8))
+        if place is None or not start + 8 <= place <= size - 8:
+            return None
+        stream.seek(place + 4)
+        return _Table(points, _unpacked("<I", stream.read(4)) or 0, place - start - 8)
+
+
+def _unpacked(layout: str, data: bytes) -> int | None:
+    return struct.unpack(layout, data)[0] if len(data) == struct.calcsize(layout) else None

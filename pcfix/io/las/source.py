@@ -24,6 +24,7 @@ from laspy.vlrs.vlrlist import VLRList
 from pcfix.errors import InputError
 from pcfix.io.crs import METRES
 from pcfix.io.files import check_input
+from pcfix.io.las.counts import check_chunks
 from pcfix.io.las.part import CloudPart, check_levels, extent_of, is_copc, nodes_in
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -51,6 +52,12 @@ _PLACES = (
     .decompress_point_source_id()
     .decompress_rgb()
 )
+
+MOST_SCALE_M = 1000.0
+"""Largest step of coordinates that a header may state."""
+
+_LAST_DIGIT = 2.0**-52
+"""Of a float64, relative."""
 
 CHUNK_POINTS = 1_000_000
 """Points that are worked on at a time, which bounds the memory."""
@@ -103,6 +110,8 @@ def read_records(stream: BinaryIO) -> tuple[list[Record], list[Record]]:
     head = stream.read(375)
     if head[:4] != b"LASF":
         raise ValueError("it does not begin with LASF")
+    if len(head) > 25 and head[24] != 1:
+        raise ValueError(f"its version is {head[24]}.{head[25]}, and there are 1.0 to 1.4")
     start, points_start, count = struct.unpack_from("<HII", head, 94)
     vlrs = _read(stream, start, count, _VLR, points_start)
     encoding, minor = head[6], head[25]
@@ -205,9 +214,11 @@ class LasSource:
                 self.identity = stream.read(_IDENTITY_SIZE)
             self._reader = laspy.open(self.path.open("rb"), laz_backend=backend(jobs))
         self.header: laspy.LasHeader = self._reader.header
-        self.held = len(self)
         self._selection = laspy.DecompressionSelection.all()  # also where a part is counted
         try:
+            with las_errors(self.path):
+                self.held = len(self)
+                check_chunks(self.path, self.header, self.vlrs)
             self._check_header()
             if isinstance(self.path, CloudPart):
                 self._take_part(self.path)
@@ -231,10 +242,17 @@ class LasSource:
 
     def _check_header(self) -> None:
         scales, offsets = self.header.scales, self.header.offsets
-        if not (np.isfinite(scales).all() and (scales > 0).all() and np.isfinite(offsets).all()):
+        usable = (scales > 0.0) & (scales <= MOST_SCALE_M)
+        if not (usable.all() and np.isfinite(offsets).all()):
             raise InputError(
                 f"{self.path}: the header's scales {scales.tolist()} and offsets"
-                f" {offsets.tolist()} must be finite and the scales positive; export it again."
+                f" {offsets.tolist()} must be finite, the scales positive and at most"
+                f" {MOST_SCALE_M:,.0f}; export it again."
+            )
+        if (np.abs(offsets) * _LAST_DIGIT > scales).any():
+            raise InputError(
+                f"{self.path}: the header's offsets {offsets.tolist()} are so large that steps of"
+                f" {scales.tolist()} m are lost beside them; export it again."
             )
         if len(self) == 0:
             raise InputError(f"{self.path}: holds no points.")

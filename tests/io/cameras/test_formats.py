@@ -29,3 +29,25 @@ def test_nothing_is_of_several_formats_by_accident(tmp_path):
     (tmp_path / "a.txt").write_text("no cameras at all\n")
     with pytest.raises(pcfix.InputError, match="is not a camera file that pcfix knows"):
         pcfix.read_cameras(tmp_path / "a.txt")
+
+
+@pytest.mark.parametrize("angles", [True, False])
+def test_a_sensor_of_positions_alone_is_refused(tmp_path, angles):
+    """BlocksExchange without a lens: with rotations the sensor counts, without it says nothing."""
+    turn = "".join(f"<M_{i}{j}>{float(i == j)}</M_{i}{j}>" for i in range(3) for j in range(3))
+    rotation = f"<Rotation>{turn}</Rotation>" if angles else ""
+    photo = (
+        f"<Photo><Id>0</Id><ImagePath>a.jpg</ImagePath><Pose>{rotation}"
+        "<Center><x>1</x><y>2</y><z>3</z></Center></Pose></Photo>"
+    )
+    (tmp_path / "b.xml").write_text(
+        '<BlocksExchange version="3.2"><Block><Photogroups><Photogroup><Name>g</Name>'
+        f"{photo}</Photogroup></Photogroups></Block></BlocksExchange>"
+    )
+    sensor = tmp_path / "s.csv"
+    sensor.write_text("focal,sensor_x,sensor_y\n8.8,13.2,8.8\n")
+    if angles:
+        assert pcfix.read_cameras(tmp_path / "b.xml", sensor).lenses[0].focal == 8.8
+    else:
+        with pytest.raises(pcfix.InputError, match="no angles, so the sensor"):
+            pcfix.read_cameras(tmp_path / "b.xml", sensor)

@@ -391,6 +391,30 @@ def test_the_user_may_vouch_for_heights(cloud):
     assert found.notes == ()
 
 
+@pytest.mark.parametrize(("undulation_m", "agree"), [(51.5, False), (0.2, True)])
+def test_heights_that_were_vouched_for_are_compared_with_the_gnss(undulation_m, agree):
+    """The GNSS is in the cloud's heights; those of the cameras are above it by the undulation."""
+    ecef = geocentric(*VALENCIA_LON_LAT)
+    read = cameras(ecef, "EPSG:4936", project_crs=UTM30_ALICANTE)
+    east, north, up = bring_to(read, UTM30_ALICANTE, cameras_crs=UTM30).centres[0]
+    stated = np.array([[east, north, up - undulation_m]])
+    gnss = GnssPositions(stated, np.full((1, 3), 0.02), UTM30_ALICANTE)
+    found = bring_to(replace(read, gnss=gnss), UTM30_ALICANTE, cameras_crs=UTM30, name="a.xml")
+    if agree:
+        assert found.notes == ()
+    else:
+        assert "the cameras are 51.5 m above the heights that their GNSS states" in found.notes[0]
+
+
+def test_a_crs_without_a_code_of_its_own_is_named_by_one_that_can_be_typed():
+    """The WKT of a cloud may have no code; the remedy prints no page of it."""
+    bare = CRS.from_epsg(25830).to_json_dict()
+    del bare["id"]
+    read = cameras(geocentric(*VALENCIA_LON_LAT), "EPSG:4936", project_crs=UTM30_ALICANTE)
+    with pytest.raises(InputError, match="give --cameras-crs EPSG:25830, the horizontal"):
+        bring_to(read, CRS.from_json_dict(bare), name="a.xml")
+
+
 GEOID = """
 import sys, numpy as np, pyproj, rasterio
 from rasterio.transform import from_origin

@@ -314,3 +314,110 @@ def test_other_files_are_not_recognised(tmp_path, text):
     path.write_text(text)
     assert not micmac.recognises(Source(path))
     assert not micmac.recognises(Source(tmp_path))
+
+
+# ---- MMVII ----
+
+POSE_2 = """<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>
+<Root><Type>"MMVII_Serialization"</Type><Version>"0.0.0"</Version><Data><CameraPose>
+<NameImage>"IMGP4168.JPG"</NameImage>
+<NameInternalCalib>"Calib-PerspCentral-Foc-28000_Cam-PENTAX_K5"</NameInternalCalib>
+<Center>5.203315710339428 0.801558951120939 2.104233883945823</Center>
+<RotMatrix>
+<AxeI>-0.16360794707346 0.050533795937991 0.985230315775202</AxeI>
+<AxeJ>0.115991824112041 0.992745533269003 -0.03165758856268</AxeJ>
+<AxeK>-0.979682773347357 0.109099228423211 -0.168282565834643</AxeK>
+</RotMatrix></CameraPose></Data></Root>"""
+CALIBRATION_2 = """<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>
+<Root><Type>"MMVII_Serialization"</Type><Data><InternalCalibration>
+<Name>"Calib-PerspCentral-Foc-28000_Cam-PENTAX_K5"</Name>
+<PixelFrame><NbPix>1728 1152</NbPix></PixelFrame><Projection>"Stenope"</Projection>
+<PerfectProj><F>{f}</F><PP>{x} {y}</PP></PerfectProj>
+<Distorsion>{terms}</Distorsion></InternalCalibration></Data></Root>"""
+FILE_2 = "Calib-PerspCentral-Foc-28000_Cam-PENTAX_K5.xml"
+BY_V1 = {
+    "f": 2112.04115765381403, "x": 856.865441648138244, "y": 577.614006671525772,
+    "k": (-2.13187449928481487e-08, 1.7226374299904674e-15, 5.49746079672967297e-21,
+          -2.41801731114306416e-27),
+}  # fmt: skip
+"""The calibration of the same image by version 1: pixels, radial about the principal point."""
+SEEN_BY_V1 = [
+    ((796.228448867797738, 622.67246246337902), (2.342012894, 1.18060072005993355, 1.5238954104)),
+    ((1333.43151855468409, 435.223903656006939), (-0.8743145176, 1.1176173229, 2.44423536554699)),
+    ((79.8580291278442189, 116.648677826356376), (0.7004565327, 0.1832672713, -0.4188742243257)),
+    ((1700.28139114184114, 47.3248143208406162), (0.4589538174, 0.2551497878, 3.16255323043381)),
+    ((1544.98360061627091, 738.844093322710933), (0.1693280845, 1.7953410696, 2.85824590322565)),
+]
+"""Image places and points by which version 1 checks its file of that pose (its `Verif`)."""
+
+
+def version_2(folder, terms="", f=F, x=PP[0], y=PP[1], pose=POSE_2):
+    (folder / FILE_2).write_text(CALIBRATION_2.format(f=f, x=x, y=y, terms=terms))
+    path = folder / "Ori-PerspCentral-IMGP4168.JPG.xml"
+    path.write_text(pose)
+    return path
+
+
+def test_version_2_sees_points_where_version_1_did(tmp_path):
+    """The pose is a file of MMVII's own tests, converted from one of version 1."""
+    f = BY_V1["f"]
+    terms = "".join(f"<K{i}>{k * f ** (2 * i)!r}</K{i}>" for i, k in enumerate(BY_V1["k"], start=1))
+    numbers = {name: BY_V1[name] for name in ("f", "x", "y")}
+    path = version_2(tmp_path, f"<Radial>{terms}</Radial>", **numbers)
+    for given in (path, tmp_path):
+        assert micmac.recognises(Source(given))
+        cameras = micmac.read(Source(given))
+    for place, point in SEEN_BY_V1:
+        ray = cameras.rotations[0] @ (np.array(point) - cameras.centres[0])
+        assert project(cameras.lenses[0], ray[None])[0] == pytest.approx(place, abs=1e-4)
+    assert cameras.labels == ("IMGP4168.JPG",)
+    assert (cameras.lenses[0].width, cameras.lenses[0].height) == (1728.0, 1152.0)
+
+
+def test_version_2_distorts_the_ideal_place(tmp_path):
+    """By the formulas that its files write beside the coefficients."""
+    k1, k2, p1, p2, b1, b2 = -0.1, 0.11, 1e-3, -2e-3, 1e-7, 2e-7
+    terms = (
+        f"<Radial><K1>{k1}</K1><K2>{k2}</K2></Radial><Decentric><p1>{p1}</p1><p2>{p2}</p2>"
+        f"</Decentric><Polynomial><b1>{b1}</b1><b2>{b2}</b2></Polynomial>"
+    )
+    lens = micmac.read(Source(version_2(tmp_path, terms, f=2112.0, x=857.0, y=577.0))).lenses[0]
+    x, y = 0.3, -0.2
+    r = x * x + y * y
+    bent = k1 * r + k2 * r * r
+    u = x + x * bent + p1 * (3 * x * x + y * y) + p2 * 2 * x * y + b1 * x + b2 * y
+    v = y + y * bent + p1 * 2 * x * y + p2 * (x * x + 3 * y * y)
+    expected = 857.0 + 2112.0 * u, 577.0 + 2112.0 * v
+    assert project(lens, np.array([[x, y, 1.0]]))[0] == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("terms", "pose", "said"),
+    [
+        ("<Decentric><p3>0.1</p3></Decentric>", POSE_2, "with the terms p3"),
+        (
+            "<Radial><K1>9</K1></Radial><Polynomial><b1>0.1</b1></Polynomial>",
+            POSE_2,
+            "with an affinity",
+        ),
+        ("", POSE_2.replace("Foc-28000", "Foc-1"), "is not beside it"),
+        ("", POSE_2.replace("-0.16360794707346", "0.9"), "not orthonormal"),
+        ("", POSE_2.replace("<Center>5.2", "<Center>x5.2"), "is not a number"),
+        ("", POSE_2[:-200], "damaged or cut off"),
+        ("<Radial><K1>x</K1></Radial>", POSE_2, "K1: 'x' is not a number"),
+    ],
+)
+def test_version_2_that_is_wrong(tmp_path, terms, pose, said):
+    path = version_2(tmp_path, terms, pose=pose)
+    with pytest.raises(InputError, match=said):
+        micmac.read(Source(path))
+
+
+@pytest.mark.parametrize("name", [FILE_2, "Ori-PerspCentral-IMGP4168.JPG.xml"])
+def test_every_cut_of_version_2_is_an_input_error(tmp_path, name):
+    path = version_2(tmp_path, "<Radial><K1>0.1</K1></Radial>")
+    text = (tmp_path / name).read_text()
+    for end in range(0, len(text) - 1, 7):
+        (tmp_path / name).write_text(text[:end])
+        with pytest.raises(InputError):
+            micmac.read(Source(path))

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from pyproj import CRS
 from scipy.spatial.transform import Rotation
 
 import pcfix
@@ -703,3 +704,23 @@ def test_damage_is_refused_or_read_but_never_an_error_of_python(tmp_path, seed):
         assert "cameras.csv" in str(refusal)
     else:
         assert np.isfinite(cameras.centres).all()
+
+
+@pytest.mark.parametrize("flavour", ["WKT1_ESRI", "WKT1_GDAL", "WKT2_2019"])
+def test_a_projection_beside_a_table_is_its_crs(tmp_path, flavour):
+    path = tmp_path / "cameras.csv"
+    path.write_text("label,x,y,z\na,500000,5200000,90\n")
+    assert pcfix.read_cameras(path).crs is None
+    path.with_suffix(".prj").write_text(CRS.from_epsg(32632).to_wkt(flavour))
+    assert CRS(pcfix.read_cameras(path).crs).equals(CRS(32632), ignore_axis_order=True)
+    path.write_text("# crs: EPSG:25832\nlabel,x,y,z\na,500000,5200000,90\n")
+    assert pcfix.read_cameras(path).crs == "EPSG:25832"  # what the table itself says counts
+
+
+def test_a_projection_that_is_none_is_noted(tmp_path):
+    """As the project of another software that ends alike."""
+    path = tmp_path / "cameras.csv"
+    path.write_text("label,x,y,z\na,500000,5200000,90\n")
+    path.with_suffix(".prj").write_bytes(b"$PROJECT 6.0.0\n\xff")
+    with pytest.warns(pcfix.PcfixWarning, match="is not understood"):
+        assert pcfix.read_cameras(path).crs is None

@@ -5,6 +5,7 @@ import zipfile
 
 import pytest
 
+import pcfix
 from pcfix import InputError
 from pcfix.io.cameras import table, unsupported
 from pcfix.io.cameras.formats import Source
@@ -37,6 +38,11 @@ FILES = {
     "transforms.json": (json.dumps(NERF).encode(), "nerfstudio"),
     "gcp_list.txt": (b"EPSG:32632\n500 5000 10 120 80 a.jpg\n", "ground control points"),
     "sensor.csv": (b"focal,sensor_x,sensor_y\n8.8,13.2,8.8\n", "--sensor"),
+    "AutoCal_Foc-8800.xml": (
+        b"<ExportAPERO><CalibrationInternConique><F>3</F></CalibrationInternConique></ExportAPERO>",
+        "Orientation-*.xml",
+    ),
+    "cameras.json": (b'{"v2 dji": {"projection_type": "brown"}}', "reconstruction.json"),
     "bare.csv": (b"a.jpg,456010,5432010,90\nb.jpg,456060,5432010,90\n", "label,x,y,z"),
     "bare.txt": (b"456010 5432010 90\n456060 5432010 90\n", "label,x,y,z"),
 }
@@ -56,6 +62,37 @@ def test_files_are_refused_by_name(tmp_path, name):
     assert str(refusal.value).endswith(".")
 
 
+PIX4D = "calibrated_camera_parameters.txt of the same export"
+PARTS = {
+    "a_calibrated_images_position.txt": "a.jpg,456010.1,5432010.2,90.3\n",
+    "a_pmatrix.txt": "a.jpg 1 2 3 4 5 6 7 8 9 10 11 12\n",
+    "a_offset.xyz": "456000.000 5432000.000 90.000\n",
+    "a_pix4d_calibrated_internal_camera_parameters.cam": "F 8.8\nPx 6.6\nPy 4.4\n",
+    "a_calibrated_external_camera_parameters_error.txt": (
+        "imageName X Y Z Omega Phi Kappa\na.jpg 0.01 0.01 0.02 0.001 0.001 0.001\n"
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PARTS)
+@pytest.mark.parametrize("what", ["file", "folder"])
+def test_a_part_of_an_export_names_the_file_that_is_wanted(tmp_path, name, what):
+    """Standard errors have the very header of a table of poses."""
+    (tmp_path / name).write_text(PARTS[name])
+    with pytest.raises(InputError, match="Pix4D") as refusal:
+        pcfix.read_cameras(tmp_path / name if what == "file" else tmp_path)
+    assert name in str(refusal.value)
+    assert PIX4D in str(refusal.value)
+
+
+@pytest.mark.parametrize("beside", ["a.jpg", "offset.xyz"])
+def test_a_folder_with_a_camera_file_names_that_and_its_software(tmp_path, beside):
+    (tmp_path / "poses.csv").write_text("label,x,y,z\na.jpg,1,2,3\n")
+    (tmp_path / beside).write_text("1 2 3\n")
+    with pytest.raises(InputError, match=r"holds poses.csv \(CSV table\); give .*poses.csv itself"):
+        pcfix.read_cameras(tmp_path)
+
+
 def test_a_zip(tmp_path):
     with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:
         archive.writestr("cameras.csv", "label,x,y,z\n")
@@ -71,6 +108,8 @@ def test_a_zip(tmp_path):
         ("cameras.sfm", "AliceVision"),
         ("transforms.json", "nerfstudio"),
         ("1_initial", "1_initial/params"),
+        ("AutoCal_Foc-8800.xml", "Orientation-"),
+        ("cameras.json", "reconstruction.json"),
     ],
 )
 def test_folders_are_refused_by_what_is_in_them(tmp_path, inside, expected):

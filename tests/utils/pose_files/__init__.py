@@ -6,7 +6,7 @@ returns a `PoseFile`. Numbers are written in full, so that what a reader gives b
 by what is wrong.
 """
 
-from tests.utils.pose_files import mapping, metashape, opensfm, sparse, tables
+from tests.utils.pose_files import mapping, metashape, opensfm, opf, sparse, tables
 
 WRITERS = {
     "Metashape XML, geocentric": metashape.metashape_georeferenced,
@@ -14,6 +14,7 @@ WRITERS = {
     "Metashape omega-phi-kappa": metashape.metashape_omega_phi_kappa,
     "Metashape reference table": metashape.metashape_reference,
     "Pix4D params": mapping.pix4d,
+    "OPF": opf.opf,
     "OpenSfM": opensfm.opensfm,
     "ODM shots.geojson": opensfm.odm_shots,
     "ODM reconstruction": opensfm.odm_reconstruction,

@@ -47,6 +47,7 @@ from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.table.attitude import read_rotations
 from pcfix.io.cameras.table.columns import EXIF, Columns, axes, headers, is_header, read_columns
 from pcfix.io.cameras.table.sensor import read_lenses, read_sensor
+from pcfix.io.crs import shortened
 from pcfix.io.tables import Table, number, read_lines
 from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray
 
@@ -172,22 +173,32 @@ def crs(columns: Columns) -> tuple[str | None, tuple[str, ...]]:
     """Return the CRS that a table says or shows, and what to tell about it.
 
     Longitude and latitude without more are those of WGS 84. Heights then are ellipsoidal only
-    if the header calls them so; else the CRS has no heights.
+    if the header calls them so; else the CRS has no heights. A ``.prj`` of the table's name beside
+    it counts where the table itself says nothing.
     """
-    if columns.crs is None:
+    said = columns.crs or _beside(columns.path)
+    if said is None:
         if axes(columns.place) != ("longitude", "latitude", "z"):
             return None, ()
         ellipsoidal = columns.name("z").startswith("ellipsoid")
         return WGS84_ELLIPSOIDAL if ellipsoidal else WGS84, ()
-    if columns.crs.startswith("LOCAL_CS"):
+    if said.startswith("LOCAL_CS"):
         return "local", ()
-    if not checks.names_crs(columns.crs):
+    if not checks.names_crs(said):
         note = (
-            f"{columns.path}: its coordinate system '{columns.crs[:60]}' is not understood; the"
+            f"{columns.path}: its coordinate system '{shortened(said)}' is not understood; the"
             " cloud's is assumed."
         )
         return None, (note,)
-    return columns.crs, ()
+    return said, ()
+
+
+def _beside(path: Path) -> str | None:
+    """Return the CRS in the .prj of a table, None where there is none."""
+    projection = path.with_suffix(".prj")
+    if projection == path or not projection.is_file():
+        return None
+    return projection.read_bytes().decode("utf-8-sig", errors="replace").strip() or None
 
 
 def are_by_gnss(columns: Columns) -> bool:

@@ -1,0 +1,323 @@
+"""OPF: what images saw by its own formulas falls where the reader's cameras see it."""
+
+import json
+import math
+import warnings
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import pcfix
+from pcfix.errors import InputError
+from pcfix.io.cameras import FORMATS, opf, read_tie_points
+from pcfix.io.cameras.formats import Source
+from pcfix.lens.imaging import project
+from tests.utils.pose_files.block import Block
+from tests.utils.pose_files.opf import FIRST_ID, Base
+from tests.utils.pose_files.opf import opf as write
+from tests.utils.reprojection import bring_to, tie_point_residuals_px
+
+RADIAL, T1, T2 = (-0.05, 0.02, -0.003), 0.004, -0.002
+POLYNOMIAL, AFFINE = (0.01, 1.0, 0.02, -0.1), (1810.0, 3.0, -2.0, 1800.0)
+SIZE = (4000, 3000)
+FLOAT32_PX = 3e-4
+"""Of a pixel coordinate below 4096, and of points some tens of metres from their node."""
+
+
+def seen(kind, angles_deg, centre, point):
+    """Return u, v by the specification, one point at a time: R = Rx Ry Rz, then the lens."""
+    turns = []
+    for axis, angle in zip("xyz", np.radians(angles_deg), strict=True):
+        c, s = math.cos(angle), math.sin(angle)
+        turns.append(
+            {
+                "x": np.array([[1, 0, 0], [0, c, -s], [0, s, c]]),
+                "y": np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]),
+                "z": np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]),
+            }[axis]
+        )
+    right, top, back = (turns[0] @ turns[1] @ turns[2]).T @ (point - centre)
+    x, y, z = right, -top, -back
+    cx, cy = SIZE[0] / 2 + 11.0, SIZE[1] / 2 - 7.0
+    if kind == "fisheye":
+        theta = 2.0 / math.pi * math.atan2(math.hypot(x, y), z)
+        rho = sum(p * theta**i for i, p in enumerate(POLYNOMIAL)) / math.hypot(x, y)
+        c, d, e, f = AFFINE
+        return c * rho * x + d * rho * y + cx, e * rho * x + f * rho * y + cy
+    x, y = x / z, y / z
+    r = x * x + y * y
+    bent = 1.0 + RADIAL[0] * r + RADIAL[1] * r**2 + RADIAL[2] * r**3
+    u = x * bent + 2 * T1 * x * y + T2 * (r + 2 * x * x)
+    v = y * bent + 2 * T2 * x * y + T1 * (r + 2 * y * y)
+    return 3000.0 * u + cx, 3000.0 * v + cy
+
+
+LENSES = {
+    "perspective": {
+        "type": "perspective", "focal_length_px": 3000.0, "radial_distortion": list(RADIAL),
+        "tangential_distortion": [T1, T2],
+    },
+    "fisheye": {
+        "type": "fisheye", "affine": list(AFFINE), "polynomial": list(POLYNOMIAL),
+        "is_symmetric_affine": False, "is_p0_zero": False,
+    },
+}  # fmt: skip
+PLACES = np.array([[500_000.0, 5_200_000.0, 480.0], [500_012.5, 5_200_003.0, 481.0]])
+ANGLES = np.array([[12.0, -8.0, 101.0], [-20.0, 15.0, -37.0]])
+
+
+def change(folder, name, **values):
+    """Change what a part of a project has at its top."""
+    path = folder / name
+    path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+
+@pytest.fixture
+def make(tmp_path):
+    """Write a project of two obliques with tracks, of a kind of lens, in a base CRS."""
+
+    def made(kind="perspective", base=None, epsg=32632, places=PLACES):
+        up_back = Rotation.from_euler("XYZ", ANGLES, degrees=True).as_matrix()
+        rotations = (up_back @ np.diag([1.0, -1.0, -1.0])).transpose(0, 2, 1)
+        block = Block(("a b.jpg", "b.jpg"), places, rotations, 3000.0, *SIZE, epsg)
+        noise = np.random.default_rng(1).uniform(-6.0, 6.0, (30, 3))
+        xyz = places.mean(axis=0) - [0.0, 0.0, 60.0] + noise
+        # as the file rounds them, so that they are seen where they are
+        shift = -block.origin - [0.25, 0.5, 0.125]
+        middle = np.round(np.median(xyz + shift, axis=0))
+        xyz = (xyz + shift - middle).astype("<f4") + middle - shift
+        point, camera = np.repeat(np.arange(30), 2)[:-1], np.tile([0, 1], 30)[:-1]
+        uv = np.array(
+            [seen(kind, ANGLES[c], places[c], xyz[p]) for p, c in zip(point, camera, strict=True)]
+        )
+        path = write(tmp_path, block, base, (xyz, point, camera, uv)).path
+        middle_px = [SIZE[0] / 2 + 11.0, SIZE[1] / 2 - 7.0]
+        inner = LENSES[kind] | {"principal_point_px": middle_px}
+        change(tmp_path, "calibrated-cameras.json", sensors=[{"id": 7, "internals": inner}])
+        return path, xyz
+
+    return made
+
+
+@pytest.mark.parametrize("kind", LENSES)
+def test_tracks_fall_where_the_images_saw_them(make, kind):
+    path, xyz = make(kind)
+    cameras = pcfix.read_cameras(path)
+    ties = read_tie_points(path, cameras)
+    assert ties.xyz == pytest.approx(xyz, abs=1e-5)
+    assert np.diff(ties.views.start).tolist() == [2] * 29 + [1]
+    misses = tie_point_residuals_px(cameras, ties)
+    assert len(misses) == 59
+    assert misses.max() < FLOAT32_PX
+    assert cameras.labels == ("a b.jpg", "b.jpg")
+    assert cameras.lenses[0].pixel_size_mm == pytest.approx(2.4e-3)
+    assert cameras.source == "OPF PIX4Dmatic 1.6"
+
+
+def test_wrong_angles_would_be_noticed(make):
+    path, _ = make()
+    cameras = pcfix.read_cameras(path)
+    ties = read_tie_points(path, cameras)
+    turned = Rotation.from_euler("z", 0.01, degrees=True).as_matrix() @ cameras.rotations
+    rays = (ties.xyz[0] - cameras.centres[0]) @ turned[0].T
+    assert np.hypot(*(project(cameras.lenses[0], rays[None])[0] - ties.image_xy[0])) > 0.05
+
+
+@pytest.mark.parametrize("given", ["folder", "project.opf", "calibrated-cameras.json"])
+def test_project_folder_and_calibration_are_one_block(make, tmp_path, given):
+    path, _ = make()
+    found = pcfix.read_cameras(tmp_path if given == "folder" else tmp_path / given)
+    assert (found.centres == pcfix.read_cameras(path).centres).all()
+    assert found.crs == pcfix.read_cameras(path).crs
+
+
+FOOT = 1200.0 / 3937.0
+BASES = {
+    "metres, heights above a geoid": (Base("EPSG:32632+5773"), 32632, [1.0, 1.0, 1.0]),
+    "northing before easting": (Base("EPSG:31467", north_first=True), 31467, [1.0, 1.0, 1.0]),
+    "feet": (Base("EPSG:6434", plan_m=FOOT, up_m=FOOT), 6434, [FOOT, FOOT, 1.0]),
+    "feet, as EPSG+EPSG": (
+        Base("EPSG:6434+EPSG:6360", plan_m=FOOT, up_m=FOOT), 6434, [FOOT, FOOT, FOOT],
+    ),
+    "metres in plan, feet up": (Base("EPSG:32618+6360", up_m=FOOT), 32618, [1.0, 1.0, FOOT]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BASES)
+def test_out_of_the_processing_frame_into_the_crs(make, name):
+    """Centres in the units of the CRS, east before north; axes stay east, north, up."""
+    base, epsg, unit_m = BASES[name]
+    places = np.array([[303_000.0, 212_000.0, 60.0], [303_012.5, 212_003.0, 61.0]])
+    if epsg == 31467:
+        places = PLACES + np.array([3_000_000.0, 0.0, 0.0])
+    path, _ = make(base=base, epsg=epsg, places=places)
+    cameras = pcfix.read_cameras(path)
+    assert cameras.centres * unit_m == pytest.approx(places, abs=1e-6)
+    there = bring_to(cameras, None)
+    assert there.centres * unit_m == pytest.approx(places, abs=1e-6)
+    plain, _ = make()
+    turned = pcfix.read_cameras(plain).rotations.transpose(0, 2, 1) @ cameras.rotations
+    assert turned == pytest.approx(np.tile(np.eye(3), (2, 1, 1)), abs=1e-9)
+
+
+def test_heights_of_a_crs_without_them_are_ellipsoidal(make):
+    """So says the specification; a cloud that is silent, as PIX4Dmatic's, is taken as it is."""
+    path, _ = make()
+    cameras = pcfix.read_cameras(path)
+    assert cameras.project_crs == "EPSG:32632"
+    found = bring_to(cameras, "EPSG:32632")
+    assert found.centres == pytest.approx(PLACES, abs=1e-6)
+    assert found.notes == ()
+    with pytest.raises(InputError, match="ellipsoidal heights"):
+        bring_to(cameras, "EPSG:32632+5783")
+
+
+def test_an_arbitrary_frame_is_local(make, tmp_path):
+    path, _ = make()
+    local = (
+        'ENGINEERINGCRS["site",ENGINEERINGDATUM["corner"],CS[Cartesian,3],AXIS["x",east],'
+        'AXIS["y",north],AXIS["z",up],LENGTHUNIT["metre",1]]'
+    )
+    change(tmp_path, "scene-reference-frame.json", crs={"definition": local})
+    assert pcfix.read_cameras(path).crs == "local"
+    project = json.loads(path.read_text())
+    project["items"] = [i for i in project["items"] if i["type"] != "scene_reference_frame"]
+    path.write_text(json.dumps(project))
+    assert pcfix.read_cameras(path).crs == "local"
+
+
+def test_a_constant_geoid_is_said(make, tmp_path):
+    path, _ = make()
+    crs = {"definition": "EPSG:32632+5783", "geoid_height": 47.5}
+    change(tmp_path, "scene-reference-frame.json", crs=crs)
+    with pytest.warns(pcfix.PcfixWarning, match="a constant geoid, 47.5 m over the ellipsoid"):
+        pcfix.read_cameras(path)
+
+
+def test_gnss_is_of_the_reference_camera_east_before_north(make, tmp_path):
+    """Coordinates are in the order of the CRS, standard deviations metres."""
+    path, _ = make()
+    cameras = [{"id": FIRST_ID + i} for i in range(3)]
+    place = {
+        "crs": {"definition": "EPSG:4326"}, "coordinates": [46.95, 9.0, 512.0],
+        "sigmas": [0.02, 0.03, 0.05],
+    }  # fmt: skip
+    capture = {
+        "id": 1, "reference_camera_id": FIRST_ID + 1, "cameras": cameras, "geolocation": place,
+    }  # fmt: skip
+    change(tmp_path, "input-cameras.json", captures=[capture])
+    found = pcfix.read_cameras(path)
+    assert np.isnan(found.gnss.xyz[0]).all()
+    assert found.gnss.xyz[1].tolist() == [9.0, 46.95, 512.0]
+    assert found.gnss.sigma_m[1].tolist() == [0.03, 0.02, 0.05]
+    assert found.unposed == (f"camera {FIRST_ID + 2}",)
+
+
+def test_without_input_cameras_frames_are_boundless(make, tmp_path):
+    path, _ = make()
+    change(tmp_path, "input-cameras.json", sensors=[])
+    with pytest.warns(pcfix.PcfixWarning, match="frames are taken as boundless"):
+        assert pcfix.read_cameras(path).lenses is None
+
+
+def test_a_sensor_is_honoured_where_the_file_has_no_lens_and_refused_where_it_has(make, tmp_path):
+    path, _ = make()
+    sensor = tmp_path / "sensor.csv"
+    sensor.write_text("focal_px,width_px,height_px\n3000,4000,3000\n")
+    with pytest.raises(InputError, match=r"has the lenses of its images \(OPF.*leave it out"):
+        pcfix.read_cameras(path, sensor)
+    change(tmp_path, "input-cameras.json", sensors=[])
+    found = pcfix.read_cameras(path, sensor)  # without the warning of boundless frames
+    assert [lens.focal for lens in found.lenses] == [3000.0, 3000.0]
+
+
+WRONG = {
+    "no calibration": ("project.opf", {"items": []}, "has 0 files of calibrated cameras"),
+    "gone": ("project.opf", None, "calibrated-cameras.json: is missing"),
+    "spherical": (
+        "calibrated-cameras.json",
+        {"sensors": [{"id": 7, "internals": {"type": "spherical", "principal_point_px": [1, 2]}}]},
+        "sensor one: the type 'spherical'",
+    ),
+    "angles": (
+        "calibrated-cameras.json",
+        {"cameras": [{"id": FIRST_ID, "sensor_id": 7, "position": [0, 0, 0]}]},
+        "image a b.jpg, orientation: None is not 3 finite number",
+    ),
+    "scale": (
+        "scene-reference-frame.json",
+        {"base_to_canonical": {"shift": [0, 0, 0], "scale": [0, 1, 1], "swap_xy": False}},
+        "must be positive",
+    ),
+    "crs": ("scene-reference-frame.json", {"crs": {"definition": "nowhere"}}, "nowhere"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_wrong_is_said(make, tmp_path, name):
+    path, _ = make()
+    part, values, words = WRONG[name]
+    if values is None:
+        (tmp_path / "calibrated-cameras.json").unlink()
+    else:
+        change(tmp_path, part, **values)
+    with pytest.raises(InputError) as refusal:
+        pcfix.read_cameras(path)
+    assert words in str(refusal.value)
+
+
+def test_tracks_that_are_cut_off_or_not_there(make, tmp_path):
+    path, _ = make()
+    cameras = pcfix.read_cameras(path)
+    (tmp_path / "pixels.bin").write_bytes(b"")
+    with pytest.raises(InputError, match=r"pixels\.bin: is missing or cut off"):
+        read_tie_points(path, cameras)
+    (tmp_path / "tracks.gltf").unlink()
+    with pytest.raises(InputError, match=r"tracks\.gltf: is missing"):
+        read_tie_points(path, cameras)
+
+
+def places_in(value, way=()):
+    """Yield the way to every value inside a JSON document."""
+    pairs = value.items() if isinstance(value, dict) else enumerate(value)
+    for key, inner in pairs:
+        yield (*way, key)
+        if isinstance(inner, dict | list):
+            yield from places_in(inner, (*way, key))
+
+
+JUNK = (None, "x", [], {}, -1, 1e400, [[1]], True)
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        "project.opf", "calibrated-cameras.json", "input-cameras.json", "camera-list.json",
+        "scene-reference-frame.json", "tracks.gltf",
+    ],
+)  # fmt: skip
+def test_every_wrong_value_is_an_input_error_or_harmless(make, tmp_path, part):
+    path, _ = make()
+    content = json.loads((tmp_path / part).read_text())
+    cameras = pcfix.read_cameras(path)
+    for number, way in enumerate(places_in(content)):
+        inside = json.loads(json.dumps(content))
+        held = inside
+        for key in way[:-1]:
+            held = held[key]
+        held[way[-1]] = JUNK[number % len(JUNK)]
+        (tmp_path / part).write_text(json.dumps(inside))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", pcfix.PcfixWarning)
+            try:
+                pcfix.read_cameras(path)
+                read_tie_points(path, cameras)
+            except InputError as error:
+                assert str(tmp_path) in str(error)
+
+
+def test_a_file_of_another_json_is_not_claimed(tmp_path):
+    (tmp_path / "a.json").write_text('{"shots": {}}')
+    assert not opf.recognises(Source(tmp_path / "a.json"))
+    assert [form.reader for form in FORMATS].count(opf) == 1
