@@ -21,6 +21,7 @@ from pcfix.clean.points import (
 from pcfix.errors import InputError
 from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
+from pcfix.io.drafts import all_or_none
 from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
@@ -81,9 +82,10 @@ def clean_file(
     step = _Cleaning(task, given)
     with threads(given.jobs), scratch_arrays(task.target):
         step.find(tile_m)
-    replace(task, progress=None).run(step)  # the step counts the points of all passes
-    result = step.summary()
-    task.tell(result.as_dict())
+    with all_or_none():
+        replace(task, progress=None).run(step)  # the step counts the points of all passes
+        result = step.summary()
+        task.tell(result.as_dict())
     return result
 
 

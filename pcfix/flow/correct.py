@@ -29,6 +29,7 @@ from pcfix.flow.surfaces import (
 )
 from pcfix.flow.through_water import Label, correct_checked
 from pcfix.flow.tiles import TiledRun
+from pcfix.io.drafts import all_or_none
 from pcfix.io.files import local_path
 from pcfix.io.las import columns
 from pcfix.io.las.part import part_report
@@ -260,11 +261,12 @@ def correct_file(
         step.job.look_around(
             partial(file_points, task.source, step.job.water, given.jobs, task.kept)
         )
-        step.run(task)
-    step.job.save_regression()
-    result = step.job.summary(str(task.source), str(task.target), task.seconds)
-    result = replace(result, part=part_report(task.source))
-    task.tell(result.as_dict())
+        with all_or_none():
+            step.run(task)
+            step.job.save_regression()
+            result = step.job.summary(str(task.source), str(task.target), task.seconds)
+            result = replace(result, part=part_report(task.source))
+            task.tell(result.as_dict())
     return result
 
 

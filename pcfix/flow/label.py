@@ -25,6 +25,7 @@ from pcfix.flow.surfaces import (
     view_of,
 )
 from pcfix.flow.tiles import TiledRun
+from pcfix.io.drafts import all_or_none
 from pcfix.io.files import local_path
 from pcfix.io.las.columns import convert
 from pcfix.io.las.part import part_report
@@ -153,12 +154,12 @@ def label_file(
             LabelSummary,
         )
     task = file_task(single(input), output, given, reads=paths_in(given), progress=progress)
-    with threads(given.jobs):
+    with threads(given.jobs), all_or_none():
         step = _step_for(task.source, given)
         task.run(step)
-    result = _summary(step, str(task.source), str(task.target), task.seconds)
-    result = replace(result, part=part_report(task.source))
-    task.tell(result.as_dict())
+        result = _summary(step, str(task.source), str(task.target), task.seconds)
+        result = replace(result, part=part_report(task.source))
+        task.tell(result.as_dict())
     return result
 
 

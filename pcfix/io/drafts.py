@@ -14,8 +14,10 @@ import shutil
 import stat
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
+from typing import NamedTuple
 
 from pcfix.errors import InputError
 
@@ -57,12 +59,46 @@ def replaced_when_whole(target: Path) -> Iterator[Path]:
     The name is that of the target. Whatever goes wrong, nothing is left behind; what is renamed is
     on the disk, and has the mode of the file that it replaces.
     """
-    with _draft(target) as draft:
-        yield draft
-        if target.is_file():
-            draft.chmod(stat.S_IMODE(target.stat().st_mode))
-        _settle(draft)
+    together = _together.get()
+    with ExitStack() as stack:
+        draft = (stack if together is None else together.drafts).enter_context(_draft(target))
+        with _sentences(target, draft):
+            yield draft
+            if target.is_file():
+                draft.chmod(stat.S_IMODE(target.stat().st_mode))
+            _settle(draft)
+        if together is None:
+            _rename(draft, target)
+        else:
+            together.whole[target] = draft
+
+
+@contextmanager
+def all_or_none() -> Iterator[None]:
+    """Let the files that are written in the block appear when it ends well, or none of them."""
+    with ExitStack() as drafts:
+        together = _Together(drafts, {})
+        token = _together.set(together)
+        try:
+            yield
+        finally:
+            _together.reset(token)
+        for target, draft in together.whole.items():
+            _rename(draft, target)
+
+
+class _Together(NamedTuple):
+    drafts: ExitStack
+    whole: dict[Path, Path]
+
+
+_together: ContextVar[_Together | None] = ContextVar("_together", default=None)
+
+
+def _rename(draft: Path, target: Path) -> None:
+    with _sentences(target, draft):
         draft.replace(target)
+    _settle(target.parent)
 
 
 @contextmanager
@@ -71,7 +107,7 @@ def folder_when_whole(target: Path) -> Iterator[Path]:
 
     An older folder of that name goes as a whole, with whatever it held.
     """
-    with _draft(target) as draft:
+    with _draft(target) as draft, _sentences(target, draft):
         draft.mkdir()
         yield draft
         for path in draft.rglob("*"):
@@ -79,6 +115,7 @@ def folder_when_whole(target: Path) -> Iterator[Path]:
         if target.exists():
             target.rename(draft.parent / "old")
         draft.replace(target)
+        _settle(target.parent)
 
 
 def cannot_write(target: Path, error: Exception, written: Path | None = None) -> InputError:
@@ -93,18 +130,22 @@ def cannot_write(target: Path, error: Exception, written: Path | None = None) ->
 
 @contextmanager
 def _draft(target: Path) -> Iterator[Path]:
-    """Give a place beside the target, and turn what the system refuses into a sentence."""
-    draft = None
+    """Give a place beside the target."""
+    with ExitStack() as stack:
+        try:
+            folder = stack.enter_context(draft_folder(target.parent))
+        except OSError as error:
+            raise cannot_write(target, error) from error
+        yield folder / target.name
+
+
+@contextmanager
+def _sentences(target: Path, draft: Path) -> Iterator[None]:
+    """Turn what the system refuses into a sentence."""
     try:
-        with draft_folder(target.parent) as folder:
-            draft = folder / target.name
-            try:
-                yield draft
-            except OSError as error:
-                raise cannot_write(target, error, draft) from error
-        _settle(target.parent)
+        yield
     except OSError as error:
-        raise cannot_write(target, error) from error
+        raise cannot_write(target, error, draft) from error
 
 
 def _settle(path: Path) -> None:

@@ -148,6 +148,24 @@ def test_what_a_living_process_writes_stays(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["other.txt"]
 
 
+@pytest.mark.parametrize("name", ["correct_file", "label_file", "clean_file"])
+def test_a_summary_that_cannot_be_written_takes_the_cloud_with_it(
+    name, inputs, tmp_path, monkeypatch
+):
+    def full(options, summary):
+        raise pcfix.InputError(f"{options.summary}: cannot be written (the disk is full).")
+
+    given = {"summary": tmp_path / "s.json"}
+    if name == "correct_file":
+        given |= {"cameras": inputs / "cameras.csv", "sensor": inputs / "sensor.csv"}
+    if name != "clean_file":
+        given |= {"water": 0.37}
+    monkeypatch.setattr("pcfix.flow.runner.write_summary", full)
+    with pytest.raises(pcfix.InputError, match="the disk is full"):
+        getattr(pcfix, name)(inputs / "cloud.laz", tmp_path / "out.laz", **given)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_mode_of_a_replaced_file_is_kept(inputs, tmp_path):
     target = tmp_path / "labelled.las"
     target.write_bytes(b"")
