@@ -20,7 +20,11 @@ from hashlib import sha256
 from pathlib import Path
 from typing import IO, Any
 
+import llvmlite.binding as llvm
 from numba.core.caching import CacheImpl, CompileResultCacheImpl, FunctionCache, _CacheLocator
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompileResult
+from numba.core.runtime import rtsys
 
 from pcfix.errors import PcfixWarning
 
@@ -30,9 +34,13 @@ waits: list[Callable[[], object]] = [
 """Called when a kernel is waited for; each once, and taken out."""
 
 
+_FORMAT = b"2"
+"""Of what is written; kernels of another one are compiled anew."""
+
+
 @cache
 def _stamp(source: str) -> str:
-    return sha256(Path(source).read_bytes()).hexdigest()
+    return sha256(_FORMAT + Path(source).read_bytes()).hexdigest()
 
 
 @cache
@@ -71,6 +79,22 @@ def private_folder() -> Path | None:
     return _warn()
 
 
+def roots() -> tuple[Path, ...]:
+    """Return under which folders kernels are looked for; the first is where new ones are kept."""
+    package = Path(__file__).parent
+    given = "NUMBA_CACHE_DIR" in os.environ
+    if not given and is_writable(package / "__pycache__"):
+        return (package,)
+    own = private_folder()
+    return () if own is None else (own,) if given else (own, package)
+
+
+def kept_kernels() -> set[tuple[Path, int]]:
+    """Return the files of all kernels that are kept, and when each was written, ns."""
+    files = (file for root in roots() for file in root.rglob("*.nbc"))
+    return {(file, file.stat().st_mtime_ns) for file in files}
+
+
 def _warn() -> Path | None:
     warnings.warn(
         "Kernels are compiled each time anew (half a minute), as neither the folder of pcfix, nor "
@@ -101,6 +125,24 @@ class _Locator(_CacheLocator):  # type: ignore[misc]  # numba has no types
         return str(self._line)
 
 
+class _Library(JITCodeLibrary):  # type: ignore[misc]
+    """The code of a kernel that was kept; its text for LLVM is read when another links it alone."""
+
+    _shared_module: Any
+
+    def __init__(self, codegen: Any, name: str, code: bytes, text: bytes) -> None:
+        super().__init__(codegen, name)
+        self._text = text
+        self.enable_object_caching()
+        self._set_compiled_object(code)
+        self._finalize_final_module()
+
+    def _get_module_for_linking(self) -> Any:
+        if self._shared_module is None:
+            self._shared_module = llvm.parse_bitcode(self._text)
+        return self._shared_module
+
+
 class _Impl(CompileResultCacheImpl):  # type: ignore[misc]
     """What numba writes of a kernel, in a folder that was chosen before."""
 
@@ -110,6 +152,34 @@ class _Impl(CompileResultCacheImpl):  # type: ignore[misc]
         name = f"{Path(code.co_filename).stem}.{function.__qualname__}"
         self._filename_base = CacheImpl.get_filename_base(self, name, sys.abiflags)
 
+    def reduce(self, compiled: Any) -> Any:
+        """Return what is written: as numba has it, and the names that it defines and needs."""
+        module = compiled.library._final_module
+        named = [*module.functions, *module.global_variables]
+        defined = {one.name for one in named if not one.is_declaration}
+        needed = {one.name for one in named if one.is_declaration}
+        needed = {name for name in needed if not name.startswith("llvm.")}
+        return defined, needed, super().reduce(compiled)
+
+    def rebuild(self, context: Any, written: Any) -> Any:
+        """Return a kernel, without all that numba needs to compile one, where it can do so."""
+        defined, needed, ((name, _, codes), description, environment, *rest) = written
+        rtsys.initialize(context)
+        if not all(map(llvm.address_of_symbol, needed)):
+            context.refresh()
+        signature, is_object, lifted, annotation, init, others = rest
+        for function in init:
+            function()
+        library = _Library(context.codegen(), name, *codes)
+        library.codegen._engine._defined_symbols |= defined
+        entry = context.get_executable(library, description, environment)
+        for one in others:
+            library.codegen.set_env(one.env_name, one)
+        return CompileResult(
+            context.typing_context, context, entry, None, annotation, signature, is_object,
+            lifted, description, library, None, environment, None, init, others,
+        )  # fmt: skip
+
 
 class _Folder(FunctionCache):  # type: ignore[misc]
     """A kernel in one folder."""
@@ -117,6 +187,11 @@ class _Folder(FunctionCache):  # type: ignore[misc]
     def __init__(self, function: Any, folder: Path | None) -> None:
         self._impl_class = lambda function: _Impl(function, folder)
         super().__init__(function)
+
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        """Return a kernel; numba would first load all that it needs to compile one."""
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(signature, context)
 
 
 class Kept:

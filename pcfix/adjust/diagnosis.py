@@ -22,13 +22,15 @@ The first of them that can say something decides.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.adjust.mend import Mended
-from pcfix.adjust.problem import Intersected, similarity_gradients
 from pcfix.model import BoolArray, FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from pcfix.adjust.mend import Mended
+    from pcfix.adjust.problem import Intersected
 
 LEAST_POINTS = 30
 """Tie points under water that a statement takes."""
@@ -285,6 +287,8 @@ def gnss_is_suspicious(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArr
 
 def _as_a_whole(centres: FloatArray) -> FloatArray:
     """Return how centres move with shift, turn and scale of the block, shape (k, 3, 7)."""
+    from pcfix.adjust.problem import similarity_gradients  # not quick to load
+
     return similarity_gradients(centres - centres.mean(axis=0))
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -26,12 +26,13 @@ from pcfix.adjust.diagnosis import (
     tie_point_sign,
 )
 from pcfix.adjust.gather import Datum, deeper, no_datum, straight_images, taken
-from pcfix.adjust.mend import Mended, mended
-from pcfix.adjust.problem import intersect_fixed
 from pcfix.errors import GeometryError
 from pcfix.model import Cameras, FloatArray, GroundControl, TiePoints, WaterDimension, WaterSurface
 from pcfix.water.fit import heights_from_cloud, is_near
 from pcfix.water.surface import is_submerged, surface_above
+
+if TYPE_CHECKING:
+    from pcfix.adjust.mend import Mended
 
 TIE_POINTS, LEAST_TIE_VIEWS = 3000, 3
 CLOUD_POINTS, POINTS_PER_IMAGE = 1500, 10
@@ -201,6 +202,8 @@ def _sign_of_ties(evidence: Evidence) -> tuple[Sign | None, FloatArray | None]:
     rows = np.flatnonzero((counts >= LEAST_TIE_VIEWS) & np.isfinite(ties.xyz).all(axis=1))
     if not len(rows):
         return None, None
+    from pcfix.adjust.problem import intersect_fixed  # not quick to load
+
     block = plain_block(
         evidence.cameras, taken(ties, rows[:: max(1, len(rows) // TIE_POINTS)]), None, n
     )
@@ -229,6 +232,8 @@ def _mended(evidence: Evidence, apparent: FloatArray | None) -> Mended:
         if evidence.view is None:
             raise GeometryError("there is no cloud")
         apparent = sample_of(evidence.view, wanted)
+    from pcfix.adjust.mend import mended  # not quick to load
+
     some = apparent[:: max(1, len(apparent) // wanted)]
     return mended(some, evidence.cameras, evidence.water, evidence.refractive_index)
 

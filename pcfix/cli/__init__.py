@@ -62,7 +62,7 @@ def _run(arguments: list[str]) -> None:
     for command, _ in EXAMPLES:
         if name_of(command) in arguments[:1]:
             prepare(command)
-    if arguments in ([], *([name] for name in app if name not in ("demo", "--version"))):
+    if arguments in ([], *([name] for name in app if name not in ("demo", "warm-up", "--version"))):
         app([*arguments, "--help"], result_action="return_value")
         sys.exit(0 if arguments in (["--help"], ["-h"]) else 2)
     app(arguments, exit_on_error=False, print_error=False, result_action="return_value")

@@ -9,14 +9,16 @@ import shlex
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pcfix.adjust.result import Adjusted
 from pcfix.flow.inputs import Inputs
 from pcfix.model import Cameras, WaterPlane
 from pcfix.options.declare import File, options_of
 from pcfix.options.survey import AdjustOptions
 from pcfix.port.shapes import spec_of
+
+if TYPE_CHECKING:
+    from pcfix.adjust.result import Adjusted
 
 MODELS = ("colmap", "opensfm/reconstruction.json", "cameras.csv")
 """What an adjustment leaves, in the order in which a next step takes it."""

@@ -234,8 +234,6 @@ def _common(turn: FloatArray) -> float | None:
 
 def _heights(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Result:
     """Compare tie points with their image places, and with the heights of the cloud."""
-    from scipy.spatial import cKDTree
-
     if ties is None or cameras.lenses is None or cameras.rotations is None:
         return Result(unchecked="heights (no tie points)")
     miss = _median_miss(cameras, ties)
@@ -247,6 +245,8 @@ def _heights(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Res
             " places: poses, lens and points of the camera file do not belong together; export"
             " them again."
         )
+    from scipy.spatial import cKDTree  # not quick to load
+
     placed = ties.xyz[np.isfinite(ties.xyz).all(axis=1)]
     placed = placed[:: 1 + len(placed) // TIES]
     tree = cKDTree(cloud[:, :2])

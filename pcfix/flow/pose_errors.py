@@ -9,12 +9,11 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from pcfix.adjust.carry import Carrying, Pair
-from pcfix.adjust.members import Members
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.flow.old_cameras import ListedViews
 from pcfix.flow.surfaces import Points
@@ -25,6 +24,9 @@ from pcfix.refract.batch import Batch, MadeWith, Survey
 from pcfix.refract.methods import correct
 from pcfix.refract.pose_errors import PoseErrors, pose_errors_of
 from pcfix.water.surface import is_submerged, surface_above
+
+if TYPE_CHECKING:
+    from pcfix.adjust.members import Members
 
 SAMPLE_POINTS, BED_POINTS = 20_000, 1000
 """Of the cloud, and at most about so many of those under water: the errors are smooth."""

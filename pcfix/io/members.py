@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
 import numpy as np
 
-from pcfix.adjust.members import Members
 from pcfix.errors import InputError
 from pcfix.options.declare import File
+
+if TYPE_CHECKING:
+    from pcfix.adjust.members import Members
 
 FILE = "ensemble.npz"
 
@@ -36,6 +39,8 @@ def find_members(cameras: File) -> tuple[Path, Members] | None:
     found = next((at / FILE for at in (path, *path.parents[:2]) if (at / FILE).is_file()), None)
     if found is None:
         return None
+    from pcfix.adjust.members import Members  # not quick to load
+
     try:
         with np.load(found) as arrays:
             values = {one.name: arrays[one.name] for one in fields(Members)}

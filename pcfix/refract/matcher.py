@@ -15,7 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, kernel, lean, part
+from pcfix.kernels import Span, in_tiles, kernel, lean
+from pcfix.lens.algebra import Vector, dot, minus, row_of
 from pcfix.lens.frames import Frames, frames_of
 from pcfix.lens.imaging import project
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints, Views
@@ -171,7 +172,7 @@ def _scores(
                 if cell[j, p] < 0:
                     continue
                 covered[cell[i, p]] = True
-                angle = _angle_deg(centres[i], centres[j], places[p])
+                angle = _angle_deg(row_of(centres, i), row_of(centres, j), row_of(places, p))
                 scale = depth[j, p] / depth[i, p]
                 found = 1.0 if tracked else np.exp(-((angle / REPEATED_DEG) ** 2))
                 total += found * _angle_weight(angle) * _scale_weight(scale)
@@ -186,11 +187,11 @@ def _scores(
                 score[i, j] = total * area
 
 
-@part
-def _angle_deg(one: FloatArray, other: FloatArray, place: FloatArray) -> float:
+@lean
+def _angle_deg(one: Vector, other: Vector, place: Vector) -> float:
     """Return the angle between the rays from a place to two centres."""
-    a, b = one - place, other - place
-    cosine = (a * b).sum() / np.sqrt((a * a).sum() * (b * b).sum())
+    a, b = minus(one, place), minus(other, place)
+    cosine = dot(a, b) / np.sqrt(dot(a, a) * dot(b, b))
     return float(np.degrees(np.arccos(min(1.0, cosine))))
 
 

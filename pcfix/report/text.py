@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.clean.points import CleanSummary
-from pcfix.grid.model import DsmSummary
 from pcfix.options.correct import LEVEL_M
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
-from pcfix.photos.calm import CalmSummary
 from pcfix.refract.tally import ORDERS, Summary
 
 if TYPE_CHECKING:
+    from pcfix.clean.points import CleanSummary
+    from pcfix.grid.model import DsmSummary
     from pcfix.label.labelling import LabelSummary
+    from pcfix.photos.calm import CalmSummary
 
 BELOW = "\n" + 13 * " "
 FEWEST = 59

@@ -22,7 +22,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from pcfix.model import FloatArray, IntArray
 from pcfix.water.samples import Samples, square_tiles
@@ -121,8 +120,19 @@ def gain_of(moments: Moments, times: FloatArray | None = None) -> Gain:
     sigma = np.sqrt(held) / own
     temper = variance * own / (held + _TINY)
     width = max(1, round(_STEADY_M / (moments.heights_m[1] - moments.heights_m[0])))
-    gain = 0.5 * n * np.log(sse / left) * uniform_filter1d(temper, width)
+    gain = 0.5 * n * np.log(sse / left) * running_mean(temper, width)
     return Gain(np.where(own > 1e3 * _TINY, gain, 0.0), amplitude, sigma)
+
+
+def running_mean(values: FloatArray, width: int) -> FloatArray:
+    """Return means over so many neighbours, shape (n,), mirrored at the ends.
+
+    To the bit what scipy's ``uniform_filter1d`` has, which is not quick to load.
+    """
+    before = width // 2
+    around = np.pad(values, (before, width - 1 - before), mode="symmetric")
+    first = np.cumsum(around[:width])[-1:]
+    return np.asarray(np.cumsum(np.r_[first, around[width:] - around[:-width]]) / width)
 
 
 def tile_moments(

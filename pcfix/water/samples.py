@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from pcfix.model import FloatArray, IntArray
 
@@ -113,6 +112,8 @@ def _log_means(values: npt.NDArray[Any], group: IntArray, count: IntArray) -> Fl
 
 def _planes_around(ground: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return height at each place, and rms residual, of the plane through the places around."""
+    from scipy.spatial import cKDTree  # not quick to load
+
     k = min(NEIGHBOURS, len(ground) - 1)
     _, near = cKDTree(ground[:, :2]).query(ground[:, :2], k=k + 1)
     around = ground[np.asarray(near)[:, 1:]] - ground[:, None]

@@ -7,7 +7,7 @@ import pytest
 from pcfix.errors import GeometryError, SettingError
 from pcfix.report.water import shoreline_figure
 from pcfix.water.auto import find_water
-from pcfix.water.cues import Break, gain_of, gather, tile_moments
+from pcfix.water.cues import Break, gain_of, gather, running_mean, tile_moments
 from tests.utils.shared import needs
 
 RENDERED, needs_rendered = needs("rendered_a", "cloud.las")
@@ -178,3 +178,11 @@ def test_a_river_without_land_is_refused():
     rgb = np.column_stack([cloud.red, cloud.green, cloud.blue])
     with pytest.raises(GeometryError, match="too weak"):
         find_water(cloud.xyz, rgb=rgb)
+
+
+@pytest.mark.parametrize("width", [1, 2, 5, 6, 40])
+def test_running_means_are_scipys_to_the_bit(width):
+    from scipy.ndimage import uniform_filter1d
+
+    values = np.random.default_rng(3).uniform(0.0, 1.0, 25)
+    assert running_mean(values, width).tobytes() == uniform_filter1d(values, width).tobytes()
