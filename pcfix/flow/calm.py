@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import mmap
 import tempfile
 import time
 import warnings
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from pcfix.blocks import let_go
 from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
@@ -186,7 +186,7 @@ def _median(
             )
         same = np.array_equal(way.homography[number], np.eye(3))
         stack[number] = frame if same else laid(frame, way.homography[number])
-        _let_go(stack)
+        let_go()
     shape = stack.shape[1:3]
     median = np.empty(stack.shape[1:], stack.dtype)
     spread = np.empty(shape, np.float32)
@@ -195,15 +195,8 @@ def _median(
         bottom = min(top + at_once, shape[0])
         known = np.stack([covered(one, shape, top, bottom) for one in way.homography])
         median[top:bottom], spread[top:bottom] = median_of(stack[:, top:bottom], known)
-        _let_go(stack)
+        let_go()
     return median, spread, stack
-
-
-def _let_go(stack: Any) -> None:
-    """Hand what is mapped of a file back to the system, which else counts as memory of ours."""
-    stack.flush()
-    if hasattr(mmap, "MADV_DONTNEED"):
-        stack._mmap.madvise(mmap.MADV_DONTNEED)
 
 
 def _view(given: CalmOptions, frames: Frames) -> tuple[View, str | None]:
@@ -277,7 +270,7 @@ def _water(
     )
     for number, frame in enumerate(count(stack)):
         shifts[number], weights[number] = measure.of(frame)
-        _let_go(stack)
+        let_go()
     weights[:, still(shifts, weights)] = 0.0
     middle = nodes.xy.mean(axis=0)
     depth = float(np.nanmedian(view.level_m - view.bed(nodes.xy[nodes.seen])))

@@ -129,7 +129,7 @@ def view_of(cloud: Path | Tiles, jobs: int | None = None) -> CloudView:
     """Return the view of a LAS or LAZ file, or of many as one cloud."""
     with open_cloud(cloud, jobs) as source:
         if not isinstance(cloud, Tiles):
-            check_count(source.path, source.header, source.vlrs)
+            check_count(source.path, source.header, source.vlrs, source.held)
         crs, points = metric_crs(source), len(source)
         low, high = np.array(source.header.mins[:2]), np.array(source.header.maxs[:2])
         software = str(source.header.generating_software or "")

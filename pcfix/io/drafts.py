@@ -124,7 +124,8 @@ def cannot_write(target: Path, error: Exception, written: Path | None = None) ->
     if getattr(error, "errno", None) in _FULL or "No space left" in str(error):
         size = 0 if written is None or not written.is_file() else written.stat().st_size
         so_far = f" after {size / 1e6:,.1f} MB of it" if size else ""
-        reason = f"the disk of {target.absolute().parent} is full{so_far}; make room on it"
+        folder = target.absolute().parent
+        reason = f"No space left on the disk of {folder}{so_far}; make room on it"
     return InputError(f"{target}: cannot be written ({reason}).")
 
 

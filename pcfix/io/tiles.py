@@ -228,7 +228,7 @@ def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
     for path in paths:
         try:
             with LasSource(path) as source:
-                check_count(source.path, source.header, source.vlrs)
+                check_count(source.path, source.header, source.vlrs, source.held)
                 header = source.header
                 crs, format = metric_crs(source), header.point_format
                 words = f"CRS {crs.name}" if crs else "no CRS"

@@ -15,6 +15,7 @@ import rasterio
 import pcfix
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow import dsm as flow
+from pcfix.flow import sorted_points
 from pcfix.flow.dsm import grid_dsm
 from pcfix.grid.lattice import round_resolution
 from pcfix.io.las import source
@@ -63,7 +64,9 @@ def test_no_seams(awkward_cloud, tmp_path, monkeypatch, method, fill):
     for name, sizes in SIZES.items():
         with monkeypatch.context() as patch:
             for key, value in sizes.items():
-                patch.setattr(source if key == "CHUNK_POINTS" else flow, key, value)
+                for module in (source, flow, sorted_points):
+                    if hasattr(module, key):
+                        patch.setattr(module, key, value)
             patch.setattr(flow, "TIN_BLOCK_POINTS", sizes.get("BLOCK_POINTS", 400_000))
             parts = run(name)
         for one, other in zip(whole, parts, strict=True):

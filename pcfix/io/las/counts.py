@@ -13,8 +13,8 @@ _WITHOUT_CHUNKS = 1
 """The compressor of files that are one stream (LASzip record)."""
 
 
-def check_count(path: Path, header: Any, vlrs: Any) -> None:
-    """Refuse a header that counts fewer points than its file holds.
+def check_count(path: Path, header: Any, vlrs: Any, stated: int) -> None:
+    """Refuse a header that states fewer points than its file holds.
 
     Bytes of zeros behind the last point are padding.
 
@@ -26,18 +26,18 @@ def check_count(path: Path, header: Any, vlrs: Any) -> None:
     if header.are_points_compressed:
         held, words = _least_in_chunks(path, header, vlrs), "at least "
     else:
-        held, words = _held(path, header), ""
-    if held > header.point_count:
+        held, words = _held(path, header, stated), ""
+    if held > stated:
         raise InputError(
-            f"{path}: its header counts {header.point_count:,} points, the file holds"
+            f"{path}: its header counts {stated:,} points, the file holds"
             f" {words}{held:,}: those beyond would be lost; mend the header, or export the cloud"
             " again."
         )
 
 
-def _held(path: Path, header: Any) -> int:
+def _held(path: Path, header: Any, stated: int) -> int:
     """Return how many records lie between the header and what comes behind the points."""
-    stated, size, start = header.point_count, header.point_format.size, header.offset_to_point_data
+    size, start = header.point_format.size, header.offset_to_point_data
     behind = [path.stat().st_size]
     for name in ("start_of_first_evlr", "start_of_waveform_data_packet_record"):
         place = getattr(header, name, None) or 0
@@ -47,7 +47,7 @@ def _held(path: Path, header: Any) -> int:
         with path.open("rb") as stream:
             stream.seek(start + stated * size)
             if not any(stream.read(size)):
-                return int(stated)
+                return stated
     return int(held)
 
 
