@@ -121,7 +121,7 @@ def test_nothing_depends_on_tiles_order_or_threads(name, points):
             same(whole, snell(points, cameras, 0.0))
 
 
-def boxes(rng, count=400):
+def boxes(rng, count=200):
     """Return upright boxes of all sizes below and above the block."""
     middle = rng.uniform((-100, -100, -20), (200, 200, 150), (count, 3))
     half = 10 ** rng.uniform(-2, 1.5, (count, 1)) * rng.uniform(0.05, 1, (count, 3))
