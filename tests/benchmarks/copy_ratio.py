@@ -1,9 +1,10 @@
 """How much longer a correction takes than a plain copy of the same file.
 
 Simulates a cloud once (kept in a folder for the next run), then times, in one run and by turns,
-``pcfix correct``, the same with ``--method snell --max-angle none``, and a plain laspy
-read-and-write, each as a process of its own. Prints the ratios, the peak memory, and the speed of
-the kernel of ``snell`` in point-camera pairs per second.
+``pcfix correct``, the same with ``--method snell --max-angle none``, and plain laspy reading and
+writing of the input and of the very records that the correction writes, each as a process of its
+own. Prints times, processor time, the ratios to the latter copy, and the peak memory. How fast the
+kernel is, `scaling.py` tells.
 
     python tests/benchmarks/copy_ratio.py [--points 5000000] [--cameras 200] [--cloud depth-maps]
         [--folder DIR]
@@ -11,13 +12,15 @@ the kernel of ``snell`` in point-camera pairs per second.
 
 import argparse
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
+
+COPIED = "copy of the same records"
 COPY = """
 import sys, laspy
 with laspy.open(sys.argv[1]) as source, laspy.open(
@@ -39,33 +42,29 @@ def main():
     scene = camera_table(cloud)
     copied, corrected = folder / "copy.laz", folder / "corrected.laz"
     words = ["--cameras", scene, "--sensor", folder / "sensor.csv", "--water", "0.37"]
-    commands = {"plain copy": [sys.executable, "-c", COPY, cloud, copied]}
-    options = {"snell": ["--method", "snell", "--max-angle", "none"], "pcfix correct": []}
-    for name, more in options.items():
-        commands[name] = [
-            *(sys.executable, "-m", "pcfix", "correct", cloud, corrected),
-            *(*words, *more, "--overwrite", "--quiet"),
-        ]
+    correct = [sys.executable, "-m", "pcfix", "correct", cloud, corrected, *words]
+    commands = {
+        "snell": [*correct, "--method", "snell", "--max-angle", "none", "--overwrite", "--quiet"],
+        "default": [*correct, "--overwrite", "--quiet"],
+        "copy of the input": [sys.executable, "-c", COPY, cloud, copied],
+        COPIED: [sys.executable, "-c", COPY, corrected, copied],
+    }
+    for name in ("snell", "default"):
         run(commands[name])  # compile the kernels
-    seconds, peak = {name: [] for name in commands}, dict.fromkeys(commands, 0.0)
+    found = {name: [] for name in commands}
     for _ in range(arguments.runs):
         for name, command in commands.items():
-            taken, memory = run(command)
-            seconds[name].append(taken)
-            peak[name] = max(peak[name], memory)
-    for name in commands:
-        middle, least = statistics.median(seconds[name]), min(seconds[name])
-        print(
-            f"{name:<14} {middle:7.2f} s median, {least:6.2f} s least,"
-            f" {arguments.points / middle / 1e6:5.2f} M points/s, peak {peak[name]:5.0f} MB"
-        )
-    for one, other in (("snell", "plain copy"), ("pcfix correct", "snell")):
-        pairs = zip(seconds[one], seconds[other], strict=True)
-        ratio = statistics.median(a / b for a, b in pairs)
-        print(f"ratio {ratio:7.2f} ({one} / {other}, median of {arguments.runs} pairs of runs)")
+            found[name].append(run(command))
+    print("                              clock, median  processor  peak memory")
+    for name, runs in found.items():
+        clock, core, peak = np.median(runs, axis=0)
+        print(f"{name:<28}  {clock:11.2f} s  {core:7.2f} s  {peak:8.0f} MB")
+    for name in ("snell", "default"):
+        ratios = np.array(found[name])[:, :2] / np.array(found[COPIED])[:, :2]
+        clock, core = np.median(ratios, axis=0)
+        print(f"{name} / {COPIED}: {clock:.2f} by the clock, {core:.2f} of the processor")
     sizes = [p.stat().st_size / arguments.points for p in (cloud, corrected)]
     print(f"file           {sizes[0]:.2f} -> {sizes[1]:.2f} bytes a point")
-    kernel(cloud, scene, folder / "sensor.csv")
 
 
 def parsed(about):
@@ -95,44 +94,14 @@ def camera_table(cloud):
 
 
 def run(command, stdout=None):
-    """Return seconds and peak memory, MB, of a process."""
+    """Return seconds by the clock and of the processor, and peak memory, MB, of a process."""
     started = time.perf_counter()
     child = subprocess.Popen([str(word) for word in command], stdout=stdout)
     _, status, usage = os.wait4(child.pid, 0)
     if status:
         raise SystemExit(f"failed: {command}")
-    return time.perf_counter() - started, usage.ru_maxrss / 1024
-
-
-def kernel(cloud, cameras, sensor):
-    """Time the intersection alone on a million points in memory."""
-    import numpy as np
-
-    import pcfix
-    from pcfix.io.las.source import read_xyz
-    from pcfix.options.correct import ScienceOptions
-    from pcfix.refract.batch import Batch, Survey
-    from pcfix.refract.intersect import intersect_in_frame
-    from pcfix.water.surface import SurfaceAbove
-
-    xyz = read_xyz(cloud)
-    xyz = xyz[xyz[:, 2] < 0.37][:1_000_000]
-    block, water = pcfix.read_cameras(cameras, sensor), pcfix.WaterPlane(0.37)
-    surface = SurfaceAbove(np.full(len(xyz), 0.37), np.zeros((len(xyz), 2)))
-    survey = Survey(water, block, ScienceOptions(method="snell", dimensions="minimal"))
-    best, found = np.inf, None
-    for _ in range(15):
-        started = time.perf_counter()
-        found = intersect_in_frame(Batch(xyz, surface, survey))
-        best = min(best, time.perf_counter() - started)
-    rays = int(found.ray_count.sum())
-    print(
-        f"kernel         {rays / best / 1e6:7.0f} M rays/s ({len(xyz):,} points,"
-        f" {len(block)} cameras, {rays / len(xyz):.0f} rays a point; least of 15 runs, ordering"
-        f" and scattering included);"
-        f"\n               all pairs of the block, most of them ruled out by tile:"
-        f" {len(xyz) * len(block) / best / 1e6:,.0f} M/s"
-    )
+    clock, core = time.perf_counter() - started, usage.ru_utime + usage.ru_stime
+    return clock, core, usage.ru_maxrss / 1024
 
 
 if __name__ == "__main__":

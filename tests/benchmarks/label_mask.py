@@ -59,7 +59,7 @@ def main():
     seconds, peak = {name: [] for name in commands}, dict.fromkeys(commands, 0.0)
     for _ in range(arguments.runs):
         for name, command in commands.items():
-            taken, memory = run(command)
+            taken, _, memory = run(command)
             seconds[name].append(taken)
             peak[name] = max(peak[name], memory)
     copy = statistics.median(seconds["plain copy"])

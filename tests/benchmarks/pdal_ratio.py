@@ -44,7 +44,7 @@ def main():
     run(commands["pcfix correct"])  # compile the kernels
     for _ in range(arguments.runs):
         for name, command in commands.items():
-            taken, peak = run(command)
+            taken, _, peak = run(command)
             seconds[name].append(taken)
             memory[name] = max(memory[name], peak)
     for name in commands:
