@@ -11,6 +11,8 @@ from pcfix.errors import InputError
 from pcfix.flow.runner import json_text
 from pcfix.io.files import file_state, read_json, write_text
 
+VERSION = "pcfix"
+"""Of a request: which version of pcfix did it."""
 STEPS = ("adjust", "correct", "clean", "dsm", "compare", "map", "report")
 """In their order; each depends on those before it."""
 
@@ -58,7 +60,10 @@ class Record:
         names = [one for one in {**now, **then} if now.get(one) != then.get(one)]
         both = [*plain["inputs"], *earlier["inputs"]]
         files = [one for one in both if both.count(one) == 1]
-        self.changed = [f"--{name.replace('_', '-')}" for name in names]
+        self.changed = [
+            "version of pcfix" if name == VERSION else f"--{name.replace('_', '-')}"
+            for name in names
+        ]
         self.changed = self.changed or list(dict.fromkeys(Path(one["path"]).name for one in files))
         firsts = [*map(self._since, names), *(one.get("step", STEPS[0]) for one in files)]
         self.first = min(firsts, key=STEPS.index, default=None)

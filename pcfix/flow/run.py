@@ -22,7 +22,7 @@ from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.flow.layers import Drawn, write_map
 from pcfix.flow.old_cameras import read_blocks
 from pcfix.flow.rasters import SURFACE, raster_files, resolution_sentence, write_rasters
-from pcfix.flow.record import Record, read_record
+from pcfix.flow.record import VERSION, Record, read_record
 from pcfix.flow.report import write_report
 from pcfix.flow.run_adjust import (
     FOLDER,
@@ -37,7 +37,7 @@ from pcfix.flow.shore import check_shoreline
 from pcfix.flow.surfaces import view_of
 from pcfix.grid.maps import MOST_CELLS
 from pcfix.io.clouds import own_water
-from pcfix.io.files import check_input, files_in
+from pcfix.io.files import check_input, files_around, files_in
 from pcfix.io.geopackage import check_layers
 from pcfix.io.las.source import LasSource
 from pcfix.io.rasters import open_raster, preview, write_dod
@@ -54,6 +54,7 @@ from pcfix.report.page import Picture, Table
 from pcfix.report.run import Later, adjustment_sentence, adjustment_table, reason_sentence
 from pcfix.report.text import uncertainty_sentence
 from pcfix.report.water import found_picture
+from pcfix.version import __version__
 from pcfix.water.index import Water, with_index
 
 RECORD = "run.json"
@@ -94,7 +95,8 @@ class Request(RunOptions):
     def record(self) -> dict[str, Any]:
         """Return plain values, without what the results do not depend on."""
         values = self.as_dict()
-        return {name: values[name] for name in values if name not in ("overwrite", "jobs")}
+        kept = {name: values[name] for name in values if name not in ("overwrite", "jobs")}
+        return {**kept, VERSION: __version__}
 
     def files(self) -> dict[str, list[Path]]:
         """Return the input files, each of which exists, by the first step that reads them."""
@@ -103,6 +105,15 @@ class Request(RunOptions):
         found += [Path(self.water)] if Path(self.water).is_file() else []
         compared = [] if self.reference is None else files_in(self.reference)
         return {"adjust": found, "compare": [*compared, *(check_input(p) for _, p in self.also)]}
+
+    def watched(self, results: Path) -> dict[str, list[Path]]:
+        """Return all files that the results may go by; those in the folder of results are none."""
+        read = self.files()
+        names = paths_in(self, but=("water",))
+        around = {path for name in names for path in files_around(name)}
+        own = results.resolve()
+        more = sorted(one for one in around if own not in one.resolve().parents)
+        return {**read, "adjust": list(dict.fromkeys([*read["adjust"], *more]))}
 
 
 _CORRECTION = {one.name for one in options_of(CorrectOptions)}.difference(
@@ -126,7 +137,8 @@ def request_of(record: Path) -> Request:
     # runs before there were adjustments did without
     kept = {"adjust": "no", **read_record(record)["request"]}
     input = kept.pop("input", "")
-    kept.pop("index_from", None)
+    for name in ("index_from", VERSION):
+        kept.pop(name, None)
     try:
         with warnings.catch_warnings():  # a record of old may have old names
             warnings.simplefilter("ignore", PcfixWarning)
@@ -186,7 +198,7 @@ def run_all(
     inputs = [path for some in read.values() for path in some]
     if request.m3c2:
         load_py4dgeo()
-    record = _begun(request, out_dir, read, overwrite, say)
+    record = _begun(request, out_dir, overwrite, say)
     check_shoreline(request.shoreline, overwrite=overwrite or record.resumes, inputs=inputs)
     files = Files(out_dir)
     shore = [] if request.shoreline is None else [Path(request.shoreline)]
@@ -244,18 +256,12 @@ def run_all(
     return files.report
 
 
-def _begun(
-    request: Request,
-    out_dir: Path,
-    read: dict[str, list[Path]],
-    overwrite: bool,
-    say: Callable[[str], None],
-) -> Record:
+def _begun(request: Request, out_dir: Path, overwrite: bool, say: Callable[[str], None]) -> Record:
     """Return the record of a folder, made where it is missing; refuse one of another run."""
     if not out_dir.parent.is_dir():
         raise SettingError(f"{out_dir}: the folder {out_dir.parent} does not exist; make it first.")
     out_dir.mkdir(exist_ok=True)
-    record = Record(out_dir / RECORD, request.record(), read, _since)
+    record = Record(out_dir / RECORD, request.record(), request.watched(out_dir), _since)
     changed = ", ".join(record.changed)
     if not (overwrite or record.resumes) and any(out_dir.iterdir()):
         other = f"a run with another {changed}" if changed else "other files"

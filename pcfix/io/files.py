@@ -79,6 +79,30 @@ def files_in(path: File) -> list[Path]:
     return [check_input(found)]
 
 
+BESIDE = ("sensor.csv",)
+"""What readers look for beside a file that is named; it may be missing."""
+PROJECTS = {".psx": ".files", ".p4d": ""}
+"""What the folder of a project ends with, by the suffix of its file."""
+
+
+def files_around(path: File) -> list[Path]:
+    """Return what may be read where a file or folder is named.
+
+    Of a folder all that it and its folders hold, but hidden ones; of a project the same of its
+    folder; and the files that are looked for beside a file.
+    """
+    found = Path(path)
+    if found.is_dir():
+        inside = (one for one in found.rglob("*") if one.is_file())
+        return sorted(
+            one for one in inside if not any(p[0] == "." for p in one.relative_to(found).parts)
+        )
+    ending = PROJECTS.get(found.suffix.lower())
+    folder = None if ending is None else found.with_suffix(ending)
+    inside_of = files_around(folder) if folder is not None and folder.is_dir() else []
+    return [check_input(found), *(found.with_name(name) for name in BESIDE), *inside_of]
+
+
 def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:
     """Return the path of a file that may be written.
 

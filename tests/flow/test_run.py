@@ -9,6 +9,7 @@ import re
 import shutil
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -300,6 +301,37 @@ def test_another_option_redoes_what_depends_on_it(copied, more, first, changed):
     assert lines[-1].startswith("report    done: out/report.html: depth: range 0.")
     assert accuracy in lines[-1]
     assert ("Lake &lt;2&gt;" in (copied / "out" / "report.html").read_text()) is (first == "report")
+
+
+def test_files_that_are_read_unasked_and_the_version_count(finished, tmp_path, monkeypatch):
+    for name in ("cameras.csv", "sensor.csv"):
+        shutil.copy(SCENE / name, tmp_path)
+    project = tmp_path / "project.files" / "0"
+    project.mkdir(parents=True)
+    (tmp_path / "project.psx").touch()
+    (project / "doc.xml").touch()
+    request = replace(
+        request_of(finished[0] / "run.json"), cameras=str(tmp_path / "cameras.csv"),
+        views=str(tmp_path / "project.psx"),
+    )  # fmt: skip
+
+    def record():
+        watched = request.watched(tmp_path / "out")
+        return Record(tmp_path / "run.json", request.record(), watched, _since)
+
+    before = record()
+    before.step("adjust", [], lambda: None)
+    before.step("correct", [], lambda: None)
+    assert (record().changed, record().resumes) == ([], True)
+    for name in ("sensor.csv", "project.files/0/doc.xml"):
+        (tmp_path / name).write_text("another")
+        assert (record().changed, record().resumes) == ([Path(name).name], False)
+        record().step("adjust", [], lambda: None)
+        record().step("correct", [], lambda: None)
+    (tmp_path / "sensor.csv").unlink()
+    assert record().changed == ["sensor.csv"]
+    monkeypatch.setattr("pcfix.flow.run.__version__", "9.9")
+    assert record().changed == ["version of pcfix"]
 
 
 def test_a_reference_that_is_added_is_compared_with(finished, tmp_path):
