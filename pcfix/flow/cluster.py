@@ -57,7 +57,8 @@ def in_processes(
             ) from error
         except BaseException:
             for process in list((pool._processes or {}).values()):
-                os.kill(process.pid or 0, signal.SIGINT)
+                if process.pid is not None:  # it is not started yet
+                    os.kill(process.pid, signal.SIGINT)
             pool.shutdown(cancel_futures=True)
             raise
 
