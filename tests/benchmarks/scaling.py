@@ -74,7 +74,8 @@ def draw(found, path):
     axes.semilogx(cameras, core, "o-")
     axes.set(
         ylim=(0.0, 1.2 * core.max()), xlabel="cameras of the block, at one overlap",
-        ylabel="processor, microseconds a point", xticks=cameras, xticklabels=[f"{c:,.0f}" for c in cameras],
+        ylabel="processor, microseconds a point", xticks=cameras,
+        xticklabels=[f"{c:,.0f}" for c in cameras],
     )  # fmt: skip
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
