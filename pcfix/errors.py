@@ -3,7 +3,9 @@
 Each message is one sentence that a person can act on: the file, the value, the rule, the remedy.
 """
 
+import errno
 import importlib
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable
@@ -13,8 +15,29 @@ from typing import Any, TypeVar
 _Found = TypeVar("_Found")
 
 
+LONGEST_VALUE, LONGEST_NAME = 60, 255
+_UNBROKEN = re.compile(rf"[^\s/\\'\":;()]{{{LONGEST_VALUE + 1},}}")
+_FILE_NAME = re.compile(r"\.\w{1,6}$")
+
+
+def brief(message: str) -> str:
+    """Return a message in which no value is longer than 60 characters, and no name of a file 255.
+
+    Values with spaces in them are shortened where they are quoted.
+    """
+
+    def shortened(match: re.Match[str]) -> str:
+        is_name = len(match[0]) <= LONGEST_NAME and _FILE_NAME.search(match[0])
+        return match[0] if is_name else match[0][: LONGEST_VALUE - 3] + "..."
+
+    return _UNBROKEN.sub(shortened, message)
+
+
 class PcfixError(Exception):
     """Anything that a user can mend; the command line prints it and exits with 1."""
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(brief(str(message)))
 
 
 class InputError(PcfixError):
@@ -31,6 +54,22 @@ class GeometryError(PcfixError):
 
 class PcfixWarning(UserWarning):
     """Something that was done on the user's behalf and that they should know of."""
+
+
+_REFUSALS = {
+    errno.ENOENT: "there is no such file",
+    errno.ENOTDIR: "there is no such file",
+    errno.EISDIR: "is a folder; give a file",
+    errno.ELOOP: "its links lead in a circle; give the file itself",
+    errno.ENAMETOOLONG: "the name is longer than the system allows",
+    errno.EACCES: "access is denied; change the rights of the file or of its folder",
+}
+
+
+def refusal(error: Exception) -> str:
+    """Return in words what the system says of a file."""
+    words = getattr(error, "strerror", None) or str(error).strip().rstrip(".")
+    return _REFUSALS.get(getattr(error, "errno", None) or 0, f"cannot be read ({words})")
 
 
 def installing(extra: str) -> str:
@@ -73,4 +112,4 @@ def show_warning(
     """Show a warning of pcfix as one line on stderr, others not: for `warnings.showwarning`."""
     del where, more
     if issubclass(category, PcfixWarning):
-        sys.stderr.write(f"pcfix: warning: {message}\n")
+        sys.stderr.write(f"pcfix: warning: {brief(str(message))}\n")

@@ -59,13 +59,13 @@ def open_raster(path: File) -> Iterator[DatasetReader]:
 
     found = check_input(path)
     try:
-        source = rasterio.open(found)
+        with rasterio.open(found) as source:
+            yield source
     except rasterio.errors.RasterioError as error:
         raise InputError(
-            f"{found}: is damaged, or is not a raster ({error}); export it again as GeoTIFF."
+            f"{found}: is damaged, or is not a raster ({error.__cause__ or error}); export it again"
+            " as GeoTIFF."
         ) from error
-    with source:
-        yield source
 
 
 def place_of(transform: Affine, column: Any, row: Any) -> tuple[Any, Any]:

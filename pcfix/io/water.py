@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import math
 import os
+import os
 import tempfile
 import warnings
 from collections.abc import Iterator
@@ -105,7 +106,7 @@ def read_water(
     try:
         return WaterPlane(*_finite([text], text))
     except SettingError:
-        if not (Path(text).is_file() or Path(text).suffix[1:2].isalpha()):
+        if not (os.path.lexists(text) or Path(text).suffix[1:2].isalpha()):
             raise  # no number ends as file names do
         check_input(text)
     if Path(text).suffix.lower() in _NO_RASTERS:
