@@ -191,10 +191,10 @@ def _transformed(
         matrix = np.array([line.split()[:4] for line in text.splitlines() if line.strip()], float)
     except ValueError:
         matrix = np.empty((0, 0))
-    turn, shift = matrix[:3, :3], matrix[:3, 3:].ravel()
+    matrix = matrix if matrix.shape == (4, 4) else np.zeros((4, 4))
+    turn, shift = matrix[:3, :3], matrix[:3, 3]
     if (
-        matrix.shape != (4, 4)
-        or not np.isfinite(matrix).all()
+        not np.isfinite(matrix).all()
         or np.abs(turn.T @ turn - np.eye(3)).max() > SCALE_TOLERANCE
     ):
         raise InputError(
