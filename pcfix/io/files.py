@@ -88,7 +88,7 @@ def kind_of(mode: int) -> str:
 def is_same(one: File, other: File) -> bool:
     """Whether two names are of one file, which need not exist."""
     try:
-        return os.path.samefile(one, other)
+        return Path(one).samefile(other)
     except OSError:
         return os.path.realpath(one) == os.path.realpath(other)
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import ctypes
 import math
 import os
-import os
 import tempfile
 import warnings
 from collections.abc import Iterator

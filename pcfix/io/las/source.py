@@ -356,7 +356,9 @@ def stated_crs(source: LasSource, complaint: str, remedy: str) -> CRS | None:
         with las_errors(source.path):
             crs: CRS | None = source.header.parse_crs()
     except CRSError as error:
-        raise InputError(f"{source.path}: {complaint} ({shortened(str(error))}); {remedy}.") from error
+        raise InputError(
+            f"{source.path}: {complaint} ({shortened(str(error))}); {remedy}."
+        ) from error
     return crs
 
 

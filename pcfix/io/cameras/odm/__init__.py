@@ -193,10 +193,7 @@ def _transformed(
         matrix = np.empty((0, 0))
     matrix = matrix if matrix.shape == (4, 4) else np.zeros((4, 4))
     turn, shift = matrix[:3, :3], matrix[:3, 3]
-    if (
-        not np.isfinite(matrix).all()
-        or np.abs(turn.T @ turn - np.eye(3)).max() > SCALE_TOLERANCE
-    ):
+    if not np.isfinite(matrix).all() or np.abs(turn.T @ turn - np.eye(3)).max() > SCALE_TOLERANCE:
         raise InputError(
             f"{path}: is not four rows of four numbers that turn and shift the reconstruction."
         )
