@@ -149,6 +149,38 @@ def test_the_shoreline_of_the_cloud_speaks_against_a_level(off_m, north, says):
     assert bool(doubts) == bool(says)
 
 
+REAL = {
+    "river": ("river/cameras.csv", "river/points.las", None),
+    "a as table": ("rendered_a/cameras.csv", "rendered_a/cloud.las", LEVEL_M),
+    "a, absorbed": ("rendered_a_free/cameras.xml", "rendered_a_free/cloud.las", LEVEL_M),
+    "c": ("rendered_c/cameras.xml", "rendered_c/cloud.las", LEVEL_M),
+    "c, absorbed": ("rendered_c_free/cameras.xml", "rendered_c_free/cloud.las", LEVEL_M),
+    "ODM": (
+        "cameras/odm/testerarm_sub0",
+        "cameras/odm/testerarm_sub0/odm_georeferencing/odm_georeferenced_model.laz",
+        None,
+    ),
+}
+"""Cameras and clouds that belong together, and the water where there is a shore."""
+
+
+@rendered
+@pytest.mark.filterwarnings("default::pcfix.PcfixWarning")
+@pytest.mark.parametrize("name", REAL)
+def test_no_real_block_is_accused(name):
+    cameras, cloud, level = REAL[name]
+    path, view = RENDERED.parent / cameras, view_of(RENDERED.parent / cloud)
+    inputs = Inputs(cameras=path, water=0.0)
+    sample = CloudSample(view.points)
+    for points in file_points(RENDERED.parent / cloud, None):
+        sample.add(points, np.full(len(points.xyz), np.nan if level is None else level))
+    ties, flight = quick_ties(inputs, view.crs), Flight(path, level, every=sample.every)
+    block = inputs.block(view.crs)[0]
+    found = plausible(block, sample.xyz, ties, sample.level_doubts(), flight)
+    assert not found.doubts
+    assert str(found).startswith("cameras and cloud fit; tested: 100 % of the points")
+
+
 @rendered
 def test_positions_of_the_gnss_tell_of_shifts():
     cameras = Inputs(cameras=RENDERED / "cameras.xml", water=LEVEL_M).block("EPSG:32636")[0]
