@@ -152,7 +152,7 @@ def label(
 
 
 def clean(
-    input: Input,
+    input: Inputs,
     output: Output,
     /,
     *,
@@ -227,9 +227,10 @@ def ortho(
 
 
 def compare(
-    cloud: Input,
+    cloud: Inputs,
     reference: Annotated[
-        Path, Parameter(help="LAS or LAZ, CSV check points (x,y,z), or a GeoTIFF of heights.")
+        str,
+        Parameter(help="LAS or LAZ, or tiles; CSV check points (x,y,z), or a GeoTIFF of heights."),
     ],
     /,
     *,
