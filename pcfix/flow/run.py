@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -35,16 +35,17 @@ from pcfix.flow.run_adjust import (
 from pcfix.flow.runner import Bar, Progress, no_bar
 from pcfix.flow.shore import check_shoreline
 from pcfix.flow.surfaces import view_of
+from pcfix.flow.tiles import HOW, RECORDS
 from pcfix.grid.maps import MOST_CELLS
-from pcfix.io.clouds import own_water
-from pcfix.io.files import check_input, files_around, files_in
+from pcfix.io.clouds import is_cloud, own_water, reference_of
+from pcfix.io.files import files_around, files_in
 from pcfix.io.geopackage import check_layers
-from pcfix.io.las.source import LasSource
 from pcfix.io.rasters import open_raster, preview, write_dod
+from pcfix.io.tiles import Tiles, cloud_of, inputs_of, open_cloud, tiles_from, tiles_of
 from pcfix.model import Cameras, WaterSurface
 from pcfix.options.correct import CorrectOptions
 from pcfix.options.declare import named, options_of
-from pcfix.options.steps import DistanceOptions
+from pcfix.options.steps import CleanOptions, DistanceOptions
 from pcfix.options.survey import RunOptions
 from pcfix.refract.tally import Summary
 from pcfix.report.adjustment_text import all_notes
@@ -58,16 +59,28 @@ from pcfix.version import __version__
 from pcfix.water.index import Water, with_index
 
 RECORD = "run.json"
+CLEAN = CleanOptions(overwrite=True)
+CLOUDS = ("corrected", "cleaned")
 SECTIONS = 3
 DOD, REFERENCE_DSM = "dod.tif", "reference_dsm.tif"
-CLOUDS = (".las", ".laz")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Request(RunOptions):
     """Everything that the results of a run depend on; ``run.json`` keeps it."""
 
-    input: str = ""
+    input: str | tuple[str, ...] = ""
+    """The cloud; many files as `tiles_of` takes them."""
+
+    @cached_property
+    def source(self) -> Path | Tiles:
+        """The cloud, in one file or many."""
+        return tiles_of(self.input) or Path(str(self.input))
+
+    @cached_property
+    def surveyed(self) -> Path | Tiles:
+        """The reference, in one file or many."""
+        return reference_of(self.reference or "")
 
     def check(self) -> None:
         """Check what options say together."""
@@ -95,16 +108,17 @@ class Request(RunOptions):
     def record(self) -> dict[str, Any]:
         """Return plain values, without what the results do not depend on."""
         values = self.as_dict()
-        kept = {name: values[name] for name in values if name not in ("overwrite", "jobs")}
+        kept = {name: values[name] for name in values if name not in HOW}
         return {**kept, VERSION: __version__}
 
     def files(self) -> dict[str, list[Path]]:
         """Return the input files, each of which exists, by the first step that reads them."""
-        names = [self.input, *paths_in(self, but=("water",)), self.gcps, self.gnss, self.lens]
-        found = [path for name in names if name is not None for path in files_in(name)]
+        names = [*paths_in(self, but=("water",)), self.gcps, self.gnss, self.lens]
+        found = [*_files_of(self.source), *(p for n in names if n is not None for p in files_in(n))]
         found += [Path(self.water)] if Path(self.water).is_file() else []
-        compared = [] if self.reference is None else files_in(self.reference)
-        return {"adjust": found, "compare": [*compared, *(check_input(p) for _, p in self.also)]}
+        compared = [] if self.reference is None else _files_of(self.surveyed)
+        compared += [path for _, one in self.also for path in _files_of(cloud_of(one))]
+        return {"adjust": found, "compare": compared}
 
     def watched(self, results: Path) -> dict[str, list[Path]]:
         """Return all files that the results may go by; those in the folder of results are none."""
@@ -114,6 +128,10 @@ class Request(RunOptions):
         own = results.resolve()
         more = sorted(one for one in around if own not in one.resolve().parents)
         return {**read, "adjust": list(dict.fromkeys([*read["adjust"], *more]))}
+
+
+def _files_of(cloud: Path | Tiles) -> list[Path]:
+    return inputs_of(cloud) if isinstance(cloud, Tiles) else files_in(cloud)
 
 
 _CORRECTION = {one.name for one in options_of(CorrectOptions)}.difference(
@@ -148,14 +166,45 @@ def request_of(record: Path) -> Request:
 
 
 class Files:
-    """Where a run leaves what it makes."""
+    """Where a run leaves what it makes: of many files a folder of them."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, source: Path | Tiles | None = None) -> None:
         self.folder = folder
-        self.corrected, self.cleaned = folder / "corrected.laz", folder / "cleaned.laz"
+        self._many = source.paths if isinstance(source, Tiles) else None
+        ending = ".laz" if self._many is None else ""
+        self.corrected, self.cleaned = (folder / f"{one}{ending}" for one in CLOUDS)
         self.surface, self.map = folder / SURFACE, folder / "map.gpkg"
         self.compare, self.report = folder / "compare", folder / "report.html"
         self.regression = folder / "regression.json"
+
+    def parts(self, target: Path) -> list[Path]:
+        """Return the files of a cloud."""
+        return [target] if self._many is None else [target / one.name for one in self._many]
+
+    @cached_property
+    def corrected_cloud(self) -> Path | Tiles:
+        """The corrected cloud, once it is there."""
+        return self._cloud(self.corrected)
+
+    @cached_property
+    def cleaned_cloud(self) -> Path | Tiles:
+        """The cleaned cloud, once it is there."""
+        return self._cloud(self.cleaned)
+
+    def _cloud(self, target: Path) -> Path | Tiles:
+        with warnings.catch_warnings():  # what is said of the tiles was said of the inputs
+            warnings.simplefilter("ignore", PcfixWarning)
+            return target if self._many is None else tiles_from(str(target), self.parts(target))
+
+    def remove_others(self) -> None:
+        """Remove the clouds that an earlier run made of other files; they would pass for these."""
+        kept = {*self.parts(self.corrected), *self.parts(self.cleaned)}
+        for one in CLOUDS:
+            records = (self.folder / one / RECORDS).glob("*.la[sz].npz")
+            made = {self.folder / one / path.stem: path for path in records}
+            for path in {self.folder / f"{one}.laz", *made} - kept:
+                path.unlink(missing_ok=True)
+                made.get(path, path).unlink(missing_ok=True)
 
 
 def run_all(
@@ -200,7 +249,7 @@ def run_all(
         load_py4dgeo()
     record = _begun(request, out_dir, overwrite, say)
     check_shoreline(request.shoreline, overwrite=overwrite or record.resumes, inputs=inputs)
-    files = Files(out_dir)
+    files = Files(out_dir, request.source)
     shore = [] if request.shoreline is None else [Path(request.shoreline)]
 
     def step(
@@ -208,29 +257,47 @@ def run_all(
         outputs: list[Path],
         work: Callable[[Progress | None], Any],
         more: Callable[[Any], str] = lambda result: "",
+        shown: Path | None = None,
     ) -> Any:
         result, was_done = record.step(name, outputs, lambda: _with_bar(bar, name, work))
-        say(f"{name:<9} {'done before' if was_done else 'done'}: {outputs[0]}{more(result)}")
+        done = "done before" if was_done else "done"
+        say(f"{name:<9} {done}: {shown or outputs[0]}{more(result)}")
         return result
 
     first, was_done = record.step(
         "adjust",
         outputs_of(out_dir),
         lambda: _with_bar(
-            bar, "adjust", lambda _: adjust_first(request.adjust_step(), out_dir, inputs, jobs)
+            bar,
+            "adjust",
+            lambda _: adjust_first(
+                replace(request.adjust_step(), cloud=request.source), out_dir, inputs, jobs
+            ),
         ),
     )
     _say_adjusted(first, out_dir, was_done, say)
     request = request.with_adjusted(out_dir, first)
-    clouds = [files.corrected] + ([] if request.check_depths is None else [files.regression])
-    corrected = step("correct", [*clouds, *shore], partial(_correct, request, files, jobs))
+    line = [] if request.check_depths is None else [files.regression]
+    corrected = step(
+        "correct",
+        [*files.parts(files.corrected), *line, *shore],
+        partial(_correct, request, files, jobs),
+        shown=files.corrected,
+    )
     corrected = _with_checked(corrected, first)
     if not first["is_said"] and is_worth_saying(first, _is_bent(corrected)):
         first = {**first, "is_said": True}
         _say_adjusted(first, out_dir, was_done, say)
     # the surface of a dimension is still in the cloud, and what was corrected is known anyway
-    clean = partial(clean_file, files.corrected, files.cleaned, overwrite=True, jobs=jobs)
-    step("clean", [files.cleaned], lambda progress: clean(progress=progress).as_dict())
+    clean = replace(CLEAN, jobs=jobs, scheduler=request.scheduler)
+    step(
+        "clean",
+        files.parts(files.cleaned),
+        lambda progress: clean_file(
+            files.corrected_cloud, files.cleaned, options=clean, progress=progress
+        ).as_dict(),
+        shown=files.cleaned,
+    )
     errors = corrected["uncertainty"] is not None
     outputs = raster_files(out_dir, errors=errors)
     cells = partial(resolution_sentence, given=request.resolution is not None)
@@ -305,7 +372,8 @@ def _correct(
     options = replace(request, overwrite=True, jobs=jobs).part(CorrectOptions)
     if request.check_depths is not None:
         options = replace(options, save_regression=files.regression)
-    summary = correct_file(request.input, files.corrected, options=options, progress=progress)
+    files.remove_others()
+    summary = correct_file(request.source, files.corrected, options=options, progress=progress)
     return vars(summary)
 
 
@@ -327,7 +395,7 @@ def _grid(
     request: Request, files: Files, errors: bool, progress: Progress | None
 ) -> dict[str, Any]:
     return write_rasters(
-        files.cleaned, files.folder, resolution=request.resolution,
+        files.cleaned_cloud, files.folder, resolution=request.resolution,
         cameras=_cameras(request, files), errors=errors, progress=progress,
     )  # fmt: skip
 
@@ -337,18 +405,23 @@ def _cameras(request: Request, files: Files) -> Cameras:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PcfixWarning)
         inputs = replace(request, views=None).part(Inputs)
-        return read_blocks(inputs, view_of(files.corrected).crs).cameras
+        return read_blocks(inputs, view_of(files.corrected_cloud).crs).cameras
 
 
 def _compare(request: Request, files: Files) -> dict[str, Any]:
-    reference = Path(str(request.reference))
+    reference = request.surveyed
     asked = {one.name: getattr(request, one.name) for one in options_of(DistanceOptions)}
     result = compare_clouds(
-        files.cleaned, reference, out_dir=files.compare, sections=SECTIONS, overwrite=True, **asked
+        files.cleaned_cloud,
+        reference,
+        out_dir=files.compare,
+        sections=SECTIONS,
+        overwrite=True,
+        **asked,
     )
     if _rasters(request):
-        heights = reference
-        if reference.suffix.lower() in CLOUDS:
+        heights = Path(str(reference))
+        if is_cloud(reference):
             heights = files.compare / REFERENCE_DSM
             with open_raster(files.surface) as dsm:
                 resolution = float(dsm.res[0])
@@ -375,7 +448,7 @@ def _map(request: Request, files: Files, done: dict[str, Any]) -> dict[str, int]
     summary, compared = done["correct"], done["compare"] or {}
     fitted = (summary["water_fit"] or {}).get("sigma_level_m")
     drawn = Drawn(
-        cloud=files.cleaned,
+        cloud=files.cleaned_cloud,
         folder=files.folder,
         water=_water(request, files),
         sigma_level_m=request.sigma_level if request.sigma_level is not None else fitted,
@@ -385,25 +458,24 @@ def _map(request: Request, files: Files, done: dict[str, Any]) -> dict[str, int]
         check_points=np.array(compared.get("check_points", [])).reshape(-1, 4),
         check_depths=request.check_depths,
     )
-    return write_map(files.map, drawn, view_of(files.cleaned).crs)
+    return write_map(files.map, drawn, view_of(files.cleaned_cloud).crs)
 
 
 def _water(request: Request, files: Files) -> WaterSurface:
     """Return the surface as the corrected cloud states it, else as it was asked for."""
     with warnings.catch_warnings():  # they were shown when the cloud was corrected
         warnings.simplefilter("ignore", PcfixWarning)
-        with LasSource(files.corrected) as source:
+        with open_cloud(files.corrected_cloud) as source:
             stated = own_water(source)
         inputs = replace(request, views=None).part(Inputs)
-        return stated or inputs.surface(view_of(files.corrected)).surface
+        return stated or inputs.surface(view_of(files.corrected_cloud)).surface
 
 
 def _rasters(request: Request) -> list[str]:
     """Return the rasters that a comparison leaves: none with check points."""
-    suffix = Path(str(request.reference)).suffix.lower()
-    if suffix in CLOUDS:
+    if is_cloud(request.surveyed):
         return [DOD, REFERENCE_DSM]
-    return [DOD] if suffix in (".tif", ".tiff") else []
+    return [DOD] if Path(str(request.reference)).suffix.lower() in (".tif", ".tiff") else []
 
 
 def _report(
@@ -424,13 +496,13 @@ def _report(
     again = replace(request, views=None).part(Inputs)
     cameras = _cameras(request, files)
     if is_found(summary):
-        pictures.append(found_picture(again.surface(view_of(Path(request.input)))))
+        pictures.append(found_picture(again.surface(view_of(request.source))))
     with open_raster(files.surface) as dsm:
         resolution = float(dsm.res[0])
     figures = {} if compared is None else compared["figures"]
     later = Later(pictures, tables, verdict, figures, dod, resolution)
     report = write_report(
-        files.cleaned,
+        files.cleaned_cloud,
         files.folder,
         summary=summary,
         cameras=cameras,
