@@ -43,7 +43,8 @@ def run(
 
     With --config give only the folder: pcfix run OUT_DIR --config run.json.
     """
-    from pcfix.flow.run import Request, request_of, run_all
+    from pcfix.flow.request import Request, request_of
+    from pcfix.flow.run import run_all
 
     if config is not None:
         folder = out_dir or input

@@ -14,7 +14,8 @@ from pcfix.errors import InputError, SettingError
 from pcfix.flow.layers import contours_layer
 from pcfix.flow.rasters import BED, DEPTH, SHADED, SURFACE, UNCERTAINTY
 from pcfix.flow.record import read_record
-from pcfix.flow.run import RECORD, Files, Request, run_all
+from pcfix.flow.request import Files, Request
+from pcfix.flow.run import RECORD, run_all
 from pcfix.flow.runner import Bar, no_bar
 from pcfix.io import analysis, rasters
 from pcfix.io.styles import limits_of

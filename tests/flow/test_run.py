@@ -23,7 +23,8 @@ import shapely
 import pcfix
 from pcfix.errors import SettingError
 from pcfix.flow.record import STEPS, Record
-from pcfix.flow.run import Request, _since, request_of, run_all
+from pcfix.flow.request import Request, request_of, since
+from pcfix.flow.run import run_all
 from pcfix.grid.colours import DEPTH, stops_of
 from pcfix.io import geopackage
 from pcfix.io.rasters import values_at
@@ -320,7 +321,7 @@ def test_files_that_are_read_unasked_and_the_version_count(finished, tmp_path, m
 
     def record():
         watched = request.watched(tmp_path / "out")
-        return Record(tmp_path / "run.json", request.record(), watched, _since)
+        return Record(tmp_path / "run.json", request.record(), watched, since)
 
     before = record()
     before.step("adjust", [], lambda: None)
@@ -333,7 +334,7 @@ def test_files_that_are_read_unasked_and_the_version_count(finished, tmp_path, m
         record().step("correct", [], lambda: None)
     (tmp_path / "sensor.csv").unlink()
     assert record().changed == ["sensor.csv"]
-    monkeypatch.setattr("pcfix.flow.run.__version__", "9.9")
+    monkeypatch.setattr("pcfix.flow.request.__version__", "9.9")
     assert record().changed == ["version of pcfix"]
 
 
@@ -346,7 +347,7 @@ def test_a_reference_that_is_added_is_compared_with(finished, tmp_path):
     def record(**other):
         later = {"reference": str(touched), **other}
         read = {**files, "compare": [touched] if later["reference"] else []}
-        return Record(tmp_path / "run.json", {**request.record(), **later}, read, _since)
+        return Record(tmp_path / "run.json", {**request.record(), **later}, read, since)
 
     before = record(reference=None)
     for name in ("adjust", "correct", "clean", "dsm", "map", "report"):
