@@ -117,6 +117,7 @@ def request_of(record: Path) -> Request:
     # runs before there were adjustments did without
     kept = {"adjust": "no", **read_record(record)["request"]}
     input = kept.pop("input", "")
+    input = tuple(input) if isinstance(input, list) else input
     for name in ("index_from", VERSION):
         kept.pop(name, None)
     try:

@@ -1,5 +1,6 @@
 """Clean and compare over many files: what they do to one file of the same points."""
 
+import json
 import shutil
 
 import laspy
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 import pcfix
+from pcfix.flow.request import Files, Request, request_of
 from pcfix.io.scenes import write_scene
 from tests.utils.program import run_pcfix
 from tests.utils.tiles import cut, finished, records
@@ -173,3 +175,26 @@ def test_what_is_refused_as_by_the_other_commands(scene, tmp_path):
     assert not list(tmp_path.iterdir())
     with pytest.warns(pcfix.PcfixWarning, match=r"overlap \(1 pairs"):
         pcfix.clean_file([merged, tiles / "tile1.laz"], out, jobs=1)
+
+
+def test_a_run_takes_a_list_and_removes_what_was_made_of_other_files(scene, tmp_path):
+    paths = tuple(map(str, tiles_in(scene / "cloud" / "tiles")))
+    asked = Request(input=paths, cameras="cameras.csv", water="0.37")
+    (tmp_path / "run.json").write_text(
+        json.dumps({"request": asked.record(), "inputs": [], "steps": {}})
+    )
+    assert request_of(tmp_path / "run.json") == asked
+    assert [str(path) for path in asked.source.paths] == list(paths)
+    for name in ("tile0.laz", "old.laz", "mine.laz"):
+        path = tmp_path / "cleaned" / name
+        (path.parent / ".pcfix").mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"")
+        if name != "mine.laz":
+            (path.parent / ".pcfix" / f"{name}.npz").write_bytes(b"")
+    (tmp_path / "cleaned.laz").write_bytes(b"")
+    Files(tmp_path, asked.source).remove_others()
+    assert not (tmp_path / "cleaned.laz").exists()
+    assert [path.name for path in tiles_in(tmp_path / "cleaned")] == ["mine.laz", "tile0.laz"]
+    assert len(list((tmp_path / "cleaned" / ".pcfix").iterdir())) == 1
+    Files(tmp_path, tmp_path / "cloud.laz").remove_others()
+    assert [path.name for path in tiles_in(tmp_path / "cleaned")] == ["mine.laz"]
