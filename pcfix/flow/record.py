@@ -23,9 +23,8 @@ class Record:
 
     A step counts as done while the request and the input files are those of the record, but for
     what matters to later steps only, every step before it was found done, and its own files are as
-    it left them.
-    The files that it opened beside the inputs count as these do. The JSON file at `path` is written
-    after each step.
+    it left them; files that it opened beside the inputs count as these do. The JSON file at `path`
+    is written after each step.
 
     Parameters
     ----------
