@@ -352,7 +352,7 @@ def test_files_that_readers_open_count_without_a_list(finished, tmp_path):
     out.mkdir()
 
     def record():
-        return Record(out / "run.json", request.record(), request.watched(out), _since)
+        return Record(out / "run.json", request.record(), request.watched(out), since)
 
     def read():
         (out / "kept.txt").write_text((SCENE / "scene.json").read_text())
