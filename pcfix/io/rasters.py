@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from pcfix.errors import GeometryError, InputError, SettingError
 from pcfix.grid.lattice import Lattice, Window
-from pcfix.io.drafts import replaced_when_whole
+from pcfix.io.drafts import NoRoomError, is_full_disk, replaced_when_whole
 from pcfix.io.files import check_input, check_output
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -190,6 +190,8 @@ def new_raster(
         "blockysize": TILE,
         **_compression(dtype),
     }
+    tiles = -(-lattice.width // TILE) * -(-lattice.height // TILE)
+    most_bytes = tiles * TILE**2 * len(bands) * np.dtype(dtype).itemsize
     try:
         with rasterio.open(path, "w", **profile) as target:
             for number, (name, unit) in enumerate(bands.items(), start=1):
@@ -201,7 +203,33 @@ def new_raster(
             target.update_tags(**(tags or {}))
             yield target
     except rasterio.errors.RasterioError as error:
-        raise InputError(f"{path}: the raster cannot be written ({error}).") from error
+        raise _not_written(path, error, most_bytes) from error
+    _check_whole(path, most_bytes)
+
+
+def _not_written(path: Path, error: Exception, most_bytes: int | None = None) -> OSError:
+    """Return what tells a full disk from one that fails otherwise."""
+    if is_full_disk(path.parent, error):
+        return NoRoomError(most_bytes)
+    return OSError(f"{error}; the disk may have failed")
+
+
+def _check_whole(path: Path, most_bytes: int | None = None) -> None:
+    """Read a raster that was written, as GDAL does not tell when its last parts could not be.
+
+    An OSError if it is not whole.
+    """
+    import rasterio
+
+    try:
+        with rasterio.open(path) as raster:
+            levels = [{"overview_level": level} for level in range(len(raster.overviews(1)))]
+        for level in ({}, *levels):
+            with rasterio.open(path, **level) as raster:
+                for _, window in raster.block_windows(1):
+                    raster.read(window=window)
+    except rasterio.errors.RasterioError as error:
+        raise _not_written(path, error, most_bytes) from error
 
 
 def _wkt(crs: CRS | str) -> str:
@@ -223,6 +251,7 @@ def add_overviews(path: Path) -> None:
         settings["GDAL_TIFF_OVR_BLOCKSIZE"] = str(TILE)
         with rasterio.Env(**settings), rasterio.open(path, "r+") as raster:
             raster.build_overviews(factors, Resampling.average)
+        _check_whole(path)
 
 
 def _compression(dtype: str) -> dict[str, Any]:
@@ -240,6 +269,7 @@ def copy_as_cog(source: Path, target: Path) -> None:
         source, target, driver="COG", blocksize=TILE, overview_resampling="average",
         statistics="YES", **options,
     )  # fmt: skip
+    _check_whole(target)
 
 
 def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = False) -> int:
@@ -273,6 +303,7 @@ def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = Fal
                     sink.write(whole.astype(np.float32), 1, window=window)
             if known == 0:
                 raise GeometryError(f"{dsm} and {reference} have no cell in common; see their CRS.")
+            _check_whole(draft)
             add_overviews(draft)
     return known
 
