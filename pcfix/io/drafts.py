@@ -137,10 +137,10 @@ def cannot_write(
     With `most_bytes` it says what the file would have taken at most, if it found no space.
     """
     folder, reason = target.absolute().parent, str(error).strip().rstrip(".")
-    if is_full_disk(folder, error):
+    most_bytes = getattr(error, "most_bytes", most_bytes)
+    if is_full_disk(folder, error, most_bytes):
         size = 0 if written is None or not written.is_file() else written.stat().st_size
         so_far = f" after {_size(size)} of it" if size else ""
-        most_bytes = getattr(error, "most_bytes", most_bytes)
         most = "" if most_bytes is None else f", which takes at most {_size(most_bytes)}"
         reason = f"No space left on the disk of {folder}{so_far}{most}; make room on it"
     elif getattr(error, "strerror", None):
@@ -150,15 +150,17 @@ def cannot_write(
     return InputError(f"{target}: cannot be written ({reason}).")
 
 
-def is_full_disk(folder: Path, error: Exception) -> bool:
-    """Whether something failed as the disk of a folder is full, which libraries may not say."""
-    number = getattr(error, "errno", None)
-    if number is not None:
-        return number in _FULL
+def is_full_disk(folder: Path, error: Exception, most_bytes: int | None = None) -> bool:
+    """Whether something failed as the disk of a folder is full, which libraries may not say.
+
+    Then it is if less is free than what is written takes at most.
+    """
+    if isinstance(error, OSError) and error.errno is not None:
+        return error.errno in _FULL
     if any(words in str(error) for words in _FULL_WORDS):
         return True
     try:
-        return shutil.disk_usage(folder).free < _LEAST_FREE_BYTES
+        return shutil.disk_usage(folder).free < max(_LEAST_FREE_BYTES, most_bytes or 0)
     except OSError:
         return False
 
