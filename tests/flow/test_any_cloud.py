@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,7 @@ def correct(scene: Scene, source: Path, target: Path, **given: object) -> pcfix.
         assert source.read_bytes() == before
 
 
-@given(data=st.data(), scene=scenes(), point_format=FORMATS, plain=st.booleans())
+@given(data=st.data(), scene=scenes(on_surface=True), point_format=FORMATS, plain=st.booleans())
 def test_every_row_and_bit_that_is_not_refraction_stays(data, scene, point_format, plain):
     given = data.draw(options(scene))
     encoding = data.draw(st.sampled_from(ENCODINGS))
@@ -138,21 +139,41 @@ def test_the_larger_the_index_the_deeper(data, scene, n, more):
     assert np.isfinite(one.xyz).all() and np.isfinite(two.xyz).all()
     np.testing.assert_array_equal(one.outcome, two.outcome)
     assert (two.xyz[two.corrected, 2] < one.xyz[one.corrected, 2]).all()
+    if method != "factor":
+        assert np.isfinite(one.sigma_z_m).all() and (one.sigma_z_m >= 0.0).all()
     assert (one.xyz[:, 2] <= scene.xyz[:, 2] + NANOMETRE).all()
+
+
+@st.composite
+def listed(draw, scene: Scene) -> pcfix.Views:
+    """Draw a list of two cameras or more for each point, in pairs where that is its kind."""
+    kinds = ["tracks", "depth-maps", "pairs"] if scene.cameras.rotations is not None else ["tracks"]
+    kind = draw(st.sampled_from(kinds))
+    rng = np.random.default_rng(draw(st.integers(0, 99)))
+    k = len(scene.cameras)
+    count = rng.integers(2, k + 1, len(scene.xyz)) // (2 if kind == "pairs" else 1)
+    rows = [rng.permutation(k)[: c * (2 if kind == "pairs" else 1)] for c in count]
+    start = np.cumsum([0, *map(len, rows)])
+    return pcfix.Views(start, np.concatenate(rows), None, kind)
 
 
 @given(data=st.data(), scene=scenes(), turn=st.floats(0.0, 6.3))
 def test_the_result_does_not_hang_on_frame_or_order(data, scene, turn):
-    methods = OF_A_POINT if scene.cameras.rotations is None else (*OF_A_POINT, "consistent")
-    method = data.draw(st.sampled_from(methods))
+    framed = scene.cameras.rotations is not None
+    method = data.draw(st.sampled_from((*OF_A_POINT, "consistent") if framed else OF_A_POINT))
     given = of_a_point(method)
     assume((np.abs(scene.height_m(scene.xyz)) > 1e-6).all())
     shift = data.draw(st.sampled_from([(0.0, 0.0, 0.0), (512e3, 5.4e6, 431.7)]))
     cameras = data.draw(st.permutations(range(len(scene.cameras))))
     points = data.draw(st.permutations(range(len(scene.xyz))))
+    views = data.draw(listed(scene)) if method != "factor" and data.draw(st.booleans()) else None
+    renumbered = views
+    if views is not None:
+        taken = views.take(np.array(points))
+        renumbered = replace(taken, camera=np.argsort(cameras)[taken.camera])
     other = scene.moved(turn, shift).reordered(cameras, points)
-    here = pcfix.correct_points(scene.xyz, scene.cameras, scene.water, **given)
-    there = pcfix.correct_points(other.xyz, other.cameras, other.water, **given)
+    here = pcfix.correct_points(scene.xyz, scene.cameras, scene.water, views=views, **given)
+    there = pcfix.correct_points(other.xyz, other.cameras, other.water, views=renumbered, **given)
     np.testing.assert_array_equal(there.outcome, here.outcome[points])
     np.testing.assert_array_equal(there.ray_count, here.ray_count[points])
     expected = Scene(here.xyz, scene.cameras, scene.plane).moved(turn, shift).xyz[points]
@@ -187,3 +208,48 @@ def test_a_file_says_the_same_however_it_is_written(data, scene, point_format):
     through_arrays = pcfix.correct_points(other.xyz, other.cameras, other.water, **given)
     np.testing.assert_allclose(there, through_arrays.xyz, rtol=0, atol=0.5 * max(coarse) + 1e-6)
     assert (classes[through_arrays.corrected] == 40).all()
+
+
+@st.composite
+def label_options(draw) -> dict[str, object]:
+    connected, band = draw(st.booleans()), draw(st.sampled_from([0.0, 0.02, 1.0]))
+    return {
+        "connected": connected,
+        "least_pool": draw(st.sampled_from([None, 1.0])) if connected else None,
+        "band": band,
+        "dead_band": draw(st.sampled_from([0.0, 1.5])),
+        "reset": draw(st.booleans()),
+        "respect_classes": draw(st.sampled_from([(), (2,), (0, 2, 40, 41)])),
+    }
+
+
+@given(scene=scenes(on_surface=True), given=label_options(), point_format=FORMATS, suffix=SUFFIXES)
+def test_a_labelling_changes_classes_alone(scene, given, point_format, suffix):
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = (Path(folder, name + suffix) for name in ("in", "out"))
+        scene.write(source, point_format)
+        try:
+            summary = pcfix.label_file(source, target, water=scene.water, jobs=1, **given)
+        except pcfix.GeometryError as error:
+            assert "come with the classes to respect" in str(error)
+            assume(False)
+        before, after = read_raw(source), read_raw(target)
+    old, new = fields(before), fields(after)
+    for name in old.keys() - {"class", "angle"}:
+        np.testing.assert_array_equal(new[name], old[name], name)
+    assert (after.scales, after.offsets) == (before.scales, before.offsets)
+    assert after.foreign()[: len(before.foreign())] == before.foreign()
+    assert after.extended == before.extended
+    height, was, now = scene.height_m(xyz_of(before)), old["class"], new["class"]
+    respected = np.isin(was, given["respect_classes"])
+    assert (now[respected] == was[respected]).all()
+    changed = now != was
+    assert np.isin(now[changed], [1, 40, 41]).all()
+    reset = np.isin(was, [40, 41]) & (now == 1) & given["reset"]
+    far = height > max(given["band"], given["dead_band"]) + NANOMETRE
+    assert not (changed & ~reset)[far].any()
+    assert (np.abs(height[changed & (now == 41)]) <= given["band"] + NANOMETRE).all()
+    if not (given["connected"] or given["dead_band"]):
+        wet = (height < 0.0) & ~respected & (np.abs(height) > given["band"] + NANOMETRE)
+        assert (now[wet] == 40).all()
+    assert summary.points == len(before.points)

@@ -78,8 +78,11 @@ class Scene:
 
 
 @st.composite
-def scenes(draw, with_frames: bool | None = None, slope: float = 0.045) -> Scene:
-    """Draw a scene in which a point or more lies under the water, and no camera does."""
+def scenes(draw, on_surface: bool = False) -> Scene:
+    """Draw a scene in which a point or more lies under the water, and no camera does.
+
+    Points may lie on the surface, to the bit where it is level, only if that is asked for.
+    """
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     n, k = draw(st.integers(1, 60)), draw(st.integers(2, 8))
     side, deepest = (
@@ -87,21 +90,28 @@ def scenes(draw, with_frames: bool | None = None, slope: float = 0.045) -> Scene
         draw(st.sampled_from([0.05, 3.0, 25.0])),
     )
     land = draw(st.sampled_from([0.0, 0.3, 0.9]))
-    tilt = draw(st.tuples(st.floats(-slope, slope), st.floats(-slope, slope)).filter(_is_flat))
+    slope = st.floats(-0.045, 0.045)
+    tilt = draw(st.just((0.0, 0.0)) | st.tuples(slope, slope).filter(_is_flat))
     plane = (draw(st.sampled_from([0.0, 0.37])), *tilt)
     plan = rng.uniform(-side, side, (n, 2))
     height = np.where(
         rng.random(n) < land, rng.uniform(0.01, 9.0, n), -rng.uniform(0.0, deepest, n)
     )
+    if on_surface:
+        height[rng.random(n) < 0.2] = 0.0
     height[0] = -max(0.01, -height[0])
+    plan[rng.random(n) < 0.1] = plan[0]  # one above the other, or twice the same
     surface = plane[0] + plan @ tilt
-    xyz = STEP_M * np.rint(np.column_stack([plan, surface + height]) / STEP_M)
+    xyz = np.rint(np.column_stack([plan, surface + height]) / STEP_M) * STEP_M
     spread, flying_m = draw(st.sampled_from([3.0, 30.0])), draw(st.sampled_from([20.0, 90.0]))
     centres = np.column_stack([rng.uniform(-spread, spread, (k, 2)), rng.normal(0.0, 2.0, k)])
     centres[:, 2] += plane[0] + flying_m
-    framed = draw(st.booleans()) if with_frames is None else with_frames
+    if draw(st.booleans()):
+        centres[0, :2] = xyz[0, :2]  # straight above a point
+    if draw(st.booleans()) and k > 2:
+        centres[-1] = centres[0]
     cameras = Cameras(tuple(f"c{i}" for i in range(k)), centres)
-    if framed:
+    if draw(st.booleans()):
         cameras = _with_frames(cameras, rng, draw(st.sampled_from([0.0, 5.0, 35.0])))
     return Scene(xyz, cameras, plane)
 
