@@ -72,8 +72,13 @@ def private_folder() -> Path | None:
     if given:
         return Path(given) if is_writable(Path(given)) else _warn()
     user = str(os.getuid()) if hasattr(os, "getuid") else ""
-    homes = [os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()]
-    for folder in (Path(homes[0], "pcfix-kernels"), Path(tempfile.gettempdir(), f"pcfix-{user}")):
+    folders = []
+    with suppress(RuntimeError):  # a container's user may have no home,
+        home = os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
+        folders.append(Path(home, "pcfix-kernels"))
+    with suppress(FileNotFoundError):  # and nowhere to write
+        folders.append(Path(tempfile.gettempdir(), f"pcfix-{user}"))
+    for folder in folders:
         if folder.is_absolute() and _is_private(folder):
             return folder
     return _warn()

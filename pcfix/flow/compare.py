@@ -19,6 +19,7 @@ from pcfix.compare.sections import parse_line
 from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_summary
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of
+from pcfix.io.drafts import all_or_none
 from pcfix.io.files import check_output, scratch_arrays, write_bytes, write_text
 from pcfix.io.tiles import Clouds, Tiles, cloud_of, inputs_of
 from pcfix.model import WaterSurface
@@ -151,22 +152,26 @@ def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:
 
 
 def _write(result: Comparison, given: CompareOptions) -> None:
+    files: dict[str, str] = {}
+    with all_or_none():
+        if given.out_dir is not None:
+            folder = Path(given.out_dir)
+            folder.mkdir(exist_ok=True)
+            tables = {"depth_bins.csv": result.depth_bins, "shore_bins.csv": result.shore_bins}
+            files = {"compare.json": json_text(result.as_dict())}
+            files |= {name: bins_table(bins) for name, bins in tables.items() if bins}
+            sections = enumerate(result.sections, start=1)
+            files |= {f"section_{n:02d}.csv": s.table() for n, s in sections}
+            for name, content in files.items():
+                write_text(folder / name, content, overwrite=given.overwrite)
+        if given.plot is not None:
+            from pcfix.report.c2c import c2c_figure
+            from pcfix.report.page import png_of
+
+            picture = png_of(c2c_figure(result.as_dict()))
+            write_bytes(given.plot, picture, overwrite=given.overwrite)
+        write_summary(given, result.as_dict())
     if given.out_dir is not None:
-        folder = Path(given.out_dir)
-        folder.mkdir(exist_ok=True)
-        tables = {"depth_bins.csv": result.depth_bins, "shore_bins.csv": result.shore_bins}
-        files = {"compare.json": json_text(result.as_dict())}
-        files |= {name: bins_table(bins) for name, bins in tables.items() if bins}
-        files |= {f"section_{n:02d}.csv": s.table() for n, s in enumerate(result.sections, start=1)}
-        for name, content in files.items():
-            write_text(folder / name, content, overwrite=given.overwrite)
-        for path in folder.glob("section_*.csv"):  # of an earlier comparison with more of them
+        for path in Path(given.out_dir).glob("section_*.csv"):  # of an earlier one with more
             if path.name not in files:
                 path.unlink()
-    if given.plot is not None:
-        from pcfix.report.c2c import c2c_figure
-        from pcfix.report.page import png_of
-
-        picture = png_of(c2c_figure(result.as_dict()))
-        write_bytes(given.plot, picture, overwrite=given.overwrite)
-    write_summary(given, result.as_dict())

@@ -262,6 +262,6 @@ class LabellingStep(Sums, Step):
 
     def finish(self) -> None:
         """Refuse a cloud of which no point lies below the water, or inside the mask."""
-        self.labelling.check(self._name)
         below = self.counts["submerged"] + self.counts["water_surface"]
+        self.labelling.check(self._name, below)
         check_submerged(below, self._name, self.water)

@@ -74,7 +74,11 @@ def ortho_photo(
     target = rasters.check_tif(output, overwrite=given.overwrite, inputs=known)
     check_summary(given, [*known, target])
     rasters.check_cog()
-    with threads(given.jobs), draft_folder(target.parent) as folder:
+    with (
+        threads(given.jobs),
+        replaced_when_whole(target) as draft,
+        draft_folder(target.parent) as folder,
+    ):
         block = block_of(_as_photos(given), paths, folder)
         for note in block.notes:
             warnings.warn(note, PcfixWarning, stacklevel=2)
@@ -82,8 +86,7 @@ def ortho_photo(
         covered, ground = _write(block, lattice, given, folder / "plain.tif", progress)
         if not covered:
             raise GeometryError(f"{given.dsm}: no photograph sees it; check the CRS of both.")
-        with replaced_when_whole(target) as draft:
-            rasters.copy_as_cog(folder / "plain.tif", draft)
+        rasters.copy_as_cog(folder / "plain.tif", draft)
     summary = OrthoSummary(
         str(target), len(block.photos), lattice.width, lattice.height, lattice.resolution_m,
         lattice.bounds_m, round(covered / ground, 5), round(time.perf_counter() - started, 3),

@@ -98,7 +98,8 @@ class FileTask:
         with LasSource(self.source, self.jobs, kept=self.kept or None) as source:
             header = step.header(source)
             identity = step.identity or corrected_identity(source)
-            with LasSink(self.target, header, output_evlrs(source), identity, self.jobs) as sink:
+            last = output_evlrs(source), identity, self.jobs, len(source)
+            with LasSink(self.target, header, *last) as sink:
                 done = 0
                 with written_behind(sink.write, self.jobs) as write:
                     for points in read_ahead(source.chunks(), self.jobs):

@@ -29,6 +29,17 @@ except ImportError:  # not on Windows: what a killed process leaves stays there
 _PREFIX, _SUFFIX, _LOCK = ".pcfix-", ".part", "lock"
 _NEW, _NEW_S = "new", 60.0
 _FULL = (errno.ENOSPC, errno.EDQUOT)
+_FULL_WORDS = ("No space left", "disk is full")
+_LEAST_FREE_BYTES = 65_536
+"""With less than that free, whatever fails without saying why has found no space."""
+
+
+class NoRoomError(OSError):
+    """There is no space for a file; `most_bytes` is what it takes at most, if that is known."""
+
+    def __init__(self, most_bytes: int | None = None) -> None:
+        super().__init__(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        self.most_bytes = most_bytes
 
 
 @contextmanager
@@ -119,18 +130,23 @@ def folder_when_whole(target: Path) -> Iterator[Path]:
 
 
 def cannot_write(
-    target: Path, error: Exception, written: Path | None = None, needed: int = 0
+    target: Path, error: Exception, written: Path | None = None, most_bytes: int | None = None
 ) -> InputError:
     """Return the sentence on a file that cannot be written, of which a part may be.
 
-    Where the disk is full it names that, and the bytes that are `needed`, if they are known.
+    With `most_bytes` it says what the file would have taken at most, if it found no space.
     """
-    reason = getattr(error, "strerror", None) or str(error).strip().rstrip(".")
-    if getattr(error, "errno", None) in _FULL or "No space left" in str(error):
+    folder, reason = target.absolute().parent, str(error).strip().rstrip(".")
+    most_bytes = getattr(error, "most_bytes", most_bytes)
+    if is_full_disk(folder, error, most_bytes):
         size = 0 if written is None or not written.is_file() else written.stat().st_size
-        so_far = f" after {size / 1e6:,.1f} MB of it" if size > 1e5 else ""
-        wanted = f", up to {needed / 1e6:,.1f} MB are needed" if needed else ""
-        reason = f"No space left on the disk {disk_of(target)}{so_far}{wanted}; make room on it"
+        so_far = f" after {_size(size)} of it" if size else ""
+        most = "" if most_bytes is None else f", which takes at most {_size(most_bytes)}"
+        reason = f"No space left on the disk of {disk_of(target)}{so_far}{most}; make room on it"
+    elif getattr(error, "strerror", None):
+        reason = str(getattr(error, "strerror", None))
+    elif written is not None:
+        reason = reason.replace(str(written), target.name)
     return InputError(f"{target}: cannot be written ({reason}).")
 
 
@@ -139,10 +155,32 @@ def disk_of(path: Path) -> str:
     around = Path(os.path.realpath(path)).parents
     mount = next((one for one in around if one.is_mount()), around[-1])
     try:
-        free = f" ({shutil.disk_usage(mount).free / 1e6:,.1f} MB free)"
+        free = f" ({_size(shutil.disk_usage(mount).free)} free)"
     except OSError:
         free = ""
     return f"{mount}{free}"
+
+
+def is_full_disk(folder: Path, error: Exception, most_bytes: int | None = None) -> bool:
+    """Whether something failed as the disk of a folder is full, which libraries may not say.
+
+    Then it is if less is free than what is written takes at most.
+    """
+    if isinstance(error, OSError) and error.errno is not None:
+        return error.errno in _FULL
+    if any(words in str(error) for words in _FULL_WORDS):
+        return True
+    try:
+        return shutil.disk_usage(folder).free < max(_LEAST_FREE_BYTES, most_bytes or 0)
+    except OSError:
+        return False
+
+
+def _size(count: int) -> str:
+    """Return a number of bytes in the unit that suits it."""
+    if count < 1_000_000:
+        return f"{max(count, 1000) / 1e3:,.0f} kB"
+    return f"{count / 1e6:,.1f} MB" if count < 1e9 else f"{count / 1e9:,.1f} GB"
 
 
 @contextmanager

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import shapely
 
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import SettingError
 from pcfix.io.crs import parse_crs
-from pcfix.io.drafts import replaced_when_whole
+from pcfix.io.drafts import cannot_write, replaced_when_whole
 from pcfix.io.files import check_output
 from pcfix.io.vectors import load_pyogrio
 from pcfix.options.declare import File
@@ -65,7 +65,7 @@ def write_layers(
                 )  # fmt: skip
             _write_styles(draft, [one for one in layers if one.style])
         except RuntimeError as error:
-            raise InputError(f"{target}: cannot be written ({error}).") from error
+            raise cannot_write(target, error, draft) from error
 
 
 def _write_styles(path: Path, layers: Sequence[Layer]) -> None:

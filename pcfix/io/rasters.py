@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from pcfix.errors import GeometryError, InputError, SettingError
 from pcfix.grid.lattice import Lattice, Window
-from pcfix.io.drafts import replaced_when_whole
+from pcfix.io.drafts import NoRoomError, is_full_disk, replaced_when_whole
 from pcfix.io.files import check_input, check_output
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -190,18 +190,45 @@ def new_raster(
         "blockysize": TILE,
         **_compression(dtype),
     }
+    most_bytes = _most_bytes(lattice.width, lattice.height, [dtype] * len(bands))
+    with _written(path, most_bytes), rasterio.open(path, "w", **profile) as target:
+        for number, (name, unit) in enumerate(bands.items(), start=1):
+            target.set_band_description(number, name)
+            target.set_band_unit(number, unit)
+        known = ColorInterp.__members__
+        if bands.keys() & known.keys():
+            target.colorinterp = [known.get(name, ColorInterp.undefined) for name in bands]
+        target.update_tags(**(tags or {}))
+        yield target
+
+
+def _most_bytes(width: int, height: int, dtypes: Sequence[str]) -> int:
+    """Return what the tiles of bands take unpacked."""
+    tiles = -(-width // TILE) * -(-height // TILE)
+    return tiles * TILE**2 * sum(np.dtype(one).itemsize for one in dtypes)
+
+
+@contextmanager
+def _written(path: Path, most_bytes: int | None = None) -> Iterator[None]:
+    """Read the raster that the block wrote, as GDAL may not tell that parts of it could not be.
+
+    An OSError if it is not whole; `most_bytes` is what it takes at most.
+    """
+    import rasterio
+    from rasterio._err import CPLE_BaseError
+
     try:
-        with rasterio.open(path, "w", **profile) as target:
-            for number, (name, unit) in enumerate(bands.items(), start=1):
-                target.set_band_description(number, name)
-                target.set_band_unit(number, unit)
-            known = ColorInterp.__members__
-            if bands.keys() & known.keys():
-                target.colorinterp = [known.get(name, ColorInterp.undefined) for name in bands]
-            target.update_tags(**(tags or {}))
-            yield target
-    except rasterio.errors.RasterioError as error:
-        raise InputError(f"{path}: the raster cannot be written ({error}).") from error
+        yield
+        with rasterio.open(path) as raster:
+            levels = [{"overview_level": level} for level in range(len(raster.overviews(1)))]
+        for level in ({}, *levels):
+            with rasterio.open(path, **level) as raster:
+                for _, window in raster.block_windows(1):
+                    raster.read(window=window)
+    except (rasterio.errors.RasterioError, CPLE_BaseError) as error:
+        if is_full_disk(path.parent, error, most_bytes):
+            raise NoRoomError(most_bytes) from error
+        raise OSError(str(error)) from error
 
 
 def _wkt(crs: CRS | str) -> str:
@@ -221,7 +248,7 @@ def add_overviews(path: Path) -> None:
     if factors:
         settings = {f"{k}_OVERVIEW".upper(): str(v).upper() for k, v in _compression(dtype).items()}
         settings["GDAL_TIFF_OVR_BLOCKSIZE"] = str(TILE)
-        with rasterio.Env(**settings), rasterio.open(path, "r+") as raster:
+        with _written(path), rasterio.Env(**settings), rasterio.open(path, "r+") as raster:
             raster.build_overviews(factors, Resampling.average)
 
 
@@ -236,10 +263,12 @@ def copy_as_cog(source: Path, target: Path) -> None:
 
     with open_raster(source) as raster:
         options = _compression(raster.dtypes[0])
-    copy(
-        source, target, driver="COG", blocksize=TILE, overview_resampling="average",
-        statistics="YES", **options,
-    )  # fmt: skip
+        most_bytes = 2 * _most_bytes(raster.width, raster.height, raster.dtypes)
+    with _written(target, most_bytes):
+        copy(
+            source, target, driver="COG", blocksize=TILE, overview_resampling="average",
+            statistics="YES", **options,
+        )  # fmt: skip
 
 
 def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = False) -> int:
@@ -264,7 +293,7 @@ def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = Fal
         )  # fmt: skip
         profile = one.profile | {"count": 1, "driver": "GTiff"}
         with replaced_when_whole(target) as draft:
-            with same, rasterio.open(draft, "w", **profile) as sink:
+            with same, _written(draft), rasterio.open(draft, "w", **profile) as sink:
                 sink.set_band_description(1, "difference")
                 for _, window in sink.block_windows(1):
                     difference = read_masked(one, window=window) - read_masked(same, window=window)

@@ -183,14 +183,22 @@ class Labelling(Sums):
             wet = wet & stays
         return wet
 
-    def check(self, name: str) -> None:
-        """Refuse a mask, or classes to respect, that leave none of the points below the surface.
+    def check(self, name: str, submerged: int | None = None) -> None:
+        """Refuse a mask, classes to respect or a dead band that leave none of the points below.
 
         Raises
         ------
         GeometryError
-            With where mask and points lie, or with the classes.
+            With where mask and points lie, or with the classes; of a dead band if the number of
+            points that became `submerged` is told.
         """
+        left = self._below - self._outside_mask - self._respected
+        if submerged == 0 and left and self.settings.dead_band:
+            raise GeometryError(
+                f"{name}: {left:,} points lie below the water, but within the dead band of"
+                f" {self.settings.dead_band:g} m, and most around them lie above it; give a"
+                " narrower --dead-band."
+            )
         if self._respected and self._below == self._outside_mask + self._respected:
             respected = ", ".join(map(str, self.settings.respect_classes))
             raise GeometryError(

@@ -188,8 +188,8 @@ def test_a_full_disk_is_named_with_what_was_needed(tmp_path):
     error = OSError(28, "No space left on device")
     (tmp_path / "draft").write_bytes(bytes(2_500_000))
     said = str(cannot_write(tmp_path / "out.laz", error, tmp_path / "draft", 80_000_000))
-    assert f"on the disk {disk_of(tmp_path).partition(' (')[0]} (" in said
-    assert "MB free) after 2.5 MB of it, up to 80.0 MB are needed; make room on it" in said
+    assert f"on the disk of {disk_of(tmp_path).partition(' (')[0]} (" in said
+    assert " free) after 2.5 MB of it, which takes at most 80.0 MB; make room on it" in said
 
 
 def test_two_names_of_one_file(tmp_path):

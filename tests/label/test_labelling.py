@@ -251,3 +251,11 @@ def test_a_line_of_points_and_a_stray_one():
 def test_settings_that_make_no_sense(choices, sentence):
     with pytest.raises(SettingError, match=sentence):
         LabelRules(**choices)
+
+
+def test_a_dead_band_that_leaves_no_water_is_refused_by_its_name():
+    xyz = np.array([[EAST, NORTH, WATER_M - 0.01], [EAST, NORTH, WATER_M + 0.03]])
+    classes, labelling = labelled(part_of(xyz), dead_band=1.5)
+    assert not (classes == 40).any()
+    with pytest.raises(GeometryError, match=r"1 points lie below .* narrower --dead-band"):
+        labelling.check("a cloud", 0)

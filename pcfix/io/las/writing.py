@@ -310,10 +310,11 @@ class LasSink:
         evlrs: list[Record] | None = None,
         identity: bytes = b"",
         jobs: int | None = None,
+        most_points: int | None = None,
     ) -> None:
         self.header = header
+        self._most_points = most_points
         self._path, self._evlrs, self._identity, self._jobs = path, evlrs or [], identity, jobs
-        self._needed = header.point_count * header.point_format.size
         self._stack = ExitStack()
         self._copc: CopcWriter | None = None
 
@@ -342,7 +343,7 @@ class LasSink:
             self._writer.write_points(points)
 
     def __exit__(self, kind: Any, value: Any, traceback: Any) -> None:
-        with self._stack:
+        with self._stack, self._write_errors():  # before what else is on the disk goes
             if kind is not None:
                 raise value
             self._writer.close()
@@ -356,7 +357,13 @@ class LasSink:
         try:
             yield
         except (laspy.LaspyException, lazrs.LazrsError, OSError) as error:
-            raise cannot_write(self._path, error, self._draft, self._needed) from error
+            raise cannot_write(self._path, error, self._draft, self._most_bytes()) from error
+
+    def _most_bytes(self) -> int | None:
+        """Return what the points take unpacked."""
+        return (
+            None if self._most_points is None else self._most_points * self.header.point_format.size
+        )
 
 
 def write_points(

@@ -1,0 +1,164 @@
+"""A disk that is full at any stage of a command: nothing half-written, and one clear sentence."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import sqlite3
+import subprocess
+from contextlib import closing
+from itertools import pairwise
+from pathlib import Path
+
+import laspy
+import pytest
+import rasterio
+
+from tests.utils.program import run_pcfix
+
+SCENE = Path(__file__).parents[2] / "samples" / "scene"
+PAGE = 4096
+
+
+@pytest.fixture(scope="module")
+def disk(tmp_path_factory):
+    """A folder with a disk of its own, in memory; see `resize`."""
+    if not hasattr(os, "geteuid") or os.geteuid() != 0 or shutil.which("mount") is None:
+        pytest.skip("only root may mount a small disk")
+    folder = tmp_path_factory.mktemp("disk")
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", folder], capture_output=True, text=True
+    )
+    if done.returncode:
+        pytest.skip(f"a small disk cannot be mounted here ({done.stderr.strip()})")
+    yield folder
+    subprocess.run(["umount", "--lazy", folder], check=True)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("inputs")
+    for name in ("cloud.laz", "lidar.laz"):
+        cloud = laspy.read(SCENE / name)
+        cloud.points = cloud.points[::8].copy()
+        cloud.write(folder / name)
+    for name in ("cameras.csv", "sensor.csv"):
+        shutil.copy(SCENE / name, folder)
+    done = run_pcfix(*CORRECT, "corrected.laz", "--quiet", folder=folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+CAMERAS = ("--cameras", "cameras.csv", "--water", "0.37", "--method", "snell")
+CORRECT = ("correct", "cloud.laz", *CAMERAS, "--jobs", "1")
+COMPARE = ("compare", "corrected.laz", "lidar.laz")
+COMMANDS = {
+    "correct": (*CORRECT, "DISK/c.laz", "--summary", "DISK/c.json"),
+    "correct, LAS": (*CORRECT, "DISK/c.las"),
+    "correct, COPC": (*CORRECT, "DISK/c.copc.laz"),
+    "label": ("label", "cloud.laz", "DISK/l.laz", "--water", "0.37", "--summary", "DISK/l.json"),
+    "restore": ("restore", "corrected.laz", "DISK/r.laz"),
+    "clean": ("clean", "corrected.laz", "DISK/n.laz", "--summary", "DISK/n.json"),
+    "dsm": ("dsm", "corrected.laz", "DISK/d.tif", "--resolution", "0.25", "--hillshade",
+            "DISK/h.tif", "--counts", "DISK/k.tif", "--style", "--summary", "DISK/d.json"),
+    "dsm, COG": ("dsm", "corrected.laz", "DISK/d.tif", "--cog"),
+    "compare": (*COMPARE, "--out-dir", "DISK/of", "--plot", "DISK/p.png", "--summary", "DISK/s"),
+}  # fmt: skip
+STEPS_OF_RUN = {
+    "corrected.laz": 20, "cleaned.laz": 64, "compare/": 240, "map.gpkg": 480, "figures/": 900,
+    "report.html": 1800,
+}  # fmt: skip
+"""By what does not find its place, sizes of the disk, kB."""
+
+
+def resize(disk, pages):
+    """Empty a disk and make it so many pages large."""
+    for path in disk.iterdir():
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    options = f"remount,size={pages * PAGE}"
+    subprocess.run(["mount", "-o", options, disk], check=True)
+
+
+def state(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def check_whole(path):
+    """Read a file to its end."""
+    match path.suffix:
+        case ".las" | ".laz":
+            with laspy.open(path) as file:
+                assert len(file.read()) == file.header.point_count > 0
+        case ".tif":
+            with rasterio.open(path) as raster:
+                raster.read()
+        case ".gpkg":
+            with closing(sqlite3.connect(path)) as base:
+                assert base.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+        case ".json" | "":
+            json.loads(path.read_text("utf-8"))
+        case ".png":
+            assert path.read_bytes().endswith(b"IEND\xaeB`\x82")
+        case suffix:
+            end = {".html": b"</html>", ".qml": b"</qgis>", ".csv": b""}[suffix]
+            assert path.read_bytes().rstrip(b"\n").endswith(end)
+
+
+def on_a_disk_of(pages, words, disk, inputs):
+    """Run a command; return what did not find its place, None when all did."""
+    resize(disk, pages)
+    words = [word.replace("DISK", str(disk)) for word in words]
+    done = run_pcfix(*words, "--quiet", folder=inputs)
+    files = [path for path in disk.rglob("*") if path.is_file()]
+    assert not [path for path in disk.rglob("*") if path.name.startswith(".")]
+    for path in files:
+        check_whole(path)
+    if done.returncode == 0:
+        return None
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    said = done.stderr.strip().splitlines()[-1]  # kernels may have been compiled before
+    assert said.startswith(f"pcfix: {disk}/"), done.stderr
+    blamed = said.removeprefix(f"pcfix: {disk}/").partition(":")[0]
+    assert f"No space left on the disk of {disk} (" in said or "temporary space" in said, said
+    assert done.stderr.replace("pcfix: warning", "").count("pcfix:") == 1
+    return blamed
+
+
+@pytest.mark.parametrize("growth", [1.5, pytest.param(1.07, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("name", COMMANDS)
+def test_full_at_every_stage(name, growth, disk, inputs):
+    """The disk grows until the command goes through."""
+    before, pages, blamed = state(inputs), 1, []
+    while (file := on_a_disk_of(pages, COMMANDS[name], disk, inputs)) is not None:
+        blamed.append(file)
+        pages = math.ceil(pages * growth)
+        assert pages * PAGE < 4e6
+    written = {path.name for path in disk.rglob("*") if path.is_file()}
+    named = {Path(word).name for word in COMMANDS[name] if word.startswith("DISK")}
+    assert written >= named - {"of"}
+    assert len(blamed) >= 3
+    assert state(inputs) == before
+
+
+@pytest.mark.parametrize("file", ["corrected.laz", "compare/", "map.gpkg"])
+def test_full_at_a_step_of_a_run(file, disk, inputs):
+    before = state(inputs)
+    words = ("run", "cloud.laz", "DISK/run", *CAMERAS, "--reference", "lidar.laz")
+    blamed = on_a_disk_of(STEPS_OF_RUN[file] * 1000 // PAGE, words, disk, inputs)
+    assert blamed.startswith(f"run/{file}")
+    assert state(inputs) == before
+
+
+@pytest.mark.nightly
+def test_full_at_every_step_of_a_run(disk, inputs):
+    words = ("run", "cloud.laz", "DISK/run", *CAMERAS, "--reference", "lidar.laz")
+    blamed, pages = [], 1
+    while (file := on_a_disk_of(pages, words, disk, inputs)) is not None:
+        blamed.append(file)
+        pages = math.ceil(pages * 1.2)
+    assert (disk / "run" / "report.html").is_file()
+    changes = [two for one, two in pairwise(blamed) if one != two]
+    assert len(changes) >= 8

@@ -1,0 +1,256 @@
+"""Whatever the cloud, the cameras, the water and the options: what a correction may never do."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+import pcfix
+from tests.utils.any_scene import ENCODINGS, Scene, scenes
+from tests.utils.clouds import fields, read_raw, xyz_of
+
+pytestmark = pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
+
+FORMATS = st.integers(0, 10)
+SUFFIXES = st.sampled_from([".las", ".laz"])
+WITH_RAYS = ("snell", "consistent", "shan", "butler", "murase", "dietrich")
+OF_A_POINT = ("snell", "shan", "butler", "murase", "dietrich", "factor")
+"""Methods that take each point by itself, when every ray counts."""
+NANOMETRE = 1e-9
+REFUSED = (
+    "no camera has a submerged point in sight|none of .* submerged points can be corrected"
+    "|no submerged point has two rays within|come with the classes to respect"
+)
+"""What a cloud at random may be refused for."""
+
+
+@st.composite
+def options(draw, scene: Scene) -> dict[str, object]:
+    """Draw what the cameras of a scene allow."""
+    methods = ["auto", *WITH_RAYS, "factor"]
+    if scene.cameras.rotations is None:
+        methods.remove("consistent")
+    method = draw(st.sampled_from(methods))
+    found: dict[str, object] = {
+        "method": method,
+        "deep": True,
+        "index": draw(st.floats(1.0, 1.5)),
+        "uncorrected": draw(st.sampled_from(["withhold", "keep", "drop"])),
+        "dimensions": draw(st.sampled_from(["all", "minimal", "none"])),
+        "respect_classes": draw(st.sampled_from([(), (2,), (0, 2, 40, 41)])),
+        "connected": draw(st.booleans()),
+    }
+    if method != "factor":
+        found |= {
+            "max_angle": draw(st.sampled_from(["auto", None, 20.0])),
+            "max_cameras": draw(st.sampled_from([None, 2, 5])),
+            "unsure": draw(st.sampled_from(["keep", "withhold"])),
+            "occlusion": draw(st.sampled_from(["auto", "off"])),
+        }
+    return found
+
+
+def of_a_point(method: str) -> dict[str, object]:
+    """Return the options by which a method takes each point by itself, with every ray."""
+    every = {"max_angle": None, "occlusion": "off", "camera_set": "all"}
+    return {"method": method, "deep": True} | ({} if method == "factor" else every)
+
+
+def correct(scene: Scene, source: Path, target: Path, **given: object) -> pcfix.Summary | None:
+    """Correct a file; None when it is refused for a reason that a cloud at random may give."""
+    before = source.read_bytes()
+    try:
+        return pcfix.correct_file(
+            source, target, cameras=scene.cameras, water=scene.water, jobs=1, **given
+        )
+    except pcfix.GeometryError as error:
+        assert not target.exists()
+        with pytest.raises(pcfix.GeometryError, match=REFUSED):
+            raise error
+        return None
+    finally:
+        assert source.read_bytes() == before
+
+
+@given(data=st.data(), scene=scenes(on_surface=True), point_format=FORMATS, plain=st.booleans())
+def test_every_row_and_bit_that_is_not_refraction_stays(data, scene, point_format, plain):
+    given = data.draw(options(scene))
+    encoding = data.draw(st.sampled_from(ENCODINGS))
+    with tempfile.TemporaryDirectory() as folder:
+        suffix = data.draw(SUFFIXES)
+        source, target, back = (Path(folder, name + suffix) for name in ("in", "out", "back"))
+        scene.write(source, point_format, plain=plain, scales=encoding[0], offsets=encoding[1])
+        summary = correct(scene, source, target, **given)
+        assume(summary is not None)
+        before, after = read_raw(source), read_raw(target)
+        if given["dimensions"] == "all" and given["uncorrected"] != "drop":
+            pcfix.restore_file(target, back)
+            restored = read_raw(back)
+            np.testing.assert_array_equal(restored.points, before.points)
+            assert restored.header[:90] == before.header[:90] or before.version < (1, 4)
+            assert restored.records == before.records or restored.foreign() == before.foreign()
+    old, new = fields(before), fields(after)
+    classes = given["respect_classes"]
+    below = (scene.height_m(xyz_of(before)) < 0.0) & ~np.isin(old["class"], classes)
+    assert summary.points == len(before.points)
+    assert summary.submerged <= below.sum()
+    assert given["connected"] or summary.submerged == below.sum()
+    assert summary.corrected + sum(summary.uncorrected.values()) == summary.submerged
+    assert len(after.points) == len(before.points) - summary.dropped
+    assert summary.dropped in (0, sum(summary.uncorrected.values()))
+    if summary.dropped:
+        return  # which rows, `test_dropped_rows` says
+    size = old["extra"].shape[1]
+    for name in old.keys() - {"X", "Y", "Z", "class", "angle", "extra", "withheld"}:
+        np.testing.assert_array_equal(new[name], old[name], name)
+    np.testing.assert_array_equal(new["extra"][:, :size], old["extra"])
+    moved = np.any([new[a] != old[a] for a in "XYZ"], axis=0)
+    touched = moved | (new["class"] != old["class"]) | (new["withheld"] != old["withheld"])
+    assert not touched[~below].any()
+    assert (new["class"][moved] == 40).all()
+    assert (new["withheld"] >= old["withheld"]).all()
+    wet_now = new["class"] == 40
+    assert (moved & below).sum() <= summary.corrected <= (wet_now & below).sum()
+    assert (new["Z"] <= old["Z"]).all()
+    assert (scene.height_m(xyz_of(after))[moved] < 0.0).all()
+    assert (before.scales, before.offsets) == (after.scales, after.offsets)
+    assert after.foreign()[: len(before.foreign())] == before.foreign()
+    assert after.extended == before.extended
+    assert after.extra_bytes().startswith(before.extra_bytes())
+    assert after.header[4:6] == before.header[4:6]
+    assert after.header[8:24] == before.header[8:24]
+    assert after.header[26:58] == before.header[26:58]
+
+
+@given(data=st.data(), scene=scenes(), n=st.floats(1.0, 1.4), more=st.floats(0.001, 0.1))
+def test_the_larger_the_index_the_deeper(data, scene, n, more):
+    method = data.draw(st.sampled_from(OF_A_POINT))
+    given = of_a_point(method)
+    one, two = (
+        pcfix.correct_points(scene.xyz, scene.cameras, scene.water, index=index, **given)
+        for index in (n, n + more)
+    )
+    assert np.isfinite(one.xyz).all() and np.isfinite(two.xyz).all()
+    np.testing.assert_array_equal(one.outcome, two.outcome)
+    assert (two.xyz[two.corrected, 2] < one.xyz[one.corrected, 2]).all()
+    if method != "factor":
+        assert np.isfinite(one.sigma_z_m).all() and (one.sigma_z_m >= 0.0).all()
+    assert (one.xyz[:, 2] <= scene.xyz[:, 2] + NANOMETRE).all()
+
+
+@st.composite
+def listed(draw, scene: Scene) -> pcfix.Views:
+    """Draw a list of two cameras or more for each point, in pairs where that is its kind."""
+    kinds = ["tracks", "depth-maps", "pairs"] if scene.cameras.rotations is not None else ["tracks"]
+    kind = draw(st.sampled_from(kinds))
+    rng = np.random.default_rng(draw(st.integers(0, 99)))
+    k = len(scene.cameras)
+    count = rng.integers(2, k + 1, len(scene.xyz)) // (2 if kind == "pairs" else 1)
+    rows = [rng.permutation(k)[: c * (2 if kind == "pairs" else 1)] for c in count]
+    start = np.cumsum([0, *map(len, rows)])
+    return pcfix.Views(start, np.concatenate(rows), None, kind)
+
+
+@given(data=st.data(), scene=scenes(), turn=st.floats(0.0, 6.3))
+def test_the_result_does_not_hang_on_frame_or_order(data, scene, turn):
+    framed = scene.cameras.rotations is not None
+    method = data.draw(st.sampled_from((*OF_A_POINT, "consistent") if framed else OF_A_POINT))
+    given = of_a_point(method)
+    assume((np.abs(scene.height_m(scene.xyz)) > 1e-6).all())
+    shift = data.draw(st.sampled_from([(0.0, 0.0, 0.0), (512e3, 5.4e6, 431.7)]))
+    cameras = data.draw(st.permutations(range(len(scene.cameras))))
+    points = data.draw(st.permutations(range(len(scene.xyz))))
+    views = data.draw(listed(scene)) if method != "factor" and data.draw(st.booleans()) else None
+    renumbered = views
+    if views is not None:
+        taken = views.take(np.array(points))
+        renumbered = replace(taken, camera=np.argsort(cameras)[taken.camera])
+    other = scene.moved(turn, shift).reordered(cameras, points)
+    here = pcfix.correct_points(scene.xyz, scene.cameras, scene.water, views=views, **given)
+    there = pcfix.correct_points(other.xyz, other.cameras, other.water, views=renumbered, **given)
+    np.testing.assert_array_equal(there.outcome, here.outcome[points])
+    np.testing.assert_array_equal(there.ray_count, here.ray_count[points])
+    expected = Scene(here.xyz, scene.cameras, scene.plane).moved(turn, shift).xyz[points]
+    np.testing.assert_allclose(there.xyz, expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(there.ray_miss_m, here.ray_miss_m[points], rtol=0, atol=1e-6)
+
+
+@given(data=st.data(), scene=scenes(), point_format=FORMATS)
+def test_a_file_says_the_same_however_it_is_written(data, scene, point_format):
+    """Turned by quarters, shifted by whole steps, so that both files hold the very points."""
+    method = data.draw(st.sampled_from(["snell", "butler", "shan", "factor"]))
+    given = of_a_point(method)
+    assume((np.abs(scene.height_m(scene.xyz)) > 1e-6).all())
+    turn = data.draw(st.integers(0, 3)) * np.pi / 2.0
+    shift = data.draw(st.sampled_from([(0.0,) * 3, (85e3, -3e4, 7.0)]))
+    cameras = data.draw(st.permutations(range(len(scene.cameras))))
+    points = data.draw(st.permutations(range(len(scene.xyz))))
+    other = scene.moved(turn, shift).reordered(cameras, points)
+    results = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name, one in (("a", scene), ("b", other)):
+            scales, offsets = data.draw(st.sampled_from(ENCODINGS))
+            source, target = (Path(folder, name + data.draw(SUFFIXES)) for _ in range(2))
+            target = target.with_stem(f"{name}-out")
+            one.write(source, point_format, scales=scales, offsets=offsets)
+            assume(correct(one, source, target, **given) is not None)
+            results.append((xyz_of(read_raw(target)), fields(read_raw(target))["class"], scales))
+    (here, _, fine), (there, classes, coarse) = results
+    expected = Scene(here, scene.cameras, scene.plane).moved(turn, shift).xyz[points]
+    quantum = 0.5 * (max(fine) + max(coarse))
+    np.testing.assert_allclose(there, expected, rtol=0, atol=quantum + 1e-6)
+    through_arrays = pcfix.correct_points(other.xyz, other.cameras, other.water, **given)
+    np.testing.assert_allclose(there, through_arrays.xyz, rtol=0, atol=0.5 * max(coarse) + 1e-6)
+    assert (classes[through_arrays.corrected] == 40).all()
+
+
+@st.composite
+def label_options(draw) -> dict[str, object]:
+    connected, band = draw(st.booleans()), draw(st.sampled_from([0.0, 0.02, 1.0]))
+    return {
+        "connected": connected,
+        "least_pool": draw(st.sampled_from([None, 1.0])) if connected else None,
+        "band": band,
+        "dead_band": draw(st.sampled_from([0.0, 1.5])),
+        "reset": draw(st.booleans()),
+        "respect_classes": draw(st.sampled_from([(), (2,), (0, 2, 40, 41)])),
+    }
+
+
+@given(scene=scenes(on_surface=True), given=label_options(), point_format=FORMATS, suffix=SUFFIXES)
+def test_a_labelling_changes_classes_alone(scene, given, point_format, suffix):
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = (Path(folder, name + suffix) for name in ("in", "out"))
+        scene.write(source, point_format)
+        try:
+            summary = pcfix.label_file(source, target, water=scene.water, jobs=1, **given)
+        except pcfix.GeometryError as error:
+            asked = "classes to respect" if given["respect_classes"] else "narrower --dead-band"
+            assert asked in str(error) or (given["dead_band"] and "--dead-band" in str(error))
+            assume(False)
+        before, after = read_raw(source), read_raw(target)
+    old, new = fields(before), fields(after)
+    for name in old.keys() - {"class", "angle"}:
+        np.testing.assert_array_equal(new[name], old[name], name)
+    assert (after.scales, after.offsets) == (before.scales, before.offsets)
+    assert after.foreign()[: len(before.foreign())] == before.foreign()
+    assert after.extended == before.extended
+    height, was, now = scene.height_m(xyz_of(before)), old["class"], new["class"]
+    respected = np.isin(was, given["respect_classes"])
+    assert (now[respected] == was[respected]).all()
+    changed = now != was
+    assert np.isin(now[changed], [1, 40, 41]).all()
+    reset = np.isin(was, [40, 41]) & (now == 1) & given["reset"]
+    far = height > max(given["band"], given["dead_band"]) + NANOMETRE
+    assert not (changed & ~reset)[far].any()
+    assert (np.abs(height[changed & (now == 41)]) <= given["band"] + NANOMETRE).all()
+    if not (given["connected"] or given["dead_band"]):
+        wet = (height < 0.0) & ~respected & (np.abs(height) > given["band"] + NANOMETRE)
+        assert (now[wet] == 40).all()
+    assert summary.points == len(before.points)
