@@ -4,6 +4,7 @@ Each message is one sentence that a person can act on: the file, the value, the 
 """
 
 import importlib
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable
@@ -12,9 +13,26 @@ from typing import Any, TypeVar
 
 _Found = TypeVar("_Found")
 
+_MOST_LETTERS, _FIRST, _LAST = 800, 540, 240
+_LONG_VALUE = re.compile(r"'([^']{60})[^']{40,}'")
+
+
+def one_line(message: str) -> str:
+    """Return a message as a line that a terminal can show, whatever of a file is quoted in it.
+
+    Letters that are not for print become escapes; long values lose their end, and a message that is
+    too long all the same its middle: the file is named first and the remedy last.
+    """
+    text = _LONG_VALUE.sub(r"'\1...'", message)
+    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    return text if len(text) <= _MOST_LETTERS else f"{text[:_FIRST]} ... {text[-_LAST:]}"
+
 
 class PcfixError(Exception):
     """Anything that a user can mend; the command line prints it and exits with 1."""
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 class InputError(PcfixError):
@@ -31,6 +49,9 @@ class GeometryError(PcfixError):
 
 class PcfixWarning(UserWarning):
     """Something that was done on the user's behalf and that they should know of."""
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 def installing(extra: str) -> str:

@@ -173,7 +173,10 @@ def file_state(path: Path) -> dict[str, Any]:
 
 def read_json(path: Path) -> Any:
     """Return the content of a JSON file; OSError or ValueError where it is none."""
-    return json.loads(path.read_text("utf-8"))
+    try:
+        return json.loads(path.read_text("utf-8"))
+    except RecursionError as error:
+        raise ValueError("its brackets are nested too deep") from error
 
 
 def write_bytes(path: File, data: bytes, *, overwrite: bool) -> None:

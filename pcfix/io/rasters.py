@@ -53,19 +53,19 @@ def read_raster(path: File) -> Raster:
 def open_raster(path: File) -> Iterator[DatasetReader]:
     """Open a raster to read parts of it.
 
-    An `InputError` if there is no such file, or it is none.
+    An `InputError` if there is no such file, it is none, or a part cannot be read.
     """
     import rasterio
 
     found = check_input(path)
     try:
-        source = rasterio.open(found)
+        with rasterio.open(found) as source:
+            yield source
     except rasterio.errors.RasterioError as error:
         raise InputError(
-            f"{found}: is damaged, or is not a raster ({error}); export it again as GeoTIFF."
+            f"{found}: is damaged, or is not a raster ({error.__cause__ or error}); export it again"
+            " as GeoTIFF."
         ) from error
-    with source:
-        yield source
 
 
 def place_of(transform: Affine, column: Any, row: Any) -> tuple[Any, Any]:
