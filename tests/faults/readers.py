@@ -199,14 +199,14 @@ READERS: dict[str, Reader] = {
          "geo": seeds.text("geo.txt", "EPSG:32632\n" + "\n".join(
              f"{label} {x} {y} {z}" for label, (x, y, z) in
              zip(seeds.block().labels, seeds.block().centres.tolist(), strict=True))),
-         "images": lambda folder: seeds.odm_project(folder) and folder / "images.json"},
+         "images": seeds.odm_images},
         ("pcfix.io.gnss_positions",),
     ),
     "tides": Reader(
         read_times,
         {"tide": seeds.text("tide.csv", seeds.TIDE),
          "times": seeds.text("times.csv", seeds.TIMES),
-         "images": lambda folder: seeds.odm_project(folder) and folder / "images.json"},
+         "images": seeds.odm_images},
         ("pcfix.io.tides",),
     ),
     "depths": Reader(

@@ -74,7 +74,7 @@ def of(name: str) -> Seed:
     return lambda folder: WRITERS[name](folder, block())
 
 
-def text(name: str, content: str | bytes | dict[str, Any] | list[Any]) -> Seed:
+def text(name: str, content: Any) -> Seed:
     def write(folder: Path) -> Path:
         made = content if isinstance(content, str | bytes) else json.dumps(content, indent=1)
         (folder / name).write_bytes(made.encode() if isinstance(made, str) else made)
@@ -140,16 +140,15 @@ def pix4d_params(folder: Path) -> Path:
     )
 
 
+def odm_images(folder: Path) -> Path:
+    place = {"latitude": 46.9, "longitude": 9.0, "altitude": 90.0, "utc_time": 1e12}
+    rest = place | {"gps_xy_stddev": 2.0, "gps_z_stddev": 3.0}
+    return text("images.json", [{"filename": one} | rest for one in block().labels])(folder)
+
+
 def odm_project(folder: Path) -> Path:
-    path = WRITERS["ODM up to 2020"](folder, block()).path
-    (folder / "images.json").write_text(
-        json.dumps([
-            {"filename": one, "latitude": 46.9, "longitude": 9.0, "altitude": 90.0,
-             "utc_time": 1e12, "gps_xy_stddev": 2.0, "gps_z_stddev": 3.0}
-            for one in block().labels
-        ])
-    )  # fmt: skip
-    return path
+    odm_images(folder)
+    return WRITERS["ODM up to 2020"](folder, block()).path
 
 
 def blocks_exchange(folder: Path) -> Path:
@@ -365,7 +364,7 @@ def picture(name: str) -> Callable[[Path], Path]:
 
 
 def cloud(name: str, form: int) -> Callable[[Path], Path]:
-    return lambda folder: write_cloud(folder / name, form)
+    return lambda folder: write_cloud(folder / name, form, count=60)
 
 
 def regression(folder: Path) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import struct
 
 import pytest
 
@@ -30,3 +31,94 @@ def test_mutations(bench, seed):
     for _ in range(30):
         part = chance.choice(bench.parts)
         bench.read(part, mutated(part.data, chance))
+
+
+def put(place, layout, *values):
+    """Return what puts numbers in a place."""
+
+    def damage(data):
+        changed = bytearray(data)
+        struct.pack_into(layout, changed, place, *values)
+        return bytes(changed)
+
+    return damage
+
+
+def instead(old, new):
+    """Return what puts something else where `old` is."""
+
+    def damage(data):
+        assert old in data
+        return data.replace(old, new)
+
+    return damage
+
+
+def extra_dimension(data):
+    """A dimension of no type that takes no bytes."""
+    place = data.index(b"Quality") - 4
+    return put(place, "<2xBB", 0, 0)(data)
+
+
+# What was found: reader, seed, file (and entry of an archive), damage, and what is said.
+FOUND = {
+    "points behind the end": (
+        *("las", "1.4", "cloud.las", put(96, "<I", 2**31), "its points begin behind its end"),
+    ),
+    "records of many bytes": (
+        *("las", "1.2", "cloud.las", put(105, "<HI", 60_000, 2**31), "is damaged"),
+    ),
+    "a dimension of no bytes": (*("las", "1.4", "cloud.las", extra_dimension, "is damaged"),),
+    "a place that is infinite in the world": (
+        *("metashape", "geocentric", "cameras.xml", instead(b"<scale>7.3", b"<scale>9e307")),
+        "the projection centre is not finite",
+    ),
+    "no transformation": (
+        *("odm", "project", "geocoords_transformation.txt", lambda data: b"\n" * 9),
+        "is not four rows of four numbers",
+    ),
+    "a raster of half its bytes": (
+        *("raster", "tif", "water.tif", lambda data: data[:900], "is damaged, or is not a raster"),
+    ),
+    "a column with many brackets": (
+        *("depths", "table", "depths.csv", instead(b"depth_m", b"depth" + b"(" * 20_000)),
+        "depth or z missing",
+    ),
+    "labels that are none": (
+        *("members", "npz", "ensemble.npz labels.npy", instead(b"(4,)", b"(2,)")),
+        "is no ensemble of an adjustment",
+    ),
+    "an array that is none": (
+        *("members", "npz", "ensemble.npz labels.npy", lambda data: b"no array"),
+        "is no ensemble of an adjustment",
+    ),
+    "deep brackets of a line": (
+        *("regression", "line", "line.json", lambda data: b"[" * 100_000, "nested too deep"),
+    ),
+    "deep brackets of times": (
+        *("tides", "images", "images.json", lambda data: b"[" * 100_000, "nested too deep"),
+    ),
+    "deep brackets beside a model": (
+        *("colmap text", "model", "georeference.json", lambda data: b"[" * 100_000, "is damaged"),
+    ),
+    "escapes for the terminal": (
+        *("gnss", "table", "gnss.csv", instead(b"IMG_0002.jpg,", b"IMG_0002.jpg,\x1b[2J")),
+        "'\\x1b[2J50",
+    ),
+    "a number of many digits": (
+        *("realitycapture", "one", "a.xmp", instead(b"n>10 ", b"n>" + b"9" * 5000 + b" ")),
+        "999...'",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FOUND)
+def test_what_was_found(name, tmp_path):
+    reader, seed, file, damage, expected = FOUND[name]
+    bench = Bench(reader, tmp_path)
+    (part,) = (
+        one for one in bench.parts
+        if one.seed == seed and f"{one.path.name} {one.entry}".strip() == file
+    )  # fmt: skip
+    sentence = bench.read(part, damage(part.data))[1]
+    assert expected in sentence and file.split()[0] in sentence
