@@ -14,16 +14,16 @@ from typing import Any, TypeVar
 _Found = TypeVar("_Found")
 
 _MOST_LETTERS, _FIRST, _LAST = 800, 540, 240
-_LONG_VALUE = re.compile(r"'([^']{60})[^']{40,}'")
+_LONG_WORD = re.compile(r"([^\s/\\]{60})[^\s/\\]{200,}")  # no part of a path is as long
 
 
 def one_line(message: str) -> str:
     """Return a message as a line that a terminal can show, whatever of a file is quoted in it.
 
-    Letters that are not for print become escapes; long values lose their end, and a message that is
+    Letters that are not for print become escapes; long words lose their end, and a message that is
     too long all the same its middle: the file is named first and the remedy last.
     """
-    text = _LONG_VALUE.sub(r"'\1...'", message)
+    text = _LONG_WORD.sub(r"\1...", message)
     text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
     return text if len(text) <= _MOST_LETTERS else f"{text[:_FIRST]} ... {text[-_LAST:]}"
 

@@ -204,7 +204,7 @@ READERS: dict[str, Reader] = {
     ),
     "tides": Reader(
         read_times,
-        {"tide": seeds.text("tide.csv", seeds.TIDE),
+        {"pictures": seeds.pictures, "tide": seeds.text("tide.csv", seeds.TIDE),
          "times": seeds.text("times.csv", seeds.TIMES),
          "images": seeds.odm_images},
         ("pcfix.io.tides",),

@@ -363,6 +363,13 @@ def picture(name: str) -> Callable[[Path], Path]:
     return write
 
 
+def pictures(folder: Path) -> Path:
+    """Write a picture of each image, whose EXIF data says when it was taken."""
+    for label in block().labels:
+        picture(label)(folder)
+    return folder
+
+
 def cloud(name: str, form: int) -> Callable[[Path], Path]:
     return lambda folder: write_cloud(folder / name, form, count=60)
 

@@ -77,6 +77,18 @@ FOUND = {
         *("odm", "project", "geocoords_transformation.txt", lambda data: b"\n" * 9),
         "is not four rows of four numbers",
     ),
+    "infinitely many cameras": (
+        *("bundler", "points", "bundle.out", instead(b"\n2 3", b"\n1e999 3")),
+        "line 2 must give the numbers",
+    ),
+    "an image without a name": (
+        *("tides", "images", "images.json", instead(b'"IMG_0001.jpg"', b"null")),
+        "IMG_0001",
+    ),
+    "a time that is infinite": (
+        *("tides", "images", "images.json", instead(b"1000000000000.0", b"1e999")),
+        "does not say when",
+    ),
     "a raster of half its bytes": (
         *("raster", "tif", "water.tif", lambda data: data[:900], "is damaged, or is not a raster"),
     ),
@@ -107,7 +119,7 @@ FOUND = {
     ),
     "a number of many digits": (
         *("realitycapture", "one", "a.xmp", instead(b"n>10 ", b"n>" + b"9" * 5000 + b" ")),
-        "999...'",
+        "999... is not a number",
     ),
 }
 
