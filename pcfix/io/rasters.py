@@ -61,7 +61,7 @@ def open_raster(path: File) -> Iterator[DatasetReader]:
     try:
         with rasterio.open(found) as source:
             yield source
-    except rasterio.errors.RasterioError as error:
+    except (rasterio.errors.RasterioError, UnicodeDecodeError) as error:
         raise InputError(
             f"{found}: is damaged, or is not a raster ({error.__cause__ or error}); export it again"
             " as GeoTIFF."

@@ -60,6 +60,9 @@ def extra_dimension(data):
     return put(place, "<2xBB", 0, 0)(data)
 
 
+SCALE, PLACE = struct.pack("<3d", 1, 1, 0), struct.pack("<2d", 5e5, 5.2e6)
+"""Of the raster's cells, as GeoTIFF has them."""
+
 # What was found: reader, seed, file (and entry of an archive), damage, and what is said.
 FOUND = {
     "points behind the end": (
@@ -88,6 +91,26 @@ FOUND = {
     "a time that is infinite": (
         *("tides", "images", "images.json", instead(b"1000000000000.0", b"1e999")),
         "does not say when",
+    ),
+    "a vertex too many": (  # it ended the process, in open3d
+        *("mesh", "ply", "water.ply", instead(b"9 9 1\n", b"9 9 1\n" * 3)),
+        "a face names a vertex that is not there",
+    ),
+    "an element of another name": (  # as before
+        *("mesh", "ply", "water.ply", instead(b"element vertex", b"element vvertex")),
+        "has no vertices",
+    ),
+    "a corner of many digits": (
+        *("mesh", "obj", "water.obj", instead(b"f 1/", b"f 99999999999999999999/")),
+        "there is no vertex",
+    ),
+    "a raster without a place": (
+        *("raster", "tif", "water.tif", instead(PLACE, struct.pack("<2d", float("nan"), 5.2e6))),
+        "no size or no place",
+    ),
+    "cells beyond the last digit": (
+        *("raster", "tif", "water.tif", instead(SCALE, struct.pack("<3d", 1e-20, -1e-20, 0.0))),
+        "cells of 0 m over 0 m are no raster",
     ),
     "a raster of half its bytes": (
         *("raster", "tif", "water.tif", lambda data: data[:900], "is damaged, or is not a raster"),
