@@ -75,12 +75,12 @@ def _from_exif(folder: Path, labels: Sequence[str]) -> ImageTimes:
 
 def _exif_time(file: Path) -> str:
     """Return DateTimeOriginal with fraction and zone, as far as they are there."""
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     try:
         with Image.open(file) as image:
             tags = image.getexif().get_ifd(_EXIF)
-    except (UnidentifiedImageError, OSError) as error:
+    except Exception as error:  # of any kind, where a tag has another type than it should
         raise InputError(f"{file}: is not an image that can be read ({error}).") from error
     text = str(tags.get(_DATE_TIME_ORIGINAL, "")).strip("\0 ")
     if not text:

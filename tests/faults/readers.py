@@ -176,7 +176,10 @@ READERS: dict[str, Reader] = {
         {"obj": seeds.text("water.obj", water.OBJ), "ply": seeds.text("water.ply", seeds.PLANE)},
         ("pcfix.io.water",),
     ),
-    "raster": Reader(read_water, {"tif": seeds.raster}, ("pcfix.io.water_rasters",)),
+    "raster": Reader(
+        read_water, {"tif": seeds.raster, "turned": seeds.turned_raster},
+        ("pcfix.io.water_rasters",),
+    ),
     "vectors": Reader(
         read_lines,
         {"csv": seeds.text("shore.csv", seeds.LINE),

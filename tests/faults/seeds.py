@@ -327,6 +327,16 @@ def raster(folder: Path) -> Path:
     return folder / "water.tif"
 
 
+def turned_raster(folder: Path) -> Path:
+    """Write the rows from south to north, which GeoTIFF has a matrix for."""
+    with rasterio.open(raster(folder)) as source:
+        heights, profile = source.read(), source.profile
+    profile["transform"] = rasterio.Affine(1.0, 0.0, 500_000.0, 0.0, 1.0, 5_200_000.0)
+    with rasterio.open(folder / "water.tif", "w", **profile) as target:
+        target.write(heights)
+    return folder / "water.tif"
+
+
 def vector(name: str) -> Callable[[Path], Path]:
     def write(folder: Path) -> Path:
         ring = np.array([[0, 0, 1], [50, 0, 1.1], [50, 50, 1], [0, 50, 1.2]])

@@ -60,8 +60,8 @@ def extra_dimension(data):
     return put(place, "<2xBB", 0, 0)(data)
 
 
-SCALE, PLACE = struct.pack("<3d", 1, 1, 0), struct.pack("<2d", 5e5, 5.2e6)
-"""Of the raster's cells, as GeoTIFF has them."""
+PLACE, MATRIX = struct.pack("<2d", 5e5, 5.2e6), struct.pack("<4d", 1, 0, 0, 5e5)
+"""Of a raster's cells, as GeoTIFF has them."""
 
 # What was found: reader, seed, file (and entry of an archive), damage, and what is said.
 FOUND = {
@@ -109,8 +109,17 @@ FOUND = {
         "no size or no place",
     ),
     "cells beyond the last digit": (
-        *("raster", "tif", "water.tif", instead(SCALE, struct.pack("<3d", 1e-20, -1e-20, 0.0))),
-        "cells of 0 m over 0 m are no raster",
+        *("raster", "turned", "water.tif"),
+        instead(MATRIX, struct.pack("<4d", 1e-20, 0, 0, 5e5)),
+        "cells of 0 m over 8 m are no raster",
+    ),
+    "a picture of too many pixels": (
+        *("pictures", "png", "a.png", instead(struct.pack(">I", 60), struct.pack(">I", 2**30))),
+        "is damaged, or no photograph",
+    ),
+    "a picture of no pages": (
+        *("pictures", "tif", "a.tif", lambda data: data[:4] + bytes(4) + data[8:]),
+        "is damaged, or no photograph",
     ),
     "a raster of half its bytes": (
         *("raster", "tif", "water.tif", lambda data: data[:900], "is damaged, or is not a raster"),
