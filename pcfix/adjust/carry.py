@@ -36,7 +36,8 @@ from pcfix.model import (
     TiePoints,
     Views,
 )
-from pcfix.refract.choice import spatial_order, views_in_frame
+from pcfix.refract.choice import views_in_frame
+from pcfix.refract.tiling import spatial_order
 from pcfix.sums import Sums
 from pcfix.water.surface import SurfaceAbove, is_submerged
 

@@ -23,14 +23,13 @@ from pcfix.options.steps import CleanOptions, CompareOptions, DsmOptions
 from pcfix.options.survey import AdjustOptions, CamerasCheckOptions, RunOptions, WaterCheckOptions
 
 Input = Annotated[Path, Parameter(help="LAS or LAZ cloud.")]
-Inputs = Annotated[
-    str, Parameter(help="LAS or LAZ cloud; a folder, glob, list (.txt) or index (.vpc) of tiles.")
-]
+TILED = "LAS or LAZ cloud; a folder, glob, list (.txt) or index (.vpc) of tiles."
+Inputs = Annotated[str, Parameter(help=TILED)]
 Output = Annotated[Path, Parameter(help="LAS or LAZ to write; a folder for tiles.")]
 
 
 def run(
-    input: Annotated[Path | None, Parameter(help="LAS or LAZ cloud.")] = None,
+    input: Annotated[str | None, Parameter(help=TILED)] = None,
     out_dir: Annotated[Path | None, Parameter(help="Folder for all results.")] = None,
     /,
     *,
@@ -44,7 +43,8 @@ def run(
 
     With --config give only the folder: pcfix run OUT_DIR --config run.json.
     """
-    from pcfix.flow.run import Request, request_of, run_all
+    from pcfix.flow.request import Request, request_of
+    from pcfix.flow.run import run_all
 
     if config is not None:
         folder = out_dir or input
@@ -52,11 +52,11 @@ def run(
             raise UsageError("with --config give OUT_DIR alone")
         request = request_of(config)
     else:
-        if None in (input, out_dir):
+        if input is None or out_dir is None:
             raise UsageError("INPUT and OUT_DIR are needed")
         check_needed(options)
         values = {one.name: getattr(options, one.name) for one in options_of(RunOptions)}
-        request, folder = Request(input=str(input), **values), out_dir
+        request, folder = Request(input=input, **values), out_dir
     run_all(
         request,
         Path(str(folder)),
@@ -152,7 +152,7 @@ def label(
 
 
 def clean(
-    input: Input,
+    input: Inputs,
     output: Output,
     /,
     *,
@@ -227,9 +227,10 @@ def ortho(
 
 
 def compare(
-    cloud: Input,
+    cloud: Inputs,
     reference: Annotated[
-        Path, Parameter(help="LAS or LAZ, CSV check points (x,y,z), or a GeoTIFF of heights.")
+        str,
+        Parameter(help="LAS or LAZ, or tiles; CSV check points (x,y,z), or a GeoTIFF of heights."),
     ],
     /,
     *,

@@ -24,8 +24,9 @@ from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.io.cameras.opensfm.models import write_opensfm
 from pcfix.io.cameras.table.sensor import write_table
 from pcfix.io.drafts import folder_when_whole
-from pcfix.io.files import check_input, write_text
+from pcfix.io.files import write_text
 from pcfix.io.members import write_members
+from pcfix.io.tiles import Clouds, cloud_of
 from pcfix.io.water_rasters import write_water_raster
 from pcfix.model import Cameras, TiePoints, Views, WaterRaster
 from pcfix.options.declare import File, taken
@@ -84,12 +85,12 @@ def adjust_cameras(
 
 def adjust_into(
     folder: Path | None, inputs: Inputs, survey: Survey, rules: AdjustRules,
-    cloud: File | None = None, *, overwrite: bool = False, progress: Progress | None = None,
+    cloud: Clouds | None = None, *, overwrite: bool = False, progress: Progress | None = None,
 ) -> Adjusted:  # fmt: skip
     """Adjust cameras with what was read of the options; see `adjust_cameras`."""
     unknowns_of(rules, ())
     target = None if folder is None else checked_folder(folder, overwrite, inputs.paths())
-    view = None if cloud is None else view_of(check_input(cloud))
+    view = None if cloud is None else view_of(cloud_of(cloud))
     found = adjusted(read_job(inputs, rules, view, survey), progress)
     if target is not None:
         write_adjustment(target, found, str(inputs.cameras))

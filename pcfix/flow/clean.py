@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,16 +22,19 @@ from pcfix.clean.points import (
 from pcfix.errors import InputError
 from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
+from pcfix.flow.tiles import TiledRun
 from pcfix.io.drafts import all_or_none
-from pcfix.io.files import scratch_arrays
+from pcfix.io.files import local_path, scratch_arrays
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import cleaning_vlr, noted_header, own_settings
+from pcfix.io.tiles import Clouds, Tiles, open_cloud, single, tiles_of
 from pcfix.kernels import threads
-from pcfix.model import LOW_NOISE, NOISE_CLASSES, BoolArray, FloatArray
+from pcfix.model import LOW_NOISE, NOISE_CLASSES, BoolArray, FloatArray, WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CleanOptions, CleanRules
+from pcfix.sums import Sums
 from pcfix.version import __version__
 from pcfix.water.checks import check_submerged
 from pcfix.water.surface import is_submerged, surface_above
@@ -39,7 +43,7 @@ _PASSES = 4
 
 
 def clean_file(
-    input: File,
+    input: Clouds,
     output: File,
     *,
     options: CleanOptions | None = None,
@@ -58,7 +62,8 @@ def clean_file(
     ----------
     input, output : path
         The names end in ``.las`` or ``.laz``; the output is LAS 1.4, see `correct_file`. While
-        it works, it needs 90 bytes a point of disk beside the output.
+        it works, it needs 90 bytes a point of disk beside the output. Or many files and a folder,
+        see `pcfix.correct_file`: neighbours are those of the whole cloud.
     options : CleanOptions, optional
         Or its attributes as keywords, as of ``pcfix clean``: the thresholds of the tests, water,
         drop and others.
@@ -78,15 +83,32 @@ def clean_file(
     """
     given = taken(CleanOptions, options, keywords, "clean_file")
     check_tile(tile_m)
-    task = file_task(input, output, given, reads=[given.water], progress=progress)
-    step = _Cleaning(task, given)
-    with threads(given.jobs), scratch_arrays(task.target):
-        step.find(tile_m)
+    how, last = Resources(tile_m, given.jobs), _last_pass(progress)
+    tiles = tiles_of(input)
+    if tiles is not None:
+        folder = local_path(output)
+        there = next(one for one in (folder, *folder.absolute().parents) if one.is_dir())
+        run = TiledRun("clean", tiles, folder, given, last)
+        return run.run(
+            lambda part: _Cleaning(part, given, there / folder.name, how, progress),
+            lambda step: step.summary(str(tiles), str(output), run.seconds),
+            CleanSummary,
+        )
+    task = file_task(single(input), output, given, reads=[given.water], progress=last)
+    with threads(given.jobs):
+        step = _Cleaning(task.source, given, task.target, how, progress)
     with all_or_none():
-        replace(task, progress=None).run(step)  # the step counts the points of all passes
-        result = step.summary()
+        task.run(step)
+        result = step.summary(str(task.source), str(task.target), task.seconds)
         task.tell(result.as_dict())
     return result
+
+
+def _last_pass(progress: Progress | None) -> Progress | None:
+    """Return what the writing tells, once the points have gone through all other passes."""
+    if progress is None:
+        return None
+    return lambda done, total: progress(((_PASSES - 1) * total + done) // _PASSES, total)
 
 
 RAY_DIMENSIONS = ("RayCount", "RayMiss", "Incidence")
@@ -231,66 +253,82 @@ class NoiseSearch:
         )
 
 
-class _Cleaning(Step):
-    """The step that flags noise or leaves it out, once it was found in the whole file."""
+class _Cleaning(Sums, Step):
+    """The step that flags noise or leaves it out, once it was found in the whole cloud.
 
-    def __init__(self, task: FileTask, options: CleanOptions) -> None:
-        self._task, self._drop = task, options.drop
-        with LasSource(task.source) as source:
+    Large arrays of the search lie beside a file meanwhile. A bit for each point is kept.
+    """
+
+    def __init__(
+        self,
+        cloud: Path | Tiles,
+        options: CleanOptions,
+        beside: Path,
+        how: Resources,
+        progress: Progress | None,
+    ) -> None:
+        with open_cloud(cloud) as source:
             names = set(source.header.point_format.dimension_names)
-            self._points, has_rays = len(source), _has_rays(source)
-        self._search = NoiseSearch(
-            str(task.source), options, lambda: view_of(task.source), names, has_rays=has_rays
-        )
-        self._passed = self._written = 0
+            points, has_rays = len(source), _has_rays(source)
+        passed = 0
 
-    def find(self, tile_m: float | None) -> None:
-        """Read the cloud and run the tests, with arrays on disk for what is large."""
-        resources = Resources(tile_m, self._task.jobs, self._count)
-        self._noise = self._search.run(self._chunks(), self._points, resources)
+        def count(some: int) -> None:
+            nonlocal passed
+            passed += some
+            if progress is not None:
+                progress(passed // _PASSES, points)
 
-    def _chunks(self) -> Iterator[Tested]:
-        water = self._search.water
-        with LasSource(self._task.source, self._task.jobs) as source:
-            names = set(source.header.point_format.dimension_names)
-            for chunk in source.chunks():
-                rays = {
-                    name: source.dimension(chunk, name) for name in RAY_DIMENSIONS if name in names
-                }
-                withheld = np.asarray(chunk["withheld"]).astype(np.bool_)
-                yield Tested(points_of(chunk, source, water), withheld, rays)
+        search = NoiseSearch(str(cloud), options, lambda: view_of(cloud), names, has_rays=has_rays)
+        with scratch_arrays(beside):
+            tested = _tested(cloud, search.water, how.jobs)
+            noise = search.run(tested, points, how._replace(progress=count))
+        self._drop, self._noise = options.drop, np.packbits(noise)
+        self._content = {**search.content(), "drop": options.drop}
+        self._summary = search.summary("", "", drop=options.drop, seconds=0.0)
+        if self._drop and noise.all():
+            raise InputError(
+                f"{cloud}: every point is noise by these thresholds; choose wider ones, or do not"
+                " drop."
+            )
+        self.begin(0)
 
-    def _count(self, points: int) -> None:
-        """Report so many more points of a pass."""
-        self._passed += points
-        if self._task.progress is not None:
-            self._task.progress(self._passed // _PASSES, self._points)
+    def begin(self, first_row: int) -> None:
+        """Go on at a row of the whole cloud."""
+        self._row = first_row
+
+    def run(self, task: FileTask) -> None:
+        """Take a file through."""
+        task.run(self)
 
     def header(self, source: LasSource) -> Header:
         """Return the header with the record of what is done."""
-        if self._drop and self._noise.all():
-            raise InputError(
-                f"{source.path}: every point is noise by these thresholds; choose wider ones, or"
-                " do not drop."
-            )
-        return noted_header(source, cleaning_vlr({**self._search.content(), "drop": self._drop}))
+        return noted_header(source, cleaning_vlr(self._content))
 
     def chunk(self, points: Chunk, source: LasSource, header: Header) -> Chunk:
         """Return points with their noise flagged or left out."""
         new = convert(points, header.point_format)
-        noise = self._noise[self._written : self._written + len(new)]
-        self._written += len(noise)
-        self._count(len(noise))
+        first, byte = self._row, self._row // 8
+        self._row += len(new)
+        bits = np.unpackbits(self._noise[byte : (self._row + 7) // 8])
+        noise = bits[first - 8 * byte : self._row - 8 * byte].astype(np.bool_)
         if self._drop:
             return new[~noise]
         new.array["classification"][noise] = LOW_NOISE
         new["withheld"][:] = np.asarray(new["withheld"]) | noise
         return new
 
-    def summary(self) -> CleanSummary:
+    def summary(self, input: str, output: str, seconds: float) -> CleanSummary:
         """Return the numbers of the cleaning."""
-        source, target = str(self._task.source), str(self._task.target)
-        return self._search.summary(source, target, drop=self._drop, seconds=self._task.seconds)
+        return replace(self._summary, input=input, output=output, seconds=round(seconds, 3))
+
+
+def _tested(cloud: Path | Tiles, water: WaterSurface | None, jobs: int | None) -> Iterator[Tested]:
+    with open_cloud(cloud, jobs) as source:
+        names = set(source.header.point_format.dimension_names)
+        for chunk in source.chunks():
+            rays = {name: source.dimension(chunk, name) for name in RAY_DIMENSIONS if name in names}
+            withheld = np.asarray(chunk["withheld"]).astype(np.bool_)
+            yield Tested(points_of(chunk, source, water), withheld, rays)
 
 
 def _has_rays(source: LasSource) -> bool:

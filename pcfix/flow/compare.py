@@ -18,8 +18,9 @@ from pcfix.compare.match import Match, SurveyCloud, match
 from pcfix.compare.sections import parse_line
 from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_summary
-from pcfix.io.clouds import check_same_crs, read_cloud, read_reference
-from pcfix.io.files import check_input, check_output, scratch_arrays, write_bytes, write_text
+from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of
+from pcfix.io.files import check_output, scratch_arrays, write_bytes, write_text
+from pcfix.io.tiles import Clouds, Tiles, cloud_of, inputs_of
 from pcfix.model import WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
@@ -37,7 +38,11 @@ class Held(NamedTuple):
 
 
 def compare_clouds(
-    cloud: File | Held, reference: File, *, options: CompareOptions | None = None, **keywords: Any
+    cloud: Clouds | Held,
+    reference: Clouds,
+    *,
+    options: CompareOptions | None = None,
+    **keywords: Any,
 ) -> Comparison:
     """Measure how far a cloud is from a reference; what ``pcfix compare`` runs.
 
@@ -46,12 +51,12 @@ def compare_clouds(
 
     Parameters
     ----------
-    cloud : path
-        LAS or LAZ. Where `correct_file` wrote it with all its dimensions, the figures before the
-        correction are given too.
-    reference : path
-        LAS or LAZ; CSV check points (x, y, z); or a GeoTIFF of heights. At check points the
-        cloud's surface is measured, not the reference's at each point of the cloud.
+    cloud : path, or list of paths
+        LAS or LAZ, or many as `pcfix.io.tiles.tiles_of` has them. Where `correct_file` wrote it
+        with all its dimensions, the figures before the correction are given too.
+    reference : path, or list of paths
+        LAS or LAZ, or many; CSV check points (x, y, z); or a GeoTIFF of heights. At check points
+        the cloud's surface is measured, not the reference's at each point of the cloud.
     options : CompareOptions, optional
         Or its attributes as keywords, as of ``pcfix compare``: out_dir (a folder for
         ``compare.json``, ``depth_bins.csv``, ``shore_bins.csv`` and ``section_*.csv``, made where
@@ -71,9 +76,12 @@ def compare_clouds(
     started = time.perf_counter()
     given = taken(CompareOptions, options, keywords, "compare_clouds")
     lines = [parse_line(line) if isinstance(line, str) else line for line in given.section]
-    held = cloud if isinstance(cloud, Held) else _held(cloud)
-    files = [] if isinstance(cloud, Held) else [cloud]
-    _check_outputs(given, [*files, reference, *(path for _, path in given.also)])
+    clouds = [] if isinstance(cloud, Held) else [cloud_of(cloud)]
+    held = cloud if isinstance(cloud, Held) else _held(clouds[0])
+    also = {name: cloud_of(path) for name, path in given.also}
+    surveyed = reference_of(reference)
+    read = (*clouds, surveyed, *also.values())
+    _check_outputs(given, [path for one in read for path in inputs_of(one)])
     if given.m3c2:
         load_py4dgeo()
     water = None
@@ -82,10 +90,10 @@ def compare_clouds(
 
         water = find_surface(given.water, WaterOptions(), held.view()).surface
     with scratch_arrays(_beside(given)):
-        target, whole = read_reference(reference), held.read(water)
+        target, whole = read_reference(surveyed), held.read(water)
         check_same_crs(whole.name, whole.crs, target.name, target.crs)
         matched = match(whole, target, given.part(CompareRules), given=water is not None)
-        others = {name: _further(path, water, matched) for name, path in given.also}
+        others = {name: _further(one, water, matched) for name, one in also.items()}
         result = figures_of(matched, lines, started, others)
     _write(result, given)
     return result
@@ -99,7 +107,7 @@ def _beside(given: CompareOptions) -> Path:
     return Path(tempfile.gettempdir()) / "pcfix"
 
 
-def _further(path: File, water: WaterSurface | None, first: Match) -> Match:
+def _further(path: Path | Tiles, water: WaterSurface | None, first: Match) -> Match:
     """Choose the points of a further cloud, and ask it at the same places as the first.
 
     What it does not know of the water, the first does.
@@ -114,15 +122,15 @@ def _further(path: File, water: WaterSurface | None, first: Match) -> Match:
     return replace(found, places=first.places)
 
 
-def _held(path: File) -> Held:
-    """Return the cloud of a LAS or LAZ file."""
+def _held(cloud: Path | Tiles) -> Held:
+    """Return the cloud of a LAS or LAZ file, or of many."""
 
     def view() -> CloudView:
         from pcfix.flow.surfaces import view_of  # not quick to load
 
-        return view_of(check_input(path))
+        return view_of(cloud)
 
-    return Held(view, lambda water: read_cloud(path, water))
+    return Held(view, lambda water: read_cloud(cloud, water))
 
 
 def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:

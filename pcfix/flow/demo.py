@@ -6,7 +6,8 @@ from pathlib import Path
 
 from pcfix.compare.statistics import errors_against_truth
 from pcfix.flow.correct import correct_points
-from pcfix.flow.run import Request, run_all
+from pcfix.flow.request import Request
+from pcfix.flow.run import run_all
 from pcfix.flow.runner import Bar, no_bar
 from pcfix.io.las.source import read_xyz
 from pcfix.io.scenes import write_scene

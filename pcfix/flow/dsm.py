@@ -30,7 +30,7 @@ from pcfix.io.las.part import part_report
 from pcfix.io.las.source import metric_crs
 from pcfix.io.las.writing import is_ours
 from pcfix.io.styles import raster_style
-from pcfix.io.tiles import Clouds, Tiles, inputs_of, open_cloud, single, tiles_of
+from pcfix.io.tiles import Clouds, Tiles, cloud_of, inputs_of, open_cloud
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import DsmOptions, DsmRules
 from pcfix.version import __version__
@@ -104,12 +104,12 @@ def grid_dsm(
     given = taken(DsmOptions, options, keywords, "grid_dsm")
     more = {name: getattr(given, name) for name in ("hillshade", "counts")}
     more = {name: Path(path) for name, path in more.items() if path is not None}
-    tiles = tiles_of(input)
+    cloud = cloud_of(input)
     task = file_task(
-        single(input) if tiles is None else tiles, output, given,
+        cloud, output, given,
         more=more.values(), check=rasters.check_tif, progress=progress,
     )  # fmt: skip
-    cloud = tiles or task.source
+    cloud = cloud if isinstance(cloud, Tiles) else task.source
     style = task.target.with_suffix(".qml")
     if given.style:
         check_output(style, overwrite=given.overwrite, inputs=inputs_of(cloud))

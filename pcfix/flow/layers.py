@@ -18,9 +18,9 @@ from pcfix.grid.contours import contours, depth_interval
 from pcfix.grid.shoreline import NearWater
 from pcfix.io import rasters
 from pcfix.io.geopackage import Layer, write_layers
-from pcfix.io.las.source import LasSource
 from pcfix.io.styles import Symbol, vector_style
 from pcfix.io.tables import read_check_depths
+from pcfix.io.tiles import Tiles, open_cloud
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, Cameras, FloatArray, WaterSurface
 from pcfix.options.correct import LEVEL_M
 from pcfix.options.declare import File
@@ -41,7 +41,7 @@ class Drawn(NamedTuple):
     check_points : x, y, reference height and cloud minus reference, shape (n, 4).
     """
 
-    cloud: Path
+    cloud: Path | Tiles
     folder: Path
     water: WaterSurface
     sigma_level_m: float | None
@@ -92,7 +92,7 @@ def contours_layer(folder: Path, interval: float | None = None) -> Layer:
 def _waterline(drawn: Drawn) -> Layer:
     """Return where the water meets the corrected cloud."""
     near = NearWater()
-    with LasSource(drawn.cloud) as source:
+    with open_cloud(drawn.cloud) as source:
         for chunk in source.chunks():
             points = points_of(chunk, source, drawn.water)
             above = (

@@ -18,8 +18,8 @@ from pcfix.grid.lattice import Lattice, Window, round_resolution
 from pcfix.grid.model import hillshade
 from pcfix.io import rasters
 from pcfix.io.drafts import draft_folder, replaced_when_whole
-from pcfix.io.las.source import LasSource
 from pcfix.io.styles import limits_of
+from pcfix.io.tiles import Tiles, open_cloud
 from pcfix.model import Cameras, FloatArray
 from pcfix.options.steps import DsmOptions, DsmRules
 
@@ -38,7 +38,7 @@ def raster_files(folder: Path, *, errors: bool) -> list[Path]:
 
 
 def write_rasters(
-    cloud: Path, folder: Path, *, resolution: float | None, cameras: Cameras, errors: bool,
+    cloud: Path | Tiles, folder: Path, *, resolution: float | None, cameras: Cameras, errors: bool,
     progress: Progress | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Write all rasters of a corrected cloud as cloud optimised GeoTIFF, with styles for QGIS.
@@ -81,11 +81,11 @@ def resolution_sentence(made: dict[str, Any], *, given: bool) -> str:
     return f", cells of {made['resolution_m']:g} m{', as given' if given else ''}{more}"
 
 
-def _gsd_m(cloud: Path, cameras: Cameras) -> float | None:
+def _gsd_m(cloud: Path | Tiles, cameras: Cameras) -> float | None:
     """Return the size of a pixel on the ground, straight down, median; None without lenses."""
     if not cameras.lenses:
         return None
-    with LasSource(cloud) as source:
+    with open_cloud(cloud) as source:
         middle = float(source.header.mins[2] + source.header.maxs[2]) / 2.0
     focal = np.array([lens.focal_px for lens in cameras.lenses])
     return float(np.median((cameras.centres[:, 2] - middle) / focal))

@@ -14,7 +14,8 @@ from pcfix.grid.maps import Maps, MapsBuilder
 from pcfix.io.crs import crs_words
 from pcfix.io.files import sha256, write_bytes, write_text
 from pcfix.io.las.columns import SHIFTS
-from pcfix.io.las.source import LasSource, coordinates, stated_crs
+from pcfix.io.las.source import coordinates, stated_crs
+from pcfix.io.tiles import Tiles, open_cloud
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, WaterSurface
 from pcfix.refract.tally import Summary
 from pcfix.report.first_screen import Survey
@@ -50,7 +51,7 @@ RESULTS = {
 
 
 def write_report(
-    corrected: Path,
+    corrected: Path | Tiles,
     out_dir: Path,
     *,
     summary: Summary,
@@ -65,7 +66,7 @@ def write_report(
 
     Parameters
     ----------
-    corrected : Path
+    corrected : Path or Tiles
         A cloud that `correct_file` wrote with all dimensions, cleaned or not.
     out_dir : Path
         A folder that exists.
@@ -113,7 +114,9 @@ def _beside(folder: Path) -> list[tuple[str, str]]:
     """Return the results that lie beside the page, and what they are."""
     found = [path for pattern in ("*", "*/*") for path in sorted(folder.glob(pattern))]
     names = [path.relative_to(folder).as_posix() for path in found if path.is_file()]
-    return [
+    tiled = {f"{name[:-4]}/": words for name, words in RESULTS.items() if name.endswith(".laz")}
+    names = [name for name in names if not name.startswith(tuple(tiled))]
+    return [(name, words) for name, words in tiled.items() if (folder / name).is_dir()] + [
         (name, RESULTS.get(name, "a cross-section" if "/section_" in name else ""))
         for name in names
         if name.endswith(ENDINGS) and not name.startswith((".", "figures/", PAGE))
@@ -130,9 +133,9 @@ class _Told(NamedTuple):
     heights: str
 
 
-def _read(path: Path, resolution_m: float | None) -> _Told:
+def _read(path: Path | Tiles, resolution_m: float | None) -> _Told:
     """Read a corrected cloud, without noise and what is withheld."""
-    with LasSource(path) as source:
+    with open_cloud(path) as source:
         missing = set(NEEDED).difference(source.header.point_format.dimension_names)
         if missing:
             raise InputError(
@@ -154,7 +157,7 @@ def _read(path: Path, resolution_m: float | None) -> _Told:
             for i, name in enumerate(columns):
                 told[:, i] = np.asarray(points[name])[moved]
             builder.add(coordinates(points), moved, told)
-            sample.append(told[::every, [1, 0, 3]])
+            sample.append(told[-count % every :: every, [1, 0, 3]])
             depth = told[:, 0]
             low, high = depth.min(initial=low), depth.max(initial=high)
             total, count = total + float(depth.sum()), count + len(depth)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
@@ -14,7 +14,8 @@ from pcfix.errors import InputError, SettingError
 from pcfix.flow.layers import contours_layer
 from pcfix.flow.rasters import BED, DEPTH, SHADED, SURFACE, UNCERTAINTY
 from pcfix.flow.record import read_record
-from pcfix.flow.run import RECORD, Files, Request, run_all
+from pcfix.flow.request import Files, Request
+from pcfix.flow.run import RECORD, run_all
 from pcfix.flow.runner import Bar, no_bar
 from pcfix.io import analysis, rasters
 from pcfix.io.styles import limits_of
@@ -154,7 +155,7 @@ class RunResults:
 
 
 def run(
-    input: File,
+    input: File | Iterable[File],
     out_dir: File,
     *,
     options: RunOptions | None = None,
@@ -166,8 +167,8 @@ def run(
 
     Parameters
     ----------
-    input : path
-        LAS or LAZ cloud.
+    input : path, or list of paths
+        LAS or LAZ cloud, of one file or many; see `pcfix.correct_file`.
     out_dir : path
         Folder for all results, made where its parent exists. Called again with the same options it
         resumes, and a finished run is opened at once.
@@ -201,7 +202,9 @@ def run(
         value = values[one.name]
         if one.type is Any and value is not None and not isinstance(value, tuple):
             values[one.name] = _as_text(one.name, value)
-    request, folder = Request(input=os.fspath(input), **values), Path(out_dir)
+    cloud = input if isinstance(input, str | os.PathLike) else tuple(map(str, input))
+    request = Request(input=cloud if isinstance(cloud, tuple) else str(cloud), **values)
+    folder = Path(out_dir)
     run_all(request, folder, overwrite=given.overwrite, jobs=given.jobs, say=say, bar=bar)
     return RunResults(folder)
 

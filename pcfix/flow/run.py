@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,39 +13,32 @@ from typing import Any
 import numpy as np
 
 from pcfix.compare.m3c2 import load_py4dgeo
-from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.errors import PcfixWarning, SettingError
 from pcfix.flow.clean import clean_file
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.correct import correct_file
 from pcfix.flow.dsm import grid_dsm
-from pcfix.flow.inputs import Inputs, paths_in
+from pcfix.flow.inputs import Inputs
 from pcfix.flow.layers import Drawn, write_map
 from pcfix.flow.old_cameras import read_blocks
-from pcfix.flow.rasters import SURFACE, raster_files, resolution_sentence, write_rasters
-from pcfix.flow.record import VERSION, Record, read_record
+from pcfix.flow.rasters import raster_files, resolution_sentence, write_rasters
+from pcfix.flow.record import Record
 from pcfix.flow.report import write_report
-from pcfix.flow.run_adjust import (
-    FOLDER,
-    AdjustStep,
-    adjust_first,
-    figures_of,
-    is_worth_saying,
-    outputs_of,
-)
+from pcfix.flow.request import Files, Request, since
+from pcfix.flow.run_adjust import FOLDER, adjust_first, figures_of, is_worth_saying, outputs_of
 from pcfix.flow.runner import Bar, Progress, no_bar
 from pcfix.flow.shore import check_shoreline
 from pcfix.flow.surfaces import view_of
+from pcfix.flow.tiles import TiledRun
 from pcfix.grid.maps import MOST_CELLS
-from pcfix.io.clouds import own_water
-from pcfix.io.files import check_input, files_around, files_in
+from pcfix.io.clouds import is_cloud, own_water
 from pcfix.io.geopackage import check_layers
-from pcfix.io.las.source import LasSource
 from pcfix.io.rasters import open_raster, preview, write_dod
+from pcfix.io.tiles import Tiles, check_one_file, open_cloud
 from pcfix.model import Cameras, WaterSurface
 from pcfix.options.correct import CorrectOptions
-from pcfix.options.declare import named, options_of
-from pcfix.options.steps import DistanceOptions
-from pcfix.options.survey import RunOptions
+from pcfix.options.declare import options_of
+from pcfix.options.steps import CleanOptions, DistanceOptions
 from pcfix.refract.tally import Summary
 from pcfix.report.adjustment_text import all_notes
 from pcfix.report.comparison import evaluation, in_a_sentence
@@ -54,108 +47,11 @@ from pcfix.report.page import Picture, Table
 from pcfix.report.run import Later, adjustment_sentence, adjustment_table, reason_sentence
 from pcfix.report.text import uncertainty_sentence
 from pcfix.report.water import found_picture
-from pcfix.version import __version__
-from pcfix.water.index import Water, with_index
 
 RECORD = "run.json"
+CLEAN = CleanOptions(overwrite=True)
 SECTIONS = 3
 DOD, REFERENCE_DSM = "dod.tif", "reference_dsm.tif"
-CLOUDS = (".las", ".laz")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Request(RunOptions):
-    """Everything that the results of a run depend on; ``run.json`` keeps it."""
-
-    input: str = ""
-
-    def check(self) -> None:
-        """Check what options say together."""
-        super().check()
-        self.adjust_step()
-
-    def adjust_step(self) -> AdjustStep:
-        """Return what the first step is asked for."""
-        index = with_index(self.part(RunOptions)).refractive_index
-        return AdjustStep(
-            self.input, self.part(Inputs), index, self.adjust, self.gcps, self.gnss, self.lens
-        )
-
-    def with_adjusted(self, folder: Path, step: dict[str, Any]) -> Request:
-        """Return the request of the steps that follow: with the adjusted cameras where they are."""
-        if not step["adjusted"]:
-            return self
-        return replace(
-            self,
-            cameras=str(folder / FOLDER / step["model"]),
-            adjusted_from=self.cameras,
-            adjust="no", gcps=None, gnss=None, lens=None,
-        )  # fmt: skip
-
-    def record(self) -> dict[str, Any]:
-        """Return plain values, without what the results do not depend on."""
-        values = self.as_dict()
-        kept = {name: values[name] for name in values if name not in ("overwrite", "jobs")}
-        return {**kept, VERSION: __version__}
-
-    def files(self) -> dict[str, list[Path]]:
-        """Return the input files, each of which exists, by the first step that reads them."""
-        names = [self.input, *paths_in(self, but=("water",)), self.gcps, self.gnss, self.lens]
-        found = [path for name in names if name is not None for path in files_in(name)]
-        found += [Path(self.water)] if Path(self.water).is_file() else []
-        compared = [] if self.reference is None else files_in(self.reference)
-        return {"adjust": found, "compare": [*compared, *(check_input(p) for _, p in self.also)]}
-
-    def watched(self, results: Path) -> dict[str, list[Path]]:
-        """Return all files that the results may go by; those in the folder of results are none."""
-        read = self.files()
-        names = paths_in(self, but=("water",))
-        around = {path for name in names for path in files_around(name)}
-        own = results.resolve()
-        more = sorted(one for one in around if own not in one.resolve().parents)
-        return {**read, "adjust": list(dict.fromkeys([*read["adjust"], *more]))}
-
-
-_CORRECTION = {one.name for one in options_of(CorrectOptions)}.difference(
-    ("input", "adjust", "index_formula"), Water._fields, (one.name for one in options_of(Inputs))
-) - {"index"}
-_LATER = {
-    **{one.name: "compare" for one in options_of(DistanceOptions)},
-    "reference": "compare", "resolution": "dsm", "project": "report", "date": "report",
-}  # fmt: skip
-
-
-def _since(name: str) -> str:
-    """Return the first step that an option of a request matters to."""
-    if name in _CORRECTION:
-        return "correct"
-    return _LATER.get(name, "adjust")
-
-
-def request_of(record: Path) -> Request:
-    """Return what an earlier run was asked for, from its ``run.json``."""
-    # runs before there were adjustments did without
-    kept = {"adjust": "no", **read_record(record)["request"]}
-    input = kept.pop("input", "")
-    for name in ("index_from", VERSION):
-        kept.pop(name, None)
-    try:
-        with warnings.catch_warnings():  # a record of old may have old names
-            warnings.simplefilter("ignore", PcfixWarning)
-            return Request(input=input, **named(kept, options_of(RunOptions), str(record)))
-    except (SettingError, TypeError) as error:
-        raise InputError(f"{record}: is not the record of a run ({error}).") from error
-
-
-class Files:
-    """Where a run leaves what it makes."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.corrected, self.cleaned = folder / "corrected.laz", folder / "cleaned.laz"
-        self.surface, self.map = folder / SURFACE, folder / "map.gpkg"
-        self.compare, self.report = folder / "compare", folder / "report.html"
-        self.regression = folder / "regression.json"
 
 
 def run_all(
@@ -198,9 +94,12 @@ def run_all(
     inputs = [path for some in read.values() for path in some]
     if request.m3c2:
         load_py4dgeo()
+    files = Files(out_dir, request.source)
+    check_one_file(request.source, request)
+    if isinstance(request.source, Tiles):
+        TiledRun("correct", request.source, files.corrected, request).check_folder()
     record = _begun(request, out_dir, overwrite, say)
     check_shoreline(request.shoreline, overwrite=overwrite or record.resumes, inputs=inputs)
-    files = Files(out_dir)
     shore = [] if request.shoreline is None else [Path(request.shoreline)]
 
     def step(
@@ -208,29 +107,47 @@ def run_all(
         outputs: list[Path],
         work: Callable[[Progress | None], Any],
         more: Callable[[Any], str] = lambda result: "",
+        shown: Path | None = None,
     ) -> Any:
         result, was_done = record.step(name, outputs, lambda: _with_bar(bar, name, work))
-        say(f"{name:<9} {'done before' if was_done else 'done'}: {outputs[0]}{more(result)}")
+        done = "done before" if was_done else "done"
+        say(f"{name:<9} {done}: {shown or outputs[0]}{more(result)}")
         return result
 
     first, was_done = record.step(
         "adjust",
         outputs_of(out_dir),
         lambda: _with_bar(
-            bar, "adjust", lambda _: adjust_first(request.adjust_step(), out_dir, inputs, jobs)
+            bar,
+            "adjust",
+            lambda _: adjust_first(
+                replace(request.adjust_step(), cloud=request.source), out_dir, inputs, jobs
+            ),
         ),
     )
     _say_adjusted(first, out_dir, was_done, say)
     request = request.with_adjusted(out_dir, first)
-    clouds = [files.corrected] + ([] if request.check_depths is None else [files.regression])
-    corrected = step("correct", [*clouds, *shore], partial(_correct, request, files, jobs))
+    line = [] if request.check_depths is None else [files.regression]
+    corrected = step(
+        "correct",
+        [*files.parts(files.corrected), *line, *shore],
+        partial(_correct, request, files, jobs),
+        shown=files.corrected,
+    )
     corrected = _with_checked(corrected, first)
     if not first["is_said"] and is_worth_saying(first, _is_bent(corrected)):
         first = {**first, "is_said": True}
         _say_adjusted(first, out_dir, was_done, say)
     # the surface of a dimension is still in the cloud, and what was corrected is known anyway
-    clean = partial(clean_file, files.corrected, files.cleaned, overwrite=True, jobs=jobs)
-    step("clean", [files.cleaned], lambda progress: clean(progress=progress).as_dict())
+    clean = replace(CLEAN, jobs=jobs, scheduler=request.scheduler)
+    step(
+        "clean",
+        files.parts(files.cleaned),
+        lambda progress: clean_file(
+            files.corrected_cloud, files.cleaned, options=clean, progress=progress
+        ).as_dict(),
+        shown=files.cleaned,
+    )
     errors = corrected["uncertainty"] is not None
     outputs = raster_files(out_dir, errors=errors)
     cells = partial(resolution_sentence, given=request.resolution is not None)
@@ -261,7 +178,7 @@ def _begun(request: Request, out_dir: Path, overwrite: bool, say: Callable[[str]
     if not out_dir.parent.is_dir():
         raise SettingError(f"{out_dir}: the folder {out_dir.parent} does not exist; make it first.")
     out_dir.mkdir(exist_ok=True)
-    record = Record(out_dir / RECORD, request.record(), request.watched(out_dir), _since)
+    record = Record(out_dir / RECORD, request.record(), request.watched(out_dir), since)
     changed = ", ".join(record.changed)
     if not (overwrite or record.resumes) and any(out_dir.iterdir()):
         other = f"a run with another {changed}" if changed else "other files"
@@ -305,7 +222,8 @@ def _correct(
     options = replace(request, overwrite=True, jobs=jobs).part(CorrectOptions)
     if request.check_depths is not None:
         options = replace(options, save_regression=files.regression)
-    summary = correct_file(request.input, files.corrected, options=options, progress=progress)
+    files.remove_others()
+    summary = correct_file(request.source, files.corrected, options=options, progress=progress)
     return vars(summary)
 
 
@@ -327,7 +245,7 @@ def _grid(
     request: Request, files: Files, errors: bool, progress: Progress | None
 ) -> dict[str, Any]:
     return write_rasters(
-        files.cleaned, files.folder, resolution=request.resolution,
+        files.cleaned_cloud, files.folder, resolution=request.resolution,
         cameras=_cameras(request, files), errors=errors, progress=progress,
     )  # fmt: skip
 
@@ -337,18 +255,23 @@ def _cameras(request: Request, files: Files) -> Cameras:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PcfixWarning)
         inputs = replace(request, views=None).part(Inputs)
-        return read_blocks(inputs, view_of(files.corrected).crs).cameras
+        return read_blocks(inputs, view_of(files.corrected_cloud).crs).cameras
 
 
 def _compare(request: Request, files: Files) -> dict[str, Any]:
-    reference = Path(str(request.reference))
+    reference = request.surveyed
     asked = {one.name: getattr(request, one.name) for one in options_of(DistanceOptions)}
     result = compare_clouds(
-        files.cleaned, reference, out_dir=files.compare, sections=SECTIONS, overwrite=True, **asked
+        files.cleaned_cloud,
+        reference,
+        out_dir=files.compare,
+        sections=SECTIONS,
+        overwrite=True,
+        **asked,
     )
     if _rasters(request):
-        heights = reference
-        if reference.suffix.lower() in CLOUDS:
+        heights = Path(str(reference))
+        if is_cloud(reference):
             heights = files.compare / REFERENCE_DSM
             with open_raster(files.surface) as dsm:
                 resolution = float(dsm.res[0])
@@ -375,7 +298,7 @@ def _map(request: Request, files: Files, done: dict[str, Any]) -> dict[str, int]
     summary, compared = done["correct"], done["compare"] or {}
     fitted = (summary["water_fit"] or {}).get("sigma_level_m")
     drawn = Drawn(
-        cloud=files.cleaned,
+        cloud=files.cleaned_cloud,
         folder=files.folder,
         water=_water(request, files),
         sigma_level_m=request.sigma_level if request.sigma_level is not None else fitted,
@@ -385,25 +308,24 @@ def _map(request: Request, files: Files, done: dict[str, Any]) -> dict[str, int]
         check_points=np.array(compared.get("check_points", [])).reshape(-1, 4),
         check_depths=request.check_depths,
     )
-    return write_map(files.map, drawn, view_of(files.cleaned).crs)
+    return write_map(files.map, drawn, view_of(files.cleaned_cloud).crs)
 
 
 def _water(request: Request, files: Files) -> WaterSurface:
     """Return the surface as the corrected cloud states it, else as it was asked for."""
     with warnings.catch_warnings():  # they were shown when the cloud was corrected
         warnings.simplefilter("ignore", PcfixWarning)
-        with LasSource(files.corrected) as source:
+        with open_cloud(files.corrected_cloud) as source:
             stated = own_water(source)
         inputs = replace(request, views=None).part(Inputs)
-        return stated or inputs.surface(view_of(files.corrected)).surface
+        return stated or inputs.surface(view_of(files.corrected_cloud)).surface
 
 
 def _rasters(request: Request) -> list[str]:
     """Return the rasters that a comparison leaves: none with check points."""
-    suffix = Path(str(request.reference)).suffix.lower()
-    if suffix in CLOUDS:
+    if is_cloud(request.surveyed):
         return [DOD, REFERENCE_DSM]
-    return [DOD] if suffix in (".tif", ".tiff") else []
+    return [DOD] if Path(str(request.reference)).suffix.lower() in (".tif", ".tiff") else []
 
 
 def _report(
@@ -424,13 +346,13 @@ def _report(
     again = replace(request, views=None).part(Inputs)
     cameras = _cameras(request, files)
     if is_found(summary):
-        pictures.append(found_picture(again.surface(view_of(Path(request.input)))))
+        pictures.append(found_picture(again.surface(view_of(request.source))))
     with open_raster(files.surface) as dsm:
         resolution = float(dsm.res[0])
     figures = {} if compared is None else compared["figures"]
     later = Later(pictures, tables, verdict, figures, dod, resolution)
     report = write_report(
-        files.cleaned,
+        files.cleaned_cloud,
         files.folder,
         summary=summary,
         cameras=cameras,

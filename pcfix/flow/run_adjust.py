@@ -17,10 +17,11 @@ from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths,
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.next_steps import MODELS
 from pcfix.flow.surfaces import CloudView, view_of
-from pcfix.io.files import check_input, read_json
+from pcfix.io.files import read_json
 from pcfix.io.gnss_positions import read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.io.members import FILE as MEMBERS
+from pcfix.io.tiles import Clouds, cloud_of
 from pcfix.kernels import threads
 from pcfix.model import Cameras, WaterDimension, WaterSurface
 from pcfix.options.declare import File
@@ -53,7 +54,7 @@ class AdjustStep:
     only, see `pcfix.adjust_cameras`.
     """
 
-    cloud: str
+    cloud: Clouds
     inputs: Inputs
     index: float
     when: AdjustWhen = "auto"
@@ -144,7 +145,7 @@ def _decide(step: AdjustStep) -> Decision:
     inputs, is_said = step.inputs, bool(step.survey)
     if step.unfit:
         return Decision(False, step.unfit, is_said)
-    view = view_of(check_input(step.cloud))
+    view = view_of(cloud_of(step.cloud))
     with warnings.catch_warnings():  # the correction shows them
         warnings.simplefilter("ignore", PcfixWarning)
         cameras = inputs.block(view.crs)[0]

@@ -316,7 +316,10 @@ def _sought(view: CloudView | None) -> FoundSurface:
         raise SettingError("water 'auto' is found in a cloud; give the cloud too.")
     every = max(1, view.points // SAMPLE_POINTS)
     chunks: Iterable[tuple[Any, ...]] = view.chunks()
-    parts = [[a if a is None else a[::every] for a in seen] for seen in chunks]
+    parts, row = [], 0
+    for seen in chunks:
+        parts.append([a if a is None else a[-row % every :: every] for a in seen])
+        row += len(seen[0])
     whole: list[Any] = [
         None if any(a is None for a in arrays) else np.concatenate(arrays)
         for arrays in zip(*parts, strict=True)

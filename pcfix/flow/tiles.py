@@ -177,7 +177,7 @@ class TiledRun:
             cannot be made or refuses the result.
         """
         check_one_file(self.tiles, self.options)
-        self._check_folder()
+        self.check_folder()
         check_summary(self.options, self.tiles.paths)
         key = self._key()
         work = self._work(key)
@@ -250,7 +250,7 @@ class TiledRun:
             write_summary(self.options, result.as_dict())
         return result
 
-    def _check_folder(self) -> None:
+    def check_folder(self) -> None:
         """Refuse a folder that has inputs, or lies in theirs."""
         folder, named = self.folder.resolve(), Path(self.tiles.name)
         for path in self.tiles.paths:

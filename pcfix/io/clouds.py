@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,12 +15,13 @@ from pcfix.blocks import empty, kept, let_go, mapped
 from pcfix.compare.match import Reference, SurveyCloud
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.crs import is_same, parts
-from pcfix.io.files import check_input
+from pcfix.io.files import check_input, path_of
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, stated_crs
 from pcfix.io.las.writing import own_settings
 from pcfix.io.rasters import place_of, read_masked
 from pcfix.io.tables import read_table
+from pcfix.io.tiles import SUFFIXES, Clouds, Tiles, cloud_of, open_cloud
 from pcfix.model import (
     BATHYMETRIC_POINT,
     NOISE_CLASSES,
@@ -29,22 +31,23 @@ from pcfix.model import (
     WaterPlane,
     WaterSurface,
 )
-from pcfix.options.declare import File
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
 
 def read_cloud(
-    path: File, water: WaterSurface | None = None, skip_classes: Sequence[int] = NOISE_CLASSES
+    path: Path | Tiles,
+    water: WaterSurface | None = None,
+    skip_classes: Sequence[int] = NOISE_CLASSES,
 ) -> SurveyCloud:
-    """Read the points that count of a LAS or LAZ cloud.
+    """Read the points that count of a LAS or LAZ cloud, in one file or in many.
 
     Those of `skip_classes`, and withheld ones, are left out. The `water` is by default what a cloud
     that pcfix corrected says of its own. An `InputError` if the file is damaged, no point counts,
     or it lacks the dimension that `water` names.
     """
-    with LasSource(path) as source:
+    with open_cloud(path) as source:
         crs = stated_crs(source, "its CRS cannot be read", "export it again")
         own = water or own_water(source)
         extra = set(source.header.point_format.extra_dimension_names)
@@ -152,22 +155,36 @@ def own_water(source: LasSource) -> WaterSurface | None:
 
 WATER_CLASSES = (9, 41, 42, 45)
 """ASPRS classes of water and of its surface and column: not the bed."""
+TABLES = (".csv", ".txt")
 KINDS = "a cloud (.las, .laz), check points (.csv, .txt) or a grid (.tif, .tiff)"
 
 
-def read_reference(path: File) -> Reference:
+def reference_of(reference: Clouds) -> Path | Tiles:
+    """Return a file, or many as one cloud, see `cloud_of`; ``.txt`` is a table, no list of them."""
+    is_path = isinstance(reference, str | PathLike)
+    if is_path and path_of(reference).suffix.lower() in TABLES:
+        return path_of(reference)
+    return cloud_of(reference)
+
+
+def is_cloud(reference: Path | Tiles) -> bool:
+    """Whether a reference is one by its name."""
+    return isinstance(reference, Tiles) or reference.suffix.lower() in SUFFIXES
+
+
+def read_reference(reference: Clouds) -> Reference:
     """Read a reference; the end of its name says what it is.
 
-    ``.las``, ``.laz``: all points but those withheld and those of noise or water; ``.csv``,
-    ``.txt``: columns x, y, z; ``.tif``, ``.tiff``: the centres of all cells with data. An
-    `InputError` if it is none of these, damaged or empty.
+    ``.las``, ``.laz``, and many files of these: all points but those withheld and those of noise or
+    water; ``.csv``, ``.txt``: columns x, y, z; ``.tif``, ``.tiff``: the centres of all cells with
+    data. An `InputError` if it is none of these, damaged or empty.
     """
-    source = check_input(path)
-    suffix = source.suffix.lower()
-    if suffix in (".las", ".laz"):
-        cloud = read_cloud(source, skip_classes=NOISE_CLASSES + WATER_CLASSES)
+    found = reference_of(reference)
+    if isinstance(found, Tiles) or is_cloud(check_input(found)):
+        cloud = read_cloud(found, skip_classes=NOISE_CLASSES + WATER_CLASSES)
         return Reference(cloud.name, cloud.xyz, cloud.crs, cloud.left_out)
-    if suffix in (".csv", ".txt"):
+    source, suffix = found, found.suffix.lower()
+    if suffix in TABLES:
         table = read_table(source, ("x", "y", "z"))
         xyz = np.column_stack([table.numbers(name) for name in "xyz"])
         return Reference(str(source), xyz, None, sparse=True)

@@ -21,7 +21,7 @@ from pcfix.options.declare import File
 if TYPE_CHECKING:
     import laspy
 
-Clouds: TypeAlias = File | Iterable[File]
+Clouds: TypeAlias = "File | Iterable[File] | Tiles"
 
 SUFFIXES = (".las", ".laz")
 LISTS = (".txt", ".lst", ".list")
@@ -140,7 +140,7 @@ def tiles_of(cloud: Clouds) -> Tiles | None:
 
     Parameters
     ----------
-    cloud : path or iterable of paths
+    cloud : path, iterable of paths, or Tiles
         A folder, a glob (``tiles/*.laz``), a text list with a path on each line, or a virtual
         point cloud (``.vpc``); paths in these two may be relative to their own folder.
 
@@ -154,6 +154,8 @@ def tiles_of(cloud: Clouds) -> Tiles | None:
     PcfixWarning
         If tiles overlap.
     """
+    if isinstance(cloud, Tiles):
+        return cloud
     if not isinstance(cloud, Iterable) or isinstance(cloud, str):
         paths, name = _listed(path_of(cloud)), str(cloud)
         if paths is None:
@@ -172,6 +174,26 @@ def tiles_of(cloud: Clouds) -> Tiles | None:
                 " names of their own, or correct them one by one."
             )
     return tiles_from(name, paths)
+
+
+def cloud_of(cloud: Clouds) -> Path | Tiles:
+    """Return a file, or many as one cloud that lacks none of them; see `tiles_of`.
+
+    Raises
+    ------
+    PcfixError
+        If one of many cannot be read: what is made of all would be without its points.
+    """
+    tiles = tiles_of(cloud)
+    if tiles is None:
+        return path_of(cloud)
+    if tiles.broken:
+        count, why = len(inputs_of(tiles)), "\n".join(f"  {one}" for one in tiles.broken.values())
+        raise InputError(
+            f"{tiles}: {len(tiles.broken)} of {count} files cannot be read, and the result is of"
+            f" all; mend them, or name the others alone:\n{why}"
+        )
+    return tiles
 
 
 def _listed(path: Path) -> list[Path] | None:

@@ -22,7 +22,7 @@ from pcfix.options.declare import (
     positive,
     rule,
 )
-from pcfix.options.shared import JobOptions, OverwriteOption, Panel, PartOptions, SummaryOption
+from pcfix.options.shared import OverwriteOption, Panel, PartOptions, SummaryOption, TileOptions
 
 LEAST_NEIGHBOURS, MOST_NEIGHBOURS = 6, 500
 MAX_HOLE_CELLS = 1000
@@ -144,7 +144,7 @@ class CleanRules(OptionSet):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CleanOptions(JobOptions, SummaryOption, CleanRules):
+class CleanOptions(TileOptions, SummaryOption, CleanRules):
     """The options of ``pcfix clean``."""
 
     panel = Panel.OUTPUT

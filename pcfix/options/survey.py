@@ -12,7 +12,6 @@ from pcfix.options.declare import File, OptionSet, one_or_more, option, options_
 from pcfix.options.shared import (
     CameraFileOptions,
     IndexOptions,
-    JobOptions,
     NeededOptions,
     OverwriteOption,
     Panel,
@@ -21,6 +20,7 @@ from pcfix.options.shared import (
     SubmergedOptions,
     SummaryOption,
     SurveyOptions,
+    TileOptions,
     ViewOptions,
     WaterOptions,
 )
@@ -99,7 +99,7 @@ class WaterCheckOptions(ShorelineOption, OverwriteOption, SummaryOption, WaterOp
 class RunOptions(
     ReferenceOption,
     ShorelineOption,
-    JobOptions,
+    TileOptions,
     DistanceOptions,
     SurveyedOptions,
     RefractionOptions,

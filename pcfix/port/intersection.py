@@ -42,15 +42,9 @@ from pcfix.options.correct import ScienceOptions
 from pcfix.port.light import coefficients, cosine_at_port, ray_through, through_port
 from pcfix.port.shapes import Port
 from pcfix.refract.batch import CORRECTED, NO_CAMERA, ONE_CAMERA, PARALLEL, Intersection
-from pcfix.refract.choice import (
-    ANY_NUMBER,
-    NOMINAL_FOCAL_PX,
-    TILE,
-    cameras_around,
-    near_cameras,
-    spatial_order,
-)
+from pcfix.refract.choice import ANY_NUMBER, NOMINAL_FOCAL_PX
 from pcfix.refract.rays import add_line, nearest_point
+from pcfix.refract.tiling import TILE, cameras_around, near_cameras, spatial_order
 
 # Columns of the result after the shift.
 _MISS, _SIGMA_Z, _COSINE, _OUTCOME = 3, 4, 5, 6

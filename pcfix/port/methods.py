@@ -10,8 +10,8 @@ from pcfix.port.intersection import intersect_rays, port_views, rotations_of
 from pcfix.port.inversion import consistent_through_port, port_covariances
 from pcfix.port.shapes import Port
 from pcfix.refract.batch import Intersection
-from pcfix.refract.choice import spatial_order
 from pcfix.refract.methods import batches, joined
+from pcfix.refract.tiling import spatial_order
 
 
 def correct_through_port(

@@ -5,50 +5,36 @@ Points are worked on in tiles of neighbours, so that a tile needs to look at few
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.kernels import Span, in_tiles, kernel, lean_kernel, part
-from pcfix.lens.algebra import dot, minus, normal_of, row_of
-from pcfix.lens.frames import (
-    NOT_DISTORTED,
-    NOTHING,
-    Frames,
-    frames_of,
-    holds,
-    judge,
-    may_hold,
-    no_frames,
-)
+from pcfix.kernels import Span, in_tiles, kernel, lean, lean_kernel, part
+from pcfix.lens.algebra import dot, minus, row_of
+from pcfix.lens.frames import Frames, frames_of, holds, no_frames
 from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.rays import pierce_of
+from pcfix.refract.tiling import (
+    TILE,
+    Points,
+    box_of,
+    cameras_around,
+    gather,
+    mark_camera,
+    near_cameras,
+    points_of,
+    tiles_of,
+)
 from pcfix.water.surface import Field, SurfaceAbove, Tin, build_fields, build_tin, locate
 
 NOMINAL_FOCAL_PX = 3700.0
 """Of cameras without a lens: a survey drone's of 20 megapixels, 0.27 mrad a pixel."""
 
-TILE = 128
-"""Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""
-
-
 ANY_NUMBER = 2**31
 """A list may name a camera twice, so that there can be more entries than cameras."""
-
-
-class Points(NamedTuple):
-    """Points and the water above them, for kernels; see `Batch`.
-
-    `order` brings neighbours together.
-    """
-
-    order: IntArray
-    xyz: FloatArray
-    height: FloatArray
-    slope: FloatArray
 
 
 class Rig(NamedTuple):
@@ -81,16 +67,6 @@ class Rule(NamedTuple):
     least_cosine2: float
     most: int
     bend: float
-
-
-def points_of(batch: Batch) -> Points:
-    """Return the points of a batch for kernels."""
-    return Points(
-        spatial_order(batch.xyz),
-        np.ascontiguousarray(batch.xyz),
-        np.ascontiguousarray(batch.surface.height_m),
-        np.ascontiguousarray(batch.surface.slope),
-    )
 
 
 def rig_of(survey: Survey) -> Rig:
@@ -152,10 +128,11 @@ def chosen_views(batch: Batch) -> Views:
         entries = (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64))
         begin = entries[0][:-1].copy()
         place = np.empty(len(views.camera), np.int32)
-    in_tiles(
-        _choose_all, tiles, points, rig, frames, rule_of(survey), *shapes_of(survey),
-        entries, (first, begin, count, place),
-    )  # fmt: skip
+    rule, (tin, fields), found = rule_of(survey), shapes_of(survey), (first, begin, count, place)
+    if views is None and tin is None and fields is None:
+        in_tiles(_choose_in_frame, tiles, points, rig, frames, rule, found)
+    else:
+        in_tiles(_choose_all, tiles, points, rig, frames, rule, tin, fields, entries, found)
     start = np.cumsum(count)
     chosen = np.empty(start[-1], np.int64)
     in_tiles(_gather_chosen, len(begin), begin, start, place, chosen)
@@ -193,11 +170,6 @@ def _distinct(start: IntArray, camera: IntArray, first: IntArray, distinct: IntA
                 owner[c], distinct[count] = i, c
                 count += 1
         first[i + 1] = count
-
-
-def tiles_of(batch: Batch) -> int:
-    """Return how many tiles of neighbours the points of a batch fill."""
-    return (len(batch) + TILE - 1) // TILE
 
 
 @kernel
@@ -246,6 +218,53 @@ def _choose_all(
             free += kept.size
 
 
+@kernel
+def _choose_in_frame(
+    span: Span, points: Points, rig: Rig, frames: Frames, rule: Rule,
+    found: tuple[IntArray, IntArray, IntArray, npt.NDArray[np.int32]],
+) -> None:  # fmt: skip
+    """Do what `_choose_all` does without lists and under planes, to whole tiles at once."""
+    first, begin, count, place = found
+    low, high = box_of(span, points)
+    around = cameras_around(frames, rig.centres, low, high)
+    for t in range(*span):
+        rows = points.order[t * TILE : (t + 1) * TILE]
+        tile = np.empty(7 * TILE)
+        low, high = gather(tile, rows, points)
+        near = near_cameras(around, frames, rig.centres, low, high)
+        cosine2 = np.empty((near.size, rows.size))
+        seeing = 0
+        for c in near:
+            if mark_camera(cosine2[seeing], tile, frames, c, rig.centres[c], low, high):
+                _set_steepness(cosine2[seeing], tile, rig, c, rule)
+                near[seeing] = c
+                seeing += 1
+        free, steep = first[t], np.empty(seeing)
+        for j in range(rows.size):
+            k = 0
+            for at in range(seeing):
+                if cosine2[at, j] >= 0.0:
+                    place[free + k], steep[k] = near[at], cosine2[at, j]
+                    k += 1
+            k = _keep_steepest(place[free:], steep, k, rule.most)
+            begin[rows[j]], count[rows[j] + 1] = free, k
+            free += k
+
+
+@lean
+def _set_steepness(marks: FloatArray, tile: FloatArray, rig: Rig, c: int, rule: Rule) -> None:
+    """Turn marks into squared cosines of incidence angles, negative where a ray does not count."""
+    centre, offset = row_of(rig.centres, c), rig.offset[c]
+    for j in range(marks.size):
+        z = tile[2 * TILE + j]
+        e = minus(centre, (tile[j], tile[TILE + j], z))
+        height = dot((tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]), e)
+        h = tile[6 * TILE + j] * (tile[3 * TILE + j] - (z - offset))
+        length2 = dot(e, e)
+        use = (height > h) & (height * height >= rule.least_cosine2 * length2)
+        marks[j] = height * height / length2 if use & (marks[j] > 0.0) else -1.0
+
+
 @lean_kernel
 def _gather_chosen(
     span: Span, begin: IntArray, start: IntArray, place: npt.NDArray[np.int32], chosen: IntArray
@@ -256,65 +275,15 @@ def _gather_chosen(
             chosen[start[i] + k] = place[begin[i] + k]
 
 
-def spatial_order(xyz: FloatArray) -> IntArray:
-    """Return an order that brings neighbours together, about `TILE` points to a cell.
-
-    Only speed depends on it: a tile of neighbours needs few cameras.
-    """
-    if len(xyz) <= TILE:
-        return np.arange(len(xyz))
-    x, y = xyz[:, 0], xyz[:, 1]
-    width, height = max(np.ptp(x), 1e-6), max(np.ptp(y), 1e-6)
-    cells = min(len(xyz) / TILE, 2.0**14)
-    cell_m = max(np.sqrt(width * height / cells), max(width, height) / cells)
-    columns, rows = int(width / cell_m) + 1, int(height / cell_m) + 1
-    return _cell_order(xyz, x.min(), y.min(), 1.0 / cell_m, columns, rows)
-
-
-@kernel
-def _cell_order(
-    xyz: FloatArray, x0: float, y0: float, cells_per_m: float, columns: int, rows: int
-) -> IntArray:
-    """Sort by cells, row after row to and fro, with one count and one pass over the points."""
-    cell = np.empty(len(xyz), np.int64)
-    place = np.zeros(columns * rows + 1, np.int64)
-    for i in range(len(xyz)):
-        column = min(int((xyz[i, 0] - x0) * cells_per_m), columns - 1)
-        row = min(int((xyz[i, 1] - y0) * cells_per_m), rows - 1)
-        cell[i] = row * columns + (columns - 1 - column if row & 1 else column)
-        place[cell[i] + 1] += 1
-    for c in range(columns * rows):
-        place[c + 1] += place[c]
-    order = np.empty(len(xyz), np.int64)
-    for i in range(len(xyz)):
-        order[place[cell[i]]] = i
-        place[cell[i]] += 1
-    return order
-
-
 MAX_ANGLE_WITHOUT_FRAMES_DEG = 80.0
 """Cameras without a lens have no frame to leave; nobody matches images as flat as this, and a
 block in another CRS is told apart."""
 
 
 @part
-def gather(tile: FloatArray, rows: IntArray, points: Points) -> tuple[FloatArray, FloatArray]:
-    """Bring a tile together: runs of x, y, z, surface height and unit normal; return its box."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for j in range(rows.size):
-        i = rows[j]
-        for axis in range(3):
-            value = points.xyz[i, axis]
-            tile[axis * TILE + j] = value
-            low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
-        x, y, z = normal_of(points.slope[i, 0], points.slope[i, 1])
-        tile[3 * TILE + j] = points.height[i]
-        tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j] = x, y, z
-    return low, high
-
-
-@part
-def _keep_steepest(chosen: IntArray, cosine2: FloatArray, k: int, most: int) -> int:
+def _keep_steepest(
+    chosen: npt.NDArray[np.integer[Any]], cosine2: FloatArray, k: int, most: int
+) -> int:
     """Bring the `most` steepest of k cameras to the front, in the order of the cameras."""
     if k <= most:
         return k
@@ -323,48 +292,6 @@ def _keep_steepest(chosen: IntArray, cosine2: FloatArray, k: int, most: int) -> 
     for j in range(most):
         chosen[j] = chosen[ranked[j]]
     return most
-
-
-@part
-def cameras_around(
-    frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray
-) -> IntArray:
-    """Return the cameras whose pyramids may hold a point of the box of many tiles."""
-    around = np.empty(len(centres), np.int64)
-    count = 0
-    for c in range(len(centres)):
-        if may_hold(frames.planes[c], centres[c], low, high):
-            around[count] = c
-            count += 1
-    return around[:count]
-
-
-@part
-def box_of(span: Span, points: Points) -> tuple[FloatArray, FloatArray]:
-    """Return the corners of an upright box around the points of some tiles."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for i in points.order[span[0] * TILE : span[1] * TILE]:
-        for axis in range(3):
-            value = points.xyz[i, axis]
-            low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
-    return low, high
-
-
-@part
-def near_cameras(
-    around: IntArray, frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray
-) -> IntArray:
-    """Return those of some cameras whose frames may hold a point of the box."""
-    planes, row = frames.planes, frames.row
-    near = np.empty(len(around), np.int64)
-    count = 0
-    for c in around:
-        if not may_hold(planes[c], centres[c], low, high):
-            continue
-        if row[c] == NOT_DISTORTED or judge(frames, c, centres[c], low, high) != NOTHING:
-            near[count] = c
-            count += 1
-    return near[:count]
 
 
 @part

@@ -18,39 +18,22 @@ import numpy as np
 
 from pcfix.kernels import Span, in_tiles, kernel, lean, part
 from pcfix.lens.algebra import dot, minus, row_of, scaled
-from pcfix.lens.frames import (
-    ALL,
-    NOT_DISTORTED,
-    NOTHING,
-    SOME,
-    Frames,
-    Pyramid,
-    frames_of,
-    in_frame,
-    judge,
-    mark,
-    mark_pyramid,
-    may_hold,
-    pyramid,
-)
+from pcfix.lens.frames import NOT_DISTORTED, Frames, Pyramid, frames_of, in_frame, may_hold, pyramid
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.refract.batch import CORRECTED, NO_CAMERA, ONE_CAMERA, PARALLEL, Batch, Intersection
-from pcfix.refract.choice import (
+from pcfix.refract.choice import Rig, Rule, rig_of, rule_of, shapes_of
+from pcfix.refract.rays import add_line, line_terms, nearest_point, pierce_of, refracted
+from pcfix.refract.sensitivity import SUMS, TILE_RUNS, Budget, add_below
+from pcfix.refract.tiling import (
     TILE,
     Points,
-    Rig,
-    Rule,
     box_of,
     cameras_around,
     gather,
+    mark_camera,
     points_of,
-    rig_of,
-    rule_of,
-    shapes_of,
     tiles_of,
 )
-from pcfix.refract.rays import add_line, line_terms, nearest_point, pierce_of, refracted
-from pcfix.refract.sensitivity import SUMS, TILE_RUNS, Budget, add_below
 from pcfix.refract.uncertainty import (
     add_errors,
     budget_of,
@@ -139,29 +122,7 @@ def _solve(row: FloatArray, k: float, sums: FloatArray) -> None:
 
 
 @lean
-def _mark_camera(
-    marks: FloatArray, tile: FloatArray, frames: Frames, c: int, centre: FloatArray,
-    low: FloatArray, high: FloatArray,
-) -> bool:  # fmt: skip
-    """Mark the points of a tile that lie in the frame of camera c; return whether any may."""
-    x, y, z = (
-        tile[: marks.size],
-        tile[TILE : TILE + marks.size],
-        tile[2 * TILE : 2 * TILE + marks.size],
-    )
-    if frames.row[c] == NOT_DISTORTED:
-        mark_pyramid(marks, x, y, z, centre, pyramid(frames.planes[c]))
-        return True
-    held = judge(frames, c, centre, low, high)
-    if held == ALL:
-        marks[:] = 1.0
-    if held != SOME:
-        return bool(held != NOTHING)
-    return bool(mark(marks, x, y, z, centre, frames, c) > 0)
-
-
-@lean
-def _add_camera(
+def add_camera(
     sums: FloatArray, tile: FloatArray, marks: FloatArray, g: Pyramid | None, rig: Rig, c: int,
     rule: Rule,
 ) -> int:  # fmt: skip
@@ -235,9 +196,9 @@ def _all_in_frame(
             # marks of a pyramid are for the errors alone: a pass of its own takes 40 % longer
             if frames.row[c] == NOT_DISTORTED and not len(covariance):
                 g = pyramid(frames.planes[c])
-                rays = _add_camera(sums, tile, marks[seeing], g, rig, c, rule)
-            elif _mark_camera(marks[seeing], tile, frames, c, centres[c], low, high):
-                rays = _add_camera(sums, tile, marks[seeing], None, rig, c, rule)
+                rays = add_camera(sums, tile, marks[seeing], g, rig, c, rule)
+            elif mark_camera(marks[seeing], tile, frames, c, centres[c], low, high):
+                rays = add_camera(sums, tile, marks[seeing], None, rig, c, rule)
             else:
                 rays = 0
             if rays:
@@ -294,7 +255,7 @@ def _intersect_one(
         height = dot(normal, e)
         q = 1.0 / (length2 * height)
         if h > 0.0 and tin is None and fields is None:
-            f = h * length2 * q  # as in `_add_camera`
+            f = h * length2 * q  # as in `add_camera`
         inv = height * q
         add_line(sums, scaled(f, e), refracted(e, length2, normal, height, bend), inv)
         least = min(least, height * height * inv)

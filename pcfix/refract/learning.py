@@ -10,7 +10,6 @@ from pcfix.errors import SettingError
 from pcfix.model import BoolArray, Cameras, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import UNLISTED, Batch, Learned, Survey
-from pcfix.refract.choice import spatial_order
 from pcfix.refract.consistent import check_consistent
 from pcfix.refract.fusion import likely_beds
 from pcfix.refract.hypotheses import (
@@ -29,6 +28,7 @@ from pcfix.refract.methods import batches, on_land, with_rays
 from pcfix.refract.patches import FEWEST_WITHOUT_LIST
 from pcfix.refract.regression import DepthRegression
 from pcfix.refract.stereo_factor import StereoFactor, check_stereo, stereo_factor
+from pcfix.refract.tiling import spatial_order
 from pcfix.refract.top_surface import occluder_of, wants_occlusion
 from pcfix.refract.weighing import weigh
 from pcfix.water.surface import is_submerged

@@ -10,12 +10,13 @@ from the tie points that the matcher itself went by.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, kernel, lean
+from pcfix.kernels import Span, in_tiles, kernel, lean, part
 from pcfix.lens.algebra import Vector, dot, minus, row_of
 from pcfix.lens.frames import Frames, frames_of
 from pcfix.lens.imaging import project
@@ -67,12 +68,44 @@ class Matcher(NamedTuple):
     tolerance_px2: float = TOLERANCE_PX2
 
 
+class _Seen(NamedTuple):
+    """Which images see which of p places: e entries, image after image, places in order.
+
+    Attributes
+    ----------
+    start : array, shape (k + 1,)
+        The first entry of each image.
+    place, cell : array, shape (e,)
+        The place, and in which cell of the image it lies.
+    depth : array, shape (e,)
+    of_place : array, shape (e,)
+        The entries, place after place, images in order.
+    first : array, shape (p + 1,)
+        The first of them of each place.
+    image : array, shape (e,)
+        The image of each entry.
+    """
+
+    start: IntArray
+    place: IntArray
+    cell: IntArray
+    depth: FloatArray
+    of_place: IntArray
+    first: IntArray
+    image: IntArray
+
+
 def matcher_of(cameras: Cameras, places: FloatArray) -> Matcher:
     """Return how images, with rotations and lenses, were likely matched.
 
     The places, shape (p, 3), are some thousand of the scene, as the software had them, metres.
     """
-    return _matcher(cameras, places, *_images(cameras, places), tracked=False)
+    planes = frames_of(cameras).planes
+    likely = (
+        np.flatnonzero((((centre - places) @ around.T) <= 0.0).all(axis=1))
+        for centre, around in zip(cameras.centres, planes, strict=True)
+    )
+    return _matcher(cameras, places, _seen(cameras, places, likely), tracked=False)
 
 
 def matcher_of_ties(cameras: Cameras, ties: TiePoints) -> Matcher:
@@ -81,10 +114,11 @@ def matcher_of_ties(cameras: Cameras, ties: TiePoints) -> Matcher:
     views = ties.views.take(rows)
     places = np.ascontiguousarray(ties.xyz[rows])
     owner = np.repeat(np.arange(len(rows)), np.diff(views.start))
-    saw = np.zeros((len(cameras), len(rows)), np.bool_)
-    saw[views.camera, owner] = True
-    cell, depth = _images(cameras, places)
-    return _matcher(cameras, places, np.where(saw, cell, -1), depth, tracked=True)
+    camera = np.asarray(views.camera)
+    order = np.lexsort((owner, camera))
+    ends = np.searchsorted(camera[order], np.arange(1, len(cameras)))
+    saw = (np.unique(mine) for mine in np.split(owner[order], ends))
+    return _matcher(cameras, places, _seen(cameras, places, saw), tracked=True)
 
 
 def places_for(cameras: Cameras) -> int:
@@ -92,20 +126,9 @@ def places_for(cameras: Cameras) -> int:
     return max(LEAST_PLACES, PLACES_AN_IMAGE * len(cameras))
 
 
-def _matcher(
-    cameras: Cameras, places: FloatArray, cell: IntArray, depth: FloatArray, *, tracked: bool
-) -> Matcher:
-    seen = cell >= 0
-    start = np.concatenate([[0], np.cumsum(seen.sum(axis=1))])
-    place = np.nonzero(seen)[1]
-    score = np.zeros((len(cameras), len(cameras)))
-    seen_in = cell, depth, start, place
-    in_tiles(_scores, len(cameras), places, cameras.centres, seen_in, tracked, score)
-    most = min(NEIGHBOURS, len(cameras))
-    best = np.argsort(-score, axis=1, kind="stable")[:, :most]
-    best = np.where(np.take_along_axis(score, best, axis=1) > 0.0, best, -1)
+def _matcher(cameras: Cameras, places: FloatArray, seen: _Seen, *, tracked: bool) -> Matcher:
     table = np.full((len(cameras), NEIGHBOURS), -1)
-    table[:, :most] = best
+    in_tiles(_find_partners, len(cameras), places, cameras.centres, seen, tracked, table)
     return Matcher(
         matched=np.ascontiguousarray(table[:, :MATCHED]),
         averaged=np.ascontiguousarray(table[:, :AVERAGED]),
@@ -137,54 +160,82 @@ def _narrower(lens: Lens) -> Lens:
     )
 
 
-def _images(cameras: Cameras, places: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return in which cell of each image a place lies, -1 outside, and its depth, (k, p) each."""
+def _seen(cameras: Cameras, places: FloatArray, likely: Iterable[IntArray]) -> _Seen:
+    """Return which images see which places, of the rows of places that each image may see."""
     if cameras.rotations is None or cameras.lenses is None:
         raise ValueError("a model of the matcher needs angles and lenses")
-    cell = np.full((len(cameras), len(places)), -1)
-    depth = np.empty((len(cameras), len(places)))
-    for c, lens in enumerate(cameras.lenses):
-        rays = (places - cameras.centres[c]) @ cameras.rotations[c].T
-        depth[c] = rays[:, 2]
+    found = list[tuple[IntArray, IntArray, FloatArray]]()
+    for c, (lens, rows) in enumerate(zip(cameras.lenses, likely, strict=True)):
+        rays = (places[rows] - cameras.centres[c]) @ cameras.rotations[c].T
         u, v = project(lens, rays).T
         inside = (u >= 0.0) & (u < lens.width) & (v >= 0.0) & (v < lens.height)
         column, row = CELLS * u[inside] / lens.width, CELLS * v[inside] / lens.height
-        cell[c, inside] = row.astype(int) * CELLS + column.astype(int)
-    return cell, depth
+        cell = row.astype(int) * CELLS + column.astype(int)
+        found.append((rows[inside], cell, rays[inside, 2]))
+    place, cell, depth = (np.concatenate(one) for one in zip(*found, strict=True))
+    counts = [len(rows) for rows, _, _ in found]
+    return _Seen(
+        start=np.concatenate([[0], np.cumsum(counts)]),
+        place=place,
+        cell=cell,
+        depth=depth,
+        of_place=np.argsort(place, kind="stable"),
+        first=np.concatenate([[0], np.cumsum(np.bincount(place, minlength=len(places)))]),
+        image=np.repeat(np.arange(len(cameras)), counts),
+    )
+
+
+TOTAL, ANGLES, SCALES, COMMON = range(4)
 
 
 @kernel
-def _scores(
-    span: Span, places: FloatArray, centres: FloatArray,
-    seen_in: tuple[IntArray, FloatArray, IntArray, IntArray], tracked: bool, score: FloatArray,
+def _find_partners(
+    span: Span, places: FloatArray, centres: FloatArray, seen: _Seen, tracked: bool,
+    table: IntArray,
 ) -> None:  # fmt: skip
-    """Set how good a partner each image j is for the reference i, shape (k, k)."""
-    k, (cell, depth, start, place) = len(centres), seen_in
+    """Set the best partners j of the reference i, best first.
+
+    Only images that see a place of the reference are looked at: their sums are kept in `sums`, and
+    are zero for all others.
+    """
+    k = len(centres)
+    sums, covered = np.zeros((k, 4)), np.zeros((k, CELLS * CELLS), np.bool_)
     for i in range(*span):
-        seen = place[start[i] : start[i + 1]]
-        covered = np.zeros(CELLS * CELLS, np.bool_)
-        for j in range(k):
-            if j == i:
-                continue
-            covered[:] = False
-            total, angles, scales, common = 0.0, 0.0, 0.0, 0.0
-            for p in seen:
-                if cell[j, p] < 0:
-                    continue
-                covered[cell[i, p]] = True
-                angle = _angle_deg(row_of(centres, i), row_of(centres, j), row_of(places, p))
-                scale = depth[j, p] / depth[i, p]
-                found = 1.0 if tracked else np.exp(-((angle / REPEATED_DEG) ** 2))
-                total += found * _angle_weight(angle) * _scale_weight(scale)
-                angles, scales = angles + found * angle, scales + found * scale
-                common += found
-            area = covered.sum() / (CELLS * CELLS)
-            if covered.sum() < LEAST_COMMON or area < LEAST_AREA:
-                continue
-            if not LEAST_ANGLE_DEG <= angles / common <= LARGEST_ANGLE_DEG:
-                continue
-            if SCALE_RANGE[0] <= scales / common <= SCALE_RANGE[1]:
-                score[i, j] = total * area
+        for one in range(seen.start[i], seen.start[i + 1]):
+            p = seen.place[one]
+            for other in seen.of_place[seen.first[p] : seen.first[p + 1]]:
+                j = seen.image[other]
+                if j != i:
+                    angle = _angle_deg(row_of(centres, i), row_of(centres, j), row_of(places, p))
+                    scale = seen.depth[other] / seen.depth[one]
+                    found = 1.0 if tracked else np.exp(-((angle / REPEATED_DEG) ** 2))
+                    sums[j, TOTAL] += found * _angle_weight(angle) * _scale_weight(scale)
+                    sums[j, ANGLES] += found * angle
+                    sums[j, SCALES] += found * scale
+                    sums[j, COMMON] += found
+                    covered[j, seen.cell[one]] = True
+        together = np.flatnonzero(sums[:, COMMON] > 0.0)
+        score = np.empty(len(together))
+        for at, j in enumerate(together):
+            score[at] = _score(sums[j], covered[j].sum())
+            sums[j], covered[j] = 0.0, False
+        best = np.argsort(-score, kind="mergesort")[: table.shape[1]]
+        for at, one in enumerate(best):
+            if score[one] > 0.0:
+                table[i, at] = together[one]
+
+
+@part
+def _score(sums: FloatArray, covered: int) -> float:
+    """Return how good a partner is by its sums, and the cells that common places cover."""
+    area, common = covered / (CELLS * CELLS), sums[COMMON]
+    if covered < LEAST_COMMON or area < LEAST_AREA:
+        return 0.0
+    if not LEAST_ANGLE_DEG <= sums[ANGLES] / common <= LARGEST_ANGLE_DEG:
+        return 0.0
+    if not SCALE_RANGE[0] <= sums[SCALES] / common <= SCALE_RANGE[1]:
+        return 0.0
+    return float(sums[TOTAL] * area)
 
 
 @lean

@@ -16,7 +16,7 @@ from pcfix.model import FloatArray, IntArray, Outcome, Views, WaterPlane
 from pcfix.refract import literature
 from pcfix.refract.batch import Batch, Intersection, Survey
 from pcfix.refract.cells import is_bent, is_quick
-from pcfix.refract.choice import cameras_of_pairs, chosen_views, spatial_order
+from pcfix.refract.choice import cameras_of_pairs, chosen_views
 from pcfix.refract.consistent import consistent
 from pcfix.refract.fusion import invert_fusion
 from pcfix.refract.intersect import intersect, intersect_in_frame
@@ -26,6 +26,7 @@ from pcfix.refract.occlusion import in_sight
 from pcfix.refract.shan import shan
 from pcfix.refract.smooth import consistent_in_cells
 from pcfix.refract.stereo_pairs import invert_pairs
+from pcfix.refract.tiling import spatial_order
 from pcfix.refract.uncertainty import with_doubt, with_uncertainty
 from pcfix.water.surface import SurfaceAbove
 

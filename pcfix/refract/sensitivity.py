@@ -50,8 +50,9 @@ import numpy as np
 from pcfix.kernels import lean
 from pcfix.lens.algebra import Symmetric, Vector, beyond, dot, minus, plus, product, row_of, scaled
 from pcfix.model import FloatArray, IntArray
-from pcfix.refract.choice import TILE, Rig, Rule
+from pcfix.refract.choice import Rig, Rule
 from pcfix.refract.rays import refracted
+from pcfix.refract.tiling import TILE
 
 Sight: TypeAlias = tuple[Vector, float, float, float]
 """Projection centre, its level's offset, least squared cosine, 1 / n."""

@@ -55,14 +55,13 @@ from pcfix.refract.cells import (
     set_powers,
     water_at,
 )
-from pcfix.refract.choice import rig_of
+from pcfix.refract.choice import Rig, Rule, rig_of, rule_of
 from pcfix.refract.consistent import (
     COLUMNS,
     COSINE2,
     FOUND,
     MISS,
     OUTCOME,
-    RAY_WIDTH,
     Room,
     add_image,
     add_residual,
@@ -73,7 +72,9 @@ from pcfix.refract.consistent import (
     miss,
     room_for,
 )
+from pcfix.refract.intersect import add_camera
 from pcfix.refract.rays import nearest_point
+from pcfix.refract.tiling import TILE, Points, gather
 
 TOLERANCE_PX = 0.02
 """What may be lacking, in ground pixels: of the polynomials, and of the one Newton step."""
@@ -109,8 +110,12 @@ class _Cell(NamedTuple):
     terms: FloatArray
 
 
-_Work: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
-"""Of one point: terms, their values, powers, the sums of lines, a ray, a matrix."""
+_Work: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Of points with the same cameras: terms; of one point: their values, powers, a matrix."""
+
+_Run: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Of points with the same cameras: see `gather`; ones; see `add_camera`; squared distance from the
+nearest camera (m^2) and the size of its pixel (rad)."""
 
 
 def consistent_in_cells(batch: Batch) -> Intersection:
@@ -125,38 +130,71 @@ def consistent_in_cells(batch: Batch) -> Intersection:
     result, points = np.zeros((len(batch), COLUMNS)), batch.chosen()
     order, first = cells_of(batch)
     in_tiles(
-        _correct_cells, len(first) - 1, (order, first), points, optics_of(cameras),
-        1.0 / rig_of(batch.survey).focal_px, result, points=len(batch),
+        _correct_cells, len(first) - 1, (order, first), points, rig_of(batch.survey),
+        rule_of(batch.survey)._replace(least_cosine2=0.0), optics_of(cameras), result,
+        points=len(batch),
     )  # fmt: skip
     return intersection_of(batch, result)
 
 
 @kernel
 def _correct_cells(
-    span: Span, cells: tuple[IntArray, IntArray], points: Chosen, optics: Optics,
-    pixel: FloatArray, result: FloatArray,
+    span: Span, cells: tuple[IntArray, IntArray], points: Chosen, rig: Rig, rule: Rule,
+    optics: Optics, result: FloatArray,
 ) -> None:  # fmt: skip
-    """Correct the points of each cell; `pixel` is the size (rad) of one of each camera."""
+    """Correct the points of each cell, those with the same cameras together."""
     order, first = cells
+    run = np.empty(7 * TILE), np.ones(TILE), np.empty(11 * TILE), np.empty(2 * TILE)
+    work = np.empty(_WIDTH), np.empty(_VALUES), np.empty(CUBIC), np.empty((3, 3))
     for t in range(*span):
         rows = order[first[t] : first[t + 1]]
         seen = counts_of(rows, points)
         room = room_for(len(points.centres))
-        work = (
-            np.empty(_WIDTH), np.empty(_VALUES), np.empty(CUBIC), np.empty(10),
-            np.empty(RAY_WIDTH), np.empty((3, 3)),
-        )  # fmt: skip
-        known, few = False, seen.sum() <= LEAST_POINTS * np.count_nonzero(seen)
+        few = seen.sum() <= LEAST_POINTS * np.count_nonzero(seen)
         cell = _empty_cell() if few else _cell_of(rows, seen, points, optics, room)
-        for at in range(rows.size):
-            i, last = rows[at], rows[max(at - 1, 0)]
-            cameras, out = cameras_of(points, i), result[i]
-            if not few and (at == 0 or not are_same(cameras, cameras_of(points, last))):
-                known = _add_up(work[0], cameras, cell)
-            if few or not (known and _predict(out, i, cameras, points, cell, pixel, work)):
-                if cameras.size > len(room[0]):
-                    room = room_for(cameras.size)
-                correct_one(out, points, i, cameras, optics, None, None, room)
+        at = 0
+        while at < rows.size:
+            end, cameras = _end_of_run(rows, at, points), cameras_of(points, rows[at])
+            known = not few and _add_up(work[0], cameras, cell)
+            if known:
+                _add_lines(run, rows[at:end], cameras, points, rig, rule)
+            for j in range(end - at):
+                i, k = rows[at + j], float(cameras.size)
+                if not (known and _predict(result[i], (i, j), k, points, cell, run, work)):
+                    if cameras.size > len(room[0]):
+                        room = room_for(cameras.size)
+                    correct_one(result[i], points, i, cameras, optics, None, None, room)
+            at = end
+
+
+@part
+def _end_of_run(rows: IntArray, at: int, points: Chosen) -> int:
+    """Return where the points end that have the same cameras, and are a tile at most."""
+    end, cameras = at + 1, cameras_of(points, rows[at])
+    while end < min(rows.size, at + TILE) and are_same(cameras, cameras_of(points, rows[end])):
+        end += 1
+    return end
+
+
+@part
+def _add_lines(
+    run: _Run, rows: IntArray, cameras: IntArray, points: Chosen, rig: Rig, rule: Rule
+) -> None:
+    """Sum up the refracted lines of points with the same cameras; find the nearest camera."""
+    tile, ones, lines, near = run
+    gather(tile, rows, Points(rows, points.xyz, points.height, points.slope))
+    for at in range(11):
+        lines[at * TILE : at * TILE + rows.size] = 0.0 if at < 10 else 1.0
+    near[: rows.size] = np.inf
+    for c in cameras:
+        add_camera(lines, tile, ones[: rows.size], None, rig, c, rule)
+        x, y, z = row_of(rig.centres, c)
+        pixel = 1.0 / rig.focal_px[c]
+        for j in range(rows.size):
+            dx, dy, dz = x - tile[j], y - tile[TILE + j], z - tile[2 * TILE + j]
+            length2 = dx * dx + dy * dy + dz * dz
+            near[TILE + j] = pixel if length2 < near[j] else near[TILE + j]
+            near[j] = min(near[j], length2)
 
 
 @part
@@ -235,26 +273,30 @@ def _look(
 
 @lean
 def _predict(
-    out: FloatArray, i: int, cameras: IntArray, points: Chosen, cell: _Cell, pixel: FloatArray,
+    out: FloatArray, at: tuple[int, int], k: float, points: Chosen, cell: _Cell, run: _Run,
     room: _Work,
 ) -> bool:  # fmt: skip
-    """Write the row of a point by the terms of its cameras; False where they do not serve."""
-    terms, values, basis, lines, ray, inverse = room
+    """Write the row of a point with k cameras; False where they do not serve.
+
+    It is point `at[0]`, and the one at `at[1]` of those with the same cameras.
+    """
+    (i, j), (terms, values, basis, inverse) = at, room
     if not is_under(points, i, cell.box):
         return False
     set_powers(basis, in_box(cell.box, row_of(points.xyz, i)))
     _evaluate(values, terms, basis)
-    for j in range(9):
-        inverse[j // 3, j % 3] = values[_SLOPE + j]
-    k, (distance, gsd) = float(cameras.size), _lines(lines, ray, points, i, cameras, pixel)
+    for v in range(9):
+        inverse[v // 3, v % 3] = values[_SLOPE + v]
+    lines, distance = run[2][j::TILE], np.sqrt(run[3][j])
     if not (inverted(inverse, 0.0) and nearest_point(k, lines)[0]):
         return False
-    step, allowed = scaled(-1.0, times(inverse, vector(values))), TOLERANCE_PX * gsd
+    step = scaled(-1.0, times(inverse, vector(values)))
+    allowed = TOLERANCE_PX * run[3][TILE + j] * distance
     if not (dot(step, step) <= allowed * distance and _lack2(terms, inverse) <= allowed * allowed):
         return False
     q = plus(_place(cell.middle, basis), step)
     out[0], out[1], out[2] = q
-    out[MISS], out[COSINE2] = miss(k, lines, q), lines[9]
+    out[MISS], out[COSINE2] = miss(k, lines, q), lines[10]
     out[OUTCOME], out[FOUND] = CORRECTED, 1.0
     return True
 
@@ -291,25 +333,6 @@ def _add_up(sums: FloatArray, cameras: IntArray, cell: _Cell) -> bool:
         for i in range(_WIDTH):
             sums[i] += cell.terms[at, i]
     return True
-
-
-@lean
-def _lines(
-    sums: FloatArray, ray: FloatArray, points: Chosen, i: int, cameras: IntArray, pixel: FloatArray
-) -> tuple[float, float]:
-    """Sum up the refracted lines of a point; return how far its nearest camera is, and its pixel.
-
-    Both in metres, the pixel on the ground.
-    """
-    sums[:9], sums[9] = 0.0, 1.0
-    least, width = np.inf, 0.0
-    for c in cameras:
-        begin(ray, sums, points, i, c, None, None, -1)
-        length2 = dot(vector(ray), vector(ray))
-        if length2 < least:
-            least, width = length2, pixel[c]
-    distance = np.sqrt(least)
-    return distance, width * distance
 
 
 @lean

@@ -30,18 +30,9 @@ from pcfix.model import FloatArray, IntArray, Outcome
 from pcfix.options.correct import LEVEL_M
 from pcfix.refract import sensitivity as s
 from pcfix.refract.batch import Batch, Intersection, Survey
-from pcfix.refract.choice import (
-    TILE,
-    Points,
-    Rig,
-    Rule,
-    gather,
-    points_of,
-    rig_of,
-    rule_of,
-    tiles_of,
-)
+from pcfix.refract.choice import Rig, Rule, rig_of, rule_of
 from pcfix.refract.sensitivity import Budget
+from pcfix.refract.tiling import TILE, Points, gather, points_of, tiles_of
 from pcfix.water.surface import Field, height_at
 
 Four: TypeAlias = tuple[float, float, float, float]

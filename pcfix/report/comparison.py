@@ -24,7 +24,17 @@ from pcfix.report.c2c import (
     c2c_table,
     further_colour,
 )
-from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, Picture, Table, new_figure, new_map
+from pcfix.report.page import (
+    AFTER,
+    BEFORE,
+    REFERENCE,
+    WATER,
+    Picture,
+    Table,
+    name_of,
+    new_figure,
+    new_map,
+)
 from pcfix.report.text import share
 
 if TYPE_CHECKING:
@@ -223,7 +233,7 @@ def in_a_sentence(compared: Plain) -> str:
     if is_of_bed:
         pair = compared["bed"]
     before, after = (pair[when].get("statistics", pair[when]) for when, _, _ in TIMES)
-    name = compared["reference"].rsplit("/", 1)[-1]
+    name = name_of(compared["reference"])
     way = "fell" if after["rmse_m"] <= before["rmse_m"] else "grew"
     twice = f" {CORRECTED_BEFORE}" if CORRECTED_BEFORE in compared["notes"] else ""
     return (

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from pcfix.options.correct import LEVEL_M
 from pcfix.refract.tally import COVERAGE_95, Summary
 from pcfix.report.comparison import noise_sentence, raw_of, signed
-from pcfix.report.page import Table, Tile
+from pcfix.report.page import Table, Tile, name_of
 from pcfix.report.text import FEWEST, share
 
 Plain = dict[str, Any]
@@ -140,7 +139,7 @@ def accuracy_tile(s: Summary, compared: Plain) -> Tile:
 def _measured(compared: Plain) -> Tile:
     own, pair = compared["own"], raw_of(compared)
     raw, came = pair["after"], pair["before"]
-    name = Path(compared["reference"]).name
+    name = name_of(compared["reference"])
     of = "bed" if own["of"] == "bed" else "cloud (bed and land are not told apart)"
     is_known = own["rmse_m"] is not None
     rmse, within = (own if is_known else raw)["rmse_m"], (own if is_known else raw)["within_95_m"]

@@ -11,6 +11,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from glob import has_magic
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -185,6 +186,12 @@ class Report:
 
 _FOLDERS = re.compile(r"(?<![\w.:/~-])(?:[A-Za-z]:)?[/\\](?:[^/\\\s:*?\"<>|]+[/\\])+")
 """Of an absolute path, which is of no use to a reader elsewhere."""
+
+
+def name_of(path: str) -> str:
+    """Return the name of a file, or of the folder where a pattern names many."""
+    found = Path(path)
+    return found.parent.name if has_magic(found.name) else found.name
 
 
 def _as_read(value: Any) -> Any:

@@ -32,6 +32,7 @@ from pcfix.report.page import (
     Table,
     label_plan,
     label_side,
+    name_of,
     new_figure,
     new_map,
 )
@@ -119,7 +120,7 @@ def run_report(
     pictures += later.pictures
     order = {name: place for place, name in enumerate(FIRST_FIGURES)}
     return Report(
-        title=survey.project or Path(s.input).stem,
+        title=survey.project or Path(name_of(s.input)).stem,
         lead=_lead(s) + later.verdict,
         head=head_of(s, survey),
         tiles=tiles_of(s, survey, later.compared, corrected.depth_m),
@@ -185,7 +186,7 @@ def _lead(s: Summary) -> str:
             f" adjusted ones, which moved it by {s.carried['shift_m']['rms']:.2f} m (rms)."
         )
     return (
-        f"Correction for refraction of {Path(s.input).name}: {s.corrected:,} of {s.points:,} points"
+        f"Correction for refraction of {name_of(s.input)}: {s.corrected:,} of {s.points:,} points"
         f" lay under water and were moved to where the bed is, {abs(mean):.2f} m {way} on"
         f" average.{land}"
     )
@@ -194,7 +195,7 @@ def _lead(s: Summary) -> str:
 def _facts(s: Summary, measured: Plain | None) -> Table:
     shift, depth = s.shift_z_m, s.depth_m
     rows = [
-        ["Cloud", Path(s.input).name],
+        ["Cloud", name_of(s.input)],
         ["Water", f"{s.water}; refractive index {s.settings['index']:g}"],
         ["Points", f"{s.points:,}"],
         ["Under water", f"{s.submerged:,} ({share(s.submerged, s.points)} of the points)"],

@@ -13,7 +13,7 @@ import pcfix
 from pcfix.errors import GeometryError, PcfixWarning, SettingError
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.old_cameras import paired, told_apart
-from pcfix.flow.run import Request, request_of
+from pcfix.flow.request import Request, request_of
 from pcfix.model import Cameras, Outcome, Views
 from pcfix.report.text import summary_text
 from tests.utils.beyond_frames import BEYOND_FRAMES, DEEP

@@ -6,7 +6,8 @@ import shutil
 import pytest
 
 import pcfix
-from pcfix.flow.run import Request, request_of, run_all
+from pcfix.flow.request import Request, request_of
+from pcfix.flow.run import run_all
 from tests.compare.test_files import LIDAR, SCENE
 
 

@@ -9,7 +9,7 @@ import pytest
 import pcfix
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.label import label_file, label_points
-from pcfix.flow.run import Request, request_of
+from pcfix.flow.request import Request, request_of
 from tests.pdal_stage.test_arrays import arrays_of, metadata_of, run
 from tests.utils.clouds import (
     EAST_M,

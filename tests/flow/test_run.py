@@ -8,7 +8,8 @@ import os
 import re
 import shutil
 import sqlite3
-from contextlib import closing
+import warnings
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -22,7 +23,8 @@ import shapely
 import pcfix
 from pcfix.errors import SettingError
 from pcfix.flow.record import STEPS, Record
-from pcfix.flow.run import Request, _since, request_of, run_all
+from pcfix.flow.request import Request, request_of, since
+from pcfix.flow.run import run_all
 from pcfix.grid.colours import DEPTH, stops_of
 from pcfix.io import geopackage
 from pcfix.io.rasters import values_at
@@ -30,6 +32,8 @@ from pcfix.io.styles import hex_colour
 from pcfix.refract.tally import Summary
 from pcfix.report.text import tvu_sentence
 from tests.utils.program import run_pcfix
+from tests.utils.tiles import finished as finished_in
+from tests.utils.tiles import records, write
 
 SCENE = Path(__file__).parents[2] / "samples" / "scene"
 WORDS = [
@@ -317,7 +321,7 @@ def test_files_that_are_read_unasked_and_the_version_count(finished, tmp_path, m
 
     def record():
         watched = request.watched(tmp_path / "out")
-        return Record(tmp_path / "run.json", request.record(), watched, _since)
+        return Record(tmp_path / "run.json", request.record(), watched, since)
 
     before = record()
     before.step("adjust", [], lambda: None)
@@ -330,7 +334,7 @@ def test_files_that_are_read_unasked_and_the_version_count(finished, tmp_path, m
         record().step("correct", [], lambda: None)
     (tmp_path / "sensor.csv").unlink()
     assert record().changed == ["sensor.csv"]
-    monkeypatch.setattr("pcfix.flow.run.__version__", "9.9")
+    monkeypatch.setattr("pcfix.flow.request.__version__", "9.9")
     assert record().changed == ["version of pcfix"]
 
 
@@ -343,7 +347,7 @@ def test_a_reference_that_is_added_is_compared_with(finished, tmp_path):
     def record(**other):
         later = {"reference": str(touched), **other}
         read = {**files, "compare": [touched] if later["reference"] else []}
-        return Record(tmp_path / "run.json", {**request.record(), **later}, read, _since)
+        return Record(tmp_path / "run.json", {**request.record(), **later}, read, since)
 
     before = record(reference=None)
     for name in ("adjust", "correct", "clean", "dsm", "map", "report"):
@@ -368,6 +372,72 @@ def test_a_record_repeats_its_run(finished, tmp_path):
     one, other = (laspy.read(p / "cleaned.laz") for p in (finished[0], tmp_path / "again"))
     np.testing.assert_array_equal(one.points.array, other.points.array)
     assert request_of(tmp_path / "again" / "run.json") == request_of(finished[0] / "run.json")
+
+
+@pytest.fixture(scope="module")
+def tiled(tmp_path_factory):
+    """Return a folder with the rows of the cloud and of the reference in files of their own."""
+    folder = tmp_path_factory.mktemp("tiled")
+    for name in ("cloud", "lidar"):
+        (folder / name).mkdir()
+        las = laspy.read(SCENE / f"{name}.laz")
+        for i, rows in enumerate(np.array_split(np.arange(len(las)), 3)):
+            write(folder / name / f"{name}{i}.laz", las, rows)
+    return folder
+
+
+def without_names(value):
+    """Return plain values without those of a call, and words without the names of files."""
+    own = ("seconds", "points_per_s", "input", "output", "hillshade", "counts")
+    own += ("cloud", "reference")
+    if isinstance(value, dict):
+        return {name: without_names(one) for name, one in value.items() if name not in own}
+    if isinstance(value, list):
+        return [without_names(one) for one in value]
+    return value.replace("lidar.laz", "lidar") if isinstance(value, str) else value
+
+
+def test_a_run_over_tiles_is_that_of_one_file(finished, tiled, tmp_path):
+    """The first call is stopped after a tile, and the next goes on; a third has nothing to do."""
+    out = tmp_path / "out"
+    asked = {
+        "cameras": str(SCENE / "cameras.csv"), "water": "0.37", "jobs": 1,
+        "reference": f"{tiled}/lidar/*.laz",
+    }  # fmt: skip
+
+    def stop(title):
+        def progress(done, total):
+            if finished_in(out / "corrected"):
+                raise KeyboardInterrupt
+
+        return nullcontext(progress if title == "Correcting" else None)
+
+    with warnings.catch_warnings():  # tiles of rows lie in each other
+        warnings.simplefilter("ignore", pcfix.PcfixWarning)
+        with pytest.raises(KeyboardInterrupt, match="stopped; 1 of 3 files are finished"):
+            pcfix.run(tiled / "cloud", out, bar=stop, **asked)
+        before = finished_in(out / "corrected")
+        found = pcfix.run(tiled / "cloud", out, **asked)
+        assert before.items() < finished_in(out / "corrected").items()
+        said = []
+        pcfix.run(tiled / "cloud", out, say=said.append, **asked)
+    assert [line.split()[1:3] for line in said] == [["done", "before:"]] * 6
+    for name in ("corrected", "cleaned"):
+        whole = laspy.read(finished[0] / f"{name}.laz").points.array
+        np.testing.assert_array_equal(records(*sorted((out / name).glob("*.laz"))), whole)
+    names = [path.relative_to(finished[0]) for path in finished[0].rglob("*")]
+    for name in names:
+        if name.suffix in (".tif", ".csv", ".qml", ".png"):
+            assert (out / name).read_bytes() == (finished[0] / name).read_bytes(), name
+    both = [json.loads((folder / "run.json").read_text()) for folder in (out, finished[0])]
+    many, one = (without_names({n: s["result"] for n, s in b["steps"].items()}) for b in both)
+    assert many.pop("report")["tiles"] == one.pop("report")["tiles"]
+    assert many == one
+    pages = [(folder / "report.html").read_text() for folder in (out, finished[0])]
+    maps = [re.search(r'id="data">.*?</script>', page, re.DOTALL).group() for page in pages]
+    assert maps[0] == maps[1]
+    assert '<a href="corrected/">' in pages[0]
+    assert found.summary.points == 20_000
 
 
 def test_without_reference_and_vectors_there_is_a_report_all_the_same(tmp_path, monkeypatch):

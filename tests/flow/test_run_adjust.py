@@ -20,7 +20,8 @@ from pcfix.adjust.problem import intersect_fixed
 from pcfix.errors import GeometryError, PcfixWarning, SettingError
 from pcfix.flow.correct import correct_file
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.run import Request, request_of, run_all
+from pcfix.flow.request import Request, request_of
+from pcfix.flow.run import run_all
 from pcfix.flow.run_adjust import adjust_first, figures_of
 from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.model import TiePoints, Views

@@ -10,7 +10,7 @@ import pytest
 
 import pcfix
 from pcfix.kernels import threads
-from pcfix.refract.choice import TILE, spatial_order
+from pcfix.refract.tiling import TILE, spatial_order
 from tests.utils.beyond_frames import BEYOND_FRAMES
 
 pytestmark = BEYOND_FRAMES

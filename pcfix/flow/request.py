@@ -1,0 +1,170 @@
+"""What a run is asked for, what it reads, and where it leaves what it makes."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.flow.inputs import Inputs, paths_in
+from pcfix.flow.rasters import SURFACE
+from pcfix.flow.record import VERSION, read_record
+from pcfix.flow.run_adjust import FOLDER, AdjustStep
+from pcfix.flow.tiles import HOW, RECORDS
+from pcfix.io.clouds import reference_of
+from pcfix.io.files import files_around, files_in
+from pcfix.io.tiles import Tiles, cloud_of, inputs_of, tiles_from, tiles_of
+from pcfix.options.correct import CorrectOptions
+from pcfix.options.declare import named, options_of
+from pcfix.options.steps import DistanceOptions
+from pcfix.options.survey import RunOptions
+from pcfix.version import __version__
+from pcfix.water.index import Water, with_index
+
+CLOUDS = ("corrected", "cleaned")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request(RunOptions):
+    """Everything that the results of a run depend on; ``run.json`` keeps it."""
+
+    input: str | tuple[str, ...] = ""
+    """The cloud; many files as `tiles_of` takes them."""
+
+    @cached_property
+    def source(self) -> Path | Tiles:
+        """The cloud, in one file or many."""
+        return tiles_of(self.input) or Path(str(self.input))
+
+    @cached_property
+    def surveyed(self) -> Path | Tiles:
+        """The reference, in one file or many."""
+        return reference_of(self.reference or "")
+
+    def check(self) -> None:
+        """Check what options say together."""
+        super().check()
+        self.adjust_step()
+
+    def adjust_step(self) -> AdjustStep:
+        """Return what the first step is asked for."""
+        index = with_index(self.part(RunOptions)).refractive_index
+        return AdjustStep(
+            self.input, self.part(Inputs), index, self.adjust, self.gcps, self.gnss, self.lens
+        )
+
+    def with_adjusted(self, folder: Path, step: dict[str, Any]) -> Request:
+        """Return the request of the steps that follow: with the adjusted cameras where they are."""
+        if not step["adjusted"]:
+            return self
+        return replace(
+            self,
+            cameras=str(folder / FOLDER / step["model"]),
+            adjusted_from=self.cameras,
+            adjust="no", gcps=None, gnss=None, lens=None,
+        )  # fmt: skip
+
+    def record(self) -> dict[str, Any]:
+        """Return plain values, without what the results do not depend on."""
+        values = self.as_dict()
+        kept = {name: values[name] for name in values if name not in HOW}
+        return {**kept, VERSION: __version__}
+
+    def files(self) -> dict[str, list[Path]]:
+        """Return the input files, each of which exists, by the first step that reads them."""
+        names = [*paths_in(self, but=("water",)), self.gcps, self.gnss, self.lens]
+        found = [*_files_of(self.source), *(p for n in names if n is not None for p in files_in(n))]
+        found += [Path(self.water)] if Path(self.water).is_file() else []
+        compared = [] if self.reference is None else _files_of(self.surveyed)
+        compared += [path for _, one in self.also for path in _files_of(cloud_of(one))]
+        return {"adjust": found, "compare": compared}
+
+    def watched(self, results: Path) -> dict[str, list[Path]]:
+        """Return all files that the results may go by; those in the folder of results are none."""
+        read = self.files()
+        names = paths_in(self, but=("water",))
+        around = {path for name in names for path in files_around(name)}
+        own = results.resolve()
+        more = sorted(one for one in around if own not in one.resolve().parents)
+        return {**read, "adjust": list(dict.fromkeys([*read["adjust"], *more]))}
+
+
+def _files_of(cloud: Path | Tiles) -> list[Path]:
+    return inputs_of(cloud) if isinstance(cloud, Tiles) else files_in(cloud)
+
+
+_CORRECTION = {one.name for one in options_of(CorrectOptions)}.difference(
+    ("input", "adjust", "index_formula"), Water._fields, (one.name for one in options_of(Inputs))
+) - {"index"}
+_LATER = {
+    **{one.name: "compare" for one in options_of(DistanceOptions)},
+    "reference": "compare", "resolution": "dsm", "project": "report", "date": "report",
+}  # fmt: skip
+
+
+def since(name: str) -> str:
+    """Return the first step that an option of a request matters to."""
+    if name in _CORRECTION:
+        return "correct"
+    return _LATER.get(name, "adjust")
+
+
+def request_of(record: Path) -> Request:
+    """Return what an earlier run was asked for, from its ``run.json``."""
+    # runs before there were adjustments did without
+    kept = {"adjust": "no", **read_record(record)["request"]}
+    input = kept.pop("input", "")
+    input = tuple(input) if isinstance(input, list) else input
+    for name in ("index_from", VERSION):
+        kept.pop(name, None)
+    try:
+        with warnings.catch_warnings():  # a record of old may have old names
+            warnings.simplefilter("ignore", PcfixWarning)
+            return Request(input=input, **named(kept, options_of(RunOptions), str(record)))
+    except (SettingError, TypeError) as error:
+        raise InputError(f"{record}: is not the record of a run ({error}).") from error
+
+
+class Files:
+    """Where a run leaves what it makes: of many files a folder of them."""
+
+    def __init__(self, folder: Path, source: Path | Tiles | None = None) -> None:
+        self.folder = folder
+        self._many = source.paths if isinstance(source, Tiles) else None
+        ending = ".laz" if self._many is None else ""
+        self.corrected, self.cleaned = (folder / f"{one}{ending}" for one in CLOUDS)
+        self.surface, self.map = folder / SURFACE, folder / "map.gpkg"
+        self.compare, self.report = folder / "compare", folder / "report.html"
+        self.regression = folder / "regression.json"
+
+    def parts(self, target: Path) -> list[Path]:
+        """Return the files of a cloud."""
+        return [target] if self._many is None else [target / one.name for one in self._many]
+
+    @cached_property
+    def corrected_cloud(self) -> Path | Tiles:
+        """The corrected cloud, once it is there."""
+        return self._cloud(self.corrected)
+
+    @cached_property
+    def cleaned_cloud(self) -> Path | Tiles:
+        """The cleaned cloud, once it is there."""
+        return self._cloud(self.cleaned)
+
+    def _cloud(self, target: Path) -> Path | Tiles:
+        with warnings.catch_warnings():  # what is said of the tiles was said of the inputs
+            warnings.simplefilter("ignore", PcfixWarning)
+            return target if self._many is None else tiles_from(str(target), self.parts(target))
+
+    def remove_others(self) -> None:
+        """Remove the clouds that an earlier run made of other files; they would pass for these."""
+        kept = {*self.parts(self.corrected), *self.parts(self.cleaned)}
+        for one in CLOUDS:
+            records = (self.folder / one / RECORDS).glob("*.la[sz].npz")
+            made = {self.folder / one / path.stem: path for path in records}
+            for path in {self.folder / f"{one}.laz", *made} - kept:
+                path.unlink(missing_ok=True)
+                made.get(path, path).unlink(missing_ok=True)
