@@ -60,6 +60,15 @@ def extra_dimension(data):
     return put(place, "<2xBB", 0, 0)(data)
 
 
+ROOT = 375 + 54 + 40
+"""Where the record of COPC states place and bytes of its octree."""
+
+
+def many_in_octree(data):
+    (root,) = struct.unpack_from("<Q", data, ROOT)
+    return put(root + 28, "<i", 2**30)(data)
+
+
 PLACE, MATRIX = struct.pack("<2d", 5e5, 5.2e6), struct.pack("<4d", 1, 0, 0, 5e5)
 """Of a raster's cells, as GeoTIFF has them."""
 
@@ -70,6 +79,12 @@ FOUND = {
     ),
     "records of many bytes": (
         *("las", "1.2", "cloud.las", put(105, "<HI", 60_000, 2**31), "is damaged"),
+    ),
+    "an octree behind the end": (
+        *("las", "copc", "cloud.copc.laz", put(ROOT + 8, "<Q", 2**40), "its octree begins or ends"),
+    ),
+    "an octree of many points": (
+        *("las", "copc", "cloud.copc.laz", many_in_octree, "its octree has more points"),
     ),
     "a dimension of no bytes": (*("las", "1.4", "cloud.las", extra_dimension, "is damaged"),),
     "a place that is infinite in the world": (

@@ -300,11 +300,18 @@ class LasSource:
             read += len(points)
             yield points
 
+    def _nodes(self, path: CloudPart) -> Iterator[laspy.ScaleAwarePointRecord]:
+        with las_errors(self.path):
+            info = self.header.vlrs[0]
+            if info.hierarchy_root_offset + info.hierarchy_root_size > path.stat().st_size:
+                raise ValueError("its octree begins or ends behind its end")
+            yield from nodes_in(path, path.part, self._selection, CHUNK_POINTS)
+
     def _chunks_of(self, path: CloudPart) -> Iterator[laspy.ScaleAwarePointRecord]:
         """Yield the points of a part."""
         chunks = self._whole()
         if is_copc(self.header):
-            chunks = nodes_in(path, path.part, self._selection, CHUNK_POINTS)
+            chunks = self._nodes(path)
         for points in chunks:
             inside = path.part.holds(points)
             if inside.any():
