@@ -3,6 +3,7 @@
 Each message is one sentence that a person can act on: the file, the value, the rule, the remedy.
 """
 
+import errno
 import importlib
 import re
 import sys
@@ -14,22 +15,41 @@ from typing import Any, TypeVar
 _Found = TypeVar("_Found")
 
 _MOST_LETTERS, _FIRST, _LAST = 800, 540, 240
-_LONG_WORD = re.compile(r"([^\s/\\]{60})[^\s/\\]{200,}")  # no part of a path is as long
 
 
 def one_line(message: str) -> str:
     """Return a message as a line that a terminal can show, whatever of a file is quoted in it.
 
-    Letters that are not for print become escapes; long words lose their end, and a message that is
-    too long all the same its middle: the file is named first and the remedy last.
+    Letters that are not for print become escapes, and a message that is too long all the same loses
+    its middle: the file is named first and the remedy last.
     """
-    text = _LONG_WORD.sub(r"\1...", message)
-    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in message)
     return text if len(text) <= _MOST_LETTERS else f"{text[:_FIRST]} ... {text[-_LAST:]}"
+
+
+LONGEST_VALUE, LONGEST_NAME = 60, 255
+_UNBROKEN = re.compile(rf"[^\s/\\'\":;()]{{{LONGEST_VALUE + 1},}}")
+_FILE_NAME = re.compile(r"\.\w{1,6}$")
+
+
+def brief(message: str) -> str:
+    """Return a message in which no value is longer than 60 characters, and no name of a file 255.
+
+    Values with spaces in them are shortened where they are quoted.
+    """
+
+    def shortened(match: re.Match[str]) -> str:
+        is_name = len(match[0]) <= LONGEST_NAME and _FILE_NAME.search(match[0])
+        return match[0] if is_name else match[0][: LONGEST_VALUE - 3] + "..."
+
+    return _UNBROKEN.sub(shortened, message)
 
 
 class PcfixError(Exception):
     """Anything that a user can mend; the command line prints it and exits with 1."""
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(brief(str(message)))
 
     def __str__(self) -> str:
         return one_line(super().__str__())
@@ -52,6 +72,22 @@ class PcfixWarning(UserWarning):
 
     def __str__(self) -> str:
         return one_line(super().__str__())
+
+
+_REFUSALS = {
+    errno.ENOENT: "there is no such file",
+    errno.ENOTDIR: "there is no such file",
+    errno.EISDIR: "is a folder; give a file",
+    errno.ELOOP: "its links lead in a circle; give the file itself",
+    errno.ENAMETOOLONG: "the name is longer than the system allows",
+    errno.EACCES: "access is denied; change the rights of the file or of its folder",
+}
+
+
+def refusal(error: Exception) -> str:
+    """Return in words what the system says of a file."""
+    words = getattr(error, "strerror", None) or str(error).strip().rstrip(".")
+    return _REFUSALS.get(getattr(error, "errno", None) or 0, f"cannot be read ({words})")
 
 
 def installing(extra: str) -> str:
@@ -94,4 +130,4 @@ def show_warning(
     """Show a warning of pcfix as one line on stderr, others not: for `warnings.showwarning`."""
     del where, more
     if issubclass(category, PcfixWarning):
-        sys.stderr.write(f"pcfix: warning: {message}\n")
+        sys.stderr.write(f"pcfix: warning: {brief(str(message))}\n")

@@ -14,7 +14,7 @@ from cyclopts import App, CycloptsError
 
 from pcfix.cli.commands import EXAMPLES
 from pcfix.cli.flags import UsageError, name_of, prepare
-from pcfix.errors import PcfixError, show_warning
+from pcfix.errors import PcfixError, brief, refusal, show_warning
 from pcfix.version import __version__
 
 app = App(
@@ -52,12 +52,20 @@ def main(tokens: Sequence[str] | None = None) -> None:
         _stop(f"{error}\n{_try(arguments)}", 2)
     except PcfixError as error:
         _stop(str(error), 1)
+    except UnicodeEncodeError as error:
+        if error.encoding != "utf-8" or "\n" in error.object:
+            raise
+        _stop(f"{error.object}: the name is not in UTF-8; rename the file.", 1)
     except _EndedError as end:
         _stop("stopped.", 128 + end.args[0])
     except KeyboardInterrupt as stop:
         _stop(str(stop) or "stopped.", 130)
     except BrokenPipeError:
         sys.exit(1)
+    except OSError as error:
+        if error.filename is None:
+            raise
+        _stop(f"{error.filename}: {refusal(error)}.", 1)
 
 
 def _run(arguments: list[str]) -> None:
@@ -104,5 +112,5 @@ def _try(arguments: list[str]) -> str:
 
 
 def _stop(sentence: str, code: int) -> None:
-    sys.stderr.write(f"pcfix: {sentence}\n")
+    sys.stderr.write(f"pcfix: {brief(sentence)}\n")
     sys.exit(code)

@@ -21,7 +21,7 @@ from pcfix.flow.diagnosis import (
 )
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.next_steps import adjust_words
-from pcfix.flow.plausibility import plausible
+from pcfix.flow.plausibility import Flight, plausible
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.shore import check_shoreline, write_shoreline
 from pcfix.flow.surfaces import CloudView, file_points, find_surface, view_of
@@ -108,7 +108,8 @@ def check_cameras(
         above = cameras.centres[:, 2] - level
     gnss, fit = _gnss(cameras, str(path)), None
     if view is not None:
-        fit = _fit(cameras, str(cloud), xyz, view.crs, quick_ties(inputs, view.crs))
+        flight = Flight(path, level, every=view.points / max(len(xyz), 1))
+        fit = _fit(cameras, view, xyz, quick_ties(inputs, view.crs), flight)
         if inputs.cameras_crs is not None and gnss is not None and not fit.verdict:
             fit = replace(fit, verdict=_height_doubt(gnss))
     report = CamerasReport(
@@ -348,7 +349,9 @@ def _height_doubt(gnss: GnssResiduals) -> str:
     )
 
 
-def _fit(cameras: Cameras, cloud: str, xyz: FloatArray, crs: Any, ties: TiePoints | None) -> Fit:
+def _fit(
+    cameras: Cameras, view: CloudView, xyz: FloatArray, ties: TiePoints | None, flight: Flight
+) -> Fit:
     seen = cameras_in_sight(xyz, cameras)
     shares = {str(k): float(np.mean(seen == k)) for k in (0, 1, 2)}
     shares["3 or more"] = float(np.mean(seen >= 3))
@@ -356,15 +359,15 @@ def _fit(cameras: Cameras, cloud: str, xyz: FloatArray, crs: Any, ties: TiePoint
     block_low, block_high = cameras.centres.min(axis=0), cameras.centres.max(axis=0)
     apart = np.maximum(np.maximum(low - block_high, block_low - high), 0.0)[:2]
     below = _below_ground(cameras.centres, xyz)
-    verdict = likely_mistake(cameras.centres, low, high, crs) or ""
+    verdict = likely_mistake(cameras.centres, low, high, view.crs) or ""
     if not verdict and below:
         verdict = (
             f"{below} of {len(cameras)} cameras stand below the ground: heights of cameras and"
             " cloud have different datums, or the axes are swapped."
         )
-    found = plausible(cameras, xyz, ties)
+    found = plausible(cameras, xyz, ties, flight=flight)
     verdict = verdict or " ".join(found.doubts)
-    return Fit(cloud, len(xyz), shares, float(np.hypot(*apart)), below, verdict, str(found))
+    return Fit(view.name, len(xyz), shares, float(np.hypot(*apart)), below, verdict, str(found))
 
 
 def _below_ground(centres: FloatArray, xyz: FloatArray) -> int:

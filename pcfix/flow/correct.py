@@ -16,7 +16,7 @@ from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.inputs import paths_in
 from pcfix.flow.job import Job
 from pcfix.flow.old_cameras import paired
-from pcfix.flow.plausibility import CloudSample, plausible
+from pcfix.flow.plausibility import CloudSample, Flight, plausible
 from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
 from pcfix.flow.surfaces import (
     Points,
@@ -177,7 +177,8 @@ def correct_points(
     meeting.add(points, found)
     meeting.check_reach("xyz")
     sample.add(Points(points, None, np.zeros(len(points), np.uint8)), above.height_m)
-    plausible(cameras, sample.xyz, level_doubts=sample.level_doubts()).warn()
+    flight = Flight(water_m=sample.water_m, every=sample.every)
+    plausible(cameras, sample.xyz, None, sample.level_doubts(), flight).warn()
     if line is not None and line is not regression:
         beyond = BeyondRange(line)
         beyond.add((above.height_m - points[:, 2])[found.submerged])

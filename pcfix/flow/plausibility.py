@@ -8,17 +8,21 @@ result.
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pcfix.errors import PcfixWarning
+from pcfix.flow.recorded import Result, flying_heights, positions
 from pcfix.flow.surfaces import Points
 from pcfix.lens.frames import cameras_in_sight
 from pcfix.lens.imaging import project
 from pcfix.model import BoolArray, Cameras, FloatArray, TiePoints
+from pcfix.options.declare import File
 from pcfix.sums import Sums
+from pcfix.water.tilted import Tilted
 
 SAMPLE_POINTS, IN_FRAMES = 30_000, 4_000
 """Points that are looked at for a shoreline, and in the frames; evenly spread over the cloud."""
@@ -34,6 +38,11 @@ MOST_MISS, MOST_HEIGHT = 0.01, 0.02
 """Tie points lie so near their image places (of the frame), and the cloud (of the flying height).
 """
 TIES = 3_000
+IN_LISTED_FRAMES = "listed points in the frames of their images"
+SHIFTS, SHIFTED_POINTS = (0.1, 0.2, 0.4, 0.8), 500
+"""Of the flying height, and the points of which it is asked whether they would be missed."""
+MOST_PER_PIXEL, AROUND = 10.0, 8
+"""Points that a cloud has for each pixel of an image; matchers make one at most, or a few."""
 
 
 class Plausible(NamedTuple):
@@ -94,6 +103,18 @@ class CloudSample(Sums):
             self._rgb.append(np.column_stack([colour[rows] for colour in points.colours]))
 
     @property
+    def every(self) -> float:
+        """Of how many points of the cloud there is one here."""
+        return float(self._step)
+
+    @property
+    def water_m(self) -> float | None:
+        """The height of the water, in the median."""
+        water = np.concatenate([np.zeros(0), *self._water])
+        water = water[np.isfinite(water)]
+        return float(np.median(water)) if len(water) else None
+
+    @property
     def xyz(self) -> FloatArray:
         """The points, shape (n, 3)."""
         return np.vstack(self._xyz) if self._xyz else np.zeros((0, 3))
@@ -107,9 +128,10 @@ class CloudSample(Sums):
         if known.sum() < LEAST_POINTS:
             return ()
         rgb = np.vstack(self._rgb)[known] if self._rgb else None
-        found = find_elsewhere(xyz[known], water[known], rgb)
+        found, tilted = find_elsewhere(xyz[known], water[known], rgb)
+        uneven = () if tilted is None else (_tilt_doubt(tilted),)
         if found is None:
-            return ()
+            return uneven
         off, level = found.level_m, float(np.median(water[known])) + found.level_m
         side = "above" if off > 0.0 else "below"
         return (
@@ -117,7 +139,31 @@ class CloudSample(Sums):
             f" surface that was given, at about {level:.2f} m (standard error"
             f" {found.sigma_level_m:.2f} m: {'; '.join(found.reasons)}): check the water's height"
             " and its vertical datum, or see what --water auto finds.",
+            *uneven,
         )
+
+
+def _tilt_doubt(tilted: Tilted) -> str:
+    return (
+        f"The waterline of the cloud rises to the {tilted.to} against the water surface that was"
+        f" given, by {100.0 * tilted.slope:.2g} %, from {tilted.low_m:+.2f} to"
+        f" {tilted.high_m:+.2f} m of it: the water flows there, or one of the two is tilted;"
+        " measure points on the waterline round the block, and give these as --water."
+    )
+
+
+class Flight(NamedTuple):
+    """What is known of cameras besides.
+
+    file : where they came from; water_m : the height of the water, in the median; listed : whether
+    the images that a list names were found to hold their points, else it is refused; every : of how
+    many points of the cloud there is one.
+    """
+
+    file: File = ""
+    water_m: float | None = None
+    listed: bool = False
+    every: float = 1.0
 
 
 def plausible(
@@ -125,6 +171,7 @@ def plausible(
     cloud: FloatArray,
     ties: TiePoints | None = None,
     level_doubts: tuple[str, ...] = (),
+    flight: Flight | None = None,
 ) -> Plausible:
     """Test cameras and cloud against each other.
 
@@ -138,24 +185,24 @@ def plausible(
         Of these cameras.
     level_doubts : tuple of str
         See `CloudSample.level_doubts`.
+    flight : Flight, optional
+        What else is known of them.
     """
     if not len(cameras) or not len(cloud):
         return Plausible((), level_doubts)
+    known = flight or Flight()
     xyz = np.ascontiguousarray(cloud[:: 1 + len(cloud) // IN_FRAMES])
+    flown = flying_heights(cameras, known.file, known.water_m) if known.file else Result()
+    heights = _heights(cameras, cloud, ties)
+    if heights.unchecked and any(flown):
+        heights = Result()
     results = [
         *(test(cameras, xyz) for test in (_far, _frames, _directions)),
-        _heights(cameras, cloud, ties),
+        Result(IN_LISTED_FRAMES if known.listed and cameras.lenses else ""),
+        *(positions(cameras, str(known.file)), heights, flown, _spacing(cameras, cloud, known)),
     ]
     fits, doubts, unchecked = (tuple(filter(None, words)) for words in zip(*results, strict=True))
     return Plausible(fits, (*level_doubts, *doubts), unchecked)
-
-
-class Result(NamedTuple):
-    """Of one test; each in words, and one of them only."""
-
-    fit: str = ""
-    doubt: str = ""
-    unchecked: str = ""
 
 
 def _far(cameras: Cameras, xyz: FloatArray) -> Result:
@@ -179,11 +226,61 @@ def _frames(cameras: Cameras, xyz: FloatArray) -> Result:
         return Result(unchecked="frames (the cameras have no lenses or no angles)")
     unseen = float(np.mean(cameras_in_sight(xyz, cameras) < 2))
     if unseen <= MOST_UNSEEN:
-        return Result(f"{100.0 * (1.0 - unseen):.4g} % of the points in two frames or more")
+        seen = f"{100.0 * (1.0 - unseen):.4g} % of the points in two frames or more"
+        shift_m = _shown_from_m(cameras, xyz)
+        if shift_m is None:
+            beyond = "a shift in plan (the frames reach far beyond the cloud)"
+            return Result(seen, unchecked=beyond)
+        return Result(f"{seen} (a shift in plan of {shift_m:.0f} m would show)")
     return Result(
         doubt=f"{100.0 * unseen:.1f} % of the points lie in fewer than two frames, although two"
         " images made each: the cameras may be shifted, turned or too low against the cloud, or"
         " some are missing; check their coordinates, heights, angles and interior orientation."
+    )
+
+
+def _shown_from_m(cameras: Cameras, xyz: FloatArray) -> float | None:
+    """Return from which shift in plan on, whichever way, the test of frames would speak, if any."""
+    some = np.ascontiguousarray(xyz[:: 1 + len(xyz) // SHIFTED_POINTS])
+    above = _above(cameras, xyz)
+    for share in SHIFTS:
+        steps = share * above * np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)])
+        moved = (replace(cameras, centres=cameras.centres + step) for step in steps)
+        if all(np.mean(cameras_in_sight(some, one) < 2) > MOST_UNSEEN for one in moved):
+            return share * above
+    return None
+
+
+def _above(cameras: Cameras, xyz: FloatArray) -> float:
+    """Return the flying height above the cloud, metres."""
+    return float(abs(np.median(cameras.centres[:, 2]) - np.median(xyz[:, 2])))
+
+
+def _pixel_m(cameras: Cameras, xyz: FloatArray) -> float | None:
+    """Return the size of a pixel on the ground, where lenses tell that of one in the image."""
+    lenses = cameras.lenses or ()
+    if not lenses or any(one.unit == "mm" and one.pixel_size_mm is None for one in lenses):
+        return None
+    return _above(cameras, xyz) / float(np.median([one.focal_px for one in lenses]))
+
+
+def _spacing(cameras: Cameras, cloud: FloatArray, flight: Flight) -> Result:
+    """Compare how close points lie with the pixels from which they came."""
+    pixel = _pixel_m(cameras, cloud)
+    if pixel is None or len(cloud) <= AROUND:
+        return Result()
+    from scipy.spatial import cKDTree  # not quick to load
+
+    places = cloud[:, :2]
+    reach = np.asarray(cKDTree(places).query(places[:: 1 + len(places) // TIES], k=AROUND + 1)[0])
+    area = np.pi * float(np.median(reach[:, -1])) ** 2 / (AROUND * flight.every)
+    per_pixel = pixel**2 / area if area > 0.0 else 0.0
+    if per_pixel <= MOST_PER_PIXEL:
+        return Result()
+    return Result(
+        doubt=f"The cloud has {per_pixel:.0f} points for each pixel of {100.0 * pixel:.3g} cm on"
+        f" the ground, which images from {_above(cameras, cloud):.0f} m cannot give: the cameras"
+        " are too high, in feet, or of another flight."
     )
 
 
@@ -235,7 +332,10 @@ def _common(turn: FloatArray) -> float | None:
 def _heights(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Result:
     """Compare tie points with their image places, and with the heights of the cloud."""
     if ties is None or cameras.lenses is None or cameras.rotations is None:
-        return Result(unchecked="heights (no tie points)")
+        pixel = _pixel_m(cameras, cloud)
+        sized = "" if pixel is None else f", {100.0 * pixel:.3g} cm a pixel"
+        by_them = f"by them {_above(cameras, cloud):.0f} m above the cloud{sized}"
+        return Result(unchecked=f"heights (no tie points; {by_them})")
     miss = _median_miss(cameras, ties)
     if miss is None:
         return Result(unchecked="heights (no tie points in the frames)")

@@ -10,6 +10,7 @@ from typing import Any
 from pcfix.errors import InputError
 from pcfix.flow.runner import json_text
 from pcfix.io.files import file_state, read_json, write_text
+from pcfix.io.opened import files_opened, of_inputs
 
 VERSION = "pcfix"
 """Of a request: which version of pcfix did it."""
@@ -22,7 +23,8 @@ class Record:
 
     A step counts as done while the request and the input files are those of the record, but for
     what matters to later steps only, every step before it was found done, and its own files are as
-    it left them. The JSON file at `path` is written after each step.
+    it left them; files that it opened beside the inputs count as these do. The JSON file at `path`
+    is written after each step.
 
     Parameters
     ----------
@@ -60,6 +62,12 @@ class Record:
         names = [one for one in {**now, **then} if now.get(one) != then.get(one)]
         both = [*plain["inputs"], *earlier["inputs"]]
         files = [one for one in both if both.count(one) == 1]
+        files += [
+            {**one, "step": step}
+            for step, done in earlier["steps"].items()
+            for one in done.get("read", ())
+            if file_state(Path(one["path"])) != one
+        ]
         self.changed = [
             "version of pcfix" if name == VERSION else f"--{name.replace('_', '-')}"
             for name in names
@@ -82,8 +90,16 @@ class Record:
             self._note(name, earlier)
             return earlier["result"], True
         self._earlier = {}  # what follows was made from other files
-        result = work()
-        self._note(name, {"outputs": [file_state(p) for p in outputs], "result": result})
+        with files_opened() as opened:
+            result = work()
+        inputs = [Path(one["path"]) for one in self._content["inputs"]]
+        known = {path.resolve() for path in inputs}
+        read = of_inputs(opened, inputs, self._path.parent)
+        self._note(name, {
+            "outputs": [file_state(p) for p in outputs],
+            "read": [file_state(p) for p in read if p.resolve() not in known],
+            "result": result,
+        })  # fmt: skip
         return json.loads(json.dumps(result)), False
 
     def _note(self, name: str, step: dict[str, Any]) -> None:

@@ -16,7 +16,7 @@ from pcfix.flow.diagnosis import Poses, diagnose_in_passing, quick_ties
 from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.flow.learning import Learning
 from pcfix.flow.old_cameras import Blocks, ListedViews, old_tie_points
-from pcfix.flow.plausibility import CloudSample, Plausible, plausible
+from pcfix.flow.plausibility import CloudSample, Flight, Plausible, plausible
 from pcfix.flow.pose_errors import SAMPLE_POINTS, adjustment_of, pose_errors, sample_of, with_poses
 from pcfix.flow.shore import check_shoreline, write_shoreline
 from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of
@@ -304,7 +304,11 @@ class ThroughWater(Sums):
         ties = quick_ties(self._inputs, self._view.crs) if len(self._cameras) else None
         sought = (self.found.as_dict() or {}).get("model") == "auto"
         doubts = () if sought else self._sample.level_doubts()
-        tested = plausible(self._cameras, self._sample.xyz, ties, doubts)
+        flight = Flight(
+            "" if isinstance(given, Cameras) else given or "", self._sample.water_m,
+            self._listed is not None, self._sample.every,
+        )  # fmt: skip
+        tested = plausible(self._cameras, self._sample.xyz, ties, doubts, flight)
         self._plausible = tested._replace(noted=CAUSES in self._told())
         self._plausible.warn()
         if not len(self._cameras):

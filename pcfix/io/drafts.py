@@ -118,15 +118,31 @@ def folder_when_whole(target: Path) -> Iterator[Path]:
         _settle(target.parent)
 
 
-def cannot_write(target: Path, error: Exception, written: Path | None = None) -> InputError:
-    """Return the sentence on a file that cannot be written, of which a part may be."""
+def cannot_write(
+    target: Path, error: Exception, written: Path | None = None, needed: int = 0
+) -> InputError:
+    """Return the sentence on a file that cannot be written, of which a part may be.
+
+    Where the disk is full it names that, and the bytes that are `needed`, if they are known.
+    """
     reason = getattr(error, "strerror", None) or str(error).strip().rstrip(".")
     if getattr(error, "errno", None) in _FULL or "No space left" in str(error):
         size = 0 if written is None or not written.is_file() else written.stat().st_size
-        so_far = f" after {size / 1e6:,.1f} MB of it" if size else ""
-        folder = target.absolute().parent
-        reason = f"No space left on the disk of {folder}{so_far}; make room on it"
+        so_far = f" after {size / 1e6:,.1f} MB of it" if size > 1e5 else ""
+        wanted = f", up to {needed / 1e6:,.1f} MB are needed" if needed else ""
+        reason = f"No space left on the disk {disk_of(target)}{so_far}{wanted}; make room on it"
     return InputError(f"{target}: cannot be written ({reason}).")
+
+
+def disk_of(path: Path) -> str:
+    """Return where the disk of a path is mounted, and how much of it is free."""
+    around = Path(os.path.realpath(path)).parents
+    mount = next((one for one in around if one.is_mount()), around[-1])
+    try:
+        free = f" ({shutil.disk_usage(mount).free / 1e6:,.1f} MB free)"
+    except OSError:
+        free = ""
+    return f"{mount}{free}"
 
 
 @contextmanager

@@ -12,6 +12,7 @@ import mimetypes
 import mmap
 import os
 import re
+import stat
 import subprocess
 import weakref
 from collections.abc import Iterable, Iterator
@@ -24,9 +25,9 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.blocks import Empty, on_disk
-from pcfix.errors import InputError, SettingError, optional_library
+from pcfix.errors import InputError, SettingError, optional_library, refusal
 from pcfix.grid.lattice import Window
-from pcfix.io.drafts import cannot_write, draft_folder, replaced_when_whole
+from pcfix.io.drafts import cannot_write, disk_of, draft_folder, replaced_when_whole
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.declare import File
 from pcfix.sums import Counted
@@ -61,14 +62,34 @@ def local_path(path: File) -> Path:
 
 def check_input(path: File) -> Path:
     """Return the path of a file; one that does not exist is an `InputError`."""
-    found, why = path_of(path), "there is no such file"
+    found = path_of(path)
     try:
-        is_there = found.is_file()
+        if is_remote(path):
+            why = "" if found.is_file() else "there is no such file"
+        else:
+            why = kind_of(found.stat().st_mode)
+            why = f"is {why}; give a file" if why else ""
+            if not why:
+                found.open("rb").close()
     except Exception as error:  # each object store has errors of its own
-        is_there, why = False, f"cannot be read ({error})"
-    if not is_there:
+        why = refusal(error)
+    if why:
         raise InputError(f"{found}: {why}.")
     return found
+
+
+def kind_of(mode: int) -> str:
+    """Return what something is that is no file; nothing of a file."""
+    kinds = {stat.S_IFREG: "", stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe"}
+    return kinds.get(stat.S_IFMT(mode), "a device or a socket")
+
+
+def is_same(one: File, other: File) -> bool:
+    """Whether two names are of one file, which need not exist."""
+    try:
+        return Path(one).samefile(other)
+    except OSError:
+        return os.path.realpath(one) == os.path.realpath(other)
 
 
 def files_in(path: File) -> list[Path]:
@@ -110,15 +131,20 @@ def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) ->
     """
     target = local_path(path)
     for source in (one for one in inputs if not is_remote(one)):
-        both = target.exists() and Path(source).exists()
-        if target.samefile(source) if both else target.resolve() == Path(source).resolve():
+        if is_same(target, source):
             raise SettingError(
                 f"{target}: output and {source} are the same file; give the output another name."
             )
-    if target.is_dir():
-        raise SettingError(f"{target}: the output is a folder; give a file name.")
-    if target.exists() and not overwrite:
-        raise SettingError(f"{target}: the output exists; add --overwrite to replace it.")
+    try:
+        kind = kind_of(target.stat().st_mode)
+        if kind:
+            raise SettingError(f"{target}: the output is {kind}; give a file name.")
+        if not overwrite:
+            raise SettingError(f"{target}: the output exists; add --overwrite to replace it.")
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as error:
+        raise SettingError(f"{target}: {refusal(error)}.") from error
     if not target.parent.is_dir():
         raise SettingError(f"{target}: the folder {target.parent} does not exist; make it first.")
     return target
@@ -237,8 +263,9 @@ def scratch_arrays(target: Path) -> Iterator[Empty]:
                     one = mmap.mmap(stream.fileno(), size)
             except OSError as error:
                 raise InputError(
-                    f"{target}: {size / 1e9:,.1f} GB of temporary space beside it cannot be had"
-                    f" ({error.strerror or error}); make room, or write to another disk."
+                    f"{target}: {size / 1e9:,.1f} GB of temporary space beside it, on the disk"
+                    f" {disk_of(target)}, cannot be had ({error.strerror or error}); make room, or"
+                    " write to another disk."
                 ) from error
             with suppress(OSError):  # Windows keeps it until the block ends
                 path.unlink()

@@ -25,6 +25,8 @@ DEPTH_SPELLINGS = {
 }
 _DEPTH_UNIT = re.compile(r"^(.*?)[ _]*[\[(]([^\])]*)[\])]$|^(.*)_(m|cm|mm|ft)$")
 _LONGEST_NAME = 80
+TOO_LARGE = 1e15
+"""No coordinate, in whatever unit, and no time is as large; its square is still a number."""
 _METRES = ("", "m", "metre", "metres", "meter", "meters")
 
 
@@ -49,10 +51,9 @@ class Table(NamedTuple):
         texts = self.column(name)
         values = [number(text) for text in texts]
         for line, text, value in zip(self.line, texts, values, strict=True):
-            if not math.isfinite(value) and text.lower() not in unknown:
-                raise InputError(
-                    f"{self.path}: line {line}, column {name}: '{text}' is not a finite number."
-                )
+            if not abs(value) < TOO_LARGE and text.lower() not in unknown:
+                why = "too large" if math.isfinite(value) else "not a finite number"
+                raise InputError(f"{self.path}: line {line}, column {name}: '{text}' is {why}.")
         return values
 
 

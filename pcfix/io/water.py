@@ -7,6 +7,7 @@ apart at a northing of five million, and a damaged PLY ends the process.
 from __future__ import annotations
 
 import math
+import os
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -102,7 +103,7 @@ def read_water(
     try:
         return WaterPlane(*_finite([text], text))
     except SettingError:
-        if not (Path(text).is_file() or Path(text).suffix[1:2].isalpha()):
+        if not (os.path.lexists(text) or Path(text).suffix[1:2].isalpha()):
             raise  # no number ends as file names do
         check_input(text)
     if Path(text).suffix.lower() in _NO_RASTERS:

@@ -213,6 +213,8 @@ def _facts(s: Summary, measured: Plain | None) -> Table:
         rows.insert(2, ["Method", f"{s.made['method']}. {s.made['because']}"])
     if uncertainty := uncertainty_sentence(s, measured):
         rows.append(["Uncertainty", uncertainty])
+    if s.fit is not None and s.cameras:
+        rows.append(["Fit", s.fit["words"]])
     if s.poses is not None:
         rows.append(["Poses", s.poses["words"]])
     return Table("In short", [], rows)

@@ -16,6 +16,7 @@ from pcfix.water.cues import SLOPE, gain_of
 from pcfix.water.fit import fit_water
 from pcfix.water.samples import Samples, layer_gain, sample_cloud
 from pcfix.water.search import INSTEAD, LAYER, Looked, Peak, judge
+from pcfix.water.tilted import Tilted, find_tilt
 
 LEAST_POINTS = 2_000
 LEAST_RELIEF_M = 0.3
@@ -98,8 +99,8 @@ level that was given: more than is asked of a level where there is none, as none
 
 def find_elsewhere(
     xyz: FloatArray, water_m: FloatArray, rgb: npt.NDArray[Any] | None
-) -> WaterProposal | None:
-    """Return the water that a cloud shows at another height than that which was given, if any.
+) -> tuple[WaterProposal | None, Tilted | None]:
+    """Return the water that a cloud shows elsewhere than that which was given, if any.
 
     Parameters
     ----------
@@ -111,15 +112,22 @@ def find_elsewhere(
 
     Returns
     -------
-    WaterProposal or None
+    level : WaterProposal or None
         With heights above the given surface; None where the cloud shows it there, or nothing.
         Only where another height gains most is it looked at as closely as `find_water` does.
+    tilted : Tilted or None
     """
     samples = sample_cloud(np.column_stack([xyz[:, :2], xyz[:, 2] - water_m]), rgb, None)
     heights = search.all_heights(samples)
     if np.ptp(heights) < LEAST_RELIEF_M:
-        return None
+        return None, None
     whole = search.look(samples, heights, search.NO_TILT)
+    return _elsewhere(samples, whole), find_tilt(whole)
+
+
+def _elsewhere(samples: Samples, whole: Looked) -> WaterProposal | None:
+    """Return the water at another height than zero, if it is sure."""
+    heights = whole.heights_m
     gain = search.gains(whole, search.NO_TILT)
     here = gain[np.abs(heights + samples.origin[2]) <= APART_M].max(initial=0.0)
     best = int(np.argmax(gain))

@@ -166,7 +166,7 @@ FOUND = {
     ),
     "a number of many digits": (
         *("realitycapture", "one", "a.xmp", instead(b"n>10 ", b"n>" + b"9" * 5000 + b" ")),
-        "999... is not a number",
+        "999...' is not a number",
     ),
 }
 

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import rasterio
 import shapely
+from pyproj import CRS
 
 import pcfix
 from pcfix.errors import SettingError
@@ -27,6 +28,7 @@ from pcfix.flow.request import Request, request_of, since
 from pcfix.flow.run import run_all
 from pcfix.grid.colours import DEPTH, stops_of
 from pcfix.io import geopackage
+from pcfix.io.cameras import read_cameras
 from pcfix.io.rasters import values_at
 from pcfix.io.styles import hex_colour
 from pcfix.refract.tally import Summary
@@ -336,6 +338,35 @@ def test_files_that_are_read_unasked_and_the_version_count(finished, tmp_path, m
     assert record().changed == ["sensor.csv"]
     monkeypatch.setattr("pcfix.flow.request.__version__", "9.9")
     assert record().changed == ["version of pcfix"]
+
+
+def test_files_that_readers_open_count_without_a_list(finished, tmp_path):
+    """As the coordinate system beside a table, of which no rule of `run` knows."""
+    for name in ("cameras.csv", "sensor.csv"):
+        shutil.copy(SCENE / name, tmp_path)
+    beside, unread = tmp_path / "cameras.prj", tmp_path / "unread.prj"
+    for one in (beside, unread):
+        one.write_text(CRS("EPSG:32633").to_wkt())
+    cameras, out = tmp_path / "cameras.csv", tmp_path / "out"
+    request = replace(request_of(finished[0] / "run.json"), cameras=str(cameras))
+    out.mkdir()
+
+    def record():
+        return Record(out / "run.json", request.record(), request.watched(out), since)
+
+    def read():
+        (out / "kept.txt").write_text((SCENE / "scene.json").read_text())
+        return [read_cameras(cameras).crs, (out / "kept.txt").read_text()][:1]
+
+    record().step("adjust", [], read)
+    assert record().changed == []
+    unread.write_text("another")
+    (out / "kept.txt").unlink()
+    assert record().changed == []
+    beside.write_text(CRS("EPSG:32632").to_wkt())
+    assert (record().changed, record().first) == (["cameras.prj"], "adjust")
+    beside.unlink()
+    assert record().changed == ["cameras.prj"]
 
 
 def test_a_reference_that_is_added_is_compared_with(finished, tmp_path):

@@ -53,6 +53,8 @@ def test_heights_are_read_as_such_and_may_be_negative(tmp_path, name):
         ("x,y,depth\n1,2,deep\n", "line 2, column depth: 'deep' is not a finite number"),
         ("x,y,depth\n1,2,3\n1,,3\n", "line 3, column y: '' is not a finite number"),
         ("x,y,depth\n1,2,nan\n", "line 2, column depth: 'nan' is not a finite number"),
+        ("x,y,depth\n1,2,1e308\n", "line 2, column depth: '1e308' is too large"),
+        ("x,y,depth\n1,2,1e400\n", "line 2, column depth: '1e400' is not a finite number"),
         ("x,y,depth\n1,2,1\n5,6,-3\n5,6,-4\n", "line 3 (5.00, 6.00): the depth -3 is negative"),
         ("x,y,depth\n1,2,-1\n1,2,1\n", "1 of 2; depths count positive down"),
         ("x,y,depth\n1,2\n", "line 2 has 2 fields, the header 3"),

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from laspy.vlrs.known import WktCoordinateSystemVlr
 from pyproj import CRS, Transformer
 
 from pcfix.errors import InputError
+from pcfix.flow.surfaces import view_of
 from pcfix.io.crs import (
     Topocentric,
     check_projected_metres,
@@ -20,6 +22,7 @@ from pcfix.io.crs import (
     with_heights,
 )
 from pcfix.io.transformations import HeightsError, transformation_in_plan, transformation_in_space
+from tests.utils.clouds import random_cloud
 
 ESRI = (
     'PROJCS["ETRS_1989_UTM_Zone_30N",GEOGCS["GCS_ETRS_1989",DATUM["D_ETRS_1989",'
@@ -58,6 +61,23 @@ def test_texts(text, code):
 def test_a_text_that_names_no_crs(text):
     with pytest.raises(InputError, match=r"^cameras.xml: the CRS '.*' is not one that PROJ knows"):
         parse_crs(text, "cameras.xml")
+
+
+@pytest.mark.parametrize("number", ["-1", "0", "1e999"])
+def test_wkt_with_numbers_that_no_ellipsoid_has(number, tmp_path):
+    """Of a camera file, and of a cloud, whose sentence does not hold all of it."""
+    text = CRS("EPSG:32633").to_wkt().replace("6378137", number)
+    with pytest.raises(InputError, match=r"the CRS 'PROJCRS.*\.\.\.' is not one that PROJ knows"):
+        parse_crs(text, "cameras.xml")
+    las = random_cloud(6, count=300)
+    las.header.vlrs.append(WktCoordinateSystemVlr(text))
+    las.header.global_encoding.wkt = True
+    las.write(tmp_path / "cloud.las")
+    with pytest.raises(
+        InputError, match=r"cloud\.las: its coordinate system cannot be read"
+    ) as said:
+        view_of(tmp_path / "cloud.las")
+    assert len(str(said.value).removeprefix(str(tmp_path))) < 160
 
 
 def test_a_vertical_crs_alone_is_no_place():

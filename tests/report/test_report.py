@@ -197,6 +197,7 @@ def test_paths_are_names():
 
 def test_without_a_reference_the_accuracy_is_predicted(report):
     text = (report[0] / "report.html").read_text()
+    assert re.search(r"Fit</th><td>cameras and cloud fit; tested: 100 % of the points", text)
     tile = re.search(r"<h2>Accuracy of the bed.*?</section>", text, re.S)[0]
     sigma = report[1].uncertainty["sigma_z_m"]["mean"]
     assert ">predicted<" in tile and "measured" not in tile and f"{sigma:.3f} m" in tile

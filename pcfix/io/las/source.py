@@ -22,7 +22,7 @@ from laspy.vlrs.vlr import VLR
 from laspy.vlrs.vlrlist import VLRList
 
 from pcfix.errors import InputError
-from pcfix.io.crs import METRES
+from pcfix.io.crs import METRES, shortened
 from pcfix.io.files import check_input
 from pcfix.io.las.counts import check_chunks
 from pcfix.io.las.part import CloudPart, check_levels, extent_of, is_copc, nodes_in
@@ -369,7 +369,9 @@ def stated_crs(source: LasSource, complaint: str, remedy: str) -> CRS | None:
         with las_errors(source.path):
             crs: CRS | None = source.header.parse_crs()
     except CRSError as error:
-        raise InputError(f"{source.path}: {complaint} ({error}); {remedy}.") from error
+        raise InputError(
+            f"{source.path}: {complaint} ({shortened(str(error))}); {remedy}."
+        ) from error
     return crs
 
 

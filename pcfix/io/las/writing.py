@@ -314,6 +314,7 @@ class LasSink:
     ) -> None:
         self.header = header
         self._path, self._evlrs, self._identity, self._jobs = path, evlrs or [], identity, jobs
+        self._needed = header.point_count * header.point_format.size
         self._stack = ExitStack()
         self._copc: CopcWriter | None = None
 
@@ -356,7 +357,7 @@ class LasSink:
         try:
             yield
         except (laspy.LaspyException, lazrs.LazrsError, OSError) as error:
-            raise cannot_write(self._path, error, self._draft) from error
+            raise cannot_write(self._path, error, self._draft, self._needed) from error
 
 
 def write_points(

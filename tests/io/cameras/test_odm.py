@@ -397,6 +397,10 @@ def without(name):
             "images.json: image 1.jpg, latitude: 'x'|images.json: image 1.jpg, latitude",
         ),
         (
+            {"reconstruction": reconstruction(PLACES), "transformation": ""},
+            "geocoords_transformation.txt: is not four rows",
+        ),
+        (
             {"reconstruction": reconstruction(PLACES), "transformation": "1 0 0\n0 1"},
             "geocoords_transformation.txt: is not four rows",
         ),

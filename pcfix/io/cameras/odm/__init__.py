@@ -190,11 +190,10 @@ def _transformed(
     try:
         matrix = np.array([line.split()[:4] for line in text.splitlines() if line.strip()], float)
     except ValueError:
-        matrix = np.empty(0)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        matrix = np.zeros((4, 4))
+        matrix = np.empty((0, 0))
+    matrix = matrix if matrix.shape == (4, 4) else np.zeros((4, 4))
     turn, shift = matrix[:3, :3], matrix[:3, 3]
-    if not np.abs(turn.T @ turn - np.eye(3)).max() <= SCALE_TOLERANCE:
+    if not np.isfinite(matrix).all() or np.abs(turn.T @ turn - np.eye(3)).max() > SCALE_TOLERANCE:
         raise InputError(
             f"{path}: is not four rows of four numbers that turn and shift the reconstruction."
         )

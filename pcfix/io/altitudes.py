@@ -1,0 +1,66 @@
+"""How high drones flew above their take-off place, by what they wrote into their photographs.
+
+DJI's XMP has ``drone-dji:RelativeAltitude`` (metres, by the barometer); Metashape keeps it in its
+projects, as the property ``DJI/RelativeAltitude`` of each photograph.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from contextlib import suppress
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from pcfix.errors import InputError
+from pcfix.io.cameras.metashape.documents import open_chunk
+from pcfix.io.labels import match_labels
+from pcfix.model import FloatArray
+from pcfix.options.declare import File
+
+IMAGES = (".jpg", ".jpeg", ".dng", ".tif", ".tiff")
+FOLDERS = ("", "images")
+"""Where photographs lie, from the folder of the camera file on."""
+MOST_IMAGES, HEAD_BYTES = 30, 2**17
+_ABOVE = re.compile(rb"RelativeAltitude(?:=[\"']|>)\s*([+-]?\d+(?:\.\d*)?)")
+
+
+def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
+    """Return how high each image was taken above the take-off place, shape (k,), metres.
+
+    NaN where nothing tells. Of photographs beside the camera file `MOST_IMAGES` are looked at.
+    """
+    with suppress(OSError, InputError):  # a look in passing
+        path = Path(cameras)
+        found = _of_project(path) if path.suffix.lower() == ".psx" else _of_photographs(path)
+        row = match_labels(list(found), labels, one_to_one=False).row
+        altitudes = np.full(len(labels), np.nan)
+        altitudes[row[row >= 0]] = np.array(list(found.values()))[row >= 0]
+        return altitudes
+    return np.full(len(labels), np.nan)
+
+
+def _of_photographs(path: Path) -> dict[str, float]:
+    root, found = path if path.is_dir() else path.parent, {}
+    inside = [sorted(one.iterdir()) for name in FOLDERS if (one := root / name).is_dir()]
+    images = [one for one in chain(*inside) if one.suffix.lower() in IMAGES and one.is_file()]
+    for image in images[:: 1 + len(images) // MOST_IMAGES]:
+        with image.open("rb") as stream:
+            if above := _ABOVE.search(stream.read(HEAD_BYTES)):
+                found[image.name] = float(above[1])
+    return found
+
+
+def _of_project(path: Path) -> dict[str, float]:
+    chunk, found = open_chunk(path).document, {}
+    names = {camera.get("id"): camera.get("label") for camera in chunk.root.iter("camera")}
+    for frame in chunk.root.iterfind("frames/frame"):
+        for camera in chunk.follow(frame).root.iter("camera"):
+            for entry in camera.iter("property"):
+                label = names.get(camera.get("camera_id"))
+                if entry.get("name") == "DJI/RelativeAltitude" and label:
+                    with suppress(ValueError):
+                        found[label] = float(entry.get("value", ""))
+    return found

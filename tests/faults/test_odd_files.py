@@ -1,0 +1,200 @@
+"""Names and things that are no ordinary files: one sentence each, and nothing written over."""
+
+from __future__ import annotations
+
+import os
+import stat
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pcfix.errors import InputError, PcfixError, SettingError, brief
+from pcfix.io.drafts import cannot_write, disk_of
+from pcfix.io.files import check_input, check_output, is_same
+from tests.utils.clouds import WATER_M, write_cloud
+from tests.utils.program import run_pcfix
+
+LONG = "9" * 300
+NOT_UTF8 = os.fsdecode(b"h\xf6he")
+PLY = """ply
+format ascii 1.0
+comment H\xf6he \xfcber Normal
+element vertex 3
+property double x
+property double y
+property double z
+element face 1
+property list uchar int vertex_indices
+end_header
+455900 5431900 {0}
+456300 5431900 {0}
+456100 5432300 {0}
+3 0 1 2
+"""
+
+
+@pytest.fixture(scope="module")
+def odd(tmp_path_factory):
+    """A folder with a cloud and what is no file beside it."""
+    folder = tmp_path_factory.mktemp("odd")
+    write_cloud(folder / "cloud.las", 3, count=300)
+    (folder / "one").symlink_to("other")
+    (folder / "other").symlink_to("one")
+    (folder / "folder").mkdir()
+    (folder / "folder" / "self").symlink_to("../folder")
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(folder / "pipe")
+    (folder / "latin.ply").write_text(PLY.format(WATER_M), "latin-1")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def raster(odd):
+    """A raster of heights over the cloud, and its bytes."""
+    rasterio = pytest.importorskip("rasterio")
+    place = rasterio.transform.from_origin(455_950.0, 5_432_150.0, 1.0, 1.0)
+    how = {"driver": "GTiff", "width": 200, "height": 200, "count": 1, "dtype": "float32"}
+    with rasterio.open(odd / "whole.tif", "w", transform=place, **how) as target:
+        target.write(np.full((200, 200), WATER_M, np.float32), 1)
+    return (odd / "whole.tif").read_bytes()
+
+
+def refused(folder, *words):
+    """Run a command that is refused in one line and leaves the folder as it was; return that."""
+    before = sorted(folder.iterdir())
+    done = run_pcfix(*words, folder=folder)
+    assert done.returncode == 1, done
+    lines = [one for one in done.stderr.splitlines() if not one.startswith("pcfix: warning:")]
+    assert len(lines) == 1 and lines[0].startswith("pcfix: "), done.stderr
+    assert sorted(folder.iterdir()) == before
+    return lines[0]
+
+
+def label(cloud="cloud.las", output="out.las", water=str(WATER_M)):
+    return ["label", cloud, output, "--water", water, "--overwrite"]
+
+
+CASES = {
+    "a loop as cloud": (label("one"), "one: its links lead in a circle"),
+    "a loop as output": (label(output="one"), "one: its links lead in a circle"),
+    "a loop as water": (label(water="one"), "one: its links lead in a circle"),
+    "a loop as cameras": (["cameras", "one"], "one: its links lead in a circle"),
+    "a long name as cloud": (label(f"{LONG}.las"), "longer than the system allows"),
+    "a long name as output": (label(output=f"{LONG}.las"), "longer than the system allows"),
+    "a long name as water": (label(water=f"{LONG}.tif"), "longer than the system allows"),
+    "a long name as cameras": (["cameras", f"{LONG}.csv"], "longer than the system allows"),
+    "a folder as water": (label(water="folder"), "folder: is a folder"),
+    "a folder as cloud": (label("folder"), "folder"),
+    "a folder as cameras": (["cameras", "folder"], "folder: is not a camera file"),
+    "a folder as output": (label(output="folder"), "folder: the output is a folder"),
+    "a pipe as cloud": (label("pipe"), "pipe: is a pipe"),
+    "a pipe as water": (label(water="pipe"), "pipe: is a pipe"),
+    "a pipe as cameras": (["cameras", "pipe"], "pipe: is a pipe"),
+    "a pipe as output": (label(output="pipe"), "pipe: the output is a pipe"),
+    "a pipe as summary": ([*label(), "--summary", "pipe"], "pipe: the output is a pipe"),
+    "a device as cloud": (label(os.devnull), "is a device"),
+    "a device as water": (label(water=os.devnull), "is a device"),
+    "a device as cameras": (["cameras", os.devnull], "is a device"),
+    "no UTF-8, no file": (label(water=f"{NOT_UTF8}.tif"), ".tif: there is no such file"),
+}
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="has no pipes in folders")
+@pytest.mark.parametrize("case", CASES)
+def test_what_is_no_file_is_called_what_it_is(odd, case):
+    words, sentence = CASES[case]
+    said = refused(odd, *words)
+    assert sentence in said
+    assert LONG[:61] not in said
+    assert stat.S_ISFIFO((odd / "pipe").stat().st_mode)
+
+
+def test_devices_are_never_written_over():
+    """By the rule alone: a command that broke it would replace the device."""
+    with pytest.raises(SettingError, match="the output is a device"):
+        check_output(os.devnull, overwrite=True)
+
+
+def test_names_that_are_not_utf8(odd, raster):
+    """A cloud of such a name goes through; what a library cannot open is said."""
+    cloud = odd / f"{NOT_UTF8}.las"
+    cloud.write_bytes((odd / "cloud.las").read_bytes())
+    (odd / f"{NOT_UTF8}.tif").write_bytes(raster)
+    done = run_pcfix(*label(cloud.name, f"out{NOT_UTF8}.laz"), folder=odd)
+    assert done.returncode == 0, done.stderr
+    assert "not in UTF-8; rename the file" in refused(odd, *label(water=f"{NOT_UTF8}.tif"))
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7, 0.99])
+def test_a_raster_of_the_water_that_is_cut(odd, raster, share):
+    (odd / "cut.tif").write_bytes(raster[: int(share * len(raster))])
+    assert "cut.tif: is damaged" in refused(odd, *label(water="cut.tif"))
+
+
+def test_a_mesh_whose_comments_are_latin(odd):
+    done = run_pcfix(*label(water="latin.ply"), folder=odd)
+    assert done.returncode == 0, done.stderr
+    (odd / "out.las").unlink()
+
+
+@pytest.fixture
+def closed():
+    """A folder that others may look for but not into, and a cloud that they may not read."""
+    with tempfile.TemporaryDirectory(dir="/tmp") as name:
+        folder = Path(name)
+        for part in ("closed", "open"):
+            (folder / part).mkdir()
+            write_cloud(folder / part / "cloud.las", 3, count=300)
+        (folder / "open" / "cloud.las").chmod(0)
+        folder.chmod(0o755)
+        (folder / "closed").chmod(0)
+        try:
+            yield folder
+        finally:
+            (folder / "closed").chmod(0o700)
+
+
+@pytest.mark.skipif(not hasattr(os, "seteuid"), reason="has no users to change to")
+@pytest.mark.parametrize("name", ["closed/cloud.las", "open/cloud.las"])
+def test_files_that_may_not_be_read(closed, name):
+    is_root = os.geteuid() == 0
+    if is_root:
+        os.seteuid(65534)
+    try:
+        with pytest.raises(InputError, match=r"cloud\.las: access is denied"):
+            check_input(closed / name)
+        with pytest.raises(PcfixError, match=r"cloud\.las: (access is denied|the output exists)"):
+            check_output(closed / name, overwrite=False)
+    finally:
+        if is_root:
+            os.seteuid(0)
+
+
+def test_values_are_cut_and_names_of_files_are_not():
+    name = "CA502_ReDateTime_reprocess_calibrated_external_camera_parameters_wgs84.txt"
+    assert brief(f"/long/{name}: line 2: '{LONG}' is no number") == (
+        f"/long/{name}: line 2: '{LONG[:57]}...' is no number"
+    )
+    assert str(InputError(f"index {LONG}, or {LONG}: no")) == (
+        f"index {LONG[:57]}... or {LONG[:57]}...: no"
+    )
+    command = f"run: 'pip install -e {'/a' * 80}[photos]'"
+    assert brief(command) == command
+
+
+def test_a_full_disk_is_named_with_what_was_needed(tmp_path):
+    error = OSError(28, "No space left on device")
+    (tmp_path / "draft").write_bytes(bytes(2_500_000))
+    said = str(cannot_write(tmp_path / "out.laz", error, tmp_path / "draft", 80_000_000))
+    assert f"on the disk {disk_of(tmp_path).partition(' (')[0]} (" in said
+    assert "MB free) after 2.5 MB of it, up to 80.0 MB are needed; make room on it" in said
+
+
+def test_two_names_of_one_file(tmp_path):
+    (tmp_path / "a").write_text("")
+    (tmp_path / "b").symlink_to("a")
+    assert is_same(tmp_path / "a", tmp_path / "b")
+    assert is_same(tmp_path / "none", tmp_path / "x" / ".." / "none")
+    assert not is_same(tmp_path / "a", tmp_path / "none")
