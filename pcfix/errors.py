@@ -14,6 +14,18 @@ from typing import Any, TypeVar
 
 _Found = TypeVar("_Found")
 
+_MOST_LETTERS, _FIRST, _LAST = 800, 540, 240
+
+
+def one_line(message: str) -> str:
+    """Return a message as a line that a terminal can show, whatever of a file is quoted in it.
+
+    Letters that are not for print become escapes, and a message that is too long all the same loses
+    its middle: the file is named first and the remedy last.
+    """
+    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in message)
+    return text if len(text) <= _MOST_LETTERS else f"{text[:_FIRST]} ... {text[-_LAST:]}"
+
 
 LONGEST_VALUE, LONGEST_NAME = 60, 255
 _UNBROKEN = re.compile(rf"[^\s/\\'\":;()]{{{LONGEST_VALUE + 1},}}")
@@ -39,6 +51,9 @@ class PcfixError(Exception):
     def __init__(self, message: object = "") -> None:
         super().__init__(brief(str(message)))
 
+    def __str__(self) -> str:
+        return one_line(super().__str__())
+
 
 class InputError(PcfixError):
     """A file that is missing, damaged or not what it should be."""
@@ -54,6 +69,9 @@ class GeometryError(PcfixError):
 
 class PcfixWarning(UserWarning):
     """Something that was done on the user's behalf and that they should know of."""
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 _REFUSALS = {

@@ -334,7 +334,7 @@ def _tested(cloud: Path | Tiles, water: WaterSurface | None, jobs: int | None) -
 def _has_rays(source: LasSource) -> bool:
     """Return whether a cloud, if it was corrected, was so with cameras."""
     try:
-        ours = own_settings(source.vlrs) or {}
+        ours = own_settings(source.vlrs)
     except ValueError:  # whoever needs it says so
-        ours = {}
-    return bool(ours.get("cameras") != 0)
+        return True
+    return not (isinstance(ours, dict) and ours.get("cameras") == 0)

@@ -197,9 +197,17 @@ def file_state(path: Path) -> dict[str, Any]:
     return {"path": str(path), "bytes": found.st_size, "changed_ns": found.st_mtime_ns}
 
 
+def parse_json(text: str | bytes) -> Any:
+    """Return the content of a JSON text; ValueError where it is none."""
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("its brackets are nested too deep") from error
+
+
 def read_json(path: Path) -> Any:
     """Return the content of a JSON file; OSError or ValueError where it is none."""
-    return json.loads(path.read_text("utf-8"))
+    return parse_json(path.read_text("utf-8"))
 
 
 def write_bytes(path: File, data: bytes, *, overwrite: bool) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from pcfix.adjust.members import Members
 
 FILE = "ensemble.npz"
+_NOT_READ = (OSError, ValueError, TypeError, KeyError, EOFError, BadZipFile, zlib.error)
 
 
 def write_members(folder: Path, members: Members) -> None:
@@ -43,11 +45,27 @@ def find_members(cameras: File) -> tuple[Path, Members] | None:
 
     try:
         with np.load(found) as arrays:
-            values = {one.name: arrays[one.name] for one in fields(Members)}
-    except (OSError, ValueError, KeyError, BadZipFile) as error:
+            values = {one.name: np.asarray(arrays[one.name]) for one in fields(Members)}
+        labels, lens_names = (values.pop(name) for name in ("labels", "lens_names"))
+        _check(labels, lens_names, values)
+    except (*_NOT_READ, MemoryError) as error:
         raise InputError(
             f"{found}: is no ensemble of an adjustment; adjust anew, or take the file away."
         ) from error
-    for name in ("labels", "lens_names"):
-        values[name] = tuple(values[name].tolist())
-    return found, Members(**values)
+    return found, Members(
+        labels=tuple(labels.tolist()), lens_names=tuple(lens_names.tolist()), **values
+    )
+
+
+def _check(labels: Any, lens_names: Any, values: dict[str, Any]) -> None:
+    """Raise a ValueError where arrays are not those of `Members`."""
+    m, k, p = len(values["turn"]), len(labels), len(lens_names)
+    shapes = {
+        **{"centres": (k, 3), "focal": (k,), "turn": (m, k, 3), "shift_m": (m, k, 3)},
+        **{"lens": (m, k, p), "water": (m, *values["water"].shape[1:])},
+    }
+    for name, shape in shapes.items():
+        if values[name].shape != shape or not np.isfinite(values[name]).all():
+            raise ValueError(name)
+    if values["water"].shape[1:] not in ((4,), (7,)):
+        raise ValueError("water")

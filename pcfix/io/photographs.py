@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import InputError, photo_library
+from pcfix.errors import InputError, PcfixError, photo_library
 from pcfix.io.drafts import replaced_when_whole
 from pcfix.model import BoolArray
 
@@ -40,7 +40,7 @@ def size_of(path: Path) -> tuple[int, int]:
     """Return columns and rows of a photograph, from its header."""
     with _readable(path):
         if path.suffix.lower() in TIFF:
-            import tifffile
+            tifffile = photo_library("tifffile")
 
             with tifffile.TiffFile(path) as file:
                 page: Any = file.pages[0]
@@ -108,7 +108,9 @@ def _readable(path: Path) -> Iterator[None]:
     """Turn what the libraries say of a damaged file into a sentence."""
     try:
         yield
-    except (OSError, ValueError, RuntimeError, SyntaxError) as error:
+    except PcfixError:
+        raise
+    except Exception as error:  # of any kind, where a tag has another type than it should
         raise InputError(
             f"{path}: is damaged, or no photograph that can be read ({error}); copy it from the"
             " camera again."

@@ -1,4 +1,4 @@
-"""The vertices of PLY files, with the lists that other readers refuse.
+"""The vertices and faces of PLY files, with the lists that other readers refuse.
 
 The format is Greg Turk's (The PLY Polygon File Format, 1994): a header of lines names elements and
 their properties, ``property TYPE NAME`` or ``property list COUNT_TYPE ITEM_TYPE NAME``; the records
@@ -38,13 +38,14 @@ class Property(NamedTuple):
 
 
 class Header(NamedTuple):
-    """What a PLY file says of its vertices."""
+    """What a PLY file says of its vertices, or of another element."""
 
     name: str  # of the file, for messages
     order: str  # of the bytes, "<" or ">"; empty for text
-    vertices: int  # promised, not checked
-    properties: tuple[Property, ...]  # of a vertex
-    skipped: tuple[tuple[int, tuple[Property, ...]], ...]  # elements that come before the vertices
+    kind: str  # of the records, in the plural, for messages
+    records: int  # promised, not checked
+    properties: tuple[Property, ...]  # of a record
+    skipped: tuple[tuple[int, tuple[Property, ...]], ...]  # elements that come before these
     end: int  # bytes of the header
 
     def item(self, name: str, *, is_list: bool) -> str | None:
@@ -57,10 +58,13 @@ class Header(NamedTuple):
         return int(kind[1]) if self.order else 1
 
 
-def parse_header(name: str, head: bytes) -> Header:
-    """Return what the first bytes of a PLY file say of its vertices.
+_KINDS = {"vertex": "vertices", "face": "faces"}
 
-    An `InputError` if it is not one, or has no vertices.
+
+def parse_header(name: str, head: bytes, element: str = "vertex") -> Header:
+    """Return what the first bytes of a PLY file say of its vertices, or faces.
+
+    An `InputError` if it is not one, or has none.
     """
     end = re.search(rb"end_header[ \t]*\r?\n", head)
     if not head.startswith(b"ply") or end is None:
@@ -72,18 +76,18 @@ def parse_header(name: str, head: bytes) -> Header:
         raise InputError(
             f"{name}: the PLY header is damaged ({error}); export it again."
         ) from error
-    names = [element for element, _, _ in elements]
-    if "vertex" not in names:
-        raise InputError(f"{name}: the PLY file has no vertices; give a point cloud.")
-    at = names.index("vertex")
+    names, kind = [one for one, _, _ in elements], _KINDS[element]
+    if element not in names:
+        raise InputError(f"{name}: the PLY file has no {kind}; export it again with them.")
+    at = names.index(element)
     skipped = tuple((count, tuple(p)) for _, count, p in elements[:at])
-    return Header(name, order, elements[at][1], tuple(elements[at][2]), skipped, end.end())
+    return Header(name, order, kind, elements[at][1], tuple(elements[at][2]), skipped, end.end())
 
 
-def read_header(path: Path) -> Header:
+def read_header(path: Path, element: str = "vertex") -> Header:
     """Return `parse_header` of a file."""
     with path.open("rb") as stream:
-        return parse_header(str(path), stream.read(_MOST_HEADER_BYTES))
+        return parse_header(str(path), stream.read(_MOST_HEADER_BYTES), element)
 
 
 def _elements(lines: list[list[str]]) -> tuple[str, list[tuple[str, int, list[Property]]]]:
@@ -111,19 +115,19 @@ def _elements(lines: list[list[str]]) -> tuple[str, list[tuple[str, int, list[Pr
 Places: TypeAlias = dict[tuple[str, bool], tuple[int, tuple[int, int]]]
 
 
-class Vertices:
-    """The records of the vertices, walked over once, so that every count in them holds."""
+class Records:
+    """The records of the vertices or faces, walked over once, so that every count in them holds."""
 
-    def __init__(self, path: Path) -> None:
-        """Walk over the file; one without vertices or that ends early is an `InputError`."""
-        self.header = header = read_header(path)
+    def __init__(self, path: Path, element: str = "vertex") -> None:
+        """Walk over the file; one without such or that ends early is an `InputError`."""
+        self.header = header = read_header(path, element)
         self._units = _units(path, header)
         self._item, self._prefix, self._field = _layout(header)
         least = int((self._prefix + self._item * (self._prefix == 0)).sum())
-        if header.vertices * least > len(self._units):
-            self._complain(header.vertices)
+        if header.records * least > len(self._units):
+            self._complain(header.records)
         names = [p.name for p in header.properties if p.length]
-        starts = np.zeros((len(names), header.vertices + 1), np.int64)
+        starts = np.zeros((len(names), header.records + 1), np.int64)
         which = np.array([self._field[name, True][0] for name in names], np.int64)
         big = header.order == ">"
         end = list_starts(self._units, self._item, self._prefix, big, which, starts)
@@ -134,12 +138,13 @@ class Vertices:
     def _complain(self, row: int) -> None:
         raise InputError(
             f"{self.header.name}: is cut short or damaged: the header promises"
-            f" {self.header.vertices:,} vertices, number {row:,} is not whole; copy it again."
+            f" {self.header.records:,} {self.header.kind}, number {row:,} is not whole; copy it"
+            " again."
         )
 
     def numbers(self, *names: str) -> FloatArray:
         """Return properties that are no lists as columns, shape (n, names)."""
-        count = self.header.vertices
+        count = self.header.records
         columns = [self._copy(name, count, is_list=False) for name in names]
         return np.column_stack(columns).astype(np.float64)
 
@@ -154,7 +159,7 @@ class Vertices:
         out = np.empty(count * header.size(item), self._units.dtype)
         copy_field(
             *(self._units, self._item, self._prefix, header.order == ">", field),
-            *(part, header.vertices, out),
+            *(part, header.records, out),
         )
         return out.view(header.order + item) if header.order else out
 
@@ -182,13 +187,13 @@ def _layout(header: Header) -> tuple[IntArray, IntArray, Places]:
 
 
 def _units(path: Path, header: Header) -> npt.NDArray[Any]:
-    """Return the bytes of the vertices, or the numbers of a text, to the end of the file."""
+    """Return the bytes of the records, or the numbers of a text, to the end of the file."""
     skip = 0
     for count, properties in header.skipped:
         if count and any(p.length for p in properties):
             raise InputError(
-                f"{path}: lists come before the vertices, which pcfix does not read; export the"
-                " points alone."
+                f"{path}: lists come before the {header.kind}, which pcfix does not read; export"
+                f" the {header.kind} first."
             )
         skip += count * sum(header.size(p.item) for p in properties)
     if header.order == "":

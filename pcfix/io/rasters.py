@@ -53,7 +53,7 @@ def read_raster(path: File) -> Raster:
 def open_raster(path: File) -> Iterator[DatasetReader]:
     """Open a raster to read parts of it.
 
-    An `InputError` if there is no such file, or it is none.
+    An `InputError` if there is no such file, it is none, or a part cannot be read.
     """
     import rasterio
 
@@ -61,7 +61,7 @@ def open_raster(path: File) -> Iterator[DatasetReader]:
     try:
         with rasterio.open(found) as source:
             yield source
-    except rasterio.errors.RasterioError as error:
+    except (rasterio.errors.RasterioError, UnicodeDecodeError) as error:
         raise InputError(
             f"{found}: is damaged, or is not a raster ({error.__cause__ or error}); export it again"
             " as GeoTIFF."

@@ -24,6 +24,7 @@ DEPTH_SPELLINGS = {
     "z": ("z", "height", "elevation", "elev", "altitude"),
 }
 _DEPTH_UNIT = re.compile(r"^(.*?)[ _]*[\[(]([^\])]*)[\])]$|^(.*)_(m|cm|mm|ft)$")
+_LONGEST_NAME = 80
 TOO_LARGE = 1e15
 """No coordinate, in whatever unit, and no time is as large; its square is still a number."""
 _METRES = ("", "m", "metre", "metres", "meter", "meters")
@@ -216,7 +217,7 @@ def read_check_depths(path: File) -> CheckDepths:
 
 def _split_unit(name: str) -> tuple[str, str]:
     """Return the name of a column and its unit: depth_m, Depth (m), x [m]."""
-    match = _DEPTH_UNIT.match(name)
+    match = _DEPTH_UNIT.match(name) if len(name) < _LONGEST_NAME else None  # it may take long
     if not match:
         return name.replace(" ", "_"), ""
     name, unit = (match[1], match[2]) if match[3] is None else (match[3], match[4])

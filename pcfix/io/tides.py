@@ -75,12 +75,12 @@ def _from_exif(folder: Path, labels: Sequence[str]) -> ImageTimes:
 
 def _exif_time(file: Path) -> str:
     """Return DateTimeOriginal with fraction and zone, as far as they are there."""
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     try:
         with Image.open(file) as image:
             tags = image.getexif().get_ifd(_EXIF)
-    except (UnidentifiedImageError, OSError) as error:
+    except Exception as error:  # of any kind, where a tag has another type than it should
         raise InputError(f"{file}: is not an image that can be read ({error}).") from error
     text = str(tags.get(_DATE_TIME_ORIGINAL, "")).strip("\0 ")
     if not text:
@@ -94,7 +94,7 @@ def _exif_time(file: Path) -> str:
 
 def _from_json(path: Path, labels: Sequence[str]) -> ImageTimes:
     try:
-        times = _json_times(read_json(path))
+        times = {str(name): time_s for name, time_s in _json_times(read_json(path)).items()}
     except (OSError, ValueError, TypeError, AttributeError, LookupError) as error:
         raise InputError(f"{path}: is not a file of OpenDroneMap or OpenSfM ({error}).") from error
     if not times:
@@ -102,7 +102,7 @@ def _from_json(path: Path, labels: Sequence[str]) -> ImageTimes:
     names = list(times)
     chosen = [names[row] for row in _rows(names, labels, str(path))]
     for name in chosen:
-        if not times[name] > 0.0:
+        if not 0.0 < times[name] < np.inf:
             raise InputError(f"{path}: does not say when image {name} was taken.")
     return ImageTimes(np.array([times[name] for name in chosen]), True, str(path))
 

@@ -1,26 +1,22 @@
 """The water surface, from one word that says what it is; triangle meshes.
 
-PLY goes through open3d, which keeps double precision. OBJ does not: open3d hands OBJ
-coordinates on as 32-bit floats, half a metre apart at a northing of five million, so the two
-kinds of line that matter are read here.
+These are read here, and not by open3d: it hands OBJ coordinates on as 32-bit floats, half a metre
+apart at a northing of five million, and a damaged PLY ends the process.
 """
 
 from __future__ import annotations
 
-import ctypes
 import math
 import os
-import tempfile
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.io.files import check_input
+from pcfix.io.ply import Records
 from pcfix.io.water_rasters import read_water_raster
 from pcfix.model import FloatArray, IntArray, WaterDimension, WaterMesh, WaterPlane, WaterSurface
 from pcfix.options.declare import File
@@ -41,6 +37,8 @@ _NO_RASTERS = (".csv", ".txt", ".json", ".geojson", ".gpkg", ".shp", ".wkt", ".l
 MOST_OVERLAP = 0.01
 """Of the plan area: what folds at the rim of a triangulated shore come to."""
 LEAST_FACET_M2 = 1e-6
+_CORNERS = "vertex_indices", "vertex_index"
+_MOST_VERTICES = 2**31
 
 
 def read_water(
@@ -171,7 +169,7 @@ def _note(sentence: str) -> None:
 
 
 def _read_obj(path: Path) -> tuple[FloatArray, IntArray]:
-    """Return vertices, shape (v, 3), and triangles, shape (t, 3)."""
+    """Return vertices, shape (v, 3), and triangles, shape (t, 3); polygons as fans of these."""
     vertices: list[list[float]] = []
     triangles: list[list[int]] = []
     for number, line in enumerate(path.read_text("latin-1").splitlines(), start=1):
@@ -191,53 +189,26 @@ def _read_obj(path: Path) -> tuple[FloatArray, IntArray]:
 def _obj_index(field: str, count: int) -> int:
     """Return the row of a corner such as ``7``, ``7/1/3`` or, counted from the end, ``-1``."""
     index = int(field.split("/")[0])
+    if abs(index) > _MOST_VERTICES:
+        raise ValueError(f"there is no vertex {index}")
     return index - 1 if index > 0 else count + index
 
 
 def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
-    o3d = load_open3d()
-    quiet = o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
-    with _stderr_of_c() as messages, quiet:
-        mesh = o3d.io.read_triangle_mesh(str(path))
-        messages.seek(0)
-        complaints = [line for line in messages.read().decode().splitlines() if "RPly:" in line]
-    if complaints or len(mesh.vertices) == 0:
-        reason = complaints[0].partition("RPly: ")[2] if complaints else "no vertices"
-        raise InputError(f"{path}: is not a whole PLY mesh ({reason}); export it again.")
-    return np.array(mesh.vertices), np.array(mesh.triangles, dtype=np.int64)
-
-
-@contextmanager
-def _stderr_of_c() -> Iterator[IO[bytes]]:
-    """Catch what C code writes to stderr: open3d returns half a mesh and says so only there."""
-    with tempfile.TemporaryFile() as messages:
-        kept = os.dup(2)
-        try:
-            os.dup2(messages.fileno(), 2)
-            yield messages
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-
-
-def load_open3d() -> Any:
-    """Import open3d, with the libusb that it needs.
-
-    Its camera drivers link to the system's libusb-1.0, which servers often lack; the one of the
-    package libusb-package serves as well. An `InputError` if it cannot be imported; the message
-    says what to install.
-    """
-    try:
-        try:
-            import libusb_package
-
-            ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
-        except (ImportError, OSError):
-            pass  # the system's own may do
-        import open3d
-    except (ImportError, OSError) as error:
+    """Return vertices and triangles as `_read_obj` does; see there."""
+    vertices, faces = Records(path), Records(path, "face")
+    named = [n for n in _CORNERS if faces.header.item(n, is_list=True)]
+    if not named or None in (vertices.header.item(axis, is_list=False) for axis in "xyz"):
         raise InputError(
-            f"open3d cannot be loaded ({error}); on Debian and Ubuntu: apt-get install"
-            " libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6."
-        ) from error
-    return open3d
+            f"{path}: the vertices need x, y and z, and the faces a list {_CORNERS[0]}; export it"
+            " again as a mesh."
+        )
+    start, corners = faces.lists(named[0])
+    with np.errstate(invalid="ignore"):
+        corner = corners.astype(np.int64)
+    if (corner != corners).any():
+        raise InputError(f"{path}: a face names a vertex by no whole number; export it again.")
+    count = np.maximum(np.diff(start) - 2, 0)
+    first = np.repeat(start[:-1], count)
+    other = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(count) - count, count)
+    return vertices.numbers(*"xyz"), corner[np.column_stack([first, other, other + 1])]

@@ -151,6 +151,12 @@ def _check_band(source: DatasetReader, name: str) -> None:
             f"{name}: has no place in the world (no geotransform); export it as GeoTIFF, or put"
             " its world file beside it."
         )
+    t = source.transform
+    if not np.isfinite(t).all() or not abs(t.determinant) > 0.0:
+        raise InputError(
+            f"{name}: its geotransform {tuple(t)[:6]} gives the cells no size or no place; export"
+            " it again."
+        )
 
 
 def _ways(
@@ -258,6 +264,15 @@ def check_size(cells: int, name: str) -> None:
         )
 
 
+def _check_cell(cell: float, longest: float, name: str) -> None:
+    """Refuse cells that are nothing beside the raster, or a raster without an end."""
+    if not cell > 0.0 or not longest / cell < MOST_CELLS:
+        raise InputError(
+            f"{name}: cells of {cell:g} m over {longest:g} m are no raster; check where it says"
+            " that it lies, or export it again."
+        )
+
+
 def sampled(
     part: Part, to_cloud: Points, from_cloud: Points, bounds: Bounds | None, names: tuple[str, str]
 ) -> WaterRaster:
@@ -270,6 +285,7 @@ def sampled(
     if bounds is not None:
         west, south = max(west, bounds[0]), max(south, bounds[1])
         east, north = min(east, bounds[2]), min(north, bounds[3])
+    _check_cell(cell, max(east - west, north - south), names[0])
     left, top = np.floor(west / cell) * cell, np.ceil(north / cell) * cell
     columns, rows = int(np.ceil((east - left) / cell)), int(np.ceil((top - south) / cell))
     check_size(columns * rows, names[0])

@@ -11,7 +11,7 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
-from pcfix.errors import InputError, PcfixWarning
+from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.io.cameras import (
     blocksexchange,
     bundler,
@@ -142,7 +142,10 @@ def read_cameras(
     (40, 3)
     """
     source, form = _recognised(path, sensor, angles)
-    cameras = _with_sensor(source, form.reader.read(source), form)
+    try:
+        cameras = _with_sensor(source, form.reader.read(source), form)
+    except SettingError as error:  # numbers that are finite in the file and not in the world
+        raise InputError(f"{source.path}: {error}") from error
     if not len(cameras):
         raise InputError(f"{path}: has no image with a pose.")
     for note in cameras.notes:

@@ -100,7 +100,8 @@ def _read(source: Source) -> Bundle:
         )
     values = tracks.numbers(path, body)
     counts = values[:2]
-    if len(counts) < 2 or not (counts >= 0).all() or not (counts == np.floor(counts)).all():
+    whole = np.isfinite(counts) & (counts >= 0) & (counts == np.floor(counts))
+    if len(counts) < 2 or not whole.all():
         raise InputError(f"{path}: line 2 must give the numbers of cameras and points.")
     cameras, points = (int(count) for count in counts)
     end = 2 + _CAMERA_NUMBERS * cameras

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -14,7 +13,7 @@ from xml.etree.ElementTree import Element, ParseError
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.io.files import check_output, write_bytes
+from pcfix.io.files import check_output, parse_json, write_bytes
 from pcfix.model import FloatArray, Lens
 
 ROUNDING = 1e-3
@@ -204,10 +203,10 @@ def numbers(path: Path, where: str, text: str | None, count: int) -> FloatArray:
 def load_json(path: Path) -> Any:
     """Return what a JSON file holds."""
     try:
-        return json.loads(path.read_bytes())
+        return parse_json(path.read_bytes())
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}).") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise InputError(
             f"{path}: the JSON is damaged or cut off ({error}); copy it again from the project."
         ) from error

@@ -129,6 +129,8 @@ def nodes_in(
             box = Bounds(*corners).ensure_3d(header.mins, header.maxs)
         found = load_octree_for_query(reader.source, info, reader.root_page, box, levels)
         nodes = sorted((one for one in found if one.point_count), key=lambda one: one.offset)
+        if sum(one.point_count for one in nodes) > header.point_count:
+            raise ValueError("its octree has more points than its header")
         while nodes:
             counts = np.cumsum([one.point_count for one in nodes])
             count = max(int(np.searchsorted(counts, most, side="right")), 1)

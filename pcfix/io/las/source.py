@@ -41,7 +41,7 @@ IDENTITY_PLACE, _IDENTITY_SIZE = 26, 68
 """Where the header names system, software and date (LAS 1.4 R15, table 3)."""
 _DAMAGED = (
     *(laspy.LaspyException, lazrs.LazrsError, struct.error),
-    *(ValueError, IndexError, OverflowError, OSError),
+    *(ValueError, IndexError, ArithmeticError, OSError),
 )
 """What the LAS libraries raise."""
 
@@ -61,6 +61,9 @@ _LAST_DIGIT = 2.0**-52
 
 CHUNK_POINTS = 1_000_000
 """Points that are worked on at a time, which bounds the memory."""
+
+CHUNK_BYTES = 500_000_000
+"""The same where records are so long that fewer points are as much."""
 
 KEPT_BYTES = 200_000_000
 """Point records of a cloud that are kept when it is gone through more than once."""
@@ -113,6 +116,8 @@ def read_records(stream: BinaryIO) -> tuple[list[Record], list[Record]]:
     if len(head) > 25 and head[24] != 1:
         raise ValueError(f"its version is {head[24]}.{head[25]}, and there are 1.0 to 1.4")
     start, points_start, count = struct.unpack_from("<HII", head, 94)
+    if points_start > stream.seek(0, os.SEEK_END):  # laspy would read up to there
+        raise ValueError("its points begin behind its end")
     vlrs = _read(stream, start, count, _VLR, points_start)
     encoding, minor = head[6], head[25]
     if minor >= 4:
@@ -283,10 +288,11 @@ class LasSource:
 
     def _whole(self) -> Iterator[laspy.ScaleAwarePointRecord]:
         read = 0
+        most = max(1, min(CHUNK_POINTS, CHUNK_BYTES // self.header.point_format.size))
         while read < self.held:
             with las_errors(self.path):
-                points = self._reader.read_points(CHUNK_POINTS)
-            if len(points) < min(CHUNK_POINTS, self.held - read):
+                points = self._reader.read_points(most)
+            if len(points) < min(most, self.held - read):
                 raise InputError(
                     f"{self.path}: is cut short: the header promises {self.held:,} points,"
                     f" the file holds {read + len(points):,}; copy it again."
@@ -294,11 +300,18 @@ class LasSource:
             read += len(points)
             yield points
 
+    def _nodes(self, path: CloudPart) -> Iterator[laspy.ScaleAwarePointRecord]:
+        with las_errors(self.path):
+            info = self.header.vlrs[0]
+            if info.hierarchy_root_offset + info.hierarchy_root_size > path.stat().st_size:
+                raise ValueError("its octree begins or ends behind its end")
+            yield from nodes_in(path, path.part, self._selection, CHUNK_POINTS)
+
     def _chunks_of(self, path: CloudPart) -> Iterator[laspy.ScaleAwarePointRecord]:
         """Yield the points of a part."""
         chunks = self._whole()
         if is_copc(self.header):
-            chunks = nodes_in(path, path.part, self._selection, CHUNK_POINTS)
+            chunks = self._nodes(path)
         for points in chunks:
             inside = path.part.holds(points)
             if inside.any():

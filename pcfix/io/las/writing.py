@@ -23,6 +23,7 @@ from pyproj import CRS
 
 from pcfix.errors import InputError, SettingError
 from pcfix.io.drafts import cannot_write, replaced_when_whole
+from pcfix.io.files import parse_json
 from pcfix.io.las.columns import Column, column_scale, upgraded
 from pcfix.io.las.copc import CopcWriter, check_copc, is_copc
 from pcfix.io.las.part import part_report
@@ -266,7 +267,7 @@ labelling_vlr = partial(_note, (3, "pcfix labelling (JSON)"))
 def own_settings(vlrs: Iterable[VLR]) -> Any:
     """Return what the VLR of a correction says, None without one; ValueError if it is no JSON."""
     ours = next((vlr for vlr in vlrs if is_ours(vlr)), None)
-    return None if ours is None else json.loads(ours.record_data)
+    return None if ours is None else parse_json(ours.record_data)
 
 
 def read_settings(vlrs: Iterable[VLR], path: Path) -> dict[str, Any]:

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError
-from pcfix.io.ply import Vertices, copy_field, list_starts, read_header
+from pcfix.io.ply import Records, copy_field, list_starts, read_header
 from pcfix.model import FloatArray, IntArray, TiePoints, ViewKind
 
 COLMAP_LIST = "COLMAP view list"
@@ -143,7 +143,7 @@ def _beside(path: Path, count: int) -> tuple[FloatArray | None, float, tuple[str
     ply = bare if bare.suffix.lower() == ".ply" else bare.with_suffix(".ply")
     if not ply.is_file():
         return None, 0.0, ()
-    vertices = read_header(ply).vertices
+    vertices = read_header(ply).records
     if vertices != count:
         note = (
             f"{ply}: has {vertices:,} points and {path.name} has {count:,}; its positions are not"
@@ -170,17 +170,17 @@ def _openmvs(path: Path) -> RawList:
     return RawList(path, "OpenMVS point cloud", start, image, weight, xyz, resolution_m)
 
 
-def _vertices(path: Path) -> Vertices:
+def _vertices(path: Path) -> Records:
     header = read_header(path)
-    if header.vertices == 0 or None in (header.item(axis, is_list=False) for axis in "xyz"):
+    if header.records == 0 or None in (header.item(axis, is_list=False) for axis in "xyz"):
         raise InputError(
             f"{path}: has no points with x, y and z; give the dense point cloud as the software"
             " wrote it."
         )
-    return Vertices(path)
+    return Records(path)
 
 
-def _positions(vertices: Vertices) -> tuple[FloatArray, float]:
+def _positions(vertices: Records) -> tuple[FloatArray, float]:
     """Return the vertices of a PLY file and how coarse the type of their numbers is, metres."""
     xyz, header = vertices.numbers(*"xyz"), vertices.header
     finite = np.isfinite(xyz).all(axis=1)
@@ -210,7 +210,7 @@ def _images(path: Path, number: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
     return whole
 
 
-def _weights(vertices: Vertices, start: IntArray) -> npt.NDArray[np.float32] | None:
+def _weights(vertices: Records, start: IntArray) -> npt.NDArray[np.float32] | None:
     name = vertices.header.name
     if vertices.header.item(_WEIGHTS, is_list=True) is None:
         return None

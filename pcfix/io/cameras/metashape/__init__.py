@@ -249,12 +249,12 @@ def _vertices(archive: ZipFile, name: str, needed: tuple[str, ...]) -> np.ndarra
         raise InputError(f"{where}: has no property {', '.join(missing)}; save the project again.")
     kind = np.dtype(kinds)
     whole = (len(data) - header.end) // kind.itemsize
-    if header.vertices > whole:
+    if header.records > whole:
         raise InputError(
-            f"{where}: says {header.vertices} vertices but is cut off after {whole}; save the"
+            f"{where}: says {header.records} vertices but is cut off after {whole}; save the"
             " project again."
         )
-    vertices = np.frombuffer(data, kind, header.vertices, header.end)
+    vertices = np.frombuffer(data, kind, header.records, header.end)
     if vertices["id"].dtype.kind not in "iu":
         raise InputError(f"{archive.filename}: the id of {name} is not a whole number.")
     return vertices
