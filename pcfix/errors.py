@@ -17,14 +17,22 @@ _Found = TypeVar("_Found")
 _MOST_LETTERS, _FIRST, _LAST = 800, 540, 240
 
 
-def one_line(message: str) -> str:
-    """Return a message as a line that a terminal can show, whatever of a file is quoted in it.
+_LIST = re.compile(r"\n(?=  )")
 
-    Letters that are not for print become escapes, and a message that is too long all the same loses
-    its middle: the file is named first and the remedy last.
+
+def printable(message: str) -> str:
+    """Return a message that a terminal can show, whatever of a file is quoted in it.
+
+    It is one line, and one for each entry of a list, which two spaces begin. Letters that are not
+    for print become escapes, and a line that is too long all the same loses its middle: the file is
+    named first and the remedy last.
     """
-    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in message)
-    return text if len(text) <= _MOST_LETTERS else f"{text[:_FIRST]} ... {text[-_LAST:]}"
+
+    def one_line(text: str) -> str:
+        text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+        return text if len(text) <= _MOST_LETTERS else f"{text[:_FIRST]} ... {text[-_LAST:]}"
+
+    return "\n".join(map(one_line, _LIST.split(message)))
 
 
 LONGEST_VALUE, LONGEST_NAME = 60, 255
@@ -52,7 +60,7 @@ class PcfixError(Exception):
         super().__init__(brief(str(message)))
 
     def __str__(self) -> str:
-        return one_line(super().__str__())
+        return printable(super().__str__())
 
 
 class InputError(PcfixError):
@@ -71,7 +79,7 @@ class PcfixWarning(UserWarning):
     """Something that was done on the user's behalf and that they should know of."""
 
     def __str__(self) -> str:
-        return one_line(super().__str__())
+        return printable(super().__str__())
 
 
 _REFUSALS = {

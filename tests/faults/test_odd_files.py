@@ -198,3 +198,11 @@ def test_two_names_of_one_file(tmp_path):
     assert is_same(tmp_path / "a", tmp_path / "b")
     assert is_same(tmp_path / "none", tmp_path / "x" / ".." / "none")
     assert not is_same(tmp_path / "a", tmp_path / "none")
+
+
+def test_lines_are_those_of_a_list_alone():
+    """Each of many files that failed has a line; what a file says never has."""
+    files = [f"  tile{i}.laz: is damaged; copy it again." for i in range(100)]
+    said = str(InputError("\n".join(["100 of 200 files failed:", *files])))
+    assert said.splitlines()[1:] == files
+    assert str(InputError("a.csv: 'one\ntwo' is no number")) == r"a.csv: 'one\ntwo' is no number"
