@@ -12,7 +12,7 @@ def test_the_oldest_that_is_tried_is_the_oldest_that_is_allowed():
     lines = (TESTS / "oldest.txt").read_text().splitlines()
     tried = dict(line.split("==") for line in lines if not line.startswith("#"))
     project = tomllib.loads((TESTS.parent / "pyproject.toml").read_text())["project"]
-    extras = project["optional-dependencies"]
+    extras = {k: v for k, v in project["optional-dependencies"].items() if k != "fuzz"}  # by hand
     for text in [*project["dependencies"], *(one for extra in extras.values() for one in extra)]:
         need = Requirement(text)
         name = need.name.lower().replace("_", "-")

@@ -263,9 +263,9 @@ def scratch_arrays(target: Path) -> Iterator[Empty]:
                     one = mmap.mmap(stream.fileno(), size)
             except OSError as error:
                 raise InputError(
-                    f"{target}: {size / 1e9:,.1f} GB of temporary space beside it, on the disk"
-                    f" {disk_of(target)}, cannot be had ({error.strerror or error}); make room, or"
-                    " write to another disk."
+                    f"{target}: {size / 1e9:,.1f} GB of temporary space beside it cannot be had on"
+                    f" the disk of {disk_of(target)}: {error.strerror or error}; make room, or"
+                    " write to another one."
                 ) from error
             with suppress(OSError):  # Windows keeps it until the block ends
                 path.unlink()

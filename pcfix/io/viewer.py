@@ -161,10 +161,6 @@ def _surroundings(o3d: Any, scene: Scene3d) -> list[dict[str, Any]]:
     return found
 
 
-if __name__ == "__main__":
-    _draw(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))
-
-
 def load_open3d() -> Any:
     """Import open3d, with the libusb that it needs.
 
@@ -186,3 +182,7 @@ def load_open3d() -> Any:
             " libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6."
         ) from error
     return open3d
+
+
+if __name__ == "__main__":
+    _draw(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))

@@ -4,6 +4,7 @@ import json
 import shlex
 import shutil
 import warnings
+from functools import partial
 
 import laspy
 import numpy as np
@@ -12,8 +13,10 @@ import pytest
 import pcfix
 from pcfix.adjust.diagnosis import diagnosis_of, focal_sign, neighbours_sign
 from pcfix.adjust.evidence import EXPORTS, export_of
+from pcfix.flow.adjust_job import usable_ties
 from pcfix.model import Cameras, Lens, Outcome
 from pcfix.report.text import share
+from tests.flow.test_adjust_shared import TIES
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
 
@@ -34,8 +37,9 @@ def run_line(line, **instead):
 
 
 @bent
-def test_each_line_leads_to_the_next(tmp_path):
+def test_each_line_leads_to_the_next(tmp_path, monkeypatch):
     """From the warning by `pcfix adjust` to the corrected cloud, as printed."""
+    monkeypatch.setattr("pcfix.flow.adjust_job.usable_ties", partial(usable_ties, most=TIES))
     cloud, model, listed = BENT / "cloud.las", BENT / "sparse", BENT / "dense.vis"
     done = run_pcfix(
         "correct", cloud, tmp_path / "bent.laz", "--cameras", model, "--water", LEVEL_M,
