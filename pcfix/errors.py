@@ -36,7 +36,7 @@ def printable(message: str) -> str:
 
 
 LONGEST_VALUE, LONGEST_NAME = 60, 255
-_UNBROKEN = re.compile(rf"[^\s/\\'\":;()]{{{LONGEST_VALUE + 1},}}")
+_UNBROKEN = re.compile(rf"[^\s,/\\'\":;()]{{{LONGEST_VALUE + 1},}}")
 _FILE_NAME = re.compile(r"\.\w{1,6}$")
 
 
