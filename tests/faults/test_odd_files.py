@@ -178,8 +178,10 @@ def test_values_are_cut_and_names_of_files_are_not():
         f"/long/{name}: line 2: '{LONG[:57]}...' is no number"
     )
     assert str(InputError(f"index {LONG}, or {LONG}: no")) == (
-        f"index {LONG[:57]}... or {LONG[:57]}...: no"
+        f"index {LONG[:57]}..., or {LONG[:57]}...: no"
     )
+    columns = ",".join(f"Column{i}=float" for i in range(20))  # what the user is to give
+    assert brief(f'give "{columns}"') == f'give "{columns}"'
     command = f"run: 'pip install -e {'/a' * 80}[photos]'"
     assert brief(command) == command
 
