@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -92,38 +92,16 @@ def run_all(
     """
     read = request.files()
     inputs = [path for some in read.values() for path in some]
-    if request.m3c2:
-        load_py4dgeo()
     files = Files(out_dir, request.source)
-    check_one_file(request.source, request)
-    if isinstance(request.source, Tiles):
-        TiledRun("correct", request.source, files.corrected, request).check_folder()
+    _check(request, files)
     record = _begun(request, out_dir, overwrite, say)
     check_shoreline(request.shoreline, overwrite=overwrite or record.resumes, inputs=inputs)
     shore = [] if request.shoreline is None else [Path(request.shoreline)]
 
-    def step(
-        name: str,
-        outputs: list[Path],
-        work: Callable[[Progress | None], Any],
-        more: Callable[[Any], str] = lambda result: "",
-        shown: Path | None = None,
-    ) -> Any:
-        result, was_done = record.step(name, outputs, lambda: _with_bar(bar, name, work))
-        done = "done before" if was_done else "done"
-        say(f"{name:<9} {done}: {shown or outputs[0]}{more(result)}")
-        return result
-
-    first, was_done = record.step(
-        "adjust",
-        outputs_of(out_dir),
-        lambda: _with_bar(
-            bar,
-            "adjust",
-            lambda _: adjust_first(
-                replace(request.adjust_step(), cloud=request.source), out_dir, inputs, jobs
-            ),
-        ),
+    step = _Steps(record, say, bar)
+    asked = replace(request.adjust_step(), cloud=request.source)
+    first, was_done = step.done(
+        "adjust", outputs_of(out_dir), lambda _: adjust_first(asked, out_dir, inputs, jobs)
     )
     _say_adjusted(first, out_dir, was_done, say)
     request = request.with_adjusted(out_dir, first)
@@ -173,6 +151,15 @@ def run_all(
     return files.report
 
 
+def _check(request: Request, files: Files) -> None:
+    """Refuse what cannot be done, before anything is made."""
+    if request.m3c2:
+        load_py4dgeo()
+    check_one_file(request.source, request)
+    if isinstance(request.source, Tiles):
+        TiledRun("correct", request.source, files.corrected, request).check_folder()
+
+
 def _begun(request: Request, out_dir: Path, overwrite: bool, say: Callable[[str], None]) -> Record:
     """Return the record of a folder, made where it is missing; refuse one of another run."""
     if not out_dir.parent.is_dir():
@@ -198,9 +185,37 @@ _TITLES = {
 }  # fmt: skip
 
 
-def _with_bar(bar: Bar, name: str, work: Callable[[Progress | None], Any]) -> Any:
-    with bar(_TITLES[name]) as progress:
-        return work(progress)
+@dataclass(frozen=True)
+class _Steps:
+    """Does steps that are not done yet, with a bar, and says a line on each."""
+
+    record: Record
+    say: Callable[[str], None]
+    bar: Bar
+
+    def __call__(
+        self,
+        name: str,
+        outputs: list[Path],
+        work: Callable[[Progress | None], Any],
+        more: Callable[[Any], str] = lambda result: "",
+        shown: Path | None = None,
+    ) -> Any:
+        result, was_done = self.done(name, outputs, work)
+        done = "done before" if was_done else "done"
+        self.say(f"{name:<9} {done}: {shown or outputs[0]}{more(result)}")
+        return result
+
+    def done(
+        self, name: str, outputs: list[Path], work: Callable[[Progress | None], Any]
+    ) -> tuple[Any, bool]:
+        """Return what a step comes to, and whether it was done before; nothing is said."""
+
+        def with_bar() -> Any:
+            with self.bar(_TITLES[name]) as progress:
+                return work(progress)
+
+        return self.record.step(name, outputs, with_bar)
 
 
 def _say_adjusted(
