@@ -76,7 +76,7 @@ class Budget(NamedTuple):
     in_images: bool
 
 
-# Runs of `TILE` numbers in `tile`: those of `pcfix.refract.choice.gather`, then y - h.
+# Runs of `TILE` numbers in `tile`: those of `pcfix.refract.tiling.gather`, then y - h.
 BELOW = 7
 TILE_RUNS = 8
 
