@@ -47,6 +47,13 @@ def of_chunks(name, layout, value):
     return damage
 
 
+def layer_of_gigabytes(data):
+    """A chunk begins with its first point; the count of its points and its layers' bytes follow."""
+    start, _, _ = chunks_of(data)
+    (record,) = struct.unpack_from("<H", data, RECORD)
+    return put(data, start + 8 + record + 4, "<I", 3 * 10**9)
+
+
 PACKED = {
     "count of chunks": (of_chunks("count", "<I", 2**32 - 1), "states 4,294,967,295 chunks"),
     "too many chunks": (of_chunks("count", "<I", 10**6), "states 1,000,000 chunks of points in"),
@@ -57,6 +64,7 @@ PACKED = {
     "table far away": (of_chunks("table", "<q", 2**62), "is damaged"),
     "table before the file": (of_chunks("table", "<q", -5), "is damaged"),
     "table nowhere": (of_chunks("table", "<q", -1), "is damaged"),
+    "layer of gigabytes": (layer_of_gigabytes, "in a chunk of"),
     "cut in the table": (lambda data: data[: chunks_of(data)[1] + 6], "is damaged"),
     "cut in the points": (lambda data: data[: len(data) // 2], "is damaged"),
     "one byte": (lambda data: data[:1], "does not begin with LASF"),

@@ -6,11 +6,17 @@ import struct
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import lazrs
+
 from pcfix.errors import InputError
 
 _VARIABLE_CHUNKS = 2**32 - 1
 _WITHOUT_CHUNKS = 1
 """The compressor of files that are one stream (LASzip record)."""
+_LAYERED = 3
+"""The compressor that packs the dimensions of a chunk apart, from point format 6 on."""
+_LAYERS = 9
+"""So many for each point of format 6; colours, infrared and waveforms have one each."""
 
 
 def check_count(path: Path, header: Any, vlrs: Any, stated: int) -> None:
@@ -60,11 +66,16 @@ def _least_in_chunks(path: Path, header: Any, vlrs: Any) -> int:
 
 
 class _Table(NamedTuple):
-    """The chunks of a LAZ file: points of each, how many there are, bytes of them all."""
+    """The chunks of a LAZ file: points of each, how many there are, bytes of them all.
+
+    And where the first begins, and the record that says how they are packed.
+    """
 
     points: int
     chunks: int
     size: int
+    start: int
+    packing: bytes
 
 
 def check_chunks(path: Path, header: Any, vlrs: Any) -> None:
@@ -89,6 +100,53 @@ def check_chunks(path: Path, header: Any, vlrs: Any) -> None:
             f"it states {header.point_count:,} points in {table.chunks:,} chunks of"
             f" {table.points:,}"
         )
+    if struct.unpack_from("<H", table.packing)[0] == _LAYERED and header.point_count:
+        _check_layers(path, header.point_format, table)
+
+
+def _check_layers(path: Path, point_format: Any, table: _Table) -> None:
+    """Refuse chunks that are larger than all of them, and layers larger than their chunk."""
+    with path.open("rb") as stream:
+        stream.seek(table.start - 8)
+        try:
+            chunks = lazrs.read_chunk_table(stream, lazrs.LazVlr(table.packing))
+        except lazrs.LazrsError:  # who reads the points says it
+            return
+        sizes = [size for _, size in chunks]
+        if sum(sizes) > table.size:
+            raise ValueError(f"it states chunks of {sum(sizes):,} bytes in {table.size:,}")
+        start = table.start
+        for size in sizes:
+            stream.seek(start)
+            check_chunk(stream.read(head_size(point_format)), size, point_format)
+            start += size
+
+
+def head_size(point_format: Any) -> int:
+    """Return how many bytes of a layered chunk come before its layers."""
+    return int(point_format.size + 4 + 4 * _layers(point_format))
+
+
+def check_chunk(head: bytes, size: int, point_format: Any) -> None:
+    """Refuse layers larger than their chunk, as memory is taken for them before they are read.
+
+    A layered chunk begins with its first point; then come how many points it has, and the bytes of
+    each layer.
+
+    Raises
+    ------
+    ValueError
+        With both.
+    """
+    layers = _unpacked(f"<{_layers(point_format)}I", head[point_format.size + 4 :]) or ()
+    if sum(layers) > size:
+        raise ValueError(f"it states layers of {sum(layers):,} bytes in a chunk of {size:,}")
+
+
+def _layers(point_format: Any) -> int:
+    names = set(point_format.dimension_names)
+    more = sum(one in names for one in ("red", "nir", "wavepacket_index"))
+    return int(_LAYERS + more + point_format.num_extra_bytes)
 
 
 def _table(path: Path, header: Any, vlrs: Any) -> _Table | None:
@@ -98,19 +156,21 @@ def _table(path: Path, header: Any, vlrs: Any) -> _Table | None:
         return None
     if struct.unpack_from("<H", vlr.record_data)[0] == _WITHOUT_CHUNKS:
         return None
-    (points,) = struct.unpack_from("<I", vlr.record_data, 12)
+    packing = bytes(vlr.record_data)
+    (points,) = struct.unpack_from("<I", packing, 12)
     start, size = header.offset_to_point_data, path.stat().st_size
     with path.open("rb") as stream:
         stream.seek(start)
-        place = _unpacked("<q", stream.read(8))
+        (place,) = _unpacked("<q", stream.read(8)) or (0,)
         if place == -1:  # of writers that cannot go back
             stream.seek(max(size - 8, 0))
-            place = _unpacked("<q", stream.read(8))
-        if place is None or not start + 8 <= place <= size - 8:
+            (place,) = _unpacked("<q", stream.read(8)) or (0,)
+        if not start + 8 <= place <= size - 8:
             return None
         stream.seek(place + 4)
-        return _Table(points, _unpacked("<I", stream.read(4)) or 0, place - start - 8)
+        (count,) = _unpacked("<I", stream.read(4)) or (0,)
+        return _Table(points, count, place - start - 8, start + 8, packing)
 
 
-def _unpacked(layout: str, data: bytes) -> int | None:
-    return struct.unpack(layout, data)[0] if len(data) == struct.calcsize(layout) else None
+def _unpacked(layout: str, data: bytes) -> tuple[int, ...] | None:
+    return struct.unpack(layout, data) if len(data) == struct.calcsize(layout) else None

@@ -18,6 +18,7 @@ import numpy as np
 from laspy.copc import Bounds, CopcReader, OctreeNode, load_octree_for_query
 
 from pcfix.errors import InputError, SettingError
+from pcfix.io.las.counts import check_chunk, head_size
 from pcfix.model import BoolArray, FloatArray
 
 if sys.platform == "win32":
@@ -145,7 +146,9 @@ def _unpacked(
     header, data = reader.header, bytearray()
     for one in nodes:
         reader.source.seek(one.offset)
-        data += reader.source.read(one.byte_size)
+        chunk = reader.source.read(one.byte_size)
+        check_chunk(chunk[: head_size(header.point_format)], len(chunk), header.point_format)
+        data += chunk
     rows = np.zeros(sum(one.point_count for one in nodes), header.point_format.dtype())
     table = [(one.point_count, one.byte_size) for one in nodes]
     lazrs.decompress_points_with_chunk_table(
