@@ -28,9 +28,8 @@ from numba.core.runtime import rtsys
 
 from pcfix.errors import PcfixWarning
 
-waits: list[Callable[[], object]] = [
-    lambda: sys.stderr.write("another process is compiling kernels; waiting for it\n")
-]
+WAITING = "another process is compiling kernels; waiting for it\n"
+waits: list[Callable[[], object]] = [lambda: sys.stderr.write(WAITING)]
 """Called when a kernel is waited for; each once, and taken out."""
 
 

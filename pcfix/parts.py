@@ -130,7 +130,8 @@ def _link(into: Any, module: Any) -> None:
         is_part = isinstance(library, _PartLibrary)
         one = library._final_module if is_part else library._get_module_for_linking()
         module.link_in(one, preserve=True)
-        into._reload_init.update(library._reload_init)
+        if reloaded := getattr(library, "_reload_init", None):  # numba from 0.62 on
+            into._reload_init.update(reloaded)
 
 
 class _KernelCompiler(Compiler):

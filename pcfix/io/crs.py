@@ -41,6 +41,7 @@ def parse_crs(given: str | CRS, name: str) -> CRS:
     text = re.sub(r"^(\w+)::", r"\1:", given.strip())
     try:
         crs = CRS.from_user_input(int(text) if text.isdecimal() else text)
+        parts(crs)  # which PROJ writes and reads again, and may not understand
     except (CRSError, ValueError, OverflowError) as error:
         raise InputError(
             f"{name}: the CRS '{shortened(text)}' is not one that PROJ knows; give an EPSG code"

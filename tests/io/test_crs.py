@@ -63,6 +63,16 @@ def test_a_text_that_names_no_crs(text):
         parse_crs(text, "cameras.xml")
 
 
+def test_wkt_that_proj_does_not_read_again():
+    """A code with a line break is in what PROJ writes of it, and PROJ cannot read that."""
+    text = (
+        'PROJCS["",GEOGCS["",DATUM["",SPHEROID["",7,9[""]]TOWGS84[0,0,0,0,0,0,0][""]][""[""]]'
+        '[""""]]PROJECTION[""[""""]][""][""[""]]AUTHORITY["G","2\n0"]]'
+    )
+    with pytest.raises(InputError, match="is not one that PROJ knows"):
+        parse_crs(text, "cameras.xml")
+
+
 @pytest.mark.parametrize("number", ["-1", "0", "1e999"])
 def test_wkt_with_numbers_that_no_ellipsoid_has(number, tmp_path):
     """Of a camera file, and of a cloud, whose sentence does not hold all of it."""

@@ -165,7 +165,9 @@ DAMAGES = (
 @contextmanager
 def opened(path: Path) -> Iterator[zipfile.ZipFile]:
     """Open an archive."""
-    if not path.is_file():
+    with _damage(path):  # a name may be longer than the system allows
+        is_there = path.is_file()
+    if not is_there:
         raise InputError(f"{path}: is missing; keep all files of the project together.")
     with _damage(path):
         archive = zipfile.ZipFile(path)
