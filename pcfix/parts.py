@@ -30,7 +30,7 @@ from pcfix.kept import Kept
 
 Decorator: TypeAlias = Callable[[Any], Any]
 
-TRIED = ("0.68",)
+TRIED = ("0.61", "0.62", "0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
 """Versions of numba."""
 
 _are_linked = numba.__version__.rpartition(".")[0] in TRIED and not config.DISABLE_JIT

@@ -24,17 +24,20 @@ from pcfix.refract.batch import FLAT_DEG, UNLISTED, Batch, Learned, MadeWith, Su
 from pcfix.refract.hypotheses import Verdict, hint_of
 from pcfix.refract.learning import (
     CORRECTED_RATIO,
+    Near,
     check_method,
     depth_ratio,
     learn_of_sample,
     learn_of_unlisted,
     resolved,
     seen_flat,
+    submerged_of,
     wants_sample,
     with_factor,
     with_matcher,
 )
 from pcfix.refract.occlusion import Occluder
+from pcfix.refract.patches import PATCH_WIDTH, Squares
 from pcfix.refract.regression import (
     LEAST_COUNT,
     LEAST_NEIGHBOURS,
@@ -106,7 +109,7 @@ class Learning:
         some_listed = self._views is not None and not all_listed
         if not (some_listed or wants_sample(self.survey, self._views)):
             return self.survey
-        sample, ties = self._sample(chunks, makers), self._ties()
+        (sample, near), ties = self._sample(chunks, makers), self._ties()
         sample, factor = with_factor(sample)
         if factor is not None:
             self.notes.append(str(factor))
@@ -115,7 +118,7 @@ class Learning:
         self._note_corrected(sample, ties)
         points, hint = self._view.points, hint_of((self._view.software, self.survey.cameras.source))
         if self._views is None:
-            self.survey, self.verdicts = learn_of_sample(sample, points, ties, hint)
+            self.survey, self.verdicts = learn_of_sample(sample, points, ties, hint, near)
             self._note_flat(sample)
             return self.survey
         self.survey = with_matcher(sample, ties)
@@ -123,7 +126,7 @@ class Learning:
             learned = learned._replace(occluder=self._occluder(chunks, listed=False))
             bare = replace(self.survey, settings=self._given, learned=learned)
             unlisted, self.of_unlisted = learn_of_unlisted(
-                replace(sample, survey=bare), points, ties, hint
+                replace(sample, survey=bare), points, ties, hint, near
             )
             self.survey = replace(self.survey, parts={UNLISTED: unlisted})
         return self.survey
@@ -197,28 +200,52 @@ class Learning:
         self,
         chunks: Callable[[], Iterable[Points]],
         makers: Callable[[], Iterable[MadeWith]] | None,
-    ) -> Batch:
-        """Return points of the whole cloud, evenly spread over its order, and without noise."""
+    ) -> tuple[Batch, Near | None]:
+        """Return points of the whole cloud, evenly spread over its order, and without noise.
+
+        And, where these may be too far apart to tell how it was made, submerged ones in squares.
+        """
         area_m2 = np.prod(np.maximum(np.subtract(self._view.high, self._view.low)[:2], 1.0))
-        wanted = np.clip(BED_POINTS_A_M2 * float(area_m2), FEWEST_BED_POINTS, MOST_BED_POINTS)
-        wanted = wanted if np.isfinite(wanted) else MOST_BED_POINTS  # bounds that are none
+        dense = BED_POINTS_A_M2 * float(area_m2)
+        dense = dense if np.isfinite(dense) else MOST_BED_POINTS  # bounds that are none
+        wanted = np.clip(dense, FEWEST_BED_POINTS, MOST_BED_POINTS)
         step = max(1, self._view.points // int(wanted))
+        near_step = max(1, self._view.points // int(max(dense, FEWEST_BED_POINTS)))
+        squares = Squares(PATCH_WIDTH * self._flying_height_m()) if near_step < step else None
         survey, taken = self.survey, list[Batch]()
         done = 0
         of_chunks = repeat(None) if makers is None else makers()
-        for (xyz, heights, classes, sources, _), made_with in zip(
-            chunks(), of_chunks, strict=False
-        ):
-            rows = np.arange(-done % step, len(xyz), step)
-            rows = rows[~np.isin(classes[rows], NOISE_CLASSES)]
-            above = surface_above(
-                survey.water, xyz[rows], None if heights is None else heights[rows]
-            )
-            of_rows = None if made_with is None else made_with.take(rows)
-            source = None if sources is None else sources[rows]
-            taken.append(Batch(xyz[rows], above, survey, made_with=of_rows, source=source))
-            done += len(xyz)
-        return stacked(taken)
+        for points, made_with in zip(chunks(), of_chunks, strict=False):
+            taken.append(_every(step, done, points, survey, made_with))
+            if squares is not None:
+                squares.add(submerged_of(_every(near_step, done, points, survey, made_with)))
+            done += len(points.xyz)
+        return stacked(taken), None if squares is None else Near(squares.all(), near_step)
+
+    def _flying_height_m(self) -> float:
+        """Return the height of the cameras above the water that is known below them."""
+        centres = self.survey.cameras.centres
+        unknown = np.full(len(centres), np.nan)
+        above = centres[:, 2] - surface_above(self.survey.water, centres, unknown).height_m
+        above = above[above > 0.0]
+        return float(np.median(above)) if len(above) else FLYING_HEIGHT_M
+
+
+def _every(
+    step: int, done: int, points: Points, survey: Survey, made_with: MadeWith | None
+) -> Batch:
+    """Return every so manieth point of a cloud, of a chunk before which so many were."""
+    rows = np.arange(-done % step, len(points.xyz), step)
+    rows = rows[~np.isin(points.classes[rows], NOISE_CLASSES)]
+    heights = None if points.heights is None else points.heights[rows]
+    xyz = points.xyz[rows]
+    return Batch(
+        xyz,
+        surface_above(survey.water, xyz, heights),
+        survey,
+        made_with=None if made_with is None else made_with.take(rows),
+        source=None if points.sources is None else points.sources[rows],
+    )
 
 
 def _check_regression(method: str, inputs: Inputs) -> None:
@@ -245,6 +272,9 @@ def _ties_of(inputs: Inputs, view: CloudView) -> TiePoints | None:
 
 FLAT_SHARE, FLAT_SAMPLE = 0.01, 20_000
 """Of the submerged points, from which flat obliques alone are worth a word; of so many at most."""
+
+FLYING_HEIGHT_M = 100.0
+"""Where no height of the water is known below the cameras, for the width of squares."""
 
 BED_POINTS_A_M2 = 5.0
 FEWEST_BED_POINTS, MOST_BED_POINTS = 125_000, 1_000_000

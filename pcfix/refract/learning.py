@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -158,8 +159,24 @@ def learn_of_points(batch: Batch, regression: DepthRegression | None) -> Batch:
     return replace(batch, survey=survey)
 
 
+class Near(NamedTuple):
+    """Submerged points with their neighbours, and how many of the cloud each stands for."""
+
+    batch: Batch
+    step: float
+
+    def of_source(self, source: int) -> Near:
+        """Return those of one point source."""
+        rows = np.flatnonzero(self.batch.source == source)
+        return Near(replace(self.batch.take(rows), source=None), self.step)
+
+
 def learn_of_sample(
-    batch: Batch, points: int, ties: TiePoints | None = None, hint: Hint | None = None
+    batch: Batch,
+    points: int,
+    ties: TiePoints | None = None,
+    hint: Hint | None = None,
+    near: Near | None = None,
 ) -> tuple[Survey, tuple[Verdict, ...]]:
     """Learn what ``auto`` stands for, how the images were matched, and the bed, as needed.
 
@@ -173,6 +190,8 @@ def learn_of_sample(
         Of the block that made the points; else the points tell what the images have in common.
     hint : Hint, optional
         What files say of how the cloud was made.
+    near : Near, optional
+        Which points tell how it was made, where those of the batch are too far apart.
 
     Returns
     -------
@@ -182,27 +201,32 @@ def learn_of_sample(
         Why, as far as something was to be told, and could be.
     """
     if batch.views is None and batch.survey.settings.method == "auto":
-        found = _learn_of_sources(batch, points, ties, hint)
+        found = _learn_of_sources(batch, points, ties, hint, near)
         if found is not None:
             return found
-    survey, step = batch.survey, points / max(len(batch), 1)
+    survey = batch.survey
     kind = None if batch.views is None else batch.views.kind
     if wants_matcher(survey, kind):
         survey = with_matcher(batch, ties)
-    rows = np.flatnonzero(is_submerged(batch.xyz[:, 2], batch.surface))
-    sample = replace(batch.take(rows), survey=survey)
+    sample = replace(submerged_of(batch), survey=survey)
     if batch.views is not None:
         verdict = weigh_lists(sample, is_open=False)
         return as_told(survey, verdict), () if verdict is None else (verdict,)
-    survey, verdicts = _weighed(sample, step, hint)
+    near = near or Near(sample, points / max(len(batch), 1))
+    survey, verdicts = _weighed(replace(near.batch, survey=survey), near.step, hint)
     settings, learned = survey.settings, survey.learned._replace(land=None)
     if batch.made_with is not None:
         learned = learned._replace(land=_land_of(survey, verdicts))
     if not settings.models_matcher:
         learned = learned._replace(matcher=None)
-    elif settings.method == "consistent" and settings.matcher == "depth-maps" and len(rows):
+    elif settings.method == "consistent" and settings.matcher == "depth-maps" and len(sample):
         learned = learned._replace(bed=_learn_bed(replace(sample, survey=survey)))
     return replace(survey, learned=learned), verdicts
+
+
+def submerged_of(batch: Batch) -> Batch:
+    """Return the submerged points of a batch."""
+    return batch.take(np.flatnonzero(is_submerged(batch.xyz[:, 2], batch.surface)))
 
 
 MOST_SOURCES = 8
@@ -210,7 +234,7 @@ MOST_SOURCES = 8
 
 
 def _learn_of_sources(
-    batch: Batch, points: int, ties: TiePoints | None, hint: Hint | None
+    batch: Batch, points: int, ties: TiePoints | None, hint: Hint | None, near: Near | None
 ) -> tuple[Survey, tuple[Verdict, ...]] | None:
     """Learn of each source by itself; None where all of them were made in one way."""
     if batch.source is None:
@@ -223,7 +247,8 @@ def _learn_of_sources(
     surveys, verdicts = dict[int, Survey](), list[Verdict]()
     for one in large.tolist():
         part = replace(batch.take(np.flatnonzero(batch.source == one)), source=None)
-        surveys[one], told = learn_of_sample(part, points * len(part) // len(batch), ties, hint)
+        own, of_it = points * len(part) // len(batch), near and near.of_source(one)
+        surveys[one], told = learn_of_sample(part, own, ties, hint, of_it)
         of = f"point source {one} ({100.0 * len(part) / len(batch):.0f} % of the points)"
         verdicts += [verdict._replace(of=of) for verdict in told]
     if len({verdict.chosen.words for verdict in verdicts if verdict.is_sure}) < 2:
@@ -234,7 +259,11 @@ def _learn_of_sources(
 
 
 def learn_of_unlisted(
-    batch: Batch, points: int, ties: TiePoints | None = None, hint: Hint | None = None
+    batch: Batch,
+    points: int,
+    ties: TiePoints | None = None,
+    hint: Hint | None = None,
+    near: Near | None = None,
 ) -> tuple[Survey, tuple[Verdict, ...]]:
     """Learn of points as without their list, for those that are in none; see `learn_of_sample`.
 
@@ -242,7 +271,7 @@ def learn_of_unlisted(
     """
     settings = resolved(batch.survey.settings, batch.survey.cameras, None)
     bare = replace(batch, views=None, survey=replace(batch.survey, settings=settings))
-    return learn_of_sample(bare, points, ties, hint)
+    return learn_of_sample(bare, points, ties, hint, near)
 
 
 def _weighed(sample: Batch, step: float, hint: Hint | None) -> tuple[Survey, tuple[Verdict, ...]]:

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.model import FloatArray, IntArray
-from pcfix.refract.batch import Batch
+from pcfix.refract.batch import Batch, stacked
 
 PATCHES, PATCH_POINTS, FEWEST_POINTS = 500, 16, 400
 FEWEST_WITHOUT_LIST = 2000
@@ -42,6 +42,12 @@ GRID_SHARE = 0.9
 
 SMOOTH_GSD = 0.02
 """Scatter of neighbours below which a cloud was made smooth: image noise leaves ten times that."""
+
+SQUARE_PATCHES, MOST_IN_SQUARES = 5.0, 1_000_000
+"""Width of a square, in patches; so many points are looked at."""
+
+_MIX = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0xD6E8FEB86659FD93)
+"""Odd numbers whose products look as if by chance."""
 
 _TERMS = 6
 
@@ -76,8 +82,8 @@ def patches_of(batch: Batch) -> Patches | None:
     width_m = PATCH_WIDTH * flying_height_m(batch)
     # so dense that a patch is as wide as the images' borders are far apart
     extent = np.maximum(np.ptp(batch.xyz[usable, :2], axis=0), width_m)
-    wanted = max(FEWEST_POINTS, PATCH_POINTS * float(extent.prod()) / width_m**2)
-    step = max(1, int(len(usable) / wanted))
+    covered = min(float(extent.prod()) / width_m**2, len(_squares(batch.xyz[usable], width_m)))
+    step = max(1, int(len(usable) / max(FEWEST_POINTS, PATCH_POINTS * covered)))
     usable = usable[::step]
     xy = batch.xyz[usable, :2]
     seeds = np.unique(np.linspace(0, len(xy) - 1, PATCHES).astype(int))
@@ -91,6 +97,53 @@ def patches_of(batch: Batch) -> Patches | None:
     return Patches(rows, place.reshape(patch.shape), step)
 
 
+class Squares:
+    """Points of a large cloud that have neighbours among them: of squares, not of all the ground.
+
+    Which squares goes by chance, by their place alone: of as many, in halves of halves, as the
+    points are not too many. So chunks and tiles of other sizes lead to the same points.
+
+    Parameters
+    ----------
+    width_m : float
+        Of a patch.
+    """
+
+    def __init__(self, width_m: float) -> None:
+        self._width_m = SQUARE_PATCHES * width_m
+        self._share, self._count = 1.0, 0
+        self._taken = list[tuple[Batch, FloatArray]]()
+
+    def add(self, batch: Batch) -> None:
+        """Take what lies in the squares that are looked at."""
+        rank = self._rank(batch.xyz)
+        self._taken.append((batch, rank))
+        self._only(-1)
+        while self._count > MOST_IN_SQUARES:
+            self._share /= 2.0
+            self._count = 0
+            self._only(*range(len(self._taken)))
+
+    def _only(self, *places: int) -> None:
+        """Leave out of some batches what lies beside the squares, and count the rest."""
+        for i in places:
+            batch, rank = self._taken[i]
+            rows = np.flatnonzero(rank < self._share)
+            self._taken[i] = batch.take(rows), rank[rows]
+            self._count += len(rows)
+
+    def _rank(self, xyz: FloatArray) -> FloatArray:
+        """Return a number from 0 to 1 for the square of each point, as if by chance."""
+        x, y = np.floor(xyz[:, :2].T / self._width_m).astype(np.int64).view(np.uint64)
+        mixed = (x * np.uint64(_MIX[0])) ^ (y * np.uint64(_MIX[1]))
+        mixed = (mixed ^ (mixed >> np.uint64(32))) * np.uint64(_MIX[2])
+        return np.asarray((mixed >> np.uint64(11)) / 2.0**53)
+
+    def all(self) -> Batch:
+        """Return the points."""
+        return stacked([batch for batch, _ in self._taken])
+
+
 def others_around(batch: Batch, rows: IntArray) -> Batch:
     """Return other points around some, as near as there are."""
     from scipy.spatial import cKDTree
@@ -101,6 +154,12 @@ def others_around(batch: Batch, rows: IntArray) -> Batch:
     tree = cKDTree(batch.xyz[others, :2], balanced_tree=False, compact_nodes=False)
     near = tree.query(batch.xyz[rows[::4], :2], k=PATCH_POINTS)[1]
     return batch.take(others[np.unique(near)])
+
+
+def _squares(xyz: FloatArray, width_m: float) -> IntArray:
+    """Return the squares that points lie in, one number for each."""
+    x, y = np.floor((xyz[:, :2] - xyz[:, :2].min(axis=0)).T / width_m).astype(np.int64)
+    return np.unique(x * (int(y.max()) + 1) + y)
 
 
 def flying_height_m(batch: Batch) -> float:
