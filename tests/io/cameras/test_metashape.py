@@ -964,6 +964,13 @@ def test_project_whose_folder_has_too_long_a_name(tmp_path):
         read(path)
 
 
+def test_project_whose_folder_is_elsewhere(tmp_path):
+    path = project_of(tmp_path, [chunk()])
+    path.write_text(path.read_text().replace("{projectname}", "/{projectname}"))
+    with pytest.raises(InputError, match=r"river.psx: its path '/.*' leads out of its folder"):
+        read(path)
+
+
 def test_project_without_its_chunk(tmp_path):
     path = project_of(tmp_path, [chunk()])
     (tmp_path / "river.files/0/chunk.zip").unlink()

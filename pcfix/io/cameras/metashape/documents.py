@@ -111,7 +111,10 @@ def _top(path: Path) -> Document:
     root = read_xml(path)
     inside = root.get("path")
     if root.tag == "document" and inside is not None:
-        return _from_archive(path.parent / inside.replace("{projectname}", path.stem))
+        archive = Path(inside.replace("{projectname}", path.stem))
+        if archive.is_absolute():
+            raise InputError(f"{path}: its path '{inside}' leads out of its folder; mend it.")
+        return _from_archive(path.parent / archive)
     return Document(root, path)
 
 
