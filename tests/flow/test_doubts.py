@@ -8,8 +8,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 import pcfix
+from pcfix.flow import learning
 from pcfix.model import Outcome, TiePoints, Views
 from pcfix.options.correct import ScienceOptions
+from pcfix.refract import patches
 from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.hypotheses import IN_FRAME, hint_of
 from pcfix.refract.learning import CORRECTED_RATIO, depth_ratio, learn_of_sample
@@ -117,6 +119,23 @@ def test_clouds_that_were_merged_are_told_apart(tmp_path):
         )  # fmt: skip
         least = (best.xyz - scene.true_xyz)[rows, 2]
         assert np.sqrt(np.mean(error**2)) < 1.1 * np.sqrt(np.mean(least**2))
+
+
+@pytest.mark.parametrize("cloud", ["depth-maps", pytest.param("tracks", marks=pytest.mark.nightly)])
+def test_a_cloud_too_large_for_an_even_sample_is_told(cloud, tmp_path, monkeypatch):
+    """As if it were hundreds of times as large: few of its points are looked at."""
+    scene = scene_of(cloud, points=16_000)
+    path = as_file(tmp_path / "large.las", scene.apparent_xyz, 0)
+    for name in ("FEWEST_BED_POINTS", "MOST_BED_POINTS"):
+        monkeypatch.setattr(learning, name, 1200)
+    monkeypatch.setattr(patches, "MOST_IN_SQUARES", 10_000)
+    given = {"cameras": scene.cameras, "water": scene.water, "overwrite": True}
+    made = pcfix.correct_file(path, tmp_path / "out.las", **given).made
+    assert made["sure"]
+    assert made["made_of"] == IN_FRAME[["tracks", "depth-maps"].index(cloud)].words
+    monkeypatch.setattr(learning, "Squares", lambda width_m: None)
+    made = pcfix.correct_file(path, tmp_path / "out.las", **given).made
+    assert "Too few points" in made["because"]
 
 
 def test_sources_of_one_software_are_one_cloud(tmp_path):
