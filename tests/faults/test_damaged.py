@@ -10,6 +10,7 @@ import laspy
 import pytest
 
 import pcfix
+from pcfix.io.las.source import las_errors
 
 SCENE = Path(__file__).parents[2] / "samples" / "scene"
 # Places in the header (LAS 1.4 R15, table 3).
@@ -41,7 +42,8 @@ def put(data, place, layout, *values):
 def of_chunks(name, layout, value):
     def damage(data):
         start, table, size = chunks_of(data)
-        place = {"table": start, "version": table, "count": table + 4, "size": size}[name]
+        places = {"table": start, "version": table, "count": table + 4}
+        place = (places | {"size": size, "items": size + 20})[name]
         return put(data, place, layout, value)
 
     return damage
@@ -61,6 +63,7 @@ PACKED = {
     "no chunks": (of_chunks("count", "<I", 0), "20,000 points in 0 chunks"),
     "chunks without points": (of_chunks("size", "<I", 0), "its chunks have no points"),
     "chunks of one point": (of_chunks("size", "<I", 1), "20,000 points in 1 chunks of 1"),
+    "records of no items": (of_chunks("items", "<H", 0), "at least one LazItem"),
     "table far away": (of_chunks("table", "<q", 2**62), "is damaged"),
     "table before the file": (of_chunks("table", "<q", -5), "is damaged"),
     "table nowhere": (of_chunks("table", "<q", -1), "is damaged"),
@@ -136,3 +139,13 @@ def test_random_bytes_of_header_and_records(suffix, seed, clouds, tmp_path):
         said = label(bytes(changed), suffix, tmp_path)
         refused += said is not None
     assert refused >= 1
+
+
+def test_a_panic_of_the_decompressor_is_damage_too(tmp_path):
+    """Its exceptions, which are under no name to import, are none that `except Exception` sees."""
+    panic = type("PanicException", (BaseException,), {})
+    said = pytest.raises(pcfix.InputError, match=r"cloud\.laz: is damaged.*index out of bounds")
+    with said, las_errors(tmp_path / "cloud.laz"):
+        raise panic("index out of bounds: the len is 66 but the index is 96")
+    with pytest.raises(KeyboardInterrupt), las_errors(tmp_path / "cloud.laz"):
+        raise KeyboardInterrupt

@@ -44,6 +44,8 @@ _DAMAGED = (
     *(ValueError, IndexError, ArithmeticError, OSError),
 )
 """What the LAS libraries raise."""
+_PANIC = "PanicException"
+"""What lazrs raises, too, where the packed points make no sense; it is under no name to import."""
 
 _PLACES = (
     laspy.DecompressionSelection.base()
@@ -166,7 +168,9 @@ def las_errors(path: Path) -> Iterator[None]:
     """Turn whatever the LAS libraries raise into one sentence about the file."""
     try:
         yield
-    except _DAMAGED as error:
+    except BaseException as error:
+        if not isinstance(error, _DAMAGED) and type(error).__name__ != _PANIC:
+            raise
         reason = str(error).strip().rstrip(".") or type(error).__name__
         raise InputError(
             f"{path}: is damaged, or is not LAS or LAZ ({reason}); export or copy it again."
