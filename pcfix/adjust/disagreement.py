@@ -198,7 +198,7 @@ def _sum_pulls(
                 state, given, LEAST_SQUARES, p, o, room, own[count], shared[count], r[count]
             ):
                 if len(drawn):
-                    r[count] = drawn[o]
+                    r[count, 0], r[count, 1] = drawn[o, 0], drawn[o, 1]
                 add_point(v, rhs, own[count], r[count])
                 who[count] = o
                 count += 1

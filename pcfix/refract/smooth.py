@@ -245,7 +245,7 @@ def _nodes_of(box: Box, points: Chosen) -> Chosen:
     xyz, height = box.middle + box.half * NODES, np.empty(len(NODES))
     slope, normals = np.empty((len(NODES), 2)), np.empty((len(NODES), 3))
     for k in range(len(NODES)):
-        slope[k] = box.water[1:]
+        slope[k, 0], slope[k, 1] = box.water[1], box.water[2]
         height[k] = water_at(box, xyz[k, 0], xyz[k, 1])
         xyz[k, 2] += height[k]
         normals[k, 0], normals[k, 1], normals[k, 2] = normal_of(box.water[1], box.water[2])
