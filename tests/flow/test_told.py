@@ -17,6 +17,7 @@ from pcfix.flow.adjust_job import usable_ties
 from pcfix.model import Cameras, Lens, Outcome
 from pcfix.report.text import share
 from tests.flow.test_adjust_shared import TIES
+from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
 
@@ -163,7 +164,7 @@ def told_of(folder, cameras, tmp_path, *more):
 
 
 @bent
-@pytest.mark.parametrize("listed", [False, True])
+@pytest.mark.parametrize("listed", mostly_nightly((False, True), True))
 def test_bent_poses_without_ties_or_gnss_are_noticed(tmp_path, listed):
     done, found = told_of(
         BENT, "cameras.xml", tmp_path, *(["--views", BENT / "dense.vis"] if listed else [])
