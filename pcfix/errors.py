@@ -67,6 +67,10 @@ class InputError(PcfixError):
     """A file that is missing, damaged or not what it should be."""
 
 
+class NoTiePointsError(InputError):
+    """A camera file without tie points, which most steps do without."""
+
+
 class SettingError(PcfixError, ValueError):
     """An option or argument outside its rule."""
 

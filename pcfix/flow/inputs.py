@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
+from pcfix.errors import InputError, NoTiePointsError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.surfaces import CloudView, find_surface
 from pcfix.io.cameras import read_cameras, read_tie_points
 from pcfix.io.cameras.georeference import Georeference, georeference
@@ -171,7 +171,10 @@ class Inputs(InputOptions):
         read = self.read()
         try:
             ties = read_tie_points(self.cameras, read)
-        except InputError:
+        except NoTiePointsError:
+            return None
+        except InputError as error:
+            warnings.warn(f"{error} Its tie points are left out.", PcfixWarning, stacklevel=2)
             return None
         known = np.isfinite(ties.xyz).all(axis=1)
         if placed and not known.any():

@@ -3,6 +3,7 @@
 import json
 import re
 import struct
+import warnings
 from dataclasses import replace
 
 import laspy
@@ -19,6 +20,7 @@ from pcfix.lens.imaging import project
 from pcfix.model import Cameras, Lens
 from pcfix.report.cameras import _sensor as _sensor_words
 from pcfix.report.cameras import cameras_text
+from tests.io.cameras import test_colmap as colmap
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
 
@@ -303,3 +305,18 @@ def test_views_of_a_real_cloud_change_the_rays(tmp_path):
     )  # fmt: skip
     assert summary.corrected == summary.submerged
     assert summary.rays / summary.corrected == pytest.approx(5.5, abs=0.1)  # of the list's README
+
+
+def test_tie_points_that_are_cut_short_are_said(tmp_path):
+    """And a model without any is not worth a word."""
+    model = colmap.folder(tmp_path / "sparse")
+    inputs, path = Inputs(cameras=model, water=0.0), model / "points3D.txt"
+    ties = inputs.tie_points(None)
+    assert ties is not None
+    path.write_text(f"# Number of points: {len(ties.xyz) + 1}\n{path.read_text()}")
+    with pytest.warns(pcfix.PcfixWarning, match="is cut short: .* Its tie points are left out"):
+        assert inputs.tie_points(None) is None
+    path.unlink()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert inputs.tie_points(None) is None

@@ -11,7 +11,7 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
-from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.errors import InputError, NoTiePointsError, PcfixWarning, SettingError
 from pcfix.io.cameras import (
     blocksexchange,
     bundler,
@@ -169,8 +169,10 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
 
     Raises
     ------
-    InputError
+    NoTiePointsError
         If the format has no tie points, or the file has none.
+    InputError
+        If they cannot be read.
 
     Warns
     -----
@@ -180,7 +182,7 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
     """
     source, form = _recognised(path, None, None)
     if not isinstance(form.reader, SparseReader):
-        raise InputError(f"{source.path}: the format ({form.software}) has no tie points.")
+        raise NoTiePointsError(f"{source.path}: the format ({form.software}) has no tie points.")
     found = form.reader.tie_points(source, cameras)
     ties, note = tracks.finite(found)
     if note:

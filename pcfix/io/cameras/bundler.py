@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, NoTiePointsError
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.formats import Source
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
@@ -82,9 +82,9 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     bundle = _read(source)
     points = bundle.points
     if bundle.mve:
-        raise InputError(f"{bundle.path}: MVE writes no image coordinates; no tie points.")
+        raise NoTiePointsError(f"{bundle.path}: MVE writes no image coordinates; no tie points.")
     if not len(points.xyz) or cameras.lenses is None:
-        raise InputError(f"{bundle.path}: has no points; no tie points.")
+        raise NoTiePointsError(f"{bundle.path}: has no points; no tie points.")
     places = points.rest[:, 1:] * (1.0, -1.0)
     return tracks.from_principal_point(points, bundle.posed, cameras, places)
 

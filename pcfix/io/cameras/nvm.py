@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, NoTiePointsError
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.formats import Source
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
@@ -88,7 +88,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the points of the largest model and where the images saw them."""
     part, _ = _largest(_parts(source.path))
     if not len(part.points.image) or cameras.lenses is None:
-        raise InputError(f"{source.path}: has no points; no tie points.")
+        raise NoTiePointsError(f"{source.path}: has no points; no tie points.")
     return tracks.from_principal_point(part.points, part.posed, cameras, _placed(part)[0])
 
 

@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, NoTiePointsError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import number, read_xml
 from pcfix.io.cameras.formats import Source
@@ -292,7 +292,9 @@ def read_ties(
             uv.append(_places(tokens, camera[-1], [rows.groups.get((block, n)) for n in ids], ids))
     cameras_of_all = np.concatenate([np.empty(0, np.int64), *camera])
     if not (cameras_of_all >= 0).any():
-        raise InputError(f"{path}: has no tie points that one of its {len(cameras)} photos saw.")
+        raise NoTiePointsError(
+            f"{path}: has no tie points that one of its {len(cameras)} photos saw."
+        )
     points = np.concatenate(point)
     seen, points[cameras_of_all >= 0] = np.unique(points[cameras_of_all >= 0], return_inverse=True)
     return tie_points(np.concatenate(xyz)[seen], points, cameras_of_all, np.concatenate(uv))

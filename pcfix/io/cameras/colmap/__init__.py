@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, NoTiePointsError
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.colmap import files
 from pcfix.io.cameras.formats import Source
@@ -105,11 +105,13 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     model = _model(source)
     path = model.part("points3D")
     if not path.is_file():
-        raise InputError(f"{path}: there is no such file, so there are no tie points.")
+        raise NoTiePointsError(f"{path}: there is no such file, so there are no tie points.")
     points = files.read_points(path)
     images = [i for i in files.read_images(model.part("images"), points=True) if i.posed]
     if not len(points.identifiers) or not any(len(image.points) for image in images):
-        raise InputError(f"{path}: the model has no points that its images saw; no tie points.")
+        raise NoTiePointsError(
+            f"{path}: the model has no points that its images saw; no tie points."
+        )
     seen = np.concatenate([image.points for image in images])
     camera = np.repeat(np.arange(len(cameras)), [len(image.points) for image in images])
     row = _rows_of(points.identifiers, seen)

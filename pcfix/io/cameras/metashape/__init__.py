@@ -36,7 +36,7 @@ from zipfile import ZipFile
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, NoTiePointsError
 from pcfix.io.cameras.checks import number, numbers
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import documents
@@ -76,7 +76,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     frame = None if first is None else chunk.document.follow(first)
     seen = [] if frame is None else [*_tie_points(frame, block), _markers(frame, block)]
     if not any(len(part.point) for part in seen):
-        raise InputError(
+        raise NoTiePointsError(
             f"{chunk.path}: has neither tie points nor markers that were measured in aligned"
             " images; give the project (.psx with its .files folder), or export the markers."
         )

@@ -27,7 +27,7 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, NoTiePointsError
 from pcfix.io.cameras import tracks
 from pcfix.io.cameras.checks import json_number, load_json, mapping, rows, vector
 from pcfix.io.cameras.formats import Source
@@ -257,10 +257,10 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
     """Return the points in the frame of the file, and where its images saw them."""
     path, cameras, _, points = reconstruction
     if not points:
-        raise InputError(f"{path}: has no tie points.")
+        raise NoTiePointsError(f"{path}: has no tie points.")
     beside = path.with_name("tracks.csv")
     if not beside.is_file():
-        raise InputError(
+        raise NoTiePointsError(
             f"{path}: there is no tracks.csv beside it, so its tie points have no rays."
         )
     entries = [mapping(path, f"point {k}", v).get("coordinates") for k, v in points.items()]

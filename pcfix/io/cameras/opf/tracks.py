@@ -9,7 +9,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, NoTiePointsError
 from pcfix.io.cameras.checks import load_json, mapping, vector
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.opf.project import Part, frame_of, id_of, objects, open_project, text_of
@@ -39,7 +39,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     models = project.files("calibration", "model/gltf+json")
     found = [node for model in models for node in _nodes(model, row_of)]
     if not any((node.camera >= 0).any() for node in found):
-        raise InputError(
+        raise NoTiePointsError(
             f"{project.path}: its calibration has no tracks in its {len(cameras)} images, and so"
             " no tie points."
         )

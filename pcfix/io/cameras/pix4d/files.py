@@ -10,7 +10,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, NoTiePointsError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import number, read_xml
 from pcfix.io.cameras.formats import Source
@@ -186,7 +186,7 @@ def read_observations(source: Source, cameras: Cameras) -> TiePoints:
     files = find(source)
     path = files.get("bingo") or files.get("ties")
     if path is None:
-        raise InputError(
+        raise NoTiePointsError(
             f"{source.path}: has no tp_bingo.txt or tp_pix4d.txt beside it, and so no tie points."
         )
     if cameras.lenses is None:
