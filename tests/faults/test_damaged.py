@@ -43,7 +43,7 @@ def of_chunks(name, layout, value):
     def damage(data):
         start, table, size = chunks_of(data)
         places = {"table": start, "version": table, "count": table + 4}
-        place = (places | {"size": size, "items": size + 20})[name]
+        place = (places | {"size": size, "items": size + 20, "item": size + 24})[name]
         return put(data, place, layout, value)
 
     return damage
@@ -63,7 +63,8 @@ PACKED = {
     "no chunks": (of_chunks("count", "<I", 0), "20,000 points in 0 chunks"),
     "chunks without points": (of_chunks("size", "<I", 0), "its chunks have no points"),
     "chunks of one point": (of_chunks("size", "<I", 1), "20,000 points in 1 chunks of 1"),
-    "records of no items": (of_chunks("items", "<H", 0), "at least one LazItem"),
+    "records of no items": (of_chunks("items", "<H", 0), "those that are packed 0"),
+    "records of more bytes": (of_chunks("item", "<H", 157), "those that are packed"),
     "table far away": (of_chunks("table", "<q", 2**62), "is damaged"),
     "table before the file": (of_chunks("table", "<q", -5), "is damaged"),
     "table nowhere": (of_chunks("table", "<q", -1), "is damaged"),

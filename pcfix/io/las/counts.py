@@ -13,6 +13,8 @@ from pcfix.errors import InputError
 _VARIABLE_CHUNKS = 2**32 - 1
 _WITHOUT_CHUNKS = 1
 """The compressor of files that are one stream (LASzip record)."""
+_ITEMS = 32
+"""Where the record says how many things are packed; each has a type, its bytes and a version."""
 _LAYERED = 3
 """The compressor that packs the dimensions of a chunk apart, from point format 6 on."""
 _LAYERS = 9
@@ -91,6 +93,13 @@ def check_chunks(path: Path, header: Any, vlrs: Any) -> None:
     table = _table(path, header, vlrs)
     if table is None:
         return
+    (count,) = struct.unpack_from("<H", table.packing, _ITEMS)
+    items = table.packing[_ITEMS + 2 : _ITEMS + 2 + 6 * count]
+    packed = sum(size for _, size, _ in struct.iter_unpack("<HHH", items))
+    if packed != header.point_format.size:
+        raise ValueError(
+            f"its points have {header.point_format.size} bytes, those that are packed {packed}"
+        )
     if table.points == 0:
         raise ValueError("its chunks have no points")
     if table.chunks * header.point_format.size > max(table.size, 0):
