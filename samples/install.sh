@@ -44,8 +44,13 @@ fi
 if [ ${#missing[@]} -gt 0 ]; then system_packages "${missing[@]}"; fi
 
 if [ ! -x "$folder/bin/python" ]; then "$python" -m venv "$folder"; fi
-"$folder/bin/python" -m pip install --quiet --upgrade pip
-"$folder/bin/python" -m pip install --quiet --editable ".$extras"
+# uv installs what pip would, in a tenth of the time; where it does not reach an index, pip does.
+pip=("$folder/bin/python" -m pip)
+"${pip[@]}" install --quiet --upgrade pip uv || "${pip[@]}" install --quiet --upgrade pip
+index=${PIP_INDEX_URL:-$("${pip[@]}" config get global.index-url 2>/dev/null || true)}
+what=(--quiet --editable ".$extras")
+UV_NATIVE_TLS=true "$folder/bin/uv" pip install --python "$folder/bin/python" \
+    ${index:+--default-index "$index"} "${what[@]}" || "${pip[@]}" install "${what[@]}"
 if [ -z "${2:-}" ]; then
     echo "compiling the kernels, so that the first correction need not wait for it ..."
     warm=$(mktemp -d)

@@ -74,7 +74,7 @@ use_the_pdal_there() {
 
 constrain() {
     echo "$1" >"$environment/constraints.txt"
-    export PIP_CONSTRAINT=$environment/constraints.txt
+    export PIP_CONSTRAINT=$environment/constraints.txt UV_CONSTRAINT=$environment/constraints.txt
 }
 
 unpack_debian_11() (
@@ -126,7 +126,9 @@ build_from_debian_11() {
 }
 
 if works; then
-    if [ -f "$environment/constraints.txt" ]; then export PIP_CONSTRAINT=$environment/constraints.txt; fi
+    if [ -f "$environment/constraints.txt" ]; then
+        export PIP_CONSTRAINT=$environment/constraints.txt UV_CONSTRAINT=$environment/constraints.txt
+    fi
 elif config=$(command -v pdal-config) && at_least "$("$config" --version)" 2.5; then
     use_the_pdal_there "$config"
 elif grep -qs bookworm /etc/os-release && [ "$(dpkg --print-architecture)" = amd64 ]; then
