@@ -197,13 +197,14 @@ def _read_grid(path: Path) -> Reference:
     """Read the first band of a GeoTIFF as points."""
     import rasterio
     from pyproj import CRS
+    from rasterio import errors
 
     try:
         with rasterio.open(path) as grid:
             band = read_masked(grid)
             transform, wkt = grid.transform, grid.crs.to_wkt() if grid.crs else None
             scale, offset = grid.scales[0], grid.offsets[0]
-    except rasterio.errors.RasterioError as error:
+    except (errors.RasterioError, errors.RasterioIOError) as error:  # up to 1.3 no kin
         raise InputError(f"{path}: is not a readable GeoTIFF ({error}).") from error
     if transform.is_identity:
         raise InputError(f"{path}: does not say where it lies; give a georeferenced GeoTIFF.")

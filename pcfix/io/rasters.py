@@ -56,12 +56,13 @@ def open_raster(path: File) -> Iterator[DatasetReader]:
     An `InputError` if there is no such file, it is none, or a part cannot be read.
     """
     import rasterio
+    from rasterio import errors
 
     found = check_input(path)
     try:
         with rasterio.open(found) as source:
             yield source
-    except (rasterio.errors.RasterioError, UnicodeDecodeError) as error:
+    except (errors.RasterioError, errors.RasterioIOError, UnicodeDecodeError) as error:
         raise InputError(
             f"{found}: is damaged, or is not a raster ({error.__cause__ or error}); export it again"
             " as GeoTIFF."
@@ -215,6 +216,7 @@ def _written(path: Path, most_bytes: int | None = None) -> Iterator[None]:
     An OSError if it is not whole; `most_bytes` is what it takes at most.
     """
     import rasterio
+    from rasterio import errors
     from rasterio._err import CPLE_BaseError
 
     try:
@@ -225,7 +227,7 @@ def _written(path: Path, most_bytes: int | None = None) -> Iterator[None]:
             with rasterio.open(path, **level) as raster:
                 for _, window in raster.block_windows(1):
                     raster.read(window=window)
-    except (rasterio.errors.RasterioError, CPLE_BaseError) as error:
+    except (errors.RasterioError, errors.RasterioIOError, CPLE_BaseError) as error:
         if is_full_disk(path.parent, error, most_bytes):
             raise NoRoomError(most_bytes) from error
         raise OSError(str(error)) from error

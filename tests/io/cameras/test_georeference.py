@@ -345,7 +345,7 @@ def test_a_thousand_cameras_turn_at_once_as_one_by_one():
     degrees = np.column_stack(
         [rng.uniform(-1, 0, 1000), rng.uniform(39, 40, 1000), rng.uniform(50, 500, 1000)]
     )
-    turns = Rotation.random(1000, rng=7).as_matrix()
+    turns = Rotation.from_quat(np.random.default_rng(7).normal(size=(1000, 4))).as_matrix()
     block = bring_to(cameras(degrees, "EPSG:4258", turns), UTM30)
     for i in (0, 499, 999):
         one = bring_to(cameras(degrees[i], "EPSG:4258", turns[i][None]), UTM30)
