@@ -76,7 +76,7 @@ PACKED = {
 PLAIN = {
     "version 2.0": (lambda d: put(d, VERSION, "<BB", 2, 0), "its version is 2.0"),
     "version 1.0": (lambda d: put(d, VERSION, "<BB", 1, 0), "holds no points"),
-    "version 1.9": (lambda d: put(d, VERSION, "<BB", 1, 9), "is damaged"),
+    "version 1.9": (lambda d: put(d, VERSION, "<BB", 1, 9), "its version is 1.9"),
     "offset": (lambda d: put(d, OFFSET_X, "<d", 1e18), "are lost beside them"),
     "offset not finite": (lambda d: put(d, OFFSET_X, "<d", float("nan")), "must be finite"),
     "scale": (lambda d: put(d, SCALE_X, "<d", 1e300), "at most 1,000"),

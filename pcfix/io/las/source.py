@@ -115,7 +115,7 @@ def read_records(stream: BinaryIO) -> tuple[list[Record], list[Record]]:
     head = stream.read(375)
     if head[:4] != b"LASF":
         raise ValueError("it does not begin with LASF")
-    if len(head) > 25 and head[24] != 1:
+    if len(head) > 25 and not (head[24] == 1 and head[25] <= 4):
         raise ValueError(f"its version is {head[24]}.{head[25]}, and there are 1.0 to 1.4")
     start, points_start, count = struct.unpack_from("<HII", head, 94)
     if points_start > stream.seek(0, os.SEEK_END):  # laspy would read up to there
