@@ -44,7 +44,7 @@ fi
 if [ ${#missing[@]} -gt 0 ]; then system_packages "${missing[@]}"; fi
 
 if [ ! -x "$folder/bin/python" ]; then "$python" -m venv "$folder"; fi
-# uv installs what pip would, in a tenth of the time; where it does not reach an index, pip does.
+# uv installs what pip would, in a seventh of the time; where it does not reach an index, pip does.
 pip=("$folder/bin/python" -m pip)
 "${pip[@]}" install --quiet --upgrade pip uv || "${pip[@]}" install --quiet --upgrade pip
 index=${PIP_INDEX_URL:-$("${pip[@]}" config get global.index-url 2>/dev/null || true)}

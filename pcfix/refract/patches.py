@@ -111,26 +111,19 @@ class Squares:
 
     def __init__(self, width_m: float) -> None:
         self._width_m = SQUARE_PATCHES * width_m
-        self._share, self._count = 1.0, 0
+        self._share = 1.0
         self._taken = list[tuple[Batch, FloatArray]]()
 
     def add(self, batch: Batch) -> None:
         """Take what lies in the squares that are looked at."""
-        rank = self._rank(batch.xyz)
-        self._taken.append((batch, rank))
-        self._only(-1)
-        while self._count > MOST_IN_SQUARES:
+        self._taken.append(self._inside(batch, self._rank(batch.xyz)))
+        while sum(len(one) for one, _ in self._taken) > MOST_IN_SQUARES:
             self._share /= 2.0
-            self._count = 0
-            self._only(*range(len(self._taken)))
+            self._taken = [self._inside(*one) for one in self._taken]
 
-    def _only(self, *places: int) -> None:
-        """Leave out of some batches what lies beside the squares, and count the rest."""
-        for i in places:
-            batch, rank = self._taken[i]
-            rows = np.flatnonzero(rank < self._share)
-            self._taken[i] = batch.take(rows), rank[rows]
-            self._count += len(rows)
+    def _inside(self, batch: Batch, rank: FloatArray) -> tuple[Batch, FloatArray]:
+        rows = np.flatnonzero(rank < self._share)
+        return batch.take(rows), rank[rows]
 
     def _rank(self, xyz: FloatArray) -> FloatArray:
         """Return a number from 0 to 1 for the square of each point, as if by chance."""
