@@ -234,6 +234,20 @@ def test_photos_without_a_pose_in_the_block_are_left_out(tmp_path):
     assert cameras.crs == "EPSG:32632"
 
 
+def test_poses_and_lenses_that_software_ignores_are_not_read(tmp_path):
+    ignored = GROUP.replace("wide", "raw") + "<ManualPose>false</ManualPose>"
+    text = document(block(group(photo(1)), group(photo(2), head=ignored)))
+    cameras = read(write(tmp_path, text))
+    assert (cameras.labels, cameras.unposed) == (("p1.jpg",), ("p2.jpg",))
+    assert "the poses of photogroup raw are not those of the block" in cameras.notes[0]
+    with pytest.raises(pcfix.InputError, match=r"no photo has a pose of the block \(ManualPose"):
+        read(write(tmp_path, simple(photo(1), head=ignored)))
+    head = GROUP + "<ManualOpticalParams>False</ManualOpticalParams><ManualPose>true</ManualPose>"
+    cameras = read(write(tmp_path, simple(photo(1), head=head)))
+    assert cameras.lenses is None
+    assert "its photogroup has no frame or focal length" in cameras.notes[0]
+
+
 def test_positions_alone(tmp_path):
     text = simple(photo(1).replace(f"<Rotation>{matrix()}</Rotation>", ""))
     cameras = read(write(tmp_path, text))

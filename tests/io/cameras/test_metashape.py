@@ -330,6 +330,15 @@ def test_chunk_matrix_with_the_scale_inside(tmp_path):
     assert two.rotations == pytest.approx(one.rotations, abs=1e-12)
 
 
+def test_a_collection_is_read_as_a_document(tmp_path):
+    one = read_chunk(tmp_path, rest=transform())
+    path = tmp_path / "collection.xml"
+    path.write_text(document(chunk(rest=transform())).replace("document", "collection"))
+    two = read(path)
+    assert (two.labels, two.centres.tolist()) == (one.labels, one.centres.tolist())
+    assert two.lenses == one.lenses
+
+
 def test_no_transform_leaves_the_frame_of_the_chunk(tmp_path):
     cameras = read_chunk(tmp_path, rest=f"<reference>{UTM30}</reference>")
     assert cameras.centres.tolist() == [[1.0, 2.0, 3.0]]

@@ -15,6 +15,9 @@ P0 + P1 q + P2 q^2 + ... of q = 2 theta / pi; without the matrix, it is pi / 2 t
 length. Places in mm (xmm, ymm) are in the camera axes, from the centre of the sensor for the
 principal point and from the principal point for measurements.
 
+Software ignores poses where ManualPose is false, and lenses where ManualOpticalParams is: what
+stands there did not make the cloud, and is not read.
+
 Where the GNSS said that a photo was taken is in Pose/Metadata, or in the GPS of ExifData. Tie
 points can be in a file of their own, and either file in a zip archive (.xmlz).
 
@@ -91,7 +94,7 @@ def read_photos(path: Path, root: Element) -> tuple[Cameras, document.Rows]:
             unposed += without
             groups.update({photo.key: group for photo in found})
         unposed += [_label(element) for element in block.iterfind("BulkPhotos/Photo")]
-    photos, others, notes = _of_one_frame(path, photos)
+    photos, others, notes = _of_one_frame(path, photos, _ignored(path, root))
     srs = photos[0].srs
     rotations = [photo.rotation for photo in photos if photo.rotation is not None]
     lenses = [photo.lens for photo in photos if photo.lens is not None]
@@ -117,11 +120,11 @@ def _of_group(
 ) -> tuple[list[Photo], list[str]]:
     """Return the photos of a group that have a position, and the names of the others."""
     lens, axes = group.lens(), group.axes()
-    found, without = [], []
+    found, without, posed = [], [], group.is_used("ManualPose")
     for element in group.element.iterfind("Photo"):
         label = _label(element)
         centre = element.find("Pose/Center")
-        if centre is None:
+        if centre is None or not posed:
             without.append(label)
             continue
         photo = Photo(
@@ -138,8 +141,20 @@ def _of_group(
     return found, without
 
 
+def _ignored(path: Path, root: Element) -> tuple[str, ...]:
+    """Return what is said of photogroups with poses that software ignores."""
+    groups = [document.Photogroup(path, element) for element in root.iter("Photogroup")]
+    names = [group.name for group in groups if not group.is_used("ManualPose")]
+    if not names:
+        return ()
+    return (
+        f"{path}: the poses of photogroup {', '.join(names[:10])} are not those of the block"
+        " (ManualPose is false): its photos are left out.",
+    )
+
+
 def _of_one_frame(
-    path: Path, photos: list[Photo]
+    path: Path, photos: list[Photo], notes: tuple[str, ...]
 ) -> tuple[list[Photo], list[str], tuple[str, ...]]:
     """Return the photos that belong together, the names of the others, and what to tell."""
     whole = [photo for photo in photos if photo.component == MAIN_COMPONENT] or photos
@@ -147,14 +162,15 @@ def _of_one_frame(
     kept = turned or whole
     if not kept:
         raise InputError(
-            f"{path}: no photo has a pose; export the block after the aerotriangulation."
+            f"{path}: no photo has a pose"
+            + (" of the block (ManualPose is false)" if notes else "")
+            + "; export the block after the aerotriangulation."
         )
     boundless = next((photo.label for photo in kept if photo.lens is None), None)
-    notes: tuple[str, ...] = ()
     if not turned:
-        notes = (f"{path}: no photo has a rotation, only positions are read.",)
+        notes += (f"{path}: no photo has a rotation, only positions are read.",)
     elif boundless is not None:
-        notes = (
+        notes += (
             f"{path}: image {boundless}: its photogroup has no frame or focal length; frames are"
             " taken as boundless.",
         )

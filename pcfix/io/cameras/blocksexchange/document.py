@@ -134,6 +134,10 @@ class Photogroup:
         """Return numbers below an element, 0 for those that are not there."""
         return [self.number(f"{parent}/{name}") or 0.0 for name in names]
 
+    def is_used(self, name: str) -> bool:
+        """Whether software uses what the group has: `ManualPose`, `ManualOpticalParams`."""
+        return text_of(self.element, name).lower() != "false"
+
     def axes(self) -> FloatArray:
         """Return the matrix from camera axes to x right, y down, z forward."""
         name = text_of(self.element, "CameraOrientation") or "XRightYDown"
@@ -158,7 +162,9 @@ class Photogroup:
         return self.numbers("ImageDimensions", ("Width", "Height"))
 
     def lens(self) -> Lens | None:
-        """Return the lens, or None where the group lacks frame or focal length."""
+        """Return the lens, or None where the group lacks frame or focal length, or is not used."""
+        if not self.is_used("ManualOpticalParams"):
+            return None
         kind = text_of(self.element, "CameraModelType") or "Perspective"
         if kind not in ("Perspective", "Fisheye"):
             raise InputError(

@@ -24,7 +24,12 @@ from pcfix.io.cameras.formats import Source
 
 ZIP_MAGIC = b"PK\x03\x04"
 ROOT = re.compile(r"\s*(?:<\?.*?\?>\s*|<!--.*?-->\s*)*<(\w+)", re.DOTALL)
-INSIDE = {"document": re.compile(r"<chunks?\b|\bpath="), "chunk": re.compile(r"<sensors\b")}
+OF_CHUNKS = re.compile(r"<chunks?\b|\bpath=")
+INSIDE = {
+    "document": OF_CHUNKS,
+    "collection": OF_CHUNKS,  # read as a document: no file of such a PhotoScan was at hand
+    "chunk": re.compile(r"<sensors\b"),
+}
 
 
 @dataclass(frozen=True)
