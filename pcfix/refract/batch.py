@@ -185,8 +185,10 @@ class Batch:
         sigma = self.level_sigma_m
         return replace(
             self,
-            xyz=self.xyz[rows],
-            surface=SurfaceAbove(self.surface.height_m[rows], self.surface.slope[rows]),
+            xyz=self.xyz.take(rows, axis=0),  # four times as fast as with brackets
+            surface=SurfaceAbove(
+                self.surface.height_m[rows], self.surface.slope.take(rows, axis=0)
+            ),
             views=None if self.views is None else self.views.take(rows),
             made_with=None if self.made_with is None else self.made_with.take(rows),
             level_sigma_m=None if sigma is None else sigma[rows],
@@ -243,11 +245,6 @@ class Batch:
             survey.settings.refractive_index,
         )
 
-    @property
-    def owner(self) -> IntArray:
-        """The point of each ray, shape (rays,)."""
-        return np.repeat(np.arange(len(self.xyz)), self.counts)
-
     def normals(self) -> FloatArray:
         """Return the unit normal of the surface above each point, upward, shape (m, 3)."""
         slope = self.surface.slope
@@ -287,8 +284,9 @@ class Batch:
 
     def camera_used(self, moved: BoolArray) -> BoolArray:
         """Return which cameras give a ray to a point that is moved, shape (k,)."""
-        used = np.zeros(len(self.survey.cameras), np.bool_)
-        used[self.rays.camera[moved[self.owner]]] = True
+        used, views = np.zeros(len(self.survey.cameras), np.bool_), self.rays
+        start, camera = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
+        in_tiles(_mark_used, len(self), start, camera, moved, used)
         return used
 
     def result(
@@ -348,6 +346,17 @@ def _incidence(
             along = across / np.sqrt(square)
             most, least = max(most, along), min(least, along)
         cosine[i, 0], cosine[i, 1] = most, least
+
+
+@lean_kernel
+def _mark_used(
+    span: Span, start: IntArray, camera: IntArray, moved: BoolArray, used: BoolArray
+) -> None:
+    """Mark the cameras of the points that are moved; threads write the same value."""
+    for i in range(*span):
+        if moved[i]:
+            for at in range(start[i], start[i + 1]):
+                used[camera[at]] = True
 
 
 class Intersection(NamedTuple):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import inlined, lean, part
+from pcfix.kernels import Span, in_tiles, inlined, lean, lean_kernel, part
 from pcfix.lens.algebra import Vector, row_of
 from pcfix.model import FloatArray, IntArray, WaterMesh, WaterRaster
 from pcfix.refract.batch import Batch, Chosen, Survey
@@ -93,10 +93,22 @@ def cells_of(batch: Batch) -> tuple[IntArray, IntArray]:
     cell -= cell.min(axis=0)
     key = cell[:, 1] * (cell[:, 0].max() + 1) + cell[:, 0]
     names = np.random.default_rng(0).integers(2**40, size=len(batch.survey.cameras))
-    sums = np.concatenate([[0], np.cumsum(names[batch.rays.camera])])
-    order = np.lexsort((np.diff(sums[batch.rays.start]), key))
+    views, sums = batch.rays, np.zeros(len(batch), np.int64)
+    start, camera = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
+    in_tiles(_sum_names, len(batch), start, camera, names, sums)
+    order = np.lexsort((sums, key))
     new = np.flatnonzero(np.diff(key[order])) + 1
     return order, np.concatenate([[0], new, [len(order)]])
+
+
+@lean_kernel
+def _sum_names(
+    span: Span, start: IntArray, camera: IntArray, names: IntArray, sums: IntArray
+) -> None:
+    """Sum up the numbers that stand for the cameras of each point."""
+    for i in range(*span):
+        for at in range(start[i], start[i + 1]):
+            sums[i] += names[camera[at]]
 
 
 @part

@@ -23,7 +23,7 @@ from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.refract.batch import CORRECTED, NO_CAMERA, ONE_CAMERA, PARALLEL, Batch, Intersection
 from pcfix.refract.choice import Rig, Rule, rig_of, rule_of, shapes_of
 from pcfix.refract.rays import add_line, line_terms, nearest_point, pierce_of, refracted
-from pcfix.refract.sensitivity import SUMS, TILE_RUNS, Budget, add_below
+from pcfix.refract.sensitivity import Budget, room_of
 from pcfix.refract.tiling import (
     TILE,
     Points,
@@ -122,6 +122,13 @@ def _solve(row: FloatArray, k: float, sums: FloatArray) -> None:
 
 
 @lean
+def _solve_tile(result: FloatArray, rows: IntArray, sums: FloatArray) -> None:
+    """Solve the points of a tile: where references are counted, two to each of its points."""
+    for j in range(rows.size):
+        _solve(result[rows[j]], sums[9 * TILE + j], sums[j::TILE])
+
+
+@lean
 def add_camera(
     sums: FloatArray, tile: FloatArray, marks: FloatArray, g: Pyramid | None, rig: Rig, c: int,
     rule: Rule,
@@ -180,7 +187,7 @@ def _all_in_frame(
     around = cameras_around(frames, centres, low, high)
     for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
-        tile, sums = np.empty(TILE_RUNS * TILE), np.zeros(11 * TILE)
+        tile, sums = np.empty(7 * TILE), np.zeros(11 * TILE)
         low, high = gather(tile, rows, points)
         sums[10 * TILE :] = 1.0
         near = np.empty(len(around), np.int64)
@@ -205,14 +212,12 @@ def _all_in_frame(
                 used[c] = True  # threads may write it at once: always the same value
                 near[seeing] = c
                 seeing += 1
-        for j in range(rows.size):
-            _solve(result[rows[j]], sums[9 * TILE + j], sums[j::TILE])
+        _solve_tile(result, rows, sums)
         if len(covariance):
-            add_below(tile, result, rows)
-            errors = np.zeros(SUMS * TILE)
+            room = room_of(tile, result, rows)
             for k in range(seeing):
-                add_errors(errors, tile, marks[k], rig, near[k], rule, budget)
-            finish_tile(covariance, rows, errors, tile, level_sigma, budget)
+                add_errors(room, tile, marks[k], rig, near[k], rule, budget)
+            finish_tile(covariance, rows, room, tile, level_sigma, budget)
 
 
 @kernel

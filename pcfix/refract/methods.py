@@ -241,14 +241,13 @@ def batches(order: IntArray) -> Iterator[IntArray]:
 
 def joined(parts: list[Intersection], order: IntArray, k: int) -> Intersection:
     """Return the results of batches as one, back in the order of the points."""
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
 
     def back(name: str) -> Any:
         if getattr(parts[0], name) is None:
             return None
-        values = np.concatenate([getattr(part, name) for part in parts])
-        full = np.empty_like(values)
-        full[order] = values
-        return full
+        return np.concatenate([getattr(part, name) for part in parts]).take(place, axis=0)
 
     per_point = [name for name in Intersection._fields if name != "camera_used"]
     used = np.any([part.camera_used for part in parts], axis=0) if k else np.zeros(0, np.bool_)

@@ -26,7 +26,7 @@ import numpy as np
 
 from pcfix.kernels import Span, in_tiles, inlined, kernel, lean, lean_kernel, part
 from pcfix.lens.algebra import Symmetric, Vector
-from pcfix.model import FloatArray, IntArray, Outcome
+from pcfix.model import FloatArray, IntArray, Outcome, SingleArray
 from pcfix.options.correct import LEVEL_M
 from pcfix.refract import sensitivity as s
 from pcfix.refract.batch import Batch, Intersection, Survey
@@ -119,7 +119,8 @@ def with_doubt(found: Intersection, batch: Batch) -> Intersection:
     covariance = found.covariance_m2
     if doubt is not None:
         depth = batch.surface.height_m - (batch.xyz[:, 2] + found.shift_m[:, 2])
-        covariance[moved, _ZZ] += doubt.scatter_m**2 + (doubt.per_depth * depth[moved]) ** 2
+        more = doubt.scatter_m**2 + (doubt.per_depth * depth) ** 2
+        covariance[:, _ZZ] += np.where(moved, more, 0.0)
     if poses is not None:
         covariance[moved, _ZZ] += poses.at(batch.xyz[moved, :2]) ** 2
     return found._replace(sigma_z_m=np.sqrt(covariance[:, _ZZ]), covariance_m2=covariance)
@@ -197,9 +198,9 @@ def _of_lists(
     start, camera = views
     for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
-        tile, sums = np.empty(s.TILE_RUNS * TILE), np.zeros(s.SUMS * TILE)
+        tile = np.empty(7 * TILE)
         gather(tile, rows, points)
-        s.add_below(tile, shift, rows)
+        room = s.room_of(tile, shift, rows)
         named = _named(start, camera, rows, len(rig.centres))
         place = np.zeros(len(rig.centres), np.int64)
         place[named] = np.arange(named.size)
@@ -208,8 +209,8 @@ def _of_lists(
             for at in range(start[rows[j]], start[rows[j] + 1]):
                 marks[place[camera[at]], j] += 1.0
         for at in range(named.size):
-            add_errors(sums, tile, marks[at], rig, named[at], rule, budget)
-        finish_tile(result, rows, sums, tile, level_sigma, budget)
+            add_errors(room, tile, marks[at], rig, named[at], rule, budget)
+        finish_tile(result, rows, room, tile, level_sigma, budget)
 
 
 @part
@@ -224,18 +225,20 @@ def _named(start: IntArray, camera: IntArray, rows: IntArray, k: int) -> IntArra
 
 @lean
 def add_errors(
-    sums: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule,
+    room: SingleArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule,
     budget: Budget,
 ) -> None:  # fmt: skip
     """Add one camera's rays to the points of a tile that have a mark."""
+    count, sight = marks.size, s.lens_of(rig, c, rule)
+    s.add_rays(room, tile, marks, rig, c, rule)
     if budget.in_images:
-        s.add_in_images(sums, tile, marks, rig, c, rule)
+        s.add_in_images(room, count, sight)
     else:
-        s.add_in_space(sums, tile, marks, rig, c, rule)
+        s.add_in_space(room, count, sight)
     if budget.tilt > 0.0:
-        s.add_tilt(sums, tile, marks, rig, c, rule, budget.in_images)
+        s.add_tilt(room, count, sight, budget.in_images)
     if _per_image(budget):
-        s.add_noise(sums, tile, marks, rig, c, rule, budget)
+        s.add_noise(room, count, sight, budget)
 
 
 @lean
@@ -250,11 +253,11 @@ def _per_image(budget: Budget) -> bool:
 
 @part
 def finish_tile(
-    result: FloatArray, rows: IntArray, sums: FloatArray, tile: FloatArray,
+    result: FloatArray, rows: IntArray, room: SingleArray, tile: FloatArray,
     level_sigma: FloatArray, budget: Budget,
 ) -> None:  # fmt: skip
     """Turn the sums of a tile into covariances."""
-    out, sigma = np.empty(6 * TILE), level_sigma[rows]
+    out, sigma, sums = np.empty(6 * TILE), level_sigma[rows], room.astype(np.float64)
     if not _per_image(budget):
         for at in range(6 * TILE):
             sums[s.NOISE * TILE + at] = budget.image_px**2 * sums[s.SIGHT * TILE + at]
@@ -290,10 +293,8 @@ def _solved_in_space(sums: FloatArray, j: int) -> tuple[bool, Nine, Nine]:
     That is (sum M)^-1 times sum M delta, and (sum M)^-1 (sum M D) (sum W)^-1 times the right side
     of the normal equations of P.
     """
-    k, at = sums[j], s.BY_Q * TILE + j
-    xx, xy, xz = sums[at], sums[at + TILE], sums[at + 2 * TILE]
-    yy, yz = sums[at + 3 * TILE], sums[at + 4 * TILE]
-    det, by_delta = _inverted((k - xx, -xy, -xz, -xy, k - yy, -yz, -xz, -yz, xx + yy))
+    k = sums[j]
+    det, by_delta = _inverted(_full(_six(sums, s.BY_Q * TILE + j)))
     full, by_sight = _inverted(_full(_six(sums, s.SIGHT * TILE + j)))
     by_p = _product(by_delta, _nine(sums, s.BY_P * TILE + j))
     solved = (k >= 2.0) & (det >= MIN_DETERMINANT * k * k * k) & (full > 0.0)

@@ -219,8 +219,8 @@ def test_variances_of_sources_add_up():
         return covariances(bed, found.shift_m, flat(50), cameras, ScienceOptions(**vars(errors)))
 
     parts = [cov(replace(NONE, **{name: getattr(all_of_them, name)})) for name in vars(all_of_them)]
-    # rounding only, relative to the variance in z
-    np.testing.assert_allclose(sum(parts), cov(all_of_them), rtol=0, atol=1e-9 * parts[0].max())
+    # rounding only, of single precision, relative to the variance in z
+    np.testing.assert_allclose(sum(parts), cov(all_of_them), rtol=0, atol=3e-6 * parts[0].max())
 
 
 @pytest.mark.parametrize("method", ["snell", "consistent"])

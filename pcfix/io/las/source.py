@@ -61,7 +61,7 @@ MOST_SCALE_M = 1000.0
 _LAST_DIGIT = 2.0**-52
 """Of a float64, relative."""
 
-CHUNK_POINTS = 1_000_000
+CHUNK_POINTS = 400_000
 """Points that are worked on at a time, which bounds the memory."""
 
 CHUNK_BYTES = 500_000_000
