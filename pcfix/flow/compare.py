@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,7 +20,7 @@ from pcfix.compare.sections import parse_line
 from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_summary
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of
-from pcfix.io.drafts import all_or_none
+from pcfix.io.drafts import all_or_none, made_folder
 from pcfix.io.files import check_output, scratch_arrays, write_bytes, write_text
 from pcfix.io.tiles import Clouds, Tiles, cloud_of, inputs_of
 from pcfix.model import WaterSurface
@@ -153,10 +154,9 @@ def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:
 
 def _write(result: Comparison, given: CompareOptions) -> None:
     files: dict[str, str] = {}
-    with all_or_none():
-        if given.out_dir is not None:
-            folder = Path(given.out_dir)
-            folder.mkdir(exist_ok=True)
+    folder = None if given.out_dir is None else Path(given.out_dir)
+    with nullcontext() if folder is None else made_folder(folder), all_or_none():
+        if folder is not None:
             tables = {"depth_bins.csv": result.depth_bins, "shore_bins.csv": result.shore_bins}
             files = {"compare.json": json_text(result.as_dict())}
             files |= {name: bins_table(bins) for name, bins in tables.items() if bins}
@@ -171,7 +171,7 @@ def _write(result: Comparison, given: CompareOptions) -> None:
             picture = png_of(c2c_figure(result.as_dict()))
             write_bytes(given.plot, picture, overwrite=given.overwrite)
         write_summary(given, result.as_dict())
-    if given.out_dir is not None:
-        for path in Path(given.out_dir).glob("section_*.csv"):  # of an earlier one with more
+    if folder is not None:
+        for path in folder.glob("section_*.csv"):  # of an earlier one with more
             if path.name not in files:
                 path.unlink()

@@ -12,6 +12,7 @@ from pathlib import Path
 from pcfix.errors import SettingError
 from pcfix.flow.correct import correct_points
 from pcfix.flow.runner import json_text
+from pcfix.io.drafts import all_or_none, made_folder
 from pcfix.io.files import check_output, write_bytes
 from pcfix.options.declare import File
 from pcfix.options.scenes import SimulateOptions
@@ -137,11 +138,11 @@ def _pictures(found: list[Effect], bins: DepthBins, deepest: float) -> dict[str,
 
 
 def _write(folder: Path, files: dict[str, bytes], overwrite: bool) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in files:
-        check_output(folder / name, overwrite=overwrite)
-    for name, data in files.items():
-        write_bytes(folder / name, data, overwrite=overwrite)
+    with made_folder(folder), all_or_none():
+        for name in files:
+            check_output(folder / name, overwrite=overwrite)
+        for name, data in files.items():
+            write_bytes(folder / name, data, overwrite=overwrite)
 
 
 def bowl_bins(bowl: Bowl) -> DepthBins:

@@ -98,6 +98,23 @@ def all_or_none() -> Iterator[None]:
             _rename(draft, target)
 
 
+@contextmanager
+def made_folder(folder: Path) -> Iterator[None]:
+    """Make a folder for what the block writes; a new one goes again if the block fails."""
+    is_new = not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+    try:
+        yield
+    except BaseException:
+        if is_new:
+            with suppress(OSError):  # not where others have put something into it
+                folder.rmdir()
+        raise
+
+
 class _Together(NamedTuple):
     drafts: ExitStack
     whole: dict[Path, Path]

@@ -118,6 +118,7 @@ def on_a_disk_of(pages, words, disk, inputs):
     if done.returncode == 0:
         return None
     assert done.returncode == 1
+    assert not [path for path in disk.rglob("*") if path.is_dir() and not any(path.iterdir())]
     assert "Traceback" not in done.stderr
     said = done.stderr.strip().splitlines()[-1]  # kernels may have been compiled before
     assert said.startswith(f"pcfix: {disk}/"), done.stderr
