@@ -120,10 +120,13 @@ def _on_workers(
     everywhere = client.scatter(shared, broadcast=True)  # a worker that is lost takes its own
     futures = {client.submit(work, everywhere, one, 1, pure=False): one for one in tasks}
     try:
-        for future in as_completed(list(futures), loop=client.loop):
+        done = as_completed(list(futures), loop=client.loop)
+        for future in done:
             task = futures[future]
             if future.status == "finished":
                 yield task, future.result()
+            elif future.status in ("lost", "pending"):  # its result went with a worker: once more
+                done.add(future)
             else:
                 why = future.exception() if future.status == "error" else future.status
                 yield task, f"{task}: was given up by the cluster ({why})."

@@ -14,6 +14,7 @@ from pcfix.io.files import local_path
 from pcfix.io.las.columns import (
     SHIFTS,
     UNSURE,
+    Column,
     columns_for,
     convert,
     is_corrected,
@@ -120,7 +121,8 @@ def _ours(source: LasSource, settings: dict[str, Any]) -> set[str]:
     """Return the dimensions that pcfix added, once all that undo its work are there."""
     dimensions = settings["dimensions"]
     unsure = settings.get("unsure", "keep")  # files of old have none
-    names = {column.name for column in columns_for(dimensions, unsure)}
+    columns = columns_for(dimensions, unsure)
+    names = {column.name for column in columns}
     if not names.issuperset(SHIFTS):
         raise InputError(
             f"{source.path}: was written with --dimensions {dimensions}, which keeps no way back;"
@@ -132,4 +134,18 @@ def _ours(source: LasSource, settings: dict[str, Any]) -> set[str]:
             f"{source.path}: has lost the dimensions {', '.join(sorted(missing))} since it was"
             " corrected; use the original cloud."
         )
+    _check_types(source, columns)
     return names
+
+
+def _check_types(source: LasSource, columns: tuple[Column, ...]) -> None:
+    """Refuse dimensions that another program has turned into other numbers."""
+    for column in columns:
+        found = source.header.point_format.dimension_by_name(column.name).dtype
+        known = column.dtype(wide=False), column.dtype(wide=True)
+        if found not in known:
+            raise InputError(
+                f"{source.path}: its dimension {column.name} is {found}, not"
+                f" {' or '.join(dict.fromkeys(map(str, known)))}: another program has changed it"
+                " since; use the original cloud."
+            )

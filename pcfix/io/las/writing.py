@@ -6,6 +6,7 @@ the target, which is renamed when it is whole.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -47,6 +48,8 @@ BEFORE = (
     *("offsets", "steps", "added_wkt", "undescribed"),
 )
 """What the VLR says of the file before the correction."""
+_SEAL = "sha256"
+"""Of the rest of what it says: what is not as it was written leads to another cloud."""
 
 
 def corrected_header(
@@ -79,8 +82,8 @@ def corrected_header(
         **changes,
     }
     part = part_report(source.path)
-    told = content if part is None else {**content, "part": part}
-    note = _note(_SETTINGS, {**told, "before": before})
+    told = {**content, **({} if part is None else {"part": part}), "before": before}
+    note = _note(_SETTINGS, {**told, _SEAL: _seal_of(told)})
     _set_records(header, [*vlrs, note], described + records)
     return header
 
@@ -258,6 +261,11 @@ def _note(record: tuple[int, str], content: dict[str, Any]) -> VLR:
     return VLR(USER_ID, number, description, text.encode())
 
 
+def _seal_of(content: dict[str, Any]) -> str:
+    text = json.dumps(content, ensure_ascii=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
 cleaning_vlr = partial(_note, (2, "pcfix cleaning (JSON)"))
 """The VLR that says how a file was cleaned; one for each cleaning."""
 labelling_vlr = partial(_note, (3, "pcfix labelling (JSON)"))
@@ -279,6 +287,9 @@ def read_settings(vlrs: Iterable[VLR], path: Path) -> dict[str, Any]:
         content: dict[str, Any] | None = own_settings(vlrs)
         if content is not None:
             _ = content["settings"]["dimensions"], [content["before"][key] for key in BEFORE]
+            seal = content.pop(_SEAL, None)  # files of old have none
+            if seal not in (None, _seal_of(content)):
+                raise ValueError("it is not what pcfix wrote")
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(
             f"{path}: pcfix's own VLR is damaged ({error}); use the original cloud."
