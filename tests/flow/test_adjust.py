@@ -309,6 +309,7 @@ def test_the_next_step_does_what_it_says(files, written):
     assert max(heights_rms_m(files, target)) < 0.02
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_program_and_function_agree(files, written, tmp_path):
     out, _ = written
     folder = files.folder
@@ -325,6 +326,7 @@ def test_program_and_function_agree(files, written, tmp_path):
     assert "sigma0" in done.stdout
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_folder_is_replaced_only_if_asked_and_if_it_is_ours(files, tmp_path):
     quick = {"poses": "similarity", "lens_unknowns": (), "outliers": False}
     out = tmp_path / "out"

@@ -312,6 +312,7 @@ def test_an_offset_is_for_the_file_that_does_not_say_where_it_lies(tmp_path, old
     assert (after.cameras_offset is not None) == (local in ("new", "both"))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_run_keeps_it(tmp_path):
     scene = ROOT / "samples" / "scene"
     done = run_pcfix(

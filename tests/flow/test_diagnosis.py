@@ -11,6 +11,7 @@ from pcfix.flow.checks import check_cameras
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.next_steps import adjust_words
 from pcfix.report.cameras import cameras_text
+from tests.utils.crops import middle_of
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
 
@@ -32,13 +33,12 @@ def said(source, output, **given):
 
 @bent
 def test_a_correction_with_bent_poses_warns_once(tmp_path):
-    model = BENT / "sparse"
+    model, cloud = BENT / "sparse", middle_of(BENT, tmp_path) / "cloud.las"
     found, summary = said(
-        BENT / "cloud.las", tmp_path / "out.laz", cameras=model, cameras_offset=OFFSET_M,
-        water=LEVEL_M,
-    )  # fmt: skip
+        cloud, tmp_path / "out.laz", cameras=model, cameras_offset=OFFSET_M, water=LEVEL_M
+    )
     assert len(found) == 1
-    assert f"pcfix adjust {model} OUT --water 0.37 --cloud {BENT / 'cloud.las'}" in found[0]
+    assert f"pcfix adjust {model} OUT --water 0.37 --cloud {cloud}" in found[0]
     # the land lies 0.96 m too low; the block's own centres tell most of it
     assert 0.6 < float(found[0].split("likely error is ")[1].split(" m")[0]) < 1.3
     assert found[0] in summary.warnings
@@ -47,7 +47,7 @@ def test_a_correction_with_bent_poses_warns_once(tmp_path):
 @rendered
 def test_a_correction_with_true_poses_does_not(tmp_path):
     found, _ = said(
-        TRUE / "cloud.las", tmp_path / "out.laz", cameras=TRUE / "colmap",
+        middle_of(TRUE, tmp_path) / "cloud.las", tmp_path / "out.laz", cameras=TRUE / "colmap",
         cameras_offset=OFFSET_M, water=LEVEL_M,
     )  # fmt: skip
     assert found == []

@@ -1,6 +1,7 @@
 """What SigmaZ has of methods that were told, and of clouds that tell little, odd or twice."""
 
 from dataclasses import replace
+from functools import cache
 
 import laspy
 import numpy as np
@@ -25,6 +26,7 @@ BLOCK = {"seed": 1, "lidar_per_m2": 0.0}
 OBLIQUE = {**BLOCK, "bed": "shore", "obliques_deg": 35.0, "detection": 0.5}
 
 
+@cache
 def scene_of(cloud="tracks", points=12_000, **settings):
     return simulate_scene(points, cloud=cloud, **{**BLOCK, **settings})
 

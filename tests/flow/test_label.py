@@ -341,6 +341,7 @@ def test_pipeline_has_the_same_options(tmp_path, mask):
     assert set(plain) == {"cameras", "water", "uncorrected", "dimensions"}
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_run_keeps_them_in_its_record(tmp_path, mask):
     scene = tmp_path / "scene"
     from pcfix.io.scenes import write_scene

@@ -223,6 +223,7 @@ def test_measured_uncertainty_is_said_where_there_is_a_reference(finished):
     assert f"<td>consistent. {steps['correct']['made']['because']}</td>" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_formal_order_that_the_reference_forbids_is_not_claimed(tmp_path):
     wrong = ["--water", "0.87", "--sigma-image", "0.01"]  # half a metre too high, and too proud
     done = run(tmp_path, *WORDS, *wrong)
@@ -262,6 +263,7 @@ def test_a_finished_run_is_not_done_again(copied):
     assert changed == {"run.json"}
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_run_resumes_where_a_file_is_missing(copied):
     (copied / "out" / "surface.tif").unlink()
     done = run(copied, *WORDS)
@@ -274,6 +276,7 @@ def test_a_run_resumes_where_a_file_is_missing(copied):
     assert (copied / "out" / "surface.tif").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_another_request_does_not_replace_a_run_unasked(copied):
     done = run(copied, *WORDS, "--index", "1.33")
     assert done.returncode == 1
@@ -293,6 +296,7 @@ def test_another_request_does_not_replace_a_run_unasked(copied):
         (["--resolution", "2"], "dsm", "--resolution"),
     ],
 )
+@pytest.mark.usefixtures("undrawn")
 def test_another_option_redoes_what_depends_on_it(copied, more, first, changed):
     done = run(copied, *WORDS, *more)
     assert (done.returncode, done.stderr) == (0, "")
@@ -398,6 +402,7 @@ def test_a_reference_that_is_added_is_compared_with(finished, tmp_path):
         assert record(**{name: "1.33"}).first == "adjust"
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_record_repeats_its_run(finished, tmp_path):
     done = run(tmp_path, "again", "--config", str(finished[0] / "run.json"))
     assert (done.returncode, done.stderr) == (0, "")
@@ -554,6 +559,7 @@ def test_wrong_usage(tmp_path, words):
     assert run(tmp_path, *words).returncode == 2
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_shoreline_is_written_once_and_not_over_others(tmp_path):
     pytest.importorskip("pyogrio")
     words = [

@@ -208,6 +208,7 @@ def test_auto_adjusts_bent_poses_with_a_datum(scene, tmp_path, monkeypatch):
     assert "absorbed the refraction: tie points under water" in step["why"]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_auto_without_a_datum_says_what_is_missing(scene, tmp_path):
     said = []
     with pytest.warns(PcfixWarning, match="have absorbed the refraction"):

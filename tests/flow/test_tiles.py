@@ -21,6 +21,9 @@ from tests.utils.tiles import SCENE, cut, finished, records, write
 
 CAMERAS = SCENE / "cameras.csv"
 WORDS = ("--cameras", CAMERAS, "--water", "0.37")
+PLAIN = {"method": "snell", "dimensions": "minimal"}
+"""A correction that weighs nothing: for tests of files."""
+PLAIN_WORDS = [word for name, value in PLAIN.items() for word in (f"--{name}", value)]
 OWN = ("input", "output", "seconds", "points_per_s")
 """Figures of a summary that are those of a call."""
 
@@ -87,7 +90,7 @@ def test_a_view_list_counts_the_rows_of_all_tiles(tmp_path):
 
 def test_a_shoreline_is_that_of_one_cloud(cloud, tmp_path):
     pyogrio = pytest.importorskip("pyogrio")
-    given = {"cameras": CAMERAS, "water": 0.37, "method": "snell"}
+    given = {"cameras": CAMERAS, "water": 0.37, **PLAIN}
     pcfix.correct_file(cloud[1], tmp_path / "a.las", shoreline=tmp_path / "a.gpkg", **given)
     pcfix.correct_file(cloud[0], tmp_path / "b", shoreline=tmp_path / "b.gpkg", **given)
     one, many = (pyogrio.raw.read(tmp_path / f"{name}.gpkg") for name in "ab")
@@ -144,7 +147,7 @@ def test_a_folder_a_glob_a_list_and_an_index_name_the_same_files(cloud):
 
 
 def test_a_second_call_does_only_what_is_not_finished(cloud, tmp_path):
-    given = {"cameras": CAMERAS, "water": 0.37, "method": "snell"}
+    given = {"cameras": CAMERAS, "water": 0.37, **PLAIN}
     first = pcfix.correct_file(cloud[0], tmp_path / "out", **given)
     paths = tiles_in(tmp_path / "out")
     before = [path.stat().st_mtime_ns for path in paths]
@@ -183,7 +186,7 @@ def test_a_broken_tile_does_not_stop_the_others(tmp_path):
     whole = (folder / "tile1.las").read_bytes()
     (folder / "tile1.las").write_bytes(whole[: len(whole) // 2])
     (folder / "tile3.las").write_bytes(b"no cloud")
-    done = run_pcfix("correct", folder, tmp_path / "out", *WORDS)
+    done = run_pcfix("correct", folder, tmp_path / "out", *WORDS, *PLAIN_WORDS)
     assert done.returncode == 1
     head, *failures = done.stderr.splitlines()
     assert "2 of 4 files failed, the others are finished" in head
@@ -196,7 +199,7 @@ def test_a_broken_tile_does_not_stop_the_others(tmp_path):
     done = run_pcfix("label", listed, tmp_path / "labels", "--water", "0.37")
     assert done.stderr.splitlines()[1:] == ["  tiles/tile3.las: there is no such file."]
     (folder / "tile1.las").write_bytes(whole)
-    done = run_pcfix("correct", folder, tmp_path / "out", *WORDS, "--overwrite")
+    done = run_pcfix("correct", folder, tmp_path / "out", *WORDS, *PLAIN_WORDS, "--overwrite")
     assert (done.returncode, done.stderr) == (0, "")
     assert len(records(*tiles_in(tmp_path / "out"))) == 20_000
 
@@ -213,7 +216,7 @@ def test_a_full_disk_leaves_nothing_half_written(cloud, tmp_path, monkeypatch):
             with sink._write_errors():
                 raise OSError(28, "No space left on device")
 
-    given = {"cameras": CAMERAS, "water": 0.37, "method": "snell", "jobs": 1}
+    given = {"cameras": CAMERAS, "water": 0.37, "jobs": 1, **PLAIN}
     wrote_record = tiles.write_counted
 
     def full_for_records(path, note, counted):
@@ -242,7 +245,7 @@ def test_a_result_that_cannot_be_right_leaves_nothing(cloud, tmp_path):
 def test_ctrl_c_is_a_clean_stop_and_the_same_command_goes_on(tmp_path):
     """In processes of its own, as only these are interrupted as a terminal does it."""
     folder, _ = cut(tmp_path / "tiles", 16)
-    out, words = tmp_path / "out", ["--jobs", "2", "--method", "snell", *map(str, WORDS)]
+    out, words = tmp_path / "out", ["--jobs", "2", *PLAIN_WORDS, *map(str, WORDS)]
     command = [sys.executable, "-m", "pcfix", "correct", str(folder), str(out), *words]
     running = subprocess.Popen(
         command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True

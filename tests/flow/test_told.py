@@ -16,7 +16,7 @@ from pcfix.adjust.evidence import EXPORTS, export_of
 from pcfix.flow.adjust_job import usable_ties
 from pcfix.model import Cameras, Lens, Outcome
 from pcfix.report.text import share
-from tests.flow.test_adjust_shared import TIES
+from tests.utils.crops import middle_of
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
@@ -26,6 +26,18 @@ BENT, bent = needs("rendered_c_free")
 TRUE, rendered = needs("rendered_a")
 OFFSET_M = (318700.0, 3851200.0, 0.0)
 LEVEL_M = 0.37
+TIES = 1000
+"""Enough for lines that work; `test_adjust_shared.py` asks how good the block gets."""
+
+
+@pytest.fixture(scope="module")
+def bent_middle(tmp_path_factory):
+    return middle_of(BENT, tmp_path_factory.mktemp("bent"))
+
+
+@pytest.fixture(scope="module")
+def true_middle(tmp_path_factory):
+    return middle_of(TRUE, tmp_path_factory.mktemp("true"))
 
 
 def run_line(line, **instead):
@@ -38,12 +50,13 @@ def run_line(line, **instead):
 
 
 @bent
-def test_each_line_leads_to_the_next(tmp_path, monkeypatch):
+@pytest.mark.usefixtures("undrawn")
+def test_each_line_leads_to_the_next(bent_middle, tmp_path, monkeypatch):
     """From the warning by `pcfix adjust` to the corrected cloud, as printed."""
     monkeypatch.setattr("pcfix.flow.adjust_job.usable_ties", partial(usable_ties, most=TIES))
-    cloud, model, listed = BENT / "cloud.las", BENT / "sparse", BENT / "dense.vis"
+    cloud, listed = bent_middle / "cloud.las", bent_middle / "dense.vis"
     done = run_pcfix(
-        "correct", cloud, tmp_path / "bent.laz", "--cameras", model, "--water", LEVEL_M,
+        "correct", cloud, tmp_path / "bent.laz", "--cameras", BENT / "sparse", "--water", LEVEL_M,
         "--cameras-offset", ",".join(map(str, OFFSET_M)), "--views", listed,
     )  # fmt: skip
     assert "GNSS.csv stands for the positions of the images" in done.stderr
@@ -68,17 +81,18 @@ def test_each_line_leads_to_the_next(tmp_path, monkeypatch):
 
 
 @bent
-def test_a_local_ply_beside_the_list_is_left_out(tmp_path):
+def test_a_local_ply_beside_the_list_is_left_out(bent_middle, tmp_path):
     """As of a dense workspace, shifted to the origin, where the cameras are on the map."""
-    shutil.copy(BENT / "dense.vis", tmp_path)
-    las = laspy.read(BENT / "cloud.las")
+    shutil.copy(bent_middle / "dense.vis", tmp_path)
+    las = laspy.read(bent_middle / "cloud.las")
     local = (np.asarray(las.xyz) - OFFSET_M).astype("<f4")
     axes = "".join(f"property float {axis}\n" for axis in "xyz")
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(local)}\n{axes}end_header\n"
     (tmp_path / "dense.ply").write_bytes(head.encode() + local.tobytes())
     done = run_pcfix(
-        "correct", BENT / "cloud.las", tmp_path / "out.laz", "--cameras", BENT / "cameras.xml",
-        "--water", LEVEL_M, "--views", tmp_path / "dense.vis", "--summary", tmp_path / "it.json",
+        "correct", bent_middle / "cloud.las", tmp_path / "out.laz",
+        "--cameras", BENT / "cameras.xml", "--water", LEVEL_M,
+        "--views", tmp_path / "dense.vis", "--summary", tmp_path / "it.json",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "the PLY file beside it is in another frame" in done.stderr
@@ -153,10 +167,10 @@ def test_neighbours_are_heard_before_a_calibration():
     assert bent.sentence("pcfix adjust").startswith("The poses seem to have absorbed")
 
 
-def told_of(folder, cameras, tmp_path, *more):
+def told_of(cloud, cameras, tmp_path, *more):
     """Return stdout and stderr of a correction, and its summary."""
     done = run_pcfix(
-        "correct", folder / "cloud.las", tmp_path / "out.laz", "--cameras", folder / cameras,
+        "correct", cloud, tmp_path / "out.laz", "--cameras", cameras,
         "--water", LEVEL_M, "--summary", tmp_path / "summary.json", *more,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -165,10 +179,9 @@ def told_of(folder, cameras, tmp_path, *more):
 
 @bent
 @pytest.mark.parametrize("listed", mostly_nightly((False, True), True))
-def test_bent_poses_without_ties_or_gnss_are_noticed(tmp_path, listed):
-    done, found = told_of(
-        BENT, "cameras.xml", tmp_path, *(["--views", BENT / "dense.vis"] if listed else [])
-    )
+def test_bent_poses_without_ties_or_gnss_are_noticed(bent_middle, tmp_path, listed):
+    more = ["--views", bent_middle / "dense.vis"] if listed else []
+    done, found = told_of(bent_middle / "cloud.las", BENT / "cameras.xml", tmp_path, *more)
     assert "The poses seem to have absorbed the refraction" in done.stderr
     assert "--gnss GNSS.csv" in done.stderr
     assert "poses        absorbed the refraction, by neighbours; see the warning" in done.stdout
@@ -179,8 +192,8 @@ def test_bent_poses_without_ties_or_gnss_are_noticed(tmp_path, listed):
 
 
 @rendered
-def test_true_poses_are_said_to_be_right(tmp_path):
-    done, found = told_of(TRUE, "cameras.xml", tmp_path)
+def test_true_poses_are_said_to_be_right(true_middle, tmp_path):
+    done, found = told_of(true_middle / "cloud.las", TRUE / "cameras.xml", tmp_path)
     assert "absorbed" not in done.stderr
     assert "poses        did not absorb the refraction, by neighbours" in done.stdout
     assert found["poses"]["absorbed"] is False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from functools import cache
 from pathlib import Path
 
 import laspy
@@ -38,15 +39,44 @@ def needed(folder):
     return write_half_oblique(folder)
 
 
-def corrected(needed, source, output, **more):
-    return pcfix.correct_file(source, output, **{**needed, **SNELL, "unsure": "withhold", **more})
+@pytest.fixture(scope="module")
+def corrected(folder, needed):
+    """Return a function that corrects the file, once with the same options for all tests.
+
+    It returns the summary and the file, which is to be read only.
+    """
+    usual = {**SNELL, "unsure": "withhold", "uncorrected": "withhold", "dimensions": "all"}
+    known = {}
+
+    def corrected(**more):
+        options = {**usual, **more}
+        key = tuple(sorted(options.items(), key=str))
+        if key not in known:
+            out = folder / f"corrected{len(known)}.las"
+            known[key] = pcfix.correct_file(folder / "cloud.las", out, **needed, **options), out
+        return known[key]
+
+    return corrected
+
+
+@pytest.fixture(scope="module")
+def by_default(folder, needed):
+    """Return a summary and a file as `corrected` does, with the default method."""
+    out = folder / "default.las"
+    return pcfix.correct_file(folder / "cloud.las", out, **needed, unsure="withhold"), out
+
+
+@cache
+def points_of(way, unsure):
+    """Return the points corrected in a way, and what became of each; to be read only."""
+    scene = half_oblique()
+    return pcfix.correct_points(scene.xyz, scene.cameras, scene.water, unsure=unsure, **WAYS[way])
 
 
 @pytest.mark.parametrize("way", WAYS)
 def test_they_are_those_whose_steepest_ray_is_flat(way):
     scene = half_oblique()
-    ask = {**WAYS[way], "unsure": "withhold"}
-    found = pcfix.correct_points(scene.xyz, scene.cameras, scene.water, **ask)
+    found = points_of(way, "withhold")
     cameras = without_border(scene.cameras) if way == "depth maps" else scene.cameras
     expected = found.corrected & seen_flat(scene.xyz, cameras, scene.water)
     np.testing.assert_array_equal(found.unsure, expected)
@@ -55,46 +85,36 @@ def test_they_are_those_whose_steepest_ray_is_flat(way):
 
 @pytest.mark.parametrize("way", WAYS)
 def test_they_are_corrected_as_always(way):
-    scene = half_oblique()
-    keep, withhold = (
-        pcfix.correct_points(scene.xyz, scene.cameras, scene.water, unsure=unsure, **WAYS[way])
-        for unsure in ("keep", "withhold")
-    )
+    keep, withhold = points_of(way, "keep"), points_of(way, "withhold")
     assert keep.unsure is None
     for name in {field.name for field in fields(keep)} - {"unsure"}:
         np.testing.assert_array_equal(getattr(keep, name), getattr(withhold, name), name)
 
 
-def test_with_a_list_nothing_is_unsure(folder, needed, tmp_path):
+def test_with_a_list_nothing_is_unsure(folder, corrected):
     scene = half_oblique()
     found = pcfix.correct_points(
         scene.xyz, scene.cameras, scene.water, views=scene.views, unsure="withhold", **SNELL
     )
     assert found.corrected.any() and not found.unsure.any()
-    told = corrected(
-        needed, folder / "cloud.las", tmp_path / "out.las", views=folder / "fused.ply.vis"
-    )
+    told, _ = corrected(views=folder / "fused.ply.vis")
     assert told.corrected and told.unsure == 0
 
 
-def test_of_a_list_of_some_points_the_others_may_be_unsure(folder, needed, tmp_path):
+def test_of_a_list_of_some_points_the_others_may_be_unsure(corrected, tmp_path):
     views, listed = half_oblique().views, np.arange(3000) % 2 == 0
     start = np.concatenate([[0], np.cumsum(np.where(listed, np.diff(views.start), 0))])
     camera = views.camera[np.repeat(listed, np.diff(views.start))]
     (tmp_path / "fused.ply.vis").write_bytes(colmap_vis(Views(start, camera)))
-    for name, more in (("all", {}), ("some", {"views": tmp_path / "fused.ply.vis"})):
-        corrected(needed, folder / "cloud.las", tmp_path / f"{name}.las", **more)
-    whole, some = (laspy.read(tmp_path / name) for name in ("all.las", "some.las"))
+    given = ({}, {"views": tmp_path / "fused.ply.vis"})
+    whole, some = (laspy.read(corrected(**more)[1]) for more in given)
     np.testing.assert_array_equal(some.Unsure, np.where(listed, 0, whole.Unsure))
 
 
-def test_a_file_has_them_withheld_and_marked(folder, needed, tmp_path):
-    source = folder / "cloud.las"
-    told = corrected(needed, source, tmp_path / "withhold.las")
-    corrected(needed, source, tmp_path / "keep.las", unsure="keep")
-    before, keep, withhold = (
-        laspy.read(path) for path in (source, tmp_path / "keep.las", tmp_path / "withhold.las")
-    )
+def test_a_file_has_them_withheld_and_marked(folder, corrected):
+    told, marked = corrected()
+    kept = corrected(unsure="keep")[1]
+    before, keep, withhold = (laspy.read(path) for path in (folder / "cloud.las", kept, marked))
     cameras = pcfix.read_cameras(folder / "cameras.csv")
     unsure = (keep.RayCount > 0) & seen_flat(before.xyz, cameras, half_oblique().water)
     came = np.array(before.withheld) > 0
@@ -108,50 +128,46 @@ def test_a_file_has_them_withheld_and_marked(folder, needed, tmp_path):
     assert told.unsure == told.as_dict()["unsure"] == unsure.sum() > (unsure & ~came).sum() > 0
 
 
-def test_without_the_option_a_summary_does_not_speak_of_them(folder, needed, tmp_path):
-    told = corrected(needed, folder / "cloud.las", tmp_path / "out.las", unsure="keep")
+def test_without_the_option_a_summary_does_not_speak_of_them(corrected):
+    told, _ = corrected(unsure="keep")
     assert told.unsure is None and "unsure" not in told.as_dict()
     assert "\nunsure" not in summary_text(told)
 
 
 @pytest.mark.parametrize("uncorrected", ["withhold", "keep"])
 @pytest.mark.parametrize("max_angle", [None, 38.0])
-def test_restore_gives_the_file_back(folder, needed, tmp_path, uncorrected, max_angle):
-    source = folder / "cloud.las"
-    told = corrected(
-        needed, source, tmp_path / "out.las", uncorrected=uncorrected, max_angle=max_angle
-    )
+def test_restore_gives_the_file_back(folder, corrected, tmp_path, uncorrected, max_angle):
+    told, out = corrected(uncorrected=uncorrected, max_angle=max_angle)
     assert told.unsure and (max_angle is None or sum(told.uncorrected.values()))
-    pcfix.restore_file(tmp_path / "out.las", tmp_path / "back.las")
-    assert (tmp_path / "back.las").read_bytes() == source.read_bytes()
+    pcfix.restore_file(out, tmp_path / "back.las")
+    assert (tmp_path / "back.las").read_bytes() == (folder / "cloud.las").read_bytes()
 
 
 @pytest.mark.parametrize(("dimensions", "count"), [("minimal", 3), ("none", 0)])
-def test_fewer_dimensions_have_the_same_flags(folder, needed, tmp_path, dimensions, count):
-    corrected(needed, folder / "cloud.las", tmp_path / "all.las")
-    corrected(needed, folder / "cloud.las", tmp_path / "few.las", dimensions=dimensions)
-    whole, few = (laspy.read(tmp_path / name) for name in ("all.las", "few.las"))
+def test_fewer_dimensions_have_the_same_flags(corrected, dimensions, count):
+    given = ({}, {"dimensions": dimensions})
+    whole, few = (laspy.read(corrected(**more)[1]) for more in given)
     np.testing.assert_array_equal(whole.withheld, few.withheld)
     names = list(few.point_format.extra_dimension_names)
     assert len(names) == count and ("Unsure" in names) == (count > 0)
 
 
 @pytest.mark.parametrize("unsure", ["keep", "withhold"])
-def test_the_note_on_them_advises_the_option(folder, needed, tmp_path, unsure):
-    source = folder / "cloud.las"
-    told = pcfix.correct_file(source, tmp_path / "a.las", **needed, unsure=unsure)
+def test_the_note_on_them_advises_the_option(folder, needed, by_default, tmp_path, unsure):
+    told, source = by_default[0], folder / "cloud.las"
+    if unsure == "keep":
+        told = pcfix.correct_file(source, tmp_path / "a.las", **needed, unsure=unsure)
     (note,) = (one for one in told.warnings if "seen by flat obliques alone, every ray" in one)
     assert note.endswith(", --unsure withhold flags them.") == (unsure == "keep")
 
 
-def test_command_line_and_python_give_the_same_file(folder, needed, tmp_path):
-    source = folder / "cloud.las"
-    told = pcfix.correct_file(source, tmp_path / "a.las", **needed, unsure="withhold")
+def test_command_line_and_python_give_the_same_file(folder, needed, by_default, tmp_path):
+    told, source = by_default[0], folder / "cloud.las"
     words = [word for name, value in needed.items() for word in ("--" + name, value)]
     done = run_pcfix("correct", source, tmp_path / "b.las", *words, "--unsure", "withhold")
     assert done.returncode == 0, done.stderr
     assert f"unsure       {told.unsure:,} (27 % of the corrected): seen by" in done.stdout
-    assert (tmp_path / "a.las").read_bytes() == (tmp_path / "b.las").read_bytes()
+    assert by_default[1].read_bytes() == (tmp_path / "b.las").read_bytes()
 
 
 def test_a_whole_run_has_the_option():
