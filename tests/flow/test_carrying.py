@@ -318,6 +318,7 @@ def test_a_run_keeps_it(tmp_path):
     done = run_pcfix(
         "run", "-q", scene / "cloud.laz", tmp_path / "a", "--water", "0.37",
         "--cameras", scene / "cameras.csv", "--adjusted-from", scene / "cameras.csv",
+        "--method", "snell",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     record = tmp_path / "a" / "run.json"

@@ -119,7 +119,8 @@ def test_bar_on_a_terminal(scene, tmp_path):
 
     reader = threading.Thread(target=read)  # meanwhile: a terminal that nobody reads is soon full
     reader.start()
-    words = ("--cameras", scene / "cameras.csv", "--water", "0.37", "--quiet")
+    words = ("--cameras", scene / "cameras.csv", "--water", "0.37", "--method", "snell")
+    words += ("--dimensions", "minimal", "--quiet")
     for quiet in (words, words[:-1]):
         done = subprocess.run(
             [sys.executable, "-m", "pcfix", "correct", str(scene / "cloud.laz"),

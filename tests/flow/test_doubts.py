@@ -55,14 +55,13 @@ OFF = (
 
 @pytest.mark.parametrize(("cloud", "told"), mostly_nightly(OFF, OFF[0], OFF[4]), ids=str)
 def test_a_method_that_is_off_says_so(cloud, told):
-    settings = OBLIQUE if cloud == "tracks" else BLOCK
-    scene = scene_of(cloud, **settings)
+    scene = scene_of(cloud, points=8000, **OBLIQUE) if cloud == "tracks" else scene_of(cloud)
     points = (scene.apparent_xyz, scene.cameras, scene.water)
     assert covered(scene, pcfix.correct_points(*points, **told)) >= 0.90
 
 
 def test_a_list_of_another_kind_than_told_says_so():
-    scene = scene_of("pairs")
+    scene = scene_of("pairs", points=8000)
     as_tracks = replace(scene.views, kind="tracks")
     found = pcfix.correct_points(scene.apparent_xyz, scene.cameras, scene.water, views=as_tracks)
     assert covered(scene, found) >= 0.90
@@ -123,7 +122,7 @@ def test_clouds_that_were_merged_are_told_apart(tmp_path):
         assert np.sqrt(np.mean(error**2)) < 1.1 * np.sqrt(np.mean(least**2))
 
 
-@pytest.mark.parametrize("cloud", ["depth-maps", pytest.param("tracks", marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("cloud", mostly_nightly(("depth-maps", "tracks"), "tracks"))
 def test_a_cloud_too_large_for_an_even_sample_is_told(cloud, tmp_path, monkeypatch):
     """As if it were hundreds of times as large: few of its points are looked at."""
     scene = scene_of(cloud, points=16_000)

@@ -16,6 +16,7 @@ import rasterio
 import pcfix
 from pcfix.io.tiles import tiles_of
 from pcfix.options.correct import CorrectOptions
+from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
 from tests.utils.tiles import SCENE, cut, finished, records, write
 
@@ -59,7 +60,7 @@ def test_the_default_method_learns_of_all_tiles_as_of_one_cloud(corrected):
     assert figures(one) == figures(many)
 
 
-@pytest.mark.parametrize(("count", "jobs"), [(3, 2), (2, 1)])
+@pytest.mark.parametrize(("count", "jobs"), mostly_nightly(((3, 2), (2, 1)), (3, 2)))
 def test_neither_the_number_of_tiles_nor_of_jobs_counts(count, jobs, tmp_path):
     folder, merged = cut(tmp_path / "tiles", count)
     given = {"cameras": CAMERAS, "water": 0.37, "method": "snell", "uncorrected": "drop"}
