@@ -25,7 +25,7 @@ class River:
     """A level scene turned by 0.3 %: then its water is a tilted plane, and all else is exact."""
 
     def __init__(self):
-        scene = pcfix.simulate_scene(6000, seed=11)
+        scene = pcfix.simulate_scene(3000, seed=11)
         pivot = np.array([410_260.0, 4_650_340.0, LEVEL_M])
         turn = Rotation.from_euler("y", -np.arctan(TILT)).as_matrix()
 
