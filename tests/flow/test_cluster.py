@@ -15,7 +15,7 @@ from tests.utils.program import run_pcfix
 from tests.utils.tiles import SCENE, cut, finished, records
 
 CAMERAS = SCENE / "cameras.csv"
-GIVEN = {"cameras": CAMERAS, "water": 0.37, "method": "snell", "dimensions": "minimal"}
+GIVEN = {"cameras": CAMERAS, "water": 0.37, "method": "snell"}
 
 
 def started(folder, program, *words):
