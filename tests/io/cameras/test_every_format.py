@@ -56,10 +56,14 @@ class Scene(NamedTuple):
 
 
 def corrected(cloud, out, options):
-    """Return coordinates and ray counts of a corrected file, and what was warned of."""
+    """Return coordinates and ray counts of a corrected file, and what was warned of.
+
+    The other dimensions, which take longer, are left out unless they are asked for.
+    """
+    how = {"method": "snell", "max_angle": None, "dimensions": "minimal", **options}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", pcfix.PcfixWarning)
-        pcfix.correct_file(cloud, out, **{"method": "snell", "max_angle": None, **options})
+        pcfix.correct_file(cloud, out, **how)
     las = laspy.read(out)
     said = [str(w.message) for w in caught if issubclass(w.category, pcfix.PcfixWarning)]
     return np.asarray(las.xyz), np.asarray(las.RayCount), said
