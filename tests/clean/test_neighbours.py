@@ -14,9 +14,10 @@ from tests.clean.scenes import spoilt_scene
 from tests.utils.nightly import mostly_nightly
 
 K = 12
+FEW, OUTLIERS = 15_000, 75
 
 
-def _clustered(n: int = 900) -> np.ndarray:
+def _clustered(n: int = 500) -> np.ndarray:
     """Clusters of many densities in UTM, with one point at the origin of the coordinates."""
     rng = np.random.default_rng(2)
     centres = rng.uniform(0.0, 50.0, (9, 3))
@@ -85,7 +86,7 @@ def test_tiles_hold_every_used_point_once() -> None:
 
 
 def test_blocks_of_rows_do_not_change_the_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    xyz, used = _clustered(), np.ones(900, bool)
+    xyz, used = _clustered(), np.ones(500, bool)
     whole = make_tiles(xyz, used, 4.0)
     monkeypatch.setattr("pcfix.blocks.ROWS", 77)
     cut = make_tiles(xyz, used, 4.0)
@@ -104,7 +105,7 @@ def test_points_over_each_other_are_bounded(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize("tile_m", mostly_nightly([8.0, 31.0, 400.0], 8.0))
 def test_reasons_do_not_depend_on_tiles(tile_m: float) -> None:
-    s = spoilt_scene()
+    s = spoilt_scene(FEW, OUTLIERS)
     settings = CleanRules(deviations=2.0, radius=1.0)
     whole = clean_points(s.xyz, water=s.water_level_m, settings=settings)
     cut = clean_points(s.xyz, water=s.water_level_m, settings=settings, tile_m=tile_m, jobs=1)
@@ -116,7 +117,7 @@ def test_reasons_do_not_depend_on_tiles(tile_m: float) -> None:
 @pytest.mark.parametrize("deviations", mostly_nightly([0.5, 2.0, 4.0], 2.0))
 @pytest.mark.parametrize("k", [8, 20])
 def test_statistical_outliers_are_those_of_open3d(deviations: float, k: int) -> None:
-    o3d, xyz = load_open3d(), spoilt_scene().xyz
+    o3d, xyz = load_open3d(), spoilt_scene(FEW, OUTLIERS).xyz
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz))
     _, kept = cloud.remove_statistical_outlier(k, deviations)
     settings = CleanRules(neighbours=k, deviations=deviations, below=None, floating=None)
@@ -127,7 +128,7 @@ def test_statistical_outliers_are_those_of_open3d(deviations: float, k: int) -> 
 
 @pytest.mark.parametrize(("radius", "least"), [(0.6, 1), (1.0, 6)])
 def test_radius_outliers_are_those_of_open3d(radius: float, least: int) -> None:
-    o3d, xyz = load_open3d(), spoilt_scene().xyz
+    o3d, xyz = load_open3d(), spoilt_scene(FEW, OUTLIERS).xyz
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz))
     _, kept = cloud.remove_radius_outlier(least, radius)  # it counts the point itself
     settings = CleanRules(

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import random
 import signal
-import subprocess
-import sys
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -53,24 +51,22 @@ def commands(inputs):
 
 
 @pytest.fixture(scope="module")
-def whole(commands, tmp_path_factory):
-    """What the commands leave when nothing happens, by the name of the file."""
-    out = tmp_path_factory.mktemp("whole")
-    for arguments, _ in commands.values():
-        done = subprocess.run(
-            [sys.executable, "-m", "pcfix", *at(arguments, out)], capture_output=True, text=True
-        )
-        assert done.returncode == 0, done.stderr
-    return {path.name: path.read_bytes() for path in out.iterdir()}
-
-
-@pytest.fixture(scope="module")
 def zygote(commands, tmp_path_factory):
     out = tmp_path_factory.mktemp("loaded")
     with Zygote(
         out / "log.txt", *(at(arguments, out) for arguments, _ in commands.values())
     ) as found:
         yield found
+
+
+@pytest.fixture(scope="module")
+def whole(commands, zygote, tmp_path_factory):
+    """What the commands leave when nothing happens, by the name of the file."""
+    out = tmp_path_factory.mktemp("whole")
+    for arguments, _ in commands.values():
+        zygote.start(at(arguments, out))
+        assert zygote.wait() == 0, zygote.said
+    return {path.name: path.read_bytes() for path in out.iterdir()}
 
 
 def at(arguments, out):

@@ -83,6 +83,8 @@ def _serve() -> None:
 
     for arguments in json.loads(sys.argv[1]):
         main(arguments)
+    gc.collect()
+    gc.freeze()  # what is loaded is not searched again at the end of each child
     # a child is not stopped before it runs the command
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     for number in ENDING:
