@@ -12,6 +12,7 @@ import pytest
 
 import pcfix
 from pcfix import PcfixError, SettingError
+from pcfix.flow.plausibility import CloudSample
 from pcfix.io.las import copc, part
 from pcfix.io.las.part import Box, cloud_part
 from pcfix.io.las.source import LasSource
@@ -33,9 +34,18 @@ from tests.utils.program import run_pcfix
 from tests.utils.real_pdal import needs_pdal, pdal
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 LEAF, CELLS = 100, 2
+
+
+@pytest.fixture(scope="module", autouse=True)
+def level_as_given() -> Iterator[None]:
+    """Points at random show no level; to look for one there takes longer than to correct them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(CloudSample, "level_doubts", lambda sample: ())
+        yield
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import re
 import struct
 from fractions import Fraction
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import laspy
 import numpy as np
@@ -16,6 +16,7 @@ from laspy.vlrs.vlrlist import VLRList
 import pcfix
 from pcfix import PcfixError
 from pcfix.errors import GeometryError
+from pcfix.flow.plausibility import CloudSample
 from pcfix.io.las.columns import COLUMNS, UNSURE, UPGRADE
 from tests.utils.beyond_frames import BEYOND_FRAMES, DEEP
 from tests.utils.clouds import (
@@ -39,6 +40,9 @@ from tests.utils.clouds import (
     write_cloud,
     xyz_of,
 )
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 pytestmark = [BEYOND_FRAMES, DEEP]
 
@@ -96,6 +100,14 @@ def rays_in_frame(xyz: np.ndarray, cameras: Cameras) -> np.ndarray:
     to_camera = cameras.centres - xyz[:, None]
     reach = to_camera[..., 2:] * [0.5, 0.2]
     return (np.abs(to_camera[..., :2]) <= reach).all(axis=2).sum(axis=1)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def level_as_given() -> Iterator[None]:
+    """Points at random show no level; to look for one there takes longer than to correct them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(CloudSample, "level_doubts", lambda sample: ())
+        yield
 
 
 @pytest.fixture(
