@@ -262,8 +262,15 @@ def test_fills_are_marked(tmp_path):
     )
 
 
+@pytest.fixture(scope="module")
+def corrected(tmp_path_factory):
+    path = tmp_path_factory.mktemp("scene") / "corrected.laz"
+    pcfix.correct_file(SCENE / "cloud.laz", path, cameras=SCENE / "cameras.csv", water=0.37)
+    return path
+
+
 @pytest.mark.parametrize(("method", "fill"), [("mean", None), ("tin", None), ("mean", 1.5)])
-def test_the_scene_against_its_truth(tmp_path, method, fill):
+def test_the_scene_against_its_truth(corrected, tmp_path, method, fill):
     """A DSM of the corrected cloud is that of the true one.
 
     Corrected points lie where true ones do to within the image noise of 0.5 px, which the scene's
@@ -271,8 +278,6 @@ def test_the_scene_against_its_truth(tmp_path, method, fill):
     with 8 points of a slope of 1 in 8 a point that changes cells adds a few more, so half of the
     cells must agree to 1 cm, and 99 of 100 to 10 cm; uncorrected, the bed is metres too high.
     """
-    corrected = tmp_path / "corrected.laz"
-    pcfix.correct_file(SCENE / "cloud.laz", corrected, cameras=SCENE / "cameras.csv", water=0.37)
     inputs = {"ours": corrected, "truth": SCENE / "truth.laz", "apparent": SCENE / "cloud.laz"}
     found = {}
     for name, path in inputs.items():
