@@ -159,7 +159,7 @@ def _layers(point_format: Any) -> int:
 
 
 def _table(path: Path, header: Any, vlrs: Any) -> _Table | None:
-    """Return what the table of chunks says; None where the file has none, or is cut short."""
+    """Return what the table of chunks says; None where the file has none."""
     vlr = next((v for v in vlrs if v.user_id == "laszip encoded"), None)
     if vlr is None or not header.are_points_compressed:
         return None
@@ -175,6 +175,8 @@ def _table(path: Path, header: Any, vlrs: Any) -> _Table | None:
             stream.seek(max(size - 8, 0))
             (place,) = _unpacked("<q", stream.read(8)) or (0,)
         if not start + 8 <= place <= size - 8:
+            if header.point_count:  # its reader would take gigabytes before it says so
+                raise ValueError(f"its table of chunks would begin at byte {place:,} of {size:,}")
             return None
         stream.seek(place + 4)
         (count,) = _unpacked("<I", stream.read(4)) or (0,)
