@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 import pcfix
 from pcfix.errors import SettingError
 from pcfix.options.scenes import SimulateOptions
+from pcfix.simulate.hsu_wang import simulate_bowl
 from pcfix.simulate.refraction_effect import (
     SWINGLETCAM,
     ULTRACAM,
@@ -124,6 +126,13 @@ def run(*words):
     return run_pcfix("simulate", *words)
 
 
+@pytest.fixture
+def bowl(monkeypatch):
+    """A bowl of few points beside the pair, whose figures tests/papers looks at."""
+    monkeypatch.setattr("pcfix.flow.papers.simulate_bowl", partial(simulate_bowl, 0.01))
+
+
+@pytest.mark.usefixtures("bowl")
 def test_command_writes_tables_and_pictures(tmp_path):
     done = run(tmp_path / "out", "--refraction-effect")
     assert done.returncode == 0, done.stderr
@@ -144,6 +153,7 @@ def test_command_writes_tables_and_pictures(tmp_path):
     assert again.returncode != 0 and "--overwrite" in again.stderr
 
 
+@pytest.mark.usefixtures("bowl")
 def test_command_takes_a_camera_of_ones_own(tmp_path):
     """With no refraction at all, so that the maps have to draw a level error too."""
     camera = "--effect-focal-mm 8.8 --effect-frame-px 5472x3648 --effect-pixel-um 2.41"
