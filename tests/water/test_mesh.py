@@ -67,17 +67,16 @@ def test_slow_search_over_all_facets_agrees():
 def first_hit(corners, centre, point):
     """Return where the line meets the mesh, and the normal, by trying every triangle."""
     ray = point - centre
-    for triangle in corners:
-        normal = np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
-        normal = normal / np.linalg.norm(normal) * np.sign(normal[2])
-        at = centre + ray * ((triangle[0] - centre) @ normal) / (ray @ normal)
-        sides = [
-            np.cross(triangle[(i + 1) % 3] - triangle[i], at - triangle[i]) @ normal
-            for i in range(3)
-        ]
-        if min(sides) >= -1e-12 or max(sides) <= 1e-12:
-            return at, normal
-    raise AssertionError("the line misses the mesh")
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal *= (np.sign(normal[:, 2]) / np.linalg.norm(normal, axis=1))[:, None]
+    far = ((corners[:, 0] - centre) * normal).sum(axis=1) / (normal @ ray)
+    at = centre + far[:, None] * ray
+    around = np.cross(np.roll(corners, -1, axis=1) - corners, at[:, None] - corners)
+    sides = (around * normal[:, None]).sum(axis=2)
+    hit = (sides >= -1e-12).all(axis=1) | (sides <= 1e-12).all(axis=1)
+    assert hit.any(), "the line misses the mesh"
+    first = np.flatnonzero(hit)[0]
+    return at[first], normal[first]
 
 
 def test_vertical_and_degenerate_facets_are_ignored():
