@@ -1,5 +1,7 @@
 """The water surface from the cloud alone: against made-up shores, real clouds, and nothing."""
 
+from functools import cache
+
 import laspy
 import numpy as np
 import pytest
@@ -30,9 +32,15 @@ def shore(n=30_000, *, slope=0.06, tilt=0.0, noise_m=0.01, bumps_m=0.04, seed=0)
     return xyz, ground * fading
 
 
+@cache
+def found_of(tilt=0.0):
+    """Return the water of a shore with colours, which several tests look at."""
+    xyz, rgb = shore(tilt=tilt)
+    return find_water(xyz, rgb=rgb)
+
+
 def test_level_of_a_shore_with_colours():
-    xyz, rgb = shore()
-    found = find_water(xyz, rgb=rgb)
+    found = found_of()
     assert found.surface.b == found.surface.c == 0.0
     assert abs(found.level_m - LEVEL_M) < 0.05  # m: the aim of a few centimetres
     assert abs(found.level_m - LEVEL_M) < 3.0 * found.sigma_level_m
@@ -48,8 +56,7 @@ def test_refraction_alone_is_seen_by_its_size():
 
 
 def test_tilt_of_a_river():
-    xyz, rgb = shore(tilt=0.004)
-    found = find_water(xyz, rgb=rgb)
+    found = found_of(0.004)
     along = found.shoreline[:, 1] - NORTH_M
     error = found.level_m + (found.shoreline[:, :2] - found.centre_xy) @ found.tilt
     assert found.tilt[1] == pytest.approx(0.004, abs=4.0 * found.sigma_tilt)
@@ -69,7 +76,7 @@ def test_floating_points_fix_the_level():
 
 def test_same_cloud_gives_same_bits_and_shifts_along():
     xyz, rgb = shore()
-    first, again = find_water(xyz, rgb=rgb), find_water(xyz, rgb=rgb)
+    first, again = found_of(), find_water(xyz, rgb=rgb)
     raised = find_water(xyz + np.array([0.0, 0.0, 100.0]), rgb=rgb)
     assert first.surface == again.surface and first.sigma_level_m == again.sigma_level_m
     assert raised.level_m == pytest.approx(first.level_m + 100.0, abs=1e-6)
@@ -90,9 +97,8 @@ def test_noise_classes_are_left_out():
     bad = np.array([[EAST_M, NORTH_M, 900.0], [EAST_M, NORTH_M, -900.0]])
     classes = np.r_[np.full(len(xyz), 1), 18, 7]
     colours = np.vstack([rgb, rgb[:2]])
-    clean = find_water(xyz, rgb=rgb)
     found = find_water(np.vstack([xyz, bad]), rgb=colours, classes=classes)
-    assert found.surface == clean.surface
+    assert found.surface == found_of().surface
 
 
 @pytest.mark.parametrize("offset_m", [+5.0, -12.0])
@@ -157,8 +163,7 @@ def test_amplitude_of_a_break_is_that_of_least_squares():
 
 
 def test_the_picture_is_drawn(tmp_path):
-    xyz, rgb = shore(tilt=0.004)
-    figure = shoreline_figure(find_water(xyz, rgb=rgb))
+    figure = shoreline_figure(found_of(0.004))
     figure.savefig(tmp_path / "shoreline.png")
     assert (tmp_path / "shoreline.png").stat().st_size > 20_000
     assert "Water" in figure.get_suptitle()

@@ -1,6 +1,7 @@
 """The water surface from shoreline points: planes, levels, rivers, and points without heights."""
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -95,10 +96,16 @@ def test_many_points_use_a_sample_only_to_start():
     assert fit.sigma_m == pytest.approx(0.025, rel=0.02)
 
 
+@cache
+def as_they_came():
+    points = reach(7, n=20)[0]
+    return points, fit_water(points)
+
+
 @given(st.permutations(range(20)))
 def test_the_order_of_points_does_not_matter(order):
-    points = reach(7, n=20)[0]
-    one, other = fit_water(points), fit_water(points[order])
+    points, one = as_they_came()
+    other = fit_water(points[order])
     assert one.surface == other.surface
     assert np.array_equal(one.residual_m[order], other.residual_m)
 
@@ -395,8 +402,8 @@ def drawn_by_hand(seed, folder, every_m=30.0, off_m=0.3):
 def test_a_drawn_line_is_worth_its_vertices(tmp_path):
     """Of 300 points along it 11 were drawn: its standard error is theirs."""
     level, sigma, naive = [], [], []
-    for seed in range(60):
-        xyz, counts = drawn_by_hand(seed, tmp_path)
+    drawn = [drawn_by_hand(seed, tmp_path) for seed in range(60)]
+    for xyz, counts in drawn:
         fit = fit_water(xyz, model="level", counts=counts)
         level.append(fit.level_m)
         sigma.append(fit.sigma_level_m)
@@ -404,10 +411,7 @@ def test_a_drawn_line_is_worth_its_vertices(tmp_path):
     error, said = np.sqrt(np.mean(np.square([level, sigma]), axis=1))
     assert 0.75 < error / said < 1.3  # of 60: a standard deviation of 0.09
     assert error / np.mean(naive) > 4.0
-    with_tilt = sum(
-        fit_water(xyz, counts=counts).model != "level"
-        for xyz, counts in (drawn_by_hand(seed, tmp_path) for seed in range(15))
-    )
+    with_tilt = sum(fit_water(xyz, counts=counts).model != "level" for xyz, counts in drawn[:15])
     assert with_tilt <= 3  # of 15 at 5 %: more in 1 of 100 cases
 
 
