@@ -377,6 +377,26 @@ def test_names_that_laspy_cannot_decode_are_refused(tmp_path: Path) -> None:
     _check_refused(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("found", "ahead", "other", "says"),
+    [
+        (b'"steps":[0', 9, b"7", "own VLR is damaged"),
+        (b'"identity":"', 12, b"\xff", "own VLR is damaged"),
+        (b"ShiftZ\0", -2, b"\x03", "ShiftZ is uint16, not int16 or int32: another program"),
+    ],
+    ids=["step", "identity", "type"],
+)
+def test_what_would_lead_to_another_cloud_is_not_restored(
+    tmp_path: Path, found: bytes, ahead: int, other: bytes, says: str
+) -> None:
+    output = tmp_path / "output.las"
+    correct(write_cloud(tmp_path / "cloud.las", 7), output)
+    patched(output, output.read_bytes().index(found) + ahead, other)
+    with pytest.raises(PcfixError, match=says):
+        pcfix.restore_file(output, tmp_path / "back.las")
+    assert not (tmp_path / "back.las").exists()
+
+
 def _check_refused(folder: Path) -> None:
     with pytest.raises(PcfixError, match=r"cloud\.las.*export"):
         correct(folder / "cloud.las", folder / "output.las")
