@@ -67,6 +67,7 @@ PACKED = {
     "chunks of one point": (of_chunks("size", "<I", 1), "2,500 points in 1 chunks of 1"),
     "records of no items": (of_chunks("items", "<H", 0), "those that are packed 0"),
     "records of more bytes": (of_chunks("item", "<H", 157), "those that are packed"),
+    "chunks of a billion": (of_chunks("size", "<I", 2**30), "chunks of 1,073,741,824 points, and"),
     "table far away": (of_chunks("table", "<q", 2**62), "begin at byte 4,611,686,018,427,387,904"),
     "table before the file": (of_chunks("table", "<q", -5), "is damaged"),
     "table nowhere": (of_chunks("table", "<q", -1), "is damaged"),

@@ -19,6 +19,8 @@ _LAYERED = 3
 """The compressor that packs the dimensions of a chunk apart, from point format 6 on."""
 _LAYERS = 9
 """So many for each point of format 6; colours, infrared and waveforms have one each."""
+_MOST_EMPTY_BYTES = 2**28
+"""Of a chunk that is larger than the cloud: memory is taken for all of its points."""
 
 
 def check_count(path: Path, header: Any, vlrs: Any, stated: int) -> None:
@@ -102,6 +104,11 @@ def check_chunks(path: Path, header: Any, vlrs: Any) -> None:
         )
     if table.points == 0:
         raise ValueError("its chunks have no points")
+    chunk_bytes = 0 if table.points == _VARIABLE_CHUNKS else table.points * packed
+    if table.points > header.point_count and chunk_bytes > _MOST_EMPTY_BYTES:
+        raise ValueError(
+            f"it states chunks of {table.points:,} points, and has {header.point_count:,}"
+        )
     if table.chunks * header.point_format.size > max(table.size, 0):
         raise ValueError(f"it states {table.chunks:,} chunks of points in {table.size:,} bytes")
     if table.chunks * table.points < header.point_count:
