@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.utils.nightly import mostly_nightly
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -65,7 +67,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @linux
-@pytest.mark.parametrize("way", ["two", "error", "killed"])
+@pytest.mark.parametrize("way", mostly_nightly(["two", "error", "killed"], "two", "killed"))
 def test_it_says_nothing_and_changes_nothing(way: str, alone: str, tmp_path: Path) -> None:
     assert said(way, tmp_path / way) == alone
 

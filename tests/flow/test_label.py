@@ -184,6 +184,7 @@ def test_without_choices_a_correction_says_nothing_of_them(tmp_path):
     (vlr,) = [v for v in laspy.read(tmp_path / "out.las").vlrs if v.user_id == "pcfix"]
     assert set(json.loads(vlr.record_data)) == {
         "pcfix", "settings", "water", "water_plane", "cameras", "cameras_source", "views", "before",
+        "sha256",
     }  # fmt: skip
 
 

@@ -292,7 +292,9 @@ def test_another_request_does_not_replace_a_run_unasked(copied):
     ("more", "first", "changed"),
     [
         (["--project", "Lake <2>", "--date", "2024-06-01"], "report", "--project, --date"),
-        (["--sigma-reference", "0.05"], "compare", "--sigma-reference"),
+        pytest.param(
+            ["--sigma-reference", "0.05"], "compare", "--sigma-reference", marks=pytest.mark.nightly
+        ),
         (["--resolution", "2"], "dsm", "--resolution"),
     ],
 )

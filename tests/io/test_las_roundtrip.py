@@ -112,8 +112,16 @@ def level_as_given() -> Iterator[None]:
 
 @pytest.fixture(
     scope="module",
-    params=[(number, suffix) for number in range(11) for suffix in (".las", ".laz")],
-    ids=lambda p: f"format{p[0]}{p[1]}",
+    # of each format the file or the packed one, by turns; the others at night
+    params=[
+        pytest.param(
+            (number, suffix),
+            id=f"format{number}{suffix}",
+            marks=() if (number + packed) % 2 else pytest.mark.nightly,
+        )
+        for number in range(11)
+        for packed, suffix in enumerate((".las", ".laz"))
+    ],
 )
 def trip(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Trip:
     number, suffix = request.param

@@ -30,6 +30,7 @@ from tests.utils.consistent_twin import (
     seen_through_water,
     triangulated_straight,
 )
+from tests.utils.nightly import mostly_nightly
 from tests.utils.twins import image_slowly
 
 UTM = np.array([512_345.0, 4_987_654.0, 0.0])
@@ -313,7 +314,7 @@ def noisy(block):
     return cameras, truth, apparent, views, floor
 
 
-@pytest.mark.parametrize("scene", ["nadir", "oblique", "river"])
+@pytest.mark.parametrize("scene", mostly_nightly(["nadir", "oblique", "river"], "oblique"))
 def test_noise_floor(scene):
     cameras, truth, apparent, views, floor = noisy("nadir" if scene == "nadir" else "oblique")
     turn, plane = np.eye(3), (0.0, 0.0, 0.0)

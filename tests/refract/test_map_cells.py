@@ -42,7 +42,7 @@ def both(part):
 
 
 @pytest.mark.parametrize("with_list", [True, False], ids=["list", "no list"])
-@pytest.mark.parametrize("block", mostly_nightly(BLOCKS, "half oblique"))
+@pytest.mark.parametrize("block", mostly_nightly(BLOCKS, "nadir"))
 def test_maps_of_neighbours_are_as_alone(block, with_list):
     part, views, gsd_m = batch(block)
     if with_list:  # which is slow alone: a sixth of the area
