@@ -272,7 +272,8 @@ def _stations(xy: FloatArray) -> tuple[FloatArray, float]:
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 
-    edges, shape = _edges(xy), (len(xy), len(xy))
+    # the trees of scipy 1.11 take whole numbers of 32 bits alone
+    edges, shape = _edges(xy).astype(np.int32), (len(xy), len(xy))
     length = np.hypot(*(xy[edges[:, 0]] - xy[edges[:, 1]]).T)
     tree = minimum_spanning_tree(csr_array((length, edges.T), shape=shape))
     reach = REACH * float(tree.data.max())
