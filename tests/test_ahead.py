@@ -67,7 +67,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @linux
-@pytest.mark.parametrize("way", mostly_nightly(["two", "error", "killed"], "two", "killed"))
+@pytest.mark.parametrize("way", mostly_nightly(["two", "error", "killed"], "killed"))
 def test_it_says_nothing_and_changes_nothing(way: str, alone: str, tmp_path: Path) -> None:
     assert said(way, tmp_path / way) == alone
 

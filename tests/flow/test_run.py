@@ -479,6 +479,7 @@ def test_a_run_over_tiles_is_that_of_one_file(finished, tiled, tmp_path):
     assert found.summary.points == 20_000
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_without_reference_and_vectors_there_is_a_report_all_the_same(tmp_path, monkeypatch):
     request = Request(
         input=str(SCENE / "cloud.laz"), cameras=str(SCENE / "cameras.csv"), water="0.37"
@@ -499,6 +500,7 @@ def test_without_reference_and_vectors_there_is_a_report_all_the_same(tmp_path, 
     assert not (tmp_path / "out" / "compare").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_check_points_as_reference(tmp_path):
     lidar = laspy.read(SCENE / "lidar.laz")
     rows = np.random.default_rng(2).choice(len(lidar), 300, replace=False)

@@ -13,6 +13,7 @@ from pcfix.grid.model import hillshade
 from pcfix.io.rasters import read_raster
 from tests.grid.clouds import EAST, NORTH, SCALE, scattered, write
 from tests.grid.twins import exact, slow_hillshade, slow_raster
+from tests.utils.nightly import mostly_nightly
 
 METHODS = ("mean", "median", "min", "max", "idw", "tin")
 
@@ -28,10 +29,12 @@ def cloud(tmp_path_factory):
     return write(tmp_path_factory.mktemp("cells") / "cloud.las", xyz), xyz
 
 
+KINDS = [(m, r) for m in METHODS for r in ("1", "0.7", "0.1") if (m, r) != ("tin", "0.1")]
+
+
 @pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
 @pytest.mark.parametrize(
-    ("method", "resolution"),
-    [(m, r) for m in METHODS for r in ("1", "0.7", "0.1") if (m, r) != ("tin", "0.1")],
+    ("method", "resolution"), mostly_nightly(KINDS, *((m, r) for m, r in KINDS if r != "0.7"))
 )
 def test_every_cell(cloud, tmp_path, method, resolution):
     path, xyz = cloud

@@ -78,7 +78,7 @@ def assert_same(one: Path, other: Path) -> None:
 
 @needs_pdal
 @pytest.mark.parametrize("door", ["program", "python"])
-@pytest.mark.parametrize("number", mostly_nightly([0, 1, 2, 3, 6, 7, 8], 3, 7))
+@pytest.mark.parametrize("number", mostly_nightly([0, 1, 2, 3, 6, 7, 8], 7))
 def test_stage_and_command_line_agree(tmp_path: Path, number: int, door: str) -> None:
     write_cloud(tmp_path / "cloud.las", number, plain=True)
     cameras_csv(tmp_path / "cameras.csv", framed_block(), angles=True)
@@ -98,15 +98,18 @@ def test_stage_and_command_line_agree(tmp_path: Path, number: int, door: str) ->
     assert_same(tmp_path / "cli.las", tmp_path / "stage.las")
 
 
+CALLS = (
+    {"uncorrected": "drop", "max_angle": 20.0},
+    {"uncorrected": "keep", "max_cameras": 3, "index": 1.333},
+    {"dimensions": "minimal", "jobs": 1},
+    {"dimensions": "none"},
+)
+
+
 @needs_pdal
 @pytest.mark.parametrize(
     "more",
-    [
-        {"uncorrected": "drop", "max_angle": 20.0},
-        {"uncorrected": "keep", "max_cameras": 3, "index": 1.333},
-        {"dimensions": "minimal", "jobs": 1},
-        {"dimensions": "none"},
-    ],
+    mostly_nightly(CALLS, CALLS[0], CALLS[1]),
     ids=lambda more: " ".join(map(str, more.values())),
 )
 def test_any_call_has_its_pipeline(tmp_path: Path, more: dict[str, Any]) -> None:
@@ -162,7 +165,7 @@ def test_dimensions_of_the_input_go_through(tmp_path: Path) -> None:
 
 
 @needs_pdal
-@pytest.mark.parametrize("door", ["program", "python"])
+@pytest.mark.parametrize("door", mostly_nightly(["program", "python"], "python"))
 def test_water_of_a_dimension(tmp_path: Path, door: str) -> None:
     las = random_cloud(7, plain=True)
     las.add_extra_dim(laspy.ExtraBytesParams("w_surf", "float64"))
@@ -180,7 +183,7 @@ def test_water_of_a_dimension(tmp_path: Path, door: str) -> None:
 
 
 @needs_pdal
-@pytest.mark.parametrize("door", ["program", "python"])
+@pytest.mark.parametrize("door", mostly_nightly(["program", "python"], "program"))
 def test_libraries_of_pcfix_and_of_pdal_live_in_one_process(tmp_path: Path, door: str) -> None:
     """Two PROJ or GDAL libraries in a process have crashed the program at its exit."""
     pytest.importorskip("rasterio")
@@ -466,7 +469,7 @@ def mistaken_job(folder: Path, options: dict[str, Any]) -> list[Any]:
 
 
 @needs_pdal
-@pytest.mark.parametrize("case", MISTAKES)
+@pytest.mark.parametrize("case", mostly_nightly(MISTAKES, "a value", "water too low"))
 def test_program_fails_with_the_sentence_and_writes_nothing(tmp_path: Path, case: str) -> None:
     options, sentence = MISTAKES[case]
     done = run_pipeline("program", mistaken_job(tmp_path, options), tmp_path)
@@ -479,7 +482,7 @@ def test_program_fails_with_the_sentence_and_writes_nothing(tmp_path: Path, case
 
 
 @needs_pdal
-@pytest.mark.parametrize("case", mostly_nightly(MISTAKES, "no such cameras", "a value"))
+@pytest.mark.parametrize("case", mostly_nightly(MISTAKES, "no such cameras"))
 def test_process_stays_usable_after_a_mistake(tmp_path: Path, case: str) -> None:
     options, sentence = MISTAKES[case]
     (tmp_path / "job.json").write_text(json.dumps(mistaken_job(tmp_path, options)))
