@@ -22,7 +22,7 @@ from pcfix.io.las.columns import (
     move,
 )
 from pcfix.io.las.source import LasSource
-from pcfix.io.las.writing import read_settings, restored_header
+from pcfix.io.las.writing import read_settings, record_errors, restored_header
 from pcfix.io.tiles import Clouds, single, tiles_of
 from pcfix.kernels import threads
 from pcfix.options.declare import File, taken
@@ -94,11 +94,12 @@ class Restoring(Sums, Step):
     def header(self, source: LasSource) -> Header:
         """Return the header as it was before the correction."""
         content = read_settings(source.vlrs, source.path)
-        names = _ours(source, content["settings"])
-        self._has_unsure = UNSURE.name in names
-        self.identity = content["before"]["identity"].encode("latin-1")
-        self._offset = np.array(content["before"]["steps"])
-        return restored_header(source, content["before"], names)
+        with record_errors(source.path):
+            names = _ours(source, content["settings"])
+            self._has_unsure = UNSURE.name in names
+            self.identity = content["before"]["identity"].encode("latin-1")
+            self._offset = np.array(content["before"]["steps"], np.int64).reshape(3)
+            return restored_header(source, content["before"], names)
 
     def chunk(self, points: Chunk, source: LasSource, header: Header) -> Chunk:
         """Return points with their coordinates, classes and flags of before."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import struct
 from fractions import Fraction
@@ -401,6 +402,31 @@ def test_what_would_lead_to_another_cloud_is_not_restored(
     correct(write_cloud(tmp_path / "cloud.las", 7), output)
     patched(output, output.read_bytes().index(found) + ahead, other)
     with pytest.raises(PcfixError, match=says):
+        pcfix.restore_file(output, tmp_path / "back.las")
+    assert not (tmp_path / "back.las").exists()
+
+
+@pytest.mark.parametrize(
+    ("part", "key", "other"),
+    [
+        ("settings", "dimensions", 7), ("before", "steps", "abc"), ("before", "identity", 5),
+        ("before", "version", "9.9"), ("before", "point_format", 77), ("before", "offsets", [[]]),
+        ("before", "undescribed", None),
+    ],
+)  # fmt: skip
+def test_a_record_without_a_seal_that_is_damaged_is_said(
+    tmp_path: Path, part: str, key: str, other: object
+) -> None:
+    output = tmp_path / "output.las"
+    correct(write_cloud(tmp_path / "cloud.las", 7), output)
+    las = laspy.read(output)
+    record = next(v for v in las.vlrs if v.user_id == "pcfix" and v.record_id == 1)
+    content = json.loads(record.record_data)
+    del content["sha256"]
+    content[part][key] = other
+    record.record_data = json.dumps(content).encode()
+    las.write(output)
+    with pytest.raises(PcfixError, match=r"output\.las: .*(own VLR is damaged|use the original)"):
         pcfix.restore_file(output, tmp_path / "back.las")
     assert not (tmp_path / "back.las").exists()
 

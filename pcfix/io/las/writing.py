@@ -18,6 +18,7 @@ from typing import Any
 import laspy
 import lazrs
 import numpy as np
+from laspy.errors import LaspyException
 from laspy.vlrs.known import ExtraBytesStruct, WktCoordinateSystemVlr
 from laspy.vlrs.vlr import VLR
 from pyproj import CRS
@@ -143,7 +144,7 @@ def restored_header(source: LasSource, before: dict[str, Any], drop: set[str]) -
         laspy.header.Version.from_str(before["version"]), point_format
     )
     header.global_encoding.value = before["global_encoding"]
-    header.offsets = np.array(before["offsets"], dtype=np.float64)
+    header.offsets = np.array(before["offsets"], dtype=np.float64).reshape(3)
     vlrs = [v for v in source.vlrs if not _is_layout(v) and not is_ours(v)]
     if before["added_wkt"]:
         last = max(i for i, v in enumerate(vlrs) if v.user_id == "LASF_Projection")
@@ -283,20 +284,27 @@ def read_settings(vlrs: Iterable[VLR], path: Path) -> dict[str, Any]:
 
     An `InputError` if there is none, or it is damaged.
     """
-    try:
+    with record_errors(path):
         content: dict[str, Any] | None = own_settings(vlrs)
         if content is not None:
             _ = content["settings"]["dimensions"], [content["before"][key] for key in BEFORE]
             seal = content.pop(_SEAL, None)  # files of old have none
             if seal not in (None, _seal_of(content)):
                 raise ValueError("it is not what pcfix wrote")
-    except (ValueError, TypeError, KeyError) as error:
-        raise InputError(
-            f"{path}: pcfix's own VLR is damaged ({error}); use the original cloud."
-        ) from error
     if content is None:
         raise InputError(f"{path}: was not corrected by pcfix; there is nothing to undo.")
     return content
+
+
+@contextmanager
+def record_errors(path: Path) -> Iterator[None]:
+    """Turn what a damaged VLR of a correction raises when it is used into one sentence."""
+    try:
+        yield
+    except (ValueError, TypeError, LookupError, AttributeError, LaspyException) as error:
+        raise InputError(
+            f"{path}: pcfix's own VLR is damaged ({error}); use the original cloud."
+        ) from error
 
 
 def check_suffix(path: Path) -> bool:
