@@ -166,6 +166,7 @@ def test_only_the_bed_counts():
     assert found.sd_m == pytest.approx(0.1)
 
 
+@pytest.mark.nightly
 def test_stereo_finds_a_ground_without_water():
     photos = [photo(x, tilt) for x, tilt in ((-8, (2, 1)), (0, (-1, 2)), (8, (1, -2)))]
     assert pairs_of(photos, 0.0) == [(0, 1), (0, 2), (1, 2)]
