@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+import time
+from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from itertools import pairwise
+from operator import length_hint
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -50,6 +54,9 @@ Span: TypeAlias = tuple[int, int]
 
 TILES_A_THREAD = 8
 """So many pieces of work wait for each thread, as some take longer than others."""
+
+ALONE_S = 2e-4
+"""About as long as a thread takes to begin."""
 
 _most_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 
@@ -98,21 +105,42 @@ def telling(report: Callable[[int], None]) -> Iterator[None]:
 def in_tiles(run: Callable[..., Any], rows: int, *given: Any, points: int = 0) -> None:
     """Call ``run((first, last), *given)`` for all rows, a tile of them at a time in each thread.
 
-    No row may depend on another one: which share a tile depends on the number of threads. Of
-    `points`, where there are so many in all rows, each tile is told to be done; see `telling`.
+    No row may depend on another one: which share a tile depends on the number of threads. Other
+    threads help where there is work for more than `ALONE_S`, or so few rows that each is a tile.
+    Of `points`, where there are so many in all rows, those done are told; see `telling`.
     """
     count = min(cores(), rows)
     if not rows:
         return
     tiles = min(rows, TILES_A_THREAD * count) if count > 1 or points else 1
     edges = [rows * i // tiles for i in range(tiles + 1)]
+    if 1 < tiles < rows:
+        edges.insert(1, -(-edges[1] // TILES_A_THREAD))  # it tells how long the others take
+    left, done, told, helpers = iter([*pairwise(edges)]), [0], 0, list[Future[None]]()
 
-    def one(i: int) -> None:
-        run((edges[i], edges[i + 1]), *given)
+    def work(then: Callable[[], None] = lambda: None) -> None:
+        try:
+            for span in left:
+                run(span, *given)
+                done.append(span[1] - span[0])
+                then()
+        finally:
+            deque(left, 0)  # after an error nobody goes on
 
-    with ThreadPoolExecutor(count) if count > 1 else nullcontext() as pool:
-        for _ in map(one, range(tiles)) if pool is None else pool.map(one, range(tiles)):
-            _tell(points / tiles)
+    def tell_and_ask() -> None:
+        nonlocal told
+        before, told = told, sum(done)
+        _tell(points * (told - before) / rows)
+        if length_hint(left) and not helpers and time.perf_counter() > busy_from:
+            helpers.extend(pool.submit(work) for _ in range(count - 1))
+
+    busy_from = time.perf_counter() + ALONE_S if tiles < rows else 0.0
+    with ThreadPoolExecutor(count) as pool:
+        tell_and_ask()
+        work(tell_and_ask)
+        for helper in helpers:
+            helper.result()
+    tell_and_ask()
 
 
 @lean
