@@ -15,7 +15,8 @@ The model, for an apparent point P and its pairs (a, b), all of which show one t
 
    with G_c the derivative of the image of camera c by position, 2 x 3, px/m, on the ray w_c at the
    distance of X. G_c w_c = 0, so that a residual off the ray is one in the image.
-3. The matcher's point is the median of the X_ab in x, y and z one by one.
+3. The matcher's point is the median of the X_ab in x, y and z one by one: of three pairs or more
+   it hangs on the axes, so that the cloud has to come in the frame that it was matched in.
 
 Q is looked for, where that median is P: three equations for three unknowns. The median of smooth
 functions is continuous, with kinks where it goes over from one pair to another. Broyden's method

@@ -157,6 +157,19 @@ def listed(draw, scene: Scene) -> pcfix.Views:
     return pcfix.Views(start, np.concatenate(rows), None, kind)
 
 
+def in_frames(scene: Scene, views: pcfix.Views) -> np.ndarray:
+    """Return which points lie in the frames of all their cameras, were the lens without distortion.
+
+    Beyond its frame the distortion is made up, and folds: no image there is that of one place.
+    """
+    lens, row = scene.cameras.lenses[0], np.repeat(np.arange(len(scene.xyz)), np.diff(views.start))
+    rays = scene.xyz[row] - scene.cameras.centres[views.camera]
+    x, y, z = np.einsum("nij,nj->in", scene.cameras.rotations[views.camera], rays)
+    u, v = lens.focal * x / z + lens.principal_x, lens.focal * y / z + lens.principal_y
+    inside = (z > 0.0) & (u > 0.0) & (u < lens.width) & (v > 0.0) & (v < lens.height)
+    return np.bincount(row, ~inside, len(scene.xyz)) == 0
+
+
 @given(data=st.data(), scene=scenes(), turn=st.floats(0.0, 6.3))
 def test_the_result_does_not_hang_on_frame_or_order(data, scene, turn):
     framed = scene.cameras.rotations is not None
@@ -167,7 +180,11 @@ def test_the_result_does_not_hang_on_frame_or_order(data, scene, turn):
     cameras = data.draw(st.permutations(range(len(scene.cameras))))
     points = data.draw(st.permutations(range(len(scene.xyz))))
     views = data.draw(listed(scene)) if method != "factor" and data.draw(st.booleans()) else None
-    renumbered = views
+    renumbered, told = views, np.ones(len(scene.xyz), bool)
+    if views is not None and method == "consistent":
+        told = in_frames(scene, views)
+        if views.kind == "pairs":  # their median is along the axes
+            turn = round(turn / (np.pi / 2.0)) * np.pi / 2.0
     if views is not None:
         taken = views.take(np.array(points))
         renumbered = replace(taken, camera=np.argsort(cameras)[taken.camera])
@@ -177,8 +194,10 @@ def test_the_result_does_not_hang_on_frame_or_order(data, scene, turn):
     np.testing.assert_array_equal(there.outcome, here.outcome[points])
     np.testing.assert_array_equal(there.ray_count, here.ray_count[points])
     expected = Scene(here.xyz, scene.cameras, scene.plane).moved(turn, shift).xyz[points]
-    np.testing.assert_allclose(there.xyz, expected, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(there.ray_miss_m, here.ray_miss_m[points], rtol=0, atol=1e-6)
+    rows = told[points]
+    np.testing.assert_allclose(there.xyz[rows], expected[rows], rtol=0, atol=1e-6)
+    miss = here.ray_miss_m[points]
+    np.testing.assert_allclose(there.ray_miss_m[rows], miss[rows], rtol=0, atol=1e-6)
 
 
 @given(data=st.data(), scene=scenes(), point_format=FORMATS)
