@@ -114,7 +114,7 @@ def in_tiles(run: Callable[..., Any], rows: int, *given: Any, points: int = 0) -
         return
     tiles = min(rows, TILES_A_THREAD * count) if count > 1 or points else 1
     edges = [rows * i // tiles for i in range(tiles + 1)]
-    if 1 < tiles < rows:
+    if tiles > 1 and edges[1] > 1:
         edges.insert(1, -(-edges[1] // TILES_A_THREAD))  # it tells how long the others take
     left, done, told, helpers = iter([*pairwise(edges)]), [0], 0, list[Future[None]]()
 
