@@ -24,6 +24,7 @@ import llvmlite.binding as llvm
 from numba.core.caching import CacheImpl, CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompileResult
+from numba.core.environment import Environment, lookup_environment
 from numba.core.runtime import rtsys
 
 from pcfix.errors import PcfixWarning
@@ -33,7 +34,7 @@ waits: list[Callable[[], object]] = [lambda: sys.stderr.write(WAITING)]
 """Called when a kernel is waited for; each once, and taken out."""
 
 
-_FORMAT = b"2"
+_FORMAT = b"3"
 """Of what is written; kernels of another one are compiled anew."""
 
 
@@ -129,6 +130,19 @@ class _Locator(_CacheLocator):  # type: ignore[misc]  # numba has no types
         return str(self._line)
 
 
+def _environment(name: str, constants: list[Any]) -> Environment:
+    """Return what compiled code finds its constants in.
+
+    Of numba's own it would have the names of the module it came from too, which only Python's
+    objects ask for; the modules of all parts of numba in a kernel load half of scipy.
+    """
+    found = lookup_environment(name)
+    if found is None:
+        found = Environment._memo[name] = Environment({})
+        found.env_name, found.consts[:] = name, constants
+    return found
+
+
 class _Library(JITCodeLibrary):  # type: ignore[misc]
     """The code of a kernel that was kept; its text for LLVM is read when another links it alone."""
 
@@ -163,15 +177,18 @@ class _Impl(CompileResultCacheImpl):  # type: ignore[misc]
         defined = {one.name for one in named if not one.is_declaration}
         needed = {one.name for one in named if one.is_declaration}
         needed = {name for name in needed if not name.startswith("llvm.")}
-        return defined, needed, super().reduce(compiled)
+        library, description, own, *rest, others = super().reduce(compiled)
+        constants = [(one.env_name, one.consts) for one in (own, *others)]
+        return defined, needed, (library, description, constants, *rest)
 
     def rebuild(self, context: Any, written: Any) -> Any:
         """Return a kernel, without all that numba needs to compile one, where it can do so."""
-        defined, needed, ((name, _, codes), description, environment, *rest) = written
+        defined, needed, ((name, _, codes), description, constants, *rest) = written
         rtsys.initialize(context)
         if not all(map(llvm.address_of_symbol, needed)):
             context.refresh()
-        signature, is_object, lifted, annotation, init, others = rest
+        signature, is_object, lifted, annotation, init = rest
+        environment, *others = (_environment(*one) for one in constants)
         for function in init:
             function()
         library = _Library(context.codegen(), name, *codes)

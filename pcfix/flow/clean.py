@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -304,13 +305,16 @@ class _Cleaning(Sums, Step):
         """Return the header with the record of what is done."""
         return noted_header(source, cleaning_vlr(self._content))
 
-    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Chunk:
-        """Return points with their noise flagged or left out."""
-        new = convert(points, header.point_format)
+    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Callable[[], Chunk]:
+        """Return what flags the noise among points, or leaves it out."""
         first, byte = self._row, self._row // 8
-        self._row += len(new)
+        self._row += len(points)
         bits = np.unpackbits(self._noise[byte : (self._row + 7) // 8])
         noise = bits[first - 8 * byte : self._row - 8 * byte].astype(np.bool_)
+        return partial(self._cleaned, points, header, noise)
+
+    def _cleaned(self, points: Chunk, header: Header, noise: BoolArray) -> Chunk:
+        new = convert(points, header.point_format)
         if self._drop:
             return new[~noise]
         new.array["classification"][noise] = LOW_NOISE

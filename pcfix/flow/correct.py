@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -332,9 +333,12 @@ class Correcting(Sums, Step):
             source, self._columns, self.job.provenance(), wide=self.wide, steps=self.steps
         )
 
-    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Chunk:
-        """Return corrected points with their new dimensions, classes and flags."""
+    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Callable[[], Chunk]:
+        """Return what gives corrected points their new dimensions, classes and flags."""
         correction = self.job.correct(points_of(points, source, self.job.water))
+        return partial(self._written, points, header, correction)
+
+    def _written(self, points: Chunk, header: Header, correction: Correction) -> Chunk:
         new = columns.convert(points, header.point_format)
         new.offsets = header.offsets
         for rows, part in correction.parts():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import astuple, replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -253,15 +254,19 @@ class LabellingStep(Sums, Step):
             self.counts[name] += int(rows.sum())
         return labels.classes
 
-    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Chunk:
-        """Return labelled points of a file."""
+    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Callable[[], Chunk]:
+        """Return what writes the labels of points of a file."""
         found = self.classes(points_of(points, source, self.water))
-        new = convert(points, header.point_format)
-        new.array["classification"] = found
-        return new
+        return partial(_labelled, points, header, found)
 
     def finish(self) -> None:
         """Refuse a cloud of which no point lies below the water, or inside the mask."""
         below = self.counts["submerged"] + self.counts["water_surface"]
         self.labelling.check(self._name, below)
         check_submerged(below, self._name, self.water)
+
+
+def _labelled(points: Chunk, header: Header, classes: Classes) -> Chunk:
+    new = convert(points, header.point_format)
+    new.array["classification"] = classes
+    return new

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -101,9 +102,12 @@ class Restoring(Sums, Step):
             self._offset = np.array(content["before"]["steps"], np.int64).reshape(3)
             return restored_header(source, content["before"], names)
 
-    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Chunk:
-        """Return points with their coordinates, classes and flags of before."""
+    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Callable[[], Chunk]:
+        """Return what gives points their coordinates, classes and flags of before."""
         self.points += len(points)
+        return partial(self._restored, points, header)
+
+    def _restored(self, points: Chunk, header: Header) -> Chunk:
         moved = is_corrected(points)
         points.array["classification"][moved] = points.array["SourceClass"][moved]
         ours = is_marked_uncorrected(points)

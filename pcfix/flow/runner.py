@@ -52,8 +52,8 @@ class Step(Protocol):
     def header(self, source: LasSource) -> Header:
         """Return the header of the output, and be ready for the first chunk."""
 
-    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Chunk:
-        """Return what becomes of some points."""
+    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Callable[[], Chunk]:
+        """Return what makes some points those of the output, while the next are begun with."""
 
     def finish(self) -> None:
         """Refuse a result that cannot be right; nothing is left behind then."""
@@ -135,18 +135,22 @@ def read_ahead(chunks: Iterator[Any], jobs: int | None) -> Iterator[Any]:
 
 @contextmanager
 def written_behind(write: Callable[[Any], None], jobs: int | None) -> Iterator[Callable[..., None]]:
-    """Give a function that writes chunks in order, one at a time, while others are computed."""
+    """Give a function that makes and writes chunks in order, while others are computed."""
+
+    def made(make: Callable[[], Any]) -> None:
+        write(make())
+
     if jobs == 1:
-        yield write
+        yield made
         return
     with ThreadPoolExecutor(1) as writer:
         last: Future[None] | None = None
 
-        def later(chunk: Any) -> None:
+        def later(make: Callable[[], Any]) -> None:
             nonlocal last
             if last is not None:
                 last.result()
-            last = writer.submit(write, chunk)
+            last = writer.submit(made, make)
 
         yield later
         if last is not None:
