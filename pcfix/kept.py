@@ -2,13 +2,15 @@
 
 They lie in the package, so that whoever builds an image or installs for others compiles them once.
 Where it cannot be written, they are read there all the same, and what is missing is kept in a
-folder that is the user's alone. A kernel is valid for the text of its file, not for its time:
-copies, and the layers of an image, change times.
+folder that is the user's alone. A kernel is valid for the text of its file and of all that this
+imports of the package, whose parts and numbers it has in it; not for their times: copies, and the
+layers of an image, change them.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import stat
 import sys
 import tempfile
@@ -37,10 +39,37 @@ waits: list[Callable[[], object]] = [lambda: sys.stderr.write(WAITING)]
 _FORMAT = b"3"
 """Of what is written; kernels of another one are compiled anew."""
 
+_PACKAGE = Path(__file__).parent
+_IMPORT = re.compile(rf"^from {_PACKAGE.name}\.?([\w.]*) import ([\w, ]+|\([^)]*\))", re.MULTILINE)
+
 
 @cache
 def _stamp(source: str) -> str:
-    return sha256(_FORMAT + Path(source).read_bytes()).hexdigest()
+    """Return what changes with the text of a file, and of all that it imports of the package."""
+    found, left = dict[Path, bytes](), [Path(source)]
+    while left:
+        path = left.pop()
+        if path not in found:
+            found[path], imported = _text_of(path)
+            left += imported
+    told = sha256(_FORMAT)
+    for path in sorted(found):
+        told.update(found[path])
+    return told.hexdigest()
+
+
+@cache
+def _text_of(path: Path) -> tuple[bytes, tuple[Path, ...]]:
+    """Return the digest of a file's text, and the files of the package that it imports."""
+    text, imported = path.read_bytes(), list[Path]()
+    for module, names in _IMPORT.findall(text.decode()):
+        place = _PACKAGE.joinpath(*filter(None, module.split(".")))
+        file = place.with_suffix(".py")
+        files = [file]
+        if not file.is_file():
+            files = [place / f"{name}.py" for name in ("__init__", *re.findall(r"\w+", names))]
+        imported += filter(Path.is_file, files)
+    return sha256(text).digest(), tuple(imported)
 
 
 @cache
@@ -82,6 +111,17 @@ def private_folder() -> Path | None:
         if folder.is_absolute() and _is_private(folder):
             return folder
     return _warn()
+
+
+def folder_of_numba() -> Path | None:
+    """Return where numba is to keep kernels in its own way, by the time of their own file alone.
+
+    It is another one after any change of the package, as a kernel has the parts of other files.
+    """
+    folder, told = private_folder(), sha256(_FORMAT)
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        told.update(path.read_bytes())
+    return None if folder is None else folder / told.hexdigest()[:16]
 
 
 def roots() -> tuple[Path, ...]:

@@ -26,7 +26,7 @@ from numba.core.compiler import Compiler, CompileResult
 from numba.core.registry import CPUDispatcher
 
 from pcfix.ahead import compiles, wait_for
-from pcfix.kept import Kept
+from pcfix.kept import Kept, folder_of_numba
 
 Decorator: TypeAlias = Callable[[Any], Any]
 
@@ -34,6 +34,8 @@ TRIED = ("0.61", "0.62", "0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
 """Versions of numba."""
 
 _are_linked = numba.__version__.rpartition(".")[0] in TRIED and not config.DISABLE_JIT
+if not (_are_linked or config.DISABLE_JIT):
+    config.CACHE_DIR = str(folder_of_numba() or config.CACHE_DIR)
 
 
 class _Listener(event.Listener):

@@ -81,9 +81,11 @@ def test_what_was_kept_in_a_package_is_used_where_it_cannot_be_written(package, 
         os.utime(path, (1, 1))  # an image's layers keep whole seconds, or none at all
     closed = str(package)
     assert said(start(package, home, closed)) == (first[0].replace("compiles\n", ""), "")
-    source = package / "lens" / "formulas.py"
-    source.write_text(source.read_text("utf-8") + "\n# changed\n", "utf-8")
-    assert "compiles" in said(start(package, home, closed))[0]
+    # its parts and numbers are in a kernel too, however far away
+    for changed in ("formulas", "../parts", "../model"):
+        source = package / "lens" / f"{changed}.py"
+        source.write_text(source.read_text("utf-8") + "\n# changed\n", "utf-8")
+        assert "compiles" in said(start(package, home, closed))[0]
     folder = home / "pcfix-kernels"
     assert folder.stat().st_mode & 0o777 == 0o700
     assert "compiles" not in said(start(package, home, closed))[0]

@@ -22,6 +22,8 @@ if sys.argv[1] == "apart":
     numba.__version__ = "0.0.0"
 import numpy as np, pcfix, pcfix.parts
 assert (sys.argv[1] == "linked") == pcfix.parts._are_linked
+if sys.argv[1] == "apart":  # what numba keeps by itself is not used after a change of other files
+    assert numba.config.CACHE_DIR == str(pcfix.kept.folder_of_numba())
 across, along = np.meshgrid(np.linspace(-40, 40, 3), np.linspace(-40, 40, 3))
 centres = np.column_stack([across.ravel(), along.ravel(), np.full(9, 100.0)])
 lens = pcfix.Lens(3000.0, 4000.0, 3000.0, 2010.0, 1490.0)
