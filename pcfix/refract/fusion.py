@@ -105,6 +105,8 @@ class Groups(NamedTuple):
     rise, size : array, shape (k,)
         How far up the bed is if the group of each seed made the point, metres, and how many maps
         are in it.
+    own : array, shape (k,)
+        Depth of each map by itself.
     """
 
     averaged: IntArray
@@ -115,6 +117,7 @@ class Groups(NamedTuple):
     change: FloatArray
     rise: FloatArray
     size: FloatArray
+    own: FloatArray
 
 
 @part
@@ -124,6 +127,7 @@ def _no_groups(block: Block) -> Groups:
         np.full((k, matcher.averaged.shape[1] + 1), ABSENT),
         np.full((k, matcher.fused.shape[1] + 1), ABSENT),
         np.full(k, ABSENT), np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(k),
+        np.empty(k),
     )  # fmt: skip
 
 
@@ -263,29 +267,50 @@ def _set_rises(groups: Groups, depths: Lines) -> None:
     Which maps agree is asked for the bed that the lines are of, and again for that of each group.
     """
     k = depths.t.size
-    _average(groups, depths, 0.0)
+    _set_depths(groups, depths, 0.0)
+    for q in range(k):
+        _average(q, groups, depths)
     for seed in range(k):
         groups.rise[seed], groups.size[seed] = _fuse(seed, groups)
     for seed in range(k):
-        _average(groups, depths, groups.rise[seed])
+        _average_around(seed, groups, depths, groups.rise[seed])
         step, groups.size[seed] = _fuse(seed, groups)
         groups.rise[seed] += step
 
 
 @lean
-def _average(groups: Groups, depths: Lines, rise: float) -> None:
-    """Average each depth with those of the maps around that agree, for a bed so much higher."""
-    t, slope = depths.t, depths.slope
-    for q in range(t.size):
-        own, total, change, count = t[q] + slope[q] * rise, 0.0, 0.0, 0.0
-        for a in groups.averaged[q]:
-            if a < 0:
-                break
-            other = t[a] + slope[a] * rise
-            if abs(other - own) < AVERAGED_WITHIN:
-                total, change, count = total + other, change + slope[a], count + 1.0
-        each = 1.0 / count
-        groups.depth[q], groups.change[q] = total * each, change * each
+def _average_around(seed: int, groups: Groups, depths: Lines, rise: float) -> None:
+    """Average the depths that may be fused with that of a seed, for a bed so much higher."""
+    _set_depths(groups, depths, rise)
+    for q in groups.fused[seed]:
+        if q < 0:
+            break
+        _average(q, groups, depths)
+
+
+@lean
+def _set_depths(groups: Groups, depths: Lines, rise: float) -> None:
+    """Set the depth of each map for a bed so much higher."""
+    for q in range(depths.t.size):
+        groups.own[q] = depths.t[q] + depths.slope[q] * rise
+
+
+@lean
+def _average(q: int, groups: Groups, depths: Lines) -> None:
+    """Average a depth with those of the maps around that agree.
+
+    Without a branch, as no processor guesses which do.
+    """
+    own, total, change, count = groups.own[q], 0.0, 0.0, 0.0
+    for a in groups.averaged[q]:
+        if a < 0:
+            break
+        agrees = abs(groups.own[a] - own) < AVERAGED_WITHIN
+        total += groups.own[a] if agrees else 0.0
+        change += depths.slope[a] if agrees else 0.0
+        count += 1.0 if agrees else 0.0
+    each = 1.0 / count
+    groups.depth[q], groups.change[q] = total * each, change * each
 
 
 @lean
@@ -295,10 +320,10 @@ def _fuse(seed: int, groups: Groups) -> tuple[float, float]:
     for q in groups.fused[seed]:
         if q < 0:
             break
-        if abs(groups.depth[q] - groups.depth[seed]) < AGREE:
-            total += groups.share[q] * groups.depth[q]
-            change += groups.share[q] * groups.change[q]
-            members += 1.0
+        agrees = abs(groups.depth[q] - groups.depth[seed]) < AGREE
+        total += groups.share[q] * groups.depth[q] if agrees else 0.0
+        change += groups.share[q] * groups.change[q] if agrees else 0.0
+        members += 1.0 if agrees else 0.0
     return -total / change, members
 
 
@@ -309,7 +334,7 @@ def _weigh(weight: FloatArray, seed: int, rise: float, groups: Groups, depths: L
     The weight of one that agrees goes evenly to the maps it was averaged with.
     """
     t, slope = depths.t, depths.slope
-    _average(groups, depths, rise)
+    _average_around(seed, groups, depths, rise)
     for q in groups.fused[seed]:
         if q < 0:
             break
