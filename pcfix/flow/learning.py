@@ -6,8 +6,10 @@ import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from itertools import repeat
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 
@@ -213,6 +215,8 @@ class Learning:
         near_step = max(1, self._view.points // int(max(dense, FEWEST_BED_POINTS)))
         squares = Squares(PATCH_WIDTH * self._flying_height_m()) if near_step < step else None
         survey, taken = self.survey, list[Batch]()
+        # what looks for neighbours is loaded while the cloud is read
+        Thread(target=import_module, args=("scipy.spatial",), daemon=True).start()
         done = 0
         of_chunks = repeat(None) if makers is None else makers()
         for points, made_with in zip(chunks(), of_chunks, strict=False):
