@@ -15,6 +15,8 @@ from pcfix.model import FloatArray
 Vector: TypeAlias = tuple[float, float, float]
 Symmetric: TypeAlias = tuple[float, float, float, float, float, float]
 """A symmetric matrix: xx, xy, xz, yy, yz, zz."""
+Nine: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
+"""A matrix, row by row."""
 
 
 @inlined

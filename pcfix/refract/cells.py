@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, inlined, lean, lean_kernel, part
+from pcfix.kernels import Span, in_tiles, inlined, kernel, lean, lean_kernel, part
 from pcfix.lens.algebra import Vector, row_of
 from pcfix.model import FloatArray, IntArray, WaterMesh, WaterRaster
 from pcfix.refract.batch import Batch, Chosen, Survey
+from pcfix.refract.tiling import TILE
 
 CELLS_A_HEIGHT = 8.0
 LEAST_LENGTH_M = 1e-3
@@ -86,10 +87,7 @@ def cells_of(batch: Batch) -> tuple[IntArray, IntArray]:
     """
     if not len(batch):
         return np.zeros(0, np.int64), np.zeros(1, np.int64)
-    height = np.median(batch.survey.cameras.centres[:, 2]) - np.median(batch.surface.height_m)
-    # a power of two, so that other chunks have the same cells
-    size = 2.0 ** np.rint(np.log2(max(height, LEAST_LENGTH_M) / CELLS_A_HEIGHT))
-    cell = np.floor(batch.xyz[:, :2] / size).astype(np.int64)
+    cell = np.floor(batch.xyz[:, :2] / _size_of(batch)).astype(np.int64)
     cell -= cell.min(axis=0)
     key = cell[:, 1] * (cell[:, 0].max() + 1) + cell[:, 0]
     names = np.random.default_rng(0).integers(2**40, size=len(batch.survey.cameras))
@@ -99,6 +97,70 @@ def cells_of(batch: Batch) -> tuple[IntArray, IntArray]:
     order = np.lexsort((sums, key))
     new = np.flatnonzero(np.diff(key[order])) + 1
     return order, np.concatenate([[0], new, [len(order)]])
+
+
+def _size_of(batch: Batch) -> float:
+    """Return the side of the cells, metres: a power of two, so that other chunks have the same."""
+    height = np.median(batch.survey.cameras.centres[:, 2]) - np.median(batch.surface.height_m)
+    return float(2.0 ** np.rint(np.log2(max(height, LEAST_LENGTH_M) / CELLS_A_HEIGHT)))
+
+
+def neighbours_in_cells(batch: Batch) -> tuple[IntArray, IntArray]:
+    """Return the order of the points cell by cell, and the first of each cell.
+
+    Those of a cell come a quarter of its side after the other, to and fro.
+    """
+    if not len(batch):
+        return np.zeros(0, np.int64), np.zeros(1, np.int64)
+    size, xyz = _size_of(batch), np.ascontiguousarray(batch.xyz)
+    west, east, south = (int(np.floor(at / size)) for at in (
+        xyz[:, 0].min(), xyz[:, 0].max(), xyz[:, 1].min()
+    ))  # fmt: skip
+    key = np.empty(len(xyz), np.int64)
+    in_tiles(_set_keys, len(xyz), xyz, _QUARTERS / size, west, south, east - west + 1, key)
+    order = _sorted(key)
+    new = np.flatnonzero(np.diff(key[order] // _QUARTERS**2)) + 1
+    return order, np.concatenate([[0], new, [len(order)]])
+
+
+_QUARTERS, _DIGIT_BITS = 4, 11
+
+
+@lean_kernel
+def _set_keys(
+    span: Span,
+    xyz: FloatArray,
+    quarters_a_m: float,
+    west: int,
+    south: int,
+    columns: int,
+    key: IntArray,
+) -> None:
+    """Set the number of each point's quarter, row after row of cells and to and fro in each."""
+    for i in range(*span):
+        x = int(np.floor(xyz[i, 0] * quarters_a_m)) - _QUARTERS * west
+        y = int(np.floor(xyz[i, 1] * quarters_a_m)) - _QUARTERS * south
+        column, row = x % _QUARTERS, y % _QUARTERS
+        within = _QUARTERS * row + (_QUARTERS - 1 - column if row & 1 else column)
+        cell = y // _QUARTERS * columns + x // _QUARTERS
+        key[i] = cell * _QUARTERS**2 + within
+
+
+@kernel
+def _sorted(key: IntArray) -> IntArray:
+    """Return the order of keys from zero up, digit by digit: for points a few passes."""
+    order, other, shift, most = np.arange(key.size), np.empty(key.size, np.int64), 0, key.max()
+    while most >> shift > 0:
+        place = np.zeros(2**_DIGIT_BITS + 1, np.int64)
+        for i in order:
+            place[(key[i] >> shift) % 2**_DIGIT_BITS + 1] += 1
+        place = np.cumsum(place)
+        for i in order:
+            digit = (key[i] >> shift) % 2**_DIGIT_BITS
+            other[place[digit]] = i
+            place[digit] += 1
+        order, other, shift = other, order, shift + _DIGIT_BITS
+    return order
 
 
 @lean_kernel
@@ -208,3 +270,37 @@ def fit(terms: FloatArray, by: FloatArray, values: FloatArray) -> None:
         for k in range(INSIDE):
             for f in range(many):
                 terms[j * many + f] += by[j, k] * values[k, f]
+
+
+@lean
+def add_cubic(room: FloatArray, at: int, c: FloatArray, marks: FloatArray) -> None:
+    """Add a cubic polynomial to run `at` of a tile, for the points that have a mark.
+
+    The first three runs are the coordinates in the box; the powers are those of `BASIS`.
+    """
+    one, u1, v1, w1, uu, uv, uw, vv, vw, ww = (
+        c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8], c[9]
+    )  # fmt: skip
+    uuu, uuv, uuw, uvv, uvw, uww, vvv, vvw, vww = (
+        c[10], c[11], c[12], c[13], c[14], c[15], c[16], c[17], c[18]
+    )  # fmt: skip
+    for j in range(marks.size):
+        u, v, w = room[j], room[TILE + j], room[2 * TILE + j]
+        value = one + w * (w1 + ww * w)
+        value += u * (u1 + w * (uw + uww * w) + u * (uu + uuu * u + uuv * v + uuw * w))
+        value += v * (v1 + w * (vw + vww * w) + v * (vv + vvv * v + vvw * w))
+        value += u * v * (uv + uvv * v + uvw * w)
+        room[at * TILE + j] += value if marks[j] > 0.0 else 0.0
+
+
+@lean
+def add_quadratic(room: FloatArray, at: int, c: FloatArray, marks: FloatArray) -> None:
+    """Do as `add_cubic` with a quadratic polynomial."""
+    one, u1, v1, w1, uu, uv, uw, vv, vw, ww = (
+        c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8], c[9]
+    )  # fmt: skip
+    for j in range(marks.size):
+        u, v, w = room[j], room[TILE + j], room[2 * TILE + j]
+        value = one + w * (w1 + ww * w) + u * (u1 + uu * u + uv * v + uw * w)
+        value += v * (v1 + vv * v + vw * w)
+        room[at * TILE + j] += value if marks[j] > 0.0 else 0.0

@@ -20,10 +20,10 @@ from pcfix.refract.rays import pierce_of
 from pcfix.refract.tiling import (
     TILE,
     Points,
-    box_of,
     cameras_around,
+    corners_of,
     gather,
-    mark_camera,
+    marks_in_frame,
     near_cameras,
     points_of,
     tiles_of,
@@ -175,7 +175,7 @@ def _distinct(start: IntArray, camera: IntArray, first: IntArray, distinct: IntA
 @kernel
 def _make_room(span: Span, points: Points, rig: Rig, frames: Frames, first: IntArray) -> None:
     """Set for each tile, one place on, how many entries it may get."""
-    low, high = box_of(span, points)
+    low, high = corners_of(points.order[span[0] * TILE : span[1] * TILE], points.xyz)
     around = cameras_around(frames, rig.centres, low, high)
     for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
@@ -194,7 +194,7 @@ def _choose_all(
     An entry is the number of a camera, or, where there are views, that of one of their entries.
     """
     (first, begin, count, place), listed = found, views[0].size > 0
-    low, high = box_of(span, points)
+    low, high = corners_of(points.order[span[0] * TILE : span[1] * TILE], points.xyz)
     around = cameras_around(frames, rig.centres, low, high)
     for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
@@ -225,20 +225,16 @@ def _choose_in_frame(
 ) -> None:  # fmt: skip
     """Do what `_choose_all` does without lists and under planes, to whole tiles at once."""
     first, begin, count, place = found
-    low, high = box_of(span, points)
+    low, high = corners_of(points.order[span[0] * TILE : span[1] * TILE], points.xyz)
     around = cameras_around(frames, rig.centres, low, high)
     for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
         low, high = gather(tile, rows, points)
-        near = near_cameras(around, frames, rig.centres, low, high)
-        cosine2 = np.empty((near.size, rows.size))
-        seeing = 0
-        for c in near:
-            if mark_camera(cosine2[seeing], tile, frames, c, rig.centres[c], low, high):
-                _set_steepness(cosine2[seeing], tile, rig, c, rule)
-                near[seeing] = c
-                seeing += 1
+        near, cosine2 = marks_in_frame(around, tile, frames, rig.centres, low, high, rows.size)
+        seeing = near.size
+        for at in range(seeing):
+            _set_steepness(cosine2[at], tile, rig, near[at], rule)
         free, steep = first[t], np.empty(seeing)
         for j in range(rows.size):
             k = 0

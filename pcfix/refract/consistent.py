@@ -30,8 +30,9 @@ from typing import TypeAlias
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.kernels import Span, in_tiles, kernel, lean, most_between, part
+from pcfix.kernels import Span, in_tiles, inlined, kernel, lean, most_between, part
 from pcfix.lens.algebra import (
+    Nine,
     Vector,
     beyond,
     dot,
@@ -46,7 +47,7 @@ from pcfix.lens.algebra import (
     vector,
 )
 from pcfix.lens.imaging import image_in_world, image_of
-from pcfix.model import Cameras, FloatArray, IntArray, Outcome
+from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Outcome
 from pcfix.refract.batch import (
     CORRECTED,
     NO_CAMERA,
@@ -79,7 +80,7 @@ CLOSE_M = 1e-7
 
 
 # Columns of the result.
-MISS, SIGMA_Z, COSINE2, OUTCOME, FOUND = 3, 4, 5, 6, 7
+MISS, RAYS, INCIDENCE, OUTCOME, FOUND = 3, 4, 5, 6, 7
 COLUMNS = 8
 
 # Columns of a ray: e, its plane (N, h), the gradients of its image by P, that image, its origin.
@@ -119,8 +120,8 @@ def consistent(batch: Batch) -> Intersection:
     Returns
     -------
     Intersection
-        `ray_miss_m` is the distance from the refracted rays of the apparent point, as of `snell`;
-        `sigma_z_m` is the scatter of these. A point whose views are all one camera is `ONE_CAMERA`.
+        `ray_miss_m` is the distance from the refracted rays of the apparent point, as of `snell`.
+        A point whose views are all one camera is `ONE_CAMERA`.
         Light bends for a camera whose water stood above the true point; `snell` asks the
         apparent one.
 
@@ -139,23 +140,22 @@ def consistent(batch: Batch) -> Intersection:
     survey, result = batch.survey, np.zeros((len(batch), COLUMNS))
     optics, shapes = optics_of(survey.cameras), shapes_of(survey)
     in_tiles(_correct, len(batch), batch.chosen(), optics, *shapes, result, points=len(batch))
-    return intersection_of(batch, result)
+    return intersection_of(result, batch.camera_used(result[:, RAYS] > 0.0))
 
 
-def intersection_of(batch: Batch, result: FloatArray) -> Intersection:
+def intersection_of(result: FloatArray, used: BoolArray) -> Intersection:
     """Return the rows that kernels wrote as a result, and warn of points without a solution."""
     outcome = result[:, OUTCOME].astype(np.uint8)
     moved = outcome == Outcome.CORRECTED
     warn_of_unsolved("method consistent found no solution", result[moved, FOUND] > 0.0)
-    angle = np.degrees(np.arccos(np.sqrt(np.minimum(result[:, COSINE2], 1.0))))
     return Intersection(
         shift_m=result[:, :3],
         outcome=outcome,
-        ray_count=np.where(moved, batch.counts, 0).astype(np.int32),
+        ray_count=result[:, RAYS].astype(np.int32),
         ray_miss_m=result[:, MISS],
-        sigma_z_m=result[:, SIGMA_Z],
-        incidence_deg=np.where(moved, angle, 0.0),
-        camera_used=batch.camera_used(moved),
+        sigma_z_m=np.zeros(len(result)),
+        incidence_deg=result[:, INCIDENCE],
+        camera_used=used,
     )
 
 
@@ -254,18 +254,25 @@ def _solve(
 ) -> None:  # fmt: skip
     """Solve one point and write its row; the room is its sums, and that of the search."""
     (sums, g, inverse), k = room, float(cameras.size)
-    solved, q, _, sigma_z = nearest_point(k, sums)
+    solved, q, _, _ = nearest_point(k, sums)
     if not solved:
         out[OUTCOME] = PARALLEL
         return
     found, q = _search(q, (g, inverse), rays, cameras, optics, n, tin, fields)
-    out[0], out[1], out[2] = q
-    out[MISS], out[SIGMA_Z] = miss(k, sums, q), sigma_z
-    out[COSINE2], out[OUTCOME], out[FOUND] = sums[9], CORRECTED, 1.0 if found else 0.0
+    write_row(out, q, miss(k, sums, q), k, sums[9])
+    out[FOUND] = 1.0 if found else 0.0
 
 
 @lean
-def miss(k: float, s: FloatArray, q: Vector) -> float:
+def write_row(out: FloatArray, q: Vector, miss_m: float, k: float, cosine2: float) -> None:
+    """Write the row of a point with a solution."""
+    out[0], out[1], out[2] = q
+    out[MISS], out[RAYS], out[OUTCOME], out[FOUND] = miss_m, k, CORRECTED, 1.0
+    out[INCIDENCE] = np.degrees(np.arccos(np.sqrt(min(cosine2, 1.0))))
+
+
+@inlined
+def miss(k: float, s: FloatArray | Nine, q: Vector) -> float:
     """Return the rms distance of Q from the lines of the sums, Q'MQ - 2 b'Q + s over k."""
     x, y, z = q
     along = s[0] * x * x + s[3] * y * y + (k - s[0] - s[3]) * z * z

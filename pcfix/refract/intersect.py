@@ -27,8 +27,8 @@ from pcfix.refract.sensitivity import Budget, room_of
 from pcfix.refract.tiling import (
     TILE,
     Points,
-    box_of,
     cameras_around,
+    corners_of,
     gather,
     mark_camera,
     points_of,
@@ -136,6 +136,7 @@ def add_camera(
     """Add one camera's rays to the sums of a tile; return how many it gave.
 
     The frame is a pyramid, tested as the rays are added, or it was tested before and left marks.
+    The marks are then those of the rays that count.
     `sums` and `tile` hold runs of `TILE` numbers in one array each: with one base address and
     fixed distances the compiler sees that the runs cannot overlap, and vectorises.
     """
@@ -152,6 +153,7 @@ def add_camera(
         steep = (height > h) & (height * height >= least_cosine2 * length2)
         held = marks[j] > 0.0 if g is None else in_frame(g, e)
         use = held & steep
+        marks[j] = 1.0 if use else 0.0
         # one division for two; a ray that is not used adds zeros
         q = 1.0 / (length2 * height)
         f = h * length2 * q if use and h > 0.0 else 0.0
@@ -183,7 +185,7 @@ def _all_in_frame(
     """Every camera whose frame holds the point; the surface above it is a plane."""
     centres = rig.centres
     result, used, covariance = found
-    low, high = box_of(span, points)
+    low, high = corners_of(points.order[span[0] * TILE : span[1] * TILE], points.xyz)
     around = cameras_around(frames, centres, low, high)
     for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]

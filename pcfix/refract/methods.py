@@ -1,7 +1,7 @@
 """The methods of correction, each under its name, all through one seam.
 
-``snell`` with every camera in frame has a kernel of its own that chooses cameras as it goes; the
-others get batches of points with the cameras chosen.
+``snell`` and ``consistent`` with every camera in frame choose cameras in their kernels as they go;
+the others get batches of points with the cameras chosen.
 """
 
 from __future__ import annotations
@@ -54,6 +54,12 @@ _OF_MATCHERS: dict[str, Method] = {
 }
 """What `consistent` is for the kinds of dense clouds."""
 
+_IN_FRAME: dict[Method, Method] = {
+    intersect: intersect_in_frame,
+    consistent_in_cells: consistent_in_cells,
+}
+"""Methods whose kernels choose among all cameras as they go, and what does so."""
+
 
 def correct(batch: Batch) -> Intersection:
     """Correct submerged points by the method that the settings name.
@@ -92,8 +98,8 @@ def _corrected(batch: Batch) -> Intersection:
     method = _method(batch)
     if views is not None and views.kind == "pairs":
         pairs, batch = views, replace(batch, views=cameras_of_pairs(views))
-    if method is intersect and _takes_all_in_frame(batch):
-        return with_doubt(intersect_in_frame(batch), batch)
+    if method in _IN_FRAME and _takes_all_in_frame(batch):
+        return with_doubt(_IN_FRAME[method](batch), batch)
     order = spatial_order(batch.xyz)
     parts = []
     for rows in batches(order):

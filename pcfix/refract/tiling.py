@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import Span, kernel, lean, part
+from pcfix.kernels import kernel, lean, part
 from pcfix.lens.algebra import normal_of
 from pcfix.lens.frames import (
     ALL,
@@ -125,12 +125,12 @@ def cameras_around(
 
 
 @part
-def box_of(span: Span, points: Points) -> tuple[FloatArray, FloatArray]:
-    """Return the corners of an upright box around the points of some tiles."""
+def corners_of(rows: IntArray, xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the corners of an upright box around some points."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for i in points.order[span[0] * TILE : span[1] * TILE]:
+    for i in rows:
         for axis in range(3):
-            value = points.xyz[i, axis]
+            value = xyz[i, axis]
             low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
     return low, high
 
@@ -172,3 +172,40 @@ def mark_camera(
     if held != SOME:
         return bool(held != NOTHING)
     return bool(mark(marks, x, y, z, centre, frames, c) > 0)
+
+
+@part
+def marks_of_lists(
+    start: IntArray, camera: IntArray, rows: IntArray, k: int
+) -> tuple[IntArray, FloatArray]:
+    """Return which of k cameras lists name for some points, and how often for each, in order."""
+    place = np.zeros(k, np.int64)
+    for i in rows:
+        for at in range(start[i], start[i + 1]):
+            place[camera[at]] = 1
+    named = np.flatnonzero(place)
+    place[named] = np.arange(named.size)
+    marks = np.zeros((named.size, rows.size))
+    for j in range(rows.size):
+        for at in range(start[rows[j]], start[rows[j] + 1]):
+            marks[place[camera[at]], j] += 1.0
+    return named, marks
+
+
+@part
+def marks_in_frame(
+    around: IntArray, tile: FloatArray, frames: Frames, centres: FloatArray, low: FloatArray,
+    high: FloatArray, count: int,
+) -> tuple[IntArray, FloatArray]:  # fmt: skip
+    """Return which of some cameras hold points of a tile in their frames, and the marks of these.
+
+    The tile has so many points, within a box.
+    """
+    near = near_cameras(around, frames, centres, low, high)
+    marks = np.empty((near.size, count))
+    seeing = 0
+    for c in near:
+        if mark_camera(marks[seeing], tile, frames, c, centres[c], low, high):
+            near[seeing] = c
+            seeing += 1
+    return near[:seeing], marks[:seeing]

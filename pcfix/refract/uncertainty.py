@@ -25,19 +25,17 @@ from typing import TypeAlias
 import numpy as np
 
 from pcfix.kernels import Span, in_tiles, inlined, kernel, lean, lean_kernel, part
-from pcfix.lens.algebra import Symmetric, Vector
+from pcfix.lens.algebra import Nine, Symmetric, Vector
 from pcfix.model import FloatArray, IntArray, Outcome, SingleArray
 from pcfix.options.correct import LEVEL_M
 from pcfix.refract import sensitivity as s
 from pcfix.refract.batch import Batch, Intersection, Survey
 from pcfix.refract.choice import Rig, Rule, rig_of, rule_of
 from pcfix.refract.sensitivity import Budget
-from pcfix.refract.tiling import TILE, Points, gather, points_of, tiles_of
+from pcfix.refract.tiling import TILE, Points, gather, marks_of_lists, points_of, tiles_of
 from pcfix.water.surface import Field, height_at
 
 Four: TypeAlias = tuple[float, float, float, float]
-Nine: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
-"""A matrix, row by row."""
 
 MIN_DETERMINANT = 1e-6
 """As of `pcfix.refract.rays.nearest_point`, of half the trace cubed: k^3 for k rays in space."""
@@ -201,26 +199,10 @@ def _of_lists(
         tile = np.empty(7 * TILE)
         gather(tile, rows, points)
         room = s.room_of(tile, shift, rows)
-        named = _named(start, camera, rows, len(rig.centres))
-        place = np.zeros(len(rig.centres), np.int64)
-        place[named] = np.arange(named.size)
-        marks = np.zeros((named.size, rows.size))
-        for j in range(rows.size):
-            for at in range(start[rows[j]], start[rows[j] + 1]):
-                marks[place[camera[at]], j] += 1.0
+        named, marks = marks_of_lists(start, camera, rows, len(rig.centres))
         for at in range(named.size):
             add_errors(room, tile, marks[at], rig, named[at], rule, budget)
         finish_tile(result, rows, room, tile, level_sigma, budget)
-
-
-@part
-def _named(start: IntArray, camera: IntArray, rows: IntArray, k: int) -> IntArray:
-    """Return the cameras that the lists of some points name, in their order."""
-    named = np.zeros(k, np.bool_)
-    for i in rows:
-        for at in range(start[i], start[i + 1]):
-            named[camera[at]] = True
-    return np.flatnonzero(named)
 
 
 @lean
@@ -281,7 +263,7 @@ def _solved_in_images(sums: FloatArray, j: int) -> tuple[bool, Nine]:
     Q moves by that times the right side of the normal equations of P, and times sum S delta.
     """
     m = _nine(sums, s.BY_Q * TILE + j)
-    det, inverse = _inverted(m)
+    det, inverse = inverse_of(m)
     half = 0.5 * (m[0] + m[4] + m[8])
     return (sums[j] >= 2.0) & (det >= MIN_DETERMINANT * half * half * half), inverse
 
@@ -294,8 +276,8 @@ def _solved_in_space(sums: FloatArray, j: int) -> tuple[bool, Nine, Nine]:
     of the normal equations of P.
     """
     k = sums[j]
-    det, by_delta = _inverted(_full(_six(sums, s.BY_Q * TILE + j)))
-    full, by_sight = _inverted(_full(_six(sums, s.SIGHT * TILE + j)))
+    det, by_delta = inverse_of(_full(_six(sums, s.BY_Q * TILE + j)))
+    full, by_sight = inverse_of(_full(_six(sums, s.SIGHT * TILE + j)))
     by_p = _product(by_delta, _nine(sums, s.BY_P * TILE + j))
     solved = (k >= 2.0) & (det >= MIN_DETERMINANT * k * k * k) & (full > 0.0)
     return solved, by_delta, _product(by_p, by_sight)
@@ -346,13 +328,13 @@ def _columns(
     level = _scaled(nz, by_level)
     away_u, away_v = tile[j] - budget.pivot_x, tile[TILE + j] - budget.pivot_y
     # the normal leans away from where the slope rises
-    u = _plus(_times(by_tilt, (-ux, 0.0, -uz)), _scaled(away_u, level))
-    v = _plus(_times(by_tilt, (-ny * uz, nx * uz - nz * ux, ny * ux)), _scaled(away_v, level))
+    u = _plus(product_of(by_tilt, (-ux, 0.0, -uz)), _scaled(away_u, level))
+    v = _plus(product_of(by_tilt, (-ny * uz, nx * uz - nz * ux, ny * ux)), _scaled(away_v, level))
     return (
-        _scaled(level_sigma, _times(by_delta, level)),
-        _scaled(budget.refractive_index, _times(by_delta, by_n)),
-        _scaled(budget.tilt, _times(by_delta, u)),
-        _scaled(budget.tilt, _times(by_delta, v)),
+        _scaled(level_sigma, product_of(by_delta, level)),
+        _scaled(budget.refractive_index, product_of(by_delta, by_n)),
+        _scaled(budget.tilt, product_of(by_delta, u)),
+        _scaled(budget.tilt, product_of(by_delta, v)),
     )
 
 
@@ -394,7 +376,7 @@ def _plus(x: Vector, y: Vector) -> Vector:
 
 
 @inlined
-def _times(m: Nine, x: Vector) -> Vector:
+def product_of(m: Nine, x: Vector) -> Vector:
     """Return a matrix times a vector."""
     return (
         m[0] * x[0] + m[1] * x[1] + m[2] * x[2],
@@ -406,14 +388,14 @@ def _times(m: Nine, x: Vector) -> Vector:
 @inlined
 def _product(a: Nine, b: Nine) -> Nine:
     """Return a matrix times a matrix."""
-    x, y, z = (
-        _times(a, (b[0], b[3], b[6])), _times(a, (b[1], b[4], b[7])), _times(a, (b[2], b[5], b[8]))
-    )  # fmt: skip
+    x = product_of(a, (b[0], b[3], b[6]))
+    y = product_of(a, (b[1], b[4], b[7]))
+    z = product_of(a, (b[2], b[5], b[8]))
     return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]
 
 
 @inlined
-def _inverted(m: Nine) -> tuple[float, Nine]:
+def inverse_of(m: Nine) -> tuple[float, Nine]:
     """Return the determinant of a matrix and its inverse, which without one is meaningless."""
     a, b, c, d, e, f, g, h, i = m
     x, y, z = e * i - f * h, f * g - d * i, d * h - e * g
