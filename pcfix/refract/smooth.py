@@ -83,8 +83,12 @@ from pcfix.refract.uncertainty import (
     with_errors,
 )
 
-TOLERANCE_PX = 0.02
-"""What may be lacking, in ground pixels: of the polynomials, and of the one Newton step."""
+LACK_PX, STEP_PX = 0.02, 0.03
+"""What may be lacking, in ground pixels: of the polynomials, and of the one Newton step.
+
+Where cameras of few points are flatter than most, the steps are long: of a nadir block with 80 %
+overlap 3 % of the points would be solved one by one at 0.02, a seventh of the whole time.
+"""
 
 LEAST_POINTS = 150
 """Of a cell that a camera gives rays to, on average: its polynomials cost as much as those rays."""
@@ -352,7 +356,7 @@ def _step(
     """Take the step from Q0; the points serve where little is lacking and their rays meet."""
     for axis in range(3):
         add_quadratic(room, _Q + axis, middle[:, axis], room[_SERVES * TILE :][:count])
-    allowed = TOLERANCE_PX * pixel * distance
+    lack2, step2 = (LACK_PX * pixel * distance) ** 2, STEP_PX * pixel * distance * distance
     for j in range(count):
         _, inverse = inverse_of(_nine(room, j))
         for i in range(9):
@@ -360,7 +364,7 @@ def _step(
     for corner in range(AT_CORNERS):
         for j in range(count):
             x, y, z = product_of(_nine(room, j), _three(room, _LACKS + 3 * corner, j))
-            serves = x * x + y * y + z * z <= allowed * allowed
+            serves = x * x + y * y + z * z <= lack2
             room[_SERVES * TILE + j] = room[_SERVES * TILE + j] if serves else 0.0
     for j in range(count):
         x, y, z = product_of(_nine(room, j), _three(room, _G, j))
@@ -368,9 +372,7 @@ def _step(
         m00, m11 = k - s[0], k - s[3]
         det, _ = cofactors((m00, -s[1], -s[2], m11, -s[4], 2.0 * k - m00 - m11))
         q = minus(_three(room, _Q, j), (x, y, z))
-        serves = (x * x + y * y + z * z <= allowed * distance) & (
-            det >= MIN_DETERMINANT * k * k * k
-        )
+        serves = (x * x + y * y + z * z <= step2) & (det >= MIN_DETERMINANT * k * k * k)
         room[_SERVES * TILE + j] = room[_SERVES * TILE + j] if serves else 0.0
         room[_Q * TILE + j], room[(_Q + 1) * TILE + j], room[(_Q + 2) * TILE + j] = q
         room[_MISS * TILE + j] = miss(k, s, q)

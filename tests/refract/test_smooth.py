@@ -8,6 +8,8 @@ import pytest
 from pcfix.kernels import threads
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
+from pcfix.refract.cells import neighbours_in_cells
+from pcfix.refract.choice import chosen_views
 from pcfix.refract.methods import correct
 from pcfix.water.surface import surface_above
 from tests.refract.test_consistent import (
@@ -30,6 +32,12 @@ def bed(rng, deepest_m=8.0, m=6000):
     depth = deepest_m * (0.52 + 0.4 * np.sin(x / 6.0) * np.cos(y / 9.0)) + rng.normal(0, 0.03, m)
     depth[::100] += rng.uniform(-2.0, 2.0, len(depth[::100]))
     return np.column_stack([x, y, -np.maximum(depth, 1e-3)])
+
+
+def levelled(xyz, cameras):
+    """Return points under level water as a batch without lists."""
+    settings = ScienceOptions(method="consistent", camera_set="all")
+    return batch_of(xyz, surface_above(LEVEL, xyz), LEVEL, cameras, settings)
 
 
 def both(xyz, cameras, water=LEVEL, views=None, offset=None, **settings):
@@ -78,6 +86,32 @@ def test_so_they_are_where_the_water_fell_during_the_flight():
     xyz, cameras = bed(rng, 1.0), nadir_block(rng)
     apart_px = assert_as_alone(*both(xyz, cameras, offset=rng.uniform(-0.5, 0.0, len(cameras))))
     assert np.mean(apart_px > 0.0) > 0.1  # not where a ray stays dry beside those that do not
+
+
+def test_a_camera_that_a_list_names_twice_counts_twice():
+    rng = np.random.default_rng(6)
+    xyz, cameras = bed(rng), nadir_block(rng)
+    seen = chosen_views(levelled(xyz, cameras))
+    twice = rng.random(len(seen.camera)) < 0.004
+    more = np.concatenate([[0], np.cumsum(twice)])[seen.start]
+    listed = np.repeat(seen.camera, 1 + twice)
+    quick, alone = both(xyz, cameras, views=Views(seen.start + more, listed))
+    assert np.mean(assert_as_alone(quick, alone) > 0.0) < 0.95  # as alone, where one is twice
+
+
+def test_cells_hold_their_points_and_neighbours_are_near():
+    rng = np.random.default_rng(7)
+    xyz, cameras = bed(rng), nadir_block(rng)
+    xyz[:, :2] -= 1e5
+    batch = levelled(xyz, cameras)
+    order, first = neighbours_in_cells(batch)
+    assert np.array_equal(np.sort(order), np.arange(len(xyz)))
+    cell = np.floor(xyz[order, :2] / 8.0)
+    places = [np.unique(part, axis=0) for part in np.split(cell, first[1:-1])]
+    assert all(len(part) == 1 for part in places)
+    assert len(np.unique(np.vstack(places), axis=0)) == len(places)
+    steps = np.linalg.norm(np.diff(xyz[order, :2], axis=0), axis=1)
+    assert np.median(steps) < 2.0
 
 
 def test_threads_do_not_matter_and_parts_hardly():
