@@ -251,6 +251,14 @@ def test_help_loads_nothing_heavy() -> None:
     assert done.stdout.splitlines()[-1] == "[]"
 
 
+def test_a_comparison_loads_no_adjustment_to_tell_its_figures() -> None:
+    program = "import sys, pcfix.report.comparison\nprint('pcfix.adjust' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "False\n"
+
+
 SCALARS = {
     "float", "int", "bool", "None", "tuple", "Vector", "Symmetric", "Nine", "Path",
     "Found", "Ray", "Gradients", "Jacobian", "Pyramid", "Seen", "Sight",

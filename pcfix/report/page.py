@@ -20,12 +20,13 @@ import numpy as np
 from pcfix.grid.colours import DEPTH, HEIGHT
 from pcfix.grid.maps import Maps
 from pcfix.model import FloatArray
-from pcfix.report.map_data import Layer, map_json
 
 if TYPE_CHECKING:
     from jinja2 import Environment
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from pcfix.report.map_data import Layer
 
 MOST_POINTS = 8000
 FIGURES = 4
@@ -218,6 +219,8 @@ def environment() -> Environment:
 def render(report: Report) -> str:
     """Return the page: no address outside it is used, and it works without scripts too."""
     from markupsafe import Markup
+
+    from pcfix.report.map_data import map_json  # not quick to load, and texts do without
 
     return (
         environment()
