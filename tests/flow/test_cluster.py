@@ -109,6 +109,23 @@ def test_a_worker_that_is_killed_costs_only_its_tiles(scheduler, cloud, tmp_path
     assert pcfix.correct_file(cloud[0], tmp_path / "out", scheduler="gone", **GIVEN) == many
 
 
+def test_cleaning_on_a_cluster_gives_the_same_bytes(scheduler, cloud, tmp_path, monkeypatch):
+    here = pcfix.clean_file(cloud[0], tmp_path / "here")
+    folder, address = scheduler
+    workers = [worker(folder), worker(folder)]
+    monkeypatch.setattr("pcfix.flow.tiles.in_processes", None)  # nothing is done on this machine
+    try:
+        there = pcfix.clean_file(cloud[0], tmp_path / "there", scheduler=address)
+    finally:
+        for one in workers:
+            one.kill()
+            one.wait()
+    assert there.noise == here.noise
+    for path in cloud[0].iterdir():
+        cleaned = [tmp_path / name / path.name for name in ("here", "there")]
+        assert cleaned[0].read_bytes() == cleaned[1].read_bytes()
+
+
 @pytest.fixture
 def bucket(monkeypatch):
     """Return the address of a bucket of a server on this machine."""
