@@ -19,6 +19,9 @@ Empty: TypeAlias = Callable[[tuple[int, ...], npt.DTypeLike], Array]
 """Makes an array of a shape and type, values not set: `numpy.empty`, or one on disk."""
 
 ROWS = 1_000_000
+FEW_ROWS = 65_536
+"""Rows of a block whose intermediate arrays stay in the processor's cache: memory that is fetched
+anew from the system for each of them costs more than what is done with it."""
 LARGE = 2_000_000
 """Rows from which on an array goes to disk, where there is a place for it."""
 
@@ -48,10 +51,10 @@ def let_go() -> None:
     _let_go()
 
 
-def blocks(count: int) -> Iterator[slice]:
-    """Yield all rows, at most `ROWS` at a time."""
-    for first in range(0, count, ROWS):
-        yield slice(first, min(first + ROWS, count))
+def blocks(count: int, most: int = ROWS) -> Iterator[slice]:
+    """Yield all rows, at most so many at a time."""
+    for first in range(0, count, most):
+        yield slice(first, min(first + most, count))
         _let_go()
 
 

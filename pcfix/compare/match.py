@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.blocks import blocks, bounds, empty, kept, mapped
+from pcfix.blocks import FEW_ROWS, blocks, bounds, empty, kept, mapped
 from pcfix.clean.neighbours import nearest_of
 from pcfix.compare.nearest import mean_spacing_m
 from pcfix.errors import GeometryError, InputError, SettingError
@@ -215,22 +215,22 @@ def near_in_plan(xy: FloatArray, other_xy: FloatArray, limit_m: float) -> BoolAr
     high = low + np.array([columns, rows]) * limit_m
     steps = np.array([-1, 0, 1])
     around = (steps[:, np.newaxis] * columns + steps).ravel()
-    codes = (_codes(other_xy[some], low, limit_m, columns) for some in blocks(len(other_xy)))
+    parts = (other_xy[some] for some in blocks(len(other_xy), FEW_ROWS))
+    codes = (_codes(part, low, limit_m, columns) for part in parts)
     table = np.zeros(columns * rows if columns * rows <= MAX_TABLE else 0, np.bool_)
     for some in codes if len(table) else ():
         table[some] = True
     held = np.flatnonzero(table) if len(table) else np.unique(np.hstack([*map(np.unique, codes)]))
     near = (held[:, np.newaxis] + around).ravel()
     table[near if len(table) else []] = True
-
-    def asked(some: FloatArray) -> BoolArray:
-        x, y = some[:, 0], some[:, 1]
+    found = empty((len(xy),), np.bool_)
+    for block in blocks(len(xy), FEW_ROWS):
+        x, y = xy[block, 0], xy[block, 1]
         inside = (x >= low[0]) & (x < high[0]) & (y >= low[1]) & (y < high[1])
-        codes = _codes(some[inside], low, limit_m, columns)
-        inside[inside] = table[codes] if len(table) else np.isin(codes, near)
-        return np.asarray(inside)
-
-    return mapped(asked, xy)
+        asked = _codes(kept(inside, xy[block]), low, limit_m, columns)
+        inside[inside] = table[asked] if len(table) else np.isin(asked, near)
+        found[block] = inside
+    return found
 
 
 def _codes(xy: FloatArray, low: FloatArray, side_m: float, columns: int) -> IntArray:

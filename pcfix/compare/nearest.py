@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
-from pcfix.blocks import blocks, bounds, empty
+from pcfix.blocks import FEW_ROWS, blocks, bounds, empty
 from pcfix.clean.neighbours import SLACK, Neighbours, Tiles, make_tiles, one_tile
-from pcfix.kernels import Span, in_tiles, kernel, lean, lean_kernel
+from pcfix.kernels import Span, in_tiles, lean, lean_kernel
 from pcfix.model import FloatArray, IntArray
 
 POINTS_PER_CELL = 3.0
@@ -25,48 +26,64 @@ MAX_RINGS = 10
 """How many rings a search walks before it gives up."""
 
 
-class Cells(NamedTuple):
-    """Points by cell; the points of cell i are ``points[start[i]:start[i + 1]]``."""
+Indices: TypeAlias = npt.NDArray[np.int32]
+"""Of cells, and of points in a tile, which are few enough: each pass takes half the memory."""
+
+
+class Lattice(NamedTuple):
+    """Squares over the plan; those of a row follow each other."""
 
     low: FloatArray  # (2,), the corner of the first cell
     side_m: float
     columns: int
     rows: int
-    start: IntArray
+    slack_m: float  # more than rounding
+
+
+class Cells(NamedTuple):
+    """Points by cell; the points of cell i are ``points[start[i]:start[i + 1]]``."""
+
+    lattice: Lattice
+    start: Indices
     points: FloatArray  # (m, 3), in the order of the cells
     z_range: FloatArray  # (cells, 2)
-    slack_m: float  # more than rounding
 
 
 def build_cells(points: FloatArray) -> Cells:
     """Sort points (m, 3), metres, into cells."""
-    low, extent, side = _lattice(points)
-    columns, rows = (int(n) + 1 for n in extent / side)
-    start, order = sorted_by_cell(cell_of(points, low, side, columns, rows), columns * rows)
-    arranged = np.empty((len(order), 3))
+    lattice = _lattice(points)
+    start, order = sorted_by_cell(points, lattice)
+    arranged, z_range = np.empty((len(order), 3)), np.empty((len(start) - 1, 2))
     in_tiles(_gather, len(order), points, order, arranged)
-    slack = 1e-12 * float(extent.max()) + 1e-15 * float(np.abs(low).max() + extent.max())
-    return Cells(low, side, columns, rows, start, arranged, _z_range(start, arranged), slack)
+    in_tiles(_set_z_range, len(z_range), start, arranged, z_range)
+    return Cells(lattice, start, arranged, z_range)
 
 
-def _lattice(points: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return the corner and the extent of points, and the side of their cells."""
+def _lattice(points: FloatArray) -> Lattice:
+    """Return cells of a few points each."""
     low, high = bounds(points[:, :2])
     extent = high - low
-    side = _side(extent, len(points) / POINTS_PER_CELL)
-    columns, rows = (int(n) + 1 for n in extent / side)
-    taken = np.zeros(columns * rows, np.bool_)
-    for some in blocks(len(points)):
-        taken[cell_of(points[some], low, side, columns, rows)] = True
+    slack = 1e-12 * float(extent.max()) + 1e-15 * float(np.abs(low).max() + extent.max())
+
+    def squares(side_m: float) -> Lattice:
+        columns, rows = (int(n) + 1 for n in extent / side_m)
+        return Lattice(low, side_m, columns, rows, slack)
+
+    coarse = squares(_side(extent, len(points) / POINTS_PER_CELL))
+    taken = np.zeros(coarse.columns * coarse.rows, np.bool_)
+    cell = np.empty(min(len(points), FEW_ROWS), np.int32)
+    for block in blocks(len(points), FEW_ROWS):
+        count = block.stop - block.start
+        _set_cells((0, count), points[block], coarse, cell)
+        taken[cell[:count]] = True
     # a cloud that fills little of its bounding box gets smaller cells
     share = np.count_nonzero(taken) * POINTS_PER_CELL / len(points)
-    side = max(side * np.sqrt(share), _side(extent, MAX_CELLS))
-    return low, extent, float(side)
+    return squares(float(max(coarse.side_m * np.sqrt(share), _side(extent, MAX_CELLS))))
 
 
 def spacing_m(points: FloatArray) -> float:
     """Return the side of the square that each point (n, 3) has, where there are points, metres."""
-    return _lattice(points)[2] / math.sqrt(POINTS_PER_CELL)
+    return _lattice(points).side_m / math.sqrt(POINTS_PER_CELL)
 
 
 def _side(extent: FloatArray, cells: float) -> float:
@@ -75,59 +92,68 @@ def _side(extent: FloatArray, cells: float) -> float:
     return max(float(np.sqrt(area / cells)), length / cells, length * 1e-6, 1e-9)
 
 
-@kernel
-def cell_of(
-    points: FloatArray, low: FloatArray, side_m: float, columns: int, rows: int
-) -> IntArray:
-    """Return the number of each point's cell, or of the nearest cell to a point outside."""
-    cell = np.empty(len(points), np.int64)
-    for i in range(len(points)):
+# The kernels make no arrays: numba would first load how arrays are made, which takes longer than to
+# search among a hundred thousand points.
+
+
+@lean_kernel
+def _set_cells(span: Span, points: FloatArray, lattice: Lattice, cell: Indices) -> None:
+    """Set the number of each point's cell, or of the nearest cell to a point outside."""
+    low, side_m, columns, rows, _ = lattice
+    for i in range(*span):
         u = min(max((points[i, 0] - low[0]) / side_m, 0.0), columns - 1.0)
         v = min(max((points[i, 1] - low[1]) / side_m, 0.0), rows - 1.0)
         cell[i] = int(v) * columns + int(u)
-    return cell
 
 
-@kernel
-def sorted_by_cell(cell: IntArray, count: int) -> tuple[IntArray, IntArray]:
-    """Return where each cell starts, and the rows in the order of their cells."""
-    start = np.zeros(count + 1, np.int64)
-    for i in range(len(cell)):
-        start[cell[i] + 1] += 1
-    for k in range(count):
-        start[k + 1] += start[k]
-    place = start[:-1].copy()
-    order = np.empty(len(cell), np.int64)
-    for i in range(len(cell)):
-        order[place[cell[i]]] = i
-        place[cell[i]] += 1
+def sorted_by_cell(points: FloatArray, lattice: Lattice) -> tuple[Indices, Indices]:
+    """Return where each cell starts, and the rows of points (n, 3) in the order of their cells."""
+    start = np.zeros(lattice.columns * lattice.rows + 1, np.int32)
+    cell, order = np.empty((2, len(points)), np.int32)
+    in_tiles(_set_cells, len(points), points, lattice, cell)
+    _sort(cell, start, np.empty_like(start), order)
     return start, order
 
 
 @lean_kernel
-def _gather(span: Span, points: FloatArray, order: IntArray, arranged: FloatArray) -> None:
+def _sort(cell: Indices, start: Indices, place: Indices, order: Indices) -> None:
+    """Set what `sorted_by_cell` returns, `start` being zero; `place` is room to work in."""
+    for i in range(len(cell)):
+        start[cell[i] + 1] += 1
+    place[0] = 0
+    for k in range(1, len(start)):
+        start[k] += start[k - 1]
+        place[k] = start[k]
+    for i in range(len(cell)):
+        order[place[cell[i]]] = i
+        place[cell[i]] += 1
+
+
+@lean_kernel
+def _gather(
+    span: Span, points: FloatArray, order: IntArray | Indices, arranged: FloatArray
+) -> None:
     """Set ``points[order]``, with all cores: the jumps through memory are what takes time."""
     for i in range(*span):
-        for axis in range(3):
-            arranged[i, axis] = points[order[i], axis]
+        x, y, z = points[order[i]]
+        arranged[i, 0], arranged[i, 1], arranged[i, 2] = x, y, z
 
 
-@kernel
-def _z_range(start: IntArray, points: FloatArray) -> FloatArray:
-    """Return lowest and highest Z of each cell; of an empty one, infinitely far apart."""
-    z_range = np.empty((len(start) - 1, 2))
-    z_range[:, 0], z_range[:, 1] = np.inf, -np.inf
-    for k in range(len(start) - 1):
+@lean_kernel
+def _set_z_range(span: Span, start: Indices, points: FloatArray, z_range: FloatArray) -> None:
+    """Set lowest and highest Z of each cell; of an empty one, infinitely far apart."""
+    for k in range(*span):
+        lowest, highest = np.inf, -np.inf
         for i in range(start[k], start[k + 1]):
-            z_range[k, 0] = min(z_range[k, 0], points[i, 2])
-            z_range[k, 1] = max(z_range[k, 1], points[i, 2])
-    return z_range
+            lowest, highest = min(lowest, points[i, 2]), max(highest, points[i, 2])
+        z_range[k, 0], z_range[k, 1] = lowest, highest
 
 
 @lean
-def _gap(x: float, cell: int, grid: Cells) -> float:
+def _gap(x: float, cell: int, lattice: Lattice) -> float:
     """Return how far x lies outside the cell at least, along one axis."""
-    return max(cell * grid.side_m - x, x - (cell + 1) * grid.side_m, grid.slack_m) - grid.slack_m
+    side_m, slack_m = lattice.side_m, lattice.slack_m
+    return max(cell * side_m - x, x - (cell + 1) * side_m, slack_m) - slack_m
 
 
 @lean
@@ -136,9 +162,11 @@ def _best_in_cell(grid: Cells, column: int, row: int, place: FloatArray, best: f
 
     It goes by the coordinates as they came, so that it does not depend on the cells.
     """
-    cell = row * grid.columns + column
+    lattice = grid.lattice
+    cell = row * lattice.columns + column
     x, y, z = place
-    dx, dy = _gap(x - grid.low[0], column, grid), _gap(y - grid.low[1], row, grid)
+    dx = _gap(x - lattice.low[0], column, lattice)
+    dy = _gap(y - lattice.low[1], row, lattice)
     dz = max(grid.z_range[cell, 0] - z, z - grid.z_range[cell, 1], 0.0)
     if dx * dx + dy * dy + dz * dz >= best:
         return best
@@ -156,47 +184,41 @@ def _nearest_one(grid: Cells, place: FloatArray, best: float) -> float:
 
     `best` is a squared distance; where nothing is nearer its root is returned.
     """
-    x, y = place[0] - grid.low[0], place[1] - grid.low[1]
-    column = int(min(max(x / grid.side_m, 0.0), grid.columns - 1.0))
-    row = int(min(max(y / grid.side_m, 0.0), grid.rows - 1.0))
+    low, side_m, columns, rows, slack_m = grid.lattice
+    x, y = place[0] - low[0], place[1] - low[1]
+    column = int(min(max(x / side_m, 0.0), columns - 1.0))
+    row = int(min(max(y / side_m, 0.0), rows - 1.0))
     for ring in range(MAX_RINGS + 1):
         left, right = column - ring, column + ring
         bottom, top = row - ring, row + ring
-        for j in range(max(bottom, 0), min(top, grid.rows - 1) + 1):
-            if j in (bottom, top):
-                for i in range(max(left, 0), min(right, grid.columns - 1) + 1):
+        for j in range(max(bottom, 0), min(top, rows - 1) + 1):
+            step = 1 if abs(j - row) == ring else 2 * ring
+            for i in range(left, right + 1, step):
+                if 0 <= i < columns:
                     best = _best_in_cell(grid, i, j, place, best)
-            else:
-                if left >= 0:
-                    best = _best_in_cell(grid, left, j, place, best)
-                if right < grid.columns:
-                    best = _best_in_cell(grid, right, j, place, best)
         clear = np.inf  # nothing beyond the rings so far is nearer than this
         if left > 0:
-            clear = min(clear, x - left * grid.side_m)
-        if right < grid.columns - 1:
-            clear = min(clear, (right + 1) * grid.side_m - x)
+            clear = min(clear, x - left * side_m)
+        if right < columns - 1:
+            clear = min(clear, (right + 1) * side_m - x)
         if bottom > 0:
-            clear = min(clear, y - bottom * grid.side_m)
-        if top < grid.rows - 1:
-            clear = min(clear, (top + 1) * grid.side_m - y)
-        clear -= grid.slack_m
+            clear = min(clear, y - bottom * side_m)
+        if top < rows - 1:
+            clear = min(clear, (top + 1) * side_m - y)
+        clear -= slack_m
         if clear > 0.0 and best <= clear * clear:
             return float(np.sqrt(best))
     return float(np.nan)
 
 
 @lean_kernel
-def nearest_distances(
-    span: Span, grid: Cells, places: FloatArray, order: IntArray, distance: FloatArray
-) -> None:
+def nearest_distances(span: Span, grid: Cells, places: FloatArray, distance: FloatArray) -> None:
     """Set the distance of each place (n, 3) to its nearest point where it was larger.
 
-    NaN where that is more than `MAX_RINGS` cells away. Places are visited in the given order,
-    which changes the time and nothing else.
+    NaN where that is more than `MAX_RINGS` cells away. Places that follow each other are best near
+    to each other.
     """
-    for k in range(*span):
-        i = order[k]
+    for i in range(*span):
         known = distance[i]
         found = _nearest_one(grid, places[i], known * known * SLACK)
         distance[i] = known if found > known else found
@@ -234,16 +256,21 @@ class CellSearch(Neighbours):
         self, tile: int, points: FloatArray, rows: IntArray, distance: FloatArray, place: IntArray
     ) -> None:
         grid = self._cells(tile)
-        some = points if len(rows) == len(points) else points[rows]
-        _, order = sorted_by_cell(
-            cell_of(some, grid.low, grid.side_m, grid.columns, grid.rows), grid.columns * grid.rows
-        )
-        best = distance[rows, 0]
-        in_tiles(nearest_distances, len(order), grid, some, order, best)
-        far = np.isnan(best)
-        distance[rows, 0] = np.where(far, distance[rows, 0], best)
-        if far.any():
-            super()._add(tile, points, rows[far], distance, place)
+        whole = len(rows) == len(points)
+        _, order = sorted_by_cell(points if whole else points[rows], grid.lattice)
+        near, lost = np.empty((min(len(order), FEW_ROWS), 3)), []
+        for block in blocks(len(order), FEW_ROWS):
+            asked = order[block] if whole else rows[order[block]]
+            best = distance[asked, 0]
+            # a jump to each place would cost more than its search: all at once, they overlap
+            in_tiles(_gather, len(asked), points, asked, near)
+            in_tiles(nearest_distances, len(asked), grid, near, best)
+            far = np.isnan(best)
+            lost.append(asked[far])
+            distance[asked[~far], 0] = best[~far]
+        far_rows = np.sort(np.concatenate(lost))
+        if far_rows.size:
+            super()._add(tile, points, far_rows, distance, place)
 
 
 def cloud_to_cloud(xyz: FloatArray, reference: FloatArray) -> FloatArray:
@@ -253,7 +280,10 @@ def cloud_to_cloud(xyz: FloatArray, reference: FloatArray) -> FloatArray:
     where the two clouds sample a surface at different places: half the spacing of the reference is
     its floor. See `vertical` for a signed difference.
     """
-    near, asked = CellSearch(_tiles(reference)), _tiles(xyz)
+    near = CellSearch(_tiles(reference))
+    if len(xyz) <= 2 * TILE_POINTS:
+        return near.nearest(xyz, 1)[0][:, 0]
+    asked = _tiles(xyz)
     distance = empty((len(xyz),))
     for piece in asked.pieces(2 * TILE_POINTS):
         found = near.nearest(asked.xyz[piece], 1)[0][:, 0]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.blocks import empty, kept, let_go, mapped
+from pcfix.blocks import FEW_ROWS, blocks, empty, kept, let_go, mapped
 from pcfix.compare.match import Reference, SurveyCloud
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.crs import is_same, parts
@@ -59,7 +59,8 @@ def read_cloud(
                 source.dimension(points, own.name) if isinstance(own, WaterDimension) else None,
                 {name: source.dimension(points, name) for name in extra.intersection(TOLD)},
             )
-            for points in source.chunks()
+            for chunk in source.chunks()
+            for points in (chunk[rows] for rows in blocks(len(chunk), FEW_ROWS))
         )
         given = water is not None
         return survey_cloud(str(path), crs, chunks, own, given, len(source), skip_classes)

@@ -1,7 +1,7 @@
 """How long a cloud-to-cloud comparison takes beside CloudCompare.
 
 Makes two clouds of a wavy bed once (kept in a folder for the next run), then times, in one run
-and by turns, CloudCompare as a whole process, pcfix as a whole process, and pcfix as a script
+and by turns, CloudCompare as a whole process, `pcfix compare` as one, and pcfix as a script
 has it: a second ``compare_clouds`` in a Python that has its libraries loaded, files read and
 figures written. CloudCompare gets its points as binary PLY, the quickest to load of what every
 build of it reads; pcfix gets LAS, and in rows of their own LAZ. Prints the ratios, and mean and
@@ -51,15 +51,12 @@ def main():
         if not (folder / f"{name}_{count}.ply").exists():
             make(folder, f"{name}_{count}", count, seed)
     names = [folder / f"{name}_{count}" for name in ("cloud", "reference")]
-    commands = {
-        f"pcfix{what}, {kind}": [
-            *(sys.executable, "-c", script),
-            *(f"{name}.{kind.lower()}" for name in names),
-            str(folder / "summary.json"),
-        ]
-        for what, script in (("", COMMAND), (" call", SECOND_CALL))
-        for kind in ("LAS", "LAZ")
-    }
+    summary, commands = str(folder / "summary.json"), {}
+    for kind in ("LAS", "LAZ"):
+        files = [f"{name}.{kind.lower()}" for name in names]
+        given = ["--c2c-only", "--overwrite", "--quiet", "--summary", summary]
+        commands[f"pcfix, {kind}"] = [sys.executable, "-m", "pcfix", "compare", *files, *given]
+        commands[f"pcfix call, {kind}"] = [sys.executable, "-c", SECOND_CALL, *files, summary]
     program = shutil.which("CloudCompare")
     if program:
         files = [word for name in names for word in ("-O", f"{name}.ply")]
