@@ -124,7 +124,7 @@ class Records:
         self._units = _units(path, header)
         self._item, self._prefix, self._field = _layout(header)
         least = int((self._prefix + self._item * (self._prefix == 0)).sum())
-        if header.records * least > len(self._units):
+        if header.records * max(least, 1) > len(self._units):
             self._complain(header.records)
         names = [p.name for p in header.properties if p.length]
         starts = np.zeros((len(names), header.records + 1), np.int64)

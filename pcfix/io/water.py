@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
 from pcfix.io.files import check_input
 from pcfix.io.ply import Records
 from pcfix.io.water_rasters import read_water_raster
@@ -143,7 +143,10 @@ def check_mesh(mesh: WaterMesh, path: Path) -> None:
     """
     from pcfix.water.surface import build_tin, in_two_sheets
 
-    tin = build_tin(mesh)
+    try:
+        tin = build_tin(mesh)
+    except GeometryError as error:
+        raise InputError(f"{path}: {error}") from None
     double, area_m2 = in_two_sheets(tin)
     share = float(area_m2[double].sum() / area_m2.sum())
     if share > MOST_OVERLAP:

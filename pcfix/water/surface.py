@@ -237,6 +237,8 @@ class OwnWater(NamedTuple):
 
 EDGE_TOLERANCE = 1e-9  # of a barycentric coordinate: a point on an edge belongs to both sides
 MIN_FACET_AREA_M2 = 1e-12  # in plan; below this a facet is vertical or a sliver, and has no height
+FARTHEST_M = 1e9
+"""No coordinate on Earth is as large; cells of a mesh that wide cannot be counted."""
 
 
 class Tin(NamedTuple):
@@ -260,8 +262,13 @@ def build_tin(mesh: WaterMesh) -> Tin:
     Raises
     ------
     GeometryError
-        If no facet has an area in plan.
+        If no facet has an area in plan, or a vertex is on no map.
     """
+    if not np.abs(mesh.vertices).max(initial=0.0) < FARTHEST_M:
+        raise GeometryError(
+            f"The water surface {mesh.name} has a vertex at"
+            f" {np.abs(mesh.vertices).max():.3g} m, which is on no map; export it again."
+        )
     origin = mesh.vertices[:, :2].min(axis=0)
     xyz = (mesh.vertices - np.append(origin, 0.0))[mesh.triangles]
     edge1, edge2 = xyz[:, 1] - xyz[:, 0], xyz[:, 2] - xyz[:, 0]

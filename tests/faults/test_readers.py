@@ -119,6 +119,19 @@ FOUND = {
         *("mesh", "obj", "water.obj", instead(b"f 1/", b"f 99999999999999999999/")),
         "there is no vertex",
     ),
+    "a vertex on no map": (  # it ended the process, in the index of the facets
+        *("mesh", "obj", "water.obj", instead(b"v 512000.12345", b"v -1e308")),
+        "has a vertex at 1e+308 m",
+    ),
+    "a mesh of one line": (
+        *("mesh", "obj", "water.obj", instead(b"f 1/1/1 2/1/1 3//1 -1", b"f 1 2 2")),
+        "has no facet with an area",
+    ),
+    "many records of no properties": (
+        *("mesh", "ply", "water.ply"),
+        instead(b"element face 2\n", b"element face 99999999999999999999\nelement f 2\n"),
+        "is cut short or damaged",
+    ),
     "a raster without a place": (
         *("raster", "tif", "water.tif", instead(PLACE, struct.pack("<2d", float("nan"), 5.2e6))),
         "no size or no place",
