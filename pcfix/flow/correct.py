@@ -38,13 +38,16 @@ from pcfix.io.las.source import LasSource, centring_steps
 from pcfix.io.las.writing import corrected_header
 from pcfix.io.regressions import read_regression
 from pcfix.io.tiles import Clouds, Tiles, open_cloud, single, tiles_of
+from pcfix.io.views.matching import beside
 from pcfix.kernels import threads
+from pcfix.lens.frames import beside_frames
 from pcfix.model import (
     BATHYMETRIC_POINT,
     NO_CAMERAS,
     Cameras,
     Correction,
     FloatArray,
+    IntArray,
     Views,
     WaterSurface,
 )
@@ -158,6 +161,7 @@ def correct_points(
     check_above_water(cameras, surface, offset)
     if views is not None:
         _check_views(views, len(points), len(adjusted_from or cameras))
+        _warn_of_beside(beside_frames(points, views, adjusted_from or cameras))
     label = None if may_be_submerged is None else _only(may_be_submerged, len(points))
     step, made_with = None, None
     if adjusted_from is not None:
@@ -216,6 +220,12 @@ def _check_views(views: Views, n: int, k: int) -> None:
         raise SettingError("views: the starts must not decrease.")
     if len(views.camera) and not 0 <= views.camera.min() <= views.camera.max() < k:
         raise SettingError(f"views name camera {views.camera.max()}, but there are {k}.")
+
+
+def _warn_of_beside(counts: IntArray) -> None:
+    if counts.any():
+        entries, points = int(counts.sum()), int(np.count_nonzero(counts))
+        warnings.warn(f"views: {beside(entries, points)}", PcfixWarning, stacklevel=3)
 
 
 def correct_file(

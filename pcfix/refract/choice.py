@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from pcfix.kernels import Span, in_tiles, kernel, lean, lean_kernel, part
 from pcfix.lens.algebra import dot, minus, row_of
-from pcfix.lens.frames import Frames, frames_of, holds, no_frames
+from pcfix.lens.frames import Frames, frames_of, holds, listed_frames_of
 from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey
@@ -104,7 +104,8 @@ def shapes_of(survey: Survey) -> tuple[Tin | None, Field | None]:
 def chosen_views(batch: Batch) -> Views:
     """Return the cameras whose rays each point gets, as a list.
 
-    Those of the list of the batch, or, without one, all in whose frame the point lies.
+    Those of the list of the batch that can have imaged it (`pcfix.lens.frames.BESIDE`), or,
+    without a list, all in whose frame the point lies.
 
     Returns
     -------
@@ -115,9 +116,7 @@ def chosen_views(batch: Batch) -> Views:
     if not len(survey.cameras):
         return Views(np.zeros(len(batch) + 1, np.int64), np.zeros(0, np.int64))
     points, rig = points_of(batch), rig_of(survey)
-    frames = no_frames(len(survey.cameras))
-    if views is None:
-        frames = frames_of(survey.cameras)
+    frames = frames_of(survey.cameras) if views is None else listed_frames_of(survey.cameras)
     tiles = tiles_of(batch)
     first, count = np.zeros(tiles + 1, np.int64), np.zeros(len(batch) + 1, np.int64)
     if views is None:
@@ -195,7 +194,7 @@ def _choose_all(
     """
     (first, begin, count, place), listed = found, views[0].size > 0
     low, high = corners_of(points.order[span[0] * TILE : span[1] * TILE], points.xyz)
-    around = cameras_around(frames, rig.centres, low, high)
+    around = views[1][:0] if listed else cameras_around(frames, rig.centres, low, high)
     for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)

@@ -18,9 +18,9 @@ import numpy as np
 
 from pcfix.kernels import Span, in_tiles, kernel, lean, part
 from pcfix.lens.algebra import Vector, dot, minus, row_of
-from pcfix.lens.frames import Frames, frames_of
+from pcfix.lens.frames import Frames, frames_of, with_border
 from pcfix.lens.imaging import project
-from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints, Views
+from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, Views
 
 MATCHED, AVERAGED, NEIGHBOURS = 5, 8, 12
 BEST_ANGLE_DEG, NARROW_DEG, WIDE_DEG = 12.0, 4.56, 8.4
@@ -146,18 +146,8 @@ def without_border(cameras: Cameras) -> Cameras:
     """Return cameras whose frames are narrower by the border in which no patch has room."""
     if cameras.lenses is None:
         return cameras
-    return replace(cameras, lenses=tuple(_narrower(lens) for lens in cameras.lenses))
-
-
-def _narrower(lens: Lens) -> Lens:
-    border = BORDER_PX * lens.pixel_size
-    return replace(
-        lens,
-        width=lens.width - 2.0 * border,
-        height=lens.height - 2.0 * border,
-        principal_x=lens.principal_x - border,
-        principal_y=lens.principal_y - border,
-    )
+    borders = [BORDER_PX * lens.pixel_size for lens in cameras.lenses]
+    return replace(cameras, lenses=tuple(map(with_border, cameras.lenses, borders)))
 
 
 def _seen(cameras: Cameras, places: FloatArray, likely: Iterable[IntArray]) -> _Seen:

@@ -351,6 +351,20 @@ def test_images_without_a_pose_are_left_out_and_counted(tmp_path, cameras, scene
     )
 
 
+def test_cameras_that_look_elsewhere_are_counted(tmp_path, cameras, scene):
+    """The last two of the row are 200 m and more from the first points, their frames 80 m wide."""
+    xyz, lists = scene
+    first = xyz[:, 0] < 20.0
+    listed = [[*one, 6, 7] if near and i % 9 == 0 else one
+              for i, (one, near) in enumerate(zip(lists, first, strict=True))]  # fmt: skip
+    views = read_views(write_ply(tmp_path / "d.ply", xyz, listed), cameras)
+    match = ViewMatch(views, cameras)
+    assert given(match, xyz)[0] == listed
+    points = int(np.count_nonzero(first[::9]))
+    assert (match.report.beside_entries, match.report.beside_points) == (2 * points, points)
+    assert f"{2 * points:,} entries, of {points:,} points, name" in match.report.warnings()[-1]
+
+
 def test_damaged_model_beside_the_list_is_passed_over(tmp_path, cameras, scene):
     xyz, lists = scene
     (tmp_path / "sparse").mkdir()

@@ -18,6 +18,7 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.io.views.lists import ViewList
 from pcfix.io.views.orders import entries, fitted
+from pcfix.lens.frames import beside_frames
 from pcfix.model import Cameras, FloatArray, IntArray, Views
 from pcfix.sums import Sums
 
@@ -104,7 +105,11 @@ class ViewMatch:
             self.report.by_row += len(row)
         else:
             row = self._rows(xyz, first_row, self._views.raw.xyz)
-        return self._given(row)
+        views = self._given(row)
+        apart = beside_frames(xyz, views, self._cameras)
+        self.report.beside_entries += int(apart.sum())
+        self.report.beside_points += int(np.count_nonzero(apart))
+        return views
 
     def _rows(self, xyz: FloatArray, first_row: int, listed: FloatArray) -> IntArray:
         """Return the list's row of each point, -1 where it has none."""
@@ -160,7 +165,7 @@ class ViewReport(Sums):
 
     added = (
         *("by_row", "by_position", "unmatched", "without_camera"),
-        *("entries", "unposed_entries", "_histogram"),
+        *("entries", "unposed_entries", "beside_entries", "beside_points", "_histogram"),
     )
     least = ("share_seen",)
 
@@ -175,6 +180,8 @@ class ViewReport(Sums):
     without_camera: int = 0  # matched points of whose images none has a pose
     entries: int = 0  # of the lists: cameras given out
     unposed_entries: int = 0  # images without a pose that were dropped
+    beside_entries: int = 0  # cameras that cannot have imaged their point, which do not count
+    beside_points: int = 0  # that they are listed for
     unposed: tuple[str, ...] = ()  # images without a pose that a list may name
     weights: bool = False
     notes: list[str] = field(default_factory=list)
@@ -235,6 +242,8 @@ class ViewReport(Sums):
                 f"{self.source}: {self.unposed_entries:,} entries name images without a pose"
                 f"{named}; they are left out."
             )
+        if self.beside_entries:
+            sentences.append(f"{self.source}: {beside(self.beside_entries, self.beside_points)}")
         return sentences
 
     def _tolerance(self) -> str:
@@ -250,6 +259,15 @@ class ViewReport(Sums):
             "distance_median_m": self.distance_m(0.5),
             "distance_95_m": self.distance_m(0.95),
         }
+
+
+def beside(entries: int, points: int) -> str:
+    """Return the sentence on cameras that cannot have imaged what they are listed for."""
+    return (
+        f"{entries:,} entries, of {points:,} points, name cameras that look elsewhere: the point is"
+        " farther beside the image than that is long, or behind the camera. They are left out; the"
+        " list, or poses, are of another cloud or in part wrong."
+    )
 
 
 def spacing_m(xyz: FloatArray) -> float | None:
