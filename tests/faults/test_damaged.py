@@ -62,6 +62,7 @@ PACKED = {
     "count of chunks": (of_chunks("count", "<I", 2**32 - 1), "states 4,294,967,295 chunks"),
     "too many chunks": (of_chunks("count", "<I", 10**6), "states 1,000,000 chunks of points in"),
     "more chunks than points": (of_chunks("count", "<I", 2), "its header counts 2,500 points"),
+    "fewer points": (lambda d: put(d, COUNT, "<Q", 300), "the file holds at least 2,500"),
     "no chunks": (of_chunks("count", "<I", 0), "2,500 points in 0 chunks"),
     "chunks without points": (of_chunks("size", "<I", 0), "its chunks have no points"),
     "chunks of one point": (of_chunks("size", "<I", 1), "2,500 points in 1 chunks of 1"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import lazrs
 
@@ -62,11 +62,21 @@ def _held(path: Path, header: Any, stated: int) -> int:
 
 
 def _least_in_chunks(path: Path, header: Any, vlrs: Any) -> int:
-    """Return how many points the full chunks of a LAZ file hold, and one more; 0 if not known."""
+    """Return how many points the full chunks of a LAZ file hold, and the last; 0 if not known.
+
+    Of the last chunk only a layered one says how many it has: else it is taken for one.
+    """
     table = _table(path, header, vlrs)
     if table is None or table.points == _VARIABLE_CHUNKS or not table.chunks:
         return 0
-    return (table.chunks - 1) * table.points + 1
+    last = 1
+    if _is_layered(table):
+        with path.open("rb") as stream:
+            sizes = _chunk_sizes(stream, table)
+            stream.seek(table.start + sum(sizes[:-1]) + header.point_format.size)
+            (stated,) = _unpacked("<I", stream.read(4)) or (1,)
+        last = stated if sizes and stated <= table.points else 1
+    return (table.chunks - 1) * table.points + last
 
 
 class _Table(NamedTuple):
@@ -116,19 +126,14 @@ def check_chunks(path: Path, header: Any, vlrs: Any) -> None:
             f"it states {header.point_count:,} points in {table.chunks:,} chunks of"
             f" {table.points:,}"
         )
-    if struct.unpack_from("<H", table.packing)[0] == _LAYERED and header.point_count:
+    if _is_layered(table) and header.point_count:
         _check_layers(path, header.point_format, table)
 
 
 def _check_layers(path: Path, point_format: Any, table: _Table) -> None:
     """Refuse chunks that are larger than all of them, and layers larger than their chunk."""
     with path.open("rb") as stream:
-        stream.seek(table.start - 8)
-        try:
-            chunks = lazrs.read_chunk_table(stream, lazrs.LazVlr(table.packing))
-        except lazrs.LazrsError:  # who reads the points says it
-            return
-        sizes = [size for _, size in chunks]
+        sizes = _chunk_sizes(stream, table)
         if sum(sizes) > table.size:
             raise ValueError(f"it states chunks of {sum(sizes):,} bytes in {table.size:,}")
         start = table.start
@@ -136,6 +141,20 @@ def _check_layers(path: Path, point_format: Any, table: _Table) -> None:
             stream.seek(start)
             check_chunk(stream.read(head_size(point_format)), size, point_format)
             start += size
+
+
+def _is_layered(table: _Table) -> bool:
+    return bool(struct.unpack_from("<H", table.packing)[0] == _LAYERED)
+
+
+def _chunk_sizes(stream: BinaryIO, table: _Table) -> list[int]:
+    """Return the bytes of each chunk; none where the table is damaged: who reads points says it."""
+    stream.seek(table.start - 8)
+    try:
+        chunks = lazrs.read_chunk_table(stream, lazrs.LazVlr(table.packing))
+    except lazrs.LazrsError:
+        return []
+    return [size for _, size in chunks]
 
 
 def head_size(point_format: Any) -> int:
