@@ -4,8 +4,8 @@ The time of the processor is a sum: so much for each point (reading, packing, ro
 each ray; bytes go by the size of a point before and after. Start-up counts once for each tile.
 Prints a table; the constants are those of `copy_ratio.py` and `scaling.py` on one machine.
 
-    python -m tests.benchmarks.archive [--core-us-per-point 1.6] [--core-ns-per-ray 35]
-        [--rays 17] [--cores 2 64 1024] [--start-up-s 3]
+    python -m tests.benchmarks.archive [--core-us-per-point 0.8] [--core-ns-per-ray 10]
+        [--rays 17] [--cores 2 64 1024] [--start-up-s 2]
 """
 
 import argparse
@@ -17,10 +17,10 @@ SIZES = (("5 million", 5e6), ("100 million", 1e8), ("a billion", 1e9), ("a trill
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--core-us-per-point", type=float, default=1.6)
-    parser.add_argument("--core-ns-per-ray", type=float, default=35.0)
+    parser.add_argument("--core-us-per-point", type=float, default=0.8)
+    parser.add_argument("--core-ns-per-ray", type=float, default=10.0)
     parser.add_argument("--rays", type=float, default=17.0)
-    parser.add_argument("--start-up-s", type=float, default=3.0)
+    parser.add_argument("--start-up-s", type=float, default=2.0)
     parser.add_argument("--cores", type=int, nargs="+", default=[2, 64, 1024])
     given = parser.parse_args()
     print(f"points        core-hours  {'  '.join(f'{c:>6,} cores' for c in given.cores)}  TB moved")
