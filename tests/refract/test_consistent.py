@@ -16,7 +16,8 @@ from pcfix.kernels import threads
 from pcfix.lens.imaging import coefficients, image_and_gradients
 from pcfix.model import Cameras, Lens, Outcome, Views, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.consistent import check_consistent
+from pcfix.refract.consistent import check_consistent, consistent
+from pcfix.refract.intersect import intersect
 from pcfix.refract.methods import correct
 from pcfix.simulate.tracing import triangulate
 from pcfix.water.surface import surface_above
@@ -445,12 +446,18 @@ def test_no_points_at_all():
 
 
 def test_points_without_a_solution_keep_that_of_snell():
-    # the second camera looks away: it has no image of the point
-    cameras = looking([[-20.0, 0, 70], [20.0, 0, 70]], [15.0, 170.0], [0.0, 0.0])
+    # the second camera looks away: it has no image of the point, and no list gives it a ray
+    cameras, water = (
+        looking([[-20.0, 0, 70], [20.0, 0, 70]], [15.0, 170.0], [0.0, 0.0]),
+        WaterPlane(0.0),
+    )
     points, views = np.array([[0.0, 0, -3], [0.0, 1, -2]]), views_of([[0, 1], [0, 1]])
+    listed = run(points, cameras, water, views)
+    assert (listed.outcome == Outcome.ONE_CAMERA).all()
+    batch = batch_of(points, surface_above(water, points), water, cameras, ScienceOptions(), views)
     with pytest.warns(PcfixWarning, match="no solution for 2 of 2 points"):
-        result = run(points, cameras, WaterPlane(0.0), views)
-    expected = run(points, cameras, WaterPlane(0.0), views, method="snell")
+        result = consistent(batch)
+    expected = intersect(batch)
     assert (result.outcome == Outcome.CORRECTED).all()
     assert result.shift_m == pytest.approx(expected.shift_m, abs=NANOMETRE)
 

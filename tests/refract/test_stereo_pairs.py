@@ -14,6 +14,7 @@ from pcfix.model import Cameras, Lens, Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
 from pcfix.refract.choice import cameras_of_pairs
+from pcfix.refract.intersect import intersect
 from pcfix.refract.matcher import matcher_of
 from pcfix.refract.methods import correct
 from pcfix.refract.stereo_pairs import invert_pairs
@@ -256,14 +257,15 @@ def test_no_points_at_all():
 
 
 def test_points_without_a_solution_keep_that_of_snell():
-    # the second camera looks away: it has no image of the point
+    # the second camera looks away: it has no image of the point, and no list gives it a ray
     cameras = looking([[-20.0, 0, 70], [20.0, 0, 70]], [15.0, 170.0], [0.0, 0.0], LENS)
-    points, water = np.array([[0.0, 0, -3]]), WaterPlane(0.0)
-    with pytest.warns(PcfixWarning, match="no solution for 1 of 1 points"):
-        result = run(points, cameras, water, listed([[[0, 1]]]))
+    points, water, pairs = np.array([[0.0, 0, -3]]), WaterPlane(0.0), listed([[[0, 1]]])
+    assert run(points, cameras, water, pairs).outcome.tolist() == [Outcome.ONE_CAMERA]
     settings = ScienceOptions(method="snell", index=N_WATER)
-    views = Views(np.array([0, 2]), np.array([0, 1]))
-    plain = correct(batch_of(points, surface_above(water, points), water, cameras, settings, views))
+    batch = batch_of(points, surface_above(water, points), water, cameras, settings, pairs)
+    with pytest.warns(PcfixWarning, match="no solution for 1 of 1 points"):
+        result = invert_pairs(batch)
+    plain = intersect(replace(batch, views=cameras_of_pairs(pairs)))
     assert result.shift_m == pytest.approx(plain.shift_m, abs=1e-9)
 
 
