@@ -12,6 +12,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import pcfix
+from pcfix.refract.stereo_pairs import CLOSE_M
 from tests.utils.any_scene import ENCODINGS, Scene, scenes
 from tests.utils.clouds import fields, read_raw, xyz_of
 
@@ -167,7 +168,7 @@ def test_cameras_that_look_elsewhere_count_as_if_not_listed(data, scene):
     assume(scene.cameras.rotations is not None and len(scene.cameras) > 3)
     method, kind = data.draw(st.sampled_from(("snell", "consistent"))), "tracks"
     rotations = scene.cameras.rotations.copy()
-    rotations[:2] = rotations[:2] * [[[1.0], [-1.0], [-1.0]]]
+    rotations[:2] = np.eye(3)
     cameras, n = replace(scene.cameras, rotations=rotations), len(scene.xyz)
     rng = np.random.default_rng(data.draw(st.integers(0, 99)))
     right = [2 + rng.permutation(len(cameras) - 2)[: rng.integers(0, 3)] for _ in range(n)]
@@ -202,9 +203,10 @@ def test_the_result_does_not_hang_on_frame_or_order(data, scene, turn):
     cameras = data.draw(st.permutations(range(len(scene.cameras))))
     points = data.draw(st.permutations(range(len(scene.xyz))))
     views = data.draw(listed(scene)) if method != "factor" and data.draw(st.booleans()) else None
-    renumbered = views
+    renumbered, bound_m = views, 1e-6
     if views is not None and method == "consistent" and views.kind == "pairs":
         turn = round(turn / (np.pi / 2.0)) * np.pi / 2.0  # their median is along the axes
+        bound_m = 6.0 * CLOSE_M  # each is off by up to three; the search begins at the point before
     if views is not None:
         taken = views.take(np.array(points))
         renumbered = replace(taken, camera=np.argsort(cameras)[taken.camera])
@@ -214,8 +216,10 @@ def test_the_result_does_not_hang_on_frame_or_order(data, scene, turn):
     np.testing.assert_array_equal(there.outcome, here.outcome[points])
     np.testing.assert_array_equal(there.ray_count, here.ray_count[points])
     expected = Scene(here.xyz, scene.cameras, scene.plane).moved(turn, shift).xyz[points]
-    np.testing.assert_allclose(there.xyz, expected, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(there.ray_miss_m, here.ray_miss_m[points], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(there.xyz, expected, rtol=0, atol=bound_m)
+    # their squares are what is left of sums of squares of 100 m, of rays that are nearly parallel
+    miss2, expected2 = there.ray_miss_m**2, here.ray_miss_m[points] ** 2
+    np.testing.assert_allclose(miss2, expected2, rtol=0, atol=1e-7)
 
 
 @given(data=st.data(), scene=scenes(), point_format=FORMATS)
