@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.kernels import Span, in_tiles, inlined, kernel, lean, lean_kernel, part
-from pcfix.lens.algebra import Vector, row_of
+from pcfix.lens.algebra import Vector, normal_of, row_of
 from pcfix.model import FloatArray, IntArray, WaterMesh, WaterRaster
 from pcfix.refract.batch import Batch, Chosen, Survey
 from pcfix.refract.tiling import TILE
@@ -223,6 +223,22 @@ def box_of(rows: IntArray, points: Chosen) -> Box:
 def water_at(box: Box, x: float, y: float) -> float:
     """Return the height of the water at a place."""
     return box.water[0] + box.water[1] * (x - box.middle[0]) + box.water[2] * (y - box.middle[1])
+
+
+@part
+def nodes_of(box: Box, points: Chosen) -> Chosen:
+    """Return the nodes of a box as points."""
+    xyz, height = box.middle + box.half * NODES, np.empty(len(NODES))
+    slope, normals = np.empty((len(NODES), 2)), np.empty((len(NODES), 3))
+    for k in range(len(NODES)):
+        slope[k, 0], slope[k, 1] = box.water[1], box.water[2]
+        height[k] = water_at(box, xyz[k, 0], xyz[k, 1])
+        xyz[k, 2] += height[k]
+        normals[k, 0], normals[k, 1], normals[k, 2] = normal_of(box.water[1], box.water[2])
+    return Chosen(
+        xyz, xyz, height, slope, normals, points.centres, points.offset, points.start,
+        points.camera, points.n,
+    )  # fmt: skip
 
 
 @lean

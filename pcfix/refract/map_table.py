@@ -120,7 +120,7 @@ def table_of(rows: IntArray, seeing: BoolArray, block: Block) -> Table:
             if j >= 0:
                 involved[j] = True
     order = np.concatenate((first, np.flatnonzero(involved & ~seeing)))
-    place, box = np.full(seeing.size, -1), _bed_under(box_of(rows, block.points))
+    place, box = np.full(seeing.size, -1), bed_under(box_of(rows, block.points))
     views = np.empty((order.size, len(NODES), 4))
     ways = np.empty((order.size, CUBIC * 3))
     for at in range(order.size):
@@ -136,7 +136,7 @@ def table_of(rows: IntArray, seeing: BoolArray, block: Block) -> Table:
 
 
 @part
-def _bed_under(box: Box) -> Box:
+def bed_under(box: Box) -> Box:
     """Return the box in which the bed of the points of a box lies."""
     deep, shallow = box.half[2] - box.middle[2], -box.half[2] - box.middle[2]
     low, high = -DEEPEST * deep, -max(shallow, LEAST_LENGTH_M)
@@ -233,7 +233,7 @@ def _is_near(terms: FloatArray, values: FloatArray, view: FloatArray, focal_px: 
     """Whether polynomials are what they should be at the corners."""
     near = True
     for k in range(INSIDE, len(NODES)):
-        away, miss, curved = _values(terms, BASIS[k])
+        away, miss, curved = values_of(terms, BASIS[k])
         off_px = abs(away - values[k, AWAY]) * focal_px / view[k, 3]
         near = near and max(off_px, abs(miss - values[k, MISS])) <= TOLERANCE_PX
         near = near and abs(curved - values[k, CURVED]) <= TOLERANCE_PX * values[k, CURVED]
@@ -268,17 +268,17 @@ def read_table(
             continue
         j = block.matcher.matched[c, p]
         if state == SOMETIMES:
-            way = _values(table.ways[table.place[j]], powers)
+            way = values_of(table.ways[table.place[j]], powers)
             if not holds(block.matcher.inner, j, scaled(-1.0, way)):
                 continue
-        away, miss, partners[count, 2] = _values(table.terms[at, EACH * CUBIC * p :], powers)
+        away, miss, partners[count, 2] = values_of(table.terms[at, EACH * CUBIC * p :], powers)
         partners[count, 0], partners[count, 1] = usual_m + away, miss * miss
         count += 1
     return count
 
 
 @summed
-def _values(terms: FloatArray, powers: FloatArray) -> Vector:
+def values_of(terms: FloatArray, powers: FloatArray) -> Vector:
     """Return the values of three polynomials."""
     x, y, z = 0.0, 0.0, 0.0
     for t in range(CUBIC):

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.kernels import Span, in_tiles, inlined, kernel, lean, part
-from pcfix.lens.algebra import Nine, Vector, beyond, cofactors, minus, normal_of, row_of
+from pcfix.lens.algebra import Nine, Vector, beyond, cofactors, minus, row_of
 from pcfix.lens.frames import Frames, frames_of, no_frames
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.refract.batch import Batch, Chosen, Intersection, Optics, optics_of
@@ -44,6 +44,7 @@ from pcfix.refract.cells import (
     fit,
     in_box,
     neighbours_in_cells,
+    nodes_of,
     water_at,
 )
 from pcfix.refract.choice import Rig, Rule, rig_of, rule_of
@@ -234,26 +235,10 @@ def _seen(
 def _cell_of(rows: IntArray, common: IntArray, points: Chosen, optics: Optics, room: Room) -> _Cell:
     """Return a cell, with the Q0 of those cameras that most of its points have in common."""
     box = box_of(rows, points)
-    nodes, shift = _nodes_of(box, points), np.zeros((len(SOME), COLUMNS))
+    nodes, shift = nodes_of(box, points), np.zeros((len(SOME), COLUMNS))
     for k in range(len(SOME)):
         correct_one(shift[k], nodes, SOME[k], common, optics, None, None, room)
     return _Cell(box, nodes, FIT_SOME @ shift[:, :3].copy())
-
-
-@part
-def _nodes_of(box: Box, points: Chosen) -> Chosen:
-    """Return the nodes of a box as points."""
-    xyz, height = box.middle + box.half * NODES, np.empty(len(NODES))
-    slope, normals = np.empty((len(NODES), 2)), np.empty((len(NODES), 3))
-    for k in range(len(NODES)):
-        slope[k, 0], slope[k, 1] = box.water[1], box.water[2]
-        height[k] = water_at(box, xyz[k, 0], xyz[k, 1])
-        xyz[k, 2] += height[k]
-        normals[k, 0], normals[k, 1], normals[k, 2] = normal_of(box.water[1], box.water[2])
-    return Chosen(
-        xyz, xyz, height, slope, normals, points.centres, points.offset, points.start,
-        points.camera, points.n,
-    )  # fmt: skip
 
 
 @part

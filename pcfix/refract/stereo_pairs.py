@@ -34,21 +34,16 @@ import numpy as np
 from pcfix.kernels import Span, in_tiles, kernel, lean, most_between
 from pcfix.lens.algebra import (
     Vector,
-    beyond,
     column_of,
     cross,
     dot,
     minus,
-    plus,
     row_of,
     scaled,
-    solved,
     times,
     transposed_times,
     vector,
 )
-from pcfix.lens.formulas import KIND, PERSPECTIVE
-from pcfix.lens.imaging import image_in_world
 from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, Views
 from pcfix.refract.batch import (
     CORRECTED,
@@ -57,25 +52,24 @@ from pcfix.refract.batch import (
     PARALLEL,
     Batch,
     Chosen,
-    Images,
     Intersection,
-    Optics,
-    as_made,
     images_of,
     optics_of,
     warn_of_unsolved,
 )
-from pcfix.refract.cells import are_same, cameras_of, cells_of
+from pcfix.refract.cells import are_same, cameras_of, cells_of, is_quick
 from pcfix.refract.choice import cameras_of_pairs
 from pcfix.refract.consistent import check_consistent
-from pcfix.refract.rays import (
-    MIN_DETERMINANT,
-    add_line,
-    direction,
-    light_path,
-    nearest_point,
-    refracted,
+from pcfix.refract.pair_places import ABOVE, RAY_WIDTH, PairImages, begin, meet, see
+from pcfix.refract.pair_table import (
+    LEAST_POINTS,
+    PairTable,
+    has_pairs,
+    no_pair_table,
+    pair_table_of,
+    read_pairs,
 )
+from pcfix.refract.rays import MIN_DETERMINANT, add_line, nearest_point, refracted
 
 MAX_STEPS = 40
 ALIKE = 0.5
@@ -88,17 +82,13 @@ CLOSE_M = 1e-6
 # Columns of the result.
 _MISS, _OUTCOME, _FOUND, _WIDTH = 3, 4, 5, 6
 
-# Columns of a ray: e, the height of its water over P, e as the matcher had it, how its scale
-# changes (g of `_meet`), and of the image of Q G'G (xx, xy, xz, yy, yz, zz), G'G e, |G e|^2.
-_ABOVE, _MADE, _BY_PLACE, _SQUARE, _RIGHT, _RAY_WIDTH = 3, 4, 7, 10, 16, 20
 
+class _Point(NamedTuple):
+    """The apparent point, and whether the table of its cell has all its pairs; the table."""
 
-class _Images(NamedTuple):
-    """Those of the matcher; `both` has them as they were and as they are now; n."""
-
-    optics: Optics
-    both: Images
-    n: float
+    xyz: Vector
+    quick: bool
+    table: PairTable
 
 
 def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
@@ -148,11 +138,13 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     matched = np.zeros((0, 0), np.int64) if matcher is None else matcher.matched
     used, result = np.zeros(len(batch.rays.camera), np.bool_), np.zeros((len(batch), _WIDTH))
     both = images_of(batch.made_with, cameras)
-    optics = optics_of(made)
+    images = PairImages(optics_of(made), both, batch.survey.settings.refractive_index)
+    quick = is_quick(batch) and matcher is not None and batch.made_with is None
+    focal_px = np.zeros(0) if matcher is None or not quick else matcher.focal_px
     order, first = cells_of(batch)
     in_tiles(
-        _invert, len(first) - 1, (order, first), batch.chosen(), optics, both, (*listed, matched),
-        used, result, points=len(batch),
+        _invert, len(first) - 1, (order, first), batch.chosen(), images, (*listed, matched),
+        focal_px, used, result, points=len(batch),
     )  # fmt: skip
     outcome = result[:, _OUTCOME].astype(np.uint8)
     moved = outcome == Outcome.CORRECTED
@@ -165,31 +157,35 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
 
 @kernel
 def _invert(
-    span: Span, cells: tuple[IntArray, IntArray], points: Chosen, optics: Optics, both: Images,
-    listed: tuple[IntArray, IntArray, IntArray], used: BoolArray, result: FloatArray,
+    span: Span, cells: tuple[IntArray, IntArray], points: Chosen, images: PairImages,
+    listed: tuple[IntArray, IntArray, IntArray], focal_px: FloatArray, used: BoolArray,
+    result: FloatArray,
 ) -> None:  # fmt: skip
     """Correct the points of each cell.
 
-    Without listed pairs, which are empty then, they are those of the images that were matched. A
-    point starts from the one before it, if that has the same cameras.
+    Without listed pairs, which are empty then, they are those of the images that were matched; with
+    focal lengths the cell has polynomials. A point starts from the one before it, if that has the
+    same cameras.
     """
-    order, first = cells
-    start, images, matched = points.start, _Images(optics, both, points.n), listed[2]
+    (order, first), none = cells, no_pair_table()
+    start, matched = points.start, listed[2]
     most = most_between((0, len(start) - 1), start)
     most_pairs = most * matched.shape[1]
     if listed[0].size:
         most_pairs = most_between((0, len(start) - 1), listed[0]) // 2
-    rays, place = np.empty((most, _RAY_WIDTH)), np.full(len(points.centres), -1)
-    pairs, places = np.empty((most_pairs, 2), np.int64), np.empty((3, most_pairs))
+    rays, place = np.empty((most, RAY_WIDTH)), np.full(len(points.centres), -1)
+    pairs, places = np.empty((most_pairs, 3), np.int64), np.empty((3, most_pairs))
     room, before = (np.empty(9), np.empty((3, 3))), -1
     for t in range(*span):
-        before = -1
-        for i in order[first[t] : first[t + 1]]:
+        before, inside, table = -1, order[first[t] : first[t + 1]], none
+        if focal_px.size and inside.size >= LEAST_POINTS:
+            table = pair_table_of(inside, points, images, matched, focal_px)
+        for i in inside:
             cameras = points.camera[start[i] : start[i + 1]]
             flags, normal = used[start[i] : start[i + 1]], row_of(points.normals, i)
             for j in range(cameras.size):
                 place[cameras[j]] = j
-                _begin(rays[j], points, i, cameras[j], images)
+                begin(rays[j], points, i, cameras[j], images)
             if listed[0].size:
                 entries = listed[1][listed[0][i] : listed[0][i + 1]]
                 count = _listed_pairs(pairs, entries, place)
@@ -208,8 +204,9 @@ def _invert(
             near[:] = np.nan
             if before >= 0 and are_same(cameras, cameras_of(points, before)):
                 _start(near, points, i, before, result[before])
+            point = _Point(row_of(points.xyz, i), has_pairs(table, points, i, pairs[:wide]), table)
             of_pairs = pairs[:wide], places[:, :wide]
-            _solve(result[i], rays, cameras, flags, of_pairs, normal, images, room)
+            _solve(result[i], rays, cameras, flags, of_pairs, normal, images, room, point)
             before = i if result[i, _FOUND] > 0.0 else -1
 
 
@@ -224,49 +221,33 @@ def _start(near: FloatArray, points: Chosen, i: int, before: int, found: FloatAr
 
 
 @lean
-def _begin(ray: FloatArray, points: Chosen, i: int, c: int, images: _Images) -> None:
-    """Fill in where a ray comes from, and how its scale changes with the place.
-
-    The distance that the scale of an image goes by, in terms of P's, is in perspective that along
-    the axis, in other projections that from the centre.
-    """
-    e = minus(row_of(points.centres, c), row_of(points.xyz, i))
-    ray[_ABOVE] = points.normals[i, 2] * (points.height[i] - points.xyz[i, 2] + points.offset[c])
-    made, optics = e, images.optics
-    if len(images.both.centres):
-        made = minus(row_of(images.both.centres, c), row_of(points.made_xyz, i))
-    axis, size2 = row_of(optics.rotations[c], 2), dot(made, made)
-    ahead = -dot(axis, made)
-    flat = optics.lenses[optics.row[c], KIND] == PERSPECTIVE and ahead > 0.0
-    for j in range(3):
-        ray[j], ray[_MADE + j] = e[j], made[j]
-        ray[_BY_PLACE + j] = axis[j] / ahead if flat else -made[j] / size2
-
-
-@lean
 def _listed_pairs(pairs: IntArray, entries: IntArray, place: IntArray) -> int:
     """Write the pairs of a list whose cameras both have a place; return how many."""
     count = 0
     for p in range(entries.size // 2):
         a, b = place[entries[2 * p]], place[entries[2 * p + 1]]
         if a >= 0 and b >= 0 and a != b:
-            pairs[count, 0], pairs[count, 1] = a, b
+            pairs[count, 0], pairs[count, 1], pairs[count, 2] = a, b, -1
             count += 1
     return count
 
 
 @lean
 def _matched_pairs(pairs: IntArray, cameras: IntArray, matched: IntArray, place: IntArray) -> int:
-    """Write the pairs of cameras of which either was matched with the other; return how many."""
-    count = 0
+    """Write the pairs of cameras of which either was matched with the other; return how many.
+
+    And by which entry of what was matched.
+    """
+    count, partners = 0, matched.shape[1]
     for a in range(cameras.size):
-        for partner in matched[cameras[a]]:
+        for p in range(partners):
+            partner = matched[cameras[a], p]
             if partner < 0:
                 break
             b = place[partner]
             if b < 0 or (b < a and _contains(matched[partner], cameras[a])):
                 continue
-            pairs[count, 0], pairs[count, 1] = a, b
+            pairs[count, 0], pairs[count, 1], pairs[count, 2] = a, b, cameras[a] * partners + p
             count += 1
     return count
 
@@ -291,11 +272,12 @@ def _wide_pairs(pairs: IntArray, rays: FloatArray, normal: Vector) -> int:
         first, second = rays[pairs[p, 0]], rays[pairs[p, 1]]
         a, b = vector(first), vector(second)
         across = cross(a, b)
-        above = dot(normal, a) > max(first[_ABOVE], 0.0)
-        above = above and dot(normal, b) > max(second[_ABOVE], 0.0)
+        above = dot(normal, a) > max(first[ABOVE], 0.0)
+        above = above and dot(normal, b) > max(second[ABOVE], 0.0)
         wide = dot(across, across) >= 4.0 * MIN_DETERMINANT * (dot(a, a) * dot(b, b))
         if above and wide:
             pairs[count, 0], pairs[count, 1] = pairs[p, 0], pairs[p, 1]
+            pairs[count, 2] = pairs[p, 2]
             count += 1
     return count
 
@@ -303,8 +285,8 @@ def _wide_pairs(pairs: IntArray, rays: FloatArray, normal: Vector) -> int:
 @lean
 def _solve(
     out: FloatArray, rays: FloatArray, cameras: IntArray, used: BoolArray,
-    pairs: tuple[IntArray, FloatArray], normal: Vector, images: _Images,
-    room: tuple[FloatArray, FloatArray],
+    pairs: tuple[IntArray, FloatArray], normal: Vector, images: PairImages,
+    room: tuple[FloatArray, FloatArray], point: _Point,
 ) -> None:  # fmt: skip
     """Solve one point and write its row; the pairs come with room for their places.
 
@@ -317,12 +299,17 @@ def _solve(
         return
     found, near = False, vector(out)
     if near[0] == near[0]:  # B is still that of the point before
-        found, near = _search(near, inverse, rays, cameras, used, pairs, normal, images)
+        found, near = _search(near, inverse, rays, cameras, used, pairs, normal, images, point)
     if found:
         q = near
     else:
         _as_from_above(inverse, 1.0, images.n)
-        found, q = _search(q, inverse, rays, cameras, used, pairs, normal, images)
+        start = q
+        found, q = _search(start, inverse, rays, cameras, used, pairs, normal, images, point)
+        if point.quick and not found:  # beyond the table
+            _as_from_above(inverse, 1.0, images.n)
+            point = _Point(point.xyz, False, point.table)
+            found, q = _search(start, inverse, rays, cameras, used, pairs, normal, images, point)
     out[0], out[1], out[2] = q
     out[_MISS] = _miss(q, rays, used, normal, images.n)
     out[_OUTCOME], out[_FOUND] = CORRECTED, 1.0 if found else 0.0
@@ -333,7 +320,7 @@ def _line(ray: FloatArray, normal: Vector, n: float) -> tuple[Vector, Vector, fl
     """Return where the ray through P enters the water, its direction, and its length squared."""
     e = vector(ray)
     length2, across = dot(e, e), dot(normal, e)
-    f, bend = (ray[_ABOVE] / across, 1.0 / n) if ray[_ABOVE] > 0.0 else (0.0, 1.0)
+    f, bend = (ray[ABOVE] / across, 1.0 / n) if ray[ABOVE] > 0.0 else (0.0, 1.0)
     return scaled(f, e), refracted(e, length2, normal, across, bend), length2
 
 
@@ -370,7 +357,7 @@ def _miss(q: Vector, rays: FloatArray, used: BoolArray, normal: Vector, n: float
 @lean
 def _search(
     start: Vector, inverse: FloatArray, rays: FloatArray, cameras: IntArray, used: BoolArray,
-    pairs: tuple[IntArray, FloatArray], normal: Vector, images: _Images,
+    pairs: tuple[IntArray, FloatArray], normal: Vector, images: PairImages, point: _Point,
 ) -> tuple[bool, Vector]:  # fmt: skip
     """Return whether a Q was found where the median F of the pairs' places is P, and it.
 
@@ -380,7 +367,11 @@ def _search(
     """
     q, nearest, at_nearest, best, share = start, start, (0.0, 0.0, 0.0), np.inf, 1.0
     for _ in range(MAX_STEPS):
-        f = _median_of_pairs(q, rays, cameras, used, pairs, normal, images)
+        if point.quick:
+            read_pairs(pairs[1], q, point.xyz, pairs[0], point.table)
+        else:
+            _place_pairs(q, rays, cameras, used, pairs, normal, images)
+        f = _median(pairs[1][0]), _median(pairs[1][1]), _median(pairs[1][2])
         size = np.sqrt(dot(f, f))
         if size <= CLOSE_M:
             return True, q
@@ -419,18 +410,17 @@ def _update(inverse: FloatArray, step: Vector, change: Vector) -> None:
 
 
 @lean
-def _median_of_pairs(
+def _place_pairs(
     q: Vector, rays: FloatArray, cameras: IntArray, used: BoolArray,
-    of_pairs: tuple[IntArray, FloatArray], normal: Vector, images: _Images,
-) -> Vector:  # fmt: skip
-    """Return where the pairs would have placed Q; NaN where some camera has no image of it."""
+    of_pairs: tuple[IntArray, FloatArray], normal: Vector, images: PairImages,
+) -> None:  # fmt: skip
+    """Set where the pairs would have placed Q; NaN where some camera has no image of it."""
     pairs, places = of_pairs
     for j in range(used.size):
         if used[j]:
-            _see(rays[j], q, cameras[j], normal, images)
+            see(rays[j], q, cameras[j], normal, images)
     for p in range(len(pairs)):
-        places[0, p], places[1, p], places[2, p] = _meet(rays[pairs[p, 0]], rays[pairs[p, 1]])
-    return _median(places[0]), _median(places[1]), _median(places[2])
+        places[0, p], places[1, p], places[2, p] = meet(rays[pairs[p, 0]], rays[pairs[p, 1]])
 
 
 @lean
@@ -446,67 +436,3 @@ def _median(values: FloatArray) -> float:
         values[place] = value
     half = values.size // 2
     return values[half] if values.size % 2 else 0.5 * (values[half - 1] + values[half])
-
-
-@lean
-def _see(ray: FloatArray, q: Vector, c: int, normal: Vector, images: _Images) -> None:
-    """Write what the image of Q says about places: G'G, G'G e and |G e|^2.
-
-    w, as the matcher had it, is scaled to be as far away as P, so that G is that of there.
-    """
-    path = light_path(q, vector(ray), normal, ray[_ABOVE], images.n)
-    w = as_made(images.both, c, direction(path, normal))
-    w = scaled(1.0 / dot(w, vector(ray, _BY_PLACE)), w)
-    optics, e = images.optics, vector(ray, _MADE)
-    _, _, by_u, by_v = image_in_world(optics.lenses[optics.row[c]], optics.rotations[c], w)
-    ray[_SQUARE:] = 0.0
-    for g in (by_u, by_v):
-        (x, y, z), off = g, dot(g, e)
-        terms = (x * x, x * y, x * z, y * y, y * z, z * z, off * x, off * y, off * z, off * off)
-        for i in range(10):
-            ray[_SQUARE + i] += terms[i]
-
-
-@lean
-def _meet(a: FloatArray, b: FloatArray) -> Vector:
-    """Return where two straight rays have the least squared residuals in their images.
-
-    At X the residual of a camera is G (X - e) / t, t = 1 + g.X how far away X is in terms of P. The
-    first round takes t as one. The second has it, and that it changes with X: at the least
-
-        sum_c G'G (X - e) / t^2 - r^2 / t^3 g = 0,    r^2 = |G (X - e)|^2
-
-    which tells in narrow pairs of rays that miss each other.
-    """
-    place = _solve_two(a, b, 1.0, 1.0, 0.0, 0.0)
-    t, r2 = _residual(place, a)
-    t_b, r2_b = _residual(place, b)
-    return _solve_two(a, b, 1.0 / (t * t), 1.0 / (t_b * t_b), r2 / t**3, r2_b / t_b**3)
-
-
-@lean
-def _residual(place: Vector, ray: FloatArray) -> tuple[float, float]:
-    """Return t and r^2 of a place."""
-    (x, y, z), s = place, ray[_SQUARE:]
-    t = 1.0 + x * ray[_BY_PLACE] + y * ray[_BY_PLACE + 1] + z * ray[_BY_PLACE + 2]
-    twice = x * (s[1] * y + s[2] * z) + s[4] * y * z - (s[6] * x + s[7] * y + s[8] * z)
-    return t, s[0] * x * x + s[3] * y * y + s[5] * z * z + 2.0 * twice + s[9]
-
-
-@lean
-def _solve_two(
-    a: FloatArray, b: FloatArray, of_a: float, of_b: float, g_a: float, g_b: float
-) -> Vector:
-    """Solve the normal equations of two rays."""
-    x, y, z = beyond(
-        beyond(_sum(a, b, of_a, of_b, _RIGHT), g_a, vector(a, _BY_PLACE)), g_b, vector(b, _BY_PLACE)
-    )
-    xx, xy, xz = _sum(a, b, of_a, of_b, _SQUARE)
-    yy, yz, zz = _sum(a, b, of_a, of_b, _SQUARE + 3)
-    return solved((xx, xy, xz, yy, yz, zz), (x, y, z))[1]
-
-
-@lean
-def _sum(a: FloatArray, b: FloatArray, of_a: float, of_b: float, at: int) -> Vector:
-    """Return so many times three columns of one ray and of the other."""
-    return plus(scaled(of_a, vector(a, at)), scaled(of_b, vector(b, at)))

@@ -244,12 +244,16 @@ def test_without_a_lens_a_frame_is_everything_in_front():
     assert far.outcome.tolist() == [pcfix.Outcome.NO_CAMERA]
 
 
-def test_views_ignore_frames():
+def test_views_ignore_frames_within_a_length_of_them():
     cameras = block(LENSES["barrel"], k=2)
-    away = np.array([[400.0, 350.0, -2.0]])
-    assert snell(away, cameras, 0.0).outcome[0] == pcfix.Outcome.NO_CAMERA
+    beside, away = np.array([[100.0, 87.5, -2.0]]), np.array([[400.0, 350.0, -2.0]])
+    for point in (beside, away):
+        assert snell(point, cameras, 0.0).outcome[0] == pcfix.Outcome.NO_CAMERA
     views = pcfix.Views(np.array([0, 2]), np.array([0, 1]))
-    assert snell(away, cameras, 0.0, views=views).ray_count[0] == 2
+    assert snell(beside, cameras, 0.0, views=views).ray_count[0] == 2
+    with pytest.warns(pcfix.PcfixWarning, match="2 entries, of 1 points, name cameras"):
+        found = snell(away, cameras, 0.0, views=views)
+    assert found.outcome[0] == pcfix.Outcome.NO_CAMERA
 
 
 def test_compiled_and_interpreted_agree(tmp_path, points):
