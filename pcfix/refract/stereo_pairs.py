@@ -21,7 +21,8 @@ The model, for an apparent point P and its pairs (a, b), all of which show one t
 Q is looked for, where that median is P: three equations for three unknowns. The median of smooth
 functions is continuous, with kinks where it goes over from one pair to another. Broyden's method
 starts at `snell`'s solution with the derivative diag(1, 1, 1/n), as if all light came from straight
-above, and is taken back to half of such a step wherever it does not come nearer.
+above, and is taken back to half of such a step wherever it does not come nearer. Where a cell has
+many points, X_ab(Q) is a polynomial (`pcfix.refract.pair_table`).
 """
 
 from __future__ import annotations
