@@ -40,9 +40,9 @@ for place, (command, example) in enumerate(EXAMPLES):
 def main(tokens: Sequence[str] | None = None) -> None:
     """Run the command line; a user's mistake is one line on stderr and exit code 1."""
     arguments = list(sys.argv[1:] if tokens is None else tokens)
-    _seldom_collect()
     try:
         _end_cleanly()
+        _seldom_collect()
         _run(arguments)
     except CycloptsError as error:
         if isinstance(error.__cause__, PcfixError):

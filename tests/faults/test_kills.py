@@ -16,8 +16,8 @@ import pcfix
 from tests.utils.zygote import Zygote
 
 SCENE = Path(__file__).parents[2] / "samples" / "scene"
-LONGEST_S = 0.5
-"""After which a signal is sent at the latest; most commands have ended by then."""
+LONGEST_S = 0.3
+"""After which a signal is sent at the latest; a command has ended by then, or nearly."""
 
 
 @pytest.fixture(scope="module")
