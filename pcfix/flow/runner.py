@@ -53,7 +53,7 @@ class Step(Protocol):
         """Return the header of the output, and be ready for the first chunk."""
 
     def chunk(self, points: Chunk, source: LasSource, header: Header) -> Callable[[], Chunk]:
-        """Return what makes some points those of the output, while the next are begun with."""
+        """Return what turns some points into those of the output; it may run beside the next."""
 
     def finish(self) -> None:
         """Refuse a result that cannot be right; nothing is left behind then."""
