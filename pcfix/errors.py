@@ -1,6 +1,7 @@
-"""The few errors and the one warning that pcfix raises for a user's mistake.
+"""Errors and warnings for mistakes that a user can correct.
 
-Each message is one sentence that a person can act on: the file, the value, the rule, the remedy.
+Each has a short code for programs (``"cameras.no_overlap"``), a sentence for people (the file, what
+is wrong with the value, what to do), and the values that a program may want.
 """
 
 import errno
@@ -14,37 +15,77 @@ from typing import Any, TypeVar
 
 _Found = TypeVar("_Found")
 
-_MOST_LETTERS, _FIRST, _LAST = 800, 540, 240
 
+class _Coded:
+    """The code, sentence and values of an error or a warning.
 
-_LIST = re.compile(r"\n(?=  )")
-
-
-def printable(message: str) -> str:
-    """Return a message that a terminal can show, whatever of a file is quoted in it.
-
-    It is one line, and one for each entry of a list, which two spaces begin. Letters that are not
-    for print become escapes, and a line that is too long all the same loses its middle: the file is
-    named first and the remedy last.
+    Attributes
+    ----------
+    code : str
+        The subject and the mistake, such as ``"water.spec"``.
+    message : str
+    values : dict
+        What a program may want: the file, the offending value, its limit.
     """
 
-    def one_line(text: str) -> str:
-        text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
-        return text if len(text) <= _MOST_LETTERS else f"{text[:_FIRST]} ... {text[-_LAST:]}"
+    def __init__(self, code: str, message: object = None, **values: Any) -> None:
+        if message is None:  # until every sentence has a code
+            code, message = "", code
+        self.code, self.message, self.values = code, brief(str(message)), values
+        super().__init__(code, self.message)
 
-    return "\n".join(map(one_line, _LIST.split(message)))
+    def __str__(self) -> str:
+        return printable(self.message)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, as the JSON of a summary holds them."""
+        values = {name: _plain(value) for name, value in self.values.items()}
+        return {"code": self.code, "message": str(self), **values}
 
 
-LONGEST_VALUE, LONGEST_NAME = 60, 255
+class PcfixError(_Coded, Exception):
+    """A mistake that the user can correct; the command line prints it and exits with 1."""
+
+
+class InputError(PcfixError):
+    """A file that is missing, damaged, or not what it should be."""
+
+
+class NoTiePointsError(InputError):
+    """A camera file without tie points; most steps do not need them."""
+
+
+class SettingError(PcfixError, ValueError):
+    """An option or argument that breaks its rule."""
+
+
+class GeometryError(PcfixError):
+    """Cloud, cameras and water that do not fit together."""
+
+
+class PcfixWarning(_Coded, UserWarning):
+    """Something that affects the result and that the user can act on."""
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON can hold it."""
+    if isinstance(value, str | int | float | bool | None):
+        return value
+    if isinstance(value, dict):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple | set):
+        return [_plain(one) for one in value]
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+MOST_LETTERS, LONGEST_VALUE, LONGEST_NAME = 800, 60, 255
+_LIST = re.compile(r"\n(?=  )")
 _UNBROKEN = re.compile(rf"[^\s,/\\'\":;()]{{{LONGEST_VALUE + 1},}}")
 _FILE_NAME = re.compile(r"\.\w{1,6}$")
 
 
 def brief(message: str) -> str:
-    """Return a message in which no value is longer than 60 characters, and no name of a file 255.
-
-    Values with spaces in them are shortened where they are quoted.
-    """
+    """Shorten every unbroken value to 60 characters, and every file name to 255."""
 
     def shortened(match: re.Match[str]) -> str:
         is_name = len(match[0]) <= LONGEST_NAME and _FILE_NAME.search(match[0])
@@ -53,51 +94,32 @@ def brief(message: str) -> str:
     return _UNBROKEN.sub(shortened, message)
 
 
-class PcfixError(Exception):
-    """Anything that a user can mend; the command line prints it and exits with 1."""
+def printable(message: str) -> str:
+    """Escape what a terminal cannot show, as messages quote the contents of files.
 
-    def __init__(self, message: object = "") -> None:
-        super().__init__(brief(str(message)))
+    The result is one line, plus one for each entry of a list (lines that two spaces begin). A line
+    of more than 800 characters loses its middle: the file comes first and the remedy last.
+    """
 
-    def __str__(self) -> str:
-        return printable(super().__str__())
+    def one_line(text: str) -> str:
+        text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+        return text if len(text) <= MOST_LETTERS else f"{text[:540]} ... {text[-240:]}"
 
-
-class InputError(PcfixError):
-    """A file that is missing, damaged or not what it should be."""
-
-
-class NoTiePointsError(InputError):
-    """A camera file without tie points, which most steps do without."""
-
-
-class SettingError(PcfixError, ValueError):
-    """An option or argument outside its rule."""
-
-
-class GeometryError(PcfixError):
-    """Cloud, cameras and water that do not fit together."""
-
-
-class PcfixWarning(UserWarning):
-    """Something that was done on the user's behalf and that they should know of."""
-
-    def __str__(self) -> str:
-        return printable(super().__str__())
+    return "\n".join(map(one_line, _LIST.split(message)))
 
 
 _REFUSALS = {
     errno.ENOENT: "there is no such file",
     errno.ENOTDIR: "there is no such file",
     errno.EISDIR: "is a folder; give a file",
-    errno.ELOOP: "its links lead in a circle; give the file itself",
+    errno.ELOOP: "its links form a circle; give the file they should point to",
     errno.ENAMETOOLONG: "the name is longer than the system allows",
-    errno.EACCES: "access is denied; change the rights of the file or of its folder",
+    errno.EACCES: "access is denied; change the permissions of the file or of its folder",
 }
 
 
 def refusal(error: Exception) -> str:
-    """Return in words what the system says of a file."""
+    """Describe in words why the system refused a file."""
     words = getattr(error, "strerror", None) or str(error).strip().rstrip(".")
     return _REFUSALS.get(getattr(error, "errno", None) or 0, f"cannot be read ({words})")
 
@@ -109,37 +131,46 @@ def installing(extra: str) -> str:
     return f"{sys.executable} -m pip install {what}"
 
 
-def shown_once(read: Callable[[], _Found], notes: Callable[[_Found], Iterable[str]]) -> _Found:
-    """Return what a function returns, and show of its warnings those that are none of its notes."""
+def optional_library(name: str, extra: str, who: str) -> Any:
+    """Import a library of an extra.
+
+    Raises
+    ------
+    InputError
+        ``library.missing``, with the command that installs the extra.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(
+            "library.missing",
+            f"{who} needs {name}, which is not installed. Run: {installing(extra)}",
+            library=name,
+            extra=extra,
+        ) from error
+
+
+def photo_library(name: str) -> Any:
+    """Import a library of the extra ``photos``."""
+    return optional_library(name, "photos", "Work on photographs")
+
+
+def shown_once(read: Callable[[], _Found], notes: Callable[[_Found], Iterable[object]]) -> _Found:
+    """Call a function, and show those of its warnings that its result does not hold as notes."""
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("always", PcfixWarning)
         found = read()
-    known = set(notes(found))
+    known = {str(note) for note in notes(found)}
     for one in shown:
         if str(one.message) not in known:
             warnings.warn(one.message, one.category, stacklevel=3)
     return found
 
 
-def optional_library(name: str, extra: str, who: str) -> Any:
-    """Return a library of an extra, or say who needs it and how to get it."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise InputError(
-            f"{who} needs {name}, which is not installed; run: {installing(extra)}"
-        ) from error
-
-
-def photo_library(name: str) -> Any:
-    """Return a library of the extra ``photos``, or say how to get it."""
-    return optional_library(name, "photos", "Work on photographs")
-
-
 def show_warning(
     message: Warning | str, category: type[Warning], *where: object, **more: object
 ) -> None:
-    """Show a warning of pcfix as one line on stderr, others not: for `warnings.showwarning`."""
+    """Print a warning of pcfix as one line on stderr; a replacement of `warnings.showwarning`."""
     del where, more
     if issubclass(category, PcfixWarning):
-        sys.stderr.write(f"pcfix: warning: {brief(str(message))}\n")
+        sys.stderr.write(f"pcfix: warning: {message}\n")

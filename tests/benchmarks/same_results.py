@@ -1,32 +1,34 @@
-"""Whether two versions of the code give the same results, to the bit.
+"""Compare the results of two versions of the code, within tolerances.
 
-Runs the command lines of same_results_commands.py, each in a folder of its own, and records what
-a user can see of each: exit code, output, and every file, part by part (dimensions of a cloud,
-bands of a raster, keys of a summary). Times, paths and versions are left out.
+`record` runs the command lines of same_results_commands.py and keeps what each leaves: its files,
+its exit codes and what it printed. `compare` reads two such folders and prints every difference:
 
-    python tests/benchmarks/same_results.py record OUT.json [--tree DIR] [--only NAME,...] [--pdal]
-    python tests/benchmarks/same_results.py compare A.json B.json [--common]
+- coordinates, depths, shifts, standard errors and rasters that differ by more than `--metres`;
+- classes, flags, counts and other whole numbers that differ at all;
+- numbers in JSON, tables and text files that differ by more than `--relative`;
+- exit codes, and files, dimensions, bands, layers and JSON keys that only one side has.
 
-The data is found through PCFIX_SHARED. `--only` takes patterns, as river.*; the earlier commands
-whose files they read are run too, and what OUT.json has of others stays in it. Of a tree that has
-not run yet the kernels are compiled first, which takes several minutes more.
+Sentences, dates, times and paths are not compared. A dimension stored as whole multiples of a step
+(a LAS coordinate of 1 mm, say) may differ by one step in the few points that a change below the
+tolerance moves across a rounding limit.
+
+    python tests/benchmarks/same_results.py record FOLDER [--tree DIR] [--only NAME,...] [--pdal]
+    python tests/benchmarks/same_results.py compare FOLDER FOLDER [--only NAME,...]
+
+The data is found through PCFIX_SHARED. `--only` takes patterns such as ``river.*``; earlier
+commands whose files they read are run too. Keep the folders outside the repository: a full record
+has about 1 GB.
 """
 
-from __future__ import annotations
-
 import argparse
-import datetime
-import difflib
 import fnmatch
-import hashlib
 import json
 import os
 import re
 import shlex
-import struct
+import shutil
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -35,278 +37,294 @@ from same_results_commands import pdal_table, table, write_inputs
 
 ROOT = Path(__file__).parents[2]
 SHARED = Path(os.environ.get("PCFIX_SHARED", ROOT.parent / "shared")).absolute() / "data"
-# the last two are of files: those that hold times and paths are now and then a byte longer
-LEFT_OUT = {"seconds", "points_per_s", "pcfix", "made_by", "changed_ns", "bytes"}
-TODAY = datetime.datetime.now(datetime.UTC).date().isoformat()
-NORMALISED = [
-    (rf"{TODAY}([T ][\d:.]+(Z|[+-]\d\d:\d\d)?)?", "DATE"),
-    (r"\d[\d.,]* (M )?points/s", "SPEED points/s"),
-    (r"\b\d[\d.,]* s\b", "TIME s"),
-    (r"(?s)Traceback \(most recent.*?(?=pcfix\.errors\.)", "TRACEBACK "),  # as PDAL prints it
-    (r"pcfix \d+\.\d+\.\d+\w*", "pcfix VERSION"),
-]
-MANY = 200
-"""A list or object with more values than that is recorded as a whole."""
+OUTCOME = "outcome.json"
+NOT_COMPARED = {"seconds", "points_per_s", "pcfix", "made_by", "changed_ns", "bytes", "identity"}
+"""Keys of JSON that hold times, versions, or sizes of files that contain them."""
+ZERO = 1e-9
+"""Numbers closer to each other than this are equal, whatever their relative difference."""
+NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
+SHOWN = 12
+"""Differences that are printed of each command; the rest are counted."""
 
 
 def main():
-    words = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    doors = words.add_subparsers(dest="door", required=True)
-    door = doors.add_parser("record")
-    door.add_argument("out", type=Path)
-    door.add_argument("--tree", type=Path, default=ROOT)
-    door.add_argument("--only", default="*", help="names or patterns, with commas between")
-    door.add_argument("--pdal", action="store_true", help="the commands that need pdal")
-    door.add_argument("--scratch", type=Path, help="folder to keep, which must not exist")
-    door = doors.add_parser("compare")
-    door.add_argument("one", type=Path)
-    door.add_argument("other", type=Path)
-    door.add_argument("--common", action="store_true", help="leave out what only one of them has")
-    given = words.parse_args()
-    if given.door == "record":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    actions = parser.add_subparsers(dest="action", required=True)
+    action = actions.add_parser("record")
+    action.add_argument("folder", type=Path)
+    action.add_argument("--tree", type=Path, default=ROOT, help="checkout whose code is run")
+    action.add_argument("--only", default="*", help="names or patterns, separated by commas")
+    action.add_argument("--pdal", action="store_true", help="the commands that need PDAL")
+    action = actions.add_parser("compare")
+    action.add_argument("one", type=Path)
+    action.add_argument("other", type=Path)
+    action.add_argument("--only", default="*", help="names or patterns, separated by commas")
+    action.add_argument("--metres", type=float, default=1e-6, help="tolerance of lengths [m]")
+    action.add_argument("--relative", type=float, default=1e-6, help="tolerance of other numbers")
+    given = parser.parse_args()
+    if given.action == "record":
         record(given)
     else:
-        sys.exit(compare(given.one, given.other, given.common))
+        sys.exit(compare(given))
 
 
 def record(given):
     commands = pdal_table() if given.pdal else table()
     if given.pdal and not Path(sys.executable).with_name("pdal").exists():
-        raise SystemExit("no program pdal beside this Python")
-    with tempfile.TemporaryDirectory() as temporary:
-        scratch = given.scratch or Path(temporary) / "scratch"
-        scratch.mkdir()
-        write_inputs(scratch / "inputs", SHARED, ROOT / "samples")
-        places = Places(given.tree.resolve(), scratch.resolve())
-        found = (
-            json.loads(given.out.read_text()) if given.only != "*" and given.out.exists() else {}
-        )
-        for name in wanted(commands, given.only):
-            started, before = time.perf_counter(), os.times()
-            found[name] = outcome(name, commands[name], places)
-            taken, after = time.perf_counter() - started, os.times()
-            busy = after.children_user + after.children_system
-            busy -= before.children_user + before.children_system
-            print(
-                f"{name:<40} exit{found[name]['exit']:<4} {taken:6.1f} s, processor {busy:6.1f} s",
-                flush=True,
-            )
-            given.out.write_text(json.dumps(found, indent=1))
+        raise SystemExit("There is no program 'pdal' beside this Python.")
+    folder, tree = given.folder.resolve(), given.tree.resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(folder / "inputs", ignore_errors=True)
+    write_inputs(folder / "inputs", SHARED, ROOT / "samples")
+    for name in chosen(commands, given.only):
+        shutil.rmtree(folder / name, ignore_errors=True)
+        started = time.perf_counter()
+        codes = run(folder / name, commands[name], tree)
+        print(f"{name:<40} exit {codes!s:<8} {time.perf_counter() - started:6.1f} s", flush=True)
 
 
-def wanted(commands, only):
-    """Return the names asked for and, before them, those whose files they read."""
-    patterns = only.split(",")
-    names = [n for n in commands if any(fnmatch.fnmatch(n, p) for p in patterns)]
-    for name in names:  # grows
+def chosen(commands, only):
+    """Return the names that match and, before each, those whose files it reads."""
+    names = [name for name in commands if matches(name, only)]
+    for name in names:  # the list grows while it is read
         names += [n for n in re.findall(r"{([\w.-]+)/", commands[name]) if n in commands]
     return [name for name in commands if name in names]
 
 
-class Places:
-    """The folders of a recording: what placeholders mean, and what is left out of texts."""
-
-    def __init__(self, tree, scratch):
-        self.tree, self.scratch = tree, scratch
-        self._of = {"shared": SHARED, "samples": ROOT / "samples", "tree": tree}
-
-    def filled(self, line):
-        def path(match):
-            return str(self._of.get(match[1], self.scratch / match[1]))
-
-        return re.sub(r"{([\w./-]+)}", path, line)
-
-    def normalised(self, text):
-        """Return a text without folders, times and versions."""
-        for place, name in ((self.scratch, "SCRATCH"), (SHARED, "SHARED"), (self.tree, "TREE")):
-            text = text.replace(str(place), name)
-        text = text.replace(str(ROOT), "TREE").replace(sys.executable, "PYTHON")
-        for pattern, word in NORMALISED:
-            text = re.sub(pattern, word, text)
-        # the frames that typer draws are filled up to the length of the paths in them
-        rows = [re.sub(r"[ ─]+", " ", r) if set("│─") & set(r) else r for r in text.split("\n")]
-        return "\n".join(rows)
+def matches(name, only):
+    return any(fnmatch.fnmatch(name, pattern) for pattern in only.split(","))
 
 
-def outcome(name, line, places):
-    """Run a command line in its folder, and return all that can be seen of it."""
-    folder = places.scratch / name
+def run(folder, line, tree):
+    """Run a command line in its own folder, keep what it printed, and return its exit codes."""
     folder.mkdir()
+    places = {"shared": SHARED, "samples": ROOT / "samples", "tree": tree}
+    filled = re.sub(r"{([\w./-]+)}", lambda m: str(places.get(m[1], folder.parent / m[1])), line)
     programs = Path(sys.executable).parent
-    seen = {"exit": "", "stdout": "", "stderr": "", "files": {}}
     environment = {
-        **os.environ, "PYTHONPATH": str(places.tree), "COLUMNS": "200", "NO_COLOR": "1",
+        **os.environ, "PYTHONPATH": str(tree), "COLUMNS": "200", "NO_COLOR": "1",
         "MPLBACKEND": "agg", "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}",
     }  # fmt: skip
-    for part in line.split(" && "):
-        words = shlex.split(places.filled(part))
+    codes, printed = [], ""
+    for part in filled.split(" && "):
+        words = shlex.split(part)
         if words[0] == "python":
             words[0] = sys.executable
-        elif words[0] == "pdal":
-            words[0] = str(programs / "pdal")
-        else:
+        elif words[0] != "pdal":
             words = [sys.executable, "-m", "pcfix", *words]
         done = subprocess.run(
             words, cwd=folder, env=environment, capture_output=True, text=True, check=False
         )
-        seen["exit"] += f" {done.returncode}"
-        seen["stdout"] += places.normalised(done.stdout)
-        seen["stderr"] += places.normalised(done.stderr)
-    for path in sorted(folder.rglob("*")):
-        if path.is_file():
-            seen["files"][str(path.relative_to(folder))] = parts_of(path, places)
-    return seen
+        codes.append(done.returncode)
+        printed += done.stdout + done.stderr
+    (folder / OUTCOME).write_text(json.dumps({"exit": codes, "printed": printed}, indent=1))
+    return codes
 
 
-def parts_of(path, places):
-    """Return a value for each part of a file."""
-    suffix = path.suffix.lower()
-    if suffix in (".las", ".laz"):
-        return cloud_parts(path, places)
-    if suffix in (".tif", ".tiff"):
-        return raster_parts(path)
-    if suffix == ".png":
-        return {"exists": "yes"}
-    data = path.read_bytes()
-    try:
-        text = places.normalised(data.decode())
-    except UnicodeDecodeError:
-        return {"bytes": digest(data)}
-    if suffix in (".json", ".geojson"):
-        return flat(json.loads(text))
-    if suffix == ".html":
-        return page_parts(text)
-    return {"text": text if len(text) < 3000 else f"{text.count(chr(10))} lines {digest(text)}"}
+def compare(given):
+    """Print the differences between two records, and return whether there are any."""
+    sides = [
+        {path.name for path in folder.iterdir() if (path / OUTCOME).exists()}
+        for folder in (given.one, given.other)
+    ]
+    names = sorted(name for name in sides[0] & sides[1] if matches(name, given.only))
+    count = 0
+    for name in names:
+        found = list(differences(given.one / name, given.other / name, given))
+        count += len(found)
+        for line in found[:SHOWN]:
+            print(f"{name}: {line}")
+        if len(found) > SHOWN:
+            print(f"{name}: and {len(found) - SHOWN} more")
+    alone = sorted(name for name in sides[0] ^ sides[1] if matches(name, given.only))
+    if alone:
+        print(f"{len(alone)} commands are in one record only: {' '.join(alone)}")
+    print(f"{count} differences in {len(names)} commands")
+    return int(count > 0 or not names)
 
 
-def cloud_parts(path, places):
+def differences(one, other, given):
+    """Yield the differences between what one command left on the two sides."""
+    codes = [json.loads((side / OUTCOME).read_text())["exit"] for side in (one, other)]
+    if codes[0] != codes[1]:
+        yield f"exit codes {codes[0]} and {codes[1]}"
+    files = [
+        {str(path.relative_to(side)) for path in side.rglob("*") if path.is_file()} - {OUTCOME}
+        for side in (one, other)
+    ]
+    yield from (f"{file} is in one record only" for file in sorted(files[0] ^ files[1]))
+    for file in sorted(files[0] & files[1]):
+        differ = COMPARED.get(Path(file).suffix.lower(), differ_by_text)
+        for line in differ(one / file, other / file, given):
+            yield f"{file}: {line}"
+
+
+def differ_as_clouds(one, other, given):
+    """Yield the differences between two LAS or LAZ files."""
     import laspy
 
-    las = laspy.read(path)
-    header, array = las.header, las.points.array
-    names = (
-        "version point_format point_count scales offsets mins maxs system_identifier"
-        " generating_software file_source_id number_of_points_by_return"
-    )
-    values = {name: getattr(header, name) for name in names.split()}
-    parts = {
-        f"header {name}": str(value.tolist() if isinstance(value, np.ndarray) else value)
-        for name, value in values.items()
-    }
-    parts = {key: places.normalised(value) for key, value in parts.items()}
-    parts["header encoding"] = str(header.global_encoding.value)
-    for name in las.point_format.dimension_names:
-        values = array[name] if name in array.dtype.names else np.asarray(las[name])
-        parts[f"dimension {name}"] = f"{values.dtype} {digest(np.ascontiguousarray(values))}"
-    for number, (user, kind, description, data) in enumerate(variable_records(path)):
-        key = f"record {number} {user} {kind}"
-        parts[f"{key} description"] = places.normalised(description)
-        if user == "pcfix":
-            values = flat(json.loads(places.normalised(data.rstrip(b"\0").decode())))
-            parts.update({f"{key} {name}": value for name, value in values.items()})
-        else:
-            parts[key] = digest(data)
-    return parts
+    las = [laspy.read(path) for path in (one, other)]
+    heads = [cloud.header for cloud in las]
+    for name in ("version", "point_format", "point_count", "scales", "offsets", "global_encoding"):
+        values = [plain(getattr(head, name)) for head in heads]
+        if values[0] != values[1]:
+            yield f"header {name} {values[0]} and {values[1]}"
+    if heads[0].point_count != heads[1].point_count:
+        return
+    names = [set(cloud.point_format.dimension_names) for cloud in las]
+    yield from (f"dimension {name} is in one record only" for name in sorted(names[0] ^ names[1]))
+    for name in sorted((names[0] & names[1]) - {"X", "Y", "Z"} | {"x", "y", "z"}):
+        step = dict(zip("xyz", heads[0].scales, strict=True)).get(name)
+        if step is None:
+            scales = las[0].point_format.dimension_by_name(name).scales
+            step = None if scales is None else float(np.max(scales))
+        values = [np.asarray(cloud[name]) for cloud in las]
+        if line := differ_as_arrays(*values, given.metres, step):
+            yield f"dimension {name}: {line}"
+    records = [[*cloud.header.vlrs, *(cloud.evlrs or [])] for cloud in las]
+    kinds = [[(record.user_id, record.record_id) for record in side] for side in records]
+    if kinds[0] != kinds[1]:
+        yield f"VLRs {kinds[0]} and {kinds[1]}"
+        return
+    for pair in zip(*records, strict=True):
+        data = [record.record_data_bytes().rstrip(b"\0") for record in pair]
+        if pair[0].user_id == "pcfix":
+            for line in differ_as_values(*map(json.loads, data), given):
+                yield f"VLR {pair[0].record_id} {line}"
+        elif pair[0].user_id != "laszip encoded" and data[0] != data[1]:
+            yield f"VLR {pair[0].user_id} {pair[0].record_id} differs"
 
 
-def variable_records(path):
-    """Return user, record id, description and content of the VLRs and EVLRs of a LAS file."""
-    data = path.read_bytes()
-    size, _, count = struct.unpack_from("<HII", data, 94)
-    blocks = [(size, count, "<2x16sHH32s")]
-    if data[25] >= 4:
-        blocks.append((*struct.unpack_from("<QI", data, 235), "<2x16sHQ32s"))
-    found = []
-    for at, how_many, layout in blocks:
-        for _ in range(how_many):
-            user, kind, length, description = struct.unpack_from(layout, data, at)
-            at += struct.calcsize(layout)
-            words = [w.split(b"\0")[0].decode("latin-1") for w in (user, description)]
-            found.append((words[0], kind, words[1], data[at : at + length]))
-            at += length
-    return found
+def plain(value):
+    return str(value.tolist() if isinstance(value, np.ndarray) else getattr(value, "value", value))
 
 
-def raster_parts(path):
+def differ_as_arrays(one, other, tolerance, step=None):
+    """Return how two arrays differ by more than a tolerance, or nothing.
+
+    `step` is the step of numbers that are stored as whole multiples of it: a change of d moves a
+    share of d / step of them to the next multiple.
+    """
+    if one.shape != other.shape or one.dtype.kind != other.dtype.kind:
+        return f"{one.dtype} {one.shape} and {other.dtype} {other.shape}"
+    if one.dtype.kind != "f":
+        count = int(np.count_nonzero(one != other))
+        return f"{count:,} of {one.size:,} values differ" if count else ""
+    with np.errstate(invalid="ignore"):
+        apart = np.where((one == other) | (np.isnan(one) & np.isnan(other)), 0.0, one - other)
+    apart = np.abs(np.where(np.isnan(apart), np.inf, apart))
+    wrong = apart > tolerance
+    if step is not None and step > tolerance:
+        moved = (apart < 1.5 * step) & wrong
+        if np.count_nonzero(moved) <= 3 + 2 * one.size * tolerance / step:
+            wrong &= ~moved
+    count = int(np.count_nonzero(wrong))
+    return f"{count:,} of {one.size:,} values differ, by at most {apart.max():.3g}" if count else ""
+
+
+def differ_as_rasters(one, other, given):
+    """Yield the differences between two rasters."""
     import rasterio
 
-    with rasterio.open(path) as source:
-        parts = {key: str(value) for key, value in source.profile.items()}
-        parts["tags"] = str(source.tags())
-        for band, description in enumerate(source.descriptions, 1):
-            parts[f"band {band} name"] = f"{description} {source.tags(band)}"
-            parts[f"band {band}"] = digest(source.read(band))
-    return parts
+    with rasterio.open(one) as left, rasterio.open(other) as right:
+        profiles = [{key: str(value) for key, value in file.profile.items()} for file in (left, right)]
+        if profiles[0] != profiles[1]:
+            yield f"profiles {profiles[0]} and {profiles[1]}"
+            return
+        for band in left.indexes:
+            if line := differ_as_arrays(left.read(band), right.read(band), given.metres):
+                yield f"band {band}: {line}"
 
 
-def flat(value, key=""):
-    """Return the leaves of a JSON document by their keys."""
-    inner = value.items() if isinstance(value, dict) else enumerate(value)
-    if len(value) > MANY:
-        return {key: f"{len(value)} values {digest(json.dumps(value))}"}
-    leaves = {}
-    for name, child in inner:
-        here = f"{key}[{name}]" if isinstance(value, list) else f"{key}.{name}".lstrip(".")
-        if name in LEFT_OUT and not isinstance(child, dict):
-            leaves[here] = "left out"
-        elif isinstance(child, dict | list) and child:
-            leaves.update(flat(child, here))
-        elif name == "identity":  # of the file before; day and year of its creation come last
-            leaves[here] = repr(child[:-4])
+def differ_as_layers(one, other, given):
+    """Yield the differences between two GeoPackages."""
+    import pyogrio
+
+    names = [[str(row[0]) for row in pyogrio.list_layers(path)] for path in (one, other)]
+    if names[0] != names[1]:
+        yield f"layers {names[0]} and {names[1]}"
+        return
+    for name in names[0]:
+        tables = [pyogrio.read_dataframe(path, layer=name) for path in (one, other)]
+        if tables[0].shape != tables[1].shape:
+            yield f"layer {name}: {tables[0].shape} and {tables[1].shape}"
+            continue
+        lines = [json.loads(table.to_json()) for table in tables]
+        for line in differ_as_values(*lines, given):
+            yield f"layer {name} {line}"
+
+
+def differ_as_json(one, other, given):
+    yield from differ_as_values(*(json.loads(path.read_text()) for path in (one, other)), given)
+
+
+def differ_as_values(one, other, given, key=""):
+    """Yield the differences between two JSON values; sentences, dates and paths are skipped."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        for name in sorted(one.keys() ^ other.keys()):
+            yield f"{key}.{name} is in one record only"
+        for name in sorted((one.keys() & other.keys()) - NOT_COMPARED):
+            yield from differ_as_values(one[name], other[name], given, f"{key}.{name}")
+    elif isinstance(one, list) and isinstance(other, list):
+        if len(one) != len(other):
+            yield f"{key} has {len(one)} and {len(other)} entries"
         else:
-            leaves[here] = repr(child)
-    return leaves
+            for i, pair in enumerate(zip(one, other, strict=True)):
+                yield from differ_as_values(*pair, given, f"{key}[{i}]")
+    elif isinstance(one, str) and isinstance(other, str):
+        is_word = re.fullmatch(r"[A-Za-z][\w:-]*", one) and re.fullmatch(r"[A-Za-z][\w:-]*", other)
+        if is_word and one != other:
+            yield f"{key} {one} and {other}"
+    elif not is_close(one, other, given.relative):
+        yield f"{key} {one!r} and {other!r}"
 
 
-def page_parts(text):
-    """Return the sections of a page, without its images."""
-    text = re.sub(r"base64,[A-Za-z0-9+/=\s]+", "base64,IMAGE", text)
-    sections = re.split(r"(?=<h[12][ >])", text)
-    found = {}
-    for number, section in enumerate(sections):
-        title = re.sub(r"<[^>]+>", "", section.split("</h")[0])[:40].strip() if number else "head"
-        found[f"section {number} {title}"] = digest(section)
-    return found
+def is_close(one, other, relative):
+    if not all(isinstance(value, int | float) and value is not True for value in (one, other)):
+        return one == other
+    return abs(one - other) <= max(ZERO, relative * max(abs(one), abs(other))) or one == other
 
 
-def digest(data):
-    return hashlib.sha256(data.encode() if isinstance(data, str) else data).hexdigest()[:24]
+def differ_by_text(one, other, given):
+    """Yield the differences between the numbers of two texts, or the bytes of other files."""
+    data = [path.read_bytes() for path in (one, other)]
+    if data[0] == data[1]:
+        return
+    try:
+        texts = [NUMBER.findall(text.decode()) for text in data]
+    except UnicodeDecodeError:
+        yield f"{len(data[0]):,} and {len(data[1]):,} bytes differ"
+        return
+    if len(texts[0]) != len(texts[1]):
+        yield f"{len(texts[0])} and {len(texts[1])} numbers"
+        return
+    pairs = [(float(a), float(b)) for a, b in zip(*texts, strict=True)]
+    apart = [pair for pair in pairs if not is_close(*pair, given.relative)]
+    if apart:
+        yield f"{len(apart)} of {len(pairs)} numbers differ, the first {apart[0][0]} and {apart[0][1]}"
 
 
-def compare(one, other, common=False):
-    """Print every difference, and return whether there are any."""
-    before, after = (json.loads(path.read_text()) for path in (one, other))
-    both = [name for name in before if name in after]
-    count = 0
-    for name in both:
-        sides = [leaves_of(side[name]) for side in (before, after)]
-        for key in sorted(sides[0].keys() | sides[1].keys()):
-            values = [side.get(key, "(absent)") for side in sides]
-            if values[0] != values[1]:
-                count += 1
-                print(f"{name}: {key}\n{difference(*values)}")
-    print(f"{count} differences in {len(both)} commands")
-    apart = 0
-    for path, side in () if common else ((one, before), (other, after)):
-        missing = [name for name in side if name not in both]
-        apart += len(missing)
-        if missing:
-            print(f"{len(missing)} commands are only in {path}: {' '.join(missing)}")
-    return int(count + apart > 0)
+def differ_as_pages(one, other, given):
+    """Yield the differences between the numbers of headings, tables and pictures of two pages."""
+    for tag in ("<h2", "<table", "<img", "<svg", "<tr"):
+        counts = [path.read_text().count(tag) for path in (one, other)]
+        if counts[0] != counts[1]:
+            yield f"{counts[0]} and {counts[1]} of {tag}>"
 
 
-def leaves_of(seen):
-    leaves = {key: seen[key] for key in ("exit", "stdout", "stderr")}
-    for file, parts in seen["files"].items():
-        leaves[file] = "is there"
-        leaves.update({f"{file}: {part}": value for part, value in parts.items()})
-    return leaves
+def pass_over(one, other, given):
+    """Yield nothing: pictures are looked at, and records of the run hold times and paths."""
+    return ()
 
 
-def difference(one, other):
-    rows = difflib.unified_diff(one.split("\n"), other.split("\n"), lineterm="", n=0)
-    return "\n".join(f"    {row}" for row in rows if row[:2] not in ("--", "++", "@@"))
-
+COMPARED = {
+    ".las": differ_as_clouds, ".laz": differ_as_clouds,
+    ".tif": differ_as_rasters, ".tiff": differ_as_rasters,
+    ".gpkg": differ_as_layers,
+    ".json": differ_as_json, ".geojson": differ_as_json,
+    ".html": differ_as_pages,
+    ".png": pass_over,
+}  # fmt: skip
 
 if __name__ == "__main__":
     main()

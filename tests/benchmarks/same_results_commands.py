@@ -25,6 +25,10 @@ BLOCK = (
     "correct {inputs}/a.las out.las --cameras {shared}/rendered_a/colmap --water 0.37"
     f" {OFFSET} --summary summary.json"
 )
+OBLIQUES = (
+    "correct {inputs}/c.las out.las --cameras {shared}/rendered_c/colmap --water 0.37"
+    " --cameras-offset 318700,3851200,0 --summary summary.json"
+)
 FREE = "{shared}/rendered_a_free"
 KNOWN = f"out --water 0.37 {OFFSET} --gnss {FREE}/gnss.csv --jobs 1"
 ADJUST = f"adjust {{shared}}/rendered_a/colmap {KNOWN}"  # 6,000 tie points, for 42,000 of the other
@@ -143,7 +147,18 @@ OF_ADJUST = {
     "fixed": "--poses fixed --sigma-index 0.01 --sigma-tilt 0.1",
     "free-datum": "--datum free --lens {inputs}/lens.csv --sigma-image 0.5",
     "not-told-apart": "--free level,tilt,index",
-    "colmap": "--engine colmap",
+}
+OF_OBLIQUES = {
+    "default": "",
+    "views": "--views {inputs}/c.vis",
+    "snell": "--method snell",
+    "exact": "--method consistent --exact",
+    "withhold": "--unsure withhold --occlusion on",
+}
+OF_PHOTOS = {"exact": "--dsm {dsm.block/out.tif}", "paper": "--mapping paper --dsm {inputs}/a.las"}
+OF_PLAN = {
+    "nadir": "--height 60 --depth 1:5:1",
+    "obliques": "--height 40 --obliques 30 --overlap 0.7 --depth 3",
 }
 OF_CLEAN = {
     "default": "",
@@ -165,6 +180,7 @@ OF_COMPARE = {
     "c2c": "{samples}/scene/lidar.laz --c2c-only",
     "sections": f"{{samples}}/scene/lidar.laz {SECTION} --neighbours 12 --max-gap 2",
     "m3c2": "{samples}/scene/lidar.laz --m3c2 --water 0.37",
+    "both": "{samples}/scene/lidar.laz --direction both",
     "csv": "{inputs}/checks.csv",
     "tif": "{dsm.mean/out.tif}",
 }
@@ -275,6 +291,10 @@ def table() -> dict[str, str]:
     add("scene", f"correct {SCENE}", OF_SCENE)
     add("bad", "", BAD)
     add("block", BLOCK, OF_BLOCK)
+    add("obliques", OBLIQUES, OF_OBLIQUES)
+    for fusion in ("multi", "steepest"):
+        matched = f"correct {{inputs}}/sgm_{fusion}.las out.las"
+        commands[f"sgm.{fusion}"] = OBLIQUES.replace("correct {inputs}/c.las out.las", matched)
     add("port", PORT, OF_PORT)
     add("adjust", ADJUST, OF_ADJUST)
     commands["adjust.ties"] = f"adjust {FREE}/sparse {KNOWN} --ties measured"
@@ -304,6 +324,21 @@ def table() -> dict[str, str]:
     carried += f" --cameras {{adjust.ties/out}}/colmap --adjusted-from {FREE}/sparse"
     views = "--views {inputs}/free.vis --method consistent"
     add("carried", carried, {"snell": "", "views": views})
+    tiles = "--cameras {samples}/scene/cameras.csv --water 0.37 --summary summary.json"
+    commands["tiles.correct"] = f"correct {{inputs}}/tiles out {tiles} --shoreline shore.geojson"
+    commands["tiles.clean"] = "clean {tiles.correct/out} out --summary summary.json"
+    commands["tiles.dsm"] = "dsm {tiles.correct/out} out.tif --resolution 2 --what depth"
+    commands["tiles.restore"] = "restore {tiles.correct/out} out"
+    commands["dsm.block"] = "dsm {block.ties/out.las} out.tif --resolution 0.5 --fill 5"
+    photographs = f"--cameras {{shared}}/rendered_a/colmap {OFFSET} --water 0.37"
+    add("photos", f"photos {{inputs}}/images out {photographs}", OF_PHOTOS)
+    ortho = f"ortho {{inputs}}/images out.tif {photographs} --dsm {{dsm.block/out.tif}}"
+    commands["ortho"] = f"{ortho} --resolution 0.2"
+    commands["calm"] = "calm {inputs}/frames out.png --surface --depth 2 --gsd 0.02 --interval 0.2"
+    add("plan", "plan --summary summary.json", OF_PLAN)
+    shown = "--reference {samples}/scene/lidar.laz --cameras {samples}/scene/cameras.csv"
+    commands["view"] = f"view {{scene.snell/out.laz}} {shown} --water 0.37 --image out.png"
+    commands["qgis-plugin"] = "qgis-plugin out.zip"
     add("pipeline", f"pipeline {SCENE}", {"scene": "", "more": "--max-angle 40 --connected"})
     commands["pipeline.river"] = IN_RIVER.replace("correct ", "pipeline ", 1)
     flight = "--cloud depth-maps --block oblique --detection 0.9 --position-noise-m 0.03"
@@ -358,9 +393,15 @@ def write_inputs(folder, shared, samples):
     rng = np.random.default_rng(5)
     river(folder, shared / "river", rng)
     thin(shared / "river/points.las", folder / "river.las", 10)
-    for name, data, step in (("a", "rendered_a", 12), ("free", "rendered_a_free", 10)):
+    blocks = ("a", "rendered_a", 12), ("c", "rendered_c", 12), ("free", "rendered_a_free", 10)
+    for name, data, step in blocks:
         thin(shared / data / "cloud.las", folder / f"{name}.las", step)
         thin_views(shared / data / "dense.vis", folder / f"{name}.vis", step)
+    for fusion in ("multi", "steepest"):
+        thin(shared / f"rendered_c_sgm/{fusion}.laz", folder / f"sgm_{fusion}.las", 12)
+    tiles(samples / "scene/cloud.laz", folder / "tiles")
+    photographs(shared / "rendered_a/images", folder / "images")
+    frames(folder / "frames", rng)
     port(folder, rng)
     labels = [row.split(",")[0] for row in lines(samples / "scene/cameras.csv")]
     times = [f"{label},2024-05-01T10:{at:02d}:00Z" for at, label in enumerate(labels)]
@@ -451,6 +492,45 @@ def thin(source, target, step):
     las = laspy.read(source)
     las.points = las.points[np.arange(0, len(las), step)]
     las.write(target)
+
+
+def tiles(source, folder):
+    """Split a cloud into three tiles by X."""
+    import laspy
+
+    folder.mkdir()
+    las = laspy.read(source)
+    tile = np.searchsorted(np.quantile(las.x, [0.3, 0.6]), np.asarray(las.x))
+    for number in range(3):
+        part = laspy.LasData(las.header, las.points[tile == number])
+        part.write(folder / f"tile_{number}.laz")
+
+
+def photographs(source, folder):
+    """Take every eighth photograph."""
+    folder.mkdir()
+    for path in sorted(source.glob("*.JPG"))[::8]:
+        (folder / path.name).symlink_to(path)
+
+
+def frames(folder, rng):
+    """Draw a bed of smooth random texture that waves shift a little differently in each frame."""
+    from scipy.ndimage import gaussian_filter, map_coordinates
+
+    try:
+        from PIL import Image
+    except ImportError:
+        return
+    folder.mkdir()
+    bed = gaussian_filter(rng.normal(size=(240, 320)), 1.5)
+    bed = 128 + 40 * bed / bed.std()
+    rows, columns = np.mgrid[:240, :320].astype(float)
+    for number in range(8):
+        phase = rng.uniform(0, 2 * np.pi, 2)
+        shifted = [rows + 1.5 * np.sin(columns / 20 + phase[0])]
+        shifted += [columns + 1.5 * np.sin(rows / 25 + phase[1])]
+        image = map_coordinates(bed, shifted, order=1, mode="reflect").clip(0, 255)
+        Image.fromarray(image.astype("uint8")).convert("RGB").save(folder / f"f{number:02d}.png")
 
 
 def thin_views(source, target, step):
