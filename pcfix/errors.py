@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 _Found = TypeVar("_Found")
 
 
-class _Coded:
+class CodedError(Exception):
     """The code, sentence and values of an error or a warning.
 
     Attributes
@@ -43,7 +43,7 @@ class _Coded:
         return {"code": self.code, "message": str(self), **values}
 
 
-class PcfixError(_Coded, Exception):
+class PcfixError(CodedError):
     """A mistake that the user can correct; the command line prints it and exits with 1."""
 
 
@@ -63,7 +63,7 @@ class GeometryError(PcfixError):
     """Cloud, cameras and water that do not fit together."""
 
 
-class PcfixWarning(_Coded, UserWarning):
+class PcfixWarning(CodedError, UserWarning):
     """Something that affects the result and that the user can act on."""
 
 

@@ -1,53 +1,125 @@
-"""How kernels are compiled, and how their rows are shared out among threads."""
+"""Numba settings, and threads over tiles of rows."""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import shutil
+import tempfile
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import cache, partial
 from itertools import pairwise
 from operator import length_hint
-from typing import Any, TypeAlias, TypeVar
+from pathlib import Path
+from typing import Any, TypeAlias, TypeVar, cast, overload
 
+import numba
 import numpy as np
 import numpy.typing as npt
 
-from pcfix import parts
-from pcfix.errors import SettingError
+from pcfix.errors import PcfixWarning, SettingError
+from pcfix.version import __version__
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
-kernel: Callable[[_Function], _Function] = parts.kernel(error_model="numpy", nogil=True)
-"""Compile a kernel: Python calls it."""
-
-part: Callable[[_Function], _Function] = parts.part(error_model="numpy", nogil=True)
-"""Compile a part of kernels: only they call it, and other parts."""
-
-lean_kernel: Callable[[_Function], _Function] = parts.kernel(
-    error_model="numpy", nogil=True, _nrt=False
-)
-"""Compile a kernel that makes no array and calls nothing that does.
-
-References to arrays are not counted in it. Counting takes two locked operations for each array of
-each argument, which was two thirds of the time of kernels that are handed tuples of arrays.
-"""
-
-lean: Callable[[_Function], _Function] = parts.part(error_model="numpy", nogil=True, _nrt=False)
-"""Compile a part that makes no array and calls none that does; see `lean_kernel`."""
-
-inlined: Callable[[_Function], _Function] = parts.part(
-    error_model="numpy", nogil=True, forceinline=True, _nrt=False
-)
-"""Compile a small lean part into those that call it."""
-
-summed: Callable[[_Function], _Function] = parts.part(
-    error_model="numpy", nogil=True, forceinline=True, _nrt=False,
-    fastmath={"reassoc", "contract"},
+KERNEL_SOURCES = (
+    "kernels.py", "model.py", "io/ply.py", "adjust/*.py", "clean/*.py", "compare/*.py", "grid/*.py",
+    "label/*.py", "lens/*.py", "port/*.py", "refract/**/*.py", "water/*.py",
 )  # fmt: skip
-"""Compile a small lean part of long sums into those that call it; their order is left open."""
+"""Files with kernels, and those whose constants are compiled into them."""
+CACHES_KEPT = 5
+"""Compiled kernels of older versions that stay in the user's cache."""
+
+
+@cache
+def cache_folder() -> Path | None:
+    """Return the folder of the compiled kernels, made if need be; None if none can be written.
+
+    numba compares a cached kernel with its own source file only, and does not see edits of the
+    files that it imports. So the name of the folder has the version and a hash of the sources.
+    """
+    package, sources = Path(__file__).parent, hashlib.blake2b(digest_size=8)
+    for path in sorted(path for part in KERNEL_SOURCES for path in package.glob(part)):
+        sources.update(path.read_bytes())
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pcfix"
+    root = Path(given) if given else user
+    folder = root / f"kernels-{__version__}-{sources.hexdigest()}"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError:
+        return None
+    older = sorted(root.glob("kernels-*"), key=lambda path: path.stat().st_mtime)
+    for path in older[:-CACHES_KEPT]:
+        shutil.rmtree(path, ignore_errors=True)
+    return folder
+
+
+@overload
+def kernel(function: _Function) -> _Function: ...
+@overload
+def kernel(*, allocates: bool) -> Callable[[_Function], _Function]: ...
+def kernel(function: Any = None, *, allocates: bool = False) -> Any:
+    """Compile a function that Python calls, and cache the result.
+
+    With `allocates` it may make arrays. Without, numba counts no references to arrays, which takes
+    two locked operations for every array of every argument: a third of the time of a correction.
+    """
+    if function is None:
+        return partial(_compile, allocates=allocates)
+    return _compile(function)
+
+
+def _compile(function: _Function, *, allocates: bool = False) -> _Function:
+    options = {"nogil": True, "error_model": "numpy", "_nrt": allocates}
+    folder = cache_folder()
+    if folder is None:
+        _warn_of_no_cache()
+        return cast(_Function, numba.njit(**options)(function))
+    # numba reads its setting when the function is declared; functions of others keep theirs
+    before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
+    try:
+        return cast(_Function, numba.njit(cache=True, **options)(function))
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+@overload
+def device(function: _Function) -> _Function: ...
+@overload
+def device(*, allocates: bool = False, **options: Any) -> Callable[[_Function], _Function]: ...
+def device(function: Any = None, *, allocates: bool = False, **options: Any) -> Any:
+    """Compile a function that only kernels call; it becomes part of their cached code.
+
+    It has no wrappers for Python and C, which would take a third of the first run: a call from
+    Python ends the process. Tests call it through ``tests.utils.compiled``.
+    `allocates` is as for `kernel`; `options` are further options of ``numba.njit``.
+    """
+    decorator = numba.njit(
+        nogil=True, error_model="numpy", _nrt=allocates,
+        no_cpython_wrapper=True, no_cfunc_wrapper=True, **options,
+    )  # fmt: skip
+    return decorator if function is None else decorator(function)
+
+
+@cache
+def _warn_of_no_cache() -> None:
+    warnings.warn(
+        PcfixWarning(
+            "kernels.no_cache",
+            "Compiled kernels cannot be cached, because the user's cache folder cannot be written:"
+            " each start compiles them again (about a minute). Set NUMBA_CACHE_DIR to a folder"
+            " that can be written.",
+        ),
+        stacklevel=2,
+    )
+
 
 Span: TypeAlias = tuple[int, int]
 """The first of the rows of a tile, and the one after its last."""
@@ -143,7 +215,7 @@ def in_tiles(run: Callable[..., Any], rows: int, *given: Any, points: int = 0) -
     tell_and_ask()
 
 
-@lean
+@device
 def most_between(span: Span, start: npt.NDArray[np.int64]) -> int:
     """Return how many entries, ``start[i]`` to ``start[i + 1]``, a row of a tile has at most."""
     most = 0

@@ -19,9 +19,7 @@ HOUSE = Path(__file__).parents[1] / "pcfix"
 # The floors, from the ground up. What shares a floor stands side by side; a file may import from
 # lower floors and from its own room. "pcfix" is the front door, pcfix/__init__.py.
 FLOORS = (
-    ("version", "errors", "ahead", "blocks", "qgis"),
-    ("kept",),
-    ("parts",),
+    ("version", "errors", "blocks", "qgis"),
     ("kernels",),
     ("options",),
     ("model", "sums"),
@@ -62,8 +60,7 @@ OPENING = {"read_text", "read_bytes", "write_text", "write_bytes"}
 OUTSIDE_IO = {
     "pcfix.qgis.command": "it runs in QGIS's Python, without pcfix",
     "pcfix.qgis.provider": "as its neighbour",
-    "pcfix.ahead": "what its second process says goes nowhere",
-    "pcfix.kept": "a kernel is valid for the text of its file",
+    "pcfix.kernels": "the folder of the cache is named by a hash of the kernels",
 }
 
 MOST_PARAMETERS = 9

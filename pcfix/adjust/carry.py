@@ -22,7 +22,7 @@ import numpy as np
 
 from pcfix.adjust.gather import some_cameras
 from pcfix.errors import GeometryError, PcfixWarning
-from pcfix.kernels import Span, in_tiles, kernel, lean, most_between
+from pcfix.kernels import Span, device, in_tiles, kernel, most_between
 from pcfix.lens.algebra import dot, minus, plus, plus_square, row_of, scaled, solved, times, vector
 from pcfix.lens.imaging import image_in_world, image_of, lens_table
 from pcfix.model import (
@@ -95,7 +95,7 @@ class _Side(NamedTuple):
     lenses: FloatArray
 
 
-@kernel
+@kernel(allocates=True)
 def _carry(
     span: Span, xyz: FloatArray, start: IntArray, camera: IntArray, old: _Side, new: _Side,
     shift: FloatArray, moved: BoolArray,
@@ -115,7 +115,7 @@ def _carry(
             moved[i] = _meet(shift[i], xyz[i], image[:count], who[:count], new)
 
 
-@lean
+@device
 def _meet(shift: FloatArray, xyz: FloatArray, image: FloatArray, who: IntArray, new: _Side) -> bool:
     """Find the shift after which the cameras image the point nearest to the places; whether so."""
     moved, point = (0.0, 0.0, 0.0), vector(xyz)

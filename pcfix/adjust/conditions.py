@@ -26,12 +26,12 @@ from pcfix.adjust.block import (
 from pcfix.adjust.curved import height_of
 from pcfix.adjust.observe import POINT
 from pcfix.errors import GeometryError
-from pcfix.kernels import kernel, lean
+from pcfix.kernels import device, kernel
 from pcfix.model import FloatArray
 from pcfix.refract.rays import plane_at
 
 
-@lean
+@device
 def condition(
     state: State, given: Given, p: int, own: FloatArray, shared: FloatArray, r: FloatArray
 ) -> bool:
@@ -72,7 +72,7 @@ def condition(
     return True
 
 
-@kernel
+@kernel(allocates=True)
 def distances(state: State, given: Given) -> FloatArray:
     """Return surface minus point, shape (m,), metres along the axis of the surface.
 

@@ -15,7 +15,7 @@ surface itself rises at P. Put into one another these are two equations for dp.
 from __future__ import annotations
 
 from pcfix.adjust.block import SHAPE
-from pcfix.kernels import lean
+from pcfix.kernels import device
 from pcfix.lens.algebra import Vector, beyond, column_of, dot, plus, scaled, vector
 from pcfix.model import FloatArray
 from pcfix.refract.rays import direction, lay, light_path
@@ -24,7 +24,7 @@ STEPS, CLOSE_M = 30, 1e-12
 """To where the light leaves: each step takes curvature times depth of the error of the last."""
 
 
-@lean
+@device
 def height_of(water: FloatArray, x: float, y: float) -> Vector:
     """Return height, dz/dx and dz/dy of the water at a place."""
     d, e, f = water[SHAPE], water[SHAPE + 1], water[SHAPE + 2]
@@ -32,7 +32,7 @@ def height_of(water: FloatArray, x: float, y: float) -> Vector:
     return z, water[1] + 2.0 * d * x + e * y, water[2] + e * x + 2.0 * f * y
 
 
-@lean
+@device
 def curved_plane(plane: FloatArray, water: FloatArray, q: Vector, centre: Vector) -> bool:
     """Set the plane (N, h) that touches the water where light from Q to C leaves it.
 
@@ -55,7 +55,7 @@ def curved_plane(plane: FloatArray, water: FloatArray, q: Vector, centre: Vector
     return True
 
 
-@lean
+@device
 def curved_gradients(
     plane: FloatArray, water: FloatArray, centre: Vector, light: FloatArray, shape: FloatArray
 ) -> None:
@@ -95,7 +95,7 @@ def curved_gradients(
             block[i, at] += turn_x[i] * dx + turn_y[i] * dy
 
 
-@lean
+@device
 def _rise(column: int, x: float, y: float) -> float:
     """Return by how much the water rises at a place with Q, C, a, b, c, n, d, e or f."""
     by = (1.0, x, y, 0.0, x * x, x * y, y * y)

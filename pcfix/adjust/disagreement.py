@@ -182,7 +182,7 @@ def pulls_of(problem: Problem, found: Solution, group: IntArray, drawn: FloatArr
     return pulls
 
 
-@kernel
+@kernel(allocates=True)
 def _sum_pulls(
     span: Span, part: int, state: State, given: Given, group: IntArray, drawn: FloatArray,
     pulls: FloatArray, work: Workspace,

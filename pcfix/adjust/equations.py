@@ -26,7 +26,7 @@ from pcfix.adjust.normal import (
 )
 from pcfix.adjust.observe import POINT, WIDTH, scratch
 from pcfix.adjust.problem import Problem, Solution, priors_at
-from pcfix.kernels import Span, kernel, part
+from pcfix.kernels import Span, device, kernel
 from pcfix.lens.algebra import inverted
 from pcfix.model import BoolArray, FloatArray, IntArray
 
@@ -196,7 +196,7 @@ def point_covariances(equations: Undamped, found: Solution, inverse: FloatArray)
     return out
 
 
-@kernel
+@kernel(allocates=True)
 def _find_fixed(state: State, given: Given, is_fixed: BoolArray) -> None:
     """Find the points whose normal matrix V, priors included, is not singular."""
     room, seen = scratch(), given.seen
@@ -214,7 +214,7 @@ def _find_fixed(state: State, given: Given, is_fixed: BoolArray) -> None:
         is_fixed[p] = inverted(v, FLAT)
 
 
-@kernel
+@kernel(allocates=True)
 def _point_covariances(
     span: Span, part: int, state: State, given: Given, fixed: tuple[BoolArray, IntArray],
     inverse: FloatArray, out: FloatArray, work: Workspace,
@@ -251,7 +251,7 @@ def _point_covariances(
         _add_up(v, w[:size], at[:size], inverse, out[p])
 
 
-@part
+@device(allocates=True)
 def _add_up(
     v: FloatArray, w: FloatArray, at: IntArray, inverse: FloatArray, out: FloatArray
 ) -> None:

@@ -102,7 +102,7 @@ def _common(lenses: tuple[Lens, ...], seen: Seen, tile: IntArray) -> list[FloatA
     ]
 
 
-@kernel
+@kernel(allocates=True)
 def _sum_tiles(
     span: Span, part: int, state: State, given: Given, tile: IntArray, sums: _Tiles,
     work: Workspace,

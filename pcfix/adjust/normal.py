@@ -33,7 +33,7 @@ from pcfix.adjust.observe import (
     lens_gradients,
     scratch,
 )
-from pcfix.kernels import Span, in_tiles, lean, lean_kernel
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import inverted
 from pcfix.model import FloatArray, IntArray
 
@@ -177,7 +177,7 @@ def cost_of(squares: FloatArray, loss: Loss) -> float:
     return float(s.sum() + LOST * lost.sum())
 
 
-@lean
+@device
 def _influence(square: float, loss: Loss) -> float:
     """Return the derivative of the loss by the square: the weight of the observation."""
     if loss.kind == HUBER:
@@ -187,7 +187,7 @@ def _influence(square: float, loss: Loss) -> float:
     return 1.0
 
 
-@lean_kernel
+@kernel
 def _residuals(
     span: Span, part: int, state: State, seen: Seen, surface: Surface, found: FloatArray,
     work: Workspace,
@@ -198,7 +198,7 @@ def _residuals(
             found[o, 0], found[o, 1] = seen.image_xy[o, 0] - u, seen.image_xy[o, 1] - v
 
 
-@lean
+@device
 def linearise(
     state: State, given: Given, loss: Loss, p: int, o: int, room: Scratch,
     own: FloatArray, shared: FloatArray, r: FloatArray,
@@ -236,7 +236,7 @@ def linearise(
     return True
 
 
-@lean
+@device
 def _similarity_gradients(
     state: State, c: int, own: FloatArray, pivot: FloatArray, shared: FloatArray, at: int
 ) -> None:
@@ -261,7 +261,7 @@ def _similarity_gradients(
             own[row, i] = 0.0
 
 
-@lean
+@device
 def point_block(
     v: FloatArray, rhs: FloatArray, priors: PointPriors, xyz: FloatArray, p: int, damping: float
 ) -> bool:
@@ -276,7 +276,7 @@ def point_block(
     return inverted(v, 1e-14)
 
 
-@lean_kernel
+@kernel
 def _sum_up(
     span: Span, part: int, state: State, given: Given, rule: tuple[Loss, float], slot: IntArray,
     sums: Sums, work: Workspace,
@@ -309,7 +309,7 @@ def _sum_up(
         _eliminate(of_part, slot, who[:count], work)
 
 
-@lean
+@device
 def add_point(v: FloatArray, rhs: FloatArray, own: FloatArray, r: FloatArray) -> None:
     """Add B'B and B'r."""
     for i in range(3):
@@ -318,7 +318,7 @@ def add_point(v: FloatArray, rhs: FloatArray, own: FloatArray, r: FloatArray) ->
         rhs[i] += own[0, POINT + i] * r[0] + own[1, POINT + i] * r[1]
 
 
-@lean
+@device
 def _add_pose(
     sums: Sums, c: int, slot: IntArray, w: FloatArray,
     own: FloatArray, shared: FloatArray, r: FloatArray,
@@ -337,7 +337,7 @@ def _add_pose(
         right[i] += own[0, i] * r[0] + own[1, i] * r[1]
 
 
-@lean
+@device
 def _add_shared(
     sums: Sums, w_g: FloatArray, own: FloatArray, shared: FloatArray, r: FloatArray
 ) -> None:
@@ -352,7 +352,7 @@ def _add_shared(
         right[i] += shared[0, i] * r[0] + shared[1, i] * r[1]
 
 
-@lean
+@device
 def _eliminate(sums: Sums, slot: IntArray, who: IntArray, work: Workspace) -> None:
     """Take a point out of the equations, with V inverted."""
     blocks, border, corner, poses, shared_right, _, _ = sums
@@ -384,7 +384,7 @@ def _eliminate(sums: Sums, slot: IntArray, who: IntArray, work: Workspace) -> No
             corner[i, j] -= y0 * w_g[j, 0] + y1 * w_g[j, 1] + y2 * w_g[j, 2]
 
 
-@lean_kernel
+@kernel
 def _point_steps(
     span: Span, part: int, state: State, given: Given, rule: tuple[Loss, float],
     moved: FloatArray, steps: FloatArray, work: Workspace,
@@ -412,7 +412,7 @@ def _point_steps(
             solved(v, rhs, steps[p])
 
 
-@lean
+@device
 def solved(v: FloatArray, rhs: FloatArray, step: FloatArray) -> None:
     """Fill in the step of a point, with V inverted."""
     for i in range(3):

@@ -29,7 +29,7 @@ from pcfix.adjust.block import (
     Surface,
 )  # fmt: skip
 from pcfix.adjust.curved import curved_gradients, curved_plane
-from pcfix.kernels import kernel, lean
+from pcfix.kernels import device, kernel
 from pcfix.lens import formulas as places
 from pcfix.lens.algebra import (
     column_of,
@@ -73,7 +73,7 @@ class Scratch(NamedTuple):
     port: FloatArray
 
 
-@kernel
+@kernel(allocates=True)
 def scratch() -> Scratch:
     """Return new room."""
     return Scratch(
@@ -89,7 +89,7 @@ _TANGENTIAL, _IN_TURN = places.TANGENTIAL, places.IN_TURN
 _PRINCIPAL_X, _PRINCIPAL_Y = places.PRINCIPAL_X, places.PRINCIPAL_Y
 
 
-@lean
+@device
 def water_plane(
     room: Scratch, water: FloatArray, surface: Surface, q: FloatArray, centre: FloatArray
 ) -> bool:
@@ -111,7 +111,7 @@ def water_plane(
     return True
 
 
-@lean
+@device
 def set_port(port: FloatArray, water: FloatArray, surface: Surface) -> None:
     """Set the port, with the distance or the centre that is estimated."""
     for i in range(port.size):
@@ -123,7 +123,7 @@ def set_port(port: FloatArray, water: FloatArray, surface: Surface) -> None:
             port[X + i] = water[PORT + 1 + i]
 
 
-@lean
+@device
 def image(
     state: State, seen: Seen, surface: Surface, p: int, c: int, room: Scratch
 ) -> tuple[float, float]:
@@ -146,7 +146,7 @@ def image(
     return image_of(state.lenses[seen.lens_row[c]], *x)
 
 
-@lean
+@device
 def image_and_all_gradients(
     state: State, seen: Seen, surface: Surface, p: int, c: int, room: Scratch, out: FloatArray
 ) -> tuple[float, float]:
@@ -200,7 +200,7 @@ def image_and_all_gradients(
     return u, v
 
 
-@lean
+@device
 def lens_gradients(c: FloatArray, ahead: FloatArray, codes: IntArray, out: FloatArray) -> None:
     """Fill in how the image of a direction, camera frame, moves with parameters of the lens.
 
@@ -243,7 +243,7 @@ def lens_gradients(c: FloatArray, ahead: FloatArray, codes: IntArray, out: Float
             out[0, i], out[1, i] = fx * bx + b2 * by, fy * by + b3 * bx
 
 
-@lean
+@device
 def _brown_gradient(c: FloatArray, x: float, y: float, code: int) -> tuple[float, float]:
     """Return the derivative of Brown's formula at a place by one of its parameters."""
     r2 = x * x + y * y

@@ -42,7 +42,7 @@ from pcfix.adjust.problem import (
 )
 from pcfix.adjust.solve import moved_by
 from pcfix.errors import GeometryError
-from pcfix.kernels import Span, kernel, lean, part
+from pcfix.kernels import Span, device, kernel
 from pcfix.lens.algebra import inverted
 from pcfix.model import BoolArray, FloatArray, IntArray
 
@@ -83,7 +83,7 @@ def straight_columns(problem: Problem, start: Solution, apparent_xyz: FloatArray
     return tests
 
 
-@kernel
+@kernel(allocates=True)
 def _columns(state: State, given: Given, tests: FloatArray) -> None:
     room, own, r, start = scratch(), np.empty((2, WIDTH)), np.empty(2), given.seen.start
     shared = np.zeros((2, given.columns.total))
@@ -175,7 +175,7 @@ def _newton(
     return step, points
 
 
-@part
+@device(allocates=True)
 def _rows(most: int, g: int) -> _Rows:
     """Return room for so many observations."""
     right, left = np.empty((most, 2, WATER + g)), np.empty((most, 2, WATER + g))
@@ -183,7 +183,7 @@ def _rows(most: int, g: int) -> _Rows:
     return _Rows(right, left, r, who, np.empty((3, 3)), np.empty(3))
 
 
-@part
+@device(allocates=True)
 def _gather(
     state: State, given: Given, tests: FloatArray, tested: bool, p: int, rows: _Rows,
     work: Workspace,
@@ -219,7 +219,7 @@ def _gather(
     return count if point_block(v, rhs, given.priors, state.xyz[p], p, 0.0) else 0
 
 
-@kernel
+@kernel(allocates=True)
 def _sum_tested(
     span: Span, part: int, state: State, given: Given, tests: FloatArray, is_tested: BoolArray,
     matrix: FloatArray, side: FloatArray, work: Workspace,
@@ -261,7 +261,7 @@ def _sum_tested(
                 row[column[j]] -= y0 * w_right[0, j] + y1 * w_right[1, j] + y2 * w_right[2, j]
 
 
-@lean
+@device
 def _add_direct(
     matrix: FloatArray, side: FloatArray, right: FloatArray, left: FloatArray, r: FloatArray,
     at: int, border: int, g: int,
@@ -277,7 +277,7 @@ def _add_direct(
                 matrix[row, border + j] += value * right[a, WATER + j]
 
 
-@kernel
+@kernel(allocates=True)
 def _tested_points(
     span: Span, part: int, state: State, given: Given, tests: FloatArray, is_tested: BoolArray,
     moved: FloatArray, steps: FloatArray, work: Workspace,

@@ -68,12 +68,18 @@ def main(tokens: Sequence[str] | None = None) -> None:
         _stop(f"{error.filename}: {refusal(error)}.", 1)
 
 
+REMOVED = {"warm-up": "it compiled the kernels ahead; 'pcfix demo' does that, as any first command"}
+"""Commands that there were, and what to do instead."""
+
+
 def _run(arguments: list[str]) -> None:
     warnings.showwarning = show_warning
+    if arguments and arguments[0] in REMOVED:
+        raise UsageError(f"'{arguments[0]}' is no longer a command: {REMOVED[arguments[0]]}.")
     for command, _ in EXAMPLES:
         if name_of(command) in arguments[:1]:
             prepare(command)
-    if arguments in ([], *([name] for name in app if name not in ("demo", "warm-up", "--version"))):
+    if arguments in ([], *([name] for name in app if name not in ("demo", "--version"))):
         app([*arguments, "--help"], result_action="return_value")
         sys.exit(0 if arguments in (["--help"], ["-h"]) else 2)
     app(arguments, exit_on_error=False, print_error=False, result_action="return_value")

@@ -15,7 +15,7 @@ import pcfix
 from pcfix.cli.flags import FLAGS, Quiet, UsageError, check_needed, progress_bar, say, status_line
 from pcfix.options.correct import CorrectOptions, LabelOptions
 from pcfix.options.declare import options_of
-from pcfix.options.handover import PlanOptions, PluginOptions, ViewerOptions, WarmUpOptions
+from pcfix.options.handover import PlanOptions, PluginOptions, ViewerOptions
 from pcfix.options.photos import CalmOptions, OrthoOptions, PhotosOptions
 from pcfix.options.scenes import DemoOptions, SimulateOptions
 from pcfix.options.shared import TileOptions
@@ -361,17 +361,6 @@ def qgis_plugin(
         f" {Path(sys.prefix)}", quiet)  # fmt: skip
 
 
-def warm_up(
-    *, options: Annotated[WarmUpOptions, FLAGS] = WarmUpOptions(), quiet: Quiet = False
-) -> None:
-    """Compile kernels now, so that no command need wait: after an installation, or in an image."""
-    from pcfix.flow import warm_up as warming
-
-    with progress_bar("Compiling", quiet, unit="steps") as progress:
-        found = warming.warm_up(options, progress)
-    say(str(found), quiet)
-
-
 def demo(
     out_dir: Annotated[Path, Parameter(help="Folder to make.")] = Path("pcfix-demo"),
     /,
@@ -405,7 +394,6 @@ EXAMPLES: tuple[tuple[Callable[..., None], str], ...] = (
     (pipeline, "pcfix pipeline cloud.laz corrected.laz --cameras cameras.csv --water 0.37"),
     (plan, "pcfix plan --height 60 --overlap 0.8 --sidelap 0.7 --depth 5 --plot plan.png"),
     (qgis_plugin, "pcfix qgis-plugin pcfix.zip"),
-    (warm_up, "pcfix warm-up"),
     (demo, "pcfix demo"),
 )
 """The commands in the order of the help, each with a line that shows it at work."""

@@ -13,7 +13,6 @@ from typing import Annotated, Any, get_args, get_type_hints
 
 from cyclopts import Group, Parameter
 
-from pcfix.ahead import announce
 from pcfix.options.declare import Option, OptionSet, options_of
 from pcfix.options.shared import Panel
 
@@ -97,8 +96,12 @@ Quiet = Annotated[
 
 @cache
 def _announce_compiling() -> None:
-    """Say on a terminal, once, that kernels are compiled."""
-    announce.append(lambda: sys.stderr.write("compiling the kernels, once (half a minute)\n"))
+    """Say on a terminal, once, that the first command compiles the kernels."""
+    from pcfix.kernels import cache_folder
+
+    folder = cache_folder()
+    if folder is None or not any(folder.iterdir()):
+        sys.stderr.write("Compiling the kernels; the first command takes about a minute longer.\n")
 
 
 @contextmanager

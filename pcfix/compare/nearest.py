@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from pcfix.blocks import FEW_ROWS, blocks, bounds, empty
 from pcfix.clean.neighbours import SLACK, Neighbours, Tiles, make_tiles, one_tile
-from pcfix.kernels import Span, in_tiles, lean, lean_kernel
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.model import FloatArray, IntArray
 
 POINTS_PER_CELL = 3.0
@@ -96,7 +96,7 @@ def _side(extent: FloatArray, cells: float) -> float:
 # search among a hundred thousand points.
 
 
-@lean_kernel
+@kernel
 def _set_cells(span: Span, points: FloatArray, lattice: Lattice, cell: Indices) -> None:
     """Set the number of each point's cell, or of the nearest cell to a point outside."""
     low, side_m, columns, rows, _ = lattice
@@ -115,7 +115,7 @@ def sorted_by_cell(points: FloatArray, lattice: Lattice) -> tuple[Indices, Indic
     return start, order
 
 
-@lean_kernel
+@kernel
 def _sort(cell: Indices, start: Indices, place: Indices, order: Indices) -> None:
     """Set what `sorted_by_cell` returns, `start` being zero; `place` is room to work in."""
     for i in range(len(cell)):
@@ -129,7 +129,7 @@ def _sort(cell: Indices, start: Indices, place: Indices, order: Indices) -> None
         place[cell[i]] += 1
 
 
-@lean_kernel
+@kernel
 def _gather(
     span: Span, points: FloatArray, order: IntArray | Indices, arranged: FloatArray
 ) -> None:
@@ -139,7 +139,7 @@ def _gather(
         arranged[i, 0], arranged[i, 1], arranged[i, 2] = x, y, z
 
 
-@lean_kernel
+@kernel
 def _set_z_range(span: Span, start: Indices, points: FloatArray, z_range: FloatArray) -> None:
     """Set lowest and highest Z of each cell; of an empty one, infinitely far apart."""
     for k in range(*span):
@@ -149,14 +149,14 @@ def _set_z_range(span: Span, start: Indices, points: FloatArray, z_range: FloatA
         z_range[k, 0], z_range[k, 1] = lowest, highest
 
 
-@lean
+@device
 def _gap(x: float, cell: int, lattice: Lattice) -> float:
     """Return how far x lies outside the cell at least, along one axis."""
     side_m, slack_m = lattice.side_m, lattice.slack_m
     return max(cell * side_m - x, x - (cell + 1) * side_m, slack_m) - slack_m
 
 
-@lean
+@device
 def _best_in_cell(grid: Cells, column: int, row: int, place: FloatArray, best: float) -> float:
     """Return the least squared distance to the points of a cell, or `best` where that is less.
 
@@ -178,7 +178,7 @@ def _best_in_cell(grid: Cells, column: int, row: int, place: FloatArray, best: f
     return best
 
 
-@lean
+@device
 def _nearest_one(grid: Cells, place: FloatArray, best: float) -> float:
     """Return the distance to the nearest point, NaN where it is too many rings away.
 
@@ -211,7 +211,7 @@ def _nearest_one(grid: Cells, place: FloatArray, best: float) -> float:
     return float(np.nan)
 
 
-@lean_kernel
+@kernel
 def nearest_distances(span: Span, grid: Cells, places: FloatArray, distance: FloatArray) -> None:
     """Set the distance of each place (n, 3) to its nearest point where it was larger.
 

@@ -269,7 +269,7 @@ def correct_file(
         return run.run(partial(_step_over, given), partial(_summary_over, run), Summary)
     task = file_task(single(input), output, given, reads=paths_in(given), progress=progress)
     step = Correcting(job_for(task.source, given))
-    with threads(given.jobs), step.job.compiling():
+    with threads(given.jobs):
         step.job.look_around(
             partial(file_points, task.source, step.job.water, given.jobs, task.kept)
         )
@@ -285,10 +285,9 @@ def correct_file(
 def _step_over(options: CorrectOptions, tiles: Tiles) -> Correcting:
     """Return the step for many files, with what is learned of the cloud that they are."""
     job = job_for(tiles, options)
-    with job.compiling():
-        job.look_around(partial(file_points, tiles, job.water, options.jobs))
-        if job.views.list is not None:  # the first chunk tells what it lists
-            job.correct(first_points(file_points(tiles, job.water, options.jobs)))
+    job.look_around(partial(file_points, tiles, job.water, options.jobs))
+    if job.views.list is not None:  # the first chunk tells what it lists
+        job.correct(first_points(file_points(tiles, job.water, options.jobs)))
     return Correcting(job)
 
 

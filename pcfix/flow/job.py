@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager
 from itertools import compress
 from typing import Any
 
 import numpy as np
 
-from pcfix.ahead import compiling_ahead
 from pcfix.errors import GeometryError
 from pcfix.flow.inputs import Inputs, mask_of
 from pcfix.flow.old_cameras import ListedViews, read_blocks
@@ -18,7 +16,6 @@ from pcfix.flow.through_port import ThroughPort
 from pcfix.flow.through_water import ThroughWater
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.regressions import write_regression
-from pcfix.kernels import cores
 from pcfix.label.labelling import Labelling
 from pcfix.model import Correction, Outcome, WaterSurface
 from pcfix.options.correct import CorrectOptions, LabelRules, ScienceOptions
@@ -77,10 +74,6 @@ class Job(Sums):
         self.labelling.restart()
         self.medium.restart(first_row)
         self.views.restart()
-
-    def compiling(self) -> AbstractContextManager[None]:
-        """Let kernels that will be needed be compiled meanwhile."""
-        return compiling_ahead(self.medium.rehearsals(), cores())
 
     def look_around(self, chunks: Callable[[], Iterable[Points]]) -> None:
         """Learn what must be known of the whole cloud, before the first chunk is corrected."""

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.ahead import Rehearsal
 from pcfix.errors import GeometryError, SettingError
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.old_cameras import Blocks, ListedViews
@@ -86,10 +85,6 @@ class ThroughPort(Sums):
         """Forget the chunks so far."""
         del first_row
         self._miss_sum_m = 0.0
-
-    def rehearsals(self) -> tuple[Rehearsal, ...]:
-        """Return what compiles kernels ahead: nothing."""
-        return ()
 
     def look_around(
         self, chunks: Callable[[], Iterable[Points]], labelling: Labelling, views: ListedViews

@@ -11,7 +11,6 @@ import numpy as np
 
 from pcfix.adjust.carry import Carrying
 from pcfix.adjust.evidence import Evidence
-from pcfix.ahead import Rehearsal
 from pcfix.flow.diagnosis import Poses, diagnose_in_passing, quick_ties
 from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.flow.learning import Learning
@@ -41,7 +40,6 @@ from pcfix.refract.hypotheses import CAUSES, Verdict
 from pcfix.refract.learning import as_told, for_own_water, weigh_lists
 from pcfix.refract.methods import correct, shift_of_land
 from pcfix.refract.regression import LEAST_BEYOND, BeyondRange, DepthRegression
-from pcfix.refract.rehearsal import rehearsals
 from pcfix.refract.tally import Tally
 from pcfix.sums import Sums
 from pcfix.water.checks import WaterMeeting, check_above_water, check_tilt, refuse_under_water
@@ -119,10 +117,6 @@ class ThroughWater(Sums):
         self._shore = None if self._options.shoreline is None else NearWater()
         if self.carrying is not None:
             self.carrying.restart()
-
-    def rehearsals(self) -> tuple[Rehearsal, ...]:
-        """Return what compiles the kernels that ``auto`` needs."""
-        return rehearsals(self.survey) if self.survey.settings.method == "auto" else ()
 
     def look_around(
         self, chunks: Callable[[], Iterable[Points]], labelling: Labelling, views: ListedViews

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import Delaunay, QhullError
 
 from pcfix.grid.lattice import Window
-from pcfix.kernels import cores, kernel, lean
+from pcfix.kernels import cores, device, kernel
 from pcfix.model import BoolArray, FloatArray, IntArray
 
 MOVED = 1e-4
@@ -96,7 +96,7 @@ def _triangles(position: FloatArray) -> IntArray:
     return corners[np.lexsort(corners.T[::-1])]
 
 
-@kernel
+@kernel(allocates=True)
 def _draw(
     position: FloatArray,
     moved: FloatArray,
@@ -131,7 +131,7 @@ def _draw(
                     out[row, column] = z[i] + s * (z[j] - z[i]) + u * (z[k] - z[i])
 
 
-@lean
+@device
 def _shares(a: FloatArray, b: FloatArray, c: FloatArray, x: float, y: float) -> tuple[float, float]:
     """Return the barycentric coordinates of a place that belong to the corners b and c."""
     bx, by, cx, cy = b[0] - a[0], b[1] - a[1], c[0] - a[0], c[1] - a[1]
@@ -140,7 +140,7 @@ def _shares(a: FloatArray, b: FloatArray, c: FloatArray, x: float, y: float) -> 
     return (px * cy - py * cx) / area, (bx * py - by * px) / area
 
 
-@lean
+@device
 def _square_radius(a: FloatArray, b: FloatArray, c: FloatArray) -> float:
     """Return the square of the radius of the circle through three points, a b c / 4 area."""
     bx, by, cx, cy = b[0] - a[0], b[1] - a[1], c[0] - a[0], c[1] - a[1]

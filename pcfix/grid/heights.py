@@ -169,7 +169,7 @@ def inverse_distance(block: Block) -> FloatArray:
     return np.asarray(_weighted(block.position[order], block.z[order], start, *block.window))
 
 
-@kernel
+@kernel(allocates=True)
 def _weighted(
     position: FloatArray,
     z: FloatArray,

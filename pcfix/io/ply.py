@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError
-from pcfix.kernels import lean, lean_kernel
+from pcfix.kernels import device, kernel
 from pcfix.model import FloatArray, IntArray
 
 _TYPES = {
@@ -215,7 +215,7 @@ def _text_numbers(path: Path, start: int) -> FloatArray:
         ) from error
 
 
-@lean
+@device
 def _length(units: npt.NDArray[Any], at: int, size: int, big: bool) -> int:
     """Return a list's count from its bytes, or from its one number where the file is text."""
     count = 0
@@ -224,7 +224,7 @@ def _length(units: npt.NDArray[Any], at: int, size: int, big: bool) -> int:
     return count
 
 
-@lean_kernel
+@kernel
 def list_starts(
     units: npt.NDArray[Any], item: IntArray, prefix: IntArray, big: bool, which: IntArray,
     start: IntArray,
@@ -255,7 +255,7 @@ def list_starts(
     return at
 
 
-@lean_kernel
+@kernel
 def copy_field(
     units: npt.NDArray[Any], item: IntArray, prefix: IntArray, big: bool, field: int,
     part: tuple[int, int], records: int, out: npt.NDArray[Any],

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.kernels import Span, in_tiles, lean_kernel
+from pcfix.kernels import Span, in_tiles, kernel
 from pcfix.model import BoolArray, FloatArray, IntArray
 
 States = npt.NDArray[np.uint8]
@@ -109,7 +109,7 @@ def _cells_over(area: Any, corner: FloatArray, side_m: float) -> _Cells:
     return _Cells(west, south, side_m / 2**HALVINGS, states)
 
 
-@lean_kernel
+@kernel
 def _look_up(
     span: Span, cells: _Cells, bounds: FloatArray, x: FloatArray, y: FloatArray, states: States
 ) -> None:
@@ -298,7 +298,7 @@ def _pools(
     return Pools(number, area, stays)
 
 
-@lean_kernel
+@kernel
 def _add(
     lattice: Lattice,
     flags: Flags,

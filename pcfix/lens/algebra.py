@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from pcfix.kernels import inlined, lean
+from pcfix.kernels import device
 from pcfix.model import FloatArray
 
 Vector: TypeAlias = tuple[float, float, float]
@@ -19,67 +19,67 @@ Nine: TypeAlias = tuple[float, float, float, float, float, float, float, float, 
 """A matrix, row by row."""
 
 
-@inlined
+@device
 def dot(a: Vector, b: Vector) -> float:
     """Return a.b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@inlined
+@device
 def cross(a: Vector, b: Vector) -> Vector:
     """Return a x b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@inlined
+@device
 def plus(a: Vector, b: Vector) -> Vector:
     """Return a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-@inlined
+@device
 def minus(a: Vector, b: Vector) -> Vector:
     """Return a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-@inlined
+@device
 def scaled(c: float, a: Vector) -> Vector:
     """Return c a."""
     return c * a[0], c * a[1], c * a[2]
 
 
-@inlined
+@device
 def beyond(a: Vector, f: float, b: Vector) -> Vector:
     """Return a + f b: so many times b on from a."""
     return a[0] + f * b[0], a[1] + f * b[1], a[2] + f * b[2]
 
 
-@lean
+@device
 def unit(a: Vector) -> Vector:
     """Return a vector of length 1; NaN for one without length."""
     return scaled(1.0 / np.sqrt(dot(a, a)) if dot(a, a) > 0.0 else np.nan, a)
 
 
-@inlined
+@device
 def vector(row: FloatArray, at: int = 0) -> Vector:
     """Return three numbers of a row, from a place on."""
     return row[at], row[at + 1], row[at + 2]
 
 
-@inlined
+@device
 def row_of(rows: FloatArray, i: int) -> Vector:
     """Return row i of an array, shape (n, 3)."""
     return rows[i, 0], rows[i, 1], rows[i, 2]
 
 
-@inlined
+@device
 def column_of(m: FloatArray, j: int) -> Vector:
     """Return column j of an array, shape (3, n)."""
     return m[0, j], m[1, j], m[2, j]
 
 
-@inlined
+@device
 def times(m: FloatArray, a: Vector) -> Vector:
     """Return m a: with the rotation of a camera, a vector of the world in its frame."""
     return (
@@ -89,7 +89,7 @@ def times(m: FloatArray, a: Vector) -> Vector:
     )
 
 
-@inlined
+@device
 def transposed_times(m: FloatArray, a: Vector) -> Vector:
     """Return m' a: with the rotation of a camera, what is in its frame in the world."""
     return (
@@ -99,21 +99,21 @@ def transposed_times(m: FloatArray, a: Vector) -> Vector:
     )
 
 
-@inlined
+@device
 def normal_of(b: float, c: float) -> Vector:
     """Return the unit normal, upward, of a plane with the slopes dz/dx = b and dz/dy = c."""
     up = 1.0 / np.sqrt(1.0 + b * b + c * c)
     return -b * up, -c * up, up
 
 
-@inlined
+@device
 def plus_square(m: Symmetric, a: Vector) -> Symmetric:
     """Return m + a a'."""
     x, y, z = a
     return m[0] + x * x, m[1] + x * y, m[2] + x * z, m[3] + y * y, m[4] + y * z, m[5] + z * z
 
 
-@inlined
+@device
 def cofactors(m: Symmetric) -> tuple[float, Symmetric]:
     """Return the determinant of a symmetric matrix and its cofactors: det times its inverse."""
     xx, xy, xz, yy, yz, zz = m
@@ -124,7 +124,7 @@ def cofactors(m: Symmetric) -> tuple[float, Symmetric]:
     return xx * c[0] + xy * c[1] + xz * c[2], c
 
 
-@inlined
+@device
 def product(m: Symmetric, a: Vector) -> Vector:
     """Return a symmetric matrix times a vector."""
     return (
@@ -134,7 +134,7 @@ def product(m: Symmetric, a: Vector) -> Vector:
     )
 
 
-@lean
+@device
 def solved(m: Symmetric, a: Vector) -> tuple[float, Vector]:
     """Return the determinant of a symmetric matrix, and its inverse times a vector."""
     det, c = cofactors(m)
@@ -142,7 +142,7 @@ def solved(m: Symmetric, a: Vector) -> tuple[float, Vector]:
     return det, (x / det, y / det, z / det)
 
 
-@lean
+@device
 def inverted(m: FloatArray, least: float) -> bool:
     """Replace a matrix by its inverse; whether it has one.
 

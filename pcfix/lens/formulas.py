@@ -17,7 +17,7 @@ from typing import TypeAlias, get_args
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from pcfix.kernels import inlined, lean, lean_kernel
+from pcfix.kernels import device, kernel
 from pcfix.model import FloatArray, Lens, Projection
 
 KIND, LARGEST_ANGLE, LARGEST_RADIUS = range(3)
@@ -76,7 +76,7 @@ def largest_radius(c: FloatArray) -> float:
     return rho if rho >= 0.0 else np.inf  # a tangent or a quotient beyond its pole by rounding
 
 
-@lean_kernel
+@kernel
 def _largest_radius(c: FloatArray) -> float:
     return radius(c, c[LARGEST_ANGLE])
 
@@ -99,12 +99,12 @@ def first_root(polynomial: Polynomial) -> float:
     return 1.0 / float(real.max()) if real.size else np.inf
 
 
-@inlined
+@device
 def _shape(c: FloatArray, i: int) -> float:
     return c[int(c[SHAPE]) + i]
 
 
-@inlined
+@device
 def radius(c: FloatArray, theta: float) -> float:
     """Return the distance from the centre of the plane of a direction at an angle."""
     kind, s0, s1 = int(c[KIND]), _shape(c, 0), _shape(c, 1)
@@ -130,7 +130,7 @@ def radius(c: FloatArray, theta: float) -> float:
     return np.tan(theta)
 
 
-@lean_kernel
+@kernel
 def angle(c: FloatArray, rho: float) -> float:
     """Return the angle from the axis of a place in the plane; undoes `radius`."""
     if not rho <= c[LARGEST_RADIUS]:
@@ -154,7 +154,7 @@ def angle(c: FloatArray, rho: float) -> float:
     return np.arctan(rho)
 
 
-@inlined
+@device
 def _polynomial(c: FloatArray, theta: float) -> tuple[float, float]:
     """Return Pix4D's polynomial and its slope."""
     q = theta / RIGHT_ANGLE
@@ -165,7 +165,7 @@ def _polynomial(c: FloatArray, theta: float) -> tuple[float, float]:
     return value, slope / RIGHT_ANGLE
 
 
-@inlined
+@device
 def _dual(share: float, theta: float) -> tuple[float, float]:
     """Return the mean of perspective and equidistant, and its slope."""
     if share == 0.0:
@@ -174,7 +174,7 @@ def _dual(share: float, theta: float) -> tuple[float, float]:
     return share * tangent + (1.0 - share) * theta, 1.0 + share * tangent * tangent
 
 
-@lean
+@device
 def _search(c: FloatArray, rho: float) -> float:
     """Solve radius(theta) = rho by Newton's steps, halving the bracket where they leave it."""
     low, high = 0.0, c[LARGEST_ANGLE]
@@ -202,7 +202,7 @@ def _search(c: FloatArray, rho: float) -> float:
 Jacobian: TypeAlias = tuple[float, float, float, float]
 
 
-@inlined
+@device
 def _radial(c: FloatArray, r2: float) -> tuple[float, float]:
     """Return r' / r and its derivative by r^2."""
     k, d = int(c[RADIALS]), int(c[DENOMINATORS])
@@ -224,7 +224,7 @@ def _radial(c: FloatArray, r2: float) -> tuple[float, float]:
     return g, (slope - g * below_slope) / below
 
 
-@inlined
+@device
 def _sideways(c: FloatArray, x: float, y: float) -> tuple[float, float]:
     """Return the tangential and thin prism terms."""
     p1, p2, p3, p4 = c[TANGENTIAL], c[TANGENTIAL + 1], c[TANGENTIAL + 2], c[TANGENTIAL + 3]
@@ -236,7 +236,7 @@ def _sideways(c: FloatArray, x: float, y: float) -> tuple[float, float]:
     return tx + (s1 + s2 * r2) * r2, ty + (s3 + s4 * r2) * r2
 
 
-@inlined
+@device
 def distorted(c: FloatArray, x: float, y: float) -> tuple[float, float]:
     """Return Brown's formula at a place; NaN outside the disc where it is one to one."""
     r2 = x * x + y * y
@@ -251,7 +251,7 @@ def distorted(c: FloatArray, x: float, y: float) -> tuple[float, float]:
     return fx + tx, fy + ty
 
 
-@lean
+@device
 def _sideways_jacobian(c: FloatArray, x: float, y: float) -> Jacobian:
     p1, p2, p3, p4 = c[TANGENTIAL], c[TANGENTIAL + 1], c[TANGENTIAL + 2], c[TANGENTIAL + 3]
     s1, s2, s3, s4 = c[THIN_PRISM], c[THIN_PRISM + 1], c[THIN_PRISM + 2], c[THIN_PRISM + 3]
@@ -269,7 +269,7 @@ def _sideways_jacobian(c: FloatArray, x: float, y: float) -> Jacobian:
     )
 
 
-@lean
+@device
 def jacobian(c: FloatArray, x: float, y: float) -> Jacobian:
     """Return d x'/d x, d x'/d y, d y'/d x, d y'/d y of `distorted`."""
     g, slope = _radial(c, x * x + y * y)
@@ -283,7 +283,7 @@ def jacobian(c: FloatArray, x: float, y: float) -> Jacobian:
     return a * xx + b * xy, a * xy + b * yy, d * xx + e * xy, d * xy + e * yy
 
 
-@lean
+@device
 def _start(c: FloatArray, rho: float) -> float:
     """Return the radius that the radial terms alone bring to `rho`, or one near the fold."""
     low, high = 0.0, min(c[DISC], 1e6)
@@ -304,7 +304,7 @@ def _start(c: FloatArray, rho: float) -> float:
     return r
 
 
-@lean
+@device
 def undistorted(c: FloatArray, u: float, v: float) -> tuple[float, float]:
     """Return the place in the disc that `distorted` brings to (u, v), NaN where there is none.
 
@@ -359,7 +359,7 @@ def _radial_fold(lens: Lens) -> float:
 _DIRECTIONS, _RADII_PER_DECADE = 72, 40
 
 
-@lean
+@device
 def _bends(c: FloatArray, r: float) -> bool:
     """Whether the symmetric part of the Jacobian is anywhere not positive definite on a circle."""
     for i in range(_DIRECTIONS):
@@ -370,7 +370,7 @@ def _bends(c: FloatArray, r: float) -> bool:
     return False
 
 
-@lean_kernel
+@kernel
 def _first_bend(c: FloatArray, fold: float) -> float:
     """Return the smallest radius that bends, found on a fine series and then halved to it."""
     low = 0.0

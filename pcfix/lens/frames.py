@@ -22,7 +22,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, inlined, lean, lean_kernel
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Vector, dot, minus, row_of, scaled, times
 from pcfix.lens.formulas import (
     B2,
@@ -266,7 +266,7 @@ def with_border(lens: Lens, border: float) -> Lens:
     )
 
 
-@lean
+@device
 def pyramid(g: FloatArray) -> Pyramid:
     """Return the planes of one camera, shape (4, 3), as twelve numbers.
 
@@ -275,7 +275,7 @@ def pyramid(g: FloatArray) -> Pyramid:
     return row_of(g, 0), row_of(g, 1), row_of(g, 2), row_of(g, 3)
 
 
-@lean
+@device
 def in_frame(g: Pyramid, e: Vector) -> bool:
     """Whether the point at C - e is on the inner side of all four planes."""
     return (
@@ -286,20 +286,20 @@ def in_frame(g: Pyramid, e: Vector) -> bool:
     )
 
 
-@inlined
+@device
 def _image(lens: FloatArray, r: FloatArray, e: Vector) -> tuple[float, float]:
     """Return where a lens with rotation r images the point at C - e."""
     return image_of(lens, *scaled(-1.0, times(r, e)))
 
 
-@inlined
+@device
 def _images(lens: FloatArray, r: FloatArray, e: Vector) -> bool:
     """Whether that place is in the frame."""
     u, v = _image(lens, r, e)
     return (u >= 0.0) & (u <= lens[WIDTH]) & (v >= 0.0) & (v <= lens[HEIGHT])
 
 
-@lean
+@device
 def holds(frames: Frames, c: int, e: Vector) -> bool:
     """Whether the frame of camera c holds the point at C - e, distortion included."""
     if not in_frame(pyramid(frames.planes[c]), e):
@@ -308,7 +308,7 @@ def holds(frames: Frames, c: int, e: Vector) -> bool:
     return row == NOT_DISTORTED or _images(frames.lenses[row], frames.rotations[c], e)
 
 
-@lean
+@device
 def mark_pyramid(
     marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, centre: FloatArray, g: Pyramid
 ) -> None:
@@ -318,7 +318,7 @@ def mark_pyramid(
         marks[j] = 1.0 if in_frame(g, (cx - x[j], cy - y[j], cz - z[j])) else 0.0
 
 
-@lean
+@device
 def mark(
     marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray,
     centre: FloatArray, frames: Frames, c: int,
@@ -334,7 +334,7 @@ def mark(
     return _mark_any(marks, x, y, z, centre, around, frames.rotations[c], lens)
 
 
-@lean
+@device
 def _mark_any(
     marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, centre: FloatArray,
     around: Pyramid, r: FloatArray, lens: FloatArray,
@@ -349,7 +349,7 @@ def _mark_any(
     return count
 
 
-@lean
+@device
 def _mark_plain(
     marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, centre: FloatArray,
     r: FloatArray, c: FloatArray,
@@ -382,7 +382,7 @@ def _mark_plain(
     return count
 
 
-@lean
+@device
 def may_hold(g: FloatArray, centre: FloatArray, low: FloatArray, high: FloatArray) -> bool:
     """Whether a pyramid can hold any point of an upright box; never wrongly False."""
     for p in range(4):
@@ -395,7 +395,7 @@ def may_hold(g: FloatArray, centre: FloatArray, low: FloatArray, high: FloatArra
     return True
 
 
-@lean
+@device
 def judge(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: FloatArray) -> int:
     """Return whether the distorted frame of camera c holds all or nothing of an upright box.
 
@@ -447,7 +447,7 @@ def cameras_in_sight(xyz: FloatArray, cameras: Cameras) -> IntArray:
     return counts
 
 
-@lean_kernel
+@kernel
 def _count(
     span: Span, xyz: FloatArray, centres: FloatArray, frames: Frames, counts: IntArray
 ) -> None:
@@ -482,7 +482,7 @@ def beside_frames(xyz: FloatArray, views: Views, cameras: Cameras) -> IntArray:
     return counts
 
 
-@lean_kernel
+@kernel
 def _count_beside(
     span: Span, xyz: FloatArray, start: IntArray, camera: IntArray, centres: FloatArray,
     frames: Frames, counts: IntArray,

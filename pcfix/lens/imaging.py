@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from pcfix.kernels import inlined, kernel, lean
+from pcfix.kernels import device, kernel
 from pcfix.lens import formulas as places
 from pcfix.lens.algebra import Vector, times, transposed_times
 from pcfix.lens.formulas import (
@@ -127,7 +127,7 @@ def _is_plain(lens: Lens) -> bool:
     return lens.projection == "perspective" and not (lens.inverse or lens.in_turn or any(beyond))
 
 
-@inlined
+@device
 def in_plane(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]:
     """Return the plane coordinates of a direction, before distortion."""
     if c[places.KIND] == places.PERSPECTIVE:
@@ -142,7 +142,7 @@ def in_plane(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]
     return scale * x, scale * y
 
 
-@inlined
+@device
 def image_of(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]:
     """Return u, v of one direction."""
     px, py = in_plane(c, x, y, z)
@@ -156,7 +156,7 @@ def image_of(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]
     return u, c[places.PRINCIPAL_Y] + c[places.FOCAL_Y] * dy + c[places.B3] * dx
 
 
-@lean
+@device
 def direction_of(c: FloatArray, u: float, v: float) -> tuple[float, float, float]:
     """Return the unit direction of one place in the image."""
     cx, cy = c[places.CENTRE_X], c[places.CENTRE_Y]
@@ -175,7 +175,7 @@ def direction_of(c: FloatArray, u: float, v: float) -> tuple[float, float, float
     return scale * px, scale * py, np.cos(theta)
 
 
-@kernel
+@kernel(allocates=True)
 def _project(c: FloatArray, directions: FloatArray) -> FloatArray:
     image = np.empty((len(directions), 2))
     for i in range(len(directions)):
@@ -184,7 +184,7 @@ def _project(c: FloatArray, directions: FloatArray) -> FloatArray:
     return image
 
 
-@kernel
+@kernel(allocates=True)
 def _unproject(c: FloatArray, image: FloatArray) -> FloatArray:
     directions = np.empty((len(image), 3))
     for i in range(len(image)):
@@ -199,7 +199,7 @@ Gradients: TypeAlias = tuple[float, float, float, float, float, float]
 _NOWHERE = (np.nan,) * 6
 
 
-@lean
+@device
 def image_and_gradients(
     c: FloatArray, x: float, y: float, z: float
 ) -> tuple[float, float, Gradients]:
@@ -246,7 +246,7 @@ def image_and_gradients(
     )  # fmt: skip
 
 
-@lean
+@device
 def image_in_world(
     c: FloatArray, r: FloatArray, direction: Vector
 ) -> tuple[float, float, Vector, Vector]:
@@ -258,7 +258,7 @@ def image_in_world(
     return u, v, transposed_times(r, g[:3]), transposed_times(r, g[3:])
 
 
-@lean
+@device
 def _plane_and_gradients(
     c: FloatArray, x: float, y: float, z: float
 ) -> tuple[float, float, Gradients]:
@@ -290,7 +290,7 @@ def _plane_and_gradients(
     )
 
 
-@lean
+@device
 def _radius_slope(c: FloatArray, theta: float, rho: float) -> float:
     """Return d rho / d theta of `pcfix.lens.formulas.radius`."""
     kind = int(c[places.KIND])
@@ -319,7 +319,7 @@ def _radius_slope(c: FloatArray, theta: float, rho: float) -> float:
     return 1.0 / (cosine * cosine)
 
 
-@lean
+@device
 def _polynomial_slope(c: FloatArray, theta: float) -> float:
     """Return the slope of Pix4D's polynomial, in which a right angle counts as 1."""
     q, slope = theta / RIGHT_ANGLE, 0.0

@@ -7,16 +7,7 @@ from typing import Any, Literal
 
 from pcfix.errors import SettingError
 from pcfix.options.correct import BudgetOptions
-from pcfix.options.declare import (
-    File,
-    OptionSet,
-    at_least,
-    one_or_more,
-    option,
-    positive,
-    rule,
-    within,
-)
+from pcfix.options.declare import File, OptionSet, at_least, option, positive, rule, within
 from pcfix.options.scenes import depth_series
 from pcfix.options.shared import (
     CameraFileOptions,
@@ -153,25 +144,3 @@ class ViewerOptions(OverwriteOption, CameraFileOptions, WaterOptions):
 @dataclass(frozen=True, kw_only=True)
 class PluginOptions(OverwriteOption):
     """The options of ``pcfix qgis-plugin``."""
-
-
-WARMED = ("correct", "clean", "dsm", "compare")
-
-
-@dataclass(frozen=True, kw_only=True)
-class WarmUpOptions(OptionSet):
-    """The options of ``pcfix warm-up``."""
-
-    panel = Panel.OUTPUT
-
-    commands: tuple[str, ...] = option(
-        WARMED,
-        f"Those whose kernels are compiled, of {', '.join(WARMED)}.",
-        rule=rule(
-            lambda value: bool(value) and set(value) <= set(WARMED),
-            f"{{option}} {{value}} must be of {', '.join(WARMED)}.",
-        ),
-        parse=one_or_more(str, "correct,dsm"),
-        default_is="all of these",
-        metavar="NAME,NAME",
-    )

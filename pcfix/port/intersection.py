@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.kernels import Span, in_tiles, kernel, lean, part
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import (
     Vector,
     column_of,
@@ -200,7 +200,7 @@ def rotations_of(cameras: Cameras) -> FloatArray:
     return np.asarray(cameras.rotations, np.float64)
 
 
-@kernel
+@kernel(allocates=True)
 def _choose(
     span: Span, order: IntArray, xyz: FloatArray, rig: Rig, frames: Frames,
     views: tuple[IntArray, IntArray], limits: tuple[float, int], shift: FloatArray,
@@ -233,7 +233,7 @@ def _choose(
                 start[i + 1] = kept.size
 
 
-@part
+@device(allocates=True)
 def _box(xyz: FloatArray, rows: IntArray, shift: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the corners of an upright box around points; with shifts, a wide one around both.
 
@@ -250,7 +250,7 @@ def _box(xyz: FloatArray, rows: IntArray, shift: FloatArray) -> tuple[FloatArray
     return low - wide, high + wide
 
 
-@part
+@device(allocates=True)
 def _usable(
     candidates: IntArray, point: Vector, rig: Rig, frames: Frames, limits: tuple[float, int],
     through: bool,
@@ -281,7 +281,7 @@ def _usable(
     return kept[ranked]
 
 
-@kernel
+@kernel(allocates=True)
 def _intersect(
     span: Span, near: FloatArray, directions: FloatArray, start: IntArray, camera: IntArray,
     rig: Rig, result: FloatArray,
@@ -302,7 +302,7 @@ def _intersect(
         _solve(result[i], sums, k, least)
 
 
-@lean
+@device
 def _solve(row: FloatArray, sums: FloatArray, k: int, cosine: float) -> None:
     """Solve one point and write its row; a point without a solution keeps a shift of zero."""
     if k < 2:

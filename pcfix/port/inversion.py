@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, kernel, lean, part
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import (
     Vector,
     cross,
@@ -112,7 +112,7 @@ def _rows(views: Views) -> tuple[IntArray, IntArray]:
     return start, np.ascontiguousarray(views.camera, np.int64)
 
 
-@lean
+@device
 def _image_through(a: Vector, rig: Rig, c: int, out: FloatArray, image: FloatArray) -> None:
     """Fill in where a camera images what lies at C + a through the port.
 
@@ -131,7 +131,7 @@ def _image_through(a: Vector, rig: Rig, c: int, out: FloatArray, image: FloatArr
         image[axis, 1], image[axis, 2], image[axis, 3] = x, y, z
 
 
-@kernel
+@kernel(allocates=True)
 def _search_all(
     span: Span, moved: IntArray, xyz: FloatArray, start: IntArray, camera: IntArray, rig: Rig,
     shift: FloatArray, found: BoolArray,
@@ -142,7 +142,7 @@ def _search_all(
         found[m] = _search(shift[i], row_of(xyz, i), camera[start[i] : start[i + 1]], rig)
 
 
-@part
+@device(allocates=True)
 def _search(shift: FloatArray, point: Vector, cameras: IntArray, rig: Rig) -> bool:
     """Move a point to where g is zero; whether it was reached."""
     q = shift.copy()
@@ -169,7 +169,7 @@ def _search(shift: FloatArray, point: Vector, cameras: IntArray, rig: Rig) -> bo
     return False
 
 
-@kernel
+@kernel(allocates=True)
 def _covariances(
     span: Span, xyz: FloatArray, start: IntArray, camera: IntArray, rig: Rig,
     sigma_image: FloatArray, sigmas: tuple[float, float, float], result: FloatArray,
@@ -208,7 +208,7 @@ def _covariances(
                 at += 1
 
 
-@lean
+@device
 def _image_noise(
     w: FloatArray, image: FloatArray, seen: Vector, sigma_image: float, sigma_centre: float,
     sigma_attitude: float,

@@ -20,7 +20,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from pcfix.kernels import lean
+from pcfix.kernels import device
 from pcfix.lens.algebra import Vector, beyond, dot, minus, plus, scaled, unit
 from pcfix.model import FloatArray
 from pcfix.port.shapes import DomePort, FlatPort, Port
@@ -29,7 +29,7 @@ Ray: TypeAlias = tuple[float, float, float, float, float, float]
 """A place and a unit direction."""
 
 
-@lean
+@device
 def bent(s: Vector, normal: Vector, r: float) -> Vector:
     """Return the unit direction behind a face: Snell's law in vector form.
 
@@ -50,7 +50,7 @@ FLAT_CLOSE = 1e-8
 """Of a step, relative; as each step squares the error, the next would be below rounding."""
 
 
-@lean
+@device
 def through_flat(
     normal: Vector, distance: float, thickness: float, glass: float, n: float,
     point: Vector, out: FloatArray,
@@ -96,7 +96,7 @@ def through_flat(
             out[i, BY_PORT] = -below * k * (1.0 - 1.0 / root_n) * aside[i]
 
 
-@lean
+@device
 def _slope(
     distance: float, thickness: float, depth: float, aside2: float, glass: float, n: float
 ) -> float:
@@ -117,7 +117,7 @@ def _slope(
     return np.nan
 
 
-@lean
+@device
 def ray_through_flat(
     normal: Vector, distance: float, thickness: float, glass: float, n: float, direction: Vector
 ) -> Ray:
@@ -140,7 +140,7 @@ SERIES_UP_TO = 0.01
 """Beyond, the closed form of the derivative loses two digits at most."""
 
 
-@lean
+@device
 def turn(y: float, u: float) -> tuple[float, float, float]:
     """Return asin(y sqrt(u)) / sqrt(u), which is a series in u, and its derivatives by y and u."""
     z = y * y * u
@@ -156,7 +156,7 @@ def turn(y: float, u: float) -> tuple[float, float, float]:
     return y * s, 1.0 / root, y * y * y * by_z
 
 
-@lean
+@device
 def _miss(
     q: float, v: float, u: float, far: float, a: float, b: float, glass: float, n: float
 ) -> tuple[float, float, float, float, float, float, float]:
@@ -188,7 +188,7 @@ def _miss(
     return total, left_q - by_p * p_q, -by_p * p_v, by_u - by_p * p_u, by_far, by_n, by_o2
 
 
-@lean
+@device
 def _place(v: float, u: float, far: float, a: float, b: float, glass: float, n: float) -> float:
     """Solve for q: Newton's method, and halving where it would leave the bracket."""
     # where the straight line from o to X meets the inner sphere
@@ -212,7 +212,7 @@ def _place(v: float, u: float, far: float, a: float, b: float, glass: float, n: 
     return q
 
 
-@lean
+@device
 def through_dome(
     centre: Vector, a: float, thickness: float, glass: float, n: float,
     point: Vector, out: FloatArray,
@@ -283,7 +283,7 @@ def through_dome(
             out[i, BY_PORT + j] = -out[i, 1 + j] - by_o
 
 
-@lean
+@device
 def ray_through_dome(
     centre: Vector, a: float, thickness: float, glass: float, n: float, direction: Vector
 ) -> Ray:
@@ -296,7 +296,7 @@ def ray_through_dome(
     return plus(outer, centre) + t
 
 
-@lean
+@device
 def _meet(start: Vector, s: Vector, radius: float) -> Vector:
     """Return where a ray that starts inside a sphere about the origin, or on it, leaves it."""
     along = dot(start, s)
@@ -304,7 +304,7 @@ def _meet(start: Vector, s: Vector, radius: float) -> Vector:
     return beyond(start, f, s)
 
 
-@lean
+@device
 def cosine_at_dome(centre: Vector, a: float, direction: Vector) -> float:
     """Return the cosine of the angle at which a ray from the projection centre meets a dome."""
     o, s = scaled(-1.0, centre), unit(direction)
@@ -328,7 +328,7 @@ def coefficients(port: Port) -> FloatArray:
     return np.array(c, np.float64)
 
 
-@lean
+@device
 def through_port(port: FloatArray, n: float, x: float, y: float, z: float, out: FloatArray) -> None:
     """Find in which direction the light of a point comes to the projection centre.
 
@@ -354,7 +354,7 @@ def through_port(port: FloatArray, n: float, x: float, y: float, z: float, out: 
         through_dome(where, size, thickness, glass, n, (x, y, z), out)
 
 
-@lean
+@device
 def ray_through(port: FloatArray, n: float, dx: float, dy: float, dz: float) -> Ray:
     """Return how a ray from the projection centre goes on in the water.
 
@@ -378,7 +378,7 @@ def ray_through(port: FloatArray, n: float, dx: float, dy: float, dz: float) -> 
     return ray_through_dome(where, size, thickness, glass, n, (dx, dy, dz))
 
 
-@lean
+@device
 def cosine_at_port(port: FloatArray, dx: float, dy: float, dz: float) -> float:
     """Return the cosine of the angle of incidence in air at the inner face.
 

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import PcfixWarning
-from pcfix.kernels import Span, in_tiles, inlined, lean, lean_kernel
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Vector, times, transposed_times
 from pcfix.lens.imaging import direction_of, image_of, lens_table
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Outcome, Views, WaterSurface
@@ -330,7 +330,7 @@ def stacked(batches: list[Batch]) -> Batch:
     )
 
 
-@lean_kernel
+@kernel
 def _incidence(
     span: Span, xyz: FloatArray, normals: FloatArray, centres: FloatArray, start: IntArray,
     camera: IntArray, cosine: FloatArray,
@@ -348,7 +348,7 @@ def _incidence(
         cosine[i, 0], cosine[i, 1] = most, least
 
 
-@lean_kernel
+@kernel
 def _mark_used(
     span: Span, start: IntArray, camera: IntArray, moved: BoolArray, used: BoolArray
 ) -> None:
@@ -499,7 +499,7 @@ def _are_equal(made: Cameras, now: Cameras) -> bool:
     )
 
 
-@inlined
+@device
 def as_made(images: Images, c: int, a: Vector) -> Vector:
     """Return where the matcher had what camera c sees in a direction, both in the world frame.
 
@@ -513,7 +513,7 @@ def as_made(images: Images, c: int, a: Vector) -> Vector:
     )  # fmt: skip
 
 
-@lean
+@device
 def as_now(images: Images, c: int, a: Vector) -> Vector:
     """Return in which direction camera c sees what the matcher had in a direction."""
     return _through(
@@ -522,7 +522,7 @@ def as_now(images: Images, c: int, a: Vector) -> Vector:
     )  # fmt: skip
 
 
-@lean
+@device
 def _through(
     r: FloatArray, lens: FloatArray, to_r: FloatArray, to_lens: FloatArray, a: Vector
 ) -> Vector:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, inlined, kernel, lean, lean_kernel, part
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Vector, normal_of, row_of
 from pcfix.model import FloatArray, IntArray, WaterMesh, WaterRaster
 from pcfix.refract.batch import Batch, Chosen, Survey
@@ -126,7 +126,7 @@ def neighbours_in_cells(batch: Batch) -> tuple[IntArray, IntArray]:
 _QUARTERS, _DIGIT_BITS = 4, 11
 
 
-@lean_kernel
+@kernel
 def _set_keys(
     span: Span,
     xyz: FloatArray,
@@ -146,7 +146,7 @@ def _set_keys(
         key[i] = cell * _QUARTERS**2 + within
 
 
-@kernel
+@kernel(allocates=True)
 def _sorted(key: IntArray) -> IntArray:
     """Return the order of keys from zero up, digit by digit: for points a few passes."""
     order, other, shift, most = np.arange(key.size), np.empty(key.size, np.int64), 0, key.max()
@@ -163,7 +163,7 @@ def _sorted(key: IntArray) -> IntArray:
     return order
 
 
-@lean_kernel
+@kernel
 def _sum_names(
     span: Span, start: IntArray, camera: IntArray, names: IntArray, sums: IntArray
 ) -> None:
@@ -173,13 +173,13 @@ def _sum_names(
             sums[i] += names[camera[at]]
 
 
-@part
+@device(allocates=True)
 def cameras_of(points: Chosen, i: int) -> IntArray:
     """Return the cameras of a point."""
     return points.camera[points.start[i] : points.start[i + 1]]
 
 
-@lean
+@device
 def are_same(a: IntArray, b: IntArray) -> bool:
     """Whether two lists of cameras are one."""
     same = a.size == b.size
@@ -188,7 +188,7 @@ def are_same(a: IntArray, b: IntArray) -> bool:
     return same
 
 
-@part
+@device(allocates=True)
 def counts_of(rows: IntArray, points: Chosen) -> IntArray:
     """Return how many of some points each camera sees."""
     seen = np.zeros(len(points.centres), np.int64)
@@ -198,13 +198,13 @@ def counts_of(rows: IntArray, points: Chosen) -> IntArray:
     return seen
 
 
-@part
+@device(allocates=True)
 def no_box() -> Box:
     """Return a box that nothing is in."""
     return Box(np.zeros(3), np.ones(3), np.ones(3), np.zeros(3))
 
 
-@part
+@device(allocates=True)
 def box_of(rows: IntArray, points: Chosen) -> Box:
     """Return the box of some points; the water is that of the first of them."""
     i, low, high = rows[0], np.full(3, np.inf), np.full(3, -np.inf)
@@ -219,13 +219,13 @@ def box_of(rows: IntArray, points: Chosen) -> Box:
     return Box(middle, half, 1.0 / half, np.array([a + b * middle[0] + c * middle[1], b, c]))
 
 
-@inlined
+@device
 def water_at(box: Box, x: float, y: float) -> float:
     """Return the height of the water at a place."""
     return box.water[0] + box.water[1] * (x - box.middle[0]) + box.water[2] * (y - box.middle[1])
 
 
-@part
+@device(allocates=True)
 def nodes_of(box: Box, points: Chosen) -> Chosen:
     """Return the nodes of a box as points."""
     xyz, height = box.middle + box.half * NODES, np.empty(len(NODES))
@@ -241,7 +241,7 @@ def nodes_of(box: Box, points: Chosen) -> Chosen:
     )  # fmt: skip
 
 
-@lean
+@device
 def is_under(points: Chosen, i: int, box: Box) -> bool:
     """Whether the water over a point is the plane of the cell."""
     off = points.height[i] - water_at(box, points.xyz[i, 0], points.xyz[i, 1])
@@ -249,7 +249,7 @@ def is_under(points: Chosen, i: int, box: Box) -> bool:
     return bool(max(abs(off), max(abs(b), abs(c))) <= SAME_PLANE)
 
 
-@inlined
+@device
 def in_box(box: Box, place: Vector) -> Vector:
     """Return the coordinates of a place of the world."""
     x, y, z = place
@@ -260,7 +260,7 @@ def in_box(box: Box, place: Vector) -> Vector:
     )
 
 
-@inlined
+@device
 def set_powers(basis: FloatArray, at: Vector) -> None:
     """Write the powers of coordinates, one for each term."""
     u, v, w = at
@@ -273,7 +273,7 @@ def set_powers(basis: FloatArray, at: Vector) -> None:
         basis[j] = powers[j]
 
 
-@lean
+@device
 def fit(terms: FloatArray, by: FloatArray, values: FloatArray) -> None:
     """Write the polynomials through values at the nodes, shape (nodes, values).
 
@@ -288,7 +288,7 @@ def fit(terms: FloatArray, by: FloatArray, values: FloatArray) -> None:
                 terms[j * many + f] += by[j, k] * values[k, f]
 
 
-@lean
+@device
 def add_cubic(room: FloatArray, at: int, c: FloatArray, marks: FloatArray) -> None:
     """Add a cubic polynomial to run `at` of a tile, for the points that have a mark.
 
@@ -309,7 +309,7 @@ def add_cubic(room: FloatArray, at: int, c: FloatArray, marks: FloatArray) -> No
         room[at * TILE + j] += value if marks[j] > 0.0 else 0.0
 
 
-@lean
+@device
 def add_quadratic(room: FloatArray, at: int, c: FloatArray, marks: FloatArray) -> None:
     """Do as `add_cubic` with a quadratic polynomial."""
     one, u1, v1, w1, uu, uv, uw, vv, vw, ww = (

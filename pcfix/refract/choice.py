@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.kernels import Span, in_tiles, kernel, lean, lean_kernel, part
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot, minus, row_of
 from pcfix.lens.frames import Frames, frames_of, holds, listed_frames_of
 from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterMesh, WaterPlane, WaterRaster
@@ -159,7 +159,7 @@ def cameras_of_pairs(pairs: Views) -> Views:
     return Views(start, distinct[: start[-1]])
 
 
-@kernel
+@kernel(allocates=True)
 def _distinct(start: IntArray, camera: IntArray, first: IntArray, distinct: IntArray) -> None:
     owner = np.full(camera.max() + 1 if camera.size else 0, -1)
     count = 0
@@ -171,7 +171,7 @@ def _distinct(start: IntArray, camera: IntArray, first: IntArray, distinct: IntA
         first[i + 1] = count
 
 
-@kernel
+@kernel(allocates=True)
 def _make_room(span: Span, points: Points, rig: Rig, frames: Frames, first: IntArray) -> None:
     """Set for each tile, one place on, how many entries it may get."""
     low, high = corners_of(points.order[span[0] * TILE : span[1] * TILE], points.xyz)
@@ -182,7 +182,7 @@ def _make_room(span: Span, points: Points, rig: Rig, frames: Frames, first: IntA
         first[t + 1] = rows.size * near_cameras(around, frames, rig.centres, low, high).size
 
 
-@kernel
+@kernel(allocates=True)
 def _choose_all(
     span: Span, points: Points, rig: Rig, frames: Frames, rule: Rule, tin: Tin | None,
     fields: Field | None, views: tuple[IntArray, IntArray],
@@ -217,7 +217,7 @@ def _choose_all(
             free += kept.size
 
 
-@kernel
+@kernel(allocates=True)
 def _choose_in_frame(
     span: Span, points: Points, rig: Rig, frames: Frames, rule: Rule,
     found: tuple[IntArray, IntArray, IntArray, npt.NDArray[np.int32]],
@@ -246,7 +246,7 @@ def _choose_in_frame(
             free += k
 
 
-@lean
+@device
 def _set_steepness(marks: FloatArray, tile: FloatArray, rig: Rig, c: int, rule: Rule) -> None:
     """Turn marks into squared cosines of incidence angles, negative where a ray does not count."""
     centre, offset = row_of(rig.centres, c), rig.offset[c]
@@ -260,7 +260,7 @@ def _set_steepness(marks: FloatArray, tile: FloatArray, rig: Rig, c: int, rule: 
         marks[j] = height * height / length2 if use & (marks[j] > 0.0) else -1.0
 
 
-@lean_kernel
+@kernel
 def _gather_chosen(
     span: Span, begin: IntArray, start: IntArray, place: npt.NDArray[np.int32], chosen: IntArray
 ) -> None:
@@ -275,7 +275,7 @@ MAX_ANGLE_WITHOUT_FRAMES_DEG = 80.0
 block in another CRS is told apart."""
 
 
-@part
+@device(allocates=True)
 def _keep_steepest(
     chosen: npt.NDArray[np.integer[Any]], cosine2: FloatArray, k: int, most: int
 ) -> int:
@@ -289,7 +289,7 @@ def _keep_steepest(
     return most
 
 
-@part
+@device(allocates=True)
 def choose(
     candidates: IntArray, tile: FloatArray, j: int, rig: Rig, frames: Frames, rule: Rule,
     tin: Tin | None, fields: Field | None, facet: int,

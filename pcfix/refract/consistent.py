@@ -30,7 +30,7 @@ from typing import TypeAlias
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.kernels import Span, in_tiles, inlined, kernel, lean, most_between, part
+from pcfix.kernels import Span, device, in_tiles, kernel, most_between
 from pcfix.lens.algebra import (
     Nine,
     Vector,
@@ -159,7 +159,7 @@ def intersection_of(result: FloatArray, used: BoolArray) -> Intersection:
     )
 
 
-@kernel
+@kernel(allocates=True)
 def _correct(
     span: Span, points: Chosen, optics: Optics, tin: Tin | None, fields: Field | None,
     result: FloatArray,
@@ -176,13 +176,13 @@ Room: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 """Of one point: its rays, their sums, g and the inverse of its derivative."""
 
 
-@part
+@device(allocates=True)
 def room_for(rays: int) -> Room:
     """Return room for a point with at most so many rays."""
     return np.empty((rays, RAY_WIDTH)), np.empty(10), np.empty(3), np.empty((3, 3))
 
 
-@lean
+@device
 def correct_one(
     out: FloatArray, points: Chosen, i: int, cameras: IntArray, optics: Optics,
     tin: Tin | None, fields: Field | None, room: Room,
@@ -200,7 +200,7 @@ def correct_one(
     _solve(out, rays, (sums, g, inverse), cameras, optics, points.n, tin, fields)
 
 
-@lean
+@device
 def _are_one(cameras: IntArray) -> bool:
     """Whether there is one camera at most, perhaps several times."""
     one = True
@@ -209,7 +209,7 @@ def _are_one(cameras: IntArray) -> bool:
     return one
 
 
-@lean
+@device
 def begin(
     ray: FloatArray, sums: FloatArray, points: Chosen, i: int, c: int,
     tin: Tin | None, fields: Field | None, facet: int,
@@ -237,7 +237,7 @@ def begin(
     ray[_ORIGIN], ray[_ORIGIN + 1], ray[_ORIGIN + 2] = lowered
 
 
-@lean
+@device
 def add_image(ray: FloatArray, optics: Optics, c: int) -> None:
     """Fill in where the camera images P, and how that moves with P in the world frame."""
     lens, down = optics.lenses[optics.row[c]], scaled(-1.0, vector(ray))
@@ -247,7 +247,7 @@ def add_image(ray: FloatArray, optics: Optics, c: int) -> None:
     ray[_IMAGE], ray[_IMAGE + 1] = u, v
 
 
-@lean
+@device
 def _solve(
     out: FloatArray, rays: FloatArray, room: tuple[FloatArray, FloatArray, FloatArray],
     cameras: IntArray, optics: Optics, n: float, tin: Tin | None, fields: Field | None,
@@ -263,7 +263,7 @@ def _solve(
     out[FOUND] = 1.0 if found else 0.0
 
 
-@lean
+@device
 def write_row(out: FloatArray, q: Vector, miss_m: float, k: float, cosine2: float) -> None:
     """Write the row of a point with a solution."""
     out[0], out[1], out[2] = q
@@ -271,7 +271,7 @@ def write_row(out: FloatArray, q: Vector, miss_m: float, k: float, cosine2: floa
     out[INCIDENCE] = np.degrees(np.arccos(np.sqrt(min(cosine2, 1.0))))
 
 
-@inlined
+@device
 def miss(k: float, s: FloatArray | Nine, q: Vector) -> float:
     """Return the rms distance of Q from the lines of the sums, Q'MQ - 2 b'Q + s over k."""
     x, y, z = q
@@ -282,7 +282,7 @@ def miss(k: float, s: FloatArray | Nine, q: Vector) -> float:
     return np.sqrt(max(rest, 0.0) / k)
 
 
-@lean
+@device
 def _search(
     start: Vector, room: tuple[FloatArray, FloatArray], rays: FloatArray, cameras: IntArray,
     optics: Optics, n: float, tin: Tin | None, fields: Field | None,
@@ -316,7 +316,7 @@ def _search(
     return False, start
 
 
-@lean
+@device
 def _gradient(
     g: FloatArray, slope: FloatArray, q: Vector, rays: FloatArray, cameras: IntArray,
     optics: Optics, n: float, tin: Tin | None, fields: Field | None,
@@ -327,7 +327,7 @@ def _gradient(
         add_residual(g, slope, q, rays[j], cameras[j], optics, n, tin, fields)
 
 
-@lean
+@device
 def add_residual(
     g: FloatArray, slope: FloatArray, q: Vector, ray: FloatArray, c: int, optics: Optics, n: float,
     tin: Tin | None, fields: Field | None,
@@ -347,7 +347,7 @@ def add_residual(
         _add_slope(slope, ray, path, slope_of_path(path, normal, n))
 
 
-@lean
+@device
 def _add_slope(slope: FloatArray, ray: FloatArray, path: Path, by_q: Vector) -> None:
     """Add (N.e) J'J d w / d Q, with d w / d Q = k (I - N N') + s (grad k)'."""
     k, s, normal = path[0], path[4], vector(ray, _PLANE)

@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import inlined, lean, part
+from pcfix.kernels import device
 from pcfix.lens.algebra import Vector, beyond, dot, minus, plus, row_of, scaled, unit
 from pcfix.lens.frames import holds
 from pcfix.model import FloatArray, IntArray
@@ -120,7 +120,7 @@ class Room(NamedTuple):
     found: IntArray
 
 
-@part
+@device(allocates=True)
 def room_for(k: int) -> Room:
     """Return new room, in which no image has a place."""
     return Room(
@@ -130,7 +130,7 @@ def room_for(k: int) -> Room:
     )  # fmt: skip
 
 
-@lean
+@device
 def sight_of(points: Chosen, i: int) -> Sight:
     """Return point i."""
     normal = row_of(points.normals, i)
@@ -138,13 +138,13 @@ def sight_of(points: Chosen, i: int) -> Sight:
     return Sight(row_of(points.xyz, i), row_of(points.made_xyz, i), above, normal)
 
 
-@inlined
+@device
 def _up(sight: Sight, points: Chosen, c: int) -> Vector:
     """Return the way from the point to the projection centre."""
     return minus(row_of(points.centres, c), sight.now)
 
 
-@inlined
+@device
 def made_up(sight: Sight, block: Block, c: int) -> Vector:
     """Return the way from the point to the projection centre as the matcher had both."""
     if len(block.images.centres) == 0:
@@ -152,7 +152,7 @@ def made_up(sight: Sight, block: Block, c: int) -> Vector:
     return minus(row_of(block.images.centres, c), sight.made)
 
 
-@inlined
+@device
 def _above(sight: Sight, points: Chosen, c: int) -> float:
     """Return how high the water of an image is over the point."""
     return sight.above + sight.normal[2] * points.offset[c]
@@ -193,7 +193,7 @@ class Lines(NamedTuple):
     slope: FloatArray
 
 
-@lean
+@device
 def look(
     maps: IntArray, weight: FloatArray, bed: float, sight: Sight, block: Block, table: Table,
     room: Room,
@@ -204,7 +204,7 @@ def look(
             _look(room.looks[q], maps[q], bed, sight, block, table, room)
 
 
-@lean
+@device
 def find_lines(
     lines: Lines, maps: IntArray, sight: Sight, block: Block, table: Table, room: Room
 ) -> None:
@@ -233,7 +233,7 @@ def find_lines(
         lines.slope[q] = room.looks[q, 5]
 
 
-@lean
+@device
 def likely_bed(sight: Sight, block: Block) -> float:
     """Return a likely height of the bed, relative to the apparent point."""
     points, above = block.points, 0.0
@@ -243,7 +243,7 @@ def likely_bed(sight: Sight, block: Block) -> float:
     return -LIKELY * max(above, LEAST_DEPTH_M) / sight.normal[2] * (points.n - 1.0)
 
 
-@lean
+@device
 def balance(t: FloatArray, slope: FloatArray, weight: FloatArray) -> float:
     """Return how far up the bed must go so that the weighted mean of the depths is zero."""
     total, change = 0.0, 0.0
@@ -253,7 +253,7 @@ def balance(t: FloatArray, slope: FloatArray, weight: FloatArray) -> float:
     return -total / change
 
 
-@lean
+@device
 def settle_bed(
     row: FloatArray, maps: IntArray, weight: FloatArray, depths: Lines, sight: Sight,
     block: Block, table: Table, room: Room,
@@ -291,7 +291,7 @@ def settle_bed(
     row[OUTCOME], row[_COUNT] = CORRECTED, count
 
 
-@inlined
+@device
 def _look(
     out: FloatArray, c: int, bed: float, sight: Sight, block: Block, table: Table, room: Room
 ) -> None:
@@ -331,14 +331,14 @@ def _look(
     out[5] = -steep * change / length if t == t else np.nan
 
 
-@inlined
+@device
 def _length(sight: Sight, block: Block, c: int) -> float:
     """Return how far the point is from the projection centre, as the matcher had both, metres."""
     made = made_up(sight, block, c)
     return np.sqrt(dot(made, made))
 
 
-@inlined
+@device
 def _ray(c: int, sight: Sight, block: Block) -> tuple[Vector, Vector, float]:
     """Return the ray on which image c shows the point.
 
@@ -354,7 +354,7 @@ def _ray(c: int, sight: Sight, block: Block) -> tuple[Vector, Vector, float]:
     return a, e, above - dot(sight.normal, a)
 
 
-@lean
+@device
 def _compare(
     partners: FloatArray, c: int, q: Vector, length: float, sight: Sight, block: Block
 ) -> int:
@@ -381,7 +381,7 @@ def _compare(
     return count
 
 
-@lean
+@device
 def best_pairs(partners: FloatArray, pairs: FloatArray, tolerance: float) -> float:
     """Return the depth at which two images agree best: a mean over the pairs, the best most.
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, kernel, lean, part
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Batch, Intersection
@@ -120,7 +120,7 @@ class Groups(NamedTuple):
     own: FloatArray
 
 
-@part
+@device(allocates=True)
 def _no_groups(block: Block) -> Groups:
     k, matcher = len(block.points.centres), block.matcher
     return Groups(
@@ -131,7 +131,7 @@ def _no_groups(block: Block) -> Groups:
     )  # fmt: skip
 
 
-@lean
+@device
 def _group(groups: Groups, maps: IntArray, matcher: Matcher) -> None:
     """Find the places of the depth maps of a point."""
     groups.place[:] = ABSENT
@@ -142,7 +142,7 @@ def _group(groups: Groups, maps: IntArray, matcher: Matcher) -> None:
         _place(groups.fused[q], q, matcher.fused[maps[q]], groups.place)
 
 
-@lean
+@device
 def _place(members: IntArray, q: int, others: IntArray, place: IntArray) -> None:
     """Write a place and those of other images that have one."""
     members[0], count = q, 1
@@ -152,7 +152,7 @@ def _place(members: IntArray, q: int, others: IntArray, place: IntArray) -> None
     members[count:] = ABSENT
 
 
-@kernel
+@kernel(allocates=True)
 def _likely(
     span: Span, cells: tuple[IntArray, IntArray], block: Block, quick: bool, likely: FloatArray
 ) -> None:
@@ -171,7 +171,7 @@ def _likely(
             _likely_of(likely[i], i, maps, groups, block, table, room)
 
 
-@lean
+@device
 def _likely_of(
     likely: FloatArray, i: int, maps: IntArray, groups: Groups, block: Block, table: Table,
     room: Room,
@@ -187,7 +187,7 @@ def _likely_of(
             likely[seed] = depths.bed + groups.rise[seed]
 
 
-@kernel
+@kernel(allocates=True)
 def _invert(
     span: Span, cells: tuple[IntArray, IntArray], block: Block, quick: bool, around: FloatArray,
     result: FloatArray,
@@ -207,7 +207,7 @@ def _invert(
             _invert_one(result[i], i, maps, around[i], groups, block, table, room)
 
 
-@lean
+@device
 def _invert_one(
     row: FloatArray, i: int, maps: IntArray, around: float, groups: Groups, block: Block,
     table: Table, room: Room,
@@ -227,14 +227,14 @@ def _invert_one(
     settle_bed(row, maps, weight, depths, sight, block, table, room)
 
 
-@lean
+@device
 def _set_shares(share: FloatArray, maps: IntArray, sight: Sight, block: Block) -> None:
     for q in range(maps.size):
         made = made_up(sight, block, maps[q])
         share[q] = 1.0 / dot(made, made)
 
 
-@lean
+@device
 def _best_seed(groups: Groups, depths: Lines, wanted: float) -> tuple[int, float, float]:
     """Return the seed whose group has the bed nearest to the wanted height, or the largest one.
 
@@ -260,7 +260,7 @@ def _best_seed(groups: Groups, depths: Lines, wanted: float) -> tuple[int, float
     return best, at_best, np.sqrt(max(second / total - mean * mean, 0.0))
 
 
-@lean
+@device
 def _set_rises(groups: Groups, depths: Lines) -> None:
     """Find how far up the bed is if the group of each seed made the point, and its size.
 
@@ -278,7 +278,7 @@ def _set_rises(groups: Groups, depths: Lines) -> None:
         groups.rise[seed] += step
 
 
-@lean
+@device
 def _average_around(seed: int, groups: Groups, depths: Lines, rise: float) -> None:
     """Average the depths that may be fused with that of a seed, for a bed so much higher."""
     _set_depths(groups, depths, rise)
@@ -288,14 +288,14 @@ def _average_around(seed: int, groups: Groups, depths: Lines, rise: float) -> No
         _average(q, groups, depths)
 
 
-@lean
+@device
 def _set_depths(groups: Groups, depths: Lines, rise: float) -> None:
     """Set the depth of each map for a bed so much higher."""
     for q in range(depths.t.size):
         groups.own[q] = depths.t[q] + depths.slope[q] * rise
 
 
-@lean
+@device
 def _average(q: int, groups: Groups, depths: Lines) -> None:
     """Average a depth with those of the maps around that agree.
 
@@ -313,7 +313,7 @@ def _average(q: int, groups: Groups, depths: Lines) -> None:
     groups.depth[q], groups.change[q] = total * each, change * each
 
 
-@lean
+@device
 def _fuse(seed: int, groups: Groups) -> tuple[float, float]:
     """Return how far up the bed must go for the group of a seed, and how many maps it has."""
     total, change, members = 0.0, 0.0, 0.0
@@ -327,7 +327,7 @@ def _fuse(seed: int, groups: Groups) -> tuple[float, float]:
     return -total / change, members
 
 
-@lean
+@device
 def _weigh(weight: FloatArray, seed: int, rise: float, groups: Groups, depths: Lines) -> None:
     """Write what each depth map counts for in the group of a seed.
 

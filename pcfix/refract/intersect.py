@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, kernel, lean, part
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot, minus, row_of, scaled
 from pcfix.lens.frames import NOT_DISTORTED, Frames, Pyramid, frames_of, in_frame, may_hold, pyramid
 from pcfix.model import BoolArray, FloatArray, IntArray
@@ -105,7 +105,7 @@ def _as_intersection(result: FloatArray, used: BoolArray) -> Intersection:
 _MISS, _SIGMA_Z, _INCIDENCE, _COUNT, _OUTCOME = 3, 4, 5, 6, 7
 
 
-@lean
+@device
 def _solve(row: FloatArray, k: float, sums: FloatArray) -> None:
     """Solve one point and write its row; a point without a solution keeps a shift of zero."""
     if k < 2.0:
@@ -121,14 +121,14 @@ def _solve(row: FloatArray, k: float, sums: FloatArray) -> None:
     row[_COUNT], row[_OUTCOME] = k, CORRECTED
 
 
-@lean
+@device
 def _solve_tile(result: FloatArray, rows: IntArray, sums: FloatArray) -> None:
     """Solve the points of a tile: where references are counted, two to each of its points."""
     for j in range(rows.size):
         _solve(result[rows[j]], sums[9 * TILE + j], sums[j::TILE])
 
 
-@lean
+@device
 def add_camera(
     sums: FloatArray, tile: FloatArray, marks: FloatArray, g: Pyramid | None, rig: Rig, c: int,
     rule: Rule,
@@ -177,7 +177,7 @@ def add_camera(
     return rays
 
 
-@kernel
+@kernel(allocates=True)
 def _all_in_frame(
     span: Span, points: Points, rig: Rig, frames: Frames, rule: Rule, budget: Budget,
     level_sigma: FloatArray, found: tuple[FloatArray, BoolArray, FloatArray],
@@ -222,7 +222,7 @@ def _all_in_frame(
             finish_tile(covariance, rows, room, tile, level_sigma, budget)
 
 
-@kernel
+@kernel(allocates=True)
 def _chosen(
     span: Span, points: Points, rig: Rig, rule: Rule, tin: Tin | None, fields: Field | None,
     views: tuple[IntArray, IntArray], result: FloatArray, used: BoolArray,
@@ -242,7 +242,7 @@ def _chosen(
             _intersect_one(result[i], cameras, tile, j, rig, rule.bend, tin, fields, facet)
 
 
-@part
+@device(allocates=True)
 def _intersect_one(
     row: FloatArray, cameras: IntArray, tile: FloatArray, j: int, rig: Rig, r: float,
     tin: Tin | None, fields: Field | None, facet: int,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, kernel, lean, part
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot
 from pcfix.lens.frames import holds
 from pcfix.model import BoolArray, FloatArray, IntArray
@@ -64,7 +64,7 @@ def invert_depth_maps(batch: Batch) -> Intersection:
     return intersection_of(batch, result)
 
 
-@kernel
+@kernel(allocates=True)
 def _invert(
     span: Span, cells: tuple[IntArray, IntArray], block: Block, quick: bool, weight: FloatArray,
     result: FloatArray,
@@ -83,7 +83,7 @@ def _invert(
             _invert_one(result[i], i, points.camera[begin:end], given, block, table, room)
 
 
-@part
+@device(allocates=True)
 def _may_count(rows: IntArray, block: Block) -> BoolArray:
     """Return which images, or their neighbours, are listed for some points."""
     listed = counts_of(rows, block.points) > 0
@@ -95,7 +95,7 @@ def _may_count(rows: IntArray, block: Block) -> BoolArray:
     return with_neighbours
 
 
-@lean
+@device
 def _invert_one(
     row: FloatArray, i: int, listed: IntArray, given: FloatArray, block: Block, table: Table,
     room: Room,
@@ -131,7 +131,7 @@ def _invert_one(
                 room.place[a] = ABSENT
 
 
-@lean
+@device
 def _with_neighbours(
     found: IntArray, place: IntArray, listed: IntArray, sight: Sight, block: Block
 ) -> int:
@@ -155,7 +155,7 @@ def _with_neighbours(
     return count
 
 
-@lean
+@device
 def _share(
     counts: FloatArray, listed: IntArray, own: FloatArray, now: FloatArray, averaged: IntArray,
     place: IntArray,
@@ -172,7 +172,7 @@ def _share(
                 counts[place[a]] += own[k] / members
 
 
-@lean
+@device
 def _averages(own: int, a: int, now: FloatArray, place: IntArray) -> bool:
     """Whether a depth is averaged with that of image a: both show the place, nearly alike."""
     if a < 0 or place[a] < 0:

@@ -21,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.kernels import kernel, lean, part
+from pcfix.kernels import device, kernel
 from pcfix.lens.algebra import minus, row_of
 from pcfix.model import BoolArray, FloatArray, IntArray, Outcome
 from pcfix.refract.batch import Batch, Chosen, Intersection
@@ -39,13 +39,13 @@ def down(shift_m: FloatArray) -> FloatArray:
     return np.column_stack([none, none, -shift_m])
 
 
-@lean
+@device
 def depth_ratio(tan2: float, n: float) -> float:
     """Return tan a / tan b of a ray with tan^2 a = `tan2`: what a depth grows by along it."""
     return np.sqrt(n * n + (n * n - 1.0) * tan2)
 
 
-@kernel
+@kernel(allocates=True)
 def _mean_crossings(points: Chosen) -> tuple[FloatArray, FloatArray]:
     """Return how far below its apparent point the bent rays of each cross its plumb line.
 
@@ -64,7 +64,7 @@ def _mean_crossings(points: Chosen) -> tuple[FloatArray, FloatArray]:
     return lowered, miss
 
 
-@part
+@device(allocates=True)
 def _miss(points: Chosen, i: int, rays: IntArray, lowered: float) -> float:
     """Return the root mean square distance of a place on the plumb line from the bent rays.
 
@@ -77,7 +77,7 @@ def _miss(points: Chosen, i: int, rays: IntArray, lowered: float) -> float:
     return np.sqrt(squares / max(rays.size, 1))
 
 
-@lean
+@device
 def _crossing(points: Chosen, i: int, c: int) -> tuple[float, float]:
     """Return how far below the apparent point a bent ray crosses its plumb line; cos^2 a."""
     ex, ey, ez = minus(row_of(points.centres, c), row_of(points.xyz, i))
@@ -241,7 +241,7 @@ def murase(batch: Batch) -> Intersection:
     return batch.result(down(lowered), outcome=outcome, ray_miss_m=miss)
 
 
-@kernel
+@kernel(allocates=True)
 def _equal_x(points: Chosen) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return how far each point sinks by its pairs, its distance from the rays, where they fail.
 
@@ -270,7 +270,7 @@ def _equal_x(points: Chosen) -> tuple[FloatArray, FloatArray, BoolArray]:
     return lowered, miss, failed
 
 
-@lean
+@device
 def _pair(points: Chosen, i: int, first: int, second: int) -> tuple[float, float]:
     """Return the X-parallax of two bent rays by metre of depth, and at the apparent point."""
     x, y, _ = minus(row_of(points.centres, second), row_of(points.centres, first))

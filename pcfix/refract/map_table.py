@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import inlined, lean, part, summed
+from pcfix.kernels import device
 from pcfix.lens.algebra import Vector, cross, dot, minus, normal_of, row_of, scaled, unit
 from pcfix.lens.frames import holds
 from pcfix.model import BoolArray, FloatArray, IntArray
@@ -100,7 +100,7 @@ def block_of(batch: Batch) -> Block:
     return Block(batch.chosen(), images_of(batch.made_with, batch.survey.cameras), matcher)
 
 
-@part
+@device(allocates=True)
 def no_table() -> Table:
     """Return a table without polynomials."""
     none = np.empty((0, 0))
@@ -110,7 +110,7 @@ def no_table() -> Table:
     )  # fmt: skip
 
 
-@part
+@device(allocates=True)
 def table_of(rows: IntArray, seeing: BoolArray, block: Block) -> Table:
     """Fit the polynomials of some points, for the images that may see them."""
     matched, first = block.matcher.matched, np.flatnonzero(seeing)
@@ -135,7 +135,7 @@ def table_of(rows: IntArray, seeing: BoolArray, block: Block) -> Table:
     return Table(box, place, terms, in_frame, ways, np.zeros(seeing.size), np.ones(1))
 
 
-@part
+@device(allocates=True)
 def bed_under(box: Box) -> Box:
     """Return the box in which the bed of the points of a box lies."""
     deep, shallow = box.half[2] - box.middle[2], -box.half[2] - box.middle[2]
@@ -145,7 +145,7 @@ def bed_under(box: Box) -> Box:
     return Box(middle, half, 1.0 / half, box.water)
 
 
-@lean
+@device
 def _see(view: FloatArray, c: int, box: Box, block: Block) -> None:
     """Write where an image sees the nodes, as the matcher had it, and how far away they seem."""
     points = block.points
@@ -162,14 +162,14 @@ def _see(view: FloatArray, c: int, box: Box, block: Block) -> None:
         view[k, 3] = np.sqrt(dot(w, w)) * (path[2] + USUAL * path[3])
 
 
-@inlined
+@device
 def _made_centre(block: Block, c: int) -> Vector:
     if len(block.images.centres) == 0:
         return row_of(block.points.centres, c)
     return row_of(block.images.centres, c)
 
 
-@lean
+@device
 def _fit_image(
     terms: FloatArray, in_frame: IntArray, values: FloatArray, views: FloatArray, c: int,
     place: IntArray, block: Block,
@@ -194,7 +194,7 @@ def _fit_image(
     return near
 
 
-@inlined
+@device
 def meet(u: Vector, a: Vector, base: Vector, focal_px: float) -> tuple[float, float, float]:
     """Return where the ray u comes nearest to the ray a, and what an image on a says of that.
 
@@ -208,7 +208,7 @@ def meet(u: Vector, a: Vector, base: Vector, focal_px: float) -> tuple[float, fl
     return away, scale * dot(base, across) / np.sqrt(sine2), scale * scale * sine2
 
 
-@lean
+@device
 def _has(view: FloatArray, j: int, block: Block) -> int:
     """Return whether a frame holds all nodes, or none, beyond one of its sides."""
     planes, all_in = block.matcher.inner.planes[j], True
@@ -228,7 +228,7 @@ def _has(view: FloatArray, j: int, block: Block) -> int:
     return NEVER if most == len(NODES) else SOMETIMES
 
 
-@lean
+@device
 def _is_near(terms: FloatArray, values: FloatArray, view: FloatArray, focal_px: float) -> bool:
     """Whether polynomials are what they should be at the corners."""
     near = True
@@ -240,14 +240,14 @@ def _is_near(terms: FloatArray, values: FloatArray, view: FloatArray, focal_px: 
     return near
 
 
-@inlined
+@device
 def has_terms(table: Table, c: int) -> bool:
     """Whether a table has the polynomials of an image."""
     at = table.place[c] if table.place.size else -1
     return bool(0 <= at < len(table.terms) and table.terms[at, 0] == table.terms[at, 0])
 
 
-@inlined
+@device
 def read_table(
     partners: FloatArray, powers: FloatArray, table: Table, c: int, place: Vector,
     usual_m: float, block: Block,
@@ -277,7 +277,7 @@ def read_table(
     return count
 
 
-@summed
+@device(fastmath={"reassoc", "contract"})
 def values_of(terms: FloatArray, powers: FloatArray) -> Vector:
     """Return the values of three polynomials."""
     x, y, z = 0.0, 0.0, 0.0
@@ -288,7 +288,7 @@ def values_of(terms: FloatArray, powers: FloatArray) -> Vector:
     return x, y, z
 
 
-@inlined
+@device
 def reads(table: Table, points: Chosen, i: int) -> bool:
     """Whether the water over a point is that of the table."""
     return table.place.size > 0 and is_under(points, i, table.box)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, kernel, lean, part
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Vector, dot, minus, row_of
 from pcfix.lens.frames import Frames, frames_of, with_border
 from pcfix.lens.imaging import project
@@ -178,7 +178,7 @@ def _seen(cameras: Cameras, places: FloatArray, likely: Iterable[IntArray]) -> _
 TOTAL, ANGLES, SCALES, COMMON = range(4)
 
 
-@kernel
+@kernel(allocates=True)
 def _find_partners(
     span: Span, places: FloatArray, centres: FloatArray, seen: _Seen, tracked: bool,
     table: IntArray,
@@ -215,7 +215,7 @@ def _find_partners(
                 table[i, at] = together[one]
 
 
-@part
+@device(allocates=True)
 def _score(sums: FloatArray, covered: int) -> float:
     """Return how good a partner is by its sums, and the cells that common places cover."""
     area, common = covered / (CELLS * CELLS), sums[COMMON]
@@ -228,7 +228,7 @@ def _score(sums: FloatArray, covered: int) -> float:
     return float(sums[TOTAL] * area)
 
 
-@lean
+@device
 def _angle_deg(one: Vector, other: Vector, place: Vector) -> float:
     """Return the angle between the rays from a place to two centres."""
     a, b = minus(one, place), minus(other, place)
@@ -236,14 +236,14 @@ def _angle_deg(one: Vector, other: Vector, place: Vector) -> float:
     return float(np.degrees(np.arccos(min(1.0, cosine))))
 
 
-@lean
+@device
 def _angle_weight(angle_deg: float) -> float:
     wide = NARROW_DEG if angle_deg < BEST_ANGLE_DEG else WIDE_DEG
     off = (angle_deg - BEST_ANGLE_DEG) / wide
     return max(np.exp(-0.5 * off * off), LEAST_ANGLE_WEIGHT)
 
 
-@lean
+@device
 def _scale_weight(scale: float) -> float:
     if scale > FINER:
         return (FINER / scale) ** 2
@@ -363,7 +363,7 @@ def bed_of(xyz: FloatArray, likely_m: FloatArray) -> Bed:
     return Bed(grid, float(low[0]), float(low[1]), cell)
 
 
-@kernel
+@kernel(allocates=True)
 def _without_outliers(height: FloatArray) -> FloatArray:
     """Return heights in which a cell far off the median of its 5 x 5 surroundings is that median.
 
@@ -401,7 +401,7 @@ def _cell_m(xy: FloatArray, low: FloatArray, high: FloatArray) -> float:
     return side
 
 
-@kernel
+@kernel(allocates=True)
 def _vote(
     span: Span, order: IntArray, start: IntArray, z: FloatArray, likely: FloatArray,
     found: FloatArray,
@@ -430,7 +430,7 @@ def _vote(
         found[c] = low + np.argmax(votes) * step
 
 
-@lean
+@device
 def _add_vote(vote: FloatArray, at: float) -> None:
     """Vote once for every height at which a point can be, however many groups say so."""
     reach = int(3.0 * _STEPS)

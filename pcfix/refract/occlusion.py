@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.kernels import Span, in_tiles, lean, lean_kernel
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.model import BoolArray, FloatArray, IntArray, Views
 
 Heights = npt.NDArray[np.float32]
@@ -107,7 +107,7 @@ def in_sight(xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occlu
     return Views(start, views.camera[stays], weight, views.kind)
 
 
-@lean_kernel
+@kernel
 def _hidden(
     span: Span, xyz: FloatArray, centres: FloatArray, start: IntArray, camera: IntArray,
     o: Occluder, found: BoolArray,
@@ -137,12 +137,12 @@ def _hidden(
             found[entry] = pierces or _meets(o, u, v, z + slack, du, dv, rise, run, first)
 
 
-@lean
+@device
 def _inside(height: Heights, u: float, v: float) -> bool:
     return 0.0 <= u < height.shape[1] and 0.0 <= v < height.shape[0]
 
 
-@lean
+@device
 def _is_roofed(height: Heights, row: int, column: int, z: float) -> bool:
     """Whether all cells as near as is not tested stand above z."""
     if not height[row, column] > z:
@@ -157,7 +157,7 @@ def _is_roofed(height: Heights, row: int, column: int, z: float) -> bool:
     return True
 
 
-@lean
+@device
 def _to_edge(x: float, dx: float, side: int) -> float:
     """Return how far the ray goes until it leaves its block along one axis."""
     if dx == 0.0:
@@ -166,7 +166,7 @@ def _to_edge(x: float, dx: float, side: int) -> float:
     return (edge - x) / dx
 
 
-@lean
+@device
 def _meets(
     o: Occluder, u: float, v: float, z: float, du: float, dv: float, rise: float, run: float,
     first: float,
@@ -190,7 +190,7 @@ def _meets(
     return False
 
 
-@lean
+@device
 def _through_roof(
     o: Occluder, u: float, v: float, z: float, du: float, dv: float, rise: float, run: float,
     slack: float,

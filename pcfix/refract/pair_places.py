@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from pcfix.kernels import lean
+from pcfix.kernels import device
 from pcfix.lens.algebra import Vector, beyond, dot, minus, plus, row_of, scaled, solved, vector
 from pcfix.lens.formulas import KIND, PERSPECTIVE
 from pcfix.lens.imaging import image_in_world
@@ -29,7 +29,7 @@ class PairImages(NamedTuple):
     n: float
 
 
-@lean
+@device
 def begin(ray: FloatArray, points: Chosen, i: int, c: int, images: PairImages) -> None:
     """Fill in where a ray comes from, and how its scale changes with the place.
 
@@ -49,7 +49,7 @@ def begin(ray: FloatArray, points: Chosen, i: int, c: int, images: PairImages) -
         ray[_BY_PLACE + j] = axis[j] / ahead if flat else -made[j] / size2
 
 
-@lean
+@device
 def see(ray: FloatArray, q: Vector, c: int, normal: Vector, images: PairImages) -> None:
     """Write what the image of Q says about places: G'G, G'G e and |G e|^2.
 
@@ -68,7 +68,7 @@ def see(ray: FloatArray, q: Vector, c: int, normal: Vector, images: PairImages) 
             ray[_SQUARE + i] += terms[i]
 
 
-@lean
+@device
 def meet(a: FloatArray, b: FloatArray) -> Vector:
     """Return where two straight rays have the least squared residuals in their images.
 
@@ -85,7 +85,7 @@ def meet(a: FloatArray, b: FloatArray) -> Vector:
     return _solve_two(a, b, 1.0 / (t * t), 1.0 / (t_b * t_b), r2 / t**3, r2_b / t_b**3)
 
 
-@lean
+@device
 def _residual(place: Vector, ray: FloatArray) -> tuple[float, float]:
     """Return t and r^2 of a place."""
     (x, y, z), s = place, ray[_SQUARE:]
@@ -94,7 +94,7 @@ def _residual(place: Vector, ray: FloatArray) -> tuple[float, float]:
     return t, s[0] * x * x + s[3] * y * y + s[5] * z * z + 2.0 * twice + s[9]
 
 
-@lean
+@device
 def _solve_two(
     a: FloatArray, b: FloatArray, of_a: float, of_b: float, g_a: float, g_b: float
 ) -> Vector:
@@ -107,7 +107,7 @@ def _solve_two(
     return solved((xx, xy, xz, yy, yz, zz), (x, y, z))[1]
 
 
-@lean
+@device
 def _sum(a: FloatArray, b: FloatArray, of_a: float, of_b: float, at: int) -> Vector:
     """Return so many times three columns of one ray and of the other."""
     return plus(scaled(of_a, vector(a, at)), scaled(of_b, vector(b, at)))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import lean, part
+from pcfix.kernels import device
 from pcfix.lens.algebra import Vector, dot, minus, plus, row_of, vector
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Chosen
@@ -59,13 +59,13 @@ class PairTable(NamedTuple):
     powers: FloatArray
 
 
-@part
+@device(allocates=True)
 def no_pair_table() -> PairTable:
     """Return a table without polynomials."""
     return PairTable(no_box(), np.empty(0, np.int64), np.empty((0, 0)), np.empty(CUBIC))
 
 
-@part
+@device(allocates=True)
 def pair_table_of(
     rows: IntArray, points: Chosen, images: PairImages, matched: IntArray, focal_px: FloatArray
 ) -> PairTable:
@@ -99,14 +99,14 @@ def pair_table_of(
     return PairTable(box, row, terms, np.empty(CUBIC))
 
 
-@lean
+@device
 def _look(values: FloatArray, a: FloatArray, b: FloatArray, off: FloatArray) -> None:
     """Set how far from the nodes a pair has them, metres."""
     for k in range(len(NODES)):
         values[k, 0], values[k, 1], values[k, 2] = plus(meet(a[k], b[k]), row_of(off, k))
 
 
-@lean
+@device
 def _is_near(terms: FloatArray, values: FloatArray, rays: FloatArray, focal_px: float) -> bool:
     """Whether polynomials are what they should be at the corners."""
     near = True
@@ -117,7 +117,7 @@ def _is_near(terms: FloatArray, values: FloatArray, rays: FloatArray, focal_px: 
     return near
 
 
-@lean
+@device
 def has_pairs(table: PairTable, points: Chosen, i: int, pairs: IntArray) -> bool:
     """Whether a table has all pairs of a point, which are named in their last column."""
     found = table.row.size > 0 and is_under(points, i, table.box)
@@ -126,7 +126,7 @@ def has_pairs(table: PairTable, points: Chosen, i: int, pairs: IntArray) -> bool
     return found
 
 
-@lean
+@device
 def read_pairs(
     places: FloatArray, q: Vector, point: Vector, pairs: IntArray, table: PairTable
 ) -> None:

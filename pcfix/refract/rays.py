@@ -55,7 +55,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from pcfix.kernels import lean
+from pcfix.kernels import device
 from pcfix.lens.algebra import (
     Vector,
     beyond,
@@ -71,7 +71,7 @@ from pcfix.model import FloatArray
 from pcfix.water.surface import Field, Tin, height_at, locate
 
 
-@lean
+@device
 def refracted(e: Vector, length2: float, normal: Vector, height: float, r: float) -> Vector:
     """Return the refracted ray's direction (downward), with the length L of e.
 
@@ -98,7 +98,7 @@ def refracted(e: Vector, length2: float, normal: Vector, height: float, r: float
     return minus(scaled(k, normal), scaled(r, e))
 
 
-@lean
+@device
 def line_terms(
     a: Vector, d: Vector, inv_length2: float
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
@@ -121,7 +121,7 @@ def line_terms(
     return d[0] * t[0], d[0] * t[1], d[0] * t[2], d[1] * t[1], d[1] * t[2], bx, by, bz, s
 
 
-@lean
+@device
 def add_line(sums: FloatArray, a: Vector, d: Vector, inv_length2: float) -> None:
     """Add the terms of one line to the first nine sums."""
     terms = line_terms(a, d, inv_length2)
@@ -134,7 +134,7 @@ MIN_DETERMINANT = 1e-6
 below any usable base, and keeps rounding below 1e-9 m."""
 
 
-@lean
+@device
 def nearest_point(k: float, sums: FloatArray) -> tuple[bool, Vector, float, float]:
     """Solve M Q = b for the point nearest to k lines, all with equal weight.
 
@@ -173,7 +173,7 @@ CLOSE_M = 1e-9
 allows (1e-12 m at 5000 m)."""
 
 
-@lean
+@device
 def pierce(
     tin: Tin | None, field: Field | None, p: Vector, e: Vector, h: float, normal: Vector, facet: int
 ) -> tuple[float, Vector]:
@@ -204,7 +204,7 @@ def pierce(
     return h / dot(normal, e), normal
 
 
-@lean
+@device
 def pierce_of(
     c: int, tin: Tin | None, fields: Field | None, p: Vector, e: Vector, h: float, normal: Vector,
     facet: int,
@@ -216,7 +216,7 @@ def pierce_of(
     return pierce(tin, field, p, e, h, normal, facet)
 
 
-@lean
+@device
 def _pierce_mesh(tin: Tin, p: Vector, e: Vector, facet: int) -> tuple[float, Vector]:
     f, b, c = 0.0, 0.0, 0.0
     for _ in range(PIERCING_STEPS):
@@ -230,7 +230,7 @@ def _pierce_mesh(tin: Tin, p: Vector, e: Vector, facet: int) -> tuple[float, Vec
     return f, normal_of(b, c)
 
 
-@lean
+@device
 def _pierce_raster(
     field: Field, p: Vector, e: Vector, h: float, normal: Vector
 ) -> tuple[float, Vector]:
@@ -262,7 +262,7 @@ CLOSE = 1e-8
 """Of a step of k, relative; as each step squares the error, the next would be below rounding."""
 
 
-@lean
+@device
 def light_path(q: Vector, e: Vector, normal: Vector, h: float, n: float) -> Path:
     """Return how light goes from Q to a camera through a plane.
 
@@ -303,13 +303,13 @@ def light_path(q: Vector, e: Vector, normal: Vector, h: float, n: float) -> Path
     return k, root, height, depth, s
 
 
-@lean
+@device
 def direction(path: Path, normal: Vector) -> Vector:
     """Return w = k s - N, from the camera to where the light leaves the water."""
     return minus(scaled(path[0], path[4]), normal)
 
 
-@lean
+@device
 def slope_of_path(path: Path, normal: Vector, n: float) -> Vector:
     """Return the gradient of k by Q, on one plane.
 
@@ -332,7 +332,7 @@ HALVINGS = 36
 """Change of the path between two steps over a mesh or raster, as of `pcfix.refract.rays`."""
 
 
-@lean
+@device
 def plane_at(
     tin: Tin | None, field: Field | None, x: float, y: float, origin: FloatArray
 ) -> tuple[float, float, float]:
@@ -354,7 +354,7 @@ def plane_at(
     return np.nan, 0.0, 0.0
 
 
-@lean
+@device
 def settle(
     plane: FloatArray, tin: Tin | None, field: Field | None, origin: FloatArray,
     q: Vector, e: Vector, n: float,
@@ -379,7 +379,7 @@ def settle(
     _settle_on_crease(plane, tin, field, origin, before, (b, c), q, e, n)
 
 
-@lean
+@device
 def settle_of(
     c: int, plane: FloatArray, tin: Tin | None, fields: Field | None, origin: FloatArray,
     q: Vector, e: Vector, n: float,
@@ -392,7 +392,7 @@ def settle_of(
         settle(plane, tin, field, origin, q, e, n)
 
 
-@lean
+@device
 def _settle_on_crease(
     plane: FloatArray, tin: Tin | None, field: Field | None, origin: FloatArray,
     one: tuple[float, float], other: tuple[float, float], q: Vector, e: Vector, n: float,
@@ -418,7 +418,7 @@ def _settle_on_crease(
             high, b1, c1 = share, b, c
 
 
-@lean
+@device
 def _way_out(plane: FloatArray, q: Vector, e: Vector, n: float) -> tuple[Vector, float]:
     """Return where light from Q leaves the water through a plane, and the depth of Q below it."""
     normal = vector(plane)
@@ -426,7 +426,7 @@ def _way_out(plane: FloatArray, q: Vector, e: Vector, n: float) -> tuple[Vector,
     return beyond(e, path[2], direction(path, normal)), path[3]
 
 
-@lean
+@device
 def lay(plane: FloatArray, x: float, y: float, z: float, b: float, c: float) -> None:
     """Lay the plane (N, h) with the slopes b, c through a place."""
     plane[0], plane[1], plane[2] = normal_of(b, c)

@@ -47,7 +47,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from pcfix.kernels import lean, part
+from pcfix.kernels import device
 from pcfix.lens.algebra import Symmetric, Vector, beyond, dot, minus, plus, product, row_of, scaled
 from pcfix.model import FloatArray, IntArray, SingleArray
 from pcfix.refract.choice import Rig, Rule
@@ -95,7 +95,7 @@ _ZERO, _HALF, _ONE, _TWO = np.array([0.0, 0.5, 1.0, 2.0], np.float32)
 _single: Any = np.float32
 
 
-@part
+@device(allocates=True)
 def room_of(tile: FloatArray, shift: FloatArray, rows: IntArray) -> SingleArray:
     """Return room for the sums of a tile, and how far below P the true points lie, along N.
 
@@ -113,7 +113,7 @@ def room_of(tile: FloatArray, shift: FloatArray, rows: IntArray) -> SingleArray:
     return room
 
 
-@lean
+@device
 def add_rays(
     room: SingleArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule
 ) -> None:
@@ -138,7 +138,7 @@ def add_rays(
         room[_HEIGHT * TILE + j] = h
 
 
-@lean
+@device
 def lens_of(rig: Rig, c: int, rule: Rule) -> Sight:
     """Return a camera as plain numbers, which stay in registers, for the loops over points."""
     x, y, z = row_of(rig.axes, c)
@@ -146,7 +146,7 @@ def lens_of(rig: Rig, c: int, rule: Rule) -> Sight:
     return axis, _single(rig.focal_px[c] * rig.focal_px[c]), _single(rule.bend)
 
 
-@lean
+@device
 def _seen(room: SingleArray, j: int, bend: float) -> Seen:
     """Return how often a ray counts; e, N, H, L^2, h, y and r where the light bends."""
     at = _AWAY * TILE + j
@@ -159,7 +159,7 @@ def _seen(room: SingleArray, j: int, bend: float) -> Seen:
     return room[_COUNT * TILE + j], e, normal, dot(normal, e), dot(e, e), h, y, bend
 
 
-@lean
+@device
 def _bent(
     height: float, length2: float, h: float, y: float, bend: float
 ) -> tuple[float, float, float, float, float, float, float]:
@@ -175,7 +175,7 @@ def _bent(
     )  # fmt: skip
 
 
-@lean
+@device
 def _weight(one: float, e: Vector, length2: float, axis: Vector, square: float) -> Symmetric:
     """Return J'J of a camera whose squared focal length (px) is `square`, at P.
 
@@ -196,7 +196,7 @@ def _weight(one: float, e: Vector, length2: float, axis: Vector, square: float) 
     )  # fmt: skip
 
 
-@lean
+@device
 def _add_three(sums: FloatArray, at: int, c: float, a: Vector) -> None:
     """Add c a."""
     sums[at] += c * a[0]
@@ -204,7 +204,7 @@ def _add_three(sums: FloatArray, at: int, c: float, a: Vector) -> None:
     sums[at + 2 * TILE] += c * a[2]
 
 
-@lean
+@device
 def _add_six(sums: FloatArray, at: int, m: Symmetric) -> None:
     sums[at] += m[0]
     sums[at + TILE] += m[1]
@@ -214,7 +214,7 @@ def _add_six(sums: FloatArray, at: int, m: Symmetric) -> None:
     sums[at + 5 * TILE] += m[5]
 
 
-@lean
+@device
 def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: Vector) -> None:
     """Add c m + g q'."""
     sums[at] += c * m[0] + g[0] * q[0]
@@ -228,7 +228,7 @@ def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: V
     sums[at + 8 * TILE] += c * m[5] + g[2] * q[2]
 
 
-@lean
+@device
 def _in_space(
     one: float, e: Vector, normal: Vector, height: float, length2: float, bend: float,
     kappa: float, inv2: float,
@@ -244,7 +244,7 @@ def _in_space(
     return m, minus(scaled(along, e), scaled(up, normal))
 
 
-@lean
+@device
 def add_in_space(room: SingleArray, count: int, sight: Sight) -> None:
     """Add one camera's rays to the sums of a tile's points, of so many."""
     axis, square, bend_of = sight
@@ -263,7 +263,7 @@ def add_in_space(room: SingleArray, count: int, sight: Sight) -> None:
         _add_six(room, SIGHT * TILE + j, _weight(one, e, length2, axis, square))
 
 
-@lean
+@device
 def add_in_images(room: SingleArray, count: int, sight: Sight) -> None:
     """Add one camera's rays to the sums of a tile's points, of so many.
 
@@ -288,7 +288,7 @@ def add_in_images(room: SingleArray, count: int, sight: Sight) -> None:
         _add_six(room, SIGHT * TILE + j, w)
 
 
-@lean
+@device
 def _inverse(height: float, length2: float, away: float, beta: float) -> tuple[float, float]:
     """Return what D^-1 does to p across d, and along it."""
     outer = away + beta * (length2 - height * height)
@@ -296,7 +296,7 @@ def _inverse(height: float, length2: float, away: float, beta: float) -> tuple[f
     return share * outer, share * away
 
 
-@lean
+@device
 def _turned(
     height: float, inv_h: float, h: float, y: float, bend: float, inv_k: float, lean: float
 ) -> tuple[float, float]:
@@ -306,7 +306,7 @@ def _turned(
     return -y * (_ONE - height * lean), along
 
 
-@lean
+@device
 def add_tilt(room: SingleArray, count: int, sight: Sight, in_images: bool) -> None:
     """Add how the slope of the water moves each of one camera's rays, M delta or S delta.
 
@@ -329,7 +329,7 @@ def add_tilt(room: SingleArray, count: int, sight: Sight, in_images: bool) -> No
         _add_nine(room, BY_TILT * TILE + j, turn, w, g, scaled(along, e))
 
 
-@lean
+@device
 def add_noise(room: SingleArray, count: int, sight: Sight, budget: Budget) -> None:
     """Add the noise of one camera's rays to the normal equations of the straight rays.
 
@@ -368,7 +368,7 @@ def add_noise(room: SingleArray, count: int, sight: Sight, budget: Budget) -> No
         _add_six(room, NOISE * TILE + j, noise)
 
 
-@lean
+@device
 def _squared(m: Symmetric) -> Symmetric:
     """Return the square of a symmetric matrix."""
     xx, xy, xz, yy, yz, zz = m

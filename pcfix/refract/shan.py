@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, kernel, lean, part
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.model import BoolArray, FloatArray, Outcome
 from pcfix.refract.batch import Batch, Chosen, Intersection
 from pcfix.refract.literature import depth_ratio
@@ -61,7 +61,7 @@ def shan(batch: Batch) -> Intersection:
     return batch.result(found[:, :3], outcome=outcome, ray_miss_m=found[:, 3])
 
 
-@kernel
+@kernel(allocates=True)
 def _solve_all(span: Span, points: Chosen, found: FloatArray, failed: BoolArray) -> None:
     """Fill in shift and distance from the rays of each point with two rays or more."""
     for i in range(*span):
@@ -82,7 +82,7 @@ def _solve_all(span: Span, points: Chosen, found: FloatArray, failed: BoolArray)
             found[i, 3] = _miss(e, d, points.n, x, y, sunk)
 
 
-@part
+@device(allocates=True)
 def _iterate(e: FloatArray, d: FloatArray, n: float) -> tuple[bool, float, float, float]:
     """Solve for one point; e (k, 3) leads from it to the cameras, d (k,) is its depth for each.
 
@@ -111,7 +111,7 @@ def _iterate(e: FloatArray, d: FloatArray, n: float) -> tuple[bool, float, float
     return True, x, y, sunk
 
 
-@part
+@device(allocates=True)
 def _intersected(e: FloatArray, d: FloatArray, s: FloatArray) -> tuple[bool, float, float, float]:
     """Solve the collinearity equations with s known.
 
@@ -146,7 +146,7 @@ def _intersected(e: FloatArray, d: FloatArray, s: FloatArray) -> tuple[bool, flo
     return True, mean_r[0] + sunk * mean_v[0], mean_r[1] + sunk * mean_v[1], sunk
 
 
-@lean
+@device
 def _miss(e: FloatArray, d: FloatArray, n: float, x: float, y: float, sunk: float) -> float:
     """Return the root mean square distance of the point found from the bent rays themselves."""
     squares = 0.0

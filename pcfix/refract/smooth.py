@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, inlined, kernel, lean, part
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Nine, Vector, beyond, cofactors, minus, row_of
 from pcfix.lens.frames import Frames, frames_of, no_frames
 from pcfix.model import BoolArray, FloatArray, IntArray
@@ -166,7 +166,7 @@ def _points_of(batch: Batch) -> Chosen:
     )  # fmt: skip
 
 
-@kernel
+@kernel(allocates=True)
 def _correct_cells(
     span: Span, cells: tuple[IntArray, IntArray], points: Chosen, rig: Rig, frames: Frames,
     rule: Rule, optics: Optics, errors: tuple[Budget, FloatArray],
@@ -208,7 +208,7 @@ def _correct_cells(
                 finish_tile(covariance, rows, sums, tile, level_sigma, budget)
 
 
-@part
+@device(allocates=True)
 def _seen(
     lines: FloatArray, tile: FloatArray, rows: IntArray, points: Chosen, rig: Rig, frames: Frames,
     rule: Rule, around: IntArray,
@@ -231,7 +231,7 @@ def _seen(
     return near[:seeing], marks[:seeing]
 
 
-@part
+@device(allocates=True)
 def _cell_of(rows: IntArray, common: IntArray, points: Chosen, optics: Optics, room: Room) -> _Cell:
     """Return a cell, with the Q0 of those cameras that most of its points have in common."""
     box = box_of(rows, points)
@@ -241,7 +241,7 @@ def _cell_of(rows: IntArray, common: IntArray, points: Chosen, optics: Optics, r
     return _Cell(box, nodes, FIT_SOME @ shift[:, :3].copy())
 
 
-@part
+@device(allocates=True)
 def _fit_camera(terms: FloatArray, c: int, cell: _Cell, optics: Optics, room: Room) -> None:
     """Write what camera c adds in a cell; NaN where some of it has no image."""
     values = np.empty((len(NODES), _VALUES))
@@ -262,7 +262,7 @@ def _fit_camera(terms: FloatArray, c: int, cell: _Cell, optics: Optics, room: Ro
         terms[:] = np.nan
 
 
-@lean
+@device
 def _look(
     out: FloatArray, q: Vector, nodes: Chosen, k: int, c: int, optics: Optics, room: Room
 ) -> None:
@@ -278,7 +278,7 @@ def _look(
             out[_SLOPE + 3 * i + j] = slope[i, j]
 
 
-@lean
+@device
 def _place(room: FloatArray, tile: FloatArray, count: int, box: Box) -> None:
     """Set where the points of a tile lie in the box, and whether its water is above them."""
     for j in range(count):
@@ -291,7 +291,7 @@ def _place(room: FloatArray, tile: FloatArray, count: int, box: Box) -> None:
         room[_SERVES * TILE + j] = 1.0 if under else 0.0
 
 
-@part
+@device(allocates=True)
 def _add_cameras(room: FloatArray, marks: FloatArray, near: IntArray, terms: FloatArray) -> None:
     """Set the values at the points of a tile: of the cameras of all at once, then of each other."""
     room[_G * TILE : _MISS * TILE] = 0.0
@@ -305,7 +305,7 @@ def _add_cameras(room: FloatArray, marks: FloatArray, near: IntArray, terms: Flo
     _add(room, sums, np.ones(count))
 
 
-@lean
+@device
 def _add(room: FloatArray, terms: FloatArray, marks: FloatArray) -> None:
     """Add values to those of the points that have a mark."""
     for f in range(_SLOPE):
@@ -318,7 +318,7 @@ def _add(room: FloatArray, terms: FloatArray, marks: FloatArray) -> None:
             room[(_LACKS + f) * TILE + j] += lack if marks[j] > 0.0 else 0.0
 
 
-@lean
+@device
 def _nearest(box: Box, near: IntArray, rig: Rig) -> tuple[float, float]:
     """Return how far the nearest camera is from a box, metres, and the size of its pixel, rad."""
     least, pixel = np.inf, 0.0
@@ -333,7 +333,7 @@ def _nearest(box: Box, near: IntArray, rig: Rig) -> tuple[float, float]:
     return np.sqrt(least), pixel
 
 
-@lean
+@device
 def _step(
     room: FloatArray, lines: FloatArray, count: int, middle: FloatArray, distance: float,
     pixel: float,
@@ -363,25 +363,25 @@ def _step(
         room[_MISS * TILE + j] = miss(k, s, q)
 
 
-@inlined
+@device
 def _three(room: FloatArray, run: int, j: int) -> Vector:
     at = run * TILE + j
     return room[at], room[at + TILE], room[at + 2 * TILE]
 
 
-@inlined
+@device
 def _nine(room: FloatArray, j: int) -> Nine:
     a, b, c = _three(room, _BY_Q, j), _three(room, _BY_Q + 3, j), _three(room, _BY_Q + 6, j)
     return a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
 
 
-@inlined
+@device
 def _sums(s: FloatArray, j: int) -> Nine:
     a, b, c = _three(s, 0, j), _three(s, 3, j), _three(s, 6, j)
     return a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
 
 
-@part
+@device(allocates=True)
 def _write(
     result: FloatArray, rows: IntArray, room: FloatArray, lines: FloatArray, marks: FloatArray,
     near: IntArray, points: Chosen, optics: Optics, alone: Room,
@@ -402,7 +402,7 @@ def _write(
     return alone
 
 
-@part
+@device(allocates=True)
 def _use(
     used: BoolArray, result: FloatArray, rows: IntArray, marks: FloatArray, near: IntArray
 ) -> None:

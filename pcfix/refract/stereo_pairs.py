@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, kernel, lean, most_between
+from pcfix.kernels import Span, device, in_tiles, kernel, most_between
 from pcfix.lens.algebra import (
     Vector,
     column_of,
@@ -156,7 +156,7 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     return replace(batch, views=in_pairs).result(shift, outcome=outcome, ray_miss_m=miss)
 
 
-@kernel
+@kernel(allocates=True)
 def _invert(
     span: Span, cells: tuple[IntArray, IntArray], points: Chosen, images: PairImages,
     listed: tuple[IntArray, IntArray, IntArray], focal_px: FloatArray, used: BoolArray,
@@ -211,7 +211,7 @@ def _invert(
             before = i if result[i, _FOUND] > 0.0 else -1
 
 
-@lean
+@device
 def _start(near: FloatArray, points: Chosen, i: int, before: int, found: FloatArray) -> None:
     """Write where the true point lies if it is as far off by its depth as that of another one."""
     depth = points.height[i] - points.xyz[i, 2]
@@ -221,7 +221,7 @@ def _start(near: FloatArray, points: Chosen, i: int, before: int, found: FloatAr
             near[axis] = found[axis] * (depth / there)
 
 
-@lean
+@device
 def _listed_pairs(pairs: IntArray, entries: IntArray, place: IntArray) -> int:
     """Write the pairs of a list whose cameras both have a place; return how many."""
     count = 0
@@ -233,7 +233,7 @@ def _listed_pairs(pairs: IntArray, entries: IntArray, place: IntArray) -> int:
     return count
 
 
-@lean
+@device
 def _matched_pairs(pairs: IntArray, cameras: IntArray, matched: IntArray, place: IntArray) -> int:
     """Write the pairs of cameras of which either was matched with the other; return how many.
 
@@ -253,7 +253,7 @@ def _matched_pairs(pairs: IntArray, cameras: IntArray, matched: IntArray, place:
     return count
 
 
-@lean
+@device
 def _contains(row: IntArray, value: int) -> bool:
     found = False
     for one in row:
@@ -261,7 +261,7 @@ def _contains(row: IntArray, value: int) -> bool:
     return found
 
 
-@lean
+@device
 def _wide_pairs(pairs: IntArray, rays: FloatArray, normal: Vector) -> int:
     """Bring the pairs with a base to the front, as seen from P; return how many there are.
 
@@ -283,7 +283,7 @@ def _wide_pairs(pairs: IntArray, rays: FloatArray, normal: Vector) -> int:
     return count
 
 
-@lean
+@device
 def _solve(
     out: FloatArray, rays: FloatArray, cameras: IntArray, used: BoolArray,
     pairs: tuple[IntArray, FloatArray], normal: Vector, images: PairImages,
@@ -316,7 +316,7 @@ def _solve(
     out[_OUTCOME], out[_FOUND] = CORRECTED, 1.0 if found else 0.0
 
 
-@lean
+@device
 def _line(ray: FloatArray, normal: Vector, n: float) -> tuple[Vector, Vector, float]:
     """Return where the ray through P enters the water, its direction, and its length squared."""
     e = vector(ray)
@@ -325,7 +325,7 @@ def _line(ray: FloatArray, normal: Vector, n: float) -> tuple[Vector, Vector, fl
     return scaled(f, e), refracted(e, length2, normal, across, bend), length2
 
 
-@lean
+@device
 def _snell(
     sums: FloatArray, rays: FloatArray, used: BoolArray, normal: Vector, n: float
 ) -> tuple[bool, Vector]:
@@ -341,7 +341,7 @@ def _snell(
     return fixed, q
 
 
-@lean
+@device
 def _miss(q: Vector, rays: FloatArray, used: BoolArray, normal: Vector, n: float) -> float:
     """Return the rms distance of Q from the refracted rays through P."""
     k, total = 0.0, 0.0
@@ -355,7 +355,7 @@ def _miss(q: Vector, rays: FloatArray, used: BoolArray, normal: Vector, n: float
     return np.sqrt(total / k)
 
 
-@lean
+@device
 def _search(
     start: Vector, inverse: FloatArray, rays: FloatArray, cameras: IntArray, used: BoolArray,
     pairs: tuple[IntArray, FloatArray], normal: Vector, images: PairImages, point: _Point,
@@ -391,14 +391,14 @@ def _search(
     return False, start
 
 
-@lean
+@device
 def _as_from_above(inverse: FloatArray, share: float, n: float) -> None:
     """Set B to a share of what it is where all light comes from straight above."""
     inverse[:] = 0.0
     inverse[0, 0], inverse[1, 1], inverse[2, 2] = share, share, share * n
 
 
-@lean
+@device
 def _update(inverse: FloatArray, step: Vector, change: Vector) -> None:
     """Bring B to where it takes the last change of F for the last step (Broyden)."""
     missing, left = minus(step, times(inverse, change)), transposed_times(inverse, step)
@@ -410,7 +410,7 @@ def _update(inverse: FloatArray, step: Vector, change: Vector) -> None:
             inverse[i, j] += missing[i] * left[j] / scale
 
 
-@lean
+@device
 def _place_pairs(
     q: Vector, rays: FloatArray, cameras: IntArray, used: BoolArray,
     of_pairs: tuple[IntArray, FloatArray], normal: Vector, images: PairImages,
@@ -424,7 +424,7 @@ def _place_pairs(
         places[0, p], places[1, p], places[2, p] = meet(rays[pairs[p, 0]], rays[pairs[p, 1]])
 
 
-@lean
+@device
 def _median(values: FloatArray) -> float:
     """Return the median, NaN where one is; the values are sorted."""
     for i in range(values.size):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import kernel, lean, part
+from pcfix.kernels import device, kernel
 from pcfix.lens.algebra import normal_of
 from pcfix.lens.frames import (
     ALL,
@@ -73,7 +73,7 @@ def spatial_order(xyz: FloatArray) -> IntArray:
     return _cell_order(xyz, x.min(), y.min(), 1.0 / cell_m, columns, rows)
 
 
-@kernel
+@kernel(allocates=True)
 def _cell_order(
     xyz: FloatArray, x0: float, y0: float, cells_per_m: float, columns: int, rows: int
 ) -> IntArray:
@@ -94,7 +94,7 @@ def _cell_order(
     return order
 
 
-@part
+@device(allocates=True)
 def gather(tile: FloatArray, rows: IntArray, points: Points) -> tuple[FloatArray, FloatArray]:
     """Bring a tile together: runs of x, y, z, surface height and unit normal; return its box."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -110,7 +110,7 @@ def gather(tile: FloatArray, rows: IntArray, points: Points) -> tuple[FloatArray
     return low, high
 
 
-@part
+@device(allocates=True)
 def cameras_around(
     frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray
 ) -> IntArray:
@@ -124,7 +124,7 @@ def cameras_around(
     return around[:count]
 
 
-@part
+@device(allocates=True)
 def corners_of(rows: IntArray, xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the corners of an upright box around some points."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -135,7 +135,7 @@ def corners_of(rows: IntArray, xyz: FloatArray) -> tuple[FloatArray, FloatArray]
     return low, high
 
 
-@part
+@device(allocates=True)
 def near_cameras(
     around: IntArray, frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray
 ) -> IntArray:
@@ -152,7 +152,7 @@ def near_cameras(
     return near[:count]
 
 
-@lean
+@device
 def mark_camera(
     marks: FloatArray, tile: FloatArray, frames: Frames, c: int, centre: FloatArray,
     low: FloatArray, high: FloatArray,
@@ -174,7 +174,7 @@ def mark_camera(
     return bool(mark(marks, x, y, z, centre, frames, c) > 0)
 
 
-@part
+@device(allocates=True)
 def marks_of_lists(
     start: IntArray, camera: IntArray, rows: IntArray, k: int
 ) -> tuple[IntArray, FloatArray]:
@@ -192,7 +192,7 @@ def marks_of_lists(
     return named, marks
 
 
-@part
+@device(allocates=True)
 def marks_in_frame(
     around: IntArray, tile: FloatArray, frames: Frames, centres: FloatArray, low: FloatArray,
     high: FloatArray, count: int,

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.kernels import kernel, lean_kernel
+from pcfix.kernels import kernel
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.occlusion import BLOCK, LARGE_BLOCK, MARGIN_BLOCK, Occluder
@@ -166,7 +166,7 @@ def _quads(cells: Heights, pad: tuple[tuple[int, int], ...]) -> list[Any]:
     return [full[::2, ::2], full[::2, 1::2], full[1::2, ::2], full[1::2, 1::2]]
 
 
-@lean_kernel
+@kernel
 def _add(cells: _Cells, xyz: FloatArray) -> None:
     for i in range(len(xyz)):
         c = int(np.floor(xyz[i, 0] / cells.side_m)) - cells.first_column
@@ -179,7 +179,7 @@ def _add(cells: _Cells, xyz: FloatArray) -> None:
             cells.second[r, c] = z
 
 
-@kernel
+@kernel(allocates=True)
 def _without_spikes(second: Heights) -> Heights:
     """Return heights that no cell has alone; NaN where there is none, or none beside it."""
     rows, columns = second.shape
@@ -197,7 +197,7 @@ def _without_spikes(second: Heights) -> Heights:
     return height
 
 
-@kernel
+@kernel(allocates=True)
 def _tops(height: Heights, side: int) -> Heights:
     """Return the highest of each block, minus infinity where no height is known."""
     rows, columns = height.shape
@@ -218,7 +218,7 @@ def _margins(highest: Heights, second: Heights) -> Heights:
     return np.where(known, gaps, everywhere).astype(np.float32) * np.float32(GAPS_TO_MARGIN)
 
 
-@kernel
+@kernel(allocates=True)
 def _wide_gaps(highest: Heights, second: Heights) -> tuple[Heights, npt.NDArray[np.int64]]:
     """Return the upper quartile of the gaps of each block, and of how many cells."""
     side = MARGIN_BLOCK

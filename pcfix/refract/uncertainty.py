@@ -24,7 +24,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from pcfix.kernels import Span, in_tiles, inlined, kernel, lean, lean_kernel, part
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Nine, Symmetric, Vector
 from pcfix.model import FloatArray, IntArray, Outcome, SingleArray
 from pcfix.options.correct import LEVEL_M
@@ -148,7 +148,7 @@ def level_sigma_of(batch: Batch) -> FloatArray:
     return np.hypot(full, of_own)
 
 
-@lean_kernel
+@kernel
 def _own_sigma(
     span: Span, points: Points, rig: Rig, sigma: Field, views: tuple[IntArray, IntArray],
     found: FloatArray,
@@ -187,7 +187,7 @@ def budget_of(survey: Survey) -> Budget:
     )
 
 
-@kernel
+@kernel(allocates=True)
 def _of_lists(
     span: Span, points: Points, shift: FloatArray, rig: Rig, views: tuple[IntArray, IntArray],
     rule: Rule, budget: Budget, level_sigma: FloatArray, result: FloatArray,
@@ -205,7 +205,7 @@ def _of_lists(
         finish_tile(result, rows, room, tile, level_sigma, budget)
 
 
-@lean
+@device
 def add_errors(
     room: SingleArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule,
     budget: Budget,
@@ -223,7 +223,7 @@ def add_errors(
         s.add_noise(room, count, sight, budget)
 
 
-@lean
+@device
 def _per_image(budget: Budget) -> bool:
     """Whether rays differ by more than the noise of image coordinates."""
     return max(budget.waves, max(budget.centre_m, budget.attitude)) > 0.0
@@ -233,7 +233,7 @@ def _per_image(budget: Budget) -> bool:
 # is not vectorised, and takes five times as long.
 
 
-@part
+@device(allocates=True)
 def finish_tile(
     result: FloatArray, rows: IntArray, room: SingleArray, tile: FloatArray,
     level_sigma: FloatArray, budget: Budget,
@@ -256,7 +256,7 @@ def finish_tile(
             result[rows[j], at] = out[at * TILE + j]
 
 
-@inlined
+@device
 def _solved_in_images(sums: FloatArray, j: int) -> tuple[bool, Nine]:
     """Return whether the rays fix a point, and the inverse of sum S T.
 
@@ -268,7 +268,7 @@ def _solved_in_images(sums: FloatArray, j: int) -> tuple[bool, Nine]:
     return (sums[j] >= 2.0) & (det >= MIN_DETERMINANT * half * half * half), inverse
 
 
-@inlined
+@device
 def _solved_in_space(sums: FloatArray, j: int) -> tuple[bool, Nine, Nine]:
     """Return whether the rays fix a point, and by what it moves.
 
@@ -283,7 +283,7 @@ def _solved_in_space(sums: FloatArray, j: int) -> tuple[bool, Nine, Nine]:
     return solved, by_delta, _product(by_p, by_sight)
 
 
-@inlined
+@device
 def _write(
     out: FloatArray, j: int, solved: bool, by_delta: Nine, by_noise: Nine, sums: FloatArray,
     tile: FloatArray, level_sigma: float, budget: Budget,
@@ -307,12 +307,12 @@ def _write(
     out[5 * TILE + j] = noise[8] + _dot(z, z) if solved else 0.0
 
 
-@inlined
+@device
 def _dot(x: Four, y: Four) -> float:
     return x[0] * y[0] + x[1] * y[1] + x[2] * y[2] + x[3] * y[3]
 
 
-@inlined
+@device
 def _columns(
     by_delta: Nine, sums: FloatArray, tile: FloatArray, j: int, level_sigma: float, budget: Budget
 ) -> tuple[Vector, Vector, Vector, Vector]:
@@ -338,12 +338,12 @@ def _columns(
     )
 
 
-@inlined
+@device
 def _three(sums: FloatArray, at: int) -> Vector:
     return sums[at], sums[at + TILE], sums[at + 2 * TILE]
 
 
-@inlined
+@device
 def _six(sums: FloatArray, at: int) -> Symmetric:
     return (
         sums[at], sums[at + TILE], sums[at + 2 * TILE],
@@ -351,7 +351,7 @@ def _six(sums: FloatArray, at: int) -> Symmetric:
     )  # fmt: skip
 
 
-@inlined
+@device
 def _nine(sums: FloatArray, at: int) -> Nine:
     return (
         sums[at], sums[at + TILE], sums[at + 2 * TILE],
@@ -360,22 +360,22 @@ def _nine(sums: FloatArray, at: int) -> Nine:
     )  # fmt: skip
 
 
-@inlined
+@device
 def _full(m: Symmetric) -> Nine:
     return m[0], m[1], m[2], m[1], m[3], m[4], m[2], m[4], m[5]
 
 
-@inlined
+@device
 def _scaled(c: float, x: Vector) -> Vector:
     return c * x[0], c * x[1], c * x[2]
 
 
-@inlined
+@device
 def _plus(x: Vector, y: Vector) -> Vector:
     return x[0] + y[0], x[1] + y[1], x[2] + y[2]
 
 
-@inlined
+@device
 def product_of(m: Nine, x: Vector) -> Vector:
     """Return a matrix times a vector."""
     return (
@@ -385,7 +385,7 @@ def product_of(m: Nine, x: Vector) -> Vector:
     )
 
 
-@inlined
+@device
 def _product(a: Nine, b: Nine) -> Nine:
     """Return a matrix times a matrix."""
     x = product_of(a, (b[0], b[3], b[6]))
@@ -394,7 +394,7 @@ def _product(a: Nine, b: Nine) -> Nine:
     return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]
 
 
-@inlined
+@device
 def inverse_of(m: Nine) -> tuple[float, Nine]:
     """Return the determinant of a matrix and its inverse, which without one is meaningless."""
     a, b, c, d, e, f, g, h, i = m

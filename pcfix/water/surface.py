@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import GeometryError, SettingError
-from pcfix.kernels import Span, in_tiles, kernel, lean, lean_kernel
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.model import (
     BoolArray,
     FloatArray,
@@ -183,7 +183,7 @@ def build_fields(
     return Field(heights, shape, frame, 0)
 
 
-@lean
+@device
 def patch_at(field: Field, x: float, y: float) -> tuple[float, float, float, float, float, float]:
     """Return z00, s, t, both differences and k at a plan position (world frame); NaN if not known.
 
@@ -204,7 +204,7 @@ def patch_at(field: Field, x: float, y: float) -> tuple[float, float, float, flo
     return z, u - column, v - row, east, south, twist
 
 
-@lean
+@device
 def height_at(field: Field, x: float, y: float) -> tuple[float, float, float]:
     """Return height, dz/dx and dz/dy at a plan position (world frame); NaN where not known."""
     z, s, t, east, south, twist = patch_at(field, x, y)
@@ -220,7 +220,7 @@ def heights_above(field: Field, x: FloatArray, y: FloatArray) -> tuple[FloatArra
     return height, slope
 
 
-@lean_kernel
+@kernel
 def _set_heights(
     span: Span, field: Field, x: FloatArray, y: FloatArray, height: FloatArray, slope: FloatArray
 ) -> None:
@@ -304,7 +304,7 @@ def _index_cells(corners: FloatArray) -> tuple[float, int, int, IntArray, IntArr
     return cell, columns, rows, start.astype(np.int64), facet[order].astype(np.int64)
 
 
-@lean
+@device
 def locate(tin: Tin, x: float, y: float) -> int:
     """Return the facet above the plan position (world frame), or -1 outside the mesh."""
     u, v = x - tin.origin_x, y - tin.origin_y
@@ -319,7 +319,7 @@ def locate(tin: Tin, x: float, y: float) -> int:
     return -1
 
 
-@lean
+@device
 def _inside(corners: FloatArray, u: float, v: float) -> bool:
     """Whether a plan position lies in a triangle, edges included."""
     ax, ay = corners[1, 0] - corners[0, 0], corners[1, 1] - corners[0, 1]
@@ -331,7 +331,7 @@ def _inside(corners: FloatArray, u: float, v: float) -> bool:
     return bool(s >= -EDGE_TOLERANCE and t >= -EDGE_TOLERANCE and s + t <= 1.0 + EDGE_TOLERANCE)
 
 
-@lean_kernel
+@kernel
 def _set_facets(
     span: Span, tin: Tin, x: FloatArray, y: FloatArray, facet: npt.NDArray[np.int64]
 ) -> None:
@@ -355,7 +355,7 @@ def in_two_sheets(tin: Tin) -> tuple[BoolArray, FloatArray]:
     return double, area_m2
 
 
-@kernel
+@kernel(allocates=True)
 def _meet_others(tin: Tin, centres: FloatArray) -> BoolArray:
     """Return which facets' centres lie in another facet of another height."""
     double = np.zeros(len(centres), np.bool_)

@@ -34,6 +34,12 @@ from pcfix.model import Lens, WaterRaster
 from pcfix.port.light import coefficients as port_coefficients
 from pcfix.port.shapes import DomePort, FlatPort
 from pcfix.water.surface import build_field
+from tests.utils.compiled import compiled
+
+image = compiled(image)
+image_and_all_gradients = compiled(image_and_all_gradients)
+lens_gradients = compiled(lens_gradients)
+linearise = compiled(linearise)
 
 DOWN = np.diag([1.0, -1.0, -1.0])
 PLAIN = Lens(3600.0, 5472.0, 3648.0, 2730.0, 1830.0)

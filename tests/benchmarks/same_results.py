@@ -227,7 +227,9 @@ def differ_as_rasters(one, other, given):
     import rasterio
 
     with rasterio.open(one) as left, rasterio.open(other) as right:
-        profiles = [{key: str(value) for key, value in file.profile.items()} for file in (left, right)]
+        profiles = [
+            {key: str(value) for key, value in file.profile.items()} for file in (left, right)
+        ]
         if profiles[0] != profiles[1]:
             yield f"profiles {profiles[0]} and {profiles[1]}"
             return
@@ -301,7 +303,7 @@ def differ_by_text(one, other, given):
     pairs = [(float(a), float(b)) for a, b in zip(*texts, strict=True)]
     apart = [pair for pair in pairs if not is_close(*pair, given.relative)]
     if apart:
-        yield f"{len(apart)} of {len(pairs)} numbers differ, the first {apart[0][0]} and {apart[0][1]}"
+        yield f"{len(apart)} of {len(pairs)} numbers differ, the first {apart[0]}"
 
 
 def differ_as_pages(one, other, given):

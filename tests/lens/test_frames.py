@@ -15,8 +15,13 @@ from pcfix.lens.imaging import project
 from pcfix.refract.intersect import TILE
 from tests.refract.test_kernels import interpreted_environment, same
 from tests.utils.beyond_frames import BEYOND_FRAMES
+from tests.utils.compiled import compiled
 from tests.utils.nightly import mostly_nightly
 from tests.utils.twins import image_slowly
+
+holds = compiled(holds)
+may_hold = compiled(may_hold)
+judge = compiled(judge)
 
 pytestmark = BEYOND_FRAMES
 

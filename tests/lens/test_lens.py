@@ -11,7 +11,11 @@ from scipy.optimize import root
 import pcfix
 from pcfix.lens.formulas import distorted, jacobian
 from pcfix.lens.imaging import coefficients, project, unproject
+from tests.utils.compiled import compiled
 from tests.utils.twins import brown_slowly, image_slowly
+
+distorted = compiled(distorted)
+jacobian = compiled(jacobian)
 
 RELATIVE = 1e-10  # of the focal length: a millionth of a pixel
 

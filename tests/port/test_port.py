@@ -10,7 +10,12 @@ from hypothesis import strategies as st
 from pcfix.errors import SettingError
 from pcfix.port.light import coefficients, cosine_at_port, ray_through, through_port
 from pcfix.port.shapes import DomePort, FlatPort, port_of
+from tests.utils.compiled import compiled
 from tests.utils.port_scenes import fermat_directions
+
+through_port = compiled(through_port)
+ray_through = compiled(ray_through)
+cosine_at_port = compiled(cosine_at_port)
 
 N_WATER = 1.34
 PORTS = {

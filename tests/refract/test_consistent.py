@@ -22,6 +22,7 @@ from pcfix.refract.methods import correct
 from pcfix.simulate.tracing import triangulate
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
+from tests.utils.compiled import compiled
 from tests.utils.consistent_twin import (
     found_by_full_triangulation,
     image_in,
@@ -33,6 +34,8 @@ from tests.utils.consistent_twin import (
 )
 from tests.utils.nightly import mostly_nightly
 from tests.utils.twins import image_slowly
+
+image_and_gradients = compiled(image_and_gradients)
 
 UTM = np.array([512_345.0, 4_987_654.0, 0.0])
 MICROMETRE, NANOMETRE = 1e-6, 1e-9

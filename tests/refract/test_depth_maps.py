@@ -20,9 +20,14 @@ from pcfix.refract.methods import correct
 from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
+from tests.utils.compiled import compiled
 from tests.utils.depth_map_twin import LENS, costs_of, fused_slowly, looking, on_bed, slow_depth
 from tests.utils.nightly import mostly_nightly
 from tests.utils.shared import needs
+
+best_pairs = compiled(best_pairs)
+sight_of = compiled(sight_of)
+_compare = compiled(_compare)
 
 RENDERED, rendered = needs("rendered_a")
 N_WATER, TOLERANCE = 1.34, 0.1

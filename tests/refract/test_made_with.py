@@ -14,7 +14,11 @@ from pcfix.refract.matcher import Bed, Matcher
 from pcfix.refract.methods import correct, on_land, shift_of_land
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
+from tests.utils.compiled import compiled
 from tests.utils.depth_map_twin import LENS, fused_slowly, looking
+
+as_made = compiled(as_made)
+as_now = compiled(as_now)
 
 N_WATER, TOLERANCE = 1.34, 0.1
 WATER = WaterPlane(0.3, 0.004, -0.003)

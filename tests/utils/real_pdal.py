@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from pcfix.kept import WAITING
-
 ROOT = Path(__file__).parents[2]
 PROGRAM = Path(sys.executable).with_name("pdal")
 IS_THERE = PROGRAM.exists() and importlib.util.find_spec("pdal") is not None
@@ -35,7 +33,7 @@ def python(program: str, *arguments: object, folder: Path) -> subprocess.Complet
 
 
 def _run(command: list[object], folder: Path) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run(
+    return subprocess.run(
         [str(word) for word in command],
         cwd=folder,
         capture_output=True,
@@ -44,5 +42,3 @@ def _run(command: list[object], folder: Path) -> subprocess.CompletedProcess[str
         timeout=300,
         env={**os.environ, "PATH": f"{PROGRAM.parent}:{os.environ['PATH']}"},
     )
-    done.stderr = done.stderr.replace(WAITING, "")  # other tests may compile meanwhile
-    return done

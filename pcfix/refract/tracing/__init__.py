@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import SettingError
-from pcfix.kernels import Span, in_tiles, kernel, lean
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Vector, dot, minus, plus, row_of, scaled, vector
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
@@ -199,7 +199,7 @@ def _as_kernels_take(
     raise SettingError(f"Light is traced through a plane, raster or mesh, not {surface}.")
 
 
-@kernel
+@kernel(allocates=True)
 def _trace(
     span: Span, points: FloatArray, centres: FloatArray, plane: FloatArray, tin: Tin | None,
     field: Field | None, how: tuple[float, int, bool], result: FloatArray,
@@ -216,7 +216,7 @@ def _trace(
         _path(result[i], water, e, n, method, narrow)
 
 
-@lean
+@device
 def _path(
     out: FloatArray, water: Water, e: Vector, n: float, method: int,
     narrow: bool,
@@ -244,7 +244,7 @@ def _path(
         _write(out, water, e, x, y, n)
 
 
-@lean
+@device
 def _search(
     water: Water, level: float, e: Vector, n: float, method: int
 ) -> tuple[float, float, int, bool]:
@@ -258,7 +258,7 @@ def _search(
     return scattershot(water, level, e, n)
 
 
-@lean
+@device
 def _write(out: FloatArray, water: Water, e: Vector, x: float, y: float, n: float) -> None:
     """Fill in place and slope of the surface where the light leaves the water.
 

@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import SettingError
-from pcfix.kernels import Span, in_tiles, lean, lean_kernel
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Vector, dot, minus, normal_of, row_of, vector
 from pcfix.model import FloatArray
 from pcfix.refract.rays import light_path
@@ -43,7 +43,7 @@ DIRECTION, BY_POINT, BY_CENTRE, BY_LEVEL, BY_SLOPES, BY_INDEX = 0, 1, 4, 7, 8, 1
 """First columns of what `light_and_gradients` fills in."""
 
 
-@lean
+@device
 def light_and_gradients(
     q: Vector, e: Vector, normal: Vector, h: float, n: float, out: FloatArray
 ) -> None:
@@ -90,7 +90,7 @@ def light_and_gradients(
         out[i, BY_LEVEL], out[i, BY_INDEX], out[i, 11] = s[i] * by_level, s[i] * by_n, 0.0
 
 
-@lean
+@device
 def _by_places(
     out: FloatArray, k: float, up: float, along: float, aside: float, s: Vector, normal: Vector
 ) -> None:
@@ -107,7 +107,7 @@ def _by_places(
             out[i, BY_CENTRE + j] = -flat - s[i] * (up * normal[j] + aside_j)
 
 
-@lean
+@device
 def _by_slope(
     out: FloatArray, j: int, k: float, rest: float, s: Vector, normal: Vector, dk: float
 ) -> None:
@@ -203,7 +203,7 @@ def gradients(
     )
 
 
-@lean_kernel
+@kernel
 def _differentiate(
     span: Span, points: FloatArray, centres: FloatArray, piercing: FloatArray, slope: FloatArray,
     n: float, result: FloatArray,
@@ -225,7 +225,7 @@ def _differentiate(
         _of_unit_direction(out)
 
 
-@lean
+@device
 def _of_unit_direction(out: FloatArray) -> None:
     """Scale the direction to one, and its derivatives with it."""
     w = out[:, DIRECTION]

@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from pcfix.kernels import lean
+from pcfix.kernels import device
 from pcfix.lens.algebra import Vector, cross, dot, minus, normal_of, scaled
 from pcfix.model import FloatArray
 from pcfix.refract.rays import plane_at, refracted
@@ -52,13 +52,13 @@ class Water(NamedTuple):
     origin: FloatArray
 
 
-@lean
+@device
 def height_of(water: Water, x: float, y: float) -> tuple[float, float, float]:
     """Return height over the point, dz/dx and dz/dy of the water at a plan place; NaN if none."""
     return _height_of(water.plane, water.tin, water.field, water.origin, x, y)
 
 
-@lean
+@device
 def _height_of(
     plane: FloatArray, tin: Tin | None, field: Field | None, origin: FloatArray, x: float, y: float
 ) -> tuple[float, float, float]:
@@ -68,7 +68,7 @@ def _height_of(
     return plane_at(tin, field, x, y, origin)
 
 
-@lean
+@device
 def pierce(water: Water, e: Vector, d: Vector) -> tuple[float, float]:
     """Return the plan place where the ray from e along d pierces the surface.
 
@@ -93,7 +93,7 @@ def pierce(water: Water, e: Vector, d: Vector) -> tuple[float, float]:
     return (x, y) if abs(gap) <= CLOSE_M else (np.nan, np.nan)
 
 
-@lean
+@device
 def bent(water: Water, e: Vector, x: float, y: float, n: float) -> tuple[Vector, Vector]:
     """Return piercing point and refracted ray of the ray through a plan place of the surface.
 
@@ -112,14 +112,14 @@ def bent(water: Water, e: Vector, x: float, y: float, n: float) -> tuple[Vector,
     return a, (np.nan, np.nan, np.nan)
 
 
-@lean
+@device
 def miss_through(water: Water, e: Vector, x: float, y: float, n: float) -> tuple[float, float]:
     """Return the miss of the ray that pierces the surface at the plan place x, y."""
     a, t = bent(water, e, x, y, n)
     return x - t[0] * a[2] / t[2], y - t[1] * a[2] / t[2]
 
 
-@lean
+@device
 def shoot(
     water: Water, level: float, e: Vector, x: float, y: float, n: float
 ) -> tuple[float, float, float, float]:
@@ -129,7 +129,7 @@ def shoot(
     return ax, ay, mx, my
 
 
-@lean
+@device
 def travel(water: Water, e: Vector, x: float, y: float, n: float) -> float:
     """Return optical length (m) of the path through a plan place; infinite where there is none."""
     z, b, c = height_of(water, x, y)
@@ -145,7 +145,7 @@ KOTOWSKI_STEPS = 40
 HALVINGS = 24
 
 
-@lean
+@device
 def kotowski(water: Water, level: float, e: Vector, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, steps, found).
 
@@ -188,7 +188,7 @@ def kotowski(water: Water, level: float, e: Vector, n: float) -> Found:
     return x, y, KOTOWSKI_STEPS, False
 
 
-@lean
+@device
 def _snell_at(
     water: Water, e: Vector, x: float, y: float, n: float
 ) -> tuple[float, float, float, float, float]:
@@ -214,7 +214,7 @@ def _snell_at(
     )
 
 
-@lean
+@device
 def _twist_at(field: Field | None, x: float, y: float) -> float:
     """Return the second derivative z_xy of a raster's patch at a place (world frame), 1 / m."""
     if field is not None:
@@ -226,7 +226,7 @@ def _twist_at(field: Field | None, x: float, y: float) -> float:
 AFRT_STEPS = 60
 
 
-@lean
+@device
 def afrt(water: Water, level: float, e: Vector, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, steps, found).
 
@@ -275,7 +275,7 @@ NARROW_M = 1e-6
 """The least distance of the aims: below, rounding would outdo what is left out."""
 
 
-@lean
+@device
 def _distance(
     water: Water, level: float, e: Vector, x: float, y: float, n: float
 ) -> tuple[float, float, Vector, Vector]:
@@ -292,7 +292,7 @@ def _distance(
     return ax, ay, minus(scaled(dot(t, a) / dot(t, t), t), a), t
 
 
-@lean
+@device
 def mdfrt(water: Water, level: float, e: Vector, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, steps, found).
 
@@ -345,7 +345,7 @@ BLUNT_M = 1e-7
 NEIGHBOUR_M = 1e-4
 
 
-@lean
+@device
 def scattershot(water: Water, level: float, e: Vector, n: float) -> Found:
     """Return where light from the origin leaves the water towards e, (x, y, shots, found).
 
@@ -375,7 +375,7 @@ def scattershot(water: Water, level: float, e: Vector, n: float) -> Found:
     return x, y, shots + 1, found
 
 
-@lean
+@device
 def narrowed(water: Water, e: Vector, x: float, y: float, half: float, n: float) -> Found:
     """Return the nearest place of least optical length, from a place and half a grid's size on.
 
@@ -389,7 +389,7 @@ def narrowed(water: Water, e: Vector, x: float, y: float, half: float, n: float)
     return x, y, first + second, _inside(water, x, y)
 
 
-@lean
+@device
 def _draw_together(
     water: Water, e: Vector, x: float, y: float, half: float, end: float,
     n: float, by_miss: bool,
@@ -413,7 +413,7 @@ def _draw_together(
     return x, y, shots, best
 
 
-@lean
+@device
 def _badness(water: Water, e: Vector, x: float, y: float, n: float, by_miss: bool) -> float:
     """Return the miss of a ray or the optical length of a path, metres; infinite without any."""
     if by_miss:
@@ -422,7 +422,7 @@ def _badness(water: Water, e: Vector, x: float, y: float, n: float, by_miss: boo
     return travel(water, e, x, y, n)
 
 
-@lean
+@device
 def _inside(water: Water, x: float, y: float) -> bool:
     """Whether there is water on all sides: at an edge the shortest path means nothing."""
     for i in (-1.0, 1.0):

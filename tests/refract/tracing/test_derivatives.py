@@ -7,7 +7,12 @@ import pytest
 
 from pcfix.refract.rays import direction, light_path
 from pcfix.refract.tracing.gradients import COLUMNS, light_and_gradients
+from tests.utils.compiled import compiled
 from tests.utils.tracing_twin import through_plane
+
+light_and_gradients = compiled(light_and_gradients)
+direction = compiled(direction)
+light_path = compiled(light_path)
 
 STEPS = np.array([3e-3] * 6 + [3e-3, 1e-4, 1e-4, 1e-3])
 """Of Q and C (m), level (m), slopes and n: rounding and what the differences leave out are both
