@@ -63,7 +63,7 @@ class GeometryError(PcfixError):
     """Cloud, cameras and water that do not fit together."""
 
 
-class PcfixWarning(CodedError, UserWarning):
+class PcfixWarning(CodedError, UserWarning):  # noqa: N818
     """Something that affects the result and that the user can act on."""
 
 
