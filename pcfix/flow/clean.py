@@ -25,7 +25,7 @@ from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
 from pcfix.flow.tiles import TiledRun
 from pcfix.io.drafts import all_or_none
-from pcfix.io.files import local_path, scratch_arrays
+from pcfix.io.files import path_of, scratch_arrays
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import cleaning_vlr, noted_header, own_settings
@@ -87,7 +87,7 @@ def clean_file(
     how, last = Resources(tile_m, given.jobs), _last_pass(progress)
     tiles = tiles_of(input)
     if tiles is not None:
-        folder = local_path(output)
+        folder = path_of(output)
         there = next(one for one in (folder, *folder.absolute().parents) if one.is_dir())
         run = TiledRun("clean", tiles, folder, given, last)
         return run.run(

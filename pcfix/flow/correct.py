@@ -31,7 +31,7 @@ from pcfix.flow.surfaces import (
 from pcfix.flow.through_water import Label, correct_checked
 from pcfix.flow.tiles import TiledRun
 from pcfix.io.drafts import all_or_none
-from pcfix.io.files import local_path
+from pcfix.io.files import path_of
 from pcfix.io.las import columns
 from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource, centring_steps
@@ -265,7 +265,7 @@ def correct_file(
     given = taken(CorrectOptions, options, keywords, "correct_file")
     tiles = tiles_of(input)
     if tiles is not None:
-        run = TiledRun("correct", tiles, local_path(output), given, progress)
+        run = TiledRun("correct", tiles, path_of(output), given, progress)
         return run.run(partial(_step_over, given), partial(_summary_over, run), Summary)
     task = file_task(single(input), output, given, reads=paths_in(given), progress=progress)
     step = Correcting(job_for(task.source, given))

@@ -125,7 +125,7 @@ def grid_dsm(
             name: stack.enter_context(replaced_when_whole(path))
             for name, path in {"dsm": task.target, **more}.items()
         }
-        run.write(stack.enter_context(draft_folder(task.target.parent)), **drafts)
+        run.write(stack.enter_context(draft_folder(task.target)), **drafts)
     if given.style:
         write_text(style, raster_style(task.target, rules.what), overwrite=given.overwrite)
     result = replace(

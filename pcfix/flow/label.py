@@ -27,7 +27,7 @@ from pcfix.flow.surfaces import (
 )
 from pcfix.flow.tiles import TiledRun
 from pcfix.io.drafts import all_or_none
-from pcfix.io.files import local_path
+from pcfix.io.files import path_of
 from pcfix.io.las.columns import convert
 from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource
@@ -148,7 +148,7 @@ def label_file(
     given = taken(LabelOptions, options, keywords, "label_file")
     tiles = tiles_of(input)
     if tiles is not None:
-        run = TiledRun("label", tiles, local_path(output), given, progress)
+        run = TiledRun("label", tiles, path_of(output), given, progress)
         return run.run(
             lambda part: _step_for(part, given),
             lambda step: _summary(step, str(tiles), str(output), run.seconds),

@@ -74,11 +74,7 @@ def ortho_photo(
     target = rasters.check_tif(output, overwrite=given.overwrite, inputs=known)
     check_summary(given, [*known, target])
     rasters.check_cog()
-    with (
-        threads(given.jobs),
-        replaced_when_whole(target) as draft,
-        draft_folder(target.parent) as folder,
-    ):
+    with threads(given.jobs), replaced_when_whole(target) as draft, draft_folder(target) as folder:
         block = block_of(_as_photos(given), paths, folder)
         for note in block.notes:
             warnings.warn(note, PcfixWarning, stacklevel=2)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 from pcfix.errors import InputError, SettingError
 from pcfix.flow.correct import job_for
 from pcfix.io.las.columns import UPGRADE, Column, columns_for
-from pcfix.io.las.copc import is_copc
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix
 from pcfix.io.pdal import CLASS_FLAGS, OUTCOME, STAGE_SOURCE, add_dimension
@@ -46,11 +45,6 @@ def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str
         format.
     """
     check_suffix(output)
-    if is_copc(output):
-        raise SettingError(
-            f"{output}: the pipeline would write LAZ without the octree of COPC; give a name that"
-            " ends in .las, or use 'pcfix correct'."
-        )
     job_for(input, options)
     with LasSource(input) as source:
         point_format = source.header.point_format

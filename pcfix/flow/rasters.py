@@ -97,7 +97,7 @@ def _write_shaded(folder: Path) -> None:
     high = limits_of(rasters.preview(folder / DEPTH)[0], "depth")[1]
     with ExitStack() as stack:
         draft = stack.enter_context(replaced_when_whole(target))
-        plain = stack.enter_context(draft_folder(folder)) / SHADED
+        plain = stack.enter_context(draft_folder(target)) / SHADED
         surface = stack.enter_context(rasters.open_raster(folder / SURFACE))
         depth = stack.enter_context(rasters.open_raster(folder / DEPTH))
         lattice = rasters.lattice_of(surface)

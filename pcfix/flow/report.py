@@ -161,6 +161,6 @@ def _read(path: Path | Tiles, resolution_m: float | None) -> _Told:
             depth = told[:, 0]
             low, high = depth.min(initial=low), depth.max(initial=high)
             total, count = total + float(depth.sum()), count + len(depth)
-        crs, heights = crs_words(stated_crs(source, "its CRS cannot be read", "export it again"))
+        crs, heights = crs_words(stated_crs(source))
     depth_m = {"min": float(low), "mean": total / max(count, 1), "max": float(high)}
     return _Told(builder.maps(), np.vstack(sample), depth_m, crs, heights)

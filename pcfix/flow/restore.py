@@ -11,7 +11,7 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.flow.runner import Chunk, FileTask, Header, Step, file_task
 from pcfix.flow.tiles import TiledRun
-from pcfix.io.files import local_path
+from pcfix.io.files import path_of
 from pcfix.io.las.columns import (
     SHIFTS,
     UNSURE,
@@ -66,7 +66,7 @@ def restore_file(
     given = taken(TileOptions, options, keywords, "restore_file")
     tiles = tiles_of(input)
     if tiles is not None:
-        run = TiledRun("restore", tiles, local_path(output), given, progress)
+        run = TiledRun("restore", tiles, path_of(output), given, progress)
         return run.run(lambda _: Restoring(), lambda step: step.points)
     task = file_task(single(input), output, given, progress=progress)
     step = Restoring()

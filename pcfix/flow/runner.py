@@ -98,7 +98,7 @@ class FileTask:
         with LasSource(self.source, self.jobs, kept=self.kept or None) as source:
             header = step.header(source)
             identity = step.identity or corrected_identity(source)
-            last = output_evlrs(source), identity, self.jobs, len(source)
+            last = output_evlrs(source), identity, self.jobs
             with LasSink(self.target, header, *last) as sink:
                 done = 0
                 with written_behind(sink.write, self.jobs) as write:

@@ -16,7 +16,6 @@ import numpy.typing as npt
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.runner import Chunk, read_ahead
 from pcfix.io.las import source as las
-from pcfix.io.las.counts import check_count
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.tiles import Tiles, open_cloud
 from pcfix.io.water import read_water
@@ -128,8 +127,6 @@ def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 def view_of(cloud: Path | Tiles, jobs: int | None = None) -> CloudView:
     """Return the view of a LAS or LAZ file, or of many as one cloud."""
     with open_cloud(cloud, jobs) as source:
-        if not isinstance(cloud, Tiles):
-            check_count(source.path, source.header, source.vlrs, source.held)
         crs, points = metric_crs(source), len(source)
         low, high = np.array(source.header.mins[:2]), np.array(source.header.maxs[:2])
         software = str(source.header.generating_software or "")

@@ -25,7 +25,7 @@ from pcfix import version
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.cluster import Run, in_processes, on_cluster
 from pcfix.flow.runner import FileTask, Progress, Step, check_cloud, check_summary, write_summary
-from pcfix.io.files import digest_of, is_remote, read_counted, write_counted
+from pcfix.io.files import digest_of, read_counted, write_counted
 from pcfix.io.tiles import BrokenTileError, Tiles, check_one_file
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.kernels import threads
@@ -254,7 +254,7 @@ class TiledRun:
         """Refuse a folder that has inputs, or lies in theirs."""
         folder, named = self.folder.resolve(), Path(self.tiles.name)
         for path in self.tiles.paths:
-            if not is_remote(path) and path.parent.resolve() == folder:
+            if path.parent.resolve() == folder:
                 raise SettingError(
                     f"{self.folder}: is the folder of {path.name}, an input; give another one."
                 )
@@ -290,9 +290,8 @@ class TiledRun:
         """Return a tile for each file, in their order."""
         work, row = {}, 0
         for path, points in zip(self.tiles.paths, self.tiles.points, strict=True):
-            source = path if is_remote(path) else path.resolve()
             target = self.folder.resolve() / path.name
-            work[path] = Tile(source, target, points, row, key, version.__version__)
+            work[path] = Tile(path.resolve(), target, points, row, key, version.__version__)
             row += points
         return work
 

@@ -48,7 +48,7 @@ def read_cloud(
     or it lacks the dimension that `water` names.
     """
     with open_cloud(path) as source:
-        crs = stated_crs(source, "its CRS cannot be read", "export it again")
+        crs = stated_crs(source)
         own = water or own_water(source)
         extra = set(source.header.point_format.extra_dimension_names)
         chunks = (
@@ -105,8 +105,10 @@ def survey_cloud(
     xyz, water_m, bathymetric, *shifts = (column[:first] for column in columns)
     if first == 0:
         raise InputError(
-            f"{name}: every point is withheld or of a class that does not count"
-            f" ({', '.join(map(str, skip_classes))}); there is nothing to compare."
+            "cloud.nothing_left",
+            f"{name}: every point is withheld or in a class that is skipped"
+            f" ({', '.join(map(str, skip_classes))}); there is nothing to compare.",
+            path=name,
         )
     exact = given or not mapped(np.isfinite, water_m).any()
     return SurveyCloud(
@@ -150,7 +152,10 @@ def own_water(source: LasSource) -> WaterSurface | None:
         return None if plane is None else WaterPlane(*map(float, plane))
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(
-            f"{source.path}: pcfix's own VLR is damaged ({error}); correct the original again."
+            "cloud.vlr_damaged",
+            f"{source.path}: the VLR in which pcfix recorded the correction is damaged ({error})."
+            " Correct the original again.",
+            path=source.path,
         ) from error
 
 
@@ -191,7 +196,11 @@ def read_reference(reference: Clouds) -> Reference:
         return Reference(str(source), xyz, None, sparse=True)
     if suffix in (".tif", ".tiff"):
         return _read_grid(source)
-    raise InputError(f"{source}: is not a reference that pcfix reads; give {KINDS}.")
+    raise InputError(
+        "reference.unknown",
+        f"{source}: is not a reference that pcfix can read. Give {KINDS}.",
+        path=source,
+    )
 
 
 def _read_grid(path: Path) -> Reference:
@@ -206,13 +215,19 @@ def _read_grid(path: Path) -> Reference:
             transform, wkt = grid.transform, grid.crs.to_wkt() if grid.crs else None
             scale, offset = grid.scales[0], grid.offsets[0]
     except (errors.RasterioError, errors.RasterioIOError) as error:  # up to 1.3 no kin
-        raise InputError(f"{path}: is not a readable GeoTIFF ({error}).") from error
+        raise InputError(
+            "raster.damaged", f"{path}: is not a readable GeoTIFF ({error}).", path=path
+        ) from error
     if transform.is_identity:
-        raise InputError(f"{path}: does not say where it lies; give a georeferenced GeoTIFF.")
+        raise InputError(
+            "raster.not_georeferenced",
+            f"{path}: has no georeference. Give a georeferenced GeoTIFF.",
+            path=path,
+        )
     height = band * scale + offset
     row, column = np.nonzero(np.isfinite(height))
     if len(row) == 0:
-        raise InputError(f"{path}: no cell holds a height.")
+        raise InputError("raster.empty", f"{path}: no cell contains a height.", path=path)
     x, y = place_of(transform, column + 0.5, row + 0.5)
     xyz = np.column_stack([x, y, height[row, column]])
     crs = CRS.from_wkt(wkt) if wkt else None
@@ -228,14 +243,20 @@ def check_same_crs(cloud: str, crs: CRS | None, reference: str, other: CRS | Non
     for name, one in ((cloud, crs), (reference, other)):
         if one is not None and one.is_geographic:
             raise InputError(
-                f"{name}: is in degrees ({one.name}); bring it to a projected CRS in metres first."
+                "crs.degrees",
+                f"{name}: is in degrees ({one.name}). Reproject it to a CRS in metres first.",
+                path=name,
+                crs=one.name,
             )
     if crs is None or other is None:
         if (crs is None) != (other is None):
             bare, full = (cloud, other) if crs is None else (reference, crs)
             warnings.warn(
-                f"{bare} names no CRS; taken to be in {full.name if full else ''}.",
-                PcfixWarning,
+                PcfixWarning(
+                    "crs.assumed",
+                    f"{bare} names no CRS; {full.name if full else ''} is assumed.",
+                    path=bare,
+                ),
                 stacklevel=3,
             )
         return
@@ -243,12 +264,19 @@ def check_same_crs(cloud: str, crs: CRS | None, reference: str, other: CRS | Non
     other_plan, other_height = parts(other)
     if not is_same(plan, other_plan):
         raise InputError(
-            f"{cloud} is in {plan.name}, {reference} in {other_plan.name}; bring the reference to"
-            " the CRS of the cloud first, heights included (PDAL's filters.reprojection or"
-            " gdalwarp), and check its vertical datum."
+            "crs.differs",
+            f"{cloud} is in {plan.name}, {reference} in {other_plan.name}. Transform the reference"
+            " to the CRS of the cloud first, heights included (PDAL's filters.reprojection).",
+            path=reference,
+            crs=other_plan.name,
+            expected=plan.name,
         )
     if height is not None and other_height is not None and not is_same(height, other_height):
         raise InputError(
-            f"{cloud} has heights in {height.name}, {reference} in {other_height.name}; bring the"
-            " reference to the heights of the cloud first."
+            "crs.heights_differ",
+            f"{cloud} has heights in {height.name}, {reference} in {other_height.name}. Transform"
+            " the heights of the reference first.",
+            path=reference,
+            crs=other_height.name,
+            expected=height.name,
         )

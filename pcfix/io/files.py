@@ -6,7 +6,6 @@ What is written is whole or not at all, and never over another's work.
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
 import mimetypes
 import mmap
@@ -16,18 +15,19 @@ import stat
 import subprocess
 import weakref
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from tempfile import TemporaryFile
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.blocks import Empty, on_disk
-from pcfix.errors import InputError, SettingError, optional_library, refusal
+from pcfix.errors import InputError, SettingError, refusal
 from pcfix.grid.lattice import Window
-from pcfix.io.drafts import cannot_write, disk_of, draft_folder, replaced_when_whole
+from pcfix.io.drafts import disk_of, replaced_when_whole
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.declare import File
 from pcfix.sums import Counted
@@ -37,45 +37,30 @@ LAST_LINES = 3
 """Of what another program says when it fails."""
 
 
-def is_remote(path: Any) -> bool:
-    """Whether a path is the address of something in an object store, as ``s3://bucket/key``."""
-    return re.match(r"\w{2,}:/", str(path)) is not None  # of s3:// a Path leaves s3:/
-
-
 def path_of(path: Any) -> Path:
-    """Return a path as an object, also that of an object store, which reads by fsspec."""
-    if not is_remote(path):
-        return path if isinstance(path, Path) else Path(path)
-    upath = optional_library("upath", "remote", f"{path}: reading from object stores")
-    try:
-        return cast(Path, upath.UPath(re.sub(":/+", "://", str(path), count=1)))
-    except (ImportError, ValueError) as error:  # of a store that fsspec does not know
-        raise InputError(f"{path}: cannot be read ({error}).") from error
-
-
-def local_path(path: File) -> Path:
-    """Return the path of an output; a `SettingError` if it is in an object store."""
-    if is_remote(path):
-        raise SettingError(f"{path}: outputs go to a folder; write there, and copy them after.")
-    return Path(path)
+    """Return a path as an object; the address of an object store is refused."""
+    if re.match(r"\w{2,}:/", str(path)):  # of s3:// a Path leaves s3:/
+        raise InputError(
+            "input.remote",
+            f"{path}: pcfix reads and writes local files only. Copy the file first, or use"
+            " 'pcfix pipeline': PDAL reads addresses.",
+            path=path,
+        )
+    return path if isinstance(path, Path) else Path(path)
 
 
 def check_input(path: File) -> Path:
-    """Return the path of a file; one that does not exist is an `InputError`."""
+    """Return the path of a file; one that cannot be read is an `InputError`."""
     found = path_of(path)
     try:
-        if is_remote(path):
-            why = "" if found.is_file() else "there is no such file"
-        else:
-            why = kind_of(found.stat().st_mode)
-            why = f"is {why}; give a file" if why else ""
-            if not why:
-                found.open("rb").close()
-    except Exception as error:  # each object store has errors of its own
+        kind = kind_of(found.stat().st_mode)
+        if not kind:
+            found.open("rb").close()
+            return found
+        why = f"is {kind}; give a file"
+    except OSError as error:
         why = refusal(error)
-    if why:
-        raise InputError(f"{found}: {why}.")
-    return found
+    raise InputError("input.unreadable", f"{found}: {why}.", path=found)
 
 
 def kind_of(mode: int) -> str:
@@ -127,26 +112,43 @@ def files_around(path: File) -> list[Path]:
 def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:
     """Return the path of a file that may be written.
 
-    A `SettingError` if it is one of the inputs, exists without `overwrite`, or has no folder.
+    Raises
+    ------
+    SettingError
+        If it is one of the inputs, exists without `overwrite`, or has no folder.
     """
-    target = local_path(path)
-    for source in (one for one in inputs if not is_remote(one)):
+    target = path_of(path)
+    for source in inputs:
         if is_same(target, source):
             raise SettingError(
-                f"{target}: output and {source} are the same file; give the output another name."
+                "output.is_input",
+                f"{target}: output and {source} are the same file. Give the output another name.",
+                path=target,
             )
     try:
         kind = kind_of(target.stat().st_mode)
-        if kind:
-            raise SettingError(f"{target}: the output is {kind}; give a file name.")
-        if not overwrite:
-            raise SettingError(f"{target}: the output exists; add --overwrite to replace it.")
     except (FileNotFoundError, NotADirectoryError):
-        pass
+        kind = None
     except OSError as error:
-        raise SettingError(f"{target}: {refusal(error)}.") from error
+        raise SettingError(
+            "output.cannot_write", f"{target}: {refusal(error)}.", path=target
+        ) from error
+    if kind:
+        raise SettingError(
+            "output.not_a_file", f"{target}: the output is {kind}. Give a file name.", path=target
+        )
+    if kind is not None and not overwrite:
+        raise SettingError(
+            "output.exists",
+            f"{target}: the output exists. Add --overwrite to replace it.",
+            path=target,
+        )
     if not target.parent.is_dir():
-        raise SettingError(f"{target}: the folder {target.parent} does not exist; make it first.")
+        raise SettingError(
+            "output.no_folder",
+            f"{target}: the folder {target.parent} does not exist. Make it first.",
+            path=target,
+        )
     return target
 
 
@@ -231,105 +233,108 @@ def run_logged(words: list[str], log: Path) -> tuple[int, list[str]]:
         with log.open("wb") as stream:
             done = subprocess.run(words, stdout=stream, stderr=subprocess.STDOUT, check=False)
     except OSError as error:
-        raise InputError(f"{words[0]}: cannot be run ({error.strerror or error}).") from error
+        raise InputError(
+            "photos.command",
+            f"{words[0]}: cannot be run ({error.strerror or error}).",
+            command=words[0],
+        ) from error
     lines = log.read_text("utf-8", errors="replace").splitlines()
     return done.returncode, [line.strip() for line in lines if line.strip()][-LAST_LINES:]
 
 
 @contextmanager
 def scratch_arrays(target: Path) -> Iterator[Empty]:
-    """Give a maker of arrays in temporary files beside the target, gone when the block ends.
+    """Give a maker of arrays on the disk of a target, which are gone when the block ends.
 
-    Within the block the large arrays of `pcfix.blocks` are such, too. The disk has its place back
-    as soon as an array is no longer used. An `InputError` if it cannot hold them.
+    Within the block the large arrays of `pcfix.blocks` are made this way too. Their files have no
+    name, so that nothing stays when the process is killed, and the disk gets its space back as soon
+    as an array is no longer used.
+
+    Raises
+    ------
+    InputError
+        ``output.disk_full``.
     """
     maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
-    made = itertools.count()
-    with ExitStack() as stack:
+
+    def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
         try:
-            folder = stack.enter_context(draft_folder(target.parent))
+            with TemporaryFile(dir=target.parent) as stream:
+                if hasattr(os, "posix_fallocate"):  # writing to a map of a full disk would kill us
+                    os.posix_fallocate(stream.fileno(), 0, size)
+                else:
+                    stream.truncate(size)
+                one = mmap.mmap(stream.fileno(), size)
         except OSError as error:
-            raise cannot_write(target, error) from error
+            raise InputError(
+                "output.disk_full",
+                f"{target}: {size / 1e9:,.1f} GB of temporary space are not available on the disk"
+                f" of {disk_of(target)}: {error.strerror or error}. Free some space, or write to"
+                " another disk.",
+                path=target,
+            ) from error
+        maps.add(one)
+        return np.frombuffer(one, dtype).reshape(shape)
 
-        def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-            path = folder / f"{next(made)}.bin"
-            size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-            try:
-                with path.open("w+b") as stream:  # a full disk kills whoever writes to a map
-                    if hasattr(os, "posix_fallocate"):
-                        os.posix_fallocate(stream.fileno(), 0, size)
-                    else:
-                        stream.truncate(size)
-                    one = mmap.mmap(stream.fileno(), size)
-            except OSError as error:
-                raise InputError(
-                    f"{target}: {size / 1e9:,.1f} GB of temporary space beside it cannot be had on"
-                    f" the disk of {disk_of(target)}: {error.strerror or error}; make room, or"
-                    " write to another one."
-                ) from error
-            with suppress(OSError):  # Windows keeps it until the block ends
-                path.unlink()
-            maps.add(one)
-            return np.frombuffer(one, dtype).reshape(shape)
+    def let_go() -> None:
+        for one in maps:
+            if hasattr(mmap, "MADV_DONTNEED"):
+                one.madvise(mmap.MADV_DONTNEED)
 
-        def let_go() -> None:
-            for one in maps:
-                if hasattr(mmap, "MADV_DONTNEED"):
-                    one.madvise(mmap.MADV_DONTNEED)
-
-        stack.enter_context(on_disk(empty, let_go))
+    with on_disk(empty, let_go):
         yield empty
 
 
 class Bins:
-    """Points sorted by place, as float64, in files of a folder that the caller makes and removes.
+    """Points sorted by place into one file without a name, on the disk of a folder.
 
-    There is a file for each square of `side` cells; `corner` is column and row of a corner of the
-    squares, counted from x = 0 and y = 0. Each point has so many `numbers`: its coordinates, and
-    what else belongs to it.
+    The plane is divided into squares of `side` cells; `corner` is the column and row of a corner of
+    the squares, counted from x = 0 and y = 0. Each point has so many `numbers` (float64): its
+    coordinates, and what else belongs to it.
     """
 
     def __init__(self, folder: Path, side: int, corner: Iterable[int], numbers: int = 3) -> None:
-        self._numbers = numbers
-        self._folder, self.side = folder, side
+        self.side, self._numbers = side, numbers
+        self._stream = TemporaryFile(dir=folder)  # noqa: SIM115  # closed with this object
         self._corner = np.array(list(corner), np.int64)
-        self._points: dict[tuple[int, int], int] = {}
+        self._pieces: dict[tuple[int, int], list[tuple[int, int]]] = {}
+        """Of each square the offsets in the file, and how many points lie there."""
 
     def add(self, cell: IntArray, xyz: FloatArray) -> None:
         """Store points, shape (n, numbers), by columns and rows of their cells, shape (n, 2).
 
-        Those of one cell keep their order.
+        Points of one cell keep their order.
         """
         square = (cell - self._corner) // self.side
         order = np.lexsort((square[:, 0], square[:, 1]))
         square, xyz = square[order], xyz[order]
         first = np.flatnonzero((np.diff(square, axis=0, prepend=square[:1] - 1) != 0).any(axis=1))
+        offset = self._stream.seek(0, os.SEEK_END)
         for start, stop in zip(first, [*first[1:], len(xyz)], strict=True):
             place = (int(square[start, 0]), int(square[start, 1]))
-            self._points[place] = self._points.get(place, 0) + int(stop - start)
-            with self._file(place).open("ab") as stream:
-                stream.write(xyz[start:stop].tobytes())
+            self._pieces.setdefault(place, []).append((offset, int(stop - start)))
+            offset += self._stream.write(xyz[start:stop].tobytes())
 
     def read(self, cells: Window) -> FloatArray:
         """Return the points, shape (n, numbers), of all squares that touch a window.
 
         Points of the squares outside the window are among them.
         """
-        places, numbers = self._touched(cells), self._numbers
-        parts = [np.fromfile(self._file(place)).reshape(-1, numbers) for place in places]
-        return np.concatenate([np.empty((0, numbers)), *parts])
+        data = bytearray()
+        for offset, points in self._touched(cells):
+            self._stream.seek(offset)
+            data += self._stream.read(points * self._numbers * 8)
+        return np.frombuffer(data).reshape(-1, self._numbers)
 
     def count(self, cells: Window) -> int:
         """Return how many points `read` would return."""
-        return sum(self._points[place] for place in self._touched(cells))
+        return sum(points for _, points in self._touched(cells))
 
     def _touched(self, cells: Window) -> list[tuple[int, int]]:
-        """Return the squares with points that touch a window."""
+        """Return the pieces of all squares that touch a window."""
         column, row = self._corner.tolist()
         left, right = (cells.column - column) // self.side, (cells.column_stop - 1 - column)
         top, bottom = (cells.row - row) // self.side, (cells.row_stop - 1 - row)
         columns, rows = range(left, right // self.side + 1), range(top, bottom // self.side + 1)
-        return [(c, r) for r in rows for c in columns if (c, r) in self._points]
-
-    def _file(self, place: tuple[int, int]) -> Path:
-        return self._folder / f"{place[0]}_{place[1]}.points"
+        return [piece for r in rows for c in columns for piece in self._pieces.get((c, r), ())]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import os
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,7 +15,7 @@ import numpy.typing as npt
 
 from pcfix.errors import GeometryError, InputError, SettingError
 from pcfix.grid.lattice import Lattice, Window
-from pcfix.io.drafts import NoRoomError, is_full_disk, replaced_when_whole
+from pcfix.io.drafts import is_full_disk, replaced_when_whole
 from pcfix.io.files import check_input, check_output
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -191,8 +193,7 @@ def new_raster(
         "blockysize": TILE,
         **_compression(dtype),
     }
-    most_bytes = _most_bytes(lattice.width, lattice.height, [dtype] * len(bands))
-    with _written(path, most_bytes), rasterio.open(path, "w", **profile) as target:
+    with _written(path), rasterio.open(path, "w", **profile) as target:
         for number, (name, unit) in enumerate(bands.items(), start=1):
             target.set_band_description(number, name)
             target.set_band_unit(number, unit)
@@ -203,17 +204,11 @@ def new_raster(
         yield target
 
 
-def _most_bytes(width: int, height: int, dtypes: Sequence[str]) -> int:
-    """Return what the tiles of bands take unpacked."""
-    tiles = -(-width // TILE) * -(-height // TILE)
-    return tiles * TILE**2 * sum(np.dtype(one).itemsize for one in dtypes)
-
-
 @contextmanager
-def _written(path: Path, most_bytes: int | None = None) -> Iterator[None]:
-    """Read the raster that the block wrote, as GDAL may not tell that parts of it could not be.
+def _written(path: Path) -> Iterator[None]:
+    """Read the raster that the block wrote, because GDAL may not say that the disk was full.
 
-    An OSError if it is not whole; `most_bytes` is what it takes at most.
+    An OSError if it is not complete.
     """
     import rasterio
     from rasterio import errors
@@ -228,8 +223,8 @@ def _written(path: Path, most_bytes: int | None = None) -> Iterator[None]:
                 for _, window in raster.block_windows(1):
                     raster.read(window=window)
     except (errors.RasterioError, errors.RasterioIOError, CPLE_BaseError) as error:
-        if is_full_disk(path.parent, error, most_bytes):
-            raise NoRoomError(most_bytes) from error
+        if is_full_disk(path.parent, error):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
         raise OSError(str(error)) from error
 
 
@@ -265,8 +260,7 @@ def copy_as_cog(source: Path, target: Path) -> None:
 
     with open_raster(source) as raster:
         options = _compression(raster.dtypes[0])
-        most_bytes = 2 * _most_bytes(raster.width, raster.height, raster.dtypes)
-    with _written(target, most_bytes):
+    with _written(target):
         copy(
             source, target, driver="COG", blocksize=TILE, overview_resampling="average",
             statistics="YES", **options,

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
-from pcfix.io.files import is_remote, path_of, read_json
-from pcfix.io.las.counts import check_count
+from pcfix.io.files import path_of, read_json
 from pcfix.io.las.source import LasSource, metric_crs
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -33,7 +32,7 @@ class BrokenTileError(InputError):
     """One of many files that cannot be read; `path` is which."""
 
     def __init__(self, path: Path, sentence: str) -> None:
-        super().__init__(sentence)
+        super().__init__("cloud.broken_tile", sentence, path=path)
         self.path = path
 
 
@@ -74,7 +73,7 @@ class Tiles:
         """Return the others, where one turns out to be broken."""
         rows = [i for i, one in enumerate(self.paths) if one != path]
         if not rows:
-            raise InputError(why)
+            raise InputError("cloud.broken_files", why)
         return replace(
             self,
             paths=tuple(self.paths[i] for i in rows),
@@ -122,7 +121,11 @@ def check_one_file(cloud: Any, options: Any) -> None:
     for name in ("bounds", "read_resolution") if many else ("scheduler",):
         if getattr(options, name, None) is not None:
             kind = "a single file" if many else "many files (a folder, glob or list of tiles)"
-            raise SettingError(f"{name.replace('_', '-')} is for {kind} alone; leave it out.")
+            raise SettingError(
+                "option.one_file",
+                f"{name.replace('_', '-')} works only with {kind}; omit it.",
+                option=name,
+            )
 
 
 def inputs_of(cloud: Any) -> list[Any]:
@@ -164,14 +167,20 @@ def tiles_of(cloud: Clouds) -> Tiles | None:
         paths = [path_of(one) for one in cloud]
         name = f"{len(paths)} files"
     if not paths:
-        raise InputError(f"{name}: has no LAS or LAZ files; give a folder, glob or list of some.")
+        raise InputError(
+            "cloud.no_files",
+            f"{name}: contains no LAS or LAZ files. Give a folder, glob or list that does.",
+            path=name,
+        )
     by_name: dict[str, Path] = {}
     for path in paths:
         other = by_name.setdefault(path.name, path)
         if other is not path:
             raise SettingError(
-                f"{name}: {other} and {path} would both become {path.name}; give them"
-                " names of their own, or correct them one by one."
+                "cloud.same_names",
+                f"{name}: {other} and {path} would both be written as {path.name}. Rename one of"
+                " them, or correct them one by one.",
+                path=path,
             )
     return tiles_from(name, paths)
 
@@ -190,8 +199,10 @@ def cloud_of(cloud: Clouds) -> Path | Tiles:
     if tiles.broken:
         count, why = len(inputs_of(tiles)), "\n".join(f"  {one}" for one in tiles.broken.values())
         raise InputError(
-            f"{tiles}: {len(tiles.broken)} of {count} files cannot be read, and the result is of"
-            f" all; mend them, or name the others alone:\n{why}"
+            "cloud.broken_files",
+            f"{tiles}: {len(tiles.broken)} of {count} files cannot be read. Replace them, or give"
+            f" only the others:\n{why}",
+            paths=list(tiles.broken),
         )
     return tiles
 
@@ -201,9 +212,6 @@ def _listed(path: Path) -> list[Path] | None:
     text = str(path)
     if path.suffix.lower() in SUFFIXES and not glob.has_magic(text):
         return None
-    if glob.has_magic(text) and is_remote(path):
-        store = cast(Any, path).fs
-        return sorted(path_of(store.unstrip_protocol(one)) for one in store.glob(text))
     if glob.has_magic(text) and not path.exists():
         return sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
     if path.suffix.lower() == ".vpc":
@@ -218,9 +226,7 @@ def _listed(path: Path) -> list[Path] | None:
 
 def _beside(path: Path, text: str) -> Path:
     """Return a path that a list names: beside the list, else as it is."""
-    if is_remote(text) or not (is_remote(path) or (path.parent / text).exists()):
-        return path_of(text)
-    return path.parent / text
+    return path.parent / text if (path.parent / text).exists() else path_of(text)
 
 
 def _of_index(path: Path) -> list[Path]:
@@ -231,8 +237,10 @@ def _of_index(path: Path) -> list[Path]:
         return [_beside(path, link.removeprefix("file://")) for link in links]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as error:
         raise InputError(
-            f"{path}: is not a virtual point cloud ({type(error).__name__}: {error}); give the"
-            " index that 'pdal_wrench build_vpc' writes, or a folder of tiles."
+            "cloud.index",
+            f"{path}: is not a virtual point cloud ({type(error).__name__}: {error}). Give the"
+            " index that 'pdal_wrench build_vpc' writes, or a folder of tiles.",
+            path=path,
         ) from error
 
 
@@ -250,7 +258,6 @@ def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
     for path in paths:
         try:
             with LasSource(path) as source:
-                check_count(source.path, source.header, source.vlrs, source.held)
                 header = source.header
                 crs, format = metric_crs(source), header.point_format
                 words = f"CRS {crs.name}" if crs else "no CRS"
@@ -259,7 +266,7 @@ def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
         except InputError as error:
             broken[path] = str(error)
     if not heads:
-        raise InputError(next(iter(broken.values())))
+        raise InputError("cloud.broken_files", next(iter(broken.values())), paths=list(broken))
     _refuse_mixed(name, kinds)
     _warn_of_overlap(name, {path: (low, high) for path, (_, low, high, _) in heads.items()})
     points, lows, highs, steps = zip(*heads.values(), strict=True)
@@ -281,8 +288,10 @@ def _refuse_mixed(name: str, kinds: dict[Path, tuple[Any, ...]]) -> None:
     at = next(i for i in range(3) if one[i] != other[i])
     more = f" (and {len(others) - 1} more)" if len(others) > 1 else ""
     raise InputError(
-        f"{name}: {first.name} has {said[at][0]}, {others[0].name}{more} {said[at][1]}; tiles of"
-        " one cloud have the same: convert them, or correct them apart."
+        "cloud.mixed_tiles",
+        f"{name}: {first.name} has {said[at][0]}, {others[0].name}{more} {said[at][1]}. Convert"
+        " them to the same, or correct them separately.",
+        paths=[first, others[0]],
     )
 
 
@@ -301,9 +310,11 @@ def _warn_of_overlap(name: str, boxes: dict[Path, tuple[FloatArray, FloatArray]]
                 found.append((one.name, other.name))
     if found:
         warnings.warn(
-            f"{name}: the extents of {found[0][0]} and {found[0][1]} overlap ({len(found)} pairs"
-            " do); points that are in both count twice: cut the buffers off, unless the tiles"
-            " share none.",
-            PcfixWarning,
+            PcfixWarning(
+                "cloud.overlap",
+                f"{name}: the extents of {found[0][0]} and {found[0][1]} overlap ({len(found)}"
+                " pairs do). Points in both count twice; cut off the buffers of the tiles.",
+                pairs=found,
+            ),
             stacklevel=3,
         )

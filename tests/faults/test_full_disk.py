@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import os
@@ -57,7 +58,6 @@ COMPARE = ("compare", "corrected.laz", "lidar.laz")
 COMMANDS = {
     "correct": (*CORRECT, "DISK/c.laz", "--summary", "DISK/c.json"),
     "correct, LAS": (*CORRECT, "DISK/c.las"),
-    "correct, COPC": (*CORRECT, "DISK/c.copc.laz"),
     "label": ("label", "cloud.laz", "DISK/l.laz", "--water", "0.37", "--summary", "DISK/l.json"),
     "restore": ("restore", "corrected.laz", "DISK/r.laz"),
     "clean": ("clean", "corrected.laz", "DISK/n.laz", "--summary", "DISK/n.json"),
@@ -75,6 +75,7 @@ STEPS_OF_RUN = {
 
 def resize(disk, pages):
     """Empty a disk and make it so many pages large."""
+    gc.collect()  # arrays of a refused command may still hold files without a name
     for path in disk.iterdir():
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     options = f"remount,size={pages * PAGE}"
@@ -119,18 +120,14 @@ def on_a_disk_of(pages, words, disk, inputs):
         return None
     assert done.returncode == 1
     assert not [path for path in disk.rglob("*") if path.is_dir() and not any(path.iterdir())]
-    assert "Traceback" not in done.stderr
-    said = done.stderr.strip().splitlines()[-1]  # kernels may have been compiled before
-    assert said.startswith(f"pcfix: {disk}/"), done.stderr
-    blamed = said.removeprefix(f"pcfix: {disk}/").partition(":")[0]
-    assert f"No space left on the disk of {disk} (" in said or "temporary space" in said, said
+    assert done.code == "output.disk_full", done.stderr
     assert done.stderr.replace("pcfix: warning", "").count("pcfix:") == 1
-    return blamed
+    return str(Path(done.error.values["path"]).relative_to(disk))
 
 
 @pytest.mark.parametrize("growth", [1.5, pytest.param(1.07, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("name", COMMANDS)
-def test_full_at_every_stage(name, growth, disk, inputs):
+def test_full_at_any_stage(name, growth, disk, inputs):
     """The disk grows until the command goes through."""
     before, pages, blamed = state(inputs), 1, []
     while (file := on_a_disk_of(pages, COMMANDS[name], disk, inputs)) is not None:

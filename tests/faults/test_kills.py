@@ -13,6 +13,8 @@ import laspy
 import pytest
 
 import pcfix
+from pcfix.io.drafts import replaced_when_whole
+from tests.utils.codes import refused
 from tests.utils.zygote import Zygote
 
 SCENE = Path(__file__).parents[2] / "samples" / "scene"
@@ -85,7 +87,7 @@ def is_whole(name, content, whole):
 @pytest.mark.parametrize(
     "seed", [1, *(pytest.param(s, marks=pytest.mark.nightly) for s in range(2, 18))]
 )
-def test_kills_at_random_moments(seed, inputs, commands, whole, zygote, tmp_path):
+def test_kills(seed, inputs, commands, whole, zygote, tmp_path):
     random_moment = random.Random(seed)
     before, ended, hidden = state(inputs), [], set()
     for number in range(60):
@@ -105,9 +107,10 @@ def test_kills_at_random_moments(seed, inputs, commands, whole, zygote, tmp_path
         earlier, hidden = hidden, {one for one in left if one.startswith(".")}
         most = 2 if code == -signal.SIGKILL else 0  # a cloud and its summary
         assert len(hidden - earlier) <= most, case
-        if code == 0:
-            kept = [one for one in hidden & earlier if (tmp_path / one / "lock").exists()]
-            assert kept == [], case  # what was left before is gone
+        if code == 0:  # it removed what was left of its own files
+            assert not [one for one in hidden for file in files if one.startswith(f".{file}.")], (
+                case
+            )
         for one in set(left) - hidden:
             assert is_whole(one, (tmp_path / one).read_bytes(), whole), f"{case}: {one}"
         if code == 0:
@@ -116,40 +119,35 @@ def test_kills_at_random_moments(seed, inputs, commands, whole, zygote, tmp_path
     assert sum(code != 0 for code in ended) >= 20  # most were stopped in their work
 
 
-def test_what_a_killed_process_left_goes_with_the_next(inputs, commands, zygote, tmp_path):
+def test_leftover_goes_with_the_next_run(inputs, commands, zygote, tmp_path):
     arguments, files = commands["correct"]
     for _ in range(50):
         process = zygote.start(at(arguments, tmp_path))
-        while Path(f"/proc/{process}").exists() and not any(tmp_path.glob(".pcfix-*/lock")):
+        while Path(f"/proc/{process}").exists() and not any(tmp_path.glob(".*.part.laz")):
             time.sleep(0.001)
         with suppress(ProcessLookupError):
             os.kill(process, signal.SIGKILL)
-        if zygote.wait() == -signal.SIGKILL and any(tmp_path.glob(".pcfix-*/lock")):
+        if zygote.wait() == -signal.SIGKILL and any(tmp_path.glob(".*.part.laz")):
             break
-    (orphan,) = tmp_path.glob(".pcfix-*")
-    assert orphan.stat().st_mode & 0o077 == 0  # its owner's alone
+    assert [path.name.startswith(".corrected.laz.") for path in tmp_path.iterdir()] == [True]
     zygote.start(at(arguments, tmp_path))
     assert zygote.wait() == 0
     assert [path.name for path in tmp_path.iterdir()] == files
 
 
-def test_what_a_living_process_writes_stays(tmp_path):
-    from pcfix.io.drafts import draft_folder, replaced_when_whole
-
-    with draft_folder(tmp_path) as one:
-        (one / "kept").write_text("kept")
-        with replaced_when_whole(tmp_path / "other.txt") as draft:
-            draft.write_text("whole")
-        assert (one / "kept").read_text() == "kept"
-    assert [path.name for path in tmp_path.iterdir()] == ["other.txt"]
+def test_other_outputs_of_the_folder_stay(tmp_path):
+    with replaced_when_whole(tmp_path / "one.txt") as one:
+        one.write_text("one")
+        with replaced_when_whole(tmp_path / "one") as other:
+            other.write_text("other")
+        assert one.read_text() == "one"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["one", "one.txt"]
 
 
 @pytest.mark.parametrize("name", ["correct_file", "label_file", "clean_file"])
-def test_a_summary_that_cannot_be_written_takes_the_cloud_with_it(
-    name, inputs, tmp_path, monkeypatch
-):
+def test_no_cloud_without_its_summary(name, inputs, tmp_path, monkeypatch):
     def full(options, summary):
-        raise pcfix.InputError(f"{options.summary}: cannot be written (the disk is full).")
+        raise pcfix.InputError("output.disk_full", f"{options.summary}: the disk is full.")
 
     given = {"summary": tmp_path / "s.json"}
     if name == "correct_file":
@@ -157,12 +155,12 @@ def test_a_summary_that_cannot_be_written_takes_the_cloud_with_it(
     if name != "clean_file":
         given |= {"water": 0.37}
     monkeypatch.setattr("pcfix.flow.runner.write_summary", full)
-    with pytest.raises(pcfix.InputError, match="the disk is full"):
+    with refused("output.disk_full"):
         getattr(pcfix, name)(inputs / "cloud.laz", tmp_path / "out.laz", **given)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_mode_of_a_replaced_file_is_kept(inputs, tmp_path):
+def test_mode_of_a_replaced_file(inputs, tmp_path):
     target = tmp_path / "labelled.las"
     target.write_bytes(b"")
     target.chmod(0o640)

@@ -75,4 +75,6 @@ def run_pcfix(*words: object, folder: Path | str = ".") -> Done:
                 error = getattr(error, "__cause__", None)
     done = Done(arguments, code, out.getvalue(), err.getvalue())
     done.error, done.warnings = error if isinstance(error, PcfixError) else None, warned
+    if done.error is not None:  # its frames would hold open files
+        done.error.__traceback__ = done.error.__context__ = done.error.__cause__ = None
     return done

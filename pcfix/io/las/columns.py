@@ -154,9 +154,11 @@ def fill(
                 raise TooNarrowError
             step = column_scale(column, points.scales)
             raise InputError(
-                f"{column.name} reaches {value.max() * step:g} m, more than {target.dtype} holds:"
-                " the cloud has points far below the water; remove them, or write it with a"
-                " coarser scale."
+                "cloud.too_deep",
+                f"{column.name} reaches {value.max() * step:g} m, more than {target.dtype} can"
+                " hold. Remove the points far below the water, or use a coarser scale.",
+                dimension=column.name,
+                value=float(value.max() * step),
             )
         target[filled] = value
 

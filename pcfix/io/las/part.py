@@ -18,7 +18,6 @@ import numpy as np
 from laspy.copc import Bounds, CopcReader, OctreeNode, load_octree_for_query
 
 from pcfix.errors import InputError, SettingError
-from pcfix.io.las.counts import check_chunk, head_size
 from pcfix.model import BoolArray, FloatArray
 
 if sys.platform == "win32":
@@ -146,9 +145,7 @@ def _unpacked(
     header, data = reader.header, bytearray()
     for one in nodes:
         reader.source.seek(one.offset)
-        chunk = reader.source.read(one.byte_size)
-        check_chunk(chunk[: head_size(header.point_format)], len(chunk), header.point_format)
-        data += chunk
+        data += reader.source.read(one.byte_size)
     rows = np.zeros(sum(one.point_count for one in nodes), header.point_format.dtype())
     table = [(one.point_count, one.byte_size) for one in nodes]
     lazrs.decompress_points_with_chunk_table(
@@ -170,8 +167,10 @@ def extent_of(
         if not count:
             low, high = header.mins, header.maxs
             raise InputError(
-                f"{path}: no point lies {path.part}; it reaches from {low[0]:.12g},{low[1]:.12g}"
-                f" to {high[0]:.12g},{high[1]:.12g}."
+                "cloud.bounds",
+                f"{path}: no point lies {path.part}. The cloud reaches from {low[0]:.12g},"
+                f"{low[1]:.12g} to {high[0]:.12g},{high[1]:.12g}.",
+                path=path,
             )
         low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
         mins, maxs = (end * header.scales + header.offsets for end in (low, high))
@@ -183,6 +182,8 @@ def check_levels(path: CloudPart, header: laspy.LasHeader) -> None:
     """Refuse a resolution of what has no levels."""
     if path.part.resolution is not None and not is_copc(header):
         raise SettingError(
-            f"{path}: is not COPC, so it has no coarser levels to read; leave out"
-            " --read-resolution, or convert the cloud to COPC first."
+            "cloud.not_copc",
+            f"{path}: is not a COPC file and has no coarser levels to read. Omit"
+            " --read-resolution, or convert the cloud to COPC first.",
+            path=path,
         )

@@ -24,7 +24,6 @@ from laspy.vlrs.vlrlist import VLRList
 from pcfix.errors import InputError
 from pcfix.io.crs import METRES, shortened
 from pcfix.io.files import check_input
-from pcfix.io.las.counts import check_chunks
 from pcfix.io.las.part import CloudPart, check_levels, extent_of, is_copc, nodes_in
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -44,6 +43,9 @@ _DAMAGED = (
     *(ValueError, IndexError, ArithmeticError, OSError),
 )
 """What the LAS libraries raise."""
+_ONE_STREAM, _LAYERED = 1, 3
+"""Compressors of LAZ: one without chunks, and one that stores the dimensions separately."""
+_VARIABLE_CHUNKS = 2**32 - 1
 _PANIC = "PanicException"
 """What lazrs raises, too, where the packed points make no sense; it is under no name to import."""
 
@@ -173,7 +175,9 @@ def las_errors(path: Path) -> Iterator[None]:
             raise
         reason = str(error).strip().rstrip(".") or type(error).__name__
         raise InputError(
-            f"{path}: is damaged, or is not LAS or LAZ ({reason}); export or copy it again."
+            "cloud.damaged",
+            f"{path}: is damaged, or is not a LAS or LAZ file ({reason}). Export or copy it again.",
+            path=path,
         ) from error
 
 
@@ -182,10 +186,12 @@ def refuse_ply(path: Path, head: bytes) -> None:
     if head.startswith((b"ply\n", b"ply\r")):
         millimetres = " ".join(f"--writers.las.scale_{axis}=0.001" for axis in "xyz")
         raise InputError(
-            f"{path}: is a PLY file, and pcfix takes LAS and LAZ; convert it with: pdal translate"
+            "cloud.ply",
+            f"{path}: is a PLY file; pcfix reads LAS and LAZ. Convert it with: pdal translate"
             f" {path} {path.with_suffix('.laz')} {millimetres} --writers.las.offset_x=auto"
             " --writers.las.offset_y=auto --writers.las.offset_z=auto"
-            " --writers.las.a_srs=EPSG:CODE (CODE is that of its CRS)"
+            " --writers.las.a_srs=EPSG:CODE (CODE is that of its CRS)",
+            path=path,
         )
 
 
@@ -227,8 +233,8 @@ class LasSource:
         try:
             with las_errors(self.path):
                 self.held = len(self)
-                check_chunks(self.path, self.header, self.vlrs)
             self._check_header()
+            self._check_count()
             if isinstance(self.path, CloudPart):
                 self._take_part(self.path)
         except BaseException:
@@ -254,17 +260,86 @@ class LasSource:
         usable = (scales > 0.0) & (scales <= MOST_SCALE_M)
         if not (usable.all() and np.isfinite(offsets).all()):
             raise InputError(
-                f"{self.path}: the header's scales {scales.tolist()} and offsets"
-                f" {offsets.tolist()} must be finite, the scales positive and at most"
-                f" {MOST_SCALE_M:,.0f}; export it again."
+                "cloud.scales",
+                f"{self.path}: the header's scales {scales.tolist()} must be positive and at most"
+                f" {MOST_SCALE_M:,.0f}, its offsets {offsets.tolist()} finite. Export the cloud"
+                " again.",
+                path=self.path,
             )
         if (np.abs(offsets) * _LAST_DIGIT > scales).any():
             raise InputError(
-                f"{self.path}: the header's offsets {offsets.tolist()} are so large that steps of"
-                f" {scales.tolist()} m are lost beside them; export it again."
+                "cloud.scales",
+                f"{self.path}: the header's offsets {offsets.tolist()} are too large for steps of"
+                f" {scales.tolist()} m. Export the cloud again.",
+                path=self.path,
             )
         if len(self) == 0:
-            raise InputError(f"{self.path}: holds no points.")
+            raise InputError("cloud.empty", f"{self.path}: contains no points.", path=self.path)
+
+    def _check_count(self) -> None:
+        """Refuse a header whose number of points disagrees with the points, which would be lost."""
+        stated = len(self)
+        with las_errors(self.path):
+            least, most = (
+                self._points_of_chunks()
+                if self.header.are_points_compressed
+                else self._points_of_records()
+            )
+        if not least <= stated <= most:
+            held = f"{least:,}" if least == most else f"{least:,} to {most:,}"
+            raise InputError(
+                "cloud.count",
+                f"{self.path}: the header counts {stated:,} points, but the file holds {held}."
+                " Export the cloud again.",
+                path=self.path,
+                stated=stated,
+            )
+
+    def _points_of_records(self) -> tuple[int, float]:
+        """Return how many point records fit between the header and what follows the points.
+
+        Zeros behind the last point are padding. A file that is cut short is found on reading.
+        """
+        stated, size = len(self), self.header.point_format.size
+        start = self.header.offset_to_point_data
+        ends = [self.path.stat().st_size]
+        for name in ("start_of_first_evlr", "start_of_waveform_data_packet_record"):
+            place = getattr(self.header, name, None) or 0
+            ends += [place] if place > start else []
+        held = (min(ends) - start) // size
+        if held > stated:
+            with self.path.open("rb") as stream:
+                stream.seek(start + stated * size)
+                held = held if any(stream.read(size)) else stated
+        return held, np.inf
+
+    def _points_of_chunks(self) -> tuple[int, float]:
+        """Return the least and the largest number of points that the chunks of a LAZ file hold."""
+        laszip = next((v.record_data for v in self.vlrs if v.user_id == "laszip encoded"), b"")
+        (compressor,) = struct.unpack_from("<H", laszip)
+        (chunk_points,) = struct.unpack_from("<I", laszip, 12)
+        if compressor == _ONE_STREAM or chunk_points == _VARIABLE_CHUNKS:
+            return 0, np.inf
+        start, size = self.header.offset_to_point_data + 8, self.path.stat().st_size
+        with self.path.open("rb") as stream:
+            stream.seek(start - 8)
+            (table,) = struct.unpack("<q", stream.read(8))
+            if table == -1:  # written by software that cannot seek backwards
+                stream.seek(-8, os.SEEK_END)
+                (table,) = struct.unpack("<q", stream.read(8))
+            if not start <= table <= size - 8:
+                raise ValueError(f"its chunk table is at byte {table:,} of {size:,}")
+            stream.seek(table + 4)
+            (chunks,) = struct.unpack("<I", stream.read(4))
+            if not 0 < chunks <= table - start:  # lazrs would take memory for all of them
+                raise ValueError(f"{chunks:,} chunks in {table - start:,} bytes")
+            last = 1
+            if compressor == _LAYERED:  # these chunks state their number of points
+                stream.seek(start - 8)
+                sizes = [size for _, size in lazrs.read_chunk_table(stream, lazrs.LazVlr(laszip))]
+                stream.seek(start + sum(sizes[:-1]) + self.header.point_format.size)
+                (last,) = struct.unpack("<I", stream.read(4))
+        return (chunks - 1) * chunk_points + last, chunks * chunk_points
 
     def _take_part(self, path: CloudPart) -> None:
         """Let the header tell of a part, whose points are counted the first time."""
@@ -298,8 +373,11 @@ class LasSource:
                 points = self._reader.read_points(most)
             if len(points) < min(most, self.held - read):
                 raise InputError(
-                    f"{self.path}: is cut short: the header promises {self.held:,} points,"
-                    f" the file holds {read + len(points):,}; copy it again."
+                    "cloud.count",
+                    f"{self.path}: the file ends after {read + len(points):,} of"
+                    f" {self.held:,} points. Copy it again.",
+                    path=self.path,
+                    stated=self.held,
                 )
             read += len(points)
             yield points
@@ -329,8 +407,13 @@ class LasSource:
         names = list(self.header.point_format.dimension_names)
         if name not in names:
             extra = list(self.header.point_format.extra_dimension_names)
-            listing = f"its extra dimensions are {', '.join(extra)}" if extra else "it has no extra"
-            raise InputError(f"{self.path}: has no dimension {name}; {listing}.")
+            listing = f"its extra dimensions are {', '.join(extra)}" if extra else "it has none"
+            raise InputError(
+                "cloud.no_dimension",
+                f"{self.path}: has no dimension {name}; {listing}.",
+                path=self.path,
+                dimension=name,
+            )
         return np.asarray(points[name], dtype=np.float64)
 
 
@@ -365,7 +448,7 @@ def read_xyz(path: File) -> FloatArray:
         return np.vstack([coordinates(points) for points in source.chunks()])
 
 
-def stated_crs(source: LasSource, complaint: str, remedy: str) -> CRS | None:
+def stated_crs(source: LasSource) -> CRS | None:
     """Return the coordinate system of a cloud, or None; an `InputError` if it cannot be read."""
     from pyproj.exceptions import CRSError
 
@@ -374,7 +457,10 @@ def stated_crs(source: LasSource, complaint: str, remedy: str) -> CRS | None:
             crs: CRS | None = source.header.parse_crs()
     except CRSError as error:
         raise InputError(
-            f"{source.path}: {complaint} ({shortened(str(error))}); {remedy}."
+            "cloud.crs",
+            f"{source.path}: its coordinate system cannot be read ({shortened(str(error))})."
+            " Set it again.",
+            path=source.path,
         ) from error
     return crs
 
@@ -384,13 +470,16 @@ def metric_crs(source: LasSource) -> CRS | None:
 
     An `InputError` if its plan coordinates are in degrees, feet or another unit.
     """
-    crs = stated_crs(source, "its coordinate system cannot be read", "set it again")
+    crs = stated_crs(source)
     if crs is None:
         return None
     units = {axis.unit_name for axis in crs.axis_info[:2]}
     if not units.issubset(METRES):
         raise InputError(
-            f"{source.path}: its coordinate system {crs.name} is in {' and '.join(sorted(units))};"
-            " reproject the cloud to one in metres first."
+            "cloud.crs_unit",
+            f"{source.path}: its coordinate system {crs.name} is in {' and '.join(sorted(units))}."
+            " Reproject the cloud to one in metres first.",
+            path=source.path,
+            crs=crs.name,
         )
     return crs

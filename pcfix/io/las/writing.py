@@ -27,7 +27,6 @@ from pcfix.errors import InputError, SettingError
 from pcfix.io.drafts import cannot_write, replaced_when_whole
 from pcfix.io.files import parse_json
 from pcfix.io.las.columns import Column, column_scale, upgraded
-from pcfix.io.las.copc import CopcWriter, check_copc, is_copc
 from pcfix.io.las.part import part_report
 from pcfix.io.las.source import (
     IDENTITY_PLACE,
@@ -189,15 +188,20 @@ def _extra_bytes(
 def _refuse_twice(source: LasSource, columns: tuple[Column, ...]) -> None:
     if any(is_ours(v) for v in source.vlrs):
         raise InputError(
-            f"{source.path}: was corrected by pcfix already; use the original, or get it back"
-            " with 'pcfix restore'."
+            "cloud.corrected",
+            f"{source.path}: was already corrected by pcfix. Use the original, or undo the"
+            " correction with 'pcfix restore'.",
+            path=source.path,
         )
     there = set(source.header.point_format.dimension_names)
     for column in columns:
         if column.name in there:
             raise InputError(
-                f"{source.path}: has a dimension {column.name} already, which pcfix would write;"
-                " rename it, or use --dimensions none."
+                "cloud.dimension_exists",
+                f"{source.path}: already has a dimension {column.name}, which pcfix would write."
+                " Rename it, or use --dimensions none.",
+                path=source.path,
+                dimension=column.name,
             )
 
 
@@ -288,11 +292,14 @@ def read_settings(vlrs: Iterable[VLR], path: Path) -> dict[str, Any]:
         content: dict[str, Any] | None = own_settings(vlrs)
         if content is not None:
             _ = content["settings"]["dimensions"], [content["before"][key] for key in BEFORE]
-            seal = content.pop(_SEAL, None)  # files of old have none
-            if seal not in (None, _seal_of(content)):
-                raise ValueError("it is not what pcfix wrote")
+            if content.pop(_SEAL) != _seal_of(content):
+                raise ValueError("its checksum differs")
     if content is None:
-        raise InputError(f"{path}: was not corrected by pcfix; there is nothing to undo.")
+        raise InputError(
+            "cloud.not_corrected",
+            f"{path}: was not corrected by pcfix; there is nothing to undo.",
+            path=path,
+        )
     return content
 
 
@@ -303,24 +310,35 @@ def record_errors(path: Path) -> Iterator[None]:
         yield
     except (ValueError, TypeError, LookupError, AttributeError, LaspyException) as error:
         raise InputError(
-            f"{path}: pcfix's own VLR is damaged ({error}); use the original cloud."
+            "cloud.vlr_damaged",
+            f"{path}: the VLR in which pcfix recorded the correction is damaged ({error}). Use the"
+            " original cloud.",
+            path=path,
         ) from error
 
 
 def check_suffix(path: Path) -> bool:
     """Return whether a name asks for LAZ rather than LAS; a `SettingError` if for neither."""
     suffix = path.suffix.lower()
+    if path.name.lower().endswith(".copc.laz"):
+        raise SettingError(
+            "output.copc",
+            f"{path}: pcfix does not write COPC. Write a .laz file and convert it with"
+            " 'pdal translate' (writers.copc) or untwine.",
+            path=path,
+        )
     if suffix not in (".las", ".laz"):
-        raise SettingError(f"{path}: give an output name that ends in .las or .laz.")
+        raise SettingError(
+            "output.suffix", f"{path}: give an output name that ends in .las or .laz.", path=path
+        )
     return suffix == ".laz"
 
 
 class LasSink:
     """An output file that is being written; use it as a context manager.
 
-    The suffix of its path decides between LAS, LAZ and COPC (``.copc.laz``), which puts the points
-    in the order of its octree; `evlrs` stand behind the points, `identity` in the header as it is
-    (see `LasSource`).
+    The suffix of its path decides between LAS and LAZ; the `evlrs` follow the points, and
+    `identity` goes into the header as it is (see `LasSource`).
     """
 
     def __init__(
@@ -330,30 +348,22 @@ class LasSink:
         evlrs: list[Record] | None = None,
         identity: bytes = b"",
         jobs: int | None = None,
-        most_points: int | None = None,
     ) -> None:
         self.header = header
-        self._most_points = most_points
         self._path, self._evlrs, self._identity, self._jobs = path, evlrs or [], identity, jobs
         self._stack = ExitStack()
-        self._copc: CopcWriter | None = None
 
     def __enter__(self) -> LasSink:
         laz = check_suffix(self._path)
-        if is_copc(self._path):
-            check_copc(self._path, self.header)
         with ExitStack() as stack:
             draft = stack.enter_context(replaced_when_whole(self._path))
             self._draft = draft
             stack.enter_context(self._write_errors())
             self._stream = stack.enter_context(draft.open("w+b"))
-            packing: Any = backend(self._jobs)
-            if is_copc(self._path):
-                packing = self._copc = CopcWriter(draft.parent, self._jobs)
-                stack.callback(self._copc.forget)
             self._writer = laspy.LasWriter(
-                self._stream, self.header, do_compress=laz, laz_backend=packing, closefd=False
-            )
+                self._stream, self.header, do_compress=laz, laz_backend=backend(self._jobs),
+                closefd=False,
+            )  # fmt: skip
             self._stack = stack.pop_all()
         return self
 
@@ -367,8 +377,7 @@ class LasSink:
             if kind is not None:
                 raise value
             self._writer.close()
-            evlrs = self._evlrs if self._copc is None else [self._copc.hierarchy, *self._evlrs]
-            append_evlrs(self._stream, evlrs, self.header.version.minor)
+            append_evlrs(self._stream, self._evlrs, self.header.version.minor)
             self._stream.seek(IDENTITY_PLACE)
             self._stream.write(self._identity)
 
@@ -377,13 +386,7 @@ class LasSink:
         try:
             yield
         except (laspy.LaspyException, lazrs.LazrsError, OSError) as error:
-            raise cannot_write(self._path, error, self._draft, self._most_bytes()) from error
-
-    def _most_bytes(self) -> int | None:
-        """Return what the points take unpacked."""
-        return (
-            None if self._most_points is None else self._most_points * self.header.point_format.size
-        )
+            raise cannot_write(self._path, error, self._draft) from error
 
 
 def write_points(
