@@ -26,7 +26,7 @@ from pcfix.io.tables import read_check_depths
 from pcfix.io.tides import read_image_times, read_tide
 from pcfix.io.vectors import read_shoreline, read_water_polygons
 from pcfix.io.views import ViewMatch, read_views
-from tests.faults import seeds
+from tests.fuzz import seeds
 from tests.io import test_ground_control as control
 from tests.io import test_water as water
 from tests.io.cameras import test_bundler as bundles
@@ -232,4 +232,4 @@ READERS: dict[str, Reader] = {
         ("pcfix.io.las", "pcfix.io.clouds"),
     ),
 }  # fmt: skip
-"""By the name that `tests.faults.fuzz` takes."""
+"""By the name that `tests.fuzz.fuzz` takes."""

@@ -21,7 +21,6 @@ from scipy.spatial.transform import Rotation
 from pcfix.io.cameras.colmap import FILE as FILE_OF_PLACE
 from pcfix.io.cameras.colmap import place_text
 from pcfix.io.cameras.colmap.files import MODELS
-from pcfix.io.las.writing import LasSink
 from pcfix.io.members import FILE, write_members
 from pcfix.model import Cameras, Lens
 from tests.io import test_ground_control as control
@@ -34,6 +33,7 @@ from tests.io.cameras import test_opensfm as opensfm
 from tests.io.cameras import test_opf as opf_test
 from tests.io.cameras import test_pix4d as pix4d
 from tests.utils.clouds import random_cloud, write_cloud
+from tests.utils.copc import write_copc
 from tests.utils.pose_files import WRITERS
 from tests.utils.pose_files import opf as opf_files
 from tests.utils.pose_files.block import Block, PoseFile
@@ -281,10 +281,7 @@ def opf_fisheye(folder: Path) -> Path:
 
 
 def copc(folder: Path) -> Path:
-    las = random_cloud(7, count=300)
-    with LasSink(folder / "cloud.copc.laz", las.header, jobs=1) as sink:
-        sink.write(las.points)
-    return folder / "cloud.copc.laz"
+    return write_copc(folder / "cloud.copc.laz", random_cloud(7, count=300, plain=True))
 
 
 def vis(folder: Path) -> Path:

@@ -1,6 +1,6 @@
 """Look for damage that a reader does not stand, for as long as one likes.
 
-``python -m tests.faults.fuzz READER --minutes 30 --seed 1`` writes into a folder, ``fuzz-READER``,
+``python -m tests.fuzz.fuzz READER --minutes 30 --seed 1`` writes into a folder, ``fuzz-READER``,
 what it found and how often it read, and says how much of the reader's code that reached. With
 `atheris` (``pip install '.[fuzz]'``) coverage guides what is tried, and the corpus is kept and gone
 on with; without, the damage is random. ``--again FILE`` reads what was found again.
@@ -47,7 +47,7 @@ def main() -> None:
 
 
 def _arguments() -> Any:
-    parser = argparse.ArgumentParser(prog="python -m tests.faults.fuzz", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz.fuzz", description=__doc__)
     parser.add_argument("reader", help="see READERS of tests/faults/readers.py")
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=1)
@@ -133,8 +133,8 @@ def run(reader: str, out: Path, seconds: float, seed: int, guided: bool) -> None
             _import_all("io")
         for name in KERNELS:
             _instrument_functions(importlib.import_module(name), atheris)
-    from tests.faults.judge import Bench, Finding
-    from tests.faults.mutations import mutated
+    from tests.fuzz.judge import Bench, Finding
+    from tests.fuzz.mutations import mutated
 
     log = Log(out)
     with tempfile.TemporaryDirectory(dir=_fast()) as folder:
@@ -208,8 +208,8 @@ def replay(reader: str, out: Path) -> None:
 
     counter = coverage.Coverage(source=["pcfix"], data_file=None, messages=False)
     counter.start()
-    from tests.faults.judge import Bench, Finding
-    from tests.faults.mutations import mutated
+    from tests.fuzz.judge import Bench, Finding
+    from tests.fuzz.mutations import mutated
 
     inputs = sorted((out / "corpus").glob("*")) if (out / "corpus").is_dir() else []
     still = 0
@@ -248,7 +248,7 @@ def replay(reader: str, out: Path) -> None:
 
 def again(reader: str, path: Path) -> None:
     """Read one input, and show what happens."""
-    from tests.faults.judge import Bench
+    from tests.fuzz.judge import Bench
 
     data = path.read_bytes()
     with tempfile.TemporaryDirectory() as folder:

@@ -20,7 +20,7 @@ import numpy as np
 
 import pcfix
 from pcfix.model import Cameras, GroundControl, TiePoints, Views
-from tests.faults.readers import READERS
+from tests.fuzz.readers import READERS
 
 LONGEST_S = 10.0
 """Of processor time; the slowest reading of an undamaged seed takes 0.2 s."""

@@ -7,9 +7,9 @@ import struct
 
 import pytest
 
-from tests.faults.judge import Bench
-from tests.faults.mutations import mutated
-from tests.faults.readers import READERS
+from tests.fuzz.judge import Bench
+from tests.fuzz.mutations import mutated
+from tests.fuzz.readers import READERS
 
 SEEDS = [1, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in range(2, 12))]
 
@@ -19,7 +19,7 @@ def bench(request, tmp_path_factory):
     return Bench(request.param, tmp_path_factory.mktemp("bench"))
 
 
-def test_what_is_whole_is_read(bench):
+def test_whole_files(bench):
     for part in {part.seed: part for part in bench.parts}.values():
         results, sentence = bench.read(part, part.data)
         assert results or "unsupported" in bench.reader.modules[0], sentence
@@ -28,7 +28,7 @@ def test_what_is_whole_is_read(bench):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_mutations(bench, seed):
     chance = random.Random(seed)
-    for _ in range(30):
+    for _ in range(10):
         part = chance.choice(bench.parts)
         bench.read(part, mutated(part.data, chance))
 
@@ -72,125 +72,80 @@ def many_in_octree(data):
 PLACE, MATRIX = struct.pack("<2d", 5e5, 5.2e6), struct.pack("<4d", 1, 0, 0, 5e5)
 """Of a raster's cells, as GeoTIFF has them."""
 
-# What was found: reader, seed, file (and entry of an archive), damage, and what is said.
+# Faults that fuzzing found: reader, seed, file (and entry of an archive), and the damage.
 FOUND = {
-    "points behind the end": (
-        *("las", "1.4", "cloud.las", put(96, "<I", 2**31), "its points begin behind its end"),
-    ),
-    "records of many bytes": (
-        *("las", "1.2", "cloud.las", put(105, "<HI", 60_000, 2**31), "is damaged"),
-    ),
-    "an octree behind the end": (
-        *("las", "copc", "cloud.copc.laz", put(ROOT + 8, "<Q", 2**40), "its octree begins or ends"),
-    ),
-    "an octree of many points": (
-        *("las", "copc", "cloud.copc.laz", many_in_octree, "its octree has more points"),
-    ),
-    "a dimension of no bytes": (*("las", "1.4", "cloud.las", extra_dimension, "is damaged"),),
-    "a place that is infinite in the world": (
+    "points behind the end": ("las", "1.4", "cloud.las", put(96, "<I", 2**31)),
+    "records of many bytes": ("las", "1.2", "cloud.las", put(105, "<HI", 60_000, 2**31)),
+    "octree behind the end": ("las", "copc", "cloud.copc.laz", put(ROOT + 8, "<Q", 2**40)),
+    "octree of many points": ("las", "copc", "cloud.copc.laz", many_in_octree),
+    "dimension of no bytes": ("las", "1.4", "cloud.las", extra_dimension),
+    "infinite place": (
         *("metashape", "geocentric", "cameras.xml", instead(b"<scale>7.3", b"<scale>9e307")),
-        "the projection centre is not finite",
     ),
     "no transformation": (
         *("odm", "project", "geocoords_transformation.txt", lambda data: b"\n" * 9),
-        "is not four rows of four numbers",
     ),
-    "infinitely many cameras": (
-        *("bundler", "points", "bundle.out", instead(b"\n2 3", b"\n1e999 3")),
-        "line 2 must give the numbers",
-    ),
-    "an image without a name": (
-        *("tides", "images", "images.json", instead(b'"IMG_0001.jpg"', b"null")),
-        "IMG_0001",
-    ),
-    "a time that is infinite": (
-        *("tides", "images", "images.json", instead(b"1000000000000.0", b"1e999")),
-        "does not say when",
-    ),
-    "a vertex too many": (  # it ended the process, in open3d
-        *("mesh", "ply", "water.ply", instead(b"9 9 1\n", b"9 9 1\n" * 3)),
-        "a face names a vertex that is not there",
-    ),
-    "an element of another name": (  # as before
+    "infinitely many cameras": ("bundler", "points", "bundle.out", instead(b"\n2 3", b"\n1e999 3")),
+    "image without a name": ("tides", "images", "images.json", instead(b'"IMG_0001.jpg"', b"null")),
+    "infinite time": ("tides", "images", "images.json", instead(b"1000000000000.0", b"1e999")),
+    # these three ended the process, in open3d or in the index of the facets
+    "vertex too many": ("mesh", "ply", "water.ply", instead(b"9 9 1\n", b"9 9 1\n" * 3)),
+    "element of another name": (
         *("mesh", "ply", "water.ply", instead(b"element vertex", b"element vvertex")),
-        "has no vertices",
     ),
-    "a corner of many digits": (
+    "vertex on no map": ("mesh", "obj", "water.obj", instead(b"v 512000.12345", b"v -1e308")),
+    "corner of many digits": (
         *("mesh", "obj", "water.obj", instead(b"f 1/", b"f 99999999999999999999/")),
-        "there is no vertex",
     ),
-    "a vertex on no map": (  # it ended the process, in the index of the facets
-        *("mesh", "obj", "water.obj", instead(b"v 512000.12345", b"v -1e308")),
-        "has a vertex at 1e+308 m",
-    ),
-    "a mesh of one line": (
+    "mesh of one line": (
         *("mesh", "obj", "water.obj", instead(b"f 1/1/1 2/1/1 3//1 -1", b"f 1 2 2")),
-        "has no facet with an area",
     ),
     "many records of no properties": (
         *("mesh", "ply", "water.ply"),
         instead(b"element face 2\n", b"element face 99999999999999999999\nelement f 2\n"),
-        "is cut short or damaged",
     ),
-    "a raster without a place": (
+    "raster without a place": (
         *("raster", "tif", "water.tif", instead(PLACE, struct.pack("<2d", float("nan"), 5.2e6))),
-        "no size or no place",
     ),
     "cells beyond the last digit": (
         *("raster", "turned", "water.tif"),
         instead(MATRIX, struct.pack("<4d", 1e-20, 0, 0, 5e5)),
-        "cells of 0 m over 8 m are no raster",
     ),
-    "a picture of too many pixels": (
+    "picture of too many pixels": (
         *("pictures", "png", "a.png", instead(struct.pack(">I", 60), struct.pack(">I", 2**30))),
-        "is damaged, or no photograph",
     ),
-    "a picture of no pages": (
+    "picture of no pages": (
         *("pictures", "tif", "a.tif", lambda data: data[:4] + bytes(4) + data[8:]),
-        "is damaged, or no photograph",
     ),
-    "a raster of half its bytes": (
-        *("raster", "tif", "water.tif", lambda data: data[:900], "is damaged, or is not a raster"),
-    ),
-    "a column with many brackets": (
+    "raster of half its bytes": ("raster", "tif", "water.tif", lambda data: data[:900]),
+    "column with many brackets": (
         *("depths", "table", "depths.csv", instead(b"depth_m", b"depth" + b"(" * 20_000)),
-        "depth or z missing",
     ),
     "labels that are none": (
         *("members", "npz", "ensemble.npz labels.npy", instead(b"(4,)", b"(2,)")),
-        "is no ensemble of an adjustment",
     ),
-    "an array that is none": (
-        *("members", "npz", "ensemble.npz labels.npy", lambda data: b"no array"),
-        "is no ensemble of an adjustment",
-    ),
-    "deep brackets of a line": (
-        *("regression", "line", "line.json", lambda data: b"[" * 100_000, "nested too deep"),
-    ),
-    "deep brackets of times": (
-        *("tides", "images", "images.json", lambda data: b"[" * 100_000, "nested too deep"),
-    ),
+    "array that is none": ("members", "npz", "ensemble.npz labels.npy", lambda data: b"no array"),
+    "deep brackets of a line": ("regression", "line", "line.json", lambda data: b"[" * 100_000),
+    "deep brackets of times": ("tides", "images", "images.json", lambda data: b"[" * 100_000),
     "deep brackets beside a model": (
-        *("colmap text", "model", "georeference.json", lambda data: b"[" * 100_000, "is damaged"),
+        *("colmap text", "model", "georeference.json", lambda data: b"[" * 100_000),
     ),
     "escapes for the terminal": (
         *("gnss", "table", "gnss.csv", instead(b"IMG_0002.jpg,", b"IMG_0002.jpg,\x1b[2J")),
-        "'\\x1b[2J50",
     ),
-    "a number of many digits": (
+    "number of many digits": (
         *("realitycapture", "one", "a.xmp", instead(b"n>10 ", b"n>" + b"9" * 5000 + b" ")),
-        "999...' is not a number",
     ),
 }
 
 
 @pytest.mark.parametrize("name", FOUND)
-def test_what_was_found(name, tmp_path):
-    reader, seed, file, damage, expected = FOUND[name]
+def test_found(name, tmp_path):
+    reader, seed, file, damage = FOUND[name]
     bench = Bench(reader, tmp_path)
     (part,) = (
         one for one in bench.parts
         if one.seed == seed and f"{one.path.name} {one.entry}".strip() == file
     )  # fmt: skip
     sentence = bench.read(part, damage(part.data))[1]
-    assert expected in sentence and file.split()[0] in sentence
+    assert file.split()[0] in sentence
