@@ -47,13 +47,13 @@ def cache_folder() -> Path | None:
     for path in sorted(path for part in KERNEL_SOURCES for path in package.glob(part)):
         sources.update(path.read_bytes())
     given = os.environ.get("NUMBA_CACHE_DIR")
-    user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pcfix"
-    root = Path(given) if given else user
-    folder = root / f"kernels-{__version__}-{sources.hexdigest()}"
     try:
+        user = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        root = Path(given) if given else Path(user, "pcfix")
+        folder = root / f"kernels-{__version__}-{sources.hexdigest()}"
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
-    except OSError:
+    except (OSError, RuntimeError):  # a user without a home
         return None
     older = sorted(root.glob("kernels-*"), key=lambda path: path.stat().st_mtime)
     for path in older[:-CACHES_KEPT]:

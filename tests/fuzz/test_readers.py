@@ -64,11 +64,6 @@ ROOT = 375 + 54 + 40
 """Where the record of COPC states place and bytes of its octree."""
 
 
-def many_in_octree(data):
-    (root,) = struct.unpack_from("<Q", data, ROOT)
-    return put(root + 28, "<i", 2**30)(data)
-
-
 PLACE, MATRIX = struct.pack("<2d", 5e5, 5.2e6), struct.pack("<4d", 1, 0, 0, 5e5)
 """Of a raster's cells, as GeoTIFF has them."""
 
@@ -77,7 +72,6 @@ FOUND = {
     "points behind the end": ("las", "1.4", "cloud.las", put(96, "<I", 2**31)),
     "records of many bytes": ("las", "1.2", "cloud.las", put(105, "<HI", 60_000, 2**31)),
     "octree behind the end": ("las", "copc", "cloud.copc.laz", put(ROOT + 8, "<Q", 2**40)),
-    "octree of many points": ("las", "copc", "cloud.copc.laz", many_in_octree),
     "dimension of no bytes": ("las", "1.4", "cloud.las", extra_dimension),
     "infinite place": (
         *("metashape", "geocentric", "cameras.xml", instead(b"<scale>7.3", b"<scale>9e307")),
