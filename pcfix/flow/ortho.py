@@ -73,7 +73,6 @@ def ortho_photo(
     known = [*paths_in(given), *([given.dsm] if given.dsm else []), *paths]
     target = rasters.check_tif(output, overwrite=given.overwrite, inputs=known)
     check_summary(given, [*known, target])
-    rasters.check_cog()
     with (
         threads(given.jobs),
         replaced_when_whole(target) as draft,
