@@ -45,7 +45,7 @@ def parse_crs(given: str | CRS, name: str) -> CRS:
         raise bad_file(
             name,
             "crs.unknown",
-            f"PROJ does not know the CRS '{shortened(text)}'. Give an EPSG code"
+            f"the CRS '{shortened(text)}' is not one that PROJ knows. Give an EPSG code"
             " (EPSG:25830, or EPSG:25830+5782 with the heights), WKT or a PROJ string.",
             value=shortened(text),
         ) from error

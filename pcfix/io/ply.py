@@ -65,7 +65,7 @@ def parse_header(name: str, head: bytes, element: str = "vertex") -> Header:
     """Parse the first bytes of a PLY file, for its vertices or faces."""
     end = re.search(rb"end_header[ \t]*\r?\n", head)
     if not head.startswith(b"ply") or end is None:
-        raise bad_file(name, "ply.header", "has no complete PLY header. Export it again.")
+        raise bad_file(name, "ply.header", "is not a PLY file with a complete header.")
     order: str | None = None
     elements: list[tuple[str, int, list[Property]]] = []
     lines = [line.split() for line in head[: end.start()].decode("latin-1").splitlines()]

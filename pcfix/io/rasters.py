@@ -41,7 +41,7 @@ def open_raster(path: File) -> Iterator[DatasetReader]:
         with rasterio.open(found) as source:
             yield source
     except (errors.RasterioError, errors.RasterioIOError, UnicodeDecodeError) as error:
-        sentence = f"is damaged, or not a raster ({error.__cause__ or error}). Export a GeoTIFF."
+        sentence = f"is damaged, or is not a raster ({error.__cause__ or error}). Export a GeoTIFF."
         raise bad_file(found, "raster.damaged", sentence) from error
 
 

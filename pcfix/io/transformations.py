@@ -111,20 +111,21 @@ def _operation(
         (one for one in lacking if one[0]), key=lambda one: len(one[0]), default=([], -1.0)
     )
     commands = " && ".join(f"pyproj sync --file {grid}" for grid in grids)
-    install = f"Install the missing grid with '{commands}', or set PROJ_NETWORK=ON"
+    without = f" without the grid {', '.join(grids)}" if grids else ""
+    install = f"Install it with '{commands}', or set PROJ_NETWORK=ON"
     if not real:
         why = install if grids else "PROJ knows no transformation between them"
         raise HeightsError(
             "crs.heights",
-            f"{name}: {_height_words(source)} cannot be transformed to {_height_words(target)}."
-            f" {why}",
+            f"{name}: {_height_words(source)} cannot be transformed to"
+            f" {_height_words(target)}{without}. {why}",
             grids=grids,
         )
     best = next((one for one in real if np.isfinite(one.transform(*at.T)).all()), real[0])
     names = f"from {source.name} to {target.name}"
     if "ballpark geographic" in best.description.lower():
         if grids:
-            sentence = f"cannot be transformed {names}. {install}."
+            sentence = f"cannot be transformed {names}{without}. {install}."
             raise bad_file(name, "crs.grid_missing", sentence, grids=grids)
         sentence = f"{name}: PROJ knows no transformation {names}; their datums are treated as one."
         return best, (PcfixWarning("crs.datum", sentence),)
@@ -132,7 +133,7 @@ def _operation(
         return best, ()
     better = ""
     if grids and 0.0 <= accuracy_m < best.accuracy:
-        better = f", or {accuracy_m:g} m with a grid. {install}"
+        better = f", but to {accuracy_m:g} m with the grid {', '.join(grids)}. {install}"
     sentence = f"{name}: positions {names} are accurate to about {best.accuracy:g} m{better}."
     values = {"accuracy_m": best.accuracy, "grids": grids}
     return best, (PcfixWarning("crs.accuracy", sentence, **values),)

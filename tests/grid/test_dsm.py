@@ -338,7 +338,7 @@ BAD = {
     "azimuth": ({"azimuth": float("nan")}, "azimuth is nan"),
     "rms": ({"what": "uncertainty", "method": "tin"}, "leave --method and --fill out"),
     "what": ({"what": "Colour"}, "no dimension Colour; --what is one of height, depth, "),
-    "suffix": ({"output": "d.asc"}, "written as GeoTIFF; end the name in .tif"),
+    "suffix": ({"output": "d.asc"}, "written as GeoTIFF. End the name in .tif"),
     "shade": ({"hillshade": "h.png"}, "h.png: a raster is written as GeoTIFF"),
     "twice": ({"hillshade": "d.tif"}, "are the same file"),
     "folder": ({"output": "nowhere/d.tif"}, "does not exist; make it first"),
@@ -388,7 +388,7 @@ def test_not_a_raster(tmp_path, content):
     path = tmp_path / "r.tif"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(InputError, match=r"r\.tif: (is damaged, or not a raster|there is no)"):
+    with pytest.raises(InputError, match=r"r\.tif: (is damaged, or is not a raster|there is no)"):
         read_raster(path)
 
 

@@ -56,7 +56,7 @@ def fails(tmp_path, rows, *words, **more):
 def test_rendered_a_free_lies_where_its_marks_say():
     cameras = read_cameras(FREE / "sparse")
     cameras = bring_to(cameras, "EPSG:32636", offset_m=(319900.0, 3842700.0, 0.0))
-    with pytest.warns(PcfixWarning, match=r"gcps.csv: names no CRS; taken to be in the cloud's"):
+    with pytest.warns(PcfixWarning, match=r"gcps.csv: names no CRS; that of the cloud is assumed"):
         found = read_ground_control(FREE / "gcps.csv", cameras)
     lines = (FREE / "gcps.csv").read_text().splitlines()[1:]
     assert found.names == tuple(f"G{i}" for i in range(1, 10))

@@ -248,7 +248,7 @@ def test_feet(tmp_path):
     with warned("crs.assumed"):
         expect_plane(pcfix.read_water(path))
     path = write(tmp_path / "plan.tif", np.full((5, 5), 10.0), crs="EPSG:2225")
-    with warned("water.raster_unit", unit_m=1200.0 / 3937.0):
+    with warned("water.raster_unit"):
         pcfix.read_water(path, "EPSG:26910")
     with refused("crs.cloud_missing"):
         pcfix.read_water(path)
