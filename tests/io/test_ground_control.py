@@ -204,7 +204,7 @@ def test_longitude_and_latitude(tmp_path):
     lon, lat = to_degrees.transform(*XYZ["G1"][:2])
     head = "name,latitude,longitude,ellipsoidal_height,image,u,v"
     path = write(tmp_path, f"G1,{lat:.11f},{lon:.11f},2.5,a.jpg,100,200", head=head)
-    with pytest.warns(PcfixWarning, match="has ellipsoidal heights"):
+    with pytest.warns(PcfixWarning, match="vertical datum"):
         found = read_ground_control(path, block())
     assert found.xyz[0] == pytest.approx(XYZ["G1"], abs=2e-6)
 

@@ -584,7 +584,7 @@ def test_without_the_clouds_crs_no_map_is_chosen(at, crs, more):
         (VALENCIA, "nonsense", UTM30, "a.xml: the CRS 'nonsense' is not one"),
         (VALENCIA, UTM30, "nonsense", "the cloud: the CRS 'nonsense' is not one"),
         (VALENCIA, "EPSG:32630", "EPSG:4326", "the cloud: WGS 84 is in degrees. Reproject"),
-        (VALENCIA, "EPSG:32630", "EPSG:2992", "is in foot; reproject"),
+        (VALENCIA, "EPSG:32630", "EPSG:2992", "is in foot. Reproject"),
         (VALENCIA, "ENU:39", UTM30, "a.xml: 'ENU:39' is not ENU:latitude"),
         (VALENCIA, "EPSG:5703", UTM30, "is a vertical CRS"),
         ([1e30, 1e30, 5.0], "EPSG:32631", UTM30, r"image 0.jpg: its position 1e\+30.*cannot be"),
