@@ -94,26 +94,8 @@ def is_same(one: CRS, other: CRS) -> bool:
     one, other = unbound(one), unbound(other)
     if one.equals(other, ignore_axis_order=True):
         return True
-    if _differ_in_projection(one, other):  # cheap; a search for a code may take a second
-        return False
     code = one.to_epsg()
     return code is not None and code == other.to_epsg()
-
-
-def _differ_in_projection(one: CRS, other: CRS) -> bool:
-    """Whether only one is a map, or both are the same kind of map with other parameters."""
-    if one.is_projected != other.is_projected:
-        return True
-    first, second = one.coordinate_operation, other.coordinate_operation
-    if first is None or second is None or first.method_name != second.method_name:
-        return False
-    here, there = (
-        np.sort([float(p.value) * p.unit_conversion_factor for p in operation.params])
-        if all(isinstance(p.value, float) for p in operation.params)
-        else np.empty(0)
-        for operation in (first, second)
-    )
-    return len(here) == len(there) and not np.allclose(here, there, rtol=1e-9, atol=1e-9)
 
 
 def is_same_vertical_datum(one: CRS, other: CRS) -> bool:

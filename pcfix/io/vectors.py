@@ -120,12 +120,8 @@ def read_vectors(path: File, *, crs: str | None = None) -> Vectors:
     gone[at[~np.isfinite(xy).all(axis=1)]] = True
     if gone.all():
         raise bad_file(name, "vector.empty", "holds no geometry with coordinates.")
-    vectors = Vectors(geometries[~gone], crs or found, name)
+    vectors = Vectors(geometries[~gone], crs or found, name)  # without empty features
     _check_degrees(vectors)
-    if gone.any():
-        count = int(gone.sum())
-        sentence = f"{count} features without coordinates are ignored."
-        vectors = vectors.noted("vector.no_coordinates", sentence, count=count)
     return vectors
 
 
@@ -394,10 +390,6 @@ def read_water_polygons(path: File, cloud_crs: str | CRS | None = None) -> Water
             count=count,
             area_m2=area_m2,
         )
-    if not is_polygon.all():
-        count = int((~is_polygon).sum())
-        sentence = f"{count} points or lines beside the polygons are ignored."
-        vectors = vectors.noted("mask.no_polygons", sentence, count=count)
     area = shapely.union_all(polygons)
     if not area.area > 0.0:
         kinds = sorted({geometry.geom_type for geometry in vectors.geometries})

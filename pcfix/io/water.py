@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
+from pcfix.errors import GeometryError, SettingError, bad_file
 from pcfix.io.files import check_input
 from pcfix.io.ply import Records
 from pcfix.io.water_rasters import read_water_raster
@@ -31,7 +30,6 @@ _NOT_RASTERS = (".csv", ".txt", ".json", ".geojson", ".gpkg", ".shp", ".wkt", ".
 """GDAL would try some of these as rasters all the same."""
 MOST_OVERLAP = 0.01
 """Of the plan area; the triangulation of a shoreline may fold at its rim by less."""
-LEAST_FACET_M2 = 1e-6
 _CORNERS = "vertex_indices", "vertex_index"
 _MOST_VERTICES = 2**31
 
@@ -99,6 +97,9 @@ def _not_water(text: str, rule: str) -> SettingError:
 
 
 def _mesh(path: Path) -> WaterMesh:
+    """Read a mesh that is a height field."""
+    from pcfix.water.surface import build_tin, in_two_sheets
+
     read = _read_obj if path.suffix.lower() == ".obj" else _read_ply
     vertices, triangles = read(path)
     if len(triangles) == 0:
@@ -109,22 +110,11 @@ def _mesh(path: Path) -> WaterMesh:
         sentence = "a face names a vertex that does not exist. Export it again."
         raise bad_file(path, "water.mesh_damaged", sentence)
     mesh = WaterMesh(vertices, triangles, path.name)
-    _check_mesh(mesh, path)
-    return mesh
-
-
-def _check_mesh(mesh: WaterMesh, path: Path) -> None:
-    """Refuse a mesh that is not a height field, and warn of facets that are ambiguous or ignored.
-
-    The orientation of facets does not matter, nor do holes, edges of three facets, or facets that
-    overlap at one height: the height is well defined in all these cases.
-    """
-    from pcfix.water.surface import build_tin, in_two_sheets
-
     try:
         tin = build_tin(mesh)
     except GeometryError as error:
         raise bad_file(path, "water.mesh_flat", str(error)) from None
+    # holes, edges of three facets and facets that overlap at one height do not matter
     double, area_m2 = in_two_sheets(tin)
     share = float(area_m2[double].sum() / area_m2.sum())
     if share > MOST_OVERLAP:
@@ -135,18 +125,7 @@ def _check_mesh(mesh: WaterMesh, path: Path) -> None:
             " water surface only, not a closed body or several surfaces.",
             share=share,
         )
-
-    def warn(code: str, sentence: str, count: int) -> None:
-        if count > 0:
-            note = PcfixWarning(code, f"{path}: {count:,} {sentence}", path=path, count=count)
-            warnings.warn(note, stacklevel=5)
-
-    sentence = f"of {len(mesh.triangles):,} facets overlap others; there the water may be either."
-    warn("water.mesh_overlap", sentence, int(double.sum()))
-    edges = np.diff(mesh.vertices[mesh.triangles], axis=1)
-    size_m2 = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2.0
-    upright = int((size_m2 > LEAST_FACET_M2).sum()) - int((area_m2 > LEAST_FACET_M2).sum())
-    warn("water.mesh_vertical", "vertical facets have no height and are ignored.", upright)
+    return mesh
 
 
 def _read_obj(path: Path) -> tuple[FloatArray, IntArray]:

@@ -97,7 +97,6 @@ def test_features_without_coordinates(tmp_path):
     shapes = [None, shapely.Point(), not_finite, *shapely.points(SHORE)]
     found = read_vectors(write(tmp_path / "a.gpkg", shapes))
     assert found.coordinates[:, 0].tolist() == SHORE[:, 0].tolist()
-    assert codes(found) == ["vector.no_coordinates"] and found.notes[0].values["count"] == 3
 
 
 def test_layers(tmp_path):
@@ -293,7 +292,7 @@ def test_repaired_mask(tmp_path):
     found = read_water_polygons(path)
     assert found.area.is_valid
     assert found.area.area == pytest.approx(50.0 + 96.0 + 100.0)  # the hole stays a hole
-    assert codes(found) == ["mask.repaired", "mask.no_polygons"]
+    assert codes(found) == ["mask.repaired"]
     assert found.notes[0].values == {"count": 2, "area_m2": pytest.approx(146.0)}
 
 

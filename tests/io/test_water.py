@@ -321,15 +321,13 @@ def test_closed_body(tmp_path):
         pcfix.read_water(write_obj(tmp_path / "box.obj", SQUARE + below, faces))
 
 
-def test_small_folds_and_walls(tmp_path):
-    fold = [(9.0, 9.0, 2.0), (9.9, 9.0, 2.0), (9.0, 9.9, 2.0), (0, 0, 5.0)]
-    plain, walls = [(1, 2, 3), (1, 3, 4)], [(1, 2, 8)]
-    with warned("water.mesh_overlap", count=1):
-        pcfix.read_water(write_obj(tmp_path / "fold.obj", SQUARE + fold, [*plain, (5, 6, 7)]))
-    with warned("water.mesh_vertical", count=1):
-        pcfix.read_water(write_obj(tmp_path / "wall.obj", SQUARE + fold, plain + walls))
-    twice = write_obj(tmp_path / "twice.obj", SQUARE, plain + plain)
-    assert len(pcfix.read_water(twice).triangles) == 4  # at one height: no harm
+def test_folds_and_walls(tmp_path):
+    """Small ones do no harm, nor facets that overlap at one height."""
+    more = [(9.0, 9.0, 2.0), (9.9, 9.0, 2.0), (9.0, 9.9, 2.0), (0, 0, 5.0)]
+    plain = [(1, 2, 3), (1, 3, 4)]
+    for faces in ([*plain, (5, 6, 7)], [*plain, (1, 2, 8)], plain + plain):
+        mesh = pcfix.read_water(write_obj(tmp_path / "fold.obj", SQUARE + more, faces))
+        assert len(mesh.triangles) == len(faces)
 
 
 # Water and cloud

@@ -44,9 +44,6 @@ _ENOUGH = 1000
 """Entries that are enough to choose the order of the images; with fewer, later chunks decide."""
 
 _PLACES = (".", "sparse", "sparse/0")
-_CAMERA = ("0", "CAMERA")
-"""Type of a sensor, in bytes and in text."""
-
 _FRAME_HEAD, _DATA = struct.Struct("<II7dI"), struct.Struct("<iIQ")
 
 
@@ -111,45 +108,22 @@ def _orders(model: Path) -> list[tuple[str, list[str]]]:
 
 
 def _frames(model: Path) -> list[list[int]]:
-    """Return the image ids of each frame of a model with rigs, as COLMAP sorts them.
+    """Return the image ids of each frame of a model with rigs, in the order of COLMAP.
 
-    See https://colmap.github.io/format.html for ``frames.bin`` and ``frames.txt``.
+    See https://colmap.github.io/format.html for ``frames.bin``.
     """
-    frames: dict[int, list[tuple[int, int]]] = {}
-    if (model / "frames.bin").is_file():
-        frames = _binary_frames((model / "frames.bin").read_bytes())
-    elif (model / "frames.txt").is_file():
-        frames = _text_frames((model / "frames.txt").read_text("utf-8", errors="replace"))
-    return [[image for _, image in sorted(frames[i])] for i in sorted(frames)]
-
-
-def _binary_frames(data: bytes) -> dict[int, list[tuple[int, int]]]:
-    frames = {}
-    (count,) = struct.unpack_from("<Q", data)
-    at = 8
-    for _ in range(count):
+    path = model / "frames.bin"
+    if not path.is_file():
+        return []
+    data, at, frames = path.read_bytes(), 8, {}
+    for _ in range(*struct.unpack_from("<Q", data)):
         frame_id, *_, images = _FRAME_HEAD.unpack_from(data, at)
         at += _FRAME_HEAD.size
         end = at + _DATA.size * images
-        if end > len(data):
-            raise ValueError("cut short")
-        entries = (_DATA.unpack_from(data, place) for place in range(at, end, _DATA.size))
-        frames[frame_id] = [(sensor, image) for kind, sensor, image in entries if kind == 0]
+        entries = [_DATA.unpack_from(data, place) for place in range(at, end, _DATA.size)]
+        frames[frame_id] = sorted((sensor, image) for kind, sensor, image in entries if kind == 0)
         at = end
-    return frames
-
-
-def _text_frames(content: str) -> dict[int, list[tuple[int, int]]]:
-    frames = {}
-    for line in content.splitlines():
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        fields = line.split()
-        entries = zip(fields[10::3], fields[11::3], fields[12::3], strict=False)
-        frames[int(fields[0])] = [
-            (int(sensor), int(image)) for kind, sensor, image in entries if kind in _CAMERA
-        ]
-    return frames
+    return [[image for _, image in frames[i]] for i in sorted(frames)]
 
 
 def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -> ViewList:
