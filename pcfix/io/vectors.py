@@ -121,7 +121,20 @@ def read_vectors(path: File, *, crs: str | None = None) -> Vectors:
     if gone.all():
         raise bad_file(name, "vector.empty", "holds no geometry with coordinates.")
     vectors = Vectors(geometries[~gone], crs or found, name)  # without empty features
-    _check_degrees(vectors)
+    if vectors.crs is None or vectors.crs.strip().lower() == LOCAL:
+        return vectors
+    stated = parse_crs(vectors.crs, name)
+    x, y = vectors.coordinates[:, 0], vectors.coordinates[:, 1]
+    wrong = (np.abs(x) > 360.0) | (np.abs(y) > 90.0)
+    if stated.is_geographic and stated.axis_info[0].unit_name == "degree" and wrong.any():
+        i = int(np.argmax(wrong))
+        raise bad_file(
+            name,
+            "vector.not_degrees",
+            f"{x[i]:.10g}, {y[i]:.10g} is not a longitude and latitude, but its CRS is"
+            f" {stated.name} (the default of GeoJSON). Give the CRS that it is in.",
+            crs=stated.name,
+        )
     return vectors
 
 
@@ -129,26 +142,6 @@ def _split_layer(path: File) -> tuple[str, str | None]:
     """Return the file and the layer of ``file|layername=layer``, as QGIS writes it."""
     file, _, layer = str(path).partition(LAYER_MARK)
     return file, layer.removeprefix("layername=") or None
-
-
-def _check_degrees(vectors: Vectors) -> None:
-    """Refuse a CRS that is unknown, and numbers that cannot be degrees, as many GeoJSON have."""
-    if vectors.crs is None or vectors.crs.strip().lower() == LOCAL:
-        return
-    crs = parse_crs(vectors.crs, vectors.name)
-    if not crs.is_geographic or crs.axis_info[0].unit_name != "degree":
-        return
-    x, y = vectors.coordinates[:, 0], vectors.coordinates[:, 1]
-    wrong = (np.abs(x) > 360.0) | (np.abs(y) > 90.0)
-    if wrong.any():
-        i = int(np.argmax(wrong))
-        raise bad_file(
-            vectors.name,
-            "vector.not_degrees",
-            f"{x[i]:.10g}, {y[i]:.10g} is not a longitude and latitude, but its CRS is {crs.name}"
-            " (the default of GeoJSON). Give the CRS that it is in.",
-            crs=crs.name,
-        )
 
 
 def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool) -> Vectors:

@@ -139,7 +139,7 @@ def test_heights_of_tie_points(with_ties):
     [
         (0.0, 0.0, {}),
         (3.0, 0.0, {"water.shoreline_level": ("off_m", pytest.approx(-3.03, abs=0.005))}),
-        (0.0, 0.01, {"water.shoreline_tilt": ("to", "south")}),
+        (0.0, 0.01, {"water.shoreline_tilt": ("to", "south-east")}),
     ],
 )
 def test_shoreline_of_the_cloud(off_m, north, expected):

@@ -108,10 +108,12 @@ def test_definitions():
     y = A + B * x + rng.normal(0, 0.2, 15)
     design = np.column_stack([np.ones(15), x])
     answer, (squares,), _, _ = np.linalg.lstsq(design, y, rcond=None)
-    errors = np.sqrt(np.diag(np.linalg.inv(design.T @ design)) * squares / 13)
+    covariance = np.linalg.inv(design.T @ design) * squares / 13
+    errors = np.sqrt(np.diag(covariance))
     found = fit_depths(x, y)
     assert [found.intercept_m, found.slope] == pytest.approx(answer.tolist(), rel=1e-9)
     assert [found.intercept_se_m, found.slope_se] == pytest.approx(errors.tolist(), rel=1e-9)
+    assert found.covariance_m == pytest.approx(covariance[0, 1], rel=1e-9)
     assert found.rmse_m == pytest.approx(math.sqrt(squares / 15), rel=1e-9)
     assert found.r2 == pytest.approx(1.0 - squares / ((y - y.mean()) ** 2).sum(), rel=1e-9)
     assert found.as_dict()["slope"] == found.slope

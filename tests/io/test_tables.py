@@ -87,15 +87,6 @@ def test_regression_round_trip(tmp_path, line):
     assert read_regression(tmp_path / "line.json") == line
 
 
-def test_covariance_of_least_squares():
-    rng = np.random.default_rng(6)
-    x = rng.uniform(0.2, 5.0, 20)
-    y = 0.05 + 1.4 * x + rng.normal(0, 0.1, 20)
-    found, (_, covariance) = fit_depths(x, y), np.polyfit(x, y, 1, cov=True)
-    assert found.covariance_m == pytest.approx(covariance[0, 1])
-    assert [found.slope_se**2, found.intercept_se_m**2] == pytest.approx(np.diag(covariance))
-
-
 def changed(tmp_path, line, **values):
     path = tmp_path / "line.json"
     write_regression(path, line, overwrite=False)

@@ -1,4 +1,4 @@
-"""Tide tables, the times of images, and the water level of each image."""
+"""Tide tables, the times of images, the water level of each, and recorded flying heights."""
 
 import json
 import math
@@ -11,11 +11,14 @@ from PIL import Image
 
 import pcfix
 from pcfix.flow.inputs import Inputs
+from pcfix.io.altitudes import read_altitudes
+from pcfix.io.cameras import read_cameras
 from pcfix.io.scenes import write_scene
 from pcfix.io.tides import ImageTimes, TideTable, level_offsets, read_image_times, read_tide
 from tests.utils.codes import refused
 from tests.utils.shared import needs
 
+CAMERAS, real = needs("cameras")
 ODM, odm = needs("cameras/odm/testerarm_sub0")
 
 TIDE = """time,level_m
@@ -202,3 +205,27 @@ def test_inputs(tmp_path):
         Inputs(cameras=cameras, water=0.37, image_times=tide).level_offset_m(cameras)
     with refused("table.column_missing"):
         Inputs(cameras=file, water=0.37, tide=tide).level_offset_m(cameras)
+
+
+@pytest.mark.parametrize("text", ['="+30.10"', ">30.10</drone-dji:RelativeAltitude>", "='30.1'"])
+def test_heights_in_images(tmp_path, text):
+    (tmp_path / "a.JPG").write_text(f"<x drone-dji:RelativeAltitude{text} y>")
+    (tmp_path / "b.JPG").write_text("<x drone-dji:AbsoluteAltitude='88.0'>")
+    (tmp_path / "c.txt").write_text("RelativeAltitude='99.0'")
+    for place in (tmp_path, tmp_path / "cameras.csv"):
+        found = read_altitudes(place, ["folder/a", "b", "c"])
+        np.testing.assert_array_equal(found, [30.1, np.nan, np.nan])
+
+
+@pytest.mark.parametrize("name", ["none/cameras.csv", "none.psx", "cameras.csv"])
+def test_no_heights(tmp_path, name):
+    assert np.isnan(read_altitudes(tmp_path / name, ["a", "b"])).all()
+
+
+@real
+def test_heights_in_a_metashape_project():
+    path = CAMERAS / "metashape" / "easyidp_wheat_psx" / "wheat_tanashi.psx"
+    found = read_altitudes(path, read_cameras(path).labels)
+    assert len(found) == 138
+    assert found[:3].tolist() == [30.0, 29.9, 29.8]
+    assert np.ptp(found) < 2.0
