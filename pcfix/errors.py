@@ -51,6 +51,11 @@ class InputError(PcfixError):
     """A file that is missing, damaged, or not what it should be."""
 
 
+def bad_file(path: object, code: str, sentence: str, **values: Any) -> InputError:
+    """Return the error of a file; the message is its path and a sentence."""
+    return InputError(code, f"{path}: {sentence}", path=path, **values)
+
+
 class NoTiePointsError(InputError):
     """A camera file without tie points; most steps do not need them."""
 

@@ -1,6 +1,6 @@
-"""Door 2: the functions of PDAL's ``filters.python``: correct, label, clean and compare.
+"""The functions of PDAL's ``filters.python``: correct, label, clean and compare.
 
-A pipeline imports one of them, which belongs to the stage that imported it: PDAL passes options,
+A pipeline imports one of them, which belongs to the stage that imports it: PDAL passes options,
 metadata and the report through the globals of the stage's source::
 
     {
@@ -30,19 +30,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 import numpy as np
 
 from pcfix.errors import PcfixError, SettingError, show_warning
-from pcfix.io.pdal import (
-    NAME,
-    OUTCOME,
-    Dimensions,
-    Flags,
-    Results,
-    check_dimensions,
-    column_values,
-    crs_of,
-    dimension,
-    metadata_of,
-    scales_of,
-)
+from pcfix.io.pdal import NAME, OUTCOME, Dimensions, PdalCloud, Results, metadata_of
 from pcfix.model import LOW_NOISE, WaterDimension, WaterSurface
 from pcfix.options.declare import Option, OptionSet, named, options_of
 from pcfix.options.shared import PartOptions
@@ -51,49 +39,30 @@ Set = TypeVar("Set", bound=OptionSet)
 
 if TYPE_CHECKING:
     from pcfix.compare.match import SurveyCloud
-    from pcfix.flow.clean import Tested
     from pcfix.flow.surfaces import CloudView, Points
-    from pcfix.model import FloatArray
 
 Stage: TypeAlias = Callable[[Dimensions, Dimensions], bool]
 Work: TypeAlias = Callable[[dict[str, Any], Dimensions, Dimensions], None]
 
 _WORD = {str: "a text", float: "a number", int: "a whole number", bool: "true or false"}
+COLOURS = ("Red", "Green", "Blue")
 
 
 def __getattr__(name: str) -> Stage:
-    """Return the function of that name for the globals of whoever imports it."""
+    """Return the function of that name for the globals of the module that imports it."""
     work = {"correct": _correct, "label": _label, "clean": _clean, "compare": _compare}.get(name)
     if work is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return _stage(work, sys._getframe(1).f_globals)
+    namespace = sys._getframe(1).f_globals
 
-
-def stages(namespace: dict[str, Any]) -> tuple[Stage, Stage]:
-    """Return ``correct`` and ``label`` for a stage's globals, as pipelines of 0.1.0 ask for them.
-
-    Parameters
-    ----------
-    namespace : dict
-        ``globals()`` of the stage's source.
-
-    Returns
-    -------
-    correct, label : callable
-        Each takes PDAL's dictionaries of input and output arrays.
-    """
-    return _stage(_correct, namespace), _stage(_label, namespace)
-
-
-def _stage(work: Work, namespace: dict[str, Any]) -> Stage:
-    def function(ins: Dimensions, outs: Dimensions) -> bool:
+    def stage(ins: Dimensions, outs: Dimensions) -> bool:
         return _run(work, namespace, ins, outs)
 
-    return function
+    return stage
 
 
 def _run(work: Work, namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> bool:
-    """Work with libraries kept apart from PDAL's, and leave the process usable after a failure."""
+    """Run with libraries separate from PDAL's, and leave the process usable after a failure."""
     before = sys.getdlopenflags()
     # PDAL links to a PROJ and a GDAL of its own; two of a kind crash the program at its exit
     sys.setdlopenflags(os.RTLD_NOW | getattr(os, "RTLD_DEEPBIND", 0))
@@ -112,13 +81,15 @@ def _run(work: Work, namespace: dict[str, Any], ins: Dimensions, outs: Dimension
         raise
     finally:
         sys.setdlopenflags(before)
+    sentence = str(mistake)
     if in_program:
-        # the program shows an error as the repr of each line of a traceback, and always one: the
-        # sentence goes before that, and the traceback is cut down to its last line
+        # the program prints an error as the repr of each line of a traceback, and always one: the
+        # sentence is printed before that, and the traceback cut down to its last line
         sys.stderr.write(f"pcfix: {mistake}\n")
         sys.tracebacklimit = 0
-        raise type(mistake)("refused, as said above")
-    raise type(mistake)(str(mistake))  # anew, without the places in pcfix that it came through
+        sentence = "refused, see the line above"
+    # a new error, without the traceback through pcfix
+    raise type(mistake)(mistake.code, sentence, **mistake.values)
 
 
 def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
@@ -135,29 +106,27 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
         raise _missing("cameras")
     if options.uncorrected == "drop":
         raise SettingError(
-            "uncorrected 'drop': a stage of PDAL cannot set dimensions and drop points at once;"
-            f' use withhold or keep, add "{OUTCOME}=uint8" to add_dimension, and let'
-            f' filters.range keep "{OUTCOME}[0:1]".'
+            "option.not_in_pdal",
+            "uncorrected 'drop': a stage of PDAL cannot set dimensions and drop points at once."
+            f' Use withhold or keep, add "{OUTCOME}=uint8" to add_dimension, and let filters.range'
+            f' keep "{OUTCOME}[0:1]".',
+            option="uncorrected",
         )
-    columns = columns_for(options.dimensions, options.unsure)
-    check_dimensions(ins, columns)
-    metadata = namespace.get("metadata")
-    scales = scales_of(metadata)
-    flags = Flags(ins, metadata)
-    step_m = 0.0 if scales is None else float(scales.max())
-    job = Job(NAME, options, _view(ins, metadata, flags), step_m)
+    cloud = PdalCloud(ins, namespace.get("metadata"))
+    results = Results(cloud, columns_for(options.dimensions, options.unsure))
+    step_m = 0.0 if cloud.scales is None else float(cloud.scales.max())
+    job = Job(NAME, options, _view(cloud), step_m)
     check_summary(options, paths_in(options))
-    results = Results(ins, columns, flags, scales)
     with threads(options.jobs):
-        job.look_around(lambda: (points for _, points in _chunks(ins, job.water, flags)))
-        for rows, points in _chunks(ins, job.water, flags):
+        job.look_around(lambda: (points for _, points in _chunks(cloud, job.water)))
+        for rows, points in _chunks(cloud, job.water):
             results.add(rows, job.correct(points), options.uncorrected == "withhold")
     job.check_fit()
     outs.update(results.dimensions)
     summary = job.summary(NAME, NAME, time.perf_counter() - started)
     job.save_regression()
     write_summary(options, summary.as_dict())
-    namespace["out_metadata"] = metadata_of(summary.as_dict(), flags)
+    namespace["out_metadata"] = metadata_of(summary.as_dict(), cloud.flags)
 
 
 def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
@@ -165,36 +134,38 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     from pcfix.options.correct import StageLabelOptions
 
     options = _options(namespace, StageLabelOptions, needed=("water",))
-    metadata = namespace.get("metadata")
-    flags = Flags(ins, metadata)
-    step = LabellingStep(NAME, options, _view(ins, metadata, flags))
-    step.look_around(lambda: (points for _, points in _chunks(ins, step.water, flags)))
-    classes = flags.classes.copy()
-    for rows, points in _chunks(ins, step.water, flags):
+    cloud = PdalCloud(ins, namespace.get("metadata"))
+    step = LabellingStep(NAME, options, _view(cloud))
+    step.look_around(lambda: (points for _, points in _chunks(cloud, step.water)))
+    classes = cloud.flags.classes.copy()
+    for rows, points in _chunks(cloud, step.water):
         classes[rows] = step.classes(points)
     step.finish()
     outs["Classification"] = classes
-    outs.update(flags.dimensions())
+    outs.update(cloud.flags.dimensions())
     found = {**step.counts, "labelling": step.labelling.report()}
-    namespace["out_metadata"] = metadata_of(found, flags)
+    namespace["out_metadata"] = metadata_of(found, cloud.flags)
 
 
 def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
     from pcfix.clean.points import Resources
-    from pcfix.flow.clean import NoiseSearch
+    from pcfix.flow.clean import RAY_DIMENSIONS, NoiseSearch, Tested
     from pcfix.flow.runner import check_summary, write_summary
     from pcfix.kernels import threads
     from pcfix.options.steps import CleanOptions
 
     started = time.perf_counter()
     options = _options(namespace, CleanOptions)
-    metadata = namespace.get("metadata")
-    flags = Flags(ins, metadata)
-    search = NoiseSearch(NAME, options, lambda: _view(ins, metadata, flags), ins)
+    cloud = PdalCloud(ins, namespace.get("metadata"))
+    flags, rays = cloud.flags, cloud.columns(tuple(RAY_DIMENSIONS))
+    search = NoiseSearch(NAME, options, lambda: _view(cloud), ins)
     check_summary(options)
+    chunks = (
+        Tested(points, flags.withheld[rows], {name: rays[name][rows] for name in rays})
+        for rows, points in _chunks(cloud, search.water)
+    )
     with threads(options.jobs):
-        chunks = _tested(ins, search.water, flags, scales_of(metadata))
-        noise = search.run(chunks, len(ins["X"]), Resources(jobs=options.jobs))
+        noise = search.run(chunks, len(cloud), Resources(jobs=options.jobs))
     if options.drop:
         outs["Mask"] = ~noise
     else:
@@ -207,58 +178,43 @@ def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     namespace["out_metadata"] = metadata_of(summary, None if options.drop else flags)
 
 
-def _tested(
-    ins: Dimensions, water: WaterSurface | None, flags: Flags, scales: FloatArray | None
-) -> Iterator[Tested]:
-    """Yield the points of each chunk as the tests for noise need them."""
-    from pcfix.flow.clean import RAY_DIMENSIONS, Tested
-
-    rays = {name: column_values(ins, name, scales) for name in RAY_DIMENSIONS if name in ins}
-    for rows, points in _chunks(ins, water, flags):
-        yield Tested(points, flags.withheld[rows], {name: rays[name][rows] for name in rays})
-
-
 def _compare(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
-    """Compare, and let all points pass as they are."""
+    """Compare, and pass all points on unchanged."""
     from pcfix.flow.compare import Held, compare_clouds
     from pcfix.options.steps import StageCompareOptions
 
     options = _options(namespace, StageCompareOptions, needed=("reference",))
-    metadata = namespace.get("metadata")
-    flags = Flags(ins, metadata)
-    cloud = Held(
-        lambda: _view(ins, metadata, flags), lambda water: _surveyed(ins, metadata, flags, water)
-    )
-    found = compare_clouds(cloud, options.reference or "", options=options)
+    cloud = PdalCloud(ins, namespace.get("metadata"))
+    held = Held(lambda: _view(cloud), lambda water: _survey(cloud, water))
+    found = compare_clouds(held, options.reference or "", options=options)
     namespace["out_metadata"] = metadata_of(found.as_dict())
 
 
-def _surveyed(
-    ins: Dimensions, metadata: dict[str, Any] | None, flags: Flags, water: WaterSurface | None
-) -> SurveyCloud:
+def _survey(cloud: PdalCloud, water: WaterSurface | None) -> SurveyCloud:
     """Return the cloud as a comparison needs it."""
     from pcfix.io.clouds import TOLD, Told, survey_cloud
     from pcfix.io.crs import parse_crs
 
-    stated, scales = crs_of(metadata), scales_of(metadata)
-    told = {name: column_values(ins, name, scales) for name in TOLD if name in ins}
+    told, withheld = cloud.columns(tuple(TOLD)), cloud.flags.withheld
     chunks = (
-        Told(points.xyz, points.classes, flags.withheld[rows], points.heights,
+        Told(points.xyz, points.classes, withheld[rows], points.heights,
              {name: told[name][rows] for name in told})
-        for rows, points in _chunks(ins, water, flags)
+        for rows, points in _chunks(cloud, water)
     )  # fmt: skip
-    crs = None if stated is None else parse_crs(stated, NAME)
-    return survey_cloud(NAME, crs, chunks, water, water is not None, len(ins["X"]))
+    crs = None if cloud.crs is None else parse_crs(cloud.crs, NAME)
+    return survey_cloud(NAME, crs, chunks, water, water is not None, len(cloud))
 
 
 def _options(namespace: dict[str, Any], kind: type[Set], needed: tuple[str, ...] = ()) -> Set:
     """Return the stage's options, of the right types."""
     given = namespace.get("pdalargs") or {}
     if not isinstance(given, dict):
-        raise SettingError(f"pdalargs: must be an object of options, not {given!r}.")
+        sentence = f"pdalargs: must be an object of options, not {given!r}."
+        raise SettingError("option.type", sentence, value=given)
     twice = next((name for name in given if "-" in name and name.replace("-", "_") in given), None)
     if twice is not None:
-        raise SettingError(f"pdalargs: {twice} is given twice, with dashes and underscores.")
+        sentence = f"pdalargs: {twice} is given twice, with dashes and underscores."
+        raise SettingError("option.twice", sentence, option=twice)
     given = {name.replace("-", "_"): value for name, value in given.items()}
     elsewhere = {"port", *(one.name for one in options_of(PartOptions))}  # readers choose points
     known = {one.name: one for one in options_of(kind) if one.name not in elsewhere}
@@ -274,11 +230,12 @@ def _options(namespace: dict[str, Any], kind: type[Set], needed: tuple[str, ...]
 
 
 def _missing(name: str) -> SettingError:
-    return SettingError(f"pdalargs: the option '{name}' is needed.")
+    sentence = f"pdalargs: the option '{name}' is needed."
+    return SettingError("option.missing", sentence, option=name)
 
 
 def _converted(one: Option, value: Any) -> Any:
-    """Return a value of JSON as what the option takes; numbers may be text."""
+    """Convert a value of JSON to the type of the option; numbers may be text."""
     if one.default == () and one.parse is None:  # may be repeated on the command line
         texts = value if isinstance(value, list) else [value]
         if all(isinstance(text, str) for text in texts):
@@ -296,7 +253,8 @@ def _converted(one: Option, value: Any) -> Any:
                 continue
             return kind(number)
     words = " or ".join(_WORD[kind] for kind in kinds)
-    raise SettingError(f"pdalargs: {one.name} must be {words}, not {json.dumps(value)}.")
+    sentence = f"pdalargs: {one.name} must be {words}, not {json.dumps(value)}."
+    raise SettingError("option.type", sentence, option=one.name, value=value)
 
 
 def _slices(n: int) -> Iterator[slice]:
@@ -305,46 +263,44 @@ def _slices(n: int) -> Iterator[slice]:
     return (slice(start, start + CHUNK_POINTS) for start in range(0, n, CHUNK_POINTS))
 
 
-def _chunks(
-    ins: Dimensions, water: WaterSurface | None, flags: Flags
-) -> Iterator[tuple[slice, Points]]:
-    """Yield the rows of each chunk, and its coordinates, heights of the water and classes."""
+def _chunks(cloud: PdalCloud, water: WaterSurface | None) -> Iterator[tuple[slice, Points]]:
+    """Yield the rows of each chunk, and its points."""
     from pcfix.flow.surfaces import Points
     from pcfix.water.checks import checked_points
 
-    for rows in _slices(len(ins["X"])):
-        xyz = checked_points(np.column_stack([ins[axis][rows] for axis in "XYZ"]))
-        heights = dimension(ins, water.name)[rows] if isinstance(water, WaterDimension) else None
+    ins = cloud.ins
+    for rows in _slices(len(cloud)):
+        xyz = checked_points(cloud.xyz(rows))
+        heights = None
+        if isinstance(water, WaterDimension):
+            heights = cloud.dimension(water.name)[rows]
         sources = ins["PointSourceId"][rows] if "PointSourceId" in ins else None
-        has_colours = all(name in ins for name in ("Red", "Green", "Blue"))
-        colours = (
-            tuple(ins[name][rows] for name in ("Red", "Green", "Blue")) if has_colours else None
-        )
-        yield rows, Points(xyz, heights, flags.classes[rows], sources, colours)
+        rgb = tuple(ins[name][rows] for name in COLOURS if name in ins)
+        colours = rgb if len(rgb) == len(COLOURS) else None
+        yield rows, Points(xyz, heights, cloud.flags.classes[rows], sources, colours)
 
 
-def _view(ins: Dimensions, metadata: dict[str, Any] | None, flags: Flags) -> CloudView:
+def _view(cloud: PdalCloud) -> CloudView:
     """Return the cloud as a water surface needs it."""
     from pcfix.flow.surfaces import CloudView, Seen, corners
 
-    def chunks() -> Iterator[Seen]:
-        colours = ("Red", "Green", "Blue")
-        for rows in _slices(len(ins["X"])):
-            xyz = np.column_stack([ins[axis][rows] for axis in "XYZ"])
-            rgb = None
-            if all(name in ins for name in colours):
-                rgb = np.column_stack([ins[name][rows] for name in colours])
-            returns = ins["NumberOfReturns"][rows] if "NumberOfReturns" in ins else None
-            yield Seen(xyz, rgb, flags.classes[rows], returns)
+    ins = cloud.ins
 
-    return CloudView(NAME, crs_of(metadata), *corners(ins["X"], ins["Y"]), len(ins["X"]), chunks)
+    def chunks() -> Iterator[Seen]:
+        for rows in _slices(len(cloud)):
+            has_colours = all(name in ins for name in COLOURS)
+            rgb = np.column_stack([ins[name][rows] for name in COLOURS]) if has_colours else None
+            returns = ins["NumberOfReturns"][rows] if "NumberOfReturns" in ins else None
+            yield Seen(cloud.xyz(rows), rgb, cloud.flags.classes[rows], returns)
+
+    return CloudView(NAME, cloud.crs, *corners(ins["X"], ins["Y"]), len(cloud), chunks)
 
 
 def _repair_process(error: BaseException) -> None:
-    """Make up for what PDAL's plugin does to a Python process when a stage fails.
+    """Undo what PDAL's plugin does to a Python process when a stage fails.
 
-    It drops one reference too many to the exception's class, which in the end frees the class;
-    and it leaves stdout redirected, which it only undoes after a pipeline that succeeds.
+    It releases one reference too many to the exception's class, which in the end frees the class;
+    and it leaves stdout redirected until a pipeline succeeds.
     """
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(type(error)))
     pdal = sys.modules.get("pdal")

@@ -1,14 +1,14 @@
-"""What a camera file and a water surface are, and whether they fit a cloud."""
+"""Inspect a camera file or a water surface, alone and against a cloud."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pcfix.adjust.diagnosis import Diagnosis
 from pcfix.adjust.evidence import Evidence
 from pcfix.errors import InputError, SettingError, shown_once
 from pcfix.flow.diagnosis import (
@@ -44,32 +44,23 @@ from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
 
 MOST_SENSORS = 8
-"""Lines on lenses; more are put together by sensor and frame, or by what kind they are."""
+"""Lines on lenses; if there are more, they are grouped by sensor and frame, or by kind."""
 SAMPLE_POINTS, WATER_SAMPLE_POINTS = 50_000, 200_000
-"""Points of the cloud that are looked for in the frames, and below the water; evenly spread."""
+"""Points of the cloud that are tested in the frames, and below the water; evenly spread."""
 
 
 def check_cameras(
     path: File, options: CamerasCheckOptions | None = None, **keywords: Any
 ) -> CamerasReport:
-    """Read cameras and say what they are, and whether they fit a cloud; ``pcfix cameras``.
+    """Inspect a camera file: contents, fit to a cloud, absorbed refraction; ``pcfix cameras``.
 
     Parameters
     ----------
     path : path
         See `pcfix.read_cameras`.
     options : CamerasCheckOptions, optional
-        Or its attributes as keywords. With a cloud and water it is also said whether the poses
-        have absorbed the refraction, see `pcfix.adjust.diagnosis`.
-
-    Returns
-    -------
-    CamerasReport
-
-    Raises
-    ------
-    PcfixError
-        If a file cannot be read, or the two CRS cannot be reconciled.
+        Or its attributes as keywords. With a cloud and water it is tested whether the poses have
+        absorbed refraction, see `pcfix.adjust.diagnosis`.
     """
     given = taken(CamerasCheckOptions, options, keywords, "check_cameras")
     cloud, plot = given.cloud, given.plot
@@ -79,23 +70,29 @@ def check_cameras(
         known = [file for file in files if file is not None]
         check_output(plot, overwrite=given.overwrite, inputs=known)
     if cloud is None or given.water is None:
-        _refuse_surveys(given)
+        for name in ("gcps", "lens", "reference"):
+            if getattr(given, name) is not None:
+                sentence = f"{name} needs cloud and water, to test for absorbed refraction."
+                raise SettingError("option.needs", sentence, options=[name, "cloud", "water"])
     water = 0.0 if given.water is None else given.water
     inputs = replace(replace(given, water=water).part(Inputs), cameras=path)
     read = shown_once(inputs.read, lambda cameras: cameras.notes)
     view = None if cloud is None else view_of(check_input(cloud))
     surface = None if given.water is None else inputs.surface(view).surface
-    xyz, heights = np.zeros((0, 3)), None
+    xyz, heights, problem = np.zeros((0, 3)), None, ""
     if view is not None:
         xyz, heights = _sample(view, SAMPLE_POINTS, surface)
-        cameras, problem = inputs.block(view.crs, read)[0], ""
+        cameras = inputs.block(view.crs, read)[0]
     else:
-        cameras, problem = _without_cloud(inputs, read)
+        try:
+            cameras = inputs.block(None, read)[0]
+        except InputError as error:
+            cameras, problem = read, str(error)
     if given.gnss is not None:
         cameras = read_gnss(given.gnss, cameras)
     diagnosis, remedy = None, ("", "")
     if view is not None and surface is not None:
-        diagnosis = _diagnosis(given, inputs, cameras, view, surface)
+        diagnosis = diagnose(_evidence(given, inputs, cameras, view, surface))
         surveys = {name: getattr(given, name) for name in ("gnss", "gcps", "lens", "index")}
         remedy = adjust_words(inputs, view.name, has_datum=has_datum(cameras, str(path)), **surveys)
     level = None
@@ -103,24 +100,32 @@ def check_cameras(
         at = cameras.centres if heights is None else xyz
         known_m = surface_above(surface, at, heights).height_m
         level = float(np.nanmean(known_m)) if np.isfinite(known_m).any() else None
-    above = None
+    above = range_m = tilt_deg = None
     if level is not None and not problem:  # geocentric cameras have no heights
         above = cameras.centres[:, 2] - level
+        range_m = float(above.min()), float(above.mean()), float(above.max())
+    if cameras.rotations is not None and not problem:
+        tilt = np.degrees(np.arccos(np.clip(-cameras.rotations[:, 2, 2], -1.0, 1.0)))
+        tilt_deg = float(np.median(tilt)), float(tilt.max())
     gnss, fit = _gnss(cameras, str(path)), None
     if view is not None:
         flight = Flight(path, level, every=view.points / max(len(xyz), 1))
         fit = _fit(cameras, view, xyz, quick_ties(inputs, view.crs), flight)
-        if inputs.cameras_crs is not None and gnss is not None and not fit.verdict:
-            fit = replace(fit, verdict=_height_doubt(gnss))
+        up = None if gnss is None or inputs.cameras_crs is None else gnss.mean_m[2]
+        if up is not None and abs(up) >= UNDULATION_M[0] and not fit.verdict:
+            verdict = (
+                f"With --cameras-crs the cameras are {abs(up):.1f} m"
+                f" {'above' if up > 0.0 else 'below'} their GNSS heights. One of them is likely"
+                " above the ellipsoid and the other above the geoid; check the vertical CRS."
+            )
+            fit = replace(fit, verdict=verdict)
     report = CamerasReport(
         path=str(path),
         cameras=cameras,
         crs_read=read.crs,
         sensors=_sensors(cameras, above),
-        height_above_water_m=None
-        if above is None
-        else (float(above.min()), float(above.mean()), float(above.max())),
-        tilt_deg=None if problem else _tilt_deg(cameras),
+        height_above_water_m=range_m,
+        tilt_deg=tilt_deg,
         gnss=gnss,
         fit=fit,
         sample_xyz=xyz,
@@ -138,7 +143,7 @@ def check_cameras(
 def check_water(
     spec: Any, options: WaterCheckOptions | None = None, **keywords: Any
 ) -> WaterReport:
-    """Read, fit or find a water surface, and say what it is; ``pcfix water``.
+    """Read, fit or find a water surface, and describe it; ``pcfix water``.
 
     Parameters
     ----------
@@ -146,11 +151,6 @@ def check_water(
         See `pcfix.flow.surfaces.find_surface`.
     options : WaterCheckOptions, optional
         Or its attributes as keywords.
-
-    Raises
-    ------
-    PcfixError
-        With one sentence on what to mend.
     """
     given = taken(WaterCheckOptions, options, keywords, "check_water")
     cloud, plot = given.cloud, given.plot
@@ -161,15 +161,13 @@ def check_water(
     check_shoreline(given.shoreline, overwrite=given.overwrite, inputs=inputs)
     view = None if cloud is None else view_of(check_input(cloud))
     found = shown_once(lambda: find_surface(spec, given, view), lambda found: found.notes)
-    sample, below, unknown = np.zeros((0, 3)), None, None
+    sample, below, unknown, shoreline = np.zeros((0, 3)), None, None, None
     if view is not None:
         sample, _ = _sample(view, WATER_SAMPLE_POINTS)
         if not isinstance(found.surface, WaterDimension):
             height = surface_above(found.surface, sample, None).height_m
             unknown = float(np.mean(~np.isfinite(height)))
             below = float(np.mean(sample[:, 2] < height))
-    name = None if view is None else view.name
-    shoreline = None
     if view is not None and given.shoreline is not None:
         points = NearWater()
         for one in file_points(Path(view.name), found.surface):
@@ -178,6 +176,7 @@ def check_water(
         shoreline = write_shoreline(
             given.shoreline, points, found.sigma_level_m, view.crs, overwrite=given.overwrite
         )
+    name = None if view is None else view.name
     report = WaterReport(str(spec), found, name, below, unknown, sample, shoreline)
     if plot is not None:
         write_bytes(plot, png_of(water_figure(report)), overwrite=given.overwrite)
@@ -185,53 +184,32 @@ def check_water(
     return report
 
 
-def _refuse_surveys(given: CamerasCheckOptions) -> None:
-    """Refuse surveys without the cloud and the water that they are about."""
-    for name in ("gcps", "lens", "reference"):
-        value = getattr(given, name)
-        if value is not None:
-            raise SettingError(
-                f"{name} {value}: tells whether the poses have absorbed the refraction; give"
-                " cloud and water too."
-            )
-
-
-def _diagnosis(
+def _evidence(
     given: CamerasCheckOptions,
     inputs: Inputs,
     cameras: Cameras,
     view: CloudView,
     surface: WaterSurface,
-) -> Diagnosis:
-    """Look for all signs that the poses have absorbed the refraction."""
+) -> Evidence:
+    """Collect all evidence on whether the poses have absorbed refraction."""
     path, lens, gcps = str(inputs.cameras), given.lens, given.gcps
     reference = None if given.reference is None else read_reference(given.reference)
     if reference is not None:
         crs = None if isinstance(view.crs, str) else view.crs
         check_same_crs(view.name, crs, reference.name, reference.crs)
-    return diagnose(
-        Evidence(
-            cameras, path, surface, index_of(given.index, given.index_formula)[0],
-            view=view, reference=reference,
-            control=None if gcps is None else read_ground_control(gcps, cameras).surveyed,
-            calibrated=given_focal_lengths(path) if lens is None else focal_length_of(lens),
-            ties=ties_of(inputs, view.crs),
-        )
+    return Evidence(
+        cameras, path, surface, index_of(given.index, given.index_formula)[0],
+        view=view, reference=reference,
+        control=None if gcps is None else read_ground_control(gcps, cameras).surveyed,
+        calibrated=given_focal_lengths(path) if lens is None else focal_length_of(lens),
+        ties=ties_of(inputs, view.crs),
     )  # fmt: skip
-
-
-def _without_cloud(inputs: Inputs, read: Cameras) -> tuple[Cameras, str]:
-    """Return the cameras where their software delivers clouds, or as read and why not there."""
-    try:
-        return inputs.block(None, read)[0], ""
-    except InputError as error:
-        return read, str(error)
 
 
 def _sample(
     view: CloudView, most: int, water: WaterSurface | None = None
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Return points evenly spread over the file, and their water heights where there are any."""
+    """Return points evenly spread over the file, and their water heights if it has any."""
     every = max(1, view.points // most)
     parts, heights = [], []
     for xyz, height, *_ in file_points(Path(view.name), water):
@@ -242,31 +220,25 @@ def _sample(
 
 
 def _sensors(cameras: Cameras, above_m: FloatArray | None) -> tuple[Sensor, ...]:
-    """Return the lenses of a block: each by itself, or those of one kind together if many."""
+    """Return the lenses of a block: each separately, or grouped by frame or kind if many."""
     lenses = cameras.lenses
     if lenses is None:
         return ()
-    groups: dict[tuple[Any, ...], list[int]] = {}
-    for key in (_itself, _frame_of, _kind_of):
+    keys: list[Callable[[Lens], Any]] = [
+        lambda lens: lens,
+        lambda lens: (lens.sensor, lens.width, lens.height, lens.unit, lens.projection),
+        lambda lens: (lens.unit, lens.projection, _is_distorted(lens)),
+    ]
+    groups: dict[Any, list[int]] = {}
+    for key in keys:
         groups = {}
         for row, lens in enumerate(lenses):
             groups.setdefault(key(lens), []).append(row)
-        if len(groups) <= MOST_SENSORS and (key is not _itself or len(groups) <= len(lenses) // 2):
+        # separately only if most lenses have several images
+        if len(groups) <= MOST_SENSORS and (key is not keys[0] or len(groups) <= len(lenses) // 2):
             break
     calibrated = any(_is_distorted(lens) for lens in lenses)
     return tuple(_sensor(lenses, rows, above_m, calibrated) for rows in groups.values())
-
-
-def _itself(lens: Lens) -> tuple[Any, ...]:
-    return (lens,)
-
-
-def _frame_of(lens: Lens) -> tuple[Any, ...]:
-    return lens.sensor, lens.width, lens.height, lens.unit, lens.projection
-
-
-def _kind_of(lens: Lens) -> tuple[Any, ...]:
-    return lens.unit, lens.projection, _is_distorted(lens)
 
 
 def _is_distorted(lens: Lens) -> bool:
@@ -310,13 +282,6 @@ def _folded(lens: Lens) -> float:
     return float(np.mean(np.isnan(unproject(lens, places.reshape(-1, 2))).any(axis=1)))
 
 
-def _tilt_deg(cameras: Cameras) -> tuple[float, float] | None:
-    if cameras.rotations is None:
-        return None
-    tilt = np.degrees(np.arccos(np.clip(-cameras.rotations[:, 2, 2], -1.0, 1.0)))
-    return float(np.median(tilt)), float(tilt.max())
-
-
 def _gnss(cameras: Cameras, name: str) -> GnssResiduals | None:
     if cameras.gnss is None:
         return None
@@ -327,53 +292,35 @@ def _gnss(cameras: Cameras, name: str) -> GnssResiduals | None:
     enu = found.enu_m[rows]
     length = np.sqrt(np.nansum(enu * enu, axis=1))
     worst = int(np.argmax(length))
-
-    def plain(values: FloatArray) -> tuple[float | None, ...]:
-        return tuple(float(v) if np.isfinite(v) else None for v in values)
-
-    return GnssResiduals(
-        len(rows), plain(enu.mean(axis=0)), plain(enu.std(axis=0)), float(length[worst]),
-        cameras.labels[rows[worst]], found.reason,
-    )  # fmt: skip
-
-
-def _height_doubt(gnss: GnssResiduals) -> str:
-    """Return a sentence where --cameras-crs gave cameras other heights than their GNSS has."""
-    up = gnss.mean_m[2]
-    if up is None or abs(up) < UNDULATION_M[0]:
-        return ""
-    return (
-        f"With --cameras-crs the cameras are {abs(up):.1f} m {'above' if up > 0.0 else 'below'} the"
-        " heights that their GNSS states: heights of one are likely above the ellipsoid and of the"
-        " other above the geoid; see the vertical CRS of both."
+    mean, sd = (
+        tuple(float(one) if np.isfinite(one) else None for one in values)
+        for values in (enu.mean(axis=0), enu.std(axis=0))
     )
+    image = cameras.labels[rows[worst]]
+    return GnssResiduals(len(rows), mean, sd, float(length[worst]), image, found.reason)
 
 
 def _fit(
     cameras: Cameras, view: CloudView, xyz: FloatArray, ties: TiePoints | None, flight: Flight
 ) -> Fit:
-    seen = cameras_in_sight(xyz, cameras)
-    shares = {str(k): float(np.mean(seen == k)) for k in (0, 1, 2)}
-    shares["3 or more"] = float(np.mean(seen >= 3))
-    low, high = xyz.min(axis=0), xyz.max(axis=0)
-    block_low, block_high = cameras.centres.min(axis=0), cameras.centres.max(axis=0)
-    apart = np.maximum(np.maximum(low - block_high, block_low - high), 0.0)[:2]
-    below = _below_ground(cameras.centres, xyz)
-    verdict = likely_mistake(cameras.centres, low, high, view.crs) or ""
-    if not verdict and below:
-        verdict = (
-            f"{below} of {len(cameras)} cameras stand below the ground: heights of cameras and"
-            " cloud have different datums, or the axes are swapped."
-        )
-    found = plausible(cameras, xyz, ties, flight=flight)
-    verdict = verdict or " ".join(found.doubts)
-    return Fit(view.name, len(xyz), shares, float(np.hypot(*apart)), below, verdict, str(found))
-
-
-def _below_ground(centres: FloatArray, xyz: FloatArray) -> int:
-    """Count cameras that are lower than the nearest point of the cloud in plan."""
+    """Test cameras against a sample of the cloud."""
     from scipy.spatial import cKDTree
 
+    visible = cameras_in_sight(xyz, cameras)
+    shares = {str(k): float(np.mean(visible == k)) for k in (0, 1, 2)}
+    shares["3 or more"] = float(np.mean(visible >= 3))
+    low, high, centres = xyz.min(axis=0), xyz.max(axis=0), cameras.centres
+    apart = np.maximum(np.maximum(low - centres.max(axis=0), centres.min(axis=0) - high), 0.0)[:2]
+    # cameras lower than the nearest point of the cloud in plan
     reach = float(np.hypot(*np.ptp(xyz[:, :2], axis=0))) * 0.1 + 1.0
-    distance, row = cKDTree(xyz[:, :2]).query(centres[:, :2])
-    return int(np.count_nonzero((distance < reach) & (centres[:, 2] <= xyz[row, 2])))
+    distance, row = (np.asarray(one) for one in cKDTree(xyz[:, :2]).query(centres[:, :2]))
+    below = int(np.count_nonzero((distance < reach) & (centres[:, 2] <= xyz[row, 2])))
+    verdict = likely_mistake(centres, low, high, view.crs) or ""
+    if not verdict and below:
+        verdict = (
+            f"{below} of {len(cameras)} cameras are below the ground. Check the vertical datum and"
+            " the order of the axes."
+        )
+    found = plausible(cameras, xyz, ties, flight=flight)
+    verdict = verdict or " ".join(map(str, found.doubts))
+    return Fit(view.name, len(xyz), shares, float(np.hypot(*apart)), below, verdict, str(found))

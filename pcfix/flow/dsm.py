@@ -113,8 +113,6 @@ def grid_dsm(
     style = task.target.with_suffix(".qml")
     if given.style:
         check_output(style, overwrite=given.overwrite, inputs=inputs_of(cloud))
-    if given.cog:
-        rasters.check_cog()
     rules = given.part(DsmRules)
     if given.resolution is None:
         spacing_m = point_spacing_m(cloud, rules)

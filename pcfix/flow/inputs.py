@@ -1,8 +1,9 @@
-"""What a correction is made with: from the words of its user to cameras, views and water."""
+"""Read the inputs of a correction: cameras, view list, water, tide and mask."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -28,72 +29,69 @@ if TYPE_CHECKING:
 
 
 TIMED = (".json", ".geojson")
-"""Camera files that may say when each image was taken."""
+"""Camera files that may hold the time of each image."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs(InputOptions):
-    """Cameras, view lists and water as the user names them, and how they are read.
+    """Cameras, view list and water as the user gives them.
 
     `cameras` and `adjusted_from` may be `pcfix.Cameras`, then in the cloud's CRS; `water` may be a
-    `pcfix.WaterSurface`, `port` a `Port`. With `adjusted_from`, views, offset and CRS are told
-    apart by `pcfix.flow.old_cameras`.
+    `pcfix.WaterSurface`, `port` a `Port`. `pcfix.flow.old_cameras` decides whether views, offset
+    and CRS belong to `cameras` or `adjusted_from`.
     """
 
     water_mask: File | None = None
 
     def check(self) -> None:
-        """Check that the light bends somewhere, and at one place only."""
+        """Check that there is either a water surface or a housing port."""
         super().check()
         if self.water is None and self.port is None:
             raise SettingError(
-                "water is missing: give the water surface, or the port of a cloud that was taken"
-                " under water."
+                "water.missing",
+                "water is missing: give the water surface, or the port of an underwater camera.",
             )
         if self.water is not None and self.port is not None:
             raise SettingError(
-                "water and port exclude each other: a camera in a housing sees no water surface;"
-                " leave out the water for a cloud that was taken under water, else the port."
+                "option.conflict",
+                "water and port exclude each other: give the port for images taken under water,"
+                " the water for images taken through it.",
+                options=["water", "port"],
             )
         if isinstance(self.port, str):
             object.__setattr__(self, "port", port_of(self.port))
 
     def paths(self) -> list[File]:
-        """Return what may be files, which no output may replace."""
+        """Return the options that may be files, which no output may replace."""
         return paths_in(self)
 
     def surface(self, view: CloudView | None = None) -> FoundSurface:
         """Return the water surface over a cloud; see `pcfix.flow.surfaces.find_surface`."""
         if self.water is None:
-            raise SettingError("there is no water surface before a port.")
+            raise SettingError("water.missing", "there is no water surface in front of a port.")
         return find_surface(self.water, self, view)
 
     def level_offset_m(self, cameras: Cameras) -> FloatArray | None:
-        """Return how much higher the water stood at each image, shape (k,), where it moved.
-
-        Raises
-        ------
-        PcfixError
-            If the tide or the times cannot be read, or do not cover the images.
-        """
+        """Return how much higher than on average the water stood at each image, shape (k,)."""
         if self.tide is None:
             if self.image_times is not None:
-                raise SettingError("image-times is of no use without tide; give both, or neither.")
+                sentence = "image-times needs tide: give both, or neither."
+                raise SettingError("option.needs", sentence, options=["image_times", "tide"])
             return None
         from pcfix.io.tides import level_offsets, read_image_times, read_tide
 
         own = self.cameras if self.adjusted_from is None else self.adjusted_from
         given = own if self.image_times is None else self.image_times
         if isinstance(given, Cameras):
-            raise SettingError("a tide needs image-times: when each image was taken.")
+            sentence = "tide needs image-times, the time of each image."
+            raise SettingError("option.needs", sentence, options=["tide", "image_times"])
         times = read_image_times(given, cameras.labels)
         offset, notes = level_offsets(read_tide(self.tide), times, cameras.labels)
-        for note in notes:
-            warnings.warn(note, PcfixWarning, stacklevel=2)
+        _warn(notes)
         return offset
 
     def dates(self, cameras: Cameras) -> str:
-        """Return the first and last day of the images; empty where it is not known."""
+        """Return the first and last day of the images; empty if unknown."""
         from pcfix.io.tides import read_image_times
 
         given = self.image_times or self.adjusted_from or self.cameras
@@ -101,7 +99,7 @@ class Inputs(InputOptions):
             return ""
         try:
             days = read_image_times(given, cameras.labels).time_s.astype("datetime64[s]")
-        except PcfixError:  # the correction is done without them
+        except PcfixError:  # only the report shows them
             return ""
         first, last = (str(day.astype("datetime64[D]")) for day in (days.min(), days.max()))
         return first if first == last else f"{first} to {last}"
@@ -115,56 +113,42 @@ class Inputs(InputOptions):
     def block(
         self, cloud_crs: str | CRS | None, read: Cameras | None = None
     ) -> tuple[Cameras, ViewList | None]:
-        """Return the cameras in the cloud's CRS, and the view list where one was named.
+        """Return the cameras in the cloud's CRS, and the view list if one is given.
 
-        Parameters
-        ----------
-        cloud_crs : str, CRS or None
-        read : Cameras, optional
-            What `read` gave, where that was called before.
-
-        Raises
-        ------
-        PcfixError
-            If a file cannot be read or does not fit, or the CRS cannot be reconciled.
+        `read` are the cameras in the frame of their file, if they were read before.
         """
         from pcfix.io.views import read_views, track_views
 
         if isinstance(self.cameras, Cameras):
-            if self.views is None:
-                return self.cameras, None
-            return self.cameras, self._of_kind(read_views(self.views, self.cameras))
-        read = self.read() if read is None else read
-        way = self._georeferenced(read, cloud_crs)
-        cameras = way.cameras(read)
-        for note in way.notes:
-            warnings.warn(note, PcfixWarning, stacklevel=2)
+            cameras, to_cloud = self.cameras, None
+        else:
+            read = self.read() if read is None else read
+            way = self._georeferenced(read, cloud_crs)
+            cameras, to_cloud = way.cameras(read), way.points
+            _warn(way.notes)
         if self.views is None:
             return cameras, None
-        if Path(self.views) == Path(self.cameras):
-            ties = read_tie_points(self.cameras, read)
-            tracks = track_views(Path(self.views), ties, cameras, to_cloud=way.points)
-            return cameras, self._of_kind(tracks)
-        return cameras, self._of_kind(read_views(self.views, cameras, to_cloud=way.points))
+        if read is not None and Path(self.views) == Path(str(self.cameras)):
+            ties = read_tie_points(self.views, read)
+            views = track_views(Path(self.views), ties, cameras, to_cloud=to_cloud)
+        else:
+            views = read_views(self.views, cameras, to_cloud=to_cloud)
+        if self.views_are == "auto":
+            return cameras, views
+        kind: ViewKind = "pair-images" if self.views_are == "pairs" else self.views_are
+        return cameras, replace(views, kind=kind)
 
     def _georeferenced(self, read: Cameras, cloud_crs: str | CRS | None) -> Georeference:
-        """Return the way from the frame of the camera file to the cloud's CRS."""
+        """Return the transformation from the frame of the camera file to the cloud's CRS."""
         return georeference(
             read, cloud_crs, cameras_crs=self.cameras_crs, offset_m=self.cameras_offset,
             name=str(self.cameras),
         )  # fmt: skip
 
-    def _of_kind(self, views: ViewList) -> ViewList:
-        """Return a view list as what the user says that it is."""
-        kind: ViewKind = views.kind
-        if self.views_are != "auto":
-            kind = "pair-images" if self.views_are == "pairs" else self.views_are
-        return replace(views, kind=kind)
-
     def tie_points(self, cloud_crs: str | CRS | None, *, placed: bool = True) -> TiePoints | None:
-        """Return the tie points of the camera file in the cloud's CRS, where it has any.
+        """Return the tie points of the camera file in the cloud's CRS, if it has any.
 
-        Some formats have their image places only; with `placed` these count as none.
+        Some formats have image coordinates only; with `placed` these count as none.
         """
         if isinstance(self.cameras, Cameras):
             return None
@@ -174,7 +158,8 @@ class Inputs(InputOptions):
         except NoTiePointsError:
             return None
         except InputError as error:
-            warnings.warn(f"{error} Its tie points are left out.", PcfixWarning, stacklevel=2)
+            sentence = f"{error} Its tie points are ignored."
+            warnings.warn(PcfixWarning("cameras.tie_points", sentence), stacklevel=2)
             return None
         known = np.isfinite(ties.xyz).all(axis=1)
         if placed and not known.any():
@@ -188,38 +173,31 @@ class Inputs(InputOptions):
 def mask_of(
     path: File | None, cloud_crs: str | CRS | None, low: FloatArray, high: FloatArray
 ) -> WaterMask | None:
-    """Return the mask in the cloud's CRS, where a file was named, and warn of what was done to it.
+    """Read the mask in the cloud's CRS, if a file is given.
 
-    Parameters
-    ----------
-    path : path or None
-        See `pcfix.io.vectors.read_water_polygons`.
-    cloud_crs : str, CRS or None
-    low, high : array, shape (2,)
-        South-west and north-east corner of the cloud, metres.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, holds no polygon, or cannot be brought to the cloud's CRS.
+    `low` and `high`, shape (2,), are the south-west and north-east corner of the cloud, metres.
     """
     if path is None:
         return None
     from pcfix.io.vectors import read_water_polygons
 
     polygons = read_water_polygons(path, cloud_crs)
-    for note in polygons.notes:
-        warnings.warn(note, PcfixWarning, stacklevel=2)
-    return WaterMask(polygons.area, polygons.name, low, high, polygons.notes)
+    _warn(polygons.notes)
+    return WaterMask(polygons.area, polygons.name, low, high, tuple(map(str, polygons.notes)))
+
+
+def _warn(notes: Iterable[str | PcfixWarning]) -> None:
+    for note in notes:
+        warnings.warn(note, PcfixWarning, stacklevel=3)
 
 
 NO_FILES = ("port", "water_model", "water_crs", "views_are", "angles", "cameras_crs")
 
 
 def paths_in(options: Any, but: tuple[str, ...] = ()) -> list[File]:
-    """Return what among the options of a command, `but` some, may be files that it reads.
+    """Return the options of a command, except `but`, that may be files that it reads.
 
-    A vector file may be named with a layer, which is left out.
+    The layer of a vector file is removed.
     """
     names = [one.name for one in options_of(InputOptions)] + ["water_mask", "water_per_image"]
     given = [getattr(options, name, None) for name in names if name not in (*NO_FILES, *but)]

@@ -162,7 +162,7 @@ class Job(Sums):
             views=None if report is None else report.as_dict(),
             warnings=[
                 *self.cameras.notes,
-                *([] if report is None else report.warnings()),
+                *([] if report is None else map(str, report.warnings())),
                 *self.labelling.notes,
                 *self.medium.notes(tally),
             ],

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.altitudes import read_altitudes
 from pcfix.io.cameras.georeference import adjusted_minus_gnss
 from pcfix.model import Cameras
@@ -19,10 +19,10 @@ TAKE_OFF_M, MOST_SHARE = (-15.0, 25.0), 0.1
 
 
 class Result(NamedTuple):
-    """Of one test; each in words, or nothing."""
+    """The result of one test: what fits, what does not, or what could not be tested."""
 
     fit: str = ""
-    doubt: str = ""
+    doubt: PcfixWarning | None = None
     unchecked: str = ""
 
 
@@ -40,11 +40,11 @@ def positions(cameras: Cameras, name: str) -> Result:
     middle = float(np.median(apart))
     if middle <= MOST_APART_M:
         return Result(f"positions {middle:.1f} m in plan from their GNSS")
-    return Result(
-        doubt=f"The cameras stand {middle:.4g} m in plan from the positions that their GNSS"
-        f" recorded (median of {len(apart)}): they are shifted, of another place, or in another"
-        " coordinate system; check their CRS and offset."
+    sentence = (
+        f"The cameras are {middle:.4g} m in plan from their GNSS positions (median of"
+        f" {len(apart)}). Check their CRS and offset."
     )
+    return Result(doubt=PcfixWarning("cameras.gnss", sentence, off_m=middle))
 
 
 def flying_heights(cameras: Cameras, file: File, water_m: float | None) -> Result:
@@ -60,8 +60,10 @@ def flying_heights(cameras: Cameras, file: File, water_m: float | None) -> Resul
     where = f"{abs(off):.0f} m {'above' if off > 0.0 else 'below'} the water"
     if low - least <= off <= high + least:
         return Result(f"heights as recorded in flight, from a take-off {where}")
-    return Result(
-        doubt=f"The cameras stand {above:.0f} m above the water, and {flown:.0f} m above their"
-        f" take-off by their own record (median of {len(rows)}), which would be {where}: unless it"
-        " was, check the heights of cameras and water, their vertical datum and their unit."
+    sentence = (
+        f"The cameras are {above:.0f} m above the water, and recorded {flown:.0f} m above their"
+        f" take-off (median of {len(rows)}), which would be {where}. Unless it was, check the"
+        " vertical datum and the unit of cameras and water."
     )
+    values = {"above_water_m": above, "above_take_off_m": flown}
+    return Result(doubt=PcfixWarning("cameras.flying_height", sentence, **values))

@@ -333,7 +333,7 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
     from pcfix.water.river import fit_river
 
     shore = read_shoreline(path, None if view is None else view.crs, crs=options.water_crs)
-    xyz, notes = shore.xyz, list(shore.notes)
+    xyz, notes = shore.xyz, list[Any](shore.notes)
     if np.isnan(xyz[:, 2]).any():
         xyz = _with_heights(xyz, shore.name, view, notes)
     found: WaterFit | RiverFit
@@ -350,11 +350,11 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
             f"{shore.name}: {len(xyz):,} points along lines that were drawn count as"
             f" {shore.counts.sum():.0f} independent ones."
         )
-    return FoundSurface(found.surface, found, xyz, (*notes, *found.notes))
+    return FoundSurface(found.surface, found, xyz, (*map(str, notes), *found.notes))
 
 
 def _with_heights(
-    xyz: FloatArray, name: str, view: CloudView | None, notes: list[str]
+    xyz: FloatArray, name: str, view: CloudView | None, notes: list[Any]
 ) -> FloatArray:
     """Give the points without a height that of the cloud about them."""
     from pcfix.io.vectors import SHORE_RADIUS_M

@@ -325,7 +325,14 @@ class ThroughWater(Sums):
         bent = self._poses.warning if self._poses else ""
         said = [one for one in (bent, self._no_poses) if one]
         doubts, own = self._plausible.doubts, self._own_notes
-        return [*doubts, *self._told(), *self.found.notes, *own, *self._meeting.notes, *said]
+        return [
+            *map(str, doubts),
+            *self._told(),
+            *self.found.notes,
+            *own,
+            *self._meeting.notes,
+            *said,
+        ]
 
     def figures(self, tally: Tally) -> dict[str, Any]:
         """Return what the summary says of depths and water."""

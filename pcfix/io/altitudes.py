@@ -1,7 +1,7 @@
-"""How high drones flew above their take-off place, by what they wrote into their photographs.
+"""Read how high drones flew above their take-off place, as they recorded it in their images.
 
-DJI's XMP has ``drone-dji:RelativeAltitude`` (metres, by the barometer); Metashape keeps it in its
-projects, as the property ``DJI/RelativeAltitude`` of each photograph.
+DJI's XMP has ``drone-dji:RelativeAltitude`` (metres, by the barometer); Metashape stores it in its
+projects, as the property ``DJI/RelativeAltitude`` of each image.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from contextlib import suppress
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,7 @@ from pcfix.options.declare import File
 
 IMAGES = (".jpg", ".jpeg", ".dng", ".tif", ".tiff")
 FOLDERS = ("", "images")
-"""Where photographs lie, from the folder of the camera file on."""
+"""Where images lie, relative to the folder of the camera file."""
 MOST_IMAGES, HEAD_BYTES = 30, 2**17
 _ABOVE = re.compile(rb"RelativeAltitude(?:=[\"']|>)\s*([+-]?\d+(?:\.\d*)?)")
 
@@ -30,22 +29,21 @@ _ABOVE = re.compile(rb"RelativeAltitude(?:=[\"']|>)\s*([+-]?\d+(?:\.\d*)?)")
 def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
     """Return how high each image was taken above the take-off place, shape (k,), metres.
 
-    NaN where nothing tells. Of photographs beside the camera file `MOST_IMAGES` are looked at.
+    NaN where it is not recorded. At most `MOST_IMAGES` images near the camera file are read.
     """
-    with suppress(OSError, InputError):  # a look in passing
+    altitudes = np.full(len(labels), np.nan)
+    with suppress(OSError, InputError):  # no correction needs them
         path = Path(cameras)
-        found = _of_project(path) if path.suffix.lower() == ".psx" else _of_photographs(path)
+        found = _of_project(path) if path.suffix.lower() == ".psx" else _of_images(path)
         row = match_labels(list(found), labels, one_to_one=False).row
-        altitudes = np.full(len(labels), np.nan)
         altitudes[row[row >= 0]] = np.array(list(found.values()))[row >= 0]
-        return altitudes
-    return np.full(len(labels), np.nan)
+    return altitudes
 
 
-def _of_photographs(path: Path) -> dict[str, float]:
+def _of_images(path: Path) -> dict[str, float]:
     root, found = path if path.is_dir() else path.parent, {}
-    inside = [sorted(one.iterdir()) for name in FOLDERS if (one := root / name).is_dir()]
-    images = [one for one in chain(*inside) if one.suffix.lower() in IMAGES and one.is_file()]
+    inside = [one for name in FOLDERS for one in sorted(root.joinpath(name).glob("*"))]
+    images = [one for one in inside if one.suffix.lower() in IMAGES and one.is_file()]
     for image in images[:: 1 + len(images) // MOST_IMAGES]:
         with image.open("rb") as stream:
             if above := _ABOVE.search(stream.read(HEAD_BYTES)):

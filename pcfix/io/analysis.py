@@ -1,12 +1,11 @@
-"""Results as xarray, GeoPandas and pandas have them; these are loaded when first asked for."""
+"""Open results as xarray, GeoPandas and pandas objects; these libraries are loaded on first use."""
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pcfix.errors import SettingError
+from pcfix.errors import optional_library
 from pcfix.io.files import check_input
 
 if TYPE_CHECKING:
@@ -18,13 +17,8 @@ if TYPE_CHECKING:
 
 
 def load_for_analysis(name: str) -> Any:
-    """Import a library; where it is not installed, a `SettingError` names the extra."""
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise SettingError(
-            f"This needs {name}, which is not installed; run: pip install 'pcfix[analysis]'."
-        ) from error
+    """Import a library of the extra ``analysis``."""
+    return optional_library(name, "analysis", "This")
 
 
 def open_array(path: Path) -> DataArray:
@@ -35,16 +29,16 @@ def open_array(path: Path) -> DataArray:
 
 
 def frame_of_layer(path: Path, layer: str) -> GeoDataFrame:
-    """Return a layer of a GeoPackage."""
+    """Read a layer of a GeoPackage."""
     return load_for_analysis("geopandas").read_file(check_input(path), layer=layer)
 
 
 def frame_of(layer: Layer, crs: Any) -> GeoDataFrame:
-    """Return a layer that has not been written."""
+    """Return a layer that has not been written yet."""
     frame = load_for_analysis("geopandas").GeoDataFrame
     return frame(layer.values, geometry=list(layer.geometries), crs=crs)
 
 
 def table_of_csv(path: Path) -> DataFrame:
-    """Return a table."""
+    """Read a table."""
     return load_for_analysis("pandas").read_csv(check_input(path))

@@ -1,8 +1,8 @@
-"""Coordinate reference systems: what a text names, its parts, its units, the kind of its heights.
+"""Coordinate reference systems: parse them, and find their parts, units and kind of heights.
 
 Frames that are not maps are here too: axes through the centre of the earth, and axes at a place.
 
-Numbers always stand in the order x (east, longitude), y (north, latitude), z, whatever order of
+Coordinates are always in the order x (east, longitude), y (north, latitude), z, whatever order of
 axes a CRS states.
 """
 
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import bad_file
 from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
@@ -28,10 +28,9 @@ METRES = ("metre", "meter")
 
 
 def parse_crs(given: str | CRS, name: str) -> CRS:
-    """Return the CRS that a text names, as EPSG code, WKT of any flavour, PROJ string or name.
+    """Return the CRS of a text: an EPSG code, WKT of any flavour, PROJ string or name.
 
-    An `InputError` if PROJ does not know it, or it says where nothing lies (a vertical CRS alone);
-    the message has the `name` of the file or option that gave it.
+    `name` is the file or option that gave it, for messages.
     """
     from pyproj import CRS
     from pyproj.exceptions import CRSError
@@ -41,16 +40,18 @@ def parse_crs(given: str | CRS, name: str) -> CRS:
     text = re.sub(r"^(\w+)::", r"\1:", given.strip())
     try:
         crs = CRS.from_user_input(int(text) if text.isdecimal() else text)
-        parts(crs)  # which PROJ writes and reads again, and may not understand
+        parts(crs)  # PROJ writes and reads it again, which may fail
     except (CRSError, ValueError, OverflowError) as error:
-        raise InputError(
-            f"{name}: the CRS '{shortened(text)}' is not one that PROJ knows; give an EPSG code"
-            " (EPSG:25830, or EPSG:25830+5782 with the heights), WKT or a PROJ string."
+        raise bad_file(
+            name,
+            "crs.unknown",
+            f"the CRS '{shortened(text)}' is not one that PROJ knows. Give an EPSG code"
+            " (EPSG:25830, or EPSG:25830+5782 with the heights), WKT or a PROJ string.",
+            value=shortened(text),
         ) from error
     if crs.is_vertical and not crs.is_compound and len(crs.axis_info) == 1:
-        raise InputError(
-            f"{name}: {crs.name} is a vertical CRS; add the horizontal one, as EPSG:25830+5782."
-        )
+        sentence = f"{crs.name} is a vertical CRS. Add the horizontal one, as EPSG:25830+5782."
+        raise bad_file(name, "crs.vertical_only", sentence, crs=crs.name)
     return crs
 
 
@@ -60,7 +61,7 @@ def is_local(crs: CRS) -> bool:
 
 
 def parts(crs: CRS) -> tuple[CRS, CRS | None]:
-    """Return the horizontal CRS, two axes, and the vertical CRS where there is one."""
+    """Return the horizontal CRS, two axes, and the vertical CRS or None."""
     if crs.is_compound:
         plan, vertical = crs.sub_crs_list[:2]
         return plan, (vertical.source_crs or vertical) if vertical.is_bound else vertical
@@ -70,17 +71,14 @@ def parts(crs: CRS) -> tuple[CRS, CRS | None]:
 
 
 def heights_of(crs: CRS) -> Heights:
-    """Return what z means: above the ellipsoid, above a vertical datum, or not stated."""
+    """Return whether z is above the ellipsoid, above a vertical datum, or not stated."""
     if parts(crs)[1] is not None:
         return "gravity"
     return "ellipsoidal" if len(crs.axis_info) == 3 else "unstated"
 
 
 def crs_words(crs: CRS | None) -> tuple[str, str]:
-    """Return the name of a system in plan, with its code, and what heights are above.
-
-    Each is empty where it is not stated.
-    """
+    """Return the horizontal CRS, with its code, and the vertical datum; empty if not stated."""
     if crs is None:
         return "", ""
     plan, vertical = parts(crs)
@@ -92,34 +90,16 @@ def crs_words(crs: CRS | None) -> tuple[str, str]:
 
 
 def is_same(one: CRS, other: CRS) -> bool:
-    """Whether two CRS are one, whatever their order of axes and their shift to WGS 84."""
+    """Whether two CRS are the same, whatever their order of axes and their shift to WGS 84."""
     one, other = unbound(one), unbound(other)
     if one.equals(other, ignore_axis_order=True):
         return True
-    if _differ_in_projection(one, other):  # cheap, where looking for a code may take a second
-        return False
     code = one.to_epsg()
     return code is not None and code == other.to_epsg()
 
 
-def _differ_in_projection(one: CRS, other: CRS) -> bool:
-    """Whether one alone is a map, or both are the same kind of map with other parameters."""
-    if one.is_projected != other.is_projected:
-        return True
-    first, second = one.coordinate_operation, other.coordinate_operation
-    if first is None or second is None or first.method_name != second.method_name:
-        return False
-    here, there = (
-        np.sort([float(p.value) * p.unit_conversion_factor for p in operation.params])
-        if all(isinstance(p.value, float) for p in operation.params)
-        else np.empty(0)
-        for operation in (first, second)
-    )
-    return len(here) == len(there) and not np.allclose(here, there, rtol=1e-9, atol=1e-9)
-
-
 def is_same_vertical_datum(one: CRS, other: CRS) -> bool:
-    """Whether two vertical CRS count from one datum, in whatever unit."""
+    """Whether two vertical CRS have the same datum, in whatever unit."""
     datums = [crs if crs.datum is None else crs.datum for crs in (one, other)]
     names = ["".join(c for c in datum.name.lower() if c.isalnum()) for datum in datums]
     return is_same(one, other) or (names[0] == names[1] and names[0] not in ("", "unknown"))
@@ -137,7 +117,7 @@ def plan_unit(crs: CRS) -> tuple[str, float]:
 
 
 def metres_up(crs: CRS) -> float:
-    """Return how many metres up one unit of z is; heights not stated are in the unit of the plan.
+    """Return how many metres up one unit of z is; unstated heights are in the unit of the plan.
 
     A frame of cameras has one scale, so a projected CRS in feet without a vertical part has its
     heights in feet too. Degrees go with metres.
@@ -152,23 +132,16 @@ def metres_up(crs: CRS) -> float:
 
 
 def check_projected_metres(crs: CRS, name: str) -> None:
-    """Refuse a CRS in which a cloud cannot be computed.
-
-    An `InputError` if it is geographic or geocentric, or in another unit than metres, heights
-    included.
-    """
+    """Refuse a cloud that is not in a projected CRS in metres, heights included."""
     if not crs.is_projected:
         kind = "degrees" if crs.is_geographic else "no map projection"
-        raise InputError(
-            f"{name}: {crs.name} is in {kind}; reproject the cloud to a projected CRS in metres"
-            " (UTM, say) and set that as its CRS."
-        )
+        sentence = f"{crs.name} is in {kind}. Reproject the cloud to metres (such as UTM)."
+        raise bad_file(name, "crs.not_projected", sentence, crs=crs.name)
     units = {axis.unit_name for axis in crs.axis_info}
     if not units.issubset(METRES):
-        raise InputError(
-            f"{name}: {crs.name} is in {' and '.join(sorted(units))}; reproject the cloud to one"
-            " in metres, heights included."
-        )
+        unit = " and ".join(sorted(units))
+        sentence = f"{crs.name} is in {unit}. Reproject the cloud to metres, heights included."
+        raise bad_file(name, "crs.unit", sentence, crs=crs.name, unit=unit)
 
 
 def with_heights(plan: CRS, vertical: CRS) -> CRS:
@@ -182,7 +155,7 @@ def with_heights(plan: CRS, vertical: CRS) -> CRS:
 
 
 def crs_text(crs: CRS) -> str:
-    """Return the shortest text that names a CRS exactly: codes where it has them, else WKT."""
+    """Return the shortest text that names a CRS exactly: its codes, else WKT."""
     whole = _code(crs)
     if whole is not None:
         return ":".join(whole)
@@ -194,13 +167,13 @@ def crs_text(crs: CRS) -> str:
 
 
 def _code(crs: CRS) -> tuple[str, str] | None:
-    """Return authority and code that a CRS has itself; a search for one that fits takes long."""
+    """Return authority and code that a CRS states; a search for one that fits takes long."""
     given = crs.to_json_dict().get("id")
     return None if given is None else (str(given["authority"]), str(given["code"]))
 
 
 def typed(crs: CRS) -> str:
-    """Return what a person types for a CRS: its code, or that of the one that it equals."""
+    """Return the code of a CRS, or that of an equal one, for messages."""
     found = _code(crs) or crs.to_authority(min_confidence=70)
     return ":".join(found) if found else f"'{crs.name}'"
 
@@ -245,26 +218,18 @@ class Topocentric:
 
     @classmethod
     def from_text(cls, text: str, name: str) -> Topocentric:
-        """Read ``ENU:latitude,longitude,height``; the height may be left out and is then 0.
-
-        An `InputError` if these are not two or three numbers, or no place on the earth.
-        """
+        """Read ``ENU:latitude,longitude,height``; without a height it is 0."""
         try:
-            numbers = [float(part) for part in text.partition(":")[2].split(",")]
+            latitude, longitude, *height = map(float, text.partition(":")[2].split(","))
+            numbers = latitude, longitude, *(height or [0.0])
+            if len(numbers) != 3 or not all(map(isfinite, numbers)):
+                raise ValueError
         except ValueError:
-            numbers = []
-        if len(numbers) == 2:
-            numbers.append(0.0)
-        if len(numbers) != 3 or not all(isfinite(number) for number in numbers):
-            raise InputError(
-                f"{name}: '{shortened(text)}' is not ENU:latitude,longitude,height in degrees and"
-                " metres."
-            )
-        if abs(numbers[0]) > 90.0 or abs(numbers[1]) > 360.0:
-            raise InputError(
-                f"{name}: the origin {shortened(text)} is not on the earth; give latitude, then"
-                " longitude, in degrees."
-            )
+            sentence = f"'{shortened(text)}' is not ENU:latitude,longitude,height. Give degrees."
+            raise bad_file(name, "crs.origin", sentence, value=text) from None
+        if abs(latitude) > 90.0 or abs(longitude) > 360.0:
+            sentence = f"the origin {shortened(text)} is not on the earth. Give the latitude first."
+            raise bad_file(name, "crs.origin", sentence, value=text)
         return cls(*numbers)
 
     def to_geocentric(self, enu: FloatArray) -> FloatArray:
@@ -273,11 +238,9 @@ class Topocentric:
 
         to_geocentric = Transformer.from_crs(GEOGRAPHIC_WGS84, GEOCENTRIC_WGS84, always_xy=True)
         place = self.longitude_deg, self.latitude_deg, self.height_m
-        return np.asarray(to_geocentric.transform(*place)) + enu @ self._axes()
-
-    def _axes(self) -> FloatArray:
-        """Return the directions east, north and up, one a row, in geocentric axes."""
-        lon, lat = np.radians([self.longitude_deg, self.latitude_deg])
+        lon, lat = np.radians(place[:2])
+        # east, north and up in geocentric axes, one a row
         up = [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]
         north = [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)]
-        return np.array([[-np.sin(lon), np.cos(lon), 0.0], north, up])
+        axes = np.array([[-np.sin(lon), np.cos(lon), 0.0], north, up])
+        return np.asarray(to_geocentric.transform(*place)) + enu @ axes

@@ -6,6 +6,7 @@ The forms of file are in `control_marks`.
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -203,7 +204,7 @@ def _check_frames(marks: Marks, cameras: Cameras, camera: IntArray) -> None:
 
 def _to_cameras(
     marks: Marks, cameras: Cameras, crs: str | None, rows: IntArray
-) -> tuple[FloatArray, tuple[str, ...]]:
+) -> tuple[FloatArray, tuple[Any, ...]]:
     """Return the points of some rows in the CRS of the cameras."""
     name, source, target = str(marks.path), crs or marks.crs, cameras.crs
     xyz = marks.xyz[rows]

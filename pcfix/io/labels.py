@@ -1,4 +1,4 @@
-"""Which camera a name of an image means."""
+"""Match the names of images with the labels of cameras."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pcfix.model import IntArray
 
 
 class Matched(NamedTuple):
-    """What n names were found to mean."""
+    """The labels of n names."""
 
     row: IntArray  # (n,), of the labels; -1 where there is none or it could be several
     ambiguous: tuple[str, ...]  # names that could be several labels, or share one with another name
@@ -22,9 +22,9 @@ class Matched(NamedTuple):
 def match_labels(
     names: Sequence[str], labels: Sequence[str], *, one_to_one: bool = True
 ) -> Matched:
-    """Find each name among labels: whole, without its folder, without its extension.
+    """Find each name among labels: the whole name, else without its folder or its extension.
 
-    A label is meant by one name at most where the match is `one_to_one`.
+    With `one_to_one` no two names may have the same label.
     """
     row = np.full(len(names), -1, np.int64)
     unclear: set[int] = set()
@@ -41,7 +41,7 @@ def match_labels(
 
 
 def unnamed(names: Iterable[str], labels: Iterable[str]) -> tuple[str, ...]:
-    """Return the names, each once, that none of the labels can mean."""
+    """Return the names, each once, that match none of the labels."""
     stems = {_stem(label) for label in labels}
     return tuple(name for name in dict.fromkeys(names) if _stem(name) not in stems)
 

@@ -1,8 +1,8 @@
-"""The vertices and faces of PLY files, with the lists that other readers refuse.
+"""Read the vertices and faces of PLY files, with lists, which other readers refuse.
 
 The format is Greg Turk's (The PLY Polygon File Format, 1994): a header of lines names elements and
 their properties, ``property TYPE NAME`` or ``property list COUNT_TYPE ITEM_TYPE NAME``; the records
-follow as text or as bytes without padding. A unit, below, is a byte, or a number of a text.
+follow as text or as bytes without padding. Below, a unit is a byte, or a number of a text.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from __future__ import annotations
 import re
 import warnings
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import InputError
+from pcfix.errors import bad_file
 from pcfix.kernels import device, kernel
 from pcfix.model import FloatArray, IntArray
 
@@ -27,6 +27,9 @@ _TYPES = {
 }
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MOST_HEADER_BYTES = 1 << 20
+_KINDS = {"vertex": "vertices", "face": "faces"}
+_ROWS_AT_ONCE = 1_000_000
+"""Of lists that are copied at a time, which bounds the memory."""
 
 
 class Property(NamedTuple):
@@ -38,12 +41,12 @@ class Property(NamedTuple):
 
 
 class Header(NamedTuple):
-    """What a PLY file says of its vertices, or of another element."""
+    """The header of a PLY file, for its vertices or another element."""
 
     name: str  # of the file, for messages
     order: str  # of the bytes, "<" or ">"; empty for text
     kind: str  # of the records, in the plural, for messages
-    records: int  # promised, not checked
+    records: int  # stated, not checked
     properties: tuple[Property, ...]  # of a record
     skipped: tuple[tuple[int, tuple[Property, ...]], ...]  # elements that come before these
     end: int  # bytes of the header
@@ -58,27 +61,36 @@ class Header(NamedTuple):
         return int(kind[1]) if self.order else 1
 
 
-_KINDS = {"vertex": "vertices", "face": "faces"}
-
-
 def parse_header(name: str, head: bytes, element: str = "vertex") -> Header:
-    """Return what the first bytes of a PLY file say of its vertices, or faces.
-
-    An `InputError` if it is not one, or has none.
-    """
+    """Parse the first bytes of a PLY file, for its vertices or faces."""
     end = re.search(rb"end_header[ \t]*\r?\n", head)
     if not head.startswith(b"ply") or end is None:
-        raise InputError(f"{name}: is not a PLY file with a whole header; export it again.")
+        raise bad_file(name, "ply.header", "is not a PLY file with a complete header.")
+    order: str | None = None
+    elements: list[tuple[str, int, list[Property]]] = []
     lines = [line.split() for line in head[: end.start()].decode("latin-1").splitlines()]
     try:
-        order, elements = _elements(lines)
+        for key, *fields in filter(None, lines):
+            if key == "format":
+                order = _FORMATS[fields[0]]
+            elif key == "element":
+                elements.append((fields[0], int(fields[1]), []))
+            elif key == "property" and fields[0] == "list":
+                elements[-1][2].append(Property(fields[3], _TYPES[fields[2]], _TYPES[fields[1]]))
+            elif key == "property":
+                elements[-1][2].append(Property(fields[1], _TYPES[fields[0]]))
+        if order is None:
+            raise ValueError("no format")
+        if any(count < 0 for _, count, _ in elements):
+            raise ValueError("a negative number of records")
+        if any(p.length.startswith("f") for _, _, properties in elements for p in properties):
+            raise ValueError("a list counted by a fraction")
     except (KeyError, ValueError, IndexError) as error:
-        raise InputError(
-            f"{name}: the PLY header is damaged ({error}); export it again."
-        ) from error
+        sentence = f"the PLY header is damaged ({error}). Export it again."
+        raise bad_file(name, "ply.header", sentence) from error
     names, kind = [one for one, _, _ in elements], _KINDS[element]
     if element not in names:
-        raise InputError(f"{name}: the PLY file has no {kind}; export it again with them.")
+        raise bad_file(name, "ply.element_missing", f"has no {kind}. Export it again with them.")
     at = names.index(element)
     skipped = tuple((count, tuple(p)) for _, count, p in elements[:at])
     return Header(name, order, kind, elements[at][1], tuple(elements[at][2]), skipped, end.end())
@@ -90,100 +102,85 @@ def read_header(path: Path, element: str = "vertex") -> Header:
         return parse_header(str(path), stream.read(_MOST_HEADER_BYTES), element)
 
 
-def _elements(lines: list[list[str]]) -> tuple[str, list[tuple[str, int, list[Property]]]]:
-    order: str | None = None
-    elements: list[tuple[str, int, list[Property]]] = []
-    for key, *fields in filter(None, lines):
-        if key == "format":
-            order = _FORMATS[fields[0]]
-        elif key == "element":
-            count = int(fields[1])
-            if count < 0:
-                raise ValueError(f"{count} records of {fields[0]}")
-            elements.append((fields[0], count, []))
-        elif key == "property" and fields[0] == "list":
-            if (count_type := _TYPES[fields[1]])[0] == "f":
-                raise ValueError(f"a list counted in {fields[1]}")
-            elements[-1][2].append(Property(fields[3], _TYPES[fields[2]], count_type))
-        elif key == "property":
-            elements[-1][2].append(Property(fields[1], _TYPES[fields[0]]))
-    if order is None:
-        raise ValueError("no format")
-    return order, elements
-
-
-Places: TypeAlias = dict[tuple[str, bool], tuple[int, tuple[int, int]]]
-
-
 class Records:
-    """The records of the vertices or faces, walked over once, so that every count in them holds."""
+    """The records of the vertices or faces; it is checked that all are there."""
 
     def __init__(self, path: Path, element: str = "vertex") -> None:
-        """Walk over the file; one without such or that ends early is an `InputError`."""
         self.header = header = read_header(path, element)
         self._units = _units(path, header)
-        self._item, self._prefix, self._field = _layout(header)
-        least = int((self._prefix + self._item * (self._prefix == 0)).sum())
-        if header.records * max(least, 1) > len(self._units):
-            self._complain(header.records)
-        names = [p.name for p in header.properties if p.length]
-        starts = np.zeros((len(names), header.records + 1), np.int64)
-        which = np.array([self._field[name, True][0] for name in names], np.int64)
-        big = header.order == ">"
-        end = list_starts(self._units, self._item, self._prefix, big, which, starts)
-        if end < 0:
-            self._complain(-1 - end)
-        self._starts = dict(zip(names, starts, strict=True))
-
-    def _complain(self, row: int) -> None:
-        raise InputError(
-            f"{self.header.name}: is cut short or damaged: the header promises"
-            f" {self.header.records:,} {self.header.kind}, number {row:,} is not whole; copy it"
-            " again."
-        )
+        # neighbouring numbers are one field, whose count is 1: units of an item and of a count
+        fields: list[tuple[int, int]] = []
+        self._place: dict[tuple[str, bool], tuple[int, int]] = {}
+        for p in header.properties:
+            size, is_list = header.size(p.item), bool(p.length)
+            if is_list or not fields or fields[-1][1]:
+                fields.append((0, header.size(p.length) if is_list else 0))
+            before, count = fields[-1]
+            self._place[p.name, is_list] = len(fields) - 1, before
+            fields[-1] = before + size, count
+        self._item, prefix = np.array(fields, np.int64).reshape(-1, 2).T.copy()
+        least = int((prefix + self._item * (prefix == 0)).sum())
+        complete = len(self._units) // max(least, 1)
+        if header.records <= complete:
+            shape = header.records, len(fields)
+            self._start, self._count = np.empty(shape, np.int64), np.empty(shape, np.int64)
+            complete, _ = list_starts(
+                self._units, self._item, prefix, header.order == ">", self._start, self._count
+            )
+        if complete < header.records:
+            raise bad_file(
+                header.name,
+                "ply.cut_short",
+                f"is cut short or damaged: it should have {header.records:,} {header.kind}, and"
+                f" number {complete:,} is not complete. Copy it again.",
+                records=header.records,
+            )
 
     def numbers(self, *names: str) -> FloatArray:
-        """Return properties that are no lists as columns, shape (n, names)."""
-        count = self.header.records
-        columns = [self._copy(name, count, is_list=False) for name in names]
+        """Return properties that are not lists as columns, shape (n, names)."""
+        columns = []
+        for name in names:
+            field, offset = self._place[name, False]
+            item = self.header.item(name, is_list=False)
+            columns.append(
+                items_at(self._units, self.header.order, item)[self._start[:, field] + offset]
+            )
         return np.column_stack(columns).astype(np.float64)
 
     def lists(self, name: str) -> tuple[IntArray, npt.NDArray[Any]]:
         """Return where the lists of a property start, shape (n + 1,), and their items."""
-        start = self._starts[name]
-        return start, self._copy(name, int(start[-1]), is_list=True)
-
-    def _copy(self, name: str, count: int, *, is_list: bool) -> npt.NDArray[Any]:
-        header, (field, part) = self.header, self._field[name, is_list]
-        item = header.item(name, is_list=is_list) or ""
-        out = np.empty(count * header.size(item), self._units.dtype)
-        copy_field(
-            *(self._units, self._item, self._prefix, header.order == ">", field),
-            *(part, header.records, out),
-        )
-        return out.view(header.order + item) if header.order else out
+        field, _ = self._place[name, True]
+        units = items_at(self._units, self.header.order, self.header.item(name, is_list=True))
+        return joined(units, self._start[:, field], self._count[:, field], int(self._item[field]))
 
 
-def _layout(header: Header) -> tuple[IntArray, IntArray, Places]:
-    """Return the fields of a record, with neighbouring numbers taken as one.
+def items_at(units: npt.NDArray[Any], order: str, item: str | None) -> npt.NDArray[Any]:
+    """View units as the item of a type that begins at each of them; text has numbers as units."""
+    if not order:
+        return units
+    kind = np.dtype(f"{order}{item}")
+    return np.ndarray(max(len(units) - kind.itemsize + 1, 0), kind, units, strides=(1,))
 
-    The units of each field's items; those of its list's length, 0 for numbers; and by name, and
-    whether it is a list, the field of each property and its first and last unit among the numbers.
+
+def joined(
+    items: npt.NDArray[Any], first: IntArray, count: IntArray, size: int
+) -> tuple[IntArray, npt.NDArray[Any]]:
+    """Copy lists, each of `count` items of `size` units from `first` on, one after another.
+
+    Returns
+    -------
+    start : array, shape (n + 1,)
+        Of each list in the copy.
+    values : array, shape (start[-1],)
     """
-    fields: list[list[int]] = []
-    places: Places = {}
-    for p in header.properties:
-        size = header.size(p.item)
-        if p.length:
-            places[p.name, True] = len(fields), (0, 0)
-            fields.append([size, header.size(p.length)])
-            continue
-        if not fields or fields[-1][1]:
-            fields.append([0, 0])
-        places[p.name, False] = len(fields) - 1, (fields[-1][0], fields[-1][0] + size)
-        fields[-1][0] += size
-    item, prefix = np.array(fields, np.int64).reshape(-1, 2).T.copy()
-    return item, prefix, places
+    start = np.concatenate([[0], np.cumsum(count)])
+    values = np.empty(start[-1], items.dtype)
+    for at in range(0, len(count), _ROWS_AT_ONCE):
+        rows = slice(at, at + _ROWS_AT_ONCE)
+        low, high = start[at], start[min(at + _ROWS_AT_ONCE, len(count))]
+        unit = np.repeat(first[rows] - size * start[:-1][rows], count[rows])
+        values[low:high] = items[unit + size * np.arange(low, high)]
+    return start, values
 
 
 def _units(path: Path, header: Header) -> npt.NDArray[Any]:
@@ -191,33 +188,26 @@ def _units(path: Path, header: Header) -> npt.NDArray[Any]:
     skip = 0
     for count, properties in header.skipped:
         if count and any(p.length for p in properties):
-            raise InputError(
-                f"{path}: lists come before the {header.kind}, which pcfix does not read; export"
-                f" the {header.kind} first."
-            )
+            sentence = f"has lists before the {header.kind}. Export the {header.kind} first."
+            raise bad_file(path, "ply.order", sentence)
         skip += count * sum(header.size(p.item) for p in properties)
-    if header.order == "":
-        return _text_numbers(path, header.end)[skip:]
-    if path.stat().st_size == header.end:  # nothing cannot be mapped
-        return np.zeros(0, np.uint8)
-    return np.memmap(path, np.uint8, "r", offset=header.end)[skip:]
-
-
-def _text_numbers(path: Path, start: int) -> FloatArray:
-    text = path.read_bytes()[start:].decode("latin-1")
+    if header.order:
+        if path.stat().st_size == header.end:  # an empty map is not allowed
+            return np.zeros(0, np.uint8)
+        return np.memmap(path, np.uint8, "r", offset=header.end)[skip:]
+    text = path.read_bytes()[header.end :].decode("latin-1")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)
-            return np.fromstring(text, np.float64, sep=" ")
+            return np.fromstring(text, np.float64, sep=" ")[skip:]
     except (DeprecationWarning, ValueError) as error:
-        raise InputError(
-            f"{path}: says that it is text, but not all of it is numbers; export it again."
-        ) from error
+        sentence = "is a text PLY, but not all of it is numbers. Export it again."
+        raise bad_file(path, "ply.text", sentence) from error
 
 
 @device
 def _length(units: npt.NDArray[Any], at: int, size: int, big: bool) -> int:
-    """Return a list's count from its bytes, or from its one number where the file is text."""
+    """Return a list's count from its bytes, or from its one number in a text."""
     count = 0
     for j in range(size):
         count = count * 256 + int(units[at + (j if big else size - 1 - j)])
@@ -226,55 +216,28 @@ def _length(units: npt.NDArray[Any], at: int, size: int, big: bool) -> int:
 
 @kernel
 def list_starts(
-    units: npt.NDArray[Any], item: IntArray, prefix: IntArray, big: bool, which: IntArray,
-    start: IntArray,
-) -> int:  # fmt: skip
-    """Walk over records and note where the lists of the fields `which` start.
+    units: npt.NDArray[Any], item: IntArray, prefix: IntArray, big: bool, start: IntArray,
+    count: IntArray,
+) -> tuple[int, int]:  # fmt: skip
+    """Walk over records, and fill in where each of their fields starts and how many items it has.
 
-    A unit is a byte, or a number of a text. Field f of a record has items of ``item[f]`` units;
-    it is a list when ``prefix[f]``, the units of its count, is not zero. `start` has a row per
-    field of `which`, and one place more than there are records. Return the end, or -1 - i where
-    record i does not end within the units.
+    Field f of a record has items of ``item[f]`` units; it is a list if ``prefix[f]``, the units of
+    its count, is not zero. `start` and `count` have a row per record and a column per field.
+    Return how many records are complete, and the unit where they end.
     """
     at = 0
-    start[:, 0] = 0
-    for i in range(start.shape[1] - 1):
+    for i in range(start.shape[0]):
         for f in range(item.size):
-            count = 1
+            length = 1
             if prefix[f]:
                 if prefix[f] > units.size - at:
-                    return -1 - i
-                count = _length(units, at, prefix[f], big)
+                    return i, at
+                length = _length(units, at, prefix[f], big)
                 at += prefix[f]
-            if count < 0 or count > (units.size - at) // item[f]:
-                return -1 - i
-            at += count * item[f]
-            for k in range(which.size):
-                if which[k] == f:
-                    start[k, i + 1] = start[k, i] + count
-    return at
-
-
-@kernel
-def copy_field(
-    units: npt.NDArray[Any], item: IntArray, prefix: IntArray, big: bool, field: int,
-    part: tuple[int, int], records: int, out: npt.NDArray[Any],
-) -> None:  # fmt: skip
-    """Copy one field of records that `list_starts` has walked over without complaint.
-
-    Of a list, all items; of a field that is none, the units from ``part[0]`` to ``part[1]``.
-    """
-    at = 0
-    filled = 0
-    for _ in range(records):
-        for f in range(item.size):
-            width = item[f]
-            if prefix[f]:
-                width *= _length(units, at, prefix[f], big)
-                at += prefix[f]
-            if f == field:
-                first, last = (0, width) if prefix[f] else part
-                for j in range(first, last):
-                    out[filled] = units[at + j]
-                    filled += 1
-            at += width
+            # divided, not multiplied: a damaged count times the item would overflow
+            if length < 0 or length > (units.size - at) // item[f]:
+                return i, at
+            start[i, f] = at
+            count[i, f] = length
+            at += length * item[f]
+    return start.shape[0], at

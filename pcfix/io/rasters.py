@@ -1,4 +1,4 @@
-"""Read rasters, write GeoTIFFs part by part, and subtract one from another (DoD)."""
+"""Read rasters, write GeoTIFFs window by window, and subtract one from another (DoD)."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import GeometryError, InputError, SettingError
+from pcfix.errors import GeometryError, SettingError, bad_file
 from pcfix.grid.lattice import Lattice, Window
 from pcfix.io.drafts import is_full_disk, replaced_when_whole
 from pcfix.io.files import check_input, check_output
@@ -32,31 +32,9 @@ TILE = 256
 _SUFFIXES = (".tif", ".tiff")
 
 
-class Raster(NamedTuple):
-    """A raster in memory: `array` (bands, rows, columns) as stored, the first row at the top.
-
-    `transform` goes from (column, row) of a cell's corner to x and y in the raster's CRS; `nodata`
-    is the value of cells that have none.
-    """
-
-    array: npt.NDArray[Any]
-    transform: Affine
-    crs: Any
-    nodata: float | None
-
-
-def read_raster(path: File) -> Raster:
-    """Return a whole raster of any format that GDAL reads; see `open_raster`."""
-    with open_raster(path) as source:
-        return Raster(source.read(), source.transform, source.crs, source.nodata)
-
-
 @contextmanager
 def open_raster(path: File) -> Iterator[DatasetReader]:
-    """Open a raster to read parts of it.
-
-    An `InputError` if there is no such file, it is none, or a part cannot be read.
-    """
+    """Open a raster to read parts of it; what cannot be read is a ``raster.damaged``."""
     import rasterio
     from rasterio import errors
 
@@ -65,23 +43,19 @@ def open_raster(path: File) -> Iterator[DatasetReader]:
         with rasterio.open(found) as source:
             yield source
     except (errors.RasterioError, errors.RasterioIOError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{found}: is damaged, or is not a raster ({error.__cause__ or error}); export it again"
-            " as GeoTIFF."
-        ) from error
+        sentence = f"is damaged, or is not a raster ({error.__cause__ or error}). Export a GeoTIFF."
+        raise bad_file(found, "raster.damaged", sentence) from error
 
 
 def place_of(transform: Affine, column: Any, row: Any) -> tuple[Any, Any]:
-    """Return the place of a column and row: numbers or arrays of them."""
+    """Return x and y of a column and row: numbers or arrays of them."""
     t = transform
     return t.a * column + t.b * row + t.c, t.d * column + t.e * row + t.f
 
 
 def read_heights(source: DatasetReader, window: Window) -> FloatArray:
-    """Return part of the first band, shape (rows, columns), with NaN where it has no value."""
-    height = source.read(1, window=_slices(window)).astype(np.float64)
-    height[height == source.nodata] = np.nan
-    return np.asarray(height)
+    """Return part of the first band, shape (rows, columns), NaN for no value."""
+    return read_masked(source, window=_slices(window))
 
 
 def read_within(source: DatasetReader, window: Window, whole: Window) -> FloatArray:
@@ -101,24 +75,19 @@ def lattice_of(source: DatasetReader) -> Lattice:
 
 
 def read_masked(raster: Any, **how: Any) -> FloatArray:
-    """Return the first band as float64, NaN where it has no value; `how` is of rasterio's read."""
+    """Return the first band as float64, NaN for no value; `how` goes to rasterio."""
     return np.asarray(raster.read(1, masked=True, **how).astype(np.float64).filled(np.nan))
 
 
 def filled_heights(source: DatasetReader, *, fill: bool) -> FloatArray:
-    """Return the first band, NaN where it has no value; its holes interpolated from around them.
-
-    Raises
-    ------
-    InputError
-        If it has no heights at all.
-    """
+    """Return the first band, NaN for no value; with `fill` its holes are interpolated."""
     from rasterio.fill import fillnodata
 
     height = read_masked(source)
     known = np.isfinite(height)
     if not known.any():
-        raise InputError(f"{source.name}: has no heights in its first band; give a DSM.")
+        sentence = "has no heights in its first band. Give a DSM."
+        raise bad_file(source.name, "raster.empty", sentence)
     if not fill or known.all():
         return height
     reach = float(max(height.shape))
@@ -140,21 +109,9 @@ def check_tif(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Pa
     """Return the path of a GeoTIFF that may be written, by its suffix and `check_output`."""
     target = check_output(path, overwrite=overwrite, inputs=inputs)
     if target.suffix.lower() not in _SUFFIXES:
-        raise SettingError(f"{target}: a raster is written as GeoTIFF; end the name in .tif.")
+        sentence = f"{target}: a raster is written as GeoTIFF. End the name in .tif."
+        raise SettingError("output.suffix", sentence, path=target, suffixes=list(_SUFFIXES))
     return target
-
-
-def check_cog() -> None:
-    """Refuse to promise a cloud optimised GeoTIFF where GDAL cannot write one."""
-    import rasterio
-
-    with rasterio.Env() as environment:
-        known = "COG" in environment.drivers()
-    if not known:
-        raise SettingError(
-            f"The GDAL {rasterio.__gdal_version__} of this rasterio has no COG driver, which came"
-            " with GDAL 3.1; leave --cog out, or install a newer rasterio."
-        )
 
 
 @contextmanager
@@ -185,7 +142,7 @@ def new_raster(
         "count": len(bands),
         "dtype": dtype,
         "nodata": nodata,
-        "crs": None if crs is None else rasterio.CRS.from_wkt(_wkt(crs)),
+        "crs": None if crs is None else rasterio.CRS.from_user_input(crs),
         "transform": from_origin(lattice.left_m, lattice.top_m, size, size),
         "interleave": "band",
         "tiled": True,
@@ -228,25 +185,19 @@ def _written(path: Path) -> Iterator[None]:
         raise OSError(str(error)) from error
 
 
-def _wkt(crs: CRS | str) -> str:
-    return crs if isinstance(crs, str) else crs.to_wkt()
-
-
 def add_overviews(path: Path) -> None:
-    """Give a GeoTIFF smaller versions of itself, in the same file, until one fits a tile."""
+    """Add overviews to a GeoTIFF, until one fits a tile."""
     import rasterio
     from rasterio.enums import Resampling
 
     with rasterio.open(path) as raster:
         dtype, longest = raster.dtypes[0], max(raster.width, raster.height)
-    factors: list[int] = []
-    while longest > TILE * 2 ** len(factors):
-        factors.append(2 ** (len(factors) + 1))
-    if factors:
+    levels = math.ceil(math.log2(max(longest / TILE, 1.0)))
+    if levels:
         settings = {f"{k}_OVERVIEW".upper(): str(v).upper() for k, v in _compression(dtype).items()}
         settings["GDAL_TIFF_OVR_BLOCKSIZE"] = str(TILE)
         with _written(path), rasterio.Env(**settings), rasterio.open(path, "r+") as raster:
-            raster.build_overviews(factors, Resampling.average)
+            raster.build_overviews([2**k for k in range(1, levels + 1)], Resampling.average)
 
 
 def _compression(dtype: str) -> dict[str, Any]:
@@ -255,7 +206,7 @@ def _compression(dtype: str) -> dict[str, Any]:
 
 
 def copy_as_cog(source: Path, target: Path) -> None:
-    """Write a GeoTIFF again, cloud optimised: what is needed first stands first in the file."""
+    """Copy a GeoTIFF as a cloud optimised one (COG)."""
     from rasterio.shutil import copy
 
     with open_raster(source) as raster:
@@ -271,17 +222,15 @@ def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = Fal
     """Write the first band of one raster minus that of another, metres, and count its cells.
 
     The output is a GeoTIFF of one band, float32, with the cells and the CRS of `dsm`; -9999 where
-    either has no height. Where the cells of the reference are others it is resampled (bilinear).
-    A `GeometryError` if the two have no cell in common.
+    either has no height. If the cells of the reference differ, it is resampled (bilinear).
     """
+    import rasterio
     from rasterio.enums import Resampling
     from rasterio.vrt import WarpedVRT
 
     target = check_tif(output, overwrite=overwrite, inputs=[dsm, reference])
     known = 0
     with open_raster(dsm) as one, open_raster(reference) as source:
-        import rasterio
-
         crs = source.crs or one.crs
         same = WarpedVRT(
             source, src_crs=crs, crs=one.crs or crs, transform=one.transform, width=one.width,
@@ -297,7 +246,8 @@ def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = Fal
                     whole = np.where(np.isfinite(difference), difference, NO_HEIGHT)
                     sink.write(whole.astype(np.float32), 1, window=window)
             if known == 0:
-                raise GeometryError(f"{dsm} and {reference} have no cell in common; see their CRS.")
+                sentence = f"{dsm} and {reference} have no cell in common. Check their CRS."
+                raise GeometryError("raster.no_overlap", sentence, dsm=dsm, reference=reference)
             add_overviews(draft)
     return known
 
@@ -307,7 +257,7 @@ PREVIEW_CELLS = 360_000
 
 
 def preview(path: Path, cells: int = PREVIEW_CELLS) -> tuple[FloatArray, Bounds]:
-    """Return a raster of at most so many cells, NaN for no data, and west, east, south, north."""
+    """Return a raster of at most `cells`, NaN for no data, and west, east, south, north."""
     with open_raster(path) as source:
         shape, bounds = _small(source, cells)
         return read_masked(source, out_shape=shape), bounds
@@ -328,14 +278,14 @@ def _small(source: DatasetReader, cells: int) -> tuple[tuple[int, int], Bounds]:
 
 
 def centres(place: FloatArray, values: FloatArray, bounds: Bounds) -> FloatArray:
-    """Return x and y of columns and rows, shape (n, 2), of a `preview`: whole ones are centres."""
+    """Return x and y of columns and rows, shape (n, 2), of a `preview`; integers are centres."""
     west, east, south, north = bounds
     size = (east - west) / values.shape[1], (south - north) / values.shape[0]
     return np.asarray((west, north) + (place + 0.5) * size)
 
 
 def outlines(path: Path, cells: int) -> list[Any]:
-    """Return the polygons around what a raster knows, by a `preview`; gaps of a cell close."""
+    """Return the polygons around the known cells of a `preview`; gaps of a cell are closed."""
     import shapely
     from rasterio.features import shapes
     from rasterio.transform import from_bounds
@@ -351,7 +301,9 @@ def outlines(path: Path, cells: int) -> list[Any]:
 
 
 def values_at(path: Path, xy: FloatArray) -> FloatArray:
-    """Return the first band at places (n, 2), that of their cell; NaN where it has no value."""
+    """Return the cells of the first band at places (n, 2); NaN for no value."""
     with open_raster(path) as source:
-        found = np.array([value[0] for value in source.sample(xy, 1, masked=True)], object)
-    return np.array([np.nan if np.ma.is_masked(one) else one for one in found], np.float64)
+        found = [
+            cell.astype(np.float64).filled(np.nan)[0] for cell in source.sample(xy, 1, masked=True)
+        ]
+    return np.array(found, np.float64)

@@ -1,6 +1,6 @@
-"""The water surface, from one word that says what it is; triangle meshes.
+"""Read the water surface: a level, a plane, a dimension, a triangle mesh or a raster.
 
-These are read here, and not by open3d: it hands OBJ coordinates on as 32-bit floats, half a metre
+Meshes are read here, not by open3d: it returns OBJ coordinates as 32-bit floats, half a metre
 apart at a northing of five million, and a damaged PLY ends the process.
 """
 
@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
+from pcfix.errors import GeometryError, SettingError, bad_file
 from pcfix.io.files import check_input
 from pcfix.io.ply import Records
 from pcfix.io.water_rasters import read_water_raster
@@ -24,19 +23,13 @@ from pcfix.options.declare import File
 if TYPE_CHECKING:
     from pyproj import CRS
 
-
 KINDS = (
-    "a level such as 0.37, plane:a,b,c, dim:NAME, a mesh file (.obj, .ply), or a raster of heights"
-    " (.tif or another that GDAL reads)"
+    "a level such as 0.37, plane:a,b,c, dim:NAME, a mesh (.obj, .ply) or a raster of heights (.tif)"
 )
-
-_NO_RASTERS = (".csv", ".txt", ".json", ".geojson", ".gpkg", ".shp", ".wkt", ".las", ".laz")
+_NOT_RASTERS = (".csv", ".txt", ".json", ".geojson", ".gpkg", ".shp", ".wkt", ".las", ".laz")
 """GDAL would try some of these as rasters all the same."""
-
-
 MOST_OVERLAP = 0.01
-"""Of the plan area: what folds at the rim of a triangulated shore come to."""
-LEAST_FACET_M2 = 1e-6
+"""Of the plan area; the triangulation of a shoreline may fold at its rim by less."""
 _CORNERS = "vertex_indices", "vertex_index"
 _MOST_VERTICES = 2**31
 
@@ -46,7 +39,7 @@ def read_water(
     cloud_crs: str | CRS | None = None,
     bounds: tuple[float, float, float, float] | None = None,
 ) -> WaterSurface:
-    """Return the water surface that a word describes.
+    """Read the water surface.
 
     Parameters
     ----------
@@ -56,8 +49,8 @@ def read_water(
         ``plane:a,b,c``
             the plane z = a + b x + c y in the cloud's own coordinates;
         ``dim:NAME``
-            a dimension of the cloud that holds the height of the surface above each point;
-            NaN where it is not known;
+            a dimension of the cloud with the height of the surface above each point; NaN if it
+            is not known;
         ``surface.obj``, ``surface.ply``
             a triangulated surface in the cloud's own coordinates;
         ``surface.tif``
@@ -65,19 +58,7 @@ def read_water(
     cloud_crs : str or CRS, optional
         Projected, metres; rasters are brought to it. Default: that of the raster.
     bounds : tuple of 4 float, optional
-        West, south, east and north end of the cloud: of a large raster only what lies about it
-        is read.
-
-    Returns
-    -------
-    WaterSurface
-
-    Raises
-    ------
-    SettingError
-        If the word is none of these, or its numbers are not finite.
-    InputError
-        If the mesh or raster is missing or damaged, or cannot be brought to the cloud's CRS.
+        West, south, east and north end of the cloud: only this part of a raster is read.
 
     Examples
     --------
@@ -85,94 +66,70 @@ def read_water(
     >>> pcfix.read_water("0.37")
     WaterPlane(a=0.37, b=0.0, c=0.0)
     """
-    if isinstance(spec, (int, float)):
-        return WaterPlane(*_finite([float(spec)], str(spec)))
     text = str(spec).strip()
     kind, colon, rest = text.partition(":")
-    if colon and kind.lower() == "plane":
-        parts = rest.split(",")
-        if len(parts) != 3:
-            raise SettingError(f"water '{text}': plane: needs three numbers a,b,c.")
-        return WaterPlane(*_finite(parts, text))
     if colon and kind.lower() == "dim":
         if not rest:
-            raise SettingError(f"water '{text}': name the dimension, as in dim:w_surf.")
+            raise _not_water(text, "name the dimension, as in dim:w_surf")
         return WaterDimension(rest)
-    if Path(text).suffix.lower() in (".obj", ".ply"):
-        return _mesh(check_input(text))
+    is_plane = bool(colon) and kind.lower() == "plane"
     try:
-        return WaterPlane(*_finite([text], text))
-    except SettingError:
-        if not (os.path.lexists(text) or Path(text).suffix[1:2].isalpha()):
-            raise  # no number ends as file names do
-        check_input(text)
-    if Path(text).suffix.lower() in _NO_RASTERS:
-        raise InputError(f"{text}: is not a water surface that pcfix reads; give {KINDS}.")
+        numbers = [float(part) for part in (rest.split(",") if is_plane else [text])]
+    except ValueError:
+        numbers = []
+    suffix = Path(text).suffix.lower()
+    if len(numbers) == (3 if is_plane else 1):
+        if not all(map(math.isfinite, numbers)):
+            raise _not_water(text, "the numbers must be finite")
+        return WaterPlane(*numbers)
+    if is_plane or not (os.path.lexists(text) or suffix[1:2].isalpha()):
+        raise _not_water(text, "plane: needs three numbers a,b,c" if is_plane else f"give {KINDS}")
+    found = check_input(text)
+    if suffix in (".obj", ".ply"):
+        return _mesh(found)
+    if suffix in _NOT_RASTERS:
+        raise bad_file(text, "water.format", f"is not a water surface. Give {KINDS}.")
     return read_water_raster(text, cloud_crs, bounds)
 
 
-def _finite(values: list[str] | list[float], text: str) -> list[float]:
-    try:
-        numbers = [float(value) for value in values]
-    except ValueError:
-        raise SettingError(f"water '{text}' is not understood; give {KINDS}.") from None
-    if not all(math.isfinite(number) for number in numbers):
-        raise SettingError(f"water '{text}': the numbers must be finite.")
-    return numbers
+def _not_water(text: str, rule: str) -> SettingError:
+    return SettingError("water.spec", f"water '{text}' is not understood: {rule}.", value=text)
 
 
 def _mesh(path: Path) -> WaterMesh:
+    """Read a mesh that is a height field."""
+    from pcfix.water.surface import build_tin, in_two_sheets
+
     read = _read_obj if path.suffix.lower() == ".obj" else _read_ply
     vertices, triangles = read(path)
     if len(triangles) == 0:
-        raise InputError(f"{path}: holds no triangles; export the water surface as a mesh.")
+        raise bad_file(path, "water.mesh_empty", "has no triangles. Export a mesh.")
     if not np.isfinite(vertices).all():
-        raise InputError(f"{path}: a vertex is not finite; export the mesh again.")
+        raise bad_file(path, "water.mesh_damaged", "a vertex is not finite. Export it again.")
     if triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise InputError(f"{path}: a face names a vertex that is not there; export it again.")
+        sentence = "a face names a vertex that does not exist. Export it again."
+        raise bad_file(path, "water.mesh_damaged", sentence)
     mesh = WaterMesh(vertices, triangles, path.name)
-    check_mesh(mesh, path)
-    return mesh
-
-
-def check_mesh(mesh: WaterMesh, path: Path) -> None:
-    """Refuse a mesh that is no height field, and warn of facets that do not count.
-
-    Which way a facet faces does not matter, nor do holes, edges of three facets, or facets that
-    overlap at one height: all are well defined as heights. Vertical facets have none.
-    """
-    from pcfix.water.surface import build_tin, in_two_sheets
-
     try:
         tin = build_tin(mesh)
     except GeometryError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise bad_file(path, "water.mesh_flat", str(error)) from None
+    # holes, edges of three facets and facets that overlap at one height do not matter
     double, area_m2 = in_two_sheets(tin)
     share = float(area_m2[double].sum() / area_m2.sum())
     if share > MOST_OVERLAP:
-        raise InputError(
-            f"{path}: {100.0 * share:.0f} % of the mesh lies above or below another part of it;"
-            " the water has one height at a place, so export its surface alone, not a closed body"
-            " or several surfaces."
+        raise bad_file(
+            path,
+            "water.mesh_overlap",
+            f"{100.0 * share:.0f} % of the mesh lies above or below another part of it. Export the"
+            " water surface only, not a closed body or several surfaces.",
+            share=share,
         )
-    if double.any():
-        _note(
-            f"{path}: facets overlap others at another height ({int(double.sum()):,} of"
-            f" {len(mesh.triangles):,}); there the water may be either."
-        )
-    edges = np.diff(mesh.vertices[mesh.triangles], axis=1)
-    size_m2 = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2.0
-    upright = int((size_m2 > LEAST_FACET_M2).sum()) - int((area_m2 > LEAST_FACET_M2).sum())
-    if upright > 0:
-        _note(f"{path}: vertical facets have no height and are left out ({upright:,}).")
-
-
-def _note(sentence: str) -> None:
-    warnings.warn(sentence, PcfixWarning, stacklevel=4)
+    return mesh
 
 
 def _read_obj(path: Path) -> tuple[FloatArray, IntArray]:
-    """Return vertices, shape (v, 3), and triangles, shape (t, 3); polygons as fans of these."""
+    """Return vertices, shape (v, 3), and triangles, shape (t, 3); a polygon is a fan of these."""
     vertices: list[list[float]] = []
     triangles: list[list[int]] = []
     for number, line in enumerate(path.read_text("latin-1").splitlines(), start=1):
@@ -185,7 +142,8 @@ def _read_obj(path: Path) -> tuple[FloatArray, IntArray]:
                 corners = [_obj_index(field, len(vertices)) for field in fields]
                 triangles += [[corners[0], *corners[i : i + 2]] for i in range(1, len(corners) - 1)]
         except ValueError as error:
-            raise InputError(f"{path}: line {number} is not an OBJ line ({error}).") from error
+            sentence = f"line {number} is not an OBJ line ({error})."
+            raise bad_file(path, "water.mesh_damaged", sentence, line=number) from error
     return np.array(vertices).reshape(-1, 3), np.array(triangles, dtype=np.int64).reshape(-1, 3)
 
 
@@ -198,19 +156,18 @@ def _obj_index(field: str, count: int) -> int:
 
 
 def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
-    """Return vertices and triangles as `_read_obj` does; see there."""
+    """Return vertices and triangles as `_read_obj` does."""
     vertices, faces = Records(path), Records(path, "face")
     named = [n for n in _CORNERS if faces.header.item(n, is_list=True)]
     if not named or None in (vertices.header.item(axis, is_list=False) for axis in "xyz"):
-        raise InputError(
-            f"{path}: the vertices need x, y and z, and the faces a list {_CORNERS[0]}; export it"
-            " again as a mesh."
-        )
+        sentence = f"needs vertices with x, y, z and faces with {_CORNERS[0]}. Export a mesh."
+        raise bad_file(path, "water.mesh_damaged", sentence)
     start, corners = faces.lists(named[0])
     with np.errstate(invalid="ignore"):
         corner = corners.astype(np.int64)
     if (corner != corners).any():
-        raise InputError(f"{path}: a face names a vertex by no whole number; export it again.")
+        sentence = "a face names a vertex by a number that is not whole. Export it again."
+        raise bad_file(path, "water.mesh_damaged", sentence)
     count = np.maximum(np.diff(start) - 2, 0)
     first = np.repeat(start[:-1], count)
     other = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(count) - count, count)

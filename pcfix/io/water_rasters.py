@@ -1,9 +1,9 @@
-"""Rasters of the water's height, in the cloud's CRS.
+"""Read and write rasters of the water's height.
 
-A north-up raster in the cloud's own CRS is taken cell by cell. Any other is sampled on a grid in
-the cloud's CRS, with the same rule between its cells as `pcfix.water.surface` has, so that a gap
-stays a gap; GDAL would fill half a cell of it. Positions go through the transformations that
-cameras go through, which refuse what PROJ can only guess.
+A north-up raster in the cloud's own CRS is used cell by cell. Any other is resampled to a grid in
+the cloud's CRS, with the interpolation of `pcfix.water.surface`, so that a gap stays a gap; GDAL
+would fill half a cell of it. Positions are transformed as those of cameras are, which refuses what
+PROJ can only guess.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.crs import is_local, metres_up, parse_crs, parts
 from pcfix.io.labels import match_labels
 from pcfix.io.rasters import open_raster, place_of, read_masked
-from pcfix.io.transformations import LOCAL, Points, transformation_in_plan, way_to_cloud
+from pcfix.io.transformations import LOCAL, Notes, Points, transformation, way_to_cloud
 from pcfix.model import FloatArray, WaterRaster
 from pcfix.options.declare import File
 
@@ -30,11 +30,10 @@ if TYPE_CHECKING:
 
 Bounds = tuple[float, float, float, float]
 
-
 MARGIN_M = 100.0
-"""Beyond the cloud: rays pass the water at most about so far from their points."""
+"""Beyond the cloud: piercing points are at most about so far from their points."""
 IMPOSSIBLE_M = 9000.0
-"""No water surface is so far from zero; where no nodata value is stated, this is one."""
+"""No water surface is so far from zero; a height beyond it is a nodata value that is not stated."""
 _UNITS_M = {
     "": None, "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0,
     "cm": 0.01, "mm": 0.001, "ft": 0.3048, "foot": 0.3048, "feet": 0.3048,
@@ -48,48 +47,54 @@ _AT_ONCE = 1_000_000
 def read_water_raster(
     path: File, cloud_crs: str | CRS | None = None, bounds: Bounds | None = None
 ) -> WaterRaster:
-    """Read the heights of the water, in the cloud's CRS and metres; warn of what is taken on trust.
-
-    An `InputError` if it cannot be read, has several bands or no heights there, or cannot be
-    brought to the cloud's CRS and heights.
+    """Read the heights of the water, in the cloud's CRS and metres; warn of what is assumed.
 
     Parameters
     ----------
     path : path
         A raster of any format that GDAL reads.
     cloud_crs : str, CRS or None
-        Projected, in metres. A raster that names no CRS, or a cloud that names none, is taken
-        to share the other's.
+        Projected, in metres. If the raster or the cloud names no CRS, that of the other is
+        assumed.
     bounds : tuple of 4 float, optional
-        West, south, east and north end of the cloud, metres: only what lies within `MARGIN_M`
-        of it is read. Default, and where one is not finite: the whole raster.
+        West, south, east and north end of the cloud, metres: only this part, and `MARGIN_M`
+        around it, is read. Default, and if one is not finite: the whole raster.
     """
     if bounds is not None:
         west, south, east, north = bounds
         about = west - MARGIN_M, south - MARGIN_M, east + MARGIN_M, north + MARGIN_M
         bounds = about if np.isfinite(bounds).all() else None
+    name = str(path)
     with open_raster(path) as source:
-        name = str(path)
-        _check_band(source, name)
+        if source.count != 1:
+            sentence = f"has {source.count} bands. Write the height of the water as one band."
+            raise bad_file(name, "water.raster_bands", sentence, value=source.count)
+        t = source.transform
+        if t.is_identity or not np.isfinite(t).all() or not abs(t.determinant) > 0.0:
+            sentence = "has no valid geotransform. Export it as GeoTIFF, or with a world file."
+            raise bad_file(name, "water.raster_place", sentence)
         to_cloud, from_cloud, notes = _ways(source, cloud_crs, bounds, name)
         part = _read(source, name, None if bounds is None else from_cloud(_edge(bounds)))
-        known = np.isfinite(part.heights)
-        if not known.any():
-            there = "" if bounds is None else " near the cloud"
-            raise InputError(f"{name}: holds no height{there}; check its nodata value.")
         title = source.name.replace("\\", "/").rpartition("/")[2]
+    if not np.isfinite(part.heights).any():
+        raise _no_heights(name)
     for note in notes + part.notes:
-        warnings.warn(note, PcfixWarning, stacklevel=3)
+        warnings.warn(note, stacklevel=3)
     t = part.transform
-    if to_cloud is None and t.b == t.d == 0.0 and t.a > 0.0 > t.e:  # north-up: as it is
+    if to_cloud is None and t.b == t.d == 0.0 and t.a > 0.0 > t.e:  # north-up in the cloud's CRS
         return WaterRaster(part.heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), title)
-    return sampled(part, to_cloud or (lambda xyz: xyz), from_cloud, bounds, (name, title))
+    return _resampled(part, to_cloud or (lambda xyz: xyz), from_cloud, bounds, (name, title))
+
+
+def _no_heights(name: str) -> Exception:
+    sentence = "has no height near the cloud. Check its CRS and its nodata value."
+    return bad_file(name, "water.raster_empty", sentence)
 
 
 def rasters_of_images(
     folder: File, names: Sequence[str]
 ) -> tuple[dict[int, Path], tuple[str, ...]]:
-    """Find the rasters of the water, TIFF files in a folder, that bear the names of images.
+    """Find the rasters of the water, TIFF files in a folder, that have the names of images.
 
     Returns
     -------
@@ -97,27 +102,22 @@ def rasters_of_images(
         By the rows of the images.
     notes : tuple of str
         On images without one.
-
-    Raises
-    ------
-    InputError
-        If there is none, or one could be that of several images.
     """
     files = sorted(Path(folder).glob("*.tif"))
     row, unclear = match_labels(names, [one.stem for one in files])
     if unclear:
-        raise InputError(
-            f"{folder}: its raster for {unclear[0]} could be that of several images; give every"
-            " image a name of its own."
-        )
+        sentence = f"its raster for {unclear[0]} matches several images. Give images unique names."
+        raise bad_file(folder, "water.image_ambiguous", sentence, image=unclear[0])
     found = {image: files[at] for image, at in enumerate(row.tolist()) if at >= 0}
     if not found:
-        raise InputError(
-            f"{folder}: holds no raster of an image's name, as {Path(names[0]).stem}.tif; give the"
-            " folder that 'pcfix calm --surface' wrote."
+        raise bad_file(
+            folder,
+            "water.no_image_rasters",
+            f"has no raster named after an image, such as {Path(names[0]).stem}.tif. Give the"
+            " folder that 'pcfix calm --surface' wrote.",
         )
     lost = len(names) - len(found)
-    return found, (f"{lost} images have no water of their own in {folder}.",) * (lost > 0)
+    return found, (f"{lost} images have no water raster of their own in {folder}.",) * (lost > 0)
 
 
 def write_water_raster(path: Path, water: WaterRaster, crs: str | None) -> None:
@@ -126,7 +126,8 @@ def write_water_raster(path: Path, water: WaterRaster, crs: str | None) -> None:
     from rasterio.transform import from_origin
 
     rows, columns = water.height_m.shape
-    parsed = None if crs is None or crs.strip().lower() == LOCAL else parse_crs(crs, "cameras")
+    named = crs is not None and crs.strip().lower() != LOCAL
+    parsed = parse_crs(crs or "", "cameras") if named else None
     if parsed is not None and is_local(parsed):
         parsed = None
     profile = {
@@ -139,46 +140,22 @@ def write_water_raster(path: Path, water: WaterRaster, crs: str | None) -> None:
         target.write(water.height_m, 1)
 
 
-def _check_band(source: DatasetReader, name: str) -> None:
-    if source.count != 1:
-        raise InputError(
-            f"{name}: has {source.count} bands; write the height of the water as a raster of one."
-        )
-    if source.dtypes[0].startswith("complex"):
-        raise InputError(f"{name}: holds complex numbers; write heights as float32.")
-    if source.transform.is_identity:
-        raise InputError(
-            f"{name}: has no place in the world (no geotransform); export it as GeoTIFF, or put"
-            " its world file beside it."
-        )
-    t = source.transform
-    if not np.isfinite(t).all() or not abs(t.determinant) > 0.0:
-        raise InputError(
-            f"{name}: its geotransform {tuple(t)[:6]} gives the cells no size or no place; export"
-            " it again."
-        )
-
-
 def _ways(
     source: DatasetReader, cloud_crs: str | CRS | None, bounds: Bounds | None, name: str
-) -> tuple[Points | None, Points, tuple[str, ...]]:
-    """Return the way to the cloud (None: the same numbers), the way back in plan, and notes."""
+) -> tuple[Points | None, Points, Notes]:
+    """Return the transformation to the cloud (None for none), its inverse in plan, and notes."""
     stated = None if source.crs is None else source.crs.to_wkt()
-    corners = np.array([place_of(source.transform, *corner) for corner in _corners(source)])
-    at = np.column_stack([corners, np.zeros(len(corners))])
+    share = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.5, 0.5)])
+    x, y = place_of(source.transform, *(share * [source.width, source.height]).T)
+    at = np.column_stack([x, y, np.zeros(len(x))])
     forward, notes = way_to_cloud(stated, cloud_crs, at, name, heights=True)
     if forward is None or stated is None or cloud_crs is None:
         return None, lambda xyz: xyz, notes
     cloud, crs = parse_crs(cloud_crs, "the cloud"), parse_crs(stated, name)
     near = forward(at) if bounds is None else _edge(bounds)
-    back = transformation_in_plan(cloud, crs, near, name)
+    back = transformation(cloud, crs, near, name, heights=False)
     unit = [1.0, 1.0, metres_up(crs)]
     return lambda xyz: forward(xyz / unit), back.forward, notes
-
-
-def _corners(source: DatasetReader) -> list[tuple[float, float]]:
-    width, height = source.width, source.height
-    return [(0, 0), (width, 0), (0, height), (width, height), (width / 2, height / 2)]
 
 
 def _edge(bounds: Bounds) -> FloatArray:
@@ -191,7 +168,15 @@ def _edge(bounds: Bounds) -> FloatArray:
     return np.column_stack([along_x, along_y, np.zeros(len(along_x))])
 
 
-def _read(source: DatasetReader, name: str, near: FloatArray | None) -> Part:
+class _Part(NamedTuple):
+    """Part of a raster: heights, the transform from (column, row) of it to its CRS, and notes."""
+
+    heights: FloatArray
+    transform: Affine
+    notes: Notes
+
+
+def _read(source: DatasetReader, name: str, near: FloatArray | None) -> _Part:
     """Read the heights around some places, shape (n, 3), or all; metres of the raster's CRS."""
     from rasterio.windows import Window
 
@@ -201,11 +186,9 @@ def _read(source: DatasetReader, name: str, near: FloatArray | None) -> Part:
         left, right = (int(v) for v in np.clip([column.min() - 2, column.max() + 3], 0, right))
         top, bottom = (int(v) for v in np.clip([row.min() - 2, row.max() + 3], 0, bottom))
     if right - left < 2 or bottom - top < 2:
-        raise InputError(
-            f"{name}: does not reach the cloud, or has fewer than two rows and columns there; check"
-            " its CRS."
-        )
-    check_size((bottom - top) * (right - left), name)
+        sentence = "has fewer than two rows and columns near the cloud. Check its CRS."
+        raise bad_file(name, "water.raster_apart", sentence)
+    _check_size((bottom - top) * (right - left), name)
     window = Window(left, top, right - left, bottom - top)
     stored = read_masked(source, window=window)
     unit_m, notes = _metres(source, name)
@@ -215,94 +198,78 @@ def _read(source: DatasetReader, name: str, near: FloatArray | None) -> Part:
     heights[np.isinf(heights)] = np.nan
     unknown = int(np.isnan(heights).sum())
     if source.nodata is None and unknown:
-        note = (
-            f"{name}: states no nodata value; {unknown:,} cells that are not finite or beyond"
-            f" {IMPOSSIBLE_M:g} m are taken as unknown."
+        sentence = (
+            f"{name}: states no nodata value. {unknown:,} cells that are not finite or beyond"
+            f" {IMPOSSIBLE_M:g} m are ignored."
         )
-        notes = (note, *notes)
-    return Part(heights, source.window_transform(window), notes)
+        notes = (PcfixWarning("water.raster_nodata", sentence, count=unknown), *notes)
+    return _Part(heights, source.window_transform(window), notes)
 
 
-def _metres(source: DatasetReader, name: str) -> tuple[float, tuple[str, ...]]:
-    """Return how many metres one unit of the heights is: the band's unit, else the CRS's.
-
-    A note says where heights are taken to be in feet only because positions are.
-    """
+def _metres(source: DatasetReader, name: str) -> tuple[float, Notes]:
+    """Return how many metres one unit of the heights is: the band's unit, else the CRS's."""
     stated = (source.units[0] or "").strip()
     if stated.lower() not in _UNITS_M:
-        raise InputError(
-            f"{name}: its heights are in '{stated}'; convert them to metres, or correct the band's"
-            " unit."
-        )
+        sentence = f"its heights are in '{stated}'. Convert them to metres, or correct the unit."
+        raise bad_file(name, "water.raster_unit", sentence, value=stated)
     factor = _UNITS_M[stated.lower()]
     if factor is not None or source.crs is None:
         return factor or 1.0, ()
     crs = parse_crs(source.crs.to_wkt(), name)
     factor = 1.0 if is_local(crs) else metres_up(crs)
-    if factor == 1.0 or source.units[0] or parts(crs)[1] is not None:
+    if factor == 1.0 or parts(crs)[1] is not None:
         return factor, ()
-    return factor, (
-        f"{name}: does not say in which unit its heights are; taken to be in that of its CRS"
-        f" ({factor:.4f} m).",
+    sentence = (
+        f"{name}: states no unit of its heights; that of its CRS is assumed ({factor:.4f} m)."
     )
+    return factor, (PcfixWarning("water.raster_unit", sentence, unit_m=factor),)
 
 
-class Part(NamedTuple):
-    """Part of a raster: heights, the transform from (column, row) of it to its CRS, and notes."""
-
-    heights: FloatArray
-    transform: Affine
-    notes: tuple[str, ...]
-
-
-def check_size(cells: int, name: str) -> None:
+def _check_size(cells: float, name: str) -> None:
     """Refuse more cells than memory should hold."""
-    if cells > MOST_CELLS:
-        raise InputError(
-            f"{name}: {cells:,} cells are too many ({MOST_CELLS:,} at most); water is smooth, so"
-            " resample it to coarser cells, 1 m for instance."
+    if not 0.0 < cells <= MOST_CELLS:
+        raise bad_file(
+            name,
+            "water.raster_size",
+            f"has {cells:,.0f} cells, at most {MOST_CELLS:,} are allowed. Water is smooth, so"
+            " resample it to coarser cells, such as 1 m.",
+            cells=cells,
         )
 
 
-def _check_cell(cell: float, longest: float, name: str) -> None:
-    """Refuse cells that are nothing beside the raster, or a raster without an end."""
-    if not cell > 0.0 or not longest / cell < MOST_CELLS:
-        raise InputError(
-            f"{name}: cells of {cell:g} m over {longest:g} m are no raster; check where it says"
-            " that it lies, or export it again."
-        )
-
-
-def sampled(
-    part: Part, to_cloud: Points, from_cloud: Points, bounds: Bounds | None, names: tuple[str, str]
+def _resampled(
+    part: _Part, to_cloud: Points, from_cloud: Points, bounds: Bounds | None, names: tuple[str, str]
 ) -> WaterRaster:
-    """Sample on a grid in the cloud's CRS with square cells as fine as the raster's finest.
+    """Resample to a grid in the cloud's CRS with square cells as small as the raster's smallest.
 
-    The way back `from_cloud` is of the plan alone; `bounds` are of what is wanted, in the cloud's
-    CRS; `names` are the raster's for messages and as its title.
+    `from_cloud` transforms the plan only; `bounds` are in the cloud's CRS; `names` are the
+    raster's for messages and its title.
     """
     cell, (west, south, east, north) = _extent(part, to_cloud, names[0])
     if bounds is not None:
         west, south = max(west, bounds[0]), max(south, bounds[1])
         east, north = min(east, bounds[2]), min(north, bounds[3])
-    _check_cell(cell, max(east - west, north - south), names[0])
+    if not cell > 0.0 or not max(east - west, north - south) / cell < MOST_CELLS:
+        sentence = f"its cells have a size of {cell:g} m in the cloud's CRS. Check its CRS."
+        raise bad_file(names[0], "water.raster_place", sentence)
     left, top = np.floor(west / cell) * cell, np.ceil(north / cell) * cell
     columns, rows = int(np.ceil((east - left) / cell)), int(np.ceil((top - south) / cell))
-    check_size(columns * rows, names[0])
-    heights = np.empty((max(rows, 2), max(columns, 2)))
-    x = left + (np.arange(heights.shape[1]) + 0.5) * cell
-    for first in range(0, len(heights), max(1, _AT_ONCE // len(x))):
-        strip = heights[first : first + max(1, _AT_ONCE // len(x))]
+    columns, rows = max(columns, 2), max(rows, 2)
+    _check_size(columns * rows, names[0])
+    heights = np.empty((rows, columns))
+    x = left + (np.arange(columns) + 0.5) * cell
+    for first in range(0, rows, max(1, _AT_ONCE // columns)):
+        strip = heights[first : first + max(1, _AT_ONCE // columns)]
         y = top - (first + np.arange(len(strip)) + 0.5) * cell
         plan = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x)), np.zeros(strip.size)])
         strip[:] = _heights_at(part, from_cloud(plan), to_cloud).reshape(strip.shape)
     if not np.isfinite(heights).any():
-        raise InputError(f"{names[0]}: holds no height near the cloud; check its CRS.")
+        raise _no_heights(names[0])
     return WaterRaster(heights, float(left), float(top), (float(cell), float(cell)), names[1])
 
 
-def _extent(part: Part, to_cloud: Points, name: str) -> tuple[float, Bounds]:
-    """Return the smaller side of a cell amid a raster, and the raster's bounds, in the cloud's."""
+def _extent(part: _Part, to_cloud: Points, name: str) -> tuple[float, Bounds]:
+    """Return the smaller side of the middle cell, and the bounds, in the cloud's CRS."""
     rows, columns = part.heights.shape
     share = np.linspace(0.0, 1.0, _EDGE_POINTS)
     c, r = (grid.ravel() for grid in np.meshgrid(share * columns, share * rows))
@@ -311,14 +278,15 @@ def _extent(part: Part, to_cloud: Points, name: str) -> tuple[float, Bounds]:
     level = np.full(len(x), np.nanmean(part.heights))
     placed = to_cloud(np.column_stack([x, y, level]))
     if not np.isfinite(placed).all():
-        raise InputError(f"{name}: reaches beyond where the cloud's CRS can be used; clip it.")
+        sentence = "extends beyond the area of use of the cloud's CRS. Clip it."
+        raise bad_file(name, "water.raster_place", sentence)
     sides = np.hypot(*(placed[-2:] - placed[-3])[:, :2].T)
     (west, south, _), (east, north, _) = placed.min(axis=0), placed.max(axis=0)
     return float(sides.min()), (float(west), float(south), float(east), float(north))
 
 
-def _heights_at(part: Part, places: FloatArray, to_cloud: Points) -> FloatArray:
-    """Return heights in the cloud's system at places in the raster's CRS; NaN where unknown."""
+def _heights_at(part: _Part, places: FloatArray, to_cloud: Points) -> FloatArray:
+    """Return heights in the cloud's CRS at places in the raster's CRS; NaN if unknown."""
     from pcfix.water.surface import Field, heights_above
 
     column, row = place_of(~part.transform, places[:, 0], places[:, 1])

@@ -261,7 +261,7 @@ def test_mask_that_crosses_itself_is_mended_and_said_so(tmp_path):
 @pytest.mark.parametrize(
     ("area", "sentence"),
     [
-        (shapely.Point(EAST_M, NORTH_M), r"mask.wkt: holds no polygon \(Point\); a mask needs"),
+        (shapely.Point(EAST_M, NORTH_M), r"mask.wkt: holds no polygon with an area \(Point\)"),
         (shapely.box(10, 20, 30, 40), r"mask.wkt: the mask holds none of the \d+ points"),
     ],
 )

@@ -10,10 +10,10 @@ import pytest
 from pcfix.flow.dsm import grid_dsm
 from pcfix.grid.lattice import cells_of
 from pcfix.grid.model import hillshade
-from pcfix.io.rasters import read_raster
 from tests.grid.clouds import EAST, NORTH, SCALE, scattered, write
 from tests.grid.twins import exact, slow_hillshade, slow_raster
 from tests.utils.nightly import mostly_nightly
+from tests.utils.rasters import read_raster
 
 METHODS = ("mean", "median", "min", "max", "idw", "tin")
 

@@ -6,9 +6,9 @@ import json
 
 import pytest
 
-from pcfix.io.rasters import read_raster
 from tests.grid.clouds import scattered, write
 from tests.utils.program import run_pcfix
+from tests.utils.rasters import read_raster
 
 
 @pytest.fixture

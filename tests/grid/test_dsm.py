@@ -19,11 +19,11 @@ from pcfix.flow import sorted_points
 from pcfix.flow.dsm import grid_dsm
 from pcfix.grid.lattice import round_resolution
 from pcfix.io.las import source
-from pcfix.io.rasters import read_raster
 from pcfix.report.text import dsm_text
 from tests.grid.clouds import EAST, NORTH, awkward, scattered, write
 from tests.utils.gdal import HAS_STATISTICS
 from tests.utils.nightly import mostly_nightly
+from tests.utils.rasters import read_raster
 from tests.utils.shared import ROOT
 
 SCENE = ROOT / "samples" / "scene"
@@ -338,7 +338,7 @@ BAD = {
     "azimuth": ({"azimuth": float("nan")}, "azimuth is nan"),
     "rms": ({"what": "uncertainty", "method": "tin"}, "leave --method and --fill out"),
     "what": ({"what": "Colour"}, "no dimension Colour; --what is one of height, depth, "),
-    "suffix": ({"output": "d.asc"}, "written as GeoTIFF; end the name in .tif"),
+    "suffix": ({"output": "d.asc"}, "written as GeoTIFF. End the name in .tif"),
     "shade": ({"hillshade": "h.png"}, "h.png: a raster is written as GeoTIFF"),
     "twice": ({"hillshade": "d.tif"}, "are the same file"),
     "folder": ({"output": "nowhere/d.tif"}, "does not exist; make it first"),
@@ -381,13 +381,6 @@ def test_not_in_metres(tmp_path, crs, unit):
     cloud = write(tmp_path / "c.las", xyz, crs=crs, offsets=offsets)
     with pytest.raises(InputError, match=f"is in {unit}; reproject the cloud to one in metres"):
         grid_dsm(cloud, tmp_path / "d.tif", resolution=2.0)
-
-
-def test_no_cog_driver(tmp_path, monkeypatch):
-    cloud = write(tmp_path / "c.las", scattered(50, 10.0, 10.0))
-    monkeypatch.setattr(rasterio.Env, "drivers", lambda self: {"GTiff": "GeoTIFF"})
-    with pytest.raises(SettingError, match=r"has no COG driver.*leave --cog out"):
-        grid_dsm(cloud, tmp_path / "d.tif", resolution=2.0, cog=True)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a raster", None])

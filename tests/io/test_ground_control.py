@@ -56,7 +56,7 @@ def fails(tmp_path, rows, *words, **more):
 def test_rendered_a_free_lies_where_its_marks_say():
     cameras = read_cameras(FREE / "sparse")
     cameras = bring_to(cameras, "EPSG:32636", offset_m=(319900.0, 3842700.0, 0.0))
-    with pytest.warns(PcfixWarning, match=r"gcps.csv: names no CRS; taken to be in the cloud's"):
+    with pytest.warns(PcfixWarning, match=r"gcps.csv: names no CRS; that of the cloud is assumed"):
         found = read_ground_control(FREE / "gcps.csv", cameras)
     lines = (FREE / "gcps.csv").read_text().splitlines()[1:]
     assert found.names == tuple(f"G{i}" for i in range(1, 10))
@@ -204,7 +204,7 @@ def test_longitude_and_latitude(tmp_path):
     lon, lat = to_degrees.transform(*XYZ["G1"][:2])
     head = "name,latitude,longitude,ellipsoidal_height,image,u,v"
     path = write(tmp_path, f"G1,{lat:.11f},{lon:.11f},2.5,a.jpg,100,200", head=head)
-    with pytest.warns(PcfixWarning, match="has ellipsoidal heights"):
+    with pytest.warns(PcfixWarning, match="vertical datum"):
         found = read_ground_control(path, block())
     assert found.xyz[0] == pytest.approx(XYZ["G1"], abs=2e-6)
 

@@ -1,4 +1,4 @@
-"""Tide tables, the times of images, and the level that each image saw."""
+"""Tide tables, the times of images, the water level of each, and recorded flying heights."""
 
 import json
 import math
@@ -11,10 +11,14 @@ from PIL import Image
 
 import pcfix
 from pcfix.flow.inputs import Inputs
+from pcfix.io.altitudes import read_altitudes
+from pcfix.io.cameras import read_cameras
 from pcfix.io.scenes import write_scene
 from pcfix.io.tides import ImageTimes, TideTable, level_offsets, read_image_times, read_tide
+from tests.utils.codes import refused
 from tests.utils.shared import needs
 
+CAMERAS, real = needs("cameras")
 ODM, odm = needs("cameras/odm/testerarm_sub0")
 
 TIDE = """time,level_m
@@ -31,25 +35,14 @@ def table(tmp_path, text, name="tide.csv"):
     return path
 
 
-def times_of(tmp_path, *times, labels=None, name="times.csv"):
-    labels = labels or [f"IMG_{i}" for i in range(len(times))]
+def times_of(tmp_path, *times):
+    labels = [f"IMG_{i}" for i in range(len(times))]
     rows = [f"{label}.JPG,{time}" for label, time in zip(labels, times, strict=True)]
-    path = table(tmp_path, "\n".join(["label,time", *rows]) + "\n", name)
+    path = table(tmp_path, "\n".join(["label,time", *rows]) + "\n", "times.csv")
     return read_image_times(path, labels), labels
 
 
-def test_offsets_are_linear_in_time_and_have_no_mean(tmp_path):
-    tide = read_tide(table(tmp_path, TIDE))
-    times, labels = times_of(
-        tmp_path, "2026-05-01T10:15:00Z", "2026-05-01T12:45:00+02:00", "2026-05-01T10:30:00Z"
-    )
-    offset, notes = level_offsets(tide, times, labels)
-    level = np.array([1.15, 1.35, 1.30])
-    assert offset == pytest.approx(level - level.mean(), abs=1e-9)
-    assert notes == ()
-
-
-def test_zones_and_spellings_are_one_moment(tmp_path):
+def test_zones_and_spellings(tmp_path):
     words = [
         "2026-05-01T12:00:00Z", "2026-05-01T12:00:00+00:00", "2026-05-01 14:00:00+02:00",
         "2026:05:01 05:00:00.0-07:00", "20260501T120000Z", "2026-05-01T12:00Z",
@@ -59,8 +52,25 @@ def test_zones_and_spellings_are_one_moment(tmp_path):
     assert times.time_s.tolist() == [NOON_S] * len(words)
 
 
+@pytest.mark.parametrize(
+    ("text", "times", "level", "codes"),
+    [
+        (TIDE, ("T10:15:00Z", "T12:45:00+02:00", "T10:30:00Z"), (1.15, 1.35, 1.30), []),
+        (TIDE.replace("Z", ""), ("T10:00:00", "T10:30:00"), (1.0, 1.3), []),
+        (TIDE, ("T09:30:00Z", "T11:30:00Z"), (0.7, 1.5), ["tide.extrapolated"]),
+        (TIDE.replace("T11", "T16"), ("T10:15Z", "T13:15:00Z"), (1.15, 1.35), ["tide.sparse"]),
+    ],
+)
+def test_offsets(tmp_path, text, times, level, codes):
+    tide = read_tide(table(tmp_path, text))
+    found, labels = times_of(tmp_path, *(f"2026-05-01{time}" for time in times))
+    offset, notes = level_offsets(tide, found, labels)
+    assert offset == pytest.approx(np.array(level) - np.mean(level), abs=1e-9)
+    assert [note.code for note in notes] == codes
+
+
 @given(shift=st.floats(-5, 5), share=st.lists(st.floats(0, 1), min_size=2, max_size=9))
-def test_the_gauge_may_count_from_anywhere(shift, share):
+def test_any_gauge_zero(shift, share):
     at, labels = np.linspace(0.0, 44_712.0, 60), [str(i) for i in range(len(share))]
     level = np.sin(at / 44_712.0 * 2.0 * math.pi)
     times = ImageTimes(np.array(share) * at[-1], True, "images")
@@ -72,68 +82,43 @@ def test_the_gauge_may_count_from_anywhere(shift, share):
     assert one == pytest.approx(true - true.mean(), abs=0.003)
 
 
-def test_one_row_beyond_the_ends_and_no_more(tmp_path):
+def test_table_that_does_not_fit(tmp_path):
     tide = read_tide(table(tmp_path, TIDE))
-    times, labels = times_of(tmp_path, "2026-05-01T09:30:00Z", "2026-05-01T11:30:00Z")
-    offset, notes = level_offsets(tide, times, labels)
-    assert offset == pytest.approx([-0.4, 0.4], abs=1e-9)  # levels 0.70 and 1.50
-    assert "2 images were taken before its first or after its last row" in notes[0]
-    late, labels = times_of(tmp_path, "2026-05-01T10:00:00Z", "2026-05-01T11:30:01Z")
-    with pytest.raises(
-        pcfix.InputError,
-        match=r"covers 2026-05-01 10:00:00 UTC to 2026-05-01 11:00:00 UTC, but image IMG_1 was"
-        r" taken at 2026-05-01 11:30:01 UTC \(1 of 2 images are outside\)",
-    ):
-        level_offsets(tide, late, labels)
-
-
-def test_rows_far_apart_are_said(tmp_path):
-    sparse = TIDE.replace("T11:00", "T16:30")
-    times, labels = times_of(tmp_path, "2026-05-01T10:15:00Z", "2026-05-01T12:00:00Z")
-    _, notes = level_offsets(read_tide(table(tmp_path, sparse)), times, labels)
-    assert "rows are 6.0 h apart" in notes[0]
-
-
-def test_local_times_on_both_sides(tmp_path):
-    tide = read_tide(table(tmp_path, TIDE.replace("Z", "")))
-    times, labels = times_of(tmp_path, "2026-05-01T10:00:00", "2026-05-01T10:30:00")
-    assert not tide.zoned
-    assert level_offsets(tide, times, labels)[0] == pytest.approx([-0.15, 0.15])
-
-
-def test_zones_on_one_side_are_refused(tmp_path):
-    times, labels = times_of(tmp_path, "2026-05-01T10:00:00", "2026-05-01T10:30:00")
-    with pytest.raises(pcfix.InputError, match=r"times.csv: times have no zone, those of .*tide"):
-        level_offsets(read_tide(table(tmp_path, TIDE)), times, labels)
-    with pytest.raises(pcfix.InputError, match=r"line 3: '2026-05-01T10:30:00' has no zone"):
-        times_of(tmp_path, "2026-05-01T10:00:00Z", "2026-05-01T10:30:00")
+    late = times_of(tmp_path, "2026-05-01T10:00:00Z", "2026-05-01T11:30:01Z")
+    with refused("tide.not_covered", path=tide.name, image="IMG_1", count=1):
+        level_offsets(tide, *late)
+    local = times_of(tmp_path, "2026-05-01T10:00:00", "2026-05-01T10:30:00")
+    with refused("time.zone", path=tmp_path / "times.csv"):
+        level_offsets(tide, *local)
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "code", "values"),
     [
-        ("time,level_ft\n2026-05-01T10:00:00Z,1\n", "level_m missing"),
-        (TIDE.replace("1.30", "high"), r"line 3, column level_m: 'high' is not a finite number"),
-        (TIDE.replace("2026-05-01T10:30:00Z", "half ten"), r"line 3: 'half ten' is not a date"),
-        (TIDE.replace("2026-05-01T10:30:00Z", "2026-05-01"), r"'2026-05-01' is not a date with"),
-        (TIDE.replace("T10:30", "T10:00"), "line 3: the time is not later than the one before"),
-        ("time,level_m\n2026-05-01T10:00:00Z,1\n", "has one row"),
+        ("time,level_ft\n2026-05-01T10:00:00Z,1\n", "table.column_missing", {}),
+        (TIDE.replace("1.30", "high"), "table.not_a_number", {"line": 3, "value": "high"}),
+        (TIDE.replace("2026-05-01T10:30:00Z", "half ten"), "time.format", {"value": "half ten"}),
+        (TIDE.replace("T10:30:00Z", ""), "time.format", {"value": "2026-05-01"}),
+        (TIDE.replace("10:30:00Z", "10:30:00"), "time.zone", {"value": "2026-05-01T10:30:00"}),
+        (TIDE.replace("T10:30", "T10:00"), "tide.order", {"line": 3}),
+        ("time,level_m\n2026-05-01T10:00:00Z,1\n", "tide.one_row", {}),
     ],
 )
-def test_a_table_that_is_no_tide(tmp_path, text, message):
-    with pytest.raises(pcfix.InputError, match=message):
+def test_bad_tides(tmp_path, text, code, values):
+    with refused(code, path=tmp_path / "tide.csv", **values):
         read_tide(table(tmp_path, text))
 
 
-def test_labels_are_found_without_folder_and_extension(tmp_path):
+def test_labels(tmp_path):
+    """Without folder and extension; missing and ambiguous ones."""
     path = table(tmp_path, "label,time\nday1/A.JPG,2026-05-01T10:00Z\nb,2026-05-01T11:00Z\n")
     times = read_image_times(path, ["B.tif", "C:\\flight\\a"])
     assert times.time_s.tolist() == [NOON_S - 3600.0, NOON_S - 7200.0]
-    with pytest.raises(pcfix.InputError, match=r"when image c was taken \(1 of 2 images"):
+    with refused("image_times.missing", images=["c"]):
         read_image_times(path, ["a", "c"])
     table(tmp_path, path.read_text() + "day2/A.JPG,2026-05-01T10:00Z\n")
-    with pytest.raises(pcfix.InputError, match="when image a was taken"):
-        read_image_times(table(tmp_path, path.read_text() + "d2/A.JPG,2026-05-01T10:00Z\n"), ["a"])
+    with refused("image_times.missing", images=["a"]):
+        read_image_times(path, ["a"])
 
 
 def photo(path, **tags):
@@ -142,7 +127,9 @@ def photo(path, **tags):
     Image.new("RGB", (8, 6)).save(path, exif=exif)
 
 
-def test_times_from_the_images(tmp_path):
+def test_exif(tmp_path):
+    with refused("image_times.missing"):
+        read_image_times(tmp_path, ["one"])
     (tmp_path / "a").mkdir()
     when = "2026:05:01 14:00:00"
     photo(tmp_path / "a" / "one.jpg", x9003=when, x9011="+02:00", x9291="50")
@@ -152,68 +139,54 @@ def test_times_from_the_images(tmp_path):
     assert times.time_s.tolist() == [NOON_S + 0.5, NOON_S + 3600.0]
     photo(tmp_path / "three.jpg", x9003=when)
     assert not read_image_times(tmp_path, ["three"]).zoned
-    with pytest.raises(pcfix.InputError, match=r"image three.jpg: '2026:05:01 14:00:00' has no"):
+    with refused("time.zone", value=when):
         read_image_times(tmp_path, ["one", "three"])
+    Image.new("RGB", (8, 6)).save(tmp_path / "four.jpg")
+    with refused("image_times.missing", path=tmp_path / "four.jpg"):
+        read_image_times(tmp_path, ["four"])
+    (tmp_path / "five.jpg").write_text("no image")
+    with refused("photos.unreadable", path=tmp_path / "five.jpg"):
+        read_image_times(tmp_path, ["five"])
 
 
-def test_images_that_do_not_say(tmp_path):
-    with pytest.raises(pcfix.InputError, match="holds no images"):
-        read_image_times(tmp_path, ["a"])
-    Image.new("RGB", (8, 6)).save(tmp_path / "a.jpg")
-    with pytest.raises(pcfix.InputError, match="its EXIF data has no DateTimeOriginal"):
-        read_image_times(tmp_path, ["a"])
-    (tmp_path / "b.jpg").write_text("no image")
-    with pytest.raises(pcfix.InputError, match=r"b.jpg: is not an image that can be read"):
-        read_image_times(tmp_path, ["b"])
-
-
-LAYOUTS = {
-    "images.json": [{"filename": "a.jpg", "utc_time": 1000.0 * NOON_S}],
-    "shots.geojson": {
-        "features": [{"properties": {"filename": "a.jpg", "capture_time": NOON_S}}]
-    },
-    "reconstruction.json": [{"shots": {"a.jpg": {"capture_time": NOON_S}}}],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", LAYOUTS)
-def test_times_that_the_software_kept(tmp_path, name):
-    path = table(tmp_path, json.dumps(LAYOUTS[name]), name)
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("images.json", [{"filename": "a.jpg", "utc_time": 1000.0 * NOON_S}]),
+        ("shots.geojson",
+         {"features": [{"properties": {"filename": "a.jpg", "capture_time": NOON_S}}]}),
+        ("reconstruction.json", [{"shots": {"a.jpg": {"capture_time": NOON_S}}}]),
+    ],
+)  # fmt: skip
+def test_times_of_other_software(tmp_path, name, content):
+    path = table(tmp_path, json.dumps(content), name)
     times = read_image_times(path, ["a"])
     assert (times.time_s.tolist(), times.zoned) == ([NOON_S], True)
-    nought = path.read_text().replace(str(1000.0 * NOON_S), "0").replace(str(NOON_S), "0")
-    with pytest.raises(pcfix.InputError, match=r"does not say when image a.jpg was taken"):
-        read_image_times(table(tmp_path, nought, name), ["a"])
+    zero = path.read_text().replace(str(1000.0 * NOON_S), "0").replace(str(NOON_S), "0")
+    with refused("image_times.missing", images=["a"]):
+        read_image_times(table(tmp_path, zero, name), ["a"])
 
 
 @pytest.mark.parametrize("text", ["{", "[1, 2]", '{"features": [{}]}', "[]"])
-def test_json_that_holds_no_times(tmp_path, text):
-    with pytest.raises(pcfix.InputError, match=r"t.json: (is not a file of|has no times)"):
+def test_json_without_times(tmp_path, text):
+    with refused("image_times.missing" if text == "[]" else "image_times.not_one"):
         read_image_times(table(tmp_path, text, "t.json"), ["a"])
 
 
 @odm
-def test_one_project_says_the_same_twice():
+def test_odm_project():
     labels = list(json.loads((ODM / "opensfm/reconstruction.json").read_text())[0]["shots"])
     names = ("images.json", "opensfm/reconstruction.json")
     one, other = (read_image_times(ODM / name, labels).time_s for name in names)
-    assert one == pytest.approx(other, abs=1.0)  # whole seconds, or parts of them
-    with pytest.raises(pcfix.InputError, match="does not say when image"):
+    assert one == pytest.approx(other, abs=1.0)  # whole seconds, or fractions of them
+    with refused("image_times.missing"):
         read_image_times(ODM / "odm_report/shots.geojson", labels)  # of that version
 
 
-# Through the inputs of a correction
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene")
-    write_scene(pcfix.simulate_scene(500, seed=3), folder, overwrite=False)
-    return folder
-
-
-def test_inputs_give_each_camera_its_level(scene, tmp_path):
-    cameras = pcfix.read_cameras(scene / "cameras.csv")
+def test_inputs(tmp_path):
+    write_scene(pcfix.simulate_scene(500, seed=3), tmp_path, overwrite=False)
+    file = tmp_path / "cameras.csv"
+    cameras = pcfix.read_cameras(file)
     minutes = np.linspace(0, 59, len(cameras)).astype(int)
     rows = [
         f"{label},2026-05-01T10:{m:02d}:00Z"
@@ -221,18 +194,38 @@ def test_inputs_give_each_camera_its_level(scene, tmp_path):
     ]
     times = table(tmp_path, "\n".join(["label,time", *rows]) + "\n", "times.csv")
     tide = table(tmp_path, TIDE)
-    inputs = Inputs(cameras=scene / "cameras.csv", water=0.37, tide=tide, image_times=times)
+    inputs = Inputs(cameras=file, water=0.37, tide=tide, image_times=times)
     level = np.interp(minutes, [0, 30, 60], [1.0, 1.3, 1.4])
     assert inputs.level_offset_m(cameras) == pytest.approx(level - level.mean(), abs=1e-9)
     assert {tide, times} <= set(inputs.paths())
-
-
-def test_inputs_that_lack_times_or_a_tide(scene, tmp_path):
-    cameras, tide = pcfix.read_cameras(scene / "cameras.csv"), table(tmp_path, TIDE)
     assert Inputs(cameras=cameras, water=0.37).level_offset_m(cameras) is None
-    with pytest.raises(pcfix.SettingError, match="a tide needs image-times"):
+    with refused("option.needs", options=["tide", "image_times"]):
         Inputs(cameras=cameras, water=0.37, tide=tide).level_offset_m(cameras)
-    with pytest.raises(pcfix.SettingError, match="image-times is of no use without tide"):
+    with refused("option.needs", options=["image_times", "tide"]):
         Inputs(cameras=cameras, water=0.37, image_times=tide).level_offset_m(cameras)
-    with pytest.raises(pcfix.InputError, match="must name the columns label, time"):
-        Inputs(cameras=scene / "cameras.csv", water=0.37, tide=tide).level_offset_m(cameras)
+    with refused("table.column_missing"):
+        Inputs(cameras=file, water=0.37, tide=tide).level_offset_m(cameras)
+
+
+@pytest.mark.parametrize("text", ['="+30.10"', ">30.10</drone-dji:RelativeAltitude>", "='30.1'"])
+def test_heights_in_images(tmp_path, text):
+    (tmp_path / "a.JPG").write_text(f"<x drone-dji:RelativeAltitude{text} y>")
+    (tmp_path / "b.JPG").write_text("<x drone-dji:AbsoluteAltitude='88.0'>")
+    (tmp_path / "c.txt").write_text("RelativeAltitude='99.0'")
+    for place in (tmp_path, tmp_path / "cameras.csv"):
+        found = read_altitudes(place, ["folder/a", "b", "c"])
+        np.testing.assert_array_equal(found, [30.1, np.nan, np.nan])
+
+
+@pytest.mark.parametrize("name", ["none/cameras.csv", "none.psx", "cameras.csv"])
+def test_no_heights(tmp_path, name):
+    assert np.isnan(read_altitudes(tmp_path / name, ["a", "b"])).all()
+
+
+@real
+def test_heights_in_a_metashape_project():
+    path = CAMERAS / "metashape" / "easyidp_wheat_psx" / "wheat_tanashi.psx"
+    found = read_altitudes(path, read_cameras(path).labels)
+    assert len(found) == 138
+    assert found[:3].tolist() == [30.0, 29.9, 29.8]
+    assert np.ptp(found) < 2.0

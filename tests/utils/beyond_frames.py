@@ -3,7 +3,7 @@
 import pytest
 
 BEYOND_FRAMES = pytest.mark.filterwarnings(
-    "ignore:.*lie in fewer than two frames:pcfix.errors.PcfixWarning"
+    "ignore:.*in fewer than two frames:pcfix.errors.PcfixWarning"
 )
 """Points at random, many of them in one frame or none."""
 DEEP = pytest.mark.filterwarnings("ignore:.*deeper than 30 m:pcfix.errors.PcfixWarning")

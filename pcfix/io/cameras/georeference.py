@@ -224,7 +224,7 @@ def _into(
     step = transformation(
         frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
     )
-    found = Georeference(frame, step, offset, crs, (*step.notes, *notes), name)
+    found = Georeference(frame, step, offset, crs, (*map(str, step.notes), *notes), name)
     if stated.trusted and not (frame.direct or frame.topocentric):
         return replace(found, notes=found.notes + _on_trust(found, cameras, frame, target))
     return found

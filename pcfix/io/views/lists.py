@@ -1,4 +1,4 @@
-"""View lists as files have them: COLMAP's ``fused.ply.vis``, the dense PLY of OpenMVS, tie points.
+"""Read view lists: COLMAP's ``fused.ply.vis``, the dense PLY of OpenMVS, or tie points.
 
 ``fused.ply.vis``, which COLMAP's stereo fusion writes beside ``fused.ply``, is little-endian: a
 uint64 number of points; then for each point, in the order of the vertices of ``fused.ply``, a
@@ -9,35 +9,36 @@ those whose depth maps were fused at the point.
 
 The dense cloud of OpenMVS (and so of ODM) is a PLY file with two lists at each vertex:
 ``view_indices`` names the depth maps that were fused at the point, by the number of their image in
-the scene, from 0; ``view_weights`` says what each counted for. The importers number the images as
-they come: InterfaceCOLMAP in the order of ``images.txt``, OpenSfM's exporter (ODM) in the order of
-the shots of the undistorted reconstruction. Defined by OpenMVS's source, libs/MVS/PointCloud.cpp
-and apps/InterfaceCOLMAP. A depth map was itself matched against other images, which are not named.
+the scene, from 0; ``view_weights`` are their weights. The importers number the images in their
+order: InterfaceCOLMAP in that of ``images.txt``, OpenSfM's exporter (ODM) in that of the shots of
+the undistorted reconstruction. Defined by OpenMVS's source, libs/MVS/PointCloud.cpp and
+apps/InterfaceCOLMAP. The images that a depth map was matched against are not named.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import InputError
-from pcfix.io.ply import Records, copy_field, list_starts, read_header
+from pcfix.errors import PcfixWarning, bad_file
+from pcfix.io.ply import Records, joined, list_starts, read_header
 from pcfix.model import FloatArray, IntArray, TiePoints, ViewKind
 
 COLMAP_LIST = "COLMAP view list"
 _HEAD = 8
 _IMAGES, _WEIGHTS = "view_indices", "view_weights"
 _OTHERS = {
-    b"LASF": "a LAS file: the cloud, not the list of its images",
-    b"MVSI": "an OpenMVS scene: give the dense PLY file beside it",
+    b"LASF": "a LAS file",
+    b"MVSI": "an OpenMVS scene",
     b"PK\x03\x04": "a ZIP archive or a project",
     b"SQLi": "a database",
 }
-"""What people give instead, by its first bytes."""
+"""Files that people give instead, by their first bytes."""
+_REMEDY = "Give COLMAP's fused.ply.vis or OpenMVS's dense PLY, as the software wrote it."
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,42 +48,37 @@ class RawList:
     path: Path
     what: str  # the kind of file
     start: IntArray  # (n + 1,)
-    image: npt.NDArray[np.int32]  # (start[-1],), what the file counts its images by
+    image: npt.NDArray[np.int32]  # (start[-1],), the file's number of the image
     weight: npt.NDArray[np.float32] | None = None  # (start[-1],)
     xyz: FloatArray | None = None  # (n, 3), frame of the file
     resolution_m: float = 0.0  # how far off a position can be, from the type of its numbers
-    notes: tuple[str, ...] = ()
+    notes: tuple[PcfixWarning, ...] = ()
 
     def __len__(self) -> int:
         return len(self.start) - 1
-
-    @property
-    def is_beside(self) -> bool:
-        """Whether its positions, if any, are of another file, so that it can do without."""
-        return self.what == COLMAP_LIST
 
 
 @dataclass(frozen=True, eq=False)
 class ImageOrder:
     """One meaning of the image numbers."""
 
-    what: str  # where it is from
-    camera: npt.NDArray[np.int32]  # (images,), rows of `Cameras`, -1 where there is none
+    what: str  # its source
+    camera: npt.NDArray[np.int32]  # (images,), rows of `Cameras`, -1 without one
     unposed: tuple[str, ...] = ()  # images without a row
 
 
 @dataclass(frozen=True, eq=False)
 class ViewList:
-    """Which cameras made each of n points; `pcfix.io.views.matching` gives it to a cloud's rows.
+    """The cameras that contributed to each of n points; `ViewMatch` gives them to a cloud's rows.
 
-    `share_seen` of the listed cameras have the point in their frame, None while not looked at, or
-    where the cameras have no frames. A match by position may be off by `default_spacings`.
+    `share_seen` of the listed cameras have the point in their frame; None before it is tested, or
+    if the cameras have no frames. A match by position may be off by `default_spacings`.
     """
 
     raw: RawList  # with positions in the frame of the cameras
-    orders: tuple[ImageOrder, ...]  # what a number may mean; one, once geometry has told which
+    orders: tuple[ImageOrder, ...]  # possible meanings of a number; one, once geometry has decided
     share_seen: float | None
-    spacing_m: float | None  # between neighbouring points, where there are positions
+    spacing_m: float | None  # between neighbouring points, if there are positions
     default_spacings: float
     kind: ViewKind  # see `pcfix.model.Views`
 
@@ -91,14 +87,11 @@ class ViewList:
 
 
 def read_list(path: Path) -> RawList:
-    """Read the view list of a dense cloud, whichever software wrote it."""
+    """Read the view list of a dense cloud."""
     with path.open("rb") as stream:
         head = stream.read(4)
     if head in _OTHERS:
-        raise InputError(
-            f"{path}: is {_OTHERS[head]}; a view list is the fused.ply.vis of COLMAP or the dense"
-            " PLY of OpenMVS."
-        )
+        raise bad_file(path, "views.not_one", f"is {_OTHERS[head]}, not a view list. {_REMEDY}")
     if not head.startswith(b"ply"):
         return _colmap(path)
     beside = path.with_name(f"{path.name}.vis")
@@ -107,129 +100,99 @@ def read_list(path: Path) -> RawList:
 
 
 def _colmap(path: Path) -> RawList:
-    """Read ``fused.ply.vis``, and the positions from the PLY file beside it where it has one."""
+    """Read ``fused.ply.vis``, and the positions from the PLY file beside it, if there is one."""
     size = path.stat().st_size
-    if size <= _HEAD or size % 4:
-        _complain(path, f"its {size:,} bytes are not one number of 8 bytes and more of 4")
     with path.open("rb") as stream:
         count = int.from_bytes(stream.read(_HEAD), "little")
-    if count == 0 or count > (size - _HEAD) // 4:
-        _complain(path, f"it would hold {count:,} points in {size:,} bytes")
-    words = np.memmap(path, "<u4", "r", offset=_HEAD)
-    one, start = np.ones(1, np.int64), np.empty((1, count + 1), np.int64)
-    used = list_starts(words, one, one, False, np.zeros(1, np.int64), start)
-    if used < 0:
-        _complain(path, f"the list of point {-1 - used:,} of {count:,} does not end in the file")
-    if used < len(words):
-        _complain(path, f"{4 * (len(words) - used):,} bytes follow the lists of {count:,} points")
-    number = np.empty(int(start[0, -1]), words.dtype)
-    copy_field(words, one, one, False, 0, (0, 0), count, number)
-    image = number.view(np.int32)
-    if image.size and image.min() < 0:
-        _complain(path, f"a point names image {int(image.min()) % 2**32}")
-    return RawList(path, COLMAP_LIST, start[0], image, None, *_beside(path, count))
-
-
-def _complain(path: Path, what: str) -> NoReturn:
-    raise InputError(
-        f"{path}: is not a whole COLMAP view list ({what}); give the fused.ply.vis of COLMAP or the"
-        " dense PLY of OpenMVS, as the software wrote it."
-    )
-
-
-def _beside(path: Path, count: int) -> tuple[FloatArray | None, float, tuple[str, ...]]:
-    """Return positions, their resolution and notes from ``fused.ply`` beside ``fused.ply.vis``."""
+    complete, used, words = 0, 0, np.zeros(1, np.uint32)
+    if size % 4 == 0 and 0 < count <= (size - _HEAD) // 4:
+        words = np.memmap(path, "<u4", "r", offset=_HEAD)
+        one = np.ones(1, np.int64)
+        first, length = np.empty((2, count, 1), np.int64)
+        complete, used = list_starts(words, one, one, False, first, length)
+    if complete < count or used < len(words):
+        raise bad_file(
+            path,
+            "views.damaged",
+            f"is not a complete COLMAP view list: {complete:,} lists of {count:,} points and"
+            f" {_HEAD + 4 * used:,} of {size:,} bytes can be read. {_REMEDY}",
+            points=count,
+            complete=complete,
+        )
+    start, number = joined(words, first[:, 0], length[:, 0], 1)
+    raw = RawList(path, COLMAP_LIST, start, _checked_images(path, number))
     bare = path.with_suffix("")
     ply = bare if bare.suffix.lower() == ".ply" else bare.with_suffix(".ply")
     if not ply.is_file():
-        return None, 0.0, ()
+        return raw
     vertices = read_header(ply).records
-    if vertices != count:
-        note = (
-            f"{ply}: has {vertices:,} points and {path.name} has {count:,}; its positions are not"
-            " used."
-        )
-        return None, 0.0, (note,)
-    return *_positions(_vertices(ply)), ()
+    if vertices == count:
+        return replace(raw, **_positions(Records(ply)))
+    note = PcfixWarning(
+        "views.other_points",
+        f"{ply}: has {vertices:,} points and the list has {count:,}. Its positions are not used.",
+        path=ply,
+    )
+    return replace(raw, notes=(note,))
 
 
 def _openmvs(path: Path) -> RawList:
-    """Read positions, view lists and, where there are any, weights."""
+    """Read positions, view lists and, if there are any, weights."""
     header = read_header(path)
     if header.item(_IMAGES, is_list=True) is None:
         names = ", ".join(p.name for p in header.properties)
-        raise InputError(
-            f"{path}: its points have no {_IMAGES} (they have: {names}); other software drops the"
-            " lists on saving, so give the dense PLY as OpenMVS wrote it, or COLMAP's"
-            " fused.ply.vis."
-        )
-    vertices = _vertices(path)
+        sentence = f"its points have no {_IMAGES} (they have: {names}). {_REMEDY}"
+        raise bad_file(path, "views.no_lists", sentence)
+    vertices = Records(path)
     start, number = vertices.lists(_IMAGES)
-    xyz, resolution_m = _positions(vertices)
-    image, weight = _images(path, number), _weights(vertices, start)
-    return RawList(path, "OpenMVS point cloud", start, image, weight, xyz, resolution_m)
-
-
-def _vertices(path: Path) -> Records:
-    header = read_header(path)
-    if header.records == 0 or None in (header.item(axis, is_list=False) for axis in "xyz"):
-        raise InputError(
-            f"{path}: has no points with x, y and z; give the dense point cloud as the software"
-            " wrote it."
+    raw = RawList(path, "OpenMVS point cloud", start, _checked_images(path, number))
+    raw = replace(raw, **_positions(vertices))
+    if header.item(_WEIGHTS, is_list=True) is None:
+        return raw
+    weight_start, weight = vertices.lists(_WEIGHTS)
+    if not np.array_equal(weight_start, start) or not ((weight >= 0.0) & (weight < np.inf)).all():
+        sentence = (
+            f"its {_WEIGHTS} are not one positive number for each of the {_IMAGES}. {_REMEDY}"
         )
-    return Records(path)
+        raise bad_file(path, "views.weights", sentence)
+    return replace(raw, weight=weight.astype(np.float32))
 
 
-def _positions(vertices: Records) -> tuple[FloatArray, float]:
-    """Return the vertices of a PLY file and how coarse the type of their numbers is, metres."""
-    xyz, header = vertices.numbers(*"xyz"), vertices.header
+def _positions(vertices: Records) -> dict[str, Any]:
+    """Return the vertices of a PLY file, and how coarse the type of their numbers is, metres."""
+    header = vertices.header
+    if header.records == 0 or None in (header.item(axis, is_list=False) for axis in "xyz"):
+        sentence = f"has no points with x, y and z. {_REMEDY}"
+        raise bad_file(header.name, "views.no_positions", sentence)
+    xyz = vertices.numbers(*"xyz")
     finite = np.isfinite(xyz).all(axis=1)
     if not finite.all():
-        raise InputError(
-            f"{header.name}: vertex {int(np.argmin(finite)):,} has no finite position; remove it"
-            " or export the points again."
-        )
+        row = int(np.argmin(finite))
+        sentence = f"vertex {row:,} has no finite position. Export the points again."
+        raise bad_file(header.name, "views.not_finite", sentence, row=row)
     single = header.item("x", is_list=False) == "f4"
-    return xyz, float(np.spacing(np.float32(np.abs(xyz).max()))) if single else 0.0
+    step = float(np.spacing(np.float32(np.abs(xyz).max()))) if single else 0.0
+    return {"xyz": xyz, "resolution_m": step}
 
 
-def _images(path: Path, number: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
-    """Return image numbers as int32; others than whole ones from 0 to 2147483647 are refused."""
-    if number.size == 0:
-        return np.zeros(0, np.int32)
-    low, high = number.min(), number.max()
-    if not (low >= 0 and high <= np.iinfo(np.int32).max):
-        wrong = high if low >= 0 else low
-        raise InputError(
-            f"{path}: names an image {wrong}; image numbers start at 0, the file is damaged or of"
-            " another kind."
-        )
-    whole = number.astype(np.int32)
-    if number.dtype.kind == "f" and (whole != number).any():
-        raise InputError(f"{path}: names an image by a number that is not whole; export it again.")
-    return whole
-
-
-def _weights(vertices: Records, start: IntArray) -> npt.NDArray[np.float32] | None:
-    name = vertices.header.name
-    if vertices.header.item(_WEIGHTS, is_list=True) is None:
-        return None
-    weight_start, weight = vertices.lists(_WEIGHTS)
-    if not np.array_equal(weight_start, start):
-        row = int(np.argmax(np.diff(weight_start) != np.diff(start)))
-        raise InputError(
-            f"{name}: vertex {row:,} has not as many {_WEIGHTS} as {_IMAGES}; export it again."
-        )
-    if weight.size and not (weight.min() >= 0.0 and weight.max() < np.inf):
-        raise InputError(f"{name}: a weight is negative or not finite; export it again.")
-    return weight.astype(np.float32)
+def _checked_images(path: Path, number: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
+    """Return image numbers as int32, if they are whole and not negative."""
+    with np.errstate(invalid="ignore"):  # NaN and infinity of a text
+        image = number.astype(np.int32)
+    wrong = np.flatnonzero((image < 0) | (image != number))
+    if wrong.size:
+        value = number[wrong[0]].item()
+        sentence = f"names image {value}, which is not a whole number from 0 on. {_REMEDY}"
+        raise bad_file(path, "views.image_number", sentence, value=value)
+    return image
 
 
 def tracks_as_list(path: Path, tie_points: TiePoints) -> RawList:
     """Return the tie points that have a position, each camera once, sorted."""
     rows = np.flatnonzero(np.isfinite(tie_points.xyz).all(axis=1))
     if rows.size == 0:
-        raise InputError(f"{path}: has no tie points with positions; give another view list.")
+        sentence = "has no tie points with positions. Give another view list."
+        raise bad_file(path, "views.no_positions", sentence)
     views = tie_points.views.take(rows)
     row = np.repeat(np.arange(len(rows)), np.diff(views.start))
     pairs = np.unique(np.column_stack([row, views.camera]), axis=0)  # a track may name one twice

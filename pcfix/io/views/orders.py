@@ -1,16 +1,16 @@
-"""What the image numbers of a view list mean.
+"""Find the images that the numbers of a view list stand for.
 
-No list names its images. A number counts them in the order in which the dense matcher had them:
+A list does not name its images. A number counts them in the order of the dense matcher:
 
-- COLMAP takes the registered images of its sparse model. Some versions keep them in the order of
-  ``images.bin`` or ``images.txt``, which is none in particular; others by ascending IMAGE_ID;
-  those with rigs frame by frame, by ascending FRAME_ID (``Reconstruction::RegImageIds``).
-- OpenMVS takes what its importer gave, for COLMAP in the order of ``images.txt``.
+- COLMAP uses the registered images of its sparse model. Some versions have them in the order of
+  ``images.bin`` or ``images.txt``, which is arbitrary; others by ascending IMAGE_ID; those with
+  rigs frame by frame, by ascending FRAME_ID (``Reconstruction::RegImageIds``).
+- OpenMVS uses the order of its importer, for COLMAP that of ``images.txt``.
 
 So every order that a sparse model beside the list allows is a candidate, then that of the cameras
-as they were given. Geometry tells which of them is right: a depth map holds only what its image
-shows, so that nearly every listed camera must have the apparent point in its frame. With the image
-numbers misread by one, a quarter of the cameras of an ordinary block look elsewhere.
+that are given. Geometry decides: a depth map holds only what its image shows, so nearly every
+listed camera must have the apparent point in its frame. With image numbers off by one, a quarter
+of the cameras of an ordinary block do not.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras.colmap.files import read_images
 from pcfix.io.labels import match_labels
 from pcfix.io.views.lists import ImageOrder, RawList, ViewList
@@ -32,8 +32,8 @@ from pcfix.lens.imaging import project
 from pcfix.model import Cameras, FloatArray, IntArray
 
 LEAST_SHARE = 0.95
-"""Of listed cameras whose frame holds the point: 1.00 on a real dense cloud, 0.75 with the image
-numbers misread by one, 0.4 with any order."""
+"""Of listed cameras whose frame holds the point: 1.00 on a real dense cloud, 0.75 with image
+numbers off by one, 0.4 in a random order."""
 
 MARGIN = 0.02
 """Of the frame's sides: other lens models or adjustments move an edge by less."""
@@ -41,21 +41,14 @@ MARGIN = 0.02
 SAMPLE_POINTS = 20_000
 
 _ENOUGH = 1000
-"""Entries with which the order of the images is settled; with fewer, later chunks may differ."""
+"""Entries that are enough to choose the order of the images; with fewer, later chunks decide."""
 
 _PLACES = (".", "sparse", "sparse/0")
-_CAMERA = ("0", "CAMERA")
-"""Type of a sensor, in bytes and in text."""
-
 _FRAME_HEAD, _DATA = struct.Struct("<II7dI"), struct.Struct("<iIQ")
 
 
 def image_orders(raw: RawList, cameras: Cameras) -> tuple[ImageOrder, ...]:
-    """Return the orders that the image numbers may follow, the likeliest first.
-
-    An `InputError` if a number is beyond the images of all of them, or the images are not those of
-    the cameras.
-    """
+    """Return the orders that the image numbers may follow, the most likely first."""
     found = []
     for what, names in _model_orders(raw.path.parent):
         row = match_labels(names, cameras.labels).row.astype(np.int32)
@@ -66,17 +59,20 @@ def image_orders(raw: RawList, cameras: Cameras) -> tuple[ImageOrder, ...]:
     fitting = [order for order in found if most < len(order.camera)]
     if not fitting:
         largest = max(found, key=lambda order: len(order.camera))
-        raise InputError(
-            f"{raw.path}: names image number {most} (from 0), but there are"
-            f" {len(largest.camera)} in {largest.what}; put the sparse model of the dense"
-            " workspace beside the list, or give the cameras that it was made with."
+        raise bad_file(
+            raw.path,
+            "views.image_number",
+            f"names image number {most} (from 0), but there are {len(largest.camera)} in"
+            f" {largest.what}. Put the sparse model of the dense workspace beside the list.",
+            value=most,
         )
     known = [order for order in fitting if (order.camera >= 0).any()]
     if not known:
-        raise InputError(
-            f"{raw.path}: none of the images in {fitting[0].what} is among the cameras (the"
-            f" first are {fitting[0].unposed[0]} and {cameras.labels[0]}); give the cameras of this"
-            " block."
+        raise bad_file(
+            raw.path,
+            "views.other_block",
+            f"no image of {fitting[0].what} is among the cameras (the first are"
+            f" {fitting[0].unposed[0]} and {cameras.labels[0]}). Give the cameras of this block.",
         )
     distinct: dict[bytes, ImageOrder] = {}
     for order in known:
@@ -87,7 +83,7 @@ def image_orders(raw: RawList, cameras: Cameras) -> tuple[ImageOrder, ...]:
 def _model_orders(folder: Path) -> Iterator[tuple[str, list[str]]]:
     """Yield the orders of the images of the sparse models of a workspace, and their names.
 
-    A damaged model gives none.
+    A damaged model is skipped.
     """
     for place in _PLACES:
         with suppress(InputError, OSError, struct.error, ValueError, IndexError, KeyError):
@@ -112,52 +108,29 @@ def _orders(model: Path) -> list[tuple[str, list[str]]]:
 
 
 def _frames(model: Path) -> list[list[int]]:
-    """Return the image ids of each frame of a model with rigs, as COLMAP sorts them.
+    """Return the image ids of each frame of a model with rigs, in the order of COLMAP.
 
-    See https://colmap.github.io/format.html for ``frames.bin`` and ``frames.txt``.
+    See https://colmap.github.io/format.html for ``frames.bin``.
     """
-    frames: dict[int, list[tuple[int, int]]] = {}
-    if (model / "frames.bin").is_file():
-        frames = _binary_frames((model / "frames.bin").read_bytes())
-    elif (model / "frames.txt").is_file():
-        frames = _text_frames((model / "frames.txt").read_text("utf-8", errors="replace"))
-    return [[image for _, image in sorted(frames[i])] for i in sorted(frames)]
-
-
-def _binary_frames(data: bytes) -> dict[int, list[tuple[int, int]]]:
-    frames = {}
-    (count,) = struct.unpack_from("<Q", data)
-    at = 8
-    for _ in range(count):
+    path = model / "frames.bin"
+    if not path.is_file():
+        return []
+    data, at, frames = path.read_bytes(), 8, {}
+    for _ in range(*struct.unpack_from("<Q", data)):
         frame_id, *_, images = _FRAME_HEAD.unpack_from(data, at)
         at += _FRAME_HEAD.size
         end = at + _DATA.size * images
-        if end > len(data):
-            raise ValueError("cut short")
-        entries = (_DATA.unpack_from(data, place) for place in range(at, end, _DATA.size))
-        frames[frame_id] = [(sensor, image) for kind, sensor, image in entries if kind == 0]
+        entries = [_DATA.unpack_from(data, place) for place in range(at, end, _DATA.size)]
+        frames[frame_id] = sorted((sensor, image) for kind, sensor, image in entries if kind == 0)
         at = end
-    return frames
-
-
-def _text_frames(content: str) -> dict[int, list[tuple[int, int]]]:
-    frames = {}
-    for line in content.splitlines():
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        fields = line.split()
-        entries = zip(fields[10::3], fields[11::3], fields[12::3], strict=False)
-        frames[int(fields[0])] = [
-            (int(sensor), int(image)) for kind, sensor, image in entries if kind in _CAMERA
-        ]
-    return frames
+    return [[image for _, image in frames[i]] for i in sorted(frames)]
 
 
 def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -> ViewList:
-    """Return the list with the one order of images with which its cameras see the points.
+    """Choose the order of images with which the listed cameras see the points.
 
     The apparent points, shape (m, 3), are in the frame of the cameras; `rows`, shape (m,), are
-    theirs of the list. One that fits with no order is an `InputError`.
+    theirs of the list.
     """
     if cameras.rotations is None or cameras.lenses is None:
         return replace(views, orders=views.orders[:1])
@@ -170,22 +143,23 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -
         return views
     share, best = max(known, key=lambda pair: pair[0])
     if share < LEAST_SHARE:
-        raise InputError(
-            f"{views.raw.path}: only {100 * share:.0f} % of the listed cameras have their point in"
-            " the frame, so the list counts other images or its coordinates are in another frame;"
-            " put the sparse model of the dense workspace beside it, give the cameras it was made"
-            " with, or the offset of its coordinates (--cameras-offset)."
+        raise bad_file(
+            views.raw.path,
+            "views.other_images",
+            f"only {100 * share:.0f} % of the listed cameras have their point in the frame. Put the"
+            " sparse model beside the list, or give its cameras or its offset (--cameras-offset).",
+            share=share,
         )
     others = () if len(image) >= _ENOUGH else views.orders[:best] + views.orders[best + 1 :]
     return replace(views, orders=(views.orders[best], *others), share_seen=share)
 
 
 def entries(start: IntArray, rows: IntArray) -> tuple[IntArray, slice | IntArray]:
-    """Return where the lists of some rows start one after another, and which entries these are."""
+    """Return where the lists of some rows start in a copy, and which entries these are."""
     counts = start[rows + 1] - start[rows]
     ends = np.concatenate([[0], np.cumsum(counts)])
     if len(rows) and rows[-1] - rows[0] == len(rows) - 1 and (np.diff(rows) == 1).all():
-        return ends, slice(int(start[rows[0]]), int(start[rows[-1] + 1]))  # no copy is quicker
+        return ends, slice(int(start[rows[0]]), int(start[rows[-1] + 1]))  # without a copy
     return ends, np.repeat(start[rows] - ends[:-1], counts) + np.arange(ends[-1])
 
 
@@ -195,23 +169,16 @@ def share_seen(cameras: Cameras, camera: npt.NDArray[np.int32], xyz: FloatArray)
     `camera`, shape (m,), has rows of cameras with rotations and lenses, of which negative ones do
     not count; `xyz`, shape (m, 3), the point of each.
     """
+    if cameras.rotations is None or cameras.lenses is None:
+        return None
     order = np.argsort(camera, kind="stable")
     ends = np.searchsorted(camera[order], np.arange(len(cameras) + 1))
-    seen = sum(
-        _seen(cameras, i, xyz[order[ends[i] : ends[i + 1]]])
-        for i in range(len(cameras))
-        if ends[i] < ends[i + 1]
-    )
+    seen = 0
+    for i, lens in enumerate(cameras.lenses):
+        some = xyz[order[ends[i] : ends[i + 1]]]
+        u, v = project(lens, (some - cameras.centres[i]) @ cameras.rotations[i].T).T
+        wide, high = MARGIN * lens.width, MARGIN * lens.height
+        inside = (u >= -wide) & (u <= lens.width + wide) & (v >= -high) & (v <= lens.height + high)
+        seen += int(np.count_nonzero(inside))
     count = int(ends[-1] - ends[0])
     return seen / count if count else None
-
-
-def _seen(cameras: Cameras, i: int, xyz: FloatArray) -> int:
-    """Return how many of the points one camera's frame holds."""
-    if cameras.rotations is None or cameras.lenses is None:
-        return 0
-    lens = cameras.lenses[i]
-    u, v = project(lens, (xyz - cameras.centres[i]) @ cameras.rotations[i].T).T
-    wide, high = MARGIN * lens.width, MARGIN * lens.height
-    inside = (u >= -wide) & (u <= lens.width + wide) & (v >= -high) & (v <= lens.height + high)
-    return int(np.count_nonzero(inside))

@@ -372,7 +372,9 @@ def test_a_missing_geoid_is_refused_and_named():
         with pytest.raises(InputError) as caught:
             bring_to(read, cloud, name="cameras.xml")
         message = str(caught.value)
-        assert message.startswith("cameras.xml: ellipsoidal heights (ETRS89) cannot be brought to")
+        assert message.startswith(
+            "cameras.xml: ellipsoidal heights (ETRS89) cannot be transformed to"
+        )
         assert "es_ign_egm08-rednap.tif" in message
         assert "pyproj sync" in message
         assert "PROJ_NETWORK=ON" in message
@@ -460,7 +462,9 @@ def test_with_the_geoid_installed_heights_are_brought_over(tmp_path):
 
 
 def test_two_vertical_datums_need_their_grids():
-    with pytest.raises(InputError, match=r"EGM96 height cannot be brought to Alicante height") as e:
+    with pytest.raises(
+        InputError, match=r"EGM96 height cannot be transformed to Alicante height"
+    ) as e:
         bring_to(cameras(VALENCIA, "EPSG:32630+5773"), UTM30_ALICANTE)
     assert "us_nga_egm96_15.tif" in str(e.value)
     assert "--cameras-crs EPSG:32630, the" in str(e.value)
@@ -579,8 +583,8 @@ def test_without_the_clouds_crs_no_map_is_chosen(at, crs, more):
         (VALENCIA, "EPSG:4326+5773", UTM30, "are not longitude and latitude"),
         (VALENCIA, "nonsense", UTM30, "a.xml: the CRS 'nonsense' is not one"),
         (VALENCIA, UTM30, "nonsense", "the cloud: the CRS 'nonsense' is not one"),
-        (VALENCIA, "EPSG:32630", "EPSG:4326", "the cloud: WGS 84 is in degrees; reproject"),
-        (VALENCIA, "EPSG:32630", "EPSG:2992", "is in foot; reproject"),
+        (VALENCIA, "EPSG:32630", "EPSG:4326", "the cloud: WGS 84 is in degrees. Reproject"),
+        (VALENCIA, "EPSG:32630", "EPSG:2992", "is in foot. Reproject"),
         (VALENCIA, "ENU:39", UTM30, "a.xml: 'ENU:39' is not ENU:latitude"),
         (VALENCIA, "EPSG:5703", UTM30, "is a vertical CRS"),
         ([1e30, 1e30, 5.0], "EPSG:32631", UTM30, r"image 0.jpg: its position 1e\+30.*cannot be"),

@@ -39,7 +39,7 @@ from pcfix.io.crs import (
     parse_crs,
     shortened,
 )
-from pcfix.io.transformations import transformation_in_plan, transformation_in_space
+from pcfix.io.transformations import transformation
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, Projection, TiePoints
 from pcfix.options.declare import File
 
@@ -239,8 +239,7 @@ def _world(
         )
     source, geographic = frame_of(cameras.crs, name).crs, parse_crs(GEOGRAPHIC_WGS84, name)
     stated = heights_of(source) != "unstated"
-    way = transformation_in_space if stated else transformation_in_plan
-    to_degrees = way(source, geographic, cameras.centres, name).forward
+    to_degrees = transformation(source, geographic, cameras.centres, name, heights=stated).forward
     longitude, latitude, _ = to_degrees(np.median(cameras.centres, axis=0)[None])[0].tolist()
     place = Topocentric(latitude, longitude, 0.0)
     centres, points = (_topocentric(to_degrees(xyz), place) for xyz in (cameras.centres, points))

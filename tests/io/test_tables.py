@@ -1,0 +1,123 @@
+"""Check depths in tables, and the file of a depth regression."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pcfix.io.regressions import read_regression, write_regression
+from pcfix.io.tables import read_check_depths
+from pcfix.refract.regression import fit_depths
+from tests.utils.codes import refused
+
+ROWS = "500001.5,4600002.25,1.5\n500003,4600004,2\n"
+
+
+def written(tmp_path, text, name="checks.csv"):
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x,y,depth\n" + ROWS,
+        "X;Y;Depth (m)\n" + ROWS.replace(",", ";"),
+        "id,Easting,Northing,Water depth [m],sigma\nA1,500001.5,4600002.25,1.5,0.02\n"
+        "A2,500003,4600004,2,\n",
+        "depth_m\ty_m\tx_m\n1.5\t4600002.25\t500001.5\n2\t4600004\t500003\n",
+        "x y depth\n\n" + ROWS.replace(",", " "),
+        "x,y,z,depth\n500001.5,4600002.25,-7,1.5\n500003,4600004,-7,2\n",
+    ],
+)
+def test_check_depths(tmp_path, text):
+    found = read_check_depths(written(tmp_path, text))
+    assert found.xy.tolist() == [[500001.5, 4600002.25], [500003.0, 4600004.0]]
+    assert found.value_m.tolist() == [1.5, 2.0]
+    assert not found.are_heights
+    assert len(found) == 2
+
+
+@pytest.mark.parametrize("name", ["z", "Elevation", "height_m", "altitude"])
+def test_check_heights(tmp_path, name):
+    found = read_check_depths(written(tmp_path, f"id,x,y,{name}\nA,1,2,-3.5\n"))
+    assert found.are_heights
+    assert found.value_m.tolist() == [-3.5]
+    assert found.where(0).endswith("checks.csv: line 2 (1.00, 2.00)")
+
+
+BAD = [
+    ("x,y\n1,2\n", "table.column_missing", {"missing": ["depth or z"]}),
+    ("y,depth\n1,2\n", "table.column_missing", {"missing": ["x"]}),
+    ("longitude,latitude,depth\n1,2,3\n", "table.column_missing", {"missing": ["x", "y"]}),
+    ("x,y,depth\n", "table.empty", {}),
+    ("", "table.empty", {}),
+    ("x,y,depth\n1,2,deep\n", "table.not_a_number", {"line": 2, "column": "depth"}),
+    ("x,y,depth\n1,2,3\n1,,3\n", "table.not_a_number", {"line": 3, "column": "y"}),
+    ("x,y,depth\n1,2,nan\n", "table.not_a_number", {"value": "nan"}),
+    ("x,y,depth\n1,2,1e308\n", "table.not_a_number", {"value": "1e308"}),
+    ("x,y,depth\n1,2,1e400\n", "table.not_a_number", {"value": "1e400"}),
+    ("x,y,depth\n1,2,1\n5,6,-3\n5,6,-4\n", "check_depths.negative", {"line": 3, "count": 2}),
+    ("x,y,depth\n1,2\n", "table.shifted", {"line": 2}),
+    ('x,y,depth\n1,2,"' + "1" * 200_000, "table.not_csv", {}),
+    ("x,y,depth_cm\n1,2,300\n", "table.unit", {"column": "depth_cm", "value": "cm"}),
+    ("x,y,depth (ft)\n1,2,3\n", "table.unit", {"value": "ft"}),
+    ("x,easting,y,depth\n1,1,2,3\n", "table.column_twice", {"columns": ["x", "easting"]}),
+    ("x,y,depth,depth\n1,2,3,4\n", "table.column_twice", {"columns": ["depth", "depth"]}),
+]
+
+
+@pytest.mark.parametrize(("text", "code", "values"), BAD)
+def test_bad_check_depths(tmp_path, text, code, values):
+    path = written(tmp_path, text)
+    with refused(code, path=path, **values):
+        read_check_depths(path)
+
+
+@pytest.fixture
+def line():
+    rng = np.random.default_rng(4)
+    x = rng.uniform(0.2, 5.0, 20)
+    return fit_depths(x, 0.05 + 1.4 * x + rng.normal(0, 0.1, 20))
+
+
+def test_regression_round_trip(tmp_path, line):
+    write_regression(tmp_path / "line.json", line, overwrite=False)
+    assert read_regression(tmp_path / "line.json") == line
+
+
+def changed(tmp_path, line, **values):
+    path = tmp_path / "line.json"
+    write_regression(path, line, overwrite=False)
+    content = {**json.loads(path.read_text()), **values}
+    path.write_text(json.dumps({k: v for k, v in content.items() if v is not ...}))
+    return path
+
+
+def test_slope_of_hsu_and_wang(tmp_path, line):
+    """They count heights from an origin at 190 mm; the slope is noted, not refused."""
+    values = {"slope": 0.9895, "intercept": -0.0083428, "r2": 0.79, "count": 16}
+    assert len(read_regression(changed(tmp_path, line, **values)).notes) == 1
+
+
+@pytest.mark.parametrize("text", ["slope = 1.4", "[1]", '{"version": 1}'])
+def test_not_a_regression(tmp_path, text):
+    with refused("regression.not_one"):
+        read_regression(written(tmp_path, text, "line.json"))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("slope", ...), ("cv_rmse", ...), ("slope", "1.4"), ("rmse", True)),
+        *(("intercept", float("nan")), ("slope", 0), ("slope", -1.4), ("slope_se", -0.1)),
+        *(("count", 2), ("count", 3.5), ("deepest", 0.0), ("version", 2), ("unit", "mm")),
+    ],
+)
+def test_bad_regression(tmp_path, line, name, value):
+    is_header = name in ("version", "unit")
+    with refused("regression.version" if is_header else "regression.value") as caught:
+        read_regression(changed(tmp_path, line, **{name: value}))
+    if not is_header:
+        assert caught.value.values["name"] == name
