@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, TypeAlias, TypeVar
 
 from pcfix.compare.match import Match
 from pcfix.compare.nearest import cloud_to_cloud, spacing_m
 from pcfix.compare.statistics import Distribution, distances_of
+from pcfix.errors import PcfixWarning
 from pcfix.model import FloatArray
 
 Given = TypeVar("Given")
 Figure = TypeVar("Figure")
 
 SPARSER = 2.0
-"""How many times farther apart points must be to be called sparse."""
+"""A cloud is called sparse if its spacing is so many times that of the other."""
 
 
 @dataclass(frozen=True, slots=True)
 class AfterBefore(Generic[Figure]):
-    """A figure after the correction and, where the cloud says where its points were, before."""
+    """A figure after the correction and, if the cloud has shift dimensions, before it."""
 
     after: Figure
     before: Figure | None
@@ -29,38 +30,24 @@ class AfterBefore(Generic[Figure]):
 def both(
     figure: Callable[[Given], Figure], after: Given, before: Given | None
 ) -> AfterBefore[Figure]:
-    """Return a figure of what is after, and of what was before where that is known."""
+    """Return a figure of the corrected cloud, and of the apparent one if it is known."""
     return AfterBefore(figure(after), None if before is None else figure(before))
 
 
-@dataclass(frozen=True, slots=True)
-class Further:
-    """The C2C of a further cloud, as it is; see `pcfix.compare.figures.Comparison`."""
-
-    name: str
-    cloud: str
-    c2c: Distribution | None
-    c2c_from_reference: Distribution | None
-
-
-@dataclass(frozen=True, slots=True)
-class C2c:
-    """The distances of a cloud in the directions that were asked for."""
-
-    to_reference: AfterBefore[Distribution] | None
-    from_reference: AfterBefore[Distribution] | None
+C2c: TypeAlias = tuple[AfterBefore[Distribution] | None, AfterBefore[Distribution] | None]
+"""Distances to the reference and from it; None for a direction that was not asked for."""
 
 
 def c2c_of(match: Match) -> C2c:
-    """Return the distances in every direction that the settings ask for.
+    """Return the distances in the directions of the settings.
 
-    By default from each point of the cloud, or of check points. From the reference means from each
-    of its points that the cloud reaches in plan, to the nearest of the whole cloud.
+    By default they start at each point of the cloud, or at each check point. From the reference
+    means from each of its points that the cloud covers in plan, to the nearest of the whole cloud.
     """
     rules = match.settings
 
     def distances(xyz: FloatArray) -> Distribution:
-        return distances_of(far_of(match, xyz), rules.classes, rules.share)
+        return distances_of(distances_to(match, xyz), rules.classes, rules.share)
 
     def distances_back(xyz: FloatArray) -> Distribution:
         return distances_of(cloud_to_cloud(match.places, xyz), rules.classes, rules.share)
@@ -70,49 +57,38 @@ def c2c_of(match: Match) -> C2c:
         to = both(distances, match.cloud.xyz, match.cloud.apparent)
     if rules.from_reference:
         back = both(distances_back, match.asked.xyz, match.asked.apparent)
-    return C2c(to, back)
+    return to, back
 
 
-def far_of(match: Match, xyz: FloatArray) -> FloatArray:
+def distances_to(match: Match, xyz: FloatArray) -> FloatArray:
     """Return the distance from each point of a cloud, or from each check point, shape (p,), m."""
     if match.reference.sparse:
         return cloud_to_cloud(match.places, xyz)
     return cloud_to_cloud(xyz, match.reference.xyz)
 
 
-def further_of(others: Mapping[str, Match]) -> tuple[Further, ...]:
-    """Return the distances of further clouds, by name."""
-    rows = []
-    for name, match in others.items():
-        found = c2c_of(match)
-        to, back = (
-            None if p is None else p.after for p in (found.to_reference, found.from_reference)
-        )
-        rows.append(Further(name, match.whole.name, to, back))
-    return tuple(rows)
-
-
-def sparse_notes(match: Match, found: C2c) -> list[str]:
-    """Return which distances rather say how far apart the points of a sparse cloud are."""
+def sparse_notes(match: Match, found: C2c) -> list[PcfixWarning]:
+    """Return warnings of distances that mostly measure the spacing of a sparse cloud."""
     if match.reference.sparse:
         return []
-    apart_m = {"reference": spacing_m(match.reference.xyz), "cloud": spacing_m(match.asked.xyz)}
-    ways = (
-        (found.to_reference, "reference", "cloud"), (found.from_reference, "cloud", "reference")
-    )  # fmt: skip
+    spacings = {"reference": spacing_m(match.reference.xyz), "cloud": spacing_m(match.asked.xyz)}
     notes = []
-    for pair, sparse, dense in ways:
-        times = apart_m[sparse] / max(apart_m[dense], 1e-9)
-        if pair is None or times < SPARSER or apart_m[sparse] < pair.after.statistics.mean_m:
+    for pair, sparse, dense in zip(found, spacings, reversed(spacings), strict=True):
+        apart, times = spacings[sparse], spacings[sparse] / max(spacings[dense], 1e-9)
+        if pair is None or times < SPARSER or apart < (mean := pair.after.statistics.mean_m):
             continue
-        remedy = f"give --direction {'from' if sparse == 'reference' else 'to'}-reference"
+        remedy = f"Give --direction {'from' if sparse == 'reference' else 'to'}-reference."
         if match.reference.raster:
-            remedy = "judge by the vertical error, or give the reference as points"
-        elif None not in (found.to_reference, found.from_reference):
-            remedy = f"judge by C2C from each point of the {sparse}"
+            remedy = "Use the vertical error, or give the reference as points."
+        elif None not in found:
+            remedy = f"Use C2C from each point of the {sparse}."
         notes.append(
-            f"the points of the {sparse} are {apart_m[sparse]:.2g} m apart, {times:.0f} times as"
-            f" far as those of the {dense}, so that C2C to the nearest of them"
-            f" ({pair.after.statistics.mean_m:.3f} m on average) is mostly this spacing; {remedy}"
+            PcfixWarning(
+                f"{sparse}.sparse",
+                f"C2C to the {sparse} ({mean:.3f} m on average) mostly measures the spacing of its"
+                f" points: {apart:.2g} m, {times:.0f} times that of the {dense}. {remedy}",
+                spacing_m=apart,
+                times=times,
+            )
         )
     return notes

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -44,12 +45,31 @@ def checked_points(xyz: npt.ArrayLike) -> FloatArray:
     """
     points = np.ascontiguousarray(xyz, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise SettingError(f"xyz must have the shape (n, 3), not {points.shape}.")
+        raise SettingError(
+            "option.shape", f"xyz has the shape {points.shape}. It must be (n, 3).",
+            option="xyz", shape=points.shape,
+        )  # fmt: skip
     finite = np.isfinite(points)
     if not finite.all():
         row = int(np.argmin(finite.all(axis=1)))
-        raise SettingError(f"xyz row {row} is not finite: {points[row].tolist()}; remove it.")
+        raise SettingError(
+            "cloud.not_finite",
+            f"xyz row {row} is not finite: {points[row].tolist()}. Remove the point.",
+            row=row,
+        )
     return points
+
+
+def checked_column(name: str, values: npt.ArrayLike, shape: tuple[int, ...]) -> npt.NDArray[Any]:
+    """Return values as an array; SettingError ``option.shape`` if it has not this shape."""
+    column = np.asarray(values)
+    if column.shape != shape:
+        raise SettingError(
+            "option.shape",
+            f"{name} has the shape {column.shape}. It must be {shape}, one row per point.",
+            option=name, shape=column.shape,
+        )  # fmt: skip
+    return column
 
 
 def as_surface(
