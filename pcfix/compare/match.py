@@ -206,11 +206,13 @@ def near_in_plan(xy: FloatArray, other_xy: FloatArray, limit_m: float) -> BoolAr
     all within the limit count, and none beyond 2.83 times the limit.
     """
     low, high = bounds(other_xy[:, :2])
-    size = ((high - low) / limit_m).astype(np.int64) + 6
-    low = low - 2.0 * limit_m  # the outermost squares are not near: points beyond fall into them
+    size = ((high - low) / limit_m).astype(np.int64) + 8
+    low = low - 2.0 * limit_m
 
     def squares(some: FloatArray) -> IntArray:
-        column, row = np.clip((some[:, :2] - low) / limit_m, 0, size - 1).astype(np.int64).T
+        # points beyond fall into the outermost squares, which are near to none
+        square = np.clip(np.floor((some[:, :2] - low) / limit_m) + 1.0, 0, size - 1)
+        column, row = square.astype(np.int64).T
         return np.asarray(row * size[0] + column)
 
     held = np.unique(np.hstack([np.unique(squares(other_xy[b])) for b in blocks(len(other_xy))]))

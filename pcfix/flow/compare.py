@@ -108,7 +108,7 @@ def _beside(given: CompareOptions) -> Path:
 
 
 def _further(path: Path | Tiles, water: WaterSurface | None, first: Match) -> Match:
-    """Match a further cloud at the places of the first, whose water it has if its own is unknown."""
+    """Match a further cloud at the places of the first, with its water where its own is unknown."""
     cloud, target = read_cloud(path, water), first.reference
     check_same_crs(cloud.name, cloud.crs, target.name, target.crs)
     over = first.water_at(cloud.xyz) if first.settings.submerged else None

@@ -1,19 +1,18 @@
-r"""Find the true point behind a port from which software would have made the apparent one.
+r"""Find the true point behind a port that straight rays would reconstruct at the apparent one.
 
-As `pcfix.refract.consistent` does it at a water surface: software that knows nothing of the port
-makes of the image points x_i of a true point Q the point P with the least squared residuals in the
-images, over straight rays. There the derivative by P is zero,
+As `pcfix.refract.consistent` at a water surface: software without a port model reconstructs from
+the image points x_i of a true point Q the point P with the least squared residuals in the images,
+over straight rays. There the derivative by P is zero,
 
     g(Q) = sum_i J_i' (x_i(Q) - pi_i(P)) = 0,    J_i = d pi_i / d P
 
-with pi_i the projection of camera i, three equations for the three unknowns of Q. Here x_i(Q) is
-the image of the direction in which the light of Q comes through the port, and
+with pi_i the projection of camera i: three equations for the three unknowns of Q. Here x_i(Q) is
+the image of the direction in which the light of Q comes through the port. Newton's method uses
 
     d g / d Q = sum_i J_i' K_i R_i,    K_i = d x_i / d w  d w / d X
 
-comes with it from `pcfix.port.light.through_port`: Newton's method.
-
-The covariance of Q is that of an adjustment of the images through the port,
+from `pcfix.port.light.through_port`. The covariance of Q is that of an adjustment of the images
+through the port,
 
     Cov Q = H^-1 (sum_i L_i' Cov(x_i) L_i) H^-1,    L_i = K_i R_i,  H = sum_i L_i' L_i
 
@@ -47,7 +46,7 @@ from pcfix.refract.consistent import check_consistent
 
 MAX_STEPS = 30
 CLOSE_M = 1e-7
-"""Of a step; as each squares the error, the next would be below a nanometre."""
+"""Length of the last step; as each squares the error, the next is below a nanometre."""
 
 
 def consistent_through_port(
@@ -58,16 +57,11 @@ def consistent_through_port(
     settings: ScienceOptions,
     start: Intersection,
 ) -> Intersection:
-    """Return `start` with shifts after which straight rays to the images meet in the points.
+    """Return `start` with the shifts of the true points that lead to the apparent points.
 
-    Apparent points xyz, shape (m, 3), metres, world frame; `start` is what `snell` makes of them,
-    from where the search begins; the rest as of `pcfix.port.methods.intersect_through_port`.
-    Points for which no true point is found keep the solution of `snell`, with a warning.
-
-    Raises
-    ------
-    SettingError
-        If the cameras have no angles or no lenses.
+    `start`, the solution of `snell`, is the first approximation; the rest is as for
+    `pcfix.port.methods.intersect_through_port`. Points without a solution keep that of `snell`,
+    with a warning. Raises SettingError if the cameras have no angles or no lenses.
     """
     check_consistent(cameras)
     moved = np.flatnonzero(start.outcome == Outcome.CORRECTED)
@@ -84,14 +78,13 @@ def port_covariances(
 ) -> FloatArray:
     """Return the covariance of points behind a port, true_xyz, shape (m, 3), metres, world frame.
 
-    Of the standard deviations those of the images, the refractive index, the projection centres
-    and the attitudes count. There is no surface to err.
+    The standard deviations of images, refractive index, projection centres and attitudes are used.
 
     Returns
     -------
     array, shape (m, 6)
-        xx, xy, xz, yy, yz, zz in metres squared, world frame; zeros where fewer than two rays
-        meet. Cameras without a lens stand in with that of a survey drone.
+        xx, xy, xz, yy, yz, zz in metres squared, world frame; zeros if fewer than two rays meet.
+        Cameras without a lens have that of a survey drone.
     """
     result = np.zeros((len(true_xyz), 6))
     in_tiles(
@@ -114,10 +107,10 @@ def _rows(views: Views) -> tuple[IntArray, IntArray]:
 
 @device
 def _image_through(a: Vector, rig: Rig, c: int, out: FloatArray, image: FloatArray) -> None:
-    """Fill in where a camera images what lies at C + a through the port.
+    """Project the point at C + a through the port of a camera.
 
-    `image`, shape (2, 8): the place, its derivatives by the point in the world and in the frame of
-    the camera, and by n.
+    `image`, shape (2, 8), gets u and v, their derivatives by the point in the world frame and in
+    the camera frame, and by n.
     """
     r = rig.rotations[c]
     through_port(rig.port, rig.n, *times(r, a), out)
@@ -136,7 +129,7 @@ def _search_all(
     span: Span, moved: IntArray, xyz: FloatArray, start: IntArray, camera: IntArray, rig: Rig,
     shift: FloatArray, found: BoolArray,
 ) -> None:  # fmt: skip
-    """Search each point; one that is not found keeps its shift."""
+    """Search each point; without a solution it keeps its shift."""
     for m in range(*span):
         i = moved[m]
         found[m] = _search(shift[i], row_of(xyz, i), camera[start[i] : start[i + 1]], rig)
@@ -144,7 +137,7 @@ def _search_all(
 
 @device(allocates=True)
 def _search(shift: FloatArray, point: Vector, cameras: IntArray, rig: Rig) -> bool:
-    """Move a point to where g is zero; whether it was reached."""
+    """Move a point by Newton's method to where g is zero; False if it is not reached."""
     q = shift.copy()
     out, image, g, slope = np.empty((3, 5)), np.empty((2, 8)), np.empty(3), np.empty((3, 3))
     for _ in range(MAX_STEPS):
@@ -174,9 +167,9 @@ def _covariances(
     span: Span, xyz: FloatArray, start: IntArray, camera: IntArray, rig: Rig,
     sigma_image: FloatArray, sigmas: tuple[float, float, float], result: FloatArray,
 ) -> None:  # fmt: skip
-    """Sum up H, the noise and the column of n over the rays of each point, and solve.
+    """Sum H, the noise and the column of n over the rays of each point, and solve.
 
-    Standard deviations of the image for each camera; of index, projection centre and attitude.
+    `sigmas` are those of index, projection centre and attitude.
     """
     for i in range(*span):
         cameras = camera[start[i] : start[i + 1]]
@@ -213,10 +206,10 @@ def _image_noise(
     w: FloatArray, image: FloatArray, seen: Vector, sigma_image: float, sigma_centre: float,
     sigma_attitude: float,
 ) -> None:  # fmt: skip
-    """Fill in the covariance of one image place: its own, and that of what the pose errs.
+    """Write the covariance of one image place: its own, and that of the errors of the pose.
 
-    A camera that moves sees the point move the other way; one that turns about its centre takes
-    the port along, and sees the point X move by X x omega.
+    If a camera moves, the point moves the other way in its frame; if it turns about its centre with
+    its port, the point X moves by X x omega.
     """
     for a in range(2):
         for b in range(2):

@@ -1,4 +1,4 @@
-"""The correction of a cloud that was taken through a housing port: choose, intersect, invert."""
+"""Correct a cloud taken through a housing port: choose cameras, intersect, invert."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def correct_through_port(
     settings: ScienceOptions,
     views: Views | None = None,
 ) -> Intersection:
-    """Return where the points of a cloud are that straight rays made under water, and how well.
+    """Correct points reconstructed with straight rays under water, with their uncertainty.
 
-    The parameters, errors and result are those of `intersect_through_port`; besides, `sigma_z_m`
-    and `covariance_m2` are filled, of `pcfix.port.inversion.port_covariances`.
+    As `intersect_through_port`, with `sigma_z_m` and `covariance_m2` of
+    `pcfix.port.inversion.port_covariances`.
     """
     parts, order = [], spatial_order(xyz)
     for rows in batches(order):
@@ -44,30 +44,31 @@ def intersect_through_port(
     settings: ScienceOptions,
     views: Views | None = None,
 ) -> tuple[Intersection, Views]:
-    """Return where the points of a cloud are that straight rays made under water.
+    """Correct points reconstructed with straight rays under water.
+
+    Snell's law at each face (Skarlatos & Agrafiotis 2018, eq 10), then the point nearest to all
+    rays (eq 11).
 
     Parameters
     ----------
     xyz : array, shape (m, 3)
-        Points where straight rays put them, metres, world frame; all of them under water.
+        Apparent points, metres, world frame; all of them under water.
     cameras : Cameras
-        Poses that are right, world frame, and lenses; a lens that has taken on what the port does
-        belongs to `pcfix adjust` first.
+        Correct poses, world frame, and lenses. (If the lens absorbed the port, run `pcfix adjust`
+        first.)
     port : Port
-        The same before each camera.
+        The same for all cameras.
     settings : ScienceOptions
-        Refractive index of the water; the largest angle is that in air at the inner face, and of
-        more than the most cameras those with the smallest are taken. With the method consistent
-        the residuals of the straight rays count, with any other they are taken for zero.
+        The incidence angle is that in air at the inner face. With the method consistent the
+        residuals of the straight rays are used, with any other they are taken as zero.
     views : Views, optional
-        The cameras of each point. Without it, every camera whose frame holds it: with the method
-        consistent the image of the true point must be in the frame, with others the apparent one.
+        The cameras of each point. Without it, every camera whose frame holds the image of the true
+        point (method consistent) or of the apparent one (other methods).
 
     Returns
     -------
     found : Intersection
-        One row per input point, in the same order. The miss is that of the rays through the
-        apparent point, the incidence that in air at the inner face.
+        One row per input point. The ray distance is that of the rays through the apparent point.
     chosen : Views
         The cameras that were used.
 
@@ -75,11 +76,6 @@ def intersect_through_port(
     ------
     SettingError
         If the cameras have no angles, or the method consistent finds no lenses.
-
-    Notes
-    -----
-    Snell's law at each face (Skarlatos & Agrafiotis 2018, eq 10), then the point nearest to all
-    rays (eq 11).
     """
     chosen = port_views(xyz, cameras, port, settings, views)
     found = _intersect_chosen(xyz, chosen, cameras, port, settings)
@@ -96,13 +92,13 @@ def intersect_through_port(
 
 
 ROUNDS = 6
-"""A point at the border of an image may go in and out; it stays as it is after so many rounds."""
+"""At the border of an image a point may alternate in and out; after so many rounds it stays."""
 
 
 def _intersect_chosen(
     xyz: FloatArray, chosen: Views, cameras: Cameras, port: Port, settings: ScienceOptions
 ) -> Intersection:
-    """Intersect the rays through apparent points, shape (m, 3), with their cameras known."""
+    """Intersect the rays through apparent points, shape (m, 3), of known cameras."""
     owner = np.repeat(np.arange(len(xyz)), np.diff(chosen.start))
     ray = xyz[owner] - cameras.centres[chosen.camera]
     looking = np.einsum("oij,oj->oi", rotations_of(cameras)[chosen.camera], ray)
@@ -113,7 +109,7 @@ def _intersect_chosen(
 
 
 def _other_rows(one: Views, other: Views) -> IntArray:
-    """Return the points that have other cameras in one list than in the other."""
+    """Return the points whose cameras differ between two lists."""
     same = np.diff(one.start) == np.diff(other.start)
     rows = np.flatnonzero(same)
     a, b = one.take(rows), other.take(rows)
