@@ -22,7 +22,7 @@ from pcfix.lens.imaging import project
 from pcfix.model import BoolArray, Cameras, FloatArray, TiePoints
 from pcfix.options.declare import File
 from pcfix.sums import Sums
-from pcfix.water.tilted import Tilted
+from pcfix.water.search import Tilted
 
 SAMPLE_POINTS, IN_FRAMES = 30_000, 4_000
 """Points that are looked at for a shoreline, and in the frames; evenly spread over the cloud."""
