@@ -348,7 +348,7 @@ def _with_heights(
     heights = heights_from_cloud(places, np.vstack(near), SHORE_RADIUS_M)
     notes.append(
         f"{name}: {int(lacking.sum()):,} points have no height and get that of the cloud within"
-        f" {SHORE_RADIUS_M:g} m; {int(np.isnan(heights).sum()):,} of them have none and are ignored."
+        f" {SHORE_RADIUS_M:g} m; {int(np.isnan(heights).sum()):,} have none and are ignored."
     )
     filled = xyz.copy()
     filled[lacking, 2] = heights

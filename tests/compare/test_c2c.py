@@ -124,11 +124,8 @@ def test_submerged(corrected):
     )
     # S: refraction left 0.4 and 2.2 m; here a bed of twelve metres
     assert before.mean_m > 1.5 > 0.5 > after.mean_m
-
-
-def test_water_of_first_cloud(corrected):
-    given = {"submerged": True, "also": {"raw": SCENE / "cloud.laz"}}
-    found = compare_clouds(corrected, LIDAR, **given)
+    # a further cloud without water has that of the first
+    found = compare_clouds(corrected, LIDAR, submerged=True, also={"raw": SCENE / "cloud.laz"})
     raw, before = found.also[0].c2c.statistics, found.c2c.before.statistics
     # points within a millimetre of the surface may be dry here and wet there
     assert raw.count == pytest.approx(before.count, abs=20)
@@ -144,6 +141,9 @@ def test_classes_of_cloudcompare(count, classes):
     assert sum(found.histogram.counts) == count
     assert found.histogram.edges_m[-1] >= found.statistics.max_m
     assert len(distances_of(values, 20, []).histogram.counts) == 20
+    touching = [(0.0, 0.5), (0.5, 1.0), (1.0, 3.0)]
+    shares = distances_of(np.array([0.0, 0.5, 0.5, 1.0, 2.0]), None, touching).shares
+    assert [one.share for one in shares] == [0.2, 0.4, 0.4]
 
 
 def test_further_cloud_at_same_places(tmp_path):
@@ -159,12 +159,6 @@ def test_further_cloud_at_same_places(tmp_path):
     assert found.also[0].c2c_from_reference.statistics.count == count
     assert len(beside) <= count < len(there)
     assert found.also[0].c2c_from_reference.statistics.max_m > 30.0
-
-
-def test_touching_bands():
-    values = np.array([0.0, 0.5, 0.5, 1.0, 2.0])
-    shares = distances_of(values, None, [(0.0, 0.5), (0.5, 1.0), (1.0, 3.0)]).shares
-    assert [one.share for one in shares] == [0.2, 0.4, 0.4]
 
 
 def test_gauss_as_in_cloudcompare(both):

@@ -190,7 +190,7 @@ def test_respect_classes():
     kept = np.isin(classes, (2, 41))
     np.testing.assert_array_equal(found[kept], classes[kept])
     assert (found[(classes == 40) & (xyz[:, 2] > WATER_M + 0.02)] == 1).all()
-    with refused("option.respect_classes", points=wet.sum()):
+    with refused("option.respect_classes", points=int(wet.sum())):
         labelled(part_of(xyz, classes), respect_classes=(0, 2, 5, 40, 41))[1].check("cloud")
 
 
