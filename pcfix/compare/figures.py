@@ -6,15 +6,15 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
 from pcfix.blocks import kept, mapped
 from pcfix.clean.neighbours import nearest_distance
-from pcfix.compare.c2c import AfterBefore, both, c2c_of, distances_to, sparse_notes
 from pcfix.compare.m3c2 import M3c2, m3c2_distances
 from pcfix.compare.match import Match
+from pcfix.compare.nearest import cloud_to_cloud, spacing_m
 from pcfix.compare.sections import Section, SectionLine, lines_downslope, section_along
 from pcfix.compare.statistics import (
     Bin,
@@ -25,6 +25,7 @@ from pcfix.compare.statistics import (
     Statistics,
     Tvu,
     binned,
+    distances_of,
     distribution_of,
     fit_line,
     own_of,
@@ -35,6 +36,17 @@ from pcfix.compare.vertical import Pairs, heights_at
 from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.model import BoolArray, FloatArray
 from pcfix.options.steps import CompareRules
+
+Given = TypeVar("Given")
+Figure = TypeVar("Figure")
+
+
+@dataclass(frozen=True, slots=True)
+class AfterBefore(Generic[Figure]):
+    """A figure after the correction and, if the cloud has shift dimensions, before it."""
+
+    after: Figure
+    before: Figure | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,6 +149,8 @@ def bins_table(bins: Iterable[Bin]) -> str:
     return "\n".join(lines) + "\n"
 
 
+SPARSER = 2.0
+"""A cloud is called sparse if its spacing is so many times that of the other."""
 AS_DEEP, TOO_DEEP = 0.10, 0.15
 """Relative to the depth: a cloud whose apparent depths differ from the reference by at most the
 first, and whose corrected ones by more than the second, was corrected twice. Refraction makes
@@ -216,6 +230,73 @@ def figures_of(
         seconds=round(time.perf_counter() - started, 3),
         check_points=residuals,
     )
+
+
+def both(
+    figure: Callable[[Given], Figure], after: Given, before: Given | None
+) -> AfterBefore[Figure]:
+    """Return a figure of the corrected cloud, and of the apparent one if it is known."""
+    return AfterBefore(figure(after), None if before is None else figure(before))
+
+
+C2c: TypeAlias = tuple[AfterBefore[Distribution] | None, AfterBefore[Distribution] | None]
+"""Distances to the reference and from it; None for a direction that was not asked for."""
+
+
+def c2c_of(match: Match) -> C2c:
+    """Return the distances in the directions of the settings.
+
+    By default they start at each point of the cloud, or at each check point. From the reference
+    means from each of its points that the cloud covers in plan, to the nearest of the whole cloud.
+    """
+    rules = match.settings
+
+    def distances(xyz: FloatArray) -> Distribution:
+        return distances_of(distances_to(match, xyz), rules.classes, rules.share)
+
+    def distances_back(xyz: FloatArray) -> Distribution:
+        return distances_of(cloud_to_cloud(match.places, xyz), rules.classes, rules.share)
+
+    to = back = None
+    if rules.direction != "from-reference":
+        to = both(distances, match.cloud.xyz, match.cloud.apparent)
+    if rules.from_reference:
+        back = both(distances_back, match.asked.xyz, match.asked.apparent)
+    return to, back
+
+
+def distances_to(match: Match, xyz: FloatArray) -> FloatArray:
+    """Return the distance from each point of a cloud, or from each check point, shape (p,), m."""
+    if match.reference.sparse:
+        return cloud_to_cloud(match.places, xyz)
+    return cloud_to_cloud(xyz, match.reference.xyz)
+
+
+def sparse_notes(match: Match, found: C2c) -> list[PcfixWarning]:
+    """Return warnings of distances that mostly measure the spacing of a sparse cloud."""
+    if match.reference.sparse:
+        return []
+    spacings = {"reference": spacing_m(match.reference.xyz), "cloud": spacing_m(match.asked.xyz)}
+    notes = []
+    for pair, sparse, dense in zip(found, spacings, reversed(spacings), strict=True):
+        apart, times = spacings[sparse], spacings[sparse] / max(spacings[dense], 1e-9)
+        if pair is None or times < SPARSER or apart < (mean := pair.after.statistics.mean_m):
+            continue
+        remedy = f"Give --direction {'from' if sparse == 'reference' else 'to'}-reference."
+        if match.reference.raster:
+            remedy = "Use the vertical error, or give the reference as points."
+        elif None not in found:
+            remedy = f"Use C2C from each point of the {sparse}."
+        notes.append(
+            PcfixWarning(
+                f"{sparse}.sparse",
+                f"C2C to the {sparse} ({mean:.3f} m on average) mostly measures the spacing of its"
+                f" points: {apart:.2g} m, {times:.0f} times that of the {dense}. {remedy}",
+                spacing_m=apart,
+                times=times,
+            )
+        )
+    return notes
 
 
 def _pairs(match: Match) -> AfterBefore[Pairs]:

@@ -8,7 +8,7 @@ A dense cloud has no image places, but its points stand for them: software witho
 the point P where straight lines from the projection centres meet best. So the line from a centre C
 to P has the direction of the image place, except for the residual of that adjustment. Through a
 flat port that residual is large, a hundred pixels and more if many images of a camera calibrated in
-air see a point. The method `consistent` (`pcfix.port.inversion`) uses it, `snell` does not.
+air see a point. The method `consistent` (`pcfix.port.methods`) uses it, `snell` does not.
 
 Which images contributed to P matters as much. Without a view list it is a set of images whose
 frames hold the image of the true point that they lead to. There may be several such sets; then the

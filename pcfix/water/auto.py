@@ -13,9 +13,8 @@ from pcfix.errors import GeometryError
 from pcfix.model import NOISE_CLASSES, FloatArray, WaterPlane
 from pcfix.water import search
 from pcfix.water.checks import checked_column
-from pcfix.water.cues import SLOPE, gain_of
+from pcfix.water.cues import SLOPE, Samples, gain_of, layer_gain, sample_cloud
 from pcfix.water.fit import fit_water
-from pcfix.water.samples import Samples, layer_gain, sample_cloud
 from pcfix.water.search import INSTEAD, LAYER, Looked, Peak, Tilted, find_tilt, judge
 
 LEAST_POINTS = 2_000

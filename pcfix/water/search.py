@@ -9,8 +9,17 @@ import numpy as np
 
 from pcfix.errors import GeometryError
 from pcfix.model import BoolArray, FloatArray
-from pcfix.water.cues import BRIGHT, SLOPE, Cue, Moments, cue_moments, cues_of, gain_of
-from pcfix.water.samples import Samples, layer_gain
+from pcfix.water.cues import (
+    BRIGHT,
+    SLOPE,
+    Cue,
+    Moments,
+    Samples,
+    cue_moments,
+    cues_of,
+    gain_of,
+    layer_gain,
+)
 
 LARGEST_TILT, USUAL_TILT = 0.006, 0.002
 TILT_STEP_M, MOST_TILT_STEPS = 0.15, 9

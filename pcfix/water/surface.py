@@ -322,23 +322,13 @@ def in_two_sheets(tin: Tin) -> tuple[BoolArray, FloatArray]:
 
     A height field has one height above each place, so that its mesh must be one sheet.
     """
-    double = _meet_others(tin, tin.corners.mean(axis=1))
-    edge1, edge2 = tin.corners[:, 1] - tin.corners[:, 0], tin.corners[:, 2] - tin.corners[:, 0]
-    area_m2 = np.abs(edge1[:, 0] * edge2[:, 1] - edge1[:, 1] * edge2[:, 0]) / 2.0
-    return double, area_m2
+    import shapely
 
-
-@kernel(allocates=True)
-def _meet_others(tin: Tin, centres: FloatArray) -> BoolArray:
-    """Return the facets whose centre lies in another facet of another height."""
+    triangles, centres = shapely.polygons(tin.corners), tin.corners.mean(axis=1)
+    tree = shapely.STRtree(triangles)
+    facet, other = tree.query(shapely.points(centres), predicate="intersects")
+    a, b, c = (tin.planes[other] - tin.planes[facet]).T
+    u, v = centres[facet].T
     double = np.zeros(len(centres), np.bool_)
-    for f in range(len(centres)):
-        u, v = centres[f]
-        cell = int(v // tin.cell_m) * tin.columns + int(u // tin.cell_m)
-        for k in range(tin.cell_start[cell], tin.cell_start[cell + 1]):
-            other = tin.cell_facet[k]
-            a, b, c = tin.planes[other] - tin.planes[f]
-            if abs(a + (b * u + c * v)) > APART_M and _inside(tin.corners[other], u, v):
-                double[f] = True
-                break
-    return double
+    double[facet[np.abs(a + (b * u + c * v)) > APART_M]] = True
+    return double, shapely.area(triangles)

@@ -13,8 +13,7 @@ from pcfix.lens.imaging import unproject
 from pcfix.model import Outcome
 from pcfix.options.correct import BudgetOptions, ScienceOptions
 from pcfix.port.intersection import intersect_rays, port_views
-from pcfix.port.inversion import port_covariances
-from pcfix.port.methods import correct_through_port, intersect_through_port
+from pcfix.port.methods import correct_through_port, intersect_through_port, port_covariances
 from pcfix.port.shapes import DomePort, FlatPort
 from tests.utils.codes import refused
 from tests.utils.port_scenes import simulate_port
