@@ -1,15 +1,15 @@
-"""The nearest neighbours of points, exact across the borders of tiles.
+"""Nearest neighbours of points, in memory that does not grow with the cloud.
 
-A point's neighbours are looked for in its own tile, then in every other tile whose box is nearer
-than the farthest neighbour so far; the k nearest of all that were found are kept. So the result is
-that of one tree over the whole cloud, however the tiles lie, and an outlier far from everything
-costs a few queries, not a tree of everything.
+The cloud is cut into square tiles of the plan. The neighbours of a point are searched in its own
+tile, then in every other tile whose bounding box is nearer than the farthest neighbour so far. So
+the result is that of one tree over the whole cloud, and an outlier far from everything costs a few
+queries.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 
 PIECE_ROWS = 65_536
 SLACK = 1.0 + 1e-9
-"""Distances nearer to each other than this count as equal: more than rounding, less than any
-step of a LAS file at the distance of neighbours."""
+"""Distances whose ratio is smaller than this count as equal: more than rounding, less than any step
+of a LAS file at the distance of neighbours."""
 _TREES = 16
-_SPARE, _MOST_COLUMNS = 8, 1024
+_SPARE_COLUMNS, _MOST_COLUMNS = 8, 1024
 _ENTRIES = 4_000_000
 
 
 class Neighbours:
-    """Finds neighbours among the points of tiles.
+    """Search neighbours among the points of tiles.
 
     Parameters
     ----------
@@ -47,7 +47,15 @@ class Neighbours:
     def __init__(self, tiles: Tiles, axes: int, jobs: int | None = None) -> None:
         self.tiles, self.axes, self.workers = tiles, axes, -1 if jobs is None else jobs
         self._low, self._high = tiles.low[:, :axes], tiles.high[:, :axes]
-        self._tree = _trees(tiles, axes)
+
+        @lru_cache(maxsize=_TREES)
+        def tree(tile: int) -> cKDTree:
+            from scipy.spatial import cKDTree  # slow to import, and C2C seldom needs it
+
+            first, last = tiles.start[tile : tile + 2]
+            return cKDTree(np.array(tiles.xyz[first:last, :axes]), balanced_tree=False)
+
+        self._tree = tree
 
     def nearest(self, xyz: FloatArray, k: int) -> tuple[FloatArray, IntArray]:
         """Return the k nearest points of the tiles, which hold at least k.
@@ -55,7 +63,7 @@ class Neighbours:
         Parameters
         ----------
         xyz : array, shape (q, 3)
-            Best near to each other.
+            Queries are quicker if these are near to each other.
         k : int
 
         Returns
@@ -63,8 +71,8 @@ class Neighbours:
         distance_m : array, shape (q, k)
             Ascending.
         place : array of int, shape (q, k)
-            In the arrays of the tiles. Which of equally far points comes first, or comes at all
-            where the last are equally far, is not defined.
+            Index in the arrays of the tiles. The order of equally far points is not defined, nor
+            which of them are returned if the last ones are equally far.
         """
         points = np.ascontiguousarray(xyz[:, : self.axes])
         distance = np.full((len(points), k), np.inf)
@@ -81,7 +89,7 @@ class Neighbours:
             if not rest.size:
                 break
             rows = rest
-            for axis in range(self.axes):  # most lie beyond a side of it, which is quick to see
+            for axis in range(self.axes):  # one side of the box rejects most points at once
                 at, reach = points[rows, axis], distance[rows, -1] * SLACK
                 low, high = self._low[tile, axis], self._high[tile, axis]
                 rows = rows[(low - at <= reach) & (at - high <= reach)]
@@ -102,8 +110,7 @@ class Neighbours:
             distance_upper_bound=float(distance[rows, -1].max()) * SLACK,
             workers=self.workers,
         )
-        new, where = np.asarray(found[0]), np.asarray(found[1])
-        places = where + self.tiles.start[tile]
+        new, places = np.asarray(found[0]), np.asarray(found[1]) + self.tiles.start[tile]
         if np.isinf(distance[rows, 0]).all():  # nothing to merge with
             distance[rows, : new.shape[1]], place[rows, : new.shape[1]] = new, places
             return
@@ -112,6 +119,25 @@ class Neighbours:
         distance[rows] = np.take_along_axis(both, order, axis=1)
         place[rows] = np.take_along_axis(places, order, axis=1)
 
+    def with_ties(
+        self, xyz: FloatArray, k: int, spare: int
+    ) -> Iterator[tuple[IntArray, FloatArray, IntArray]]:
+        """Yield rows of xyz with their k nearest points and all that are as far as the last.
+
+        The number of columns begins with k + spare and is doubled until the last column is farther
+        than column k, or there are a thousand.
+        """
+        most = min(len(self.tiles.row), max(_MOST_COLUMNS, k))
+        columns, rest = min(k + spare, most), np.arange(len(xyz))
+        while rest.size:
+            size, tied = max(1, _ENTRIES // columns), []
+            for rows in (rest[first : first + size] for first in range(0, len(rest), size)):
+                distance, place = self.nearest(xyz[rows], columns)
+                more = (distance[:, -1] <= distance[:, k - 1] * SLACK) & (columns < most)
+                tied.append(rows[more])
+                yield rows[~more], distance[~more], place[~more]
+            columns, rest = min(2 * columns, most), np.concatenate(tied)
+
 
 def nearest_of(
     places: FloatArray, points: FloatArray, k: int, axes: int
@@ -119,31 +145,16 @@ def nearest_of(
     """Yield rows (c,) of places, these, and distances (c, k) and places of their k nearest points.
 
     Places and points, (n, 2) or (n, 3), are in one frame, metres; there are at least k points. The
-    nearest comes first, and of equally far ones the first of the cloud, whatever the tiles.
+    nearest comes first; of equally far ones, the first of the cloud.
     """
-    near = Neighbours(make_tiles(points), axes)
-    asked = make_tiles(places)
+    near, asked = Neighbours(make_tiles(points), axes), make_tiles(places)
     for piece in asked.pieces(PIECE_ROWS):
-        xyz = asked.xyz[piece]
-        distance, place = _first_nearest(near, xyz, k, k + 1)
-        yield asked.row[piece], xyz, distance, near.tiles.xyz[place]
-
-
-def _first_nearest(
-    near: Neighbours, xyz: FloatArray, k: int, columns: int
-) -> tuple[FloatArray, IntArray]:
-    """Return distance and place of the k nearest, looking at more until all that tie are seen."""
-    columns = min(columns, len(near.tiles.row))
-    distance, place = near.nearest(xyz, columns)
-    tied = np.flatnonzero(distance[:, -1] == distance[:, k - 1])
-    order = np.lexsort((near.tiles.row[place], distance), axis=1)[:, :k]
-    distance = np.take_along_axis(distance, order, axis=1)
-    place = np.take_along_axis(place, order, axis=1)
-    if tied.size and columns < min(len(near.tiles.row), _MOST_COLUMNS):
-        size = max(1, _ENTRIES // (2 * columns))
-        for rows in (tied[a : a + size] for a in range(0, len(tied), size)):
-            distance[rows], place[rows] = _first_nearest(near, xyz[rows], k, 2 * columns)
-    return distance, place
+        row, xyz = asked.row[piece], asked.xyz[piece]
+        for some, distance, place in near.with_ties(xyz, k, 1):
+            order = np.lexsort((near.tiles.row[place], distance), axis=1)[:, :k]
+            first = np.take_along_axis(place, order, axis=1)
+            distance = np.take_along_axis(distance, order, axis=1)
+            yield row[some], xyz[some], distance, near.tiles.xyz[first]
 
 
 def nearest_distance(places: FloatArray, points: FloatArray, axes: int) -> FloatArray:
@@ -155,76 +166,34 @@ def nearest_distance(places: FloatArray, points: FloatArray, axes: int) -> Float
     return distance
 
 
-def _trees(tiles: Tiles, axes: int) -> Callable[[int], cKDTree]:
-    """Return what grows the tree of a tile, and keeps the last few."""
+def height_quartiles(near: Neighbours, xyz: FloatArray, k: int) -> FloatArray:
+    """Return the lower and upper quartile of the neighbours' heights, shape (q, 2), metres.
 
-    @lru_cache(maxsize=_TREES)
-    def tree(tile: int) -> cKDTree:
-        from scipy.spatial import cKDTree  # not quick to load, and C2C seldom needs it
-
-        first, last = tiles.start[tile : tile + 2]
-        return cKDTree(np.array(tiles.xyz[first:last, :axes]), balanced_tree=False)
-
-    return tree
+    The neighbours of points (q, 3) are the k nearest in plan and all that are as far as the last of
+    them, so that the result does not depend on the order of the points. (If more than a thousand
+    are equally far, any thousand of them.) `near` has two axes.
+    """
+    quartiles = np.empty((len(xyz), 2))
+    for rows, distance, place in near.with_ties(xyz, k, _SPARE_COLUMNS):
+        counts = distance <= distance[:, k - 1 : k] * SLACK
+        heights = np.sort(np.where(counts, near.tiles.xyz[:, 2][place], np.inf), axis=1)
+        last = counts.sum(axis=1)[:, None] - 1
+        # linear between order statistics, as numpy.percentile has it, but for rows of own lengths
+        position = last * np.array([0.25, 0.75])
+        left = np.floor(position).astype(np.int64)
+        a, b = (
+            np.take_along_axis(heights, at, axis=1) for at in (left, np.minimum(left + 1, last))
+        )
+        quartiles[rows] = a + (position - left) * (b - a)
+    return quartiles
 
 
 def _gap(
     low: FloatArray, high: FloatArray, other_low: FloatArray, other_high: FloatArray
 ) -> FloatArray:
-    """Return the distance between boxes, zero where they touch; the last axis is x, y(, z)."""
+    """Return the distance between boxes, zero if they touch; the last axis is x, y(, z)."""
     apart = np.maximum(np.maximum(other_low - high, low - other_high), 0.0)
     return np.asarray(np.sqrt((apart * apart).sum(axis=-1)))
-
-
-def mean_of_first(distance: FloatArray, k: int) -> FloatArray:
-    """Return the mean of the first k columns, shape (q,), summed from the left."""
-    total = np.zeros(len(distance))
-    for column in range(k):
-        total += distance[:, column]
-    return total / k
-
-
-def height_quartiles(
-    neighbours: Neighbours, xyz: FloatArray, k: int, columns: int | None = None
-) -> FloatArray:
-    """Return the lower and upper quartile of the neighbours' heights, shape (q, 2), metres.
-
-    The neighbours are the k nearest in plan and all that are as far as the last of them, so that
-    the result does not depend on the order of the points. (Where more than a thousand are equally
-    far, any thousand of them.)
-
-    Parameters
-    ----------
-    neighbours : Neighbours
-        With two axes.
-    xyz : array, shape (q, 3)
-        Metres, world frame.
-    k : int
-    columns : int, optional
-        How many to look at; grows until all that are equally far are among them.
-    """
-    count = len(neighbours.tiles.row)
-    columns = min(columns or k + _SPARE, count)
-    distance, place = neighbours.nearest(xyz, columns)
-    near = distance <= distance[:, k - 1 : k] * SLACK
-    heights = np.where(near, neighbours.tiles.xyz[:, 2][place], np.inf)
-    quartiles = _quartiles(np.sort(heights, axis=1), near.sum(axis=1))
-    if columns < min(count, _MOST_COLUMNS):
-        tied = np.flatnonzero(near[:, -1])
-        size = max(1, _ENTRIES // (2 * columns))
-        for first in range(0, len(tied), size):
-            rows = tied[first : first + size]
-            quartiles[rows] = height_quartiles(neighbours, xyz[rows], k, 2 * columns)
-    return quartiles
-
-
-def _quartiles(ascending: FloatArray, count: IntArray) -> FloatArray:
-    """Return the quartiles of the first `count` entries of each row, between two of them linear."""
-    position = (count[:, None] - 1) * np.array([0.25, 0.75])
-    left = np.floor(position).astype(np.int64)
-    right = np.minimum(left + 1, count[:, None] - 1)
-    a, b = (np.take_along_axis(ascending, at, axis=1) for at in (left, right))
-    return np.asarray(a + (position - left) * (b - a))
 
 
 POINTS_PER_TILE = 250_000
@@ -235,24 +204,12 @@ _SPACINGS_ACROSS = 8
 
 @dataclass(frozen=True, eq=False)
 class Tiles:
-    """The m used points of a cloud, tile by tile, neighbours in a tile near to each other.
+    """The m used points of a cloud, sorted by tile."""
 
-    Attributes
-    ----------
-    xyz : array, shape (m, 3)
-        Metres, world frame.
-    row : array, shape (m,)
-        Where each point stands in the cloud.
-    start : array, shape (t + 1,)
-        Tile i holds the places ``start[i]`` to ``start[i + 1]``. No tile is empty.
-    low, high : array, shape (t, 3)
-        The smallest box about the points of each tile.
-    """
-
-    xyz: FloatArray
-    row: IntArray
-    start: IntArray
-    low: FloatArray
+    xyz: FloatArray  # (m, 3), metres, world frame
+    row: IntArray  # (m,), index of each point in the cloud
+    start: IntArray  # (t + 1,), tile i holds the places start[i] to start[i + 1]; none is empty
+    low: FloatArray  # (t, 3), bounding box of the points of each tile
     high: FloatArray
 
     def __len__(self) -> int:
@@ -266,7 +223,7 @@ class Tiles:
                 let_go()
 
     def within(self, low: FloatArray, high: FloatArray) -> IntArray:
-        """Return the places of the points in a box, (3,) each, those of the cloud's order."""
+        """Return the places of the points in a box, (3,) each, in the order of the cloud."""
         touched = np.flatnonzero(((self.low <= high) & (self.high >= low)).all(axis=1))
         found = [np.empty(0, np.int64)]
         for first, last in ((int(self.start[i]), int(self.start[i + 1])) for i in touched):
@@ -292,6 +249,9 @@ def make_tiles(
 ) -> Tiles:
     """Sort the used points into square tiles.
 
+    The tiles cover all but the outermost hundredth of the points, so that no outlier stretches
+    them; points beyond belong to the tile at the edge.
+
     Parameters
     ----------
     xyz : array, shape (n, 3), or (n, 2) in plan
@@ -299,66 +259,45 @@ def make_tiles(
     used : array of bool, shape (n,), optional
         At least one is true; default all.
     tile_m : float, optional
-        Side of a tile; default such that a tile holds about so many `points`.
+        Side of a tile; default such that a tile holds about `points`.
     strips : bool
-        Whether the points of a tile are put in an order that trees are quick in.
+        Whether to sort the points of a tile along narrow strips. A tree is queried twice as fast in
+        this order: each point finds in the processor's cache what its predecessor needed.
     """
-    lattice = _Lattice(xyz, used, tile_m, points)
-    tiles = lattice.columns * lattice.rows
-    number = mapped(lattice.tile_of, xyz)
+    step = max(1, len(xyz) // _SAMPLE)
+    sample = xyz[::step] if used is None else xyz[::step][used[::step]]
+    if used is not None and not len(sample):
+        sample = np.array(xyz[int(np.argmax(used))])[None, :]
+    origin, high = np.percentile(sample[:, :2], (1.0, 99.0), axis=0)
+    extent = np.maximum(high - origin, 1e-3)
+    share = points / (len(xyz) if used is None else int(used.sum()))
+    side = math.sqrt(float(extent.prod()) * share) if tile_m is None else tile_m
+    side = max(side, float(extent.max()) / _MOST_TILES_A_SIDE)
+    columns, rows = np.ceil(extent / side).astype(int).tolist()
+
+    def tile_of(some: FloatArray) -> IntArray:
+        cell = np.clip(np.floor((some[:, :2] - origin) / side), 0, (columns - 1, rows - 1))
+        column, row = cell.astype(np.uint16).T
+        return np.asarray(column * np.uint16(rows) + row)
+
+    number = mapped(tile_of, xyz)
     if used is not None:
-        number[~used] = tiles
-    start, (sorted_xyz, row) = grouped(number, tiles + 1, xyz, row_numbers(len(xyz)))
+        number[~used] = columns * rows  # one more tile, which is cut off
+    start, (places, row) = grouped(number, columns * rows + 1, xyz, row_numbers(len(xyz)))
     start = np.unique(start[:-1])
     boxes = []
     for a, b in pairwise(start):
         if strips:
-            order = _along_strips(sorted_xyz[a:b], lattice.side_m)
-            sorted_xyz[a:b], row[a:b] = sorted_xyz[a:b][order], row[a:b][order]
-        boxes.append(bounds(sorted_xyz[a:b]))
+            strip = np.floor(places[a:b, 1] * (math.sqrt(b - a) / (_SPACINGS_ACROSS * side)))
+            order = np.lexsort((places[a:b, 0], strip))
+            places[a:b], row[a:b] = places[a:b][order], row[a:b][order]
+        boxes.append(bounds(places[a:b]))
         let_go()
     low, high = np.swapaxes(np.array(boxes), 0, 1)
-    return Tiles(sorted_xyz[: start[-1]], row[: start[-1]], start, low, high)
+    return Tiles(places[: start[-1]], row[: start[-1]], start, low, high)
 
 
 def one_tile(xyz: FloatArray) -> Tiles:
     """Return the points of a cloud, (n, 3), as they are, as a single tile."""
     low, high = bounds(xyz)
     return Tiles(xyz, row_numbers(len(xyz)), np.array([0, len(xyz)]), low[None], high[None])
-
-
-def _along_strips(xyz: FloatArray, side_m: float) -> IntArray:
-    """Return the rows of a tile's points along narrow strips of the plan.
-
-    A tree is asked twice as fast in this order as in a random one: each point finds in the
-    processor's cache what its predecessor needed.
-    """
-    strip = np.floor(xyz[:, 1] * (math.sqrt(len(xyz)) / (_SPACINGS_ACROSS * side_m)))
-    return np.lexsort((xyz[:, 0], strip))
-
-
-class _Lattice:
-    """Where the tiles lie; points beyond its edges belong to the tile at the edge.
-
-    It covers all but the outermost hundredth of the points, so that no outlier stretches it.
-    """
-
-    def __init__(
-        self, xyz: FloatArray, used: BoolArray | None, tile_m: float | None, points: int
-    ) -> None:
-        step = max(1, len(xyz) // _SAMPLE)
-        sample = xyz[::step] if used is None else xyz[::step][used[::step]]
-        if used is not None and not len(sample):
-            sample = np.array(xyz[int(np.argmax(used))])[None, :]
-        self.origin, high = np.percentile(sample[:, :2], (1.0, 99.0), axis=0)
-        extent = np.maximum(high - self.origin, 1e-3)
-        share = points / (len(xyz) if used is None else int(used.sum()))
-        side = math.sqrt(float(extent.prod()) * share) if tile_m is None else tile_m
-        self.side_m = max(side, float(extent.max()) / _MOST_TILES_A_SIDE)
-        self.columns, self.rows = np.ceil(extent / self.side_m).astype(int).tolist()
-
-    def tile_of(self, xyz: FloatArray) -> IntArray:
-        """Return the number of the tile of each point, shape (n,)."""
-        cell = np.floor((xyz[:, :2] - self.origin) / self.side_m)
-        column, row = np.clip(cell, 0, (self.columns - 1, self.rows - 1)).astype(np.uint16).T
-        return np.asarray(column * np.uint16(self.rows) + row)

@@ -1,4 +1,4 @@
-"""The tests, each of which sets its bit of `Reason` in the rows that fail it.
+"""The tests for noise, each of which sets its bit of `Reason` in the rows that fail it.
 
 They are independent of each other: each looks at all used points, whatever another found.
 """
@@ -21,14 +21,13 @@ from pcfix.clean.neighbours import (
     Neighbours,
     height_quartiles,
     make_tiles,
-    mean_of_first,
     used_rows,
 )
 from pcfix.errors import InputError, SettingError
 from pcfix.kernels import threads
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import LEAST_NEIGHBOURS, CleanRules
-from pcfix.water.checks import as_surface, checked_points
+from pcfix.water.checks import as_surface, checked_column, checked_points
 from pcfix.water.surface import is_submerged, surface_above
 
 ReasonArray = npt.NDArray[np.uint8]
@@ -47,34 +46,20 @@ class Reason(IntFlag):
 
 
 class Cloud(NamedTuple):
-    """What the tests need of n points.
+    """What the tests need of n points."""
 
-    Attributes
-    ----------
-    xyz : array, shape (n, 3)
-        Metres, world frame.
-    used, submerged : array of bool, shape (n,)
-        The points to test, and those of them to test against the bed; the others are no one's
-        neighbour.
-    reasons : array of uint8, shape (n,)
-        Bits of `Reason`; the tests set them.
-    """
-
-    xyz: FloatArray
-    used: BoolArray
-    submerged: BoolArray
-    reasons: ReasonArray
+    xyz: FloatArray  # (n, 3), metres, world frame
+    used: BoolArray  # (n,), the points to test; the others are not neighbours of any
+    submerged: BoolArray  # (n,), those of them to test against the bed
+    reasons: ReasonArray  # (n,), bits of `Reason`, set by the tests
 
 
 class Resources(NamedTuple):
-    """With what the tests work, without effect on the result; see `make_tiles`, `Neighbours`.
-
-    `progress` is called with the number of points after each piece.
-    """
+    """Settings of the work that do not change the result; see `make_tiles`, `Neighbours`."""
 
     tile_m: float | None = None
     jobs: int | None = None
-    progress: Callable[[int], None] | None = None
+    progress: Callable[[int], None] | None = None  # called with the number of points of each piece
 
 
 def flag_weak(
@@ -86,14 +71,8 @@ def flag_weak(
 ) -> None:
     """Flag weak intersections among the corrected points, those with a ray count above zero.
 
-    Parameters
-    ----------
-    settings : CleanRules
-    reasons : array of uint8, shape (n,)
-        Gets `Reason.FEW_RAYS`, `RAY_MISS` and `INCIDENCE`.
-    ray_count : array, shape (n,)
-    ray_miss_m, incidence_deg : array, shape (n,), optional
-        See `pcfix.Correction`; without them their test is not run.
+    Sets `Reason.FEW_RAYS`, `RAY_MISS` and `INCIDENCE`. All arrays have the shape (n,); without ray
+    distances or incidence angles (see `pcfix.Correction`) their test is skipped.
     """
     corrected = ray_count > 0
     if settings.min_rays is not None:
@@ -104,50 +83,61 @@ def flag_weak(
         _set(reasons, corrected & (incidence_deg > settings.max_incidence), Reason.INCIDENCE)
 
 
+def flag_neighbours(
+    name: str, cloud: Cloud, settings: CleanRules, resources: Resources
+) -> dict[str, float]:
+    """Run the tests that look at neighbours: see `flag_sparse` and `flag_off_bed`.
+
+    Raises
+    ------
+    InputError
+        ``cloud.too_few_points``: fewer used or submerged points than a neighbourhood has. No
+        submerged points are allowed.
+    """
+    least = max(LEAST_NEIGHBOURS, settings.nearest)
+    used, submerged = int(cloud.used.sum()), int(cloud.submerged.sum())
+    if used < least + 1:
+        raise InputError(
+            "cloud.too_few_points",
+            f"{name}: has {used:,} points that are neither withheld nor noise, too few for a"
+            f" neighbourhood of {least}. Use fewer neighbours, or skip the cleaning.",
+            path=name, points=used, least=least + 1,
+        )  # fmt: skip
+    if settings.below_or_floating and 0 < submerged < settings.bed_neighbours + 1:
+        raise InputError(
+            "cloud.too_few_points",
+            f"{name}: has {submerged:,} submerged points, too few for a neighbourhood of"
+            f" {settings.bed_neighbours} on the bed. Use fewer bed-neighbours, or switch off the"
+            " tests below and floating.",
+            path=name, points=submerged, least=settings.bed_neighbours + 1,
+        )  # fmt: skip
+    distances = flag_sparse(cloud, settings, resources) if settings.nearest else {}
+    if settings.below_or_floating and submerged:
+        flag_off_bed(cloud, settings, resources)
+    return distances
+
+
 def flag_sparse(cloud: Cloud, settings: CleanRules, resources: Resources) -> dict[str, float]:
     """Flag statistical and radius outliers: `Reason.STATISTICAL` and `RADIUS`.
 
-    More than ``settings.nearest`` points are used.
+    More than ``settings.nearest`` points are used. Returns mean, standard deviation and limit of
+    the mean distances to the neighbours, metres; empty without the statistical test.
 
-    Returns
-    -------
-    dict
-        Mean, sd and limit of the mean distances to the neighbours, metres; empty without the
-        statistical test.
-
-    Notes
-    -----
     Both tests find what open3d's ``remove_statistical_outlier`` and ``remove_radius_outlier``
-    find, but for two kinds of clouds: where so many points coincide that the mean distance is
-    zero, and where it is the same for all points, open3d takes them for outliers and pcfix does
-    not.
+    find, except in clouds where so many points coincide that the mean distance is zero, or where it
+    is the same for all points. There open3d takes all points for outliers, and pcfix none.
     """
     mean_m = empty((len(cloud.xyz),)) if settings.statistical else None
     for near, rows, xyz in _pieces(cloud.xyz, cloud.used, 3, resources):
         distance, _ = near.nearest(xyz, settings.nearest)
         if mean_m is not None:
-            mean_m[rows] = mean_of_first(distance, settings.neighbours)
+            mean_m[rows] = distance[:, : settings.neighbours].mean(axis=1)
         if settings.radius is not None:
-            alone = distance[:, settings.radius_neighbours] * SLACK >= settings.radius
-            _set(cloud.reasons, rows[alone], Reason.RADIUS)
-    return {} if mean_m is None else _flag_far(mean_m, cloud, settings)
-
-
-def _pieces(
-    xyz: FloatArray, used: BoolArray, axes: int, resources: Resources
-) -> Iterator[tuple[Neighbours, IntArray, FloatArray]]:
-    """Yield the used points piece by piece, with their rows and what finds their neighbours."""
-    tiles = make_tiles(xyz, used, resources.tile_m)
-    near = Neighbours(tiles, axes, resources.jobs)
-    for piece in tiles.pieces(PIECE_ROWS):
-        yield near, tiles.row[piece], tiles.xyz[piece]
-        if resources.progress is not None:
-            resources.progress(piece.stop - piece.start)
-
-
-def _flag_far(mean_m: FloatArray, cloud: Cloud, settings: CleanRules) -> dict[str, float]:
-    """Flag the points whose mean distance is beyond the limit of all; sums go by file order."""
-    used, count = cloud.used, int(cloud.used.sum())
+            lonely = distance[:, settings.radius_neighbours] * SLACK >= settings.radius
+            _set(cloud.reasons, rows[lonely], Reason.RADIUS)
+    if mean_m is None:
+        return {}
+    used, count = cloud.used, int(cloud.used.sum())  # sums in the order of the file
     mean = math.fsum(float(mean_m[rows].sum()) for rows in used_rows(used)) / count
     squares = math.fsum(float(((mean_m[rows] - mean) ** 2).sum()) for rows in used_rows(used))
     sd = math.sqrt(squares / (count - 1))
@@ -158,11 +148,10 @@ def _flag_far(mean_m: FloatArray, cloud: Cloud, settings: CleanRules) -> dict[st
 
 
 def flag_off_bed(cloud: Cloud, settings: CleanRules, resources: Resources) -> None:
-    """Flag submerged points below the bed and floating in the water.
+    """Flag submerged points below the bed (`Reason.BELOW_BED`) and above it (`FLOATING`).
 
-    They get `Reason.BELOW_BED` and `FLOATING`. The bed about a point is the middle half, by
-    height, of the submerged points nearest to it in plan; see `CleanRules`. At least
-    ``settings.bed_neighbours`` points are submerged.
+    The bed at a point is the middle half, by height, of the submerged points nearest to it in plan;
+    see `CleanRules`. At least ``settings.bed_neighbours`` points are submerged.
     """
     for near, rows, xyz in _pieces(cloud.xyz, cloud.submerged, 2, resources):
         lower, upper = height_quartiles(near, xyz, settings.bed_neighbours).T
@@ -173,6 +162,18 @@ def flag_off_bed(cloud: Cloud, settings: CleanRules, resources: Resources) -> No
         if settings.floating is not None:
             above = z - upper > np.maximum(fence, settings.floating)
             _set(cloud.reasons, rows[above], Reason.FLOATING)
+
+
+def _pieces(
+    xyz: FloatArray, used: BoolArray, axes: int, resources: Resources
+) -> Iterator[tuple[Neighbours, IntArray, FloatArray]]:
+    """Yield the search, and rows and coordinates of the used points, piece by piece."""
+    tiles = make_tiles(xyz, used, resources.tile_m)
+    near = Neighbours(tiles, axes, resources.jobs)
+    for piece in tiles.pieces(PIECE_ROWS):
+        yield near, tiles.row[piece], tiles.xyz[piece]
+        if resources.progress is not None:
+            resources.progress(piece.stop - piece.start)
 
 
 def _set(reasons: ReasonArray, where: BoolArray | IntArray, reason: Reason) -> None:
@@ -192,7 +193,7 @@ def clean_points(
     tile_m: float | None = None,
     jobs: int | None = None,
 ) -> npt.NDArray[np.uint8]:
-    """Find the points that are noise, and say why.
+    """Find the points that are noise, and the reasons.
 
     Parameters
     ----------
@@ -207,11 +208,11 @@ def clean_points(
     ray_miss_m, incidence_deg : array, shape (n,), optional
         Metres, degrees in air; see `pcfix.Correction`.
     used : array of bool, shape (n,), optional
-        Points to test; the others are no one's neighbour. Default: all.
+        Points to test; the others are not neighbours of any. Default: all.
     settings : CleanRules, optional
         The thresholds.
     tile_m : float, optional
-        Side of the square tiles that are worked on; without effect on the result.
+        Side of the square tiles of the search; the result does not depend on it.
     jobs : int, optional
         Threads; default all cores.
 
@@ -223,7 +224,7 @@ def clean_points(
     Raises
     ------
     SettingError
-        If an argument is outside its rule.
+        If an argument breaks its rule.
     InputError
         If there are fewer points than a neighbourhood has.
 
@@ -245,123 +246,53 @@ def clean_points(
     settings = settings or CleanRules()
     check_tile(tile_m)
     n = len(points)
-    given, rays = _column("used", used, n), _column("ray_count", ray_count, n)
+    given, rays, miss, incidence = (
+        None if one is None else checked_column(name, one, (n,))
+        for name, one in {
+            "used": used, "ray_count": ray_count, "ray_miss_m": ray_miss_m,
+            "incidence_deg": incidence_deg,
+        }.items()
+    )  # fmt: skip
     mask = np.ones(n, np.bool_) if given is None else given.astype(np.bool_)
-    reasons = np.zeros(n, np.uint8)
+    submerged, reasons = np.zeros(n, np.bool_), np.zeros(n, np.uint8)
     if rays is not None:
-        miss = _column("ray_miss_m", ray_miss_m, n)
-        flag_weak(settings, reasons, rays, miss, _column("incidence_deg", incidence_deg, n))
+        flag_weak(settings, reasons, rays, miss, incidence)
         reasons[~mask] = 0
-    cloud = Cloud(points, mask, mask & _submerged(points, water, rays), reasons)
+        submerged = rays > 0
+    if water is not None:
+        surface, heights = as_surface(water, n)
+        submerged = is_submerged(points[:, 2], surface_above(surface, points, heights))
     with threads(jobs):
+        cloud = Cloud(points, mask, mask & submerged, reasons)
         flag_neighbours("xyz", cloud, settings, Resources(tile_m, jobs=jobs))
     return reasons
 
 
 def check_tile(tile_m: float | None) -> None:
-    """Refuse a side of the tiles that is none.
-
-    Raises
-    ------
-    SettingError
-    """
+    """Raise SettingError ``option.range`` if the side of the tiles is not positive."""
     if tile_m is not None and not 0.0 < tile_m < np.inf:
-        raise SettingError(f"tile_m {tile_m:g} must be above 0: give metres, or None.")
-
-
-def _column(name: str, values: npt.ArrayLike | None, n: int) -> FloatArray | None:
-    if values is None:
-        return None
-    column = np.asarray(values, dtype=np.float64)
-    if column.shape != (n,):
         raise SettingError(
-            f"{name} must have one value per point, shape ({n},), not {column.shape}."
-        )
-    return column
-
-
-def _submerged(
-    points: FloatArray, water: WaterSurface | float | npt.ArrayLike | None, rays: FloatArray | None
-) -> BoolArray:
-    if water is not None:
-        surface, heights = as_surface(water, len(points))
-        return is_submerged(points[:, 2], surface_above(surface, points, heights))
-    return np.zeros(len(points), np.bool_) if rays is None else rays > 0
-
-
-def flag_neighbours(
-    name: str, cloud: Cloud, settings: CleanRules, resources: Resources
-) -> dict[str, float]:
-    """Run the tests that look at neighbours: see `flag_sparse` and `flag_off_bed`.
-
-    Raises
-    ------
-    InputError
-        If there are fewer used or submerged points than a neighbourhood has; no submerged ones
-        are allowed.
-    """
-    _check_enough(name, int(cloud.used.sum()), int(cloud.submerged.sum()), settings)
-    distances = flag_sparse(cloud, settings, resources) if settings.nearest else {}
-    if settings.below_or_floating and cloud.submerged.any():
-        flag_off_bed(cloud, settings, resources)
-    return distances
-
-
-def _check_enough(name: str, used: int, submerged: int, settings: CleanRules) -> None:
-    least = max(LEAST_NEIGHBOURS, settings.nearest)
-    if used < least + 1:
-        raise InputError(
-            f"{name}: has {used:,} points that are neither withheld nor noise already, too few"
-            f" for a neighbourhood of {least}; choose fewer neighbours, or do without cleaning."
-        )
-    if settings.below_or_floating and 0 < submerged < settings.bed_neighbours + 1:
-        raise InputError(
-            f"{name}: has {submerged:,} submerged points, too few for a neighbourhood of"
-            f" {settings.bed_neighbours} on the bed; choose fewer bed-neighbours, or leave out the"
-            " tests below and floating."
-        )
+            "option.range",
+            f"tile_m is {tile_m:g}: it must be positive. Give metres, or None.",
+            option="tile_m", value=tile_m,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class CleanSummary:
-    """What a cleaning did, in numbers; `as_dict` is what ``--summary`` writes.
+    """The numbers of a cleaning; `as_dict` is what ``--summary`` writes."""
 
-    Attributes
-    ----------
-    input, output, pcfix : str
-        The files and the version.
-    points : int
-        Points read.
-    set_aside : int
-        Points that came withheld or as noise (class 7 or 18): neither tested nor a neighbour.
-    submerged : int
-        Points that were tested against the bed.
-    noise : int
-        Points flagged.
-    reasons : dict
-        Points for each `Reason`; a point may count under several.
-    dropped : int
-        Points left out of the output.
-    neighbour_distance_m : dict
-        Of the statistical test: mean, sd and limit of the mean distances to the neighbours.
-    not_run : list of str
-        Tests that were asked for and could not be run, and why.
-    water : str or None
-    settings : dict
-    seconds : float
-    """
-
-    input: str
+    input: str  # files
     output: str
-    pcfix: str
-    points: int
-    set_aside: int
-    submerged: int
-    noise: int
-    reasons: dict[str, int]
-    dropped: int
-    neighbour_distance_m: dict[str, float]
-    not_run: list[str]
+    pcfix: str  # version
+    points: int  # read
+    set_aside: int  # withheld or noise (class 7 or 18) in the input: not tested, not neighbours
+    submerged: int  # tested against the bed
+    noise: int  # flagged
+    reasons: dict[str, int]  # points of each `Reason`; a point may have several
+    dropped: int  # not written to the output
+    neighbour_distance_m: dict[str, float]  # mean, sd and limit; see `flag_sparse`
+    not_run: list[str]  # tests that could not be run, and why
     water: str | None
     settings: dict[str, Any]
     seconds: float

@@ -1,20 +1,20 @@
-"""What a comparison says of the points that were matched, in figures."""
+"""All figures of a comparison of matched points."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import partial
-from typing import Any, Literal
+from dataclasses import asdict, dataclass
+from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
 from pcfix.blocks import kept, mapped
-from pcfix.compare.c2c import AfterBefore, Further, both, c2c_of, far_of, further_of, sparse_notes
+from pcfix.clean.neighbours import nearest_distance
 from pcfix.compare.m3c2 import M3c2, m3c2_distances
 from pcfix.compare.match import Match
+from pcfix.compare.nearest import cloud_to_cloud, spacing_m
 from pcfix.compare.sections import Section, SectionLine, lines_downslope, section_along
 from pcfix.compare.statistics import (
     Bin,
@@ -25,17 +25,28 @@ from pcfix.compare.statistics import (
     Statistics,
     Tvu,
     binned,
-    distance_from_shore,
+    distances_of,
     distribution_of,
     fit_line,
     own_of,
     statistics_of,
     tvu_of,
 )
-from pcfix.compare.vertical import Pairs, pairs_at_cloud, pairs_at_reference
-from pcfix.errors import GeometryError
+from pcfix.compare.vertical import Pairs, heights_at
+from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.model import BoolArray, FloatArray
 from pcfix.options.steps import CompareRules
+
+Given = TypeVar("Given")
+Figure = TypeVar("Figure")
+
+
+@dataclass(frozen=True, slots=True)
+class AfterBefore(Generic[Figure]):
+    """A figure after the correction and, if the cloud has shift dimensions, before it."""
+
+    after: Figure
+    before: Figure | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,66 +64,42 @@ class Counts:
     reference_compared: int  # with C2C from the reference
 
 
+@dataclass(frozen=True, slots=True)
+class Further:
+    """C2C of a further cloud, as it is."""
+
+    name: str
+    cloud: str
+    c2c: Distribution | None
+    c2c_from_reference: Distribution | None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """A cloud against a reference; all errors are cloud minus reference, metres.
-
-    Attributes
-    ----------
-    cloud, reference : str
-    measured_at : {"cloud", "reference"}
-        Whether each point of the cloud was compared, or each check point.
-    counts : Counts
-    c2c : AfterBefore of Distribution, or None
-        From each point of the cloud to the nearest of the reference, without sign; from each check
-        point to the nearest of the cloud. None with ``direction="from-reference"``.
-    c2c_from_reference : AfterBefore of Distribution, or None
-        From each point of the reference to the nearest of the cloud, where that was asked for.
-    also : tuple of Further
-        C2C of the further clouds.
-    vertical : AfterBefore of Distribution, or None
-        Signed, along the vertical.
-    bed, land : AfterBefore of Statistics, or None
-        The same of what lies under water and of what does not.
-    own : Own or None
-        Those of the bed, or of all where it is not known, without the noise of the reference.
-    depth : AfterBefore of Line, or None
-        Depth against reference depth; None where the water surface is not known.
-    depth_bins, shore_bins : tuple of Bin
-        Submerged places by reference depth, and by distance in plan from the nearest dry point.
-    tvu : Tvu or None
-        Of all submerged places.
-    m3c2 : AfterBefore of M3c2, or None
-    sections : tuple of Section
-    settings : CompareRules
-    notes : tuple of str
-        What was left out, and why.
-    seconds : float
-    check_points : array, shape (p, 4), or None
-        x, y and z of single points of the reference, and the error there.
-    """
+    """A cloud against a reference; all errors are cloud minus reference, metres."""
 
     cloud: str
     reference: str
-    measured_at: Literal["cloud", "reference"]
+    measured_at: Literal["cloud", "reference"]  # each point of the cloud, or each check point
     counts: Counts
+    # unsigned distances, to the reference (from check points: to the cloud) and from it
     c2c: AfterBefore[Distribution] | None
     c2c_from_reference: AfterBefore[Distribution] | None
-    also: tuple[Further, ...]
-    vertical: AfterBefore[Distribution] | None
-    bed: AfterBefore[Statistics] | None
+    also: tuple[Further, ...]  # further clouds
+    vertical: AfterBefore[Distribution] | None  # signed, along the vertical
+    bed: AfterBefore[Statistics] | None  # the same of submerged places and of the others
     land: AfterBefore[Statistics] | None
-    own: Own | None
-    depth: AfterBefore[Line | None] | None
-    depth_bins: tuple[Bin, ...]
-    shore_bins: tuple[Bin, ...]
-    tvu: Tvu | None
+    own: Own | None  # of the bed, or of all, without the noise of the reference
+    depth: AfterBefore[Line | None] | None  # depth against reference depth, if water is known
+    depth_bins: tuple[Bin, ...]  # submerged places by reference depth
+    shore_bins: tuple[Bin, ...]  # and by distance in plan from the nearest dry point
+    tvu: Tvu | None  # of all submerged places
     m3c2: AfterBefore[M3c2] | None
     sections: tuple[Section, ...]
     settings: CompareRules
-    notes: tuple[str, ...]
+    notes: tuple[PcfixWarning, ...]
     seconds: float
-    check_points: FloatArray | None = None
+    check_points: FloatArray | None = None  # (p, 4): x, y, z of check points, and the error
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON; a section by its line, its heights are CSV."""
@@ -126,6 +113,8 @@ class Comparison:
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, PcfixWarning):
+        return value.as_dict()
     if hasattr(value, "__dataclass_fields__"):
         return _plain(asdict(value))
     if isinstance(value, dict):
@@ -160,15 +149,15 @@ def bins_table(bins: Iterable[Bin]) -> str:
     return "\n".join(lines) + "\n"
 
 
-CORRECTED_BEFORE = (
-    "As it came, the cloud has the depths of the reference: it was likely corrected before."
-)
+SPARSER = 2.0
+"""A cloud is called sparse if its spacing is so many times that of the other."""
 AS_DEEP, TOO_DEEP = 0.10, 0.15
-"""Of the depth: a cloud that came so near to the reference, and is deeper by that much now, was
-corrected twice; as refraction leaves it, it lacks a quarter.
+"""Relative to the depth: a cloud whose apparent depths differ from the reference by at most the
+first, and whose corrected ones by more than the second, was corrected twice. Refraction makes
+apparent depths a quarter too small.
 """
 MIN_REACH_M, REACH_FACTOR = 1.0, 1.5
-"""M3C2 looks along the normal beyond nearly all differences: 1.5 times their 99th percentile."""
+"""M3C2 searches along the normal as far as 1.5 times the 99th percentile of the differences."""
 
 
 def figures_of(
@@ -176,159 +165,238 @@ def figures_of(
 ) -> Comparison:
     """Return all figures that the settings ask for.
 
-    The cross-sections along `lines` come beside the automatic ones; the comparison `started` at a
-    time of `time.perf_counter`; `others` are further clouds by name. A `GeometryError` if there are
-    too few points for planes, or M3C2 finds nothing.
+    The cross-sections along `lines` come with the automatic ones; the comparison `started` at a
+    time of `time.perf_counter`; `others` are further clouds by name. Raises GeometryError if there
+    are too few points for planes, or M3C2 finds nothing.
     """
-    notes, c2c = _notes(match), c2c_of(match)
-    notes += sparse_notes(match, c2c)
-    pairs = None
+    whole, reference = match.whole, match.reference
+    notes = []
+    if match.cloud.shift_m is None:
+        notes.append(
+            PcfixWarning(
+                "cloud.no_shifts",
+                "The cloud has no dimensions ShiftX, ShiftY and ShiftZ, so its apparent points are"
+                " not compared.",
+            )
+        )
+    c2c, c2c_from_reference = found = c2c_of(match)
+    notes += sparse_notes(match, found)
+    pairs = vertical = residuals = None
     if match.settings.vertical:
-        _check_enough(match)
-        pairs = both(partial(_pairs, match), match.cloud.xyz, match.cloud.apparent)
-    vertical = (
-        None
-        if pairs is None
-        else both(lambda p: distribution_of(p.error_m), pairs.after, pairs.before)
+        pairs = _pairs(match)
+        vertical = both(lambda p: distribution_of(p.error_m), pairs.after, pairs.before)
+        if reference.sparse:
+            after = pairs.after
+            residuals = np.column_stack([after.xy, after.reference_m, after.error_m])
+    by_depth = {} if pairs is None else _by_depth(match, pairs, notes)
+    own = None
+    if vertical is not None:
+        bed, stated = by_depth.get("bed"), match.settings.sigma_reference
+        errors = vertical.after.statistics if bed is None else bed.after
+        own = own_of(errors, "all" if bed is None else "bed", stated, reference.kind)
+    also = []
+    for name, other in others.items():
+        ways = (None if way is None else way.after for way in c2c_of(other))
+        also.append(Further(name, other.whole.name, *ways))
+    counts = Counts(
+        cloud=len(whole) + whole.left_out,
+        cloud_left_out=whole.left_out,
+        reference=len(reference.xyz) + reference.left_out,
+        reference_left_out=reference.left_out,
+        outside_overlap=match.outside,
+        not_submerged=match.not_submerged,
+        compared=len(match.places) if reference.sparse else len(match.cloud),
+        by_nearest=0 if pairs is None else int(pairs.after.by_nearest.sum()),
+        reference_compared=len(match.places) if match.settings.from_reference else 0,
     )
-    of_depth = _by_depth(match, pairs, notes)
+    nothing = {
+        "bed": None, "land": None, "depth": None, "depth_bins": (), "shore_bins": (), "tvu": None
+    }  # fmt: skip
     return Comparison(
-        cloud=match.whole.name,
-        reference=match.reference.name,
-        measured_at="reference" if match.reference.sparse else "cloud",
-        counts=_counts(match, pairs),
-        c2c=c2c.to_reference,
-        c2c_from_reference=c2c.from_reference,
-        also=further_of(others),
+        cloud=whole.name,
+        reference=reference.name,
+        measured_at="reference" if reference.sparse else "cloud",
+        counts=counts,
+        c2c=c2c,
+        c2c_from_reference=c2c_from_reference,
+        also=tuple(also),
         vertical=vertical,
-        bed=of_depth.bed,
-        land=of_depth.land,
-        own=_own(match, of_depth.bed, vertical),
-        depth=of_depth.fits,
-        depth_bins=of_depth.depth_bins,
-        shore_bins=of_depth.shore_bins,
-        tvu=of_depth.tvu,
-        m3c2=_m3c2(match, pairs),
+        own=own,
+        **{**nothing, **by_depth},
+        m3c2=_m3c2(match, pairs) if match.settings.m3c2 else None,
         sections=_sections(match, lines, others),
         settings=match.settings,
         notes=tuple(notes),
         seconds=round(time.perf_counter() - started, 3),
-        check_points=_residuals(match, pairs),
+        check_points=residuals,
     )
 
 
-def _residuals(match: Match, pairs: AfterBefore[Pairs] | None) -> FloatArray | None:
-    if pairs is None or not match.reference.sparse:
-        return None
-    after = pairs.after
-    return np.column_stack([after.xy, after.reference_m, after.error_m])
+def both(
+    figure: Callable[[Given], Figure], after: Given, before: Given | None
+) -> AfterBefore[Figure]:
+    """Return a figure of the corrected cloud, and of the apparent one if it is known."""
+    return AfterBefore(figure(after), None if before is None else figure(before))
 
 
-def _check_enough(match: Match) -> None:
-    """Refuse surfaces with too few points for a plane."""
-    sparse, wanted = match.reference.sparse, match.settings.neighbours
+C2c: TypeAlias = tuple[AfterBefore[Distribution] | None, AfterBefore[Distribution] | None]
+"""Distances to the reference and from it; None for a direction that was not asked for."""
+
+
+def c2c_of(match: Match) -> C2c:
+    """Return the distances in the directions of the settings.
+
+    By default they start at each point of the cloud, or at each check point. From the reference
+    means from each of its points that the cloud covers in plan, to the nearest of the whole cloud.
+    """
+    rules = match.settings
+
+    def distances(xyz: FloatArray) -> Distribution:
+        return distances_of(distances_to(match, xyz), rules.classes, rules.share)
+
+    def distances_back(xyz: FloatArray) -> Distribution:
+        return distances_of(cloud_to_cloud(match.places, xyz), rules.classes, rules.share)
+
+    to = back = None
+    if rules.direction != "from-reference":
+        to = both(distances, match.cloud.xyz, match.cloud.apparent)
+    if rules.from_reference:
+        back = both(distances_back, match.asked.xyz, match.asked.apparent)
+    return to, back
+
+
+def distances_to(match: Match, xyz: FloatArray) -> FloatArray:
+    """Return the distance from each point of a cloud, or from each check point, shape (p,), m."""
+    if match.reference.sparse:
+        return cloud_to_cloud(match.places, xyz)
+    return cloud_to_cloud(xyz, match.reference.xyz)
+
+
+def sparse_notes(match: Match, found: C2c) -> list[PcfixWarning]:
+    """Return warnings of distances that mostly measure the spacing of a sparse cloud."""
+    if match.reference.sparse:
+        return []
+    spacings = {"reference": spacing_m(match.reference.xyz), "cloud": spacing_m(match.asked.xyz)}
+    notes = []
+    for pair, sparse, dense in zip(found, spacings, reversed(spacings), strict=True):
+        apart, times = spacings[sparse], spacings[sparse] / max(spacings[dense], 1e-9)
+        if pair is None or times < SPARSER or apart < (mean := pair.after.statistics.mean_m):
+            continue
+        remedy = f"Give --direction {'from' if sparse == 'reference' else 'to'}-reference."
+        if match.reference.raster:
+            remedy = "Use the vertical error, or give the reference as points."
+        elif None not in found:
+            remedy = f"Use C2C from each point of the {sparse}."
+        notes.append(
+            PcfixWarning(
+                f"{sparse}.sparse",
+                f"C2C to the {sparse} ({mean:.3f} m on average) mostly measures the spacing of its"
+                f" points: {apart:.2g} m, {times:.0f} times that of the {dense}. {remedy}",
+                spacing_m=apart,
+                times=times,
+            )
+        )
+    return notes
+
+
+def _pairs(match: Match) -> AfterBefore[Pairs]:
+    """Return the heights of cloud and reference at each point of the cloud, or check point."""
+    sparse, k = match.reference.sparse, match.settings.neighbours
     name = match.whole.name if sparse else match.reference.name
     count = len(match.cloud if sparse else match.reference.xyz)
-    if count < wanted:
+    if count < k:
         raise GeometryError(
-            f"{name}: {count} points are too few for planes through {wanted} neighbours; give"
-            " more points (at least 6, with --neighbours 6)."
-        )
+            "cloud.too_few_points" if sparse else "reference.too_few_points",
+            f"{name}: {count} points are too few for planes through {k} neighbours. Give more"
+            " points (at least 6, with --neighbours 6).",
+            path=name, points=count, least=k,
+        )  # fmt: skip
+
+    def pairs(xyz: FloatArray) -> Pairs:
+        if sparse:
+            plane = heights_at(match.places, xyz, k)
+            return Pairs(match.places[:, :2], plane.height_m, match.places[:, 2], plane.by_nearest)
+        plane = heights_at(xyz, match.reference.xyz, k)
+        return Pairs(xyz[:, :2], xyz[:, 2], plane.height_m, plane.by_nearest)
+
+    return both(pairs, match.cloud.xyz, match.cloud.apparent)
 
 
-def _pairs(match: Match, xyz: FloatArray) -> Pairs:
-    k = match.settings.neighbours
-    if match.reference.sparse:
-        return pairs_at_reference(xyz, match.places, k)
-    return pairs_at_cloud(xyz, match.reference.xyz, k)
-
-
-@dataclass(frozen=True)
-class _OfDepth:
-    """What is said of the submerged places, and of the others; see `Comparison`."""
-
-    fits: AfterBefore[Line | None] | None = None
-    depth_bins: tuple[Bin, ...] = ()
-    shore_bins: tuple[Bin, ...] = ()
-    tvu: Tvu | None = None
-    bed: AfterBefore[Statistics] | None = None
-    land: AfterBefore[Statistics] | None = None
-
-
-def _by_depth(match: Match, pairs: AfterBefore[Pairs] | None, notes: list[str]) -> _OfDepth:
-    """Return fits, tables and TVU of the submerged places, as far as the water is known."""
-    nothing = _OfDepth()
-    if pairs is None:
-        return nothing
+def _by_depth(match: Match, pairs: AfterBefore[Pairs], notes: list[PcfixWarning]) -> dict[str, Any]:
+    """Return the figures of submerged places, and of the others, by the names of `Comparison`."""
     after, before = pairs.after, pairs.before
     surface = match.water_at(after.xy)
     if surface is None:
-        notes.append("no water surface is known, so nothing is said of depth; give --water")
-        return nothing
+        text = "The water surface is not known, so there are no figures by depth. Give --water."
+        notes.append(PcfixWarning("water.missing", text))
+        return {}
     wet = mapped(np.less, after.reference_m, surface) if match.reference.sparse else match.wet
     wet = wet & mapped(np.isfinite, surface)
     if not wet.any():
-        notes.append("no compared point is under water, so nothing is said of depth")
-        return nothing
-    depth, error = _of(wet, np.subtract, surface, after.reference_m), kept(wet, after.error_m)
-    fits = AfterBefore(fit_line(depth, mapped(np.subtract, depth, error)), None)
-    error_before: FloatArray | None = None
+        text = "No compared point is under water, so there are no figures by depth."
+        notes.append(PcfixWarning("cloud.not_submerged", text))
+        return {}
+    depth, error = _at(wet, np.subtract, surface, after.reference_m), kept(wet, after.error_m)
+    line, line_before, error_before = fit_line(depth, mapped(np.subtract, depth, error)), None, None
     if before is not None:
-        over = match.water_at(before.xy)
-        over = surface if over is None else over
-        depth_before = _of(wet, np.subtract, over, before.reference_m)
+        above = match.water_at(before.xy)
+        above = surface if above is None else above
+        depth_before = _at(wet, np.subtract, above, before.reference_m)
         error_before = kept(wet, before.error_m)
-        line = fit_line(depth_before, mapped(np.subtract, depth_before, error_before))
-        fits = replace(fits, before=line)
-        now, came = _ratio(depth, error), _ratio(depth_before, error_before)
-        if abs(came - 1.0) <= AS_DEEP and now > 1.0 + TOO_DEEP:
-            notes.append(CORRECTED_BEFORE)
-    bins = binned(depth, error, error_before, match.settings.bin_width)
-    bed, land = _errors_of(pairs, wet), _errors_of(pairs, ~wet)
-    found = _OfDepth(fits, bins, tvu=tvu_of(error, depth), bed=bed, land=land)
-    if not match.dry.any():
-        notes.append("the cloud has no dry point, so nothing is said of the distance from shore")
-        return found
-    shore = distance_from_shore(kept(wet, after.xy), kept(match.dry, match.whole.xyz)[:, :2])
-    width = match.settings.shore_bin_width
-    return replace(found, shore_bins=binned(shore, error, error_before, width))
+        line_before = fit_line(depth_before, mapped(np.subtract, depth_before, error_before))
+        corrected, apparent = _ratio(depth, error), _ratio(depth_before, error_before)
+        if abs(apparent - 1.0) <= AS_DEEP and corrected > 1.0 + TOO_DEEP:
+            notes.append(
+                PcfixWarning(
+                    "cloud.corrected_twice",
+                    "The input cloud had the depths of the reference already: it was likely"
+                    " corrected before.",
+                    apparent_ratio=apparent,
+                    corrected_ratio=corrected,
+                )
+            )
+    rules, shore_bins = match.settings, tuple[Bin, ...]()
+    if match.dry.any():
+        dry = kept(match.dry, match.whole.xyz)[:, :2]
+        shore = nearest_distance(kept(wet, after.xy), dry, 2)
+        shore_bins = binned(shore, error, error_before, rules.shore_bin_width)
+    else:
+        text = "The cloud has no dry point, so there are no figures by distance from the shore."
+        notes.append(PcfixWarning("cloud.no_land", text))
+    return {
+        "depth": AfterBefore(line, line_before),
+        "depth_bins": binned(depth, error, error_before, rules.bin_width),
+        "shore_bins": shore_bins,
+        "tvu": tvu_of(error, depth),
+        "bed": _errors_of(pairs, wet),
+        "land": _errors_of(pairs, ~wet),
+    }
 
 
 def _errors_of(pairs: AfterBefore[Pairs], rows: BoolArray) -> AfterBefore[Statistics] | None:
-    """Return what the vertical errors of some places are; None without any."""
+    """Return the vertical errors of some places; None if there are none."""
     if not rows.any():
         return None
     return both(lambda p: statistics_of(kept(rows, p.error_m)), pairs.after, pairs.before)
 
 
-def _of(rows: BoolArray, function: Callable[..., Any], *columns: FloatArray) -> FloatArray:
+def _at(rows: BoolArray, function: Callable[..., Any], *columns: FloatArray) -> FloatArray:
     """Return a function of columns, (n,), at some rows."""
     return mapped(function, *(kept(rows, one) for one in columns))
 
 
-def _own(
-    match: Match, bed: AfterBefore[Statistics] | None, vertical: AfterBefore[Distribution] | None
-) -> Own | None:
-    if vertical is None:
-        return None
-    errors = (vertical.after.statistics, "all") if bed is None else (bed.after, "bed")
-    return own_of(*errors, match.settings.sigma_reference, match.reference.kind)
-
-
 def _ratio(depth_m: FloatArray, error_m: FloatArray) -> float:
-    """Return the median of depth over reference depth, where that is one; NaN if nowhere."""
+    """Return the median of depth over reference depth, where that is positive; NaN if nowhere."""
     some = mapped(lambda depth: depth > 0.0, depth_m)
     if not some.any():
         return math.nan
-    ratio = _of(some, lambda error, depth: 1.0 - error / depth, error_m, depth_m)
+    ratio = _at(some, lambda error, depth: 1.0 - error / depth, error_m, depth_m)
     return float(Sample(ratio).percentiles(50))
 
 
-def _m3c2(match: Match, pairs: AfterBefore[Pairs] | None) -> AfterBefore[M3c2] | None:
-    if not match.settings.m3c2:
-        return None
+def _m3c2(match: Match, pairs: AfterBefore[Pairs] | None) -> AfterBefore[M3c2]:
     if pairs is None:
-        far = far_of(match, match.cloud.xyz)
+        far = distances_to(match, match.cloud.xyz)
     else:
         far = mapped(np.abs, (pairs.before or pairs.after).error_m)
     reach = max(MIN_REACH_M, REACH_FACTOR * float(Sample(far).percentiles(99)))
@@ -352,30 +420,3 @@ def _sections(
     }
     known = {name: xyz for name, xyz in layers.items() if xyz is not None and len(xyz)}
     return tuple(section_along(line, known, match.settings.corridor) for line in lines)
-
-
-def _counts(match: Match, pairs: AfterBefore[Pairs] | None) -> Counts:
-    whole, reference = match.whole, match.reference
-    return Counts(
-        cloud=len(whole) + whole.left_out,
-        cloud_left_out=whole.left_out,
-        reference=len(reference.xyz) + reference.left_out,
-        reference_left_out=reference.left_out,
-        outside_overlap=match.outside,
-        not_submerged=match.not_submerged,
-        compared=len(match.places) if reference.sparse else len(match.cloud),
-        by_nearest=0 if pairs is None else int(pairs.after.by_nearest.sum()),
-        reference_compared=len(match.places) if match.settings.from_reference else 0,
-    )
-
-
-def _notes(match: Match) -> list[str]:
-    notes = []
-    if match.cloud.shift_m is None:
-        notes.append(
-            "the cloud does not say where its points were before (no dimensions ShiftX, ShiftY,"
-            " ShiftZ), so only its present state is compared"
-        )
-    if match.reference.sparse:
-        notes.append("the reference is check points, so the cloud's surface is measured at each")
-    return notes

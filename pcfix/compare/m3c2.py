@@ -1,4 +1,4 @@
-"""M3C2 distances, by the library py4dgeo, which is the optional extra ``m3c2``."""
+"""M3C2 distances by the library py4dgeo (extra ``m3c2``)."""
 
 from __future__ import annotations
 
@@ -7,64 +7,44 @@ import logging
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from pcfix.clean.neighbours import SLACK, Neighbours, Tiles, make_tiles
 from pcfix.compare.statistics import Statistics, statistics_of
-from pcfix.errors import GeometryError, SettingError, installing
+from pcfix.errors import GeometryError, optional_library
 from pcfix.model import FloatArray, IntArray
 
 MAX_CORE_POINTS = 100_000
 TILE_POINTS = 500_000
-"""Points of either cloud that py4dgeo is given at a time, but for those around."""
+"""Points of either cloud that are passed to py4dgeo at a time, without those of the margin."""
 SPACING_SAMPLE = 10_000
 NORMAL_SPACINGS, CYLINDER_SPACINGS = 6.0, 3.0
-"""Scales, in point spacings of the sparser cloud: a cylinder holds about 28 points."""
+"""Radii in point spacings of the sparser cloud: a cylinder holds about 28 points."""
 
 
 @dataclass(frozen=True, slots=True)
 class M3c2:
-    """Signed distances along the local normal, positive where the cloud lies above.
-
-    Attributes
-    ----------
-    core_points : int
-        Where the distance was asked for.
-    statistics : Statistics
-        Of the distances, metres, where both clouds had points in the cylinder.
-    mean_level_of_detection_m : float
-        At 95 %: what roughness and density alone could make.
-    significant_share : float
-        Of the distances, how many are beyond their own level of detection, 0 to 1.
-    normal_radius_m, cylinder_radius_m, max_distance_m : float
-        The scales that were used.
-    """
+    """Signed distances along the local normal, positive where the cloud lies above."""
 
     core_points: int
-    statistics: Statistics
-    mean_level_of_detection_m: float
-    significant_share: float
+    statistics: Statistics  # of the distances where both clouds have points in the cylinder
+    mean_level_of_detection_m: float  # at 95 %, from roughness and density
+    significant_share: float  # of distances beyond their own level of detection, 0 to 1
     normal_radius_m: float
     cylinder_radius_m: float
     max_distance_m: float
 
 
 def load_py4dgeo() -> Any:
-    """Import py4dgeo; where it is not installed, a `SettingError` names the extra."""
-    try:
-        with _silence():
-            return import_module("py4dgeo")
-    except ImportError as error:
-        raise SettingError(
-            f"M3C2 needs py4dgeo, which is not installed; run: {installing('m3c2')}"
-        ) from error
+    """Import py4dgeo; InputError ``library.missing`` if it is not installed."""
+    with _silence():
+        return optional_library("py4dgeo", "m3c2", "M3C2")
 
 
 def point_spacing_m(xyz: FloatArray, tiles: Tiles) -> float:
-    """Return the median distance to the nearest other point, of a sample of the cloud (n, 3)."""
+    """Return the median distance to the nearest other point of a sample of the cloud (n, 3)."""
     near, rows = Neighbours(tiles, 3), sample_rows(len(xyz), SPACING_SAMPLE)
     sample = make_tiles(xyz[rows])
     pieces = (sample.xyz[piece] for piece in sample.pieces(SPACING_SAMPLE))
@@ -73,28 +53,16 @@ def point_spacing_m(xyz: FloatArray, tiles: Tiles) -> float:
 
 
 def sample_rows(count: int, most: int) -> IntArray:
-    """Return at most `most` of `count` row numbers, evenly spread and always the same."""
+    """Return at most `most` of `count` row numbers, evenly spread."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
 def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float) -> M3c2:
     """Return M3C2 distances of a cloud from a reference, at `MAX_CORE_POINTS` points at most.
 
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Metres, world frame; the core points are rows of it, and it gives the normals.
-    reference : array, shape (m, 3)
-        The same frame.
-    max_distance_m : float
-        Half the length of the cylinders at least.
-
-    Raises
-    ------
-    SettingError
-        If py4dgeo is not installed.
-    GeometryError
-        If no cylinder holds points of both clouds.
+    The core points are rows of the cloud, (n, 3), which also gives the normals; the reference has
+    the shape (m, 3), both metres, world frame. The cylinders reach at least `max_distance_m` to
+    either side. Raises GeometryError ``reference.no_overlap`` if no cylinder holds points of both.
     """
     clouds = make_tiles(xyz, points=TILE_POINTS), make_tiles(reference, points=TILE_POINTS)
     spacing = max(
@@ -110,9 +78,11 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
     known = np.isfinite(distance)
     if not known.any():
         raise GeometryError(
+            "reference.no_overlap",
             f"M3C2: no cylinder of {cylinder:.3g} m radius holds points of both clouds within"
-            f" {max_distance_m:.3g} m; check that they overlap."
-        )
+            f" {max_distance_m:.3g} m. Check that they overlap.",
+            radius_m=cylinder, max_distance_m=max_distance_m,
+        )  # fmt: skip
     found, limits = distance[known], detection[known]
     certain = np.isfinite(limits)
     return M3c2(
@@ -133,10 +103,10 @@ def _in_tiles(
     cylinder_m: float,
     max_distance_m: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return distance and level of detection of each core point (n, 3); NaN where not known.
+    """Return distance and level of detection of each core point (n, 3); NaN if unknown.
 
-    A tile of core points sees the cloud and the reference as far as a normal or a cylinder
-    reaches, whichever way it leans.
+    A tile of core points gets both clouds with a margin as wide as a normal or a tilted cylinder
+    reaches.
     """
     py4dgeo = load_py4dgeo()
     found = np.full((2, len(core)), np.nan)

@@ -1,4 +1,4 @@
-"""Which points of a cloud are compared with which of a reference."""
+"""Choose the points of a cloud and of a reference to compare."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.blocks import FEW_ROWS, blocks, bounds, empty, kept, mapped
+from pcfix.blocks import blocks, bounds, empty, kept, mapped
 from pcfix.clean.neighbours import nearest_of
 from pcfix.compare.nearest import mean_spacing_m
 from pcfix.errors import GeometryError, InputError, SettingError
@@ -16,32 +16,32 @@ from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import CompareRules
 
 GAP_SPACINGS, MIN_GAP_M = 5.0, 1.0
-"""How far outside the other cloud a point still counts, unless the user says so."""
+"""A point counts up to this distance outside the other cloud, unless the user sets it."""
 
 
 @dataclass(frozen=True, eq=False)
 class SurveyCloud:
-    """The n points of a cloud that count; world frame, metres."""
+    """The n points of a cloud that are used; world frame, metres."""
 
     name: str  # for messages
     xyz: FloatArray  # (n, 3)
     crs: Any  # pyproj.CRS or None
-    left_out: int  # points withheld, or of a class that does not count
+    left_out: int  # points withheld, or of an ignored class
     shift_m: FloatArray | None  # (n, 3), true minus apparent, of a cloud that pcfix corrected
     bathymetric: BoolArray  # (n,), class 40
-    water_m: FloatArray  # (n,), height of the water above each point; NaN where not known
-    water: WaterSurface | None = None  # itself, where it is known away from the points too
+    water_m: FloatArray  # (n,), height of the water above each point; NaN if unknown
+    water: WaterSurface | None = None  # the surface itself, if it is known
 
     def __len__(self) -> int:
         return len(self.xyz)
 
     @cached_property
     def apparent(self) -> FloatArray | None:
-        """Where the points were before the correction, shape (n, 3), metres."""
+        """The points before the correction, shape (n, 3), metres."""
         return None if self.shift_m is None else mapped(np.subtract, self.xyz, self.shift_m)
 
     def take(self, rows: BoolArray) -> SurveyCloud:
-        """Return the cloud with these rows alone; itself where these are all."""
+        """Return the cloud with these rows only."""
         if rows.all():
             return self
         return replace(
@@ -61,33 +61,33 @@ class Reference:
     xyz: FloatArray  # (m, 3), metres
     crs: Any  # pyproj.CRS or None
     left_out: int = 0  # points withheld, of noise, or of water; cells without data
-    sparse: bool = False  # whether these are single check points, not a sampled surface
-    raster: bool = False  # whether these are the centres of cells
+    sparse: bool = False  # single check points, not a sampled surface
+    raster: bool = False  # centres of cells
 
     @property
     def kind(self) -> str:
-        """Of the `SIGMA_REFERENCE_M`."""
+        """Key of `SIGMA_REFERENCE_M`."""
         return "table of check points" if self.sparse else "raster" if self.raster else "cloud"
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """A cloud and a reference, of each the points that are compared."""
+    """The points of a cloud and a reference that are compared."""
 
     whole: SurveyCloud  # all points that are neither withheld nor noise
     cloud: SurveyCloud  # the n points of it to compare
-    wet: BoolArray  # (n,), which of these are under water
-    dry: BoolArray  # which of the whole cloud are above the water
+    wet: BoolArray  # (n,), those under water
+    dry: BoolArray  # those of the whole cloud above the water
     reference: Reference
-    places: FloatArray  # (p, 3), points of the reference that the cloud reaches, metres
-    asked: SurveyCloud  # of the cloud, the points that may be the nearest to one of these
-    outside: int  # points that were not chosen, as the next; check points where that is what counts
+    places: FloatArray  # (p, 3), points of the reference that the cloud covers, metres
+    asked: SurveyCloud  # points of the cloud that may be the nearest to one of these
+    outside: int  # points outside the overlap, and on land; check points if the reference is sparse
     not_submerged: int
     settings: CompareRules
 
     @cached_property
     def water_points(self) -> FloatArray:
-        """The water surface above the points that know it, shape (w, 3), metres."""
+        """The water surface above the points where it is known, shape (w, 3), metres."""
         known = mapped(np.isfinite, self.whole.water_m)
         if not known.any():
             return np.empty((0, 3))
@@ -95,12 +95,12 @@ class Match:
         return mapped(lambda p, w: np.column_stack([p[:, :2], w]), xyz, water_m)
 
     def water_at(self, xy: FloatArray) -> FloatArray | None:
-        """Return the height of the water at places (n, 2); None where unknown.
+        """Return the height of the water at places (n, 2); None if unknown.
 
-        It is the surface's own, or that above the nearest point that knows it.
+        Without a surface it is the height above the nearest point where it is known.
         """
         if self.whole.water is not None:
-            from pcfix.water.surface import surface_above  # with its compiler, not quick to load
+            from pcfix.water.surface import surface_above  # slow to import
 
             water = self.whole.water
             return mapped(
@@ -117,19 +117,34 @@ class Match:
 def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, given: bool) -> Match:
     """Choose the points to compare.
 
-    Where the user has `given` the water surface it counts, else what the cloud says, its classes
-    too. A `PcfixError` if nothing is under water where that was asked for, or the two do not
-    overlap, or C2C is wanted in a direction that the reference does not have.
+    If the user has `given` the water surface it decides what is submerged, else also class 40.
+    Raises PcfixError if the clouds do not overlap, nothing is under water where that was asked for,
+    or the reference does not allow the direction of C2C.
     """
-    _check_direction(target, settings)
+    if target.raster and settings.from_reference:
+        raise SettingError(
+            "reference.no_points",
+            f"{target.name} is a raster, and --direction {settings.direction} starts at measured"
+            " points of the reference. Give the reference as LAS or LAZ, or leave out --direction.",
+            path=target.name, direction=settings.direction,
+        )  # fmt: skip
+    if target.sparse and settings.direction not in (None, "from-reference"):
+        raise SettingError(
+            "reference.check_points",
+            f"{target.name} has check points, and --direction {settings.direction} needs a dense"
+            " reference. Use --direction from-reference, or leave it out.",
+            path=target.name, direction=settings.direction,
+        )  # fmt: skip
     wet = mapped(lambda xyz, water: xyz[:, 2] < water, whole.xyz, whole.water_m)
     if not given:
         wet |= whole.bathymetric
     chosen = wet if settings.submerged else np.ones(len(whole), np.bool_)
     if not chosen.any():
         raise InputError(
-            f"{whole.name}: no point is of class 40 or below the water; give the surface with"
-            " --water, or compare without --submerged."
+            "cloud.not_submerged",
+            f"{whole.name}: no point is of class 40 or below the water. Give the water surface with"
+            " --water, or leave out --submerged.",
+            path=whole.name,
         )
     not_submerged = int(len(whole) - chosen.sum())
     places, near = target.xyz, chosen
@@ -143,11 +158,16 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
         near = chosen & near_in_plan(whole.xyz, target.xyz, gap)
         outside = int(chosen.sum() - near.sum())
     if not (near.any() and len(places)):
+        boxes = [bounds(xyz[:, :2]) for xyz in (kept(chosen, whole.xyz), target.xyz)]
+        (x0, y0), (x1, y1) = boxes[0]
+        (u0, v0), (u1, v1) = boxes[1]
         raise GeometryError(
-            f"{whole.name} and {target.name} do not overlap in plan: the points to compare lie in"
-            f" {_bounds(kept(chosen, whole.xyz))}, the reference in {_bounds(target.xyz)}; check"
-            " the CRS of both."
-        )
+            "reference.no_overlap",
+            f"{whole.name} (x {x0:.1f} to {x1:.1f}, y {y0:.1f} to {y1:.1f}) and {target.name}"
+            f" (x {u0:.1f} to {u1:.1f}, y {v0:.1f} to {v1:.1f}) do not overlap in plan. Check the"
+            " CRS of both.",
+            cloud=whole.name, reference=target.name, bounds=boxes,
+        )  # fmt: skip
     cloud = whole.take(near)
     asked = whole.take(chosen) if settings.from_reference and not target.sparse else cloud
     found = Match(
@@ -157,33 +177,18 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
     return _only_wet_places(found) if by_place and settings.submerged else found
 
 
-def _check_direction(target: Reference, settings: CompareRules) -> None:
-    """Refuse C2C that a reference is not made for."""
-    if target.raster and settings.from_reference:
-        raise SettingError(
-            f"{target.name}: is a raster, whose cells are no measured points, and --direction"
-            f" {settings.direction} starts at those of the reference; give the reference as points"
-            " (.las, .laz), or leave --direction out."
-        )
-    if target.sparse and settings.direction not in (None, "from-reference"):
-        raise SettingError(
-            f"{target.name}: holds check points, too far apart to be the nearest ones of a cloud;"
-            f" give --direction from-reference instead of {settings.direction}, or leave it out."
-        )
-
-
 def _only_wet_places(found: Match) -> Match:
-    """Leave out points of the reference above the water, where the water is known."""
+    """Exclude points of the reference above the water, if the water is known."""
     surface = found.water_at(found.places[:, :2])
     if surface is None:
         return found
     wet = mapped(lambda xyz, water: xyz[:, 2] < water, found.places, surface)
     if not wet.any():
         raise GeometryError(
-            f"{found.reference.name}: no check point is under water; compare without --submerged."
-            if found.reference.sparse
-            else f"{found.reference.name}: no point near the cloud is under water; compare without"
-            " --submerged."
+            "reference.not_submerged",
+            f"{found.reference.name}: none of its points near the cloud is under water. Check the"
+            " water level, or leave out --submerged.",
+            path=found.reference.name,
         )
     dry = int((~wet).sum()) if found.reference.sparse else 0
     return replace(found, places=kept(wet, found.places), not_submerged=found.not_submerged + dry)
@@ -193,47 +198,24 @@ def _gap(xyz: FloatArray, settings: CompareRules) -> float:
     return settings.max_gap or max(GAP_SPACINGS * mean_spacing_m(xyz), MIN_GAP_M)
 
 
-def _bounds(xyz: FloatArray) -> str:
-    (x0, y0), (x1, y1) = bounds(xyz[:, :2])
-    return f"x {x0:.1f} to {x1:.1f}, y {y0:.1f} to {y1:.1f}"
-
-
-MAX_TABLE = 50_000_000
-"""Squares up to which each has a place of its own in memory."""
-
-
 def near_in_plan(xy: FloatArray, other_xy: FloatArray, limit_m: float) -> BoolArray:
-    """Return which points have a point of the other cloud about them in plan.
+    """Return which points have a point of the other cloud near them in plan.
 
-    The plan is cut into squares of side `limit_m`; a point, (n, 2) or (n, 3) in metres, counts when
+    The plan is cut into squares of side `limit_m`; a point, (n, 2) or (n, 3) in metres, counts if
     its own square or one of the eight around it holds a point of the other cloud, (m, 2 or 3). So
     all within the limit count, and none beyond 2.83 times the limit.
     """
     low, high = bounds(other_xy[:, :2])
-    columns, rows = (int(n / limit_m) + 6 for n in high - low)
+    size = ((high - low) / limit_m).astype(np.int64) + 8
     low = low - 2.0 * limit_m
-    high = low + np.array([columns, rows]) * limit_m
+
+    def squares(some: FloatArray) -> IntArray:
+        # points beyond fall into the outermost squares, which are near to none
+        square = np.clip(np.floor((some[:, :2] - low) / limit_m) + 1.0, 0, size - 1)
+        column, row = square.astype(np.int64).T
+        return np.asarray(row * size[0] + column)
+
+    held = np.unique(np.hstack([np.unique(squares(other_xy[b])) for b in blocks(len(other_xy))]))
     steps = np.array([-1, 0, 1])
-    around = (steps[:, np.newaxis] * columns + steps).ravel()
-    parts = (other_xy[some] for some in blocks(len(other_xy), FEW_ROWS))
-    codes = (_codes(part, low, limit_m, columns) for part in parts)
-    table = np.zeros(columns * rows if columns * rows <= MAX_TABLE else 0, np.bool_)
-    for some in codes if len(table) else ():
-        table[some] = True
-    held = np.flatnonzero(table) if len(table) else np.unique(np.hstack([*map(np.unique, codes)]))
-    near = (held[:, np.newaxis] + around).ravel()
-    table[near if len(table) else []] = True
-    found = empty((len(xy),), np.bool_)
-    for block in blocks(len(xy), FEW_ROWS):
-        x, y = xy[block, 0], xy[block, 1]
-        inside = (x >= low[0]) & (x < high[0]) & (y >= low[1]) & (y < high[1])
-        asked = _codes(kept(inside, xy[block]), low, limit_m, columns)
-        inside[inside] = table[asked] if len(table) else np.isin(asked, near)
-        found[block] = inside
-    return found
-
-
-def _codes(xy: FloatArray, low: FloatArray, side_m: float, columns: int) -> IntArray:
-    column = ((xy[:, 0] - low[0]) / side_m).astype(np.int64)
-    row = ((xy[:, 1] - low[1]) / side_m).astype(np.int64)
-    return np.asarray(row * columns + column)
+    near = np.unique(held[:, None, None] + steps[:, None] * size[0] + steps)
+    return mapped(lambda some: np.isin(squares(some), near), xy)

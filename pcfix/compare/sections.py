@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from pcfix.blocks import blocks, bounds, kept, mapped
 from pcfix.errors import GeometryError, SettingError
-from pcfix.model import BoolArray, FloatArray
+from pcfix.model import FloatArray
 
 STATIONS = 200
-"""Stations of a section at most; they are never closer than a quarter of the corridor's width."""
+"""At most so many stations; they are at least a quarter of the corridor's width apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +28,9 @@ class SectionLine:
         """Check that the line has a length."""
         if not (np.isfinite(self.length_m) and self.length_m > 0.0):
             raise SettingError(
-                f"section {self}: give two different points x1,y1,x2,y2 in the cloud's coordinates."
+                "option.section",
+                f"section {self} has no length. Give two different points x1,y1,x2,y2.",
+                value=str(self),
             )
 
     def __str__(self) -> str:
@@ -51,25 +52,17 @@ class SectionLine:
 class Section:
     """Heights along a line: running medians of the points in a corridor.
 
-    Attributes
-    ----------
-    line : SectionLine
-    half_width_m : float
-        Of the corridor.
-    distance_m : array, shape (s,)
-        Stations, from the start of the line.
-    heights_m : dict of array, shape (s,)
-        World Z of ``water``, ``apparent``, ``corrected`` and ``reference``, as far as known, and of
-        further clouds by name; NaN where the corridor is empty.
+    The heights, world Z, are those of ``water``, ``apparent``, ``corrected`` and ``reference``, as
+    far as known, and of further clouds by name; NaN if the corridor is empty.
     """
 
     line: SectionLine
     half_width_m: float
-    distance_m: FloatArray
-    heights_m: dict[str, FloatArray] = field(default_factory=dict)
+    distance_m: FloatArray  # (s,), stations from the start of the line
+    heights_m: dict[str, FloatArray]  # (s,) each
 
     def table(self) -> str:
-        """Return the section as CSV text; empty fields where nothing is known."""
+        """Return the section as CSV text; unknown heights are empty fields."""
         columns = [self.distance_m, *self.heights_m.values()]
         lines = [",".join(["distance_m", *(f"{name}_m" for name in self.heights_m)])]
         lines += [
@@ -80,16 +73,14 @@ class Section:
 
 
 def parse_line(text: str) -> SectionLine:
-    """Return the line that the words ``x1,y1,x2,y2`` describe.
-
-    A `SettingError` if these are not four numbers, or the points are one.
-    """
+    """Parse ``x1,y1,x2,y2``; SettingError ``option.section`` if that is no line."""
     try:
         x1, y1, x2, y2 = (float(part) for part in text.split(","))
     except ValueError:
         raise SettingError(
-            f"section '{text}' is not understood; give four numbers x1,y1,x2,y2 in the cloud's"
-            " coordinates."
+            "option.section",
+            f"section '{text}' is not four numbers x1,y1,x2,y2. Give them in the CRS of the cloud.",
+            value=text,
         ) from None
     return SectionLine(x1, y1, x2, y2)
 
@@ -97,42 +88,35 @@ def parse_line(text: str) -> SectionLine:
 def section_along(line: SectionLine, layers: dict[str, FloatArray], half_width_m: float) -> Section:
     """Return the heights of several clouds, (n, 3) by name, metres, world frame, along a line.
 
-    Points up to a positive `half_width_m` from the line count.
+    Each is the median of the points within a positive `half_width_m` across the line, and within
+    that or the distance of the stations along it.
     """
     step = max(line.length_m / STATIONS, 0.5 * half_width_m)
     stations = np.linspace(0.0, line.length_m, max(round(line.length_m / step), 1) + 1)
-    window = max(step, half_width_m)
-    heights = {
-        name: _medians(line, xyz, stations, half_width_m, window) for name, xyz in layers.items()
-    }
+    window, heights = max(step, half_width_m), {}
+    for name, xyz in layers.items():
+        found = []
+        for rows in blocks(len(xyz)):
+            along, across = line.along_across(xyz[rows])
+            inside = np.abs(across) <= half_width_m
+            found.append((along[inside], xyz[rows, 2][inside]))
+        along, z = np.hstack(found)
+        order = np.argsort(along, kind="stable")
+        along, z = along[order], z[order]
+        first = np.searchsorted(along, stations - window, side="left")
+        last = np.searchsorted(along, stations + window, side="right")
+        heights[name] = np.array(
+            [np.median(z[a:b]) if b > a else np.nan for a, b in zip(first, last, strict=True)]
+        )
     return Section(line, half_width_m, stations, heights)
-
-
-def _medians(
-    line: SectionLine, xyz: FloatArray, stations: FloatArray, half_width_m: float, window_m: float
-) -> FloatArray:
-    """Return the median height within `window_m` along of each station."""
-    found = []
-    for rows in blocks(len(xyz)):
-        along, across = line.along_across(xyz[rows])
-        inside = np.abs(across) <= half_width_m
-        found.append((along[inside], xyz[rows, 2][inside]))
-    along, z = np.hstack(found)
-    order = np.argsort(along, kind="stable")
-    along, z = along[order], z[order]
-    first = np.searchsorted(along, stations - window_m, side="left")
-    last = np.searchsorted(along, stations + window_m, side="right")
-    return np.array(
-        [np.median(z[a:b]) if b > a else np.nan for a, b in zip(first, last, strict=True)]
-    )
 
 
 def lines_downslope(xyz: FloatArray, count: int) -> tuple[SectionLine, ...]:
     """Return evenly spaced lines down the steepest direction of a bed.
 
     The direction is that of the plane fitted to all points (n, 3), metres, world frame; each line
-    runs over the extent of the points in its own share of the bed, from high to low. Points that
-    lie on a line in plan are a `GeometryError`.
+    runs over the extent of the points in its own share of the bed, from high to low. Raises
+    GeometryError ``cloud.on_line`` if the points lie on a line in plan.
     """
     origin = np.sum([xyz[rows].sum(axis=0) for rows in blocks(len(xyz))], axis=0) / len(xyz)
     locals_ = (xyz[rows] - origin for rows in blocks(len(xyz)))
@@ -140,7 +124,9 @@ def lines_downslope(xyz: FloatArray, count: int) -> tuple[SectionLine, ...]:
     covariance = products[:, :2]
     eigenvalues = np.linalg.eigvalsh(covariance)
     if len(xyz) < 3 or eigenvalues[0] <= 1e-6 * eigenvalues[1]:
-        raise GeometryError("The bed lies on a line in plan; give --section x1,y1,x2,y2 instead.")
+        raise GeometryError(
+            "cloud.on_line", "The bed lies on a line in plan. Give --section x1,y1,x2,y2 instead."
+        )
     gradient = np.linalg.solve(covariance, products[:, 2])
     steepness = float(np.hypot(*gradient))
     down = -gradient / steepness if steepness > 1e-9 else np.array([1.0, 0.0])
@@ -150,15 +136,11 @@ def lines_downslope(xyz: FloatArray, count: int) -> tuple[SectionLine, ...]:
     edges = np.linspace(right, top, count + 1)
     lines = []
     for low, high in pairwise(edges):
-        inside = mapped(partial(_between, low, high), place[:, 1])
-        share = kept(inside, place)
+        left_of = place[:, 1]
+        share = kept((left_of >= low) & (left_of <= high), place)
         (start, _), (stop, _) = bounds(share) if len(share) else np.zeros((2, 2))
         if stop > start:
             middle = origin[:2] + 0.5 * (low + high) * left
             ends = np.append(middle + start * down, middle + stop * down)
             lines.append(SectionLine(*ends.tolist()))
     return tuple(lines)
-
-
-def _between(low: float, high: float, values: FloatArray) -> BoolArray:
-    return (values >= low) & (values <= high)

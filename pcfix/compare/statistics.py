@@ -1,4 +1,4 @@
-"""What a sample of distances or of signed errors says, in numbers."""
+"""Statistics of a sample of distances or of signed errors."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.blocks import blocks, empty, grouped, mapped, total
-from pcfix.clean.neighbours import nearest_distance
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.steps import SIGMA_REFERENCE_M
@@ -19,15 +18,15 @@ from pcfix.refract.tally import share_of_orders, within_orders
 
 PERCENTILES = (5, 25, 50, 75, 95)
 NMAD_FACTOR = 1.4826
-"""Of the median absolute deviation: makes it the standard deviation of a normal sample."""
-BINS = 64
+"""The median absolute deviation times this is the standard deviation of a normal sample."""
+BINS, MAX_BINS = 64, 10_000
 TAIL_PERCENT = 0.5
-"""A histogram leaves out so much on either side, so that one outlier does not set its width."""
+"""Percentage outside a histogram on either side, so that one outlier does not set its width."""
 
 
 @dataclass(frozen=True, slots=True)
 class Histogram:
-    """Counts between edges (m), and how many values lie outside on either side."""
+    """Counts between edges (m), and the number of values below and above them."""
 
     edges_m: list[float]
     counts: list[int]
@@ -37,33 +36,21 @@ class Histogram:
 
 @dataclass(frozen=True, slots=True)
 class Normal:
-    """A normal distribution fitted to a sample.
+    """A normal distribution fitted to a sample."""
 
-    Attributes
-    ----------
-    mu_m, sigma_m : float
-        By maximum likelihood: mean and standard deviation of the sample.
-    histogram_mu_m, histogram_sigma_m : float or None
-        Of the parabola fitted to the histogram's logarithm, which outliers hardly move; None
-        where there is no solution.
-    note : str
-        Why something is missing; empty when nothing is.
-    """
-
-    mu_m: float
+    mu_m: float  # by maximum likelihood: mean and standard deviation of the sample
     sigma_m: float
-    histogram_mu_m: float | None
+    histogram_mu_m: float | None  # of the histogram, robust to outliers; None without a solution
     histogram_sigma_m: float | None
-    note: str = ""
+    note: str = ""  # why something is missing
 
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """A sample of distances or errors, metres.
+    """Statistics of distances or errors, metres.
 
-    For signed errors the mean is the bias. The standard deviation is that of the sample itself
-    (divided by n), so that rmse^2 = mean^2 + sd^2; 95 % of the sample are no larger than
-    `within_95_m`, whatever their sign.
+    The mean of signed errors is the bias. The standard deviation is that of the sample itself
+    (divided by n), so that rmse^2 = mean^2 + sd^2.
     """
 
     count: int
@@ -74,13 +61,13 @@ class Statistics:
     median_m: float
     min_m: float
     max_m: float
-    within_95_m: float
+    within_95_m: float  # 95 % of the absolute values are no larger
     percentiles_m: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """The share of a sample, 0 to 1, from one value up to, and without, another."""
+    """Share of a sample, 0 to 1, from one value up to and without another."""
 
     low_m: float
     high_m: float
@@ -98,10 +85,9 @@ class Distribution:
 
 
 class Sample:
-    """Values, shape (n,), sorted block by block, so that any order statistic of all is at hand.
+    """Values, shape (n,), sorted block by block for order statistics of all of them.
 
-    A value's rank is the sum of its ranks in the blocks. What has a rank is found by halving
-    between the bits of the smallest and the largest number: exactly, with nothing held in memory.
+    The rank of a value is the sum of its ranks in the blocks.
     """
 
     def __init__(self, values: FloatArray) -> None:
@@ -112,12 +98,16 @@ class Sample:
         self._runs = [runs[rows] for rows in blocks(self.count)]
 
     def below(self, marks: npt.ArrayLike, *, among: bool = False) -> IntArray:
-        """Return how many values are less than each mark, or `among` these."""
+        """Return how many values are less than each mark, or less or equal (`among`)."""
         side: Literal["right", "left"] = "right" if among else "left"
         return np.sum([np.searchsorted(run, marks, side) for run in self._runs], axis=0)
 
     def ranked(self, ranks: IntArray) -> FloatArray:
-        """Return the values of so many smaller ones, counted from 0."""
+        """Return the values of ranks, counted from 0.
+
+        They are found by bisection of the bits of floats as whole numbers, which have the same
+        order: exact, and nothing but the marks is held in memory.
+        """
         if len(self._runs) == 1:
             return np.asarray(self._runs[0][ranks])
         low, high = np.full(ranks.shape, _key(-np.inf)), np.full(ranks.shape, _key(np.inf))
@@ -128,7 +118,7 @@ class Sample:
         return _value(low) + 0.0
 
     def percentiles(self, marks: npt.ArrayLike) -> FloatArray:
-        """Return the values at so many percent, between two of them linear, as numpy does."""
+        """Return percentiles, linear between two values as those of numpy."""
         place = np.asarray(marks) / 100.0 * (self.count - 1)
         first = np.floor(place).astype(np.int64)
         a, b = self.ranked(np.array([first, np.minimum(first + 1, self.count - 1)]))
@@ -136,14 +126,14 @@ class Sample:
         return np.where(part < 0.5, a + (b - a) * part, b - (b - a) * (1.0 - part))
 
     def counts(self, edges: FloatArray) -> list[int]:
-        """Return how many values lie between edges; the last one belongs to the last class."""
+        """Return how many values lie between edges; the last edge belongs to the last class."""
         below = self.below(edges)
         below[-1] = self.below(edges[-1], among=True)
         return [int(n) for n in np.diff(below)]
 
 
 def _key(value: npt.ArrayLike) -> IntArray:
-    """Return whole numbers in the order of floats."""
+    """Return the bits of floats as whole numbers in the same order."""
     bits = np.asarray(value, np.float64).view(np.int64)
     return np.asarray(bits ^ ((bits >> 63) & np.int64(2**63 - 1)))
 
@@ -158,25 +148,26 @@ def mean_of(values: FloatArray) -> float:
 
 
 def statistics_of(values: FloatArray, sample: Sample | None = None) -> Statistics:
-    """Return the statistics of values, shape (n,), metres, finite; none is a `GeometryError`.
+    """Return the statistics of values, shape (n,), metres, finite; a `sample` has the same values.
 
-    The `sample` has the same values.
+    Raises GeometryError ``reference.nothing_compared`` if there are none.
     """
     count = len(values)
     if count == 0:
-        raise GeometryError("There is no difference to take statistics of: no point is left.")
+        raise GeometryError(
+            "reference.nothing_compared", "No point is left to compare: there are no differences."
+        )
     sample = sample or Sample(values)
     marks = sample.percentiles((*PERCENTILES, 0, 100))
     median, mean = float(marks[PERCENTILES.index(50)]), mean_of(values)
-    is_size = marks[-2] >= 0.0
-    sizes = sample if is_size else Sample(mapped(np.abs, values))
-    apart = Sample(mapped(lambda some: np.abs(some - median), values))
+    sizes = sample if marks[-2] >= 0.0 else Sample(mapped(np.abs, values))
+    deviations = Sample(mapped(lambda some: np.abs(some - median), values))
     return Statistics(
         count=count,
         mean_m=mean,
         sd_m=math.sqrt(total(lambda some: np.sum((some - mean) ** 2), values) / count),
         rmse_m=math.sqrt(total(lambda some: np.sum(some * some), values) / count),
-        nmad_m=float(NMAD_FACTOR * apart.percentiles(50)),
+        nmad_m=float(NMAD_FACTOR * deviations.percentiles(50)),
         median_m=median,
         min_m=float(marks[-2]),
         max_m=float(marks[-1]),
@@ -188,19 +179,28 @@ def statistics_of(values: FloatArray, sample: Sample | None = None) -> Statistic
 
 
 def distribution_of(values: FloatArray, sample: Sample | None = None) -> Distribution:
-    """Return statistics, histogram and fitted normal distribution of a sample, shape (n,), m."""
+    """Return statistics, histogram and fitted normal distribution of values, shape (n,), metres.
+
+    The histogram lies between the outer half percents.
+    """
     sample = sample or Sample(values)
-    statistics, histogram = statistics_of(values, sample), histogram_of(sample)
+    low, high = sample.percentiles((TAIL_PERCENT, 100.0 - TAIL_PERCENT)).tolist()
+    if not high > low:
+        low, high = low - 0.5e-3, high + 0.5e-3
+    edges = np.histogram_bin_edges(np.empty(0), BINS, (low, high))
+    below, above = int(sample.below(low)), sample.count - int(sample.below(high, among=True))
+    histogram = Histogram(edges.tolist(), sample.counts(edges), below, above)
+    statistics = statistics_of(values, sample)
     return Distribution(statistics, histogram, normal_of(statistics, histogram))
 
 
 def distances_of(
     values: FloatArray, classes: int | None, bands: Iterable[tuple[float, float]]
 ) -> Distribution:
-    """Return the same of distances, with the histogram that CloudCompare draws, and shares.
+    """Return the same of distances, with shares and the histogram that CloudCompare draws.
 
-    The histogram has all values, shape (n,), metres; without a number of classes it has the square
-    root of n, rounded up. A band is from its lower bound up to, and without, its upper one, m.
+    The histogram has all values, shape (n,), metres, in as many classes as given, by default the
+    square root of n, rounded up. A band is from its lower bound up to, and without, its upper one.
     """
     sample = Sample(values)
     plain = distribution_of(values, sample)
@@ -209,16 +209,6 @@ def distances_of(
     shares = [Share(*band, float(np.diff(sample.below(band))[0]) / len(values)) for band in bands]
     histogram = Histogram(edges.tolist(), sample.counts(edges), 0, 0)
     return replace(plain, histogram=histogram, shares=tuple(shares))
-
-
-def histogram_of(sample: Sample) -> Histogram:
-    """Return the histogram of a sample, metres, between its outer half percents."""
-    low, high = sample.percentiles((TAIL_PERCENT, 100.0 - TAIL_PERCENT)).tolist()
-    if not high > low:
-        low, high = low - 0.5e-3, high + 0.5e-3
-    edges = np.histogram_bin_edges(np.empty(0), BINS, (low, high))
-    below, within = sample.below(low), sample.below(high, among=True)
-    return Histogram(edges.tolist(), sample.counts(edges), int(below), int(sample.count - within))
 
 
 def normal_of(statistics: Statistics, histogram: Histogram) -> Normal:
@@ -243,9 +233,6 @@ def normal_of(statistics: Statistics, histogram: Histogram) -> Normal:
     return Normal(mu, sigma, centre, scale * float(np.sqrt(-0.5 / square)))
 
 
-MAX_BINS = 10_000
-
-
 @dataclass(frozen=True, slots=True)
 class Line:
     """depth = intercept + slope * reference depth, by least squares; 1 and 0 are perfect.
@@ -261,55 +248,34 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """The errors between two depths, or two distances from the shore.
-
-    `before` is None where the cloud does not say where its points were.
-    """
+    """The errors between two depths, or two distances from the shore."""
 
     from_m: float
     to_m: float
     after: Statistics
-    before: Statistics | None
+    before: Statistics | None  # None if the cloud has no shift dimensions
 
 
 @dataclass(frozen=True, slots=True)
 class Tvu:
-    """Total vertical uncertainty at 95 % as it was measured, in the terms of IHO S-44.
+    """Measured total vertical uncertainty at 95 %, as IHO S-44 defines it."""
 
-    Attributes
-    ----------
-    count : int
-        Differences that it is of.
-    tvu_95_m : float
-        That 95 % of them do not exceed.
-    s44 : dict
-        The share of them, 0 to 1, within the TVU of each order at the depth of the reference.
-    """
-
-    count: int
-    tvu_95_m: float
-    s44: dict[str, float]
+    count: int  # differences
+    tvu_95_m: float  # 95 % of them are no larger
+    s44: dict[str, float]  # share within the TVU of each order at the reference depth, 0 to 1
 
 
 @dataclass(frozen=True, slots=True)
 class Own:
     """Errors without the noise of the reference, metres; the bias stays as it is.
 
-    Attributes
-    ----------
-    of : {"bed", "all"}
-    sigma_reference_m : float
-    is_assumed : bool
-        Whether the noise is that of its kind of reference, as none was stated.
-    mean_m : float
-    rmse_m, within_95_m : float or None
-        None where the errors scatter no more than the reference is said to, so that nothing is
-        known of the cloud's own part. 95 % shrink as the RMSE does.
+    RMSE and 95 % bound are None if the errors scatter no more than the reference, so that nothing
+    is known about the cloud's own share. The bound shrinks as the RMSE does.
     """
 
-    of: str
+    of: str  # "bed" or "all"
     sigma_reference_m: float
-    is_assumed: bool
+    is_assumed: bool  # whether the noise is the usual one of this kind of reference
     mean_m: float
     rmse_m: float | None
     within_95_m: float | None
@@ -326,7 +292,7 @@ def own_of(s: Statistics, of: str, stated_m: float | None, kind: str) -> Own:
 
 
 def tvu_of(error_m: FloatArray, depth_m: FloatArray) -> Tvu:
-    """Return the vertical uncertainty that errors at reference depths, shape (n,), m, come to."""
+    """Return the vertical uncertainty of errors at reference depths, both (n,), metres."""
     size = mapped(np.abs, error_m)
     within = sum(within_orders(size[rows], depth_m[rows]) for rows in blocks(len(size)))
     shares = share_of_orders(np.asarray(within), len(size))
@@ -336,7 +302,7 @@ def tvu_of(error_m: FloatArray, depth_m: FloatArray) -> Tvu:
 def fit_line(reference_depth_m: FloatArray, depth_m: FloatArray) -> Line | None:
     """Fit depth against reference depth, both of shape (n,), metres.
 
-    None where fewer than three depths, or only equal ones, leave the line undefined.
+    None if fewer than three depths, or only equal ones, leave the line undefined.
     """
     if len(depth_m) < 3:
         return None
@@ -364,14 +330,19 @@ def binned(
     """Return the bins of reference depth, or of distance, that hold points, in order.
 
     Errors after and before, shape (n,), metres, are sorted `by_m`; edges of bins are multiples of
-    the width. A width that makes too many bins is a `SettingError`.
+    the width. Raises SettingError ``option.range`` if there are more than `MAX_BINS`.
     """
     if len(by_m) == 0:
         return ()
     place = mapped(lambda some: np.floor(some / width_m), by_m)
     numbers = np.unique(np.hstack([np.unique(place[rows]) for rows in blocks(len(place))]))
     if len(numbers) > MAX_BINS:
-        raise SettingError(f"bin width {width_m:g} m makes {len(numbers):,} bins; widen it.")
+        raise SettingError(
+            "option.range",
+            f"A bin width of {width_m:g} m makes {len(numbers):,} bins. Use a larger one.",
+            value=width_m,
+            bins=len(numbers),
+        )
     group = mapped(lambda some: np.searchsorted(numbers, some).astype(np.uint16), place)
     errors = [after_m] if before_m is None else [after_m, before_m]
     start, errors = grouped(group, len(numbers), *errors)
@@ -384,11 +355,6 @@ def binned(
         )
         for number, first, last in zip(numbers, start, start[1:], strict=False)
     )
-
-
-def distance_from_shore(xy: FloatArray, dry_xy: FloatArray) -> FloatArray:
-    """Return the distance in plan, metres, of places (n, 2) to the nearest dry point of (m, 2)."""
-    return nearest_distance(xy, dry_xy, 2)
 
 
 def errors_against_truth(xyz: FloatArray, true_xyz: FloatArray) -> tuple[float, float, float]:

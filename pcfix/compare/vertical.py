@@ -13,30 +13,24 @@ from pcfix.clean.neighbours import nearest_of
 from pcfix.model import BoolArray, FloatArray
 
 MIN_SHAPE = 1e-3
-"""Least ratio of the neighbours' variances across and along; below, they lie on a line."""
+"""Points are on a line if the determinant of their covariance over its squared trace is less."""
 MAX_REACH = 3.0
-"""Farthest place from the neighbours' centre, in their standard deviations that way."""
+"""Largest distance of a place from the neighbours' centre, in their standard deviations."""
 
 
 class Heights(NamedTuple):
-    """Heights of a surface at n places.
+    """Heights of a surface at n places."""
 
-    height_m : shape (n,), world Z.
-    by_nearest : shape (n,), where no plane could be fitted and the nearest point's height stands.
-    """
-
-    height_m: FloatArray
-    by_nearest: BoolArray
+    height_m: FloatArray  # (n,), world Z
+    by_nearest: BoolArray  # (n,), no plane could be fitted: the nearest point's height is used
 
 
 def heights_at(xy: FloatArray, surface: FloatArray, neighbours: int) -> Heights:
     """Return the height of a surface at places in plan.
 
-    At each place, (n, 2) or (n, 3), a plane is fitted to that many nearest points of the surface
-    (m, 3), which has no fewer, and evaluated there: nearest in plan, least squares in Z; metres,
-    world frame.
-    Where these points lie on a line, or the place lies far outside them, a plane has no meaning,
-    and the height of the nearest point is taken.
+    At each place, (n, 2) or (n, 3), a plane is fitted by least squares in Z to the `neighbours`
+    points of the surface, (m, 3), that are nearest in plan, and evaluated; metres, world frame. If
+    these points lie on a line, or the place far outside them, the height of the nearest is used.
     """
     height, by_nearest = empty((len(xy),)), empty((len(xy),), np.bool_)
     for rows, here, _, near in nearest_of(xy, surface, neighbours, 2):
@@ -54,8 +48,10 @@ def _plane_at_origin(near: FloatArray) -> Heights:
     determinant, trace = uu * vv - uv * uv, uu + vv
     flat = determinant > MIN_SHAPE * trace * trace
     safe = np.where(flat, determinant, 1.0)
+    # normal equations of z = a + slope_u u + slope_v v about the mean
     slope_u, slope_v = (vv * uz - uv * vz) / safe, (uu * vz - uv * uz) / safe
     mu, mv = middle[:, 0], middle[:, 1]
+    # squared distance of the origin from the mean, in standard deviations that way (Mahalanobis)
     reach = (vv * mu * mu - 2.0 * uv * mu * mv + uu * mv * mv) / safe
     fitted = flat & (reach <= MAX_REACH**2)
     plane = middle[:, 2] - slope_u * mu - slope_v * mv
@@ -69,21 +65,9 @@ class Pairs:
     xy: FloatArray  # (n, 2), metres, world frame
     measured_m: FloatArray  # (n,), of the cloud
     reference_m: FloatArray  # (n,)
-    by_nearest: BoolArray  # (n,), where one of the two is that of a single point: see `heights_at`
+    by_nearest: BoolArray  # (n,), one of the two heights is that of a single point
 
     @cached_property
     def error_m(self) -> FloatArray:
         """Measured minus reference, shape (n,): positive where the cloud is too high."""
         return mapped(np.subtract, self.measured_m, self.reference_m)
-
-
-def pairs_at_cloud(xyz: FloatArray, reference: FloatArray, neighbours: int) -> Pairs:
-    """Return a pair at each point of the cloud (n, 3): its Z, and the reference's plane there."""
-    plane = heights_at(xyz, reference, neighbours)
-    return Pairs(xyz[:, :2], xyz[:, 2], plane.height_m, plane.by_nearest)
-
-
-def pairs_at_reference(xyz: FloatArray, reference: FloatArray, neighbours: int) -> Pairs:
-    """Return a pair at each check point (m, 3): the cloud's plane there, and the check's Z."""
-    plane = heights_at(reference, xyz, neighbours)
-    return Pairs(reference[:, :2], plane.height_m, reference[:, 2], plane.by_nearest)

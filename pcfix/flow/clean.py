@@ -1,4 +1,4 @@
-"""The cleaning of a LAS or LAZ file: read, test, write, in bounded memory."""
+"""Clean a LAS or LAZ file: read, test, write, in bounded memory."""
 
 from __future__ import annotations
 
@@ -54,24 +54,22 @@ def clean_file(
 ) -> CleanSummary:
     """Flag or drop the noise of a LAS or LAZ cloud; what ``pcfix clean`` runs.
 
-    Noise gets class 7 and the withheld flag; nothing else of it changes, and nothing at all of
-    the other points. Points that come withheld or with class 7 or 18 stay as they are and are
-    no one's neighbour. `restore_file` undoes a correction before or after the cleaning; it gives
-    back all but the class and the withheld flag of the points that are noise.
+    Noise gets class 7 and the withheld flag; nothing else changes. Points that are withheld or of
+    class 7 or 18 in the input are neither tested nor neighbours of others. `restore_file` undoes a
+    correction before or after the cleaning, except the class and the withheld flag of noise.
 
     Parameters
     ----------
     input, output : path
-        The names end in ``.las`` or ``.laz``; the output is LAS 1.4, see `correct_file`. While
-        it works, it needs 90 bytes a point of disk beside the output. Or many files and a folder,
-        see `pcfix.correct_file`: neighbours are those of the whole cloud.
+        The names end in ``.las`` or ``.laz``; the output is LAS 1.4, see `correct_file`. The
+        search needs 90 bytes per point of disk beside the output. Or many files and a folder, see
+        `pcfix.correct_file`: neighbours are those of the whole cloud.
     options : CleanOptions, optional
-        Or its attributes as keywords, as of ``pcfix clean``: the thresholds of the tests, water,
-        drop and others.
+        Or its attributes as keywords: the options of ``pcfix clean``.
     tile_m : float, optional
-        Side of the square tiles that are worked on. The result does not depend on it.
+        Side of the square tiles of the search. The result does not depend on it.
     progress : callable, optional
-        Called with (points done, points in all), over all passes.
+        Called with (points done, all points), over all passes.
 
     Returns
     -------
@@ -80,7 +78,7 @@ def clean_file(
     Raises
     ------
     PcfixError
-        With one sentence on what to mend; no output is left behind.
+        If a file, an option or the cloud cannot be used; no output is left behind.
     """
     given = taken(CleanOptions, options, keywords, "clean_file")
     check_tile(tile_m)
@@ -106,14 +104,15 @@ def clean_file(
 
 
 def _last_pass(progress: Progress | None) -> Progress | None:
-    """Return what the writing tells, once the points have gone through all other passes."""
+    """Return the progress of writing, which is the last of the passes."""
     if progress is None:
         return None
     return lambda done, total: progress(((_PASSES - 1) * total + done) // _PASSES, total)
 
 
 RAY_DIMENSIONS = ("RayCount", "RayMiss", "Incidence")
-"""What a correction said of each point, and the tests of weak intersections need."""
+"""Dimensions of a corrected cloud that the tests of weak intersections need."""
+_NEEDS = {"few rays": "min_rays", "ray miss": "max_ray_miss", "incidence": "max_incidence"}
 
 
 class Tested(NamedTuple):
@@ -125,19 +124,19 @@ class Tested(NamedTuple):
 
 
 class NoiseSearch:
-    """The tests of a whole cloud, whichever door it came through.
+    """The tests of a whole cloud, from a file or a PDAL pipeline.
 
     Parameters
     ----------
     name : str
-        Of the cloud, for messages.
+        Name of the cloud, for messages.
     options : CleanOptions
     view : callable
         Returns the cloud as a water surface needs it.
     names : collection of str
-        The dimensions that the cloud has.
+        The dimensions of the cloud.
     has_rays : bool
-        Whether, if it was corrected, there were cameras.
+        False if the cloud was corrected without cameras.
     """
 
     cloud: Cloud
@@ -152,16 +151,21 @@ class NoiseSearch:
         has_rays: bool = True,
     ) -> None:
         rules = options.part(CleanRules)
-        self._not_run = []
+        self._name, self._not_run = name, list[str]()
         if rules.weak and not has_rays:
             rules = replace(rules, weak=False)
-            self._not_run = [
-                "few rays, ray miss, incidence: the cloud was corrected without cameras"
-            ]
-        self._name, self._rules = name, rules
+            self._not_run.append(f"{', '.join(_NEEDS)}: the cloud was corrected without cameras")
         given = options.water
         self.water = None if given is None else find_surface(given, WaterOptions(), view()).surface
-        self._has = [one for one in RAY_DIMENSIONS if {"RayCount", one} <= set(names)]
+        has = [one for one in RAY_DIMENSIONS if {"RayCount", one} <= set(names)]
+        self._not_run += [
+            f"{test}: the cloud has no dimension {dimension if has else 'RayCount'}"
+            for (test, limit), dimension in zip(_NEEDS.items(), RAY_DIMENSIONS, strict=True)
+            if getattr(rules, limit) is not None and dimension not in has
+        ]
+        if rules.below_or_floating and self.water is None and not has:
+            self._not_run.append("below bed, floating: no --water, and no dimension RayCount")
+        self._rules = rules
 
     def run(self, chunks: Iterable[Tested], n: int, resources: Resources) -> BoolArray:
         """Run the tests on all n points; return which are noise, shape (n,)."""
@@ -169,20 +173,29 @@ class NoiseSearch:
         self.cloud = Cloud(empty((n, 3)), used, submerged, reasons)
         first = 0
         for one in chunks:
-            self._add(one, slice(first, first + len(one.withheld)))
-            first += len(one.withheld)
+            count = len(one.withheld)
+            self._add(one, slice(first, first + count))
+            first += count
             let_go()
             if resources.progress is not None:
-                resources.progress(len(one.withheld))
-        self._check()
+                resources.progress(count)
+        if not used.any():
+            raise InputError(
+                "cloud.all_withheld",
+                f"{self._name}: all {n:,} points are withheld or noise (class 7 or 18). There is"
+                " nothing left to clean.",
+                path=self._name, points=n,
+            )  # fmt: skip
         if not self._rules.below_or_floating:
             submerged[:] = False
+        elif self.water is not None:
+            check_submerged(int(submerged.sum()), self._name, self.water)
         self._distance_m = flag_neighbours(self._name, self.cloud, self._rules, resources)
-        self.cloud = self.cloud._replace(xyz=np.zeros((0, 3)))  # gives the disk back
+        self.cloud = self.cloud._replace(xyz=np.zeros((0, 3)))  # frees the disk
         return reasons != 0
 
     def _add(self, one: Tested, rows: slice) -> None:
-        """Take coordinates and masks, and flag weak intersections on the way."""
+        """Store coordinates and masks of some points, and flag weak intersections."""
         cloud, (xyz, heights, classes, *_) = self.cloud, one.points
         used = ~(one.withheld | np.isin(classes, NOISE_CLASSES))
         rays, miss, incidence = (one.rays.get(name) for name in RAY_DIMENSIONS)
@@ -196,35 +209,8 @@ class NoiseSearch:
         elif rays is not None:
             cloud.submerged[rows] = used & (rays > 0)
 
-    def _check(self) -> None:
-        """Refuse a cloud that leaves nothing to test."""
-        if not self.cloud.used.any():
-            raise InputError(
-                f"{self._name}: all {len(self.cloud.used):,} points are withheld or noise (class 7"
-                " or 18) already; there is nothing left to clean."
-            )
-        if self.water is not None and self._rules.below_or_floating:
-            check_submerged(int(self.cloud.submerged.sum()), self._name, self.water)
-
-    def _tests_not_run(self) -> list[str]:
-        """Return which tests the cloud does not allow, and why."""
-        rules, has = self._rules, self._has
-        needs = (
-            ("few rays", "RayCount", rules.min_rays),
-            ("ray miss", "RayMiss", rules.max_ray_miss),
-            ("incidence", "Incidence", rules.max_incidence),
-        )
-        missing = self._not_run + [
-            f"{test}: the cloud has no dimension {dimension if has else 'RayCount'}"
-            for test, dimension, limit in needs
-            if limit is not None and dimension not in has
-        ]
-        if rules.below_or_floating and self.water is None and not has:
-            missing.append("below bed, floating: no --water, and no dimension RayCount")
-        return missing
-
     def content(self) -> dict[str, Any]:
-        """Return what the file and the summary say of the cleaning."""
+        """Return what the record in the file and the summary have in common."""
         reasons = self.cloud.reasons
         return {
             "pcfix": __version__,
@@ -248,16 +234,16 @@ class NoiseSearch:
             noise=noise,
             dropped=noise if drop else 0,
             neighbour_distance_m=self._distance_m,
-            not_run=self._tests_not_run(),
+            not_run=self._not_run,
             seconds=round(seconds, 3),
             **self.content(),
         )
 
 
 class _Cleaning(Sums, Step):
-    """The step that flags noise or leaves it out, once it was found in the whole cloud.
+    """Flag or drop the noise of each chunk, once it was found in the whole cloud.
 
-    Large arrays of the search lie beside a file meanwhile. A bit for each point is kept.
+    The large arrays of the search lie on disk `beside` a file. One bit per point is kept.
     """
 
     def __init__(
@@ -270,7 +256,12 @@ class _Cleaning(Sums, Step):
     ) -> None:
         with open_cloud(cloud) as source:
             names = set(source.header.point_format.dimension_names)
-            points, has_rays = len(source), _has_rays(source)
+            points = len(source)
+            try:
+                ours = own_settings(source.vlrs)
+            except ValueError:  # a damaged record is reported where its content is needed
+                ours = None
+        has_rays = not (isinstance(ours, dict) and ours.get("cameras") == 0)
         passed = 0
 
         def count(some: int) -> None:
@@ -288,25 +279,27 @@ class _Cleaning(Sums, Step):
         self._summary = search.summary("", "", drop=options.drop, seconds=0.0)
         if self._drop and noise.all():
             raise InputError(
-                f"{cloud}: every point is noise by these thresholds; choose wider ones, or do not"
-                " drop."
-            )
+                "cloud.all_noise",
+                f"{cloud}: every point is noise by these thresholds. Use wider thresholds, or leave"
+                " out --drop.",
+                path=cloud, points=points,
+            )  # fmt: skip
         self.begin(0)
 
     def begin(self, first_row: int) -> None:
-        """Go on at a row of the whole cloud."""
+        """Continue at a row of the whole cloud."""
         self._row = first_row
 
     def run(self, task: FileTask) -> None:
-        """Take a file through."""
+        """Process a file."""
         task.run(self)
 
     def header(self, source: LasSource) -> Header:
-        """Return the header with the record of what is done."""
+        """Return the header with the record of the cleaning."""
         return noted_header(source, cleaning_vlr(self._content))
 
     def chunk(self, points: Chunk, source: LasSource, header: Header) -> Callable[[], Chunk]:
-        """Return what flags the noise among points, or leaves it out."""
+        """Return what flags or drops the noise among points."""
         first, byte = self._row, self._row // 8
         self._row += len(points)
         bits = np.unpackbits(self._noise[byte : (self._row + 7) // 8])
@@ -333,12 +326,3 @@ def _tested(cloud: Path | Tiles, water: WaterSurface | None, jobs: int | None) -
             rays = {name: source.dimension(chunk, name) for name in RAY_DIMENSIONS if name in names}
             withheld = np.asarray(chunk["withheld"]).astype(np.bool_)
             yield Tested(points_of(chunk, source, water), withheld, rays)
-
-
-def _has_rays(source: LasSource) -> bool:
-    """Return whether a cloud, if it was corrected, was so with cameras."""
-    try:
-        ours = own_settings(source.vlrs)
-    except ValueError:  # whoever needs it says so
-        return True
-    return not (isinstance(ours, dict) and ours.get("cameras") == 0)

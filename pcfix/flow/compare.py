@@ -1,4 +1,4 @@
-"""A cloud against a reference: files in, figures out."""
+"""Compare the files of a cloud and a reference."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 class Held(NamedTuple):
-    """A cloud that is at hand, in no file: its view, and what gives its points for a water."""
+    """A cloud in memory: its view, and a function that returns its points for a water surface."""
 
     view: Callable[[], CloudView]
     read: Callable[[WaterSurface | None], SurveyCloud]
@@ -46,25 +46,23 @@ def compare_clouds(
     options: CompareOptions | None = None,
     **keywords: Any,
 ) -> Comparison:
-    """Measure how far a cloud is from a reference; what ``pcfix compare`` runs.
+    """Compare a cloud with a reference; what ``pcfix compare`` runs.
 
-    Both lie in one CRS, metres. Points that are withheld or of class 7 or 18 never count, nor do
+    Both are in one CRS, metres. Points that are withheld or of class 7 or 18 are ignored, and
     points of the reference of classes 9, 41, 42 and 45 (water, its surface and column).
 
     Parameters
     ----------
     cloud : path, or list of paths
-        LAS or LAZ, or many as `pcfix.io.tiles.tiles_of` has them. Where `correct_file` wrote it
-        with all its dimensions, the figures before the correction are given too.
+        LAS or LAZ, or many as `pcfix.io.tiles.tiles_of` has them. If `correct_file` wrote it with
+        all its dimensions, the apparent points are compared too.
     reference : path, or list of paths
         LAS or LAZ, or many; CSV check points (x, y, z); or a GeoTIFF of heights. At check points
         the cloud's surface is measured, not the reference's at each point of the cloud.
     options : CompareOptions, optional
-        Or its attributes as keywords, as of ``pcfix compare``: out_dir (a folder for
-        ``compare.json``, ``depth_bins.csv``, ``shore_bins.csv`` and ``section_*.csv``, made where
-        its parent exists), submerged, water, m3c2, section (texts ``x1,y1,x2,y2`` or
-        `pcfix.compare.sections.SectionLine`), direction, share (texts or pairs), also (texts, pairs
-        or a dict of paths by name) and others.
+        Or its attributes as keywords: the options of ``pcfix compare``. `section` takes texts
+        ``x1,y1,x2,y2`` or `pcfix.compare.sections.SectionLine`, `share` texts or pairs, `also`
+        texts, pairs or a dict of paths by name.
 
     Returns
     -------
@@ -73,13 +71,13 @@ def compare_clouds(
     Raises
     ------
     PcfixError
-        With one sentence on what to mend.
+        If a file or an option cannot be used, or the two do not overlap.
     """
     started = time.perf_counter()
     given = taken(CompareOptions, options, keywords, "compare_clouds")
     lines = [parse_line(line) if isinstance(line, str) else line for line in given.section]
     clouds = [] if isinstance(cloud, Held) else [cloud_of(cloud)]
-    held = cloud if isinstance(cloud, Held) else _held(clouds[0])
+    held = cloud if isinstance(cloud, Held) else _in_file(clouds[0])
     also = {name: cloud_of(path) for name, path in given.also}
     surveyed = reference_of(reference)
     read = (*clouds, surveyed, *also.values())
@@ -88,7 +86,7 @@ def compare_clouds(
         load_py4dgeo()
     water = None
     if given.water is not None:
-        from pcfix.flow.surfaces import find_surface  # not quick to load
+        from pcfix.flow.surfaces import find_surface  # slow to import
 
         water = find_surface(given.water, WaterOptions(), held.view()).surface
     with scratch_arrays(_beside(given)):
@@ -102,7 +100,7 @@ def compare_clouds(
 
 
 def _beside(given: CompareOptions) -> Path:
-    """Return a file or folder to write beside, where large clouds lie meanwhile."""
+    """Return the output beside which the arrays of large clouds are stored."""
     for path in (given.out_dir, given.summary, given.plot):
         if path is not None:
             return Path(path)
@@ -110,10 +108,7 @@ def _beside(given: CompareOptions) -> Path:
 
 
 def _further(path: Path | Tiles, water: WaterSurface | None, first: Match) -> Match:
-    """Choose the points of a further cloud, and ask it at the same places as the first.
-
-    What it does not know of the water, the first does.
-    """
+    """Match a further cloud at the places of the first, with its water where its own is unknown."""
     cloud, target = read_cloud(path, water), first.reference
     check_same_crs(cloud.name, cloud.crs, target.name, target.crs)
     over = first.water_at(cloud.xyz) if first.settings.submerged else None
@@ -124,11 +119,11 @@ def _further(path: Path | Tiles, water: WaterSurface | None, first: Match) -> Ma
     return replace(found, places=first.places)
 
 
-def _held(cloud: Path | Tiles) -> Held:
+def _in_file(cloud: Path | Tiles) -> Held:
     """Return the cloud of a LAS or LAZ file, or of many."""
 
     def view() -> CloudView:
-        from pcfix.flow.surfaces import view_of  # not quick to load
+        from pcfix.flow.surfaces import view_of  # slow to import
 
         return view_of(cloud)
 
@@ -136,13 +131,19 @@ def _held(cloud: Path | Tiles) -> Held:
 
 
 def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:
-    """Refuse what cannot be written, before anything is computed."""
+    """Raise an error for outputs that cannot be written, before anything is computed."""
     if given.out_dir is not None:
         folder = Path(given.out_dir)
         if folder.exists() and not folder.is_dir():
-            raise SettingError(f"{folder}: is a file; give a folder.")
+            raise SettingError(
+                "output.no_folder", f"{folder} is a file. Give a folder.", path=folder
+            )
         if not folder.parent.is_dir():
-            raise SettingError(f"{folder}: the folder {folder.parent} does not exist; make it.")
+            raise SettingError(
+                "output.no_folder",
+                f"{folder}: the folder {folder.parent} does not exist. Make it.",
+                path=folder.parent,
+            )
         names = ["compare.json", "depth_bins.csv", "shore_bins.csv"]
         if folder.is_dir():
             for path in [*(folder / name for name in names), *folder.glob("section_*.csv")]:
@@ -172,6 +173,6 @@ def _write(result: Comparison, given: CompareOptions) -> None:
             write_bytes(given.plot, picture, overwrite=given.overwrite)
         write_summary(given, result.as_dict())
     if folder is not None:
-        for path in folder.glob("section_*.csv"):  # of an earlier one with more
+        for path in folder.glob("section_*.csv"):  # of an earlier comparison with more
             if path.name not in files:
                 path.unlink()

@@ -1,8 +1,8 @@
-"""A LAS or LAZ cloud to a raster of heights, depths or whatever it holds, with bounded memory.
+"""Grid a LAS or LAZ cloud to a raster of heights, depths or another quantity, in bounded memory.
 
-The points go once through, into files for squares of the plan; then the raster is made window by
-window. Whatever decides on a cell is read with its window, so the raster does not depend on where
-chunks, squares and windows end.
+The points are sorted once into files for squares of the plan; then the raster is made window by
+window. All points that decide on a cell are read with its window, so that the raster does not
+depend on the size of chunks, squares and windows.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ if TYPE_CHECKING:
 
 BLOCK_POINTS = 2_000_000
 TIN_BLOCK_POINTS = 400_000
-"""Windows are halved until they have no more points than this."""
+"""Windows are halved until they have at most so many points."""
 TIN_REACH_SPACINGS = 5.0
 TIN_REACH_CELLS = 3.0
-"""Circles around triangles may be as wide as the larger of the two, or as --fill."""
+"""Largest diameter of circles around triangles: the larger of the two, or --fill."""
 
 METRE = "metre"
 
@@ -56,36 +56,33 @@ def grid_dsm(
     progress: Progress | None = None,
     **keywords: Any,
 ) -> DsmSummary:
-    """Grid a cloud to a GeoTIFF of heights or of another quantity; what ``pcfix dsm`` runs.
+    """Grid a cloud to a GeoTIFF of heights or another quantity; what ``pcfix dsm`` runs.
 
-    The file has one band of float32, -9999 (nodata) where a cell has no value. Heights keep the
-    vertical datum that the cloud states, if any; a file of anything else has the plan alone, as
-    programs would take its values for heights.
-
-    Depth is `WaterDepth`, and uncertainty the vertical one at 95 %, of the bed (class 40), as
-    `pcfix.correct_file` leaves them; see `pcfix.grid.heights.as_uncertainty`.
+    The file has one band of float32, -9999 (nodata) if a cell has no value. Heights keep the
+    vertical datum of the cloud; other quantities have the horizontal CRS only, as programs would
+    take their values for heights. Depth is `WaterDepth`, and uncertainty the vertical one at 95 %,
+    of the bed (class 40), as `pcfix.correct_file` writes them; see
+    `pcfix.grid.heights.as_uncertainty`.
 
     With `counts` a second file has two bands: count (points in the cell) and spread (population
-    standard deviation of their values). A cell that has a value and count 0 has no points of its
-    own: its value was interpolated, and its spread is nodata.
+    standard deviation of their values). A cell with a value and count 0 was interpolated.
 
     Parameters
     ----------
     input : path, or list of paths
-        LAS or LAZ, in metres; of many, as `pcfix.io.tiles.tiles_of` has them, one raster is made.
+        LAS or LAZ, in metres; many, as `pcfix.io.tiles.tiles_of` has them, make one raster.
     output : path
         The name ends in ``.tif`` or ``.tiff``.
     options : DsmOptions, optional
-        Or its attributes as keywords, as of ``pcfix dsm``. The bounds of the raster are multiples
-        of the resolution (m); a point on an edge belongs to the cell east or north of it. Without
-        one it is chosen by `pcfix.grid.lattice.round_resolution`. Of the methods "idw" weights
-        points around the centre of cells that have some with 1 / distance squared; "tin" takes the
-        height at the centre from Delaunay's triangles, and fill is the width of the widest circle
-        without a point that is bridged, by default five times the spacing of the points and at
-        least three cells. Withheld points and noise (classes 7 and 18) are never used. The
-        hillshade is uint8: 1 dark to 255 bright, nodata 0.
+        Or its attributes as keywords: the options of ``pcfix dsm``. The bounds of the raster are
+        multiples of the resolution (m), by default that of `pcfix.grid.lattice.round_resolution`; a
+        point on an edge belongs to the cell east or north of it. The method "idw" weights points
+        around the centre with 1 / distance squared; "tin" uses Delaunay triangles, and fill is the
+        diameter of the widest circle without a point, by default five times the spacing of the
+        points and at least three cells. Withheld points and noise (classes 7 and 18) are not used.
+        The hillshade is uint8: 1 dark to 255 bright, nodata 0.
     progress : callable, optional
-        Called with (points done, points in all), reading and gridding counting half each.
+        Called with (points done, all points); reading and gridding count half each.
 
     Returns
     -------
@@ -94,12 +91,12 @@ def grid_dsm(
     Raises
     ------
     PcfixError
-        With one sentence on what to mend; no output is left behind.
+        If a file, an option or the cloud cannot be used; no output is left behind.
 
     Warns
     -----
     PcfixWarning
-        If the cells are so small that most would have no point.
+        If the cells are so small that most have no point.
     """
     given = taken(DsmOptions, options, keywords, "grid_dsm")
     more = {name: getattr(given, name) for name in ("hillshade", "counts")}
@@ -138,7 +135,7 @@ def grid_dsm(
 
 @dataclass
 class _Run:
-    """One cloud on its way into a raster."""
+    """The gridding of one cloud."""
 
     task: FileTask
     cloud: Path | Tiles
@@ -182,7 +179,7 @@ class _Run:
             self.finish(numbers, counts)
 
     def grid(self, heights: DatasetWriter, counts: DatasetWriter | None) -> None:
-        """Write values to one raster, the numbers of points and their spread to another."""
+        """Write values to one raster, numbers of points and their spread to another."""
         done, lattice = 0, self.lattice
         how = Gridding(lattice, self.settings.method, self.reach_m, self.near.spacing_m)
         into = ((heights, 1), (counts, 1), (counts, 2))
@@ -201,7 +198,7 @@ class _Run:
 
     @property
     def reach_m(self) -> float:
-        """Width of the widest circle around a triangle of the TIN."""
+        """Diameter of the widest circle around a triangle of the TIN."""
         spacings = TIN_REACH_SPACINGS * self.near.spacing_m
         cells = TIN_REACH_CELLS * self.settings.cell_m
         return max(spacings, cells, self.settings.fill or 0.0)
@@ -209,7 +206,7 @@ class _Run:
     def grid_and_fill(
         self, dsm: DatasetWriter, counts: DatasetWriter | None, unfilled: Path
     ) -> None:
-        """Write values to a raster of their own, and from there, with holes filled, to the DSM."""
+        """Write values to a temporary raster, and from there, with holes filled, to the DSM."""
         with rasters.new_raster(unfilled, self.lattice, None, {"height": METRE}) as heights:
             self.grid(heights, counts)
         widest = (self.settings.fill or 0.0) / self.settings.cell_m
@@ -239,14 +236,14 @@ class _Run:
         self.finish(plain, target)
 
     def finish(self, plain: Path, target: Path) -> None:
-        """Add overviews; a cloud optimised file is a copy, which brings its own."""
+        """Add overviews; a cloud optimised file is a copy with its own."""
         if self.cog:
             rasters.copy_as_cog(plain, target)
         else:
             rasters.add_overviews(plain)
 
     def report(self, share: float) -> None:
-        """Tell how much is done, in points."""
+        """Report the progress, in points."""
         if self.task.progress is not None:
             self.task.progress(round(share * self.points), self.points)
 

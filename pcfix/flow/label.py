@@ -1,4 +1,4 @@
-"""Labelling as a step of its own: classes for points, in arrays and in files of any size."""
+"""Label submerged points, in arrays and in files of any size."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from pcfix.water.surface import surface_above
 Classes = npt.NDArray[np.uint8]
 
 COUNTS = ("submerged", "water_surface", "stale", "water_unknown", "points")
-"""What becomes of points, under the names of `LabelSummary`."""
+"""Counts of points, by the names of `LabelSummary`."""
 
 
 def label_points(
@@ -69,11 +69,11 @@ def label_points(
     water : WaterSurface, float, or array of shape (n,)
         See `pcfix.correct_points`.
     classes : array of uint8, shape (n,), optional
-        That they come with. Default: 0, never classified.
+        Their classes. Default: 0, never classified.
     water_mask : WaterMask or path, optional
         See `label_file`.
     crs : str, optional
-        Of the points, for a mask from a file.
+        CRS of the points, for a mask from a file.
     options : LabelRules, optional
         Or its attributes as keywords: band, dead_band, connected, respect_classes and others.
 
@@ -84,7 +84,7 @@ def label_points(
     Raises
     ------
     PcfixError
-        If an argument is outside its rule, or the mask cannot be used.
+        If an argument breaks its rule, or the mask cannot be used.
 
     Examples
     --------
@@ -97,9 +97,11 @@ def label_points(
     given = np.zeros(len(points), np.uint8) if classes is None else np.asarray(classes)
     if given.shape != (len(points),) or given.dtype != np.uint8:
         raise SettingError(
-            f"classes must be {len(points)} values of uint8, not {given.dtype} of shape"
-            f" {given.shape}."
-        )
+            "option.shape",
+            f"classes are {given.dtype} of the shape {given.shape}. Give {len(points)} values of"
+            " uint8.",
+            option="classes", shape=given.shape,
+        )  # fmt: skip
     surface, heights = as_surface(water, len(points))
     if water_mask is None or isinstance(water_mask, str | PathLike):
         water_mask = mask_of(water_mask, crs, *corners(*points[:, :2].T))
@@ -118,11 +120,10 @@ def label_file(
     progress: Progress | None = None,
     **keywords: Any,
 ) -> LabelSummary:
-    """Give the submerged points of a LAS or LAZ cloud class 40; what ``pcfix label`` runs.
+    """Set the submerged points of a LAS or LAZ cloud to class 40; what ``pcfix label`` runs.
 
-    Nothing else changes, but for class 41 where a band is asked for, and points that come as 40
-    or 41 and are neither, which become class 1 with ``reset``. Ground and all other classes above
-    the water stay, and so do the classes 42 to 45 there, which say what others knew of the water.
+    With a band, points near the surface get class 41; with ``reset``, points of class 40 or 41 that
+    are neither get class 1. All other classes above the water stay, 42 to 45 too.
 
     Parameters
     ----------
@@ -130,9 +131,8 @@ def label_file(
         The names end in ``.las`` or ``.laz``; the output is LAS 1.4. Or many files and a folder,
         see `pcfix.correct_file`.
     options : LabelOptions, optional
-        Or its attributes as keywords, as of ``pcfix label``: water, water_mask, band and others.
-        With a dead band or connectivity the cloud is read twice. The result does not depend on
-        the size of chunks. A point on the border of the mask is inside.
+        Or its attributes as keywords: the options of ``pcfix label``. With a dead band or
+        connectivity the cloud is read twice. A point on the border of the mask is inside.
     progress : callable, optional
         See `pcfix.correct_file`.
 
@@ -143,7 +143,7 @@ def label_file(
     Raises
     ------
     PcfixError
-        With one sentence on what to mend; no output is left behind.
+        If a file, an option or the water cannot be used; no output is left behind.
     """
     given = taken(LabelOptions, options, keywords, "label_file")
     tiles = tiles_of(input)
@@ -165,7 +165,7 @@ def label_file(
 
 
 def _step_for(cloud: Path | Tiles, options: LabelOptions) -> LabellingStep:
-    """Return the step, with what it learns of the whole cloud."""
+    """Return the step after it has scanned the whole cloud, if its rules need that."""
     step = LabellingStep(str(cloud), options, view_of(cloud))
     step.look_around(lambda: file_points(cloud, step.water, options.jobs))
     return step
@@ -186,20 +186,10 @@ def _summary(step: LabellingStep, input: str, output: str, seconds: float) -> La
 
 
 class LabellingStep(Sums, Step):
-    """The step that labels points: of a file, and of the arrays that PDAL hands over.
+    """Label the points of a file, or the arrays of a PDAL pipeline.
 
-    Parameters
-    ----------
-    name : str
-        What is being labelled, for messages.
-    options : LabelOptions
-    view : CloudView
-        Of the whole cloud.
-
-    Raises
-    ------
-    PcfixError
-        If the water or the mask cannot be read or do not fit.
+    The name is for messages; the view is that of the whole cloud. Raises PcfixError if the water or
+    the mask cannot be read or do not fit.
     """
 
     added = ("counts", "labelling")
@@ -213,24 +203,24 @@ class LabellingStep(Sums, Step):
         self.begin(0)
 
     def begin(self, first_row: int) -> None:
-        """Forget the chunks so far, wherever the next one is."""
+        """Reset the counts; the result does not depend on the row of the next chunk."""
         del first_row
         self.counts: dict[str, Any] = dict.fromkeys(COUNTS, 0)
         self.labelling.restart()
 
     def run(self, task: FileTask) -> None:
-        """Take a file through."""
+        """Process a file."""
         task.run(self)
 
     def look_around(self, chunks: Callable[[], Iterable[Points]]) -> None:
-        """Learn the surroundings of all points, where the rules need them."""
+        """Scan the surroundings of all points, if the rules need them."""
         if self.labelling.looks_around:
             self.labelling.look_around(
                 lambda: parts_of(chunks(), self.water), self._view.low, self._view.high
             )
 
     def header(self, source: LasSource) -> Header:
-        """Return the header of a labelled file, with a record of what was done."""
+        """Return the header of a labelled file, with the record of the labelling."""
         water, mask = self.water, self.labelling.mask
         content = {
             "pcfix": __version__,
@@ -260,7 +250,7 @@ class LabellingStep(Sums, Step):
         return partial(_labelled, points, header, found)
 
     def finish(self) -> None:
-        """Refuse a cloud of which no point lies below the water, or inside the mask."""
+        """Raise GeometryError if no point lies below the water, or inside the mask."""
         below = self.counts["submerged"] + self.counts["water_surface"]
         self.labelling.check(self._name, below)
         check_submerged(below, self._name, self.water)

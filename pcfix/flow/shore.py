@@ -1,4 +1,4 @@
-"""The shoreline of a cloud as a file: gathered with the chunks, written at the end."""
+"""Write the shoreline of a cloud to a file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LAYER = "shoreline"
 
 
 def check_shoreline(path: File | None, *, overwrite: bool, inputs: Iterable[File] = ()) -> None:
-    """Refuse a file that could not be written, before anything is computed."""
+    """Check that the file can be written, before anything is computed."""
     if path is not None:
         check_layers(check_output(path, overwrite=overwrite, inputs=inputs))
 
@@ -32,9 +32,9 @@ def write_shoreline(
     *,
     overwrite: bool,
 ) -> dict[str, Any]:
-    """Write the lines of a cloud in its CRS; return what a summary says of them.
+    """Write the lines of a cloud in its CRS, and return their figures for the summary.
 
-    Where `sigma_level_m` knows no standard error of the water's height it is `LEVEL_M`.
+    The standard error of the water's height is `LEVEL_M` if `sigma_level_m` returns none.
     """
 
     def sigma(xy: FloatArray) -> FloatArray:
@@ -51,7 +51,7 @@ def write_shoreline(
 
 
 def shoreline_layer(name: str, lines: Sequence[Shoreline], style: str = "") -> Layer:
-    """Return lines as a layer: of each the level, the standard error across it, the length."""
+    """Return lines as a layer, with level, standard error across the line, and length."""
     values = {
         figure: np.array([getattr(one, figure) for one in lines], np.float64)
         for figure in ("level_m", "sigma_m", "length_m")

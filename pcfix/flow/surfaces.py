@@ -41,26 +41,13 @@ if TYPE_CHECKING:
 
 
 class Points(NamedTuple):
-    """Points of a chunk.
+    """The points of a chunk."""
 
-    Attributes
-    ----------
-    xyz : array, shape (n, 3)
-        World frame, metres.
-    heights : array, shape (n,), or None
-        Of the water above each, where a dimension has it.
-    classes : array of uint8, shape (n,)
-    sources : array of int, shape (n,), or None
-        The point source of each, where the cloud has it: which of several clouds it came from.
-    colours : tuple of array, each of shape (n,), or None
-        Red, green and blue, where the cloud has them.
-    """
-
-    xyz: FloatArray
-    heights: FloatArray | None
-    classes: npt.NDArray[np.uint8]
-    sources: IntArray | None = None
-    colours: tuple[npt.NDArray[Any], ...] | None = None
+    xyz: FloatArray  # (n, 3), world frame, metres
+    heights: FloatArray | None  # (n,), of the water above each, if a dimension has it
+    classes: npt.NDArray[np.uint8]  # (n,)
+    sources: IntArray | None = None  # (n,), point source IDs
+    colours: tuple[npt.NDArray[Any], ...] | None = None  # red, green and blue, (n,) each
 
     def take(self, rows: IntArray) -> Points:
         """Return some of the points."""
@@ -70,19 +57,17 @@ class Points(NamedTuple):
         return Points(self.xyz[rows], heights, self.classes[rows], sources, colours)
 
 
-"""Some points: coordinates (n, 3), water heights where those are a dimension, classes."""
-
 RGB = ("red", "green", "blue")
 
 SAMPLE_POINTS = 2_000_000
-"""Points of a cloud that are looked at for a surface, evenly spread."""
+"""Points of a cloud that are searched for water, evenly spread."""
 
 
 CloudPlace: TypeAlias = "tuple[CRS | str | None, FloatArray, FloatArray]"
 
 
 class Seen(NamedTuple):
-    """Some points of a cloud, and what they show; None where the cloud does not have it."""
+    """Some points of a cloud with their attributes; None if the cloud does not have them."""
 
     xyz: FloatArray
     rgb: npt.NDArray[Any] | None
@@ -92,29 +77,15 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True)
 class CloudView:
-    """A cloud as a water surface needs it.
+    """A cloud as a water surface needs it."""
 
-    Attributes
-    ----------
-    name : str
-        For messages.
-    crs : CRS, str or None
-    low, high : array, shape (2,)
-        South-west and north-east corner, metres.
-    points : int
-    chunks : callable
-        Returns the points, `Seen` after `Seen`.
-    software : str
-        What the file says that it was made with.
-    """
-
-    name: str
+    name: str  # for messages
     crs: CRS | str | None
-    low: FloatArray
+    low: FloatArray  # (2,), south-west and north-east corner, metres
     high: FloatArray
     points: int
     chunks: Callable[[], Iterator[Seen]]
-    software: str = ""
+    software: str = ""  # generating software in the header
 
 
 def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -151,14 +122,14 @@ def file_points(
     jobs: int | None = None,
     kept: list[Chunk] | None = None,
 ) -> Iterator[Points]:
-    """Yield all points of a LAS or LAZ file, or of many, chunk by chunk, see `LasSource`."""
+    """Yield all points of a LAS or LAZ file, or of many, chunk by chunk; see `LasSource`."""
     places = not isinstance(water, WaterDimension)
     with open_cloud(cloud, jobs, places_only=places, kept=kept) as source:
         yield from read_ahead((points_of(one, source, water) for one in source.chunks()), jobs)
 
 
 def first_points(chunks: Iterable[Points]) -> Points:
-    """Return as many points of a cloud as a chunk has, however many these have, without colours."""
+    """Return the first points of a cloud, as many as a chunk has, without colours."""
     parts: list[Points] = []
     count = 0
     for one in chunks:
@@ -192,30 +163,30 @@ def parts_of(chunks: Iterable[Points], water: WaterSurface) -> Iterable[Part]:
 def find_surface(
     water: WaterSurface | float | File, options: WaterOptions, view: CloudView | None
 ) -> FoundSurface:
-    """Return the water surface that the user means, for a cloud.
+    """Read, fit or find the water surface of a cloud.
 
     Parameters
     ----------
     water : WaterSurface, float, str or path
         See `pcfix.read_water`; besides, a vector file of shoreline points or lines, to which a
-        surface is fitted, or ``auto``: the surface is sought in the cloud.
+        surface is fitted, or ``auto``: the surface is found in the cloud.
     options : WaterOptions
-        What is fitted to shoreline points (see `pcfix.water.fit.fit_water` and
-        `pcfix.water.river.fit_river`), and their CRS.
+        Model of the fit (see `pcfix.water.fit.fit_water` and `pcfix.water.river.fit_river`), and
+        CRS of the shoreline.
     view : CloudView or None
         Without a cloud only surfaces that do not need one.
 
     Raises
     ------
     PcfixError
-        If the surface cannot be read, fitted or found, or needs a cloud and there is none.
+        If the surface cannot be read, fitted or found, or needs a cloud.
     """
     from pcfix.io.vectors import is_vector_file
 
     if not isinstance(water, str | PathLike | float | int):
         return FoundSurface(water)
     if str(water).strip().lower() == "auto":
-        return _sought(view)
+        return _found(view)
     if isinstance(water, str | PathLike) and is_vector_file(water):
         return _fitted(options, water, view)
     if view is None:
@@ -224,7 +195,7 @@ def find_surface(
 
 
 APART_M = 2.0
-"""Between the common water and that of an image, in the median: waves and tides are smaller."""
+"""Largest median difference between the common water and that of an image, more than tides."""
 
 
 def own_water_of(
@@ -234,32 +205,33 @@ def own_water_of(
     view: CloudPlace,
     level_offset_m: FloatArray | None = None,
 ) -> tuple[OwnWater | None, tuple[str, ...]]:
-    """Return the water of images that have one of their own, and what to say of it.
+    """Return the separate water surfaces of images, and notes on them.
 
     Parameters
     ----------
     folder : path or None
-        Of rasters with the names of the images, and their standard errors in a folder ``sigma``.
+        With rasters named after the images, and their standard errors in a folder ``sigma``.
     cameras : Cameras
     water : WaterSurface
-        That of the others.
+        That of the other images.
     view : CRS, and two arrays, shape (2,)
-        Of the cloud: its CRS, its south-west and its north-east corner, metres.
+        CRS of the cloud, its south-west and its north-east corner, metres.
     level_offset_m : array, shape (k,), optional
-        How much higher than `water` it stood when each camera took its image.
+        Height of the water above `water` at each image.
 
     Raises
     ------
     InputError
-        If no raster bears the name of an image, one cannot be read, or none lies where the cloud
-        and the other water do.
+        ``water.no_overlap`` or ``water.datum``, or if a raster cannot be read.
     """
     if folder is None:
         return None, ()
     if isinstance(water, WaterMesh):
         raise SettingError(
-            "water-per-image does not go with a mesh as the water of the other images; give a"
-            " level, a plane or a raster."
+            "option.exclusive",
+            "water-per-image does not work with a mesh as the water of the other images. Give a"
+            " level, a plane or a raster.",
+            options=["water_per_image", "water"],
         )
     crs, low, high = view
     paths, notes = rasters_of_images(folder, cameras.labels)
@@ -268,7 +240,7 @@ def own_water_of(
     sigma = _read_alike({row: path for row, path in errors.items() if path.is_file()}, crs)
     if len(sigma) < len(heights):
         lost = len(heights) - len(sigma)
-        notes += (f"{folder}: {lost} rasters have no standard error in its folder sigma.",)
+        notes += (f"{folder}: {lost} rasters have no standard errors in the folder sigma.",)
     offset = np.zeros(len(cameras)) if level_offset_m is None else level_offset_m
     places, apart = [], []
     for image, raster in heights.items():
@@ -280,19 +252,22 @@ def own_water_of(
             level = surface_above(water, np.column_stack([x, y, x])).height_m + offset[image]
             apart.append(np.nanmedian(np.append(raster.height_m[rows, columns] - level, np.nan)))
     if np.isfinite(low).all() and not any(places):
-        raise InputError(f"{folder}: none of its rasters lies over the cloud; check their CRS.")
+        text = f"{folder}: none of its rasters overlaps the cloud. Check their CRS."
+        raise InputError("water.no_overlap", text, path=folder)
     off = float(np.nanmedian(apart)) if np.isfinite(apart).any() else 0.0
     if abs(off) > APART_M:
         raise InputError(
-            f"{folder}: its water stands {off:+.2f} m from --water ({water}); give both the same"
-            " vertical datum, 'pcfix calm' the --level of the calm water."
-        )
+            "water.datum",
+            f"{folder}: its water differs by {off:+.2f} m from --water ({water}). Give both the"
+            " same vertical datum, and 'pcfix calm' the --level of the calm water.",
+            path=folder, difference_m=off,
+        )  # fmt: skip
     k, common = len(cameras), water if isinstance(water, WaterRaster) else None
     return OwnWater(build_fields(heights, k, common), build_fields(sigma, k)), notes
 
 
 def _read_alike(paths: dict[int, Path], crs: CRS | str | None) -> dict[int, WaterRaster]:
-    """Read rasters of one kind, and warn of the first alone."""
+    """Read rasters of one kind, and show the warnings of the first only."""
     rasters = dict[int, WaterRaster]()
     with warnings.catch_warnings():
         for row, path in paths.items():
@@ -302,15 +277,16 @@ def _read_alike(paths: dict[int, Path], crs: CRS | str | None) -> dict[int, Wate
 
 
 def _bounds(low: FloatArray, high: FloatArray) -> tuple[float, float, float, float]:
-    """Return the west, south, east and north end of a box."""
+    """Return the bounds west, south, east and north of a box."""
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
-def _sought(view: CloudView | None) -> FoundSurface:
+def _found(view: CloudView | None) -> FoundSurface:
     from pcfix.water.auto import find_water
 
     if view is None:
-        raise SettingError("water 'auto' is found in a cloud; give the cloud too.")
+        text = "The water surface 'auto' is found in a cloud. Give the cloud too."
+        raise SettingError("cloud.missing", text)
     every = max(1, view.points // SAMPLE_POINTS)
     chunks: Iterable[tuple[Any, ...]] = view.chunks()
     parts, row = [], 0
@@ -347,7 +323,7 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
         warnings.warn(note, PcfixWarning, stacklevel=2)
     if (shore.counts < 1.0).any():
         notes.append(
-            f"{shore.name}: {len(xyz):,} points along lines that were drawn count as"
+            f"{shore.name}: {len(xyz):,} points along drawn lines count as"
             f" {shore.counts.sum():.0f} independent ones."
         )
     return FoundSurface(found.surface, found, xyz, (*map(str, notes), *found.notes))
@@ -356,19 +332,20 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
 def _with_heights(
     xyz: FloatArray, name: str, view: CloudView | None, notes: list[Any]
 ) -> FloatArray:
-    """Give the points without a height that of the cloud about them."""
+    """Return points with the heights of the cloud where they have none."""
     from pcfix.io.vectors import SHORE_RADIUS_M
     from pcfix.water.fit import heights_from_cloud, is_near
 
     if view is None:
-        raise InputError(f"{name}: has points without a height; give the cloud too.")
+        text = f"{name} has points without a height. Give the cloud too."
+        raise InputError("cloud.missing", text, path=name)
     lacking = np.isnan(xyz[:, 2])
     places = xyz[lacking, :2]
     near = [seen.xyz[is_near(places, seen.xyz, SHORE_RADIUS_M)] for seen in view.chunks()]
     heights = heights_from_cloud(places, np.vstack(near), SHORE_RADIUS_M)
     notes.append(
-        f"{name}: {int(lacking.sum()):,} points have no height and take that of the cloud within"
-        f" {SHORE_RADIUS_M:g} m; {int(np.isnan(heights).sum()):,} found none and do not count."
+        f"{name}: {int(lacking.sum()):,} points have no height and get that of the cloud within"
+        f" {SHORE_RADIUS_M:g} m; {int(np.isnan(heights).sum()):,} have none and are ignored."
     )
     filled = xyz.copy()
     filled[lacking, 2] = heights

@@ -1,7 +1,7 @@
-"""The colours of maps: one ramp for each kind of figure, in pictures, pages and GIS styles alike.
+"""Colour ramps of maps: one for each quantity, in pictures, pages and GIS styles.
 
-All are ramps of matplotlib that keep their order for colour-blind eyes and in print: depth is
-light where it is shallow, and what is high in a difference is red.
+All are ramps of matplotlib that keep their order for colour-blind readers and in print: shallow
+water is light, and positive differences are red.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ DIFFERENCE = "RdBu_r"
 
 
 def stops_of(ramp: str, steps: int = 9) -> list[tuple[float, tuple[int, ...]]]:
-    """Return shares of a ramp's way, 0 to 1, and their colours (red, green, blue; 0 to 255)."""
+    """Return positions along a ramp, 0 to 1, and their colours (red, green, blue; 0 to 255)."""
     from matplotlib import colormaps
 
     shares = [step / (steps - 1) for step in range(steps)]
@@ -33,24 +33,17 @@ def stops_of(ramp: str, steps: int = 9) -> list[tuple[float, tuple[int, ...]]]:
 
 LAND = (214, 205, 188)
 DARKEST = 0.35
-"""Of the colour that is left where no light falls."""
+"""Share of the colour without light."""
 
 
 def relief_colours(
     light: npt.NDArray[np.uint8], depth_m: FloatArray, deepest_m: float, *, flat: float
 ) -> npt.NDArray[np.uint8]:
-    """Return red, green, blue and alpha, shape (4, rows, columns), of a lit bed and its land.
+    """Return red, green, blue and alpha, shape (4, rows, columns), of a shaded bed and its land.
 
-    Parameters
-    ----------
-    light : array of uint8, shape (rows, columns)
-        Of `pcfix.grid.model.hillshade`.
-    depth_m : array, shape (rows, columns)
-        NaN on land.
-    deepest_m : float
-        What has the last colour of the ramp.
-    flat : float
-        Share of the light that level ground has; it keeps its colour.
+    `light`, shape (rows, columns), is that of `pcfix.grid.model.hillshade`; level ground has the
+    share `flat` of it and keeps its colour. Depths are NaN on land; `deepest_m` has the last colour
+    of the ramp.
     """
     stops = stops_of(DEPTH, 33)
     at = np.array([share for share, _ in stops]) * deepest_m

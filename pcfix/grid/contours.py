@@ -1,4 +1,4 @@
-"""Contours of a raster, at an interval that it can bear."""
+"""Contours of a raster, at an interval that fits its range and accuracy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MOST_LEVELS = 15
 SMOOTH_CELLS = 1.0
 """Standard deviation of the filter before the lines are drawn."""
 LEAST_CELLS = 12.0
-"""Shorter lines are scraps."""
+"""Shorter lines are dropped."""
 
 
 class Contour(NamedTuple):
@@ -25,9 +25,9 @@ class Contour(NamedTuple):
 
 
 def interval_of(height: float, least: float) -> float:
-    """Return 1, 2 or 5 times a power of ten, so that few levels go into a height.
+    """Return 1, 2 or 5 times a power of ten that divides a height into few levels.
 
-    It is at least `least`, such as the uncertainty: finer lines would draw what is not known.
+    It is at least `least`, such as the uncertainty.
     """
     wanted = max(height / MOST_LEVELS, least, 1e-3)
     power = 10.0 ** math.floor(math.log10(wanted) + 1e-9)
@@ -35,16 +35,16 @@ def interval_of(height: float, least: float) -> float:
 
 
 def depth_interval(depth_m: FloatArray, uncertainty_m: FloatArray) -> float:
-    """Return the interval for a map of depths; both NaN where not known, of any shape."""
+    """Return the interval for a map of depths; both NaN if unknown, of any shape."""
     known = uncertainty_m[np.isfinite(uncertainty_m)]
     deepest = np.max(depth_m, where=np.isfinite(depth_m), initial=0.0)
     return interval_of(float(deepest), float(np.median(known)) if known.size else 0.0)
 
 
 def contours(values: FloatArray, interval: float) -> list[Contour]:
-    """Return the contours of cells (rows, columns), NaN where not known, at whole intervals.
+    """Return the contours of cells (rows, columns), NaN if unknown, at whole intervals.
 
-    The lowest and the highest value are no levels.
+    The lowest and the highest value have no contour.
     """
     from contourpy import contour_generator
 

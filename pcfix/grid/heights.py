@@ -1,4 +1,4 @@
-"""One height for each cell, from the points in and around it."""
+"""Compute one height for each cell from the points in and around it."""
 
 from __future__ import annotations
 
@@ -9,53 +9,41 @@ import numpy as np
 
 from pcfix.grid.delaunay import triangulated
 from pcfix.grid.lattice import Lattice, Window
-from pcfix.kernels import kernel
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.steps import DsmMethod
 
 TO_95 = 1.959964
-"""From a standard deviation to the half-width that holds 95 % of a normal distribution."""
+"""Half-width of 95 % of a normal distribution, in standard deviations."""
 
 
 class Gridding(NamedTuple):
-    """How heights are made: the raster, the key of `HEIGHTS`, and distances in metres.
-
-    reach_m : width of the widest circle around a triangle of the TIN.
-    spacing_m : of the points; see `pcfix.grid.lattice.Occupancy`.
-    """
+    """The raster and the method of its heights."""
 
     lattice: Lattice
-    method: DsmMethod
-    reach_m: float
-    spacing_m: float
+    method: DsmMethod  # key of `HEIGHTS`
+    reach_m: float  # diameter of the widest circle around a triangle of the TIN
+    spacing_m: float  # of the points; see `pcfix.grid.lattice.Occupancy`
 
     @property
     def margin_cells(self) -> int:
-        """How many cells around a window hold points that decide on it."""
+        """The number of cells around a window whose points decide on it."""
         return HEIGHTS[self.method].margin(self.reach_m / self.lattice.resolution_m)
 
 
 class Block(NamedTuple):
-    """What a height of the cells of a window is made from.
+    """The points of a window, with `Gridding.margin_cells` of margin."""
 
-    position : shape (n, 2), columns and rows, in cells from the top left corner of the raster.
-    cell : shape (n, 2), column and row of each point's cell; they reach `Gridding.margin_cells`
-        beyond the window.
-    z : shape (n,), metres.
-    numbers : of the window's cells.
-    """
-
-    position: FloatArray
-    cell: IntArray
-    z: FloatArray
+    position: FloatArray  # (n, 2), columns and rows, in cells from the raster's top left corner
+    cell: IntArray  # (n, 2), column and row of each point's cell
+    z: FloatArray  # (n,), metres
     window: Window
-    numbers: Cells
-    reach: float
+    numbers: Cells  # of the window's cells
+    reach: float  # in cells, as the next
     spacing: float
 
 
 class Gridded(NamedTuple):
-    """The bands of a window, each of its shape; NaN where nothing is known."""
+    """The bands of a window, each of its shape; NaN if unknown."""
 
     height: FloatArray
     points: IntArray
@@ -65,14 +53,8 @@ class Gridded(NamedTuple):
 def grid_window(points: FloatArray, cell: IntArray, window: Window, how: Gridding) -> Gridded:
     """Return the bands of a part of a raster.
 
-    Parameters
-    ----------
-    points : array, shape (n, 3)
-        x and y, world frame, metres, and the height, or what else the raster is made of.
-    cell : array of int, shape (n, 2)
-        Column and row of each point in the raster.
-    window : Window
-    how : Gridding
+    Points, shape (n, 3), are x and y, world frame, metres, and the height or another quantity;
+    `cell`, shape (n, 2), is the column and row of each point.
     """
     inner, shape = window.holds(cell), (window.height, window.width)
     code = (cell[inner, 1] - window.row) * window.width + cell[inner, 0] - window.column
@@ -87,7 +69,7 @@ def grid_window(points: FloatArray, cell: IntArray, window: Window, how: Griddin
 
 
 class Cells(NamedTuple):
-    """The points of n cells in numbers, each of shape (n,); NaN where a cell has none."""
+    """Statistics of the points of n cells, each of shape (n,); NaN without points."""
 
     points: IntArray
     mean: FloatArray
@@ -98,21 +80,11 @@ class Cells(NamedTuple):
 
 
 def cell_numbers(cell: IntArray, z: FloatArray, size: int) -> Cells:
-    """Return the numbers of each cell.
+    """Return the statistics of `size` cells, from the cell and height of each point, shape (k,).
 
     Heights are summed in ascending order, as differences from the lowest of their cell, so that
-    neither the order of the points nor the height above the datum touches the result. `spread` is
-    the root mean square distance of the heights from their mean (their population standard
-    deviation): 0 in a cell with one point.
-
-    Parameters
-    ----------
-    cell : array of int, shape (k,)
-        The cell of each point, from 0 to size - 1.
-    z : array, shape (k,)
-        Heights, metres.
-    size : int
-        Number of cells, n.
+    the result does not depend on the order of the points or the vertical datum. `spread` is the
+    population standard deviation of the heights: 0 in a cell with one point.
     """
     order = np.lexsort((z, cell))
     z, count = z[order], np.bincount(cell, minlength=size)
@@ -121,90 +93,56 @@ def cell_numbers(cell: IntArray, z: FloatArray, size: int) -> Cells:
     first = np.cumsum(n) - n
     low = z[first]
     above = z - np.repeat(low, n)
-    offset = _sums(above, first) / n
-    scatter = np.sqrt(_sums((above - np.repeat(offset, n)) ** 2, first) / n)
+    offset = np.add.reduceat(above, first) / n
+    scatter = np.sqrt(np.add.reduceat((above - np.repeat(offset, n)) ** 2, first) / n)
     median = (z[first + (n - 1) // 2] + z[first + n // 2]) / 2.0
     columns = (low + offset, median, low, z[first + n - 1], scatter)
-    return Cells(count, *(_spread_out(values, filled, size) for values in columns))
+    whole = np.full((len(columns), size), np.nan)
+    whole[:, filled] = columns
+    return Cells(count, *whole)
 
 
 def as_uncertainty(bands: Gridded) -> Gridded:
-    """Return the vertical uncertainty (m) at 95 % of cells whose bands are of standard errors.
+    """Return the vertical uncertainty (m) at 95 % from bands of standard errors.
 
-    It is the root mean square of the points', and not divided by the square root of their number.
-    What the points of a cell are wrong by comes in good part from level, index and tilt of the
-    water and from poses, which they share, and which more points do not average out; to take all
-    of it as shared is the cautious side.
+    It is the root mean square over the points of a cell, not divided by the square root of their
+    number: errors of level, index and tilt of the water and of poses are common to them and do not
+    average out. To treat all errors as common is conservative.
     """
     return bands._replace(height=TO_95 * np.hypot(bands.height, bands.spread))
 
 
-def _sums(values: FloatArray, first: IntArray) -> FloatArray:
-    """Return the sum of each run of values; runs begin at `first`."""
-    return np.asarray(np.add.reduceat(values, first))
-
-
-def _spread_out(values: FloatArray, where: IntArray, size: int) -> FloatArray:
-    out = np.full(size, np.nan)
-    out[where] = values
-    return out
-
-
 REACH_CELLS = 2.0**0.5
-"""Points this far from a centre count; they lie in its cell and the eight around it."""
+"""Points up to this distance from a centre count; they lie in its cell and the eight around it."""
 NEAREST_CELLS = 1e-4
-"""A point nearer to a centre weighs as if it were this far from it."""
+"""Least distance of a point from a centre for its weight."""
 
 
 def inverse_distance(block: Block) -> FloatArray:
     """Return the mean of the heights around each centre, weighted with 1 / distance squared.
 
-    The nearer a point, the more it counts; points farther than `REACH_CELLS` do not count, and
-    cells without a point of their own get NaN. The points cover the window with a margin of a cell.
+    Points farther than `REACH_CELLS` do not count, and cells without a point of their own are NaN.
+    The points cover the window with a margin of a cell.
     """
-    wide = block.window.grown(1)
-    code = (block.cell[:, 1] - wide.row) * wide.width + block.cell[:, 0] - wide.column
-    order = np.lexsort((block.z, code))
-    start = np.searchsorted(code[order], np.arange(wide.height * wide.width + 1))
-    return np.asarray(_weighted(block.position[order], block.z[order], start, *block.window))
-
-
-@kernel(allocates=True)
-def _weighted(
-    position: FloatArray,
-    z: FloatArray,
-    start: IntArray,
-    row_first: int,
-    row_stop: int,
-    column_first: int,
-    column_stop: int,
-) -> FloatArray:
-    """Return the weighted means; `start` indexes the points of cells with a margin of one."""
-    height, width = row_stop - row_first, column_stop - column_first
-    out = np.full((height, width), np.nan)
-    for row in range(height):
-        for column in range(width):
-            own = (row + 1) * (width + 2) + column + 1
-            if start[own] == start[own + 1]:
-                continue
-            weights, total, base = 0.0, 0.0, z[start[own]]
-            for r in range(row, row + 3):
-                for c in range(column, column + 3):
-                    code = r * (width + 2) + c
-                    for k in range(start[code], start[code + 1]):
-                        across = position[k, 0] - (column_first + column) - 0.5
-                        down = position[k, 1] - (row_first + row) - 0.5
-                        square = across * across + down * down
-                        if square <= REACH_CELLS * REACH_CELLS:
-                            weight = 1.0 / max(square, NEAREST_CELLS * NEAREST_CELLS)
-                            weights += weight
-                            total += weight * (z[k] - base)
-            out[row, column] = base + total / weights
-    return out
+    order = np.lexsort((block.z, block.cell[:, 0], block.cell[:, 1]))
+    position, cell, z = block.position[order], block.cell[order], block.z[order]
+    window, cells = block.window, block.window.height * block.window.width
+    weights, total = np.zeros(cells), np.zeros(cells)
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):  # each point counts for its cell and those around it
+            near = cell + np.array([right, down])
+            square = ((near + 0.5 - position) ** 2).sum(axis=1)
+            rows = window.holds(near) & (square <= REACH_CELLS * REACH_CELLS)
+            to = (near[rows, 1] - window.row) * window.width + near[rows, 0] - window.column
+            weight = 1.0 / np.maximum(square[rows], NEAREST_CELLS * NEAREST_CELLS)
+            weights += np.bincount(to, weight, cells)
+            total += np.bincount(to, weight * z[rows], cells)
+    known = block.numbers.points > 0
+    return np.where(known, total / np.where(known, weights, 1.0), np.nan)
 
 
 class Height(NamedTuple):
-    """One way to give cells a height; and how many cells around a window it needs, by `reach`."""
+    """A method, and the number of cells around a window that it needs, by `reach`."""
 
     of: Callable[[Block], FloatArray]
     margin: Callable[[float], int] = lambda reach: 0
@@ -221,4 +159,4 @@ HEIGHTS: dict[DsmMethod, Height] = {
         lambda reach: int(np.ceil(reach)) + 1,
     ),
 }
-"""The statistics of a DSM. One more is an entry here and a word in `DsmMethod`."""
+"""The methods of a DSM. A new one is an entry here and in `DsmMethod`."""

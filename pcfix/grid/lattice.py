@@ -15,7 +15,7 @@ from pcfix.options.steps import MIN_RESOLUTION_M
 
 MAX_CELLS = 1_000_000_000
 EDGE_M = 1e-7
-"""A point this near to an edge lies on it: 5432000.1 / 0.1 in floating point may fall short."""
+"""Tolerance of points on an edge: 5432000.1 / 0.1 in floating point may be too small."""
 
 
 class Window(NamedTuple):
@@ -37,20 +37,20 @@ class Window(NamedTuple):
         return self.column_stop - self.column
 
     def grown(self, cells: int) -> Window:
-        """Return the window with a margin on each side, which may reach beyond the raster."""
+        """Return the window with a margin on each side, which may extend beyond the raster."""
         return Window(
             self.row - cells, self.row_stop + cells, self.column - cells, self.column_stop + cells
         )
 
     def moved(self, rows: int, columns: int) -> Window:
-        """Return the window so many rows and columns further."""
+        """Return the window shifted by rows and columns."""
         return Window(
             self.row + rows, self.row_stop + rows, self.column + columns,
             self.column_stop + columns,
         )  # fmt: skip
 
     def holds(self, cell: IntArray) -> BoolArray:
-        """Return which columns and rows, shape (n, 2), are in the window."""
+        """Return whether columns and rows, shape (n, 2), are in the window."""
         column, row = cell.T
         across = (column >= self.column) & (column < self.column_stop)
         return np.asarray(across & (row >= self.row) & (row < self.row_stop))
@@ -62,7 +62,7 @@ class Window(NamedTuple):
                 yield Window(row, row + side, column, column + side).clipped(self)
 
     def clipped(self, other: Window) -> Window:
-        """Return what this window and another have in common."""
+        """Return the intersection with another window."""
         return Window(
             max(self.row, other.row), min(self.row_stop, other.row_stop),
             max(self.column, other.column), min(self.column_stop, other.column_stop),
@@ -81,8 +81,8 @@ class Lattice:
     """The cells of one raster."""
 
     resolution_m: float
-    first_column: int  # how many cells the left edge lies east of x = 0
-    first_row: int  # how many cells the top edge lies south of y = 0
+    first_column: int  # cells from x = 0 eastwards to the left edge
+    first_row: int  # cells from y = 0 southwards to the top edge
     width: int  # in cells, as the next
     height: int
 
@@ -124,8 +124,8 @@ class Lattice:
 def cells_of(xyz: FloatArray, resolution_m: float) -> IntArray:
     """Return columns eastwards and rows southwards of points, counted from x = 0 and y = 0.
 
-    Points have the shape (n, 2) or (n, 3), metres, world frame. One on an edge belongs to the cell
-    east or north of it.
+    Points have the shape (n, 2) or (n, 3), metres, world frame. A point on an edge belongs to the
+    cell east or north of it.
     """
     cells = np.floor((xyz[:, :2] + EDGE_M) / resolution_m).astype(np.int64)
     cells[:, 1] = -cells[:, 1] - 1
@@ -139,29 +139,26 @@ def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float) -> Latt
 
 
 def fits(low: FloatArray, high: FloatArray, resolution_m: float) -> bool:
-    """Return whether a raster over the rectangle has no more cells than are allowed."""
+    """Return whether a raster over the rectangle has at most `MAX_CELLS`."""
     columns, rows = _size(low, high, resolution_m)
     return columns * rows <= MAX_CELLS
 
 
 def refuse_size(low: FloatArray, high: FloatArray, resolution_m: float, name: str) -> None:
-    """Refuse a raster with more cells than are allowed, with the smallest resolution that is."""
+    """Raise SettingError ``option.resolution`` for a raster with more than `MAX_CELLS`."""
     if fits(low, high, resolution_m):
         return
     columns, rows = _size(low, high, resolution_m)
-    raise SettingError(
-        f"{name}: a resolution of {resolution_m:g} m makes {columns:,.0f} x {rows:,.0f} cells, more"
-        f" than the {MAX_CELLS:,} that are allowed; take {finest_m(low, high):g} m or coarser."
-    )
-
-
-def finest_m(low: FloatArray, high: FloatArray) -> float:
-    """Return the smallest resolution for which `fits` holds, rounded up to three digits."""
-    finest = MIN_RESOLUTION_M
+    finest = MIN_RESOLUTION_M  # rounded up to three digits
     while not fits(low, high, finest):
         step = 10.0 ** (math.floor(math.log10(finest * 1.0000001)) - 2)
         finest = round(finest / step + 1.0) * step
-    return finest
+    raise SettingError(
+        "option.resolution",
+        f"{name}: a resolution of {resolution_m:g} m makes {columns:,.0f} x {rows:,.0f} cells, more"
+        f" than {MAX_CELLS:,}. Use {finest:g} m or more.",
+        value=resolution_m, finest=finest,
+    )  # fmt: skip
 
 
 def _size(low: FloatArray, high: FloatArray, resolution_m: float) -> tuple[float, float]:
@@ -172,19 +169,17 @@ def _size(low: FloatArray, high: FloatArray, resolution_m: float) -> tuple[float
 
 
 POINTS_A_CELL = 2.0, 4.0
-"""Where no resolution is given."""
+"""Range for a chosen resolution."""
 ROUND = (1.0, 2.0, 5.0, 2.5, 4.0, 8.0, 1.25, 1.6, 3.2, 6.4)
-"""Figures of a resolution, the roundest first; those that neighbour differ by less than sqrt 2."""
+"""Figures of a resolution, the roundest first; neighbours differ by less than sqrt 2."""
 
 
 def round_resolution(spacing_m: float, finest_m: float) -> float:
-    """Return a round side of cells with `POINTS_A_CELL`, by the distance of the points, metres.
+    """Return a round side of cells with `POINTS_A_CELL` for a spacing of points, metres.
 
-    It is not finer than `finest_m`, such as the size of a pixel on the ground: then more points
-    share a cell.
+    It is at least `finest_m`, such as the ground sampling distance.
     """
-    least = spacing_m * math.sqrt(POINTS_A_CELL[0])
-    least = max(least, finest_m, MIN_RESOLUTION_M)
+    least = max(spacing_m * math.sqrt(POINTS_A_CELL[0]), finest_m, MIN_RESOLUTION_M)
     power = 10.0 ** math.floor(math.log10(least))
     most = least * math.sqrt(POINTS_A_CELL[1] / POINTS_A_CELL[0])
     sides = (figure * scale for figure in ROUND for scale in (power, 10.0 * power))
@@ -196,14 +191,14 @@ MOST_SQUARES = 4_000_000
 
 
 class Occupancy:
-    """The extent of a cloud, and in which squares of the plan it has points.
+    """The extent of a cloud, and the squares of the plan with points, accumulated over chunks.
 
-    `points` counts them so far; `low` and `high`, shape (2,), are the south-west and north-east
-    corner of their extent, metres, world frame.
+    `points` is their number; `low` and `high`, shape (2,), are the south-west and north-east corner
+    of their extent, metres, world frame.
     """
 
     def __init__(self, area_m2: float, points: int, finest_m: float) -> None:
-        """Take squares by area and number of all points to come, none smaller than the finest."""
+        """Choose squares by area and number of all points, not smaller than `finest_m`."""
         wanted = max(POINTS_A_SQUARE / points, 1.0 / MOST_SQUARES) * area_m2
         self.side_m = max(float(np.sqrt(wanted)), finest_m)
         self.points = 0
@@ -222,7 +217,7 @@ class Occupancy:
 
     @property
     def spacing_m(self) -> float:
-        """Side of the square that each point has for itself; 0 if all are on one line."""
+        """Spacing of the points within the area that they fill; 0 if all are on one line."""
         row = self._squares >> 32
         corner = np.column_stack([self._squares - (row << 32), row]) * self.side_m
         sides = np.minimum(corner + self.side_m, self.high) - np.maximum(corner, self.low)

@@ -1,4 +1,4 @@
-"""What a run did, cell by cell: small maps for the report, added up chunk by chunk."""
+"""Small maps for the report: means per cell, accumulated over chunks."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from pcfix.model import BoolArray, FloatArray, IntArray
 
 LONG_SIDE_CELLS = 360
 MOST_CELLS = 500_000
-"""Of a map at the resolution of a raster, so that a page with half a dozen stays below 8 MB."""
+"""At most so many cells of a map, so that a page with six maps stays below 8 MB."""
 POINTS_PER_CELL = 6.0
-"""A sparse cloud gets larger cells, so that its maps have few holes."""
+"""At least so many points per cell: a sparse cloud gets larger cells, with few holes."""
 FEWEST_AROUND = 5
-"""Of the eight cells about one without points, so that it has their mean."""
+"""An empty cell with so many known neighbours of eight gets their mean."""
 
 Extent = tuple[float, float, float, float]
 """West, east, south and north, metres."""
@@ -22,13 +22,11 @@ Extent = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Maps:
-    """Means of the points of each cell, shape (rows, columns); NaN where there are none.
+    """Means of the points of each cell, shape (rows, columns); NaN without points.
 
-    They reach as far as there are any.
-
-    The first row lies in the north. A single empty cell amid others has their mean. All but the
-    height is of the corrected points; the uncertainty is 1.96 times the root mean square of their
-    standard errors of Z.
+    The first row is the northernmost. A single empty cell has the mean of its neighbours. Heights
+    are of all points, the rest of the corrected points; the uncertainty is 1.96 times the root mean
+    square of their standard errors of Z.
     """
 
     west_m: float  # the outer corner of the upper left cell, in the cloud's CRS
@@ -48,7 +46,7 @@ class Maps:
         return self.west_m, east, self.north_m - rows * self.cell_m, self.north_m
 
     def sampled(self, values: FloatArray, extent_m: Extent) -> FloatArray:
-        """Return a raster of any resolution as it is at the centres of the cells."""
+        """Sample a raster of any resolution at the centres of the cells."""
         west, east, south, north = extent_m
         rows, columns = self.height_m.shape
         x = self.west_m + (np.arange(columns) + 0.5) * self.cell_m
@@ -70,9 +68,9 @@ class MapsBuilder:
     low, high : array, shape (2,)
         Corners of the area in plan, metres.
     points : int
-        How many there will be.
+        Number of points to come.
     resolution_m : float, optional
-        Of a raster of the same points, whose cells the maps have then, or some of them in one.
+        Resolution of a raster of the same points; the cells have this size or a multiple of it.
     """
 
     def __init__(
@@ -97,9 +95,9 @@ class MapsBuilder:
     def add(
         self, xyz: FloatArray, moved: BoolArray | None = None, told: FloatArray | None = None
     ) -> None:
-        """Add n points, shape (n, 3), and of the m that moved what is `told`, shape (m, 4).
+        """Add n points, shape (n, 3), and for the m that `moved` the columns `told`, shape (m, 4).
 
-        That is depth, shift in Z, number of rays and standard error of Z.
+        These are depth, shift in Z, number of rays and standard error of Z.
         """
         column, row = ((xyz[:, :2] - self._low) / self._cell_m).astype(np.int64).T
         column = np.clip(column, 0, self._columns - 1)
@@ -115,7 +113,7 @@ class MapsBuilder:
         cells = sums.shape[1]
         sums[0] += np.bincount(cell, minlength=cells)
         for i, value in enumerate(values, start=1):
-            np.add.at(sums[i], cell, value)  # one by one: to the bit the same for any chunks
+            np.add.at(sums[i], cell, value)  # one by one: the same bits for any chunks
 
     def maps(self) -> Maps:
         """Return the means."""
@@ -128,14 +126,14 @@ class MapsBuilder:
         (top, left), (last, right) = (
             (known.min(axis=0), known.max(axis=0)) if len(known) else ((0, 0), np.array(shape) - 1)
         )
-        part = np.s_[top : last + 1, left : right + 1]  # bounds hold what is noise too
+        part = np.s_[top : last + 1, left : right + 1]  # the bounds include noise
         north = float(self._low[1]) + (self._rows - top) * self._cell_m
         place = float(self._low[0]) + left * self._cell_m, float(north), self._cell_m
         return Maps(*place, heights[part], depth[part], shift[part], rays[part], uncertainty[part])
 
 
 def _filled(values: FloatArray) -> FloatArray:
-    """Return values with the mean of those around where one amid others is NaN."""
+    """Replace single NaN cells by the mean of their neighbours."""
     from scipy.ndimage import uniform_filter
 
     known = np.isfinite(values)
@@ -146,7 +144,7 @@ def _filled(values: FloatArray) -> FloatArray:
 
 
 def smoothed(values: FloatArray, sigma_cells: float) -> FloatArray:
-    """Return a map smoothed by a Gaussian bell, NaN where it was NaN."""
+    """Return a map smoothed by a Gaussian filter; NaN stays NaN."""
     from scipy.ndimage import gaussian_filter
 
     known = np.isfinite(values)

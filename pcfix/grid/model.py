@@ -1,4 +1,4 @@
-"""What is asked of a DSM, and what it came to."""
+"""Summary, counts and hillshade of a DSM."""
 
 from __future__ import annotations
 
@@ -17,72 +17,33 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class DsmSummary:
-    """What a DSM came to; the keys of ``pcfix dsm --summary`` are these names.
-
-    Attributes
-    ----------
-    input, output : str
-    hillshade, counts : str or None
-    what : str
-        The cells hold; see `DsmRules`.
-    pcfix : str
-        Version.
-    crs, heights : str or None
-        Names of the coordinate system, and of its vertical part, that the cloud states.
-    width, height : int
-        Columns and rows.
-    bounds_m : tuple of float
-        Left, bottom, right, top.
-    points, points_used : int
-        In the cloud, and in the raster: of the surface asked for, neither noise nor withheld.
-    cells : int
-        With points.
-    filled : int
-        With a height but no points.
-    empty : int
-        Without a height.
-    points_per_cell : float
-        Mean, over the cells with points.
-    spacing_m : float
-        Of the points used: the side of the square each has for itself, where there are any.
-    hole_m : float or None
-        Width of the widest hole that was bridged.
-    settings : dict
-    seconds : float
-    values : dict
-        Least, mean and largest of the cells, before holes are filled.
-    resolution_is : {"given", "chosen"}
-    part : dict or None
-        How many points were read, of how many, and by which bounds; None where all were.
-    stray : int
-        Points that are left out, as they lie far from all others.
-    """
+    """The numbers of a DSM; the keys of ``pcfix dsm --summary`` are these names."""
 
     input: str
     output: str
     hillshade: str | None
     counts: str | None
-    what: str
-    pcfix: str
-    crs: str | None
+    what: str  # the quantity in the cells; see `DsmRules`
+    pcfix: str  # version
+    crs: str | None  # coordinate system of the cloud, and its vertical part
     heights: str | None
-    width: int
+    width: int  # columns and rows
     height: int
-    bounds_m: tuple[float, float, float, float]
-    points: int
-    points_used: int
-    cells: int
-    filled: int
-    empty: int
-    points_per_cell: float
-    spacing_m: float
-    hole_m: float | None
+    bounds_m: tuple[float, float, float, float]  # left, bottom, right, top
+    points: int  # in the cloud
+    points_used: int  # in the raster: of the surface asked for, neither noise nor withheld
+    cells: int  # with points
+    filled: int  # with a height but no points
+    empty: int  # without a height
+    points_per_cell: float  # mean over the cells with points
+    spacing_m: float  # of the points used, within the area that they fill
+    hole_m: float | None  # width of the widest hole that was bridged
     settings: dict[str, Any]
     seconds: float
-    values: dict[str, float]
+    values: dict[str, float]  # least, mean and largest of the cells, before holes are filled
     resolution_is: Literal["given", "chosen"] = "given"
-    part: dict[str, Any] | None = None
-    stray: int = 0
+    part: dict[str, Any] | None = None  # points read, of how many, and by which bounds
+    stray: int = 0  # points ignored because they lie far from all others
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""
@@ -91,7 +52,7 @@ class DsmSummary:
 
 @dataclass
 class Tally:
-    """Cells of a DSM so far, and what their values come to."""
+    """Counts and values of the cells of a DSM, accumulated over windows."""
 
     cells: int = 0
     filled: int = 0
@@ -114,7 +75,7 @@ class Tally:
         self.high = max(self.high, float(values.max(initial=-math.inf)))
 
     def values(self) -> dict[str, float]:
-        """Return least, mean and largest; nothing where no cell has a value."""
+        """Return least, mean and largest; nothing if no cell has a value."""
         if not self.gridded:
             return {}
         mean = self.total / self.gridded
@@ -128,25 +89,15 @@ NO_LIGHT = 0
 def hillshade(
     height: FloatArray, resolution_m: float, azimuth_deg: float, altitude_deg: float
 ) -> npt.NDArray[np.uint8]:
-    """Return how brightly each cell is lit.
+    """Return the brightness of each cell, 1 (dark) to 255; `NO_LIGHT` without a height.
 
-    The slope of a cell comes from its eight neighbours, those beside it counting twice (B. K. P.
+    The slope of a cell comes from its eight neighbours, the four nearest counting twice (B. K. P.
     Horn, Hill shading and the reflectance map, 1981); the light is the cosine of the angle between
-    the normal and the direction to the sun. Where a neighbour has no height, the cell's own
-    stands in.
+    the normal and the direction of the sun, given by its azimuth clockwise from north and its
+    altitude above the horizon. A neighbour without a height gets the cell's own.
 
-    Parameters
-    ----------
-    height : array, shape (rows + 2, columns + 2)
-        Metres, with a margin of one cell; the first row is the northernmost. NaN: not known.
-    resolution_m : float
-    azimuth_deg, altitude_deg : float
-        Where the sun stands: clockwise from north, and above the horizon.
-
-    Returns
-    -------
-    array of uint8, shape (rows, columns)
-        1 (dark) to 255 (bright); `NO_LIGHT` without a height.
+    Heights have the shape (rows + 2, columns + 2), metres, NaN if unknown, with a margin of one
+    cell; the first row is the northernmost. The result has the shape (rows, columns).
     """
     rows, columns = height.shape[0] - 2, height.shape[1] - 2
     own = height[1:-1, 1:-1]

@@ -1,8 +1,7 @@
-"""The shoreline: where the water surface meets the cloud, and how well that is known.
+"""The shoreline of a cloud, with its standard error.
 
 Points near the water's height are averaged in cells, by their height above the water; the line is
-where that is zero. A height that is off by some amount moves the line by as much over the slope of
-the bed.
+the zero contour. An error in height moves the line by the error over the slope of the bed.
 """
 
 from __future__ import annotations
@@ -19,43 +18,33 @@ from pcfix.model import FloatArray
 from pcfix.sums import Counted, Sums
 
 REACH_M = 2.0
-"""Points higher above the water or deeper say nothing of the line."""
+"""Points farther above or below the water are not used."""
 MOST_POINTS = 2_000_000
-"""So many are kept, evenly spread."""
+"""At most so many points are kept, evenly spread."""
 POINTS_PER_CELL = 4.0
 MAX_CELLS = 25_000_000
 SMOOTH_CELLS = 1.0
-"""Standard deviation of the filter over the cells; it takes the mean of some 50 points."""
+"""Standard deviation of the filter over the cells; it averages about 50 points."""
 KNOWN_SHARE = 0.4
-"""Of the filter's weight, on cells with points: gaps up to some two cells are bridged."""
+"""Least share of the filter's weight on cells with points: gaps of two cells are bridged."""
 LEAST_CELLS = 12.0
 LEAST_SIGMAS = 4.0
-"""Lines shorter than so many cells, or standard errors, are scraps."""
+"""Shorter lines, in cells or in standard errors, are dropped."""
 FLATTEST = 0.01
-"""A slope below this counts as this: where ground is flat the line may be anywhere."""
+"""Least slope for the standard error: on flat ground the line may be anywhere."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shoreline:
-    """A line, and what is known of it.
+    """A line and its accuracy."""
 
-    Attributes
-    ----------
-    xy : array, shape (n, 2)
-        World frame, metres; an island's or a pool's ends where it begins.
-    level_m : float
-        Mean height of the water along it.
-    sigma_m : float
-        Standard error in plan, across the line; the root mean square along it.
-    """
-
-    xy: FloatArray
-    level_m: float
-    sigma_m: float
+    xy: FloatArray  # (n, 2), world frame, metres; closed for an island or a pool
+    level_m: float  # mean height of the water along it
+    sigma_m: float  # standard error in plan across the line, root mean square along it
 
     @property
     def length_m(self) -> float:
-        """Along the line, in plan."""
+        """Length in plan."""
         return float(np.hypot(*np.diff(self.xy, axis=0).T).sum())
 
 
@@ -69,16 +58,10 @@ class NearWater(Sums):
     def add(
         self, xyz: FloatArray, above_m: FloatArray, sigma_z_m: FloatArray | None = None
     ) -> None:
-        """Add a chunk.
+        """Add a chunk of n points, shape (n, 3), world frame, metres.
 
-        Parameters
-        ----------
-        xyz : array, shape (n, 3)
-            World frame, metres.
-        above_m : array, shape (n,)
-            Height above the water surface; NaN where that is not known.
-        sigma_z_m : array, shape (n,), optional
-            Standard error of the heights; zero where it is not known.
+        `above_m` is the height above the water surface, NaN if unknown, and `sigma_z_m` the
+        standard error of the heights, zero if unknown; both have the shape (n,).
         """
         rows = np.flatnonzero(np.abs(above_m) <= REACH_M)[:: self._every]
         sigma = np.zeros(len(xyz)) if sigma_z_m is None else sigma_z_m
@@ -86,14 +69,14 @@ class NearWater(Sums):
         self._thin()
 
     def counted(self) -> Counted:
-        """Return the points, and which part of all they are."""
+        """Return the points, and of how many each is one."""
         return {
             "points": np.concatenate([np.empty((0, 5)), *self._parts]),
             "every": np.array(self._every),
         }
 
     def add_counted(self, counted: Counted) -> None:
-        """Take the points that another one has gathered."""
+        """Add the points of another process."""
         every = int(counted["every"])
         most = max(every, self._every)
         self._parts = [part[:: most // self._every] for part in self._parts]
@@ -102,19 +85,18 @@ class NearWater(Sums):
         self._thin()
 
     def _thin(self) -> None:
-        """Keep no more points than are needed."""
+        """Drop every second point while there are too many."""
         while sum(map(len, self._parts)) > MOST_POINTS:
             self._parts = [part[::2] for part in self._parts]
             self._every *= 2
 
     def lines(self, sigma_level_m: Callable[[FloatArray], FloatArray]) -> list[Shoreline]:
-        """Return the lines, the longest first; several where there are islands or pools.
+        """Return the lines, the longest first; several if there are islands or pools.
 
-        Parameters
-        ----------
-        sigma_level_m : callable
-            Returns the standard error of the water's height at places, shape (m, 2).
+        `sigma_level_m` returns the standard error of the water's height at places, shape (m, 2).
         """
+        from contourpy import contour_generator
+
         points = np.concatenate([np.empty((0, 5)), *self._parts])
         if not len(points) or not points[:, 3].min() < 0.0 < points[:, 3].max():
             return []
@@ -122,14 +104,16 @@ class NearWater(Sums):
         wanted_m = math.sqrt(2.0 / 7.0 * field.blur_m * field.cell_m)
         if wanted_m > field.cell_m:  # so that the line's own scatter is half a cell
             field = _field_of(points, wanted_m)
-        found = [_measured(line, field, sigma_level_m) for line in _contours(field)]
+        maker = contour_generator(z=np.ma.masked_invalid(field.above_m))
+        places = (field.low + np.asarray(line) * field.cell_m for line in maker.lines(0.0))
+        found = [_measured(xy, field, sigma_level_m) for xy in places]
         least_m = LEAST_CELLS * field.cell_m
         kept = [one for one in found if one.length_m >= max(least_m, LEAST_SIGMAS * one.sigma_m)]
         return sorted(kept, key=lambda one: -one.length_m)
 
 
 def _cell_m(xy: FloatArray) -> float:
-    """Return the side of cells that hold `POINTS_PER_CELL` points where they hold any."""
+    """Return the side of cells with `POINTS_PER_CELL` points within the area they fill."""
     extent = np.maximum(np.ptp(xy, axis=0), 1e-3)
     side = math.sqrt(float(extent.prod()) * POINTS_PER_CELL / len(xy))
     for _ in range(2):  # a strip along a shore fills little of its box
@@ -139,7 +123,7 @@ def _cell_m(xy: FloatArray) -> float:
 
 
 class _Field(NamedTuple):
-    """Smoothed cells, each (rows, columns); what is not known is NaN."""
+    """Smoothed cells, each (rows, columns); NaN if unknown."""
 
     low: FloatArray  # (2,), the centre of the first cell
     cell_m: float
@@ -147,11 +131,11 @@ class _Field(NamedTuple):
     water_m: FloatArray
     sigma_z_m: FloatArray  # of a point
     slope: FloatArray
-    blur_m: float  # how far the scatter of one point's height moves the line, in the median
+    blur_m: float  # median shift of the line by the scatter of one point's height
 
 
 def _field_of(points: FloatArray, cell_m: float) -> _Field:
-    """Return points (n, 5): x, y, z, height above the water, standard error, in cells."""
+    """Average points (n, 5), x, y, z, height above the water and standard error, in cells."""
     from scipy.ndimage import distance_transform_edt, gaussian_filter
 
     low = points[:, :2].min(axis=0) - 2.0 * cell_m
@@ -173,7 +157,7 @@ def _field_of(points: FloatArray, cell_m: float) -> _Field:
         errors = summed(sigma) / summed(sigma > 0.0)
     slope = np.hypot(*np.gradient(height, cell_m))
     steep = np.isfinite(slope)
-    if steep.any():  # at the edge of the cloud that of the nearest place within
+    if steep.any():  # at the edge of the cloud, that of the nearest cell inside
         nearest = distance_transform_edt(~steep, return_distances=False, return_indices=True)
         slope = slope[tuple(nearest)]
     field = _Field(low + cell_m / 2.0, cell_m, height, water, errors, slope, 0.0)
@@ -195,19 +179,10 @@ def _at(field: _Field, values: FloatArray, xy: FloatArray) -> FloatArray:
     return np.asarray(map_coordinates(values, place, order=1, mode="nearest"))
 
 
-def _contours(field: _Field) -> list[FloatArray]:
-    """Return where the field is level with the water, each line (n, 2), world frame."""
-    from contourpy import contour_generator
-
-    maker = contour_generator(z=np.ma.masked_invalid(field.above_m))
-    lines = [np.asarray(line) for line in maker.lines(0.0)]
-    return [field.low + line * field.cell_m for line in lines]
-
-
 def _measured(
     xy: FloatArray, field: _Field, sigma_level_m: Callable[[FloatArray], FloatArray]
 ) -> Shoreline:
-    """Return a line with its standard error: of the heights, over the slope, along its length."""
+    """Return a line with its standard error: that of the heights over the slope."""
     slope = np.maximum(np.nan_to_num(_at(field, field.slope, xy)), FLATTEST)
     height_m = np.hypot(sigma_level_m(xy), _at(field, field.sigma_z_m, xy))
     step = np.hypot(*np.diff(xy, axis=0).T)

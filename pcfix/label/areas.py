@@ -1,14 +1,12 @@
-"""Areas in plan: the polygons of a mask, and the waters that hang together.
+"""Areas in plan: the polygons of a mask, and connected water bodies.
 
-For a mask, asked of millions of points at a time, the plan is cut into square cells, each wholly
-inside, wholly outside, or crossed by the border. Only for points in crossed cells the polygons
-themselves are asked. (`rasterize` of rasterio says of a cell whether its centre is inside: it
-cannot say that a border crosses it, and is not exact.)
+A mask is tested for millions of points. So the plan is cut into square cells that are inside,
+outside, or crossed by the border, and the polygons are only tested for points in crossed cells.
+(`rasterize` of rasterio is not exact: it does not mark the cells that a border crosses.)
 
-What lies around a point is said by a grid over the cloud, filled chunk by chunk. Cells have sides
-of a power of two, in metres, and count from the origin of the world frame, so that a point's cell
-does not depend on the order or the number of points that come before it. All sums are of whole
-numbers, for the same reason.
+Connected water is found in a grid over the cloud, filled chunk by chunk. Its cells have sides of a
+power of two, in metres, and count from the origin of the world frame, so that the cell of a point
+does not depend on other points. All sums are of whole numbers, for the same reason.
 """
 
 from __future__ import annotations
@@ -27,8 +25,8 @@ Flags = npt.NDArray[np.uint8]
 
 OUTSIDE, INSIDE, CROSSED = 0, 1, 2
 HALVINGS = 9
-"""So often the square around the area is halved: 512 by 512 cells."""
-_MARGIN = 1e-6  # of a cell: what is tested is a little larger, so that rounding cannot matter
+"""Subdivisions of the square around the area: 512 by 512 cells."""
+_MARGIN = 1e-6  # relative margin of a tested cell, more than rounding
 
 
 class _Cells(NamedTuple):
@@ -52,10 +50,10 @@ class WaterMask:
     name : str
         For messages.
     low, high : array, shape (2,), optional
-        South-west and north-east corner of where points will be. It makes the cells finer where
-        the area reaches far beyond, and has no effect on the result.
+        South-west and north-east corner of the points. They make the cells finer if the area
+        extends far beyond; the result is the same.
     notes : tuple of str
-        What was done on reading it, for the summary.
+        Notes of the reader, for the summary.
     """
 
     def __init__(
@@ -87,7 +85,7 @@ class WaterMask:
 
 
 def _cells_over(area: Any, corner: FloatArray, side_m: float) -> _Cells:
-    """Return the states of the cells of a square, halving only those that the border crosses."""
+    """Return the states of the cells of a square, subdividing those that the border crosses."""
     import shapely
 
     shapely.prepare(area)
@@ -113,7 +111,7 @@ def _cells_over(area: Any, corner: FloatArray, side_m: float) -> _Cells:
 def _look_up(
     span: Span, cells: _Cells, bounds: FloatArray, x: FloatArray, y: FloatArray, states: States
 ) -> None:
-    """Write the state of each position; those off the cells but within the bounds are unsure."""
+    """Write the state of each position; off the cells but within the bounds it is `CROSSED`."""
     rows, columns = cells.states.shape
     for i in range(*span):
         column = np.floor((x[i] - cells.west) / cells.cell_m)
@@ -128,16 +126,16 @@ def _look_up(
 
 
 MOST_CELLS = 2**24
-"""Bounds the memory; where a cloud needs more, its cells are larger."""
+"""Limits the memory; a larger cloud has larger cells."""
 POINTS_A_CELL = 4.0
-"""Cells are as small as they can be with so many points, on average, where there is water."""
+"""Cells are the smallest with so many points per water cell, on average."""
 FINEST_M = 2.0**-10
 SHARE_OF_LARGEST = 0.1
-"""Of the area of the largest water; a pool of at least so much of it stays in."""
+"""Pools of at least this share of the area of the largest water body are kept."""
 _VOTE = 1000
 
 PRESENT, BELOW, UNDECIDED = 1, 2, 4
-"""A cell has points at all; has points below the surface; has points within the dead band."""
+"""A cell has points; points below the surface; points within the dead band."""
 
 
 class Lattice(NamedTuple):
@@ -162,29 +160,20 @@ def lattice_over(low: FloatArray, high: FloatArray) -> Lattice:
 
 
 class Pools(NamedTuple):
-    """The waters of a grid: what hangs together is one.
+    """The connected water bodies of a grid."""
 
-    number : shape (rows, columns), 0 where there is none, else a row of the others.
-    area_m2 : of the cells with submerged points.
-    stays : whether it counts as water.
-    """
-
-    number: npt.NDArray[np.int32]
-    area_m2: FloatArray
-    stays: BoolArray
+    number: npt.NDArray[np.int32]  # (rows, columns), 0 for none, else an index of the others
+    area_m2: FloatArray  # of the cells with submerged points
+    stays: BoolArray  # whether it counts as water
 
 
 class Surroundings(NamedTuple):
-    """What a grid says of the points in its cells.
-
-    is_wet : shape (rows, columns), whether an undecided point in the cell is submerged.
-    joined : shape (rows, columns), whether the cell, or one beside it, is of a water that stays.
-    """
+    """What a grid knows about the cells of points."""
 
     lattice: Lattice
-    is_wet: BoolArray
+    is_wet: BoolArray  # (rows, columns), whether an undecided point in the cell is submerged
     pools: Pools | None
-    joined: BoolArray | None
+    joined: BoolArray | None  # (rows, columns), whether a kept water body is in the cell or beside
 
     def cells(self, x: FloatArray, y: FloatArray) -> tuple[IntArray, IntArray]:
         """Return row and column of n plan positions that the grid was made with."""
@@ -195,11 +184,11 @@ class Surroundings(NamedTuple):
 
 
 class Grid:
-    """Adds up points, chunk by chunk.
+    """Points per cell, added chunk by chunk.
 
-    Made with the south-west and north-east corner of the cloud, metres, shape (2,): if they turn
-    out to be wrong, `fits` tells, `low` and `high` are those of the points so far, and the points
-    must be added again. Points at most the dead band from the surface are undecided.
+    It is made with the south-west and north-east corner of the cloud, metres, shape (2,). If these
+    turn out to be wrong, `fits` is False, `low` and `high` are those of the points so far, and the
+    points must be added again. Points within the dead band of the surface are undecided.
     """
 
     def __init__(self, low: FloatArray, high: FloatArray, dead_band_m: float) -> None:
@@ -211,9 +200,9 @@ class Grid:
         self._votes: IntArray = np.zeros(shape if dead_band_m else (1, 1), np.int64)
 
     def add(self, x: FloatArray, y: FloatArray, height_m: FloatArray, counts: BoolArray) -> None:
-        """Add n points, with their heights above the water surface, NaN where that is not known.
+        """Add n points with their heights above the water surface, NaN if unknown.
 
-        `counts` says whether a point may be submerged; the others only show that there is no gap.
+        Points that do not count cannot be submerged; they only show that there is no gap.
         """
         if not x.size:
             return
@@ -225,7 +214,7 @@ class Grid:
 
     @property
     def fits(self) -> bool:
-        """Whether the grid is the one that the points so far would have."""
+        """Whether the points so far would have the same grid."""
         own, fitting = self.lattice, lattice_over(self.low, self.high)
         across, up = fitting.first_column - own.first_column, fitting.first_row - own.first_row
         return (
@@ -235,7 +224,7 @@ class Grid:
         )
 
     def surroundings(self, *, connected: bool, least_pool_m2: float | None) -> Surroundings:
-        """Return what the points say together; the grid is used up."""
+        """Coarsen the grid until its cells have enough points, and find the water bodies."""
         from scipy.ndimage import convolve
 
         lattice, flags, votes = self.lattice, self._flags, self._votes
@@ -260,19 +249,16 @@ def _halved(lattice: Lattice, flags: Flags, votes: IntArray) -> tuple[Lattice, F
     _, column, row, columns, rows = lattice
     west, south = column % 2, row % 2  # the cells to add, for pairs that begin with an even one
     pad = (south, (south + rows) % 2), (west, (west + columns) % 2)
+
+    def quads(cells: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
+        full = np.pad(cells, pad) if np.any(pad) else cells
+        return [full[i::2, j::2] for i in (0, 1) for j in (0, 1)]
+
     if votes.size == flags.size:
-        votes = np.add.reduce(_quads(votes, pad))
-    flags = np.bitwise_or.reduce(_quads(flags, pad))
+        votes = np.add.reduce(quads(votes))
+    flags = np.bitwise_or.reduce(quads(flags))
     rows, columns = flags.shape
     return Lattice(lattice.side_m * 2.0, column // 2, row // 2, columns, rows), flags, votes
-
-
-def _quads(
-    cells: npt.NDArray[Any], pad: tuple[tuple[int, int], ...]
-) -> tuple[npt.NDArray[Any], ...]:
-    """Return the four cells of each two by two, after adding empty rows and columns."""
-    full = np.pad(cells, pad) if np.any(pad) else cells
-    return full[::2, ::2], full[::2, 1::2], full[1::2, ::2], full[1::2, 1::2]
 
 
 def _grown(cells: BoolArray) -> BoolArray:
@@ -285,7 +271,7 @@ def _grown(cells: BoolArray) -> BoolArray:
 def _pools(
     water: BoolArray, is_gap: BoolArray, cell_m2: float, least_pool_m2: float | None
 ) -> Pools:
-    """Return what hangs together over sides, corners, and gaps of at most two cells."""
+    """Return water connected over sides, corners, and gaps of at most two cells."""
     from scipy.ndimage import label
 
     found, count = label(water | (_grown(water) & is_gap), np.ones((3, 3), np.int8))

@@ -1,11 +1,11 @@
-"""Which points are submerged, and which class they get: one rule for every door.
+"""Decide which points are submerged, and set their classes.
 
-A point is submerged if it lies below the water surface, is inside the mask where there is one,
-does not come with a class to respect, and, where that is asked for, belongs to water that is
-joined. Within the dead band its surroundings decide instead of its own height: each point inside
-the mask, and of no class to respect, has a vote, its height above the surface divided by the dead
-band and cut to -1 ... 1; a point within the dead band is submerged if the votes of its cell and
-the eight cells around it are negative together.
+A point is submerged if it lies below the water surface, inside the mask if there is one, is not of
+a respected class, and, if that is asked for, belongs to the connected water. Within the dead band
+its surroundings decide instead of its own height: each point inside the mask and of no respected
+class votes with its height above the surface, divided by the dead band and clipped to -1 ... 1. A
+point within the dead band is submerged if the votes of its cell and the eight around it sum to a
+negative number.
 """
 
 from __future__ import annotations
@@ -19,14 +19,7 @@ import numpy.typing as npt
 
 from pcfix.errors import GeometryError
 from pcfix.label.areas import Grid, Surroundings, WaterMask
-from pcfix.model import (
-    BATHYMETRIC_POINT,
-    UNCLASSIFIED,
-    WATER_SURFACE,
-    BoolArray,
-    FloatArray,
-    IntArray,
-)
+from pcfix.model import BATHYMETRIC_POINT, UNCLASSIFIED, WATER_SURFACE, BoolArray, FloatArray
 from pcfix.options.correct import LabelRules
 from pcfix.sums import Sums
 from pcfix.water.surface import SurfaceAbove, is_submerged
@@ -35,15 +28,15 @@ Classes = npt.NDArray[np.uint8]
 
 
 class Part(NamedTuple):
-    """Some points of a cloud: shape (n, 3), metres; the water above them; shape (n,)."""
+    """Some points of a cloud."""
 
-    xyz: FloatArray
-    surface: SurfaceAbove
-    classes: Classes
+    xyz: FloatArray  # (n, 3), metres
+    surface: SurfaceAbove  # the water above them
+    classes: Classes  # (n,)
 
 
 class Labels(NamedTuple):
-    """What n points become: their classes, and which of them got 40 and 41 just now."""
+    """The new classes of n points, and which of them were set to 40 and 41."""
 
     classes: Classes
     submerged: BoolArray
@@ -51,7 +44,7 @@ class Labels(NamedTuple):
 
 
 class Labelling(Sums):
-    """The rules of a labelling, the surroundings of its points, and what it left out so far."""
+    """The rules of a labelling, the surroundings of its points, and counts of excluded points."""
 
     added = ("_below", "_outside_mask", "_respected", "_in_pool")
     least, most = ("_low",), ("_high",)
@@ -62,7 +55,7 @@ class Labelling(Sums):
         self.restart()
 
     def restart(self) -> None:
-        """Forget the points so far, but not their surroundings."""
+        """Reset the counts, but not the surroundings."""
         self._below = self._outside_mask = self._respected = 0
         self._low, self._high = np.full(2, np.inf), np.full(2, -np.inf)
         pools = None if self._around is None else self._around.pools
@@ -70,26 +63,26 @@ class Labelling(Sums):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was done to the mask on reading it."""
+        """Notes on reading the mask."""
         return () if self.mask is None else self.mask.notes
 
     @property
     def is_plain(self) -> bool:
-        """Whether all that counts for being submerged is to lie below the surface."""
+        """Whether a point is submerged exactly if it lies below the surface."""
         s = self.settings
         return self.mask is None and not (s.respect_classes or s.connected or s.dead_band)
 
     @property
     def looks_around(self) -> bool:
-        """Whether `look_around` must see the whole cloud first."""
+        """Whether `look_around` must scan the whole cloud first."""
         return self.settings.connected or self.settings.dead_band > 0.0
 
     def look_around(
         self, parts: Callable[[], Iterable[Part]], low: FloatArray, high: FloatArray
     ) -> None:
-        """Learn the surroundings of all points.
+        """Scan the surroundings of all points.
 
-        `parts` returns the whole cloud, part by part, and is called again if its south-west and
+        `parts` returns the whole cloud in chunks, and is called again if its south-west and
         north-east corner, `low` and `high`, were wrong.
         """
         settings = self.settings
@@ -115,10 +108,7 @@ class Labelling(Sums):
         self.restart()
 
     def submerged(self, xyz: FloatArray, surface: SurfaceAbove, classes: Classes) -> BoolArray:
-        """Return which of n points are submerged, and count those that are not although below.
-
-        `classes`, shape (n,), are those that they come with.
-        """
+        """Return which of n points are submerged, and count those that are excluded below it."""
         below = is_submerged(xyz[:, 2], surface)
         if self.is_plain:
             return below
@@ -129,14 +119,20 @@ class Labelling(Sums):
         return wet
 
     def labels(self, part: Part) -> Labels:
-        """Return what points become; the classes of all that is not submerged stay."""
+        """Return the new classes of points; those of land do not change."""
         wet = self.submerged(*part)
         new = part.classes.copy()
         if self.settings.reset:
             new[sets_class(part.classes) & ~self._is_respected(part.classes)] = UNCLASSIFIED
         at_surface = np.zeros(len(wet), np.bool_)
         if self.settings.band > 0.0:
-            at_surface[self._at_surface(*part)] = True
+            near = _within(part.xyz[:, 2] - part.surface.height_m, self.settings.band)
+            rows = np.flatnonzero(near & ~self._is_respected(part.classes))
+            x, y = np.ascontiguousarray(part.xyz[rows, :2].T)
+            keep = self._is_inside(x, y)
+            if self._around is not None and self._around.joined is not None:
+                keep &= self._around.joined[self._around.cells(x, y)]
+            at_surface[rows[keep]] = True
         wet &= ~at_surface
         new[wet], new[at_surface] = BATHYMETRIC_POINT, WATER_SURFACE
         return Labels(new, wet, at_surface)
@@ -146,19 +142,6 @@ class Labelling(Sums):
 
     def _is_inside(self, x: FloatArray, y: FloatArray) -> BoolArray:
         return np.ones(len(x), np.bool_) if self.mask is None else self.mask.inside(x, y)
-
-    def _at_surface(self, xyz: FloatArray, surface: SurfaceAbove, classes: Classes) -> IntArray:
-        """Return the rows of points in the band.
-
-        With `connected` they need water that stays in their cell or beside it.
-        """
-        near = _within(xyz[:, 2] - surface.height_m, self.settings.band)
-        rows = np.flatnonzero(near & ~self._is_respected(classes))
-        x, y = np.ascontiguousarray(xyz[rows, :2].T)
-        keep = self._is_inside(x, y)
-        if self._around is not None and self._around.joined is not None:
-            keep &= self._around.joined[self._around.cells(x, y)]
-        return rows[keep]
 
     def _decided(self, xyz: FloatArray, height: FloatArray, classes: Classes) -> BoolArray:
         """Return which points that are below or within the dead band are submerged."""
@@ -184,39 +167,45 @@ class Labelling(Sums):
         return wet
 
     def check(self, name: str, submerged: int | None = None) -> None:
-        """Refuse a mask, classes to respect or a dead band that leave none of the points below.
+        """Check that mask, respected classes and dead band leave points below the water.
 
         Raises
         ------
         GeometryError
-            With where mask and points lie, or with the classes; of a dead band if the number of
-            points that became `submerged` is told.
+            ``option.dead_band`` (if the number of points that became `submerged` is given),
+            ``option.respect_classes`` or ``mask.no_points``.
         """
         left = self._below - self._outside_mask - self._respected
         if submerged == 0 and left and self.settings.dead_band:
             raise GeometryError(
-                f"{name}: {left:,} points lie below the water, but within the dead band of"
-                f" {self.settings.dead_band:g} m, and most around them lie above it; give a"
-                " narrower --dead-band."
-            )
-        if self._respected and self._below == self._outside_mask + self._respected:
+                "option.dead_band",
+                f"{name}: all {left:,} points below the water are within the dead band of"
+                f" {self.settings.dead_band:g} m, and most points near them are above it. Give a"
+                " narrower --dead-band.",
+                path=name, points=left, value=self.settings.dead_band,
+            )  # fmt: skip
+        if self._respected and not left:
             respected = ", ".join(map(str, self.settings.respect_classes))
             raise GeometryError(
-                f"{name}: all {self._respected:,} points below the water come with the classes to"
-                f" respect ({respected}); respect fewer."
-            )
+                "option.respect_classes",
+                f"{name}: all {self._respected:,} points below the water are of the classes to"
+                f" respect ({respected}). Respect fewer classes.",
+                path=name, points=self._respected,
+            )  # fmt: skip
         if self.mask is None or self._outside_mask < max(self._below, 1):
             return
         west, south, east, north = self.mask.bounds
+        (x0, y0), (x1, y1) = self._low, self._high
         raise GeometryError(
-            f"{self.mask.name}: the mask holds none of the {self._below:,} points of {name} that"
-            f" are below the water: its polygons lie at {_extent(west, east, south, north)}, these"
-            f" points at {_extent(self._low[0], self._high[0], self._low[1], self._high[1])}; check"
-            " the CRS of both, and that the polygons are of water."
-        )
+            "mask.no_points",
+            f"{self.mask.name} (x {west:.1f} to {east:.1f}, y {south:.1f} to {north:.1f}) contains"
+            f" none of the points of {name} below the water (x {x0:.1f} to {x1:.1f}, y {y0:.1f} to"
+            f" {y1:.1f}). Check the CRS of both, and that the polygons are of water.",
+            path=self.mask.name, points=self._below, bounds=self.mask.bounds,
+        )  # fmt: skip
 
     def report(self) -> dict[str, Any] | None:
-        """Return the rules and what they left out, in plain values; None if there was no rule."""
+        """Return rules and counts of excluded points as plain values; None without rules."""
         if self.is_plain:
             return None
         return {
@@ -230,7 +219,7 @@ class Labelling(Sums):
         }
 
     def _separate(self) -> dict[str, Any] | None:
-        """Return how many points were left out in pools that are apart, and the largest of them."""
+        """Return the number of excluded pools and their points, and the largest of them."""
         if self._around is None or self._around.pools is None:
             return None
         lattice, pools = self._around.lattice, self._around.pools
@@ -238,7 +227,7 @@ class Labelling(Sums):
         if area.any():
             pool = int(np.argmax(area))
             cells = np.argwhere(pools.number == pool)
-            row, column = cells[len(cells) // 2]  # a place that surely is in it
+            row, column = cells[len(cells) // 2]  # a place inside it
             largest = {
                 "area_m2": round(float(pools.area_m2[pool]), 2),
                 "points": int(self._in_pool[pool]),
@@ -258,43 +247,24 @@ def sets_class(classes: Classes) -> BoolArray:
     return np.asarray((classes == BATHYMETRIC_POINT) | (classes == WATER_SURFACE))
 
 
-def _extent(west: float, east: float, south: float, north: float) -> str:
-    return f"x {west:.1f} to {east:.1f}, y {south:.1f} to {north:.1f}"
-
-
 @dataclass(frozen=True)
 class LabelSummary:
-    """What a labelling did, in numbers; `as_dict` is what ``--summary`` writes.
-
-    Attributes
-    ----------
-    points, submerged, water_surface : int
-        In all; of class 40 now because they are submerged; of class 41 because in the band.
-    stale : int
-        Points that came as class 40 or 41 and are neither: class 1 with `reset`, else as they
-        came.
-    water_unknown : int
-        Points without a known height of the water.
-    labelling : dict or None
-        What was left out, by the rules beyond the surface.
-    part : dict or None
-        How many points were read, of how many, and by which bounds; None where all were.
-    """
+    """The numbers of a labelling; `as_dict` is what ``--summary`` writes."""
 
     input: str
     output: str
     pcfix: str
     points: int
-    submerged: int
-    water_surface: int
-    stale: int
-    water_unknown: int
+    submerged: int  # of class 40 now because they are submerged
+    water_surface: int  # of class 41 now because they are in the band
+    stale: int  # class 40 or 41 in the input and neither now; set to 1 with `reset`
+    water_unknown: int  # without a known height of the water
     water: str
     settings: dict[str, Any]
-    labelling: dict[str, Any] | None
+    labelling: dict[str, Any] | None  # excluded points, by rule
     seconds: float
     warnings: list[str] = field(default_factory=list)
-    part: dict[str, Any] | None = None
+    part: dict[str, Any] | None = None  # points read, of how many, and by which bounds
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""

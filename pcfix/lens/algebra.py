@@ -1,6 +1,6 @@
 """Vectors and matrices of three for kernels: as tuples of numbers they stay in registers.
 
-Sums are taken from left to right, so that a result is the same to the bit wherever it is formed.
+Sums are always formed from left to right, so that equal operands give equal results.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def scaled(c: float, a: Vector) -> Vector:
 
 @device
 def beyond(a: Vector, f: float, b: Vector) -> Vector:
-    """Return a + f b: so many times b on from a."""
+    """Return a + f b."""
     return a[0] + f * b[0], a[1] + f * b[1], a[2] + f * b[2]
 
 
@@ -63,7 +63,7 @@ def unit(a: Vector) -> Vector:
 
 @device
 def vector(row: FloatArray, at: int = 0) -> Vector:
-    """Return three numbers of a row, from a place on."""
+    """Return three numbers of a row, from index `at`."""
     return row[at], row[at + 1], row[at + 2]
 
 
@@ -81,7 +81,7 @@ def column_of(m: FloatArray, j: int) -> Vector:
 
 @device
 def times(m: FloatArray, a: Vector) -> Vector:
-    """Return m a: with the rotation of a camera, a vector of the world in its frame."""
+    """Return m a: with the rotation of a camera, from the world to the camera frame."""
     return (
         m[0, 0] * a[0] + m[0, 1] * a[1] + m[0, 2] * a[2],
         m[1, 0] * a[0] + m[1, 1] * a[1] + m[1, 2] * a[2],
@@ -91,7 +91,7 @@ def times(m: FloatArray, a: Vector) -> Vector:
 
 @device
 def transposed_times(m: FloatArray, a: Vector) -> Vector:
-    """Return m' a: with the rotation of a camera, what is in its frame in the world."""
+    """Return m' a: with the rotation of a camera, from the camera frame to the world."""
     return (
         m[0, 0] * a[0] + m[1, 0] * a[1] + m[2, 0] * a[2],
         m[0, 1] * a[0] + m[1, 1] * a[1] + m[2, 1] * a[2],
@@ -144,10 +144,7 @@ def solved(m: Symmetric, a: Vector) -> tuple[float, Vector]:
 
 @device
 def inverted(m: FloatArray, least: float) -> bool:
-    """Replace a matrix by its inverse; whether it has one.
-
-    It has none where the determinant is less than this share of the product of the diagonal.
-    """
+    """Invert a matrix in place; False if its determinant over that of the diagonal is `least`."""
     a, b, c = m[0, 0], m[0, 1], m[0, 2]
     d, e, f = m[1, 0], m[1, 1], m[1, 2]
     g, h, i = m[2, 0], m[2, 1], m[2, 2]

@@ -1,12 +1,12 @@
-"""The formulas of a lens, both ways: its numbers, its projection, Brown's distortion.
+"""The formulas of a lens, both ways: projection and Brown's distortion.
 
-Its numbers stand in the flat array that the kernels take; those of several lenses, padded with
-zeros, are the rows of one table. `pcfix.lens.imaging.coefficients` fills it; the formulas and the
-names are in `pcfix.model.Lens`. `angle` answers NaN beyond the image of the largest angle.
+A lens is a flat array of numbers for the kernels, filled by `pcfix.lens.imaging.coefficients`;
+several lenses, padded with zeros, are the rows of a table. Formulas and names are those of
+`pcfix.model.Lens`. `angle` returns NaN beyond the image of the largest angle.
 
-Of Brown's formula, places are relative to the centre of distortion. It is used inside the largest
+In Brown's formula, places are relative to the centre of distortion. It is used inside the largest
 disc in which the symmetric part of its Jacobian is positive definite: on a disc that is enough for
-no two places to have one image. Without tangential terms it is the disc up to the fold, where
+no two places to have the same image. Without tangential terms it is the disc up to the fold, where
 d r' / d r = 0.
 """
 
@@ -21,7 +21,7 @@ from pcfix.kernels import device, kernel
 from pcfix.model import FloatArray, Lens, Projection
 
 KIND, LARGEST_ANGLE, LARGEST_RADIUS = range(3)
-"""The projection as a number, and how far it goes: radians, and in its plane."""
+"""The projection as a number, and its limits: radians, and the radius in its plane."""
 
 TANGENTIAL, THIN_PRISM = 3, 7
 IN_TURN, INVERSE, CENTRE_X, CENTRE_Y, DISC = range(11, 16)
@@ -30,13 +30,13 @@ IN_TURN, INVERSE, CENTRE_X, CENTRE_Y, DISC = range(11, 16)
 FOCAL_X, B2, B3, FOCAL_Y, PRINCIPAL_X, PRINCIPAL_Y, WIDTH, HEIGHT = range(16, 24)
 
 PLAIN = 24
-"""Whether the lens is perspective with Brown's k1 to k4, p1 and p2 alone, the common one."""
+"""Whether the lens is the common one: perspective with Brown's k1 to k4, p1 and p2 only."""
 
 RADIALS, DENOMINATORS, SHAPES, SHAPE, TAIL = range(25, 30)
-"""How many there are of each; k1 is at `TAIL`, the others follow, the first shape at `SHAPE`."""
+"""Number of each; k1 is at `TAIL`, the others follow, the first shape number at `SHAPE`."""
 
 LEAST_RADIALS, LEAST_SHAPES = 4, 2
-"""Zeros are added up to these, so that the first few can be read without asking."""
+"""Zeros are added up to these numbers, so that the first few can be read unconditionally."""
 
 
 CODES: dict[str, int] = {name: i for i, name in enumerate(get_args(Projection))}
@@ -46,13 +46,16 @@ RIGHT_ANGLE = 0.5 * np.pi
 
 
 def largest_angle(lens: Lens) -> float:
-    """Return the angle up to which the projection goes outwards, radians."""
+    """Return the angle up to which the radius of the projection grows, radians."""
     s0, s1 = (*lens.shape, 0.0, 0.0)[:2]
     match lens.projection:
         case "equidistant" | "equisolid":
             return np.pi
         case "polynomial":
-            return _end_of_polynomial(lens.shape)
+            slope = Polynomial(lens.shape or (0.0,)).deriv()
+            if slope(0.0) <= 0.0:
+                return 0.0
+            return RIGHT_ANGLE * min(2.0, first_root(slope))
         case "dual" if s0 == 0.0:
             return np.pi
         case "dual" if s0 < 0.0:
@@ -71,28 +74,20 @@ def largest_angle(lens: Lens) -> float:
 
 
 def largest_radius(c: FloatArray) -> float:
-    """Return the distance from the centre of the largest angle; may be infinite."""
+    """Return the radius of the largest angle; may be infinite."""
     rho = float(_largest_radius(c))
     return rho if rho >= 0.0 else np.inf  # a tangent or a quotient beyond its pole by rounding
 
 
 @kernel
 def _largest_radius(c: FloatArray) -> float:
-    return radius(c, c[LARGEST_ANGLE])
-
-
-def _end_of_polynomial(shape: tuple[float, ...]) -> float:
-    slope = Polynomial(shape or (0.0,)).deriv()
-    if slope(0.0) <= 0.0:
-        return 0.0
-    return RIGHT_ANGLE * min(2.0, first_root(slope))
+    return radius(c, c[LARGEST_ANGLE])[0]
 
 
 def first_root(polynomial: Polynomial) -> float:
-    """Return the smallest positive real root; infinite where there is none.
+    """Return the smallest positive real root, or infinity.
 
-    Found as the largest root of the polynomial in 1 / x, as the lowest coefficient is never
-    small while the highest may be next to nothing.
+    It is the largest root of the polynomial in 1 / x, whose leading coefficient is never small.
     """
     roots = np.asarray(Polynomial(polynomial.coef[::-1]).roots(), complex)
     real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 1e-300)]
@@ -105,34 +100,44 @@ def _shape(c: FloatArray, i: int) -> float:
 
 
 @device
-def radius(c: FloatArray, theta: float) -> float:
-    """Return the distance from the centre of the plane of a direction at an angle."""
+def radius(c: FloatArray, theta: float) -> tuple[float, float]:
+    """Return the radius in the plane of a direction at an angle from the axis, and its slope."""
     kind, s0, s1 = int(c[KIND]), _shape(c, 0), _shape(c, 1)
-    if kind == EQUIDISTANT:
-        return theta
+    if kind == EQUIDISTANT or (kind == DUAL and s0 == 0.0):
+        return theta, 1.0
     if kind == EQUISOLID:
-        return 2.0 * np.sin(0.5 * theta)
-    if kind == POLYNOMIAL:
-        return _polynomial(c, theta)[0]
+        return 2.0 * np.sin(0.5 * theta), np.cos(0.5 * theta)
+    if kind == POLYNOMIAL:  # Pix4D's, in which a right angle counts as 1
+        q, rho, slope = theta / RIGHT_ANGLE, 0.0, 0.0
+        for i in range(int(c[SHAPES]) - 1, -1, -1):
+            slope = slope * q + rho
+            rho = rho * q + _shape(c, i)
+        return rho, slope / RIGHT_ANGLE
+    sine, cosine, tangent = np.sin(theta), np.cos(theta), np.tan(theta)
     if kind == FOV and s0 != 0.0:
-        return np.arctan(2.0 * np.tan(0.5 * s0) * np.tan(theta)) / s0
-    if kind == DUAL:
-        return _dual(s0, theta)[0]
-    sine, cosine = np.sin(theta), np.cos(theta)
+        twice = 2.0 * np.tan(0.5 * s0)
+        slope = twice / (s0 * (cosine * cosine + twice * twice * sine * sine))
+        return np.arctan(twice * tangent) / s0, slope
+    if kind == DUAL:  # the weighted mean of perspective and equidistant
+        return s0 * tangent + (1.0 - s0) * theta, 1.0 + s0 * tangent * tangent
     if kind == DIVISION:
         root = np.sqrt(max(cosine * cosine - 4.0 * s0 * sine * sine, 0.0))
-        if cosine < 0.0:
-            return (cosine - root) / (2.0 * s0 * sine)
-        return 2.0 * sine / (cosine + root)
+        rho = (cosine - root) / (2.0 * s0 * sine) if cosine < 0.0 else 2.0 * sine / (cosine + root)
+        # rho cos = (1 + s0 rho^2) sin, differentiated; safe beyond a right angle
+        above = (1.0 + s0 * rho * rho) * cosine + rho * sine
+        return rho, above / (cosine - 2.0 * s0 * rho * sine)
     if kind == EUCM:
         d = np.sqrt(s1 * sine * sine + cosine * cosine)
-        return sine / (s0 * d + (1.0 - s0) * cosine)
-    return np.tan(theta)
+        below = s0 * d + (1.0 - s0) * cosine
+        below_slope = s0 * (s1 - 1.0) * sine * cosine / d - (1.0 - s0) * sine
+        rho = sine / below
+        return rho, (cosine - rho * below_slope) / below
+    return tangent, 1.0 / (cosine * cosine)
 
 
 @kernel
 def angle(c: FloatArray, rho: float) -> float:
-    """Return the angle from the axis of a place in the plane; undoes `radius`."""
+    """Return the angle from the axis of a radius in the plane: the inverse of `radius`."""
     if not rho <= c[LARGEST_RADIUS]:
         return np.nan
     kind, s0, s1 = int(c[KIND]), _shape(c, 0), _shape(c, 1)
@@ -155,37 +160,14 @@ def angle(c: FloatArray, rho: float) -> float:
 
 
 @device
-def _polynomial(c: FloatArray, theta: float) -> tuple[float, float]:
-    """Return Pix4D's polynomial and its slope."""
-    q = theta / RIGHT_ANGLE
-    value, slope = 0.0, 0.0
-    for i in range(int(c[SHAPES]) - 1, -1, -1):
-        slope = slope * q + value
-        value = value * q + _shape(c, i)
-    return value, slope / RIGHT_ANGLE
-
-
-@device
-def _dual(share: float, theta: float) -> tuple[float, float]:
-    """Return the mean of perspective and equidistant, and its slope."""
-    if share == 0.0:
-        return theta, 1.0
-    tangent = np.tan(theta)
-    return share * tangent + (1.0 - share) * theta, 1.0 + share * tangent * tangent
-
-
-@device
 def _search(c: FloatArray, rho: float) -> float:
-    """Solve radius(theta) = rho by Newton's steps, halving the bracket where they leave it."""
+    """Solve radius(theta) = rho by Newton's method, with bisection if a step leaves the bracket."""
     low, high = 0.0, c[LARGEST_ANGLE]
-    if rho < radius(c, low):
+    if rho < radius(c, low)[0]:
         return np.nan
     theta = 0.5 * high
     for _ in range(100):
-        if c[KIND] == DUAL:
-            value, slope = _dual(_shape(c, 0), theta)
-        else:
-            value, slope = _polynomial(c, theta)
+        value, slope = radius(c, theta)
         if value < rho:
             low = theta
         else:
@@ -204,7 +186,7 @@ Jacobian: TypeAlias = tuple[float, float, float, float]
 
 @device
 def _radial(c: FloatArray, r2: float) -> tuple[float, float]:
-    """Return r' / r and its derivative by r^2."""
+    """Return r' / r and its derivative by r^2 (Horner's scheme for both)."""
     k, d = int(c[RADIALS]), int(c[DENOMINATORS])
     above, slope = 0.0, 0.0
     for i in range(TAIL + k - 1, TAIL - 1, -1):
@@ -285,7 +267,7 @@ def jacobian(c: FloatArray, x: float, y: float) -> Jacobian:
 
 @device
 def _start(c: FloatArray, rho: float) -> float:
-    """Return the radius that the radial terms alone bring to `rho`, or one near the fold."""
+    """Return the radius that the radial terms map to `rho`, or one near the fold."""
     low, high = 0.0, min(c[DISC], 1e6)
     r = min(rho, 0.9 * high)
     for _ in range(100):
@@ -306,10 +288,10 @@ def _start(c: FloatArray, rho: float) -> float:
 
 @device
 def undistorted(c: FloatArray, u: float, v: float) -> tuple[float, float]:
-    """Return the place in the disc that `distorted` brings to (u, v), NaN where there is none.
+    """Return the place in the disc that `distorted` maps to (u, v), or NaN.
 
-    Newton's method from the solution without tangential terms, each step halved until it stays
-    in the disc and comes nearer.
+    Newton's method from the solution without tangential terms; each step is halved until it stays
+    in the disc and reduces the residual.
     """
     rho = np.sqrt(u * u + v * v)
     if rho == 0.0 or not rho < np.inf:
@@ -342,18 +324,14 @@ def undistorted(c: FloatArray, u: float, v: float) -> tuple[float, float]:
 
 def largest_disc(lens: Lens, c: FloatArray) -> float:
     """Return the radius of the disc where Brown's formula is one to one; may be infinite."""
-    fold = _radial_fold(lens)
-    if any(lens.tangential) or any(lens.thin_prism):
-        return float(_first_bend(c, fold))
-    return fold
-
-
-def _radial_fold(lens: Lens) -> float:
-    """Return the smallest r with d r' / d r = 0, or at which r' is infinite."""
+    # the radial fold: the smallest r with d r' / d r = 0, or at which r' is infinite
     above, below = Polynomial((1.0, *lens.radial)), Polynomial((1.0, *lens.denominator))
     twice_q = Polynomial((0.0, 2.0))
     slope = (above + twice_q * above.deriv()) * below - twice_q * above * below.deriv()
-    return float(np.sqrt(min(first_root(slope), first_root(below))))
+    fold = float(np.sqrt(min(first_root(slope), first_root(below))))
+    if any(lens.tangential) or any(lens.thin_prism):
+        return float(_first_bend(c, fold))
+    return fold
 
 
 _DIRECTIONS, _RADII_PER_DECADE = 72, 40
@@ -372,7 +350,7 @@ def _bends(c: FloatArray, r: float) -> bool:
 
 @kernel
 def _first_bend(c: FloatArray, fold: float) -> float:
-    """Return the smallest radius that bends, found on a fine series and then halved to it."""
+    """Return the smallest radius that bends: a fine series of radii, then bisection."""
     low = 0.0
     for step in range(-3 * _RADII_PER_DECADE, 6 * _RADII_PER_DECADE):
         high = min(10.0 ** (step / _RADII_PER_DECADE), fold)

@@ -1,17 +1,16 @@
-"""Which cameras have a point in their frame, and which can have one of a whole tile.
+"""Test whether points, or whole tiles of points, lie in the frames of cameras.
 
-The frame of a central projection without distortion is a pyramid with its tip in the
-projection centre. Four planes bound it; a point is in the frame when it is on the inner side of
-all four.
+The frame of a central projection without distortion is a pyramid with its tip in the projection
+centre: a point is in the frame if it is on the inner side of its four planes.
 
-A distorted frame has curved sides, and the point has to be projected. Most tiles are spared
-that: those outside of a pyramid around the frame (of a cone, where the frame is too wide), and
-those whose middle falls so far from the border of the image that no ray of the tile can cross
-it. How far that is says the `scale` of the lens: no turn of a ray by an angle moves its image by
-more than `scale` times that angle, in the frame and within a `margin` around it.
+A distorted frame has curved sides, and the point has to be projected. Most tiles need no
+projection: those outside a pyramid around the frame (a cone, if the frame is too wide), and those
+whose middle is imaged so far from the border that no ray of the tile can cross it. The `scale` of
+the lens bounds that: turning a ray by an angle moves its image by at most `scale` times the angle,
+in the frame and within a `margin` around it.
 
-The border of the image is sent out through the lens, densely; where all of it is there, what it
-encloses is the frame, as a lens is used only where it is one to one.
+The border of the image is unprojected densely. If all of it has directions, what it encloses is
+the frame, as a lens is used only where it is one to one.
 """
 
 from __future__ import annotations
@@ -58,8 +57,16 @@ class FrameShape(NamedTuple):
 @lru_cache(maxsize=8192)
 def frame_shape(lens: Lens) -> FrameShape:
     """Return the frame of a lens."""
-    if _is_a_pyramid(lens):
-        return FrameShape(_frame_planes(lens), distorted=False, widest=np.pi, reach=(np.inf, 0.0))
+    brown = (*lens.radial, *lens.denominator, *lens.tangential, *lens.thin_prism)
+    if lens.projection == "perspective" and not any(brown):  # straight lines stay straight
+        width, height = lens.width - lens.principal_x, lens.height - lens.principal_y
+        inward = np.array([
+            (lens.focal + lens.b1, lens.b2, lens.principal_x),
+            (-(lens.focal + lens.b1), -lens.b2, width),
+            (lens.b3, lens.focal, lens.principal_y),
+            (-lens.b3, -lens.focal, height),
+        ])  # fmt: skip
+        return FrameShape(inward, distorted=False, widest=np.pi, reach=(np.inf, 0.0))
     border = unproject(lens, _border(lens))
     return FrameShape(
         _planes_around(border),
@@ -69,28 +76,11 @@ def frame_shape(lens: Lens) -> FrameShape:
     )
 
 
-def _is_a_pyramid(lens: Lens) -> bool:
-    """Whether straight lines stay straight."""
-    brown = (*lens.radial, *lens.denominator, *lens.tangential, *lens.thin_prism)
-    return lens.projection == "perspective" and not any(brown)
-
-
-def _frame_planes(lens: Lens) -> FloatArray:
-    """Return the inward normals of the frame of a lens without distortion, shape (4, 3)."""
-    width, height = lens.width - lens.principal_x, lens.height - lens.principal_y
-    return np.array([
-        (lens.focal + lens.b1, lens.b2, lens.principal_x),
-        (-(lens.focal + lens.b1), -lens.b2, width),
-        (lens.b3, lens.focal, lens.principal_y),
-        (-lens.b3, -lens.focal, height),
-    ])  # fmt: skip
-
-
 BORDER = 400
-"""Points along each side of a frame; between neighbours it is taken to be nearly straight."""
+"""Points along each side of a frame, which is nearly straight between neighbours."""
 
 STEEPEST = np.cos(np.radians(80.0))
-"""A pyramid with flatter sides would be too long to be of use."""
+"""A pyramid with flatter sides would be too wide to exclude anything."""
 
 
 def _border(lens: Lens) -> FloatArray:
@@ -103,7 +93,7 @@ def _border(lens: Lens) -> FloatArray:
 
 
 def _widest_step(points: FloatArray) -> float:
-    """Return the largest distance between neighbours; a curve strays less from its points."""
+    """Return the largest distance between neighbours: a curve deviates less from its points."""
     return float(np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1).max()))
 
 
@@ -172,34 +162,18 @@ NOTHING, SOME, ALL = 0, 1, 2
 
 
 class Frames(NamedTuple):
-    """The frames of k cameras; directions are in the world frame.
+    """The frames of k cameras; directions are in the world frame."""
 
-    Attributes
-    ----------
-    planes : array, shape (k, 4, 3)
-        Inward normals of the pyramid that is the frame, or is around it. Zeros hold everything.
-    row : array, shape (k,)
-        The lens of each camera in `lenses`, or `NOT_DISTORTED`: then the pyramid is the frame.
-    cone : array, shape (k, 4)
-        An axis, and the angle (rad) from it that nothing of the frame exceeds.
-    reach : array, shape (k, 2)
-        Scale (unit of the lens per rad) and margin (unit of the lens) of the lens.
-    lenses : array, shape (l, ...)
-        Coefficients, one row per lens.
-    rotations : array, shape (k, 3, 3)
-        World to camera.
-    """
-
-    planes: FloatArray
-    row: IntArray
-    cone: FloatArray
-    reach: FloatArray
-    lenses: FloatArray
-    rotations: FloatArray
+    planes: FloatArray  # (k, 4, 3), inward normals of the pyramid that is, or encloses, the frame
+    row: IntArray  # (k,), lens of each camera; `NOT_DISTORTED` if the pyramid is the frame
+    cone: FloatArray  # (k, 4), an axis, and the largest angle (rad) of the frame from it
+    reach: FloatArray  # (k, 2), scale (unit per rad) and margin (unit) of the lens
+    lenses: FloatArray  # (l, ...), coefficients, one row per lens
+    rotations: FloatArray  # (k, 3, 3), world to camera
 
 
 def no_frames(k: int) -> Frames:
-    """Return frames of k cameras that hold every point."""
+    """Return frames of k cameras that hold every point: planes of zeros do."""
     return Frames(
         planes=np.zeros((k, 4, 3)),
         row=np.full(k, NOT_DISTORTED),
@@ -235,18 +209,18 @@ def frames_of(cameras: Cameras) -> Frames:
 
 
 BESIDE = 1.0
-"""How far beside a frame, in lengths of its longer side, an image may be that a list names.
+"""A view list may name a camera whose frame misses the point by at most this times its longer side.
 
-Farther off the distortion is made up, and the search of a point goes astray in it: of 40,000
-points of drawn scenes with lists 47 lay elsewhere in another frame, by up to 41 m, all of them with
-an image more than eight lengths away. An apparent point is some pixels from its image.
+An apparent point is some pixels from its image. Much farther outside the distortion is
+extrapolated, and the search of a true point may fail: of 40,000 points of simulated scenes 47 were
+up to 41 m off, all of them imaged more than eight lengths outside.
 """
 
 
 def listed_frames_of(cameras: Cameras) -> Frames:
-    """Return the frames that hold what a list may name the cameras for.
+    """Return the widened frames for points of a view list.
 
-    Those of cameras without lenses or angles hold everything: no method goes through their images.
+    Those of cameras without lenses or angles hold everything: no method projects into them.
     """
     if cameras.rotations is None or cameras.lenses is None:
         return no_frames(len(cameras))
@@ -268,10 +242,7 @@ def with_border(lens: Lens, border: float) -> Lens:
 
 @device
 def pyramid(g: FloatArray) -> Pyramid:
-    """Return the planes of one camera, shape (4, 3), as twelve numbers.
-
-    As numbers they stay in registers; as an array they would be read again for every point.
-    """
+    """Return the planes of one camera, shape (4, 3), as numbers, which stay in registers."""
     return row_of(g, 0), row_of(g, 1), row_of(g, 2), row_of(g, 3)
 
 
@@ -288,13 +259,13 @@ def in_frame(g: Pyramid, e: Vector) -> bool:
 
 @device
 def _image(lens: FloatArray, r: FloatArray, e: Vector) -> tuple[float, float]:
-    """Return where a lens with rotation r images the point at C - e."""
+    """Return u, v of the point at C - e for a lens with rotation r."""
     return image_of(lens, *scaled(-1.0, times(r, e)))
 
 
 @device
 def _images(lens: FloatArray, r: FloatArray, e: Vector) -> bool:
-    """Whether that place is in the frame."""
+    """Whether u, v are in the frame."""
     u, v = _image(lens, r, e)
     return (u >= 0.0) & (u <= lens[WIDTH]) & (v >= 0.0) & (v <= lens[HEIGHT])
 
@@ -325,22 +296,12 @@ def mark(
 ) -> int:  # fmt: skip
     """Set to 1 the marks of points in the distorted frame of camera c, to 0 those of others.
 
-    Returns how many are in it. It does to many points what `holds` does to one.
+    Returns their number. It is `holds` for many points.
     """
-    lens = frames.lenses[frames.row[c]]
+    lens, r = frames.lenses[frames.row[c]], frames.rotations[c]
     if lens[PLAIN] != 0.0:
-        return _mark_plain(marks, x, y, z, centre, frames.rotations[c], lens)
-    around = pyramid(frames.planes[c])
-    return _mark_any(marks, x, y, z, centre, around, frames.rotations[c], lens)
-
-
-@device
-def _mark_any(
-    marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, centre: FloatArray,
-    around: Pyramid, r: FloatArray, lens: FloatArray,
-) -> int:  # fmt: skip
-    """Take any lens, point by point."""
-    count = 0
+        return _mark_plain(marks, x, y, z, centre, r, lens)
+    around, count = pyramid(frames.planes[c]), 0
     for j in range(marks.size):
         e = centre[0] - x[j], centre[1] - y[j], centre[2] - z[j]
         inside = in_frame(around, e) and _images(lens, r, e)
@@ -354,7 +315,7 @@ def _mark_plain(
     marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, centre: FloatArray,
     r: FloatArray, c: FloatArray,
 ) -> int:  # fmt: skip
-    """Take the common lens: `image_of` written out without branches, for several points at once."""
+    """Mark with the common lens: `image_of` without branches, which the compiler vectorizes."""
     cx, cy, cz = centre[0], centre[1], centre[2]
     xx, xy, xz, yx, yy, yz = r[0, 0], r[0, 1], r[0, 2], r[1, 0], r[1, 1], r[1, 2]
     zx, zy, zz = r[2, 0], r[2, 1], r[2, 2]
@@ -370,6 +331,7 @@ def _mark_plain(
         a = -(xx * ex + xy * ey + xz * ez) / front - px
         b = -(yx * ex + yy * ey + yz * ez) / front - py
         r2 = a * a + b * b
+        # Brown: radial factor, then tangential terms and the centre of distortion
         g = 1.0 + (((k4 * r2 + k3) * r2 + k2) * r2 + k1) * r2
         da = g * a + (p1 * (r2 + 2.0 * a * a) + 2.0 * p2 * a * b) + px
         db = g * b + (p2 * (r2 + 2.0 * b * b) + 2.0 * p1 * a * b) + py
@@ -384,7 +346,7 @@ def _mark_plain(
 
 @device
 def may_hold(g: FloatArray, centre: FloatArray, low: FloatArray, high: FloatArray) -> bool:
-    """Whether a pyramid can hold any point of an upright box; never wrongly False."""
+    """Whether a pyramid may hold a point of an upright box; never wrongly False."""
     for p in range(4):
         reach = 0.0
         for axis in range(3):
@@ -397,10 +359,10 @@ def may_hold(g: FloatArray, centre: FloatArray, low: FloatArray, high: FloatArra
 
 @device
 def judge(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: FloatArray) -> int:
-    """Return whether the distorted frame of camera c holds all or nothing of an upright box.
+    """Return `ALL`, `NOTHING` or `SOME`: what the distorted frame of camera c holds of a box.
 
-    `ALL`, `NOTHING` or `SOME`; never wrongly one of the first two. The box is taken as the ball
-    around it, seen from the camera under the angle `turn` about its middle.
+    `ALL` and `NOTHING` are never wrong. The upright box is replaced by the ball around it, which
+    the camera sees within the angle `turn` about its middle.
     """
     e = (
         centre[0] - 0.5 * (low[0] + high[0]),
@@ -418,6 +380,7 @@ def judge(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: Flo
     lens, r = frames.lenses[frames.row[c]], frames.rotations[c]
     u, v = _image(lens, r, e)
     within = min(min(u, lens[WIDTH] - u), min(v, lens[HEIGHT] - v))
+    # no ray of the ball is imaged farther than this from the image of its middle
     move, margin = turn * frames.reach[c, 0], frames.reach[c, 1]
     if within > move:
         return ALL
@@ -425,22 +388,11 @@ def judge(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: Flo
 
 
 BORDER_POINTS = 8
-"""On each side of a footprint: enough to show the curve of a distorted frame."""
+"""Points on each side of a footprint, enough to show the curve of a distorted frame."""
 
 
 def cameras_in_sight(xyz: FloatArray, cameras: Cameras) -> IntArray:
-    """Return how many cameras have each point in their frame; nothing hides a point.
-
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Metres, world frame.
-    cameras : Cameras
-
-    Returns
-    -------
-    array of int, shape (n,)
-    """
+    """Return how many cameras have each point, (n, 3), in their frame; occlusion is ignored."""
     counts = np.zeros(len(xyz), np.int64)
     xyz = np.ascontiguousarray(xyz)
     in_tiles(_count, len(xyz), xyz, cameras.centres, frames_of(cameras), counts)
@@ -457,20 +409,7 @@ def _count(
 
 
 def beside_frames(xyz: FloatArray, views: Views, cameras: Cameras) -> IntArray:
-    """Return how many cameras are listed for each point that cannot have imaged it.
-
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Metres, world frame.
-    views : Views
-        Of these points.
-    cameras : Cameras
-
-    Returns
-    -------
-    array of int, shape (n,)
-    """
+    """Return the number of cameras in the view list of each point, (n, 3), that cannot image it."""
     counts = np.zeros(len(xyz), np.int64)
     listed = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
     if cameras.rotations is not None and cameras.lenses is not None:
@@ -493,16 +432,7 @@ def _count_beside(
 
 
 def footprint(cameras: Cameras, row: int, height_m: float) -> FloatArray:
-    """Return the border of a frame on a level, shape (p, 2); NaN where it looks past it.
-
-    Parameters
-    ----------
-    cameras : Cameras
-        With rotations and lenses.
-    row : int
-    height_m : float
-        Of the level, world frame.
-    """
+    """Return the border of a frame on a level (world Z), shape (p, 2); NaN above the horizon."""
     if cameras.rotations is None or cameras.lenses is None:
         return np.zeros((0, 2))
     lens = cameras.lenses[row]

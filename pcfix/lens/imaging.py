@@ -1,8 +1,8 @@
-"""From a direction in the camera frame to a place in the image, and back.
+"""Project a direction in the camera frame to the image, and back.
 
-The formulas are those of `pcfix.model.Lens`. Both ways are used only where they are one to one:
-a direction beyond the fold of the distortion, which would be bent back into the image, has no
-place in it, and a place beyond the image of the fold has no direction. What is not there is NaN.
+The formulas are those of `pcfix.model.Lens`, used only where they are one to one: a direction
+beyond the fold of the distortion has no place in the image, and a place beyond the image of the
+fold no direction. Both are NaN.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from pcfix.lens import formulas as places
 from pcfix.lens.algebra import Vector, times, transposed_times
 from pcfix.lens.formulas import (
     CODES,
-    RIGHT_ANGLE,
     angle,
     distorted,
     jacobian,
@@ -31,37 +30,25 @@ from pcfix.model import FloatArray, IntArray, Lens
 
 
 def project(lens: Lens, directions: FloatArray) -> FloatArray:
-    """Return where directions meet the image.
-
-    Parameters
-    ----------
-    lens : Lens
-    directions : array, shape (n, 3)
-        Camera frame, any length.
+    """Return the image coordinates of directions, shape (n, 3), camera frame, any length.
 
     Returns
     -------
     array, shape (n, 2)
-        u, v in the unit of the lens, inside the frame or not; NaN where the lens has no image,
-        as behind a perspective camera or beyond the fold of the distortion.
+        u, v in the unit of the lens, also outside the frame; NaN where the lens has no image, as
+        behind a perspective camera or beyond the fold of the distortion.
     """
     rows = np.ascontiguousarray(directions, np.float64).reshape(-1, 3)
     return _project(coefficients(lens), rows)
 
 
 def unproject(lens: Lens, image_xy: FloatArray) -> FloatArray:
-    """Return the directions that places in the image look to.
-
-    Parameters
-    ----------
-    lens : Lens
-    image_xy : array, shape (n, 2)
-        u, v in the unit of the lens.
+    """Return the directions of image coordinates, shape (n, 2), in the unit of the lens.
 
     Returns
     -------
     array, shape (n, 3)
-        Unit vectors in the camera frame; NaN where nothing is imaged.
+        Unit vectors in the camera frame; NaN outside the image of the lens.
     """
     rows = np.ascontiguousarray(image_xy, np.float64).reshape(-1, 2)
     return _unproject(coefficients(lens), rows)
@@ -79,8 +66,16 @@ def coefficients(lens: Lens) -> FloatArray:
     c[places.FOCAL_X : places.FOCAL_Y + 1] = lens.focal + lens.b1, lens.b2, lens.b3, lens.focal
     c[places.PRINCIPAL_X : places.PRINCIPAL_Y + 1] = lens.principal_x, lens.principal_y
     c[places.WIDTH : places.HEIGHT + 1] = lens.width, lens.height
-    c[places.PLAIN] = _is_plain(lens)
-    c = _with_tail(c, lens)
+    more = (*lens.radial[4:], *lens.denominator, *lens.tangential[2:], *lens.thin_prism)
+    is_plain = not (lens.inverse or lens.in_turn or any(more))
+    c[places.PLAIN] = is_plain and lens.projection == "perspective"
+    # what has no fixed length stands at the end
+    radial = _filled(lens.radial, places.LEAST_RADIALS)
+    shape = _filled(lens.shape, places.LEAST_SHAPES)
+    counts = len(radial), len(lens.denominator), len(shape)
+    c[places.RADIALS : places.SHAPES + 1] = counts
+    c[places.SHAPE] = places.TAIL + counts[0] + counts[1]
+    c = np.concatenate([c, radial, lens.denominator, shape])
     c[places.LARGEST_ANGLE] = largest_angle(lens)
     c[places.LARGEST_RADIUS] = largest_radius(c)
     c[places.DISC] = largest_disc(lens, c)
@@ -94,7 +89,7 @@ def lens_table(lenses: tuple[Lens, ...]) -> tuple[IntArray, FloatArray]:
     Returns
     -------
     row : array, shape (k,)
-        Where the lens of each camera is in the table.
+        Index of the lens of each camera in the table.
     table : array, shape (l, ...)
         See `pcfix.lens.formulas`; padded with zeros.
     """
@@ -107,24 +102,9 @@ def lens_table(lenses: tuple[Lens, ...]) -> tuple[IntArray, FloatArray]:
     return row, table
 
 
-def _with_tail(c: FloatArray, lens: Lens) -> FloatArray:
-    """Return the array with what has no fixed length at its end."""
-    radial = _filled(lens.radial, places.LEAST_RADIALS)
-    shape = _filled(lens.shape, places.LEAST_SHAPES)
-    counts = len(radial), len(lens.denominator), len(shape)
-    c[places.RADIALS : places.SHAPES + 1] = counts
-    c[places.SHAPE] = places.TAIL + counts[0] + counts[1]
-    return np.concatenate([c, radial, lens.denominator, shape])
-
-
 def _filled(numbers: tuple[float, ...], least: int) -> tuple[float, ...]:
-    """Return the numbers, with zeros up to the least length."""
+    """Return the numbers, filled up with zeros to the least length."""
     return (*numbers, *(0.0,) * (least - len(numbers)))
-
-
-def _is_plain(lens: Lens) -> bool:
-    beyond = (*lens.radial[4:], *lens.denominator, *lens.tangential[2:], *lens.thin_prism)
-    return lens.projection == "perspective" and not (lens.inverse or lens.in_turn or any(beyond))
 
 
 @device
@@ -138,13 +118,13 @@ def in_plane(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]
         return np.nan, np.nan
     if across == 0.0:
         return (0.0, 0.0) if z > 0.0 else (np.nan, np.nan)
-    scale = radius(c, theta) / across
+    scale = radius(c, theta)[0] / across
     return scale * x, scale * y
 
 
 @device
 def image_of(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]:
-    """Return u, v of one direction."""
+    """Return u, v of one direction: projection, distortion, interior orientation."""
     px, py = in_plane(c, x, y, z)
     cx, cy = c[places.CENTRE_X], c[places.CENTRE_Y]
     if c[places.INVERSE] != 0.0:
@@ -158,7 +138,7 @@ def image_of(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]
 
 @device
 def direction_of(c: FloatArray, u: float, v: float) -> tuple[float, float, float]:
-    """Return the unit direction of one place in the image."""
+    """Return the unit direction of one place in the image: `image_of` backwards."""
     cx, cy = c[places.CENTRE_X], c[places.CENTRE_Y]
     u, v = u - c[places.PRINCIPAL_X], v - c[places.PRINCIPAL_Y]
     det = c[places.FOCAL_X] * c[places.FOCAL_Y] - c[places.B2] * c[places.B3]
@@ -194,7 +174,7 @@ def _unproject(c: FloatArray, image: FloatArray) -> FloatArray:
 
 
 Gradients: TypeAlias = tuple[float, float, float, float, float, float]
-"""Of two numbers by three others: a_x, a_y, a_z, b_x, b_y, b_z."""
+"""Derivatives of two numbers by three others: a_x, a_y, a_z, b_x, b_y, b_z."""
 
 _NOWHERE = (np.nan,) * 6
 
@@ -203,24 +183,9 @@ _NOWHERE = (np.nan,) * 6
 def image_and_gradients(
     c: FloatArray, x: float, y: float, z: float
 ) -> tuple[float, float, Gradients]:
-    """Return where a lens images a direction, and how that moves.
+    """Return u, v of a direction (x, y, z), camera frame, and their derivatives by it.
 
-    The formulas are those of `pcfix.model.Lens`, in the same three steps: projection, Brown's
-    distortion, image. The chain rule joins them.
-
-    Parameters
-    ----------
-    c : array
-        Of `pcfix.lens.imaging.coefficients`.
-    x, y, z : float
-        Camera frame, any length.
-
-    Returns
-    -------
-    u, v : float
-        In the unit of the lens; NaN where it has no image.
-    gradients : Gradients
-        Of u and v by x, y, z, per unit of the direction.
+    The three steps are those of `image_of`, joined by the chain rule. NaN where there is no image.
     """
     px, py, (ax, ay, az, bx, by, bz) = _plane_and_gradients(c, x, y, z)
     px, py = px - c[places.CENTRE_X], py - c[places.CENTRE_Y]
@@ -250,9 +215,9 @@ def image_and_gradients(
 def image_in_world(
     c: FloatArray, r: FloatArray, direction: Vector
 ) -> tuple[float, float, Vector, Vector]:
-    """Return where a camera with rotation r images a direction, and how u and v move with it.
+    """Return u, v of a direction in the world frame, and the gradients of u and v there.
 
-    The direction and the gradients of u and v are in the world frame.
+    The camera has the rotation r.
     """
     u, v, g = image_and_gradients(c, *times(r, direction))
     return u, v, transposed_times(r, g[:3]), transposed_times(r, g[3:])
@@ -277,8 +242,7 @@ def _plane_and_gradients(
     theta = np.arctan2(np.sqrt(q2), z)
     if not (theta <= c[places.LARGEST_ANGLE] and (q2 > 0.0 or z > 0.0)):
         return np.nan, np.nan, _NOWHERE
-    rho = radius(c, theta)
-    slope = _radius_slope(c, theta, rho)
+    rho, slope = radius(c, theta)
     scale = rho / np.sqrt(q2) if q2 > 0.0 else slope / z
     turn = (slope * z / r2 - scale) / q2 if q2 > 0.0 else 0.0
     away = -slope / r2
@@ -288,41 +252,3 @@ def _plane_and_gradients(
         scale * y,
         (scale + turn * x * x, cross, away * x, cross, scale + turn * y * y, away * y),
     )
-
-
-@device
-def _radius_slope(c: FloatArray, theta: float, rho: float) -> float:
-    """Return d rho / d theta of `pcfix.lens.formulas.radius`."""
-    kind = int(c[places.KIND])
-    s0, s1 = c[int(c[places.SHAPE])], c[int(c[places.SHAPE]) + 1]
-    sine, cosine = np.sin(theta), np.cos(theta)
-    if kind == places.EQUIDISTANT:
-        return 1.0
-    if kind == places.EQUISOLID:
-        return np.cos(0.5 * theta)
-    if kind == places.POLYNOMIAL:
-        return _polynomial_slope(c, theta)
-    if kind == places.FOV and s0 != 0.0:
-        twice = 2.0 * np.tan(0.5 * s0)
-        return twice / (s0 * (cosine * cosine + twice * twice * sine * sine))
-    if kind == places.DUAL:
-        return 1.0 if s0 == 0.0 else s0 / (cosine * cosine) + 1.0 - s0
-    if kind == places.DIVISION:
-        # rho cos = (1 + s0 rho^2) sin, differentiated; safe beyond a right angle
-        above = (1.0 + s0 * rho * rho) * cosine + rho * sine
-        return above / (cosine - 2.0 * s0 * rho * sine)
-    if kind == places.EUCM:
-        d = np.sqrt(s1 * sine * sine + cosine * cosine)
-        below = s0 * d + (1.0 - s0) * cosine
-        below_slope = s0 * (s1 - 1.0) * sine * cosine / d - (1.0 - s0) * sine
-        return (cosine - rho * below_slope) / below
-    return 1.0 / (cosine * cosine)
-
-
-@device
-def _polynomial_slope(c: FloatArray, theta: float) -> float:
-    """Return the slope of Pix4D's polynomial, in which a right angle counts as 1."""
-    q, slope = theta / RIGHT_ANGLE, 0.0
-    for i in range(int(c[places.SHAPES]) - 1, 0, -1):
-        slope = slope * q + i * c[int(c[places.SHAPE]) + i]
-    return slope / RIGHT_ANGLE

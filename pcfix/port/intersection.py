@@ -1,20 +1,18 @@
-"""Forward intersection through a housing port, for a cloud that was taken under water.
+"""Forward intersection through a housing port, for a cloud taken under water.
 
-Picture a camera in a housing, and a place in its image. The lens tells in which direction the
-camera looks there; the port bends that ray at its faces; behind the outer face it goes on straight
-through the water. Rays of several images meet at the true point. Mulsow calls the port a
-bundle-invariant interface: it goes along with each camera. There is no water surface between
-camera and point, all points are under water, and where up is does not matter.
+The lens gives the direction of an image place; the port refracts that ray at its faces; behind the
+outer face it goes straight through the water. The rays of several images meet at the true point.
+There is no water surface between camera and point, and the direction of up does not matter.
 
-A dense cloud has no image places, but its points stand for them: software that knows nothing of
-the port put the point P where straight lines from the projection centres met best. So the line
-from a centre C to P has the direction of the image place, but for the residual of that adjustment.
-Through a flat port that residual is large, a hundred pixels and more where many images of a
-camera calibrated in air see a point: the straight rays hardly meet. The method `consistent`
-(`pcfix.port.inversion`) takes it into account, `snell` does not.
+A dense cloud has no image places, but its points stand for them: software without a port model puts
+the point P where straight lines from the projection centres meet best. So the line from a centre C
+to P has the direction of the image place, except for the residual of that adjustment. Through a
+flat port that residual is large, a hundred pixels and more if many images of a camera calibrated in
+air see a point. The method `consistent` (`pcfix.port.methods`) uses it, `snell` does not.
 
-Which images made P matters as much. Without a list, those are sought whose frames hold the image
-of the true point that they lead to. There may be several such sets; then the point may be wrong.
+Which images contributed to P matters as much. Without a view list it is a set of images whose
+frames hold the image of the true point that they lead to. There may be several such sets; then the
+point may be wrong.
 """
 
 from __future__ import annotations
@@ -46,46 +44,36 @@ from pcfix.refract.choice import ANY_NUMBER, NOMINAL_FOCAL_PX
 from pcfix.refract.rays import add_line, nearest_point
 from pcfix.refract.tiling import TILE, cameras_around, near_cameras, spatial_order
 
-# Columns of the result after the shift.
 _MISS, _SIGMA_Z, _COSINE, _OUTCOME = 3, 4, 5, 6
+"""Columns of the result after the shift."""
 
 
 class Rig(NamedTuple):
-    """The k cameras and the port before each of them, for kernels.
+    """The k cameras and the port before each of them, for kernels."""
 
-    Attributes
-    ----------
-    centres, rotations : array, shapes (k, 3) and (k, 3, 3)
-        Metres, world frame; world to camera.
-    row, lenses : array
-        The lens of each camera in a table, see `pcfix.lens.imaging.lens_table`; without lenses
-        that of a survey drone.
-    port : array
-        See `pcfix.port.light.coefficients`.
-    n : float
-        Refractive index of the water.
-    """
-
-    centres: FloatArray
-    rotations: FloatArray
-    row: IntArray
+    centres: FloatArray  # (k, 3), metres, world frame
+    rotations: FloatArray  # (k, 3, 3), world to camera
+    row: IntArray  # lens of each camera, see `pcfix.lens.imaging.lens_table`
     lenses: FloatArray
-    port: FloatArray
-    n: float
+    port: FloatArray  # see `pcfix.port.light.coefficients`
+    n: float  # refractive index of the water
 
 
 def lenses_of(cameras: Cameras) -> tuple[Lens, ...]:
-    """Return the lenses of cameras; without, those of a survey drone."""
+    """Return the lenses of cameras, or those of a survey drone."""
     nominal = Lens(NOMINAL_FOCAL_PX, NOMINAL_WIDTH_PX, NOMINAL_WIDTH_PX, 0.0, 0.0)
     return cameras.lenses or (nominal,) * len(cameras)
 
 
 def rig_of(cameras: Cameras, port: Port, settings: ScienceOptions) -> Rig:
     """Return the cameras and their port for kernels."""
-    centres, rotations = np.ascontiguousarray(cameras.centres), rotations_of(cameras)
-    table = lens_table(lenses_of(cameras))
-    c = coefficients(port)
-    return Rig(centres, np.ascontiguousarray(rotations), *table, c, settings.refractive_index)
+    return Rig(
+        np.ascontiguousarray(cameras.centres),
+        np.ascontiguousarray(rotations_of(cameras)),
+        *lens_table(lenses_of(cameras)),
+        coefficients(port),
+        settings.refractive_index,
+    )
 
 
 def intersect_rays(
@@ -101,19 +89,19 @@ def intersect_rays(
     Parameters
     ----------
     near : array, shape (m, 3)
-        A place near each point, metres, world frame, as its apparent one; shifts are from there.
+        A place near each point, metres, world frame, as its apparent one; origin of its shift.
     directions : array, shape (o, 3)
-        Where each camera looks, one row per entry of ``views.camera``: camera frame, any length,
-        as `pcfix.lens.imaging.unproject` has them of places in the image.
+        Directions of the image places, one row per entry of ``views.camera``, camera frame, any
+        length; see `pcfix.lens.imaging.unproject`.
     views : Views
         The cameras of each point.
     cameras, port, settings
-        As of `pcfix.port.methods.intersect_through_port`.
+        See `pcfix.port.methods.intersect_through_port`.
 
     Returns
     -------
     Intersection
-        One row per point. A ray that does not meet the port does not count.
+        One row per point. A ray that does not meet the port is ignored.
     """
     result = np.zeros((len(near), 7))
     in_tiles(
@@ -151,20 +139,11 @@ def port_views(
     views: Views | None = None,
     shift_m: FloatArray | None = None,
 ) -> Views:
-    """Return the cameras whose rays each point gets, as a list.
+    """Return the cameras whose rays are used for each point, in the order of the cameras or views.
 
-    Parameters
-    ----------
-    xyz, cameras, port, settings, views
-        As of `pcfix.port.methods.intersect_through_port`.
-    shift_m : array, shape (m, 3), optional
-        To the true points; without `views`, their images through the port must be in the frame
-        instead of those of the apparent points along straight lines.
-
-    Returns
-    -------
-    Views
-        In the order of the cameras, or of `views`.
+    The parameters are those of `pcfix.port.methods.intersect_through_port`. With `shift_m`, shape
+    (m, 3), to the true points and without `views`, the images of these through the port must be in
+    the frame, instead of those of the apparent points along straight lines.
     """
     limit = settings.limit_deg
     count, none = np.zeros(len(xyz) + 1, np.int64), np.zeros(0, np.int64)
@@ -191,11 +170,12 @@ def port_views(
 
 
 def rotations_of(cameras: Cameras) -> FloatArray:
-    """Return the rotations of cameras, shape (k, 3, 3); an error where they have none."""
+    """Return the rotations of cameras, shape (k, 3, 3); SettingError ``cameras.no_angles``."""
     if cameras.rotations is None:
         raise SettingError(
-            "port: it is fixed to the camera, and these cameras have no angles; give a camera file"
-            " that has them."
+            "cameras.no_angles",
+            "A port is fixed to the camera, and the cameras have no angles. Give a camera file with"
+            " angles.",
         )
     return np.asarray(cameras.rotations, np.float64)
 
@@ -206,9 +186,9 @@ def _choose(
     views: tuple[IntArray, IntArray], limits: tuple[float, int], shift: FloatArray,
     found: tuple[IntArray, IntArray],
 ) -> None:  # fmt: skip
-    """Fill in the cameras of point i from ``start[i]``; without room count to ``start[i + 1]``.
+    """Write the cameras of point i from ``chosen[start[i]]``, or count them in ``start[i + 1]``.
 
-    Views and shifts are empty where there are none.
+    They are counted if `chosen` is empty. Views and shifts are empty if there are none.
     """
     start, chosen = found
     low, high = _box(xyz, order[span[0] * TILE : span[1] * TILE], shift)
@@ -235,10 +215,10 @@ def _choose(
 
 @device(allocates=True)
 def _box(xyz: FloatArray, rows: IntArray, shift: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the corners of an upright box around points; with shifts, a wide one around both.
+    """Return the corners of an upright box around apparent and true points, widened by the shifts.
 
-    A straight line to the true point leaves the frame where the bent light may still be in it, by
-    no more than it was moved.
+    The straight line to a true point may miss a frame that its refracted light reaches, by at most
+    the shift.
     """
     low, high, wide = xyz[rows[0]].copy(), xyz[rows[0]].copy(), 0.0
     for i in rows:
@@ -255,9 +235,9 @@ def _usable(
     candidates: IntArray, point: Vector, rig: Rig, frames: Frames, limits: tuple[float, int],
     through: bool,
 ) -> IntArray:  # fmt: skip
-    """Return the cameras that give a ray, in their order: at most so many, the steepest.
+    """Return the cameras that give a ray, in their order: at most `most`, the steepest.
 
-    The point is seen along a straight line, or through the port.
+    The point is imaged along a straight line, or `through` the port.
     """
     least_cosine, most = limits
     kept, cosine = np.empty(candidates.size, np.int64), np.empty(candidates.size)
@@ -286,7 +266,7 @@ def _intersect(
     span: Span, near: FloatArray, directions: FloatArray, start: IntArray, camera: IntArray,
     rig: Rig, result: FloatArray,
 ) -> None:  # fmt: skip
-    """Intersect the rays of each point, with the place near it as the origin."""
+    """Intersect the rays of each point; the place near it is the origin."""
     for i in range(*span):
         sums, least, k = np.zeros(9), 1.0, 0
         for o in range(start[i], start[i + 1]):
@@ -304,7 +284,7 @@ def _intersect(
 
 @device
 def _solve(row: FloatArray, sums: FloatArray, k: int, cosine: float) -> None:
-    """Solve one point and write its row; a point without a solution keeps a shift of zero."""
+    """Solve one point and write its row; without a solution the shift stays zero."""
     if k < 2:
         row[_OUTCOME] = ONE_CAMERA if k == 1 else NO_CAMERA
         return

@@ -1,17 +1,16 @@
-"""The light through the port of a housing: from a point to its image, and back out.
+"""Refraction at the port of a housing: from a point to its image, and from an image into the water.
 
 Everything is in the camera frame, with the projection centre as the origin: metres, x right, y
 down, z forward. Two questions are answered for each kind of port:
 
-`through_port`: a point in the water is given. In which direction w does its light come to the
-projection centre? A lens images the point where it images w. With the derivatives by the point and
-by the refractive index of the water, which a bundle adjustment needs.
+`through_port`: in which direction w does the light of a point in the water reach the projection
+centre? The lens images the point where it images w. With derivatives by the point and by the
+refractive index of the water, for the bundle adjustment.
 
-`ray_through`: a direction is given that the lens looks to. Where does that ray leave the port, and
-how does it go on through the water?
+`ray_through`: where does the ray of a direction in air leave the port, and in which direction?
 
-The two are solved apart, the first by an equation in one unknown, the second by Snell's law at one
-face after the other, so that each proves the other right.
+The first solves an equation in one unknown, the second applies Snell's law at one face after the
+other, so that each verifies the other.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ def bent(s: Vector, normal: Vector, r: float) -> Vector:
 
     Skarlatos & Agrafiotis 2018, eq 10, with the normal along the light instead of against it:
     t = r s + (sqrt(1 - r^2 (1 - c^2)) - r c) N, c = N.s, with r the refractive index before the
-    face by that behind it. NaN where all light is reflected.
+    face over that behind it. NaN for total reflection.
     """
     c = dot(normal, s)
     k = np.sqrt(1.0 - r * r * (1.0 - c * c)) - r * c
@@ -43,11 +42,11 @@ def bent(s: Vector, normal: Vector, r: float) -> Vector:
 
 
 BY_PORT = 5
-"""First column of the derivatives by what a port may be wrong by, of `through_port`."""
+"""First column of the derivatives by the position of the port, of `through_port`."""
 
 FLAT_STEPS = 60
 FLAT_CLOSE = 1e-8
-"""Of a step, relative; as each step squares the error, the next would be below rounding."""
+"""Relative length of the last step; as each squares the error, the next is below rounding."""
 
 
 @device
@@ -55,24 +54,23 @@ def through_flat(
     normal: Vector, distance: float, thickness: float, glass: float, n: float,
     point: Vector, out: FloatArray,
 ) -> None:  # fmt: skip
-    r"""Find the direction of a point behind a flat port, as `pcfix.port.light.through_port`.
+    r"""Find the direction of a point behind a flat port, see `through_port`.
 
-    Picture the projection centre, and the unit normal N of the port, towards the water. The light
-    crosses the layers air, glass, water, thick d, T and D along N; D belongs to the point X. The
-    part of X across N is s. As at the surface of a lake (`pcfix.refract.rays`) the direction at the
-    projection centre is
+    Seen from the projection centre, with the unit normal N of the port towards the water, the light
+    crosses layers of air, glass and water with the thicknesses d, T and D along N; D belongs to the
+    point X. The part of X across N is s. As at the surface of a lake (`pcfix.refract.rays`) the
+    direction at the projection centre is
 
         w = N + k s
 
-    so that t = k \|s\| is the tangent of the angle of incidence in air, and with Snell's law the
+    so that t = k \|s\| is the tangent of the incidence angle in air, and with Snell's law the
     sideways distances add up to \|s\|. With S(m) = sqrt(m^2 + (m^2 - 1) k^2 s.s):
 
         G(k) = k (d + T / S(g) + D / S(n)) - 1 = 0
 
-    G rises and bends down, so that Newton's method started at k = 1 / (d + T / g + D / n), where G
-    <= 0, comes to the only root from the left and needs no bracket. Nothing is divided by \|s\|.
-
-    Of G(k, D, s.s, n) = 0, implicitly, with grad D = N and grad s.s = 2 s.
+    G rises and is concave, so that Newton's method started at k = 1 / (d + T / g + D / n), where G
+    <= 0, converges to the only root from the left without a bracket. Nothing is divided by \|s\|.
+    The derivatives are those of the implicit function, with grad D = N and grad s.s = 2 s.
     """
     along = dot(normal, point)
     aside = minus(point, scaled(along, normal))
@@ -92,7 +90,7 @@ def through_flat(
             gradient = by_depth * normal[j] + by_aside * aside[j]
             across = (1.0 if i == j else 0.0) - normal[i] * normal[j]
             out[i, 1 + j] = k * across + aside[i] * gradient
-        if out.shape[1] > BY_PORT:  # the farther the port, the less is water: dG = k (1 - 1 / S(n))
+        if out.shape[1] > BY_PORT:  # the farther the port, the less water: dG = k (1 - 1 / S(n))
             out[i, BY_PORT] = -below * k * (1.0 - 1.0 / root_n) * aside[i]
 
 
@@ -100,7 +98,7 @@ def through_flat(
 def _slope(
     distance: float, thickness: float, depth: float, aside2: float, glass: float, n: float
 ) -> float:
-    """Solve G for k; NaN for a point that is not in the water, or out of reach of all light."""
+    """Solve G for k; NaN for a point that is not in the water, or that no light reaches."""
     if not depth > 0.0:
         return np.nan
     g2, n2 = glass * glass, n * n
@@ -121,7 +119,7 @@ def _slope(
 def ray_through_flat(
     normal: Vector, distance: float, thickness: float, glass: float, n: float, direction: Vector
 ) -> Ray:
-    """Return the ray behind a flat port, as `pcfix.port.light.ray_through`."""
+    """Return the ray behind a flat port, see `ray_through`."""
     s = unit(direction)
     steep = dot(normal, s)
     inside = bent(s, normal, 1.0 / glass)
@@ -134,15 +132,14 @@ def ray_through_flat(
 
 DOME_STEPS = 100
 DOME_CLOSE = 1e-9
-"""Of a step of q, relative to 1 / a; as each step squares the error, the next would be below
-rounding."""
+"""Length of the last step of q relative to 1 / a; the next is below rounding."""
 SERIES_UP_TO = 0.01
-"""Beyond, the closed form of the derivative loses two digits at most."""
+"""Above this the closed form of the derivative loses at most two digits."""
 
 
 @device
 def turn(y: float, u: float) -> tuple[float, float, float]:
-    """Return asin(y sqrt(u)) / sqrt(u), which is a series in u, and its derivatives by y and u."""
+    """Return asin(y sqrt(u)) / sqrt(u), a power series in u, and its derivatives by y and u."""
     z = y * y * u
     root = np.sqrt(1.0 - z)
     if z < SERIES_UP_TO:
@@ -160,9 +157,9 @@ def turn(y: float, u: float) -> tuple[float, float, float]:
 def _miss(
     q: float, v: float, u: float, far: float, a: float, b: float, glass: float, n: float
 ) -> tuple[float, float, float, float, float, float, float]:
-    """Return by how much the two sides differ at q, and its derivatives by q, v, u, R, n and o.o.
+    """Return the difference of the two sides at q, and its derivatives by q, v, u, R, n and o.o.
 
-    Those by v and u leave o.o, which is v^2 + u, as it is.
+    Those by v and u are for a constant o.o, which is v^2 + u.
     """
     cosine = np.sqrt(1.0 - q * q * u)
     cosine_q, cosine_u = -q * u / cosine, -0.5 * q * q / cosine
@@ -190,7 +187,7 @@ def _miss(
 
 @device
 def _place(v: float, u: float, far: float, a: float, b: float, glass: float, n: float) -> float:
-    """Solve for q: Newton's method, and halving where it would leave the bracket."""
+    """Solve for q: Newton's method, with bisection if a step leaves the bracket."""
     # where the straight line from o to X meets the inner sphere
     run2 = (far - v) ** 2 + u
     part = v * v + u - v * far
@@ -217,33 +214,32 @@ def through_dome(
     centre: Vector, a: float, thickness: float, glass: float, n: float,
     point: Vector, out: FloatArray,
 ) -> None:  # fmt: skip
-    r"""Find the direction of a point behind a dome, as `pcfix.port.light.through_port`.
+    r"""Find the direction of a point behind a dome, see `through_port`.
 
-    Picture it from the centre of the dome. The projection centre lies at o, the point X at the
-    distance R in the unit direction e; light between them stays in the plane of the two. It crosses
-    the inner sphere, of radius a, at
+    Seen from the centre of the dome, the projection centre lies at o, and the point X at the
+    distance R in the unit direction e; the light between them stays in the plane of the two. It
+    crosses the inner sphere, of radius a, at
 
         A = a (cos theta e + sin theta f),    f the unit vector across e, towards o
 
-    and comes to the projection centre along w = A - o. In shells the product of refractive index
-    and distance from the centre at which the ray's line passes, p, is the same in each (Bouguer).
-    So between two radii in a medium m the ray turns about the centre by asin(p / m r1) - asin(p / m
-    r2), and
+    and reaches the projection centre along w = A - o. In concentric shells the refractive index
+    times the distance of the ray's line from the centre, p, is constant (Bouguer). So between two
+    radii in a medium m the ray turns about the centre by asin(p / m r1) - asin(p / m r2), and
 
         theta = asin(p / g a) - asin(p / g b) + asin(p / n b) - asin(p / n R)
 
-    with the outer radius b, the glass g and the water n. Of theta between 0, where the left side is
-    the smaller one, and the straight line from X to the projection centre, where it is the larger
-    one as glass and water turn a ray less than air does, exactly one solves it: the difference
-    rises all the way (for g and n of at least 1).
+    with the outer radius b, the glass g and the water n. Between theta = 0, where the left side is
+    smaller, and the straight line from X to the projection centre, where it is larger, the
+    difference rises (for g and n of at least 1), so that there is exactly one root.
 
-    So that a point, centre and camera in one line are no special case, the unknown is q =
-    sin(theta) / \|o across\|, with \|o across\|^2 = u and o.e = v, and both sides are divided by
-    \|o across\|; asin(y sqrt(u)) / sqrt(u) is a power series in u. Then
+    So that a point in line with both centres is no special case, the unknown is q = sin(theta) /
+    \|o across\|, with \|o across\|^2 = u and o.e = v, and both sides are divided by \|o across\|;
+    asin(y sqrt(u)) / sqrt(u) is a power series in u. Then
 
         w = a (cos theta - q v) e + (a q - 1) o
 
-    Implicitly, with grad R = e, grad v = (o - v e) / R and grad u = -2 v grad v.
+    The derivatives are those of the implicit function, with grad R = e, grad v = (o - v e) / R and
+    grad u = -2 v grad v.
     """
     b = a + thickness
     x = minus(point, centre)
@@ -274,7 +270,7 @@ def through_dome(
             out[i, 1 + j] = e[i] * lean_j + lean * turned / far + a * o[i] * q_j
         if out.shape[1] <= BY_PORT:
             continue
-        # with the centre both x and o move the other way; by o grad v = e, grad u = 2 across
+        # if the centre moves, x and o move the other way; by o grad v = e, grad u = 2 across
         v_o, u_o = e[j], 2.0 * across[j]
         q_o = -(by_v * v_o + by_u * u_o + 2.0 * by_o2 * o[j]) / by_q
         lean_o = lean_q * q_o - a * q * (0.5 * q * u_o / cosine + v_o)
@@ -287,7 +283,7 @@ def through_dome(
 def ray_through_dome(
     centre: Vector, a: float, thickness: float, glass: float, n: float, direction: Vector
 ) -> Ray:
-    """Return the ray behind a dome, as `pcfix.port.light.ray_through`."""
+    """Return the ray behind a dome, see `ray_through`."""
     o, s = scaled(-1.0, centre), unit(direction)
     inner = _meet(o, s, a)
     inside = bent(s, unit(inner), 1.0 / glass)
@@ -298,17 +294,10 @@ def ray_through_dome(
 
 @device
 def _meet(start: Vector, s: Vector, radius: float) -> Vector:
-    """Return where a ray that starts inside a sphere about the origin, or on it, leaves it."""
+    """Return where a ray that starts inside or on a sphere about the origin leaves it."""
     along = dot(start, s)
     f = -along + np.sqrt(along * along + max(radius * radius - dot(start, start), 0.0))
     return beyond(start, f, s)
-
-
-@device
-def cosine_at_dome(centre: Vector, a: float, direction: Vector) -> float:
-    """Return the cosine of the angle at which a ray from the projection centre meets a dome."""
-    o, s = scaled(-1.0, centre), unit(direction)
-    return dot(s, unit(_meet(o, s, a)))
 
 
 KIND, X, Y, Z, SIZE, THICK, GLASS = range(7)
@@ -330,7 +319,7 @@ def coefficients(port: Port) -> FloatArray:
 
 @device
 def through_port(port: FloatArray, n: float, x: float, y: float, z: float, out: FloatArray) -> None:
-    """Find in which direction the light of a point comes to the projection centre.
+    """Find the direction in which the light of a point reaches the projection centre.
 
     Parameters
     ----------
@@ -339,12 +328,12 @@ def through_port(port: FloatArray, n: float, x: float, y: float, z: float, out: 
     n : float
         Refractive index of the water relative to air, at least 1.
     x, y, z : float
-        The point, in the water outside of the port; camera frame, metres.
-    out : array, shape (3, 5) or wider
-        Filled. Column 0 is the direction w, camera frame, of any length; columns 1 to 3 are the
-        derivatives of w by x, y, z; column 4 is that by n; of a wider one, of eight columns at
-        least, column 5 is that by the distance of a flat port, or 5 to 7 are those by the centre
-        of a dome. NaN where the point is not outside of the port, or no light comes from it.
+        The point, in the water outside the port; camera frame, metres.
+    out : array, shape (3, 5) or (3, 8)
+        Column 0 gets the direction w, camera frame, of any length, columns 1 to 3 the derivatives
+        of w by x, y, z, column 4 that by n. Of eight columns, 5 gets that by the distance of a flat
+        port, or 5 to 7 those by the centre of a dome. NaN if the point is not outside the port, or
+        no light comes from it.
     """
     where = port[X], port[Y], port[Z]
     size, thickness, glass = port[SIZE], port[THICK], port[GLASS]
@@ -356,20 +345,10 @@ def through_port(port: FloatArray, n: float, x: float, y: float, z: float, out: 
 
 @device
 def ray_through(port: FloatArray, n: float, dx: float, dy: float, dz: float) -> Ray:
-    """Return how a ray from the projection centre goes on in the water.
+    """Return where a ray from the projection centre leaves the port, and its unit direction.
 
-    Parameters
-    ----------
-    port, n
-        As of `through_port`.
-    dx, dy, dz : float
-        Direction at the projection centre, camera frame, of any length.
-
-    Returns
-    -------
-    Ray
-        Where the ray leaves the outer face (metres) and its unit direction in the water, camera
-        frame; NaN where it does not meet the port.
+    Its direction in air, (dx, dy, dz), has any length; the rest is as for `through_port`. NaN if it
+    misses the port.
     """
     where = port[X], port[Y], port[Z]
     size, thickness, glass = port[SIZE], port[THICK], port[GLASS]
@@ -380,11 +359,8 @@ def ray_through(port: FloatArray, n: float, dx: float, dy: float, dz: float) -> 
 
 @device
 def cosine_at_port(port: FloatArray, dx: float, dy: float, dz: float) -> float:
-    """Return the cosine of the angle of incidence in air at the inner face.
-
-    The parameters are those of `ray_through`.
-    """
-    where = port[X], port[Y], port[Z]
+    """Return the cosine of the incidence angle in air at the inner face; see `ray_through`."""
+    where, s = (port[X], port[Y], port[Z]), unit((dx, dy, dz))
     if port[KIND] == FLAT:
-        return dot(where, unit((dx, dy, dz)))
-    return cosine_at_dome(where, port[SIZE], (dx, dy, dz))
+        return dot(where, s)
+    return dot(s, unit(_meet(scaled(-1.0, where), s, port[SIZE])))

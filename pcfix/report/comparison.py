@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.compare.figures import CORRECTED_BEFORE
 from pcfix.grid.colours import DIFFERENCE
 from pcfix.model import FloatArray
 from pcfix.options.steps import LAYERS
@@ -235,7 +234,9 @@ def in_a_sentence(compared: Plain) -> str:
     before, after = (pair[when].get("statistics", pair[when]) for when, _, _ in TIMES)
     name = name_of(compared["reference"])
     way = "fell" if after["rmse_m"] <= before["rmse_m"] else "grew"
-    twice = f" {CORRECTED_BEFORE}" if CORRECTED_BEFORE in compared["notes"] else ""
+    twice = "".join(
+        f" {n['message']}" for n in compared["notes"] if n["code"] == "cloud.corrected_twice"
+    )
     return (
         f" Against {name} the vertical error{' of the bed' if is_of_bed else ''} {way} from"
         f" {before['rmse_m']:.3f} to {after['rmse_m']:.3f} m (RMSE of {after['count']:,} points,"
@@ -267,7 +268,7 @@ def _histograms(compared: Plain) -> list[Picture]:
     rows = [(f"{way}, {name}", of) for way, name, _, of in c2c_rows(compared)]
     title = "Distance to the nearest point (C2C)"
     alt = f"{title}: histograms with fitted Gaussians. {_moments(rows)}"
-    alt += "".join(f" {n[:1].upper()}{n[1:]}." for n in compared["notes"] if "C2C" in n)
+    alt += "".join(f" {n['message']}" for n in compared["notes"] if n["code"].endswith(".sparse"))
     return [*pictures, Picture("histogram_c2c", title, alt, c2c_figure(compared))]
 
 

@@ -1,4 +1,4 @@
-"""The water surface from the cloud alone: `find_water`."""
+"""Find the water surface in the cloud itself."""
 
 from __future__ import annotations
 
@@ -9,19 +9,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import GeometryError, SettingError
+from pcfix.errors import GeometryError
 from pcfix.model import NOISE_CLASSES, FloatArray, WaterPlane
 from pcfix.water import search
-from pcfix.water.cues import SLOPE, gain_of
+from pcfix.water.checks import checked_column
+from pcfix.water.cues import SLOPE, Samples, gain_of, layer_gain, sample_cloud
 from pcfix.water.fit import fit_water
-from pcfix.water.samples import Samples, layer_gain, sample_cloud
-from pcfix.water.search import INSTEAD, LAYER, Looked, Peak, judge
-from pcfix.water.tilted import Tilted, find_tilt
+from pcfix.water.search import INSTEAD, LAYER, Looked, Peak, Tilted, find_tilt, judge
 
 LEAST_POINTS = 2_000
 LEAST_RELIEF_M = 0.3
 LEAST_SIGMA_M = 0.015
-"""No waterline is sharper: waves, and the thickness of the cloud."""
+"""Least standard error of a waterline, from waves and the thickness of the cloud."""
 TILT_SIGMAS, TILT_GAIN = 3.0, 6.0
 LEAST_CLASSIFIED = 30
 WATER_CLASSES = (9, 41)
@@ -36,23 +35,22 @@ def find_water(
     number_of_returns: npt.ArrayLike | None = None,
     classes: npt.ArrayLike | None = None,
 ) -> WaterProposal:
-    """Find the water surface from what a cloud shows of it.
+    """Find the water surface of a cloud.
 
-    Looked for are a height at which the ground gets flatter, as refraction lifts the bed; from
-    which on colour fades with depth; and where points float in a thin layer. Square tiles are
-    summed up on their own, and tiles drawn anew give the standard error. Points that are
-    classified as water decide alone.
+    It is the height below which the ground gets flatter, as refraction lifts the bed, or colour
+    fades with depth, or at which points float in a thin layer. Square tiles are summed separately,
+    and resampling them gives the standard error. Points classified as water are used instead.
 
     Parameters
     ----------
     xyz : array, shape (n, 3)
         Apparent points, metres, world frame.
     rgb : array, shape (n, 3), optional
-        In any unit from zero up. All equal counts as none.
+        In any unit from zero up. Equal colours count as none.
     number_of_returns : array, shape (n,), optional
-        Where pulses have several, points that float are sought among these.
+        If pulses have several, only points of these may float.
     classes : array, shape (n,), optional
-        ASPRS classes: 9 and 41 are the water surface, 7 and 18 noise that is left out.
+        ASPRS classes: 9 and 41 are the water surface, 7 and 18 noise, which is ignored.
 
     Returns
     -------
@@ -61,25 +59,30 @@ def find_water(
     Raises
     ------
     SettingError
-        If the arrays do not belong together.
+        ``option.shape`` if the arrays do not belong together.
     GeometryError
-        If the evidence is poor: no land, no water, weak or contradictory cues.
+        ``cloud.too_few_points``, ``cloud.flat``, or ``water.not_found`` if there is no land, no
+        water, or weak or contradictory evidence.
     """
     points = np.asarray(xyz, np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise SettingError(f"xyz must have the shape (n, 3), not {points.shape}.")
-    colours = _column("rgb", rgb, (len(points), 3))
-    returns = _column("number_of_returns", number_of_returns, (len(points),))
-    labels = _column("classes", classes, (len(points),))
+    n = len(points)
+    checked_column("xyz", points, (n, 3))
+    colours = None if rgb is None else checked_column("rgb", rgb, (n, 3))
+    labels = None if classes is None else checked_column("classes", classes, (n,))
+    returns = number_of_returns
+    if returns is not None:
+        returns = checked_column("number_of_returns", returns, (n,))
     kept = np.isfinite(points).all(axis=1)
     if labels is not None:
         kept &= ~np.isin(labels, NOISE_CLASSES)
     points = points[kept]
     if len(points) < LEAST_POINTS:
         raise GeometryError(
-            f"No water surface was looked for: {len(points)} points are too few,"
-            f" {LEAST_POINTS} are needed; {INSTEAD}."
-        )
+            "cloud.too_few_points",
+            f"{len(points)} points are too few to find the water, {LEAST_POINTS} are needed."
+            f" {INSTEAD}",
+            points=len(points), least=LEAST_POINTS,
+        )  # fmt: skip
     samples = sample_cloud(
         points, *(None if column is None else column[kept] for column in (colours, returns))
     )
@@ -91,16 +94,16 @@ def find_water(
 
 
 APART_M, APART_SIGMAS = 0.5, 3.0
-"""By how much a level must miss the shoreline of a cloud to be worth a word."""
+"""A level is only reported as another one if it differs by more than both."""
 LEAST_AGAINST, SURE_AGAINST = 100.0, 0.8
-"""Evidence of colours alone, and confidence of slope and colours together, that stands against a
-level that was given: more than is asked of a level where there is none, as none may be wrong."""
+"""Evidence of colours only, or confidence of slope and colours together, that contradicts a given
+level. They are higher than for `find_water`, to avoid false alarms."""
 
 
 def find_elsewhere(
     xyz: FloatArray, water_m: FloatArray, rgb: npt.NDArray[Any] | None
 ) -> tuple[WaterProposal | None, Tilted | None]:
-    """Return the water that a cloud shows elsewhere than that which was given, if any.
+    """Return water that a cloud shows elsewhere than the given water surface.
 
     Parameters
     ----------
@@ -113,8 +116,8 @@ def find_elsewhere(
     Returns
     -------
     level : WaterProposal or None
-        With heights above the given surface; None where the cloud shows it there, or nothing.
-        Only where another height gains most is it looked at as closely as `find_water` does.
+        With heights above the given surface; None if the cloud shows it there, or nothing. The full
+        search of `find_water` runs only if another height gains most.
     tilted : Tilted or None
     """
     samples = sample_cloud(np.column_stack([xyz[:, :2], xyz[:, 2] - water_m]), rgb, None)
@@ -126,7 +129,7 @@ def find_elsewhere(
 
 
 def _elsewhere(samples: Samples, whole: Looked) -> WaterProposal | None:
-    """Return the water at another height than zero, if it is sure."""
+    """Return the water at another height than zero, if it is certain."""
     heights = whole.heights_m
     gain = search.gains(whole, search.NO_TILT)
     here = gain[np.abs(heights + samples.origin[2]) <= APART_M].max(initial=0.0)
@@ -151,24 +154,15 @@ def _elsewhere(samples: Samples, whole: Looked) -> WaterProposal | None:
     return found if apart and sure else None
 
 
-def _column(
-    name: str, values: npt.ArrayLike | None, shape: tuple[int, ...]
-) -> npt.NDArray[Any] | None:
-    if values is None:
-        return None
-    column = np.asarray(values)
-    if column.shape != shape:
-        raise SettingError(f"{name} must have the shape {shape}, not {column.shape}.")
-    return column
-
-
 def _from_cues(samples: Samples) -> WaterProposal:
     heights = search.all_heights(samples)
     if np.ptp(heights) < LEAST_RELIEF_M:
         raise GeometryError(
-            f"No water surface was looked for: the ground has {np.ptp(heights):.2f} m of relief,"
-            f" {LEAST_RELIEF_M:g} m are needed to tell land from bed; {INSTEAD}."
-        )
+            "cloud.flat",
+            f"The ground has {np.ptp(heights):.2f} m of relief, {LEAST_RELIEF_M:g} m are needed to"
+            f" find the water. {INSTEAD}",
+            relief_m=float(np.ptp(heights)), least=LEAST_RELIEF_M,
+        )  # fmt: skip
     whole = search.look(samples, heights, search.NO_TILT)
     peak, near, sigma_m, tilt_along, sigma_tilt = _choose(samples, whole)
     confidence, evidence, reasons = judge(samples, peak, near, whole, sigma_m)
@@ -179,7 +173,8 @@ def _from_cues(samples: Samples) -> WaterProposal:
         )
     shore = samples.xyz[search.near_surface(samples, peak)]
     if len(shore) == 0:
-        raise GeometryError(f"No water surface was found: nowhere does ground pass it; {INSTEAD}.")
+        text = f"No water surface was found: no ground crosses the best candidate. {INSTEAD}"
+        raise GeometryError("water.not_found", text, reason="no_shoreline")
     shore = shore[:: math.ceil(len(shore) / MOST_SHORELINE)]
     centre = shore[:, :2].mean(axis=0)
     level = peak.level_m + float(centre @ peak.tilt) + float(samples.origin[2])
@@ -205,10 +200,10 @@ def _from_cues(samples: Samples) -> WaterProposal:
 
 
 def _choose(samples: Samples, whole: Looked) -> tuple[Peak, Looked, float, float, float]:
-    """Return the level, or the plane where the tilt is significant and earns its keep.
+    """Return the level, or the plane if its tilt is significant and gains enough.
 
-    With it come what was seen near it, the standard error of the level, and the tilt along the
-    shore with its standard error, NaN where it was not looked for.
+    Then follow the sums near it, the standard error of the level, and the tilt along the shore with
+    its standard error, NaN if it was not searched.
     """
     start = search.best(whole, search.NO_TILT[None])
     level, near = search.refine(samples, start, None)
@@ -221,6 +216,7 @@ def _choose(samples: Samples, whole: Looked) -> tuple[Peak, Looked, float, float
         along = float(plane.tilt @ axis)
         if plane.score > level.score + TILT_GAIN and abs(along) <= search.LARGEST_TILT:
             levels, tilts = search.drawn(near_plane, axis, step)
+            # the median absolute deviation, and the rounding to steps of tilt
             sigma_tilt = math.hypot(1.4826 * float(np.median(np.abs(tilts))), step / 6.0)
             if abs(along) > TILT_SIGMAS * sigma_tilt:
                 return plane, near_plane, _sigma(levels), along, sigma_tilt
@@ -234,52 +230,23 @@ def _sigma(levels_m: FloatArray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class WaterProposal:
-    """A water surface that a cloud suggests.
-
-    Attributes
-    ----------
-    surface : WaterPlane
-    sigma_level_m : float
-        Standard error of its height at `centre_xy`, from drawing tiles of the cloud anew. It knows
-        nothing of what deceives all of the shore alike, such as a bank that stops at the water.
-    centre_xy : array, shape (2,)
-        The middle of the shoreline, metres, world frame.
-    level_m : float
-        The height of the surface there.
-    tilt : array, shape (2,)
-        dz/dx and dz/dy.
-    sigma_tilt : float
-        Standard error of the tilt along the shore, dz per metre; NaN where it was not looked for.
-    confidence : float
-        0 to 1: how far the evidence is above what is refused.
-    evidence : dict of str to float
-        The figures, by name.
-    reasons : tuple of str
-        The same in sentences.
-    shoreline : array, shape (m, 3)
-        Places where the ground passes the surface, metres, world frame.
-    curve_height_m : array, shape (h,)
-        World heights; of a tilted surface, those above `centre_xy`.
-    curves : dict of array, shape (h,)
-        What each cue, by its name, gains from water at each height: the logarithm of a ratio of
-        likelihoods, under the tilt that was chosen.
-    ground : array, shape (c, 3)
-        The cloud thinned to cells, metres, world frame.
-    """
+    """A water surface found in a cloud."""
 
     surface: WaterPlane
     sigma_level_m: float
-    centre_xy: FloatArray
-    level_m: float
-    tilt: FloatArray
-    sigma_tilt: float
-    confidence: float
-    evidence: dict[str, float]
-    reasons: tuple[str, ...]
-    shoreline: FloatArray
-    curve_height_m: FloatArray
-    curves: dict[str, FloatArray]
-    ground: FloatArray
+    """Standard error of its height at `centre_xy`, by resampling tiles of the cloud. It does not
+    include errors that all of the shore shares, such as a bank that stops at the water."""
+    centre_xy: FloatArray  # (2,), centre of the shoreline, metres, world frame
+    level_m: float  # height of the surface there
+    tilt: FloatArray  # (2,), dz/dx and dz/dy
+    sigma_tilt: float  # standard error of the tilt along the shore; NaN if it was not searched
+    confidence: float  # 0 to 1, by how much the evidence exceeds what is refused
+    evidence: dict[str, float]  # figures by name
+    reasons: tuple[str, ...]  # the same in sentences
+    shoreline: FloatArray  # (m, 3), where the ground crosses the surface, metres, world frame
+    curve_height_m: FloatArray  # (h,), world heights; of a tilted surface, above `centre_xy`
+    curves: dict[str, FloatArray]  # (h,), gain (log likelihood ratio) of each cue at each height
+    ground: FloatArray  # (c, 3), the cloud thinned to cells, metres, world frame
 
     def as_dict(self) -> dict[str, Any]:
         """Return the figures as plain values."""
@@ -296,7 +263,7 @@ class WaterProposal:
 
 
 def _from_classes(water: FloatArray, samples: Samples) -> WaterProposal:
-    """Return what fits the points of the water classes, shape (w, 3), world frame."""
+    """Fit the points of the water classes, shape (w, 3), world frame."""
     thinned = water[:: math.ceil(len(water) / MOST_SHORELINE)]
     fit = fit_water(thinned)
     share = float(fit.accepted.mean())

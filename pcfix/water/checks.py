@@ -1,9 +1,10 @@
-"""Whether points, cameras and a water surface can be ones, and how they lie to each other."""
+"""Check points and cameras against the water surface."""
 
 from __future__ import annotations
 
 import math
 import warnings
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,12 +24,12 @@ from pcfix.sums import Sums
 from pcfix.water.surface import surface_above
 
 MOST_TILT = 0.05
-"""Rise per metre of a whole surface. Rapids reach 2 %; a weir is steeper, but only in part."""
+"""Largest rise per metre of a surface. Rapids reach 2 %; a weir is steeper, but only a part."""
 DEEPEST_M = 100.0
-"""No photograph shows a bed as deep as this."""
+"""No photograph shows a bed at this depth."""
 DOUBTFUL_M, TOO_DEEP_M, DEEP_SHARE = 30.0, 60.0, 0.05
-"""Through clear water photographs show a bed down to the first; nobody has reported the second.
-More than this share of the points must be so deep, as a few may be mismatches."""
+"""In clear water photographs show a bed down to the first depth; the second was never reported.
+A smaller share of deep points may be mismatches."""
 FOOT_M = 0.3048
 CLEARLY_OFF_M = 10.0
 _ENOUGH_HEIGHTS = 200_000
@@ -37,30 +38,43 @@ _ENOUGH_HEIGHTS = 200_000
 def checked_points(xyz: npt.ArrayLike) -> FloatArray:
     """Return finite points, C-contiguous, shape (n, 3).
 
-    Raises
-    ------
-    SettingError
-        If the shape is another, or a coordinate is not finite.
+    Raises SettingError ``option.shape`` or ``cloud.not_finite``.
     """
     points = np.ascontiguousarray(xyz, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise SettingError(f"xyz must have the shape (n, 3), not {points.shape}.")
+        raise SettingError(
+            "option.shape", f"xyz has the shape {points.shape}. It must be (n, 3).",
+            option="xyz", shape=points.shape,
+        )  # fmt: skip
     finite = np.isfinite(points)
     if not finite.all():
         row = int(np.argmin(finite.all(axis=1)))
-        raise SettingError(f"xyz row {row} is not finite: {points[row].tolist()}; remove it.")
+        raise SettingError(
+            "cloud.not_finite",
+            f"xyz row {row} is not finite: {points[row].tolist()}. Remove the point.",
+            row=row,
+        )
     return points
+
+
+def checked_column(name: str, values: npt.ArrayLike, shape: tuple[int, ...]) -> npt.NDArray[Any]:
+    """Return values as an array; SettingError ``option.shape`` if it has not this shape."""
+    column = np.asarray(values)
+    if column.shape != shape:
+        raise SettingError(
+            "option.shape",
+            f"{name} has the shape {column.shape}. It must be {shape}, one row per point.",
+            option=name, shape=column.shape,
+        )  # fmt: skip
+    return column
 
 
 def as_surface(
     water: WaterSurface | float | npt.ArrayLike, n: int
 ) -> tuple[WaterSurface, FloatArray | None]:
-    """Return the water surface, and its height above each of n points where it is given so.
+    """Return the water surface, and its heights above n points if it is given by them.
 
-    Raises
-    ------
-    SettingError
-        If there is not one height per point.
+    Raises SettingError ``water.number`` or ``option.shape``.
     """
     if isinstance(water, WaterSurface):
         return water, None
@@ -68,22 +82,17 @@ def as_surface(
     if heights.ndim == 0:
         level = float(heights)
         if not math.isfinite(level):
-            raise SettingError(f"water '{level}': the numbers must be finite.")
+            raise SettingError("water.number", f"water '{level}' is not finite.", value=level)
         return WaterPlane(level), None
-    if heights.shape != (n,):
-        raise SettingError(f"water must be one height or {n}, not of shape {heights.shape}.")
-    return WaterDimension("given heights"), heights
+    return WaterDimension("given heights"), checked_column("water", heights, (n,))
 
 
 def check_above_water(
     cameras: Cameras, water: WaterSurface, level_offset_m: FloatArray | None = None
 ) -> None:
-    """Refuse cameras that stand under the water, each under its own where that moves.
+    """Raise GeometryError ``cameras.under_water`` if a camera is below the water.
 
-    Raises
-    ------
-    GeometryError
-        With the first of them, and what is likely wrong.
+    `level_offset_m`, shape (k,), is the height of the water at each image above the surface.
     """
     match water:
         case WaterPlane(a, b, c):
@@ -97,52 +106,49 @@ def check_above_water(
             height = surface_above(water, cameras.centres).height_m
             level = np.where(np.isnan(height), np.nanmin(water.height_m), height)
         case WaterDimension():
-            return  # known only once the points are; see `correct_file`
+            return  # known with the points only; see `correct_file`
     offset = 0.0 if level_offset_m is None else level_offset_m
     refuse_under_water(cameras, level + offset, str(water))
 
 
 def refuse_under_water(cameras: Cameras, level: FloatArray | float, water: str) -> None:
-    """Refuse cameras below a level, metres: one for all, or one each, shape (k,)."""
+    """Raise GeometryError for cameras below a level, metres: one for all, or shape (k,)."""
     below = np.flatnonzero(cameras.centres[:, 2] <= level)
     if below.size:
         first = below[0]
         raise GeometryError(
-            f"{below.size} of {len(cameras)} cameras are under the water, the first"
-            f" {cameras.labels[first]} at z = {cameras.centres[first, 2]:.2f} m ({water}): check"
-            " the heights' datum, the order of the columns and the water surface."
-        )
+            "cameras.under_water",
+            f"{below.size} of {len(cameras)} cameras are under the water ({water}), the first"
+            f" {cameras.labels[first]} at z = {cameras.centres[first, 2]:.2f} m. Check the vertical"
+            " datum, the order of the columns and the water surface.",
+            cameras=int(below.size), first=cameras.labels[first],
+        )  # fmt: skip
 
 
 def check_submerged(count: int, name: str, water: WaterSurface, heights: str = "") -> None:
-    """Refuse a cloud of which no point lies below the water.
+    """Raise GeometryError ``water.below_cloud`` if no point lies below the water.
 
-    Raises
-    ------
-    GeometryError
-        With the cloud's name, the surface, and what `heights` says of the cloud's.
+    `heights` describes those of the cloud.
     """
     if count == 0:
         raise GeometryError(
-            f"{name}: no point lies below the water ({water}){heights}; check the water's height,"
-            " and that it has the cloud's vertical datum."
+            "water.below_cloud",
+            f"{name}: no point lies below the water ({water}){heights}. Check the height of the"
+            " water and its vertical datum.",
+            path=name,
         )
 
 
 def check_tilt(water: WaterSurface) -> None:
-    """Refuse a surface that as a whole is steeper than water is.
-
-    Raises
-    ------
-    GeometryError
-        With the tilt of the plane that fits it best.
-    """
+    """Raise GeometryError ``water.tilt`` if a surface is steeper than `MOST_TILT` as a whole."""
     tilt = overall_tilt(water)
     if tilt > MOST_TILT:
         raise GeometryError(
-            f"The water surface ({water}) is tilted by {100.0 * tilt:.1f} %; {100 * MOST_TILT:g} %"
-            " is the most that pcfix takes for water: check the units and the order of the"
-            " numbers, and that the surface holds nothing but water."
+            "water.tilt",
+            f"The water surface ({water}) is tilted by {100.0 * tilt:.1f} %, more than"
+            f" {100 * MOST_TILT:g} %. Check its units, the order of the numbers, and that it"
+            " contains only water.",
+            tilt=tilt,
         )
 
 
@@ -154,26 +160,20 @@ def overall_tilt(water: WaterSurface) -> float:
         case WaterDimension():
             return 0.0
         case WaterMesh():
-            return _tilt_of(water.vertices[np.unique(water.triangles)])
+            xyz = water.vertices[np.unique(water.triangles)]
         case WaterRaster():
             row, column = np.nonzero(np.isfinite(water.height_m))
             step = len(row) // _ENOUGH_HEIGHTS + 1
             row, column = row[::step], column[::step]
             width, height = water.cell_m
-            return _tilt_of(
-                np.column_stack([column * width, -row * height, water.height_m[row, column]])
-            )
-
-
-def _tilt_of(xyz: FloatArray) -> float:
-    """Return the tilt of the plane with the least squares along z; of a line, along it."""
+            xyz = np.column_stack([column * width, -row * height, water.height_m[row, column]])
     local = xyz - xyz.mean(axis=0)
-    slope = np.linalg.lstsq(local[:, :2], local[:, 2], rcond=1e-6)[0]
+    slope = np.linalg.lstsq(local[:, :2], local[:, 2], rcond=1e-6)[0]  # of a line, along it
     return float(np.hypot(*slope))
 
 
 class WaterMeeting(Sums):
-    """How cloud and water lie to each other, added up chunk by chunk."""
+    """Depths and coverage of a cloud below a water surface, accumulated over chunks."""
 
     added = (
         *("_points", "_submerged", "_uncovered", "_uncovered_low"),
@@ -209,62 +209,66 @@ class WaterMeeting(Sums):
         self._uncovered_low += int((z[unknown] < self._highest_m).sum())
 
     def check_submerged(self, name: str) -> None:
-        """Refuse water that lies below the cloud.
-
-        Raises
-        ------
-        GeometryError
-            If no point lies below it.
-        """
+        """Raise GeometryError if no point lies below the water."""
         check_submerged(self._submerged, name, self._water, self._heights())
 
     def check_reach(self, name: str) -> None:
-        """Refuse water far above the cloud, and warn of points that it does not cover.
+        """Check for water far above the cloud, and warn of points that it does not cover.
 
         Raises
         ------
         GeometryError
-            If all points lie deeper than `DEEPEST_M`, or many deeper than `TOO_DEEP_M` where that
-            was not allowed.
+            ``water.above_cloud`` if all points are deeper than `DEEPEST_M`; ``water.too_deep`` if
+            many are deeper than `TOO_DEEP_M` and that was not allowed.
         """
+        found = []
+        where = f"below the water ({self._water})"
         if self._submerged == self._points and self._least_depth_m > DEEPEST_M:
             raise GeometryError(
-                f"{name}: all points lie more than {DEEPEST_M:g} m below the water"
-                f" ({self._water}), the highest {self._least_depth_m:.0f} m{self._heights()}; check"
-                " the water's height, and that it has the cloud's vertical datum."
-            )
-        self.notes = []
-        self._check_depths(name)
-        if self._uncovered_low:
-            self.notes += [
-                f"{name}: the water surface ({self._water}) does not cover"
-                f" {100.0 * self._uncovered / self._points:.1f} % of the points; of these"
-                f" {self._uncovered_low:,} lie lower than its highest place and may be under water,"
-                " but are not touched."
-            ]
-        for note in self.notes:
-            warnings.warn(note, PcfixWarning, stacklevel=2)
-
-    def _check_depths(self, name: str) -> None:
-        """Refuse, or note, depths that are not seen through water."""
+                "water.above_cloud",
+                f"{name}: all points lie more than {DEEPEST_M:g} m {where}, the highest"
+                f" {self._least_depth_m:.0f} m{self._heights()}. Check the height of the water and"
+                " its vertical datum.",
+                path=name, depth_m=self._least_depth_m,
+            )  # fmt: skip
         least = DEEP_SHARE * self._submerged
-        deepest = f"the deepest {self._most_depth_m:.0f} m below the water ({self._water})"
         land = "" if self._submerged < self._points else "; no point is left as land"
-        why = f"{deepest}{land}{self._heights()}: check the water's height and its vertical datum"
+        why = f"the deepest {self._most_depth_m:.0f} m {where}{land}{self._heights()}"
         if self._too_deep > least and not self._may_be_deep:
             raise GeometryError(
+                "water.too_deep",
                 f"{name}: {self._too_deep:,} of {self._submerged:,} submerged points lie deeper"
-                f" than {TOO_DEEP_M:g} m, which no photograph shows, {why}, or say --deep if that"
-                " is right."
-            )
+                f" than {TOO_DEEP_M:g} m, {why}. Check the height of the water and its vertical"
+                " datum, or use --deep if the depths are right.",
+                path=name, points=self._too_deep, depth_m=self._most_depth_m,
+            )  # fmt: skip
         if self._doubtful > least:
-            self.notes = [
-                f"{name}: {self._doubtful:,} of {self._submerged:,} submerged points lie deeper"
-                f" than {DOUBTFUL_M:g} m, which photographs hardly ever show, {why}."
-            ]
+            found.append(
+                PcfixWarning(
+                    "water.deep",
+                    f"{name}: {self._doubtful:,} of {self._submerged:,} submerged points lie deeper"
+                    f" than {DOUBTFUL_M:g} m, {why}. Check the height of the water and its vertical"
+                    " datum.",
+                    points=self._doubtful,
+                )
+            )
+        if self._uncovered_low:
+            found.append(
+                PcfixWarning(
+                    "water.not_covered",
+                    f"{name}: the water surface ({self._water}) does not cover"
+                    f" {100.0 * self._uncovered / self._points:.1f} % of the points;"
+                    f" {self._uncovered_low:,} of them are lower than its highest place and may be"
+                    " under water. They are not corrected.",
+                    points=self._uncovered_low,
+                )
+            )
+        self.notes = [str(one) for one in found]
+        for one in found:
+            warnings.warn(one, stacklevel=2)
 
     def _heights(self) -> str:
-        """Return between which heights the cloud lies, and whether one of the two is in feet."""
+        """Return the range of the cloud's heights, and whether cloud or water may be in feet."""
         low, high, level = self._low_m, self._high_m, self._lowest_water_m
         if not np.isfinite([low, high]).all():
             return ""
@@ -273,12 +277,12 @@ class WaterMeeting(Sums):
             return text
         for factor, whose in ((FOOT_M, "the water is"), (1.0 / FOOT_M, "the cloud's heights are")):
             if low <= level * factor <= high:
-                return f"{text}, and the water would lie among them if {whose} in feet"
+                return f"{text}, and the water would be within them if {whose} in feet"
         return text
 
 
 def _highest(water: WaterSurface) -> float:
-    """Return the highest known place of a surface that may leave points uncovered."""
+    """Return the greatest height of a surface that may not cover all points."""
     match water:
         case WaterMesh(vertices):
             return float(vertices[:, 2].max())

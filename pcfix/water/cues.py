@@ -1,69 +1,60 @@
-"""The cues whose change with height gives the water away: slope, colour, brightness, noise.
+"""Cues whose change with height shows the water: slope, colour, brightness, noise.
 
-Slope: refraction lifts the bed towards the surface, so its slopes below the waterline are about
-1/1.34 of the true ones (less under slanting rays), and a beach has a break there of known size.
-Colour: water swallows red light first (where it is brown with peat, blue), so that the ratio to
-green is steady on land and falls with the depth from the waterline on: logarithms of light fall
-straight with depth (Lyzenga 1978, Applied Optics 17: 379-383). Brightness and noise change as well,
-but wet sand is dark above the water too, and noise grows with depth: they only bear witness.
+Slope: refraction lifts the bed towards the surface, so that its slopes below the waterline are
+about 1/1.34 of the true ones (less under oblique rays), and a beach has a break of known size.
+Colour: water absorbs red light first (brown water with peat, blue), so that the ratio to green is
+constant on land and falls with depth: logarithms of light fall linearly with depth (Lyzenga 1978,
+Applied Optics 17: 379-383). Brightness and noise change too, but wet sand is dark above the water,
+and noise grows with depth: they only support the others.
 
-Looked for is a broken line against the unbroken one, tile by tile, for every height where it may
-break: y = (smooth within each tile) + trend * height + amplitude * f(depth), where f(d) = D (1 -
-exp(-d / D)) below the height in question and 0 above it; trend and amplitude are the same in all
-tiles. Where the amplitude is free, the trend must be the weaker of the two: what fades under water
-is steady on land. Each tile gives its sums of squares and products once; to add tiles, at their own
-heights under a tilted surface, or to draw them anew, costs little then.
+A broken line is tested against an unbroken one, tile by tile, for every height of the break: y =
+(smooth within each tile) + trend * height + amplitude * f(depth), where f(d) = D (1 - exp(-d / D))
+below that height and 0 above it; trend and amplitude are common to all tiles. A free amplitude must
+exceed the trend: what fades under water is constant on land. Each tile has its sums of squares and
+products, so that adding tiles, at their own heights under a tilted surface, or resampling them is
+cheap.
+
+Floating points are well above the ground around them and lie in a thin layer at one height: waves,
+foam and glints that images match by chance. Leaves and wires are above the ground too, but at all
+heights.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.model import FloatArray, IntArray
-from pcfix.water.samples import Samples, square_tiles
 
 LEAST_SIDE = 8.0
-"""Cells (weights added) that a tile must have above a height, and below, to say anything."""
+"""Least sum of weights of the cells of a tile above a height, and below."""
 _TINY = 1e-12
 _STEADY_M = 0.3
 
 
 class Break(NamedTuple):
-    """The break that is looked for.
+    """The break that is tested."""
 
-    scale_m : D, infinite for a straight line below.
-    window_m : observations weigh less towards this far above and below.
-    sign : +1 or -1, what the amplitude must be.
-    amplitude : where physics gives it; else it is free.
-    most : a free amplitude larger than this is not likely, one twice as large is something else.
-    """
-
-    scale_m: float
-    window_m: float
-    sign: float
-    amplitude: float | None = None
-    most: float = np.inf
+    scale_m: float  # D, infinite for a straight line below
+    window_m: float  # observations weigh less towards this distance above and below
+    sign: float  # +1 or -1, of the amplitude
+    amplitude: float | None = None  # given by physics, or free
+    most: float = np.inf  # a larger free amplitude is unlikely, twice as much impossible
 
 
 class Moments(NamedTuple):
-    """Sums of t tiles at h heights.
+    """Sums of t tiles at h heights."""
 
-    sums : shape (t, h, 6), of yy, yx, yf, xx, xf, ff after the smooth part is taken out of the
-        y, x (height) and f; each tile in units of its own residual variance.
-    number : shape (t, h), how many observations that is.
-    xy : shape (t, 2), the middle of each tile.
-    heights_m : shape (h,), evenly spaced.
-    what : Break
-    """
-
+    # (t, h, 6): yy, yx, yf, xx, xf, ff without the smooth part of y, x (height) and f; each tile
+    # in units of its own residual variance
     sums: FloatArray
-    number: FloatArray
-    xy: FloatArray
-    heights_m: FloatArray
+    number: FloatArray  # (t, h), observations
+    xy: FloatArray  # (t, 2), centre of each tile
+    heights_m: FloatArray  # (h,), evenly spaced
     what: Break
 
     def shifted(self, tilt: FloatArray) -> Moments:
@@ -79,20 +70,15 @@ class Moments(NamedTuple):
 
 
 class Gain(NamedTuple):
-    """What the break explains, h heights.
+    """The gain of a break at h heights."""
 
-    gain : shape (h,), logarithm of the ratio of likelihoods with and without it, scaled down to
-        what the differences between tiles allow.
-    amplitude, sigma : shape (h,), and its standard error from those differences.
-    """
-
-    gain: FloatArray
-    amplitude: FloatArray
-    sigma: FloatArray
+    gain: FloatArray  # (h,), log likelihood ratio, reduced by the differences between tiles
+    amplitude: FloatArray  # (h,)
+    sigma: FloatArray  # (h,), its standard error from those differences
 
 
 def gain_of(moments: Moments, times: FloatArray | None = None) -> Gain:
-    """Add up the tiles, each as many times as `times` says."""
+    """Add the tiles, each `times` times, and return the gain of the break."""
     sums = moments.sums if times is None else moments.sums * times[:, None, None]
     count = moments.number if times is None else moments.number * times[:, None]
     yy, yx, yf, xx, xf, ff = np.moveaxis(sums.sum(axis=0), -1, 0)
@@ -125,25 +111,20 @@ def gain_of(moments: Moments, times: FloatArray | None = None) -> Gain:
 
 
 def running_mean(values: FloatArray, width: int) -> FloatArray:
-    """Return means over so many neighbours, shape (n,), mirrored at the ends.
-
-    To the bit what scipy's ``uniform_filter1d`` has, which is not quick to load.
-    """
+    """Return means over `width` neighbours, shape (n,), mirrored at the ends."""
     before = width // 2
     around = np.pad(values, (before, width - 1 - before), mode="symmetric")
-    first = np.cumsum(around[:width])[-1:]
-    return np.asarray(np.cumsum(np.r_[first, around[width:] - around[:-width]]) / width)
+    return np.asarray(np.convolve(around, np.full(width, 1.0 / width), mode="valid"))
 
 
 def tile_moments(
     smooth: FloatArray, y: FloatArray, at_m: FloatArray, heights_m: FloatArray, what: Break,
     *, with_trend: bool,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Return the sums of one tile, shapes (h, 6) and (h,); zero at heights that it does not reach.
+    """Return the sums of one tile, shapes (h, 6) and (h,); zero at heights outside it.
 
-    The observations y, shape (n,), belong to the heights `at_m`; `smooth`, shape (n, p), has the
-    columns of the smooth part. With a trend y may change with height in the same way above and
-    below.
+    The observations y, shape (n,), have the heights `at_m`; `smooth`, shape (n, p), has the columns
+    of the smooth part. With a trend, y may change with height in the same way above and below.
     """
     reached = np.arange(*np.searchsorted(heights_m, [at_m.min(), at_m.max()]))
     depth = heights_m[reached, None] - at_m
@@ -184,7 +165,7 @@ def gather(
     parts: list[tuple[FloatArray, FloatArray]], xy: list[FloatArray], heights_m: FloatArray,
     what: Break,
 ) -> Moments | None:  # fmt: skip
-    """Put tiles together, each in units of its residual variance; None where none says anything."""
+    """Join tiles, each in units of its residual variance; None without any information."""
     telling = [i for i, (_, count) in enumerate(parts) if count.any()]
     if not telling:
         return None
@@ -196,28 +177,24 @@ def gather(
 
 
 LIFT = 0.36
-"""n - 1 and a little, as rays slant: how much flatter the bed looks than it is."""
+"""n - 1 and a little more for oblique rays: the apparent reduction of slopes."""
 MOST_FADING = 1.2
-"""Per metre. Clear water gives about 0.3, twice the difference in attenuation over the gamma of
-images; what changes faster than any but the darkest water is ground: plants, or a wet edge."""
+"""Per metre. Clear water has about 0.3, twice the difference in attenuation over the gamma of
+images; faster changes, except in the darkest water, are of the ground: plants, or a wet edge."""
 SLOPE_TILE_CELLS, LIGHT_TILE_CELLS = 12.0, 24.0
 _LEAST_CELLS, _LEAST_RELIEF_M = 40, 0.1
 _ROUGHNESS_FLOOR_M = 1e-3
 
 
 class Cue(NamedTuple):
-    """A thing to look at.
-
-    places : whether it fixes the level, or only bears witness.
-    values : what is looked at, shape (m,); None for the ground itself.
-    """
+    """A cue."""
 
     name: str
     meaning: str
     what: Break
     tile_cells: float
-    places: bool
-    values: Callable[[Samples], FloatArray] | None
+    places: bool  # whether it determines the level, or only supports others
+    values: Callable[[Samples], FloatArray] | None  # (m,); None for the ground itself
 
 
 SLOPE = Cue(
@@ -246,7 +223,7 @@ NOISE = Cue(
 
 
 def cues_of(samples: Samples) -> tuple[Cue, ...]:
-    """Return the cues that these samples can give."""
+    """Return the cues of these samples."""
     return (SLOPE, RED, BLUE, BRIGHT, NOISE) if len(samples.colour) else (SLOPE, NOISE)
 
 
@@ -265,11 +242,14 @@ def cue_moments(
             smooth, y = np.ones((len(rows), 1)), values[rows]
             at = samples.smooth_m[rows] - fall[rows]
         else:
-            smooth, y = _quadratic(xy[rows]), samples.xyz[rows, 2] - fall[rows]
+            place = xy[rows] - xy[rows].mean(axis=0)
+            u, v = (place / max(float(np.ptp(xy[rows])), 1e-9)).T
+            smooth = np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v])
+            y = samples.xyz[rows, 2] - fall[rows]
             if y.min() > heights_m[-1] or y.max() < heights_m[0]:
                 continue
-            # the ground breaks where it passes the height when smooth, not by each height itself:
-            # noise would be on both sides of the equation and hide the break
+            # the smooth ground passes the height of the break: with the heights themselves, noise
+            # would be on both sides of the equation and hide the break
             at = smooth @ np.linalg.lstsq(smooth, y, rcond=None)[0]
             if np.ptp(at) < _LEAST_RELIEF_M:
                 continue
@@ -280,7 +260,7 @@ def cue_moments(
 
 
 def _rows_of_tiles(xy: FloatArray, side_m: float) -> list[IntArray]:
-    """Return the rows of each square tile that holds enough cells; `xy` from zero up."""
+    """Return the rows of each square tile with enough cells; `xy` from zero up."""
     _, tile = np.unique(square_tiles(xy, side_m), return_inverse=True)
     tile = tile.reshape(-1)
     order = np.argsort(tile, kind="stable")
@@ -288,6 +268,131 @@ def _rows_of_tiles(xy: FloatArray, side_m: float) -> list[IntArray]:
     return [part for part in parts if len(part) >= _LEAST_CELLS]
 
 
-def _quadratic(xy: FloatArray) -> FloatArray:
-    x, y = ((xy - xy.mean(axis=0)) / max(float(np.ptp(xy)), 1e-9)).T
-    return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+MOST_CELLS = 100_000
+POINTS_PER_CELL = 4.0
+NEIGHBOURS = 8
+_TRIES = 4
+LEAST_ABOVE_M, TIMES_NOISE = 0.25, 10.0
+"""Below this, the tail of the noise follows the ground and accumulates where that is flat."""
+HALF_LAYER_M, HALF_AROUND_M = 0.05, 0.6
+MOST_GAIN = 100.0
+"""Limit of the gain of many points, which are not independent."""
+TILE_CELLS = 12.0
+
+
+class Samples(NamedTuple):
+    """One row per cell that holds points; m of them."""
+
+    xyz: FloatArray  # (m, 3), mean x and y, median z, metres from `origin`
+    smooth_m: FloatArray  # (m,), height at x, y of a plane through the cells around it
+    rough_m: FloatArray  # (m,), rms distance of the cells around from that plane
+    colour: FloatArray  # (m, 3), mean natural logarithms of red, green, blue; (0, 3) for none
+    cell_m: float  # side of a cell
+    origin: FloatArray  # (3,), world frame
+    floating: FloatArray  # (p, 3), points well above the ground, from `origin`
+    tile: IntArray  # (p,), number of the square of each of these
+
+
+def sample_cloud(
+    xyz: FloatArray, rgb: npt.NDArray[Any] | None, returns: npt.NDArray[Any] | None
+) -> Samples:
+    """Thin a cloud, shape (n, 3), metres, world frame, to cells, and find floating points.
+
+    Colours, shape (n, 3), are in any unit from zero up; equal ones count as none. `returns`, shape
+    (n,), are those of each pulse: if some have several, only these may float.
+    """
+    origin = xyz.min(axis=0)
+    local = xyz - origin
+    cell_m = _cell_m(local)
+    cell = square_tiles(local, cell_m)
+    _, of_point, count = np.unique(cell, return_inverse=True, return_counts=True)
+    of_point = of_point.reshape(-1)
+    mean = [np.bincount(of_point, local[:, i]) / count for i in (0, 1)]
+    ordered = local[np.lexsort((local[:, 2], of_point)), 2]
+    first = np.cumsum(count) - count
+    median = (ordered[first + (count - 1) // 2] + ordered[first + count // 2]) / 2.0
+    ground = np.column_stack([*mean, median])
+    smooth, rough = _planes_around(ground)
+    colour = np.empty((0, 3))
+    if rgb is not None and (rgb != rgb[:1]).any():
+        light = rgb.astype(np.float64)
+        white = max(float(np.percentile(light, 99.0)), 1e-9)
+        logs = np.log(light + 0.004 * white)  # a small part of white keeps black finite
+        colour = np.column_stack([np.bincount(of_point, column) / count for column in logs.T])
+    least = np.maximum(LEAST_ABOVE_M, TIMES_NOISE * rough)
+    above = local[:, 2] - smooth[of_point] > least[of_point]
+    if returns is not None and 0.01 <= (returns > 1).mean() <= 0.99:
+        above &= returns > 1
+    floating = local[above]
+    tile = square_tiles(floating, TILE_CELLS * cell_m)
+    return Samples(ground, smooth, rough, colour, cell_m, origin, floating, tile)
+
+
+def _cell_m(local: FloatArray) -> float:
+    """Return the side of cells of about `POINTS_PER_CELL`, at most `MOST_CELLS` of them."""
+    wanted = min(len(local) / POINTS_PER_CELL, MOST_CELLS)
+    side = float(np.sqrt(max(np.prod(np.ptp(local[:, :2], axis=0)), 1e-6) / wanted))
+    for _ in range(_TRIES):  # clouds seldom fill their bounding box
+        held = len(np.unique(square_tiles(local, side)))
+        side *= np.sqrt(held / wanted)
+    return side
+
+
+def square_tiles(local: FloatArray, side_m: float) -> IntArray:
+    """Return the number of the square of each place, x and y from zero up."""
+    column, row = (local[:, :2] / side_m).astype(np.int64).T
+    return np.asarray(row * (column.max(initial=0) + 1) + column)
+
+
+def _planes_around(ground: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return height at each place, and rms residual, of the plane through its neighbours."""
+    from scipy.spatial import cKDTree  # slow to import
+
+    k = min(NEIGHBOURS, len(ground) - 1)
+    _, near = cKDTree(ground[:, :2]).query(ground[:, :2], k=k + 1)
+    around = ground[np.asarray(near)[:, 1:]] - ground[:, None]
+    design = np.concatenate([np.ones((*around.shape[:2], 1)), around[..., :2]], axis=2)
+    normal = np.einsum("mki,mkj->mij", design, design)
+    scale = np.trace(normal, axis1=1, axis2=2)[:, None, None]
+    right = np.einsum("mki,mk->mi", design, around[..., 2])
+    plane = np.linalg.solve(normal + 1e-9 * scale * np.eye(3), right[..., None])[..., 0]
+    residual = around[..., 2] - np.einsum("mki,mi->mk", design, plane)
+    spare = max(k - 3, 1)
+    return ground[:, 2] + plane[:, 0], np.sqrt((residual**2).sum(axis=1) / spare)
+
+
+def layer_gain(
+    samples: Samples, heights_m: FloatArray, tilt: FloatArray, times: FloatArray | None = None
+) -> FloatArray:
+    """Return the log ratio of Poisson likelihoods with and without a layer at each height.
+
+    The expected counts come from above and below. Points of one tile at one height count once.
+    Heights, shape (h,), are evenly spaced above the tilted plane through the origin of the samples.
+    Each point counts as often as in `times`.
+    """
+    step = heights_m[1] - heights_m[0]
+    height = samples.floating[:, 2] - samples.floating[:, :2] @ tilt
+    column = np.rint((height - heights_m[0]) / step).astype(np.int64)
+    inside = (column >= 0) & (column < len(heights_m))
+    key = samples.tile * (np.ptp(column) + 1 if len(column) else 1) + column
+    once = np.zeros(len(column), bool)
+    once[np.unique(key - column.min(initial=0), return_index=True)[1]] = True
+    once &= inside
+    counts = np.bincount(
+        column[once], None if times is None else times[once], minlength=len(heights_m)
+    )
+    sums = np.concatenate([[0.0], np.cumsum(counts)])
+    layer, in_layer = _within(sums, round(HALF_LAYER_M / step))
+    wide, in_wide = _within(sums, round(HALF_AROUND_M / step))
+    around = np.maximum(in_wide - in_layer, 1)
+    expected = np.maximum(wide - layer, 1.0) * in_layer / around
+    ratio = np.maximum(layer / expected, 1.0)
+    gain = layer * np.log(ratio) - expected * (ratio - 1.0)
+    return np.asarray(-MOST_GAIN * np.expm1(-gain / MOST_GAIN))
+
+
+def _within(sums: FloatArray, reach: int) -> tuple[FloatArray, IntArray]:
+    """Return the counts within `reach` bins of each bin, and the number of these bins."""
+    middle = np.arange(len(sums) - 1)
+    low, high = np.maximum(middle - reach, 0), np.minimum(middle + reach + 1, len(sums) - 1)
+    return sums[high] - sums[low], high - low

@@ -1,4 +1,4 @@
-"""Points on the shoreline: their heights from the cloud, and the water surface fitted to them."""
+"""Fit a water surface to shoreline points, and take their heights from the cloud."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from pcfix.water.robust import Regression, ShoreFit, of_all, robust_regression, 
 Model = Literal["auto", "level", "plane", "along"]
 MAX_TILT_PERCENT = 5.0
 SIGNIFICANCE = 0.05
-"""A tilt that chance alone gives more often than this is none."""
+"""A tilt is significant if chance gives it more rarely."""
 LINE_RATIO = 0.1
-"""Points with less spread across than this part of their spread along are on one line."""
+"""Points are on one line if their spread across it is less than this share of that along it."""
 LONG_RATIO = 1.0 / 3.0
-"""Points with less are along a river or a coast, where water lies level across."""
+"""Points are along a river or a coast, level across, below this ratio."""
 WIDE_SCATTER_M = 0.1
 _SAME_PLACE_M = 1e-3
 _FEWEST_FOR_PLANE = 3
@@ -30,34 +30,20 @@ _MOSTLY = 0.6
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WaterFit(ShoreFit):
-    """A level or a plane, and how well the points fix it.
+    """A level or a plane, and its accuracy."""
 
-    Attributes
-    ----------
-    model : {"level", "plane", "along"}
-        ``along``: tilted in the direction in which the points lie, level across it.
-    surface : WaterPlane
-    centre_xy : array, shape (2,)
-        The middle of the points, metres, world frame.
-    level_m : float
-        The height of the surface there.
-    tilt : array, shape (2,)
-        dz/dx and dz/dy.
-    covariance : array, shape (3, 3)
-        Of `level_m` and `tilt`; zero for what the model does not have, NaN where no point is to
-        spare. It knows nothing of errors that all points share, as of a wrong datum.
-    """
-
-    model: Model
+    model: Model  # "along" is tilted in the direction of the points, and level across it
     surface: WaterPlane
-    centre_xy: FloatArray
-    level_m: float
-    tilt: FloatArray
+    centre_xy: FloatArray  # (2,), centre of the points, metres, world frame
+    level_m: float  # height of the surface there
+    tilt: FloatArray  # (2,), dz/dx and dz/dy
     covariance: FloatArray
+    """Of `level_m` and `tilt`, shape (3, 3): zero for what the model does not have, NaN without
+    redundancy. It does not include errors that all points share, as of a wrong datum."""
 
     @property
     def sigma_level_m(self) -> float:
-        """Standard error of the level in the middle of the points."""
+        """Standard error of the level at the centre of the points."""
         return math.sqrt(self.covariance[0, 0])
 
     @property
@@ -76,7 +62,7 @@ class WaterFit(ShoreFit):
 
     @property
     def downhill_deg(self) -> float:
-        """Direction in which the surface falls, clockwise from the y axis; NaN of a level."""
+        """Direction in which the surface falls, clockwise from the y axis; NaN for a level."""
         if not self.tilt.any():
             return math.nan
         return math.degrees(math.atan2(-self.tilt[0], -self.tilt[1])) % 360.0
@@ -105,7 +91,7 @@ class WaterFit(ShoreFit):
 
 
 class _Plan(NamedTuple):
-    """Where the points lie: centre, axes along and across (rows), spread (rms) along each, m."""
+    """The points in plan: centre, axes along and across (rows), spread (rms) along each, m."""
 
     centre: FloatArray
     axes: FloatArray
@@ -137,14 +123,14 @@ def fit_water(
     Parameters
     ----------
     xyz : array, shape (n, 3)
-        Metres, world frame; rows that are not finite are left out.
+        Metres, world frame; rows that are not finite are ignored.
     model : {"auto", "level", "plane", "along"}
-        ``along`` is tilted in the direction in which the points lie and level across it. ``auto``
-        takes a tilt only where it is significant, and only along the points where these are
-        nearly on one line, or lie along a river and show no tilt across it.
+        ``along`` is tilted in the direction of the points and level across it. ``auto`` is tilted
+        only if that is significant, and only along the points if these are nearly on one line, or
+        along a river without tilt across it.
     counts : array, shape (n,), optional
-        How many independent observations each point is worth, up to 1: 1 by default, less where
-        neighbours share their errors. Standard errors and tests of tilts go by their sum.
+        Number of independent observations that each point is worth: 1 by default, less if
+        neighbours share their errors. Standard errors and tests of tilts use their sum.
 
     Returns
     -------
@@ -154,19 +140,26 @@ def fit_water(
     Raises
     ------
     SettingError
-        If the model is unknown, or the shape of `xyz` is another.
+        ``option.choice`` or ``option.shape``.
     GeometryError
-        If there are too few points for the model, they lie on one line, or the surface is steeper
+        ``water.too_few_points``, ``water.on_line``, or ``water.tilt`` if the surface is steeper
         than `MAX_TILT_PERCENT`.
     """
     if model not in get_args(Model):
-        raise SettingError(f"model '{model}' is not one of {', '.join(get_args(Model))}.")
+        raise SettingError(
+            "option.choice",
+            f"The water model '{model}' is unknown. Use {', '.join(get_args(Model))}.",
+            option="water_model",
+            value=model,
+        )
     points = np.asarray(xyz, np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise SettingError(f"shoreline points must have the shape (n, 3), not {points.shape}.")
+        text = f"The shoreline points have the shape {points.shape}. It must be (n, 3)."
+        raise SettingError("option.shape", text, option="xyz", shape=points.shape)
     known = usable_rows(points)
     if len(known) == 0:
-        raise GeometryError(f"None of {len(points)} shoreline points has a height.")
+        text = f"None of {len(points)} shoreline points has a height. Give heights, or the cloud."
+        raise GeometryError("water.too_few_points", text, points=0, least=1)
     plan = _plan(points[known, :2])
     worth = np.ones(len(known)) if counts is None else np.asarray(counts, np.float64)[known]
     chosen, found, notes = _choose(points[known], plan, model, worth)
@@ -180,9 +173,11 @@ def fit_water(
     )
     if not fit.tilt_percent <= MAX_TILT_PERCENT:
         raise GeometryError(
-            f"The shoreline points tilt by {fit.tilt_percent:.1f} %, more than"
-            f" {MAX_TILT_PERCENT:g} % (standard error {fit.sigma_tilt_percent:.1f} %); check their"
-            " heights and units, or fit a level."
+            "water.tilt",
+            f"The shoreline points are tilted by {fit.tilt_percent:.1f} % (standard error"
+            f" {fit.sigma_tilt_percent:.1f} %), more than {MAX_TILT_PERCENT:g} %. Check their"
+            " heights and units, or fit a level.",
+            tilt=fit.tilt_percent / 100.0,
         )
     return fit
 
@@ -202,43 +197,50 @@ def _choose(
         _check_enough(len(xyz), plan, model)
         return model, _regression(xyz, plan, model, worth), ()
     if len(xyz) <= _FEWEST_FOR_PLANE or plan.spread_m[0] < _SAME_PLACE_M:
-        note = f"{len(xyz)} points, too few or too close together to show a tilt: a level."
+        note = f"{len(xyz)} points are too few or too close together for a tilt: a level is fitted."
         return "level", _regression(xyz, plan, "level", worth), (note,)
     along, across = plan.spread_m
     tilted: Model = "along" if across < LINE_RATIO * along else "plane"
     found = _regression(xyz, plan, tilted, worth)
     chance = _chance_of_tilt(found, worth)
     if not chance < SIGNIFICANCE:
-        note = f"The tilt of the points is not significant (chance gives it in {chance:.0%})."
-        return "level", _regression(xyz, plan, "level", worth), (f"{note[:-1]}: a level.",)
-    significant = f"The tilt of the points is significant (chance gives it in {chance:.2g})."
+        note = f"The tilt of the points is not significant (p = {chance:.2f}): a level is fitted."
+        return "level", _regression(xyz, plan, "level", worth), (note,)
+    significant = f"The tilt of the points is significant (p = {chance:.2g})."
     if tilted == "along":
         note = (
-            f"The points are nearly on one line (rms {across:.1f} m across, {along:.1f} m along),"
-            " which cannot fix a tilt across it: level across it."
+            f"The points are nearly on one line (rms {across:.1f} m across, {along:.1f} m along):"
+            " the surface is level across it."
         )
         return tilted, found, (significant, note)
     is_level_across = abs(found.beta[2]) < 2.0 * math.sqrt(found.covariance[2, 2])
     if across < LONG_RATIO * along and is_level_across:
-        note = "No tilt across the direction in which the points lie: level across it."
+        note = (
+            "There is no tilt across the direction of the points: the surface is level across it."
+        )
         return "along", _regression(xyz, plan, "along", worth), (significant, note)
     return tilted, found, (significant,)
 
 
 def _check_enough(n: int, plan: _Plan, model: Model) -> None:
-    """Refuse a model that the points cannot fix."""
+    """Raise GeometryError if the points do not determine a model."""
     if n < _UNKNOWNS[model]:
         raise GeometryError(
-            f"A water surface of the kind '{model}' needs at least {_UNKNOWNS[model]} shoreline"
-            f" points with heights, and there are {n}; fit a level."
-        )
+            "water.too_few_points",
+            f"The water model '{model}' needs at least {_UNKNOWNS[model]} shoreline points with"
+            f" heights, and there are {n}. Fit a level.",
+            points=n, least=_UNKNOWNS[model],
+        )  # fmt: skip
     along, across = plan.spread_m
     if model != "level" and along < _SAME_PLACE_M:
-        raise GeometryError(f"The {n} shoreline points are at one place; fit a level.")
+        text = f"The {n} shoreline points are at one place. Fit a level."
+        raise GeometryError("water.on_line", text, points=n)
     if model == "plane" and across < _ON_LINE * along:
         raise GeometryError(
+            "water.on_line",
             f"The {n} shoreline points are on one line (rms {across:.2g} m across, {along:.4g} m"
-            " along), which does not fix a plane; fit a level, or a tilt along them."
+            " along). Fit a level, or a tilt along them.",
+            points=n,
         )
 
 
@@ -246,8 +248,10 @@ def _regression(xyz: FloatArray, plan: _Plan, model: Model, worth: FloatArray) -
     found = robust_regression(plan.columns(xyz[:, :2], model), xyz[:, 2])
     if found is None:
         raise GeometryError(
-            f"The {len(xyz)} shoreline points do not fix a surface of the kind '{model}': too many"
-            " are on one line; fit a level."
+            "water.on_line",
+            f"Too many of the {len(xyz)} shoreline points are on one line for the water model"
+            f" '{model}'. Fit a level.",
+            points=len(xyz),
         )
     return found._replace(
         covariance=found.covariance * shared(found.weight, worth, len(found.beta))
@@ -255,7 +259,7 @@ def _regression(xyz: FloatArray, plan: _Plan, model: Model, worth: FloatArray) -
 
 
 def _chance_of_tilt(fit: Regression, worth: FloatArray) -> float:
-    """Return how often points of a level would show such a tilt (Wald's test, F distribution)."""
+    """Return the p-value of a tilt, if the surface is level (Wald's test, F distribution)."""
     from scipy.stats import f
 
     tilt, spare = fit.beta[1:], float(worth[fit.weight > 0.0].sum()) - len(fit.beta)
@@ -283,19 +287,19 @@ def _located(centre: FloatArray, model: Model, plan: _Plan, fit: Regression) -> 
 
 
 def _doubts(fit: Regression, without_height: int) -> tuple[str, ...]:
-    """Return what a user should look at."""
+    """Return notes on points that should be checked."""
     n, kept = len(fit.weight), int((fit.weight > 0.0).sum())
     notes = []
     if without_height:
-        notes.append(f"{without_height} points have no height and are left out.")
+        notes.append(f"{without_height} points have no height and are ignored.")
     if kept <= len(fit.beta):
-        notes.append("No point is to spare, so nothing tells how good the surface is.")
+        notes.append("There is no redundancy, so the accuracy of the surface is unknown.")
     if kept < _MOSTLY * n:
-        notes.append(f"Only {kept} of {n} points agree with the surface; look at the others.")
+        notes.append(f"Only {kept} of {n} points agree with the surface. Check the others.")
     if fit.sigma_m > WIDE_SCATTER_M:
         notes.append(
-            f"The points scatter by {fit.sigma_m:.2f} m: they may not be of one surface, or not"
-            " on the edge of the water."
+            f"The points scatter by {fit.sigma_m:.2f} m. They may not be of one surface, or not on"
+            " the edge of the water."
         )
     return tuple(notes)
 
@@ -307,7 +311,7 @@ FEWEST = 3
 def is_near(xy: FloatArray, cloud_xyz: FloatArray, radius_m: float) -> BoolArray:
     """Return which points of a cloud lie within a radius of a place, in plan.
 
-    A cloud that comes in chunks is thinned with it first; `heights_from_cloud` gives the same.
+    Chunks of a cloud are thinned with it for `heights_from_cloud`.
     """
     from scipy.spatial import cKDTree
 
@@ -323,31 +327,20 @@ def is_near(xy: FloatArray, cloud_xyz: FloatArray, radius_m: float) -> BoolArray
 def heights_from_cloud(xy: FloatArray, cloud_xyz: FloatArray, radius_m: float) -> FloatArray:
     """Return the height of the cloud at places: the median of the nearest points.
 
-    On the edge of the water half of the neighbours are dry and half wet, so that on an even bank
-    their median is the height of the edge.
-
-    Parameters
-    ----------
-    xy : array, shape (n, 2)
-        Metres, the cloud's frame.
-    cloud_xyz : array, shape (m, 3)
-    radius_m : float
-        Points farther off in plan do not count.
-
-    Returns
-    -------
-    array, shape (n,)
-        NaN where there are fewer than `FEWEST` points.
-
-    Raises
-    ------
-    SettingError
-        If the radius is not positive.
+    On the edge of the water half of the neighbours are on land and half on the bed, so that on an
+    even bank their median is the height of the edge. Places have the shape (n, 2), the cloud (m,
+    3), metres, in one frame; only points within the radius count. NaN for fewer than `FEWEST`.
+    Raises SettingError ``option.range`` if the radius is not positive.
     """
     from scipy.spatial import cKDTree
 
     if not radius_m > 0.0:
-        raise SettingError(f"radius {radius_m:g} m around shoreline points must be positive.")
+        raise SettingError(
+            "option.range",
+            f"The radius around shoreline points is {radius_m:g} m. It must be positive.",
+            option="radius_m",
+            value=radius_m,
+        )
     height = np.full(len(xy), np.nan)
     near = cloud_xyz[is_near(xy, cloud_xyz, radius_m)] if len(xy) else cloud_xyz[:0]
     if len(near) == 0:

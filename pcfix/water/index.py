@@ -14,14 +14,14 @@ from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX, IndexFormula
 Options = TypeVar("Options", bound=MethodOptions)
 
 SALINITY_PSU, TEMPERATURE_C, WAVELENGTH_UM = (0.0, 40.0), (0.0, 30.0), (0.4, 0.7)
-"""Where the formulas were fitted (salinities end at 35; natural seas go a little beyond)."""
+"""Ranges of the formulas (fitted up to 35 PSU; natural seas have a little more)."""
 
 GREEN_UM = 0.53
-"""Where cameras see most through water: the peak of their green pixels."""
+"""Peak of the green pixels, where cameras see most through water."""
 
 
 class Water(NamedTuple):
-    """What decides the refractive index; PSU, degrees Celsius and micrometres."""
+    """Properties that determine the refractive index: PSU, degrees Celsius, micrometres."""
 
     salinity: float = 35.0
     temperature: float = 15.0
@@ -29,7 +29,6 @@ class Water(NamedTuple):
 
 
 WATERS = {"fresh": Water(0.0), "sea": Water()}
-"""Waters by name."""
 
 
 def refractive_index(
@@ -43,30 +42,25 @@ def refractive_index(
     Parameters
     ----------
     salinity : float
-        PSU (grams of salt in a kilogram, nearly), 0 to 40.
+        PSU (nearly grams of salt per kilogram), 0 to 40.
     temperature_c : float
         Degrees Celsius, 0 to 30.
     wavelength_um : float
-        Of the light, micrometres, 0.4 to 0.7.
+        Wavelength of the light, micrometres, 0.4 to 0.7.
     formula : {"skarlatos", "quan-fry"}
         Skarlatos & Agrafiotis 2018, eq 13, as printed, or Quan & Fry 1995 (*Applied Optics* 34,
         3477, eq 3).
 
-    Returns
-    -------
-    float
-
     Raises
     ------
     SettingError
-        If a value is outside its range, or there is no such formula.
+        ``option.range`` or ``option.choice``.
 
     Notes
     -----
-    Both are fits to measurements of about 1970. Within the ranges above they differ by up to
+    Both formulas are fits to measurements of about 1970. Within the ranges they differ by up to
     4.5e-4, for fresh water at 18 degrees and 0.7 um (3 mm in 10 m of water), and in green light by
-    less than 1e-4. Without dispersion in mind a camera's green, 0.53 um, is a fair choice; blue
-    and red differ by 0.004.
+    less than 1e-4. Blue and red differ from green by 0.004.
 
     Examples
     --------
@@ -81,11 +75,17 @@ def refractive_index(
     ):
         if not (math.isfinite(value) and low <= value <= high):
             raise SettingError(
-                f"{name} {value:g} is outside {low:g} to {high:g}: give it in {unit}."
+                "option.range",
+                f"{name} {value:g} is outside {low:g} to {high:g}. Give it in {unit}.",
+                option=name,
+                value=value,
             )
     if formula not in _FORMULAS:
         raise SettingError(
-            f"index formula '{formula}' is none of {', '.join(get_args(IndexFormula))}."
+            "option.choice",
+            f"The index formula '{formula}' is unknown. Use {' or '.join(get_args(IndexFormula))}.",
+            option="index_formula",
+            value=formula,
         )
     return _FORMULAS[formula](float(salinity), float(temperature_c), float(wavelength_um))
 
@@ -116,14 +116,10 @@ _FORMULAS = {"skarlatos": _skarlatos, "quan-fry": _quan_fry}
 
 
 def with_index(options: Options) -> Options:
-    """Return options whose refractive index is a number, and which say what water it is of.
+    """Return options whose refractive index is a number, with a description of the water.
 
-    They come with an index, or where they have them salinity, temperature or wavelength.
-
-    Raises
-    ------
-    SettingError
-        If both are given, or a value is outside its range.
+    They have an index, or salinity, temperature or wavelength. Raises SettingError
+    ``option.exclusive`` if both are given.
     """
     own = {name: getattr(options, name) for name in Water._fields if hasattr(options, name)}
     given = {name: value for name, value in own.items() if value is not None}
@@ -131,8 +127,9 @@ def with_index(options: Options) -> Options:
     if given:
         if index is not None:
             raise SettingError(
-                "index and salinity, temperature or wavelength say the same twice; give one of"
-                " them."
+                "option.exclusive",
+                "index excludes salinity, temperature and wavelength. Give one or the others.",
+                options=["index", *given],
             )
         index = ",".join(map(repr, Water(**given)))
     number, origin = index_of(index, options.index_formula)
@@ -141,7 +138,7 @@ def with_index(options: Options) -> Options:
 
 
 def index_of(given: float | str | None, formula: IndexFormula = "skarlatos") -> tuple[float, str]:
-    """Return the refractive index that a number or a word means, and what water that is.
+    """Return a refractive index and a description of its water, empty if only a number is given.
 
     Parameters
     ----------
@@ -149,18 +146,12 @@ def index_of(given: float | str | None, formula: IndexFormula = "skarlatos") -> 
         A number, by default `DEFAULT_REFRACTIVE_INDEX`; ``fresh`` or ``sea``; or ``S,T`` or
         ``S,T,W``: salinity in PSU, temperature in degrees Celsius and wavelength in micrometres.
     formula : {"skarlatos", "quan-fry"}
-        By which it follows from these: see `refractive_index`.
-
-    Returns
-    -------
-    index : float
-    water : str
-        In words; empty where only a number was given.
+        See `refractive_index`.
 
     Raises
     ------
     SettingError
-        If it is none of these, or a value is outside its range.
+        ``option.index`` if it is none of these, ``option.range`` if a value is outside its range.
     """
     if given is None:
         return DEFAULT_REFRACTIVE_INDEX, ""
@@ -168,8 +159,10 @@ def index_of(given: float | str | None, formula: IndexFormula = "skarlatos") -> 
     water = WATERS.get(text)
     if re.fullmatch(r"1,\d+", text):
         raise SettingError(
-            f"index '{given}' has a decimal comma: write {text.replace(',', '.')}; a water of 1 PSU"
-            f" at {text[2:]} degrees is {text.replace(',', '.0,')}."
+            "option.index",
+            f"index '{given}' has a decimal comma. Write {text.replace(',', '.')}, or"
+            f" {text.replace(',', '.0,')} for water of 1 PSU at {text[2:]} degrees.",
+            value=given,
         )
     try:
         if water is None and "," in text:
@@ -178,8 +171,10 @@ def index_of(given: float | str | None, formula: IndexFormula = "skarlatos") -> 
             return float(text), ""
     except (ValueError, TypeError):
         raise SettingError(
-            f"index '{given}' is neither a number nor {' nor '.join(WATERS)}, nor salinity,"
-            " temperature and wavelength as 35,15,0.53."
+            "option.index",
+            f"index '{given}' is not known. Give a number, {', '.join(WATERS)}, or salinity,"
+            " temperature and wavelength as 35,15,0.53.",
+            value=given,
         ) from None
     name = f"{text}: " if text in WATERS else ""
     by = "" if formula == "skarlatos" else f", by {formula}"

@@ -1,9 +1,9 @@
-"""A water surface along a river: level across the flow, its height a profile along it.
+"""Fit a water surface along a river: level across the flow, a height profile along it.
 
-The order of the points along the river is that of their shortest ways through a net from the two
-ends, as in Isomap (Tenenbaum et al. 2000, Science 290: 2319-2323). The axis is then a principal
+The order of the points along the river is that of their shortest paths through a network from the
+two ends, as in Isomap (Tenenbaum et al. 2000, Science 290: 2319-2323). The axis is a principal
 curve (Hastie & Stuetzle 1989, J. Am. Stat. Assoc. 84: 502-516): smoothed over about the width of
-the river, and the points projected onto it anew, until that changes nothing more.
+the river, with the points projected onto it, several times.
 """
 
 from __future__ import annotations
@@ -28,30 +28,20 @@ Bounds = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RiverFit(ShoreFit):
-    """A water surface along a river, and how well the points fix it.
+    """A water surface along a river, and its accuracy."""
 
-    Attributes
-    ----------
-    surface : WaterMesh
-        Over the bounds that were asked for.
-    axis : Axis
-        Downstream.
-    profile : Profile
-        Height along the axis; its station is the axis's.
-    """
-
-    surface: WaterMesh
-    axis: Axis
-    profile: Profile
+    surface: WaterMesh  # over the given bounds
+    axis: Axis  # downstream
+    profile: Profile  # height along the axis, by its station
 
     @property
     def drop_m(self) -> float:
-        """From the first point to the last."""
+        """Fall from the first point to the last."""
         return float(self.profile.height_m[0] - self.profile.height_m[-1])
 
     @property
     def length_m(self) -> float:
-        """Along the axis, from the first point to the last."""
+        """Length along the axis from the first point to the last."""
         return float(np.ptp(self.profile.station_m))
 
     def height_at(self, xy: FloatArray) -> FloatArray:
@@ -79,45 +69,56 @@ class RiverFit(ShoreFit):
 def fit_river(
     xyz: FloatArray, bounds: Bounds, *, name: str = "river", counts: FloatArray | None = None
 ) -> RiverFit:
-    """Fit the water surface along a river to shoreline points, of which some may be wrong.
+    """Fit the water surface along a river to shoreline points, some of which may be wrong.
+
+    The height at a place is that of the nearest place on the axis, constant upstream of the first
+    point and downstream of the last.
 
     Parameters
     ----------
     xyz : array, shape (n, 3)
-        Metres, world frame, of both banks or one; rows that are not finite are left out.
+        Metres, world frame, of both banks or one; rows that are not finite are ignored.
     bounds : tuple of 4 float
-        Least x, least y, greatest x, greatest y of the cloud: what the mesh has to cover.
+        Least x, least y, greatest x, greatest y of the cloud, which the mesh has to cover.
     name : str
-        Of the mesh.
+        Name of the mesh.
     counts : array, shape (n,), optional
         See `pcfix.water.fit.fit_water`.
-
-    Returns
-    -------
-    RiverFit
 
     Raises
     ------
     GeometryError
-        If there are fewer than `FEWEST` points with heights, they are at one place, or the
-        bounds are empty.
-
-    Notes
-    -----
-    The height of a place is that of the nearest place on the axis. Upstream of the first point
-    and downstream of the last it stays as it is there.
+        ``water.too_few_points`` for fewer than `FEWEST` points with heights, or all at one place;
+        ``cloud.no_extent`` for empty bounds.
     """
     points = np.asarray(xyz, np.float64)
     known = usable_rows(points)
     if len(known) < FEWEST:
         raise GeometryError(
+            "water.too_few_points",
             f"A surface along a river needs at least {FEWEST} shoreline points with heights, and"
-            f" there are {len(known)}; fit a plane or a level."
-        )
+            f" there are {len(known)}. Fit a plane or a level.",
+            points=len(known), least=FEWEST,
+        )  # fmt: skip
     used = points[known]
-    axis = _downstream(flow_axis(used[:, :2]), used)
+    axis = flow_axis(used[:, :2])
+    station, _ = axis.locate(used[:, :2])
+    upper = station <= np.median(station)
+    if not upper.all() and np.median(used[upper, 2]) < np.median(used[~upper, 2]):
+        axis = Axis(axis.xy[::-1].copy(), axis.width_m)  # downstream
     worth = None if counts is None else counts[known]
     profile = fit_profile(axis.locate(used[:, :2])[0], used[:, 2], worth)
+    notes = [
+        f"Beyond the outermost points the surface is constant: {profile.height_m[0]:.2f} m upstream"
+        f" and {profile.height_m[-1]:.2f} m downstream."
+    ]
+    if not profile.falls:
+        notes.append(
+            "The points do not fall along the whole river, so the surface may rise. Check the"
+            " direction of the line along the river, and the points."
+        )
+    if len(known) < len(points):
+        notes.append(f"{len(points) - len(known)} points have no height and are ignored.")
     return RiverFit(
         surface=_mesh(axis, profile, bounds, name),
         axis=axis,
@@ -125,43 +126,19 @@ def fit_river(
         residual_m=of_all(profile.residual_m, known, len(points), np.nan),
         weight=of_all(profile.weight, known, len(points), 0.0),
         sigma_m=profile.sigma_m,
-        notes=_notes(profile, len(points) - len(known)),
+        notes=tuple(notes),
     )
-
-
-def _downstream(axis: Axis, xyz: FloatArray) -> Axis:
-    """Return the axis in the direction in which the points fall, by the medians of its halves."""
-    station, _ = axis.locate(xyz[:, :2])
-    upper = station <= np.median(station)
-    if upper.all() or np.median(xyz[upper, 2]) >= np.median(xyz[~upper, 2]):
-        return axis
-    return Axis(axis.xy[::-1].copy(), axis.width_m)
-
-
-def _notes(profile: Profile, without_height: int) -> tuple[str, ...]:
-    """Return what a user should look at."""
-    notes = [
-        f"Beyond the outermost points the surface stays at {profile.height_m[0]:.2f} m upstream"
-        f" and {profile.height_m[-1]:.2f} m downstream."
-    ]
-    if not profile.falls:
-        notes.append(
-            "The points do not fall all along the river, so the surface was not held to it; check"
-            " the direction of the line along the river, and the points."
-        )
-    if without_height:
-        notes.append(f"{without_height} points have no height and are left out.")
-    return tuple(notes)
 
 
 def _mesh(axis: Axis, profile: Profile, bounds: Bounds, name: str) -> WaterMesh:
     """Return the surface over the bounds as a grid of triangles.
 
-    Sections across the flow would cross one another on the inside of a bend; a grid does not fold.
+    Cross-sections would intersect on the inside of a bend; a grid does not fold.
     """
     left, bottom, right, top = bounds
     if not (np.isfinite(bounds).all() and right > left and top > bottom):
-        raise GeometryError(f"The bounds {bounds} of the water surface hold no area.")
+        text = f"The bounds {bounds} of the water surface have no area. Check the cloud."
+        raise GeometryError("cloud.no_extent", text, bounds=bounds)
     size = float(np.sqrt((right - left) * (top - bottom) / MOST_CELLS))
     cell = max(size, float(profile.station_m[1] - profile.station_m[0]) / 2.0)
     columns, rows = (int(np.ceil(side / cell)) + 1 for side in (right - left, top - bottom))
@@ -176,22 +153,18 @@ def _mesh(axis: Axis, profile: Profile, bounds: Bounds, name: str) -> WaterMesh:
 
 FEWEST_ON_AXIS = 6
 NET_POINTS = 1500
-"""Points of the net; where there are more, those of a cell count as one."""
+"""Points of the network; of more, the mean of each cell is used."""
 REACH = 2.0
-"""Longest edge of the net, over the longest that is needed to hold it together."""
+"""Longest edge of the network, relative to the longest that keeps it connected."""
 _ROUNDS, _NODES = 10, 300
 
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """A line along a river.
+    """A line along a river."""
 
-    xy : shape (m, 2), its vertices, metres, world frame.
-    width_m : twice the rms distance of the points from it.
-    """
-
-    xy: FloatArray
-    width_m: float
+    xy: FloatArray  # (m, 2), its vertices, metres, world frame
+    width_m: float  # twice the rms distance of the points from it
 
     @cached_property
     def station_m(self) -> FloatArray:
@@ -206,10 +179,7 @@ class Axis:
         return cKDTree(self.xy)
 
     def locate(self, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the distance along the line of places (n, 2), and their distance from it, m.
-
-        A place beyond an end is at that end.
-        """
+        """Return the distance along the line of places (n, 2), and their distance from it, m."""
         nearest = np.asarray(self._tree.query(xy)[1], np.int64)
         sides = [np.clip(nearest + k, 0, len(self.xy) - 2) for k in (-1, 0)]
         (one, far_one), (other, far_other) = (self._on_segment(xy, side) for side in sides)
@@ -227,16 +197,15 @@ class Axis:
 def flow_axis(xy: FloatArray) -> Axis:
     """Return the axis of a river from points (n, 2) on its banks, metres.
 
-    Raises
-    ------
-    GeometryError
-        If there are fewer than `FEWEST_ON_AXIS` points, or they are at one place.
+    Raises GeometryError ``water.too_few_points`` for fewer than `FEWEST_ON_AXIS`, or at one place.
     """
     if len(xy) < FEWEST_ON_AXIS or not np.ptp(xy, axis=0).any():
         raise GeometryError(
+            "water.too_few_points",
             f"The axis of a river needs at least {FEWEST_ON_AXIS} shoreline points at different"
-            f" places, and there are {len(xy)}; fit a plane."
-        )
+            f" places, and there are {len(xy)}. Fit a plane.",
+            points=len(xy), least=FEWEST_ON_AXIS,
+        )  # fmt: skip
     origin = xy.mean(axis=0)
     places = xy - origin
     net = _thinned(places)
@@ -251,13 +220,13 @@ def flow_axis(xy: FloatArray) -> Axis:
 
 
 def _located(nodes: FloatArray, places: FloatArray) -> tuple[FloatArray, float]:
-    """Return how far along a line places are, and twice their rms distance from it."""
+    """Return the distance of places along a line, and twice their rms distance from it."""
     station, away = Axis(nodes, 0.0).locate(places)
     return station, 2.0 * float(np.sqrt(np.mean(away**2)))
 
 
 def _thinned(xy: FloatArray) -> FloatArray:
-    """Return places, or the mean of those in each cell where they are many."""
+    """Return places, or of many the mean of each cell."""
     if len(xy) <= NET_POINTS:
         return np.unique(xy, axis=0)
     cell_m = float(np.sqrt(np.prod(np.maximum(np.ptp(xy, axis=0), 1e-3)) / NET_POINTS))
@@ -268,11 +237,11 @@ def _thinned(xy: FloatArray) -> FloatArray:
 
 
 def _stations(xy: FloatArray) -> tuple[FloatArray, float]:
-    """Return how far along the river each place is, and how far to smooth, m."""
+    """Return the distance of each place along the river, and the bandwidth of smoothing, m."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 
-    # the trees of scipy 1.11 take whole numbers of 32 bits alone
+    # scipy 1.11 needs indices of 32 bits
     edges, shape = _edges(xy).astype(np.int32), (len(xy), len(xy))
     length = np.hypot(*(xy[edges[:, 0]] - xy[edges[:, 1]]).T)
     tree = minimum_spanning_tree(csr_array((length, edges.T), shape=shape))
@@ -288,7 +257,7 @@ def _stations(xy: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _edges(xy: FloatArray) -> IntArray:
-    """Return the edges of Delaunay's triangles, each once; along a line where there are none."""
+    """Return the edges of the Delaunay triangulation, or of a chain of points on a line."""
     from scipy.spatial import Delaunay, QhullError
 
     try:
@@ -302,7 +271,7 @@ def _edges(xy: FloatArray) -> IntArray:
 
 
 def _smoothed(xy: FloatArray, station: FloatArray, bandwidth: float) -> FloatArray:
-    """Return a line through the local linear means of places along their stations."""
+    """Return a line by local linear regression of places on their stations."""
     low, high = float(station.min()), float(station.max())
     count = int(np.clip((high - low) / bandwidth * 4.0, 8, _NODES))
     at = np.linspace(low, high, count)
@@ -317,7 +286,7 @@ def _smoothed(xy: FloatArray, station: FloatArray, bandwidth: float) -> FloatArr
 
 
 def _extended(nodes: FloatArray, by_m: float) -> FloatArray:
-    """Return a line drawn on at both ends, so that the outermost points lie beside it."""
+    """Extend a line at both ends, so that the outermost points are beside it."""
     outward = nodes[[0, -1]] - nodes[[1, -2]]
     outward /= np.maximum(np.hypot(*outward.T), 1e-9)[:, None]
     first, last = nodes[[0, -1]] + 2.0 * by_m * outward

@@ -1,18 +1,17 @@
-"""Fits that wrong observations cannot spoil: linear regression, and a profile along a river.
+"""Robust fits: linear regression, and a height profile along a river.
 
-Regression, of which nearly half of the observations may be wrong: MM-estimation (Yohai 1987, Annals
-of Statistics 15: 642-656): first the solution with the smallest S-scale of its residuals, found
-from exact fits to a few points each and refined (the fast-S algorithm: Salibian-Barrera & Yohai
-2006, J. Comp. Graph. Stat. 15: 414-427); then, with that scale, Tukey's weights, which lose little
-to least squares where nothing is wrong. The points that are drawn are the same every time. (scipy's
-`least_squares` with a robust loss is the second half alone, from a start and with a scale that must
-be known, and both would be the non-robust ones.)
+Regression is MM-estimation (Yohai 1987, Annals of Statistics 15: 642-656), for nearly half of the
+observations wrong: first the solution with the smallest S-scale of its residuals, found from exact
+fits to a few points each and refined (fast-S: Salibian-Barrera & Yohai 2006, J. Comp. Graph. Stat.
+15: 414-427); then, with that scale, Tukey's weights, which are nearly as efficient as least squares
+without outliers. The samples are the same every time. (scipy's `least_squares` with a robust loss
+is only the second half; it needs a start and a scale.)
 
 The profile is robust, smooth, and falling: linear B-splines with a penalty on bends (P-splines:
-Eilers & Marx 1996, Statistical Science 11: 89-121). The penalty grows with the size of a bend and
-not with its square (trend filtering: Kim et al. 2009, SIAM Review 51: 339-360), so that pools,
-riffles and weirs keep their edges; its weight comes from cross-validation. Rises are held down by a
-penalty of their own (Bollaerts et al. 2006, Statistics in Medicine 25: 1189-1206).
+Eilers & Marx 1996, Statistical Science 11: 89-121). The penalty grows with the size of a bend
+instead of its square (trend filtering: Kim et al. 2009, SIAM Review 51: 339-360), so that pools,
+riffles and weirs keep their edges; its weight comes from cross-validation. Rises have a penalty of
+their own (Bollaerts et al. 2006, Statistics in Medicine 25: 1189-1206).
 """
 
 from __future__ import annotations
@@ -28,33 +27,21 @@ import numpy as np
 from pcfix.model import BoolArray, FloatArray, IntArray
 
 START_C, FINAL_C = 1.547645, 4.685061
-"""Tukey's constants: against half of the data; with 95 % of the efficiency of least squares."""
+"""Tukey's constants: for a breakdown point of one half, and for 95 % efficiency."""
 LEAST_SCALE_M = 0.005
-"""Residuals are weighed as if they scattered at least so much: the edge of water is no sharper."""
+"""Least scatter of residuals for their weights: the edge of water is no sharper."""
 SUBSETS, SAMPLE, REFINED, FINALISTS = 3000, 400, 20, 3
 _ROUNDS, _CONVERGED_M, _CONVERGED, _ROUGHLY = 200, 1e-10, 1e-7, 1e-2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShoreFit:
-    """What the fit of a water surface says of the n shoreline points that it was given.
+    """The fit of a water surface to n shoreline points."""
 
-    Attributes
-    ----------
-    residual_m : array, shape (n,)
-        Point minus surface; NaN of points without a height.
-    weight : array, shape (n,)
-        0 to 1; those without are rejected.
-    sigma_m : float
-        Standard deviation of one accepted point; NaN where none is to spare.
-    notes : tuple of str
-        Why this surface, and what to beware of.
-    """
-
-    residual_m: FloatArray
-    weight: FloatArray
-    sigma_m: float
-    notes: tuple[str, ...]
+    residual_m: FloatArray  # (n,), point minus surface; NaN for points without a height
+    weight: FloatArray  # (n,), 0 (rejected) to 1
+    sigma_m: float  # standard deviation of one accepted point; NaN without redundancy
+    notes: tuple[str, ...]  # reasons for this surface, and warnings
 
     @property
     def accepted(self) -> BoolArray:
@@ -73,37 +60,30 @@ class ShoreFit:
 
 
 def usable_rows(xyz: FloatArray) -> IntArray:
-    """Return the rows of finite points, in an order that does not depend on that of the points."""
+    """Return the rows of finite points, sorted, so that the order of the points does not matter."""
     known = np.flatnonzero(np.isfinite(xyz).all(axis=1))
     return known[np.lexsort(xyz[known].T)]
 
 
 def of_all(values: FloatArray, known: IntArray, count: int, otherwise: float) -> FloatArray:
-    """Return the values of known rows with those of the other rows between, shape (count,)."""
+    """Return an array of shape (count,) with the values of known rows, `otherwise` elsewhere."""
     whole = np.full(count, otherwise)
     whole[known] = values
     return whole
 
 
 class Regression(NamedTuple):
-    """The fit of z = X beta.
+    """The fit of z = X beta."""
 
-    beta : shape (p,).
-    covariance : shape (p, p), of beta; NaN where no observation is to spare.
-    sigma_m : standard deviation of one accepted observation; NaN where none is to spare.
-    residual_m : shape (n,), observed minus fitted.
-    weight : shape (n,), 0 to 1; 0 of what is rejected.
-    """
-
-    beta: FloatArray
-    covariance: FloatArray
-    sigma_m: float
-    residual_m: FloatArray
-    weight: FloatArray
+    beta: FloatArray  # (p,)
+    covariance: FloatArray  # (p, p), of beta; NaN without redundancy
+    sigma_m: float  # standard deviation of one accepted observation; NaN without redundancy
+    residual_m: FloatArray  # (n,), observed minus fitted
+    weight: FloatArray  # (n,), 0 (rejected) to 1
 
 
 def robust_regression(X: FloatArray, z: FloatArray) -> Regression | None:
-    """Fit z = X beta; None where no p observations determine beta.
+    """Fit z = X beta; None if no p observations determine beta.
 
     The columns of X, shape (n, p), are of similar size; z, shape (n,), is in metres.
     """
@@ -128,10 +108,10 @@ def robust_regression(X: FloatArray, z: FloatArray) -> Regression | None:
 
 
 def shared(weight: FloatArray, worth: FloatArray, unknowns: float) -> float:
-    """Return by how much a covariance grows, as points are not independent of their neighbours.
+    """Return the factor of a covariance for points that depend on their neighbours.
 
-    The k accepted ones are `worth` m independent observations in all: with p unknowns the
-    covariance is (k - p) / (m - p) times as large; NaN where m does not exceed p.
+    If the k accepted ones are `worth` m independent observations, the covariance of p unknowns is
+    (k - p) / (m - p) times as large; NaN if m does not exceed p.
     """
     accepted = weight > 0.0
     k, m = float(accepted.sum()), float(worth[accepted].sum())
@@ -148,7 +128,7 @@ def tukey_weight(u: FloatArray) -> FloatArray:
 def s_scale(residual_m: FloatArray, unknowns: int, precision: float) -> float:
     """Return the scale s with sum rho(r / (c s)) = (n - p) / 2; the standard deviation of normals.
 
-    rho(u) = 1 - (1 - u^2)^3, and 1 beyond |u| = 1. Zero where more than half are zero.
+    rho(u) = 1 - (1 - u^2)^3, and 1 beyond |u| = 1. Zero if more than half are zero.
     """
     square = residual_m**2
     spare = max(len(square) - unknowns, 1)
@@ -179,7 +159,7 @@ def _exact_fits(X: FloatArray, z: FloatArray) -> FloatArray:
 
 
 def _subsets(n: int, p: int) -> IntArray:
-    """Return p different row numbers of n a row: all that there are, or `SUBSETS` drawn ones."""
+    """Return subsets of p of n row numbers: all, or `SUBSETS` random ones."""
     if comb(n, p) <= SUBSETS:
         return np.array(list(combinations(range(n), p)), np.int64).reshape(-1, p)
     drawn = np.random.default_rng(0).integers(0, n, (2 * SUBSETS, p))
@@ -195,7 +175,7 @@ def _least_s_scale(
     rounds: int = _ROUNDS,
     precision: float = _CONVERGED,
 ) -> tuple[FloatArray, float]:
-    """Return beta refined to a local least of the S-scale, and that scale."""
+    """Refine beta to a local minimum of the S-scale, and return both."""
     best, least = beta, inf
     for _ in range(rounds):
         residual = z - X @ beta
@@ -210,7 +190,7 @@ def _least_s_scale(
 
 
 def _weighted(X: FloatArray, z: FloatArray, weight: FloatArray, beta: FloatArray) -> FloatArray:
-    """Return the weighted least squares solution, or beta where there is none."""
+    """Return the weighted least squares solution, or beta if there is none."""
     root = np.sqrt(weight)
     solution, _, rank, _ = np.linalg.lstsq(X * root[:, None], z * root, rcond=1e-10)
     return np.asarray(solution) if rank == X.shape[1] else beta
@@ -241,57 +221,50 @@ FOLDS = 5
 PENALTIES = tuple(10.0 ** np.arange(-4.0, 3.5, 0.5))
 MOST_NODES, NODES_A_POINT = 400, 2
 STIFF_PENALTY = 1e3
-"""On rises, and on bends near the ends."""
+"""Penalty on rises, and on bends near the ends."""
 END_POINTS = 7
-"""So many outermost points are on one straight piece, so that one of them alone cannot bend it."""
+"""The outermost points are on one straight piece, so that a single one cannot bend it."""
 RISES_IF_WORSE = 1.25
-"""The surface may rise downstream where forbidding it makes the points scatter so much more."""
+"""The surface may rise downstream if the scatter of the points is larger by this otherwise."""
 _TURNS, _BEND_M, _HUBER_M = 12, 1e-3, 0.02
-_LEAST = 1e-12  # keeps the equations solvable where no point decides
+_LEAST = 1e-12  # keeps the equations solvable without points
 _TO_SIGMA = 1.4826  # from the median of absolute values of normal numbers
 
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Heights along a river.
+    """Heights along a river."""
 
-    station_m : shape (m,), evenly spaced, from the first point to the last.
-    height_m, sigma_height_m : shape (m,), the heights there and their standard errors.
-    weight, residual_m : shape (n,), of the points, weights from 0 to 1.
-    sigma_m : standard deviation of one accepted point.
-    falls : whether it was held to fall.
-    """
-
-    station_m: FloatArray
-    height_m: FloatArray
-    sigma_height_m: FloatArray
-    weight: FloatArray
-    residual_m: FloatArray
-    sigma_m: float
-    falls: bool
+    station_m: FloatArray  # (m,), evenly spaced, from the first point to the last
+    height_m: FloatArray  # (m,)
+    sigma_height_m: FloatArray  # (m,), standard errors
+    weight: FloatArray  # (n,), of the points, 0 to 1
+    residual_m: FloatArray  # (n,)
+    sigma_m: float  # standard deviation of one accepted point
+    falls: bool  # whether it was forced to fall
 
     def height_at(self, station_m: FloatArray) -> FloatArray:
-        """Return heights at stations; beyond the ends those of the ends."""
+        """Return heights at stations, constant beyond the ends."""
         return np.interp(station_m, self.station_m, self.height_m)
 
     def sigma_at(self, station_m: FloatArray) -> FloatArray:
-        """Return standard errors of heights; beyond the ends those of the ends."""
+        """Return standard errors of heights, constant beyond the ends."""
         return np.interp(station_m, self.station_m, self.sigma_height_m)
 
 
 class _Data(NamedTuple):
-    """Points between nodes: the node before each, the share of the next one, the height."""
+    """Points between nodes of the spline."""
 
-    node: IntArray
-    share: FloatArray
+    node: IntArray  # the node before each point
+    share: FloatArray  # weight of the next one
     z: FloatArray
-    nodes: int
+    nodes: int  # their number
 
     def take(self, rows: BoolArray) -> _Data:
         return self._replace(node=self.node[rows], share=self.share[rows], z=self.z[rows])
 
     def stiff(self) -> BoolArray:
-        """Return which bends have too few points on one side, shape (nodes - 2,)."""
+        """Return the bends with too few points on one side, shape (nodes - 2,)."""
         before = np.cumsum(np.bincount(self.node, minlength=self.nodes))[: self.nodes - 2]
         return np.asarray(np.minimum(before, len(self.z) - before) < END_POINTS)
 
@@ -302,7 +275,7 @@ class _Data(NamedTuple):
 def fit_profile(station_m: FloatArray, z: FloatArray, worth: FloatArray | None = None) -> Profile:
     """Fit the height of the water, shape (n,), which falls with the station, downstream.
 
-    `worth` is how many independent observations each point is, 1 by default; see `shared`.
+    Each point is `worth` a number of independent observations, 1 by default; see `shared`.
     """
     order = np.lexsort((z, station_m))
     nodes = int(np.clip(NODES_A_POINT * len(z), 20, MOST_NODES))
@@ -321,7 +294,7 @@ def fit_profile(station_m: FloatArray, z: FloatArray, worth: FloatArray | None =
 
 
 def _best_penalty(data: _Data, *, falls: bool) -> float:
-    """Return the penalty with which left-out points are met best, outliers aside."""
+    """Return the penalty with the smallest error of cross-validation, robust to outliers."""
     fold = np.arange(len(data.z)) % FOLDS
     missed = np.empty((len(PENALTIES), len(data.z)))
     for row, penalty in enumerate(PENALTIES):
@@ -334,7 +307,7 @@ def _best_penalty(data: _Data, *, falls: bool) -> float:
 
 
 def _fit(data: _Data, station_m: FloatArray, *, falls: bool) -> Profile:
-    """Return heights with their standard errors, the points in the order of the data."""
+    """Fit heights with their standard errors; the points keep the order of the data."""
     from scipy.linalg import solveh_banded
 
     height, weight, band = _solve(data, _best_penalty(data, falls=falls), falls=falls)
@@ -357,8 +330,8 @@ def _solve(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return heights, the points' weights, and the band of the normal equations.
 
-    All weights are set anew in each round: of bends by 1 / |bend|, of rises 1 or 0, of points
-    first by Huber, then by Tukey about what that found.
+    Iteratively reweighted least squares: bends weigh 1 / |bend|, rises 1 or 0, points first by
+    Huber, then by Tukey with the scale of the Huber solution.
     """
     from scipy.linalg import solveh_banded
 

@@ -1,4 +1,4 @@
-"""The level, or plane, that the cues agree on best, and whether that is good enough."""
+"""Search the level, or plane, that the cues agree on best, and judge it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,17 @@ import numpy as np
 
 from pcfix.errors import GeometryError
 from pcfix.model import BoolArray, FloatArray
-from pcfix.water.cues import BRIGHT, SLOPE, Cue, Gain, Moments, cue_moments, cues_of, gain_of
-from pcfix.water.samples import Samples, layer_gain
+from pcfix.water.cues import (
+    BRIGHT,
+    SLOPE,
+    Cue,
+    Moments,
+    Samples,
+    cue_moments,
+    cues_of,
+    gain_of,
+    layer_gain,
+)
 
 LARGEST_TILT, USUAL_TILT = 0.006, 0.002
 TILT_STEP_M, MOST_TILT_STEPS = 0.15, 9
@@ -22,33 +31,24 @@ NO_TILT = np.zeros(2)
 
 
 class Looked(NamedTuple):
-    """Everything that was summed up about a cloud, at heights above a tilted plane.
+    """The sums of all cues of a cloud, at heights above a tilted plane."""
 
-    cues : (cue, its sums) of those that say anything.
-    samples : Samples
-    heights_m : shape (h,)
-    tilt : shape (2,), of the plane through the origin of the samples.
-    """
-
-    cues: list[tuple[Cue, Moments]]
+    cues: list[tuple[Cue, Moments]]  # those with any information
     samples: Samples
-    heights_m: FloatArray
-    tilt: FloatArray
+    heights_m: FloatArray  # (h,)
+    tilt: FloatArray  # (2,), of the plane through the origin of the samples
 
 
 class Peak(NamedTuple):
-    """The best surface: level_m + tilt . xy from the origin of the samples.
-
-    score : what its cues gain, less for tilts that are not usual.
-    """
+    """The best surface: level_m + tilt . xy from the origin of the samples."""
 
     level_m: float
     tilt: FloatArray
-    score: float
+    score: float  # total gain of its cues, reduced for unusual tilts
 
 
 def look(samples: Samples, heights_m: FloatArray, tilt: FloatArray) -> Looked:
-    """Sum up all cues at the given heights above a tilted plane."""
+    """Sum all cues at the given heights above a tilted plane."""
     cues = [(cue, cue_moments(samples, cue, heights_m, tilt)) for cue in cues_of(samples)]
     known = [(cue, sums) for cue, sums in cues if sums is not None]
     return Looked(known, samples, heights_m, tilt)
@@ -62,10 +62,10 @@ def all_heights(samples: Samples) -> FloatArray:
 
 
 def gains(looked: Looked, tilt: FloatArray, rng: np.random.Generator | None = None) -> FloatArray:
-    """Return what the cues that fix the level gain in all, at each height, shape (h,).
+    """Return the total gain of the cues that determine the level, at each height, shape (h,).
 
-    `tilt`, shape (2,), comes on top of that of `looked`. With `rng` tiles and floating points are
-    drawn anew, with replacement.
+    `tilt`, shape (2,), is added to that of `looked`. With `rng`, tiles and floating points are
+    resampled with replacement (bootstrap).
     """
     total = np.zeros(len(looked.heights_m))
     for _, sums in placing(looked):
@@ -76,7 +76,7 @@ def gains(looked: Looked, tilt: FloatArray, rng: np.random.Generator | None = No
 
 
 def placing(looked: Looked) -> list[tuple[Cue, Moments]]:
-    """Return the cues that fix the level; of the colours the one that says more."""
+    """Return the cues that determine the level; of the two colours the stronger one."""
     fixing = [(cue, sums) for cue, sums in looked.cues if cue.places]
     light = [pair for pair in fixing if "/" in pair[0].name]
     if len(light) < 2:
@@ -90,7 +90,7 @@ def _drawn(count: int, rng: np.random.Generator) -> FloatArray:
 
 
 def best(looked: Looked, tilts: FloatArray) -> Peak:
-    """Return the best height and tilt among those given, shape (k, 2)."""
+    """Return the best height and tilt among tilts of shape (k, 2)."""
     found = []
     for tilt in tilts:
         total, whole = gains(looked, tilt), looked.tilt + tilt
@@ -103,7 +103,7 @@ def best(looked: Looked, tilts: FloatArray) -> Peak:
 def axis_of(samples: Samples, peak: Peak) -> FloatArray:
     """Return the direction in which the waterline runs, shape (2,).
 
-    Water that stands is level, and water that flows is level across: only along it may it fall.
+    Standing water is level, and flowing water is level across: it may only fall along the line.
     """
     xy = samples.xyz[near_surface(samples, peak), :2]
     if len(xy) < 3:
@@ -112,12 +112,12 @@ def axis_of(samples: Samples, peak: Peak) -> FloatArray:
 
 
 def heights_above(samples: Samples, peak: Peak) -> FloatArray:
-    """Return how high the smooth ground of the cells lies above the water, shape (m,)."""
+    """Return the heights of the smooth ground of the cells above the water, shape (m,)."""
     return np.asarray(samples.smooth_m - samples.xyz[:, :2] @ peak.tilt - peak.level_m)
 
 
 def near_surface(samples: Samples, peak: Peak) -> BoolArray:
-    """Return which cells are as high as the water, shape (m,)."""
+    """Return the cells at the height of the water, shape (m,)."""
     return np.asarray(np.abs(heights_above(samples, peak)) <= WATERLINE_M)
 
 
@@ -128,13 +128,13 @@ def tilts_along(axis: FloatArray, step: float, steps: int) -> FloatArray:
 
 
 def tilt_step(samples: Samples) -> float:
-    """Return the step of tilt that is searched: so much over the extent of the cloud."""
+    """Return the step of the searched tilts: `TILT_STEP_M` over the extent of the cloud."""
     extent = float(np.ptp(samples.xyz[:, :2], axis=0).max())
     return max(TILT_STEP_M / extent, LARGEST_TILT / MOST_TILT_STEPS)
 
 
 def refine(samples: Samples, start: Peak, axis: FloatArray | None) -> tuple[Peak, Looked]:
-    """Look again near a surface, in fine steps of height and, along an axis, of tilt."""
+    """Search near a surface in fine steps of height and, along an axis, of tilt."""
     peak, step = start, tilt_step(samples)
     reach = np.arange(-FINE_REACH_M, FINE_REACH_M + FINE_M / 2.0, FINE_M)
     for _ in range(3 if axis is not None else 1):
@@ -146,9 +146,9 @@ def refine(samples: Samples, start: Peak, axis: FloatArray | None) -> tuple[Peak
 
 
 def drawn(looked: Looked, axis: FloatArray | None, step: float) -> tuple[FloatArray, FloatArray]:
-    """Return what draws of the tiles with replacement give beside the surface found.
+    """Return bootstrap samples of the level and of the tilt, relative to the surface found.
 
-    Levels with the tilt that was found, shape (`DRAWS`,), metres, and tilts along the axis, shape
+    Levels have the shape (`DRAWS`,), metres, with the tilt found; tilts along the axis the shape
     (`TILT_DRAWS`,), none without an axis.
     """
     rng = np.random.default_rng(0)
@@ -159,7 +159,7 @@ def drawn(looked: Looked, axis: FloatArray | None, step: float) -> tuple[FloatAr
     if axis is None:
         return level, np.empty(0)
     tilts = tilts_along(axis, step / 2.0, TILT_REACH)
-    tops = [  # a draw of the tiles is the same for all tilts
+    tops = [  # with the same sample for all tilts
         [gains(looked, tilt, np.random.default_rng(seed))[near].max() for tilt in tilts]
         for seed in range(TILT_DRAWS)
     ]
@@ -168,16 +168,16 @@ def drawn(looked: Looked, axis: FloatArray | None, step: float) -> tuple[FloatAr
 
 LEAST_AGREED, LEAST_EACH = 12.0, 3.0
 LIFTS = 0.15, 0.75
-"""Change of slope that can be refraction, about 0.36, seen through bumps."""
+"""Range of the change of slope by refraction, about 0.36, on rough ground."""
 LEAST_ALONE, LEAST_COLOUR_ALONE = 25.0, 40.0
-"""Slope and layer have a size that physics gives; colours can change with height by nature too."""
+"""Physics gives the size of slope and layer; colours may change with height on land too."""
 LEAST_LAYER = 15.0
-"""Noise piles up by chance more often than slopes and colours break at one height."""
+"""Noise forms a layer by chance more often than slopes and colours break at one height."""
 MOST_RIVAL_AGREED, MOST_RIVAL_ALONE = 0.75, 0.5
 MOST_SIGMA_M = 0.2
 LEAST_SHARE = 0.005
 WITNESS_SIGMAS, WITNESS_REACH_M = 3.0, 0.35
-INSTEAD = "give the water surface instead: a level, shoreline points, a plane:a,b,c or a mesh"
+INSTEAD = "Give the water surface: a level, shoreline points, plane:a,b,c or a mesh."
 LAYER = "floating points"
 
 
@@ -186,13 +186,14 @@ def judge(
 ) -> tuple[float, dict[str, float], tuple[str, ...]]:
     """Return the confidence in a surface, the figures of its evidence, and sentences about it.
 
-    `near` is what was seen about it, with its tilt, and `whole` over all heights without one;
+    `near` are the sums about it, with its tilt, and `whole` those over all heights without tilt;
     `sigma_m` is the standard error of its level.
 
     Raises
     ------
     GeometryError
-        If the evidence is poor, contradictory, or all of the cloud is on one side of the surface.
+        ``water.not_found`` if the evidence is weak or contradictory, or all of the cloud is on one
+        side of the surface.
     """
     middle = len(near.heights_m) // 2
     gain = {cue: gain_of(sums) for cue, sums in near.cues}
@@ -200,16 +201,27 @@ def judge(
     found = {cue.name: float(gain[cue].gain[middle]) for cue in fixing}
     found[LAYER] = float(layer_gain(samples, near.heights_m, near.tilt)[middle])
     evidence = {f"{name} gain": value for name, value in found.items()}
-    rival_m, evidence["rival gain"] = _rival(whole, peak)
-    evidence["rival height"] = rival_m + float(samples.origin[2])
-    witnesses = _witnesses(near, gain, evidence)
+    # the rival: the best height elsewhere
+    total = gains(whole, peak.tilt)
+    total = np.where(np.abs(whole.heights_m - peak.level_m) > SAME_PLACE_M, total, 0.0)
+    row = int(np.argmax(total))
+    evidence["rival gain"] = float(total[row])
+    evidence["rival height"] = float(whole.heights_m[row]) + float(samples.origin[2])
+    witnesses = []  # cues that only show that there is water below about here
+    close = np.abs(near.heights_m - near.heights_m[middle]) <= WITNESS_REACH_M
+    for cue, seen in gain.items():
+        if not cue.places:
+            sigmas = float((cue.what.sign * seen.amplitude / (seen.sigma + 1e-12))[close].max())
+            evidence[f"{cue.name} sigmas"] = sigmas
+            if sigmas >= WITNESS_SIGMAS:
+                witnesses.append(f"{cue.meaning} ({sigmas:.0f} standard errors)")
     evidence["total gain"] = sum(max(value, 0.0) for value in found.values())
     evidence["share below"] = float(np.mean(heights_above(samples, peak) < 0.0))
-    speaking = [
+    strong = [
         name for name, g in found.items() if g >= (LEAST_LAYER if name == LAYER else LEAST_EACH)
     ]
-    lift = float(gain[SLOPE].amplitude[middle]) if speaking == [SLOPE.name] else None
-    least = _refuse_poor(_height(samples, peak), evidence, sigma_m, speaking, lift)
+    lift = float(gain[SLOPE].amplitude[middle]) if strong == [SLOPE.name] else None
+    least = _refuse_poor(_height(samples, peak), evidence, sigma_m, strong, lift)
     sentences = []
     for cue in fixing:
         if found[cue.name] >= LEAST_EACH:
@@ -218,73 +230,46 @@ def judge(
             sentences.append(f"{cue.meaning}: {_size(cue, size, sigma)}")
     if found[LAYER] >= LEAST_EACH:
         sentences.append(f"points float in a thin layer (evidence {found[LAYER]:.0f})")
-    total, rival = evidence["total gain"], evidence["rival gain"]
-    confidence = float(min(1.0 - rival / total, 1.0 - math.exp(-total / (2.0 * least))))
+    most, rival = evidence["total gain"], evidence["rival gain"]
+    confidence = float(min(1.0 - rival / most, 1.0 - math.exp(-most / (2.0 * least))))
     return confidence, evidence, (*sentences, *witnesses)
 
 
-def _rival(whole: Looked, peak: Peak) -> tuple[float, float]:
-    """Return the best height that is another one, and its gain."""
-    total = gains(whole, peak.tilt)
-    total = np.where(np.abs(whole.heights_m - peak.level_m) > SAME_PLACE_M, total, 0.0)
-    row = int(np.argmax(total))
-    return float(whole.heights_m[row]), float(total[row])
-
-
-def _witnesses(near: Looked, gain: dict[Cue, Gain], evidence: dict[str, float]) -> list[str]:
-    """Return the sentences of cues that only say that there is water below about here."""
-    sentences = []
-    close = np.abs(near.heights_m - near.heights_m[len(near.heights_m) // 2]) <= WITNESS_REACH_M
-    for cue, seen in gain.items():
-        if not cue.places:
-            sigmas = float((cue.what.sign * seen.amplitude / (seen.sigma + 1e-12))[close].max())
-            evidence[f"{cue.name} sigmas"] = sigmas
-            if sigmas >= WITNESS_SIGMAS:
-                sentences.append(f"{cue.meaning} ({sigmas:.0f} standard errors)")
-    return sentences
-
-
 def _refuse_poor(
-    height: str, evidence: dict[str, float], sigma_m: float, speaking: list[str], lift: float | None
+    height: str, evidence: dict[str, float], sigma_m: float, strong: list[str], lift: float | None
 ) -> float:
-    """Return the evidence that is needed, or refuse.
+    """Return the evidence that is needed, or raise GeometryError ``water.not_found``.
 
-    `speaking` are the cues that gain enough to count; `lift` is the change of slope where that
-    alone speaks: a break that refraction does not make is a bank.
+    `strong` are the cues that gain enough to count; `lift` is the change of slope if that is the
+    only one: a break that refraction does not make is a bank.
     """
     total, rival, wet = (evidence[name] for name in ("total gain", "rival gain", "share below"))
     least, most_rival = LEAST_AGREED, MOST_RIVAL_AGREED
-    if len(speaking) < 2:
-        coloured = any("/" in name or name == BRIGHT.name for name in speaking)
+    if len(strong) < 2:
+        coloured = any("/" in name or name == BRIGHT.name for name in strong)
         least, most_rival = (LEAST_COLOUR_ALONE if coloured else LEAST_ALONE), MOST_RIVAL_ALONE
-    why = ""
     if not LEAST_SHARE <= wet <= 1.0 - LEAST_SHARE:
-        side = "below" if wet > 0.5 else "above"
-        why = (
-            f"nearly all of the cloud lies {side} the best candidate, {height}, so that there is no"
-            " shoreline to see"
-        )
+        reason, why = "no_shoreline", "nearly all of the cloud is on one side of it"
     elif lift is not None and not LIFTS[0] <= lift <= LIFTS[1]:
-        why = (
-            f"the only evidence is a break of slope at {height}, where slopes change by"
-            f" {1.0 + lift:.2f} times and refraction makes about 1.36: a bank or a terrace, it"
-            " seems"
-        )
+        reason = "bank"
+        why = f"slopes change by {1.0 + lift:.2f} times there, and refraction makes about 1.36"
     elif total < least:
-        why = (
-            "slopes, colours, noise and floating points were searched for a change at one height,"
-            f" and the best, {height}, is too weak (evidence {total:.0f}, {least:.0f} needed)"
-        )
+        reason, why = "weak", f"its evidence is {total:.0f}, and {least:.0f} is needed"
     elif rival > most_rival * total:
+        reason = "contradictory"
         why = (
-            f"the evidence is contradictory, {height} and {evidence['rival height']:.2f} m are"
-            f" nearly as likely (evidence {total:.0f} and {rival:.0f})"
+            f"its evidence is {total:.0f}, and {evidence['rival height']:.2f} m has {rival:.0f},"
+            " nearly as much"
         )
     elif sigma_m > MOST_SIGMA_M:
-        why = f"parts of the cloud disagree by {sigma_m:.2f} m about the best candidate, {height}"
-    if why:
-        raise GeometryError(f"No water surface was found: {why}; {INSTEAD}.")
-    return least
+        reason, why = "inconsistent", f"parts of the cloud differ by {sigma_m:.2f} m"
+    else:
+        return least
+    raise GeometryError(
+        "water.not_found",
+        f"No water surface was found. The best candidate is {height}, but {why}. {INSTEAD}",
+        reason=reason, evidence=evidence,
+    )  # fmt: skip
 
 
 def _height(samples: Samples, peak: Peak) -> str:
@@ -296,3 +281,50 @@ def _size(cue: Cue, size: float, sigma: float) -> str:
     if cue == SLOPE:
         return f"true slopes are {1.0 + size:.2f} ± {sigma:.2f} times the apparent ones"
     return f"the logarithm of the ratio falls by {-size:.2f} ± {sigma:.2f} per metre"
+
+
+TILTS = (-0.02, -0.015, -0.01, -0.0075, -0.005, -0.0025, 0.0025, 0.005, 0.0075, 0.01, 0.015, 0.02)
+DIRECTIONS = 4
+REACH_M, LEAST_APART_M = 2.0, 0.3
+"""Largest distance from the given water in the middle of the cloud; least one from end to end."""
+LEAST_GAIN, MOST_LEFT, ABOUT_AS_GOOD = 100.0, 0.4, 0.9
+"""Least evidence of a tilted waterline; the largest share of it for the level one; and the share
+from which another tilt is as likely, as the tilt across a straight shore is unknown."""
+_WINDS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
+
+
+class Tilted(NamedTuple):
+    """A waterline that is tilted against the given water."""
+
+    to: str  # the direction in which it rises
+    slope: float  # rise per metre
+    low_m: float  # lowest and highest place in the cloud, above the given water
+    high_m: float
+
+
+def find_tilt(whole: Looked) -> Tilted | None:
+    """Return the tilt of a cloud's waterline, if any; `whole` has heights above the given water."""
+    samples = whole.samples
+    middle = np.median(samples.xyz[:, :2], axis=0)
+    angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
+    ways = np.column_stack([np.cos(angles), np.sin(angles)])
+
+    def best(tilt: FloatArray) -> Peak:
+        at_middle = whole.heights_m + samples.origin[2] + middle @ tilt
+        gain = np.where(np.abs(at_middle) <= REACH_M, gains(whole, tilt), 0.0)
+        row = int(np.argmax(gain))
+        return Peak(float(whole.heights_m[row]), tilt, float(gain[row]))
+
+    level = best(NO_TILT)
+    peaks = [best(slope * way) for slope in sorted(TILTS, key=abs) for way in ways]
+    least = ABOUT_AS_GOOD * max(one.score for one in peaks)
+    peak = next(one for one in peaks if one.score >= least)  # the least tilt
+    if peak.score < LEAST_GAIN or level.score > MOST_LEFT * peak.score:
+        return None
+    shore = samples.xyz[near_surface(samples, peak), :2] @ peak.tilt
+    heights = shore + peak.level_m + samples.origin[2]
+    if len(heights) < 2 or np.ptp(heights) < LEAST_APART_M:
+        return None
+    slope = float(np.hypot(*peak.tilt))
+    wind = round(float(np.arctan2(peak.tilt[1], peak.tilt[0])) / (np.pi / 4.0)) % len(_WINDS)
+    return Tilted(_WINDS[wind], slope, float(heights.min()), float(heights.max()))

@@ -1,11 +1,10 @@
-"""The water surface as the points see it: its height and its normal above each of them.
+"""Height and slope of the water surface above points.
 
-A raster: between the centres of four cells it is bilinear, z = z00 + s dx + t dy + k s t with s and
-t from 0 to 1; its slope is the gradient of that. An unknown cell is NaN and makes the four patches
-around it unknown, by arithmetic alone. A mesh: the plan is covered by a grid of square cells, each
-of which lists the facets whose bounding box touches it. Coordinates inside are relative to the
-raster's upper left cell, or the mesh's lower left corner, so that nothing is lost at UTM northings
-of five million.
+A raster is bilinear between the centres of four cells, z = z00 + s dx + t dy + k s t with s and t
+from 0 to 1; its slope is the gradient of that. An unknown cell is NaN, and so are the four patches
+around it. Over a mesh lies a grid of square cells in plan, each with the facets whose bounding box
+touches it. Coordinates inside are relative to the raster's upper left cell, or the mesh's lower
+left corner, so that UTM northings of five million lose no digits.
 """
 
 from __future__ import annotations
@@ -41,29 +40,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class FoundSurface:
-    """A water surface and how it was come by.
-
-    Attributes
-    ----------
-    surface : WaterSurface
-    evidence : WaterFit, RiverFit, WaterProposal or None
-        None where the surface was given as it is.
-    points : array, shape (n, 3)
-        Shoreline points that were fitted, metres, the cloud's CRS.
-    notes : tuple of str
-    """
+    """A water surface and its origin."""
 
     surface: WaterSurface
-    evidence: Evidence | None = None
-    points: FloatArray | None = None
+    evidence: Evidence | None = None  # None if the surface was given
+    points: FloatArray | None = None  # (n, 3), fitted shoreline points, metres, the cloud's CRS
     notes: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any] | None:
-        """Return the figures of a fit as plain values; None where nothing was fitted."""
+        """Return the figures of a fit as plain values; None without a fit."""
         return None if self.evidence is None else dict(self.evidence.as_dict())
 
     def sigma_level_m(self, xy: FloatArray) -> FloatArray | None:
-        """Return the standard error of the water's height at places, where its fit says one."""
+        """Return the standard error of the water's height at places, if its fit has one."""
         found = self.evidence
         if found is None:
             return None
@@ -74,100 +63,80 @@ class FoundSurface:
 
 
 class SurfaceAbove(NamedTuple):
-    """The plane of the water surface above each of n points.
+    """The plane of the water surface above each of n points."""
 
-    height_m : shape (n,), world Z of the surface; NaN where the surface is not known.
-    slope : shape (n, 2), dz/dx and dz/dy.
-    """
-
-    height_m: FloatArray
-    slope: FloatArray
+    height_m: FloatArray  # (n,), world Z of the surface; NaN if unknown
+    slope: FloatArray  # (n, 2), dz/dx and dz/dy
 
 
 def surface_above(
     water: WaterSurface, xyz: FloatArray, dimension: npt.ArrayLike | None = None
 ) -> SurfaceAbove:
-    """Return the water surface above (or below) points.
+    """Return the water surface above (or below) points, shape (n, 3), metres, world frame.
 
-    Parameters
-    ----------
-    water : WaterSurface
-    xyz : array, shape (n, 3)
-        Metres, world frame. Only the plan position matters.
-    dimension : array, shape (n,), optional
-        The values of the cloud's dimension, for a `WaterDimension`.
+    A `WaterDimension` needs the values of the cloud's dimension, shape (n,).
 
     Raises
     ------
     SettingError
-        If a `WaterDimension` comes without its values, or with the wrong number of them.
+        ``option.shape`` if a `WaterDimension` comes without its values, or a wrong number of them.
     """
     match water:
         case WaterPlane(a, b, c):
-            # summed in this order, a level comes out as exactly that level
+            # in this order of summation, a level is returned exactly
             height = a + (b * xyz[:, 0] + c * xyz[:, 1])
             return SurfaceAbove(height, np.broadcast_to([b, c], (len(xyz), 2)))
         case WaterDimension(name):
             height = np.asarray([] if dimension is None else dimension, dtype=np.float64)
             if height.shape != (len(xyz),):
                 raise SettingError(
-                    f"The water surface is the dimension {name}: give one height per point,"
-                    f" shape ({len(xyz)},), not {height.shape}."
-                )
+                    "option.shape",
+                    f"The water surface is the dimension {name}. Give one height per point, shape"
+                    f" ({len(xyz)},), not {height.shape}.",
+                    option="water", shape=height.shape,
+                )  # fmt: skip
             return SurfaceAbove(
                 np.where(np.isfinite(height), height, np.nan), np.zeros((len(xyz), 2))
             )
         case WaterMesh():
-            return _mesh_above(water, xyz)
+            tin, (x, y) = build_tin(water), np.ascontiguousarray(xyz[:, :2].T)
+            facet = np.empty(len(xyz), np.int64)
+            in_tiles(_set_facets, len(xyz), tin, x, y, facet)
+            a, b, c = tin.planes[facet].T
+            height = a + b * (x - tin.origin_x) + c * (y - tin.origin_y)
+            return SurfaceAbove(np.where(facet >= 0, height, np.nan), np.column_stack([b, c]))
         case WaterRaster():
-            x, y = np.ascontiguousarray(xyz[:, 0]), np.ascontiguousarray(xyz[:, 1])
+            x, y = np.ascontiguousarray(xyz[:, :2].T)
             return SurfaceAbove(*heights_above(build_field(water), x, y))
 
 
-def _mesh_above(mesh: WaterMesh, xyz: FloatArray) -> SurfaceAbove:
-    tin = build_tin(mesh)
-    facet, (x, y) = np.empty(len(xyz), np.int64), np.ascontiguousarray(xyz[:, :2].T)
-    in_tiles(_set_facets, len(xyz), tin, x, y, facet)
-    plane = tin.planes[facet]
-    height = (
-        plane[:, 0]
-        + plane[:, 1] * (xyz[:, 0] - tin.origin_x)
-        + plane[:, 2] * (xyz[:, 1] - tin.origin_y)
-    )
-    return SurfaceAbove(np.where(facet >= 0, height, np.nan), plane[:, 1:])
-
-
 def is_submerged(z: FloatArray, surface: SurfaceAbove) -> BoolArray:
-    """Return which points lie below the water surface; unknown surface means no."""
+    """Return which points lie below the water surface; not where it is unknown."""
     return np.asarray(z < surface.height_m)
 
 
 class Field(NamedTuple):
-    """The numbers of the lookup in one of k rasters; see `build_field`.
+    """One of k rasters for the kernels; see `build_fields`."""
 
-    heights : shape (cells,), metres, of all rasters, row by row, northern row first.
-    shape : shape (k, 3), where the cells of each begin, its rows and its columns.
-    frame : shape (k, 4), x and y of the centre of the upper left cell of each, world frame, and
-    width and height of a cell, metres; NaN where there is no raster.
-    which : the raster that is meant.
-    """
-
-    heights: FloatArray
-    shape: IntArray
-    frame: FloatArray
-    which: int
+    heights: FloatArray  # (cells,), metres, of all rasters, row by row, northern row first
+    shape: IntArray  # (k, 3), first cell, rows and columns of each raster
+    frame: FloatArray  # (k, 4), x and y of the upper left cell centre, cell width and height, m
+    which: int  # the raster
 
 
 @lru_cache(maxsize=4)
 def build_field(raster: WaterRaster) -> Field:
-    """Return a raster as the kernels take it."""
+    """Return a raster for the kernels."""
     return build_fields({0: raster}, 1)
 
 
 def build_fields(
     rasters: Mapping[int, WaterRaster], k: int, common: WaterRaster | None = None
 ) -> Field:
-    """Return the rasters of some of k images, by their rows, and what the others have in common."""
+    """Return the rasters of some of k images, by index, and the common one of the others.
+
+    The frame of an image without a raster is NaN.
+    """
     shape, frame = np.zeros((k, 3), np.int64), np.full((k, 4), np.nan)
     cells, count = list[FloatArray](), 0
     for raster in dict.fromkeys([*rasters.values(), common]):
@@ -185,9 +154,9 @@ def build_fields(
 
 @device
 def patch_at(field: Field, x: float, y: float) -> tuple[float, float, float, float, float, float]:
-    """Return z00, s, t, both differences and k at a plan position (world frame); NaN if not known.
+    """Return z00, s, t, both differences and k at a plan position (world frame); NaN if unknown.
 
-    In the outer half of the cells at the edge the outermost patch goes on.
+    The outermost patch is extended over the outer half of the cells at the edge.
     """
     k, shape, frame = field.which, field.shape, field.frame
     first, rows, columns = shape[k, 0], shape[k, 1], shape[k, 2]
@@ -206,7 +175,7 @@ def patch_at(field: Field, x: float, y: float) -> tuple[float, float, float, flo
 
 @device
 def height_at(field: Field, x: float, y: float) -> tuple[float, float, float]:
-    """Return height, dz/dx and dz/dy at a plan position (world frame); NaN where not known."""
+    """Return height, dz/dx and dz/dy at a plan position (world frame); NaN if unknown."""
     z, s, t, east, south, twist = patch_at(field, x, y)
     height = z + s * east + t * south + s * t * twist
     cell_x, cell_y = field.frame[field.which, 2], field.frame[field.which, 3]
@@ -229,7 +198,7 @@ def _set_heights(
 
 
 class OwnWater(NamedTuple):
-    """The water of each image where images have one of their own, and its standard error."""
+    """Separate water surfaces of images, and their standard errors."""
 
     heights: Field
     sigma: Field
@@ -238,11 +207,11 @@ class OwnWater(NamedTuple):
 EDGE_TOLERANCE = 1e-9  # of a barycentric coordinate: a point on an edge belongs to both sides
 MIN_FACET_AREA_M2 = 1e-12  # in plan; below this a facet is vertical or a sliver, and has no height
 FARTHEST_M = 1e9
-"""No coordinate on Earth is as large; cells of a mesh that wide cannot be counted."""
+"""No coordinate on Earth is as large."""
 
 
 class Tin(NamedTuple):
-    """The arrays of the lookup; see `build_tin`."""
+    """A mesh for the kernels; see `build_tin`."""
 
     origin_x: float
     origin_y: float
@@ -262,12 +231,14 @@ def build_tin(mesh: WaterMesh) -> Tin:
     Raises
     ------
     GeometryError
-        If no facet has an area in plan, or a vertex is on no map.
+        ``water.mesh`` if no facet has an area in plan, or a vertex is not on Earth.
     """
     if not np.abs(mesh.vertices).max(initial=0.0) < FARTHEST_M:
         raise GeometryError(
-            f"The water surface {mesh.name} has a vertex at"
-            f" {np.abs(mesh.vertices).max():.3g} m, which is on no map; export it again."
+            "water.mesh",
+            f"{mesh.name}: the water surface has a vertex at {np.abs(mesh.vertices).max():.3g} m,"
+            " which is not on Earth. Export it again.",
+            path=mesh.name,
         )
     origin = mesh.vertices[:, :2].min(axis=0)
     xyz = (mesh.vertices - np.append(origin, 0.0))[mesh.triangles]
@@ -275,7 +246,8 @@ def build_tin(mesh: WaterMesh) -> Tin:
     normal = np.cross(edge1, edge2)
     flat = np.abs(normal[:, 2]) > 2.0 * MIN_FACET_AREA_M2
     if not flat.any():
-        raise GeometryError(f"The water surface {mesh.name} has no facet with an area in plan.")
+        text = f"{mesh.name}: the water surface has no facet with an area in plan. Export it again."
+        raise GeometryError("water.mesh", text, path=mesh.name)
     xyz, normal = xyz[flat], normal[flat]
     slope = -normal[:, :2] / normal[:, 2:]
     a = xyz[:, 0, 2] - (slope * xyz[:, 0, :2]).sum(axis=1)
@@ -285,7 +257,7 @@ def build_tin(mesh: WaterMesh) -> Tin:
 
 
 def _index_cells(corners: FloatArray) -> tuple[float, int, int, IntArray, IntArray]:
-    """Return cell size, columns, rows and the ragged table of facets per cell."""
+    """Return cell size, columns, rows, and the facets of each cell as starts and indices."""
     extent = corners.reshape(-1, 2).max(axis=0)
     cell = float(max(np.sqrt(extent.prod() / len(corners)), extent.max() / 4096, 1e-6))
     columns, rows = (np.floor(extent / cell).astype(int) + 1).tolist()
@@ -293,6 +265,7 @@ def _index_cells(corners: FloatArray) -> tuple[float, int, int, IntArray, IntArr
     high = np.floor(corners.max(axis=1) / cell).astype(np.int64)
     width, height = (high - low + 1).T
     facet = np.repeat(np.arange(len(corners)), width * height)
+    # number of each cell within the bounding box of its facet
     within = np.arange(len(facet)) - np.repeat(
         np.cumsum(width * height) - width * height, width * height
     )
@@ -341,31 +314,21 @@ def _set_facets(
 
 
 APART_M = 0.01
-"""Facets that overlap are of no harm where their heights differ by less."""
+"""Overlapping facets are harmless if their heights differ by less."""
 
 
 def in_two_sheets(tin: Tin) -> tuple[BoolArray, FloatArray]:
     """Return which facets have another above or below their centre, and all plan areas, m2.
 
-    A height field has one height above each place: its mesh must be one sheet.
+    A height field has one height above each place, so that its mesh must be one sheet.
     """
-    double = _meet_others(tin, tin.corners.mean(axis=1))
-    edge1, edge2 = tin.corners[:, 1] - tin.corners[:, 0], tin.corners[:, 2] - tin.corners[:, 0]
-    area_m2 = np.abs(edge1[:, 0] * edge2[:, 1] - edge1[:, 1] * edge2[:, 0]) / 2.0
-    return double, area_m2
+    import shapely
 
-
-@kernel(allocates=True)
-def _meet_others(tin: Tin, centres: FloatArray) -> BoolArray:
-    """Return which facets' centres lie in another facet of another height."""
+    triangles, centres = shapely.polygons(tin.corners), tin.corners.mean(axis=1)
+    tree = shapely.STRtree(triangles)
+    facet, other = tree.query(shapely.points(centres), predicate="intersects")
+    a, b, c = (tin.planes[other] - tin.planes[facet]).T
+    u, v = centres[facet].T
     double = np.zeros(len(centres), np.bool_)
-    for f in range(len(centres)):
-        u, v = centres[f]
-        cell = int(v // tin.cell_m) * tin.columns + int(u // tin.cell_m)
-        for k in range(tin.cell_start[cell], tin.cell_start[cell + 1]):
-            other = tin.cell_facet[k]
-            a, b, c = tin.planes[other] - tin.planes[f]
-            if abs(a + (b * u + c * v)) > APART_M and _inside(tin.corners[other], u, v):
-                double[f] = True
-                break
-    return double
+    double[facet[np.abs(a + (b * u + c * v)) > APART_M]] = True
+    return double, shapely.area(triangles)

@@ -1,4 +1,4 @@
-"""Neighbours: as a twin that measures every pair finds them, however the tiles lie."""
+"""Neighbours against brute force over all pairs, and outliers against open3d."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pcfix.clean import neighbours
-from pcfix.clean.neighbours import Neighbours, height_quartiles, make_tiles, mean_of_first
+from pcfix.clean.neighbours import Neighbours, height_quartiles, make_tiles
 from pcfix.clean.points import Reason, clean_points
 from pcfix.io.viewer import load_open3d
 from pcfix.options.steps import CleanRules
@@ -41,24 +41,19 @@ def _pairs(xyz: np.ndarray, axes: int) -> np.ndarray:
     return np.sqrt((apart**2).sum(axis=-1))
 
 
-def _mean_distances(xyz: np.ndarray, tile_m: float) -> np.ndarray:
-    cut = make_tiles(xyz, np.ones(len(xyz), bool), tile_m)
-    near, out = Neighbours(cut, 3), np.empty(len(xyz))
+def _statistics(xyz: np.ndarray, tile_m: float) -> np.ndarray:
+    """Mean distance in space, lower and upper quartile of heights, of every point."""
+    cut = make_tiles(xyz, tile_m=tile_m)
+    near, plan, out = Neighbours(cut, 3), Neighbours(cut, 2), np.empty((len(xyz), 3))
     for piece in cut.pieces(100):
-        out[cut.row[piece]] = mean_of_first(near.nearest(cut.xyz[piece], K)[0], K)
-    return out
-
-
-def _quartiles(xyz: np.ndarray, tile_m: float) -> np.ndarray:
-    cut = make_tiles(xyz, np.ones(len(xyz), bool), tile_m)
-    near, out = Neighbours(cut, 2), np.empty((len(xyz), 2))
-    for piece in cut.pieces(100):
-        out[cut.row[piece]] = height_quartiles(near, cut.xyz[piece], K)
+        some = cut.xyz[piece]
+        out[cut.row[piece], 0] = near.nearest(some, K)[0].mean(axis=1)
+        out[cut.row[piece], 1:] = height_quartiles(plan, some, K)
     return out
 
 
 @pytest.mark.parametrize("make", mostly_nightly([_clustered, _lattice], _clustered))
-def test_statistics_are_those_of_all_pairs_and_of_any_tiles(make) -> None:
+def test_statistics_of_all_pairs(make) -> None:
     xyz = make()
     twin_mean = np.sort(_pairs(xyz, 3), axis=1)[:, :K].mean(axis=1)
     plan = _pairs(xyz, 2)
@@ -66,16 +61,15 @@ def test_statistics_are_those_of_all_pairs_and_of_any_tiles(make) -> None:
     twin_quartiles = np.array(
         [np.percentile(xyz[plan[i] <= far[i] * (1 + 1e-9), 2], (25, 75)) for i in range(len(xyz))]
     )
-    whole_mean, whole_quartiles = _mean_distances(xyz, 1e9), _quartiles(xyz, 1e9)
+    whole = _statistics(xyz, 1e9)
     # rounding of sums of a dozen distances
-    np.testing.assert_allclose(whole_mean, twin_mean, rtol=1e-13)
-    np.testing.assert_allclose(whole_quartiles, twin_quartiles, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(whole[:, 0], twin_mean, rtol=1e-13)
+    np.testing.assert_allclose(whole[:, 1:], twin_quartiles, rtol=0, atol=1e-12)
     for tile_m in (0.5, 3.0, 7.3, 25.0):
-        assert np.array_equal(_mean_distances(xyz, tile_m), whole_mean)
-        assert np.array_equal(_quartiles(xyz, tile_m), whole_quartiles)
+        assert np.array_equal(_statistics(xyz, tile_m), whole)
 
 
-def test_tiles_hold_every_used_point_once() -> None:
+def test_tiles_hold_every_point(monkeypatch: pytest.MonkeyPatch) -> None:
     xyz = _clustered()
     used = np.random.default_rng(1).random(len(xyz)) < 0.7
     cut = make_tiles(xyz, used, 4.0)
@@ -83,28 +77,21 @@ def test_tiles_hold_every_used_point_once() -> None:
     assert np.array_equal(np.sort(cut.row), np.flatnonzero(used))
     assert np.array_equal(cut.xyz, xyz[cut.row])
     assert (np.diff(cut.start) > 0).all()
-
-
-def test_blocks_of_rows_do_not_change_the_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    xyz, used = _clustered(), np.ones(500, bool)
-    whole = make_tiles(xyz, used, 4.0)
     monkeypatch.setattr("pcfix.blocks.ROWS", 77)
-    cut = make_tiles(xyz, used, 4.0)
-    assert np.array_equal(cut.row, whole.row)
-    assert np.array_equal(cut.start, whole.start)
+    assert np.array_equal(make_tiles(xyz, used, 4.0).row, cut.row)
 
 
-def test_points_over_each_other_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_coincident_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """A thousand points in one place of the plan: an answer, and not a table of all pairs."""
     monkeypatch.setattr(neighbours, "_MOST_COLUMNS", 64)
     xyz = np.zeros((1000, 3))
     xyz[:, 2] = np.arange(1000.0)
-    lower, upper = _quartiles(xyz, 1.0).T
+    _, lower, upper = _statistics(xyz, 1.0).T
     assert (upper > lower).all()
 
 
 @pytest.mark.parametrize("tile_m", mostly_nightly([8.0, 31.0, 400.0], 8.0))
-def test_reasons_do_not_depend_on_tiles(tile_m: float) -> None:
+def test_tiles_do_not_matter(tile_m: float) -> None:
     s = spoilt_scene(FEW, OUTLIERS)
     settings = CleanRules(deviations=2.0, radius=1.0)
     whole = clean_points(s.xyz, water=s.water_level_m, settings=settings)
@@ -114,26 +101,21 @@ def test_reasons_do_not_depend_on_tiles(tile_m: float) -> None:
         assert (whole & reason).any()
 
 
-@pytest.mark.parametrize("deviations", mostly_nightly([0.5, 2.0, 4.0], 2.0))
-@pytest.mark.parametrize("k", [8, 20])
-def test_statistical_outliers_are_those_of_open3d(deviations: float, k: int) -> None:
-    o3d, xyz = load_open3d(), spoilt_scene(FEW, OUTLIERS).xyz
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz))
-    _, kept = cloud.remove_statistical_outlier(k, deviations)
-    settings = CleanRules(neighbours=k, deviations=deviations, below=None, floating=None)
-    found = clean_points(xyz, settings=settings, tile_m=20.0)
-    assert np.array_equal(np.flatnonzero(found == 0), np.asarray(kept))
-    assert len(kept) < len(xyz)
+OPEN3D = [
+    ("statistical", {"neighbours": 8, "deviations": 2.0}, (8, 2.0)),
+    ("statistical", {"neighbours": 20, "deviations": 2.0}, (20, 2.0)),
+    ("statistical", {"neighbours": 20, "deviations": 0.5}, (20, 0.5)),
+    ("radius", {"deviations": None, "radius": 0.6, "radius_neighbours": 1}, (1, 0.6)),
+    ("radius", {"deviations": None, "radius": 1.0, "radius_neighbours": 6}, (6, 1.0)),
+]
 
 
-@pytest.mark.parametrize(("radius", "least"), [(0.6, 1), (1.0, 6)])
-def test_radius_outliers_are_those_of_open3d(radius: float, least: int) -> None:
+@pytest.mark.parametrize(("test", "rules", "arguments"), OPEN3D)
+def test_outliers_of_open3d(test: str, rules: dict, arguments: tuple) -> None:
     o3d, xyz = load_open3d(), spoilt_scene(FEW, OUTLIERS).xyz
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz))
-    _, kept = cloud.remove_radius_outlier(least, radius)  # it counts the point itself
-    settings = CleanRules(
-        deviations=None, radius=radius, radius_neighbours=least, below=None, floating=None
-    )
+    _, kept = getattr(cloud, f"remove_{test}_outlier")(*arguments)
+    settings = CleanRules(**rules, below=None, floating=None)
     found = clean_points(xyz, settings=settings, tile_m=20.0)
     assert np.array_equal(np.flatnonzero(found == 0), np.asarray(kept))
     assert len(kept) < len(xyz)

@@ -1,4 +1,4 @@
-"""C2C either way, of several clouds, against SciPy's tree and NumPy asked directly."""
+"""C2C in both directions, of several clouds, against scipy and numpy."""
 
 import csv
 import json
@@ -15,7 +15,8 @@ from pcfix.compare.statistics import distances_of
 from pcfix.flow.compare import compare_clouds
 from pcfix.report.c2c import c2c_figure, c2c_lines, gauss
 from pcfix.report.comparison import comparison_text, evaluation
-from tests.compare.test_files import LIDAR, SCENE, lifted, plane, refused, write_las
+from tests.compare.test_files import LIDAR, SCENE, lifted, plane, write_las
+from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
 
 WHOLE = {"max_gap": 1000.0}  # no point is too far outside the other cloud
@@ -73,7 +74,7 @@ def agrees(found, expected):
         assert share.share == pytest.approx(inside / count, abs=1.5 / count)
 
 
-def test_either_way_before_and_after_is_what_scipy_finds(both, corrected):
+def test_directions(both, corrected):
     las, lidar = laspy.read(corrected), places(LIDAR)
     now = np.asarray(las.xyz)
     came = now - np.column_stack([las["ShiftX"], las["ShiftY"], las["ShiftZ"]])
@@ -84,7 +85,7 @@ def test_either_way_before_and_after_is_what_scipy_finds(both, corrected):
     assert both.counts.reference_compared == len(lidar)
 
 
-def test_a_further_cloud_is_in_the_table_and_the_sections(both, other):
+def test_further_cloud(both, other):
     (one,) = both.also
     assert (one.name, one.cloud) == ("Dietrich", str(other))
     agrees(one.c2c, far(places(other), places(LIDAR)))
@@ -95,7 +96,7 @@ def test_a_further_cloud_is_in_the_table_and_the_sections(both, other):
     np.testing.assert_array_equal(section.heights_m["Dietrich"], alone.heights_m["corrected"])
 
 
-def test_each_direction_alone_is_that_of_both(both, corrected):
+def test_single_direction(both, corrected):
     back = compare_clouds(corrected, LIDAR, direction="from-reference", share="0.6,1.0", **WHOLE)
     assert back.c2c is None
     assert back.c2c_from_reference.after.statistics == both.c2c_from_reference.after.statistics
@@ -106,7 +107,7 @@ def test_each_direction_alone_is_that_of_both(both, corrected):
     assert there.vertical == back.vertical == both.vertical
 
 
-def test_under_water_alone_both_clouds_are_cut(corrected):
+def test_submerged(corrected):
     lidar, las = places(LIDAR), laspy.read(corrected)
     given = {"submerged": True, "direction": "from-reference", "water": 0.37}
     found = compare_clouds(corrected, LIDAR, also={"raw": SCENE / "cloud.laz"}, **given, **WHOLE)
@@ -123,11 +124,8 @@ def test_under_water_alone_both_clouds_are_cut(corrected):
     )
     # S: refraction left 0.4 and 2.2 m; here a bed of twelve metres
     assert before.mean_m > 1.5 > 0.5 > after.mean_m
-
-
-def test_a_cloud_that_knows_no_water_takes_that_of_the_first(corrected):
-    given = {"submerged": True, "also": {"raw": SCENE / "cloud.laz"}}
-    found = compare_clouds(corrected, LIDAR, **given)
+    # a further cloud without water has that of the first
+    found = compare_clouds(corrected, LIDAR, submerged=True, also={"raw": SCENE / "cloud.laz"})
     raw, before = found.also[0].c2c.statistics, found.c2c.before.statistics
     # points within a millimetre of the surface may be dry here and wet there
     assert raw.count == pytest.approx(before.count, abs=20)
@@ -135,7 +133,7 @@ def test_a_cloud_that_knows_no_water_takes_that_of_the_first(corrected):
 
 
 @pytest.mark.parametrize(("count", "classes"), [(1_288_760, 1136), (2209, 47), (2210, 48), (1, 1)])
-def test_as_many_classes_as_cloudcompare_has(count, classes):
+def test_classes_of_cloudcompare(count, classes):
     """1136 are those of Figure 18 of Skarlatos & Agrafiotis 2018, with so many points of LiDAR."""
     values = np.abs(np.random.default_rng(40).normal(0.5, 0.3, count))
     found = distances_of(values, None, [])
@@ -143,9 +141,12 @@ def test_as_many_classes_as_cloudcompare_has(count, classes):
     assert sum(found.histogram.counts) == count
     assert found.histogram.edges_m[-1] >= found.statistics.max_m
     assert len(distances_of(values, 20, []).histogram.counts) == 20
+    touching = [(0.0, 0.5), (0.5, 1.0), (1.0, 3.0)]
+    shares = distances_of(np.array([0.0, 0.5, 0.5, 1.0, 2.0]), None, touching).shares
+    assert [one.share for one in shares] == [0.2, 0.4, 0.4]
 
 
-def test_further_clouds_are_asked_at_the_same_places(tmp_path):
+def test_further_cloud_at_same_places(tmp_path):
     """So that their figures can be laid side by side: all of Figure 18 has 1136 classes."""
     reference = write_las(tmp_path / "ref.las", plane(2000, 55))
     cloud = write_las(tmp_path / "cloud.las", plane(9000, 56, side_m=50.0))
@@ -160,13 +161,7 @@ def test_further_clouds_are_asked_at_the_same_places(tmp_path):
     assert found.also[0].c2c_from_reference.statistics.max_m > 30.0
 
 
-def test_bands_that_touch_count_each_distance_once():
-    values = np.array([0.0, 0.5, 0.5, 1.0, 2.0])
-    shares = distances_of(values, None, [(0.0, 0.5), (0.5, 1.0), (1.0, 3.0)]).shares
-    assert [one.share for one in shares] == [0.2, 0.4, 0.4]
-
-
-def test_gauss_is_written_as_cloudcompare_writes_it(both):
+def test_gauss_as_in_cloudcompare(both):
     values = np.concatenate([np.full(500, 1.0), np.full(500, 3.0)])
     plain = compare_clouds(LIDAR, LIDAR, c2c_only=True).as_dict()
     plain["c2c"]["after"]["normal"] = {"mu_m": 2.234814, "sigma_m": 1.441840}
@@ -183,7 +178,7 @@ def test_gauss_is_written_as_cloudcompare_writes_it(both):
     assert f"  of {count:,} points {100 * share:.1f} % are 0.6 to 1 m away" in text
 
 
-def test_the_curve_on_the_histogram_is_that_gauss(both):
+def test_histogram_curve(both):
     figure = c2c_figure(both.as_dict())
     assert len(figure.axes) == 6  # as it came, corrected, Dietrich; either way
     normal, count = both.c2c.after.normal, both.c2c.after.statistics.count
@@ -204,7 +199,7 @@ def test_the_curve_on_the_histogram_is_that_gauss(both):
     assert ["C2C to reference, corrected", largest] in [[r[0], r[-1]] for r in tables[0].rows]
 
 
-def test_a_sparse_reference_is_noted_with_the_direction_that_serves(tmp_path, corrected):
+def test_sparse_reference(tmp_path, corrected):
     """As at Amathounta, where the LiDAR of Skarlatos & Agrafiotis 2018 was a grid of 5 m."""
     x, y = (a.ravel() for a in np.meshgrid(np.arange(2.0, 60.0, 5.0), np.arange(2.0, 60.0, 5.0)))
     corner = plane(1, 1, side_m=0.0)[0, :2]
@@ -212,70 +207,69 @@ def test_a_sparse_reference_is_noted_with_the_direction_that_serves(tmp_path, co
     reference = write_las(tmp_path / "grid.las", grid)
     cloud = write_las(tmp_path / "cloud.las", lifted(plane(90_000, 50), 0.2))
     assert spacing_m(grid) == pytest.approx(5.0, rel=0.15)
-    there = compare_clouds(cloud, reference)
-    (note,) = (note for note in there.notes if "C2C" in note)
-    assert "the points of the reference are" in note
-    assert note.endswith("give --direction from-reference")
+
+    def sparse(*files, **options):
+        found = compare_clouds(*files, **options)
+        return found, {note.code for note in found.notes} & {"reference.sparse", "cloud.sparse"}
+
+    there, codes = sparse(cloud, reference)
+    assert codes == {"reference.sparse"}
     # the mean distance to the nearest node of a grid of 5 m is 0.383 times that; not 0.2 m
     assert there.c2c.after.statistics.mean_m == pytest.approx(0.383 * 5.0, rel=0.05)
-    back = compare_clouds(cloud, reference, direction="from-reference")
-    assert not any("C2C" in note for note in back.notes)
+    (note,) = (str(note) for note in there.notes if note.code in codes)
+    assert note in evaluation(there.as_dict(), [])[0][1].alt
+    back, codes = sparse(cloud, reference, direction="from-reference")
+    assert not codes
     # points every 0.2 m: at most 2 cm beside the vertical
     assert back.c2c_from_reference.after.statistics.mean_m == pytest.approx(0.2, abs=0.03)
-    turned = compare_clouds(reference, cloud, direction="from-reference").notes
-    assert any(note.endswith("give --direction to-reference") for note in turned)
-    both_ways = compare_clouds(cloud, reference, direction="both").notes
-    assert any(note.endswith("from each point of the reference") for note in both_ways)
-    caption = evaluation(there.as_dict(), [])[0][1].alt
-    assert note[1:] in caption
-    assert not any("C2C" in note for note in compare_clouds(corrected, LIDAR).notes)
+    assert sparse(reference, cloud, direction="from-reference")[1] == {"cloud.sparse"}
+    assert sparse(cloud, reference, direction="both")[1] == {"reference.sparse"}
+    assert not sparse(corrected, LIDAR)[1]
 
 
-def test_check_points_have_one_direction(tmp_path):
+def test_directions_refused(tmp_path, corrected):
+    """Check points are too far apart to be the nearest, and cells of a raster are not measured."""
     cloud = write_las(tmp_path / "a.las", plane(30_000, 51), crs=None)
     rows = [f"{x:.3f},{y:.3f},{z:.4f}" for x, y, z in plane(12, 52)]
-    (tmp_path / "checks.csv").write_text("\n".join(["x,y,z", *rows]) + "\n")
-    checks = tmp_path / "checks.csv"
-    told = compare_clouds(cloud, checks, direction="from-reference")
-    assert told.c2c_from_reference == compare_clouds(cloud, checks).c2c
-    for way in ("to-reference", "both"):
-        refused(
-            pcfix.SettingError, r"checks\.csv: holds check points", cloud, checks, direction=way
-        )
+    checks, raster = tmp_path / "checks.csv", tmp_path / "dsm.tif"
+    checks.write_text("\n".join(["x,y,z", *rows]) + "\n")
+    given = compare_clouds(cloud, checks, direction="from-reference")
+    assert given.c2c_from_reference == compare_clouds(cloud, checks).c2c
+    pcfix.grid_dsm(corrected, raster, resolution=1.0)
+    assert compare_clouds(corrected, raster, direction="to-reference").c2c
+    for files, code, ways in (
+        ((cloud, checks), "reference.check_points", ("to-reference", "both")),
+        ((corrected, raster), "reference.no_points", ("from-reference", "both")),
+    ):
+        for way in ways:
+            with refused(code, path=files[1], direction=way):
+                compare_clouds(*files, direction=way)
 
 
-def test_bad_settings_are_one_clear_sentence(tmp_path, both):
+def test_settings_refused(tmp_path):
     cloud = write_las(tmp_path / "a.las", plane(100, 53))
-    bad = pcfix.SettingError
-    for share in ("1.0,0.6", "-1,2", "1,1", "x,1", "1", "1,2,3", "nan,1", "0,inf"):
-        refused(bad, f"share '{share}' must be two distances", cloud, cloud, share=[share])
-    refused(bad, "share '2.0,1.0' must be", cloud, cloud, share=[(2.0, 1.0)])
-    for also in ("a.las", "=a.las", "one=", "a,b=a.las", " =a.las", "a\tb=a.las"):
-        refused(bad, "must be NAME=CLOUD", cloud, cloud, also=[also])
-    refused(bad, "one is the name of another cloud", cloud, cloud, also=["one=a.las", "one=b.las"])
-    refused(bad, "water is the name of a line", cloud, cloud, also={"water": cloud})
-    refused(pcfix.InputError, "no such file", cloud, cloud, also={"one": tmp_path / "b.las"})
-    refused(bad, "direction 'back' is not one of", cloud, cloud, direction="back")
-    refused(bad, "classes 1 must be a whole number", cloud, cloud, classes=1)
-    refused(bad, "same file", cloud, cloud, plot=cloud, overwrite=True)
+    shares = ("1.0,0.6", "-1,2", "1,1", "x,1", "1", "1,2,3", "nan,1", "0,inf", (2.0, 1.0))
+    also = ("a.las", "=a.las", "one=", "a,b=a.las", " =a.las", "a\tb=a.las", "water=a.las")
     other = write_las(tmp_path / "b.las", plane(100, 53), crs=32634)
-    refused(pcfix.InputError, "UTM zone 34N", cloud, cloud, also={"one": other})
+    for options in [
+        *({"share": [share]} for share in shares),
+        *({"also": [one]} for one in also),
+        {"also": ["one=a.las", "one=b.las"]},
+        {"also": {"one": tmp_path / "none.las"}},
+        {"also": {"one": other}},
+        {"direction": "back"},
+        {"classes": 1},
+        {"plot": cloud, "overwrite": True},
+    ]:
+        with pytest.raises(pcfix.PcfixError):
+            compare_clouds(cloud, cloud, **options)
     dry = {"direction": "from-reference", "submerged": True, "water": -3.0}
     high = write_las(tmp_path / "high.las", lifted(plane(100, 54), 50.0))
-    refused(pcfix.GeometryError, "no point near the cloud is under", cloud, high, **dry)
+    with refused("reference.not_submerged", path=high):
+        compare_clouds(cloud, high, **dry)
 
 
-def test_a_raster_has_no_points_to_start_from(tmp_path, corrected):
-    pcfix.grid_dsm(corrected, tmp_path / "dsm.tif", resolution=1.0)
-    for way in ("from-reference", "both"):
-        refused(
-            pcfix.SettingError, rf"dsm\.tif: is a raster.*--direction {way} starts at",
-            corrected, tmp_path / "dsm.tif", direction=way,
-        )  # fmt: skip
-    assert compare_clouds(corrected, tmp_path / "dsm.tif", direction="to-reference").c2c
-
-
-def test_the_command_leaves_figures_picture_and_sections(tmp_path, both, corrected, other):
+def test_command(tmp_path, both, corrected, other):
     done = run_pcfix(
         "compare", corrected, LIDAR, "--direction", "both", "--share", "0.6,1", "--share", "3,6",
         "--also", f"Dietrich={other}", "--max-gap", "1000", "--sections", "1", "--plot", "c.png",
@@ -289,6 +283,4 @@ def test_the_command_leaves_figures_picture_and_sections(tmp_path, both, correct
     assert (tmp_path / "c.png").read_bytes().startswith(b"\x89PNG")
     with (tmp_path / "out" / "section_01.csv").open() as stream:
         assert next(csv.reader(stream))[-1] == "Dietrich_m"
-    done = run_pcfix("compare", corrected, LIDAR, "--share", "-1,2")
-    assert done.returncode == 1
-    assert done.stderr.startswith("pcfix: share '-1,2' must be two distances LOW,HIGH")
+    assert run_pcfix("compare", corrected, LIDAR, "--share", "-1,2").returncode == 1

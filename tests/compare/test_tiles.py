@@ -1,6 +1,6 @@
-"""In tiles and blocks, with what is large on disk, the figures are those of everything at once.
+"""Figures do not depend on tiles, blocks, threads and arrays on disk.
 
-The twin of each is brute force, or NumPy over the whole array.
+They are compared with brute force, or NumPy over the whole array.
 """
 
 import json
@@ -16,11 +16,12 @@ from pcfix.compare.match import near_in_plan
 from pcfix.compare.nearest import cloud_to_cloud
 from pcfix.compare.statistics import Sample, distances_of, statistics_of
 from pcfix.compare.vertical import heights_at
-from pcfix.errors import InputError, PcfixError
+from pcfix.errors import InputError
 from pcfix.flow.compare import compare_clouds
 from pcfix.io.files import scratch_arrays
 from pcfix.kernels import threads
 from tests.compare.test_files import py4dgeo, write_las
+from tests.utils.codes import refused
 
 
 def in_small_tiles(monkeypatch, points, rows=1_000_000, large=2_000_000):
@@ -60,7 +61,7 @@ def lattice(seed):
 
 
 @pytest.mark.parametrize("make", [clustered, lattice, lambda seed: bed(1500, seed, seed % 2 * 30)])
-def test_distances_are_the_least_of_all_to_the_bit_whatever_the_tiles(make, monkeypatch):
+def test_distances(make, monkeypatch):
     cloud, reference = make(1), make(2)
     expected = least_distances(cloud, reference)
     whole = cloud_to_cloud(cloud, reference)
@@ -72,7 +73,7 @@ def test_distances_are_the_least_of_all_to_the_bit_whatever_the_tiles(make, monk
 
 
 @pytest.mark.parametrize("make", [clustered, lattice])
-def test_heights_do_not_depend_on_tiles(make, monkeypatch):
+def test_heights(make, monkeypatch):
     """On the lattice every place has four nearest points, and twelve more that tie for the rest."""
     cloud, reference = make(1), make(2)
     reference[:, 2] = np.random.default_rng(5).normal(0.0, 1.0, len(reference))
@@ -85,7 +86,7 @@ def test_heights_do_not_depend_on_tiles(make, monkeypatch):
 
 
 @pytest.mark.parametrize("count", [1, 2, 999, 4321])
-def test_order_statistics_over_blocks_are_those_of_numpy(count, monkeypatch):
+def test_order_statistics(count, monkeypatch):
     values = np.round(np.random.default_rng(count).standard_t(2, count), 2)  # with zeros and ties
     monkeypatch.setattr(blocks, "ROWS", 100)
     marks = (0, 0.5, 5, 25, 37.7, 50, 95, 99.5, 100)
@@ -101,15 +102,13 @@ def test_order_statistics_over_blocks_are_those_of_numpy(count, monkeypatch):
     assert classes.counts == np.histogram(np.abs(values), len(classes.counts))[0].tolist()
 
 
-def test_the_overlap_is_the_same_by_table_and_by_search(monkeypatch):
+def test_near_in_plan(monkeypatch):
     cloud, reference = clustered(1), clustered(2)
     near = np.sqrt((np.subtract(cloud[:, None, :2], reference[:, :2]) ** 2).sum(axis=2)).min(axis=1)
     found = near_in_plan(cloud, reference, 3.0)
     assert found[near <= 3.0].all()
     assert not found[near > 3.0 * math.sqrt(8.0)].any()
     monkeypatch.setattr(blocks, "ROWS", 100)
-    np.testing.assert_array_equal(near_in_plan(cloud, reference, 3.0), found)
-    monkeypatch.setattr("pcfix.compare.match.MAX_TABLE", 10)
     np.testing.assert_array_equal(near_in_plan(cloud, reference, 3.0), found)
 
 
@@ -135,7 +134,7 @@ def clouds(tmp_path_factory):
     return folder
 
 
-def test_a_comparison_does_not_depend_on_tiles_threads_and_disk(clouds, monkeypatch):
+def test_comparison(clouds, monkeypatch):
     whole = figures(clouds, "whole")
     in_small_tiles(monkeypatch, 300, large=500)
     with threads(1):
@@ -184,7 +183,7 @@ def m3c2_twin(cloud, reference, core, normal_m, cylinder_m, reach_m):
 
 @py4dgeo
 @pytest.mark.parametrize("points", [10_000, 800, 300])
-def test_m3c2_in_tiles_is_that_of_the_definition(points, monkeypatch):
+def test_m3c2(points, monkeypatch):
     """Were the core point on the border of two pieces of the cylinder, one in two would be off."""
     in_small_tiles(monkeypatch, points)
     cloud, reference = bed(1200, 1, 0.05), bed(900, 2)
@@ -197,29 +196,24 @@ def test_m3c2_in_tiles_is_that_of_the_definition(points, monkeypatch):
     assert found.statistics.sd_m == pytest.approx(expected.std(), abs=1e-9)
 
 
-def test_a_full_disk_is_one_sentence_and_nothing_stays(clouds, tmp_path, monkeypatch):
+def test_disk_after_errors(clouds, tmp_path, monkeypatch):
+    """Arrays on disk are removed if the clouds do not overlap, or the disk is full."""
     monkeypatch.setattr(blocks, "LARGE", 500)
+    far, summary = tmp_path / "far.las", tmp_path / "found.json"
+    write_las(far, bed(1000, 3) + 5000.0)
+    with refused("reference.no_overlap"):
+        compare_clouds(clouds / "cloud.las", far, summary=summary)
 
     def full(*_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.posix_fallocate", full, raising=False)
-    with pytest.raises(InputError, match="temporary space beside it cannot be had"):
-        compare_clouds(
-            clouds / "cloud.las", clouds / "reference.las", summary=tmp_path / "found.json"
-        )
-    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(InputError):
+        compare_clouds(clouds / "cloud.las", clouds / "reference.las", summary=summary)
+    assert list(tmp_path.iterdir()) == [far]
 
 
-def test_after_an_error_the_disk_is_empty(clouds, tmp_path, monkeypatch):
-    monkeypatch.setattr(blocks, "LARGE", 500)
-    write_las(tmp_path / "far.las", bed(1000, 3) + 5000.0)
-    with pytest.raises(PcfixError, match="do not overlap"):
-        compare_clouds(clouds / "cloud.las", tmp_path / "far.las", summary=tmp_path / "found.json")
-    assert [p.name for p in tmp_path.iterdir()] == ["far.las"]
-
-
-def test_what_was_let_go_is_still_there(tmp_path):
+def test_let_go(tmp_path):
     with scratch_arrays(tmp_path / "out") as empty:
         array = empty((300_000, 3), np.float64)
         array[:] = np.arange(900_000.0).reshape(-1, 3)

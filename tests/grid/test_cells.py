@@ -1,4 +1,4 @@
-"""Every cell of a small cloud against a slow twin."""
+"""Every cell of a small cloud against a slow implementation."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_points_on_edges(resolution):
     np.testing.assert_array_equal(cells[:, 1], -number[:, 1] - 1)
 
 
-def test_hillshade_of_every_cell():
+def test_hillshade():
     rng = np.random.default_rng(2)
     height = rng.normal(0.0, 0.4, (9, 11))
     height[rng.random(height.shape) < 0.2] = np.nan
@@ -98,7 +98,7 @@ def test_hillshade_of_every_cell():
         np.testing.assert_array_equal(light, slow_hillshade(height, 0.5, azimuth, altitude))
 
 
-def test_a_slope_that_faces_the_sun_is_the_brightest():
+def test_slope_towards_the_sun():
     """From the north-west at 45 degrees, a 45 degree slope falling to the north-west gets all."""
     row, column = np.mgrid[:5, :5] * 1.0
     towards = (column + row) / np.sqrt(2.0)  # rises to the south-east

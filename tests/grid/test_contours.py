@@ -1,4 +1,4 @@
-"""Contours: where the height is that of their level, and as many as a map can bear."""
+"""Contours: their place, and the interval of a map."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_interval(height, least, expected):
     assert interval_of(height, least) == pytest.approx(expected)
 
 
-def test_depths_have_no_lines_closer_than_they_are_known():
+def test_depth_interval():
     depth, unknown = np.array([[0.0, 1.0], [np.nan, 12.0]]), np.array([np.nan, 1.5, 1.5])
     assert depth_interval(depth, np.zeros(0)) == 1.0
     assert depth_interval(depth, unknown) == 2.0

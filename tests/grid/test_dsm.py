@@ -1,10 +1,8 @@
-"""The raster as a whole: seams, files, surfaces, holes, and what is refused."""
+"""The whole raster: seams, files, surfaces, holes, and refused input."""
 
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
 from pathlib import Path
 
 import laspy
@@ -19,8 +17,8 @@ from pcfix.flow import sorted_points
 from pcfix.flow.dsm import grid_dsm
 from pcfix.grid.lattice import round_resolution
 from pcfix.io.las import source
-from pcfix.report.text import dsm_text
 from tests.grid.clouds import EAST, NORTH, awkward, scattered, write
+from tests.utils.codes import refused
 from tests.utils.gdal import HAS_STATISTICS
 from tests.utils.nightly import mostly_nightly
 from tests.utils.rasters import read_raster
@@ -76,7 +74,7 @@ def test_no_seams(awkward_cloud, tmp_path, monkeypatch, method, fill):
 
 @pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
 @pytest.mark.parametrize("method", METHODS)
-def test_order_of_points_does_not_matter(tmp_path, method):
+def test_order_of_points(tmp_path, method):
     xyz = scattered(3000, 20.0, 20.0)
     for name, rows in (("a", xyz), ("b", xyz[::-1])):
         write(tmp_path / f"{name}.las", rows)
@@ -90,7 +88,7 @@ def sloping(x, y):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_plane(tmp_path, method):
+def test_plane(tmp_path, method):
     """Four points a cell, alike about its centre, on a plane.
 
     Their heights are whole millimetres, so they lie on it, and float32 rounds by 1e-6 m at most
@@ -111,7 +109,7 @@ def test_a_plane(tmp_path, method):
     np.testing.assert_allclose(found[part], expected[part], rtol=0, atol=2e-6)
 
 
-def test_a_plane_between_scattered_points(tmp_path):
+def test_plane_by_tin(tmp_path):
     """Triangles give the plane back wherever points lie; these are rounded to 1 mm in height."""
     xyz = scattered(3000, 30.0, 20.0)
     xyz[:, 2] = sloping(xyz[:, 0], xyz[:, 1])
@@ -135,12 +133,12 @@ def with_sigma(path, xyz, sigma):
     return path
 
 
-def test_uncertainty_is_the_root_mean_square_of_the_points(tmp_path):
+def test_uncertainty(tmp_path):
     xyz = scattered(4000, 20.0, 15.0)
     sigma = np.round(np.random.default_rng(1).uniform(0.01, 0.3, 4000), 4)
     sigma[xyz[:, 0] < EAST + 8.0] = 0.0  # land
     path = with_sigma(tmp_path / "cloud.las", xyz, sigma)
-    with pytest.raises(InputError, match="no dimension WaterDepth, of which the depth is made"):
+    with pytest.raises(InputError):  # no dimension WaterDepth
         grid_dsm(path, tmp_path / "d.tif", what="depth")
     summary = grid_dsm(path, tmp_path / "d.tif", resolution=1.0, what="uncertainty")
     with rasterio.open(tmp_path / "d.tif") as dsm:
@@ -157,10 +155,9 @@ def test_uncertainty_is_the_root_mean_square_of_the_points(tmp_path):
     known = expected[:, 8:]
     assert summary.values["mean"] == pytest.approx(known.mean(), abs=5e-5)
     assert summary.values["max"] == pytest.approx(known.max(), abs=5e-5)
-    assert "m at 95 %, formal" in dsm_text(summary)
 
 
-def test_any_dimension_has_its_mean(tmp_path):
+def test_any_dimension(tmp_path):
     xyz = scattered(2000, 10.0, 10.0)
     path = write(tmp_path / "c.las", xyz)
     las = laspy.read(path)
@@ -174,26 +171,26 @@ def test_any_dimension_has_its_mean(tmp_path):
     assert "singlebandpseudocolor" in (tmp_path / "d.qml").read_text()
 
 
-def test_a_resolution_is_chosen_by_the_distance_of_the_points(tmp_path):
+def test_chosen_resolution(tmp_path):
     """Points at random: so many a cell are as many as those of the cells without any, too."""
     for count, side in ((4000, 40.0), (9000, 25.0)):
         cloud = write(tmp_path / "c.las", scattered(count, side, side))
         summary = grid_dsm(cloud, tmp_path / "d.tif", overwrite=True)
         assert 2.0 <= count / (side / summary.settings["resolution"]) ** 2 <= 4.0
-        assert "chosen for 2 to 4 points each" in dsm_text(summary)
+        assert summary.resolution_is == "chosen"
 
 
-def test_a_pixel_is_the_least_side_of_a_cell():
+def test_round_resolution():
     for spacing in np.geomspace(0.003, 30.0, 200):
         assert 1.99 < (round_resolution(spacing, 0.0) / spacing) ** 2 < 4.01
         assert round_resolution(spacing, 0.5) >= 0.5
 
 
 @pytest.mark.parametrize("cog", [False, True])
-def test_the_file(tmp_path, cog):
+def test_file(tmp_path, cog):
     cloud = write(tmp_path / "cloud.laz", scattered(20_000, 80.0, 70.0), crs="EPSG:32633+5773")
     shade = tmp_path / "shade.tif"
-    with pytest.warns(PcfixWarning, match=r"resolution 0\.2 m is finer .* apart, so there are 0\."):
+    with pytest.warns(PcfixWarning):  # finer than the spacing of the points
         grid_dsm(
             cloud, tmp_path / "d.tif", resolution=0.2, hillshade=shade, cog=cog,
             counts=tmp_path / "n.tif",
@@ -226,19 +223,7 @@ def test_the_file(tmp_path, cog):
     assert {p.name for p in tmp_path.iterdir()} == {"cloud.laz", "d.tif", "n.tif", "shade.tif"}
 
 
-@pytest.mark.skipif(shutil.which("gdalinfo") is None, reason="gdalinfo is not installed")
-def test_gdalinfo_reads_it(tmp_path):
-    cloud = write(tmp_path / "cloud.laz", scattered(2000, 9.99, 7.99))
-    grid_dsm(cloud, tmp_path / "d.tif", resolution=0.5)
-    command = ["gdalinfo", "-json", "-checksum", str(tmp_path / "d.tif")]
-    answer = subprocess.run(command, capture_output=True, text=True, check=True)
-    info = json.loads(answer.stdout)
-    assert info["size"] == [20, 16]
-    assert [band["description"] for band in info["bands"]] == ["height"]
-    assert not answer.stderr
-
-
-def test_fills_are_marked(tmp_path):
+def test_fill(tmp_path):
     """A hole of 3 cells is filled, one of 6 is not; plane heights go on across the small one."""
     x, y = (g.ravel() for g in np.meshgrid(np.arange(0.5, 30.0), np.arange(0.5, 20.0)))
     small = (np.abs(x - 6.5) < 1.6) & (np.abs(y - 6.5) < 1.6)
@@ -270,7 +255,7 @@ def corrected(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("method", "fill"), [("mean", None), ("tin", None), ("mean", 1.5)])
-def test_the_scene_against_its_truth(corrected, tmp_path, method, fill):
+def test_scene(corrected, tmp_path, method, fill):
     """A DSM of the corrected cloud is that of the true one.
 
     Corrected points lie where true ones do to within the image noise of 0.5 px, which the scene's
@@ -311,7 +296,7 @@ def test_surfaces(tmp_path):
     np.testing.assert_array_equal(heights(tmp_path / "bed.tif")[0], [1, np.nan, 7])
 
 
-def test_the_header_may_be_wrong(tmp_path):
+def test_wrong_header(tmp_path):
     """Bounds in the header set sizes of work, not the raster."""
     xyz = scattered(3000, 20.0, 20.0)
     right, wrong = (write(tmp_path / f"{n}.las", xyz) for n in ("right", "wrong"))
@@ -325,62 +310,47 @@ def test_the_header_may_be_wrong(tmp_path):
     assert one.transform == other.transform
 
 
-BAD = {
-    "zero": ({"resolution": 0.0}, "resolution is 0 m; it must be a positive number"),
-    "minus": ({"resolution": -1.0}, "resolution is -1 m"),
-    "nan": ({"resolution": float("nan")}, "resolution is nan m"),
-    "infinite": ({"resolution": float("inf")}, "resolution is inf m"),
-    "method": ({"method": "kriging"}, "method is 'kriging'; it must be one of mean, median, min"),
-    "surface": ({"surface": "water"}, "surface is 'water'; it must be one of all, bed"),
-    "fill": ({"fill": 0.0}, "holes to fill is 0 m; it must be positive"),
-    "far": ({"fill": 2000.0}, "more than 1,000 cells of 1 m"),
-    "sun": ({"altitude": 0.0}, "altitude of the sun is 0 degrees"),
-    "azimuth": ({"azimuth": float("nan")}, "azimuth is nan"),
-    "rms": ({"what": "uncertainty", "method": "tin"}, "leave --method and --fill out"),
-    "what": ({"what": "Colour"}, "no dimension Colour; --what is one of height, depth, "),
-    "suffix": ({"output": "d.asc"}, "written as GeoTIFF. End the name in .tif"),
-    "shade": ({"hillshade": "h.png"}, "h.png: a raster is written as GeoTIFF"),
-    "twice": ({"hillshade": "d.tif"}, "are the same file"),
-    "folder": ({"output": "nowhere/d.tif"}, "does not exist; make it first"),
-    "exists": ({"output": "there.tif"}, "the output exists; add --overwrite"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_settings(tmp_path, monkeypatch, case):
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"resolution": 0.0}, {"resolution": -1.0}, {"resolution": float("nan")},
+        {"resolution": float("inf")}, {"method": "kriging"}, {"surface": "water"}, {"fill": 0.0},
+        {"fill": 2000.0}, {"altitude": 0.0}, {"azimuth": float("nan")},
+        {"what": "uncertainty", "method": "tin"}, {"what": "Colour"}, {"output": "d.asc"},
+        {"hillshade": "h.png"}, {"hillshade": "d.tif"}, {"output": "nowhere/d.tif"},
+        {"output": "there.tif"},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_settings_refused(tmp_path, monkeypatch, change):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "c.las", scattered(500, 10.0, 10.0))
     Path("there.tif").touch()
-    change, message = BAD[case]
     options = {"output": "d.tif", "resolution": 1.0} | change
-    with pytest.raises(SettingError, match=message):
+    with pytest.raises(SettingError):
         grid_dsm("c.las", options.pop("output"), **options)
     assert {p.name for p in tmp_path.iterdir()} == {"c.las", "there.tif"}
 
 
-def test_too_many_cells(tmp_path):
-    cloud = write(tmp_path / "c.las", scattered(5000, 900.0, 300.0))
-    with pytest.raises(SettingError, match=r"899,\d{3} x 299,\d{3} cells,.* 1,000,.*0\.0165 m or"):
-        grid_dsm(cloud, tmp_path / "d.tif", resolution=0.001)
-    assert [p.name for p in tmp_path.iterdir()] == ["c.las"]
-
-
-def test_no_points_left(tmp_path):
-    cloud = write(tmp_path / "c.las", scattered(50, 10.0, 10.0), classes=np.full(50, 7))
-    with pytest.raises(InputError, match="all points are noise"):
-        grid_dsm(cloud, tmp_path / "d.tif", resolution=2.0)
-    with pytest.raises(InputError, match=r"no point of class 40 .bed. that is not withheld"):
-        grid_dsm(cloud, tmp_path / "d.tif", resolution=2.0, surface="bed")
-    assert [p.name for p in tmp_path.iterdir()] == ["c.las"]
-
-
-@pytest.mark.parametrize(("crs", "unit"), [(4326, "degree"), (2263, "US survey foot")])
-def test_not_in_metres(tmp_path, crs, unit):
-    offsets = (15.0, 50.0, 0.0) if crs == 4326 else (EAST, NORTH, 0.0)
-    xyz = scattered(50, 10.0, 10.0) - (EAST, NORTH, 0.0) + offsets
-    cloud = write(tmp_path / "c.las", xyz, crs=crs, offsets=offsets)
-    with pytest.raises(InputError, match=f"is in {unit}; reproject the cloud to one in metres"):
-        grid_dsm(cloud, tmp_path / "d.tif", resolution=2.0)
+def test_clouds_refused(tmp_path, monkeypatch):
+    """Too many cells, only noise, no bed, degrees or feet, no COG driver."""
+    large = write(tmp_path / "large.las", scattered(5000, 900.0, 300.0))
+    with refused("option.resolution", value=0.001, finest=0.0165):
+        grid_dsm(large, tmp_path / "d.tif", resolution=0.001)
+    xyz = scattered(50, 10.0, 10.0)
+    noise = write(tmp_path / "noise.las", xyz, classes=np.full(50, 7))
+    at = (15.0, 50.0, 0.0)
+    degrees = write(tmp_path / "deg.las", xyz - (EAST, NORTH, 0.0) + at, crs=4326, offsets=at)
+    feet = write(tmp_path / "feet.las", xyz, crs=2263)
+    good = write(tmp_path / "good.las", xyz)
+    monkeypatch.setattr(rasterio.Env, "drivers", lambda self: {"GTiff": "GeoTIFF"})
+    for cloud, options, kind in (
+        (noise, {}, InputError), (noise, {"surface": "bed"}, InputError), (degrees, {}, InputError),
+        (feet, {}, InputError), (good, {"cog": True}, SettingError),
+    ):  # fmt: skip
+        with pytest.raises(kind):
+            grid_dsm(cloud, tmp_path / "d.tif", resolution=2.0, **options)
+    assert {p.suffix for p in tmp_path.iterdir()} == {".las"}
 
 
 @pytest.mark.parametrize("content", [b"", b"not a raster", None])
@@ -388,7 +358,7 @@ def test_not_a_raster(tmp_path, content):
     path = tmp_path / "r.tif"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(InputError, match=r"r\.tif: (is damaged, or is not a raster|there is no)"):
+    with pytest.raises(InputError):
         read_raster(path)
 
 
@@ -405,7 +375,7 @@ def test_very_few_points(tmp_path, method, count):
     assert read_raster(tmp_path / "d.tif").crs is None
 
 
-def test_no_harm_when_it_fails(tmp_path, monkeypatch):
+def test_full_disk(tmp_path, monkeypatch):
     """Whatever breaks in the middle, an older raster stays and nothing else is left."""
     cloud = write(tmp_path / "c.las", scattered(500, 10.0, 10.0))
     (tmp_path / "d.tif").write_bytes(b"older")
@@ -414,7 +384,7 @@ def test_no_harm_when_it_fails(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(flow.rasters, "write_part", full)
-    with pytest.raises(InputError, match=r"cannot be written .No space left"):
+    with pytest.raises(InputError):
         grid_dsm(cloud, tmp_path / "d.tif", resolution=1.0, overwrite=True)
     assert {p.name for p in tmp_path.iterdir()} == {"c.las", "d.tif"}
     assert (tmp_path / "d.tif").read_bytes() == b"older"
@@ -438,11 +408,11 @@ def test_summary_and_progress(tmp_path):
     assert steps[-1] == (500, 500)
 
 
-def test_a_stray_point_does_not_make_the_raster_huge(tmp_path):
+def test_stray_point(tmp_path):
     cloud = laspy.read(SCENE / "cloud.laz")
     cloud.x[5] += 200_000.0
     cloud.write(tmp_path / "stray.laz")
-    with pytest.warns(pcfix.PcfixWarning, match="1 point lies far from all others .* at 610,"):
+    with pytest.warns(pcfix.PcfixWarning):
         found = pcfix.grid_dsm(tmp_path / "stray.laz", tmp_path / "d.tif", resolution=1.0)
     whole = pcfix.grid_dsm(SCENE / "cloud.laz", tmp_path / "w.tif", resolution=1.0)
     assert (found.stray, found.points_used) == (1, 19_999)
@@ -452,7 +422,7 @@ def test_a_stray_point_does_not_make_the_raster_huge(tmp_path):
     assert differ.sum() <= 1  # the cell that the point came from
 
 
-def test_a_cloud_of_two_places_keeps_both(tmp_path):
+def test_two_places(tmp_path):
     cloud = laspy.read(SCENE / "cloud.laz")
     cloud.x[: len(cloud.x) // 10] += 3_000.0
     cloud.write(tmp_path / "two.laz")

@@ -1,4 +1,4 @@
-"""Lenses: there and back, beside the slow twin, and what lies beyond the fold."""
+"""Lenses: round trips, the slow implementation, and the fold of the distortion."""
 
 import math
 
@@ -67,7 +67,7 @@ def one(lens, *place):
 
 
 @given(lens=lenses())
-def test_image_to_direction_and_back(lens):
+def test_round_trip_from_image(lens):
     image = image_grid()
     directions = unproject(lens, image)
     there = np.isfinite(directions).all(axis=1)
@@ -77,7 +77,7 @@ def test_image_to_direction_and_back(lens):
 
 
 @given(lens=lenses(), seed=st.integers(0, 2**32 - 1))
-def test_direction_to_image_and_back_is_the_same_branch(lens, seed):
+def test_round_trip_from_direction(lens, seed):
     directions = np.random.default_rng(seed).normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     image = project(lens, directions)
@@ -90,7 +90,7 @@ def test_direction_to_image_and_back_is_the_same_branch(lens, seed):
 
 
 @given(lens=lenses())
-def test_slow_twin_agrees(lens):
+def test_slow_implementation(lens):
     directions = unproject(lens, image_grid(5))
     for direction in directions[np.isfinite(directions).all(axis=1)]:
         u, v = project(lens, 3.7 * direction[None])[0]  # the length does not matter
@@ -99,7 +99,7 @@ def test_slow_twin_agrees(lens):
 
 
 @given(lens=lenses(), x=st.floats(-0.6, 0.6), y=st.floats(-0.6, 0.6))
-def test_jacobian_is_the_derivative(lens, x, y):
+def test_jacobian(lens, x, y):
     c, h = coefficients(lens), 1e-6
     plus, minus = (np.array(distorted(c, x + s, y)) for s in (h, -h))
     above, below = (np.array(distorted(c, x, y + s)) for s in (h, -h))
@@ -109,7 +109,7 @@ def test_jacobian_is_the_derivative(lens, x, y):
 
 
 @pytest.mark.parametrize("inverse", [False, True])
-def test_inversion_beside_a_general_root_finder(inverse):
+def test_inversion(inverse):
     lens = pcfix.Lens(
         2400.0, 4000.0, 3000.0, 2013.0, 1488.0, radial=(-0.21, 0.09, -0.018, 0.001),
         tangential=(8e-4, -5e-4), b1=3.0, b2=-2.0, inverse=inverse,
@@ -144,7 +144,7 @@ FOLDING = pcfix.Lens(1000.0, 4000.0, 3000.0, 2000.0, 1500.0, radial=(-0.6,))
 FOLD = math.sqrt(1.0 / 1.8)  # 1 - 3 * 0.6 r^2 = 0
 
 
-def test_beyond_the_fold_there_is_nothing():
+def test_beyond_the_fold():
     radii = np.array([0.0, 0.5, FOLD - 1e-6, FOLD + 1e-6, 1.0, 1.29, 50.0])
     image = project(FOLDING, np.column_stack([radii, 0 * radii, 1 + 0 * radii]))
     assert np.isfinite(image[:3]).all()
@@ -156,7 +156,7 @@ def test_beyond_the_fold_there_is_nothing():
     assert np.isnan(one(FOLDING, 3999.0, 2999.0)).all()
 
 
-def test_at_the_fold_the_inversion_still_converges():
+def test_at_the_fold():
     farthest = 2000 + 1000 * FOLD * (1 - 0.6 * FOLD**2)
     for short in 10.0 ** np.arange(-12, 1):
         direction = one(FOLDING, farthest - short, 1500.0)
@@ -165,7 +165,7 @@ def test_at_the_fold_the_inversion_still_converges():
         )
 
 
-def test_a_lens_that_pulls_inwards_folds_in_the_image():
+def test_fold_of_inverse_formula():
     """With the inverse formula the fold bounds the image, not the directions."""
     lens = pcfix.Lens(1000.0, 4000.0, 3000.0, 2000.0, 1500.0, radial=(-0.6,), inverse=True)
     assert np.isfinite(one(lens, 2000 + 999.999 * FOLD, 1500.0)).all()
@@ -176,7 +176,7 @@ def test_a_lens_that_pulls_inwards_folds_in_the_image():
     assert np.isnan(image[1:]).all()
 
 
-def test_strong_tangential_terms_do_not_fold_back():
+def test_strong_tangential_terms():
     lens = pcfix.Lens(1000.0, 4000.0, 3000.0, 2000.0, 1500.0, tangential=(0.03, -0.01))
     rng = np.random.default_rng(4)
     plane = rng.uniform(-1, 1, (20_000, 2)) * 10 ** rng.uniform(-1, 3, (20_000, 1))
@@ -188,14 +188,14 @@ def test_strong_tangential_terms_do_not_fold_back():
     assert back[:, :2] / back[:, 2:] == pytest.approx(plane[seen], abs=1e-6)
 
 
-def test_a_pole_of_the_denominator_is_an_end():
+def test_pole_of_denominator():
     lens = pcfix.Lens(1000.0, 4000.0, 3000.0, 2000.0, 1500.0, denominator=(-0.25,))
     image = project(lens, np.array([[1.9, 0, 1], [2.1, 0, 1.0]]))  # the pole is at r = 2
     assert np.isfinite(image[0]).all()
     assert np.isnan(image[1]).all()
 
 
-def test_what_is_behind_and_nowhere():
+def test_behind_the_camera():
     behind = np.array([[0.1, 0.2, -1.0], [0, 0, -1.0], [1, 0, 0.0], [0, 0, 0.0], [np.nan, 0, 1]])
     perspective = pcfix.Lens(1000.0, 4000.0, 3000.0, 2000.0, 1500.0)
     assert np.isnan(project(perspective, behind)).all()
@@ -209,7 +209,7 @@ def test_what_is_behind_and_nowhere():
     assert seen.tolist() == [False, False, True, False, False]  # beside is the end of its image
 
 
-def test_fisheye_sees_beyond_ninety_degrees():
+def test_fisheye_beyond_90_deg():
     lens = pcfix.Lens(900.0, 4000.0, 3000.0, 2000.0, 1500.0, projection="equidistant")
     angle = math.radians(120)
     direction = np.array([[math.sin(angle), 0.0, math.cos(angle)]])
@@ -235,7 +235,7 @@ def test_ends_of_the_projections():
     assert np.isnan(project(nothing, np.array([[0.1, 0.1, 1.0]]))).all()
 
 
-def test_terms_in_turn_differ_from_terms_at_once():
+def test_in_turn():
     values = {"radial": (-0.1,), "tangential": (0.01, 0.005), "projection": "equidistant"}
     base = (1000.0, 4000.0, 3000.0, 2000.0, 1500.0)
     direction = np.array([[0.5, 0.4, 1.0]])
@@ -244,15 +244,11 @@ def test_terms_in_turn_differ_from_terms_at_once():
     assert 0.1 < np.abs(at_once - in_turn).max() < 5
 
 
-def test_no_points():
-    lens = pcfix.Lens(1000.0, 4000.0, 3000.0, 2000.0, 1500.0, radial=(-0.1,))
-    assert project(lens, np.empty((0, 3))).shape == (0, 2)
-    assert unproject(lens, np.empty((0, 2))).shape == (0, 3)
-
-
 def test_any_unit():
     """Millimetres do as well as pixels, and a lens of integers as one of floats."""
     pixels = pcfix.Lens(3000, 4000, 3000, 2000, 1500, radial=(-0.1, 0.02))
     mm = pcfix.Lens(9.0, 12.0, 9.0, 6.0, 4.5, radial=(-0.1, 0.02))
     directions = unproject(pixels, image_grid())
     assert project(mm, directions) / 0.003 == pytest.approx(project(pixels, directions), abs=1e-8)
+    assert project(mm, directions[:0]).shape == (0, 2)
+    assert unproject(mm, np.empty((0, 2))).shape == (0, 3)

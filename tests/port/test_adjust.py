@@ -49,7 +49,7 @@ def write_scene(folder, port):
 
 
 @pytest.mark.parametrize("port", [FLAT, DomePort(0.05, 0.0, 1.49, (0.003, 0.0, 0.004))])
-def test_poses_and_bed_come_home(tmp_path, port):
+def test_poses_and_bed(tmp_path, port):
     made = write_scene(tmp_path, port)
     with threads(1):
         found = adjust_cameras(
@@ -69,7 +69,7 @@ def test_poses_and_bed_come_home(tmp_path, port):
         assert bed < 0.1 * np.median(np.abs(made.apparent - made.truth)[:, 2])
 
 
-def test_the_program_writes_it(tmp_path):
+def test_command(tmp_path):
     made = write_scene(tmp_path, FLAT)
     words = [
         "adjust", "model", "out", "--port", "flat:distance=0.02,thickness=0.008",
@@ -84,7 +84,7 @@ def test_the_program_writes_it(tmp_path):
 
 
 @pytest.mark.parametrize("port", [FLAT, DomePort(0.05, 0.004, 1.49, (0.003, -0.002, 0.006))])
-def test_exact_images_tell_the_port(port):
+def test_port_from_exact_images(port):
     """Light by Fermat's principle; the start is off by millimetres."""
     made, is_flat = simulate_port(port, points=200, seed=4), isinstance(port, FlatPort)
     start = replace(port, distance_m=0.03) if is_flat else replace(port, centre_m=(0.0, 0.0, 0.0))
@@ -110,7 +110,7 @@ def test_exact_images_tell_the_port(port):
     ("port", "free"),
     [(FLAT, "distance"), (DomePort(0.05, 0.0, 1.49, (0.003, 0.0, 0.004)), "centre")],
 )
-def test_noisy_images_tell_the_port_within_its_standard_error(tmp_path, port, free):
+def test_port_from_noisy_images(tmp_path, port, free):
     made = write_scene(tmp_path, port)
     is_flat = free == "distance"
     start = replace(port, distance_m=0.03) if is_flat else replace(port, centre_m=(0.0, 0.0, 0.0))
@@ -134,17 +134,11 @@ def test_noisy_images_tell_the_port_within_its_standard_error(tmp_path, port, fr
     assert words.endswith(f"--port {told['port']}")
 
 
-def test_a_port_has_its_own_unknowns(tmp_path):
+@pytest.mark.parametrize(
+    ("free", "port"), [("level", FLAT), ("centre", FLAT), ("distance", DomePort(0.05))]
+)
+def test_unknowns_refused(free, port, tmp_path):
     write_scene(tmp_path, FLAT)
-    for free, port, words in (
-        ("level", FLAT, "a flat port has no level; what can be free of it is index, distance"),
-        ("centre", FLAT, "a flat port has no centre"),
-        (
-            "distance",
-            DomePort(0.05),
-            "a dome has no distance; what can be free of it is index, centre",
-        ),
-    ):
-        with pytest.raises(SettingError, match=f"free '{free}': {words}"):
-            adjust_cameras(tmp_path / "model", water=None, port=port, free=(free,),
-                           gnss=tmp_path / "gnss.csv")  # fmt: skip
+    given = {"water": None, "gnss": tmp_path / "gnss.csv"}
+    with pytest.raises(SettingError):
+        adjust_cameras(tmp_path / "model", port=port, free=(free,), **given)

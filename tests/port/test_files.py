@@ -1,4 +1,4 @@
-"""A file of points taken under water, through the doors."""
+"""Files of points taken under water, from Python and the command line."""
 
 import json
 
@@ -35,7 +35,7 @@ def cloud(scene, tmp_path_factory):
     return path
 
 
-def test_a_file_is_what_the_arrays_are(scene, cloud, tmp_path):
+def test_file(scene, cloud, tmp_path):
     told = pcfix.correct_file(
         cloud, tmp_path / "out.las", cameras=scene.cameras, port=SPEC, method="consistent",
         respect_classes=(7,), summary=tmp_path / "run.json",
@@ -57,19 +57,14 @@ def test_a_file_is_what_the_arrays_are(scene, cloud, tmp_path):
     report = json.loads((tmp_path / "run.json").read_text())
     assert report["settings"]["port"]["thickness_m"] == 0.008
     assert report["depth_m"] == {}
-    assert "seen through a flat port 20 mm before the projection centre" in summary_text(told)
+    assert str(scene.port) in summary_text(told)
 
 
-def test_forward_intersection_says_what_it_leaves_out(scene, cloud, tmp_path):
-    told = pcfix.correct_file(
-        cloud, tmp_path / "out.las", cameras=scene.cameras, port=scene.port, method="snell"
-    )
-    (note,) = [line for line in told.warnings if "miss each other" in line]
-    assert "--method consistent" in note
-
-
-def test_restored_to_the_bit(scene, cloud, tmp_path):
-    pcfix.correct_file(cloud, tmp_path / "out.las", cameras=scene.cameras, port=SPEC)
+def test_snell_warned_and_restored(scene, cloud, tmp_path):
+    given = {"cameras": scene.cameras, "port": SPEC}
+    warned = len(pcfix.correct_file(cloud, tmp_path / "right.las", **given).warnings)
+    given |= {"method": "snell", "port": scene.port}
+    assert len(pcfix.correct_file(cloud, tmp_path / "out.las", **given).warnings) > warned
     pcfix.restore_file(tmp_path / "out.las", tmp_path / "back.las")
     before, back = laspy.read(cloud), laspy.read(tmp_path / "back.las")
     assert np.array_equal(before.xyz, back.xyz)
@@ -77,50 +72,38 @@ def test_restored_to_the_bit(scene, cloud, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    "given",
     [
-        ({}, "water is missing"),
-        ({"port": SPEC, "water": 0.0}, "water and port exclude each other"),
-        ({"port": "flat"}, "distance is missing"),
-        ({"port": SPEC, "method": "murase"}, "method murase is about a water surface"),
-        ({"port": SPEC, "camera_set": "mvs"}, "camera-set mvs is of no use with a port"),
-        ({"port": SPEC, "unsure": "withhold"}, "unsure withhold is of no use with a port"),
-        ({"port": SPEC, "connected": True}, "connected is of no use with a port"),
-        ({"port": SPEC, "tide": "tide.csv"}, "tide is of no use with a port"),
+        {}, {"port": SPEC, "water": 0.0}, {"port": "flat"}, {"port": SPEC, "method": "murase"},
+        {"port": SPEC, "camera_set": "mvs"}, {"port": SPEC, "unsure": "withhold"},
+        {"port": SPEC, "connected": True}, {"port": SPEC, "tide": "tide.csv"},
     ],
-)
-def test_what_does_not_go_together_is_refused(scene, cloud, tmp_path, given, words):
-    with pytest.raises(SettingError) as raised:
+    ids=str,
+)  # fmt: skip
+def test_options_refused(scene, cloud, tmp_path, given):
+    with pytest.raises(SettingError):
         pcfix.correct_file(cloud, tmp_path / "out.las", cameras=scene.cameras, **given)
-    assert words in str(raised.value)
     assert not list(tmp_path.iterdir())
 
 
-def test_cameras_elsewhere_are_refused(scene, cloud, tmp_path):
+def test_other_cameras_refused(scene, cloud, tmp_path):
     away = pcfix.Cameras(
         scene.cameras.labels, scene.cameras.centres + np.array([5000.0, 0.0, 0.0]),
         scene.cameras.rotations, scene.cameras.lenses,
     )  # fmt: skip
-    with pytest.raises(GeometryError, match="no camera has a point in sight"):
+    with pytest.raises(GeometryError):
         pcfix.correct_file(cloud, tmp_path / "out.las", cameras=away, port=SPEC)
     assert not list(tmp_path.iterdir())
 
 
-def test_command_line(cloud, tmp_path):
-    def run(*words):
-        return run_pcfix(
-            "correct", cloud, tmp_path / "out.las", "--cameras", tmp_path / "none.csv", *words
-        )
-
-    neither = run()
-    assert neither.returncode == 2
-    assert "--port" in neither.stderr
-    both = run("--water", "0", "--port", SPEC)
-    assert both.returncode == 1
-    assert "exclude each other" in both.stderr
-    bad = run("--port", "flat:distance=-1")
-    assert bad.returncode == 1
-    assert "must not be negative" in bad.stderr
-    missing = run("--port", SPEC)
-    assert missing.returncode == 1
-    assert "none.csv" in missing.stderr
+@pytest.mark.parametrize(
+    ("words", "exit_code"),
+    [([], 2), (["--water", "0", "--port", SPEC], 1), (["--port", "flat:distance=-1"], 1),
+     (["--port", SPEC], 1)],
+)  # fmt: skip
+def test_command_line(words, exit_code, cloud, tmp_path):
+    given = ["--cameras", tmp_path / "none.csv", *words]
+    done = run_pcfix("correct", cloud, tmp_path / "out.las", *given)
+    assert done.returncode == exit_code
+    if "flat:distance=-1" in words:
+        assert done.code == "port.range"

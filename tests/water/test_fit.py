@@ -1,4 +1,4 @@
-"""The water surface from shoreline points: planes, levels, rivers, and points without heights."""
+"""Water surfaces fitted to shoreline points: planes, levels, rivers; points without heights."""
 
 import math
 from functools import cache
@@ -9,12 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from pcfix.errors import GeometryError, SettingError
 from pcfix.io.vectors import read_shoreline
-from pcfix.model import WaterPlane
 from pcfix.water.fit import fit_water, heights_from_cloud, is_near
 from pcfix.water.river import fit_river, flow_axis
 from pcfix.water.surface import surface_above
+from tests.utils.codes import refused
 from tests.utils.nightly import mostly_nightly
 
 UTM = np.array([512_345.0, 4_987_654.0])
@@ -46,7 +45,7 @@ def least_squares(points, places):
 
 
 @pytest.mark.parametrize("noise_m", mostly_nightly([0.02, 0.03], 0.02))
-def test_outliers_cost_nothing_against_least_squares_that_knows_them(noise_m):
+def test_as_good_as_without_outliers(noise_m):
     error, known, masks = [], [], 0
     for seed in range(60):
         points, corners, true, good = reach(seed, noise_m=noise_m)
@@ -61,15 +60,18 @@ def test_outliers_cost_nothing_against_least_squares_that_knows_them(noise_m):
     assert within > (0.8 if noise_m == 0.02 else 0.5)  # what 24 good points of such noise can give
 
 
-def test_plane_holds_two_centimetres_where_the_noise_allows_it():
+def test_plane_within_2_cm():
     """With 1 cm noise the corners have a standard error of 5 mm: 2 cm is four of them."""
     for seed in range(25):
         points, corners, true, _ = reach(seed, noise_m=0.01)
         for model in ("auto", "plane"):
-            assert np.abs(fit_water(points, model=model).height_at(corners) - true).max() < 0.02
+            fit = fit_water(points, model=model)
+            assert np.abs(fit.height_at(corners) - true).max() < 0.02
+        seen = surface_above(fit.surface, np.column_stack([corners, np.zeros(4)])).height_m
+        assert seen == pytest.approx(fit.height_at(corners), abs=1e-8)
 
 
-def test_standard_errors_are_what_the_errors_are():
+def test_standard_errors():
     scores, levels = [], []
     for seed in range(100):
         points, corners, true, _ = reach(seed, n=40)
@@ -82,13 +84,13 @@ def test_standard_errors_are_what_the_errors_are():
 
 
 @pytest.mark.parametrize("share", mostly_nightly([0.0, 0.3, 0.4], 0.4))
-def test_up_to_two_fifths_may_be_wrong(share):
+def test_two_fifths_wrong(share):
     for seed in range(20):
         points, corners, true, _ = reach(seed, share=share, n=40)
         assert np.abs(fit_water(points).height_at(corners) - true).max() < 0.07  # 4 sigma
 
 
-def test_many_points_use_a_sample_only_to_start():
+def test_many_points():
     points, corners, true, good = reach(3, n=20_000, share=0.3)
     fit = fit_water(points, model="plane")
     assert (fit.accepted == good).mean() > 0.999
@@ -103,7 +105,7 @@ def as_they_came():
 
 
 @given(st.permutations(range(20)))
-def test_the_order_of_points_does_not_matter(order):
+def test_order_of_points(order):
     points, one = as_they_came()
     other = fit_water(points[order])
     assert one.surface == other.surface
@@ -111,7 +113,7 @@ def test_the_order_of_points_does_not_matter(order):
 
 
 @given(st.floats(-0.035, 0.035), st.floats(-0.035, 0.035), st.floats(-50, 3000))
-def test_exact_points_give_their_plane(b, c, a):
+def test_exact_points(b, c, a):
     rng = np.random.default_rng(1)
     xy = rng.uniform(0, 100, (12, 2))
     z = a + b * xy[:, 0] + c * xy[:, 1]
@@ -121,14 +123,7 @@ def test_exact_points_give_their_plane(b, c, a):
     assert fit.sigma_m < 1e-8
 
 
-def test_surface_is_the_fit():
-    points, corners, _, _ = reach(2)
-    fit = fit_water(points)
-    seen = surface_above(fit.surface, np.column_stack([corners, np.zeros(4)])).height_m
-    assert seen == pytest.approx(fit.height_at(corners), abs=1e-8)
-
-
-def test_tilt_in_words():
+def test_tilt():
     xy = np.array([[x, y] for x in range(0, 100, 10) for y in range(0, 100, 10)], float)
     fit = fit_water(np.column_stack([xy, 5.0 - 0.01 * xy[:, 0]]), model="plane")
     assert fit.tilt_percent == pytest.approx(1.0)
@@ -137,56 +132,51 @@ def test_tilt_in_words():
     assert math.isnan(fit_water(np.column_stack([xy, xy[:, 0] * 0]), model="level").downhill_deg)
 
 
-def test_auto_takes_a_level_for_level_water():
+def test_auto_level():
     models = [fit_water(reach(seed, tilt=0.0)[0]).model for seed in range(60)]
     # chance gives a tilt in 5 % of them: more than 9 of 60 in one case of 200
     assert models.count("level") >= 51
 
 
-def test_auto_tilts_points_of_one_bank_along_it_alone():
+def test_auto_along():
     points = reach(4, width_m=0.0, n=40)[0]
     fit = fit_water(points)
     assert fit.model == "along"
-    assert any("nearly on one line" in note for note in fit.notes)
     assert fit.tilt_percent == pytest.approx(0.3, abs=0.05)
 
 
-def test_auto_takes_a_plane_where_the_tilt_is_across():
+def test_auto_plane():
     rng = np.random.default_rng(0)
     xy = rng.uniform(0, 100, (40, 2))
     z = 0.01 * xy[:, 1] + rng.normal(0, 0.02, 40)
     assert fit_water(np.column_stack([xy, z])).model == "plane"
 
 
-@pytest.mark.parametrize("xy", [np.zeros((5, 2)), np.zeros((2, 2)), np.eye(3)[:, :2]])
-def test_auto_takes_a_level_where_there_is_no_room_for_a_tilt(xy):
+@pytest.mark.parametrize(
+    "xy", [np.zeros((5, 2)), np.zeros((2, 2)), np.eye(3)[:, :2], np.zeros((1, 2))]
+)
+def test_auto_of_few_points(xy):
     fit = fit_water(np.column_stack([xy, np.full(len(xy), 1.5)]))
     assert fit.model == "level"
     assert fit.surface.a == pytest.approx(1.5, abs=1e-12)
     assert fit.surface.b == fit.surface.c == 0.0
+    assert math.isnan(fit.sigma_level_m) == (len(xy) == 1)
 
 
-def test_one_point_is_a_level_without_a_standard_error():
-    fit = fit_water(np.array([[1.0, 2.0, 3.0]]))
-    assert fit.surface == WaterPlane(3.0)
-    assert math.isnan(fit.sigma_level_m)
-    assert any("No point is to spare" in note for note in fit.notes)
-
-
-def test_three_points_are_a_plane_without_a_standard_error():
+def test_three_points():
     points = np.array([[0.0, 0, 1.0], [100, 0, 1.5], [0, 100, 1.2]])
     fit = fit_water(points, model="plane")
     assert fit.residual_m == pytest.approx(np.zeros(3), abs=1e-12)
     assert np.isnan(fit.sigma_at(points[:, :2])).all()
 
 
-def test_heights_rounded_to_centimetres_are_not_outliers():
+def test_rounded_heights():
     z = np.array([0.37] * 9 + [0.38] * 4 + [0.36] * 2)
     xy = np.random.default_rng(0).uniform(0, 50, (15, 2))
     assert fit_water(np.column_stack([xy, z])).accepted.all()
 
 
-def test_points_without_heights_are_left_out():
+def test_points_without_heights():
     points = reach(5)[0]
     points[[3, 8], 2] = np.nan
     fit = fit_water(points)
@@ -195,47 +185,34 @@ def test_points_without_heights_are_left_out():
     assert fit.as_dict()["without_height"] == 2
 
 
-def test_what_to_look_at_is_said():
+def test_notes():
     rng = np.random.default_rng(2)
     xy = rng.uniform(0, 100, (40, 2))
     scattered = fit_water(np.column_stack([xy, rng.uniform(0, 3, 40)]), model="level")
-    assert any("scatter by" in note for note in scattered.notes)
+    assert scattered.notes
     step = np.column_stack([xy, np.where(np.arange(40) < 22, 0.0, 1.0) + rng.normal(0, 0.01, 40)])
-    assert any("Only 22 of 40" in note for note in fit_water(step, model="level").notes)
+    found = fit_water(step, model="level")
+    assert found.accepted.sum() == 22
+    assert found.notes
 
 
 @pytest.mark.parametrize(
-    ("points", "model", "message"),
+    ("points", "model", "code"),
     [
-        (np.zeros((2, 3)), "plane", "needs at least 3 shoreline points with heights, and there"),
-        (np.zeros((1, 3)), "along", "needs at least 2 shoreline points"),
-        (np.zeros((5, 3)), "plane", "The 5 shoreline points are at one place; fit a level"),
-        (np.outer(np.arange(6), [10, 5, 0]), "plane", "The 6 shoreline points are on one line"),
-        (np.full((4, 3), np.nan), "auto", "None of 4 shoreline points has a height"),
-        (np.empty((0, 3)), "auto", "None of 0 shoreline points has a height"),
-        (
-            np.array([[x, y, 0.08 * x] for x in range(9) for y in range(9)], float),
-            "auto",
-            r"tilt by 8.0 %, more than 5 % .* heights and units, or fit a level",
-        ),
+        (np.zeros((2, 3)), "plane", "water.too_few_points"),
+        (np.zeros((1, 3)), "along", "water.too_few_points"),
+        (np.zeros((5, 3)), "plane", "water.on_line"),
+        (np.outer(np.arange(6), [10, 5, 0]), "plane", "water.on_line"),
+        (np.full((4, 3), np.nan), "auto", "water.too_few_points"),
+        (np.empty((0, 3)), "auto", "water.too_few_points"),
+        ([[x, y, 0.08 * x] for x in range(9) for y in range(9)], "auto", "water.tilt"),
+        (np.zeros((4, 3)), "curve", "option.choice"),
+        (np.zeros((4, 2)), "auto", "option.shape"),
     ],
 )
-def test_points_that_fix_no_surface(points, model, message):
-    with pytest.raises(GeometryError, match=message):
+def test_fit_refused(points, model, code):
+    with refused(code):
         fit_water(np.asarray(points, float), model=model)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: fit_water(np.zeros((4, 3)), model="curve"), "model 'curve' is not one of auto"),
-        (lambda: fit_water(np.zeros((4, 2))), r"must have the shape \(n, 3\), not \(4, 2\)"),
-        (lambda: heights_from_cloud(np.zeros((1, 2)), np.zeros((1, 3)), 0), "must be positive"),
-    ],
-)
-def test_settings_outside_their_rule(call, message):
-    with pytest.raises(SettingError, match=message):
-        call()
 
 
 WEIR_M = 300.5
@@ -280,7 +257,7 @@ def bounds_of(places, margin=10.0):
     ("n", "rms_m", "worst_m"),
     mostly_nightly([(80, 0.05, 0.30), (300, 0.02, 0.15)], (300, 0.02, 0.15)),
 )
-def test_a_winding_river_with_riffles_and_a_weir(n, rms_m, worst_m):
+def test_winding_river(n, rms_m, worst_m):
     """More than 10 m from the weir; the worst is at the ends of riffles, between points."""
     for seed in range(6):
         points, places, true, asked, _ = winding(seed, n)
@@ -294,7 +271,7 @@ def test_a_winding_river_with_riffles_and_a_weir(n, rms_m, worst_m):
         assert (np.diff(fit.profile.height_m) < 1e-3).all()
 
 
-def test_the_step_of_a_weir_is_found():
+def test_weir():
     points, places, true, asked, _ = winding(1, 400)
     fit = fit_river(points, bounds_of(places))
     for low, high in ((280, 290), (312, 322)):
@@ -302,7 +279,7 @@ def test_the_step_of_a_weir_is_found():
         assert np.mean((fit.height_at(places) - true)[near]) == pytest.approx(0.0, abs=0.03)
 
 
-def test_the_mesh_of_a_river_is_its_profile():
+def test_mesh_of_river():
     points, places, _, asked, _ = winding(2, 200)
     fit = fit_river(points, bounds_of(places))
     seen = surface_above(fit.surface, np.column_stack([places, np.zeros(len(places))])).height_m
@@ -311,17 +288,16 @@ def test_the_mesh_of_a_river_is_its_profile():
     assert np.abs(seen - fit.height_at(places))[calm].max() < 0.02  # a cell beside a riffle's end
 
 
-def test_beyond_the_ends_the_surface_stays_as_it_is_there():
+def test_beyond_the_ends():
     points, places, _, _, line = winding(4, 200)
     fit = fit_river(points, bounds_of(places, 200.0))
     beyond = line[:1] + 20.0 * (line[:1] - line[1:2])
     ends = fit.profile.height_m[[0, -1]]
     assert fit.height_at(beyond)[0] in ends
-    assert any("Beyond the outermost points" in note for note in fit.notes)
     assert fit.as_dict()["drop_m"] == pytest.approx(ends[0] - ends[1])
 
 
-def test_the_axis_of_one_straight_bank():
+def test_axis_of_straight_bank():
     xy = np.column_stack([np.linspace(0.0, 300.0, 40), np.zeros(40)]) + UTM
     axis = flow_axis(xy)
     station, away = axis.locate(xy)
@@ -329,30 +305,29 @@ def test_the_axis_of_one_straight_bank():
     assert np.abs(np.diff(station)) == pytest.approx(np.full(39, 300.0 / 39), abs=1e-6)
 
 
-def test_water_that_rises_in_the_middle_is_not_held_to_fall():
+def test_rising_water():
     rng = np.random.default_rng(0)
     x = rng.uniform(0, 300, 120)
     z = 1.0 + 0.5 * np.sin(x / 300 * 2 * np.pi) + rng.normal(0, 0.01, 120)
     points = np.column_stack([x, rng.choice([0.0, 15.0], 120), z])
     fit = fit_river(points, (0.0, 0.0, 300.0, 15.0))
     assert not fit.profile.falls
-    assert any("do not fall all along" in note for note in fit.notes)
 
 
 @pytest.mark.parametrize(
-    ("points", "bounds", "message"),
+    ("points", "bounds", "code"),
     [
-        (np.zeros((9, 3)), (0, 0, 1, 1), "needs at least 10 shoreline points with heights"),
-        (np.zeros((12, 3)), (0, 0, 1, 1), "at different places"),
-        (winding(0, 20)[0], (0, 0, 0, 1), "hold no area"),
+        (np.zeros((9, 3)), (0, 0, 1, 1), "water.too_few_points"),
+        (np.zeros((12, 3)), (0, 0, 1, 1), "water.too_few_points"),
+        (winding(0, 20)[0], (0, 0, 0, 1), "cloud.no_extent"),
     ],
 )
-def test_what_fixes_no_river(points, bounds, message):
-    with pytest.raises(GeometryError, match=message):
+def test_river_refused(points, bounds, code):
+    with refused(code):
         fit_river(points, bounds)
 
 
-def test_heights_on_an_even_bank_are_those_of_its_edge():
+def test_heights_on_even_bank():
     rng = np.random.default_rng(0)
     xy = rng.uniform(0, 50, (40_000, 2))
     z = 3.0 + 0.1 * (xy[:, 0] - 25.0) + rng.normal(0, 0.02, len(xy))
@@ -367,15 +342,17 @@ def test_heights_on_an_even_bank_are_those_of_its_edge():
     assert np.array_equal(near, distance <= 1.0)
 
 
-def test_places_without_cloud_have_no_height():
+def test_heights_without_cloud():
     cloud = np.array([[0.0, 0, 1], [0.1, 0, 1], [0, 0.1, 2], [9, 9, 4]])
     found = heights_from_cloud(np.array([[0.0, 0], [9, 9], [50, 50]]), cloud, 0.5)
     assert found[0] == 1.0
     assert np.isnan(found[1:]).all()
     assert np.isnan(heights_from_cloud(np.array([[70.0, 70]]), cloud, 0.5)).all()
+    with refused("option.range", value=0):
+        heights_from_cloud(np.zeros((1, 2)), np.zeros((1, 3)), 0)
 
 
-def test_chance_of_a_tilt_is_wald_s():
+def test_significance_of_tilt():
     """Twice the F statistic of many points is chi squared with two degrees of freedom."""
     rng = np.random.default_rng(3)
     xy = rng.uniform(0, 100, (4000, 2))
@@ -399,7 +376,7 @@ def drawn_by_hand(seed, folder, every_m=30.0, off_m=0.3):
     return xyz, shore.counts
 
 
-def test_a_drawn_line_is_worth_its_vertices(tmp_path):
+def test_drawn_line(tmp_path):
     """Of 300 points along it 11 were drawn: its standard error is theirs."""
     level, sigma, naive = [], [], []
     drawn = [drawn_by_hand(seed, tmp_path) for seed in range(60)]
@@ -415,7 +392,7 @@ def test_a_drawn_line_is_worth_its_vertices(tmp_path):
     assert with_tilt <= 3  # of 15 at 5 %: more in 1 of 100 cases
 
 
-def test_a_dense_line_is_worth_no_more_than_its_heights(tmp_path):
+def test_dense_line(tmp_path):
     """Vertices every 0.1 m take their heights from the same points of the cloud, within 1 m."""
     xyz, counts = drawn_by_hand(1, tmp_path, every_m=0.1, off_m=0.01)
     assert counts.sum() == pytest.approx(150.0, rel=0.05)
