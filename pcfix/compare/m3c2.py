@@ -14,7 +14,8 @@ import numpy as np
 
 from pcfix.clean.neighbours import SLACK, Neighbours, Tiles, make_tiles
 from pcfix.compare.statistics import Statistics, statistics_of
-from pcfix.errors import GeometryError, SettingError, installing
+from pcfix.errors import GeometryError, SettingError
+from pcfix.libraries import installing
 from pcfix.model import FloatArray, IntArray
 
 MAX_CORE_POINTS = 100_000

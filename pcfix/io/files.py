@@ -25,9 +25,10 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.blocks import Empty, on_disk
-from pcfix.errors import InputError, SettingError, optional_library, refusal
+from pcfix.errors import InputError, SettingError, refusal
 from pcfix.grid.lattice import Window
 from pcfix.io.drafts import cannot_write, disk_of, draft_folder, replaced_when_whole
+from pcfix.libraries import optional_library
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.declare import File
 from pcfix.sums import Counted

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import InputError, SettingError, photo_library
+from pcfix.errors import InputError, SettingError
 from pcfix.io.drafts import replaced_when_whole
 from pcfix.io.files import check_output
 from pcfix.io.photographs import PNG, photographs_in, read_photograph, size_of, write_photograph
+from pcfix.libraries import photo_library
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 

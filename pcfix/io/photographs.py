@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import InputError, PcfixError, photo_library
+from pcfix.errors import InputError, PcfixError
 from pcfix.io.drafts import replaced_when_whole
+from pcfix.libraries import photo_library
 from pcfix.model import BoolArray
 
 JPEG, TIFF, PNG = (".jpg", ".jpeg"), (".tif", ".tiff"), (".png",)

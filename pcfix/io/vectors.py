@@ -14,11 +14,12 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from pcfix.errors import InputError, SettingError, installing
+from pcfix.errors import InputError, SettingError
 from pcfix.io.crs import parse_crs
 from pcfix.io.files import check_input
 from pcfix.io.tables import Table, read_lines, split_header, table_below
 from pcfix.io.transformations import LOCAL, way_to_cloud
+from pcfix.libraries import installing
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 

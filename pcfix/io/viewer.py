@@ -6,7 +6,6 @@ open3d end it rather than raise.
 
 from __future__ import annotations
 
-import ctypes
 import os
 import subprocess
 import sys
@@ -17,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import SettingError
+from pcfix.libraries import load_open3d
 from pcfix.model import FloatArray, IntArray
 
 WATER_COLOUR = (0.29, 0.64, 0.78, 0.25)
@@ -159,29 +159,6 @@ def _surroundings(o3d: Any, scene: Scene3d) -> list[dict[str, Any]]:
         material.shader, material.base_color = "defaultLitTransparency", WATER_COLOUR
         found.append({"name": "water", "geometry": mesh, "material": material})
     return found
-
-
-def load_open3d() -> Any:
-    """Import open3d, with the libusb that it needs.
-
-    Its camera drivers link to the system's libusb-1.0, which servers often lack; the one of the
-    package libusb-package serves as well. An `InputError` if it cannot be imported; the message
-    says what to install.
-    """
-    try:
-        try:
-            import libusb_package
-
-            ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
-        except (ImportError, OSError):
-            pass  # the system's own may do
-        import open3d
-    except (ImportError, OSError) as error:
-        raise InputError(
-            f"open3d cannot be loaded ({error}); on Debian and Ubuntu: apt-get install"
-            " libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6."
-        ) from error
-    return open3d
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import photo_library
+from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray
 
 FOLLOWED_PX = 2048

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import SettingError
+from pcfix.libraries import load_open3d
 from pcfix.model import FloatArray
 
 MOST_CELLS = 6_000_000
@@ -53,9 +54,6 @@ class Ground:
         )
 
     def _built(self) -> Any:
-        from open3d.core import Tensor
-        from open3d.t.geometry import RaycastingScene
-
         rows, columns = self.height_m.shape
         x = self.left_m + (np.arange(columns) + 0.5) * self.cell_m - self.middle[0]
         y = self.top_m - (np.arange(rows) + 0.5) * self.cell_m - self.middle[1]
@@ -71,8 +69,9 @@ class Ground:
         faces = np.vstack(
             [np.column_stack([one, below, right]), np.column_stack([right, below, below + 1])]
         ).astype(np.uint32)
-        scene: Any = RaycastingScene()
-        scene.add_triangles(Tensor.from_numpy(corners), Tensor.from_numpy(faces))
+        tensor = load_open3d("open3d.core").Tensor.from_numpy
+        scene = load_open3d("open3d.t.geometry").RaycastingScene()
+        scene.add_triangles(tensor(corners), tensor(faces))
         return scene
 
     def hit(self, origin: FloatArray, direction: FloatArray) -> FloatArray:

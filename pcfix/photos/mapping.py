@@ -24,8 +24,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.errors import photo_library
 from pcfix.lens.imaging import project, unproject
+from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray, Lens, WaterMesh, WaterPlane, WaterRaster
 from pcfix.photos.ground import Ground
 from pcfix.refract.tracing import trace

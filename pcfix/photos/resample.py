@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import photo_library
+from pcfix.libraries import photo_library
 from pcfix.model import BoolArray
 from pcfix.photos.mapping import Shifts
 

@@ -47,8 +47,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import GeometryError, photo_library
+from pcfix.errors import GeometryError
 from pcfix.lens.imaging import project, unproject
+from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray
 from pcfix.photos.calm import grey8
 from pcfix.photos.mapping import Photo

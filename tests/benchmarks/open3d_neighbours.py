@@ -17,14 +17,14 @@ import numpy as np
 from pcfix.clean.neighbours import make_tiles, nearest_of
 from pcfix.clean.points import clean_points
 from pcfix.compare.nearest import cloud_to_cloud
-from pcfix.io.viewer import load_open3d
+from pcfix.libraries import load_open3d
 from pcfix.options.steps import CleanRules
 
 PLANE_POINTS, NEIGHBOURS, DEVIATIONS = 8, 20, 4.0  # the defaults of compare and clean
 RADIUS_M = 1.0  # of the hybrid search, which leaves points off the bed without neighbours
 LOADING = {
     "scipy": "import scipy.spatial",
-    "open3d": "from pcfix.io.viewer import load_open3d; load_open3d()",
+    "open3d": "from pcfix.libraries import load_open3d; load_open3d()",
 }
 
 
