@@ -20,7 +20,7 @@ from pcfix.grid.lattice import Lattice
 from pcfix.io.crs import parse_crs
 from pcfix.io.drafts import folder_when_whole, replaced_when_whole
 from pcfix.io.files import scratch_arrays
-from pcfix.io.frames import Frames, check_calm, read_frames, write_calm, write_spread
+from pcfix.io.photographs import Frames, check_calm, read_frames, write_calm, write_spread
 from pcfix.io.rasters import new_raster, write_part
 from pcfix.kernels import threads
 from pcfix.model import FloatArray, Lens, WaterRaster
