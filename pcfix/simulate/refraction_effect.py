@@ -53,6 +53,11 @@ TOLERANCE, _MOST_ITERATIONS = 1e-9, 50
 """Of tan a, between two of Shan's iterations, and their number."""
 
 
+def _check_positive(what: str, value: float) -> None:
+    if not (np.isfinite(value) and value > 0):
+        raise SettingError("option.range", f"{what} {value:g} is not above 0.", value=value)
+
+
 @dataclass(frozen=True)
 class AerialCamera:
     """A nadir frame camera; its rows are the pixels along the flight, the short side."""
@@ -84,11 +89,6 @@ FLYING_HEIGHTS_M: dict[AerialCamera, tuple[float, ...]] = {
 }
 OVERLAPS: dict[AerialCamera, tuple[float, ...]] = {SWINGLETCAM: (0.8,), ULTRACAM: (0.6, 0.8)}
 """Of Figures 5 and 6; heights above the water."""
-
-
-def _check_positive(what: str, value: float) -> None:
-    if not (np.isfinite(value) and value > 0):
-        raise SettingError("option.range", f"{what} {value:g} is not above 0.", value=value)
 
 
 @dataclass(frozen=True)

@@ -213,7 +213,7 @@ def test_the_command(tmp_path: Path) -> None:
     done = run_pcfix("clean", *words, "--summary", tmp_path / "s.json")
     assert done.returncode == 0, done.stderr
     said = json.loads((tmp_path / "s.json").read_text())
-    assert f"noise        {said['noise']:,}" in done.stdout
+    assert f"{said['noise']:,} points (" in done.stdout
     assert "below bed" in done.stdout
     assert said["settings"]["neighbours"] == 20
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.laz", "out.laz", "s.json"]

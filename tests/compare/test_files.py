@@ -408,7 +408,7 @@ def test_the_command_says_what_python_says(tmp_path, corrected, sample):
     done = run_pcfix("compare", *words)
     assert done.returncode == 0, done.stderr
     assert f"dZ after{sample.vertical.after.statistics.mean_m:21.3f}" in done.stdout
-    assert "depth fit after" in done.stdout
+    assert "Depth after" in done.stdout
     said = json.loads((tmp_path / "o" / "compare.json").read_text())
     assert said["c2c"]["after"]["statistics"] == sample.as_dict()["c2c"]["after"]["statistics"]
     quiet = run_pcfix("compare", corrected, LIDAR, "--c2c-only", "--quiet")

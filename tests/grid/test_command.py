@@ -23,8 +23,8 @@ def test_options_reach_the_raster(cloud):
     words += " --counts n.tif --what height --style"
     answer = run_pcfix("dsm", *words.split())
     assert answer.returncode == 0, answer.stderr
-    assert "raster       40 x 20 cells of 0.5 m, idw" in answer.stdout
-    assert "points       2,000 of 2,000 (bed, class 40)" in answer.stdout
+    assert "40 x 20 cells of 0.5 m, idw" in answer.stdout
+    assert "2,000 of 2,000 (bed, class 40) points" in answer.stdout
     settings = json.loads((cloud.parent / "s.json").read_text())["settings"]
     assert settings == {
         "resolution": 0.5,

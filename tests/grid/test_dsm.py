@@ -157,7 +157,7 @@ def test_uncertainty_is_the_root_mean_square_of_the_points(tmp_path):
     known = expected[:, 8:]
     assert summary.values["mean"] == pytest.approx(known.mean(), abs=5e-5)
     assert summary.values["max"] == pytest.approx(known.max(), abs=5e-5)
-    assert "m at 95 %, formal" in dsm_text(summary)
+    assert "m at 95 % (predicted)" in dsm_text(summary)
 
 
 def test_any_dimension_has_its_mean(tmp_path):

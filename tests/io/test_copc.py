@@ -362,7 +362,7 @@ def test_a_surface_model_of_a_part(tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     count = inside(laspy.read(source)).sum()
-    assert f"of {count:,} of 2,000, those within 456024,5432024,456064,5432074," in done.stdout
+    assert f"{count:,} of {count:,} (" in done.stdout
 
 
 @pytest.mark.parametrize(
